@@ -1,0 +1,56 @@
+"""rigkit: cameras, rigs and reconstructions that are right.
+
+Layers, each importing only rows below it (tests/test_architecture.py reads the imports)::
+
+    8  cli           one module a verb
+    7  report        figures, HTML report, tables in Markdown, CSV and LaTeX
+    6  io            manifests, calibration files, corner files, PLY, images
+    5  validation    planes, angles, baseline, cross-check, tables as data
+    4  reconstruct   the pipeline from matches to a Reconstruction
+    3  corners | affine | fundamental | calibration | synthetic | interop
+    2  cameras       protocol, models, rectification, registry
+    1  geometry | boards | detections | matches | cloud | posetype | progress
+    0  errors | arrays
+
+Conventions: `b_from_a` maps a to b, `x_in_a` lives in a, touching names match; camera x right, y down, z forward; pixel
+(0, 0) is the centre of the top-left pixel; `x2.T @ F21 @ x1 = 0`, `d2 ~ A21 @ d1`; lengths in mm; angles in radians
+inside, degrees in files and reports.
+
+>>> import numpy as np, rigkit
+>>> cam2_from_cam1 = rigkit.Rigid3(np.eye(3), [-300.0, 0.0, 0.0])
+>>> float(np.linalg.norm(cam2_from_cam1.translation_mm))
+300.0
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+__version__ = "0.1.0"
+
+_PUBLIC = {
+    "Board": "rigkit.boards",
+    "BoardDetection": "rigkit.detections",
+    "BoardView": "rigkit.detections",
+    "DegenerateError": "rigkit.errors",
+    "InputError": "rigkit.errors",
+    "Matches": "rigkit.matches",
+    "OrientedCloud": "rigkit.cloud",
+    "PoseType": "rigkit.posetype",
+    "Rigid3": "rigkit.geometry.rigid3",
+    "RigkitError": "rigkit.errors",
+}
+
+__all__ = sorted(_PUBLIC)
+
+
+def __getattr__(name: str) -> Any:
+    """Import public names on first use, so that `import rigkit` and `rigkit --help` stay quick."""
+    if name in _PUBLIC:
+        return getattr(importlib.import_module(_PUBLIC[name]), name)
+    raise AttributeError(f"module 'rigkit' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

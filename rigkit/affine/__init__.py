@@ -1,0 +1,1 @@
+"""Affine transformations from directions, and what they say of the surface."""

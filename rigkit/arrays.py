@@ -1,0 +1,90 @@
+"""Array aliases for signatures, and the one gate by which arrays enter results.
+
+All arrays are float64 with points in rows; a leading `...` broadcasts. Jacobians put the dependent variable first.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rigkit.errors import InputError
+
+__all__ = [
+    "Affines",
+    "BoolArray",
+    "FloatArray",
+    "IntArray",
+    "Mat3",
+    "Normals",
+    "Pixels",
+    "Points",
+    "RayJacobians",
+    "Rays",
+    "as_array",
+    "as_indices",
+]
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+Pixels = Annotated[FloatArray, "(..., 2) px, (u, v), (0, 0) the centre of the top-left pixel"]
+Points = Annotated[FloatArray, "(..., 3) mm"]
+Rays = Annotated[FloatArray, "(..., 3) unit"]
+Normals = Annotated[FloatArray, "(..., 3) unit"]
+Affines = Annotated[FloatArray, "(..., 2, 2) image 2 from image 1"]
+RayJacobians = Annotated[FloatArray, "(..., 3, 2) d ray / d pixel"]
+Mat3 = Annotated[FloatArray, "(..., 3, 3)"]
+
+
+def as_array(value: ArrayLike, shape: tuple[int | None, ...], name: str, *, finite: bool = True) -> FloatArray:
+    """Return a read-only float64 copy of `value`, checked against `shape`.
+
+    Parameters
+    ----------
+    value : array-like
+    shape : tuple of int or None
+        Expected shape; None stands for any length. A leading Ellipsis is not needed: batched functions check only
+        what they store.
+    name : str
+        How the error calls it.
+    finite : bool
+        Refuse NaN and infinity.
+
+    Raises
+    ------
+    InputError
+        Wrong shape, not numeric, or not finite.
+    """
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: not an array of numbers ({error})") from error
+    _check_shape(array, shape, name)
+    if finite and not np.isfinite(array).all():
+        bad = int((~np.isfinite(array)).sum())
+        raise InputError(f"{name}: {bad} of {array.size} values are NaN or infinite; remove them first")
+    array.flags.writeable = False
+    return array
+
+
+def as_indices(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> IntArray:
+    """Return a read-only int64 copy of `value`, checked against `shape`; raises InputError like `as_array`."""
+    raw = np.asarray(value)
+    if raw.size and not np.issubdtype(raw.dtype, np.integer):
+        raise InputError(f"{name}: whole numbers expected, got {raw.dtype}")
+    array = np.array(raw, dtype=np.int64)
+    _check_shape(array, shape, name)
+    array.flags.writeable = False
+    return array
+
+
+def _check_shape(array: NDArray[Any], shape: tuple[int | None, ...], name: str) -> None:
+    fits = array.ndim == len(shape) and all(
+        want is None or want == have for want, have in zip(shape, array.shape, strict=True)
+    )
+    if not fits:
+        wanted = "x".join("N" if want is None else str(want) for want in shape) or "a scalar"
+        raise InputError(f"{name}: expected shape {wanted}, got {'x'.join(map(str, array.shape)) or 'a scalar'}")

@@ -1,0 +1,1 @@
+"""Camera and rig calibration from views of boards."""

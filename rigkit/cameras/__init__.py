@@ -1,0 +1,1 @@
+"""Camera models behind one protocol, found by name in the registry."""

@@ -1,0 +1,18 @@
+"""Camera models by name. Adding a model is one file and one line here."""
+
+from __future__ import annotations
+
+from rigkit.cameras.base import Camera
+from rigkit.cameras.pinhole import Pinhole
+from rigkit.errors import InputError
+
+__all__ = ["MODELS", "camera_model"]
+
+MODELS: dict[str, type[Camera]] = {cls.model: cls for cls in (Pinhole,)}
+
+
+def camera_model(name: str) -> type[Camera]:
+    """Return the camera class called `name`; raises InputError that lists the known ones."""
+    if name not in MODELS:
+        raise InputError(f"camera model '{name}' is unknown; known: {', '.join(sorted(MODELS))}")
+    return MODELS[name]

@@ -1,0 +1,72 @@
+"""The `rigkit` program: finds the verb, runs it, turns errors into one line and an exit code.
+
+A verb is a module in this package with `HELP: str`, `add_arguments(parser)` and `run(args) -> int`, and one line in
+`VERBS`. Verb modules import nothing heavy at module level: `rigkit --help` must answer at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+
+from rigkit.errors import RigkitError
+
+__all__ = ["VERBS", "main"]
+
+VERBS: dict[str, tuple[str, str]] = {}
+"""Verb -> (module, one-line help)."""
+
+EXIT_INTERRUPTED = 130
+EXIT_BUG = 70
+
+
+def build_parser(verb: str | None) -> argparse.ArgumentParser:
+    """Return the parser; only the module of `verb` is imported, all others show their one-line help."""
+    from rigkit import __version__
+
+    parser = argparse.ArgumentParser(
+        prog="rigkit",
+        description="Calibrate lab cameras, reconstruct oriented point clouds, validate them against measured truth.",
+        epilog="Exit codes: 0 well; 1 a check failed; 2 bad input; 3 degenerate geometry; 70 a bug in rigkit.",
+    )
+    parser.add_argument("--version", action="version", version=f"rigkit {__version__}")
+    verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
+    for name, (module_name, summary) in VERBS.items():
+        sub = verbs.add_parser(name, help=summary, description=summary)
+        if name == verb:
+            module = importlib.import_module(module_name)
+            module.add_arguments(sub)
+            sub.set_defaults(run=module.run)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    # The matrices here are small: threads inside BLAS only get in each other's way.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    verb = next((a for a in arguments if not a.startswith("-")), None)
+    try:
+        args = build_parser(verb).parse_args(arguments)
+        return int(args.run(args))
+    except RigkitError as error:
+        print(f"rigkit: {error}", file=sys.stderr)
+        return error.exit_code
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 0
+    except KeyboardInterrupt:
+        print("rigkit: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except Exception:
+        traceback.print_exc()
+        print("rigkit: this is a bug in rigkit; please report the lines above", file=sys.stderr)
+        return EXIT_BUG
+
+
+if __name__ == "__main__":
+    sys.exit(main())

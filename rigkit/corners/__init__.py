@@ -1,0 +1,1 @@
+"""Finding chessboards and their corners, telling boards apart, directions at corners."""

@@ -1,0 +1,1 @@
+"""Epipolar geometry from points and affinities, one solver a file."""

@@ -1,0 +1,1 @@
+"""Rigid motions, rotations, planes and triangulation: numbers only, no images, no files."""

@@ -1,0 +1,97 @@
+"""Rigid motions named target_from_source."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rigkit.arrays import FloatArray, Mat3, Points, as_array
+from rigkit.errors import InputError
+from rigkit.geometry.rotation import nearest_rotation, unit
+
+__all__ = ["Rigid3", "cam_from_world_look_at"]
+
+ROTATION_TOLERANCE = 1e-4
+"""A matrix further than this from orthonormal is a mistake (a scale, a transposed homogeneous matrix), not rounding."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Rigid3:
+    """A rigid motion: `x_in_b = b_from_a.apply(x_in_a)`.
+
+    Attributes
+    ----------
+    rotation : (3, 3) rotation matrix; rounding is removed, anything worse is refused.
+    translation_mm : (3,)
+
+    >>> import numpy as np
+    >>> cam2_from_cam1 = Rigid3(np.eye(3), [-300.0, 0.0, 0.0])
+    >>> cam2_from_cam1.apply(np.array([0.0, 0.0, 1000.0])).tolist()
+    [-300.0, 0.0, 1000.0]
+    >>> (cam2_from_cam1.inverse() @ cam2_from_cam1).translation_mm.tolist()
+    [0.0, 0.0, 0.0]
+    """
+
+    rotation: Mat3
+    translation_mm: FloatArray
+
+    def __post_init__(self) -> None:
+        matrix = as_array(self.rotation, (3, 3), "rotation")
+        nearest = nearest_rotation(matrix)
+        if np.abs(nearest - matrix).max() > ROTATION_TOLERANCE:
+            raise InputError("rotation: not a rotation matrix (orthonormal, determinant +1); check scale and order")
+        object.__setattr__(self, "rotation", as_array(nearest, (3, 3), "rotation"))
+        object.__setattr__(self, "translation_mm", as_array(self.translation_mm, (3,), "translation_mm"))
+
+    @classmethod
+    def identity(cls) -> Rigid3:
+        return cls(np.eye(3), np.zeros(3))
+
+    @classmethod
+    def from_matrix(cls, matrix: ArrayLike) -> Rigid3:
+        """Build from a 4x4 (or 3x4) matrix in mm."""
+        m = np.asarray(matrix, dtype=np.float64)
+        if m.shape not in ((4, 4), (3, 4)):
+            raise InputError(f"rigid motion: expected a 4x4 or 3x4 matrix, got shape {m.shape}")
+        return cls(m[:3, :3], m[:3, 3])
+
+    def matrix(self) -> FloatArray:
+        """Return the 4x4 matrix."""
+        out = np.eye(4)
+        out[:3, :3], out[:3, 3] = self.rotation, self.translation_mm
+        return out
+
+    def apply(self, points: Points) -> Points:
+        """Map points (..., 3) from the source frame to the target frame."""
+        return np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation_mm
+
+    def inverse(self) -> Rigid3:
+        return Rigid3(self.rotation.T, -self.rotation.T @ self.translation_mm)
+
+    def __matmul__(self, other: Rigid3) -> Rigid3:
+        if not isinstance(other, Rigid3):
+            return NotImplemented
+        return Rigid3(self.rotation @ other.rotation, self.rotation @ other.translation_mm + self.translation_mm)
+
+    def allclose(self, other: Rigid3, *, rotation_tol: float = 1e-9, translation_tol_mm: float = 1e-9) -> bool:
+        """Say whether two motions agree entry by entry."""
+        return bool(
+            np.allclose(self.rotation, other.rotation, rtol=0.0, atol=rotation_tol)
+            and np.allclose(self.translation_mm, other.translation_mm, rtol=0.0, atol=translation_tol_mm)
+        )
+
+
+def cam_from_world_look_at(eye_mm: ArrayLike, target_mm: ArrayLike, down: ArrayLike = (0.0, 1.0, 0.0)) -> Rigid3:
+    """Return cam_from_world of a camera at `eye_mm` that looks at `target_mm` with its y axis leaning to `down`.
+
+    Raises InputError where eye and target coincide or the viewing direction is parallel to `down`.
+    """
+    eye = as_array(eye_mm, (3,), "eye_mm")
+    z = unit(as_array(target_mm, (3,), "target_mm") - eye)
+    x = unit(np.cross(as_array(down, (3,), "down"), z))
+    if not np.isfinite(x).all():
+        raise InputError("look_at: eye and target coincide, or the view is parallel to `down`")
+    rotation = np.stack([x, np.cross(z, x), z])
+    return Rigid3(rotation, -rotation @ eye)

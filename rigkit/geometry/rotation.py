@@ -1,0 +1,78 @@
+"""Rotations: exponential map, logarithm, skew matrices, all batched."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.arrays import FloatArray, Mat3
+
+__all__ = ["angle_between", "exp_so3", "log_so3", "nearest_rotation", "rotation_angle", "skew", "unit"]
+
+
+def skew(v: FloatArray) -> Mat3:
+    """Return the matrix [v]x with [v]x w = v x w. `v` (..., 3) -> (..., 3, 3)."""
+    v = np.asarray(v, dtype=np.float64)
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
+def exp_so3(rotation_vector: FloatArray) -> Mat3:
+    """Return the rotation by |w| radians about w. `rotation_vector` (..., 3) -> (..., 3, 3), exact at zero."""
+    w = np.asarray(rotation_vector, dtype=np.float64)
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    k = skew(w)
+    # sinc keeps both coefficients exact down to zero: (1 - cos a) / a^2 = sinc(a/2)^2 / 2.
+    first = np.sinc(angle / np.pi)
+    second = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
+    return np.asarray(np.eye(3) + first * k + second * (k @ k))
+
+
+def log_so3(rotation: Mat3) -> FloatArray:
+    """Return the rotation vector (radians, norm in [0, pi]) of `rotation` (..., 3, 3)."""
+    r = np.asarray(rotation, dtype=np.float64)
+    vee = 0.5 * np.stack(
+        [r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]], axis=-1
+    )
+    sine = np.linalg.norm(vee, axis=-1)
+    cosine = 0.5 * (np.trace(r, axis1=-2, axis2=-1) - 1.0)
+    angle = np.arctan2(sine, cosine)
+    scale = np.where(sine > 1e-12, angle / np.where(sine > 1e-12, sine, 1.0), 1.0)
+    out = vee * scale[..., None]
+    near_pi = (cosine < 0.0) & (sine < 1e-6)
+    if np.any(near_pi):
+        # The antisymmetric part vanishes at pi; the axis is the largest column of R + I.
+        sym = 0.5 * (r + np.swapaxes(r, -1, -2)) + np.eye(3)
+        column = np.argmax(np.linalg.norm(sym, axis=-2), axis=-1)
+        axis = np.take_along_axis(sym, column[..., None, None], axis=-1)[..., 0]
+        axis = unit(axis)
+        sign = np.where(np.sum(axis * vee, axis=-1) < 0.0, -1.0, 1.0)
+        out = np.where(near_pi[..., None], axis * (sign * angle)[..., None], out)
+    return np.asarray(out)
+
+
+def nearest_rotation(matrix: Mat3) -> Mat3:
+    """Return the rotation nearest to `matrix` (..., 3, 3) in the Frobenius norm."""
+    u, _, vt = np.linalg.svd(matrix)
+    flip = np.ones((*u.shape[:-2], 3))
+    flip[..., 2] = np.sign(np.linalg.det(u @ vt))
+    return np.asarray((u * flip[..., None, :]) @ vt)
+
+
+def rotation_angle(rotation: Mat3) -> FloatArray:
+    """Return the angle of `rotation` (..., 3, 3) in radians, in [0, pi], accurate for small angles."""
+    return np.asarray(np.linalg.norm(log_so3(rotation), axis=-1))
+
+
+def unit(v: FloatArray) -> FloatArray:
+    """Return `v` (..., k) scaled to length 1; NaN where the length is zero."""
+    v = np.asarray(v, dtype=np.float64)
+    length = np.linalg.norm(v, axis=-1, keepdims=True)
+    return np.asarray(np.divide(v, length, out=np.full_like(v, np.nan), where=length > 0.0))
+
+
+def angle_between(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the angle in radians between vectors (..., 3), accurate near 0 and pi (atan2, not acos)."""
+    cross = np.linalg.norm(np.cross(a, b), axis=-1)
+    return np.asarray(np.arctan2(cross, np.sum(np.asarray(a) * np.asarray(b), axis=-1)))

@@ -1,0 +1,1 @@
+"""Foreign conventions, each tool in a leaf of its own."""

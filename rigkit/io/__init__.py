@@ -1,0 +1,1 @@
+"""Files: manifests, calibrations, corners, clouds, images. Whole or not at all."""

@@ -1,0 +1,1 @@
+"""Scenes with known truth: geometry, noise, rendered images, studies."""

@@ -1,0 +1,1 @@
+"""Reconstructions against what a person measured."""
