@@ -1,0 +1,146 @@
+"""Reading images, refusing those that are not whole.
+
+Decoders fill the missing part of a cut-off JPEG with grey and say nothing; corners would then be looked for in it. So
+the file's own structure is walked before it is decoded.
+"""
+
+from __future__ import annotations
+
+import re
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.errors import InputError
+
+__all__ = ["Image", "read_image", "to_grey"]
+
+Image = NDArray[np.uint8] | NDArray[np.uint16]
+"""(H, W) grey or (H, W, 3) red green blue."""
+
+JPEG_START = b"\xff\xd8"
+JPEG_END = 0xD9
+JPEG_SCAN = 0xDA
+JPEG_STANDALONE = {0x01, *range(0xD0, 0xD8)}
+JPEG_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
+"""In entropy-coded data 0xff is followed by 0 (stuffing), a restart mark or another 0xff (fill): else it is a marker."""
+PNG_START = b"\x89PNG\r\n\x1a\n"
+BMP_START = b"BM"
+
+
+def read_image(path: str | Path) -> Image:
+    """Return the image as uint8 or uint16, (H, W) or (H, W, 3) in red, green, blue order.
+
+    Pixels come as the sensor wrote them: an orientation in the file's EXIF data is not applied, because a calibration
+    belongs to the sensor. An alpha channel is dropped.
+
+    Raises
+    ------
+    InputError
+        No such file, not an image, cut off or damaged, or a pixel type other than 8 or 16 bit.
+    """
+    source = Path(path)
+    if source.is_dir():
+        raise InputError(f"image '{source}' is a folder; give a file")
+    try:
+        data = source.read_bytes()
+    except FileNotFoundError as error:
+        raise InputError(f"image '{source}' does not exist; check the path in the manifest or session") from error
+    except OSError as error:
+        raise InputError(f"image '{source}' cannot be read: {error.strerror}; check permissions") from error
+    fault = _fault(data)
+    if fault:
+        raise InputError(f"image '{source}' is {fault}; copy it again from the camera")
+    try:
+        with _quiet_opencv():
+            raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise InputError(f"image '{source}' cannot be decoded ({error.err}); convert it to PNG or JPEG") from error
+    if raw is None:
+        raise InputError(f"image '{source}' is damaged or not an image that OpenCV knows; convert it to PNG or JPEG")
+    if raw.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"image '{source}' has {raw.dtype} pixels; save it with 8 or 16 bits")
+    if raw.ndim == 2:
+        return np.ascontiguousarray(raw)
+    return np.ascontiguousarray(raw[..., 2::-1])
+
+
+def to_grey(image: Image) -> Image:
+    """Return (H, W) of the same type; a grey image comes back as it is."""
+    if image.ndim == 2:
+        return image
+    if image.ndim != 3 or image.shape[2] != 3:
+        raise InputError(f"image: expected (H, W) or (H, W, 3), got shape {image.shape}")
+    grey: Image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    return grey
+
+
+@contextmanager
+def _quiet_opencv() -> Iterator[None]:
+    """Keep OpenCV's own lines off stderr: what is wrong is said once, in one line, by the error that follows."""
+    level = cv2.getLogLevel()
+    cv2.setLogLevel(0)
+    try:
+        yield
+    finally:
+        cv2.setLogLevel(level)
+
+
+def _fault(data: bytes) -> str | None:
+    """Return what is wrong with the file's structure, in words that follow "is"; None if nothing was found."""
+    if not data:
+        return "empty"
+    if data.startswith(JPEG_START):
+        return _jpeg_fault(data)
+    if data.startswith(PNG_START):
+        return _png_fault(data)
+    if data.startswith(BMP_START) and len(data) >= 6:
+        size = int.from_bytes(data[2:6], "little")
+        return f"cut off ({len(data)} of {size} bytes)" if len(data) < size else None
+    return None
+
+
+def _jpeg_fault(data: bytes) -> str | None:
+    """Walk the segments up to the end-of-image marker (a thumbnail inside a segment has its own: it is skipped)."""
+    at = len(JPEG_START)
+    while at + 1 < len(data):
+        if data[at] != 0xFF:
+            return f"damaged (byte {at} should start a JPEG segment)"
+        code = data[at + 1]
+        if code == 0xFF:  # fill byte
+            at += 1
+            continue
+        if code == JPEG_END:
+            return None
+        if code in JPEG_STANDALONE:
+            at += 2
+            continue
+        length = int.from_bytes(data[at + 2 : at + 4], "big")
+        if length < 2:
+            break
+        at += 2 + length
+        if code == JPEG_SCAN:
+            marker = JPEG_MARKER.search(data, at)
+            at = marker.start() if marker else len(data)
+    return f"cut off (the JPEG ends without its end marker, after {len(data)} bytes)"
+
+
+def _png_fault(data: bytes) -> str | None:
+    """Check every chunk's length and checksum up to IEND."""
+    at = len(PNG_START)
+    while at + 12 <= len(data):
+        length = int.from_bytes(data[at : at + 4], "big")
+        end = at + 8 + length
+        if end + 4 > len(data):
+            break
+        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            return f"damaged (wrong checksum in the PNG chunk at byte {at})"
+        if data[at + 4 : at + 8] == b"IEND":
+            return None
+        at = end + 4
+    return f"cut off (the PNG ends without its end chunk, after {len(data)} bytes)"
