@@ -11,6 +11,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import cast
 
 import cv2
 import numpy as np
@@ -28,7 +29,7 @@ JPEG_END = 0xD9
 JPEG_SCAN = 0xDA
 JPEG_STANDALONE = {0x01, *range(0xD0, 0xD8)}
 JPEG_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
-"""In entropy-coded data 0xff is followed by 0 (stuffing), a restart mark or another 0xff (fill): else it is a marker."""
+"""In entropy-coded data 0xff is followed by 0 (stuffing), a restart mark or 0xff (fill): else it is a marker."""
 PNG_START = b"\x89PNG\r\n\x1a\n"
 BMP_START = b"BM"
 
@@ -65,9 +66,7 @@ def read_image(path: str | Path) -> Image:
         raise InputError(f"image '{source}' is damaged or not an image that OpenCV knows; convert it to PNG or JPEG")
     if raw.dtype not in (np.uint8, np.uint16):
         raise InputError(f"image '{source}' has {raw.dtype} pixels; save it with 8 or 16 bits")
-    if raw.ndim == 2:
-        return np.ascontiguousarray(raw)
-    return np.ascontiguousarray(raw[..., 2::-1])
+    return cast(Image, np.ascontiguousarray(raw if raw.ndim == 2 else raw[..., 2::-1]))
 
 
 def to_grey(image: Image) -> Image:
@@ -76,19 +75,18 @@ def to_grey(image: Image) -> Image:
         return image
     if image.ndim != 3 or image.shape[2] != 3:
         raise InputError(f"image: expected (H, W) or (H, W, 3), got shape {image.shape}")
-    grey: Image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    return grey
+    return cast(Image, cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
 
 
 @contextmanager
 def _quiet_opencv() -> Iterator[None]:
     """Keep OpenCV's own lines off stderr: what is wrong is said once, in one line, by the error that follows."""
-    level = cv2.getLogLevel()
-    cv2.setLogLevel(0)
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         yield
     finally:
-        cv2.setLogLevel(level)
+        cv2.utils.logging.setLogLevel(level)
 
 
 def _fault(data: bytes) -> str | None:
