@@ -1,0 +1,169 @@
+"""What a calibration is: the camera, how well it explains the views, how sure it is, and what was left out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rigkit.arrays import BoolArray, FloatArray, IntArray, Pixels, Points, as_array, as_indices
+from rigkit.cameras.base import Camera
+from rigkit.errors import InputError
+from rigkit.geometry.rigid3 import Rigid3
+
+__all__ = ["BoardShape", "Calibration", "Candidate", "Convergence", "Outlier", "ViewResult"]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ViewResult:
+    """One board in one image, after the calibration.
+
+    Attributes
+    ----------
+    image : name of the image.
+    board_id : name of the board.
+    cam_from_board : pose of the board.
+    grid : (N, 2) int, (column, row) of each corner.
+    pixels : (N, 2) the corners as they were measured.
+    residuals_px : (N, 2) measured minus projected, of ALL corners of the view, outliers too; NaN where the board's
+        corner does not project.
+    kept : (N,) bool, False for outliers, which took no part in the solution.
+    """
+
+    image: str
+    board_id: str
+    cam_from_board: Rigid3
+    grid: IntArray
+    pixels: Pixels
+    residuals_px: FloatArray
+    kept: BoolArray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "grid", as_indices(self.grid, (None, 2), "grid"))
+        n = len(self.grid)
+        object.__setattr__(self, "pixels", as_array(self.pixels, (n, 2), "pixels"))
+        object.__setattr__(self, "residuals_px", as_array(self.residuals_px, (n, 2), "residuals_px", finite=False))
+        kept = np.array(self.kept, dtype=bool)
+        if kept.shape != (n,):
+            raise InputError(f"view '{self.image}': `kept` must have one entry a corner ({n}), got {kept.shape}")
+        kept.flags.writeable = False
+        object.__setattr__(self, "kept", kept)
+
+    @property
+    def rms_px(self) -> float:
+        """2-D RMS per corner, sqrt(mean |r|^2), over the kept corners; NaN if none is kept."""
+        kept = self.residuals_px[self.kept]
+        return float(np.sqrt((kept**2).sum(axis=1).mean())) if len(kept) else float("nan")
+
+
+@dataclass(frozen=True, slots=True)
+class Outlier:
+    """A corner that took no part in the solution: `residual_px` is its distance from where the board puts it."""
+
+    image: str
+    board_id: str
+    column: int
+    row: int
+    residual_px: float
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A model or board shape that was tried, and why it was (not) taken.
+
+    `heldout_rms_px` is what the choice rests on; None where it could not be had (too few images).
+    """
+
+    name: str
+    parameter_count: int
+    rms_px: float
+    heldout_rms_px: float | None
+    chosen: bool
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Convergence:
+    """How the last solve ended: `reason` in words."""
+
+    iterations: int
+    converged: bool
+    reason: str
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class BoardShape:
+    """A board's corners as the solution has them.
+
+    Attributes
+    ----------
+    board_id : name of the board.
+    kind : "flat", "warp" (print scale and a low-order bow) or "released" (every corner free under a prior).
+    points_mm : (columns * rows, 3) corners in the board frame, row by row.
+    bow_mm : largest departure from a plane.
+    """
+
+    board_id: str
+    kind: str
+    points_mm: Points
+    bow_mm: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "points_mm", as_array(self.points_mm, (None, 3), "points_mm"))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Calibration:
+    """A calibrated camera with everything a person needs to judge it.
+
+    Attributes
+    ----------
+    camera : the camera.
+    rms_px : training error: 2-D RMS per corner, sqrt(mean |residual|^2), kept corners of the views used. OpenCV's
+        convention; sqrt(2) larger than an RMS per coordinate.
+    heldout_rms_px : the headline. The same RMS over images that took no part: k-fold over images, intrinsics and board
+        shape frozen, only the pose of the held-out board refitted. None with fewer images than folds.
+    covariance : (P, P) of `camera.parameters`.
+    frame_covariance : (P + 6, P + 6) of the parameters together with the mean motion of the boards, (rad, mm): what
+        `uncertainty` needs to tell a moved camera from another lens.
+    sigma_px : standard deviation per coordinate of a corner of median quality, from the residuals.
+    views : the views used, in the order given.
+    dropped : (image, reason) of what was not used.
+    outliers : corners left out of views that were used.
+    candidates : models, degrees and board shapes tried.
+    convergence : of the final solve.
+    boards : shapes of the boards.
+    verdicts : what is good and what is not, in words.
+    """
+
+    camera: Camera
+    rms_px: float
+    heldout_rms_px: float | None
+    covariance: FloatArray
+    frame_covariance: FloatArray
+    sigma_px: float
+    views: tuple[ViewResult, ...]
+    dropped: tuple[tuple[str, str], ...]
+    outliers: tuple[Outlier, ...]
+    candidates: tuple[Candidate, ...]
+    convergence: Convergence
+    boards: tuple[BoardShape, ...]
+    verdicts: tuple[str, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        p = self.camera.parameters.size
+        object.__setattr__(self, "covariance", as_array(self.covariance, (p, p), "covariance"))
+        frame = as_array(self.frame_covariance, (p + 6, p + 6), "frame_covariance")
+        object.__setattr__(self, "frame_covariance", frame)
+        if not self.views:
+            raise InputError("calibration: no view was used; a calibration without data cannot be built")
+
+    @property
+    def parameter_sigmas(self) -> FloatArray:
+        """Standard deviations of `camera.parameters`, (P,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def corner_count(self) -> int:
+        """Number of corners used."""
+        return int(sum(int(view.kept.sum()) for view in self.views))
