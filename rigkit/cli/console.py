@@ -1,0 +1,50 @@
+"""What the verbs share: a progress line on stderr, and results on stdout."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from typing import Any
+
+from rigkit.progress import Progress
+
+__all__ = ["note", "print_json", "progress_on_stderr"]
+
+REDRAW_S = 0.1
+BAR_WIDTH = 24
+
+
+def progress_on_stderr() -> Progress:
+    """Return a progress callback: a bar that redraws on a terminal, one line a finished stage elsewhere."""
+    started: dict[str, float] = {}
+    drawn = 0.0
+
+    def show(what: str, done: int, total: int) -> None:
+        nonlocal drawn
+        now = time.monotonic()
+        started.setdefault(what, now)
+        finished = done >= total
+        if sys.stderr.isatty():
+            if finished or now - drawn >= REDRAW_S:
+                drawn = now
+                filled = BAR_WIDTH * done // max(total, 1)
+                bar = "#" * filled + "." * (BAR_WIDTH - filled)
+                end = f" {now - started[what]:.1f} s\n" if finished else ""
+                print(f"\r{what:<36.36} [{bar}] {done}/{total}{end}", end="", file=sys.stderr, flush=True)
+        elif finished:
+            print(f"{what}: {done} done in {now - started[what]:.1f} s", file=sys.stderr)
+        if finished:
+            started.pop(what, None)
+
+    return show
+
+
+def note(text: str) -> None:
+    """Print a line for the person at the terminal; results go to stdout, this goes to stderr."""
+    print(text, file=sys.stderr)
+
+
+def print_json(value: Any) -> None:
+    """Print a result for programs."""
+    print(json.dumps(value, indent=1, allow_nan=False))

@@ -1,0 +1,197 @@
+"""Pictures of a reconstructed pair: corners, epipolar curves, and the oriented cloud with both cameras.
+
+All figures are drawn with matplotlib's object interface (no global state, no display) and returned as PNG bytes.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.arrays import FloatArray, Pixels
+from rigkit.cameras.base import Camera
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.reconstruct import Reconstruction
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["BOARD_COLOURS", "cloud_png", "corners_png", "epipolar_curves", "epipolar_png"]
+
+BOARD_COLOURS = ("#e6550d", "#1f77b4", "#2ca02c", "#9467bd", "#d6b300", "#17becf", "#e377c2", "#7f7f7f")
+"""One colour a board, the same in every picture; readable on dark and light images."""
+
+DPI = 110
+NORMAL_LENGTH_SQUARES = 0.8
+PYRAMID_DEPTH = 0.18
+"""Depth of a drawn camera pyramid, relative to the median distance of the points."""
+
+CURVE_SAMPLES = 240
+
+
+def board_colour(index: int) -> str:
+    return BOARD_COLOURS[index % len(BOARD_COLOURS)]
+
+
+def corners_png(reconstruction: Reconstruction, image1: NDArray[Any], image2: NDArray[Any]) -> bytes:
+    """Draw the matched corners over both images: rows joined, first corner marked, boards named."""
+    figure, axes = _pair_axes(image1, image2)
+    for axis, pixels in zip(axes, (reconstruction.pixels1, reconstruction.pixels2), strict=True):
+        _draw_boards(axis, reconstruction, pixels)
+    axes[0].set_title(f"{reconstruction.pair_id}: corners, view 1", fontsize=9)
+    axes[1].set_title("view 2 (ring: first corner)", fontsize=9)
+    return _png(figure)
+
+
+def epipolar_png(
+    reconstruction: Reconstruction, image1: NDArray[Any], image2: NDArray[Any], *, every: int = 7
+) -> bytes:
+    """Draw every `every`-th corner and its epipolar curve over both images; the curve passes through the corner."""
+    figure, axes = _pair_axes(image1, image2)
+    chosen = np.arange(0, len(reconstruction.pixels1), every)
+    pose = reconstruction.cam2_from_cam1
+    for axis, camera, other, pixels, other_pixels, motion in (
+        (
+            axes[0],
+            reconstruction.camera1,
+            reconstruction.camera2,
+            reconstruction.pixels1,
+            reconstruction.pixels2,
+            pose.inverse(),
+        ),
+        (axes[1], reconstruction.camera2, reconstruction.camera1, reconstruction.pixels2, reconstruction.pixels1, pose),
+    ):
+        curves = epipolar_curves(other, camera, motion, other_pixels[chosen])
+        for index, curve in zip(chosen, curves, strict=True):
+            colour = board_colour(int(reconstruction.matches.board_index[index]))
+            axis.plot(curve[:, 0], curve[:, 1], color=colour, linewidth=0.7)
+            axis.plot(
+                *pixels[index], marker="o", markersize=3.5, color=colour, markeredgecolor="white", markeredgewidth=0.5
+            )
+        axis.set_xlim(-0.5, camera.size_px[0] - 0.5)
+        axis.set_ylim(camera.size_px[1] - 0.5, -0.5)
+    rms = reconstruction.sampson_rms_px
+    axes[0].set_title(f"{reconstruction.pair_id}: epipolar curves, Sampson rms {rms:.3f} px", fontsize=9)
+    return _png(figure)
+
+
+def epipolar_curves(camera1: Camera, camera2: Camera, cam2_from_cam1: Rigid3, pixels1: Pixels) -> FloatArray:
+    """Return the epipolar curves of `pixels1` (N, 2) in image 2 as (N, CURVE_SAMPLES, 2), NaN where not in view.
+
+    The curve is the image of the viewing ray, from the epipole to the vanishing point: straight
+    in a perspective view, curved in a fisheye image.
+    """
+    rays, _ = camera1.unproject(pixels1)
+    towards = rays @ cam2_from_cam1.rotation.T
+    origin = cam2_from_cam1.translation_mm / np.linalg.norm(cam2_from_cam1.translation_mm)
+    mix = np.linspace(0.0, 1.0, CURVE_SAMPLES)[:, None]
+    # Directions between the epipole and the vanishing point all lie in the epipolar plane.
+    directions = (1.0 - mix) * origin + mix * towards[:, None, :]
+    pixels, valid = camera2.project(directions)
+    width, height = camera2.size_px
+    inside = valid & (pixels >= -0.5).all(axis=-1) & (pixels[..., 0] < width) & (pixels[..., 1] < height)
+    return np.where(inside[..., None], pixels, np.nan)
+
+
+def cloud_png(reconstruction: Reconstruction) -> bytes:
+    """Render the oriented cloud: points and normals by board, both cameras as pyramids, from two directions."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13, 6), dpi=DPI)
+    FigureCanvasAgg(figure)
+    cloud = reconstruction.cloud
+    scene = cloud.points_mm
+    reach = float(np.median(np.linalg.norm(scene, axis=1)))
+    square = float(np.mean([b.square_x_mm for b in reconstruction.boards])) if reconstruction.boards else reach / 20
+    for place, (elevation, azimuth) in enumerate(((18.0, -70.0), (65.0, -90.0))):
+        axis: Any = figure.add_subplot(1, 2, place + 1, projection="3d")
+        for index, name in enumerate(cloud.board_ids):
+            on = cloud.board_index == index
+            p, n = _upright(scene[on]), _upright(cloud.normals[on]) * square * NORMAL_LENGTH_SQUARES
+            colour = board_colour(index)
+            axis.scatter(*p.T, s=5, color=colour, label=name, depthshade=False)
+            axis.quiver(*p.T, *n.T, color=colour, linewidth=0.6, arrow_length_ratio=0.25)
+        cameras = ((Rigid3.identity(), "camera 1"), (reconstruction.cam2_from_cam1.inverse(), "camera 2"))
+        for cam1_from_cam, name in cameras:
+            _draw_pyramid(axis, cam1_from_cam, reach * PYRAMID_DEPTH, name)
+        axis.set_box_aspect(_equal_limits(axis, reconstruction))
+        axis.view_init(elev=elevation, azim=azimuth)
+        axis.set_xlabel("x mm")
+        axis.set_ylabel("z mm")
+        axis.set_zlabel("-y mm")
+        axis.tick_params(labelsize=6)
+    axis.legend(fontsize=7, loc="upper right")
+    title = f"{reconstruction.pair_id}, {reconstruction.affine_method}: {len(cloud)} points, "
+    figure.suptitle(f"{title}baseline {reconstruction.baseline_mm:.2f} mm", fontsize=10)
+    return _png(figure)
+
+
+def _upright(vectors: FloatArray) -> FloatArray:
+    """Camera axes (x right, y down, z forward) to plot axes (x right, y away, z up)."""
+    return np.stack([vectors[..., 0], vectors[..., 2], -vectors[..., 1]], axis=-1)
+
+
+def _draw_pyramid(axis: Any, cam1_from_cam: Rigid3, depth: float, name: str) -> None:
+    corners = depth * np.array([[-0.6, -0.45, 1.0], [0.6, -0.45, 1.0], [0.6, 0.45, 1.0], [-0.6, 0.45, 1.0]])
+    tip = _upright(cam1_from_cam.translation_mm)
+    base = _upright(cam1_from_cam.apply(corners))
+    for start, end in zip(base, np.roll(base, -1, axis=0), strict=True):
+        axis.plot(*np.stack([start, end]).T, color="black", linewidth=0.8)
+        axis.plot(*np.stack([tip, start]).T, color="black", linewidth=0.8)
+    axis.text(*tip, name, fontsize=7)
+
+
+def _equal_limits(axis: Any, reconstruction: Reconstruction) -> FloatArray:
+    """Set limits around cloud and cameras; return the box aspect that keeps millimetres equal on all axes."""
+    centres = np.stack([np.zeros(3), reconstruction.cam2_from_cam1.inverse().translation_mm])
+    everything = _upright(np.concatenate([reconstruction.cloud.points_mm, centres]))
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    margin = 0.05 * (high - low).max()
+    low, high = low - margin, high + margin
+    axis.set_xlim(low[0], high[0])
+    axis.set_ylim(low[1], high[1])
+    axis.set_zlim(low[2], high[2])
+    return np.asarray(high - low)
+
+
+def _draw_boards(axis: Any, reconstruction: Reconstruction, pixels: Pixels) -> None:
+    matches = reconstruction.matches
+    for index, board in enumerate(reconstruction.boards):
+        on = np.flatnonzero(matches.board_index == index)
+        if not len(on):
+            continue
+        order = on[np.lexsort((matches.grid[on, 0], matches.grid[on, 1]))]
+        p = pixels[order]
+        colour = board_colour(index)
+        axis.plot(p[:, 0], p[:, 1], color=colour, linewidth=0.6, alpha=0.8)
+        axis.scatter(p[:, 0], p[:, 1], s=7, color=colour, linewidths=0)
+        axis.plot(*p[0], marker="o", markersize=9, markerfacecolor="none", markeredgecolor=colour, markeredgewidth=1.5)
+        label = {"boxstyle": "round,pad=0.2", "facecolor": "white", "alpha": 0.75, "linewidth": 0}
+        axis.text(*p.mean(axis=0), board.board_id, color=colour, fontsize=8, ha="center", va="center", bbox=label)
+
+
+def _pair_axes(image1: NDArray[Any], image2: NDArray[Any]) -> tuple[Figure, Sequence[Any]]:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    aspect = image1.shape[0] / image1.shape[1]
+    figure = Figure(figsize=(14, 7 * aspect + 0.35), dpi=DPI)
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(1, 2)
+    for axis, image in zip(axes, (image1, image2), strict=True):
+        shown = image[..., ::-1] if image.ndim == 3 else image
+        axis.imshow(shown, cmap="gray", interpolation="antialiased")
+        axis.set_axis_off()
+    figure.subplots_adjust(left=0.005, right=0.995, bottom=0.005, top=0.95, wspace=0.01)
+    return figure, axes
+
+
+def _png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return buffer.getvalue()
