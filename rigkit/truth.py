@@ -64,9 +64,10 @@ class MeasuredLength:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredAngle:
-    """The angle between the planes of boards `a` and `b` (0 to 180 degrees between the sides that face the cameras).
+    """The angle between boards `a` and `b` as a protractor laid across the two faces shows it, 0 to 180 degrees.
 
-    Two boards in a corner of a room that both face the camera are 90 degrees apart.
+    It is 180 degrees minus the angle between the normals that face the camera: a corner of a room that opens wider than
+    a right angle is more than 90 degrees.
     """
 
     a: str

@@ -117,7 +117,7 @@ class TomlTable:
             for i, v in enumerate(value)
         )
 
-    def keys(self) -> tuple[str, ...]:
+    def names(self) -> tuple[str, ...]:
         """Return all keys there are and make them known: for tables whose keys are names that the person chose."""
         for key in self._values:
             self.has(key)

@@ -1,0 +1,222 @@
+"""Data sets: which images were taken with which cameras of which boards, and what a person measured."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeVar
+
+from rigkit.boards import Board
+from rigkit.errors import InputError
+from rigkit.io.board_file import load_board
+from rigkit.io.toml_reader import TomlTable, read_toml
+from rigkit.io.truth_file import truth_from_table
+from rigkit.posetype import PoseType
+from rigkit.truth import PairTruth
+
+__all__ = ["SCHEMA", "CameraEntry", "Dataset", "Pair", "load_dataset"]
+
+SCHEMA = "rigkit.dataset/1"
+MANIFEST = "dataset.toml"
+SESSION = "session.toml"
+PLACES = ("left", "right", "floor")
+
+Entry = TypeVar("Entry")
+
+
+@dataclass(frozen=True, slots=True)
+class CameraEntry:
+    """A camera of a data set.
+
+    Attributes
+    ----------
+    camera_id : its name in the manifest.
+    calibration : the calibration file; need not exist yet if there is a session.
+    session : the session file to calibrate from, or None.
+    """
+
+    camera_id: str
+    calibration: Path
+    session: Path | None
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """Two images of the same boards.
+
+    Attributes
+    ----------
+    pair_id : its name.
+    camera1, camera2 : names of cameras; the same name where one camera was moved.
+    image1, image2 : files.
+    pose_type : as declared; AUTO lets the data decide.
+    level_sigma_deg : how well the spirit level held, or None: a soft prior.
+    boards : the boards that stand there.
+    truth : what a person measured.
+    layout : board id -> "left", "right" or "floor", as seen from camera 1; empty where not stated.
+    """
+
+    pair_id: str
+    camera1: CameraEntry
+    camera2: CameraEntry
+    image1: Path
+    image2: Path
+    pose_type: PoseType
+    level_sigma_deg: float | None
+    boards: tuple[Board, ...]
+    truth: PairTruth
+    layout: dict[str, str]
+
+    @property
+    def board_ids(self) -> tuple[str, ...]:
+        return tuple(board.board_id for board in self.boards)
+
+    def require_images(self) -> None:
+        """Raise InputError if an image is not there: worth knowing before the work starts."""
+        for number, path in ((1, self.image1), (2, self.image2)):
+            if not path.is_file():
+                raise InputError(f"pair '{self.pair_id}': image{number} '{path}' does not exist; correct the manifest")
+
+
+@dataclass(frozen=True, slots=True)
+class Dataset:
+    """A manifest as read; every path is absolute."""
+
+    name: str
+    root: Path
+    manifest: Path
+    boards: tuple[Board, ...]
+    cameras: tuple[CameraEntry, ...]
+    pairs: tuple[Pair, ...]
+
+    def pair(self, pair_id: str) -> Pair:
+        """Return the pair of that name; raises InputError that lists the known ones."""
+        return _named(pair_id, {p.pair_id: p for p in self.pairs}, f"{self.manifest}: pair")
+
+    def camera(self, camera_id: str) -> CameraEntry:
+        """Return the camera of that name; raises InputError that lists the known ones."""
+        return _named(camera_id, {c.camera_id: c for c in self.cameras}, f"{self.manifest}: camera")
+
+    def select(self, pair_ids: Iterable[str]) -> Dataset:
+        """Return the data set with only these pairs, in the order of the manifest; all of them where none is named."""
+        wanted = {self.pair(name).pair_id for name in pair_ids}
+        return replace(self, pairs=tuple(p for p in self.pairs if p.pair_id in wanted)) if wanted else self
+
+
+def load_dataset(path: str | Path) -> Dataset:
+    """Read a manifest, given its folder or the file itself.
+
+    Raises
+    ------
+    InputError
+        No manifest, unknown keys, a missing fact (no square size, pose type or name has a default), a reference to
+        something that is not declared, two things of one name, a camera with neither calibration nor session.
+    """
+    given = Path(path)
+    source = given / MANIFEST if given.is_dir() else given
+    if not source.is_file():
+        what = f"folder '{given}' has no {MANIFEST}" if given.is_dir() else f"data set '{given}' does not exist"
+        raise InputError(f"{what}; write one, or let `rigkit init` start it")
+    source = source.resolve()
+    top = read_toml(source, SCHEMA)
+    name = top.text("name", hint='name = "my-lab"')
+    boards = tuple(_board(t) for t in top.tables("boards", hint='[[boards]] with id = "plane1" and file or sizes'))
+    cameras = tuple(_camera(t) for t in top.tables("cameras", hint='[[cameras]] with id = "left" and calibration'))
+    _refuse_twice(top, "boards", [b.board_id for b in boards])
+    _refuse_twice(top, "cameras", [c.camera_id for c in cameras])
+    pairs = tuple(_pair(t, boards, cameras) for t in top.tables("pairs", hint='[[pairs]] with id = "first"'))
+    _refuse_twice(top, "pairs", [p.pair_id for p in pairs])
+    top.done()
+    return Dataset(name, source.parent, source, boards, cameras, pairs)
+
+
+def _board(table: TomlTable) -> Board:
+    board_id = table.text("id", hint='id = "plane1"')
+    if table.has("file"):
+        board = replace(load_board(table.path_to("file", hint='file = "board.toml"')), board_id=board_id)
+        table.done()
+        return board
+    columns = table.integer("columns", hint='file = "board.toml", or columns = 8 (inner corners)', at_least=2)
+    rows = table.integer("rows", hint="rows = 6 (inner corners)", at_least=2)
+    if table.has("square_x_mm") or table.has("square_y_mm"):
+        x = table.number("square_x_mm", hint="square_x_mm = 50.0, as measured along the columns")
+        y = table.number("square_y_mm", hint="square_y_mm = 50.0, as measured along the rows")
+    else:
+        x = y = table.number("square_mm", hint="square_mm = 50.0, as measured on the printed board")
+    sigma = None
+    if table.has("square_sigma_mm"):
+        sigma = table.number("square_sigma_mm", hint="square_sigma_mm = 0.05")
+    table.done()
+    return Board(board_id, columns, rows, x, y, sigma)
+
+
+def _camera(table: TomlTable) -> CameraEntry:
+    camera_id = table.text("id", hint='id = "left"')
+    calibration = table.path_to("calibration", hint='calibration = "calibration.json"')
+    session: Path | None = calibration.with_name(SESSION)
+    if table.has("session"):
+        session = table.path_to("session", hint='session = "session.toml"')
+        if not session.is_file():
+            raise table.error(f"session '{session}' does not exist; correct the path")
+    elif session is not None and not session.is_file():
+        session = None
+    if session is None and not calibration.is_file():
+        raise table.error(
+            f"calibration '{calibration}' does not exist, nor a {SESSION} beside it to calibrate from; correct the path"
+        )
+    table.done()
+    return CameraEntry(camera_id, calibration, session)
+
+
+def _pair(table: TomlTable, boards: Sequence[Board], cameras: Sequence[CameraEntry]) -> Pair:
+    pair_id = table.text("id", hint='id = "left-right"')
+    if Path(pair_id).name != pair_id or pair_id in (".", ".."):
+        raise table.error("'id' names a folder of results: use letters, digits, '-' and '_'")
+    by_camera = {c.camera_id: c for c in cameras}
+    by_board = {b.board_id: b for b in boards}
+    place = f"{table.path}: {table.where}"
+    camera1, camera2 = (
+        _named(table.text(key, hint=f'{key} = "{cameras[0].camera_id}"'), by_camera, f"{place}: {key}")
+        for key in ("camera1", "camera2")
+    )
+    image1 = table.path_to("image1", hint='image1 = "images/view1.jpg"')
+    image2 = table.path_to("image2", hint='image2 = "images/view2.jpg"')
+    kinds = [str(kind) for kind in PoseType]
+    pose_type = PoseType(table.text("pose_type", hint=f'pose_type = "general" ({", ".join(kinds)})', choices=kinds))
+    names = table.texts("boards", hint="boards = [" + ", ".join(f'"{b}"' for b in by_board) + "]")
+    if not names:
+        raise table.error("'boards' is empty; name the boards that stand in this pair")
+    chosen = tuple(_named(n, by_board, f"{place}: board") for n in names)
+    level = None
+    if table.has("level"):
+        inner = table.table("level", hint="level = { sigma_deg = 0.2 }")
+        level = inner.number("sigma_deg", hint="sigma_deg = 0.2")
+        inner.done()
+    truth = PairTruth()
+    if table.has("truth"):
+        truth = truth_from_table(table.table("truth", hint="[pairs.truth]"), chosen)
+    layout = _layout(table, names) if table.has("layout") else {}
+    table.done()
+    return Pair(pair_id, camera1, camera2, image1, image2, pose_type, level, chosen, truth, layout)
+
+
+def _layout(table: TomlTable, names: Sequence[str]) -> dict[str, str]:
+    inner = table.table("layout", hint='layout = { plane1 = "left", plane2 = "floor", plane3 = "right" }')
+    out = {}
+    for board_id in inner.names():
+        _named(board_id, dict.fromkeys(names, 0), f"{inner.path}: {inner.where}: board")
+        out[board_id] = inner.text(board_id, hint=f'{board_id} = "left"', choices=PLACES)
+    return out
+
+
+def _named(name: str, known: Mapping[str, Entry], where: str) -> Entry:
+    if name not in known:
+        raise InputError(f"{where} '{name}' is not declared; known: {', '.join(known)}")
+    return known[name]
+
+
+def _refuse_twice(table: TomlTable, what: str, names: Sequence[str]) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise table.error(f"[[{what}]]: '{name}' is declared twice; give every one its own id")

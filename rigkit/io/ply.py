@@ -1,0 +1,164 @@
+"""Oriented clouds as PLY files that Open3D, CloudCompare and MeshLab read as they are.
+
+Binary, little endian. Names of the properties are those that these programs know (x y z nx ny nz red green blue); what
+they do not know (board, column, row, sigma_mm, normal_sigma_deg) they show as scalar fields.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.cloud import OrientedCloud
+from rigkit.errors import InputError
+from rigkit.io.files import write_atomic
+
+__all__ = ["ply_bytes", "read_ply", "write_ply"]
+
+TYPES = {
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "<i2",
+    "int16": "<i2",
+    "ushort": "<u2",
+    "uint16": "<u2",
+    "int": "<i4",
+    "int32": "<i4",
+    "uint": "<u4",
+    "uint32": "<u4",
+    "float": "<f4",
+    "float32": "<f4",
+    "double": "<f8",
+    "float64": "<f8",
+}
+POINT = ("x", "y", "z")
+NORMAL = ("nx", "ny", "nz")
+COLOUR = ("red", "green", "blue")
+BOARD_COMMENT = "board "
+
+
+def write_ply(
+    path: str | Path,
+    cloud: OrientedCloud,
+    *,
+    force: bool = False,
+    single_precision: bool = False,
+    comments: Iterable[str] = (),
+) -> None:
+    """Write `cloud` to `path`: lengths in mm, the frame of camera 1.
+
+    Parameters
+    ----------
+    path : file; an existing one is refused unless `force`.
+    cloud : oriented cloud; an empty one is refused.
+    single_precision : 32-bit coordinates, for programs that know no other.
+    comments : lines for the header, such as where the cloud comes from.
+
+    Raises
+    ------
+    InputError
+        Nothing to write, the file exists, or it cannot be written.
+    """
+    write_atomic(path, ply_bytes(cloud, single_precision=single_precision, comments=comments), force=force)
+
+
+def ply_bytes(cloud: OrientedCloud, *, single_precision: bool = False, comments: Iterable[str] = ()) -> bytes:
+    """Return the file's content; raises InputError for an empty cloud."""
+    if len(cloud) == 0:
+        raise InputError("point cloud: it has no points, so there is nothing to write; see what was dropped, and why")
+    real = "float" if single_precision else "double"
+    columns: list[tuple[str, str, NDArray[np.generic]]] = [
+        *((name, real, cloud.points_mm[:, i]) for i, name in enumerate(POINT)),
+        *((name, real, cloud.normals[:, i]) for i, name in enumerate(NORMAL)),
+        *((name, "uchar", cloud.colours[:, i]) for i, name in enumerate(COLOUR)),
+        ("board", "int", cloud.board_index),
+        ("column", "int", cloud.grid[:, 0]),
+        ("row", "int", cloud.grid[:, 1]),
+        ("sigma_mm", real, cloud.sigma_mm),
+        ("normal_sigma_deg", real, np.rad2deg(cloud.normal_sigma_rad)),
+    ]
+    table = np.empty(len(cloud), dtype=[(name, TYPES[kind]) for name, kind, _ in columns])
+    for name, _, values in columns:
+        table[name] = values
+    notes = ["rigkit oriented point cloud", "units mm", "frame camera 1: x right, y down, z forward"]
+    notes += [f"{BOARD_COMMENT}{i} {board_id}" for i, board_id in enumerate(cloud.board_ids)]
+    notes += [" ".join(str(line).split()) for line in comments]
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in notes)]
+    header += [f"element vertex {len(cloud)}", *(f"property {kind} {name}" for name, kind, _ in columns), "end_header"]
+    return ("\n".join(header) + "\n").encode("utf-8") + table.tobytes()
+
+
+def read_ply(path: str | Path) -> OrientedCloud:
+    """Return the cloud of a binary little-endian PLY file with normals.
+
+    Properties beyond the coordinates and normals may be missing: then no board, grey, and NaN sigmas.
+
+    Raises
+    ------
+    InputError
+        No such file, not such a PLY, no normals, or cut off.
+    """
+    source = Path(path)
+    try:
+        data = source.read_bytes()
+    except OSError as error:
+        raise InputError(f"point cloud '{source}' cannot be read: {error.strerror}; check the path") from error
+    count, fields, board_ids, start = _header(data, source)
+    kinds = np.dtype(fields)
+    if len(data) < start + count * kinds.itemsize:
+        have = (len(data) - start) // kinds.itemsize
+        raise InputError(f"point cloud '{source}' is cut off: {have} of {count} points; write or copy it again")
+    table = np.frombuffer(data, dtype=kinds, count=count, offset=start)
+    names = set(kinds.names or ())
+    missing = [name for name in (*POINT, *NORMAL) if name not in names]
+    if missing:
+        raise InputError(f"point cloud '{source}' has no {', '.join(missing)}; an oriented cloud needs x y z nx ny nz")
+
+    def column(name: str, default: float) -> NDArray[np.generic]:
+        return np.asarray(table[name]) if name in names else np.full(count, default)
+
+    return OrientedCloud(
+        np.stack([table[name] for name in POINT], axis=-1).astype(np.float64),
+        np.stack([table[name] for name in NORMAL], axis=-1).astype(np.float64),
+        np.stack([column(name, 128) for name in COLOUR], axis=-1).astype(np.uint8),
+        column("board", -1).astype(np.int64),
+        np.stack([column("column", 0), column("row", 0)], axis=-1).astype(np.int64),
+        column("sigma_mm", np.nan).astype(np.float64),
+        np.deg2rad(column("normal_sigma_deg", np.nan).astype(np.float64)),
+        board_ids,
+    )
+
+
+def _header(data: bytes, source: Path) -> tuple[int, list[tuple[str, str]], tuple[str, ...], int]:
+    """Return the number of points, their fields, the board names, and where the points start."""
+    end = data.find(b"end_header\n")
+    if not data.startswith(b"ply") or end < 0:
+        raise InputError(f"'{source}' is not a PLY file, or its header is cut off; give a file written by rigkit")
+    lines = data[:end].decode("utf-8", errors="replace").splitlines()
+    if "format binary_little_endian 1.0" not in lines:
+        raise InputError(f"'{source}': only binary little-endian PLY is read; convert it, for example with Open3D")
+    count = -1
+    fields: list[tuple[str, str]] = []
+    boards: dict[int, str] = {}
+    for line in lines:
+        words = line.split()
+        if words[:1] == ["comment"] and line.startswith(f"comment {BOARD_COMMENT}") and words[2].isdigit():
+            boards[int(words[2])] = " ".join(words[3:])
+        elif words[:2] == ["element", "vertex"]:
+            count = int(words[2])
+        elif words[:1] == ["element"] and count < 0:
+            raise InputError(f"'{source}': the points must be the first element of the PLY; convert it with Open3D")
+        elif words[:1] == ["element"]:
+            break
+        elif words[:1] == ["property"]:
+            if words[1] not in TYPES:
+                raise InputError(f"'{source}': a point has a property of type '{words[1]}', which is not read")
+            fields.append((words[2], TYPES[words[1]]))
+    if count < 0 or not fields:
+        raise InputError(f"'{source}': the PLY declares no points; give a point cloud")
+    return count, fields, tuple(boards[i] for i in sorted(boards)), end + len(b"end_header\n")
