@@ -119,12 +119,15 @@ def cloud_png(reconstruction: Reconstruction) -> bytes:
         cameras = ((Rigid3.identity(), "camera 1"), (reconstruction.cam2_from_cam1.inverse(), "camera 2"))
         for cam1_from_cam, name in cameras:
             _draw_pyramid(axis, cam1_from_cam, reach * PYRAMID_DEPTH, name)
-        axis.set_box_aspect(_equal_limits(axis, reconstruction))
+        axis.set_box_aspect(_equal_limits(axis, reconstruction), zoom=1.25)
         axis.view_init(elev=elevation, azim=azimuth)
-        axis.set_xlabel("x mm")
-        axis.set_ylabel("z mm")
-        axis.set_zlabel("-y mm")
+        axis.set_xlabel("x mm", fontsize=7)
+        axis.set_ylabel("z mm", fontsize=7)
+        if from_above := elevation > 45.0:
+            axis.set_zticks([])
+        axis.set_zlabel("" if from_above else "-y mm", fontsize=7)
         axis.tick_params(labelsize=6)
+    figure.subplots_adjust(left=0.0, right=0.97, bottom=0.02, top=0.94, wspace=0.0)
     axis.legend(fontsize=7, loc="upper right")
     title = f"{reconstruction.pair_id}, {reconstruction.affine_method}: {len(cloud)} points, "
     figure.suptitle(f"{title}baseline {reconstruction.baseline_mm:.2f} mm", fontsize=10)
@@ -184,8 +187,7 @@ def _pair_axes(image1: NDArray[Any], image2: NDArray[Any]) -> tuple[Figure, Sequ
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, 2)
     for axis, image in zip(axes, (image1, image2), strict=True):
-        shown = image[..., ::-1] if image.ndim == 3 else image
-        axis.imshow(shown, cmap="gray", interpolation="antialiased")
+        axis.imshow(image, cmap="gray", interpolation="antialiased")
         axis.set_axis_off()
     figure.subplots_adjust(left=0.005, right=0.995, bottom=0.005, top=0.95, wspace=0.01)
     return figure, axes

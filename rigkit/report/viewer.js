@@ -7,6 +7,7 @@ const COLOURS = ["#e6550d", "#1f77b4", "#2ca02c", "#9467bd", "#b79a00", "#17becf
 const START = {yaw: -0.45, pitch: 0.45, zoom: 1};
 const TURN_PER_PX = 0.008;
 const DISTANCE = 3.2;
+const FILL = 2.1;
 
 function viewer(canvas, scene) {
   const show = {normals: true, cameras: true, planes: true};
@@ -20,7 +21,7 @@ function viewer(canvas, scene) {
     const cy = Math.cos(view.yaw), sy = Math.sin(view.yaw), cp = Math.cos(view.pitch), sp = Math.sin(view.pitch);
     const x1 = cy * x + sy * z, z1 = -sy * x + cy * z;
     const y2 = cp * y + sp * z1, z2 = -sp * y + cp * z1 + DISTANCE;
-    const scale = view.zoom * 1.35 * Math.min(canvas.width, canvas.height) / z2;
+    const scale = view.zoom * FILL * Math.min(canvas.width, canvas.height) / z2;
     return [canvas.width / 2 + scale * x1, canvas.height / 2 + scale * y2, z2];
   }
 
