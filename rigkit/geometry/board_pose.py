@@ -1,0 +1,239 @@
+"""Pose of a flat target from the unit rays of any central camera, fields of view beyond 180 degrees included.
+
+The homography between target and rays comes linearly (rows `T_k H x_k = 0`, T_k a tangent basis at ray k), the pose
+from its columns. A flat target seen from afar has a second local optimum, tilted the other way; both are refined and the
+better one is kept. Nothing needs z > 0: "in front" means along the ray.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.arrays import FloatArray, Points, Rays, as_array
+from rigkit.errors import DegenerateError, InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3, nearest_rotation, skew
+
+__all__ = ["BoardPose", "board_pose", "board_poses", "ray_residuals", "tangent_bases"]
+
+MIN_SPREAD = 1e-6
+"""Points are collinear where their second principal extent is below this part of the first."""
+MIN_HOMOGRAPHY_GAP = 1e-9
+"""The homography is not unique where the second smallest singular value is below this part of the largest."""
+MAX_STEPS = 50
+STEP_TOLERANCE = 1e-12
+"""Stop when a step gains less than this part of the cost, or moves the pose by less than this part of a radian."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class BoardPose:
+    """Where a flat target stands.
+
+    Attributes
+    ----------
+    cam_from_board : the pose, mm.
+    rms_rad : root mean square angle between measured and predicted rays (2-D per point), radians.
+    covariance : (6, 6) of (w, v): R' = exp([w]x) R, t' = t + v, in rad and mm, in the camera frame. From `sigma_rad`
+        where given, otherwise scaled by the residual; NaN where there are no more equations than unknowns.
+    """
+
+    cam_from_board: Rigid3
+    rms_rad: float
+    covariance: FloatArray
+
+
+def board_pose(rays: Rays, points_mm: Points, sigma_rad: FloatArray | None = None) -> BoardPose:
+    """Return the pose of a flat target from rays (N, 3) to its points (N, 3), mm; `sigma_rad` (N,) weights them.
+
+    Raises
+    ------
+    InputError
+        Shapes that do not fit, values that are not finite, points that do not lie in a plane.
+    DegenerateError
+        Fewer than four points, or points or rays that are (but for one) collinear.
+    """
+    return board_poses(rays, points_mm, sigma_rad)[0]
+
+
+def board_poses(rays: Rays, points_mm: Points, sigma_rad: FloatArray | None = None) -> tuple[BoardPose, ...]:
+    """Return the local optima of `board_pose`, best first: one or two (the target tilted the other way).
+
+    Arguments and errors as `board_pose`.
+    """
+    f = as_array(rays, (None, 3), "rays")
+    n = len(f)
+    f = f / np.linalg.norm(f, axis=1, keepdims=True)
+    points = as_array(points_mm, (n, 3), "points_mm")
+    if n < 4:
+        raise DegenerateError(f"board pose: {n} corners do not fix a pose; at least 4 are needed")
+    sigma = np.ones(n) if sigma_rad is None else as_array(sigma_rad, (n,), "sigma_rad")
+    if not (sigma > 0.0).all():
+        raise InputError("board pose: sigma_rad must be positive")
+    weight = 1.0 / sigma
+    plane_from_target, flat = _flatten(points)
+    bases = tangent_bases(f)
+    rotation, translation = _pose_from_homography(_homography(f, bases, flat, weight))
+    rotation, translation = _both_tilts(rotation, translation, flat)
+    rotation, translation, cost = _refine(f, bases, flat, weight, rotation, translation)
+    order = [int(np.argmin(cost)), 1 - int(np.argmin(cost))]
+    keep = order if _differ(rotation, translation, flat, cost) else order[:1]
+    poses = []
+    for k in keep:
+        residual, jacobian = ray_residuals(f, bases, flat, rotation[k], translation[k])
+        rms = float(np.sqrt((residual**2).sum(axis=-1).mean()))
+        cam_from_plane = Rigid3(rotation[k], translation[k])
+        covariance = _covariance(jacobian * weight[:, None, None], cost[k], None if sigma_rad is None else 1.0)
+        # t = t_plane + R_plane m, so a turn moves t too: v = v_plane - [R_plane m]x w.
+        shift = np.eye(6)
+        shift[3:, :3] = -skew(rotation[k] @ plane_from_target.translation_mm)
+        poses.append(BoardPose(cam_from_plane @ plane_from_target, rms, shift @ covariance @ shift.T))
+    return tuple(poses)
+
+
+def tangent_bases(rays: Rays) -> FloatArray:
+    """Return (..., 2, 3): two orthonormal rows perpendicular to each unit ray, smooth but for one direction (-z)."""
+    x, y, z = np.moveaxis(np.asarray(rays, dtype=np.float64), -1, 0)
+    sign = np.where(z < 0.0, -1.0, 1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    first = np.stack([1.0 + sign * x * x * a, sign * b, -sign * x], axis=-1)
+    second = np.stack([b, sign + y * y * a, -y], axis=-1)
+    return np.stack([first, second], axis=-2)
+
+
+def ray_residuals(
+    rays: Rays, bases: FloatArray, points: Points, rotation: FloatArray, translation: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return residuals (..., N, 2) of points against rays, and their derivatives (..., N, 2, 6) by (w, v).
+
+    `bases` (N, 2, 3) are rows perpendicular to the rays: orthonormal for radians, the pseudo-inverse of d ray / d pixel
+    for pixels. `rotation` (..., 3, 3) and `translation` (..., 3) change as R' = exp([w]x) R, t' = t + v.
+
+    Notes
+    -----
+    r = 2 T u / (1 + f.u) with u the predicted unit ray: to first order the measured offset, 2 tan(angle / 2) in
+    general, which grows up to the opposite ray (T u alone would call the opposite ray a perfect fit).
+    """
+    turned = points @ np.swapaxes(rotation, -1, -2)
+    x = turned + translation[..., None, :]
+    length = np.linalg.norm(x, axis=-1, keepdims=True)
+    u = x / length
+    closeness = np.maximum(1.0 + (u * rays).sum(axis=-1), 1e-9)[..., None]
+    tangent = np.einsum("nij,...nj->...ni", bases, u)
+    residual = 2.0 * tangent / closeness
+    by_u = (2.0 / closeness)[..., None] * (bases - (tangent / closeness)[..., None] * rays[:, None, :])
+    by_x = (by_u - (by_u @ u[..., None]) * u[..., None, :]) / length[..., None]
+    return residual, np.concatenate([-by_x @ skew(turned), by_x], axis=-1)
+
+
+def _flatten(points: Points) -> tuple[Rigid3, FloatArray]:
+    """Return plane_from_target and the points (N, 3) in a frame centred on them with z = 0."""
+    centre = points.mean(axis=0)
+    _, extent, axes = np.linalg.svd(points - centre, full_matrices=False)
+    if extent[1] < MIN_SPREAD * extent[0] or extent[0] == 0.0:
+        raise DegenerateError("board pose: the corners lie on one line; corners of at least two rows are needed")
+    if extent[2] > 1e-3 * extent[0]:
+        raise InputError("board pose: the points do not lie in a plane; a flat target is needed")
+    rotation = np.stack([axes[0], axes[1], np.cross(axes[0], axes[1])])
+    flat = (points - centre) @ rotation.T
+    return Rigid3(rotation, -rotation @ centre), flat
+
+
+def _homography(rays: Rays, bases: FloatArray, flat: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return H (3, 3), ray ~ H (x, y, 1), signed so that the target lies along the rays."""
+    scale = np.sqrt((flat[:, :2] ** 2).sum(axis=1).mean())
+    target = np.concatenate([flat[:, :2] / scale, np.ones((len(flat), 1))], axis=1)
+    # Spreading the rays evenly over all directions conditions the system as centring and scaling do in a plane, and
+    # keeps their signs, so that no ray is too far off axis.
+    values, vectors = np.linalg.eigh(rays.T @ rays / len(rays))
+    if values[0] < MIN_SPREAD**2 * values[2]:
+        raise DegenerateError("board pose: the rays lie in one plane; the target is seen edge-on")
+    spread = (vectors / np.sqrt(values)) @ vectors.T
+    spread_rays = rays @ spread.T
+    norm = np.linalg.norm(spread_rays, axis=1, keepdims=True)
+    rows = tangent_bases(spread_rays / norm)[:, :, :, None] * target[:, None, None, :] * weight[:, None, None, None]
+    _, singular, vt = np.linalg.svd(rows.reshape(-1, 9), full_matrices=True)
+    if singular[7] < MIN_HOMOGRAPHY_GAP * singular[0]:
+        raise DegenerateError("board pose: all corners but one lie on one line; corners of two full rows are needed")
+    h = np.linalg.inv(spread) @ vt[-1].reshape(3, 3)
+    along = ((target @ h.T) * rays).sum()
+    return np.asarray(h * np.sign(along) / np.array([scale, scale, 1.0]))
+
+
+def _pose_from_homography(h: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return rotation and translation from H ~ [r1 r2 t]."""
+    scale = np.sqrt(np.linalg.norm(h[:, 0]) * np.linalg.norm(h[:, 1]))
+    if not scale > 0.0:
+        raise DegenerateError("board pose: the homography has no scale; the target is seen edge-on")
+    r1, r2, t = (h / scale).T
+    return nearest_rotation(np.stack([r1, r2, np.cross(r1, r2)], axis=1)), t
+
+
+def _both_tilts(rotation: FloatArray, translation: FloatArray, flat: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the pose and the one that looks the same under weak perspective: tilt about the line of sight reversed.
+
+    Its axes have the same components across the line of sight to the target's centre and opposite ones along it.
+    """
+    sight = translation / np.linalg.norm(translation)
+    axes = rotation[:, :2] - 2.0 * np.outer(sight, sight @ rotation[:, :2])
+    other = np.column_stack([axes, np.cross(axes[:, 0], axes[:, 1])])
+    return np.stack([rotation, other]), np.stack([translation, translation])
+
+
+def _refine(
+    rays: Rays,
+    bases: FloatArray,
+    flat: FloatArray,
+    weight: FloatArray,
+    rotation: FloatArray,
+    translation: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Levenberg-Marquardt on weighted ray residuals, all start poses (K, ...) at once; returns poses and costs (K,)."""
+
+    def evaluate(r: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        residual, jacobian = ray_residuals(rays, bases, flat, r, t)
+        residual = (residual * weight[:, None]).reshape(len(r), -1)
+        jacobian = (jacobian * weight[:, None, None]).reshape(len(r), -1, 6)
+        return (residual**2).sum(axis=1), residual, jacobian
+
+    cost, residual, jacobian = evaluate(rotation, translation)
+    damping = np.full(len(rotation), 1e-4)
+    for _ in range(MAX_STEPS):
+        normal = np.swapaxes(jacobian, 1, 2) @ jacobian
+        gradient = (np.swapaxes(jacobian, 1, 2) @ residual[..., None])[..., 0]
+        diagonal = np.einsum("kii->ki", normal)
+        damped = normal + (damping[:, None] * diagonal)[..., None] * np.eye(6)
+        step = -np.linalg.solve(damped, gradient[..., None])[..., 0]
+        trial_r, trial_t = exp_so3(step[:, :3]) @ rotation, translation + step[:, 3:]
+        trial_cost, trial_residual, trial_jacobian = evaluate(trial_r, trial_t)
+        better = trial_cost < cost
+        gain = np.where(better, cost - trial_cost, 0.0)
+        size = np.abs(step[:, :3]).max(axis=1) + np.abs(step[:, 3:]).max(axis=1) / np.linalg.norm(translation, axis=1)
+        settled = np.where(better, gain <= STEP_TOLERANCE * cost, damping > 1e6) | (size < STEP_TOLERANCE)
+        rotation = np.where(better[:, None, None], trial_r, rotation)
+        translation = np.where(better[:, None], trial_t, translation)
+        residual = np.where(better[:, None], trial_residual, residual)
+        jacobian = np.where(better[:, None, None], trial_jacobian, jacobian)
+        cost = np.where(better, trial_cost, cost)
+        damping = np.where(better, np.maximum(damping * 0.1, 1e-12), damping * 10.0)
+        if settled.all():
+            break
+    return rotation, translation, cost
+
+
+def _differ(rotation: FloatArray, translation: FloatArray, flat: FloatArray, cost: FloatArray) -> bool:
+    """Say whether the two optima are distinct: both finite and some point moved by a thousandth of its distance."""
+    if not np.isfinite(cost).all():
+        return False
+    moved = flat @ (rotation[0] - rotation[1]).T + (translation[0] - translation[1])
+    return bool(np.abs(moved).max() > 1e-3 * np.linalg.norm(translation[0]))
+
+
+def _covariance(jacobian: FloatArray, cost: float, variance: float | None) -> FloatArray:
+    rows = jacobian.reshape(-1, 6)
+    if variance is None:
+        variance = cost / (len(rows) - 6) if len(rows) > 6 else np.nan
+    _, singular, vt = np.linalg.svd(rows, full_matrices=False)
+    return np.asarray((vt.T / singular**2) @ vt * variance)
