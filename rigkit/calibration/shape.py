@@ -1,0 +1,100 @@
+"""The shape of the boards as part of the solution: flat, warped (a few numbers a board), or every corner released.
+
+A shape is linear in its unknowns: points = flat points + basis @ unknowns, each unknown with a Gaussian prior around
+zero in its own unit, so that what the views do not determine stays at the flat board.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.arrays import FloatArray, Points
+from rigkit.calibration.observations import Observations
+
+__all__ = ["SHAPES", "ShapeModel", "shape_model"]
+
+SHAPES = ("flat", "warp", "released")
+
+ASPECT_SIGMA = 3e-3
+"""Prior of the print's aspect ratio: paper feeds are right to a few per mille."""
+SHEAR_SIGMA = 1e-3
+"""Prior of the print's shear, rad."""
+BOW_SIGMA = 1e-2
+"""Prior of a bow, as a fraction of the board's half diagonal: weak, a board bent by more is visibly bent."""
+RELEASED_SIGMA_XY = 3e-4
+"""Prior of a released corner in the plane, as a fraction of the board's half diagonal (0.05 mm on 9x6 x 30 mm)."""
+RELEASED_SIGMA_Z = 1.5e-3
+"""Prior of a released corner out of the plane, same unit (0.2 mm on 9x6 x 30 mm)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ShapeModel:
+    """How the board points depend on the shape's unknowns.
+
+    Attributes
+    ----------
+    kind : "flat", "warp" or "released".
+    flat : (M, 3) mm, the boards as measured.
+    basis : (M, 3, B) mm per unknown; B = 0 for flat, and for released, where the basis is the identity.
+    sigma : prior standard deviation of each unknown: (B,), or (3 M,) mm for released.
+    """
+
+    kind: str
+    flat: Points
+    basis: FloatArray
+    sigma: FloatArray
+
+    @property
+    def count(self) -> int:
+        """Number of unknowns."""
+        return int(self.sigma.size)
+
+    def points(self, unknowns: FloatArray) -> Points:
+        """Return the board points, (M, 3) mm."""
+        if self.kind == "released":
+            return self.flat + unknowns.reshape(-1, 3)
+        return self.flat + self.basis @ unknowns
+
+
+def shape_model(kind: str, observations: Observations) -> ShapeModel:
+    """Return the shape model `kind` for the boards of the observations."""
+    flat = observations.table()
+    if kind == "warp":
+        return _warp(observations, flat)
+    if kind == "released":
+        unit = np.array([RELEASED_SIGMA_XY, RELEASED_SIGMA_XY, RELEASED_SIGMA_Z])
+        size = [np.full(len(points), _half_diagonal(points)) for points in _per_board(observations, flat)]
+        sigma = (np.concatenate(size)[:, None] * unit).reshape(-1)
+        return ShapeModel(kind, flat, np.zeros((len(flat), 3, 0)), sigma)
+    return ShapeModel("flat", flat, np.zeros((len(flat), 3, 0)), np.zeros(0))
+
+
+def _per_board(observations: Observations, table: Points) -> list[Points]:
+    rows = observations.first_row
+    return [table[rows[i] : rows[i + 1]] for i in range(len(observations.boards))]
+
+
+def _half_diagonal(points: Points) -> float:
+    return 0.5 * float(np.linalg.norm(np.ptp(points[:, :2], axis=0)))
+
+
+def _warp(observations: Observations, flat: Points) -> ShapeModel:
+    """Five unknowns a board: aspect, shear, bow along x, bow along y, twist (bows in mm at the centre, twist in mm at
+    the corner). An overall scale would only move the board away: it is not among them."""
+    per_board = 5
+    basis = np.zeros((len(flat), 3, per_board * len(observations.boards)))
+    sigma = []
+    for i, points in enumerate(_per_board(observations, flat)):
+        rows = slice(observations.first_row[i], observations.first_row[i + 1])
+        centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
+        half = 0.5 * np.ptp(points, axis=0)
+        x, y = ((points - centre)[:, :2]).T
+        block = basis[rows, :, per_board * i : per_board * (i + 1)]
+        block[:, 0, 0], block[:, 1, 0] = 0.5 * x, -0.5 * y
+        block[:, 0, 1], block[:, 1, 1] = 0.5 * y, 0.5 * x
+        block[:, 2, 2], block[:, 2, 3] = 1.0 - (x / half[0]) ** 2, 1.0 - (y / half[1]) ** 2
+        block[:, 2, 4] = x / half[0] * y / half[1]
+        sigma += [ASPECT_SIGMA, SHEAR_SIGMA, *[BOW_SIGMA * _half_diagonal(points)] * 3]
+    return ShapeModel("warp", flat, basis, np.array(sigma))

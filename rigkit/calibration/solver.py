@@ -1,0 +1,192 @@
+"""Levenberg-Marquardt over intrinsics, board shapes and board poses, with the poses eliminated by 6x6 blocks.
+
+One camera, V views padded to C corners. Unknowns are ordered globals (intrinsics, then shape) and, per view, a pose
+perturbation (w, dt): R <- exp(w) R, t <- t + dt, so that no rotation is singular. The normal matrix of all views comes
+from one batched product; the reduced (Schur) system has the size of the globals only, so the cost is linear in views.
+
+Damping follows Marquardt (scaled by the diagonal) with Nielsen's update. The loss is least squares or Cauchy's
+c^2 log(1 + |r|^2 / c^2) of the 2-D residual, as iteratively reweighted least squares.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rigkit.arrays import BoolArray, FloatArray, Mat3, Points
+from rigkit.calibration.normal import Normal, normal_equations
+from rigkit.calibration.observations import Observations
+from rigkit.calibration.result import Convergence
+from rigkit.calibration.shape import ShapeModel, shape_model
+from rigkit.cameras.base import Camera
+from rigkit.errors import RigkitError
+from rigkit.geometry.rotation import exp_so3
+
+__all__ = ["Residuals", "State", "evaluate", "solve"]
+
+MAX_ITERATIONS = 60
+COST_TOLERANCE = 1e-11
+"""Stop when the quadratic model promises less than this part of the cost: Gauss-Newton converges quadratically here, so
+the optimum is then known to about 1e-10 in cost."""
+DAMPING_START = 1e-8
+DAMPING_SHRINK = 0.01
+"""Monomials of a polynomial are nearly dependent: damping that shrinks by Nielsen's 1/3 would hold their combinations
+back for dozens of steps (25 instead of 7 at degree 6)."""
+DAMPING_GROWTH = 4.0
+DAMPING_MAX = 1e12
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class State:
+    """Everything that is solved for: camera, poses (V, 3, 3) and (V, 3) mm, shape and its unknowns."""
+
+    camera: Camera
+    rotation: Mat3
+    translation_mm: Points
+    shape: ShapeModel
+    unknowns: FloatArray
+
+    @classmethod
+    def start(cls, camera: Camera, rotation: Mat3, translation_mm: Points, observations: Observations) -> State:
+        """Return the state with flat boards."""
+        return cls(camera, rotation, translation_mm, shape_model("flat", observations), np.zeros(0))
+
+    def subset(self, chosen: FloatArray) -> State:
+        """Return the state of the views `chosen`."""
+        return replace(self, rotation=self.rotation[chosen], translation_mm=self.translation_mm[chosen])
+
+    def points_in_cam(self, observations: Observations) -> tuple[Points, Points]:
+        """Return the corners in the camera frame and their lever arms R X, both (V, C, 3) mm."""
+        board = self.shape.points(self.unknowns)[observations.corner]
+        lever = board @ np.swapaxes(self.rotation, -1, -2)
+        return lever + self.translation_mm[:, None, :], lever
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Residuals:
+    """Measured minus projected, (V, C, 2) px, and where the corner projects at all."""
+
+    px: FloatArray
+    valid: BoolArray
+
+    def norm(self, observations: Observations) -> FloatArray:
+        """Return |r| (V, C), infinite where the corner does not project, NaN where padded."""
+        length = np.where(self.valid, np.linalg.norm(self.px, axis=-1), np.inf)
+        return np.where(observations.present, length, np.nan)
+
+
+def evaluate(state: State, observations: Observations) -> Residuals:
+    """Return the residuals of `state`; where a corner does not project, the diagonal of the image."""
+    points, _ = state.points_in_cam(observations)
+    with np.errstate(all="ignore"):
+        pixels, valid = state.camera.project(points)
+    residuals = observations.pixels - pixels
+    return Residuals(np.where(valid[..., None], residuals, lost_px(state.camera)), valid)
+
+
+def lost_px(camera: Camera) -> float:
+    """Return the residual per coordinate of a corner outside the model's field of view: worse than any other, so that
+    no step gains by losing corners."""
+    return float(np.hypot(*camera.size_px))
+
+
+def solve(
+    observations: Observations,
+    start: State,
+    *,
+    weight: FloatArray | None = None,
+    loss_px: float | None = None,
+    prior_sigma_px: float = 0.2,
+    max_iterations: int = MAX_ITERATIONS,
+    cost_tolerance: float = COST_TOLERANCE,
+) -> tuple[State, Convergence]:
+    """Return the state that minimises the weighted residuals from `start`, and how the solver ended. Never raises for
+    lack of data: what is not determined stays where it started.
+
+    Parameters
+    ----------
+    weight : (V, C) weights of the residuals (not squared), zero for corners to ignore; the observations' own by
+        default.
+    loss_px : scale of the Cauchy loss; None for least squares.
+    prior_sigma_px : standard deviation of a corner, which sets residuals against the prior of the shape.
+    """
+    weight = observations.weight if weight is None else weight
+    solver = _Solver(observations, weight, loss_px, prior_sigma_px)
+    return solver.run(start, max_iterations, cost_tolerance)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Solver:
+    observations: Observations
+    weight: FloatArray
+    loss_px: float | None
+    prior_sigma_px: float
+
+    def cost(self, state: State) -> float:
+        """Return the cost, infinite where the state makes no camera."""
+        residuals = evaluate(state, self.observations)
+        squared = (residuals.px**2).sum(axis=-1) * self.weight**2
+        if self.loss_px is not None:
+            squared = self.loss_px**2 * np.log1p(squared / self.loss_px**2)
+        total = float(squared.sum()) + float((self.prior(state) * state.unknowns**2).sum())
+        return total if np.isfinite(total) else np.inf
+
+    def prior(self, state: State) -> FloatArray:
+        """Return the weight of each shape unknown squared, in px^2."""
+        return np.asarray((self.prior_sigma_px / state.shape.sigma) ** 2)
+
+    def linearise(self, state: State) -> Normal:
+        return normal_equations(
+            state.camera,
+            *state.points_in_cam(self.observations),
+            state.rotation,
+            state.shape,
+            self.observations,
+            self.weight,
+            self.loss_px,
+        ).with_prior(self.prior(state), state.unknowns)
+
+    def run(self, state: State, max_iterations: int, tolerance: float) -> tuple[State, Convergence]:
+        cost, damping, growth = self.cost(state), DAMPING_START, DAMPING_GROWTH
+        normal = self.linearise(state)
+        for iteration in range(1, max_iterations + 1):
+            step = normal.step(damping)
+            if step is None:
+                damping, growth = damping * growth, growth * 2.0
+                if damping > DAMPING_MAX:
+                    return state, Convergence(iteration, False, "the normal equations are singular")
+                continue
+            if step.predicted <= tolerance * cost:
+                return state, Convergence(iteration, True, "cost stationary")
+            trial = _moved(state, step.globals, step.poses)
+            trial_cost = np.inf if trial is None else self.cost(trial)
+            gain = (cost - trial_cost) / step.predicted
+            if trial is not None and gain > 0.0:
+                stationary = cost - trial_cost <= tolerance * cost and gain > 0.5
+                state, cost = trial, trial_cost
+                if stationary:
+                    return state, Convergence(iteration, True, "cost stationary")
+                damping, growth = damping * max(DAMPING_SHRINK, 1.0 - (2.0 * gain - 1.0) ** 3), DAMPING_GROWTH
+                normal = self.linearise(state)
+            else:
+                damping, growth = damping * growth, growth * 2.0
+                if damping > DAMPING_MAX:
+                    return state, Convergence(iteration, True, "no smaller cost nearby")
+        return state, Convergence(max_iterations, False, f"stopped after {max_iterations} iterations")
+
+
+def _moved(state: State, step_globals: FloatArray, step_poses: FloatArray) -> State | None:
+    """Return the state after a step, None where the parameters make no camera."""
+    p = state.camera.parameters.size
+    try:
+        camera = state.camera.with_parameters(state.camera.parameters + step_globals[:p])
+    except RigkitError:
+        return None
+    return replace(
+        state,
+        camera=camera,
+        rotation=exp_so3(step_poses[:, :3]) @ state.rotation,
+        translation_mm=state.translation_mm + step_poses[:, 3:],
+        unknowns=state.unknowns + step_globals[p:],
+    )
