@@ -1,0 +1,82 @@
+"""Finding every chessboard of an image: loose corners, links, lattices, growth, the sub-pixel fit, and what is a board.
+
+No size need be known, no number of boards, no lens.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.boards import Board
+from rigkit.corners.grow import SaddleIndex, grow
+from rigkit.corners.lattice import Lattice, build_lattices
+from rigkit.corners.links import find_links
+from rigkit.corners.origin import orient
+from rigkit.corners.response import grey_image, pyramid
+from rigkit.corners.saddle import find_corners
+from rigkit.corners.validate import separate, tidy
+from rigkit.detections import BoardDetection
+
+__all__ = ["detect_boards"]
+
+
+def find_lattices(image: NDArray[np.generic], min_corners: int) -> list[Lattice]:
+    grey = grey_image(image)
+    levels = pyramid(grey)
+    corners, saddles = find_corners(levels)
+    lattices = build_lattices(corners, find_links(corners, levels[0]))
+    index = SaddleIndex(saddles)
+    grown: list[Lattice] = []
+    for lattice in sorted(lattices, key=lambda item: -item.count):
+        grown.append(tidy(grow(lattice, index, levels[0])))
+    return separate(grown, min_corners)
+
+
+def detect_boards(
+    image: NDArray[np.generic], boards: Sequence[Board] | None = None, *, min_corners: int = 12
+) -> tuple[BoardDetection, ...]:
+    """Find every chessboard of `image`.
+
+    Parameters
+    ----------
+    image : (H, W) or (H, W, 3 or 4), uint8 or uint16 (or float 0..255), grey or BGR.
+    boards : what may be in the image, if known. A grid of a board's size, either way round, is turned to its columns x
+        rows. A board is named only where one single given board has that size and one single detection fits it.
+    min_corners : boards with fewer corners are not reported.
+
+    Returns
+    -------
+    Detections by falling number of corners, then from top to bottom and left to right. Grids are right-handed; the
+    first corner follows the convention of `rigkit.corners.origin`.
+
+    Raises
+    ------
+    InputError
+        `image` is not an image of a supported type.
+    """
+    sizes = tuple(dict.fromkeys(board.size for board in boards or ()))
+    lattices = [orient(lattice, sizes) for lattice in find_lattices(image, min_corners)]
+    found = [_detection(lattice) for lattice in lattices]
+    found.sort(key=lambda item: (-len(item.grid), *np.round(item.pixels.mean(axis=0)[::-1], 3)))
+    return tuple(_named(found, boards or ()))
+
+
+def _detection(lattice: Lattice) -> BoardDetection:
+    row, column = np.nonzero(lattice.known)
+    columns, rows = lattice.size
+    pixels = lattice.pixels[row, column]
+    return BoardDetection(None, columns, rows, np.stack([column, row], axis=-1), pixels, np.full(len(pixels), 0.1))
+
+
+def _named(found: list[BoardDetection], boards: Sequence[Board]) -> list[BoardDetection]:
+    """Return `found` with the names of those boards that only one detection, and that only this board, can be."""
+    out = list(found)
+    for board in boards:
+        same_size = [other for other in boards if set(other.size) == set(board.size)]
+        fitting = [i for i, item in enumerate(found) if (item.columns, item.rows) == board.size]
+        if len(same_size) == 1 and len(fitting) == 1:
+            out[fitting[0]] = found[fitting[0]].named(board.board_id)
+    return out

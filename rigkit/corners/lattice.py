@@ -1,0 +1,176 @@
+"""Linked corners as lattices: rows and columns for every board.
+
+Grid directions 0, 1, 2, 3 are +column, +row, -column, -row; with the angle growing from u to v they follow each other
+like the arms of a corner, so every lattice comes out right-handed (columns, rows, away from the viewer).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rigkit.arrays import BoolArray, FloatArray, IntArray
+from rigkit.corners.links import Links, quads
+from rigkit.corners.saddle import Corners
+
+__all__ = ["STEPS", "Lattice", "build_lattices"]
+
+STEPS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
+"""(column, row) of the four grid directions."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Lattice:
+    """Corners of one board, or of a part of it.
+
+    Attributes
+    ----------
+    pixels : (R, C, 2) full resolution, NaN where no corner is known.
+    contrast : (R, C) grey levels, NaN likewise.
+    rising : whether brightness grows with the angle across the +column edge of the corner (0, 0); it alternates over
+        the lattice like the squares.
+    """
+
+    pixels: FloatArray
+    contrast: FloatArray
+    rising: bool
+
+    @property
+    def known(self) -> BoolArray:
+        return np.isfinite(self.pixels[..., 0])
+
+    @property
+    def count(self) -> int:
+        return int(self.known.sum())
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(columns, rows)."""
+        return (self.pixels.shape[1], self.pixels.shape[0])
+
+    def signs(self) -> FloatArray:
+        """Return (R, C): +1 where brightness grows with the angle across the +column edge, else -1."""
+        rows, columns = self.pixels.shape[:2]
+        odd = (np.arange(rows)[:, None] + np.arange(columns) + int(not self.rising)) % 2
+        return np.where(odd == 1, -1.0, 1.0)
+
+    def padded(self, by: int = 1) -> Lattice:
+        """Return the lattice with `by` empty rows and columns on every side."""
+        return Lattice(
+            np.pad(self.pixels, ((by, by), (by, by), (0, 0)), constant_values=np.nan),
+            np.pad(self.contrast, by, constant_values=np.nan),
+            self.rising,
+        )
+
+    def cut(self, rows: slice, columns: slice) -> Lattice:
+        """Return the part of `rows` and `columns` (slices with a start and without a step)."""
+        odd = ((rows.start or 0) + (columns.start or 0)) % 2 == 1
+        return Lattice(self.pixels[rows, columns], self.contrast[rows, columns], self.rising != odd)
+
+    def without(self, drop: BoolArray) -> Lattice:
+        """Return the lattice with the corners `drop` (R, C) forgotten."""
+        return replace(
+            self,
+            pixels=np.where(drop[..., None], np.nan, self.pixels),
+            contrast=np.where(drop, np.nan, self.contrast),
+        )
+
+    def trimmed(self) -> Lattice:
+        """Return the lattice without empty outer rows and columns."""
+        rows, columns = np.flatnonzero(self.known.any(axis=1)), np.flatnonzero(self.known.any(axis=0))
+        if not len(rows):
+            return self.cut(slice(0, 0), slice(0, 0))
+        return self.cut(slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+
+    def turned(self, quarter_turns: int) -> Lattice:
+        """Return the same corners with the first corner moved by `quarter_turns` x 90 degrees (still right-handed).
+
+        As `BoardDetection.turned`: one turn makes (column, row) into (rows - 1 - row, column).
+        """
+        out = self
+        for _ in range(quarter_turns % 4):
+            signs = -np.rot90(out.signs(), -1)
+            out = Lattice(
+                np.rot90(out.pixels, -1),
+                np.rot90(out.contrast, -1),
+                bool(signs.size and signs[0, 0] > 0),
+            )
+        return out
+
+
+def build_lattices(corners: Corners, links: Links) -> list[Lattice]:
+    """Return the lattices that closed squares of four linked corners make up, in no particular order."""
+    bound = quads(links)
+    links = Links(np.where(bound, links.corner, -1), links.arm)
+    for _ in range(3):
+        component, grid, turn = _walk(links)
+        wrong = _contradictions(links, component, grid, turn)
+        if not wrong.any():
+            break
+        links = Links(np.where(wrong, -1, links.corner), links.arm)
+    lattices = []
+    for label in range(component.max(initial=-1) + 1):
+        members = np.flatnonzero(component == label)
+        cells = grid[members]
+        _, first, copies = np.unique(cells, axis=0, return_index=True, return_counts=True)
+        members, cells = members[first[copies == 1]], cells[first[copies == 1]]
+        if len(members) < 4:
+            continue
+        cells = cells - cells.min(axis=0)
+        columns, rows = cells.max(axis=0) + 1
+        pixels = np.full((rows, columns, 2), np.nan)
+        contrast = np.full((rows, columns), np.nan)
+        pixels[cells[:, 1], cells[:, 0]] = corners.pixels[members]
+        contrast[cells[:, 1], cells[:, 0]] = corners.contrast[members]
+        rising = (turn[members[0]] + cells[0].sum()) % 2 == 0
+        lattices.append(Lattice(pixels, contrast, bool(rising)))
+    return lattices
+
+
+def _walk(links: Links) -> tuple[IntArray, IntArray, IntArray]:
+    """Return per corner its component (-1 alone), its (column, row), and the arm that points to +column."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    count = len(links.corner)
+    start, arm = np.nonzero(links.corner >= 0)
+    end = links.corner[start, arm]
+    graph = coo_matrix((np.ones(len(start), np.int8), (start, end)), shape=(count, count))
+    _, label = connected_components(graph, directed=False)
+    linked = (links.corner >= 0).any(axis=1)
+    _, component = np.unique(np.where(linked, label, -1), return_inverse=True)
+    component = component - (0 if linked.all() else 1)
+    grid, turn = np.zeros((count, 2), np.int64), np.zeros(count, np.int64)
+    degree = (links.corner >= 0).sum(axis=1)
+    order = np.lexsort((-degree, component))
+    order = order[component[order] >= 0]
+    _, first = np.unique(component[order], return_index=True)
+    frontier = order[first]
+    done = ~linked
+    done[frontier] = True
+    while len(frontier):
+        who, arm = np.nonzero(links.corner[frontier] >= 0)
+        start = frontier[who]
+        end, back = links.corner[start, arm], links.arm[start, arm]
+        fresh = ~done[end]
+        start, arm, end, back = start[fresh], arm[fresh], end[fresh], back[fresh]
+        end, first = np.unique(end, return_index=True)
+        start, arm, back = start[first], arm[first], back[first]
+        direction = (arm - turn[start]) % 4
+        grid[end] = grid[start] + STEPS[direction]
+        turn[end] = (back - direction - 2) % 4
+        done[end] = True
+        frontier = end
+    return component, grid, turn
+
+
+def _contradictions(links: Links, component: IntArray, grid: IntArray, turn: IntArray) -> BoolArray:
+    """Return the links (N, 4) that do not agree with the rows and columns given to their ends."""
+    del component
+    there = links.corner >= 0
+    end = np.where(there, links.corner, 0)
+    direction = (np.arange(4) - turn[:, None]) % 4
+    moved = (grid[end] == grid[:, None] + STEPS[direction]).all(axis=2)
+    facing = (turn[end] - (links.arm - direction - 2)) % 4 == 0
+    return there & ~(moved & facing)

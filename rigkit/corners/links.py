@@ -1,0 +1,157 @@
+"""Which corners are neighbours along an edge of a chessboard.
+
+Only local evidence counts, so any number of boards, any perspective and any lens will do: the two corners lie in the
+direction of each other's arms, one sees the edge rise where the other sees it fall, and the brightness along the way is
+dark on one side and bright on the other as the arms say.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.arrays import BoolArray, FloatArray, IntArray
+from rigkit.corners.response import FloatImage, Level, sample
+from rigkit.corners.ring import arm_vectors
+from rigkit.corners.saddle import Corners
+
+__all__ = ["Links", "edge_contrast", "find_links", "quads"]
+
+NEIGHBOURS = 32
+"""Nearest corners looked at: enough to reach across a board that is foreshortened four times."""
+
+ARM_COSINE = np.cos(np.radians(18.0))
+"""How well the chord must follow the arms at both ends; fisheye rows bend by less within a square."""
+
+CONTRAST_RATIO = 0.25
+"""Neighbours differ less than this in contrast, also across a shadow's edge."""
+
+LENGTH_RATIO = 2.1
+"""Opposite neighbours differ less than this in distance, in any perspective a board can be read in."""
+
+ALONG = np.array([0.2, 0.35, 0.5, 0.65, 0.8])
+MOST = 4
+"""An edge shows the right side dark at this many of the places `ALONG` it."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Links:
+    """Mutual neighbours.
+
+    Attributes
+    ----------
+    corner : (N, 4) index of the neighbour along each arm, -1 for none.
+    arm : (N, 4) the neighbour's arm that points back.
+    """
+
+    corner: IntArray
+    arm: IntArray
+
+
+def edge_contrast(
+    image: FloatImage, start: FloatArray, end: FloatArray, sign: FloatArray, offset_px: FloatArray
+) -> FloatArray:
+    """Return how much brighter the expected side of the edges `start` -> `end` (M, 2) is, at the places ALONG, (M, 5).
+
+    `sign` is +1 where brightness grows with the angle (from u to v) around the start; `offset_px` (M,) is how far from
+    the chord both sides are sampled.
+    """
+    chord = end - start
+    length = np.maximum(np.linalg.norm(chord, axis=1), 1e-9)
+    normal = np.stack([-chord[:, 1], chord[:, 0]], axis=1) / length[:, None]
+    along = start[:, None] + ALONG[:, None] * chord[:, None]
+    aside = (sign * offset_px)[:, None, None] * normal[:, None]
+    difference: FloatArray = sample(image, along + aside) - sample(image, along - aside)
+    return difference
+
+
+def find_links(corners: Corners, level: Level) -> Links:
+    """Return the mutual neighbours among `corners`; the brightness is read from `level` (the finest)."""
+    count = len(corners)
+    nobody = Links(np.full((count, 4), -1), np.full((count, 4), -1))
+    if count < 4:
+        return nobody
+    start, arm, end, back, distance = _candidates(corners)
+    seen = _edge_seen(corners, level, start, arm, end)
+    start, arm, end, back, distance = start[seen], arm[seen], end[seen], back[seen], distance[seen]
+    state = 4 * start + arm
+    order = np.lexsort((distance, state))
+    state, first = np.unique(state[order], return_index=True)
+    chosen = order[first]
+    to = np.full(4 * count, -1)
+    to[state] = 4 * end[chosen] + back[chosen]
+    linked = np.flatnonzero(to >= 0)
+    mutual = linked[to[to[linked]] == linked]
+    both = np.full(4 * count, -1)
+    both[mutual] = to[mutual]
+    both = _without_long(both, corners.pixels)
+    return Links(np.where(both >= 0, both // 4, -1).reshape(-1, 4), np.where(both >= 0, both % 4, -1).reshape(-1, 4))
+
+
+def _candidates(corners: Corners) -> tuple[IntArray, IntArray, IntArray, IntArray, FloatArray]:
+    """Return (start, its arm, end, its arm, distance) of the pairs whose arms point at each other."""
+    from scipy.spatial import cKDTree
+
+    pixels = corners.pixels
+    near = min(NEIGHBOURS + 1, len(pixels))
+    distance, other = cKDTree(pixels).query(pixels, k=near)
+    start = np.repeat(np.arange(len(pixels)), near)
+    end, distance = other.ravel(), distance.ravel()
+    apart = distance > 1e-6
+    start, end, distance = start[apart], end[apart], distance[apart]
+    ratio = corners.contrast[start] / corners.contrast[end]
+    alike = (ratio > CONTRAST_RATIO) & (ratio < 1.0 / CONTRAST_RATIO)
+    start, end, distance = start[alike], end[alike], distance[alike]
+    chord = (pixels[end] - pixels[start]) / distance[:, None]
+    arms = arm_vectors(corners.angles)
+    out = (arms[start] * chord[:, None]).sum(axis=2)
+    arm = out.argmax(axis=1)
+    good = out[np.arange(len(out)), arm] > ARM_COSINE
+    start, end, distance, chord, arm = start[good], end[good], distance[good], chord[good], arm[good]
+    home = -(arms[end] * chord[:, None]).sum(axis=2)
+    back = home.argmax(axis=1)
+    good = (home[np.arange(len(home)), back] > ARM_COSINE) & ((arm + back) % 2 == 1)
+    return start[good], arm[good], end[good], back[good], distance[good]
+
+
+def _edge_seen(corners: Corners, level: Level, start: IntArray, arm: IntArray, end: IntArray) -> BoolArray:
+    """Return whether the edge between the corners is there, with the polarity of the arm."""
+    first, last = level.to_level(corners.pixels[start]), level.to_level(corners.pixels[end])
+    length = np.linalg.norm(last - first, axis=1)
+    offset = np.clip(0.12 * length, 1.0, 4.0 * corners.scale[start] / level.scale)
+    sign = np.where(arm % 2 == 0, 1.0, -1.0)
+    difference = edge_contrast(level.smooth, first, last, sign, offset)
+    weakest = CONTRAST_RATIO * np.minimum(corners.contrast[start], corners.contrast[end])
+    seen: BoolArray = (difference > weakest[:, None]).sum(axis=1) >= MOST
+    return seen
+
+
+def _without_long(to: IntArray, pixels: FloatArray) -> IntArray:
+    """Drop links more than LENGTH_RATIO times as long as the link of the opposite arm."""
+    there = to >= 0
+    length = np.where(
+        there, np.linalg.norm(pixels[np.where(there, to, 0) // 4] - np.repeat(pixels, 4, axis=0), axis=1), 0
+    )
+    opposite = np.roll(length.reshape(-1, 4), 2, axis=1).ravel()
+    drop = there & (opposite > 0) & (length > LENGTH_RATIO * opposite)
+    out = to.copy()
+    out[to[drop]] = -1
+    out[drop] = -1
+    return out
+
+
+def quads(links: Links) -> BoolArray:
+    """Return which links (N, 4) bound a closed square of four corners, on either side."""
+    count = len(links.corner)
+    there = links.corner >= 0
+    state = np.where(there, 4 * links.corner + links.arm, -1).ravel()
+    turned = np.where(there, 4 * links.corner + (links.arm - 1) % 4, -1).ravel()
+    start = np.arange(4 * count)
+    walk = start
+    for _ in range(4):
+        walk = np.where(walk >= 0, turned[walk], -1)
+    closed = (walk == start) & there.ravel()
+    other = np.zeros_like(closed)
+    other[state[closed]] = True
+    return (closed | other).reshape(-1, 4)

@@ -1,0 +1,103 @@
+"""Local polynomial fits to a lattice of corners: where the next corner is, which way the rows run, how they bend."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.arrays import BoolArray, FloatArray
+
+__all__ = ["LocalFit", "fit_cells"]
+
+POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
+TERMS = {1: 3, 2: 6, 3: 10}
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class LocalFit:
+    """Position as a polynomial of (column, row) around M cells; (M, 2) each, in px per cell (squared).
+
+    Attributes
+    ----------
+    pixels : position at the cell itself.
+    along_column, along_row : first derivatives: the cell's sides.
+    bend_column, bend_row : second derivatives along the column direction and along the row direction.
+    support : (M,) number of corners behind the fit.
+    """
+
+    pixels: FloatArray
+    along_column: FloatArray
+    along_row: FloatArray
+    bend_column: FloatArray
+    bend_row: FloatArray
+    support: FloatArray
+
+    def curvature(self) -> FloatArray:
+        """Return the curvature of the column and the row line at the cells, (M, 2) 1/px, positive towards +90 degrees.
+
+        The direction of +90 degrees is that of growing angle from u to v.
+        """
+        return np.stack(
+            [_curvature(self.along_column, self.bend_column), _curvature(self.along_row, self.bend_row)], axis=-1
+        )
+
+
+def _curvature(first: FloatArray, second: FloatArray) -> FloatArray:
+    cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+    curvature: FloatArray = cross / np.maximum((first**2).sum(axis=1), 1e-12) ** 1.5
+    return curvature
+
+
+def fit_cells(
+    lattice: FloatArray,
+    cells: BoolArray,
+    *,
+    degree: int = 3,
+    radius: int = 2,
+    width: float = 2.0,
+    ridge: tuple[float, float] = (1e-8, 1e-6),
+    leave_out: bool = False,
+) -> LocalFit:
+    """Fit a polynomial of `degree` to the corners within `radius` of each of the `cells`.
+
+    Parameters
+    ----------
+    lattice : (R, C, 2) pixels, NaN where unknown.
+    cells : (R, C) bool, the M cells wanted, row by row.
+    width : standard deviation in cells of the Gaussian weight.
+    ridge : pull on the second and third derivatives, as variances of a corner (squared cells): keeps what few
+        neighbours leave open from running wild.
+    leave_out : ignore the corner of the cell itself, to predict it from its neighbours.
+    """
+    side = 2 * radius + 1
+    step_r, step_c = (a.ravel() - radius for a in np.divmod(np.arange(side * side), side))
+    powers = POWERS[: TERMS[degree]]
+    design = np.stack([step_c**i * step_r**j for i, j in powers], axis=-1).astype(np.float64)
+    weight = np.exp(-0.5 * (step_c**2 + step_r**2) / width**2)
+    if leave_out:
+        weight[step_c**2 + step_r**2 == 0] = 0.0
+    padded = np.pad(lattice, ((radius, radius), (radius, radius), (0, 0)), constant_values=np.nan)
+    row, column = np.nonzero(cells)
+    near = padded[row[:, None] + step_r + radius, column[:, None] + step_c + radius]
+    known = np.isfinite(near[..., 0]) & (weight > 0.0)
+    weights = np.where(known, weight, 0.0)
+    near = np.where(known[..., None], near, 0.0)
+    total = np.maximum(weights.sum(axis=1), 1e-12)
+    centre = (weights[..., None] * near).sum(axis=1) / total[:, None]
+    size = len(powers)
+    products = (design[:, :, None] * design[:, None, :]).reshape(len(design), -1)
+    normal = (weights @ products).reshape(-1, size, size)
+    pull = np.array([(1e-12, 1e-9, ridge[0], ridge[1])[i + j] for i, j in powers])
+    normal = normal + np.diag(pull)
+    right = np.swapaxes(weights[..., None] * (near - centre[:, None]), 1, 2) @ design
+    solution = np.swapaxes(np.linalg.solve(normal, np.swapaxes(right, 1, 2)), 1, 2)
+    zero = np.zeros((len(row), 2))
+    return LocalFit(
+        solution[..., 0] + centre,
+        solution[..., 1],
+        solution[..., 2],
+        2.0 * solution[..., 3] if degree > 1 else zero,
+        2.0 * solution[..., 5] if degree > 1 else zero,
+        known.sum(axis=1).astype(np.float64),
+    )

@@ -1,0 +1,79 @@
+"""Whether a saddle is a chessboard corner: the brightness on a ring around it.
+
+Around a corner the brightness is the same on opposite sides and changes exactly twice in half a turn. Where it rises
+(angle counted from u to v) lies line A, where it falls line B; so the ring gives the two line directions and the
+polarity: which quadrants are bright.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.arrays import BoolArray, FloatArray
+from rigkit.corners.response import FloatImage, sample
+
+__all__ = ["Rings", "arm_vectors", "read_rings"]
+
+HALF = 16
+"""Samples in half a turn."""
+
+MAX_ODD = 0.35
+"""Largest energy of the part that changes sign on opposite sides, relative to the part that does not."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Rings:
+    """What the rings around N points say.
+
+    Attributes
+    ----------
+    angles : (N, 2) rad. Line A (dark to bright with growing angle) in [0, pi), line B (bright to dark) in (A, A + pi).
+    contrast : (N,) bright minus dark, grey levels.
+    valid : (N,) looks like a chessboard corner; the other values are undefined elsewhere.
+    """
+
+    angles: FloatArray
+    contrast: FloatArray
+    valid: BoolArray
+
+
+def read_rings(image: FloatImage, pixels: FloatArray, radius_px: FloatArray | float) -> Rings:
+    """Return what rings of `radius_px` (scalar or (N,)) around `pixels` (N, 2) of `image` look like."""
+    turn = np.arange(2 * HALF) * (np.pi / HALF)
+    circle = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    radius = np.broadcast_to(np.asarray(radius_px, np.float64), pixels.shape[:1])
+    values = sample(image, pixels[:, None, :] + radius[:, None, None] * circle)
+    even = 0.5 * (values[:, :HALF] + values[:, HALF:])
+    odd = 0.5 * (values[:, :HALF] - values[:, HALF:])
+    low, high = even.min(axis=1), even.max(axis=1)
+    contrast = high - low
+    middle = 0.5 * (low + high)
+    spread = even - even.mean(axis=1, keepdims=True)
+    symmetric = (odd**2).sum(axis=1) < MAX_ODD * (spread**2).sum(axis=1)
+    above = even > middle[:, None]
+    following = np.roll(above, -1, axis=1)
+    rising, falling = ~above & following, above & ~following
+    valid = symmetric & (rising.sum(axis=1) == 1) & (contrast > 0.0)
+    angle_a = _crossing(even, middle, rising)
+    angle_b = _crossing(even, middle, falling)
+    angle_a %= np.pi
+    angle_b = angle_a + (angle_b - angle_a) % np.pi
+    return Rings(np.stack([angle_a, angle_b], axis=-1), contrast, valid)
+
+
+def _crossing(even: FloatArray, middle: FloatArray, where: BoolArray) -> FloatArray:
+    """Return the angle at which each row of `even` passes `middle` in the interval marked by `where` (the first)."""
+    row = np.arange(len(even))
+    start = where.argmax(axis=1)
+    here, there = even[row, start], even[row, (start + 1) % HALF]
+    step = np.where(there == here, 1.0, there - here)
+    angle: FloatArray = (start + np.clip((middle - here) / step, 0.0, 1.0)) * (np.pi / HALF)
+    return angle
+
+
+def arm_vectors(angles: FloatArray) -> FloatArray:
+    """Return the unit vectors of the four arms (N, 4, 2), with growing angle: A, B, -A, -B."""
+    two = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    return np.concatenate([two, -two], axis=1)

@@ -1,0 +1,113 @@
+"""Chessboard corners of an image as loose points: peaks of the saddle response that pass the ring test."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.arrays import BoolArray, FloatArray, IntArray
+from rigkit.corners.response import FloatImage, Level, peaks
+from rigkit.corners.ring import read_rings
+
+__all__ = ["Corners", "Saddles", "find_corners", "find_saddles", "saddle_step"]
+
+RADII = (4.6, 2.6)
+"""Ring radii in pixels of the level: the larger gives the better directions, the smaller fits squares of 6 px."""
+
+MAX_STEP = 1.5
+"""A Newton step to the saddle that leads further than this from the peak of the response went astray, px of the level."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Saddles:
+    """Saddle points in full-resolution pixels: (N, 2), and the scale (N,) of the level each was found on."""
+
+    pixels: FloatArray
+    scale: FloatArray
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Corners:
+    """Loose chessboard corners.
+
+    Attributes
+    ----------
+    pixels : (N, 2) full resolution, a few tenths of a pixel good.
+    angles : (N, 2) rad, lines A and B as in `Rings`.
+    contrast : (N,) grey levels.
+    scale : (N,) of the level on which the corner was found.
+    """
+
+    pixels: FloatArray
+    angles: FloatArray
+    contrast: FloatArray
+    scale: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+
+def saddle_step(smooth: FloatImage, at: IntArray) -> tuple[FloatArray, BoolArray]:
+    """Return the stationary point next to the pixels `at` (N, 2) by one Newton step, and whether it is a near saddle."""
+    u, v = at[:, 0], at[:, 1]
+    patch = {(i, j): smooth[v + j, u + i].astype(np.float64) for i in (-1, 0, 1) for j in (-1, 0, 1)}
+    gu, gv = 0.5 * (patch[1, 0] - patch[-1, 0]), 0.5 * (patch[0, 1] - patch[0, -1])
+    huu = patch[1, 0] + patch[-1, 0] - 2.0 * patch[0, 0]
+    hvv = patch[0, 1] + patch[0, -1] - 2.0 * patch[0, 0]
+    huv = 0.25 * (patch[1, 1] + patch[-1, -1] - patch[1, -1] - patch[-1, 1])
+    det = huu * hvv - huv**2
+    safe = np.where(det < 0.0, det, -1.0)
+    step = np.stack([(huv * gv - hvv * gu) / safe, (huv * gu - huu * gv) / safe], axis=-1)
+    near = (det < 0.0) & (np.abs(step).max(axis=1) <= MAX_STEP)
+    return at + step, near
+
+
+def find_saddles(level: Level) -> tuple[FloatArray, FloatArray]:
+    """Return the saddles of one level in its own pixels (N, 2), strongest first, and in full-resolution pixels."""
+    found, near = saddle_step(level.smooth, peaks(level))
+    found = found[near]
+    return found, level.to_full(found)
+
+
+def find_corners(levels: list[Level]) -> tuple[Corners, Saddles]:
+    """Return the chessboard corners of all levels, each once (the finest level wins), and all saddles."""
+    kept: list[Corners] = []
+    saddles: list[Saddles] = []
+    for level in levels:
+        local, full = find_saddles(level)
+        saddles.append(Saddles(full, np.full(len(full), level.scale)))
+        angles = np.zeros((len(local), 2))
+        contrast = np.zeros(len(local))
+        valid = np.zeros(len(local), bool)
+        for radius in RADII:
+            todo = np.flatnonzero(~valid)
+            rings = read_rings(level.smooth, local[todo], radius)
+            good = todo[rings.valid]
+            angles[good], contrast[good] = rings.angles[rings.valid], rings.contrast[rings.valid]
+            valid[good] = True
+        fresh = Corners(full[valid], angles[valid], contrast[valid], np.full(int(valid.sum()), level.scale))
+        kept.append(_without_known(fresh, kept))
+    return _joined(kept), Saddles(
+        np.concatenate([s.pixels for s in saddles]), np.concatenate([s.scale for s in saddles])
+    )
+
+
+def _without_known(fresh: Corners, known: list[Corners]) -> Corners:
+    """Return those of `fresh` that no finer level has found already."""
+    if not len(fresh) or not any(len(k) for k in known):
+        return fresh
+    from scipy.spatial import cKDTree
+
+    distance, _ = cKDTree(np.concatenate([k.pixels for k in known])).query(fresh.pixels)
+    new = distance > 2.0 * fresh.scale
+    return Corners(fresh.pixels[new], fresh.angles[new], fresh.contrast[new], fresh.scale[new])
+
+
+def _joined(parts: list[Corners]) -> Corners:
+    return Corners(
+        np.concatenate([p.pixels for p in parts]),
+        np.concatenate([p.angles for p in parts]),
+        np.concatenate([p.contrast for p in parts]),
+        np.concatenate([p.scale for p in parts]),
+    )
