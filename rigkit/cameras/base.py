@@ -33,8 +33,9 @@ class Camera(ABC):
     size_px : (width, height)
     parameters : (P,) float64, read-only, in the order of `parameter_names()`.
 
-    Every model is one file with one subclass and one line in `registry`. The class-level functions
-    `parameter_names` and the four methods below are all that the rest of rigkit uses.
+    Every model is one file with one subclass and one line in `registry`. A model writes its formulas on flat arrays of
+    coordinates (`_project`, `_unproject`, `_derivatives`); shapes, NaN and memory are dealt with here, once.
+    Validity is the model's own field of view; whether a pixel lies on the sensor is another question (`on_image`).
     """
 
     size_px: tuple[int, int]
@@ -55,37 +56,154 @@ class Camera(ABC):
             raise InputError(
                 f"{self.model} camera: {len(names)} parameters expected ({', '.join(names)}), got {array.size}"
             )
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """Check the values of the parameters and compute what the formulas need of them."""
+        return
+
+    @classmethod
+    @abstractmethod
+    def from_radial_curve(
+        cls,
+        size_px: tuple[int, int],
+        centre_px: ArrayLike,
+        theta_rad: ArrayLike,
+        radius_px: ArrayLike,
+        *,
+        order: int | None = None,
+    ) -> Self:
+        """Return the camera of this model nearest to a sampled radial curve: where every calibration starts.
+
+        Parameters
+        ----------
+        centre_px : (2,) where the optical axis meets the image.
+        theta_rad, radius_px : (N,) angles from the axis and their distances from the centre, increasing.
+        order : for models of several sizes: Brown's number of distortion terms, Scaramuzza's degree.
+
+        Raises
+        ------
+        InputError
+            The curve has too few samples, or a model of this kind cannot follow it (a pinhole beyond 90 degrees).
+        """
 
     @abstractmethod
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the entries of `parameters`; the length may depend on the instance (polynomial degree)."""
 
+    @property
     @abstractmethod
+    def max_angle_rad(self) -> float:
+        """The largest angle from the optical axis that the model sees; at most pi."""
+
+    @abstractmethod
+    def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Return u, v, valid of flat coordinates; NaN in must give invalid out, values at invalid places are free."""
+
+    @abstractmethod
+    def _unproject(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+        """Return the unit rays x, y, z and valid of flat pixels; the rest as in `_project`."""
+
+    @abstractmethod
+    def _derivatives(
+        self, x: FloatArray, y: FloatArray, z: FloatArray, by_point: FloatArray, by_parameter: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Project, fill `by_point` (2, 3, N) and, unless None, `by_parameter` (2, P, N)."""
+
     def project(self, points: Points) -> tuple[Pixels, BoolArray]:
         """Return the pixels of points (..., 3) given in the camera frame, and where they are valid.
 
         The length of a point does not matter. Invalid (outside the model's field of view, at the centre, NaN): NaN.
         """
+        points = np.asarray(points, dtype=np.float64)
+        batch = points.shape[:-1]
+        flat = points.reshape(-1, 3)
+        with np.errstate(all="ignore"):
+            u, v, valid = self._project(flat[:, 0], flat[:, 1], flat[:, 2])
+        pixels = np.stack([u, v], axis=-1)
+        _blank(pixels, valid)
+        return pixels.reshape(*batch, 2), valid.reshape(batch)
 
-    @abstractmethod
     def unproject(self, pixels: Pixels) -> tuple[Rays, BoolArray]:
         """Return the unit rays of pixels (..., 2) in the camera frame, and where they are valid (NaN elsewhere)."""
+        pixels = np.asarray(pixels, dtype=np.float64)
+        batch = pixels.shape[:-1]
+        flat = pixels.reshape(-1, 2)
+        with np.errstate(all="ignore"):
+            x, y, z, valid = self._unproject(flat[:, 0], flat[:, 1])
+        rays = np.stack([x, y, z], axis=-1)
+        _blank(rays, valid)
+        return rays.reshape(*batch, 3), valid.reshape(batch)
 
-    @abstractmethod
     def ray_jacobian(self, pixels: Pixels) -> RayJacobians:
-        """Return d ray / d pixel (..., 3, 2) at pixels (..., 2); the columns are perpendicular to the ray."""
+        """Return d ray / d pixel (..., 3, 2) at pixels (..., 2); the columns are perpendicular to the ray.
 
-    @abstractmethod
+        NaN where the pixel has no ray.
+
+        Notes
+        -----
+        At a unit ray f the derivative J = d pixel / d point (2x3) has J f = 0, so the derivative of the inverse map
+        into the sphere is the pseudo-inverse J^T (J J^T)^-1: one formula for every central camera.
+        """
+        rays, valid = self.unproject(pixels)
+        x, y, z = rays.reshape(-1, 3).T
+        by_point = np.empty((2, 3, x.size))
+        with np.errstate(all="ignore"):
+            self._derivatives(x, y, z, by_point, None)
+            uu, uv, vv = (
+                np.einsum("kn,kn->n", by_point[i], by_point[j], optimize=False) for i, j in ((0, 0), (0, 1), (1, 1))
+            )
+            determinant = uu * vv - uv * uv
+            out = np.empty((3, 2, x.size))
+            out[:, 0] = (by_point[0] * vv - by_point[1] * uv) / determinant
+            out[:, 1] = (by_point[1] * uu - by_point[0] * uv) / determinant
+        out[..., ~valid.reshape(-1)] = np.nan
+        return np.moveaxis(out.reshape(3, 2, *valid.shape), (0, 1), (-2, -1))
+
     def project_with_jacobians(self, points: Points) -> tuple[Pixels, BoolArray, FloatArray, FloatArray]:
-        """Return pixels, valid, d pixel / d point (..., 2, 3) in px/mm, and d pixel / d parameters (..., 2, P)."""
+        """Return pixels, valid, d pixel / d point (..., 2, 3) in px/mm, and d pixel / d parameters (..., 2, P).
+
+        The Jacobians are NaN where invalid. They are views of memory in the order (2, 3, ...) and (2, P, ...):
+        a solver that wants long contiguous rows moves the last two axes to the front at no cost.
+        """
+        points = np.asarray(points, dtype=np.float64)
+        batch = points.shape[:-1]
+        flat = points.reshape(-1, 3)
+        by_point = np.zeros((2, 3, flat.shape[0]))
+        by_parameter = np.zeros((2, self.parameters.size, flat.shape[0]))
+        with np.errstate(all="ignore"):
+            u, v, valid = self._derivatives(flat[:, 0], flat[:, 1], flat[:, 2], by_point, by_parameter)
+        pixels = np.stack([u, v], axis=-1)
+        if not valid.all():
+            _blank(pixels, valid)
+            by_point[..., ~valid] = np.nan
+            by_parameter[..., ~valid] = np.nan
+        return (
+            pixels.reshape(*batch, 2),
+            valid.reshape(batch),
+            np.moveaxis(by_point.reshape(2, 3, *batch), (0, 1), (-2, -1)),
+            np.moveaxis(by_parameter.reshape(2, self.parameters.size, *batch), (0, 1), (-2, -1)),
+        )
 
     def with_parameters(self, parameters: ArrayLike) -> Self:
         """Return the same model and size with other parameters."""
         return type(self)(self.size_px, np.asarray(parameters, dtype=np.float64))
 
+    def on_image(self, pixels: Pixels) -> BoolArray:
+        """Say which pixels (..., 2) lie on the sensor, whose outermost pixels reach half a pixel further out."""
+        pixels = np.asarray(pixels, dtype=np.float64)
+        limit = np.array(self.size_px) - 0.5
+        with np.errstate(invalid="ignore"):
+            return np.asarray(((pixels >= -0.5) & (pixels <= limit)).all(axis=-1))
+
     @property
     def focal_px(self) -> float:
         """Pixels per radian on the optical axis: the scale of an angular error, whatever the model."""
-        centre, _ = self.project(np.array([0.0, 0.0, 1.0]))
-        jacobian = self.ray_jacobian(centre)
-        return float(1.0 / np.sqrt(abs(np.linalg.det(jacobian[:2]))))
+        _, _, by_point, _ = self.project_with_jacobians(np.array([0.0, 0.0, 1.0]))
+        return float(np.sqrt(abs(np.linalg.det(by_point[:, :2]))))
+
+
+def _blank(values: FloatArray, valid: BoolArray) -> None:
+    """Write NaN into the rows of a fresh array that are not valid."""
+    if not valid.all():
+        values[~valid] = np.nan

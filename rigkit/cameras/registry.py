@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from rigkit.cameras.base import Camera
+from rigkit.cameras.brown import Brown
+from rigkit.cameras.double_sphere import DoubleSphere
+from rigkit.cameras.eucm import EUCM
+from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
+from rigkit.cameras.scaramuzza import Scaramuzza
+from rigkit.cameras.ucm import UCM
 from rigkit.errors import InputError
 
 __all__ = ["MODELS", "camera_model"]
 
-MODELS: dict[str, type[Camera]] = {cls.model: cls for cls in (Pinhole,)}
+MODELS: dict[str, type[Camera]] = {
+    cls.model: cls for cls in (Pinhole, Brown, KannalaBrandt, Scaramuzza, UCM, EUCM, DoubleSphere)
+}
 
 
 def camera_model(name: str) -> type[Camera]:

@@ -1,0 +1,121 @@
+"""The Kannala-Brandt fisheye: radius as an odd polynomial of the angle, as in OpenCV's fisheye module.
+
+Reference: J. Kannala, S. S. Brandt, "A generic camera model and calibration method for conventional, wide-angle, and
+fish-eye lenses", PAMI 2006, equation (6). Unlike OpenCV's implementation it is right beyond 90 degrees off the axis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rigkit.arrays import BoolArray, FloatArray
+from rigkit.cameras.monotone import first_root, horner, invert_increasing
+from rigkit.cameras.radial import FocalCamera, ScaleDerivatives, checked_curve
+
+__all__ = ["KannalaBrandt"]
+
+KNOTS = 129
+"""Samples of the curve from which its inverse starts; Newton does the rest."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class KannalaBrandt(FocalCamera):
+    """|m| = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8), u = fx m_x + cx, v = fy m_y + cy.
+
+    Parameters are fx, fy, cx, cy in px, k1..k4. The field of view ends where the curve stops rising, at most at
+    180 degrees off the axis.
+    """
+
+    model: ClassVar[str] = "kannala_brandt"
+
+    _max_angle: float = field(init=False, repr=False)
+
+    @classmethod
+    def from_radial_curve(
+        cls,
+        size_px: tuple[int, int],
+        centre_px: ArrayLike,
+        theta_rad: ArrayLike,
+        radius_px: ArrayLike,
+        *,
+        order: int | None = None,
+    ) -> Self:
+        centre, theta, radius = checked_curve(centre_px, theta_rad, radius_px, cls.model)
+        # A curve with noise may be fitted best by a polynomial that turns down just outside it: then fewer terms.
+        for terms in (5, 4, 3, 2, 1):
+            powers = theta[:, None] ** np.arange(1, 2 * terms, 2)
+            size = np.linalg.norm(powers, axis=0)
+            a = np.linalg.lstsq(powers / size, radius, rcond=None)[0] / size
+            shape = np.zeros(4)
+            shape[: terms - 1] = a[1:] / a[0]
+            camera = cls(size_px, np.array([a[0], a[0], *centre, *shape]))
+            if a[0] > 0.0 and camera.max_angle_rad > theta[-1]:
+                return camera
+        return camera
+
+    @property
+    def max_angle_rad(self) -> float:
+        return self._max_angle
+
+    def parameter_names(self) -> tuple[str, ...]:
+        return ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
+
+    def _prepare(self) -> None:
+        slope = self._slope_coefficients()
+        object.__setattr__(self, "_max_angle", float(np.sqrt(first_root(slope, np.pi**2))))
+
+    def _slope_coefficients(self) -> FloatArray:
+        """d|m| / d theta as a polynomial in theta^2."""
+        return np.asarray(np.arange(1.0, 10.0, 2.0) * np.concatenate([[1.0], self.parameters[4:]]))
+
+    def _factor(self, theta2: FloatArray) -> FloatArray:
+        """|m| / theta."""
+        return horner(np.concatenate([[1.0], self.parameters[4:]]), theta2)
+
+    def _angle(self, r2: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Return theta, theta / r and valid."""
+        r = np.sqrt(r2)
+        theta = np.arctan2(r, z)
+        ratio = np.where(r > 0.0, theta / r, 1.0 / z)
+        valid = (theta <= self._max_angle) & (r2 + z * z < np.inf) & ((r > 0.0) | (z > 0.0))
+        return theta, ratio, valid
+
+    def _scale(self, r2: FloatArray, z: FloatArray) -> tuple[FloatArray, BoolArray]:
+        theta, ratio, valid = self._angle(r2, z)
+        return ratio * self._factor(theta * theta), valid
+
+    def _scale_derivatives(self, r2: FloatArray, z: FloatArray, shape: bool) -> ScaleDerivatives:
+        theta, ratio, valid = self._angle(r2, z)
+        theta2 = theta * theta
+        scale = ratio * self._factor(theta2)
+        # d theta / d r = z / |X|^2, d theta / d z = -r / |X|^2.
+        by_angle = horner(self._slope_coefficients(), theta2) / (r2 + z * z)
+        by_r = np.where(r2 > 0.0, (by_angle * z - scale) / r2, 0.0)
+        by_shape: list[FloatArray] = []
+        if shape:
+            power = ratio
+            for _ in range(4):
+                power = power * theta2
+                by_shape.append(power)
+        return ScaleDerivatives(scale, valid, by_r, -by_angle, tuple(by_shape))
+
+    def _profile(self, radius2: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        radius = np.sqrt(radius2)
+        knots = np.linspace(0.0, self._max_angle, KNOTS)
+        values = knots * self._factor(knots * knots)
+        valid = radius <= values[-1]
+        radius = np.where(valid, radius, 0.0)
+        slope = self._slope_coefficients()
+
+        def residual(theta: FloatArray, index: np.ndarray | None) -> tuple[FloatArray, FloatArray]:
+            theta2 = theta * theta
+            wanted = radius if index is None else radius[index]
+            return theta * self._factor(theta2) - wanted, horner(slope, theta2)
+
+        theta = invert_increasing(residual, radius, knots, values)
+        sine = np.where(radius > 0.0, np.sin(theta) / radius, 1.0)
+        return sine, np.cos(theta), valid

@@ -1,0 +1,215 @@
+"""Cameras that look the same in every direction around the axis: pixel = L s(r, z) (x, y) + centre.
+
+r = |(x, y)|, s is the model's own scale, homogeneous of degree -1; L is diag(fx, fy), or Scaramuzza's affine part.
+A model supplies s with its derivatives and the inverse profile; everything else is here.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rigkit.arrays import BoolArray, FloatArray, as_array
+from rigkit.cameras.base import Camera
+from rigkit.errors import InputError
+
+__all__ = ["FocalCamera", "RadialCamera", "ScaleDerivatives", "checked_curve", "fit_shape"]
+
+FIT_STEPS = 60
+FIT_SETTLED = 1e-12
+"""The descent stops where a step gains less than this share of the cost."""
+
+
+class ScaleDerivatives(NamedTuple):
+    """The scale s with its derivatives: `by_r` is (ds/dr) / r, which has a limit on the axis."""
+
+    scale: FloatArray
+    valid: BoolArray
+    by_r: FloatArray
+    by_z: FloatArray
+    by_shape: tuple[FloatArray, ...]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RadialCamera(Camera):
+    """What radially symmetric models have in common; see the module."""
+
+    @abstractmethod
+    def _scale(self, r2: FloatArray, z: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Return s and valid from r^2 and z."""
+
+    @abstractmethod
+    def _scale_derivatives(self, r2: FloatArray, z: FloatArray, shape: bool) -> ScaleDerivatives:
+        """Return s with its derivatives; those by the shape parameters only where asked for."""
+
+    @abstractmethod
+    def _profile(self, radius2: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Return sin(theta) / radius, cos(theta) and valid, from the squared radius |s (x, y)|^2."""
+
+    @abstractmethod
+    def _linear(self) -> tuple[float, float, float, float, float]:
+        """Return l00, l01, l11 of L (l10 = 0) and the centre."""
+
+    @abstractmethod
+    def _fill_parameters(
+        self, out: FloatArray, m: tuple[FloatArray, FloatArray], by_shape: tuple[tuple[FloatArray, FloatArray], ...]
+    ) -> None:
+        """Write d pixel / d parameters (2, P, N) from m = s (x, y) and L (x, y) ds / d shape."""
+
+    def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        scale, valid = self._scale(x * x + y * y, z)
+        l00, l01, l11, cx, cy = self._linear()
+        mx, my = scale * x, scale * y
+        u = l00 * mx + cx
+        if l01:
+            u += l01 * my
+        return u, l11 * my + cy, valid
+
+    def _unproject(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+        l00, l01, l11, cx, cy = self._linear()
+        my = (v - cy) / l11
+        mx = (u - cx - l01 * my) / l00
+        sine, cosine, valid = self._profile(mx * mx + my * my)
+        return mx * sine, my * sine, cosine, valid
+
+    def _derivatives(
+        self, x: FloatArray, y: FloatArray, z: FloatArray, by_point: FloatArray, by_parameter: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        d = self._scale_derivatives(x * x + y * y, z, by_parameter is not None)
+        l00, l01, l11, cx, cy = self._linear()
+        mx, my = d.scale * x, d.scale * y
+        # L (x, y): with it d pixel / d point = s L [I 0] + L (x, y) (by_r x, by_r y, by_z).
+        lx, ly = l00 * x + l01 * y, l11 * y
+        rx, ry = d.by_r * x, d.by_r * y
+        np.multiply(lx, rx, out=by_point[0, 0])
+        by_point[0, 0] += l00 * d.scale
+        np.multiply(lx, ry, out=by_point[0, 1])
+        if l01:
+            by_point[0, 1] += l01 * d.scale
+        np.multiply(lx, d.by_z, out=by_point[0, 2])
+        np.multiply(ly, rx, out=by_point[1, 0])
+        np.multiply(ly, ry, out=by_point[1, 1])
+        by_point[1, 1] += l11 * d.scale
+        np.multiply(ly, d.by_z, out=by_point[1, 2])
+        if by_parameter is not None:
+            self._fill_parameters(by_parameter, (mx, my), tuple((lx * b, ly * b) for b in d.by_shape))
+        return l00 * mx + l01 * my + cx, l11 * my + cy, d.valid
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FocalCamera(RadialCamera):
+    """Radial models whose parameters are fx, fy, cx, cy in px and then the shape."""
+
+    def _linear(self) -> tuple[float, float, float, float, float]:
+        fx, fy, cx, cy = self.parameters[:4].tolist()
+        return fx, 0.0, fy, cx, cy
+
+    def _fill_parameters(
+        self, out: FloatArray, m: tuple[FloatArray, FloatArray], by_shape: tuple[tuple[FloatArray, FloatArray], ...]
+    ) -> None:
+        out[0, 0], out[1, 1] = m
+        out[0, 2] = out[1, 3] = 1.0
+        for k, (du, dv) in enumerate(by_shape, start=4):
+            out[0, k], out[1, k] = du, dv
+
+
+def checked_curve(
+    centre_px: ArrayLike, theta_rad: ArrayLike, radius_px: ArrayLike, model: str, *, below_rad: float = np.pi
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return centre, angles and radii of a radial curve, checked; samples on the axis are left out.
+
+    Raises InputError where fewer than 4 samples remain, where either does not increase, or where the curve reaches
+    `below_rad`, beyond which the model does not see.
+    """
+    centre = as_array(centre_px, (2,), "centre_px")
+    theta = as_array(theta_rad, (None,), "theta_rad")
+    radius = as_array(radius_px, theta.shape, "radius_px")
+    theta, radius = theta[theta > 0.0], radius[theta > 0.0]
+    if theta.size < 4:
+        raise InputError(f"radial curve: {theta.size} samples off the axis; a {model} camera needs at least 4")
+    if (np.diff(theta) <= 0.0).any() or (np.diff(radius, prepend=0.0) <= 0.0).any():
+        raise InputError("radial curve: angles and radii must both increase from the axis outwards")
+    if theta[-1] >= below_rad:
+        raise InputError(
+            f"radial curve: it reaches {np.degrees(theta[-1]):.1f} degrees, a {model} camera sees less than "
+            f"{np.degrees(below_rad):.0f}; cut the curve or take a fisheye model"
+        )
+    return centre, theta, radius
+
+
+_Focal = TypeVar("_Focal", bound=FocalCamera)
+
+
+def fit_shape(
+    model: type[_Focal],
+    size_px: tuple[int, int],
+    centre: FloatArray,
+    theta: FloatArray,
+    radius: FloatArray,
+    starts: Sequence[Sequence[float]],
+) -> _Focal:
+    """Return the camera of `model` nearest to the curve: one focal length and its shape, damped Gauss-Newton.
+
+    Each of `starts` is a shape; the best end is returned. Raises InputError where no start sees the whole curve.
+    """
+    points = np.stack([np.sin(theta), np.zeros_like(theta), np.cos(theta)], axis=-1)
+    best: tuple[float, _Focal] | None = None
+    for start in starts:
+        found = _descend(model(size_px, np.array([1.0, 1.0, *centre, *start])), points, radius)
+        if found is not None and (best is None or found[0] < best[0]):
+            best = found
+    if best is None:
+        raise InputError(
+            f"radial curve: no {model.model} camera sees all of it, out to {np.degrees(theta[-1]):.1f} deg"
+        )
+    return best[1]
+
+
+def _descend(camera: _Focal, points: FloatArray, radius: FloatArray) -> tuple[float, _Focal] | None:
+    """Return cost and camera after the descent from a camera of focal length 1, or None where it sees too little."""
+    centre = camera.parameters[2]
+    pixels, valid = camera.project(points)
+    if not valid.all():
+        return None
+    reached = pixels[:, 0] - centre
+    focal = float(reached @ radius / (reached @ reached))
+    camera = camera.with_parameters([focal, focal, *camera.parameters[2:]])
+    cost, damping = _curve_cost(camera, points, radius), 1e-6
+    for _ in range(FIT_STEPS):
+        pixels, _, _, jacobian = camera.project_with_jacobians(points)
+        # The points lie in the plane y = 0: u depends on fx alone, which then stands for both focal lengths.
+        j = np.delete(jacobian[:, 0], (1, 2, 3), axis=1)
+        normal = j.T @ j
+        gradient = j.T @ (pixels[:, 0] - centre - radius)
+        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -gradient)
+        trial = camera.parameters.copy()
+        trial[0] += step[0]
+        trial[1] = trial[0]
+        trial[4:] += step[1:]
+        try:
+            moved = camera.with_parameters(trial)
+        except InputError:
+            damping *= 10.0
+            continue
+        new_cost = _curve_cost(moved, points, radius)
+        if not new_cost < cost:
+            damping *= 10.0
+            continue
+        done = cost - new_cost <= FIT_SETTLED * cost
+        camera, cost, damping = moved, new_cost, damping * 0.1
+        if done:
+            break
+    return cost, camera
+
+
+def _curve_cost(camera: RadialCamera, points: FloatArray, radius: FloatArray) -> float:
+    """Sum of squared radius errors, infinite where a point is not seen."""
+    pixels, valid = camera.project(points)
+    if not valid.all():
+        return float("inf")
+    return float(np.sum((pixels[:, 0] - camera.parameters[2] - radius) ** 2))
