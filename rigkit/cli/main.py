@@ -17,7 +17,9 @@ from rigkit.errors import RigkitError
 
 __all__ = ["VERBS", "main"]
 
-VERBS: dict[str, tuple[str, str]] = {}
+VERBS: dict[str, tuple[str, str]] = {
+    "board": ("rigkit.cli.board", "a board to print, true to scale"),
+}
 """Verb -> (module, one-line help)."""
 
 EXIT_INTERRUPTED = 130

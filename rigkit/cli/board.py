@@ -1,0 +1,96 @@
+"""`rigkit board`: a chessboard to print, true to scale, and the measured print back into its file."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rigkit.errors import InputError
+
+if TYPE_CHECKING:
+    from rigkit.boards import Board
+
+HELP = "a board to print, true to scale (PDF and SVG), and its measured size back into the board file"
+
+BOARD_SIZE = re.compile(r"^(\d+)[xX](\d+)$")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("size", metavar="COLUMNSxROWS|BOARD.toml", help="inner corners, such as 9x6, or a board file")
+    parser.add_argument("--square-mm", type=float, help="side of a square (with COLUMNSxROWS)")
+    parser.add_argument("--paper", default="a4", help="a4 (default), a3, a2, a1, a0, letter or tabloid")
+    parser.add_argument("-o", "--output", metavar="NAME", help="write NAME.pdf, NAME.svg and NAME.toml")
+    parser.add_argument("--force", action="store_true", help="replace existing files")
+    measured = parser.add_argument_group(
+        "measured print", "what a rule shows on the print's two rulers; the board file gets the true square size"
+    )
+    measured.add_argument("--ruler-x-mm", type=float, metavar="MM", help="measured length of the lower ruler")
+    measured.add_argument("--ruler-y-mm", type=float, metavar="MM", help="measured length of the right ruler")
+    measured.add_argument("--sigma-mm", type=float, metavar="MM", help="how well you could read the rule")
+
+
+def run(args: argparse.Namespace) -> int:
+    from rigkit.boards import Board
+    from rigkit.io.board_file import load_board
+    from rigkit.io.files import ensure_writable, write_atomic
+    from rigkit.report.board_sheet import board_sheet, pdf_bytes, svg_text
+
+    size = BOARD_SIZE.match(args.size)
+    if size is not None:
+        if args.square_mm is None:
+            raise InputError("board: --square-mm is missing; give the side of a square, such as --square-mm 30")
+        if args.output is None:
+            raise InputError("board: -o is missing; give a name for the files, such as -o boards/a9x6_30")
+        board = Board("board", int(size[1]), int(size[2]), args.square_mm, args.square_mm)
+    else:
+        board = load_board(Path(args.size))
+    sheet = board_sheet(board, args.paper)
+    if args.ruler_x_mm is not None or args.ruler_y_mm is not None:
+        return _store_measured(args, board, sheet.ruler_x_mm, sheet.ruler_y_mm)
+    if args.output is None:
+        raise InputError("board: -o is missing; give a name for the files, such as -o boards/a9x6_30")
+    files: dict[str, str | bytes] = {
+        f"{args.output}.pdf": pdf_bytes(sheet),
+        f"{args.output}.svg": svg_text(sheet),
+    }
+    if size is not None:
+        files[f"{args.output}.toml"] = _board_toml(board, "nominal: print, measure both rulers, run rigkit board again")
+    ensure_writable(files, force=args.force)
+    for path, data in files.items():
+        write_atomic(path, data, force=args.force)
+        print(path)
+    return 0
+
+
+def _store_measured(args: argparse.Namespace, board: Board, ruler_x_mm: float, ruler_y_mm: float) -> int:
+    from rigkit.boards import Board
+    from rigkit.io.files import write_atomic
+
+    path = Path(args.size)
+    if BOARD_SIZE.match(args.size):
+        raise InputError("board: a measured print belongs to a board file; give BOARD.toml instead of a size")
+    if args.ruler_x_mm is None or args.ruler_y_mm is None:
+        raise InputError("board: measure both rulers; printers stretch the two directions differently")
+    for measured, nominal in ((args.ruler_x_mm, ruler_x_mm), (args.ruler_y_mm, ruler_y_mm)):
+        if not 0.5 < measured / nominal < 2.0:
+            raise InputError(f"board: a ruler of {nominal:g} mm cannot measure {measured:g} mm; check the reading")
+    x = board.square_x_mm * args.ruler_x_mm / ruler_x_mm
+    y = board.square_y_mm * args.ruler_y_mm / ruler_y_mm
+    sigma = None
+    if args.sigma_mm is not None:
+        sigma = args.sigma_mm * max(board.square_x_mm / ruler_x_mm, board.square_y_mm / ruler_y_mm)
+    measured_board = Board(board.board_id, board.columns, board.rows, x, y, sigma)
+    words = f"measured: rulers of {ruler_x_mm:g} and {ruler_y_mm:g} mm read {args.ruler_x_mm:g} and {args.ruler_y_mm:g}"
+    write_atomic(path, _board_toml(measured_board, words), force=True)
+    print(f"{path}: squares {x:.4f} x {y:.4f} mm")
+    return 0
+
+
+def _board_toml(board: Board, comment: str) -> str:
+    lines = [f"# {comment}", 'schema = "rigkit.board/1"', f"columns = {board.columns}", f"rows = {board.rows}"]
+    lines += [f"square_x_mm = {board.square_x_mm:.6g}", f"square_y_mm = {board.square_y_mm:.6g}"]
+    if board.square_sigma_mm is not None:
+        lines.append(f"square_sigma_mm = {board.square_sigma_mm:.4g}")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,179 @@
+"""A chessboard to print, true to scale, with rulers that show what the printer made of it: SVG and PDF.
+
+The sheet is a list of shapes in mm with the origin at the top left; two small writers turn it into either format.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+
+from rigkit.boards import Board
+from rigkit.errors import InputError
+
+__all__ = ["PAPERS", "Sheet", "board_sheet", "pdf_bytes", "svg_text"]
+
+PAPERS = {
+    "a4": (210.0, 297.0),
+    "a3": (297.0, 420.0),
+    "a2": (420.0, 594.0),
+    "a1": (594.0, 841.0),
+    "a0": (841.0, 1189.0),
+    "letter": (215.9, 279.4),
+    "tabloid": (279.4, 431.8),
+}
+"""Width and height in mm, upright; a board that is wider than high turns the sheet."""
+
+UNPRINTABLE_MM = 6.0
+"""Margin that most printers leave white."""
+
+RULER_STRIP_MM = 14.0
+"""Room below and to the right of the board for a ruler and its words."""
+
+RULER_STEP_MM = 10.0
+TEXT_MM = 3.0
+POINTS_PER_MM = 72.0 / 25.4
+
+
+@dataclass(frozen=True, slots=True)
+class Sheet:
+    """Shapes in mm: black rectangles (x, y, w, h), lines (x1, y1, x2, y2) and texts (x, y, degrees, words)."""
+
+    width_mm: float
+    height_mm: float
+    title: str
+    rectangles: tuple[tuple[float, float, float, float], ...]
+    lines: tuple[tuple[float, float, float, float], ...]
+    texts: tuple[tuple[float, float, float, str], ...]
+    ruler_x_mm: float
+    ruler_y_mm: float
+
+
+def board_sheet(board: Board, paper: str) -> Sheet:
+    """Lay out the board's (columns + 1) x (rows + 1) squares and two rulers on a sheet of `paper`.
+
+    The top-left square is black. Around the squares one margin of at least half a square stays white, which
+    detectors need.
+
+    Raises InputError where the paper is unknown or too small; the message names the paper that would do.
+    """
+    size = _sheet_size(board, paper)
+    across, down = board.columns + 1, board.rows + 1
+    w, h = across * board.square_x_mm, down * board.square_y_mm
+    x0 = (size[0] - RULER_STRIP_MM - w) / 2.0
+    y0 = (size[1] - RULER_STRIP_MM - h) / 2.0
+    rectangles = tuple(
+        (x0 + i * board.square_x_mm, y0 + j * board.square_y_mm, board.square_x_mm, board.square_y_mm)
+        for j in range(down)
+        for i in range(across)
+        if (i + j) % 2 == 0
+    )
+    ruler_x = RULER_STEP_MM * np.floor(w / RULER_STEP_MM)
+    ruler_y = RULER_STEP_MM * np.floor(h / RULER_STEP_MM)
+    bottom = size[1] - UNPRINTABLE_MM - 7.0
+    right = size[0] - UNPRINTABLE_MM - 7.0
+    lines = [(x0, bottom, x0 + ruler_x, bottom), (right, y0, right, y0 + ruler_y)]
+    lines += [(x0 + t, bottom, x0 + t, bottom - _tick(t)) for t in np.arange(0.0, ruler_x + 1.0, RULER_STEP_MM)]
+    lines += [(right, y0 + t, right - _tick(t), y0 + t) for t in np.arange(0.0, ruler_y + 1.0, RULER_STEP_MM)]
+    squares = f"{board.square_x_mm:g} x {board.square_y_mm:g} mm"
+    name = f"{board.columns} x {board.rows} inner corners, squares {squares}"
+    texts = (
+        (x0, bottom + 4.5, 0.0, f"rigkit: {name}. Print at 100 %. This ruler should be {ruler_x:g} mm; measure it."),
+        (right + 2.0, y0, 90.0, f"This ruler should be {ruler_y:g} mm."),
+    )
+    return Sheet(*size, name, rectangles, tuple(lines), texts, float(ruler_x), float(ruler_y))
+
+
+def svg_text(sheet: Sheet) -> str:
+    """Return the sheet as SVG with its size in mm."""
+    out = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{sheet.width_mm:g}mm" height="{sheet.height_mm:g}mm" '
+        f'viewBox="0 0 {sheet.width_mm:g} {sheet.height_mm:g}">',
+        f"<title>{escape(sheet.title)}</title>",
+        f'<rect width="{sheet.width_mm:g}" height="{sheet.height_mm:g}" fill="white"/>',
+    ]
+    # Squares that touch at a corner must not overlap: no stroke, crisp edges.
+    out += [
+        f'<rect x="{x:.6g}" y="{y:.6g}" width="{w:.6g}" height="{h:.6g}" fill="black"/>'
+        for x, y, w, h in sheet.rectangles
+    ]
+    out += [
+        f'<line x1="{a:.6g}" y1="{b:.6g}" x2="{c:.6g}" y2="{d:.6g}" stroke="black" stroke-width="0.15"/>'
+        for a, b, c, d in sheet.lines
+    ]
+    out += [
+        f'<text transform="translate({x:.6g} {y:.6g}) rotate({turn:g})" font-family="Helvetica, Arial, sans-serif" '
+        f'font-size="{TEXT_MM:g}">{escape(words)}</text>'
+        for x, y, turn, words in sheet.texts
+    ]
+    return "\n".join([*out, "</svg>\n"])
+
+
+def pdf_bytes(sheet: Sheet) -> bytes:
+    """Return the sheet as a one-page PDF of exactly its size."""
+
+    def at(x: float, y: float) -> str:
+        return f"{x * POINTS_PER_MM:.5f} {(sheet.height_mm - y) * POINTS_PER_MM:.5f}"
+
+    def extent(w: float, h: float) -> str:
+        return f"{w * POINTS_PER_MM:.5f} {h * POINTS_PER_MM:.5f}"
+
+    drawing = ["0 g"]
+    drawing += [f"{at(x, y + h)} {extent(w, h)} re f" for x, y, w, h in sheet.rectangles]
+    drawing += [f"{0.15 * POINTS_PER_MM:.4f} w"]
+    drawing += [f"{at(a, b)} m {at(c, d)} l S" for a, b, c, d in sheet.lines]
+    for x, y, turn, words in sheet.texts:
+        c, s = np.cos(np.deg2rad(-turn)), np.sin(np.deg2rad(-turn))
+        safe = words.replace("\\", r"\\").replace("(", r"\(").replace(")", r"\)")
+        matrix = f"{c:.6f} {s:.6f} {-s:.6f} {c:.6f} {at(x, y)}"
+        drawing.append(f"BT /F1 {TEXT_MM * POINTS_PER_MM:.4f} Tf {matrix} Tm ({safe}) Tj ET")
+    stream = zlib.compress("\n".join(drawing).encode("latin-1", "replace"))
+    box = f"[0 0 {extent(sheet.width_mm, sheet.height_mm)}]"
+    # PrintScaling None asks the viewer not to fit the page to the paper.
+    objects = [
+        b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
+        b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
+        f"<< /Type /Page /Parent 2 0 R /MediaBox {box} /Contents 4 0 R "
+        f"/Resources << /Font << /F1 5 0 R >> >> >>".encode(),
+        f"<< /Length {len(stream)} /Filter /FlateDecode >>\nstream\n".encode() + stream + b"\nendstream",
+        b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica >>",
+    ]
+    out = bytearray(b"%PDF-1.4\n%\xe2\xe3\xcf\xd3\n")
+    offsets = []
+    for number, body in enumerate(objects, start=1):
+        offsets.append(len(out))
+        out += f"{number} 0 obj\n".encode() + body + b"\nendobj\n"
+    start = len(out)
+    out += f"xref\n0 {len(objects) + 1}\n0000000000 65535 f \n".encode()
+    out += b"".join(f"{offset:010d} 00000 n \n".encode() for offset in offsets)
+    out += f"trailer << /Size {len(objects) + 1} /Root 1 0 R >>\nstartxref\n{start}\n%%EOF\n".encode()
+    return bytes(out)
+
+
+def _sheet_size(board: Board, paper: str) -> tuple[float, float]:
+    if paper not in PAPERS:
+        raise InputError(f"paper '{paper}' is unknown; known: {', '.join(PAPERS)}")
+    width = (board.columns + 1) * board.square_x_mm + 2.0 * UNPRINTABLE_MM + RULER_STRIP_MM
+    height = (board.rows + 1) * board.square_y_mm + 2.0 * UNPRINTABLE_MM + RULER_STRIP_MM
+    landscape = width > height
+
+    def fits(size: tuple[float, float]) -> tuple[float, float] | None:
+        turned = (max(size), min(size)) if landscape else (min(size), max(size))
+        return turned if turned[0] >= width and turned[1] >= height else None
+
+    size = fits(PAPERS[paper])
+    if size is None:
+        larger = [name for name, candidate in PAPERS.items() if fits(candidate)]
+        advice = f"use --paper {larger[0]}" if larger else "no known paper is large enough"
+        raise InputError(
+            f"a board of {width:.0f} x {height:.0f} mm (with margins and rulers) does not fit on {paper}: "
+            f"{advice}, or smaller squares"
+        )
+    return size
+
+
+def _tick(at_mm: float) -> float:
+    return 3.0 if round(at_mm) % 50 == 0 else 1.8

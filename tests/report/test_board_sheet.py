@@ -1,0 +1,67 @@
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ElementTree
+import zlib
+
+import numpy as np
+import pytest
+
+from rigkit.boards import Board
+from rigkit.errors import InputError
+from rigkit.report.board_sheet import board_sheet, pdf_bytes, svg_text
+
+POINTS_PER_MM = 72.0 / 25.4
+PDF_ROUNDING_MM = 1e-4
+"""The writer prints five decimals of a point."""
+
+
+def test_squares_alternate_and_have_their_size() -> None:
+    sheet = board_sheet(Board("b", 8, 5, 20.0, 21.0), "a4")
+    squares = np.array(sheet.rectangles)
+    assert len(squares) == (9 * 6) / 2
+    assert np.allclose(squares[:, 2:], [20.0, 21.0])
+    index = (squares[:, :2] - squares[:, :2].min(axis=0)) / [20.0, 21.0]
+    assert np.allclose(index, np.round(index))
+    assert (np.round(index).astype(int).sum(axis=1) % 2 == 0).all()
+    assert squares[:, 0].min() >= 0.0
+    assert (squares[:, 0] + squares[:, 2]).max() <= sheet.width_mm
+
+
+def test_pdf_is_true_to_scale() -> None:
+    sheet = board_sheet(Board("b", 8, 5, 20.0, 20.0), "a4")
+    data = pdf_bytes(sheet)
+    box = re.search(rb"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", data)
+    assert box is not None
+    assert float(box[1]) / POINTS_PER_MM == pytest.approx(297.0, abs=PDF_ROUNDING_MM)
+    stream = re.search(rb"stream\n(.*)\nendstream", data, re.DOTALL)
+    assert stream is not None
+    drawn = re.findall(rb"([\d.]+) ([\d.]+) ([\d.]+) ([\d.]+) re f", zlib.decompress(stream[1]))
+    mm = np.array(drawn, dtype=float) / POINTS_PER_MM
+    assert len(mm) == len(sheet.rectangles)
+    assert np.abs(mm[:, 2:] - 20.0).max() < PDF_ROUNDING_MM
+    expected = np.array(sheet.rectangles)
+    assert np.abs(mm[:, 0] - expected[:, 0]).max() < PDF_ROUNDING_MM
+    # PDF's y axis points up.
+    assert np.abs(sheet.height_mm - mm[:, 1] - mm[:, 3] - expected[:, 1]).max() < PDF_ROUNDING_MM
+    # The cross-reference table points at the objects.
+    for number, offset in enumerate(re.findall(rb"(\d{10}) 00000 n", data), start=1):
+        assert data[int(offset) :].startswith(b"%d 0 obj" % number)
+
+
+def test_svg_says_its_size_in_mm() -> None:
+    sheet = board_sheet(Board("b", 5, 8, 20.0, 20.0), "a4")
+    root = ElementTree.fromstring(svg_text(sheet))
+    assert (root.get("width"), root.get("height")) == ("210mm", "297mm")
+    assert root.get("viewBox") == "0 0 210 297"
+    black = [r for r in root.iter("{http://www.w3.org/2000/svg}rect") if r.get("fill") == "black"]
+    assert len(black) == len(sheet.rectangles)
+
+
+def test_too_large_a_board_is_told_which_paper_would_do() -> None:
+    with pytest.raises(InputError, match="use --paper a2"):
+        board_sheet(Board("b", 8, 6, 50.0, 50.0), "a4")
+    with pytest.raises(InputError, match="smaller squares"):
+        board_sheet(Board("b", 30, 30, 50.0, 50.0), "a0")
+    with pytest.raises(InputError, match="known: a4"):
+        board_sheet(Board("b", 8, 6, 5.0, 5.0), "a7")
