@@ -14,16 +14,17 @@ from rigkit.boards import Board
 from rigkit.corners.grow import SaddleIndex, grow
 from rigkit.corners.lattice import Lattice, build_lattices
 from rigkit.corners.links import find_links
-from rigkit.corners.origin import orient
+from rigkit.corners.origin import quarter_turns
 from rigkit.corners.response import grey_image, pyramid
 from rigkit.corners.saddle import find_corners
+from rigkit.corners.subpixel import RefinedLattice, refine
 from rigkit.corners.validate import separate, tidy
 from rigkit.detections import BoardDetection
 
 __all__ = ["detect_boards"]
 
 
-def find_lattices(image: NDArray[np.generic], min_corners: int) -> list[Lattice]:
+def find_lattices(image: NDArray[np.generic], min_corners: int) -> list[RefinedLattice]:
     grey = grey_image(image)
     levels = pyramid(grey)
     corners, saddles = find_corners(levels)
@@ -32,7 +33,7 @@ def find_lattices(image: NDArray[np.generic], min_corners: int) -> list[Lattice]
     grown: list[Lattice] = []
     for lattice in sorted(lattices, key=lambda item: -item.count):
         grown.append(tidy(grow(lattice, index, levels[0])))
-    return separate(grown, min_corners)
+    return refine(grey, separate(grown, min_corners))
 
 
 def detect_boards(
@@ -58,17 +59,19 @@ def detect_boards(
         `image` is not an image of a supported type.
     """
     sizes = tuple(dict.fromkeys(board.size for board in boards or ()))
-    lattices = [orient(lattice, sizes) for lattice in find_lattices(image, min_corners)]
-    found = [_detection(lattice) for lattice in lattices]
+    found = [_detection(refined, sizes) for refined in find_lattices(image, min_corners)]
     found.sort(key=lambda item: (-len(item.grid), *np.round(item.pixels.mean(axis=0)[::-1], 3)))
     return tuple(_named(found, boards or ()))
 
 
-def _detection(lattice: Lattice) -> BoardDetection:
-    row, column = np.nonzero(lattice.known)
-    columns, rows = lattice.size
-    pixels = lattice.pixels[row, column]
-    return BoardDetection(None, columns, rows, np.stack([column, row], axis=-1), pixels, np.full(len(pixels), 0.1))
+def _detection(refined: RefinedLattice, sizes: Sequence[tuple[int, int]]) -> BoardDetection:
+    row, column = np.nonzero(refined.lattice.known)
+    columns, rows = refined.lattice.size
+    grid = np.stack([column, row], axis=-1)
+    found = BoardDetection(
+        None, columns, rows, grid, refined.lattice.pixels[row, column], refined.sigma_px[row, column]
+    )
+    return found.turned(quarter_turns(refined.lattice, sizes))
 
 
 def _named(found: list[BoardDetection], boards: Sequence[Board]) -> list[BoardDetection]:

@@ -14,15 +14,18 @@ import numpy as np
 
 from rigkit.corners.lattice import Lattice
 
-__all__ = ["orient"]
+__all__ = ["quarter_turns"]
 
 
-def orient(lattice: Lattice, sizes: Sequence[tuple[int, int]] = ()) -> Lattice:
-    """Return `lattice` turned so that its first corner follows the convention; `sizes` are the known (columns, rows)."""
+def quarter_turns(lattice: Lattice, sizes: Sequence[tuple[int, int]] = ()) -> int:
+    """Return by how many quarter turns `lattice` follows the convention; `sizes` are the known (columns, rows)."""
     turns = [lattice.turned(quarter) for quarter in range(4)]
-    of_size = [turn for turn in turns if turn.size in sizes] or [turn for turn in turns if turn.size[0] >= turn.size[1]]
-    dark = [turn for turn in of_size if not turn.rising] or of_size
-    return max(dark, key=_downwards)
+    fits = [turn.size in sizes for turn in turns]
+    if not any(fits):
+        fits = [turn.size[0] >= turn.size[1] for turn in turns]
+    dark = [fit and not turn.rising for fit, turn in zip(fits, turns, strict=True)]
+    allowed = dark if any(dark) else fits
+    return max((q for q in range(4) if allowed[q]), key=lambda q: (_downwards(turns[q]), -q))
 
 
 def _downwards(lattice: Lattice) -> float:
