@@ -1,8 +1,8 @@
 """Pose of a flat target from the unit rays of any central camera, fields of view beyond 180 degrees included.
 
 The homography between target and rays comes linearly (rows `T_k H x_k = 0`, T_k a tangent basis at ray k), the pose
-from its columns. A flat target seen from afar has a second local optimum, tilted the other way; both are refined and the
-better one is kept. Nothing needs z > 0: "in front" means along the ray.
+from its columns. A flat target seen from afar has a second local optimum, tilted the other way; both are refined and
+the better one is kept. Nothing needs z > 0: "in front" means along the ray.
 """
 
 from __future__ import annotations
