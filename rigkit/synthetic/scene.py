@@ -1,0 +1,187 @@
+"""Boards and plain panels in space, and the exact image of their corners through any camera.
+
+The world frame of a trihedral capture has its origin where the three planes meet, x to the right, y down, z away from
+the viewer: plane 1 is the wall in front (normal z), plane 2 the floor (normal y), plane 3 the wall on the right
+(normal x), and the room that the cameras stand in is x, y, z < 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.arrays import BoolArray, FloatArray, Mat3, Pixels, Points, as_array
+from rigkit.boards import Board
+from rigkit.cameras.base import Camera
+from rigkit.detections import BoardDetection, BoardView
+from rigkit.errors import InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import unit
+
+__all__ = ["Panel", "PlacedBoard", "exact_detection", "exact_view", "room_walls", "trihedral"]
+
+BOARD_CLEARANCE_MM = 3.0
+"""Gap between the paper's edge and the seam of two walls: boards that touch would hide each other's edge."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Panel:
+    """A plain rectangle: a wall, a floor, a ruler across a board.
+
+    Attributes
+    ----------
+    world_from_panel : x and y along the sides, origin in the middle.
+    width_mm, height_mm : full extent along x and y.
+    reflectance : 0 (black) to 1.
+    """
+
+    world_from_panel: Rigid3
+    width_mm: float
+    height_mm: float
+    reflectance: float = 0.35
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PlacedBoard:
+    """A chessboard in the world: (columns + 1) x (rows + 1) squares, framed by a white margin.
+
+    Attributes
+    ----------
+    board : the board.
+    world_from_board : board frame (origin at the first inner corner, z into the board) to world.
+    margin_squares : width of the white margin round the squares, in squares; 0 cuts the paper at the outer squares.
+    white, black : reflectances.
+    first_black : whether the square whose lower right corner is the first inner corner is black.
+    """
+
+    board: Board
+    world_from_board: Rigid3
+    margin_squares: float = 0.5
+    white: float = 0.85
+    black: float = 0.06
+    first_black: bool = True
+
+    def points(self) -> Points:
+        """Return the inner corners in the world, (N, 3) mm, row by row."""
+        return self.world_from_board.apply(self.board.points())
+
+    def normal(self) -> FloatArray:
+        """Return the unit normal in the world that faces the viewer of the board."""
+        return np.asarray(-self.world_from_board.rotation[:, 2])
+
+    def edge_squares(self) -> tuple[FloatArray, FloatArray]:
+        """Return the lower and the upper edge of the paper along x and y, in squares from the first inner corner."""
+        m = 1.0 + self.margin_squares
+        return np.array([-m, -m]), np.array([self.board.columns - 1 + m, self.board.rows - 1 + m])
+
+    def outline(self) -> Points:
+        """Return the four corners of the paper in the world, (4, 3) mm."""
+        low, high = self.edge_squares()
+        xy = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
+        side = np.array([self.board.square_x_mm, self.board.square_y_mm])
+        return self.world_from_board.apply(np.concatenate([xy * side, np.zeros((4, 1))], axis=1))
+
+    def see(self, camera: Camera, cam_from_world: Rigid3) -> tuple[Pixels, BoolArray]:
+        """Return the exact pixels (N, 2) of all corners and which of them are in the image and seen from the front."""
+        points = cam_from_world.apply(self.points())
+        pixels, valid = camera.project(points)
+        width, height = camera.size_px
+        with np.errstate(invalid="ignore"):
+            inside = ((pixels > -0.5) & (pixels < [width - 0.5, height - 0.5])).all(axis=-1)
+        facing = float((cam_from_world.rotation @ self.normal()) @ points[0]) < 0.0
+        return pixels, valid & inside & facing
+
+
+def exact_detection(
+    placed: PlacedBoard, camera: Camera, cam_from_world: Rigid3, *, sigma_px: float = 0.01
+) -> BoardDetection:
+    """Return what a perfect detector would find of `placed`; corners outside the image are left out."""
+    pixels, valid = placed.see(camera, cam_from_world)
+    board = placed.board
+    return BoardDetection(
+        board.board_id,
+        board.columns,
+        board.rows,
+        board.grid()[valid],
+        pixels[valid],
+        np.full(int(valid.sum()), sigma_px),
+    )
+
+
+def exact_view(
+    image: str, placed: PlacedBoard, camera: Camera, cam_from_world: Rigid3, *, sigma_px: float = 0.01
+) -> BoardView:
+    """Return `exact_detection` with its object points, for calibration."""
+    return BoardView.from_detection(
+        image, exact_detection(placed, camera, cam_from_world, sigma_px=sigma_px), [placed.board]
+    )
+
+
+def wall_axes(angles_deg: tuple[float, float, float]) -> tuple[Mat3, Mat3, Mat3]:
+    """Return world_from_board rotations of three planes at the angles (1-2, 1-3, 2-3), in degrees.
+
+    Raises InputError where no three planes stand at those angles.
+    """
+    a12, a13, a23 = np.radians(as_array(angles_deg, (3,), "angles_deg"))
+    n1 = np.array([0.0, 0.0, 1.0])
+    n2 = np.array([0.0, np.sin(a12), np.cos(a12)])
+    y3 = (np.cos(a23) - np.cos(a12) * np.cos(a13)) / np.sin(a12)
+    rest = 1.0 - y3**2 - np.cos(a13) ** 2
+    if not rest > 1e-6:
+        raise InputError(f"trihedral: no three planes stand at angles {angles_deg} degrees to each other")
+    n3 = np.array([np.sqrt(rest), y3, np.cos(a13)])
+    along_12, along_13 = unit(np.cross(n2, n1)), unit(np.cross(n1, n3))
+    return (
+        np.stack([along_12, np.cross(n1, along_12), n1], axis=1),
+        np.stack([along_12, np.cross(n2, along_12), n2], axis=1),
+        np.stack([np.cross(along_13, n3), along_13, n3], axis=1),
+    )
+
+
+def trihedral(
+    boards: Sequence[Board],
+    *,
+    angles_deg: tuple[float, float, float] = (90.0, 90.0, 90.0),
+    margin_squares: float = 0.5,
+    clearance_mm: float = BOARD_CLEARANCE_MM,
+    first_black: bool = True,
+) -> tuple[PlacedBoard, PlacedBoard, PlacedBoard]:
+    """Return three boards pushed into the corner of a room: front wall, floor, right wall.
+
+    Parameters
+    ----------
+    boards : three boards of any sizes.
+    angles_deg : angles between planes 1-2, 1-3 and 2-3.
+    clearance_mm : from the paper's edges to the seams.
+    """
+    if len(boards) != 3:
+        raise InputError(f"trihedral: three boards expected, got {len(boards)}")
+    # Which corner of the paper points into the corner of the room, in board axes (+1: the far end, -1: the near end).
+    corner_side = ((1, 1), (1, -1), (-1, 1))
+    out = []
+    for board, axes, side in zip(boards, wall_axes(angles_deg), corner_side, strict=True):
+        square = np.array([board.square_x_mm, board.square_y_mm])
+        count = np.array([board.columns, board.rows])
+        m = 1.0 + margin_squares
+        far, near = (count - 1 + m) * square + clearance_mm, m * square + clearance_mm
+        origin = np.where(np.array(side) > 0, -far, near)
+        rigid = Rigid3(axes, axes[:, :2] @ origin)
+        out.append(PlacedBoard(board, rigid, margin_squares, first_black=first_black))
+    return (out[0], out[1], out[2])
+
+
+def room_walls(
+    size_mm: float = 2500.0,
+    *,
+    angles_deg: tuple[float, float, float] = (90.0, 90.0, 90.0),
+    reflectance: tuple[float, float, float] = (0.34, 0.42, 0.28),
+) -> tuple[Panel, ...]:
+    """Return the two walls and the floor behind a trihedral capture, a millimetre behind the boards."""
+    half = size_mm / 2.0
+    sides = ((-half, -half), (-half, half), (half, -half))
+    return tuple(
+        Panel(Rigid3(axes, axes @ np.array([*side, 1.0])), size_mm, size_mm, rho)
+        for axes, side, rho in zip(wall_axes(angles_deg), sides, reflectance, strict=True)
+    )
