@@ -74,8 +74,8 @@ def fit_plane(points_mm: Points, covariance_mm2: FloatArray | None = None) -> Pl
     ----------
     points_mm : (N, 3)
     covariance_mm2 : (N, 3, 3) of each point, or None. Only what lies across the plane matters: weights are
-        1 / (n^T C n), with n from the unweighted fit. They change nothing but the weights: the scatter that the normal's
-        covariance is built on is the one observed.
+        1 / (n^T C n), with n from the unweighted fit. They are used as weights only: the normal's covariance is built
+        on the scatter that is observed.
 
     Raises
     ------

@@ -1,0 +1,110 @@
+"""A reconstructed board: its plane, and the lattice that its corners were printed on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.arrays import FloatArray, IntArray, Mat3, Normals, Points
+from rigkit.boards import Board
+from rigkit.errors import DegenerateError
+from rigkit.truth import Feature
+from rigkit.validation.planes import NormalErrors, Plane, fit_plane, normal_errors
+
+__all__ = ["BoardResult", "Lattice", "fit_lattice", "measure_board"]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Lattice:
+    """x = origin + column * step_x + row * step_y, fitted to the corners by least squares.
+
+    Attributes
+    ----------
+    steps_mm : (3, 3), rows: origin, step along the columns, step along the rows.
+    scatter_mm2 : (3, 3) covariance of one corner about the lattice.
+    cofactor : (3, 3) inverse normal matrix of (1, column, row): leverage of a place on the board.
+    """
+
+    steps_mm: Mat3
+    scatter_mm2: Mat3
+    cofactor: Mat3
+
+    def at(self, place: FloatArray) -> tuple[FloatArray, Mat3]:
+        """Return the point (3,) at (column, row), mm, and its covariance (3, 3)."""
+        row = np.array([1.0, *np.asarray(place, dtype=np.float64)])
+        return row @ self.steps_mm, self.scatter_mm2 * float(row @ self.cofactor @ row)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class BoardResult:
+    """What was reconstructed of one board.
+
+    Attributes
+    ----------
+    board : the board.
+    plane : through its points.
+    lattice : of its points.
+    normal_errors : of the estimated normals against the plane's.
+    square_x_ratio, square_y_ratio : reconstructed over measured square size: 1 for the board that was declared.
+    skew_deg : how far the reconstructed columns and rows are from perpendicular.
+    right_handed : whether columns x rows points into the board, as in the board frame.
+    """
+
+    board: Board
+    plane: Plane
+    lattice: Lattice
+    normal_errors: NormalErrors
+    square_x_ratio: float
+    square_y_ratio: float
+    skew_deg: float
+    right_handed: bool
+
+    def feature(self, feature: Feature) -> tuple[FloatArray, Mat3]:
+        """Return where a corner or the centre lies (3,), mm, and its covariance (3, 3) from the corners' scatter."""
+        return self.lattice.at(self.place(feature))
+
+    def place(self, feature: Feature) -> FloatArray:
+        """Return (column, row) of a corner or of the centre, as floats."""
+        if feature.grid is not None:
+            return np.array(feature.grid, dtype=np.float64)
+        return np.array([self.board.columns - 1, self.board.rows - 1]) / 2.0
+
+
+def fit_lattice(points_mm: Points, grid: IntArray) -> Lattice:
+    """Fit the lattice to points (N, 3) with (column, row) `grid` (N, 2).
+
+    Raises DegenerateError where the corners lie in one row or column, or are fewer than four.
+    """
+    design = np.concatenate([np.ones((len(grid), 1)), grid], axis=1)
+    if len(grid) < 4 or np.linalg.matrix_rank(design) < 3:
+        raise DegenerateError(f"board: {len(grid)} corners in one line do not fix its frame; more of it must be seen")
+    steps, *_ = np.linalg.lstsq(design, points_mm, rcond=None)
+    residuals = points_mm - design @ steps
+    return Lattice(steps, residuals.T @ residuals / (len(grid) - 3), np.linalg.inv(design.T @ design))
+
+
+def measure_board(
+    board: Board, points_mm: Points, normals: Normals, grid: IntArray, covariance_mm2: FloatArray | None = None
+) -> BoardResult:
+    """Return plane, lattice and normal errors of one board's points (N, 3), normals (N, 3) and grid (N, 2).
+
+    Raises DegenerateError where too few corners are left; the message names the board.
+    """
+    try:
+        plane = fit_plane(points_mm, covariance_mm2)
+        lattice = fit_lattice(points_mm, grid)
+    except DegenerateError as error:
+        raise DegenerateError(f"board '{board.board_id}': {error}") from error
+    _, along, down = lattice.steps_mm
+    x, y = float(np.linalg.norm(along)), float(np.linalg.norm(down))
+    return BoardResult(
+        board,
+        plane,
+        lattice,
+        normal_errors(normals, plane),
+        x / board.square_x_mm,
+        y / board.square_y_mm,
+        float(np.rad2deg(np.arcsin(np.clip(abs(along @ down) / (x * y), 0.0, 1.0)))),
+        bool(np.cross(along, down) @ plane.normal < 0.0),
+    )

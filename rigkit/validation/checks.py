@@ -1,0 +1,273 @@
+"""A reconstruction against what a person measured: each quantity with both uncertainties and a verdict.
+
+A check passes where |ours - measured| <= k sqrt(sigma_ours^2 + sigma_measured^2). k = 2 is the usual coverage factor
+of a stated measurement (about 95 %, JCGM 100 "GUM", section 6): a correct result fails one check in twenty if every
+sigma is honest, and fewer where people state theirs generously.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from rigkit.errors import InputError
+from rigkit.reconstruct import Reconstruction
+from rigkit.truth import PairTruth
+from rigkit.validation.boards import BoardResult
+from rigkit.validation.measure import measure
+
+__all__ = ["COVERAGE", "AngleResult", "Check", "ValidationReport", "judge", "validate"]
+
+COVERAGE = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One measured quantity beside ours.
+
+    Attributes
+    ----------
+    name : "baseline", "angle plane1-plane2", "distance plane1.centre to plane2".
+    kind : "baseline", "angle" or "distance".
+    unit : "mm" or "deg", of all values.
+    measured, measured_sigma, how : what a person wrote down.
+    ours, our_sigma : what was reconstructed, with the predicted standard deviation.
+    difference : ours - measured.
+    combined_sigma : root of the sum of both variances.
+    k : |difference| / combined_sigma.
+    limit_k : the largest k that passes.
+    passed : the verdict.
+    count : how many points stand behind ours.
+    """
+
+    name: str
+    kind: str
+    unit: str
+    measured: float
+    measured_sigma: float
+    how: str
+    ours: float
+    our_sigma: float
+    difference: float
+    combined_sigma: float
+    k: float
+    limit_k: float
+    passed: bool
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class AngleResult:
+    """The angle between two boards' faces, degrees, its sigma, and the measured angle where there is one."""
+
+    a: str
+    b: str
+    angle_deg: float
+    sigma_deg: float
+    measured_deg: float | None
+
+    @property
+    def error_deg(self) -> float | None:
+        """|angle - measured|: the orthogonality error where a right angle was measured; None where nothing was."""
+        return None if self.measured_deg is None else abs(self.angle_deg - self.measured_deg)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ValidationReport:
+    """The verdict on one pair with one affine estimator. It cannot be built without a check.
+
+    Attributes
+    ----------
+    pair_id, pose_type, affine_method : what was judged.
+    checks : every measured quantity that could be compared.
+    unchecked : measured quantities that could not be, and why: the report does not pass then.
+    boards : plane, normal errors and frame of each board.
+    angles : between each two boards.
+    baseline_mm, baseline_sigma_mm, sampson_rms_px, count : of the reconstruction.
+    notes : the reconstruction's notes.
+    """
+
+    pair_id: str
+    pose_type: str
+    affine_method: str
+    checks: tuple[Check, ...]
+    unchecked: tuple[str, ...]
+    boards: tuple[BoardResult, ...]
+    angles: tuple[AngleResult, ...]
+    baseline_mm: float
+    baseline_sigma_mm: float
+    sampson_rms_px: float
+    count: int
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.checks:
+            why = f" ({'; '.join(self.unchecked)})" if self.unchecked else ""
+            raise InputError(
+                f"pair '{self.pair_id}': nothing measured can be checked{why}; "
+                "add a baseline or angles under [pairs.truth]"
+            )
+
+    @property
+    def passed(self) -> bool:
+        """Whether everything that was measured was checked, and every check passed."""
+        return not self.unchecked and all(check.passed for check in self.checks)
+
+    def check(self, name: str) -> Check:
+        """Return the check of that name; raises InputError that lists the known ones."""
+        for check in self.checks:
+            if check.name == name:
+                return check
+        raise InputError(f"no check is called '{name}'; known: {', '.join(c.name for c in self.checks)}")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain numbers, strings and lists; NaN becomes None."""
+        out: dict[str, Any] = {
+            "schema": "rigkit.validation/1",
+            "pair": self.pair_id,
+            "pose_type": self.pose_type,
+            "affine_method": self.affine_method,
+            "passed": self.passed,
+            "points": self.count,
+            "baseline_mm": self.baseline_mm,
+            "baseline_sigma_mm": self.baseline_sigma_mm,
+            "sampson_rms_px": self.sampson_rms_px,
+            "checks": [asdict(check) for check in self.checks],
+            "unchecked": list(self.unchecked),
+            "angles": [asdict(angle) | {"error_deg": angle.error_deg} for angle in self.angles],
+            "boards": [_board_dict(board) for board in self.boards],
+            "notes": list(self.notes),
+        }
+        cleaned: dict[str, Any] = _without_nan(out)
+        return cleaned
+
+    def to_json(self) -> str:
+        """Return `to_dict()` as JSON text."""
+        return json.dumps(self.to_dict(), indent=2, allow_nan=False)
+
+
+def validate(reconstruction: Reconstruction, truth: PairTruth, *, coverage: float = COVERAGE) -> ValidationReport:
+    """Judge a reconstruction against measured truth.
+
+    Parameters
+    ----------
+    reconstruction : of one pair.
+    truth : what a person measured of that pair.
+    coverage : largest |difference| / combined sigma that passes.
+
+    Raises
+    ------
+    InputError
+        Nothing was measured, or nothing that was measured is about a board that was reconstructed.
+    DegenerateError
+        A board has too few points for a plane.
+    """
+    measured = measure(reconstruction)
+    cloud = reconstruction.cloud
+    checks: list[Check] = []
+    unchecked: list[str] = []
+    if truth.baseline is not None:
+        known = (truth.baseline.value_mm, truth.baseline.sigma_mm, truth.baseline.how)
+        ours = (reconstruction.baseline_mm, reconstruction.baseline_sigma_mm)
+        checks.append(judge("baseline", "baseline", "mm", known, ours, coverage, len(cloud)))
+    angles = {frozenset(two): measured.angle_deg(*two) for two in combinations(measured.boards, 2)}
+    for angle in truth.angles:
+        name, both = f"angle {angle.a}-{angle.b}", (angle.a, angle.b)
+        if measured.absent(*both):
+            unchecked.append(f"{name}: {measured.absent(*both)}")
+            continue
+        known = (angle.value_deg, angle.sigma_deg, angle.how)
+        checks.append(judge(name, "angle", "deg", known, angles[frozenset(both)], coverage, measured.count(*both)))
+    for distance in truth.distances:
+        name, ends = f"distance {distance.a} to {distance.b}", (distance.a.board_id, distance.b.board_id)
+        if measured.absent(*ends):
+            unchecked.append(f"{name}: {measured.absent(*ends)}")
+            continue
+        known = (distance.value_mm, distance.sigma_mm, distance.how)
+        checks.append(
+            judge(name, "distance", "mm", known, measured.distance_mm(distance), coverage, measured.count(*ends))
+        )
+    stated = {frozenset((angle.a, angle.b)): angle.value_deg for angle in truth.angles}
+    return ValidationReport(
+        reconstruction.pair_id,
+        str(reconstruction.pose_type),
+        reconstruction.affine_method,
+        tuple(checks),
+        tuple(unchecked),
+        tuple(measured.boards.values()),
+        tuple(
+            AngleResult(a, b, *angles[frozenset((a, b))], stated.get(frozenset((a, b))))
+            for a, b in combinations(measured.boards, 2)
+        ),
+        reconstruction.baseline_mm,
+        reconstruction.baseline_sigma_mm,
+        reconstruction.sampson_rms_px,
+        len(cloud),
+        reconstruction.notes,
+    )
+
+
+def judge(
+    name: str,
+    kind: str,
+    unit: str,
+    known: tuple[float, float, str],
+    ours: tuple[float, float],
+    coverage: float,
+    count: int,
+) -> Check:
+    """Return the check of `ours` (value, sigma) against `known` (value, sigma, how).
+
+    A sigma that is NaN (not predicted) counts as zero on our side: that makes the check stricter, never laxer.
+    """
+    value, sigma, how = known
+    our_sigma = ours[1] if np.isfinite(ours[1]) else 0.0
+    difference = ours[0] - value
+    combined = float(np.hypot(sigma, our_sigma))
+    k = abs(difference) / combined
+    return Check(
+        name,
+        kind,
+        unit,
+        value,
+        sigma,
+        how,
+        float(ours[0]),
+        float(ours[1]),
+        float(difference),
+        combined,
+        float(k),
+        coverage,
+        bool(k <= coverage),
+        count,
+    )
+
+
+def _board_dict(result: BoardResult) -> dict[str, Any]:
+    plane = result.plane
+    return {
+        "board": result.board.board_id,
+        "points": plane.count,
+        "normal": plane.normal.tolist(),
+        "offset_mm": plane.offset_mm,
+        "normal_sigma_deg": float(np.rad2deg(plane.sigma_rad)),
+        "flatness_rms_mm": plane.rms_mm,
+        "flatness_peak_mm": plane.peak_mm,
+        "normal_errors": asdict(result.normal_errors),
+        "square_x_ratio": result.square_x_ratio,
+        "square_y_ratio": result.square_y_ratio,
+        "skew_deg": result.skew_deg,
+        "right_handed": result.right_handed,
+    }
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(inner) for inner in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value

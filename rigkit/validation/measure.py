@@ -1,0 +1,170 @@
+"""Angles and distances of a reconstruction, with their standard deviations.
+
+The corners' own scatter about plane and lattice is observed. The relative pose moves all points together, which no
+scatter shows: its covariance is carried through triangulation by central differences. Both parts are independent,
+because the residuals that fix the pose are orthogonal to those that fix the points. Intrinsics are taken as exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.arrays import FloatArray, Points
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
+from rigkit.geometry.triangulation import point_covariances, triangulate_rays
+from rigkit.reconstruct import Reconstruction
+from rigkit.truth import MeasuredDistance
+from rigkit.validation.boards import BoardResult, measure_board
+from rigkit.validation.planes import angle_jacobian, face_angle
+
+__all__ = ["Measured", "measure", "points_by_pose"]
+
+ROTATION_STEP_RAD = 1e-5
+TRANSLATION_STEP = 1e-5
+"""Of the baseline. Central differences are then right to about 1e-9, far below any sigma's own accuracy."""
+
+Boards = dict[str, BoardResult]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Measured:
+    """The boards of a reconstruction, and how they move with the relative pose.
+
+    Attributes
+    ----------
+    boards : by id, in the order of the reconstruction.
+    shaken : for each of the six pose parameters (rotation rad, translation mm) the boards after a small step forward
+        and backward, and the step.
+    pose_covariance : (6, 6), or None: then only the scatter counts.
+    """
+
+    boards: Boards
+    shaken: tuple[tuple[Boards, Boards, float], ...]
+    pose_covariance: FloatArray | None
+
+    def absent(self, *board_ids: str) -> str:
+        """Return in words which of the boards were not reconstructed; empty if all were."""
+        lost = [f"'{b}'" for b in dict.fromkeys(board_ids) if b not in self.boards]
+        return f"board {' and '.join(lost)} was not reconstructed" if lost else ""
+
+    def count(self, *board_ids: str) -> int:
+        """Return how many points lie on these boards."""
+        return sum(self.boards[b].plane.count for b in dict.fromkeys(board_ids))
+
+    def angle_deg(self, a: str, b: str) -> tuple[float, float]:
+        """Return the angle between two faces and its sigma, degrees."""
+        one, two = self.boards[a].plane, self.boards[b].plane
+        by_a, by_b = angle_jacobian(one, two)
+        scatter = by_a @ one.normal_covariance @ by_a + by_b @ two.normal_covariance @ by_b
+        pose = self._pose_variance(lambda boards: face_angle(boards[a].plane, boards[b].plane))
+        return float(np.rad2deg(face_angle(one, two))), float(np.rad2deg(np.sqrt(scatter + pose)))
+
+    def distance_mm(self, distance: MeasuredDistance) -> tuple[float, float]:
+        """Return a distance between features and its sigma, mm."""
+        scatter = _distance_scatter(self.boards, distance)
+        pose = self._pose_variance(lambda boards: _distance(boards, distance))
+        return _distance(self.boards, distance), float(np.sqrt(scatter + pose))
+
+    def _pose_variance(self, quantity: Callable[[Boards], float]) -> float:
+        if self.pose_covariance is None:
+            return 0.0
+        slope = np.array([(quantity(ahead) - quantity(back)) / (2.0 * step) for ahead, back, step in self.shaken])
+        return float(slope @ self.pose_covariance @ slope)
+
+
+def measure(reconstruction: Reconstruction) -> Measured:
+    """Fit plane and lattice of every board, and again for each small step of the pose.
+
+    Raises DegenerateError where a board has too few points.
+    """
+    cloud = reconstruction.cloud
+    rays1, _ = reconstruction.camera1.unproject(reconstruction.pixels1)
+    rays2, _ = reconstruction.camera2.unproject(reconstruction.pixels2)
+    # Only the ratios of these covariances count, as weights across the plane: one pixel is as good a sigma as any.
+    covariances = point_covariances(
+        cloud.points_mm,
+        reconstruction.cam2_from_cam1,
+        rays1,
+        rays2,
+        reconstruction.camera1.ray_jacobian(reconstruction.pixels1),
+        reconstruction.camera2.ray_jacobian(reconstruction.pixels2),
+    )
+    usable = bool(np.isfinite(covariances).all())
+
+    def boards_of(points: Points) -> Boards:
+        out: Boards = {}
+        for index, board in enumerate(reconstruction.boards):
+            on = cloud.board_index == index
+            if on.any():
+                out[board.board_id] = measure_board(
+                    board, points[on], cloud.normals[on], cloud.grid[on], covariances[on] if usable else None
+                )
+        return out
+
+    shaken: list[tuple[Boards, Boards, float]] = []
+    if reconstruction.pose_covariance is not None:
+        for motion, step in points_by_pose(reconstruction):
+            shaken.append((boards_of(cloud.points_mm + motion), boards_of(cloud.points_mm - motion), step))
+    return Measured(boards_of(cloud.points_mm), tuple(shaken), reconstruction.pose_covariance)
+
+
+def points_by_pose(reconstruction: Reconstruction) -> tuple[tuple[FloatArray, float], ...]:
+    """Return for each of the six pose parameters how the points move (N, 3) mm for a small step, and the step.
+
+    Parameters are those of `Reconstruction.pose_covariance`: left rotation perturbation (rad), translation (mm). The
+    points are triangulated again from the same corners. A point that has no triangulation does not move.
+    """
+    camera1, camera2 = reconstruction.camera1, reconstruction.camera2
+    rays1, _ = camera1.unproject(reconstruction.pixels1)
+    rays2, _ = camera2.unproject(reconstruction.pixels2)
+    jacobians = (camera1.ray_jacobian(reconstruction.pixels1), camera2.ray_jacobian(reconstruction.pixels2))
+    pose = reconstruction.cam2_from_cam1
+    length = float(np.linalg.norm(pose.translation_mm))
+    out = []
+    for axis in np.eye(6):
+        step = ROTATION_STEP_RAD if axis[:3].any() else TRANSLATION_STEP * length
+
+        def points(sign: float, move: FloatArray = axis * step) -> Points:
+            turned = exp_so3(sign * move[:3]) @ pose.rotation
+            shifted = Rigid3(turned, pose.translation_mm + sign * move[3:])
+            found, _ = triangulate_rays(rays1, rays2, shifted, jacobians1=jacobians[0], jacobians2=jacobians[1])
+            return found
+
+        out.append((np.nan_to_num(0.5 * (points(1.0) - points(-1.0))), step))
+    return tuple(out)
+
+
+def _distance(boards: Boards, distance: MeasuredDistance) -> float:
+    a, b = distance.a, distance.b
+    if a.is_plane:
+        a, b = b, a
+    point, _ = boards[a.board_id].feature(a)
+    if b.is_plane:
+        return abs(float(boards[b.board_id].plane.distances(point)))
+    other, _ = boards[b.board_id].feature(b)
+    return float(np.linalg.norm(point - other))
+
+
+def _distance_scatter(boards: Boards, distance: MeasuredDistance) -> float:
+    """Return the variance of a distance that comes from the corners' scatter, mm^2."""
+    a, b = distance.a, distance.b
+    if a.is_plane:
+        a, b = b, a
+    point, covariance = boards[a.board_id].feature(a)
+    if b.is_plane:
+        plane = boards[b.board_id].plane
+        across = float(plane.normal @ covariance @ plane.normal)
+        arm = point - plane.centroid_mm
+        return across + float(arm @ plane.normal_covariance @ arm) + plane.rms_mm**2 / plane.count
+    other, covariance_other = boards[b.board_id].feature(b)
+    if a.board_id == b.board_id:
+        lattice, result = boards[a.board_id].lattice, boards[a.board_id]
+        difference = np.array([0.0, *(result.place(a) - result.place(b))])
+        covariance = lattice.scatter_mm2 * float(difference @ lattice.cofactor @ difference)
+        covariance_other = np.zeros((3, 3))
+    along = (point - other) / np.linalg.norm(point - other)
+    return float(along @ (covariance + covariance_other) @ along)
