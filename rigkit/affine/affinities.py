@@ -1,0 +1,161 @@
+"""What the affine estimators take and give: epipolar normals, direction noise, affinities with their covariance.
+
+Conventions: A21 = d pixel2 / d pixel1 along the surface, vec(A) = (a11, a12, a21, a22), row by row. Source: L. Hajder,
+"Affine Correspondences in Stereo Vision: Theory, Practice, and Limitations".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rigkit.arrays import Affines, BoolArray, FloatArray, Mat3, Pixels, RayJacobians, Rays, as_array
+from rigkit.errors import InputError
+from rigkit.matches import DirectionPairs
+
+__all__ = ["Affinities", "DirectionNoise", "EpipolarNormals"]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class EpipolarNormals:
+    """Normals of the epipolar lines at N corresponding pixels, on one common scale: A21^T n2 + n1 = 0.
+
+    Attributes
+    ----------
+    n1, n2 : (N, 2) per px; not normalised, their ratio of lengths carries information. Zero at an epipole.
+
+    Notes
+    -----
+    n1 = B1^T E^T f2 and n2 = B2^T E f1 with unit rays f and ray Jacobians B: pinhole images and raw fisheye images are
+    the same here. For pinholes these are, up to one scale a point, (F^T q2)[:2] and (F q1)[:2].
+    """
+
+    n1: FloatArray
+    n2: FloatArray
+
+    def __post_init__(self) -> None:
+        n = len(np.asarray(self.n1))
+        object.__setattr__(self, "n1", as_array(self.n1, (n, 2), "epipolar normals in image 1", finite=False))
+        object.__setattr__(self, "n2", as_array(self.n2, (n, 2), "epipolar normals in image 2", finite=False))
+
+    def __len__(self) -> int:
+        return len(self.n1)
+
+    @classmethod
+    def from_rays(
+        cls, rays1: Rays, ray_jacobians1: RayJacobians, rays2: Rays, ray_jacobians2: RayJacobians, E21: Mat3
+    ) -> EpipolarNormals:
+        """Build from unit rays (N, 3), ray Jacobians (N, 3, 2) and the essential matrix: any central camera."""
+        e = np.asarray(E21, dtype=np.float64)
+        line1 = np.asarray(rays2, dtype=np.float64) @ e
+        line2 = np.asarray(rays1, dtype=np.float64) @ e.T
+        n1 = np.einsum("nij,ni->nj", ray_jacobians1, line1)
+        return cls(n1, np.einsum("nij,ni->nj", ray_jacobians2, line2))
+
+    @classmethod
+    def from_F(cls, F21: Mat3, pixels1: Pixels, pixels2: Pixels) -> EpipolarNormals:
+        """Build from a fundamental matrix and pixels (N, 2) of perspective images without distortion."""
+        f = np.asarray(F21, dtype=np.float64)
+        q1, q2 = np.asarray(pixels1, dtype=np.float64), np.asarray(pixels2, dtype=np.float64)
+        return cls(q2 @ f[:2, :2] + f[2, :2], q1 @ f[:2, :2].T + f[:2, 2])
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class DirectionNoise:
+    """First-order noise of N x K directions in either image.
+
+    Attributes
+    ----------
+    covariance1, covariance2 : (N, 2K, 2K) px^2, of the stacked vectors (direction 0, direction 1, ...). Directions that
+        share corners are correlated, and the diagonal of a chessboard is the sum of its edges: joint, not K times 2x2.
+    """
+
+    covariance1: FloatArray
+    covariance2: FloatArray
+
+    def __post_init__(self) -> None:
+        shape = np.asarray(self.covariance1).shape
+        if len(shape) != 3 or shape[1] != shape[2] or shape[1] % 2:
+            raise InputError(f"direction noise: expected covariances of shape Nx2Kx2K, got {shape}")
+        for name in ("covariance1", "covariance2"):
+            object.__setattr__(self, name, as_array(getattr(self, name), shape, f"direction {name}", finite=False))
+
+    @classmethod
+    def independent(cls, covariance1: FloatArray, covariance2: FloatArray) -> DirectionNoise:
+        """Build from (N, K, 2, 2) covariances of directions that share nothing."""
+        return cls(_block_diagonal(covariance1), _block_diagonal(covariance2))
+
+    @classmethod
+    def angular(cls, directions: DirectionPairs, sigma1_rad: ArrayLike, sigma2_rad: ArrayLike) -> DirectionNoise:
+        """Every direction turned by an independent angle, its length kept: the noise of the paper's synthetic study.
+
+        `sigma1_rad`, `sigma2_rad` broadcast to (N, K): a scalar, one a direction, or one a corner and direction.
+        """
+
+        def turned(d: FloatArray, sigma: ArrayLike) -> FloatArray:
+            across = np.stack([-d[..., 1], d[..., 0]], axis=-1) * np.broadcast_to(sigma, d.shape[:2])[..., None]
+            return np.asarray(across[..., :, None] * across[..., None, :])
+
+        return cls.independent(turned(directions.image1, sigma1_rad), turned(directions.image2, sigma2_rad))
+
+    @classmethod
+    def isotropic(cls, directions: DirectionPairs, sigma1_px: ArrayLike, sigma2_px: ArrayLike) -> DirectionNoise:
+        """The end of every direction moved by independent noise of `sigma` px per axis; broadcast to (N, K)."""
+
+        def round_blob(d: FloatArray, sigma: ArrayLike) -> FloatArray:
+            return np.asarray(np.broadcast_to(sigma, d.shape[:2])[..., None, None] ** 2 * np.eye(2))
+
+        return cls.independent(round_blob(directions.image1, sigma1_px), round_blob(directions.image2, sigma2_px))
+
+    def with_sum(self, first: int, second: int) -> DirectionNoise:
+        """Append a direction that is the exact sum of `first` and `second` (a chessboard diagonal)."""
+        k2 = self.covariance1.shape[1]
+        build = np.zeros((k2 + 2, k2))
+        build[:k2] = np.eye(k2)
+        for axis in (0, 1):
+            build[k2 + axis, 2 * first + axis] += 1.0
+            build[k2 + axis, 2 * second + axis] += 1.0
+        return DirectionNoise(build @ self.covariance1 @ build.T, build @ self.covariance2 @ build.T)
+
+
+def _block_diagonal(blocks: FloatArray) -> FloatArray:
+    c = np.asarray(blocks, dtype=np.float64)
+    if c.ndim != 4 or c.shape[2:] != (2, 2):
+        raise InputError(f"direction noise: expected covariances of shape NxKx2x2, got {c.shape}")
+    n, k = c.shape[:2]
+    out = np.zeros((n, k, 2, k, 2))
+    index = np.arange(k)
+    out[:, index, :, index, :] = np.moveaxis(c, 1, 0)
+    return out.reshape(n, 2 * k, 2 * k)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Affinities:
+    """Affine transformations of N corners.
+
+    Attributes
+    ----------
+    A21 : (N, 2, 2), NaN where invalid.
+    valid : (N,) bool.
+    conditioning : (N,) smallest singular value of the estimator's system of unit directions: how well they determine A.
+        With two perpendicular directions and an epipolar geometry it is min |unit(d2) . unit(n2)|, 0 where a direction
+        lies along its epipolar line. NaN where there are too few directions.
+    covariance : (N, 4, 4) of vec(A21), row by row, or None where no noise was given; NaN where invalid.
+    """
+
+    A21: Affines
+    valid: BoolArray
+    conditioning: FloatArray
+    covariance: FloatArray | None = None
+
+    def __len__(self) -> int:
+        return len(self.A21)
+
+    @property
+    def sigma_A(self) -> FloatArray | None:
+        """(N,) root mean square standard deviation of the four entries of A21, or None."""
+        if self.covariance is None:
+            return None
+        return np.asarray(np.sqrt(np.trace(self.covariance, axis1=-2, axis2=-1) / 4.0))

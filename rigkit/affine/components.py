@@ -1,0 +1,89 @@
+"""Directions as planar components: the layout in which closed forms over a million corners are fast.
+
+The estimators work on arrays (K, n) of single components, in blocks that fit the processor's cache, so that every step
+is one pass over contiguous memory instead of a stack of small matrices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.arrays import BoolArray, FloatArray
+from rigkit.matches import DirectionPairs
+
+__all__ = ["PlanarDirections", "blocks", "finite", "first_of", "smallest_singular", "unit_weights"]
+
+BLOCK = 8192
+"""Corners worked on at a time: about fifty rows of this length fit a second-level cache."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PlanarDirections:
+    """K directions of n corners; zero where not `use`, so that sums need no mask.
+
+    Attributes
+    ----------
+    x1, y1, x2, y2 : (K, n)
+    use : (K, n) bool.
+    """
+
+    x1: FloatArray
+    y1: FloatArray
+    x2: FloatArray
+    y2: FloatArray
+    use: BoolArray
+
+    @classmethod
+    def of(cls, directions: DirectionPairs, block: slice) -> PlanarDirections:
+        """Take the corners `block`; directions that are invalid or of length zero in an image are not used."""
+        d1 = np.ascontiguousarray(directions.image1[block].transpose(2, 1, 0))
+        d2 = np.ascontiguousarray(directions.image2[block].transpose(2, 1, 0))
+        use = directions.valid[block].T & (d1 != 0.0).any(axis=0) & (d2 != 0.0).any(axis=0)
+        return cls(d1[0], d1[1], d2[0], d2[1], use).only(use)
+
+    def only(self, use: BoolArray) -> PlanarDirections:
+        """Return the same directions with fewer in use."""
+        components = (self.x1, self.y1, self.x2, self.y2)
+        if not use.all():
+            components = tuple(np.where(use, c, 0.0) for c in components)  # type: ignore[assignment]
+        return PlanarDirections(*components, use)
+
+
+def blocks(n: int) -> Iterator[slice]:
+    """Yield slices that cover n corners."""
+    for start in range(0, n, BLOCK):
+        yield slice(start, min(start + BLOCK, n))
+
+
+def finite(array: FloatArray) -> BoolArray:
+    """Return which rows (first axis) of an array are finite throughout, (N,)."""
+    return np.asarray(np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
+
+
+def first_of(use: BoolArray, count: int) -> BoolArray:
+    """Return the first `count` directions in use of every corner, (K, n)."""
+    if use.shape[0] <= count:
+        return use
+    return np.asarray(use & (np.cumsum(use, axis=0) <= count))
+
+
+def unit_weights(directions: PlanarDirections) -> tuple[FloatArray, FloatArray]:
+    """Return 1 / |d|^2 of either image, (K, n); 0 where not in use."""
+
+    def inverse_square(x: FloatArray, y: FloatArray) -> FloatArray:
+        square = x * x + y * y
+        square += ~directions.use  # avoids 0 / 0; the masked components keep such rows at zero
+        return np.asarray(directions.use / square)
+
+    return inverse_square(directions.x1, directions.y1), inverse_square(directions.x2, directions.y2)
+
+
+def smallest_singular(m11: FloatArray, m12: FloatArray, m22: FloatArray) -> FloatArray:
+    """Return the smaller singular value of a K x 2 system from its normal matrix, without cancellation."""
+    half = 0.5 * (m11 + m22)
+    root = np.sqrt((0.5 * (m11 - m22)) ** 2 + m12 * m12)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.sqrt(np.maximum(m11 * m22 - m12 * m12, 0.0) / (half + root)))

@@ -1,0 +1,127 @@
+"""F2UDIR and F3UDIR: the affinity from directions without lengths and the epipolar geometry.
+
+All A that agree with the epipolar geometry are A = A0 + m y^T with A0 = -n2 n1^T / |n2|^2 and m = perp(n2) / |n2|;
+every direction gives one equation in y. A direction along its epipolar line gives none: in standard stereo that is
+every board edge parallel to the baseline.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.affine.affinities import EpipolarNormals
+from rigkit.affine.components import PlanarDirections, finite, first_of, smallest_singular, unit_weights
+from rigkit.arrays import Affines, BoolArray, FloatArray
+from rigkit.matches import DirectionPairs
+
+__all__ = ["epipolar_alignment", "epipolar_block", "epipolar_sensitivity", "soft_epipolar", "usable_directions"]
+
+
+def epipolar_alignment(directions: DirectionPairs, epipolar: EpipolarNormals) -> FloatArray:
+    """Return |unit(d2) . unit(n2)|, (N, K): 0 where a direction lies along its epipolar line and tells nothing."""
+    d2, n2 = directions.image2, epipolar.n2[:, None, :]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(
+            np.abs((d2 * n2).sum(-1)) / (np.hypot(d2[..., 0], d2[..., 1]) * np.hypot(n2[..., 0], n2[..., 1]))
+        )
+
+
+def usable_directions(
+    directions: PlanarDirections, n2: FloatArray, count: int | None, min_conditioning: float
+) -> BoolArray:
+    """Return which directions to use, (K, n): the first `count` (None: all) that do not lie along the epipolar line."""
+    if count is None:
+        return directions.use
+    across = directions.x2 * n2[0] + directions.y2 * n2[1]
+    bound = min_conditioning**2 * (n2[0] * n2[0] + n2[1] * n2[1])
+    square = directions.x2 * directions.x2 + directions.y2 * directions.y2
+    return first_of(directions.use & (across * across >= bound * square), count)
+
+
+def epipolar_block(directions: PlanarDirections, n1: FloatArray, n2: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return vec(A), (4, n), and the conditioning, (n,), from all directions in use (two at least).
+
+    Parameters
+    ----------
+    directions : K directions of n corners; lengths do not matter.
+    n1, n2 : (2, n) epipolar normals, A^T n2 + n1 = 0.
+
+    Notes
+    -----
+    Residual of direction k: perp(u2)^T A u1 with unit u1, u2 (the paper's alpha eliminated), that is
+    (u2 . n2/|n2|)(u1 . y) - (u2 x n2/|n2|)(n1/|n2| . u1); least squares in y. The epipolar equations hold exactly: they
+    are far more precise than directions. (Hajder stacks them with the directions; see `soft_epipolar`.)
+    """
+    x1, y1, x2, y2 = directions.x1, directions.y1, directions.x2, directions.y2
+    w1, w2 = unit_weights(directions)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = 1.0 / np.sqrt(n2[0] * n2[0] + n2[1] * n2[1])
+        nx, ny = n2[0] * inverse, n2[1] * inverse
+        vx, vy = n1[0] * inverse, n1[1] * inverse
+        c = x2 * nx + y2 * ny
+        weight = w1 * w2 * c
+        right = weight * (x2 * ny - y2 * nx) * (vx * x1 + vy * y1)
+        weight *= c
+        wx = weight * x1
+        m11, m12, m22 = (wx * x1).sum(0), (wx * y1).sum(0), (weight * y1 * y1).sum(0)
+        b1, b2 = (right * x1).sum(0), (right * y1).sum(0)
+        determinant = 1.0 / (m11 * m22 - m12 * m12)
+        p = (b1 * m22 - b2 * m12) * determinant
+        q = (b2 * m11 - b1 * m12) * determinant
+    a = np.stack([-nx * vx - ny * p, -nx * vy - ny * q, -ny * vx + nx * p, -ny * vy + nx * q])
+    return a, smallest_singular(m11, m12, m22)
+
+
+def epipolar_sensitivity(
+    directions: DirectionPairs, use: BoolArray, A21: Affines, epipolar: EpipolarNormals
+) -> tuple[FloatArray, FloatArray]:
+    """Return d vec(A) / d directions of image 1 and of image 2, each (N, 4, K, 2), to first order at consistent data.
+
+    Notes
+    -----
+    With alpha = |A d1| / |d2| the residual d2 x A d1 changes by d2 x (A dd1 - alpha dd2).
+    """
+    n, k = use.shape
+    d1 = np.where(use[..., None], directions.image1, 0.0)
+    d2 = np.where(use[..., None], directions.image2, 0.0)
+    square1, square2 = (d1**2).sum(-1) + ~use, (d2**2).sum(-1) + ~use
+    n2_hat = epipolar.n2 / np.linalg.norm(epipolar.n2, axis=-1, keepdims=True)
+    m = np.stack([-n2_hat[:, 1], n2_hat[:, 0]], axis=-1)
+    c = np.einsum("nki,ni->nk", d2, n2_hat)
+    weight = c / (square1 * square2)
+    normal = np.einsum("nk,nki,nkj->nij", weight * c, d1, d1)
+    # dy = -normal^-1 sum_k weight_k d1_k (d2_k x A dd1_k - alpha_k d2_k x dd2_k)
+    gain = -np.linalg.solve(normal, np.einsum("nk,nkj->njk", weight, d1))  # (N, 2, K)
+    across2 = np.stack([-d2[..., 1], d2[..., 0]], axis=-1)
+    stretch = np.linalg.norm(np.einsum("nij,nkj->nki", A21, d1), axis=-1) / np.sqrt(square2)
+    by1 = np.einsum("ni,njk,nkr,nrl->nijkl", m, gain, across2, A21, optimize=True)
+    by2 = -np.einsum("ni,njk,nk,nkl->nijkl", m, gain, stretch, across2, optimize=True)
+    return by1.reshape(n, 4, k, 2), by2.reshape(n, 4, k, 2)
+
+
+def soft_epipolar(
+    directions: DirectionPairs, use: BoolArray, epipolar: EpipolarNormals, weight: float = 1.0
+) -> Affines:
+    """Return A (N, 2, 2) from the directions in use with the epipolar equations as two more rows, as in the paper.
+
+    Notes
+    -----
+    Minimises sum_k (perp(u2)^T A u1)^2 + weight^2 |A^T n2 + n1|^2 / |n2|^2. Dividing by |n2| removes the arbitrary
+    scale of F that the paper's rows carry. For comparison: with hard rows the normals are as good or better.
+    """
+    keep = use[..., None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u1 = directions.image1 / np.linalg.norm(directions.image1, axis=-1, keepdims=True)
+        u2 = directions.image2 / np.linalg.norm(directions.image2, axis=-1, keepdims=True)
+        length = np.linalg.norm(epipolar.n2, axis=-1, keepdims=True)
+        n2_hat, v = epipolar.n2 / length, epipolar.n1 / length
+    across2 = np.stack([-u2[..., 1], u2[..., 0]], axis=-1)
+    rows = np.where(keep[..., None], across2[..., :, None] * u1[..., None, :], 0.0).reshape(*use.shape, 4)
+    line = weight * np.einsum("ni,jl->njil", n2_hat, np.eye(2)).reshape(-1, 2, 4)
+    system = np.concatenate([rows, line], axis=1)
+    right = -weight * np.einsum("njr,nj->nr", line, v)
+    normal = np.einsum("nki,nkj->nij", system, system)
+    solvable = finite(normal) & (np.linalg.matrix_rank(np.nan_to_num(normal)) == 4)
+    out = np.full((len(use), 2, 2), np.nan)
+    out[solvable] = np.linalg.solve(normal[solvable], right[solvable, :, None]).reshape(-1, 2, 2)
+    return out

@@ -1,0 +1,162 @@
+"""Affinities and homographies: A from H, H from a plane, H from affinities, H from one affinity and F."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.affine.components import finite
+from rigkit.arrays import Affines, BoolArray, FloatArray, Mat3, Normals, Pixels
+from rigkit.errors import DegenerateError, InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import skew
+
+__all__ = [
+    "affines_from_homography",
+    "homographies_from_affines_and_F",
+    "homography_from_affines",
+    "homography_from_plane",
+]
+
+
+def affines_from_homography(H21: Mat3, pixels1: Pixels) -> tuple[Affines, BoolArray]:
+    """Return d pixel2 / d pixel1 (N, 2, 2) of H21 (3, 3) or (N, 3, 3) at pixels1 (N, 2), and where it is defined.
+
+    Undefined (NaN) where the homography sends the pixel to infinity.
+
+    Notes
+    -----
+    A = (H[:2, :2] - q2 H[2, :2]) / (H[2] q1^). Erratum: the paper prints a2 = (h2 - h8 v2)/s and a3 = (h4 - h7 u2)/s;
+    it is a2 = (h2 - h8 u2)/s and a3 = (h4 - h7 v2)/s (tests/affine/test_homography.py).
+    """
+    h = np.asarray(H21, dtype=np.float64)
+    q = np.asarray(pixels1, dtype=np.float64)
+    mapped = np.einsum("...ij,...j->...i", h[..., :, :2], q) + h[..., :, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s = mapped[..., 2, None, None]
+        out = (h[..., :2, :2] - (mapped[..., :2, None] / s) * h[..., 2:, :2]) / s
+    valid = np.isfinite(out).all(axis=(-2, -1))
+    return np.where(valid[..., None, None], out, np.nan), valid
+
+
+def homography_from_plane(K1: Mat3, K2: Mat3, cam2_from_cam1: Rigid3, normal: Normals, offset_mm: float) -> Mat3:
+    """Return H21 (3, 3), scaled to unit Frobenius norm, of the plane normal . x = offset_mm in the frame of camera 1.
+
+    H = K2 (R + t n^T / D) K1^-1. Raises DegenerateError where the plane goes through the centre of camera 1.
+    """
+    if offset_mm == 0.0:
+        raise DegenerateError("homography of a plane: the plane goes through the centre of camera 1")
+    n = np.asarray(normal, dtype=np.float64)
+    euclidean = cam2_from_cam1.rotation + np.outer(cam2_from_cam1.translation_mm, n) / offset_mm
+    H21 = K2 @ euclidean @ np.linalg.inv(K1)
+    return np.asarray(H21 / np.linalg.norm(H21))
+
+
+def homography_from_affines(pixels1: Pixels, pixels2: Pixels, A21: Affines, *, affine_weight: float = 1.0) -> Mat3:
+    """Return the homography (3, 3), unit Frobenius norm, of N >= 2 points with affinities on one plane.
+
+    Parameters
+    ----------
+    pixels1, pixels2 : (N, 2)
+    A21 : (N, 2, 2)
+    affine_weight : of the affinities' equations against the points' in normalised coordinates; sigma_px T / sigma_A
+        with T the normalisation (about sqrt(2) over the points' spread in px) is the ratio of their noise.
+
+    Raises
+    ------
+    InputError
+        Fewer than two points, or shapes that do not fit.
+    DegenerateError
+        The points and affinities do not determine a homography (all points equal, affinities singular).
+
+    Notes
+    -----
+    A point gives the two rows of the direct linear transform, an affinity H[r, c] - q2_r H[2, c] - a_rc (H[2] q1^) = 0.
+    """
+    q1, q2, A = (np.asarray(v, dtype=np.float64) for v in (pixels1, pixels2, A21))
+    n = len(q1)
+    if n < 2 or q1.shape != (n, 2) or q2.shape != (n, 2) or A.shape != (n, 2, 2):
+        raise InputError(f"homography from affinities: two points or more with pixels and affinities, got {q1.shape}")
+    T1, T2 = _normalisation(q1), _normalisation(q2)
+    x1, x2 = q1 * T1[0, 0] + T1[:2, 2], q2 * T2[0, 0] + T2[:2, 2]
+    A = A * (T2[0, 0] / T1[0, 0])
+    x1h = np.concatenate([x1, np.ones((n, 1))], axis=1)
+    points = np.zeros((n, 2, 3, 3))
+    affine = np.zeros((n, 2, 2, 3, 3))
+    for r in range(2):
+        points[:, r, r] = x1h
+        points[:, r, 2] = -x2[:, r, None] * x1h
+        for c in range(2):
+            affine[:, r, c, r, c] = 1.0
+            affine[:, r, c, 2, c] = -x2[:, r]
+            affine[:, r, c, 2] -= A[:, r, c, None] * x1h
+    system = np.concatenate([points.reshape(-1, 9), affine_weight * affine.reshape(-1, 9)])
+    _, singular, vt = np.linalg.svd(system)
+    if singular[7] < DEGENERATE * singular[0]:
+        raise DegenerateError("homography from affinities: points and affinities do not determine it")
+    H21 = np.linalg.inv(T2) @ vt[-1].reshape(3, 3) @ T1
+    H21 /= np.linalg.norm(H21)
+    return np.asarray(H21 if np.median(H21[2] @ np.concatenate([q1, np.ones((n, 1))], 1).T) > 0.0 else -H21)
+
+
+def homographies_from_affines_and_F(
+    F21: Mat3, pixels1: Pixels, pixels2: Pixels, A21: Affines
+) -> tuple[FloatArray, BoolArray]:
+    """Return the homography (N, 3, 3), unit Frobenius norm, of each point's tangent plane, and where it is defined.
+
+    Parameters
+    ----------
+    F21 : (3, 3) fundamental matrix, rank 2.
+    pixels1, pixels2 : (N, 2), on each other's epipolar lines (correct them first).
+    A21 : (N, 2, 2)
+
+    Notes
+    -----
+    Every homography of the scene is [e2]x F + e2 v^T with the epipole e2; the equations of one point and one affinity
+    are linear in the three entries of v. Undefined at the epipole.
+    """
+    q1, q2, A = (np.asarray(v, dtype=np.float64) for v in (pixels1, pixels2, A21))
+    n = len(q1)
+    T1, T2 = _normalisation(q1), _normalisation(q2)
+    F = np.linalg.inv(T2).T @ np.asarray(F21, dtype=np.float64) @ np.linalg.inv(T1)
+    F /= np.linalg.norm(F)
+    epipole = np.linalg.svd(F)[0][:, 2]
+    base = skew(epipole) @ F
+    x1 = np.concatenate([q1 * T1[0, 0] + T1[:2, 2], np.ones((n, 1))], axis=1)
+    x2 = q2 * T2[0, 0] + T2[:2, 2]
+    a = A * (T2[0, 0] / T1[0, 0])
+    # w_r = e_r - q2_r e_3: the row (w_r^T H) x1 = 0 of the point and w_r^T H[:, c] = a_rc H[2] x1 of the affinity.
+    w = np.zeros((n, 2, 3))
+    w[:, 0, 0] = w[:, 1, 1] = 1.0
+    w[:, :, 2] = -x2
+    we, wb = w @ epipole, w @ base
+    rows = np.empty((n, 2, 3, 3))
+    right = np.empty((n, 2, 3))
+    rows[:, :, 2] = we[:, :, None] * x1[:, None, :]
+    right[:, :, 2] = -np.einsum("nri,ni->nr", wb, x1)
+    depth = x1 @ base[2]
+    for c in range(2):
+        rows[:, :, c] = we[:, :, None] * np.eye(3)[c] - a[:, :, c, None] * epipole[2] * x1[:, None, :]
+        right[:, :, c] = a[:, :, c] * depth[:, None] - wb[:, :, c]
+    system, right = rows.reshape(n, 6, 3), right.reshape(n, 6)
+    solvable = finite(system) & finite(right)
+    v = np.full((n, 3), np.nan)
+    v[solvable] = np.einsum("nij,nj->ni", np.linalg.pinv(system[solvable]), right[solvable])
+    H21 = np.empty((n, 3, 3))
+    H21[:] = np.linalg.inv(T2) @ (base + epipole[:, None] * v[:, None, :]) @ T1
+    with np.errstate(divide="ignore", invalid="ignore"):
+        H21 /= np.linalg.norm(H21, axis=(1, 2), keepdims=True)
+    H21 *= np.sign(np.einsum("ni,ni->n", H21[:, 2], np.concatenate([q1, np.ones((n, 1))], axis=1)))[:, None, None]
+    valid = finite(H21)
+    return np.where(valid[:, None, None], H21, np.nan), valid
+
+
+DEGENERATE = 1e-10
+"""Relative eighth singular value of a system on nine entries below which its null vector is not unique."""
+
+
+def _normalisation(pixels: Pixels) -> Mat3:
+    """Return the similarity that centres the points and makes their mean distance from the origin sqrt(2)."""
+    centre = pixels.mean(axis=0)
+    spread = np.linalg.norm(pixels - centre, axis=1).mean()
+    s = np.sqrt(2.0) / spread if spread > 0.0 else 1.0
+    return np.array([[s, 0.0, -s * centre[0]], [0.0, s, -s * centre[1]], [0.0, 0.0, 1.0]])

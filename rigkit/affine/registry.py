@@ -1,0 +1,179 @@
+"""The affine estimators by name. Adding one is one line in the table and one module."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.affine.affinities import Affinities, DirectionNoise, EpipolarNormals
+from rigkit.affine.components import PlanarDirections, blocks, finite, first_of
+from rigkit.affine.epipolar import epipolar_block, epipolar_sensitivity, soft_epipolar, usable_directions
+from rigkit.affine.scaled import scaled_block, scaled_sensitivity
+from rigkit.affine.unscaled import SCALES, determinant_block, determinant_sensitivity
+from rigkit.arrays import Affines, BoolArray, FloatArray, as_array
+from rigkit.errors import InputError
+from rigkit.matches import DirectionPairs
+
+__all__ = ["AFFINE_METHODS", "MIN_CONDITIONING", "affines_from_directions", "needs_epipolar", "needs_lengths"]
+
+AFFINE_METHODS = ("F2UDIR", "F3UDIR", "DET3UDIR", "2SDIR", "3SDIR")
+
+MIN_CONDITIONING = 0.05
+"""Below this the directions do not determine the affinity: noise is magnified twentyfold and more."""
+
+_COUNT: dict[str, int | None] = {"F2UDIR": 2, "F3UDIR": None, "DET3UDIR": None, "2SDIR": 2, "3SDIR": None}
+_AT_LEAST = {"F2UDIR": 2, "F3UDIR": 2, "DET3UDIR": 3, "2SDIR": 2, "3SDIR": 2}
+
+
+def needs_epipolar(method: str) -> bool:
+    """Say whether `method` needs the epipolar geometry (then re-estimating that from its affinities is circular)."""
+    return _known(method).startswith("F")
+
+
+def needs_lengths(method: str) -> bool:
+    """Say whether `method` uses the lengths of the directions."""
+    return not needs_epipolar(method)
+
+
+def affines_from_directions(
+    directions: DirectionPairs,
+    method: str,
+    *,
+    epipolar: EpipolarNormals | None = None,
+    scale: str = "area",
+    noise: DirectionNoise | None = None,
+    determinant: FloatArray | None = None,
+    epipolar_rows: str = "hard",
+    min_conditioning: float = MIN_CONDITIONING,
+) -> Affinities:
+    """Return the affinities of N corners from corresponding directions.
+
+    Parameters
+    ----------
+    directions : N corners, K directions each.
+    method : "F2UDIR" or "2SDIR" use the first two usable directions of a corner, "F3UDIR", "DET3UDIR" and "3SDIR" all.
+        Usable: valid, and for F2UDIR not along the epipolar line (|unit(d2) . unit(n2)| >= min_conditioning), so that
+        the diagonal of a board steps in for an edge that is parallel to the baseline.
+    epipolar : for F2UDIR and F3UDIR: epipolar normals in the same pixels as the directions.
+    scale : for DET3UDIR: "area" (exact, default), "ls" (exact) or "sqmean" (the paper's; biased).
+    noise : of the directions; then each affinity has a covariance.
+    determinant : (N,) for DET3UDIR: det A where it is known otherwise; then lengths are not used.
+    epipolar_rows : "hard", or "soft": the epipolar equations stacked with the directions in least squares, as in the
+        paper.
+    min_conditioning : affinities below are invalid. 0 accepts everything that can be computed.
+
+    Returns
+    -------
+    Affinities
+        `valid` is False, and A21 NaN, where too few directions are usable or they do not determine the affinity.
+
+    Raises
+    ------
+    InputError
+        Unknown method or option, no epipolar geometry or no lengths where the method needs them, lengths that differ.
+    """
+    _check(directions, method, epipolar, scale, determinant, epipolar_rows, noise)
+    n = len(directions.valid)
+    A21 = np.full((n, 2, 2), np.nan)
+    conditioning = np.full(n, np.nan)
+    use = np.zeros(directions.valid.shape, dtype=bool)
+    for block in blocks(n):
+        planar = PlanarDirections.of(directions, block)
+        if epipolar is not None and needs_epipolar(method):
+            n1, n2 = (np.ascontiguousarray(v[block].T) for v in (epipolar.n1, epipolar.n2))
+            chosen = usable_directions(planar, n2, _COUNT[method], min_conditioning)
+            planar = planar if chosen is planar.use else planar.only(chosen)
+            a, conditioning[block] = epipolar_block(planar, n1, n2)
+        elif method == "DET3UDIR":
+            known = None if determinant is None else np.asarray(determinant, dtype=np.float64)[block]
+            a, conditioning[block] = determinant_block(planar, scale, known)
+        else:
+            count = _COUNT[method]
+            planar = planar if count is None else planar.only(first_of(planar.use, count))
+            a, conditioning[block] = scaled_block(planar)
+        use[block] = planar.use.T
+        A21[block] = a.T.reshape(-1, 2, 2)
+    if epipolar is not None and needs_epipolar(method) and epipolar_rows == "soft":
+        A21 = soft_epipolar(directions, use, epipolar)
+    with np.errstate(invalid="ignore"):
+        valid = (use.sum(axis=1) >= _AT_LEAST[method]) & (conditioning >= min_conditioning)
+    valid &= finite(A21)
+    A21[~valid] = np.nan
+    covariance = None
+    if noise is not None:
+        covariance = _covariance(directions, method, use, valid, A21, epipolar, scale, determinant is not None, noise)
+    return Affinities(A21, valid, conditioning, covariance)
+
+
+def _covariance(
+    directions: DirectionPairs,
+    method: str,
+    use: BoolArray,
+    valid: BoolArray,
+    A21: Affines,
+    epipolar: EpipolarNormals | None,
+    scale: str,
+    determinant_given: bool,
+    noise: DirectionNoise,
+) -> FloatArray:
+    """Propagate the direction noise to vec(A), (N, 4, 4), to first order; NaN where invalid."""
+    n, k = directions.valid.shape
+    out = np.full((n, 4, 4), np.nan)
+    some = DirectionPairs(
+        directions.image1[valid],
+        directions.image2[valid],
+        directions.valid[valid],
+        directions.scaled,
+        directions.kinds,
+    )
+    if epipolar is not None and needs_epipolar(method):
+        normals = EpipolarNormals(epipolar.n1[valid], epipolar.n2[valid])
+        by1, by2 = epipolar_sensitivity(some, use[valid], A21[valid], normals)
+    elif method == "DET3UDIR":
+        given = determinant_given
+        by1, by2 = determinant_sensitivity(some, use[valid], A21[valid], scale, determinant_given=given)
+    else:
+        by1, by2 = scaled_sensitivity(some, use[valid], A21[valid])
+    # Directions not in use have no influence, but their noise may be NaN.
+    unused = np.repeat(~use[valid], 2, axis=1)
+    ignore = unused[:, :, None] | unused[:, None, :]
+    total = np.zeros((int(valid.sum()), 4, 4))
+    for by, covariance in ((by1, noise.covariance1), (by2, noise.covariance2)):
+        flat = by.reshape(-1, 4, 2 * k)
+        total += flat @ np.where(ignore, 0.0, covariance[valid]) @ np.swapaxes(flat, 1, 2)
+    out[valid] = total
+    return out
+
+
+def _known(method: str) -> str:
+    if method not in AFFINE_METHODS:
+        raise InputError(f"affine method '{method}' is unknown; known: {', '.join(AFFINE_METHODS)}")
+    return method
+
+
+def _check(
+    directions: DirectionPairs,
+    method: str,
+    epipolar: EpipolarNormals | None,
+    scale: str,
+    determinant: FloatArray | None,
+    epipolar_rows: str,
+    noise: DirectionNoise | None,
+) -> None:
+    n, k = directions.valid.shape
+    if scale not in SCALES:
+        raise InputError(f"affine scale '{scale}' is unknown; known: {', '.join(SCALES)}")
+    if epipolar_rows not in ("hard", "soft"):
+        raise InputError(f"epipolar rows '{epipolar_rows}' are unknown; known: hard, soft")
+    if needs_epipolar(method):
+        if epipolar is None:
+            raise InputError(f"{method} needs the epipolar geometry: pass epipolar=, or use 3SDIR")
+        if len(epipolar) != n:
+            raise InputError(f"{method}: {n} corners but epipolar normals of {len(epipolar)}")
+    elif not directions.scaled and determinant is None:
+        raise InputError(f"{method} needs the lengths of the directions, which these do not have: use F3UDIR")
+    if determinant is not None:
+        as_array(determinant, (n,), "determinant", finite=False)
+    if k < _AT_LEAST[method]:
+        raise InputError(f"{method} needs {_AT_LEAST[method]} directions a corner, got {k}")
+    if noise is not None and noise.covariance1.shape != (n, 2 * k, 2 * k):
+        raise InputError(f"direction noise: expected {n}x{2 * k}x{2 * k}, got {noise.covariance1.shape}")

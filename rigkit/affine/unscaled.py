@@ -1,0 +1,275 @@
+"""DET3UDIR: the affinity from three or more directions without lengths and its determinant. No epipolar geometry.
+
+In complex numbers A x = z x + w conj(x), with |z|^2 - |w|^2 = det A; z is the part of A that turns and scales, w the
+part that reflects. In a = (Re z, Im z, Re w, Im w) the residuals are a quadratic form with 2x2 blocks [P, Q; Q^T, R]
+and the determinant is diag(1, 1, -1, -1), which makes the 4x4 generalised eigenproblem a scalar equation.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rigkit.affine.components import PlanarDirections, first_of, unit_weights
+from rigkit.arrays import Affines, BoolArray, FloatArray
+from rigkit.errors import InputError
+from rigkit.matches import DirectionPairs
+
+__all__ = ["SCALES", "determinant_block", "determinant_from_lengths", "determinant_sensitivity", "shape_block"]
+
+SCALES = ("area", "ls", "sqmean")
+
+NEWTON_STEPS = 40
+"""Newton converges monotonically and quadratically, usually in 4 to 6 steps; only near-singular sets take more."""
+
+NEWTON_TOLERANCE = 4e-16
+
+
+class _Form(NamedTuple):
+    """The quadratic form [P, Q; Q^T, R], each entry (n,)."""
+
+    p11: FloatArray
+    p12: FloatArray
+    p22: FloatArray
+    q11: FloatArray
+    q12: FloatArray
+    q21: FloatArray
+    q22: FloatArray
+    r11: FloatArray
+    r12: FloatArray
+    r22: FloatArray
+
+
+def _form(directions: PlanarDirections) -> _Form:
+    """Sum the squared residuals Im(conj(u2) A u1) = Im(z g + w h), g = conj(u2) u1, h = conj(u2 u1)."""
+    x1, y1, x2, y2 = directions.x1, directions.y1, directions.x2, directions.y2
+    w1, w2 = unit_weights(directions)
+    w = w1 * w2
+    gx, gy = x2 * x1 + y2 * y1, x2 * y1 - y2 * x1
+    hx, hy = x2 * x1 - y2 * y1, -(x2 * y1 + y2 * x1)
+    wgx, wgy, whx, why = w * gx, w * gy, w * hx, w * hy
+    return _Form(
+        (wgy * gy).sum(0),
+        (wgy * gx).sum(0),
+        (wgx * gx).sum(0),
+        (wgy * hy).sum(0),
+        (wgy * hx).sum(0),
+        (wgx * hy).sum(0),
+        (wgx * hx).sum(0),
+        (why * hy).sum(0),
+        (why * hx).sum(0),
+        (whx * hx).sum(0),
+    )
+
+
+def shape_block(directions: PlanarDirections) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return vec(A), (4, n), with determinant 1, the conditioning, (n,), and the mean square residual, (n,).
+
+    Minimises sum_k (perp(u2_k)^T A u1_k)^2 over all A of determinant 1, globally, and signs A so that it maps d1 along,
+    not against, d2. With three directions the residual is zero unless noise has reversed their cyclic order.
+
+    Notes
+    -----
+    Stationary points: S a = mu B a. Erratum: the appendix takes the largest generalised eigenvalue (of lambda = -2
+    mu); as eigen-solvers return mu, the minimum is the smallest positive one, and the sign of A, free there, is fixed
+    here. With w = -(R + mu)^-1 Q^T z that mu is the largest root of lambda_min(P - Q (R + mu)^-1 Q^T) = mu. The left
+    side is concave in mu, so Newton from the right, from lambda_min(P), reaches that root monotonically. Its step is
+    the Rayleigh quotient a^T S a / a^T B a.
+    """
+    f = _form(directions)
+    mu = _smaller_eigenvalue(f.p11, f.p12, f.p22)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        for _ in range(NEWTON_STEPS):
+            z1, z2, w1, w2 = _vector(f, mu)
+            numerator = (
+                z1 * (f.p11 * z1 + 2.0 * f.p12 * z2)
+                + f.p22 * z2 * z2
+                + 2.0 * (z1 * (f.q11 * w1 + f.q12 * w2) + z2 * (f.q21 * w1 + f.q22 * w2))
+                + w1 * (f.r11 * w1 + 2.0 * f.r12 * w2)
+                + f.r22 * w2 * w2
+            )
+            following = np.maximum(numerator / (z1 * z1 + z2 * z2 - w1 * w1 - w2 * w2), 0.0)
+            settled = ~(np.abs(following - mu) > NEWTON_TOLERANCE * (f.p11 + f.p22) + 1e-9 * mu)
+            mu = following
+            if settled.all():
+                break
+        z1, z2, w1, w2 = _vector(f, mu)
+        determinant = z1 * z1 + z2 * z2 - w1 * w1 - w2 * w2
+        a = np.stack([z1 + w1, w2 - z2, z2 + w2, z1 - w1]) * np.where(determinant > 0.0, determinant, np.nan) ** -0.5
+        a *= np.sign(_agreement(directions, a))
+        count = directions.use.sum(0)
+        return a, _third_singular(directions), mu * 2.0 / count
+
+
+def _smaller_eigenvalue(m11: FloatArray, m12: FloatArray, m22: FloatArray) -> FloatArray:
+    half = 0.5 * (m11 + m22)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        root = half + np.sqrt((0.5 * (m11 - m22)) ** 2 + m12 * m12)
+        return np.asarray(np.maximum(m11 * m22 - m12 * m12, 0.0) / root)
+
+
+def _vector(f: _Form, mu: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return z (unit eigenvector of the smaller eigenvalue of P - Q (R + mu)^-1 Q^T) and w = -(R + mu)^-1 Q^T z."""
+    s11, s22 = f.r11 + mu, f.r22 + mu
+    inverse = 1.0 / (s11 * s22 - f.r12 * f.r12)
+    # T = (R + mu)^-1 Q^T
+    t11, t12 = (s22 * f.q11 - f.r12 * f.q12) * inverse, (s22 * f.q21 - f.r12 * f.q22) * inverse
+    t21, t22 = (s11 * f.q12 - f.r12 * f.q11) * inverse, (s11 * f.q22 - f.r12 * f.q21) * inverse
+    c11 = f.p11 - f.q11 * t11 - f.q12 * t21
+    c12 = f.p12 - f.q11 * t12 - f.q12 * t22
+    c22 = f.p22 - f.q21 * t12 - f.q22 * t22
+    half = 0.5 * (c11 - c22)
+    root = np.sqrt(half * half + c12 * c12)
+    # Of the two forms of the eigenvector take the one without cancellation.
+    upper = half > 0.0
+    z1 = np.where(upper, -c12, root - half)
+    z2 = np.where(upper, half + root, -c12)
+    norm = z1 * z1 + z2 * z2
+    # A multiple of the identity has no preferred direction: any z is an eigenvector.
+    equal = norm == 0.0
+    z1, norm = np.where(equal, 1.0, z1), np.where(equal, 1.0, norm)
+    length = 1.0 / np.sqrt(norm)
+    z1, z2 = z1 * length, z2 * length
+    return z1, z2, -(t11 * z1 + t12 * z2), -(t21 * z1 + t22 * z2)
+
+
+def _agreement(directions: PlanarDirections, a: FloatArray) -> FloatArray:
+    """Return sum_k d2_k . A d1_k / (|d1_k| |d2_k|)^2-weighted by length: positive where A maps along the directions."""
+    x1, y1, x2, y2 = directions.x1, directions.y1, directions.x2, directions.y2
+    return np.asarray((x2 * (a[0] * x1 + a[1] * y1) + y2 * (a[2] * x1 + a[3] * y1)).sum(0))
+
+
+def _third_singular(directions: PlanarDirections) -> FloatArray:
+    """Return sqrt(e3 / e2) of the rows' Gram matrix: the third singular value where the fourth is (nearly) zero.
+
+    Zero where two directions of three are parallel in both images: then the shape is not unique.
+    """
+    w1, w2 = unit_weights(directions)
+    x1, y1 = directions.x1 * np.sqrt(w1), directions.y1 * np.sqrt(w1)
+    x2, y2 = directions.x2 * np.sqrt(w2), directions.y2 * np.sqrt(w2)
+    k = len(x1)
+    gram = {}
+    for i in range(k):
+        for j in range(i, k):
+            gram[i, j] = (x1[i] * x1[j] + y1[i] * y1[j]) * (x2[i] * x2[j] + y2[i] * y2[j])
+    e2 = np.zeros_like(x1[0])
+    e3 = np.zeros_like(x1[0])
+    for i in range(k):
+        for j in range(i + 1, k):
+            e2 += gram[i, i] * gram[j, j] - gram[i, j] ** 2
+            for m in range(j + 1, k):
+                e3 += (
+                    gram[i, i] * (gram[j, j] * gram[m, m] - gram[j, m] ** 2)
+                    - gram[i, j] * (gram[i, j] * gram[m, m] - gram[j, m] * gram[i, m])
+                    + gram[i, m] * (gram[i, j] * gram[j, m] - gram[j, j] * gram[i, m])
+                )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.sqrt(np.maximum(e3, 0.0) / e2))
+
+
+def determinant_from_lengths(directions: PlanarDirections, shape: FloatArray, scale: str) -> FloatArray:
+    """Return det A, (n,), from the lengths of the directions.
+
+    "area": ratio of the signed areas that the first two directions span; exact. "ls": the scale of `shape`
+    (determinant 1) that fits the lengths best; exact. "sqmean": squared mean of the scales |d2|/|d1|, as the paper
+    has it; biased unless A is a similarity, for replication.
+    """
+    if scale == "area":
+        pair = first_of(directions.use, 2)
+        first = first_of(directions.use, 1)
+        second = pair & ~first
+
+        def area(x: FloatArray, y: FloatArray) -> FloatArray:
+            ax, ay = (x * first).sum(0), (y * first).sum(0)
+            return np.asarray(ax * (y * second).sum(0) - ay * (x * second).sum(0))
+
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return area(directions.x2, directions.y2) / area(directions.x1, directions.y1)
+    length1, length2 = np.hypot(directions.x1, directions.y1), np.hypot(directions.x2, directions.y2)
+    if scale == "ls":
+        a1, a2, a3, a4 = shape
+        mapped = np.hypot(a1 * directions.x1 + a2 * directions.y1, a3 * directions.x1 + a4 * directions.y1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(((mapped * length2).sum(0) / (mapped * mapped).sum(0)) ** 2)
+    if scale == "sqmean":
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = np.where(directions.use, length2 / length1, 0.0).sum(0) / directions.use.sum(0)
+        return np.asarray(ratio**2)
+    raise InputError(f"affine scale '{scale}' is unknown; known: {', '.join(SCALES)}")
+
+
+def determinant_block(
+    directions: PlanarDirections, scale: str, determinant: FloatArray | None
+) -> tuple[FloatArray, FloatArray]:
+    """Return vec(A), (4, n), and the conditioning, (n,), from all directions in use (three at least).
+
+    `determinant` (n,) overrides the lengths. NaN where the determinant is not positive: no surface seen from the same
+    side by both cameras reverses the order of directions.
+    """
+    shape, conditioning, _ = shape_block(directions)
+    s = determinant_from_lengths(directions, shape, scale) if determinant is None else determinant
+    with np.errstate(invalid="ignore"):
+        return shape * np.sqrt(np.where(s > 0.0, s, np.nan)), conditioning
+
+
+def determinant_sensitivity(
+    directions: DirectionPairs, use: BoolArray, A21: Affines, scale: str, *, determinant_given: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Return d vec(A) / d directions of image 1 and of image 2, each (N, 4, K, 2), to first order at consistent data.
+
+    Notes
+    -----
+    Constrained least squares: [S, c; c^T, 0] [da; -dmu] = [-sum_k k_k dr_k; dc], k_k the residual rows and c^T da =
+    dc the linearised condition on the lengths.
+    """
+    n, k = use.shape
+    d1 = np.where(use[..., None], directions.image1, 0.0)
+    d2 = np.where(use[..., None], directions.image2, 0.0)
+    length1, length2 = np.sqrt((d1**2).sum(-1) + ~use), np.sqrt((d2**2).sum(-1) + ~use)
+    across2 = np.stack([-d2[..., 1], d2[..., 0]], axis=-1)
+    per_unit = 1.0 / (length1 * length2)
+    rows = per_unit[..., None] * (across2[..., :, None] * d1[..., None, :]).reshape(n, k, 4)
+    stretch = np.linalg.norm(np.einsum("nij,nkj->nki", A21, d1), axis=-1) / length2
+    right1 = np.zeros((n, 5, k, 2))
+    right2 = np.zeros((n, 5, k, 2))
+    # d2 x A d1 changes by d2 x (A dd1 - alpha dd2).
+    right1[:, :4] = -np.einsum("nkr,nk,nki,nij->nrkj", rows, per_unit, across2, A21, optimize=True)
+    right2[:, :4] = np.einsum("nkr,nk,nk,nki->nrki", rows, per_unit, stretch, across2, optimize=True)
+    cofactor = np.stack([A21[:, 1, 1], -A21[:, 1, 0], -A21[:, 0, 1], A21[:, 0, 0]], axis=-1)
+    constraint = cofactor
+    if determinant_given:
+        pass
+    elif scale == "area":
+        right1[:, 4], right2[:, 4] = _area_sensitivity(d1, d2, use, A21)
+    elif scale == "ls":
+        # sum_k |d2_k| (|d2_k| - |A d1_k|) = 0
+        constraint = np.einsum("nki,nkj->nij", d2, d1).reshape(n, 4)
+        right2[:, 4] = d2
+        right1[:, 4] = -np.einsum("nki,nij->nkj", d2, A21)
+    else:
+        ratio = np.where(use, length2 / length1, 0.0)
+        gain = (2.0 * ratio.sum(1) / use.sum(1) ** 2)[:, None]
+        right2[:, 4] = (gain / (length1 * length2))[..., None] * d2
+        right1[:, 4] = -(gain * ratio / length1**2)[..., None] * d1
+    system = np.zeros((n, 5, 5))
+    system[:, :4, :4] = np.einsum("nki,nkj->nij", rows, rows)
+    system[:, 4, :4] = system[:, :4, 4] = constraint
+    by1 = np.asarray(np.linalg.solve(system, right1.reshape(n, 5, 2 * k)))[:, :4]
+    by2 = np.asarray(np.linalg.solve(system, right2.reshape(n, 5, 2 * k)))[:, :4]
+    return by1.reshape(n, 4, k, 2), by2.reshape(n, 4, k, 2)
+
+
+def _area_sensitivity(d1: FloatArray, d2: FloatArray, use: BoolArray, A21: Affines) -> tuple[FloatArray, FloatArray]:
+    """Return d det / d directions of either image, (N, K, 2), where det = (d2_a x d2_b) / (d1_a x d1_b)."""
+    n = len(use)
+    order = np.argsort(~use, axis=1, kind="stable")
+    row = np.arange(n)
+    a, b = order[:, 0], order[:, 1]
+    area1 = d1[row, a, 0] * d1[row, b, 1] - d1[row, a, 1] * d1[row, b, 0]
+    det = np.linalg.det(A21)
+    by1, by2 = np.zeros_like(d1), np.zeros_like(d2)
+    for out, d, gain in ((by2, d2, 1.0 / area1), (by1, d1, -det / area1)):
+        out[row, a] = gain[:, None] * np.stack([d[row, b, 1], -d[row, b, 0]], axis=-1)
+        out[row, b] = gain[:, None] * np.stack([-d[row, a, 1], d[row, a, 0]], axis=-1)
+    return by1, by2
