@@ -31,7 +31,7 @@ STEP_WIDTH = 3.0
 REACH = 0.44
 """Pixels are used up to this from the corner along the sides of its cell: short of the neighbouring edges."""
 
-MAX_RADIUS_PX = 12.0
+MAX_RADIUS_PX = 18.0
 
 MARGIN_PX = 1.5
 """Pixels beyond the rise of the step that are used: they say how bright the squares are."""

@@ -44,6 +44,8 @@ def refine(image: FloatImage, lattices: Sequence[Lattice]) -> list[RefinedLattic
 
     Corners whose fit fails are dropped.
     """
+    if not lattices:
+        return []
     current = list(lattices)
     blurs = [np.full(item.known.shape, FIRST_BLUR) for item in current]
     refined: list[RefinedLattice] = []
