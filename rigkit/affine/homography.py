@@ -137,12 +137,11 @@ def homographies_from_affines_and_F(
     for c in range(2):
         rows[:, :, c] = we[:, :, None] * np.eye(3)[c] - a[:, :, c, None] * epipole[2] * x1[:, None, :]
         right[:, :, c] = a[:, :, c] * depth[:, None] - wb[:, :, c]
-    system, right = rows.reshape(n, 6, 3), right.reshape(n, 6)
-    solvable = finite(system) & finite(right)
+    system, target = rows.reshape(n, 6, 3), right.reshape(n, 6)
+    solvable = finite(system) & finite(target)
     v = np.full((n, 3), np.nan)
-    v[solvable] = np.einsum("nij,nj->ni", np.linalg.pinv(system[solvable]), right[solvable])
-    H21 = np.empty((n, 3, 3))
-    H21[:] = np.linalg.inv(T2) @ (base + epipole[:, None] * v[:, None, :]) @ T1
+    v[solvable] = np.einsum("nij,nj->ni", np.linalg.pinv(system[solvable]), target[solvable])
+    H21 = np.linalg.inv(T2) @ (base + epipole[:, None] * v[:, None, :]) @ T1
     with np.errstate(divide="ignore", invalid="ignore"):
         H21 /= np.linalg.norm(H21, axis=(1, 2), keepdims=True)
     H21 *= np.sign(np.einsum("ni,ni->n", H21[:, 2], np.concatenate([q1, np.ones((n, 1))], axis=1)))[:, None, None]

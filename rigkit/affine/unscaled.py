@@ -78,28 +78,43 @@ def shape_block(directions: PlanarDirections) -> tuple[FloatArray, FloatArray, F
     the Rayleigh quotient a^T S a / a^T B a.
     """
     f = _form(directions)
-    mu = _smaller_eigenvalue(f.p11, f.p12, f.p22)
+    count = directions.use.sum(0)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        # Three directions have an exact solution, mu = 0, where its determinant is positive.
+        exact = (count == 3) & (_determinant(*_vector(f, np.zeros_like(f.p11))) > 0.0)
+        mu = np.where(exact, 0.0, _smaller_eigenvalue(f.p11, f.p12, f.p22))
+        open_ = np.flatnonzero(~exact)
         for _ in range(NEWTON_STEPS):
-            z1, z2, w1, w2 = _vector(f, mu)
-            numerator = (
-                z1 * (f.p11 * z1 + 2.0 * f.p12 * z2)
-                + f.p22 * z2 * z2
-                + 2.0 * (z1 * (f.q11 * w1 + f.q12 * w2) + z2 * (f.q21 * w1 + f.q22 * w2))
-                + w1 * (f.r11 * w1 + 2.0 * f.r12 * w2)
-                + f.r22 * w2 * w2
-            )
-            following = np.maximum(numerator / (z1 * z1 + z2 * z2 - w1 * w1 - w2 * w2), 0.0)
-            settled = ~(np.abs(following - mu) > NEWTON_TOLERANCE * (f.p11 + f.p22) + 1e-9 * mu)
-            mu = following
-            if settled.all():
+            if not open_.size:
                 break
+            part = _Form(*(entry[open_] for entry in f))
+            before = mu[open_]
+            after = _newton_step(part, before)
+            mu[open_] = after
+            open_ = open_[np.abs(after - before) > NEWTON_TOLERANCE * (part.p11 + part.p22) + 1e-9 * before]
         z1, z2, w1, w2 = _vector(f, mu)
-        determinant = z1 * z1 + z2 * z2 - w1 * w1 - w2 * w2
-        a = np.stack([z1 + w1, w2 - z2, z2 + w2, z1 - w1]) * np.where(determinant > 0.0, determinant, np.nan) ** -0.5
+        determinant = _determinant(z1, z2, w1, w2)
+        a = np.stack([z1 + w1, w2 - z2, z2 + w2, z1 - w1])
+        a *= 1.0 / np.sqrt(np.where(determinant > 0.0, determinant, np.nan))
         a *= np.sign(_agreement(directions, a))
-        count = directions.use.sum(0)
         return a, _third_singular(directions), mu * 2.0 / count
+
+
+def _newton_step(f: _Form, mu: FloatArray) -> FloatArray:
+    """Return the Rayleigh quotient of the vector that belongs to mu: the Newton step of the scalar equation."""
+    z1, z2, w1, w2 = _vector(f, mu)
+    numerator = (
+        z1 * (f.p11 * z1 + 2.0 * f.p12 * z2)
+        + f.p22 * z2 * z2
+        + 2.0 * (z1 * (f.q11 * w1 + f.q12 * w2) + z2 * (f.q21 * w1 + f.q22 * w2))
+        + w1 * (f.r11 * w1 + 2.0 * f.r12 * w2)
+        + f.r22 * w2 * w2
+    )
+    return np.asarray(np.maximum(numerator / _determinant(z1, z2, w1, w2), 0.0))
+
+
+def _determinant(z1: FloatArray, z2: FloatArray, w1: FloatArray, w2: FloatArray) -> FloatArray:
+    return z1 * z1 + z2 * z2 - w1 * w1 - w2 * w2
 
 
 def _smaller_eigenvalue(m11: FloatArray, m12: FloatArray, m22: FloatArray) -> FloatArray:
