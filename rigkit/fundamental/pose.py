@@ -1,0 +1,81 @@
+"""From an essential matrix to the relative pose, by cheirality along rays."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.arrays import FloatArray, Mat3, Rays
+from rigkit.errors import DegenerateError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import log_so3, skew
+from rigkit.geometry.triangulation import ray_ranges
+from rigkit.posetype import PoseType
+
+__all__ = ["choose_pose", "decompose_essential", "essential_from_pose", "hypothesis_poses", "translation_basis"]
+
+
+def essential_from_pose(cam2_from_cam1: Rigid3) -> Mat3:
+    """Return E21 = [t]x R with unit Frobenius norm; raises DegenerateError without a baseline."""
+    E21 = skew(cam2_from_cam1.translation_mm) @ cam2_from_cam1.rotation
+    size = float(np.linalg.norm(E21))
+    if size == 0.0:
+        raise DegenerateError("no baseline: the pose has a zero translation and no epipolar geometry")
+    return np.asarray(E21 / size)
+
+
+def decompose_essential(E21: Mat3) -> tuple[Rigid3, Rigid3, Rigid3, Rigid3]:
+    """Return the four poses cam2_from_cam1 (unit baseline) whose essential matrix is `E21` up to sign."""
+    u, _, vt = np.linalg.svd(E21)
+    u, vt = u * np.linalg.det(u), vt * np.linalg.det(vt)
+    W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    first, second, t = u @ W @ vt, u @ W.T @ vt, u[:, 2]
+    return Rigid3(first, t), Rigid3(first, -t), Rigid3(second, t), Rigid3(second, -t)
+
+
+def hypothesis_poses(E21: Mat3, pose_type: PoseType | str = PoseType.GENERAL) -> tuple[Rigid3, ...]:
+    """Return the poses of `E21` that the pose type allows: four in general.
+
+    The second rotation differs from the first by half a turn about the baseline. It is no rotation about the vertical
+    axis if the first one is: planar motion keeps two poses, and without rotation two are kept as well.
+    """
+    poses = decompose_essential(E21)
+    if str(pose_type) == PoseType.GENERAL:
+        return poses
+    if str(pose_type) == PoseType.PLANAR:
+        off = [float(np.linalg.norm(pose.rotation[:, 1] - [0.0, 1.0, 0.0])) for pose in poses]
+    else:
+        off = [float(np.linalg.norm(log_so3(pose.rotation))) for pose in poses]
+    nearest = min(off[0], off[2])
+    return tuple(pose for pose, value in zip(poses, off, strict=True) if value <= nearest + 1e-6)
+
+
+def choose_pose(E21: Mat3, rays1: Rays, rays2: Rays, pose_type: PoseType | str = PoseType.GENERAL) -> Rigid3:
+    """Return the pose (unit baseline) that puts most points at a positive range along both rays.
+
+    Raises DegenerateError where no pose puts more than half of the points there, or two do so equally (points at
+    infinity, no baseline).
+    """
+    poses = hypothesis_poses(E21, pose_type)
+    counts = [_in_front(pose, rays1, rays2) for pose in poses]
+    order = sorted(range(len(poses)), key=counts.__getitem__, reverse=True)
+    best, second = counts[order[0]], counts[order[1]]
+    if best <= 0.5 * len(rays1) or best == second:
+        raise DegenerateError(
+            f"cheirality does not decide the pose: the best two hypotheses put {best} and {second} of {len(rays1)} "
+            "points in front of both cameras; check that the two images are matched rightly and have a baseline"
+        )
+    return poses[order[0]]
+
+
+def _in_front(pose: Rigid3, rays1: Rays, rays2: Rays) -> int:
+    range1, range2, defined = ray_ranges(rays1, rays2, pose)
+    return int((defined & (np.nan_to_num(range1) > 0.0) & (np.nan_to_num(range2) > 0.0)).sum())
+
+
+def translation_basis(direction: FloatArray) -> FloatArray:
+    """Return two unit vectors (2, 3) perpendicular to `direction` and to each other; the first is horizontal."""
+    t = np.asarray(direction, dtype=np.float64)
+    first = np.array([t[2], 0.0, -t[0]])
+    size = np.linalg.norm(first)
+    first = first / size if size > 1e-9 else np.array([1.0, 0.0, 0.0])
+    return np.stack([first, np.cross(t, first)])

@@ -1,0 +1,37 @@
+"""Solvers of the epipolar geometry by pose type."""
+
+from __future__ import annotations
+
+from rigkit.errors import InputError
+from rigkit.fundamental.estimate import FundamentalSolver
+from rigkit.fundamental.forward import ForwardSolver
+from rigkit.fundamental.general import GeneralSolver
+from rigkit.fundamental.planar import PlanarSolver
+from rigkit.fundamental.standard import StandardSolver
+from rigkit.fundamental.translation import TranslationSolver
+
+__all__ = ["SOLVERS", "fundamental_for"]
+
+SOLVERS: dict[str, FundamentalSolver] = {
+    "general": GeneralSolver(),
+    "planar": PlanarSolver(),
+    "standard": StandardSolver(),
+    "forward": ForwardSolver(),
+    "translation": TranslationSolver(),
+}
+
+
+def fundamental_for(pose_type: str, *, motion: str | None = None) -> FundamentalSolver:
+    """Return the solver for a pose type.
+
+    `motion` overrides the solver, not the pose type: motion="planar" runs the planar solver on standard and forward
+    pairs too, as the paper does. Raises InputError for an unknown name; "auto" has to be decided first (select).
+
+    >>> fundamental_for("planar").degrees_of_freedom
+    2
+    """
+    name = str(motion or pose_type)
+    if name not in SOLVERS:
+        hint = "; decide it with pose_type_evidence first" if name == "auto" else ""
+        raise InputError(f"no epipolar solver is called '{name}'; known: {', '.join(sorted(SOLVERS))}{hint}")
+    return SOLVERS[name]
