@@ -37,8 +37,8 @@ class ShapeModel:
     ----------
     kind : "flat", "warp" or "released".
     flat : (M, 3) mm, the boards as measured.
-    basis : (M, 3, B) mm per unknown; B = 0 for flat, and for released, where the basis is the identity.
-    sigma : prior standard deviation of each unknown: (B,), or (3 M,) mm for released.
+    basis : (M, 3, B) mm per unknown of the warp; B = 0 for flat.
+    sigma : prior standard deviation of each unknown: B of the warp, then, for released boards, 3 M in mm.
     """
 
     kind: str
@@ -53,22 +53,24 @@ class ShapeModel:
 
     def points(self, unknowns: FloatArray) -> Points:
         """Return the board points, (M, 3) mm."""
-        if self.kind == "released":
-            return self.flat + unknowns.reshape(-1, 3)
-        return self.flat + self.basis @ unknowns
+        count = self.basis.shape[-1]
+        points = self.flat + self.basis @ unknowns[:count]
+        return points + unknowns[count:].reshape(-1, 3) if self.kind == "released" else points
 
 
 def shape_model(kind: str, observations: Observations) -> ShapeModel:
     """Return the shape model `kind` for the boards of the observations."""
     flat = observations.table()
+    if kind == "flat":
+        return ShapeModel("flat", flat, np.zeros((len(flat), 3, 0)), np.zeros(0))
+    warp = _warp(observations, flat)
     if kind == "warp":
-        return _warp(observations, flat)
-    if kind == "released":
-        unit = np.array([RELEASED_SIGMA_XY, RELEASED_SIGMA_XY, RELEASED_SIGMA_Z])
-        size = [np.full(len(points), _half_diagonal(points)) for points in _per_board(observations, flat)]
-        sigma = (np.concatenate(size)[:, None] * unit).reshape(-1)
-        return ShapeModel(kind, flat, np.zeros((len(flat), 3, 0)), sigma)
-    return ShapeModel("flat", flat, np.zeros((len(flat), 3, 0)), np.zeros(0))
+        return warp
+    # Released corners move against a warp: a bow costs a few numbers, not the prior of every corner.
+    unit = np.array([RELEASED_SIGMA_XY, RELEASED_SIGMA_XY, RELEASED_SIGMA_Z])
+    size = [np.full(len(points), _half_diagonal(points)) for points in _per_board(observations, flat)]
+    released = (np.concatenate(size)[:, None] * unit).reshape(-1)
+    return ShapeModel("released", flat, warp.basis, np.concatenate([warp.sigma, released]))
 
 
 def _per_board(observations: Observations, table: Points) -> list[Points]:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, Mat3, Points
+from rigkit.arrays import BoolArray, FloatArray, IntArray, Mat3, Points
 from rigkit.calibration.normal import Normal, normal_equations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Convergence
@@ -52,7 +52,7 @@ class State:
         """Return the state with flat boards."""
         return cls(camera, rotation, translation_mm, shape_model("flat", observations), np.zeros(0))
 
-    def subset(self, chosen: FloatArray) -> State:
+    def subset(self, chosen: IntArray) -> State:
         """Return the state of the views `chosen`."""
         return replace(self, rotation=self.rotation[chosen], translation_mm=self.translation_mm[chosen])
 

@@ -1,0 +1,123 @@
+"""Putting a solved model together as a result: residuals, covariances, outliers, verdicts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.arrays import FloatArray
+from rigkit.calibration.fit import Fit, rms
+from rigkit.calibration.normal import Normal, normal_equations
+from rigkit.calibration.observations import Observations
+from rigkit.calibration.result import BoardShape, Calibration, Candidate, Outlier, ViewResult
+from rigkit.calibration.solver import State, evaluate
+from rigkit.errors import DegenerateError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import skew
+
+__all__ = ["assemble", "solution_normal"]
+
+FOCAL_UNKNOWN = 0.3
+"""A focal length known to 30 % only is not known: the views leave it open."""
+LEAST_SIGMA_PX = 0.02
+"""No corner is better than this: keeps data without noise from looking determined by rounding."""
+
+
+def assemble(
+    observations: Observations,
+    fit: Fit,
+    heldout_px: float | None,
+    dropped: tuple[tuple[str, str], ...],
+    candidates: tuple[Candidate, ...],
+) -> Calibration:
+    """Return the result; raises DegenerateError where the views leave the focal length open."""
+    state = fit.state
+    sigma = fit.sigma_px if np.isfinite(fit.sigma_px) else 0.0
+    covariance = frame_covariance(solution_normal(observations, fit), state)
+    _require_focal(state, covariance * max(sigma, LEAST_SIGMA_PX) ** 2)
+    residuals = evaluate(state, observations)
+    px = np.where(residuals.valid[..., None], residuals.px, np.nan)
+    views, outliers = [], []
+    for i, view in enumerate(observations.views):
+        n = len(view.grid)
+        kept = fit.kept[i, :n]
+        pose = Rigid3(state.rotation[i], state.translation_mm[i])
+        views.append(ViewResult(view.image, view.board.board_id, pose, view.grid, view.pixels, px[i, :n], kept))
+        for j in np.flatnonzero(~kept):
+            column, row = view.grid[j]
+            length = float(np.linalg.norm(px[i, j]))
+            outliers.append(Outlier(view.image, view.board.board_id, int(column), int(row), length))
+    p = state.camera.parameters.size
+    return Calibration(
+        camera=state.camera,
+        rms_px=rms(state, observations, fit.kept),
+        heldout_rms_px=heldout_px,
+        covariance=covariance[:p, :p] * sigma**2,
+        frame_covariance=covariance * sigma**2,
+        sigma_px=sigma,
+        views=tuple(views),
+        dropped=dropped,
+        outliers=tuple(outliers),
+        candidates=candidates,
+        convergence=fit.convergence,
+        boards=_boards(observations, state),
+    )
+
+
+def solution_normal(observations: Observations, fit: Fit) -> Normal:
+    """Return the normal equations at the solution, in px^-2, priors of the shape included."""
+    state = fit.state
+    points, lever = state.points_in_cam(observations)
+    weight = fit.weight(observations)
+    normal = normal_equations(state.camera, points, lever, state.rotation, state.shape, observations, weight, None)
+    sigma = fit.sigma_px if np.isfinite(fit.sigma_px) else 1.0
+    return normal.with_prior((sigma / state.shape.sigma) ** 2, state.unknowns)
+
+
+def frame_covariance(normal: Normal, state: State) -> FloatArray:
+    """Return the covariance, for unit residuals, of the P parameters and of the mean motion of the boards (w, t).
+
+    With p_v = (dw_v, dt_v) a point x in the camera frame moves by dw_v x (x - t_v) + dt_v if it sticks to board v; on
+    average over the boards by W x x + T, W = mean dw_v and T = mean (dt_v + t_v x dw_v).
+    """
+    p = state.camera.parameters.size
+    globals_, back, own = normal.covariance()
+    used = np.einsum("vii->v", normal.pp) > 0.0
+    lever = np.zeros((len(used), 6, 6))
+    lever[:, :3, :3] = lever[:, 3:, 3:] = np.eye(3)
+    lever[:, 3:, :3] = skew(state.translation_mm)
+    lever = lever[used] / max(int(used.sum()), 1)
+    through = np.einsum("vij,vjg->ig", lever, back[used])
+    spread = np.einsum("vij,vjk,vlk->il", lever, own[used], lever)
+    chosen = globals_[:p]
+    out = np.empty((p + 6, p + 6))
+    out[:p, :p] = chosen[:, :p]
+    out[:p, p:] = -(chosen @ through.T)
+    out[p:, :p] = out[:p, p:].T
+    out[p:, p:] = through @ globals_ @ through.T + spread
+    return 0.5 * (out + out.T)
+
+
+def _require_focal(state: State, covariance: FloatArray) -> None:
+    """Raise DegenerateError where the scale of the image is not determined."""
+    camera = state.camera
+    _, _, by_point, by_parameter = camera.project_with_jacobians(np.array([0.02, 0.0, 1.0]))
+    p = camera.parameters.size
+    centre = camera.project_with_jacobians(np.array([0.0, 0.0, 1.0]))[3]
+    change = (by_parameter - centre)[0] / 0.02
+    sigma = float(np.sqrt(max(change @ covariance[:p, :p] @ change, 0.0)))
+    if not sigma < FOCAL_UNKNOWN * abs(float(by_point[0, 0])):
+        raise DegenerateError(
+            "calibration: the views leave the focal length open (all boards nearly parallel to the image, or too few "
+            "corners); take views in which the board is tilted by 20 to 50 degrees in several directions"
+        )
+
+
+def _boards(observations: Observations, state: State) -> tuple[BoardShape, ...]:
+    points = state.shape.points(state.unknowns)
+    out = []
+    for i, board in enumerate(observations.boards):
+        own = points[observations.first_row[i] : observations.first_row[i + 1]]
+        centred = own - own.mean(axis=0)
+        normal = np.linalg.svd(centred, full_matrices=False)[2][2]
+        out.append(BoardShape(board.board_id, state.shape.kind, own, float(np.abs(centred @ normal).max())))
+    return tuple(out)

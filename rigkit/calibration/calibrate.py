@@ -1,0 +1,212 @@
+"""Calibrating one camera from views of chessboards, without any guess.
+
+Every model (degree, board shape) in question is fitted; what is chosen is the one with the fewest numbers among those
+whose held-out error is the smallest but for a stated margin. All are compared on the same corners.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rigkit.arrays import BoolArray
+from rigkit.calibration.assemble import assemble
+from rigkit.calibration.fit import Fit, fit_kept, fit_model, heldout_rms, rms, robust_sigma
+from rigkit.calibration.observations import Observations
+from rigkit.calibration.result import Calibration, Candidate
+from rigkit.calibration.shape import SHAPES, shape_model
+from rigkit.calibration.usable import usable_views
+from rigkit.cameras.base import Camera
+from rigkit.cameras.registry import MODELS, camera_model
+from rigkit.detections import BoardView
+from rigkit.errors import DegenerateError, InputError
+from rigkit.progress import Progress, silent
+
+__all__ = ["DEGREES_TRIED", "calibrate"]
+
+FOLDS = 5
+MARGIN = 0.005
+"""A model with more numbers must lower the held-out error by this part to be chosen."""
+SHAPE_MARGIN = 0.02
+"""The same for the boards' shape: releasing them must pay."""
+COMPARABLE = 1.5
+"""Corners are outliers only if every model with a scatter within this factor of the best one says so."""
+MIN_KEPT_SHARE = 0.5
+"""A view in which fewer of the corners agree with the other views is dropped."""
+DEGREES_TRIED: dict[str, tuple[int | None, ...]] = {"scaramuzza": (4, 5, 6, 7, 8), "brown": (5,)}
+"""Sizes tried of models that come in several, where none is asked for."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Option:
+    """A model in the running."""
+
+    name: str
+    fit: Fit
+    heldout_px: float | None = None
+
+    @property
+    def count(self) -> int:
+        return int(self.fit.state.camera.parameters.size + self.fit.state.shape.count)
+
+
+def calibrate(
+    views: Sequence[BoardView],
+    size_px: tuple[int, int],
+    *,
+    model: str = "scaramuzza",
+    degree: int | None = None,
+    board: str = "auto",
+    folds: int = FOLDS,
+    progress: Progress = silent,
+) -> Calibration:
+    """Return the calibration of a camera from views of boards.
+
+    Parameters
+    ----------
+    views : boards as they were seen; several boards in one image are several views of one image name.
+    size_px : (width, height) of the images.
+    model : name of a camera model, or "auto": all of them, chosen by held-out error.
+    degree : size of a model that comes in several (degree of "scaramuzza", terms of "brown"); by default chosen by
+        held-out error.
+    board : "flat", "warp", "released", or "auto": chosen by held-out error.
+    folds : of the cross-validation over images; 0 for none (choices then rest on BIC).
+    progress : told of the models tried.
+
+    Raises
+    ------
+    InputError
+        No view, corners outside the image, unknown model or board shape.
+    DegenerateError
+        The views do not determine the camera.
+    """
+    if board not in (*SHAPES, "auto"):
+        raise InputError(f"board shape '{board}' is unknown; known: auto, {', '.join(SHAPES)}")
+    wanted = _wanted(model, degree)
+    used, dropped = usable_views(views, size_px)
+    observations = Observations.from_views(used)
+    options, failed = _fit_all(observations, size_px, wanted, progress)
+    keep, reasons = _agreeing(observations, options)
+    if reasons:
+        dropped = (*dropped, *reasons)
+        observations = observations.subset(np.flatnonzero(keep))
+        options, failed = _fit_all(observations, size_px, wanted, progress)
+    options = _compared(observations, options, folds, progress)
+    chosen = _choose(observations, options, MARGIN)
+    candidates = [*_described(observations, options, chosen, MARGIN), *failed]
+    if board != "flat":
+        shapes = _shapes(observations, chosen, SHAPES[1:] if board == "auto" else (board,), folds, progress)
+        if board == "auto":
+            shapes = [chosen, *shapes]
+        chosen = _choose(observations, shapes, SHAPE_MARGIN)
+        candidates += [c for c in _described(observations, shapes, chosen, SHAPE_MARGIN) if "board" in c.name]
+    return assemble(observations, chosen.fit, chosen.heldout_px, dropped, tuple(candidates))
+
+
+def _wanted(model: str, degree: int | None) -> list[tuple[str, type[Camera], int | None]]:
+    names = list(MODELS) if model == "auto" else [model]
+    out: list[tuple[str, type[Camera], int | None]] = []
+    for name in names:
+        cls = camera_model(name)
+        orders = (degree,) if degree is not None else DEGREES_TRIED.get(name, (None,))
+        out += [(name if order is None else f"{name} {order}", cls, order) for order in orders]
+    return out
+
+
+def _fit_all(
+    observations: Observations,
+    size_px: tuple[int, int],
+    wanted: Sequence[tuple[str, type[Camera], int | None]],
+    progress: Progress,
+) -> tuple[list[_Option], list[Candidate]]:
+    options: list[_Option] = []
+    failed: list[Candidate] = []
+    error: Exception | None = None
+    for i, (name, cls, order) in enumerate(wanted):
+        progress("models", i, len(wanted))
+        try:
+            options.append(_Option(name, fit_model(observations, size_px, cls, order)))
+        except (DegenerateError, InputError) as caught:
+            error = caught
+            failed.append(Candidate(name, 0, float("nan"), None, False, str(caught)))
+    progress("models", len(wanted), len(wanted))
+    if not options:
+        assert error is not None
+        raise error
+    return options, failed
+
+
+def _agreeing(observations: Observations, options: list[_Option]) -> tuple[BoolArray, tuple[tuple[str, str], ...]]:
+    """Return which views to keep, and the reason for each that goes, judged by the model with the least scatter."""
+    best = min(options, key=lambda o: robust_sigma(o.fit.state, observations))
+    kept = best.fit.kept.sum(axis=1)
+    total = observations.present.sum(axis=1)
+    keep = kept >= np.maximum(MIN_KEPT_SHARE * total, 4)
+    reasons = tuple(
+        (view.image, f"only {k} of {n} corners of board '{view.board.board_id}' agree with the other views")
+        for view, k, n, ok in zip(observations.views, kept, total, keep, strict=True)
+        if not ok
+    )
+    if not keep.any():
+        raise DegenerateError("calibration: no view agrees with the others; check the board's size and the images")
+    return keep, reasons
+
+
+def _compared(observations: Observations, options: list[_Option], folds: int, progress: Progress) -> list[_Option]:
+    """Return the options refitted to the same corners, with their held-out errors."""
+    sigma = [robust_sigma(o.fit.state, observations) for o in options]
+    near = [o.fit.kept for o, s in zip(options, sigma, strict=True) if s <= COMPARABLE * min(sigma)]
+    kept = np.any(near, axis=0)
+    out = []
+    for i, option in enumerate(options):
+        progress("cross-validation", i, len(options))
+        fit = option.fit if (option.fit.kept == kept).all() else fit_kept(observations, option.fit.state, kept)
+        out.append(replace(option, fit=fit, heldout_px=heldout_rms(observations, fit, folds)))
+    progress("cross-validation", len(options), len(options))
+    return out
+
+
+def _shapes(
+    observations: Observations, flat: _Option, kinds: Sequence[str], folds: int, progress: Progress
+) -> list[_Option]:
+    options = []
+    for kind in kinds:
+        shape = shape_model(kind, observations)
+        start = replace(flat.fit.state, shape=shape, unknowns=np.zeros(shape.count))
+        options.append(_Option(f"board {kind}", fit_kept(observations, start, flat.fit.kept, settle=True)))
+    return _compared(observations, options, folds, progress)
+
+
+def _choose(observations: Observations, options: list[_Option], margin: float) -> _Option:
+    """Return the option with the fewest numbers among those within `margin` of the smallest held-out error; with too
+    few images for that, the one with the smallest BIC."""
+    judged = [(o.heldout_px, o) for o in options if o.heldout_px is not None]
+    if not judged:
+        return min(options, key=lambda o: _bic(observations, o))
+    limit = min(error for error, _ in judged) * (1.0 + margin)
+    return min((o for error, o in judged if error <= limit), key=lambda o: o.count)
+
+
+def _bic(observations: Observations, option: _Option) -> float:
+    """Return Schwarz's criterion, n log(mean squared residual) + parameters log n."""
+    n = 2 * int(option.fit.kept.sum())
+    error = rms(option.fit.state, observations, option.fit.kept)
+    return float(n * np.log(error**2 + np.finfo(float).tiny) + option.count * np.log(n))
+
+
+def _described(observations: Observations, options: list[_Option], chosen: _Option, margin: float) -> list[Candidate]:
+    out = []
+    for o in options:
+        if len(options) == 1:
+            reason = "the only one tried"
+        elif o.heldout_px is None or chosen.heldout_px is None:
+            reason = "too few images to cross-validate: " + ("smallest BIC" if o is chosen else "larger BIC")
+        elif o is chosen:
+            reason = f"fewest numbers within {100 * margin:g} % of the smallest held-out error"
+        else:
+            reason = f"held-out error {100.0 * (o.heldout_px / chosen.heldout_px - 1.0):+.1f} % against the chosen one"
+        error = rms(o.fit.state, observations, o.fit.kept)
+        out.append(Candidate(o.name, o.count, error, o.heldout_px, o is chosen, reason))
+    return out

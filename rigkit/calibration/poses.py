@@ -1,0 +1,101 @@
+"""Poses of boards under a camera that stays as it is: every view is a problem of its own, all are solved at once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from rigkit.arrays import FloatArray
+from rigkit.calibration.normal import normal_equations
+from rigkit.calibration.observations import Observations
+from rigkit.calibration.radial_alignment import align
+from rigkit.calibration.solver import State, evaluate
+from rigkit.geometry.rotation import exp_so3, nearest_rotation
+
+__all__ = ["find_poses", "refine_poses"]
+
+MAX_ITERATIONS = 40
+TOLERANCE = 1e-10
+DAMPING_START = 1e-6
+
+
+def refine_poses(
+    observations: Observations, state: State, weight: FloatArray, loss_px: float | None = None
+) -> tuple[State, FloatArray]:
+    """Return the state with each view's pose at its own minimum, and each view's cost (V,) in px^2.
+
+    Levenberg-Marquardt with a damping of its own for each view. `loss_px` is the scale of the Cauchy loss.
+    """
+
+    def costs(s: State) -> FloatArray:
+        squared = (evaluate(s, observations).px ** 2).sum(axis=-1) * weight**2
+        if loss_px is not None:
+            squared = loss_px**2 * np.log1p(squared / loss_px**2)
+        return np.asarray(squared.sum(axis=-1))
+
+    cost = costs(state)
+    damping = np.full(len(cost), DAMPING_START)
+    active = np.ones(len(cost), dtype=bool)
+    for _ in range(MAX_ITERATIONS):
+        points, lever = state.points_in_cam(observations)
+        normal = normal_equations(
+            state.camera, points, lever, state.rotation, state.shape, observations, weight, loss_px
+        )
+        diagonal = np.diagonal(normal.pp, axis1=-2, axis2=-1)
+        diagonal = np.where(diagonal > 0.0, diagonal, 1.0)
+        damped = normal.pp + (damping[:, None] * diagonal)[..., None] * np.eye(6)
+        step: FloatArray = np.asarray(np.linalg.solve(damped, normal.p[..., None])[..., 0] * active[:, None], float)
+        predicted = (step * (damping[:, None] * diagonal * step + normal.p)).sum(axis=-1)
+        trial = replace(
+            state,
+            rotation=exp_so3(step[:, :3]) @ state.rotation,
+            translation_mm=state.translation_mm + step[:, 3:],
+        )
+        trial_cost = costs(trial)
+        better = active & (trial_cost < cost)
+        state = replace(
+            state,
+            rotation=np.where(better[:, None, None], trial.rotation, state.rotation),
+            translation_mm=np.where(better[:, None], trial.translation_mm, state.translation_mm),
+        )
+        active &= (predicted > TOLERANCE * cost) & (damping < 1e10)
+        cost = np.where(better, trial_cost, cost)
+        damping = np.where(better, damping * 0.1, damping * 10.0)
+        if not active.any():
+            break
+    return state, cost
+
+
+def find_poses(observations: Observations, state: State, weight: FloatArray, loss_px: float | None) -> State:
+    """Return the state with every pose found anew from its corners: radial alignment around the camera's centre, both
+    signs of the tilt refined, and the pose in `state` as a third start; the cheapest of the three wins."""
+    centre, _ = state.camera.project(np.array([0.0, 0.0, 1.0]))
+    board = observations.table()[observations.corner][..., :2]
+    alignment = align(observations.pixels - centre, board, weight)
+    rays, seen = state.camera.unproject(observations.pixels)
+    s = np.linalg.norm(alignment.camera_xy(board), axis=-1)
+    across = np.maximum(np.linalg.norm(rays[..., :2], axis=-1), 1e-9)
+    z = np.where(seen, s * rays[..., 2] / across, 0.0)
+    share = np.where(seen, alignment.weight * across**2, 0.0)
+    total = np.maximum(share.sum(axis=1), 1e-12)
+    best, cost = refine_poses(observations, state, weight, loss_px)
+    for sign in (1.0, -1.0):
+        tilt = sign * alignment.tilt
+        t3 = (share * (z - (board @ tilt[..., None])[..., 0])).sum(axis=1) / total
+        columns = np.concatenate([alignment.rows[..., :2], tilt[:, None, :]], axis=1)
+        third = np.cross(columns[..., 0], columns[..., 1])
+        start = replace(
+            state,
+            rotation=nearest_rotation(np.concatenate([columns, third[..., None]], axis=-1)),
+            translation_mm=np.concatenate([alignment.rows[..., 2], t3[:, None]], axis=-1),
+        )
+        found, found_cost = refine_poses(observations, start, weight, loss_px)
+        wins = found_cost < cost
+        best = replace(
+            best,
+            rotation=np.where(wins[:, None, None], found.rotation, best.rotation),
+            translation_mm=np.where(wins[:, None], found.translation_mm, best.translation_mm),
+        )
+        cost = np.where(wins, found_cost, cost)
+    return best

@@ -1,0 +1,58 @@
+"""Which views a calibration can use at all, and why not the others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rigkit.detections import BoardView
+from rigkit.errors import InputError
+
+__all__ = ["MIN_CORNERS", "usable_views"]
+
+MIN_CORNERS = 6
+"""A pose has six numbers: fewer than six corners leave hardly anything to check it by."""
+MIN_SPREAD = 1e-3
+"""Corners of a row only: their second extent, as a part of the first, is rounding."""
+
+
+def usable_views(
+    views: Sequence[BoardView], size_px: tuple[int, int]
+) -> tuple[list[BoardView], tuple[tuple[str, str], ...]]:
+    """Return the views with enough corners, and (image, reason) of the others.
+
+    Raises InputError where no view is left, or corners lie outside the image: then the images are of another size.
+    """
+    if not views:
+        raise InputError("calibration: no views; at least one image in which a board was found is needed")
+    outside = [view.image for view in views if not _inside(view, size_px)]
+    if outside:
+        more = f" and {len(outside) - 1} more" if len(outside) > 1 else ""
+        raise InputError(
+            f"image '{outside[0]}'{more}: corners outside {size_px[0]}x{size_px[1]} px; all images of a session must "
+            "have that size"
+        )
+    used, dropped = [], []
+    for view in views:
+        reason = _reason(view)
+        if reason is None:
+            used.append(view)
+        else:
+            dropped.append((view.image, reason))
+    if not used:
+        raise InputError(f"calibration: none of {len(views)} views can be used; the first: {dropped[0][1]}")
+    return used, tuple(dropped)
+
+
+def _inside(view: BoardView, size_px: tuple[int, int]) -> bool:
+    return bool(((view.pixels >= -0.5) & (view.pixels <= np.array(size_px) - 0.5)).all())
+
+
+def _reason(view: BoardView) -> str | None:
+    if len(view.grid) < MIN_CORNERS:
+        return f"{len(view.grid)} corners of board '{view.board.board_id}', at least {MIN_CORNERS} are needed"
+    extent = np.linalg.svd(view.grid - view.grid.mean(axis=0), compute_uv=False)
+    if extent[1] < MIN_SPREAD * extent[0]:
+        return f"the corners of board '{view.board.board_id}' lie on one line"
+    return None
