@@ -18,6 +18,7 @@ from rigkit.errors import RigkitError
 __all__ = ["VERBS", "main"]
 
 VERBS: dict[str, tuple[str, str]] = {
+    "detect": ("rigkit.cli.detect", "corners of every chessboard in the images"),
     "board": ("rigkit.cli.board", "a board to print, true to scale"),
 }
 """Verb -> (module, one-line help)."""

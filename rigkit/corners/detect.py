@@ -43,7 +43,7 @@ def detect_boards(
 
     Parameters
     ----------
-    image : (H, W) or (H, W, 3 or 4), uint8 or uint16 (or float 0..255), grey or BGR.
+    image : (H, W) or (H, W, 3 or 4), uint8 or uint16 (or float 0..255), grey or RGB.
     boards : what may be in the image, if known. A grid of a board's size, either way round, is turned to its columns x
         rows. A board is named only where one single given board has that size and one single detection fits it.
     min_corners : boards with fewer corners are not reported.

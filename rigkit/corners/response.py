@@ -69,7 +69,7 @@ class Level:
 
 
 def grey_image(image: NDArray[np.generic]) -> FloatImage:
-    """Return an 8- or 16-bit, grey or BGR(A) image as grey float32, 0..255.
+    """Return an 8- or 16-bit, grey or RGB(A) image as grey float32, 0..255.
 
     16-bit images are scaled by their own brightest value (the 99.9 % quantile), because 10- and 12-bit sensors do not
     fill the range. Floating-point images are taken as 0..255 as they are.
@@ -91,7 +91,7 @@ def grey_image(image: NDArray[np.generic]) -> FloatImage:
     if array.dtype == np.float64:
         array = array.astype(np.float32)
     if array.ndim == 3:
-        array = cv2.cvtColor(array, cv2.COLOR_BGR2GRAY if array.shape[2] == 3 else cv2.COLOR_BGRA2GRAY)
+        array = cv2.cvtColor(array, cv2.COLOR_RGB2GRAY if array.shape[2] == 3 else cv2.COLOR_RGBA2GRAY)
     grey = np.ascontiguousarray(array, dtype=np.float32)
     if array.dtype == np.uint16:
         step = max(1, int(np.sqrt(grey.size / 1e5)))

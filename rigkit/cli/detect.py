@@ -1,0 +1,160 @@
+"""`rigkit detect`: every chessboard of every image, to a corners file and pictures."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rigkit.errors import CheckFailed, InputError
+
+if TYPE_CHECKING:
+    from rigkit.boards import Board
+    from rigkit.detections import BoardDetection
+
+HELP = "corners of every chessboard in the images, to a corners file and overlay pictures"
+
+IMAGE_ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("images", nargs="+", metavar="IMAGE|FOLDER", help="images, or folders of images")
+    parser.add_argument(
+        "--board", action="append", default=[], metavar="BOARD.toml", help="a board that may be there; repeat for more"
+    )
+    parser.add_argument("-o", "--output", metavar="CORNERS.csv", help="write the corners file")
+    parser.add_argument("--overlay", metavar="DIR", help="write a picture of each image with its corners")
+    parser.add_argument("--min-corners", type=int, default=12, metavar="N", help="smallest board reported (12)")
+    parser.add_argument("--jobs", type=int, metavar="N", help="processes (default: one a processor)")
+    parser.add_argument("--force", action="store_true", help="replace existing files")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    from rigkit.cli.console import print_json
+    from rigkit.io.board_file import load_board
+    from rigkit.io.corners_file import write_corners
+    from rigkit.io.files import ensure_writable
+
+    if args.min_corners < 9:
+        raise InputError(
+            f"--min-corners {args.min_corners}: a chessboard of less than 3x3 corners cannot be told apart"
+        )
+    if args.jobs is not None and args.jobs < 1:
+        raise InputError(f"--jobs {args.jobs}: at least one process is needed")
+    images = list(_images(args.images))
+    boards = [load_board(path) for path in args.board]
+    overlays = _overlay_paths(images, args.overlay)
+    ensure_writable([*([args.output] if args.output else []), *filter(None, overlays)], force=args.force)
+    found = _detect_all(images, overlays, boards, args)
+    if not any(found.values()):
+        raise CheckFailed(f"no chessboard found in {len(images)} images; check focus and exposure, or --min-corners")
+    if args.output:
+        write_corners(args.output, found, force=args.force)
+    if args.json:
+        print_json({image: [_summary(item) for item in items] for image, items in found.items()})
+        return 0
+    for image, items in found.items():
+        print(f"{image}: " + (", ".join(_words(item) for item in items) or "no board"))
+    missing = sum(not items for items in found.values())
+    print(f"{sum(map(len, found.values()))} boards in {len(images) - missing} of {len(images)} images")
+    return 0
+
+
+def _images(paths: list[str]) -> Iterator[Path]:
+    seen: set[Path] = set()
+    for name in paths:
+        path = Path(name)
+        inside = [path]
+        if path.is_dir():
+            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in IMAGE_ENDINGS)
+            if not inside:
+                raise InputError(f"folder '{path}' has no images ({' '.join(sorted(IMAGE_ENDINGS))}); give another")
+        elif not path.exists():
+            raise InputError(f"image '{path}' does not exist; check the path")
+        for image in inside:
+            if image not in seen:
+                seen.add(image)
+                yield image
+
+
+def _overlay_paths(images: list[Path], folder: str | None) -> list[Path | None]:
+    """Return where each overlay goes; images of one name in several folders get their folder's name as well."""
+    if folder is None:
+        return [None] * len(images)
+    common = Counter(image.stem for image in images)
+    names = [image.stem if common[image.stem] == 1 else "_".join(image.with_suffix("").parts[-3:]) for image in images]
+    if len(set(names)) < len(names):
+        raise InputError("--overlay: several images would get the same picture name; run the folders one by one")
+    return [Path(folder) / f"{name}.png" for name in names]
+
+
+def _detect_all(
+    images: list[Path], overlays: list[Path | None], boards: list[Board], args: argparse.Namespace
+) -> dict[str, tuple[BoardDetection, ...]]:
+    """Return the detections per image in the order of `images`, whatever the number of processes."""
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    from rigkit.cli.console import progress_on_stderr
+
+    progress = progress_on_stderr()
+    tasks = [
+        (image, overlay, boards, args.min_corners, args.force) for image, overlay in zip(images, overlays, strict=True)
+    ]
+    jobs = min(args.jobs or os.cpu_count() or 1, len(images))
+    found: dict[str, tuple[BoardDetection, ...]] = {}
+
+    def collect(results: Any) -> None:
+        for image, result in zip(images, results, strict=True):
+            found[str(image)] = result
+            progress("detecting", len(found), len(images))
+
+    if jobs == 1:
+        collect(map(detect_one, tasks))
+    else:
+        # "spawn": a fork after OpenCV has started its threads can hang.
+        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+            collect(pool.map(detect_one, tasks, chunksize=max(1, min(8, len(tasks) // (4 * jobs)))))
+    return found
+
+
+def detect_one(task: tuple[Path, Path | None, list[Board], int, bool]) -> tuple[BoardDetection, ...]:
+    """Detect the boards of one image and write its overlay; at module level for other processes to find."""
+    import cv2
+
+    from rigkit.corners.detect import detect_boards
+    from rigkit.io.files import write_atomic
+    from rigkit.io.images import read_image
+    from rigkit.report.overlay import draw_boards
+
+    path, overlay, boards, min_corners, force = task
+    cv2.setNumThreads(1)
+    image = read_image(path)
+    found = detect_boards(image, boards, min_corners=min_corners)
+    if overlay is not None:
+        picture = cv2.cvtColor(draw_boards(image, found), cv2.COLOR_RGB2BGR)
+        write_atomic(overlay, cv2.imencode(".png", picture)[1].tobytes(), force=force)
+    return found
+
+
+def _words(found: BoardDetection) -> str:
+    import numpy as np
+
+    name = f"{found.board_id} " if found.board_id else ""
+    sigma = float(np.median(found.sigma_px))
+    return f"{name}{found.columns}x{found.rows} {len(found.grid)} corners +-{sigma:.3f} px"
+
+
+def _summary(found: BoardDetection) -> dict[str, Any]:
+    return {
+        "board": found.board_id,
+        "columns": found.columns,
+        "rows": found.rows,
+        "grid": found.grid.tolist(),
+        "pixels": found.pixels.tolist(),
+        "sigma_px": found.sigma_px.tolist(),
+    }
