@@ -1,0 +1,45 @@
+"""Board files: a chessboard as a person measured it (schema "rigkit.board/1").
+
+::
+
+    schema = "rigkit.board/1"
+    columns = 9              # inner corners
+    rows = 6
+    square_mm = 30.0         # or square_x_mm and square_y_mm
+    square_sigma_mm = 0.05   # optional: how well it was measured
+    id = "a9x6_30"           # optional: by default the file's name
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rigkit.boards import Board
+from rigkit.io.toml_reader import read_toml
+
+__all__ = ["SCHEMA", "load_board"]
+
+SCHEMA = "rigkit.board/1"
+
+
+def load_board(path: str | Path) -> Board:
+    """Return the board that the file describes; its id is the file's name unless it says otherwise.
+
+    Raises InputError for a missing file, an unknown or missing key, or a value that makes no board.
+    """
+    table = read_toml(path, SCHEMA)
+    board_id = table.text("id", hint='id = "plane1"') if table.has("id") else Path(path).stem
+    columns = table.integer("columns", hint="columns = 9 (inner corners along x)", at_least=2)
+    rows = table.integer("rows", hint="rows = 6 (inner corners along y)", at_least=2)
+    both = "square_x_mm = 30.0 and square_y_mm = 30.0"
+    if table.has("square_x_mm") or table.has("square_y_mm"):
+        if table.has("square_mm"):
+            raise table.error("'square_mm' together with 'square_x_mm' or 'square_y_mm'; keep one of the two forms")
+        x, y = table.number("square_x_mm", hint=both), table.number("square_y_mm", hint=both)
+    else:
+        x = y = table.number("square_mm", hint="square_mm = 30.0 (measured with a ruler over many squares)")
+    sigma = None
+    if table.has("square_sigma_mm"):
+        sigma = table.number("square_sigma_mm", hint="square_sigma_mm = 0.05")
+    table.done()
+    return Board(board_id, columns, rows, x, y, sigma)

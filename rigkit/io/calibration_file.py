@@ -1,0 +1,203 @@
+"""Calibration files (JSON, schema "rigkit.calibration/1"): written by the program, read by everything else.
+
+A file with `schema` and `camera` alone is enough for `load_camera`: that is how other tools' cameras come in. Lengths are
+mm, pixels have (0, 0) at the centre of the top-left one, residuals are measured minus projected, NaN is null.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rigkit.arrays import FloatArray
+from rigkit.calibration.result import BoardShape, Calibration, Candidate, Convergence, Outlier, ViewResult
+from rigkit.cameras.base import Camera
+from rigkit.cameras.registry import camera_model
+from rigkit.errors import InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.io.files import write_atomic
+
+__all__ = ["SCHEMA", "load_calibration", "load_camera", "save_calibration", "save_camera"]
+
+SCHEMA = "rigkit.calibration/1"
+CAMERA_KEYS = {"model", "size_px", "parameters"}
+KEYS = {
+    "schema", "camera", "rms_px", "heldout_rms_px", "sigma_px", "covariance", "frame_covariance", "verdicts",
+    "candidates", "convergence", "dropped", "outliers", "boards", "views",
+}  # fmt: skip
+
+
+def save_calibration(path: str | Path, calibration: Calibration, *, force: bool = False) -> None:
+    """Write the calibration; raises InputError where the file exists and `force` is not set."""
+    c = calibration
+    data = {
+        "schema": SCHEMA,
+        "camera": _camera_out(c.camera),
+        "rms_px": c.rms_px,
+        "heldout_rms_px": c.heldout_rms_px,
+        "sigma_px": c.sigma_px,
+        "verdicts": list(c.verdicts),
+        "candidates": [asdict(v) for v in c.candidates],
+        "convergence": asdict(c.convergence),
+        "dropped": [list(v) for v in c.dropped],
+        "outliers": [asdict(v) for v in c.outliers],
+        "covariance": c.covariance.tolist(),
+        "frame_covariance": c.frame_covariance.tolist(),
+        "boards": [
+            {"board_id": b.board_id, "kind": b.kind, "bow_mm": b.bow_mm, "points_mm": b.points_mm.tolist()}
+            for b in c.boards
+        ],
+        "views": [_view_out(v) for v in c.views],
+    }
+    write_atomic(path, _dumps(data), force=force)
+
+
+def save_camera(path: str | Path, camera: Camera, *, force: bool = False) -> None:
+    """Write a camera without the calibration that it came from."""
+    write_atomic(path, _dumps({"schema": SCHEMA, "camera": _camera_out(camera)}), force=force)
+
+
+def load_camera(path: str | Path) -> Camera:
+    """Return the camera of a calibration file.
+
+    Raises InputError for a missing or damaged file, another schema, an unknown key or model, or wrong parameters.
+    """
+    data = _read(path)
+    return _camera_in(_field(data, "camera", path), path)
+
+
+def load_calibration(path: str | Path) -> Calibration:
+    """Return the whole calibration; raises InputError like `load_camera`, also where the file has the camera alone."""
+    data = _read(path)
+    missing = sorted(KEYS - set(data))
+    if missing:
+        raise InputError(f"'{path}': no {', '.join(missing)}: a camera without its calibration; calibrate again")
+    try:
+        return Calibration(
+            camera=_camera_in(data["camera"], path),
+            rms_px=float(data["rms_px"]),
+            heldout_rms_px=None if data["heldout_rms_px"] is None else float(data["heldout_rms_px"]),
+            covariance=_array(data["covariance"]),
+            frame_covariance=_array(data["frame_covariance"]),
+            sigma_px=float(data["sigma_px"]),
+            views=tuple(_view_in(v) for v in data["views"]),
+            dropped=tuple((str(image), str(reason)) for image, reason in data["dropped"]),
+            outliers=tuple(Outlier(**_finite(v)) for v in data["outliers"]),
+            candidates=tuple(Candidate(**_finite(v, ("rms_px",))) for v in data["candidates"]),
+            convergence=Convergence(**data["convergence"]),
+            boards=tuple(BoardShape(**v) for v in data["boards"]),
+            verdicts=tuple(str(v) for v in data["verdicts"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"'{path}': damaged ({error}); calibrate again") from error
+
+
+def _read(path: str | Path) -> dict[str, Any]:
+    source = Path(path)
+    try:
+        data = json.loads(source.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise InputError(f"calibration '{source}' does not exist; run `rigkit calibrate` first") from error
+    except OSError as error:
+        raise InputError(f"calibration '{source}' cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise InputError(f"'{source}': not a calibration file ({error}); calibrate again") from error
+    found = data.get("schema") if isinstance(data, dict) else None
+    if found != SCHEMA:
+        raise InputError(f"'{source}': schema is {found!r}, but a file with schema '{SCHEMA}' is needed here")
+    unknown = sorted(set(data) - KEYS)
+    if unknown:
+        raise InputError(f"'{source}': unknown key '{unknown[0]}'; known: {', '.join(sorted(KEYS))}")
+    return dict(data)
+
+
+def _field(data: dict[str, Any], key: str, path: str | Path) -> Any:
+    if key not in data:
+        raise InputError(f"'{path}': '{key}' is missing; calibrate again")
+    return data[key]
+
+
+def _camera_out(camera: Camera) -> dict[str, Any]:
+    values = dict(zip(camera.parameter_names(), camera.parameters.tolist(), strict=True))
+    return {"model": camera.model, "size_px": list(camera.size_px), "parameters": values}
+
+
+def _camera_in(data: Any, path: str | Path) -> Camera:
+    if not isinstance(data, dict) or set(data) != CAMERA_KEYS or not isinstance(data["parameters"], dict):
+        raise InputError(f"'{path}': 'camera' must have the keys {', '.join(sorted(CAMERA_KEYS))}, and no others")
+    model = camera_model(str(data["model"]))
+    try:
+        width, height = (int(v) for v in data["size_px"])
+        values = np.array([float(v) for v in data["parameters"].values()])
+    except (TypeError, ValueError) as error:
+        raise InputError(f"'{path}': camera: {error}; size_px is [width, height], parameters are numbers") from error
+    camera = model((width, height), values)
+    names = camera.parameter_names()
+    if tuple(data["parameters"]) != names:
+        raise InputError(f"'{path}': parameters of a {camera.model} camera must be {', '.join(names)}, in this order")
+    return camera
+
+
+def _view_out(view: ViewResult) -> dict[str, Any]:
+    return {
+        "image": view.image,
+        "board_id": view.board_id,
+        "cam_from_board": view.cam_from_board.matrix()[:3].tolist(),
+        "rms_px": view.rms_px,
+        "grid": view.grid.tolist(),
+        "pixels": view.pixels.tolist(),
+        "residuals_px": view.residuals_px.tolist(),
+        "kept": view.kept.tolist(),
+    }
+
+
+def _view_in(data: dict[str, Any]) -> ViewResult:
+    return ViewResult(
+        image=str(data["image"]),
+        board_id=str(data["board_id"]),
+        cam_from_board=Rigid3.from_matrix(data["cam_from_board"]),
+        grid=np.array(data["grid"], dtype=np.int64).reshape(-1, 2),
+        pixels=_array(data["pixels"]),
+        residuals_px=_array(data["residuals_px"]),
+        kept=np.array(data["kept"], dtype=bool),
+    )
+
+
+def _array(value: Any) -> FloatArray:
+    """Return the array; null is NaN."""
+    return np.array(value, dtype=np.float64)
+
+
+def _finite(values: dict[str, Any], nullable: tuple[str, ...] = ("residual_px",)) -> dict[str, Any]:
+    return {k: math.nan if v is None and k in nullable else v for k, v in values.items()}
+
+
+def _dumps(data: dict[str, Any]) -> str:
+    """Return JSON with null for NaN; one line a key, and one line an entry of its list of objects."""
+    lines = []
+    for key, value in data.items():
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            text = "[\n  " + ",\n  ".join(_line(v) for v in value) + "\n ]"
+        else:
+            text = _line(value)
+        lines.append(f' "{key}": {text}')
+    return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def _line(value: Any) -> str:
+    return json.dumps(_without_nan(value), allow_nan=False)
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _without_nan(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,105 @@
+"""Session files: what a person writes to have a camera calibrated (schema "rigkit.session/1").
+
+::
+
+    schema = "rigkit.session/1"
+    images = "images/*.jpg"              # or a list of files and patterns, relative to this file
+    board = "../../boards/a9x6_30.toml"  # or boards = ["a.toml", "b.toml"]
+    model = "scaramuzza"                 # a camera model, or "auto"
+    degree = 6                           # optional: of the polynomial; by default chosen by held-out error
+    board_shape = "auto"                 # optional: flat, warp, released, or auto (chosen by held-out error)
+"""
+
+from __future__ import annotations
+
+import glob
+from dataclasses import dataclass
+from pathlib import Path
+
+from rigkit.boards import Board
+from rigkit.calibration.shape import SHAPES
+from rigkit.cameras.registry import MODELS
+from rigkit.errors import InputError
+from rigkit.io.board_file import load_board
+from rigkit.io.toml_reader import TomlTable, read_toml
+
+__all__ = ["SCHEMA", "Session", "load_session"]
+
+SCHEMA = "rigkit.session/1"
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Session:
+    """What to calibrate and how.
+
+    Attributes
+    ----------
+    path : the session file.
+    images : the image files, sorted by name.
+    boards : the boards that may be in them.
+    model : name of a camera model, or "auto".
+    degree : size of the model, or None to choose.
+    board_shape : "flat", "warp", "released" or "auto".
+    """
+
+    path: Path
+    images: tuple[Path, ...]
+    boards: tuple[Board, ...]
+    model: str
+    degree: int | None
+    board_shape: str
+
+    @property
+    def calibration_path(self) -> Path:
+        """Where the calibration goes: beside the session."""
+        return self.path.parent / "calibration.json"
+
+    @property
+    def corners_path(self) -> Path:
+        """Where the corners found are kept, so that calibrating again needs no images."""
+        return self.path.parent / "corners.json"
+
+
+def load_session(path: str | Path) -> Session:
+    """Return the session; raises InputError for a missing file or board, an unknown key, or patterns that match
+    nothing."""
+    source = Path(path)
+    table = read_toml(source, SCHEMA)
+    images = _images(table)
+    boards = _boards(table)
+    model = table.text("model", hint='model = "scaramuzza"', choices=("auto", *MODELS))
+    degree = table.integer("degree", hint="degree = 6", at_least=1) if table.has("degree") else None
+    shape = "auto"
+    if table.has("board_shape"):
+        shape = table.text("board_shape", hint='board_shape = "auto"', choices=("auto", *SHAPES))
+    table.done()
+    return Session(source, images, boards, model, degree, shape)
+
+
+def _images(table: TomlTable) -> tuple[Path, ...]:
+    hint = 'images = "images/*.jpg" (or a list of files and patterns)'
+    try:
+        patterns: tuple[str, ...] = (table.text("images", hint=hint),)
+    except InputError:
+        patterns = table.texts("images", hint=hint)
+    found: dict[Path, None] = {}
+    for pattern in patterns:
+        matches = sorted(glob.glob(str(table.path.parent / pattern)))
+        if not matches:
+            raise table.error(f"no image matches '{pattern}' (looked in '{table.path.parent}'); correct 'images'")
+        found |= {Path(m).resolve(): None for m in matches}
+    return tuple(found)
+
+
+def _boards(table: TomlTable) -> tuple[Board, ...]:
+    hint = 'board = "board.toml" (or boards = ["a.toml", "b.toml"])'
+    if table.has("boards"):
+        if table.has("board"):
+            raise table.error("'board' and 'boards'; keep one of the two")
+        boards = tuple(load_board(table.path.parent / name) for name in table.texts("boards", hint=hint))
+    else:
+        boards = (load_board(table.path_to("board", hint=hint)),)
+    ids = [board.board_id for board in boards]
+    if len(set(ids)) < len(ids):
+        raise table.error("two boards have the same id; give one of the files another 'id'")
+    return boards
