@@ -186,7 +186,10 @@ class Camera(ABC):
         )
 
     def with_parameters(self, parameters: ArrayLike) -> Self:
-        """Return the same model and size with other parameters."""
+        """Return the same model and size with other parameters.
+
+        Raises InputError where they are outside of what the model is defined for; a solver takes that as a failed step.
+        """
         return type(self)(self.size_px, np.asarray(parameters, dtype=np.float64))
 
     def on_image(self, pixels: Pixels) -> BoolArray:

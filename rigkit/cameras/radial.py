@@ -20,8 +20,8 @@ from rigkit.errors import InputError
 
 __all__ = ["FocalCamera", "RadialCamera", "ScaleDerivatives", "checked_curve", "fit_shape"]
 
-FIT_STEPS = 60
-FIT_SETTLED = 1e-12
+FIT_STEPS = 40
+FIT_SETTLED = 1e-6
 """The descent stops where a step gains less than this share of the cost."""
 
 
@@ -184,9 +184,10 @@ def _descend(camera: _Focal, points: FloatArray, radius: FloatArray) -> tuple[fl
         pixels, _, _, jacobian = camera.project_with_jacobians(points)
         # The points lie in the plane y = 0: u depends on fx alone, which then stands for both focal lengths.
         j = np.delete(jacobian[:, 0], (1, 2, 3), axis=1)
-        normal = j.T @ j
-        gradient = j.T @ (pixels[:, 0] - centre - radius)
-        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -gradient)
+        # Columns of length 1; one of length 0 (beta, where alpha = 0) must not make the system singular.
+        size = np.maximum(np.linalg.norm(j, axis=0), 1e-300)
+        j = j / size
+        step = np.linalg.solve(j.T @ j + damping * np.eye(size.size), j.T @ (centre + radius - pixels[:, 0])) / size
         trial = camera.parameters.copy()
         trial[0] += step[0]
         trial[1] = trial[0]
