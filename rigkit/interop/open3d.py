@@ -17,8 +17,8 @@ def to_open3d(cloud: OrientedCloud) -> Any:
     """Return an `open3d.geometry.PointCloud` with points (mm), normals and colours."""
     import open3d
 
-    out = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(cloud.points_mm))
-    out.normals = open3d.utility.Vector3dVector(cloud.normals)
+    out = _point_cloud(cloud.points_mm)
+    out.normals = open3d.utility.Vector3dVector(np.array(cloud.normals))
     out.colors = open3d.utility.Vector3dVector(cloud.colours / 255.0)
     return out
 
@@ -35,12 +35,10 @@ def mean_and_covariance(points: Points) -> tuple[FloatArray, Mat3]:
 
     Raises DegenerateError for no points.
     """
-    import open3d
-
     array = as_array(points, (None, 3), "points")
     if len(array) == 0:
         raise DegenerateError("plane: no points to take the mean of")
-    mean, covariance = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(array)).compute_mean_and_covariance()
+    mean, covariance = _point_cloud(array).compute_mean_and_covariance()
     return np.asarray(mean, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
 
 
@@ -55,8 +53,14 @@ def plane_inliers(points: Points, distance_mm: float, *, iterations: int = 1000,
     if len(array) < 3:
         raise DegenerateError(f"plane: {len(array)} points do not fix one; at least 3 are needed")
     open3d.utility.random.seed(seed)
-    point_cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(array))
-    _, inliers = point_cloud.segment_plane(distance_mm, 3, iterations)
+    _, inliers = _point_cloud(array).segment_plane(distance_mm, 3, iterations)
     mask = np.zeros(len(array), dtype=bool)
     mask[np.asarray(inliers, dtype=np.int64)] = True
     return mask
+
+
+def _point_cloud(points: Points) -> Any:
+    import open3d
+
+    # Open3D takes a view of the memory and refuses one that is read-only.
+    return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(np.array(points, dtype=np.float64)))
