@@ -1,18 +1,46 @@
-"""From matched corners of a pair to an oriented cloud in millimetres: the pose-type-aware pipeline."""
+"""From matched corners of a pair to an oriented cloud in millimetres: the pose-type-aware pipeline.
+
+Points give the epipolar geometry; directions (and, for F2UDIR and F3UDIR, that geometry) give an affinity at every
+corner; points and affinities give the epipolar geometry again, with the solver of the pair's pose type; maximum
+likelihood refines the pose; rays are intersected optimally, affinities give normals, the squares give the scale.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from rigkit.arrays import FloatArray, Mat3, Pixels
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.affine.affinities import Affinities, EpipolarNormals
+from rigkit.affine.normal import NormalEstimate, estimate_normals
+from rigkit.affine.registry import affines_from_directions, needs_epipolar
+from rigkit.arrays import BoolArray, FloatArray, Mat3, Pixels
 from rigkit.boards import Board
 from rigkit.cameras.base import Camera
 from rigkit.cloud import OrientedCloud
+from rigkit.errors import DegenerateError
+from rigkit.fundamental.metric import MetricPose, metric_pose, triangulate_matches
+from rigkit.fundamental.pose import choose_pose, essential_from_pose
+from rigkit.fundamental.refine import refine_pose
+from rigkit.fundamental.registry import fundamental_for
+from rigkit.fundamental.select import pose_type_evidence
+from rigkit.fundamental.weights import WeightRule
+from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.matches import Matches
 from rigkit.posetype import PoseType
 
-__all__ = ["Reconstruction"]
+if TYPE_CHECKING:
+    from rigkit.pairing import MatchedPair
+
+__all__ = ["Reconstruction", "reconstruct_pair"]
+
+MAX_BASELINE_SIGMA = 0.2
+"""A baseline known to no better than a fifth of itself is no baseline: whatever is built on it is noise."""
+
+GREY = 160
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -54,3 +82,152 @@ class Reconstruction:
     baseline_sigma_mm: float
     sampson_rms_px: float
     notes: tuple[str, ...] = ()
+
+
+def reconstruct_pair(
+    pair: MatchedPair,
+    *,
+    pose_type: PoseType | str,
+    affine_method: str = "3SDIR",
+    level_sigma_rad: float | None = None,
+    scale: str = "area",
+    image1: NDArray[np.generic] | None = None,
+) -> Reconstruction:
+    """Reconstruct one pair with one affine estimator.
+
+    Parameters
+    ----------
+    pair : matched corners and directions, from `match_pair`.
+    pose_type : as a person declared it; AUTO takes the type that the data support best. A declared type that the data
+        contradict is used as told, and `notes` gives the figure.
+    affine_method : see `rigkit.affine.registry.AFFINE_METHODS`.
+    level_sigma_rad : how well the spirit level held: makes the pose type a soft prior in the refinement. None: exact.
+    scale : of DET3UDIR, see `affines_from_directions`.
+    image1 : image of camera 1, (H, W) or (H, W, 3) RGB, uint8 or uint16: colours of the cloud.
+
+    Raises
+    ------
+    DegenerateError
+        No baseline, or geometry that does not determine the pose.
+
+    Notes
+    -----
+    On a chessboard the affinities come from the very corners that are the points: they take part in the linear
+    solution, as in the paper, but the likelihood counts every corner once.
+    """
+    try:
+        return _reconstruct(pair, PoseType(pose_type), affine_method, level_sigma_rad, scale, image1)
+    except DegenerateError as error:
+        raise DegenerateError(f"pair '{pair.pair_id}': {error}") from error
+
+
+def _reconstruct(
+    pair: MatchedPair,
+    pose_type: PoseType,
+    affine_method: str,
+    level_sigma_rad: float | None,
+    scale: str,
+    image1: NDArray[np.generic] | None,
+) -> Reconstruction:
+    notes = list(pair.notes)
+    by_points = fundamental_for(PoseType.GENERAL).solve(pair.matches)
+    pose_type, remark = _decide(pair.captured, pose_type, level_sigma_rad)
+    notes += remark
+    affinities = _affinities(pair, affine_method, by_points.E21, scale)
+    matches = pair.matches.with_affinities(affinities.A21, affinities.sigma_A)
+    # Affinities computed from an epipolar geometry satisfy it exactly: estimating it from them again is circular.
+    rule: WeightRule = "points" if needs_epipolar(affine_method) else "noise"
+    estimate = fundamental_for(pose_type).solve(matches, rule)
+    start = choose_pose(estimate.E21, matches.rays1, matches.rays2, pose_type)
+    refined = refine_pose(pair.captured, start, pose_type, level_sigma_rad)
+    metric = metric_pose(pair.captured, refined.cam2_from_cam1, refined.covariance, pair.boards)
+    if metric.baseline_sigma_mm > MAX_BASELINE_SIGMA * metric.baseline_mm:
+        raise DegenerateError(
+            f"the baseline is {metric.baseline_mm:.2f} mm, known to no better than {metric.baseline_sigma_mm:.2f} mm: "
+            "too short for these boards; move the camera further between the images"
+        )
+    E21 = essential_from_pose(metric.cam2_from_cam1)
+    if needs_epipolar(affine_method):
+        affinities = _affinities(pair, affine_method, E21, scale)
+        matches = pair.matches.with_affinities(affinities.A21, affinities.sigma_A)
+    cloud, kept = _cloud(pair, metric, affinities, image1)
+    if not kept.all():
+        lost = int((~kept).sum())
+        notes.append(f"{lost} of {len(kept)} corners have no {affine_method} normal or point and were left out")
+    return Reconstruction(
+        pair.pair_id,
+        pose_type,
+        affine_method,
+        pair.camera1,
+        pair.camera2,
+        pair.boards,
+        matches.select(kept),
+        pair.captured.pixels1[kept],
+        pair.captured.pixels2[kept],
+        metric.cam2_from_cam1,
+        metric.covariance,
+        E21,
+        cloud,
+        metric.baseline_mm,
+        metric.baseline_sigma_mm,
+        refined.sampson_rms_px,
+        tuple(notes),
+    )
+
+
+def _decide(captured: Matches, declared: PoseType, level_sigma_rad: float | None) -> tuple[PoseType, tuple[str, ...]]:
+    """Return the pose type to use, and what there is to say about it."""
+    if declared is PoseType.GENERAL:
+        return declared, ()
+    evidence = pose_type_evidence(captured, level_sigma_rad)
+    if declared is PoseType.AUTO:
+        chosen = evidence.types[0]
+        return chosen.pose_type, (f"pose type '{chosen.pose_type}' chosen (probability {chosen.probability:.3f})",)
+    contradiction = evidence.contradiction(declared)
+    return declared, () if contradiction is None else (contradiction,)
+
+
+def _affinities(pair: MatchedPair, method: str, E21: Mat3, scale: str) -> Affinities:
+    m = pair.matches
+    epipolar = None
+    if needs_epipolar(method):
+        epipolar = EpipolarNormals.from_rays(m.rays1, m.jacobians1, m.rays2, m.jacobians2, E21)
+    return affines_from_directions(pair.directions, method, epipolar=epipolar, scale=scale, noise=pair.noise)
+
+
+def _cloud(
+    pair: MatchedPair, metric: MetricPose, affinities: Affinities, image1: NDArray[np.generic] | None
+) -> tuple[OrientedCloud, BoolArray]:
+    """Return the oriented cloud and which of the matches are in it."""
+    pose = metric.cam2_from_cam1
+    points, covariance, seen = triangulate_matches(pair.captured, pose, metric.covariance)
+    m = pair.matches
+    J1, J2 = pair_projection_jacobians(points, m.rays1, m.jacobians1, m.rays2, m.jacobians2, pose)
+    normals: NormalEstimate = estimate_normals(J1, J2, affinities.A21, covariance=affinities.covariance)
+    kept = seen & normals.valid & np.isfinite(covariance).all(axis=(1, 2))
+    if not kept.any():
+        raise DegenerateError("no corner has both a point and a normal; check directions and baseline")
+    sigma_mm = np.sqrt(np.linalg.eigvalsh(covariance[kept])[:, -1])
+    cloud = OrientedCloud(
+        points[kept],
+        normals.normals[kept],
+        _colours(image1, pair.captured.pixels1[kept]),
+        m.board_index[kept],
+        m.grid[kept],
+        sigma_mm,
+        normals.sigma_rad[kept],
+        tuple(board.board_id for board in pair.boards),
+    )
+    return cloud, kept
+
+
+def _colours(image: NDArray[np.generic] | None, pixels: Pixels) -> NDArray[np.uint8]:
+    """Return the colours at the nearest pixels, (N, 3); grey where there is no image."""
+    if image is None:
+        return np.full((len(pixels), 3), GREY, dtype=np.uint8)
+    column, row = np.rint(pixels).astype(np.int64).T
+    values = image[np.clip(row, 0, image.shape[0] - 1), np.clip(column, 0, image.shape[1] - 1)]
+    if image.dtype == np.uint16:
+        values = values.astype(np.uint16) >> 8
+    grey = values[:, None] if values.ndim == 1 else values
+    return np.ascontiguousarray(np.broadcast_to(grey, (len(pixels), 3)), dtype=np.uint8)

@@ -1,0 +1,140 @@
+"""From a manifest to reconstructions: what `reconstruct`, `validate`, `crosscheck` and `demo` share.
+
+Cameras are calibrated first where a calibration file is missing; pairs are independent and run in several processes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from rigkit.errors import InputError
+
+if TYPE_CHECKING:
+    from rigkit.cameras.base import Camera
+    from rigkit.io.manifest import Dataset, Pair
+    from rigkit.pairing import MatchedPair
+    from rigkit.progress import Progress
+
+__all__ = ["add_dataset_arguments", "load_cameras", "match_images", "output_folder", "over_pairs", "select_dataset"]
+
+Result = TypeVar("Result")
+
+
+def add_dataset_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what every verb on a data set takes."""
+    parser.add_argument("dataset", metavar="DATASET", help="folder with a dataset.toml, or the file itself")
+    parser.add_argument("-p", "--pair", action="append", default=[], metavar="ID", help="only this pair (repeatable)")
+    parser.add_argument(
+        "-o", "--output", metavar="DIR", help="folder for results (default: out/<name of the data set>)"
+    )
+    parser.add_argument("--force", action="store_true", help="replace existing results")
+    parser.add_argument("--recalibrate", action="store_true", help="calibrate from the images even if that was done")
+    parser.add_argument(
+        "--chain", choices=("raw", "rectified"), default="raw", help="work in captured pixels (default)"
+    )
+    parser.add_argument("-j", "--jobs", type=int, metavar="N", help="processes (default: one a core)")
+    parser.add_argument("--json", action="store_true", help="print the result for programs")
+
+
+def select_dataset(args: argparse.Namespace) -> Dataset:
+    """Load the manifest, keep the pairs asked for, and make sure that their images are there."""
+    from rigkit.io.manifest import load_dataset
+
+    dataset = load_dataset(args.dataset).select(args.pair)
+    for pair in dataset.pairs:
+        pair.require_images()
+    return dataset
+
+
+def output_folder(args: argparse.Namespace, dataset: Dataset) -> Path:
+    return Path(args.output) if args.output else Path("out") / dataset.name
+
+
+def load_cameras(dataset: Dataset, *, recalibrate: bool, progress: Progress) -> dict[str, Camera]:
+    """Return the cameras that the pairs use, calibrating from their sessions where no calibration is there yet.
+
+    A new calibration is kept beside its session.
+    """
+    from rigkit.cli.calibrate import calibrate_session
+    from rigkit.io.calibration_file import load_camera, save_calibration
+    from rigkit.io.session import load_session
+
+    cameras: dict[str, Camera] = {}
+    used = {name for pair in dataset.pairs for name in (pair.camera1.camera_id, pair.camera2.camera_id)}
+    for entry in dataset.cameras:
+        if entry.camera_id not in used:
+            continue
+        if entry.calibration.is_file() and not recalibrate:
+            cameras[entry.camera_id] = load_camera(entry.calibration)
+            continue
+        if entry.session is None:
+            raise InputError(
+                f"{dataset.manifest}: camera '{entry.camera_id}' has no session to calibrate from; "
+                'add session = "session.toml" to its table'
+            )
+        calibration = calibrate_session(load_session(entry.session), progress)
+        save_calibration(entry.calibration, calibration, force=True)
+        cameras[entry.camera_id] = calibration.camera
+    return cameras
+
+
+def match_images(pair: Pair, camera1: Camera, camera2: Camera, chain: str) -> tuple[MatchedPair, Any, Any]:
+    """Return the matched corners of a pair, and its two images."""
+    from rigkit.corners.detect import detect_boards
+    from rigkit.io.images import read_image, to_grey
+    from rigkit.pairing import match_pair
+
+    images = []
+    found = []
+    for path, camera, entry in ((pair.image1, camera1, pair.camera1), (pair.image2, camera2, pair.camera2)):
+        image = read_image(path)
+        size = (image.shape[1], image.shape[0])
+        if size != camera.size_px:
+            raise InputError(
+                f"pair '{pair.pair_id}': image '{path}' is {size[0]}x{size[1]} px but camera '{entry.camera_id}' was "
+                f"calibrated at {camera.size_px[0]}x{camera.size_px[1]}; use images of that size, or recalibrate"
+            )
+        images.append(image)
+        found.append(detect_boards(to_grey(image), pair.boards))
+    for path, detections in zip((pair.image1, pair.image2), found, strict=True):
+        if not detections:
+            sizes = ", ".join(sorted({f"{b.columns}x{b.rows}" for b in pair.boards}))
+            raise InputError(
+                f"pair '{pair.pair_id}': no board ({sizes}) found in '{path}'; check the image and the boards"
+            )
+    matched = match_pair(
+        pair.pair_id,
+        camera1,
+        camera2,
+        found[0],
+        found[1],
+        pair.boards,
+        layout=pair.layout or None,
+        chain="rectified" if chain == "rectified" else "raw",
+    )
+    return matched, images[0], images[1]
+
+
+def over_pairs(
+    work: Callable[[Any], Result], jobs: Sequence[Any], processes: int | None, what: str, progress: Progress
+) -> Iterator[Result]:
+    """Yield `work(job)` for every job, in their order, from several processes where that helps."""
+    count = min(len(jobs), processes or os.cpu_count() or 1)
+    progress(what, 0, len(jobs))
+    if count <= 1:
+        for done, job in enumerate(jobs, start=1):
+            result = work(job)
+            progress(what, done, len(jobs))
+            yield result
+        return
+    # Fresh processes: threads of OpenCV do not survive a fork.
+    with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
+        for done, result in enumerate(pool.map(work, jobs), start=1):
+            progress(what, done, len(jobs))
+            yield result

@@ -1,0 +1,214 @@
+"""From the boards found in two images to matched corners and directions in the coordinates the pipeline works in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from rigkit.affine.affinities import DirectionNoise
+from rigkit.arrays import FloatArray, Pixels
+from rigkit.boards import Board
+from rigkit.cameras.base import Camera
+from rigkit.cameras.pinhole import Pinhole
+from rigkit.corners.directions import Support, direction_field
+from rigkit.corners.identify import identify_pair
+from rigkit.corners.pair_identity import PairIdentity, common_corners
+from rigkit.detections import BoardDetection
+from rigkit.errors import DegenerateError, InputError
+from rigkit.matches import DirectionPairs, Matches
+
+__all__ = ["Chain", "MatchedPair", "match_pair"]
+
+Chain = Literal["raw", "rectified"]
+
+MAX_RECTIFIED_RAD = np.deg2rad(75.0)
+"""A perspective view along the camera's axis stretches a pixel there by 1 / cos^2 = 15; beyond it the raw chain is the
+only sensible one."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class MatchedPair:
+    """Two images of the same boards, corner by corner.
+
+    Attributes
+    ----------
+    pair_id : name of the pair.
+    camera1, camera2 : calibrated cameras of the images as captured.
+    boards : boards seen in both images, in the order of `matches.board_index`.
+    identity : how boards and corners were told apart.
+    chain : "raw": `matches` are in captured pixels; "rectified": in perspective views along each camera's axis.
+    captured : the corners in captured pixels, where their noise is the same in all directions.
+    matches : the corners in the coordinates of `chain`.
+    directions : at the same corners, in the coordinates of `chain`.
+    noise : predicted covariance of the directions.
+    """
+
+    pair_id: str
+    camera1: Camera
+    camera2: Camera
+    boards: tuple[Board, ...]
+    identity: PairIdentity
+    chain: Chain
+    captured: Matches
+    matches: Matches
+    directions: DirectionPairs
+    noise: DirectionNoise
+    notes: tuple[str, ...] = ()
+
+
+def match_pair(
+    pair_id: str,
+    camera1: Camera,
+    camera2: Camera,
+    detections1: Sequence[BoardDetection],
+    detections2: Sequence[BoardDetection],
+    boards: Sequence[Board],
+    *,
+    layout: Mapping[str, str] | None = None,
+    chain: Chain = "raw",
+    support: Support = "patch",
+    window: int | None = 2,
+) -> MatchedPair:
+    """Tell the boards apart, match their corners, and take directions.
+
+    Parameters
+    ----------
+    pair_id : for messages.
+    camera1, camera2 : the cameras; one object twice where one camera was moved.
+    detections1, detections2 : all boards found in either image.
+    boards : the boards that stand there.
+    layout : board id -> "left", "right" or "floor" where a person said so.
+    chain : coordinates to work in.
+    support, window : what a direction is estimated from, see `direction_field`.
+
+    Raises
+    ------
+    InputError
+        No board is seen in both images.
+    DegenerateError
+        `chain` is "rectified" and a corner lies too far off the axis.
+    """
+    identity = identify_pair(detections1, detections2, boards, camera1, camera2, layout=layout)
+    pairs, unseen = _with_rays(identity.pairs(), camera1, camera2)
+    if not pairs:
+        reasons = "; ".join(f"{name}: {why}" for name, why in identity.missing.items())
+        raise InputError(f"pair '{pair_id}': no board is seen in both images ({reasons}); check images and boards")
+    by_id = {board.board_id: board for board in boards}
+    used = tuple(by_id[str(first.board_id)] for first, _ in pairs)
+    captured = _gather(camera1, camera2, pairs)
+    view1, view2 = camera1, camera2
+    viewed = pairs
+    if chain == "rectified":
+        view1, view2 = _axis_view(camera1, captured.rays1, pair_id), _axis_view(camera2, captured.rays2, pair_id)
+        viewed = tuple((_in_view(a, camera1, view1), _in_view(b, camera2, view2)) for a, b in pairs)
+    matches = captured if chain == "raw" else _gather(view1, view2, viewed)
+    directions, noise = _directions(viewed, view1, view2, support, window)
+    notes = [f"board '{name}': {why}" for name, why in identity.missing.items()]
+    if unseen:
+        notes.append(f"{unseen} corners lie outside the calibrated field of view and were left out")
+    return MatchedPair(
+        pair_id,
+        camera1,
+        camera2,
+        used,
+        identity,
+        chain,
+        captured,
+        matches,
+        directions,
+        noise,
+        (*notes, *identity.notes),
+    )
+
+
+def _with_rays(
+    pairs: Sequence[tuple[BoardDetection, BoardDetection]], camera1: Camera, camera2: Camera
+) -> tuple[tuple[tuple[BoardDetection, BoardDetection], ...], int]:
+    """Leave out corners that have no ray in their camera; return the pairs and how many were left out."""
+    out = []
+    dropped = 0
+    for pair in pairs:
+        kept = []
+        for detection, camera in zip(pair, (camera1, camera2), strict=True):
+            _, seen = camera.unproject(detection.pixels)
+            dropped += int((~seen).sum())
+            grid, pixels, sigma_px = detection.grid[seen], detection.pixels[seen], detection.sigma_px[seen]
+            kept.append(replace(detection, grid=grid, pixels=pixels, sigma_px=sigma_px))
+        out.append((kept[0], kept[1]))
+    return tuple(out), dropped
+
+
+def _gather(camera1: Camera, camera2: Camera, pairs: Sequence[tuple[BoardDetection, BoardDetection]]) -> Matches:
+    """Return the corners that both images share, board after board."""
+    common = [common_corners(a, b) for a, b in pairs]
+    return Matches.from_cameras(
+        camera1,
+        camera2,
+        np.concatenate([a.pixels[i] for (a, _), (_, i, _) in zip(pairs, common, strict=True)]),
+        np.concatenate([b.pixels[j] for (_, b), (_, _, j) in zip(pairs, common, strict=True)]),
+        sigma1_px=np.concatenate([a.sigma_px[i] for (a, _), (_, i, _) in zip(pairs, common, strict=True)]),
+        sigma2_px=np.concatenate([b.sigma_px[j] for (_, b), (_, _, j) in zip(pairs, common, strict=True)]),
+        board_index=np.repeat(np.arange(len(pairs)), [len(grid) for grid, _, _ in common]),
+        grid=np.concatenate([grid for grid, _, _ in common]),
+    )
+
+
+def _directions(
+    pairs: Sequence[tuple[BoardDetection, BoardDetection]],
+    view1: Camera,
+    view2: Camera,
+    support: Support,
+    window: int | None,
+) -> tuple[DirectionPairs, DirectionNoise]:
+    vectors: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+    covariances: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+    valid = []
+    for first, second in pairs:
+        _, i, j = common_corners(first, second)
+        field1 = direction_field(first, view1, support=support, window=window)
+        field2 = direction_field(second, view2, support=support, window=window)
+        for k, (field, index) in enumerate(((field1, i), (field2, j))):
+            vectors[k].append(field.vectors[index])
+            covariances[k].append(field.covariance[index, :2])
+        valid.append(field1.valid[i] & field2.valid[j])
+    directions = DirectionPairs(np.concatenate(vectors[0]), np.concatenate(vectors[1]), np.concatenate(valid))
+    # The diagonal is the sum of the other two, so its noise is not independent of theirs.
+    noise = DirectionNoise.independent(np.concatenate(covariances[0]), np.concatenate(covariances[1])).with_sum(0, 1)
+    return directions, noise
+
+
+def _axis_view(camera: Camera, rays: FloatArray, pair_id: str) -> Pinhole:
+    """Return the perspective view along the camera's own axis, at the scale of its centre; unbounded in size."""
+    widest = float(np.arccos(np.clip(rays[:, 2].min(), -1.0, 1.0)))
+    if widest > MAX_RECTIFIED_RAD:
+        raise DegenerateError(
+            f"pair '{pair_id}': a corner lies {np.rad2deg(widest):.0f} deg off the axis, too far for a perspective "
+            "view; use the raw chain (--chain raw)"
+        )
+    centre, _ = camera.project(np.array([0.0, 0.0, 1.0]))
+    return Pinhole(camera.size_px, np.array([camera.focal_px, camera.focal_px, centre[0], centre[1]]))
+
+
+def _in_view(detection: BoardDetection, camera: Camera, view: Pinhole) -> BoardDetection:
+    """Return the detection in a perspective view; sigmas grow with the local magnification."""
+    rays, _ = camera.unproject(detection.pixels)
+    pixels, _, by_point, _ = view.project_with_jacobians(rays)
+    local = by_point @ camera.ray_jacobian(detection.pixels)
+    magnification = np.linalg.norm(local, axis=(1, 2)) / np.sqrt(2.0)
+    return BoardDetection(
+        detection.board_id,
+        detection.columns,
+        detection.rows,
+        detection.grid,
+        _whole(pixels),
+        detection.sigma_px * magnification,
+    )
+
+
+def _whole(pixels: Pixels) -> Pixels:
+    if not np.isfinite(pixels).all():
+        raise DegenerateError("a corner lies behind the perspective view; use the raw chain (--chain raw)")
+    return pixels
