@@ -15,9 +15,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from rigkit.boards import Board
-from rigkit.io.toml_reader import read_toml
+from rigkit.io.toml_reader import TomlTable, read_toml
 
-__all__ = ["SCHEMA", "load_board"]
+__all__ = ["SCHEMA", "board_from_table", "load_board"]
 
 SCHEMA = "rigkit.board/1"
 
@@ -28,7 +28,14 @@ def load_board(path: str | Path) -> Board:
     Raises InputError for a missing file, an unknown or missing key, or a value that makes no board.
     """
     table = read_toml(path, SCHEMA)
-    board_id = table.text("id", hint='id = "plane1"') if table.has("id") else Path(path).stem
+    board = board_from_table(table, Path(path).stem)
+    table.done()
+    return board
+
+
+def board_from_table(table: TomlTable, default_id: str) -> Board:
+    """Return the board that a table of any file describes by the keys above; the caller calls `table.done()`."""
+    board_id = table.text("id", hint='id = "plane1"') if table.has("id") else default_id
     columns = table.integer("columns", hint="columns = 9 (inner corners along x)", at_least=2)
     rows = table.integer("rows", hint="rows = 6 (inner corners along y)", at_least=2)
     both = "square_x_mm = 30.0 and square_y_mm = 30.0"
@@ -41,5 +48,4 @@ def load_board(path: str | Path) -> Board:
     sigma = None
     if table.has("square_sigma_mm"):
         sigma = table.number("square_sigma_mm", hint="square_sigma_mm = 0.05")
-    table.done()
     return Board(board_id, columns, rows, x, y, sigma)

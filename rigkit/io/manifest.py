@@ -9,7 +9,7 @@ from typing import TypeVar
 
 from rigkit.boards import Board
 from rigkit.errors import InputError
-from rigkit.io.board_file import load_board
+from rigkit.io.board_file import board_from_table, load_board
 from rigkit.io.toml_reader import TomlTable, read_toml
 from rigkit.io.truth_file import truth_from_table
 from rigkit.posetype import PoseType
@@ -135,20 +135,10 @@ def _board(table: TomlTable) -> Board:
     board_id = table.text("id", hint='id = "plane1"')
     if table.has("file"):
         board = replace(load_board(table.path_to("file", hint='file = "board.toml"')), board_id=board_id)
-        table.done()
-        return board
-    columns = table.integer("columns", hint='file = "board.toml", or columns = 8 (inner corners)', at_least=2)
-    rows = table.integer("rows", hint="rows = 6 (inner corners)", at_least=2)
-    if table.has("square_x_mm") or table.has("square_y_mm"):
-        x = table.number("square_x_mm", hint="square_x_mm = 50.0, as measured along the columns")
-        y = table.number("square_y_mm", hint="square_y_mm = 50.0, as measured along the rows")
     else:
-        x = y = table.number("square_mm", hint="square_mm = 50.0, as measured on the printed board")
-    sigma = None
-    if table.has("square_sigma_mm"):
-        sigma = table.number("square_sigma_mm", hint="square_sigma_mm = 0.05")
+        board = board_from_table(table, board_id)
     table.done()
-    return Board(board_id, columns, rows, x, y, sigma)
+    return board
 
 
 def _camera(table: TomlTable) -> CameraEntry:

@@ -1,0 +1,126 @@
+"""Images as they are, and images that are not whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rigkit.errors import InputError
+from rigkit.io.images import read_image, to_grey
+
+
+@pytest.fixture
+def colour(rng: np.random.Generator) -> np.ndarray:
+    """Red, green, blue noise, hard to compress: files of every format are long enough to be cut."""
+    return rng.integers(0, 256, (60, 80, 3), dtype=np.uint8)
+
+
+def save(path: Path, image: np.ndarray, *options: int) -> bytes:
+    ok, data = cv2.imencode(path.suffix, image[..., ::-1] if image.ndim == 3 else image, options)
+    assert ok
+    path.write_bytes(data.tobytes())
+    return data.tobytes()
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".bmp", ".ppm"])
+def test_pixels_come_back_as_red_green_blue(tmp_path: Path, colour: np.ndarray, suffix: str) -> None:
+    save(tmp_path / f"a{suffix}", colour)
+    np.testing.assert_array_equal(read_image(tmp_path / f"a{suffix}"), colour)
+
+
+def test_grey_16_bit_and_alpha(tmp_path: Path, colour: np.ndarray) -> None:
+    deep = colour[..., 0].astype(np.uint16) * 257
+    save(tmp_path / "deep.png", deep)
+    found = read_image(tmp_path / "deep.png")
+    assert found.dtype == np.uint16
+    np.testing.assert_array_equal(found, deep)
+    blue_first = np.dstack([colour[..., ::-1], np.full((60, 80), 7, np.uint8)])
+    (tmp_path / "alpha.png").write_bytes(cv2.imencode(".png", blue_first)[1].tobytes())
+    np.testing.assert_array_equal(read_image(tmp_path / "alpha.png"), colour)
+
+
+def test_grey_of_colour_is_its_luma(colour: np.ndarray) -> None:
+    grey = to_grey(colour)
+    assert grey.dtype == np.uint8
+    # Rounded to whole grey values.
+    np.testing.assert_allclose(grey, colour @ [0.299, 0.587, 0.114], atol=1.0)
+    assert to_grey(grey) is grey
+    assert to_grey(colour.astype(np.uint16) * 257).dtype == np.uint16
+    with pytest.raises(InputError, match="shape"):
+        to_grey(np.zeros((4, 4, 2), np.uint8))
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".bmp", ".tif", ".ppm", ".webp"])
+@pytest.mark.parametrize("part", [0.2, 0.9, 0.99])
+def test_cut_off_images_are_refused_in_one_line(
+    tmp_path: Path, colour: np.ndarray, suffix: str, part: float, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / f"a{suffix}"
+    data = save(path, colour)
+    path.write_bytes(data[: int(len(data) * part)])
+    with pytest.raises(InputError, match=f"a{suffix}") as caught:
+        read_image(path)
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_jpeg_whose_rest_is_zeros_is_cut_off(tmp_path: Path, colour: np.ndarray) -> None:
+    data = save(tmp_path / "a.jpg", colour)
+    (tmp_path / "a.jpg").write_bytes(data[:2000] + bytes(len(data) - 2000))
+    with pytest.raises(InputError, match="cut off"):
+        read_image(tmp_path / "a.jpg")
+
+
+def test_whole_jpegs_of_every_kind_are_read(tmp_path: Path, colour: np.ndarray) -> None:
+    plain = save(tmp_path / "plain.jpg", colour)
+    save(tmp_path / "progressive.jpg", colour, cv2.IMWRITE_JPEG_PROGRESSIVE, 1)
+    save(tmp_path / "restart.jpg", colour, cv2.IMWRITE_JPEG_RST_INTERVAL, 2)
+    # Bytes after the end, and a thumbnail with its own end marker in front, as cameras write them.
+    (tmp_path / "trailing.jpg").write_bytes(plain + b"maker notes")
+    segment = b"\xff\xe1" + (len(plain) + 2).to_bytes(2, "big") + plain
+    (tmp_path / "thumbnail.jpg").write_bytes(plain[:2] + segment + plain[2:])
+    expected = read_image(tmp_path / "plain.jpg")
+    for name in ("progressive", "restart", "trailing", "thumbnail"):
+        np.testing.assert_array_equal(read_image(tmp_path / f"{name}.jpg"), expected)
+    # Cut after the thumbnail's end marker: that one must not count.
+    (tmp_path / "thumbnail.jpg").write_bytes(plain[:2] + segment + plain[2 : len(plain) // 2])
+    with pytest.raises(InputError, match="cut off"):
+        read_image(tmp_path / "thumbnail.jpg")
+
+
+def test_orientation_in_exif_is_not_applied(tmp_path: Path, colour: np.ndarray) -> None:
+    plain = save(tmp_path / "a.jpg", colour)
+    tiff = b"II*\x00\x08\x00\x00\x00\x01\x00\x12\x01\x03\x00\x01\x00\x00\x00\x06\x00\x00\x00\x00\x00\x00\x00"
+    exif = b"Exif\x00\x00" + tiff
+    (tmp_path / "turned.jpg").write_bytes(
+        plain[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + plain[2:]
+    )
+    assert cv2.imread(str(tmp_path / "turned.jpg")).shape == (80, 60, 3)
+    np.testing.assert_array_equal(read_image(tmp_path / "turned.jpg"), read_image(tmp_path / "a.jpg"))
+
+
+def test_a_changed_byte_in_a_png_is_found(tmp_path: Path, colour: np.ndarray) -> None:
+    data = bytearray(save(tmp_path / "a.png", colour))
+    data[len(data) // 2] ^= 1
+    (tmp_path / "a.png").write_bytes(data)
+    with pytest.raises(InputError, match="damaged"):
+        read_image(tmp_path / "a.png")
+
+
+def test_what_is_no_image(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not exist"):
+        read_image(tmp_path / "none.jpg")
+    with pytest.raises(InputError, match="folder"):
+        read_image(tmp_path)
+    (tmp_path / "empty.png").touch()
+    with pytest.raises(InputError, match="empty"):
+        read_image(tmp_path / "empty.png")
+    (tmp_path / "text.jpg").write_text("not an image")
+    with pytest.raises(InputError, match="not an image"):
+        read_image(tmp_path / "text.jpg")
+    cv2.imwrite(str(tmp_path / "real.tif"), np.zeros((4, 4), np.float32))
+    with pytest.raises(InputError, match="float32"):
+        read_image(tmp_path / "real.tif")
