@@ -6,10 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigkit.detections import BoardView
+from rigkit.boards import Board
+from rigkit.detections import BoardDetection, BoardView
 from rigkit.errors import InputError
 
-__all__ = ["MIN_CORNERS", "usable_views"]
+__all__ = ["MIN_CORNERS", "usable_views", "views_of_image"]
 
 MIN_CORNERS = 6
 """A pose has six numbers: fewer than six corners leave hardly anything to check it by."""
@@ -56,3 +57,42 @@ def _reason(view: BoardView) -> str | None:
     if extent[1] < MIN_SPREAD * extent[0]:
         return f"the corners of board '{view.board.board_id}' lie on one line"
     return None
+
+
+def views_of_image(
+    image: str, detections: Sequence[BoardDetection], boards: Sequence[Board]
+) -> tuple[list[BoardView], str | None]:
+    """Return the views that an image gives, or why it gives none.
+
+    A detection that could be several boards, or part of one, still is a flat grid of known squares: it becomes a view
+    of a board of its own, called "<board>, part of <image>".
+    """
+    views: list[BoardView] = []
+    other: list[str] = []
+    for k, found in enumerate(detections):
+        if found.board_id is not None:
+            views.append(BoardView.from_detection(image, found, boards))
+            continue
+        parent, turned = _parent(found, boards)
+        if parent is None:
+            other.append(f"{found.columns}x{found.rows}")
+            continue
+        name = f"{parent.board_id}, part of {image}" + (f" ({k + 1})" if len(detections) > 1 else "")
+        part = Board(name, turned.columns, turned.rows, parent.square_x_mm, parent.square_y_mm, parent.square_sigma_mm)
+        views.append(BoardView(image, part, turned.grid, turned.pixels, turned.sigma_px))
+    if views:
+        return views, None
+    sizes = ", ".join(f"{b.columns}x{b.rows}" for b in boards)
+    return [], f"found only {', '.join(other)} corners, the board has {sizes}" if other else "no board found"
+
+
+def _parent(found: BoardDetection, boards: Sequence[Board]) -> tuple[Board | None, BoardDetection]:
+    """Return the smallest board that the detection can be part of, and the detection turned to it."""
+    for board in sorted(boards, key=lambda b: b.corner_count):
+        square = board.square_x_mm == board.square_y_mm
+        for turns in (0, 1):
+            turned = found.turned(turns)
+            fits = turned.columns <= board.columns and turned.rows <= board.rows
+            if fits and (square or (turned.columns, turned.rows) == board.size):
+                return board, turned
+    return None, found

@@ -1,6 +1,6 @@
 """Calibration files (JSON, schema "rigkit.calibration/1"): written by the program, read by everything else.
 
-A file with `schema` and `camera` alone is enough for `load_camera`: that is how other tools' cameras come in. Lengths are
+A file with `schema` and `camera` alone is enough for `load_camera`: so other tools' cameras come in. Lengths are in
 mm, pixels have (0, 0) at the centre of the top-left one, residuals are measured minus projected, NaN is null.
 """
 

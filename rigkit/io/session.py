@@ -35,7 +35,7 @@ class Session:
     Attributes
     ----------
     path : the session file.
-    images : the image files, sorted by name.
+    images : the image files that are there, sorted by name.
     boards : the boards that may be in them.
     model : name of a camera model, or "auto".
     degree : size of the model, or None to choose.
@@ -61,8 +61,7 @@ class Session:
 
 
 def load_session(path: str | Path) -> Session:
-    """Return the session; raises InputError for a missing file or board, an unknown key, or patterns that match
-    nothing."""
+    """Return the session; raises InputError for a missing file or board, or an unknown key."""
     source = Path(path)
     table = read_toml(source, SCHEMA)
     images = _images(table)
@@ -85,8 +84,6 @@ def _images(table: TomlTable) -> tuple[Path, ...]:
     found: dict[Path, None] = {}
     for pattern in patterns:
         matches = sorted(glob.glob(str(table.path.parent / pattern)))
-        if not matches:
-            raise table.error(f"no image matches '{pattern}' (looked in '{table.path.parent}'); correct 'images'")
         found |= {Path(m).resolve(): None for m in matches}
     return tuple(found)
 

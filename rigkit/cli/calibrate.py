@@ -1,0 +1,157 @@
+"""`rigkit calibrate SESSION.toml`: from a folder of images to calibration.json."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rigkit.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from rigkit.calibration.result import Calibration
+    from rigkit.io.corner_cache import FoundCorners
+    from rigkit.io.session import Session
+
+__all__ = ["HELP", "add_arguments", "calibrate_session", "run"]
+
+HELP = "calibrate a camera from images of chessboards"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("session", type=Path, metavar="SESSION.toml", help="what to calibrate (rigkit.session/1)")
+    parser.add_argument(
+        "-o", "--output", type=Path, help="default: calibration.json beside the session"
+    )
+    parser.add_argument("--force", action="store_true", help="replace an existing calibration")
+    parser.add_argument("--json", action="store_true", help="print the result for programs")
+
+
+def run(args: argparse.Namespace) -> int:
+    from rigkit.cli.console import note, print_json, progress_on_stderr
+    from rigkit.io.calibration_file import save_calibration
+    from rigkit.io.files import ensure_writable
+    from rigkit.io.session import load_session
+
+    session = load_session(args.session)
+    target = args.output or session.calibration_path
+    ensure_writable(target, force=args.force)
+    started = time.monotonic()
+    calibration = calibrate_session(session, progress_on_stderr())
+    save_calibration(target, calibration, force=args.force)
+    note(f"{target} written, {time.monotonic() - started:.1f} s")
+    if args.json:
+        print_json(summary(calibration))
+    else:
+        print(describe(calibration))
+    return 0
+
+
+def calibrate_session(session: Session, progress: Progress = silent) -> Calibration:
+    """Return the calibration of a session: images -> corners (kept beside the session) -> calibration.
+
+    Raises InputError where no image shows a board of the session, DegenerateError where the views do not determine the
+    camera.
+    """
+    from dataclasses import replace
+
+    from rigkit.calibration.calibrate import calibrate
+    from rigkit.calibration.usable import views_of_image
+    from rigkit.errors import InputError
+
+    found = _corners(session, progress)
+    size_px = Counter(f.size_px for f in found.values()).most_common(1)[0][0]
+    views, dropped = [], []
+    for name, item in found.items():
+        if item.size_px != size_px:
+            width, height = item.size_px
+            dropped.append((name, f"{width}x{height} px, most images have {size_px[0]}x{size_px[1]}"))
+            continue
+        own, reason = views_of_image(name, item.detections, session.boards)
+        views += own
+        if reason is not None:
+            dropped.append((name, reason))
+    if not views:
+        reasons = Counter(reason for _, reason in dropped).most_common(1)[0]
+        raise InputError(
+            f"{session.path}: no board can be used in {len(found)} images; {reasons[1]} times: {reasons[0]}; check "
+            "columns and rows in the board file"
+        )
+    result = calibrate(
+        views,
+        size_px,
+        model=session.model,
+        degree=session.degree,
+        board=session.board_shape,
+        progress=progress,
+    )
+    return replace(result, dropped=(*dropped, *result.dropped))
+
+
+def _corners(session: Session, progress: Progress) -> dict[str, FoundCorners]:
+    """Return the corners of every image by name, from the images or from the cache."""
+    from rigkit.corners.detect import detect_boards
+    from rigkit.errors import InputError
+    from rigkit.io.corner_cache import CornerCache, FoundCorners, image_hash
+    from rigkit.io.images import read_image
+
+    cache = CornerCache(session.corners_path, session.boards)
+    found: dict[str, FoundCorners] = {}
+    if not session.images:
+        found = {name: item for name in cache.images if (item := cache.get(name, None)) is not None}
+        if not found:
+            raise InputError(f"{session.path}: no image matches 'images', and no corners are kept beside it")
+    for i, path in enumerate(session.images):
+        progress("corners", i, len(session.images))
+        digest = image_hash(path)
+        item = cache.get(path.name, digest)
+        if item is None:
+            image = read_image(path)
+            item = FoundCorners((image.shape[1], image.shape[0]), detect_boards(image, session.boards))
+            cache.put(path.name, digest, item)
+        found[path.name] = item
+    progress("corners", len(session.images), len(session.images))
+    cache.save()
+    return found
+
+
+def summary(calibration: Calibration) -> dict[str, Any]:
+    """Return the figures for programs."""
+    camera = calibration.camera
+    return {
+        "model": camera.model,
+        "size_px": list(camera.size_px),
+        "parameters": dict(zip(camera.parameter_names(), camera.parameters.tolist(), strict=True)),
+        "heldout_rms_px": calibration.heldout_rms_px,
+        "rms_px": calibration.rms_px,
+        "sigma_px": calibration.sigma_px,
+        "views": [{"image": v.image, "board": v.board_id, "rms_px": v.rms_px} for v in calibration.views],
+        "dropped": [{"image": image, "reason": reason} for image, reason in calibration.dropped],
+        "outliers": len(calibration.outliers),
+        "verdicts": list(calibration.verdicts),
+    }
+
+
+def describe(calibration: Calibration) -> str:
+    """Return the result for a person: the headline first."""
+    camera = calibration.camera
+    held = calibration.heldout_rms_px
+    headline = "held-out RMS not available (too few images)" if held is None else f"held-out RMS {held:.4f} px"
+    lines = [
+        f"{camera.model}, {camera.size_px[0]}x{camera.size_px[1]} px: {headline}",
+        f"training RMS {calibration.rms_px:.4f} px (2-D per corner, {calibration.corner_count} corners in "
+        f"{len(calibration.views)} views), {len(calibration.outliers)} outliers, {len(calibration.dropped)} images "
+        "dropped",
+    ]
+    sigmas = calibration.parameter_sigmas
+    for name, value, sigma in zip(camera.parameter_names(), camera.parameters, sigmas, strict=True):
+        lines.append(f"  {name:>4} = {value:.9g} +- {sigma:.2g}")
+    lines += [f"dropped {image}: {reason}" for image, reason in calibration.dropped]
+    lines += [
+        f"tried {c.name}: held-out {'-' if c.heldout_rms_px is None else format(c.heldout_rms_px, '.4f')} px, "
+        f"training {c.rms_px:.4f} px{' (chosen)' if c.chosen else ''}"
+        for c in calibration.candidates
+    ]
+    return "\n".join([*lines, *calibration.verdicts])

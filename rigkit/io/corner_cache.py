@@ -1,0 +1,105 @@
+"""Corners found before, beside the session, so that calibrating again needs no images.
+
+An entry holds as long as the image (by its hash), the detector (by the hash of its source) and the sizes of the boards
+are the same.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import rigkit.corners
+from rigkit.boards import Board
+from rigkit.detections import BoardDetection
+from rigkit.io.files import write_atomic
+
+__all__ = ["CornerCache", "FoundCorners", "image_hash"]
+
+SCHEMA = "rigkit.corners/1"
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FoundCorners:
+    """What was found in one image: its size, (width, height), and the boards."""
+
+    size_px: tuple[int, int]
+    detections: tuple[BoardDetection, ...]
+
+
+class CornerCache:
+    """The corners of a session's images. `get` what is known, `put` what is new, `save` at the end."""
+
+    def __init__(self, path: Path, boards: Sequence[Board]) -> None:
+        self.path = path
+        self.detector = _detector_version() + " " + " ".join(f"{b.columns}x{b.rows}" for b in boards)
+        self._entries: dict[str, dict[str, Any]] = {}
+        self._changed = False
+        try:
+            data = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            # A cache that cannot be read is as good as none: it is written anew.
+            return
+        if isinstance(data, dict) and data.get("schema") == SCHEMA and data.get("detector") == self.detector:
+            self._entries = data["images"]
+
+    @property
+    def images(self) -> list[str]:
+        """Names of the images whose corners are known."""
+        return sorted(self._entries)
+
+    def get(self, name: str, digest: str | None) -> FoundCorners | None:
+        """Return the corners of image `name` if its hash is `digest`; None as digest takes what is there (the image is
+        gone)."""
+        entry = self._entries.get(name)
+        if entry is None or (digest is not None and entry["sha256"] != digest):
+            return None
+        width, height = entry["size_px"]
+        return FoundCorners((int(width), int(height)), tuple(_detection_in(v) for v in entry["boards"]))
+
+    def put(self, name: str, digest: str, found: FoundCorners) -> None:
+        """Remember the corners of an image."""
+        boards = [_detection_out(d) for d in found.detections]
+        self._entries[name] = {"sha256": digest, "size_px": list(found.size_px), "boards": boards}
+        self._changed = True
+
+    def save(self) -> None:
+        """Write the file if anything is new."""
+        if self._changed:
+            data = {"schema": SCHEMA, "detector": self.detector, "images": self._entries}
+            write_atomic(self.path, json.dumps(data, allow_nan=False) + "\n", force=True)
+
+
+def image_hash(path: Path) -> str:
+    """Return the SHA-256 of the file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _detector_version() -> str:
+    digest = hashlib.sha256()
+    for path in sorted(Path(rigkit.corners.__path__[0]).glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _detection_out(d: BoardDetection) -> dict[str, Any]:
+    return {
+        "board_id": d.board_id,
+        "columns": d.columns,
+        "rows": d.rows,
+        "grid": d.grid.tolist(),
+        "pixels": d.pixels.tolist(),
+        "sigma_px": d.sigma_px.tolist(),
+    }
+
+
+def _detection_in(data: dict[str, Any]) -> BoardDetection:
+    grid = np.array(data["grid"], dtype=np.int64).reshape(-1, 2)
+    pixels, sigma = np.array(data["pixels"], dtype=float).reshape(-1, 2), np.array(data["sigma_px"], dtype=float)
+    return BoardDetection(data["board_id"], int(data["columns"]), int(data["rows"]), grid, pixels, sigma)
