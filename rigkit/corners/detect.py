@@ -12,28 +12,30 @@ from numpy.typing import NDArray
 
 from rigkit.boards import Board
 from rigkit.corners.grow import SaddleIndex, grow
-from rigkit.corners.lattice import Lattice, build_lattices
+from rigkit.corners.lattice import build_lattices
 from rigkit.corners.links import find_links
 from rigkit.corners.origin import quarter_turns
 from rigkit.corners.response import grey_image, pyramid
 from rigkit.corners.saddle import find_corners
 from rigkit.corners.subpixel import RefinedLattice, refine
-from rigkit.corners.validate import separate, tidy
+from rigkit.corners.validate import known_part, separate, tidy, trustworthy
 from rigkit.detections import BoardDetection
 
 __all__ = ["detect_boards"]
 
 
 def find_lattices(image: NDArray[np.generic], min_corners: int) -> list[RefinedLattice]:
+    """Return the lattices of all boards of `image`, refined, in no particular order and orientation."""
     grey = grey_image(image)
+    size_px = (grey.shape[1], grey.shape[0])
     levels = pyramid(grey)
     corners, saddles = find_corners(levels)
     lattices = build_lattices(corners, find_links(corners, levels[0]))
     index = SaddleIndex(saddles)
-    grown: list[Lattice] = []
-    for lattice in sorted(lattices, key=lambda item: -item.count):
-        grown.append(tidy(grow(lattice, index, levels[0])))
-    return refine(grey, separate(grown, min_corners))
+    grown = [tidy(grow(lattice, index, levels[0]), size_px) for lattice in lattices]
+    boards = separate(grown, min_corners)
+    refined = zip(boards, refine(grey, boards), strict=True)
+    return [after for before, after in refined if trustworthy(after, before.count, min_corners)]
 
 
 def detect_boards(
@@ -59,7 +61,8 @@ def detect_boards(
         `image` is not an image of a supported type.
     """
     sizes = tuple(dict.fromkeys(board.size for board in boards or ()))
-    found = [_detection(refined, sizes) for refined in find_lattices(image, min_corners)]
+    lattices = [known_part(item, sizes) for item in find_lattices(image, min_corners)]
+    found = [_detection(item, sizes) for item in lattices]
     found.sort(key=lambda item: (-len(item.grid), *np.round(item.pixels.mean(axis=0)[::-1], 3)))
     return tuple(_named(found, boards or ()))
 

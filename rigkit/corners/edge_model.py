@@ -13,7 +13,7 @@ blur, the exact form of the product where the lines cross aslant, sharpening) do
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -256,6 +256,16 @@ def _limited(step: FloatArray, values: FloatArray) -> FloatArray:
     return out
 
 
+def _surrounded(pixels: FloatArray, window: _Window) -> BoolArray:
+    """Return whether there are pixels on all sides of the corner: it is not cut off by the frame."""
+    u = window.u + (window.centre - pixels)[:, :1]
+    v = window.v + (window.centre - pixels)[:, 1:]
+    there = window.weight > 0.0
+    sides = [there & (part > 0.5) for part in (u, -u, v, -v)]
+    surrounded: BoolArray = np.all([side.sum(axis=1) >= 2 for side in sides], axis=0)
+    return surrounded
+
+
 def _result(values: FloatArray, variance: FloatArray, normal: FloatArray, window: _Window, start: EdgeStart) -> EdgeFit:
     covariance = np.linalg.inv(normal) * variance[:, None, None]
     pixels = window.centre + values[:, [X, Y]]
@@ -263,7 +273,8 @@ def _result(values: FloatArray, variance: FloatArray, normal: FloatArray, window
     used = window.weight.sum(axis=1).astype(np.int64)
     moved = np.linalg.norm(pixels - start.pixels, axis=1)
     longest = np.linalg.norm(start.sides, axis=2).max(axis=1)
-    valid = (moved < np.maximum(1.5, 0.2 * longest)) & (spread > 0.0) & (used > PARAMETERS) & np.isfinite(spread)
+    valid = (moved < np.maximum(1.5, 0.2 * longest)) & (spread > 0.0) & np.isfinite(spread)
+    valid &= (used > PARAMETERS) & _surrounded(pixels, window)
     return EdgeFit(
         pixels,
         np.sqrt(np.maximum(spread, 0.0)),

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rigkit.arrays import FloatArray
 from rigkit.corners.lattice import Lattice
 
 __all__ = ["quarter_turns"]
@@ -30,7 +31,12 @@ def quarter_turns(lattice: Lattice, sizes: Sequence[tuple[int, int]] = ()) -> in
 
 def _downwards(lattice: Lattice) -> float:
     """Return how far columns and rows run to the right and down: mean step along (1, 1), in the larger mean step."""
-    column = np.nanmean(np.diff(lattice.pixels, axis=1), axis=(0, 1))
-    row = np.nanmean(np.diff(lattice.pixels, axis=0), axis=(0, 1))
+    column, row = (_mean_step(np.diff(lattice.pixels, axis=axis)) for axis in (1, 0))
     longest = max(float(np.linalg.norm(column)), float(np.linalg.norm(row)), 1e-9)
     return round(float((column + row).sum()) / longest, 9)
+
+
+def _mean_step(steps: FloatArray) -> FloatArray:
+    known = np.isfinite(steps[..., 0])
+    mean: FloatArray = steps[known].mean(axis=0) if known.any() else np.zeros(2)
+    return mean

@@ -1,7 +1,7 @@
 """Corners of whole lattices to a hundredth of a pixel: the edge model at every corner, guided by the lattice.
 
 The lattice says which way the lines run, how far the cell reaches, and how the lines bend; the fit says where the
-corners are, and so gives a better lattice for a second pass.
+corners are, and so gives a better lattice for a second pass, which also tries the cells that were left empty.
 """
 
 from __future__ import annotations
@@ -11,16 +11,30 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
+from rigkit.arrays import BoolArray, FloatArray
 from rigkit.corners.edge_model import BLUR_RANGE, EdgeFit, EdgeStart, fit_edges
 from rigkit.corners.lattice import Lattice
-from rigkit.corners.local_fit import LocalFit, fit_cells
+from rigkit.corners.local_fit import fit_cells
 from rigkit.corners.response import FloatImage
 
 __all__ = ["RefinedLattice", "refine"]
 
-PASSES = 2
 FIRST_BLUR = 1.0
+
+FEWEST_NEIGHBOURS = 4
+"""An empty cell is tried if so many of its eight neighbours are known."""
+
+HOLE_MOVE = 0.12
+HOLE_CONTRAST = 0.3
+HOLE_RESIDUAL = 2.0
+HOLE_SIGMA = 3.0
+"""What a corner in an empty cell must show: how far from its prediction (cells); contrast, relative residual and sigma
+relative to the typical corner of the board."""
+
+ASTRAY_CELLS = 0.06
+ASTRAY_FACTOR = 8.0
+"""A corner further than both of these from where its neighbours say (cells; times the board's typical deviation) is
+something else: a finger, a glint, the end of a ruler."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -38,63 +52,120 @@ class RefinedLattice:
     blur_px: FloatArray
     residual: FloatArray
 
+    def without(self, drop: BoolArray) -> RefinedLattice:
+        """Return this with the corners `drop` (R, C) forgotten."""
+        rest = (np.where(drop, np.nan, values) for values in (self.sigma_px, self.blur_px, self.residual))
+        return RefinedLattice(self.lattice.without(drop), *rest)
+
+    def cut(self, rows: slice, columns: slice) -> RefinedLattice:
+        """Return the part of `rows` and `columns`."""
+        rest = (values[rows, columns] for values in (self.sigma_px, self.blur_px, self.residual))
+        return RefinedLattice(self.lattice.cut(rows, columns), *rest)
+
 
 def refine(image: FloatImage, lattices: Sequence[Lattice]) -> list[RefinedLattice]:
     """Return `lattices` with their corners placed by the edge model on the full-resolution grey `image`.
 
-    Corners whose fit fails are dropped.
+    Corners whose fit fails or that contradict their neighbours are dropped; corners in empty cells that the fit
+    confirms are added.
     """
     if not lattices:
         return []
-    current = list(lattices)
-    blurs = [np.full(item.known.shape, FIRST_BLUR) for item in current]
-    refined: list[RefinedLattice] = []
-    for _ in range(PASSES):
-        fits = _fit(image, current, blurs)
-        refined = [_filled(item, fit) for item, fit in zip(current, fits, strict=True)]
-        current = [item.lattice for item in refined]
-        blurs = [_typical_blur(item) for item in refined]
-    return refined
+    first = [np.full(item.known.shape, FIRST_BLUR) for item in lattices]
+    refined = _pass(image, lattices, first)
+    current = [_with_holes(item) for item in refined]
+    second = _pass(image, [item[0] for item in current], [_typical_blur(item) for item in refined])
+    return [
+        _without_astray(_confirmed(item, start, holes)) for item, (start, holes) in zip(second, current, strict=True)
+    ]
 
 
 def _typical_blur(item: RefinedLattice) -> FloatArray:
     known = np.isfinite(item.blur_px)
     typical = float(np.median(item.blur_px[known])) if known.any() else FIRST_BLUR
-    return np.where(known, np.clip(item.blur_px, 0.7 * typical, 1.4 * typical), typical).clip(*BLUR_RANGE)
+    blur: FloatArray = np.where(known, np.clip(item.blur_px, 0.7 * typical, 1.4 * typical), typical).clip(*BLUR_RANGE)
+    return blur
 
 
-def _fit(image: FloatImage, lattices: list[Lattice], blurs: list[FloatArray]) -> list[EdgeFit]:
+def _pass(image: FloatImage, lattices: Sequence[Lattice], blurs: Sequence[FloatArray]) -> list[RefinedLattice]:
     """Fit all corners of all lattices in one batch."""
-    shapes = [fit_cells(item.pixels, item.known) for item in lattices]
-    known = [item.known for item in lattices]
-    start = EdgeStart(
-        np.concatenate([item.pixels[k] for item, k in zip(lattices, known, strict=True)]),
-        np.concatenate([_sides(shape) for shape in shapes]),
-        np.concatenate([shape.curvature() for shape in shapes]),
-        np.concatenate([item.signs()[k] for item, k in zip(lattices, known, strict=True)]),
-        np.concatenate([blur[k] for blur, k in zip(blurs, known, strict=True)]),
-    )
-    fit = fit_edges(image, start)
-    ends = np.cumsum([int(k.sum()) for k in known])
-    names = EdgeFit.__slots__
-    return [
-        EdgeFit(*(getattr(fit, name)[end - int(k.sum()) : end] for name in names))
-        for end, k in zip(ends, known, strict=True)
-    ]
+    starts = []
+    for item, blur in zip(lattices, blurs, strict=True):
+        known = item.known
+        shape = fit_cells(item.pixels, known)
+        sides = np.stack([shape.along_column, shape.along_row], axis=1)
+        starts.append((item.pixels[known], sides, shape.curvature(), item.signs()[known], blur[known]))
+    fit = fit_edges(image, EdgeStart(*(np.concatenate(part) for part in zip(*starts, strict=True))))
+    ends = np.cumsum([item.count for item in lattices])
+    return [_filled(item, fit, slice(end - item.count, end)) for item, end in zip(lattices, ends, strict=True)]
 
 
-def _sides(shape: LocalFit) -> FloatArray:
-    return np.stack([shape.along_column, shape.along_row], axis=1)
-
-
-def _filled(lattice: Lattice, fit: EdgeFit) -> RefinedLattice:
+def _filled(lattice: Lattice, fit: EdgeFit, mine: slice) -> RefinedLattice:
+    """Return `lattice` with the part `mine` of `fit`, without the corners that failed."""
     known = lattice.known
-    good = fit.valid & (fit.contrast > 0.0)
+    good = fit.valid[mine] & (fit.contrast[mine] > 0.0)
 
     def spread(values: FloatArray) -> FloatArray:
         out = np.full(known.shape + values.shape[1:], np.nan)
-        out[known] = np.where(good.reshape(-1, *[1] * (values.ndim - 1)), values, np.nan)
+        out[known] = np.where(good.reshape(-1, *[1] * (values.ndim - 1)), values[mine], np.nan)
         return out
 
     refined = Lattice(spread(fit.pixels), spread(fit.contrast), lattice.rising)
     return RefinedLattice(refined, spread(fit.sigma_px), spread(fit.blur), spread(fit.residual))
+
+
+def _with_holes(item: RefinedLattice) -> tuple[Lattice, BoolArray]:
+    """Return the lattice with predictions in the empty cells among known ones, and which cells these are."""
+    known = item.lattice.known
+    padded = np.pad(known.astype(np.int64), 1)
+    rows, columns = known.shape
+    around = sum(
+        padded[1 + i : 1 + i + rows, 1 + j : 1 + j + columns]
+        for i in (-1, 0, 1)
+        for j in (-1, 0, 1)
+        if (i, j) != (0, 0)
+    )
+    holes: BoolArray = ~known & (around >= FEWEST_NEIGHBOURS)
+    if not holes.any():
+        return item.lattice, holes
+    shape = fit_cells(item.lattice.pixels, holes, degree=2, ridge=(1e-3, 1.0))
+    pixels, contrast = item.lattice.pixels.copy(), item.lattice.contrast.copy()
+    pixels[holes] = shape.pixels
+    return Lattice(pixels, contrast, item.lattice.rising), holes
+
+
+def _confirmed(item: RefinedLattice, start: Lattice, holes: BoolArray) -> RefinedLattice:
+    """Return `item` without those of the `holes` where the fit saw no proper corner."""
+    known = item.lattice.known
+    settled = known & ~holes
+    if not (holes & known).any() or not settled.any():
+        return item.without(holes)
+    contrast = item.lattice.contrast
+    relative = item.residual / np.where(known, contrast, 1.0)
+    moved = np.linalg.norm(item.lattice.pixels - start.pixels, axis=2)
+    shape = fit_cells(start.pixels, np.ones_like(known), degree=1)
+    area = shape.along_column[:, 0] * shape.along_row[:, 1] - shape.along_column[:, 1] * shape.along_row[:, 0]
+    cell = np.sqrt(np.maximum(area, 1.0)).reshape(known.shape)
+    with np.errstate(invalid="ignore"):
+        good = (moved < HOLE_MOVE * cell) & (contrast > HOLE_CONTRAST * np.median(contrast[settled]))
+        good &= relative < HOLE_RESIDUAL * np.median(relative[settled])
+        good &= item.sigma_px < HOLE_SIGMA * np.median(item.sigma_px[settled])
+    return item.without(holes & ~good)
+
+
+def _without_astray(item: RefinedLattice) -> RefinedLattice:
+    """Return `item` without corners that lie where their neighbours say they cannot."""
+    known = item.lattice.known
+    if known.sum() < 12:
+        return item
+    shape = fit_cells(item.lattice.pixels, known, leave_out=True)
+    off = item.lattice.pixels[known] - shape.pixels
+    area = shape.along_column[:, 0] * shape.along_row[:, 1] - shape.along_column[:, 1] * shape.along_row[:, 0]
+    # A prediction from one side only is no better than its neighbours are far.
+    trusted = shape.support >= 12
+    cells = np.linalg.norm(off, axis=1) / np.sqrt(np.maximum(area, 1.0))
+    typical = float(np.median(cells[trusted])) if trusted.any() else 0.0
+    astray = trusted & (cells > max(ASTRAY_CELLS, ASTRAY_FACTOR * typical))
+    drop = np.zeros_like(known)
+    drop[known] = astray
+    return item.without(drop)

@@ -1,62 +1,150 @@
-"""Which lattices are boards: enough corners in closed squares, one board to a place, and of a known size if sizes are known."""
+"""Which lattices are boards: squares that close, rows that are rows, one board to a place, sizes that are known."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
 from rigkit.arrays import BoolArray
 from rigkit.corners.lattice import Lattice
+from rigkit.corners.local_fit import fit_cells
+from rigkit.corners.subpixel import RefinedLattice
 
-__all__ = ["in_squares", "largest_part", "separate", "tidy"]
+__all__ = ["known_part", "largest_part", "separate", "tidy", "trustworthy"]
 
+STRAY_ROW = 2
+"""An outer row of so many corners or fewer, most of whose other corners should be in view too, is not of the board."""
 
-def in_squares(known: BoolArray) -> BoolArray:
-    """Return which of the `known` corners (R, C) belong to a closed square of four."""
-    square = known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:] & known[1:, 1:]
-    out = np.zeros_like(known)
-    for rows in (slice(None, -1), slice(1, None)):
-        for columns in (slice(None, -1), slice(1, None)):
-            out[rows, columns] |= square
-    return out
+FRAME_CELLS = 0.5
+"""A corner predicted nearer than this to the frame may be missing for a good reason, in cells."""
+
+MAX_RELATIVE_SIGMA = 0.02
+"""Corners more uncertain than this, in cells, make no board: keys, letters, weave."""
+
+MAX_LOST = 0.25
+"""Largest part of a lattice's corners that the sub-pixel fit may refuse."""
+
+MAX_EXTRA = 2
+"""Rows and columns that may be too many, when a grid is larger than the board it may be."""
+
+WORSE = 1.5
+"""Corners of rows that do not belong to the board fit so many times worse."""
 
 
 def largest_part(known: BoolArray) -> BoolArray:
-    """Return the largest part of `known` (R, C) that hangs together by its squares."""
+    """Return the largest part of `known` (R, C) that hangs together by closed squares of four corners."""
     import cv2
 
     square = known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:] & known[1:, 1:]
     count, label, stats, _ = cv2.connectedComponentsWithStats(square.astype(np.uint8), connectivity=4)
-    if count < 2:
-        return np.zeros_like(known)
-    best = label == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
     out = np.zeros_like(known)
+    if count < 2:
+        return out
+    best = label == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
     for rows in (slice(None, -1), slice(1, None)):
         for columns in (slice(None, -1), slice(1, None)):
             out[rows, columns] |= best
     return out
 
 
-def tidy(lattice: Lattice) -> Lattice:
-    """Return `lattice` without corners outside closed squares, trimmed."""
-    if min(lattice.pixels.shape[:2]) < 2:
-        return lattice.without(np.ones_like(lattice.known)).trimmed()
-    return lattice.without(~largest_part(lattice.known)).trimmed()
+def tidy(lattice: Lattice, size_px: tuple[int, int]) -> Lattice:
+    """Return `lattice` without corners outside closed squares and without stray outer rows, trimmed.
+
+    `size_px` is the (width, height) of the full-resolution image.
+    """
+    while min(lattice.pixels.shape[:2]) >= 2:
+        lattice = lattice.without(~largest_part(lattice.known)).trimmed()
+        stray = _stray_row(lattice, size_px)
+        if stray is None:
+            return lattice
+        lattice = lattice.without(stray).trimmed()
+    return lattice.without(np.ones_like(lattice.known)).trimmed()
 
 
-def separate(lattices: list[Lattice], least: int) -> list[Lattice]:
-    """Return the boards among `lattices`: at least `least` corners, 3x3 or more, and no corner shared with a larger one."""
+def _stray_row(lattice: Lattice, size_px: tuple[int, int]) -> BoolArray | None:
+    """Return the first outer row or column (as a mask) that has strayed into the lattice, None if there is none."""
+    known = lattice.known
+    if min(known.shape) < 3:
+        return None
+    for outer in ((0, slice(None)), (-1, slice(None)), (slice(None), 0), (slice(None), -1)):
+        row = np.zeros_like(known)
+        row[outer] = True
+        have = int((row & known).sum())
+        if have > STRAY_ROW:
+            continue
+        rest = lattice.without(row)
+        missing = row & ~known
+        shape = fit_cells(rest.pixels, missing, degree=2, radius=3, ridge=(0.02, 1.0))
+        side = np.abs(shape.along_column) + np.abs(shape.along_row)
+        margin = FRAME_CELLS * side
+        inside = (shape.pixels > margin) & (shape.pixels < np.array(size_px) - 1.0 - margin)
+        if have < int((inside.all(axis=1) & (shape.support >= 3)).sum()):
+            return row
+    return None
+
+
+def separate(lattices: Sequence[Lattice], least: int) -> list[Lattice]:
+    """Return the boards among `lattices`: `least` corners, 3x3 or more, and no corners shared with a larger one."""
     kept: list[Lattice] = []
     for lattice in sorted(lattices, key=lambda item: -item.count):
         if lattice.count < max(least, 9) or min(lattice.size) < 3:
             continue
-        mine = lattice.pixels[lattice.known]
-        if not any(_overlap(mine, other.pixels[other.known]) for other in kept):
+        if not any(_overlap(lattice, other) for other in kept):
             kept.append(lattice)
     return kept
 
 
-def _overlap(mine: np.ndarray, theirs: np.ndarray) -> bool:
+def _overlap(mine: Lattice, theirs: Lattice) -> bool:
     from scipy.spatial import cKDTree
 
-    distance, _ = cKDTree(theirs).query(mine)
+    distance, _ = cKDTree(theirs.pixels[theirs.known]).query(mine.pixels[mine.known])
     return bool((distance < 2.0).sum() > 1)
+
+
+def trustworthy(refined: RefinedLattice, before: int, least: int) -> bool:
+    """Return whether what the fit left of a lattice of `before` corners is a board."""
+    lattice = refined.lattice
+    if lattice.count < max(least, (1.0 - MAX_LOST) * before) or min(lattice.size) < 3:
+        return False
+    shape = fit_cells(lattice.pixels, lattice.known, degree=1)
+    area = shape.along_column[:, 0] * shape.along_row[:, 1] - shape.along_column[:, 1] * shape.along_row[:, 0]
+    relative = refined.sigma_px[lattice.known] / np.sqrt(np.maximum(area, 1e-6))
+    return float(np.median(relative)) < MAX_RELATIVE_SIGMA
+
+
+def known_part(refined: RefinedLattice, sizes: Sequence[tuple[int, int]]) -> RefinedLattice:
+    """Return the part of a grid that is a board of a known size, where what sticks out clearly is none of it.
+
+    The outer border of a board, or what lies beside it, sometimes passes for a row of corners: few of them, or corners
+    that fit badly. A grid of a known size, or one whose extra rows are as good as the others, comes back as it is.
+    """
+    rows, columns = refined.lattice.known.shape
+    both = {(r, c) for c, r in sizes} | {(c, r) for c, r in sizes}
+    if (rows, columns) in both or not both:
+        return refined
+    relative = refined.residual / np.where(refined.lattice.known, refined.lattice.contrast, 1.0)
+    best: tuple[int, float, RefinedLattice] | None = None
+    for r, c in both:
+        if r > rows or c > columns or rows - r + columns - c > MAX_EXTRA:
+            continue
+        for top in range(rows - r + 1):
+            for left in range(columns - c + 1):
+                part = (slice(top, top + r), slice(left, left + c))
+                inside = np.zeros((rows, columns), bool)
+                inside[part] = True
+                if not _sticks_out(refined.lattice.known, relative, inside):
+                    continue
+                rank = (int(refined.lattice.known[part].sum()), -float(np.nanmedian(relative[part])))
+                if best is None or rank > best[:2]:
+                    best = (*rank, refined.cut(*part))
+    return refined if best is None else best[2]
+
+
+def _sticks_out(known: BoolArray, relative: np.ndarray, inside: BoolArray) -> bool:
+    """Return whether the corners outside `inside` are few or fit badly, and those inside are nearly all there."""
+    outside = ~inside
+    if known[inside].mean() < 0.9:
+        return False
+    few = known[outside].mean() < 0.5
+    return bool(few or np.nanmedian(relative[outside & known]) > WORSE * np.nanmedian(relative[inside & known]))
