@@ -161,7 +161,7 @@ class _Tangent:
         """Return (N, M, 2, 2) that maps errors in the tangent plane to units of their standard deviation."""
         by_ray = (self.bases[:, None] - positions[..., None] * self.rays[:, None, None, :]) / cosine[..., None, None]
         by_pixel = by_ray @ self.jacobians[index]
-        usable = _finite(by_pixel).all(axis=-1)
+        usable = _finite(by_pixel.reshape(*index.shape, 4))
         inverse = np.linalg.inv(np.where(usable[..., None, None], by_pixel, np.eye(2)))
         return np.asarray(np.where(usable[..., None, None], inverse / self.sigma_px[index][..., None, None], 0.0))
 

@@ -16,7 +16,7 @@ from rigkit.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, nearest_rotation, skew
 
-__all__ = ["BoardPose", "board_pose", "board_poses", "ray_residuals", "tangent_bases"]
+__all__ = ["BoardPose", "board_pose", "board_poses", "point_residuals", "ray_residuals", "tangent_bases"]
 
 MIN_SPREAD = 1e-6
 """Points are collinear where their second principal extent is below this part of the first."""
@@ -57,10 +57,13 @@ def board_pose(rays: Rays, points_mm: Points, sigma_rad: FloatArray | None = Non
     return board_poses(rays, points_mm, sigma_rad)[0]
 
 
-def board_poses(rays: Rays, points_mm: Points, sigma_rad: FloatArray | None = None) -> tuple[BoardPose, ...]:
+def board_poses(
+    rays: Rays, points_mm: Points, sigma_rad: FloatArray | None = None, *, bases: FloatArray | None = None
+) -> tuple[BoardPose, ...]:
     """Return the local optima of `board_pose`, best first: one or two (the target tilted the other way).
 
-    Arguments and errors as `board_pose`.
+    `bases` (N, 2, 3), rows perpendicular to the rays, set the unit of the residuals: orthonormal rows by default,
+    the pseudo-inverses of d ray / d pixel for pixels; sigma and rms are then pixels too. Else as `board_pose`.
     """
     f = as_array(rays, (None, 3), "rays")
     n = len(f)
@@ -73,9 +76,9 @@ def board_poses(rays: Rays, points_mm: Points, sigma_rad: FloatArray | None = No
         raise InputError("board pose: sigma_rad must be positive")
     weight = 1.0 / sigma
     plane_from_target, flat = _flatten(points)
-    bases = tangent_bases(f)
-    rotation, translation = _pose_from_homography(_homography(f, bases, flat, weight))
-    rotation, translation = _both_tilts(rotation, translation, flat)
+    bases = tangent_bases(f) if bases is None else as_array(bases, (n, 2, 3), "bases")
+    rotation, translation = _pose_from_homography(_homography(f, flat, weight))
+    rotation, translation = _both_tilts(rotation, translation)
     rotation, translation, cost = _refine(f, bases, flat, weight, rotation, translation)
     order = [int(np.argmin(cost)), 1 - int(np.argmin(cost))]
     keep = order if _differ(rotation, translation, flat, cost) else order[:1]
@@ -106,26 +109,34 @@ def tangent_bases(rays: Rays) -> FloatArray:
 def ray_residuals(
     rays: Rays, bases: FloatArray, points: Points, rotation: FloatArray, translation: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return residuals (..., N, 2) of points against rays, and their derivatives (..., N, 2, 6) by (w, v).
+    """Return residuals (..., N, 2) of a rigid target against rays, and their derivatives (..., N, 2, 6) by (w, v).
+
+    `rotation` (..., 3, 3) and `translation` (..., 3) change as R' = exp([w]x) R, t' = t + v. Else as
+    `point_residuals`.
+    """
+    turned = points @ np.swapaxes(rotation, -1, -2)
+    residual, by_x = point_residuals(rays, bases, turned + translation[..., None, :])
+    return residual, np.concatenate([-by_x @ skew(turned), by_x], axis=-1)
+
+
+def point_residuals(rays: Rays, bases: FloatArray, points: Points) -> tuple[FloatArray, FloatArray]:
+    """Return residuals (..., N, 2) of points in the camera frame against rays (N, 3), and d residual / d point.
 
     `bases` (N, 2, 3) are rows perpendicular to the rays: orthonormal for radians, the pseudo-inverse of d ray / d pixel
-    for pixels. `rotation` (..., 3, 3) and `translation` (..., 3) change as R' = exp([w]x) R, t' = t + v.
+    for pixels.
 
     Notes
     -----
     r = 2 T u / (1 + f.u) with u the predicted unit ray: to first order the measured offset, 2 tan(angle / 2) in
     general, which grows up to the opposite ray (T u alone would call the opposite ray a perfect fit).
     """
-    turned = points @ np.swapaxes(rotation, -1, -2)
-    x = turned + translation[..., None, :]
-    length = np.linalg.norm(x, axis=-1, keepdims=True)
-    u = x / length
+    length = np.linalg.norm(points, axis=-1, keepdims=True)
+    u = points / length
     closeness = np.maximum(1.0 + (u * rays).sum(axis=-1), 1e-9)[..., None]
-    tangent = np.einsum("nij,...nj->...ni", bases, u)
-    residual = 2.0 * tangent / closeness
+    tangent = (bases @ u[..., None])[..., 0]
     by_u = (2.0 / closeness)[..., None] * (bases - (tangent / closeness)[..., None] * rays[:, None, :])
-    by_x = (by_u - (by_u @ u[..., None]) * u[..., None, :]) / length[..., None]
-    return residual, np.concatenate([-by_x @ skew(turned), by_x], axis=-1)
+    by_point = (by_u - (by_u @ u[..., None]) * u[..., None, :]) / length[..., None]
+    return 2.0 * tangent / closeness, by_point
 
 
 def _flatten(points: Points) -> tuple[Rigid3, FloatArray]:
@@ -141,7 +152,7 @@ def _flatten(points: Points) -> tuple[Rigid3, FloatArray]:
     return Rigid3(rotation, -rotation @ centre), flat
 
 
-def _homography(rays: Rays, bases: FloatArray, flat: FloatArray, weight: FloatArray) -> FloatArray:
+def _homography(rays: Rays, flat: FloatArray, weight: FloatArray) -> FloatArray:
     """Return H (3, 3), ray ~ H (x, y, 1), signed so that the target lies along the rays."""
     scale = np.sqrt((flat[:, :2] ** 2).sum(axis=1).mean())
     target = np.concatenate([flat[:, :2] / scale, np.ones((len(flat), 1))], axis=1)
@@ -171,7 +182,7 @@ def _pose_from_homography(h: FloatArray) -> tuple[FloatArray, FloatArray]:
     return nearest_rotation(np.stack([r1, r2, np.cross(r1, r2)], axis=1)), t
 
 
-def _both_tilts(rotation: FloatArray, translation: FloatArray, flat: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _both_tilts(rotation: FloatArray, translation: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the pose and the one that looks the same under weak perspective: tilt about the line of sight reversed.
 
     Its axes have the same components across the line of sight to the target's centre and opposite ones along it.
