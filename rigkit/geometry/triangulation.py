@@ -15,6 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, Mat3, Pixels, Points, RayJacobians, Rays
+from rigkit.geometry.projection_jacobian import projection_jacobian
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew, unit
 from rigkit.geometry.sampson import epipolar_normals
@@ -252,13 +253,13 @@ def point_covariances(
     the points.
     """
     in_cam2 = cam2_from_cam1.apply(points)
-    by_point1 = _pixel_by_point(points, rays1, jacobians1)
-    by_point_cam2 = _pixel_by_point(in_cam2, rays2, jacobians2)
+    by_point1 = projection_jacobian(rays1, jacobians1, np.linalg.norm(points, axis=-1))
+    by_point_cam2 = projection_jacobian(rays2, jacobians2, np.linalg.norm(in_cam2, axis=-1))
     by_point2 = by_point_cam2 @ cam2_from_cam1.rotation
     w1, w2 = (np.asarray(s, dtype=np.float64)[..., None, None] ** -2.0 for s in (sigma1_px, sigma2_px))
     information = w1 * np.swapaxes(by_point1, -1, -2) @ by_point1 + w2 * np.swapaxes(by_point2, -1, -2) @ by_point2
-    bad = ~np.isfinite(information).all(axis=(-2, -1)) | ~np.isfinite(np.linalg.cond(np.nan_to_num(information)))
-    covariance = np.linalg.inv(np.where(bad[..., None, None], np.eye(3), information))
+    bad = ~np.isfinite(information).all(axis=(-2, -1), keepdims=True)
+    covariance = np.linalg.inv(np.where(bad, np.eye(3), information))
     if pose_covariance is not None:
         rotated = in_cam2 - cam2_from_cam1.translation_mm
         by_pose = by_point_cam2 @ np.concatenate(
@@ -266,15 +267,7 @@ def point_covariances(
         )
         gain = covariance @ (w2 * np.swapaxes(by_point2, -1, -2) @ by_pose)
         covariance = covariance + gain @ pose_covariance @ np.swapaxes(gain, -1, -2)
-    return np.where(bad[..., None, None], np.nan, covariance)
-
-
-def _pixel_by_point(points: Points, rays: Rays, jacobians: RayJacobians) -> FloatArray:
-    """Return d pixel / d point (..., 2, 3): the first two rows of inv([range B | f])."""
-    distance = np.linalg.norm(points, axis=-1)[..., None, None]
-    square = np.concatenate([distance * jacobians, np.asarray(rays)[..., None]], axis=-1)
-    bad = ~np.isfinite(square).all(axis=(-2, -1), keepdims=True)
-    return np.asarray(np.where(bad, np.nan, np.linalg.inv(np.where(bad, np.eye(3), square)))[..., :2, :])
+    return np.where(bad, np.nan, covariance)
 
 
 def _ratio(a: FloatArray, b: FloatArray) -> FloatArray:

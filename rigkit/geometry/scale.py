@@ -1,0 +1,147 @@
+"""The metric scale of a reconstruction from chessboards whose squares were measured.
+
+Each board is a rigid, scaled copy of its grid: p_i = k (R g_i + c) with p in the unit of the reconstruction and g in
+mm. The scale is that of maximum likelihood under the points' covariances, robust to single bad corners. It uses all
+distances on the board at once, and is several times more precise than the median of neighbouring corners' distances.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rigkit.arrays import FloatArray, IntArray, Points
+from rigkit.boards import Board
+from rigkit.errors import DegenerateError, InputError
+from rigkit.geometry.rotation import exp_so3, nearest_rotation, skew
+
+__all__ = ["board_scales", "metric_scale"]
+
+MIN_CORNERS = 4
+CAUCHY_SCALE = 3.0
+"""In standard deviations of a point (three components): Gaussian corners are hardly touched."""
+ITERATIONS = 15
+
+
+def metric_scale(
+    points_unit: Points,
+    board_index: IntArray,
+    grid: IntArray,
+    boards: Sequence[Board],
+    covariances: FloatArray | None = None,
+) -> tuple[float, float]:
+    """Return the factor from the reconstruction's unit to mm and its standard deviation.
+
+    Parameters
+    ----------
+    points_unit : (N, 3) triangulated corners; NaN rows are ignored.
+    board_index : (N,) index into `boards`; -1 where the point is on none.
+    grid : (N, 2) int, (column, row).
+    boards : with their measured squares; a stated `square_sigma_mm` enters the standard deviation, and the weight.
+    covariances : (N, 3, 3) of the points in the unit of the reconstruction; None: equal and estimated from the fit.
+
+    Raises
+    ------
+    DegenerateError
+        No board has enough corners.
+
+    Notes
+    -----
+    The standard deviation holds for the given pose of the cameras; what the uncertainty of the pose adds is the
+    business of whoever knows it.
+    """
+    scales, sigmas = board_scales(points_unit, board_index, grid, boards, covariances)
+    known = np.isfinite(scales)
+    if not known.any():
+        raise DegenerateError(
+            f"no scale: none of {len(boards)} boards has {MIN_CORNERS} triangulated corners that span it"
+        )
+    square = [(board.square_sigma_mm or 0.0) / min(board.square_x_mm, board.square_y_mm) for board in boards]
+    variance = sigmas**2 + (scales * np.array(square)) ** 2
+    weights = np.where(known, 1.0 / np.maximum(np.where(known, variance, 1.0), 1e-300), 0.0)
+    total = weights.sum()
+    return float(np.sum(weights * np.where(known, scales, 0.0)) / total), float(total**-0.5)
+
+
+def board_scales(
+    points_unit: Points,
+    board_index: IntArray,
+    grid: IntArray,
+    boards: Sequence[Board],
+    covariances: FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Return scale and standard deviation of every board by itself (B,), NaN where it has too few corners.
+
+    Boards that disagree by many standard deviations have a wrong square size or a wrong pose under them. Parameters as
+    in `metric_scale`; the squares' own sigma is not included here.
+    """
+    points = np.asarray(points_unit, dtype=np.float64)
+    index, cells = np.asarray(board_index), np.asarray(grid)
+    if len(index) != len(points) or len(cells) != len(points):
+        raise InputError(f"scale: {len(points)} points, {len(index)} board indices and {len(cells)} grid positions")
+    finite = np.isfinite(points).all(axis=1)
+    if covariances is not None:
+        finite &= np.isfinite(covariances).all(axis=(-2, -1))
+    scales, sigmas = np.full(len(boards), np.nan), np.full(len(boards), np.nan)
+    for b, board in enumerate(boards):
+        on = finite & (index == b)
+        if on.sum() < MIN_CORNERS:
+            continue
+        model = board.points(cells[on])
+        # Corners in a row leave the rotation about it open, but the scale is determined: two spreads are asked all the
+        # same, because a single row is what a wrong detection looks like.
+        if np.linalg.matrix_rank(model - model.mean(axis=0)) < 2:
+            continue
+        scales[b], sigmas[b] = _similarity_scale(points[on], model, None if covariances is None else covariances[on])
+    return scales, sigmas
+
+
+def _similarity_scale(points: Points, model: Points, covariances: FloatArray | None) -> tuple[float, float]:
+    """Return mm per unit and its standard deviation for one board."""
+    centred = model - model.mean(axis=0)
+    k, R, c = _robust_start(points, centred)
+    if covariances is None:
+        whiten = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+    else:
+        floor = 1e-12 * np.trace(covariances, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        whiten = np.linalg.inv(np.linalg.cholesky(covariances + floor))
+    noise, gram = 1.0, np.eye(7)
+    for iteration in range(ITERATIONS):
+        turned = centred @ R.T
+        residual = np.einsum("nij,nj->ni", whiten, points - k * turned - c)
+        square = np.sum(residual**2, axis=1)
+        if covariances is None:
+            # Three components of a point; the median of their sum of squares is 2.37 variances.
+            noise = max(float(np.median(square)) / 2.366, 1e-300)
+        w = 1.0 / (1.0 + square / (noise * CAUCHY_SCALE**2))
+        J = np.concatenate([turned[:, :, None], -k * skew(turned), np.broadcast_to(np.eye(3), whiten.shape)], axis=2)
+        J = whiten @ J
+        gram = np.einsum("n,nij,nik->jk", w, J, J)
+        step = np.linalg.solve(gram, np.einsum("n,nij,ni->j", w, J, residual))
+        k, R, c = k + step[0], exp_so3(step[1:4]) @ R, c + step[4:]
+        if iteration > 2 and abs(step[0]) < 1e-12 * k:
+            break
+    if not k > 0.0:
+        return float("nan"), float("nan")
+    # Sandwich over model variance would need the weights' derivative; the weighted residual variance is enough here.
+    spread = float(np.sum(w * square)) / max(3.0 * w.sum() - 7.0, 1.0)
+    spread = spread if covariances is None else max(spread, 1.0)
+    return 1.0 / k, float(np.sqrt(spread * np.linalg.inv(gram)[0, 0])) / k**2
+
+
+def _robust_start(points: Points, centred: Points) -> tuple[float, FloatArray, FloatArray]:
+    """Return unit per mm (median of all distance ratios), rotation and centre to begin with."""
+    first, second = np.triu_indices(len(points), 1)
+    between = np.linalg.norm(points[first] - points[second], axis=1)
+    k = float(np.median(between / np.linalg.norm(centred[first] - centred[second], axis=1)))
+    c = np.median(points, axis=0)
+    R = nearest_rotation((points - c).T @ centred)
+    for _ in range(5):
+        off = points - k * centred @ R.T - c
+        size = np.linalg.norm(off, axis=1)
+        w = 1.0 / np.maximum(size, 0.1 * np.median(size) + 1e-300)
+        mean_p, mean_m = w @ points / w.sum(), w @ centred / w.sum()
+        R = nearest_rotation((points - mean_p).T * w @ (centred - mean_m))
+        c = mean_p - k * R @ mean_m
+    return k, R, c
