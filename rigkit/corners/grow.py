@@ -21,6 +21,10 @@ __all__ = ["SaddleIndex", "grow"]
 MAX_RINGS = 60
 """More rings than any board has rows or columns."""
 
+STIFF = (2, (0.02, 1.0))
+PLIANT = (3, (1e-3, 1e-2))
+"""Degree and ridge of the prediction: the first is steady with few neighbours, the second follows the rim of a fisheye."""
+
 REACH = 0.25
 """A corner lies within this of its prediction, in cells."""
 
@@ -56,21 +60,18 @@ class SaddleIndex:
 
 def grow(lattice: Lattice, saddles: SaddleIndex, level: Level) -> Lattice:
     """Return `lattice` with all corners that can be added one after the other; the brightness is read from `level`."""
-    tried: set[bytes] = set()
     for _ in range(MAX_RINGS):
         wide = lattice.padded()
-        added = _ring(wide, saddles, level)
+        added = _ring(wide, saddles, level, *STIFF) or _ring(wide, saddles, level, *PLIANT)
         if added is None:
             return lattice
-        key = added.pixels.tobytes()
-        if key in tried:
-            return lattice
-        tried.add(key)
         lattice = added.trimmed()
     return lattice
 
 
-def _ring(lattice: Lattice, saddles: SaddleIndex, level: Level) -> Lattice | None:
+def _ring(
+    lattice: Lattice, saddles: SaddleIndex, level: Level, degree: int, ridge: tuple[float, float]
+) -> Lattice | None:
     """Return `lattice` with the empty cells filled that can be, None if there are none."""
     known = lattice.known
     beside = np.zeros_like(known)
@@ -79,7 +80,7 @@ def _ring(lattice: Lattice, saddles: SaddleIndex, level: Level) -> Lattice | Non
     beside[:, 1:] |= known[:, :-1]
     beside[:, :-1] |= known[:, 1:]
     cells = beside & ~known
-    fit = fit_cells(lattice.pixels, cells, degree=2, radius=3, width=1.3, ridge=(0.02, 1.0))
+    fit = fit_cells(lattice.pixels, cells, degree=degree, radius=3, width=1.3, ridge=ridge)
     height = np.linalg.norm(level.smooth.shape)
     usable = (fit.support >= 3) & (np.abs(fit.pixels) < 4.0 * level.scale * height).all(axis=1)
     cell = np.argwhere(cells)

@@ -19,7 +19,7 @@ STRAY_ROW = 2
 FRAME_CELLS = 0.5
 """A corner predicted nearer than this to the frame may be missing for a good reason, in cells."""
 
-MAX_RELATIVE_SIGMA = 0.02
+MAX_RELATIVE_SIGMA = 0.015
 """Corners more uncertain than this, in cells, make no board: keys, letters, weave."""
 
 MAX_LOST = 0.25
