@@ -1,0 +1,185 @@
+"""Tables as text: Markdown, CSV, LaTeX (booktabs) and JSON."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from rigkit.validation.tables import Cell, Column, Table
+
+__all__ = ["tables_to_csv", "tables_to_json", "tables_to_latex", "tables_to_markdown"]
+
+LATEX = {
+    "\\": r"\textbackslash{}",
+    "&": r"\&",
+    "%": r"\%",
+    "$": r"\$",
+    "#": r"\#",
+    "_": r"\_",
+    "{": r"\{",
+    "}": r"\}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "±": r"$\pm$",
+    "|": r"\textbar{}",
+}
+
+
+def tables_to_markdown(tables: Sequence[Table]) -> str:
+    """Return all tables as Markdown: the paper's number in brackets, sigma behind a plus-minus, the best one bold."""
+    parts = []
+    for table in tables:
+        head = [_escape_markdown(_label(column)) for column in table.columns]
+        lines = [f"## {table.title}", "", _bar(head), _bar([":--" if left else "--:" for left in _left(table)])]
+        for row in table.rows:
+            cells = []
+            for cell, column in zip(row, table.columns, strict=True):
+                text = _escape_markdown(_text(cell, column))
+                cells.append(f"**{text}**" if text and (cell.best or cell.failed) else text)
+            lines.append(_bar(cells))
+        lines += ["", *([table.note + _legend(table)] if table.note or _legend(table) else [])]
+        parts.append("\n".join(lines).rstrip() + "\n")
+    return "\n".join(parts)
+
+
+def tables_to_csv(tables: Sequence[Table]) -> str:
+    """Return all tables one below the other, each after a line "# title"; full precision, units in the head.
+
+    The paper's numbers and the sigmas have columns of their own, so a spreadsheet can calculate with every cell.
+    """
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    for i, table in enumerate(tables):
+        if i:
+            out.write("\n")
+        out.write(f"# {table.title}\n")
+        extra = [_extra(table, j) for j in range(len(table.columns))]
+        head: list[str] = []
+        for column, (with_sigma, with_paper) in zip(table.columns, extra, strict=True):
+            unit = f" [{column.unit}]" if column.unit else ""
+            head.append(column.label + unit)
+            head += [f"{column.label} sigma{unit}"] if with_sigma else []
+            head += [f"{column.label} paper{unit}"] if with_paper else []
+        writer.writerow(head)
+        for row in table.rows:
+            cells: list[str] = []
+            for cell, (with_sigma, with_paper) in zip(row, extra, strict=True):
+                cells.append(_exact(cell.value))
+                cells += [_exact(cell.sigma)] if with_sigma else []
+                cells += [cell.paper or ""] if with_paper else []
+            writer.writerow(cells)
+    return out.getvalue()
+
+
+def tables_to_latex(tables: Sequence[Table]) -> str:
+    r"""Return all tables as LaTeX floats that need \usepackage{booktabs}, and graphicx for wide ones."""
+    parts = []
+    for table in tables:
+        head = " & ".join(_escape_latex(_label(column)) for column in table.columns)
+        lines = [
+            r"\begin{table}",
+            r"\centering",
+            rf"\caption{{{_escape_latex((table.title + '. ' + table.note + _legend(table)).strip())}}}",
+            rf"\label{{tab:{table.key}}}",
+            r"\resizebox{\textwidth}{!}{%",
+            rf"\begin{{tabular}}{{{''.join('l' if left else 'r' for left in _left(table))}}}",
+            r"\toprule",
+            head + r" \\",
+            r"\midrule",
+        ]
+        group = ""
+        for row in table.rows:
+            kind = str(row[0].value).partition(" error")[0]
+            if table.key == "planes" and group and kind != group:
+                lines.append(r"\midrule")
+            group = kind
+            cells = []
+            for cell, column in zip(row, table.columns, strict=True):
+                text = _escape_latex(_text(cell, column))
+                cells.append(rf"\textbf{{{text}}}" if text and (cell.best or cell.failed) else text)
+            lines.append(" & ".join(cells) + r" \\")
+        lines += [r"\bottomrule", r"\end{tabular}}", r"\end{table}"]
+        parts.append("\n".join(lines) + "\n")
+    return "\n".join(parts)
+
+
+def tables_to_json(tables: Sequence[Table]) -> str:
+    """Return all tables as JSON: a list of rows each, every cell with what it has of value, sigma, paper and marks."""
+    out: dict[str, Any] = {"schema": "rigkit.tables/1", "tables": []}
+    for table in tables:
+        rows = [
+            {column.label: _cell_dict(cell) for cell, column in zip(row, table.columns, strict=True)}
+            for row in table.rows
+        ]
+        units = {column.label: column.unit for column in table.columns if column.unit}
+        out["tables"].append({"key": table.key, "title": table.title, "note": table.note, "units": units, "rows": rows})
+    return json.dumps(out, indent=1, allow_nan=False)
+
+
+def _cell_dict(cell: Cell) -> Any:
+    value = None if isinstance(cell.value, float) and not np.isfinite(cell.value) else cell.value
+    marks = {name: True for name in ("best", "failed") if getattr(cell, name)}
+    more: dict[str, Any] = {} if cell.paper is None else {"paper": float(cell.paper)}
+    if cell.sigma is not None and np.isfinite(cell.sigma):
+        more["sigma"] = cell.sigma
+    return {"value": value, **more, **marks} if more or marks else value
+
+
+def _label(column: Column) -> str:
+    return f"{column.label}, {column.unit}" if column.unit else column.label
+
+
+def _text(cell: Cell, column: Column) -> str:
+    """Return the cell as a person reads it."""
+    if cell.value is None or (isinstance(cell.value, float) and not np.isfinite(cell.value)):
+        text = "" if cell.paper is None else "-"
+    elif isinstance(cell.value, str):
+        text = cell.value
+    else:
+        text = f"{cell.value:.{column.decimals}f}"
+        if cell.sigma is not None and np.isfinite(cell.sigma):
+            text += f" ± {cell.sigma:.{column.decimals}f}"
+    return text if cell.paper is None else f"{text} ({cell.paper})"
+
+
+def _left(table: Table) -> list[bool]:
+    """Return which columns hold words: those are set to the left."""
+    return [any(isinstance(row[j].value, str) for row in table.rows) for j in range(len(table.columns))]
+
+
+def _legend(table: Table) -> str:
+    printed = any(cell.paper is not None for row in table.rows for cell in row)
+    return (" " if table.note else "") + "In brackets: the paper's." if printed else ""
+
+
+def _extra(table: Table, j: int) -> tuple[bool, bool]:
+    """Return whether column j needs a column of sigmas, and one of the paper's numbers."""
+    cells = [row[j] for row in table.rows]
+    return any(cell.sigma is not None for cell in cells), any(cell.paper is not None for cell in cells)
+
+
+def _exact(value: float | str | None) -> str:
+    if value is None or (isinstance(value, float) and not np.isfinite(value)):
+        return ""
+    if isinstance(value, str):
+        return value
+    return str(int(value)) if float(value).is_integer() else repr(float(value))
+
+
+def _bar(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def _escape_markdown(text: str) -> str:
+    return text.replace("|", r"\|").replace("*", r"\*").replace("\n", " ")
+
+
+def _escape_latex(text: str) -> str:
+    return "".join(LATEX.get(letter, letter) for letter in text)

@@ -1,0 +1,303 @@
+"""The tables of a validation as plain data, in the layout of the paper's, with the paper's own numbers beside ours.
+
+L. Hajder, "Affine Correspondences in Stereo Vision: Theory, Practice, and Limitations", tables 1 (orthogonality and
+normal errors) and 2 (baselines by estimator). How a table looks as text is the business of `rigkit.report.tables`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+
+import numpy as np
+
+from rigkit.errors import InputError
+from rigkit.validation.checks import ValidationReport
+
+__all__ = [
+    "Cell",
+    "Column",
+    "PaperTables",
+    "Table",
+    "average_table",
+    "baseline_table",
+    "best_method",
+    "build_tables",
+    "check_table",
+    "estimator_table",
+    "plane_table",
+]
+
+Printed = Mapping[str, Mapping[str, str]]
+
+
+@dataclass(frozen=True, slots=True)
+class PaperTables:
+    """The paper's numbers as printed (strings, with the digits they have).
+
+    Attributes
+    ----------
+    planes : row ("orthogonality 1-2", "mean normal error 3", ...) -> capture ("regular forward") -> degrees.
+    baselines : capture -> column ("measured", "F2UDIR", ...) -> mm.
+    """
+
+    planes: Printed = field(default_factory=dict)
+    baselines: Printed = field(default_factory=dict)
+
+    def plane(self, row: str, pair_id: str) -> str | None:
+        return self.planes.get(row, {}).get(_capture(pair_id))
+
+    def baseline(self, pair_id: str, column: str) -> str | None:
+        return self.baselines.get(_capture(pair_id), {}).get(column)
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """Head of a column: label, unit and how many decimals its numbers show."""
+
+    label: str
+    unit: str = ""
+    decimals: int = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One entry.
+
+    Attributes
+    ----------
+    value : number, text, or None for nothing known.
+    paper : what the paper printed there, or None.
+    sigma : standard deviation of the value, or None.
+    best, failed : how it is marked.
+    """
+
+    value: float | str | None
+    paper: str | None = None
+    sigma: float | None = None
+    best: bool = False
+    failed: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A table: every row has one cell a column; the first column names the row. It cannot be built without rows."""
+
+    key: str
+    title: str
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.rows:
+            raise InputError(f"table '{self.title}': no rows; nothing was validated")
+        for row in self.rows:
+            if len(row) != len(self.columns):
+                raise InputError(f"table '{self.title}': {len(row)} cells in a row of {len(self.columns)} columns")
+
+
+def build_tables(reports: Sequence[ValidationReport], paper: PaperTables | None = None) -> tuple[Table, ...]:
+    """Return all tables of reports (pairs x estimators): planes, baselines, averages, checks, estimators.
+
+    Tables that would be empty are left out; raises InputError where there is no report.
+    """
+    if not reports:
+        raise InputError("tables: no report; nothing was validated")
+    printed = paper or PaperTables()
+    method = best_method(reports)
+    tables = [plane_table(reports, method, printed), check_table(reports), estimator_table(reports)]
+    if any(_measured_baseline(report) is not None for report in reports):
+        tables.insert(1, baseline_table(reports, printed))
+    averages = average_table(reports, method, printed)
+    if averages is not None:
+        tables.insert(2, averages)
+    return tuple(tables)
+
+
+def best_method(reports: Sequence[ValidationReport]) -> str:
+    """Return the estimator with the smallest mean normal error over all pairs that every estimator solved.
+
+    Nothing that a person measured enters: the choice cannot flatter the comparison with it.
+    """
+    methods = list(dict.fromkeys(report.affine_method for report in reports))
+    pairs = {m: {r.pair_id for r in reports if r.affine_method == m} for m in methods}
+    common = set.intersection(*pairs.values()) or {r.pair_id for r in reports}
+    score = {
+        method: np.mean(
+            [
+                board.normal_errors.mean_deg
+                for report in reports
+                if report.affine_method == method and report.pair_id in common
+                for board in report.boards
+            ]
+            or [np.inf]
+        )
+        for method in methods
+    }
+    return min(methods, key=lambda method: float(score[method]))
+
+
+def plane_table(reports: Sequence[ValidationReport], method: str, paper: PaperTables) -> Table:
+    """Return the layout of the paper's table 1 for one estimator: orthogonality, mean and median normal errors."""
+    chosen = {r.pair_id: r for r in reports if r.affine_method == method}
+    ids = _board_ids(reports)
+    number = {board_id: i + 1 for i, board_id in enumerate(ids)}
+    rows: list[tuple[Cell, ...]] = []
+    for a, b in combinations(ids, 2):
+        label = f"orthogonality {number[a]}-{number[b]}"
+        cells = [Cell(_orthogonality(r, a, b), paper.plane(label, r.pair_id)) for r in chosen.values()]
+        rows.append((Cell(f"orthogonality error {a}, {b}"), *cells))
+    for kind in ("mean", "median"):
+        for board_id in ids:
+            label = f"{kind} normal error {number[board_id]}"
+            cells = [Cell(_normal_error(r, board_id, kind), paper.plane(label, r.pair_id)) for r in chosen.values()]
+            rows.append((Cell(f"{kind} normal error {board_id}"), *cells))
+    columns = (Column("deg"), *(Column(pair_id, "", 4) for pair_id in chosen))
+    return Table("planes", f"Angles between planes and normal errors, {method}", columns, tuple(rows))
+
+
+def baseline_table(reports: Sequence[ValidationReport], paper: PaperTables) -> Table:
+    """Return the layout of the paper's table 2: measured baseline and that of every estimator, the nearest marked.
+
+    Pairs without a measured baseline are left out.
+    """
+    methods = list(dict.fromkeys(r.affine_method for r in reports))
+    rows: list[tuple[Cell, ...]] = []
+    for pair_id in dict.fromkeys(r.pair_id for r in reports):
+        found = {r.affine_method: r for r in reports if r.pair_id == pair_id}
+        known = _measured_baseline(next(iter(found.values())))
+        if known is None:
+            continue
+        nearest = min(found, key=lambda m: abs(found[m].baseline_mm - known[0]))
+        cells = [Cell(pair_id), Cell(known[0], paper.baseline(pair_id, "measured"), known[1])]
+        for method in methods:
+            printed = paper.baseline(pair_id, method)
+            if method in found:
+                report = found[method]
+                failed = not report.check("baseline").passed
+                cells.append(Cell(report.baseline_mm, printed, report.baseline_sigma_mm, method == nearest, failed))
+            else:
+                cells.append(Cell(None, printed))
+        rows.append(tuple(cells))
+    columns = (Column("pair"), Column("measured", "mm", 1), *(Column(m, "mm", 2) for m in methods))
+    return Table(
+        "baselines", "Baseline by estimator", columns, tuple(rows), "The nearest to the measured one is marked."
+    )
+
+
+def average_table(reports: Sequence[ValidationReport], method: str, paper: PaperTables) -> Table | None:
+    """Return the averages over all cells that the paper has too, and how many times smaller ours are; None without."""
+    rows = []
+    cells = [(row[0], cell) for row in plane_table(reports, method, paper).rows for cell in row[1:]]
+    for what in ("orthogonality error", "mean normal error", "median normal error"):
+        both = [(c.value, float(c.paper)) for head, c in cells if str(head.value).startswith(what) and c.paper]
+        rows.append(_average_row(f"{what}, {method}", "deg", [(v, p) for v, p in both if isinstance(v, float)]))
+    differences = []
+    for report in reports:
+        known, printed = _measured_baseline(report), paper.baseline(report.pair_id, report.affine_method)
+        if known is not None and printed is not None:
+            differences.append((abs(report.baseline_mm - known[0]), abs(float(printed) - known[0])))
+    rows.append(_average_row("baseline error, all estimators", "mm", differences))
+    full = tuple(row for row in rows if row is not None)
+    if not full:
+        return None
+    columns = (Column("average"), Column("unit"), Column("cells", "", 0), Column("ours", "", 4), Column("paper", "", 4))
+    return Table(
+        "averages", "Averages over the cells that the paper has", (*columns, Column("paper / ours", "", 1)), full
+    )
+
+
+def check_table(reports: Sequence[ValidationReport]) -> Table:
+    """Return every measured quantity beside ours with its verdict; what could not be checked is a row that failed."""
+    rows: list[tuple[Cell, ...]] = []
+    for report in reports:
+        head = (Cell(report.pair_id), Cell(report.affine_method))
+        for c in report.checks:
+            verdict = Cell("pass" if c.passed else "FAIL", failed=not c.passed)
+            numbers = (Cell(c.measured, sigma=c.measured_sigma), Cell(c.ours, sigma=c.our_sigma), Cell(c.difference))
+            tail = (Cell(c.combined_sigma), Cell(c.k), verdict, Cell(float(c.count)), Cell(c.how))
+            rows.append((*head, Cell(c.name), Cell(c.unit), *numbers, *tail))
+        for lost in report.unchecked:
+            name, _, why = lost.partition(": ")
+            nothing = (Cell(None),) * 5
+            rows.append(
+                (*head, Cell(name), Cell(None), *nothing, Cell("NOT CHECKED", failed=True), Cell(0.0), Cell(why))
+            )
+    columns = (
+        Column("pair"),
+        Column("estimator"),
+        Column("quantity"),
+        Column("unit"),
+        Column("measured"),
+        Column("ours"),
+        Column("difference"),
+        Column("combined sigma"),
+        Column("k", "", 2),
+        Column("verdict"),
+        Column("points", "", 0),
+        Column("measured by"),
+    )
+    limits = sorted({c.limit_k for r in reports for c in r.checks})
+    note = f"Passes where |difference| <= k x combined sigma, k = {', '.join(f'{k:g}' for k in limits)}."
+    return Table("checks", "Checks against what was measured", columns, tuple(rows), note)
+
+
+def estimator_table(reports: Sequence[ValidationReport]) -> Table:
+    """Return one row a pair and estimator: angles, normal errors, flatness, baseline, verdict."""
+    ids = _board_ids(reports)
+    columns = [Column("pair"), Column("estimator"), Column("points", "", 0)]
+    columns += [Column(f"angle {a}, {b}", "deg") for a, b in combinations(ids, 2)]
+    for statistic in ("mean", "median", "lower quartile", "upper quartile"):
+        columns += [Column(f"{statistic} normal error {board_id}", "deg") for board_id in ids]
+    columns += [Column(f"flatness {board_id}", "mm") for board_id in ids]
+    columns += [Column("baseline", "mm", 2), Column("Sampson rms", "px"), Column("verdict")]
+    rows = []
+    for report in reports:
+        row = [Cell(report.pair_id), Cell(report.affine_method), Cell(float(report.count))]
+        by_pair = {frozenset((angle.a, angle.b)): angle for angle in report.angles}
+        for two in combinations(ids, 2):
+            angle = by_pair.get(frozenset(two))
+            row.append(Cell(None) if angle is None else Cell(angle.angle_deg, sigma=angle.sigma_deg))
+        for statistic in ("mean", "median", "lower quartile", "upper quartile"):
+            row += [Cell(_normal_error(report, board_id, statistic)) for board_id in ids]
+        flat = {board.board.board_id: board.plane.rms_mm for board in report.boards}
+        row += [Cell(flat.get(board_id)) for board_id in ids]
+        row += [Cell(report.baseline_mm, sigma=report.baseline_sigma_mm), Cell(report.sampson_rms_px)]
+        rows.append((*row, Cell("pass" if report.passed else "FAIL", failed=not report.passed)))
+    return Table("estimators", "Every pair with every estimator", tuple(columns), tuple(rows))
+
+
+def _capture(pair_id: str) -> str:
+    """Return the paper's name of a capture: "regular forward" for "regular-forward"."""
+    return pair_id.replace("-", " ")
+
+
+def _board_ids(reports: Sequence[ValidationReport]) -> tuple[str, ...]:
+    """Return all board names in the order of the fullest report, then of appearance."""
+    fullest = max(reports, key=lambda report: len(report.boards))
+    return tuple(dict.fromkeys(b.board.board_id for r in (fullest, *reports) for b in r.boards))
+
+
+def _orthogonality(report: ValidationReport, a: str, b: str) -> float | None:
+    return next((angle.error_deg for angle in report.angles if {angle.a, angle.b} == {a, b}), None)
+
+
+def _normal_error(report: ValidationReport, board_id: str, statistic: str) -> float | None:
+    for board in report.boards:
+        if board.board.board_id == board_id:
+            return float(getattr(board.normal_errors, statistic.replace(" ", "_") + "_deg"))
+    return None
+
+
+def _measured_baseline(report: ValidationReport) -> tuple[float, float] | None:
+    return next(((c.measured, c.measured_sigma) for c in report.checks if c.kind == "baseline"), None)
+
+
+def _average_row(label: str, unit: str, both: Sequence[tuple[float, float]]) -> tuple[Cell, ...] | None:
+    if not both:
+        return None
+    ours, theirs = (float(np.mean(column)) for column in zip(*both, strict=True))
+    ratio = theirs / ours if ours > 0.0 else None
+    return (Cell(label), Cell(unit), Cell(float(len(both))), Cell(ours), Cell(theirs), Cell(ratio))
