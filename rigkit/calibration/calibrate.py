@@ -17,6 +17,7 @@ from rigkit.calibration.fit import Fit, fit_kept, fit_model, heldout_rms, rms, r
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.shape import SHAPES, shape_model
+from rigkit.calibration.solver import evaluate
 from rigkit.calibration.usable import usable_views
 from rigkit.cameras.base import Camera
 from rigkit.cameras.registry import MODELS, camera_model
@@ -93,6 +94,7 @@ def calibrate(
         dropped = (*dropped, *reasons)
         observations = observations.subset(np.flatnonzero(keep))
         options, failed = _fit_all(observations, size_px, wanted, progress)
+    observations = _reweighted(observations, options)
     options = _compared(observations, options, folds, progress)
     chosen = _choose(observations, options, MARGIN)
     candidates = [*_described(observations, options, chosen, MARGIN), *failed]
@@ -154,15 +156,24 @@ def _agreeing(observations: Observations, options: list[_Option]) -> tuple[BoolA
     return keep, reasons
 
 
+def _reweighted(observations: Observations, options: list[_Option]) -> Observations:
+    """Return the observations with weights that count the error which the best model leaves to all corners alike."""
+    best = min(options, key=lambda o: robust_sigma(o.fit.state, observations))
+    squared = (evaluate(best.fit.state, observations).px ** 2).sum(axis=-1)
+    return observations.with_common_error(squared, best.fit.kept)
+
+
 def _compared(observations: Observations, options: list[_Option], folds: int, progress: Progress) -> list[_Option]:
     """Return the options refitted to the same corners, with their held-out errors."""
     sigma = [robust_sigma(o.fit.state, observations) for o in options]
     near = [o.fit.kept for o, s in zip(options, sigma, strict=True) if s <= COMPARABLE * min(sigma)]
     kept = np.any(near, axis=0)
     out = []
+    unequal = float(np.ptp(observations.weight[observations.present])) > 0.0
     for i, option in enumerate(options):
         progress("cross-validation", i, len(options))
-        fit = option.fit if (option.fit.kept == kept).all() else fit_kept(observations, option.fit.state, kept)
+        same = (option.fit.kept == kept).all() and not unequal
+        fit = option.fit if same else fit_kept(observations, option.fit.state, kept)
         out.append(replace(option, fit=fit, heldout_px=heldout_rms(observations, fit, folds)))
     progress("cross-validation", len(options), len(options))
     return out

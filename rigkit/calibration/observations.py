@@ -27,6 +27,7 @@ class Observations:
     views : the V views.
     pixels : (V, C, 2), zero where padded.
     corner : (V, C) int, row of the corner in the table of all boards' points; zero where padded.
+    sigma_px : (V, C) predicted standard deviation of each corner, one where padded.
     weight : (V, C) median sigma over sigma of the corner, zero where padded: weighted residuals stay in px.
     present : (V, C) bool, False where padded.
     boards : the boards, in the order of the table.
@@ -37,6 +38,7 @@ class Observations:
     views: tuple[BoardView, ...]
     pixels: FloatArray
     corner: IntArray
+    sigma_px: FloatArray
     weight: FloatArray
     present: BoolArray
     boards: tuple[Board, ...]
@@ -67,13 +69,23 @@ class Observations:
             corner[i, :n] += view.grid[:, 1] * view.board.columns + view.grid[:, 0]
             sigma[i, :n] = view.sigma_px
             present[i, :n] = True
-        return cls(
-            tuple(views), pixels, corner, _weights(sigma, present), present, tuple(boards.values()), first_row, board
-        )
+        weight = _weights(sigma, present)
+        table = tuple(boards.values())
+        return cls(tuple(views), pixels, corner, sigma, weight, present, table, first_row, board)
 
     def table(self) -> Points:
         """Return the flat corners of all boards, (M, 3) mm."""
         return np.concatenate([board.points() for board in self.boards])
+
+    def with_common_error(self, squared_px: FloatArray, kept: BoolArray) -> Observations:
+        """Return the observations with sigmas that explain the residuals: what the corners' own sigmas do not (a lens
+        or a board that the model does not follow) is an error common to all corners, so sigma^2 + s^2.
+
+        `squared_px` (V, C) are squared 2-D residuals, `kept` (V, C) the corners to judge by.
+        """
+        excess = float((0.5 * squared_px - self.sigma_px**2)[kept].mean()) if kept.any() else 0.0
+        sigma = np.sqrt(self.sigma_px**2 + max(excess, 0.0))
+        return replace(self, weight=_weights(sigma, self.present))
 
     def subset(self, chosen: IntArray) -> Observations:
         """Return the views `chosen`; the board table stays as it is."""
@@ -82,6 +94,7 @@ class Observations:
             views=tuple(self.views[i] for i in chosen),
             pixels=self.pixels[chosen],
             corner=self.corner[chosen],
+            sigma_px=self.sigma_px[chosen],
             weight=self.weight[chosen],
             present=self.present[chosen],
             board=self.board[chosen],

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, Points
+from rigkit.arrays import BoolArray, FloatArray, Points
 from rigkit.calibration.observations import Observations
 
 __all__ = ["SHAPES", "ShapeModel", "shape_model"]
@@ -27,6 +27,11 @@ RELEASED_SIGMA_XY = 3e-4
 """Prior of a released corner in the plane, as a fraction of the board's half diagonal (0.05 mm on 9x6 x 30 mm)."""
 RELEASED_SIGMA_Z = 1.5e-3
 """Prior of a released corner out of the plane, same unit (0.2 mm on 9x6 x 30 mm)."""
+
+MIN_VIEWS = 3
+"""A board in fewer views stays flat."""
+HELD = 1e-6
+"""Size in mm that stands for the half diagonal of a board whose corners are not released: their prior holds them."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -68,9 +73,17 @@ def shape_model(kind: str, observations: Observations) -> ShapeModel:
         return warp
     # Released corners move against a warp: a bow costs a few numbers, not the prior of every corner.
     unit = np.array([RELEASED_SIGMA_XY, RELEASED_SIGMA_XY, RELEASED_SIGMA_Z])
-    size = [np.full(len(points), _half_diagonal(points)) for points in _per_board(observations, flat)]
+    size = [
+        np.full(len(points), _half_diagonal(points) if often else HELD)
+        for points, often in zip(_per_board(observations, flat), _often(observations), strict=True)
+    ]
     released = (np.concatenate(size)[:, None] * unit).reshape(-1)
     return ShapeModel("released", flat, warp.basis, np.concatenate([warp.sigma, released]))
+
+
+def _often(observations: Observations) -> BoolArray:
+    """Say of which boards the shape can be told: those in several views (in one view a bow is a pose)."""
+    return np.bincount(observations.board, minlength=len(observations.boards)) >= MIN_VIEWS
 
 
 def _per_board(observations: Observations, table: Points) -> list[Points]:
@@ -86,10 +99,12 @@ def _warp(observations: Observations, flat: Points) -> ShapeModel:
     """Five unknowns a board: aspect, shear, bow along x, bow along y, twist (bows in mm at the centre, twist in mm at
     the corner). An overall scale would only move the board away: it is not among them."""
     per_board = 5
-    basis = np.zeros((len(flat), 3, per_board * len(observations.boards)))
-    sigma = []
-    for i, points in enumerate(_per_board(observations, flat)):
-        rows = slice(observations.first_row[i], observations.first_row[i + 1])
+    often = np.flatnonzero(_often(observations))
+    basis = np.zeros((len(flat), 3, per_board * len(often)))
+    sigma: list[float] = []
+    for i, board in enumerate(often):
+        rows = slice(observations.first_row[board], observations.first_row[board + 1])
+        points = flat[rows]
         centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
         half = 0.5 * np.ptp(points, axis=0)
         x, y = ((points - centre)[:, :2]).T
