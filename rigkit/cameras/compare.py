@@ -1,0 +1,138 @@
+"""The difference of two cameras over the image, after the rotation that a recalibration leaves open.
+
+Two calibrations of one camera may differ by a rotation that all board poses take up: it is no error. What is left over
+the image, in pixels, is. As mrcal does (D. Kogan, "A tour of mrcal: differencing"), written anew.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.arrays import BoolArray, FloatArray, Mat3, Pixels
+from rigkit.cameras.base import Camera
+from rigkit.errors import DegenerateError, InputError
+from rigkit.geometry.rotation import exp_so3, nearest_rotation, rotation_angle, skew
+
+__all__ = ["CameraDifference", "compare_cameras"]
+
+STEPS = 20
+SETTLED_RAD = 1e-12
+"""The fit of the rotation stops at steps that move no pixel by a millionth."""
+MIN_PIXELS = 20
+"""Fewer common pixels say nothing about the image."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CameraDifference:
+    """Where camera b sees what camera a sees, minus where camera a sees it.
+
+    Attributes
+    ----------
+    pixels : (rows, columns, 2) the grid in the image of camera a.
+    difference_px : (rows, columns, 2), NaN where not covered.
+    covered : (rows, columns) both cameras see the ray (and the caller's mask holds).
+    b_from_a : (3, 3) the rotation taken out: x_in_b = b_from_a @ x_in_a.
+    """
+
+    pixels: Pixels
+    difference_px: FloatArray
+    covered: BoolArray
+    b_from_a: Mat3
+
+    @property
+    def map_px(self) -> FloatArray:
+        """Length of the difference (rows, columns), NaN where not covered."""
+        return np.asarray(np.linalg.norm(self.difference_px, axis=-1))
+
+    @property
+    def rms_px(self) -> float:
+        """Root of the mean squared length over the covered pixels."""
+        return float(np.sqrt(np.mean(self.map_px[self.covered] ** 2)))
+
+    @property
+    def max_px(self) -> float:
+        return float(self.map_px[self.covered].max())
+
+    @property
+    def rotation_deg(self) -> float:
+        """Angle of the rotation that was taken out."""
+        return float(np.degrees(rotation_angle(self.b_from_a)))
+
+    @property
+    def coverage(self) -> float:
+        """Share of the grid that is covered."""
+        return float(self.covered.mean())
+
+
+def compare_cameras(
+    a: Camera,
+    b: Camera,
+    *,
+    grid: tuple[int, int] = (60, 45),
+    mask: BoolArray | None = None,
+    fit_rotation: bool = True,
+    weights: FloatArray | None = None,
+) -> CameraDifference:
+    """Return the difference of camera `b` from camera `a` over the image of `a`, at infinity.
+
+    Parameters
+    ----------
+    a, b : cameras of any models and of one image size.
+    grid : (columns, rows) of the map, spread evenly from corner pixel to corner pixel.
+    mask : (rows, columns) where the boards of the calibration were: elsewhere both cameras extrapolate.
+    fit_rotation : take out the rotation that makes the sum of the squared differences least.
+    weights : (rows, columns) of the squared differences in that fit, such as the inverse variances predicted.
+
+    Raises
+    ------
+    InputError
+        The sizes differ, or `mask` or `weights` have another shape than the grid.
+    DegenerateError
+        The cameras have fewer than 20 pixels of the grid in common.
+    """
+    if a.size_px != b.size_px:
+        raise InputError(f"cameras of {a.size_px} and {b.size_px} px cannot be compared; calibrate at one image size")
+    columns, rows = grid
+    u, v = np.linspace(0.0, a.size_px[0] - 1.0, columns), np.linspace(0.0, a.size_px[1] - 1.0, rows)
+    pixels = np.stack(np.meshgrid(u, v), axis=-1)
+    for name, array in (("mask", mask), ("weights", weights)):
+        if array is not None and np.shape(array) != (rows, columns):
+            raise InputError(f"{name}: expected shape {rows}x{columns} as the grid, got {np.shape(array)}")
+    rays, covered = a.unproject(pixels)
+    if mask is not None:
+        covered = covered & mask
+    weight = np.ones((rows, columns)) if weights is None else np.asarray(weights, dtype=np.float64)
+    b_from_a = np.eye(3)
+    if fit_rotation and covered.sum() >= MIN_PIXELS:
+        b_from_a = _best_rotation(rays[covered], pixels[covered], weight[covered], b)
+    projected, seen = b.project(rays @ b_from_a.T)
+    covered = covered & seen
+    if covered.sum() < MIN_PIXELS:
+        raise DegenerateError(f"the cameras share {covered.sum()} of {covered.size} pixels; they look elsewhere")
+    difference = np.where(covered[..., None], projected - pixels, np.nan)
+    return CameraDifference(pixels, difference, covered, b_from_a)
+
+
+def _best_rotation(rays: FloatArray, pixels: FloatArray, weight: FloatArray, b: Camera) -> Mat3:
+    """Return the rotation b_from_a at which `b` projects `rays` nearest to `pixels`: rays first, then pixels."""
+    rays_b, seen = b.unproject(pixels)
+    covariance = np.einsum("n,ni,nj->ij", weight[seen], rays_b[seen], rays[seen])
+    rotation = nearest_rotation(covariance) if seen.sum() >= 3 else np.eye(3)
+    for _ in range(STEPS):
+        turned = rays @ rotation.T
+        projected, valid, by_point, _ = b.project_with_jacobians(turned)
+        if valid.sum() < 3:
+            break
+        # d pixel / d w for the turn exp([w]x) on the left: J d(w x ray) = -J [ray]x w.
+        by_turn = -by_point[valid] @ skew(turned[valid])
+        residual = projected[valid] - pixels[valid]
+        w = weight[valid]
+        normal = np.einsum("n,nki,nkj->ij", w, by_turn, by_turn)
+        gradient = np.einsum("n,nki,nk->i", w, by_turn, residual)
+        step = np.linalg.lstsq(normal, -gradient, rcond=None)[0]
+        rotation = exp_so3(step) @ rotation
+        if np.linalg.norm(step) < SETTLED_RAD:
+            break
+    return nearest_rotation(rotation)
