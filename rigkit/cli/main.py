@@ -21,6 +21,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "detect": ("rigkit.cli.detect", "corners of every chessboard in the images"),
     "calibrate": ("rigkit.cli.calibrate", "calibrate a camera from images of chessboards"),
     "rectify": ("rigkit.cli.rectify", "perspective, cylindrical or equirectangular image from any camera's image"),
+    "validate": ("rigkit.cli.validate", "the tables against measured truth, report and PLY; exit 1 if a check fails"),
     "board": ("rigkit.cli.board", "a board to print, true to scale"),
 }
 """Verb -> (module, one-line help)."""

@@ -6,9 +6,10 @@ Cameras are calibrated first where a calibration file is missing; pairs are inde
 from __future__ import annotations
 
 import argparse
+import itertools
 import multiprocessing
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -21,7 +22,15 @@ if TYPE_CHECKING:
     from rigkit.pairing import MatchedPair
     from rigkit.progress import Progress
 
-__all__ = ["add_dataset_arguments", "load_cameras", "match_images", "output_folder", "over_pairs", "select_dataset"]
+__all__ = [
+    "add_dataset_arguments",
+    "load_cameras",
+    "match_images",
+    "output_folder",
+    "over_pairs",
+    "select_dataset",
+    "write_results",
+]
 
 Result = TypeVar("Result")
 
@@ -30,9 +39,7 @@ def add_dataset_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what every verb on a data set takes."""
     parser.add_argument("dataset", metavar="DATASET", help="folder with a dataset.toml, or the file itself")
     parser.add_argument("-p", "--pair", action="append", default=[], metavar="ID", help="only this pair (repeatable)")
-    parser.add_argument(
-        "-o", "--output", metavar="DIR", help="folder for results (default: out/<name of the data set>)"
-    )
+    parser.add_argument("-o", "--output", metavar="DIR", help="folder for results (default: a new one, out/<data set>)")
     parser.add_argument("--force", action="store_true", help="replace existing results")
     parser.add_argument("--recalibrate", action="store_true", help="calibrate from the images even if that was done")
     parser.add_argument(
@@ -53,7 +60,31 @@ def select_dataset(args: argparse.Namespace) -> Dataset:
 
 
 def output_folder(args: argparse.Namespace, dataset: Dataset) -> Path:
-    return Path(args.output) if args.output else Path("out") / dataset.name
+    """Return the folder for results: the one asked for, or the first of out/NAME, out/NAME-2, ... that is free.
+
+    Raises InputError, before the work, where the folder asked for holds results and `--force` is not given.
+    """
+    if args.output:
+        folder = Path(args.output)
+        if folder.is_dir() and any(folder.iterdir()) and not args.force:
+            raise InputError(f"folder '{folder}' is not empty; use --force to replace results in it, or another folder")
+        if folder.exists() and not folder.is_dir():
+            raise InputError(f"'{folder}' is a file, not a folder; give another name with -o")
+        return folder
+    base = Path("out") / dataset.name
+    if args.force:
+        return base
+    names = itertools.chain([base], (base.with_name(f"{base.name}-{number}") for number in itertools.count(2)))
+    return next(folder for folder in names if not folder.exists())
+
+
+def write_results(folder: Path, files: Mapping[str, str | bytes], *, force: bool) -> None:
+    """Write all files (relative path -> content) into `folder`, after making sure that each may be written."""
+    from rigkit.io.files import ensure_writable, write_atomic
+
+    ensure_writable([folder / name for name in files], force=force)
+    for name, data in files.items():
+        write_atomic(folder / name, data, force=force)
 
 
 def load_cameras(dataset: Dataset, *, recalibrate: bool, progress: Progress) -> dict[str, Camera]:

@@ -20,7 +20,7 @@ from rigkit.reconstruct import Reconstruction
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["BOARD_COLOURS", "cloud_png", "corners_png", "epipolar_curves", "epipolar_png"]
+__all__ = ["BOARD_COLOURS", "as_jpeg", "cloud_png", "corners_png", "epipolar_curves", "epipolar_png"]
 
 BOARD_COLOURS = ("#e6550d", "#1f77b4", "#2ca02c", "#9467bd", "#d6b300", "#17becf", "#e377c2", "#7f7f7f")
 """One colour a board, the same in every picture; readable on dark and light images."""
@@ -31,6 +31,7 @@ PYRAMID_DEPTH = 0.18
 """Depth of a drawn camera pyramid, relative to the median distance of the points."""
 
 CURVE_SAMPLES = 240
+JPEG_QUALITY = 85
 
 
 def board_colour(index: int) -> str:
@@ -132,6 +133,14 @@ def cloud_png(reconstruction: Reconstruction) -> bytes:
     title = f"{reconstruction.pair_id}, {reconstruction.affine_method}: {len(cloud)} points, "
     figure.suptitle(f"{title}baseline {reconstruction.baseline_mm:.2f} mm", fontsize=10)
     return _png(figure)
+
+
+def as_jpeg(png: bytes) -> bytes:
+    """Return a picture as JPEG: a tenth of the size, for pages that carry many."""
+    import cv2
+
+    picture = np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR))
+    return bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1])
 
 
 def _upright(vectors: FloatArray) -> FloatArray:

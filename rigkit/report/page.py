@@ -15,38 +15,41 @@ import numpy as np
 from rigkit.arrays import FloatArray
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruct import Reconstruction
+from rigkit.validation.tables import Cell, Column, Table
 
-__all__ = ["HtmlTable", "PairSection", "build_page", "scene_of"]
+__all__ = ["PairSection", "build_page", "scene_of", "table_html"]
 
 PYRAMID_DEPTH = 0.15
 """Depth of a drawn camera pyramid, relative to the median distance of the points."""
 
-Cell = str | float | int | bool | None
+
+def table_html(table: Table) -> str:
+    """Return a table of plain data as HTML: sigmas after ±, the paper's number in brackets, verdicts in colour."""
+    head = "".join(f"<th>{html.escape(f'{c.label}, {c.unit}' if c.unit else c.label)}</th>" for c in table.columns)
+    body = "".join(
+        f"<tr>{''.join(_cell(c, column) for c, column in zip(row, table.columns, strict=True))}</tr>"
+        for row in table.rows
+    )
+    note = f'<p class="soft">{html.escape(table.note)}</p>' if table.note else ""
+    return (
+        f'<h3>{html.escape(table.title)}</h3><div class="scroll"><table><thead><tr>{head}</tr></thead>'
+        f"<tbody>{body}</tbody></table></div>{note}"
+    )
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class HtmlTable:
-    """A table of the page; a bool cell becomes a verdict, None a dash, a float is printed with `digits` decimals."""
-
-    caption: str
-    header: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
-    digits: int = 3
-
-    def html(self) -> str:
-        head = "".join(f"<th>{html.escape(h)}</th>" for h in self.header)
-        body = "".join(f"<tr>{''.join(self._cell(c) for c in row)}</tr>" for row in self.rows)
-        caption = f"<h3>{html.escape(self.caption)}</h3>" if self.caption else ""
-        return f'{caption}<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
-
-    def _cell(self, value: Cell) -> str:
-        if value is None:
-            return "<td>–</td>"
-        if isinstance(value, bool):
-            return '<td class="pass">✓ pass</td>' if value else '<td class="fail">✗ fail</td>'
-        if isinstance(value, float):
-            return f"<td>{value:.{self.digits}f}</td>" if np.isfinite(value) else "<td>–</td>"
-        return f'<td class="text">{html.escape(str(value))}</td>' if isinstance(value, str) else f"<td>{value}</td>"
+def _cell(cell: Cell, column: Column) -> str:
+    if isinstance(cell.value, str):
+        kind = "fail" if cell.failed else "pass" if cell.value == "pass" else "text"
+        return f'<td class="{kind}">{html.escape(cell.value)}</td>'
+    known = cell.value is not None and np.isfinite(cell.value)
+    words = f"{cell.value:.{column.decimals}f}" if known else "–"
+    if known and cell.sigma is not None and np.isfinite(cell.sigma):
+        words += f" ± {cell.sigma:.{column.decimals}f}"
+    if cell.best:
+        words = f"<b>{words}</b>"
+    if cell.paper is not None:
+        words += f' <span class="soft">({html.escape(cell.paper)})</span>'
+    return f'<td class="fail">{words}</td>' if cell.failed else f"<td>{words}</td>"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -55,7 +58,7 @@ class PairSection:
 
     pair_id: str
     lead: str
-    tables: tuple[HtmlTable, ...]
+    tables: tuple[Table, ...]
     images: tuple[tuple[str, str, bytes], ...]
     """(caption, MIME type, bytes)."""
     scene: Mapping[str, Any] | None
@@ -66,7 +69,7 @@ def build_page(
     title: str,
     lead: str,
     passed: bool,
-    summary: Sequence[HtmlTable],
+    summary: Sequence[Table],
     pairs: Sequence[PairSection],
     provenance: Mapping[str, str],
 ) -> str:
@@ -86,7 +89,7 @@ def build_page(
         f"<title>{html.escape(title)}</title><style>{style}</style></head><body>"
         f'<h1>{html.escape(title)}</h1><p class="lead">{html.escape(lead)}</p>'
         f'<p><span class="verdict {verdict}">{words}</span></p><nav>{links}</nav>'
-        f'<section id="summary"><h2>Summary</h2>{"".join(t.html() for t in summary)}</section>'
+        f'<section id="summary"><h2>Summary</h2>{"".join(table_html(t) for t in summary)}</section>'
         f"{''.join(_section(p, i) for i, p in enumerate(pairs))}"
         f'<section id="provenance"><h2>Provenance</h2><table><tbody>{facts}</tbody></table></section>'
         f"<script>{script}</script></body></html>\n"
@@ -116,7 +119,7 @@ def _section(pair: PairSection, number: int) -> str:
         )
     return (
         f'<section id="{html.escape(pair.pair_id)}"><h2>{html.escape(pair.pair_id)}</h2>'
-        f'<p class="lead">{html.escape(pair.lead)}</p>{"".join(t.html() for t in pair.tables)}'
+        f'<p class="lead">{html.escape(pair.lead)}</p>{"".join(table_html(t) for t in pair.tables)}'
         f"{f'<ul class=notes>{notes}</ul>' if notes else ''}{view}{figures}</section>"
     )
 

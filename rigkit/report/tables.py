@@ -12,7 +12,7 @@ import numpy as np
 
 from rigkit.validation.tables import Cell, Column, Table
 
-__all__ = ["tables_to_csv", "tables_to_json", "tables_to_latex", "tables_to_markdown"]
+__all__ = ["tables_to_csv", "tables_to_json", "tables_to_latex", "tables_to_markdown", "tables_to_text"]
 
 LATEX = {
     "\\": r"\textbackslash{}",
@@ -121,6 +121,19 @@ def tables_to_json(tables: Sequence[Table]) -> str:
         units = {column.label: column.unit for column in table.columns if column.unit}
         out["tables"].append({"key": table.key, "title": table.title, "note": table.note, "units": units, "rows": rows})
     return json.dumps(out, indent=1, allow_nan=False)
+
+
+def tables_to_text(tables: Sequence[Table]) -> str:
+    """Return all tables with aligned columns, for a terminal."""
+    parts = []
+    for table in tables:
+        grid = [[_label(column) for column in table.columns]]
+        grid += [[_text(c, column) for c, column in zip(row, table.columns, strict=True)] for row in table.rows]
+        widths = [max(len(line[j]) for line in grid) for j in range(len(table.columns))]
+        pad = [str.ljust if left else str.rjust for left in _left(table)]
+        lines = ["  ".join(p(t, w) for p, t, w in zip(pad, line, widths, strict=True)).rstrip() for line in grid]
+        parts.append("\n".join([table.title, *lines, *([table.note] if table.note else [])]))
+    return "\n\n".join(parts)
 
 
 def _cell_dict(cell: Cell) -> Any:

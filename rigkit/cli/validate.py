@@ -1,0 +1,217 @@
+"""`rigkit validate`: every pair and every estimator against what a person measured."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rigkit.cli.console import note, print_json, progress_on_stderr
+from rigkit.cli.workflow import (
+    add_dataset_arguments,
+    load_cameras,
+    match_images,
+    output_folder,
+    over_pairs,
+    select_dataset,
+    write_results,
+)
+
+if TYPE_CHECKING:
+    from rigkit.cameras.base import Camera
+    from rigkit.io.manifest import Dataset, Pair
+    from rigkit.report.page import PairSection
+    from rigkit.validation.checks import ValidationReport
+    from rigkit.validation.tables import PaperTables
+
+HELP = "the tables against measured truth, report and PLY; exit code 1 if a check fails"
+
+EXIT_CHECK_FAILED = 1
+
+PAPER = "hajder2021"
+"""Folder with the paper's tables, beside the data set."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_dataset_arguments(parser)
+    parser.add_argument("--no-pictures", action="store_true", help="leave out PNG pictures and the HTML report")
+    parser.add_argument("--no-crosscheck", action="store_true", help="leave out the comparison with pycolmap")
+
+
+def run(args: argparse.Namespace) -> int:
+    started = time.monotonic()
+    dataset = select_dataset(args)
+    out = output_folder(args, dataset)
+    progress = progress_on_stderr()
+    cameras = load_cameras(dataset, recalibrate=args.recalibrate, progress=progress)
+    jobs = [
+        PairJob(
+            pair,
+            cameras[pair.camera1.camera_id],
+            cameras[pair.camera2.camera_id],
+            args.chain,
+            not args.no_pictures,
+            not args.no_crosscheck,
+        )
+        for pair in dataset.pairs
+    ]
+    outcomes = list(over_pairs(validate_pair, jobs, args.jobs, "reconstructing and validating pairs", progress))
+    return finish(args, dataset, outcomes, out, time.monotonic() - started)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PairJob:
+    """What one process needs to know of one pair."""
+
+    pair: Pair
+    camera1: Camera
+    camera2: Camera
+    chain: str
+    pictures: bool
+    crosscheck: bool
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PairOutcome:
+    """What comes back: the reports by estimator, files by relative path, and the page's section."""
+
+    pair_id: str
+    reports: tuple[ValidationReport, ...]
+    best: ValidationReport
+    files: Mapping[str, bytes]
+    section: PairSection | None
+
+
+def validate_pair(job: PairJob) -> PairOutcome:
+    """Reconstruct one pair with every estimator and judge each."""
+    import numpy as np
+
+    from rigkit.affine.registry import AFFINE_METHODS
+    from rigkit.io.ply import ply_bytes
+    from rigkit.reconstruct import reconstruct_pair
+    from rigkit.report.validation_page import best_report
+    from rigkit.validation.checks import validate
+
+    pair = job.pair
+    matched, image1, image2 = match_images(pair, job.camera1, job.camera2, job.chain)
+    level = None if pair.level_sigma_deg is None else float(np.deg2rad(pair.level_sigma_deg))
+    reconstructions = {
+        method: reconstruct_pair(
+            matched, pose_type=pair.pose_type, affine_method=method, level_sigma_rad=level, image1=image1
+        )
+        for method in AFFINE_METHODS
+    }
+    reports = tuple(validate(r, pair.truth) for r in reconstructions.values())
+    best = best_report(reports)
+    files: dict[str, bytes] = {
+        f"{pair.pair_id}/{method}.ply": ply_bytes(r.cloud) for method, r in reconstructions.items()
+    }
+    section = None
+    if job.pictures:
+        section = _pictures(reconstructions[best.affine_method], reports, image1, image2, files)
+    return PairOutcome(pair.pair_id, reports, best, files, section)
+
+
+def _pictures(
+    reconstruction: Any, reports: tuple[ValidationReport, ...], image1: Any, image2: Any, files: dict[str, bytes]
+) -> PairSection:
+    """Draw the pair's pictures into `files`; return the section of the page, with the same pictures as JPEG."""
+    from rigkit.report.figures import as_jpeg, cloud_png, corners_png, epipolar_png
+    from rigkit.report.validation_page import pair_section
+
+    drawn = {
+        "corners": corners_png(reconstruction, image1, image2),
+        "epipolar": epipolar_png(reconstruction, image1, image2),
+        "cloud": cloud_png(reconstruction),
+    }
+    for name, data in drawn.items():
+        files[f"{reconstruction.pair_id}/{name}.png"] = data
+    shown = [
+        ("Corners as found and matched", "image/jpeg", as_jpeg(drawn["corners"])),
+        ("Epipolar curves of every seventh corner", "image/jpeg", as_jpeg(drawn["epipolar"])),
+    ]
+    return pair_section(reconstruction, reports, shown)
+
+
+def finish(args: argparse.Namespace, dataset: Dataset, outcomes: list[PairOutcome], out: Path, seconds: float) -> int:
+    """Write tables, clouds, pictures and the page; print the summary; return the exit code."""
+    from rigkit.report.page import build_page
+    from rigkit.report.tables import tables_to_csv, tables_to_json, tables_to_latex, tables_to_markdown, tables_to_text
+    from rigkit.report.validation_page import summary_table
+    from rigkit.validation.tables import build_tables
+
+    reports = [report for outcome in outcomes for report in outcome.reports]
+    passed = all(report.passed for report in reports)
+    summary = summary_table([outcome.best for outcome in outcomes])
+    tables = (summary, *build_tables(reports, _paper_tables(dataset)))
+    files: dict[str, str | bytes] = {
+        "tables.md": tables_to_markdown(tables),
+        "tables.csv": tables_to_csv(tables),
+        "tables.tex": tables_to_latex(tables),
+        "tables.json": tables_to_json(tables),
+    }
+    for outcome in outcomes:
+        files.update(outcome.files)
+    sections = [outcome.section for outcome in outcomes if outcome.section is not None]
+    if sections:
+        lead = f"{len(outcomes)} pairs, {len(reports)} reconstructions, {seconds:.0f} s"
+        shown = [table for table in tables if table.key not in ("checks", "estimators")]
+        title = f"rigkit validation: {dataset.name}"
+        files["report.html"] = build_page(title, lead, passed, shown, sections, _provenance(args, dataset))
+    write_results(out, files, force=args.force)
+    if args.json:
+        print_json({"passed": passed, "output": str(out), "reports": [report.to_dict() for report in reports]})
+    else:
+        print(tables_to_text([summary]))
+        _say_failures(reports)
+        words = "all checks passed" if passed else "a check FAILED"
+        print(f"{words}; {out}/report.html and tables.md, {seconds:.1f} s")
+    return 0 if passed else EXIT_CHECK_FAILED
+
+
+def _say_failures(reports: list[ValidationReport]) -> None:
+    for report in reports:
+        for c in report.checks:
+            if not c.passed:
+                print(
+                    f"FAILED {report.pair_id} {report.affine_method} {c.name}: {c.ours:.3f} {c.unit}, measured "
+                    f"{c.measured:g} ± {c.measured_sigma:g} ({c.how}), off by {c.k:.1f} combined sigmas"
+                )
+        for words in report.unchecked:
+            print(f"NOT CHECKED {report.pair_id} {report.affine_method} {words}")
+    for words in dict.fromkeys(f"{report.pair_id}: {n}" for report in reports for n in report.notes):
+        note(words)
+
+
+def _paper_tables(dataset: Dataset) -> PaperTables | None:
+    """Return the paper's tables where they lie beside the data set."""
+    from rigkit.io.paper_tables import load_paper_tables
+
+    folder = dataset.root.parent / PAPER
+    return load_paper_tables(folder) if folder.is_dir() else None
+
+
+def _provenance(args: argparse.Namespace, dataset: Dataset) -> dict[str, str]:
+    """Return what somebody needs to know to get the same page again."""
+    import hashlib
+    import platform
+    from datetime import UTC, datetime
+    from importlib.metadata import version
+
+    facts = {"rigkit": version("rigkit"), "Python": platform.python_version()}
+    facts |= {name: version(name) for name in ("numpy", "opencv-contrib-python-headless", "open3d", "pycolmap")}
+    facts |= {"written": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"), "chain": args.chain}
+
+    def digest(path: Path) -> str:
+        return f"{path.name}, SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
+
+    facts["manifest"] = digest(dataset.manifest)
+    for entry in dataset.cameras:
+        if entry.calibration.is_file():
+            facts[f"camera {entry.camera_id}"] = digest(entry.calibration)
+    for pair in dataset.pairs:
+        facts[f"pair {pair.pair_id}"] = f"{digest(pair.image1)}; {digest(pair.image2)}"
+    return facts

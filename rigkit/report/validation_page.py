@@ -1,0 +1,84 @@
+"""The validation of a data set as an HTML page: verdicts first, then every pair with its pictures and 3D view."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rigkit.reconstruct import Reconstruction
+from rigkit.report.page import PairSection, scene_of
+from rigkit.validation.checks import ValidationReport
+from rigkit.validation.tables import Cell, Column, Table, check_table, estimator_table
+
+__all__ = ["best_report", "pair_section", "summary_table"]
+
+
+def best_report(reports: Sequence[ValidationReport]) -> ValidationReport:
+    """Return the report of the estimator with the smallest mean normal error over the boards."""
+    return min(reports, key=_mean_normal_error)
+
+
+def summary_table(reports: Sequence[ValidationReport]) -> Table:
+    """Return one line a pair: what was measured, what came out, and whether it holds."""
+    columns = (
+        Column("pair"),
+        Column("pose type"),
+        Column("estimator"),
+        Column("points", "", 0),
+        Column("worst angle error", "deg"),
+        Column("mean normal error", "deg"),
+        Column("baseline measured", "mm", 1),
+        Column("baseline", "mm", 2),
+        Column("Sampson rms", "px"),
+        Column("verdict"),
+    )
+    rows = []
+    for report in reports:
+        known = next((c for c in report.checks if c.kind == "baseline"), None)
+        angles = [a.error_deg for a in report.angles if a.error_deg is not None]
+        rows.append(
+            (
+                Cell(report.pair_id),
+                Cell(report.pose_type),
+                Cell(report.affine_method),
+                Cell(float(report.count)),
+                Cell(max(angles) if angles else None),
+                Cell(_mean_normal_error(report)),
+                Cell(None) if known is None else Cell(known.measured, sigma=known.measured_sigma),
+                Cell(report.baseline_mm, sigma=report.baseline_sigma_mm),
+                Cell(report.sampson_rms_px),
+                Cell("pass" if report.passed else "FAIL", failed=not report.passed),
+            )
+        )
+    return Table("summary", "Every pair with its best estimator", columns, tuple(rows))
+
+
+def pair_section(
+    reconstruction: Reconstruction,
+    reports: Sequence[ValidationReport],
+    images: Sequence[tuple[str, str, bytes]],
+    extra: Sequence[Table] = (),
+) -> PairSection:
+    """Return the page's section of one pair.
+
+    Parameters
+    ----------
+    reconstruction : the one whose cloud is shown.
+    reports : of all estimators.
+    images : (caption, MIME type, bytes).
+    extra : further tables, such as the cross-check.
+    """
+    shown = next(r for r in reports if r.affine_method == reconstruction.affine_method)
+    lead = (
+        f"{shown.pose_type} motion, {shown.count} points, {len(shown.boards)} boards; "
+        f"shown: {shown.affine_method}; baseline {shown.baseline_mm:.2f} ± {shown.baseline_sigma_mm:.2f} mm; "
+        f"Sampson rms {shown.sampson_rms_px:.3f} px"
+    )
+    tables = (check_table([shown]), estimator_table(reports), *extra)
+    notes = (*shown.notes, *(f"not checked: {words}" for words in shown.unchecked))
+    return PairSection(shown.pair_id, lead, tables, tuple(images), scene_of(reconstruction), notes)
+
+
+def _mean_normal_error(report: ValidationReport) -> float:
+    return float(np.mean([board.normal_errors.mean_deg for board in report.boards]))
