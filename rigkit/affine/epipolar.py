@@ -68,7 +68,7 @@ def epipolar_block(directions: PlanarDirections, n1: FloatArray, n2: FloatArray)
         determinant = 1.0 / (m11 * m22 - m12 * m12)
         p = (b1 * m22 - b2 * m12) * determinant
         q = (b2 * m11 - b1 * m12) * determinant
-    a = np.stack([-nx * vx - ny * p, -nx * vy - ny * q, -ny * vx + nx * p, -ny * vy + nx * q])
+        a = np.stack([-nx * vx - ny * p, -nx * vy - ny * q, -ny * vx + nx * p, -ny * vy + nx * q])
     return a, smallest_singular(m11, m12, m22)
 
 
