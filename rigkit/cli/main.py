@@ -18,9 +18,11 @@ from rigkit.errors import RigkitError
 __all__ = ["VERBS", "main"]
 
 VERBS: dict[str, tuple[str, str]] = {
+    "demo": ("rigkit.cli.demo", "render a small fisheye capture and run the whole job on it; needs no data"),
     "detect": ("rigkit.cli.detect", "corners of every chessboard in the images"),
     "calibrate": ("rigkit.cli.calibrate", "calibrate a camera from images of chessboards"),
     "rectify": ("rigkit.cli.rectify", "perspective, cylindrical or equirectangular image from any camera's image"),
+    "reconstruct": ("rigkit.cli.reconstruct", "oriented clouds (PLY) and pictures of every pair"),
     "validate": ("rigkit.cli.validate", "the tables against measured truth, report and PLY; exit 1 if a check fails"),
     "board": ("rigkit.cli.board", "a board to print, true to scale"),
 }

@@ -42,9 +42,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    started = time.monotonic()
     dataset = select_dataset(args)
-    out = output_folder(args, dataset)
+    return validate_dataset(args, dataset, output_folder(args, dataset))
+
+
+def validate_dataset(args: argparse.Namespace, dataset: Dataset, out: Path) -> int:
+    """Validate every pair of a data set, write the results into `out` and return the exit code."""
+    started = time.monotonic()
     progress = progress_on_stderr()
     cameras = load_cameras(dataset, recalibrate=args.recalibrate, progress=progress)
     jobs = [
