@@ -16,6 +16,7 @@ from rigkit.affine.components import blocks, finite
 from rigkit.affine.surface import linear_gauge
 from rigkit.arrays import Affines, BoolArray, FloatArray, Normals
 from rigkit.errors import InputError
+from rigkit.geometry.rotation import angle_between
 
 __all__ = [
     "NORMAL_METHODS",
@@ -27,6 +28,9 @@ __all__ = [
 ]
 
 NORMAL_METHODS = ("optimal", "fne", "nullvector")
+
+MIN_PARALLAX = 1e-9
+"""Smallest |h| / |J2|, about the angle between the two viewing rays in radians: below, it is rounding."""
 
 RIDGE = 1e-6
 """Relative variance added across h: affinities that fulfil the epipolar geometry exactly have none there."""
@@ -40,8 +44,9 @@ class NormalEstimate:
     ----------
     normals : (N, 3) unit, facing camera 1, in the frame of the Jacobians; NaN where invalid.
     valid : (N,) bool.
-    covariance : (N, 3, 3) of the unit normal (rank 2, tangent to the sphere), rad^2; NaN where unknown.
-    sigma_rad : (N,) predicted rms angle, the root of the covariance's trace; NaN where unknown.
+    covariance : (N, 3, 3) of the unit normal to first order (rank 2, tangent to the sphere), rad^2; NaN where unknown.
+    sigma_rad : (N,) predicted rms angle; NaN where unknown. For small errors it is the root of the covariance's trace;
+        where the geometry hardly determines the normal it stays an angle, of about a radian, and does not run away.
     """
 
     normals: Normals
@@ -66,7 +71,7 @@ def normals_from_affines(
     Notes
     -----
     Optimal: with A(n) = G - h y^T, n ~ J1^T y + d, the minimum of |A(n) - A|_F is y = (G - A)^T h / (h . h).
-    Undefined where h = 0 (the point lies at the epipole, or the cameras coincide): NaN and invalid.
+    Undefined without parallax, h = 0 (the point lies at the epipole, or the cameras coincide): NaN and invalid.
     """
     J1, J2, A21 = (np.asarray(v, dtype=np.float64) for v in (J1, J2, A21))
     if method == "optimal":
@@ -110,8 +115,10 @@ def estimate_normals(
     normals, valid = normals_from_affines(J1, J2, A21, covariance=fit)
     if covariance is None:
         return NormalEstimate(normals, valid, np.full((len(A21), 3, 3), np.nan), np.full(len(A21), np.nan))
+    by_affinity = _solution(linear_gauge(J1, J2).h, fit)
+    spread_y = by_affinity @ covariance @ np.swapaxes(by_affinity, -1, -2)
     spread = normal_covariance(J1, J2, normals, covariance, weighted=weighted)
-    return NormalEstimate(normals, valid, spread, np.sqrt(np.trace(spread, axis1=-2, axis2=-1)))
+    return NormalEstimate(normals, valid, spread, _rms_angle(J1, normals, spread_y))
 
 
 def normal_covariance(
@@ -131,6 +138,25 @@ def normal_covariance(
     tangent = np.eye(3) - normals[:, :, None] * normals[:, None, :]
     by = facing * (tangent @ np.swapaxes(J1, -1, -2) @ by_affinity)
     return np.asarray(by @ covariance @ np.swapaxes(by, -1, -2))
+
+
+def _rms_angle(J1: FloatArray, normals: Normals, spread_y: FloatArray) -> FloatArray:
+    """Return the rms angle (N,) to the normals of four points one (scaled) standard deviation of y away.
+
+    Two-dimensional sigma points y +- sqrt(2) L e_i with weight 1/4: exact to first order, and bounded beyond.
+    """
+    ray = np.cross(J1[:, 0], J1[:, 1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+        gauge = normals / np.sum(normals * ray, axis=-1, keepdims=True)
+        first = np.sqrt(spread_y[:, 0, 0])
+        cross = np.where(first > 0.0, spread_y[:, 0, 1] / np.where(first > 0.0, first, 1.0), 0.0)
+        second = np.sqrt(np.maximum(spread_y[:, 1, 1] - cross * cross, 0.0))
+    total = np.zeros(len(normals))
+    for a, b in ((first, cross), (np.zeros_like(first), second)):
+        step = np.sqrt(2.0) * (J1[:, 0] * a[:, None] + J1[:, 1] * b[:, None])
+        total += angle_between(gauge, gauge + step) ** 2 + angle_between(gauge, gauge - step) ** 2
+    return np.asarray(np.sqrt(total / 4.0))
 
 
 def normals_from_views(
@@ -177,8 +203,11 @@ def _optimal(J1: FloatArray, J2: FloatArray, A21: Affines, covariance: FloatArra
         y = np.einsum("nij,nj->ni", _solution(h, covariance), (G - A21).reshape(-1, 4))
         return _from_gauge(J1, d, y)
     hx, hy = h[:, 0], h[:, 1]
+    j = J2.reshape(len(J2), 6)
+    size = sum(j[:, k] * j[:, k] for k in range(6))
     with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1.0 / (hx * hx + hy * hy)
+        square = hx * hx + hy * hy
+        inverse = 1.0 / np.where(square > MIN_PARALLAX**2 * size, square, np.nan)
         px, py = hx * inverse, hy * inverse
         y = np.empty(h.shape)
         y[:, 0] = (G[:, 0, 0] - A21[:, 0, 0]) * px + (G[:, 1, 0] - A21[:, 1, 0]) * py

@@ -1,0 +1,334 @@
+"""Normals from affinities: optimal against brute force, many views, predicted errors against Monte Carlo."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.affine_scenes import FISHEYE, REGULAR, Corners, angles_deg, general_pairs, see, special_boards, turned
+
+from rigkit.affine.affinities import DirectionNoise
+from rigkit.affine.normal import (
+    NORMAL_METHODS,
+    estimate_normals,
+    normal_covariance,
+    normals_from_affines,
+    normals_from_views,
+)
+from rigkit.affine.registry import affines_from_directions
+from rigkit.affine.surface import affines_from_normals
+from rigkit.errors import InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3, unit
+from rigkit.matches import DirectionPairs
+
+EXACT_DEG = 1e-9
+PREDICTED = 0.10
+"""Predicted over measured rms angle; medians over corners, 300 trials each (4 % standard error a corner)."""
+SINGLE_CORNER = 0.15
+"""The same for one corner with 4000 trials, where noise is still small against the geometry."""
+
+POSE = Rigid3(exp_so3(np.array([0.1, -0.3, 0.15])), [-260.0, 60.0, 90.0])
+SIDEWAYS = Rigid3(np.eye(3), [-250.0, 40.0, 30.0])
+
+
+@pytest.fixture(scope="module")
+def scene() -> Corners:
+    return general_pairs(np.random.default_rng(11), 10, (40.0, 70.0))
+
+
+@pytest.fixture(params=["pinhole", "fisheye beyond 90 degrees"])
+def corners(request: pytest.FixtureRequest) -> Corners:
+    if request.param == "pinhole":
+        out = see(REGULAR, REGULAR, POSE, [Rigid3(exp_so3(np.array([0.5, -0.4, 0.3])), [-100.0, -140.0, 900.0])])
+    else:
+        far = Rigid3(exp_so3(np.array([0.0, np.radians(105.0), 0.0])), np.zeros(3))
+        board = far @ Rigid3(exp_so3(np.array([-0.3, 0.4, 0.8])), [-100.0, -140.0, 900.0])
+        out = see(FISHEYE, FISHEYE, SIDEWAYS, [board])
+        assert out is not None
+        assert (out.points[:, 2] < 0.0).sum() > 10
+    assert out is not None
+    return out
+
+
+@pytest.mark.parametrize("method", NORMAL_METHODS)
+def test_exact_affinities_give_exact_normals(method: str, corners: Corners) -> None:
+    normals, valid = normals_from_affines(corners.J1, corners.J2, corners.A21, method=method)
+    assert valid.all()
+    limit = EXACT_DEG if method != "nullvector" else 1e-5  # the normal matrix squares the condition
+    assert angles_deg(normals, corners.normals).max() < limit
+    assert (np.sum(normals * corners.points, axis=1) < 0.0).all()
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-12)
+
+
+def test_directions_straight_to_normals_in_raw_fisheye(corners: Corners) -> None:
+    """Directions, epipolar normals and normals all in raw pixels, no rectification anywhere."""
+    for method in ("F2UDIR", "F3UDIR", "DET3UDIR", "2SDIR", "3SDIR"):
+        found = affines_from_directions(corners.directions(), method, epipolar=corners.epipolar)
+        normals, valid = normals_from_affines(corners.J1, corners.J2, found.A21)
+        assert valid.mean() > 0.9
+        assert angles_deg(normals, corners.normals)[valid].max() < 1e-6
+
+
+def test_optimal_is_never_above_brute_force(corners: Corners, rng: np.random.Generator) -> None:
+    noisy = corners.A21 + 0.1 * rng.normal(size=corners.A21.shape)
+    normals, _ = normals_from_affines(corners.J1, corners.J2, noisy)
+
+    def cost(n: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(affines_from_normals(corners.J1, corners.J2, n)[0] - noisy, axis=(1, 2))
+
+    best = cost(normals)
+    for size in (1e-4, 1e-2, 0.3, 3.0):
+        for _ in range(15):
+            other = unit(normals + size * rng.normal(size=normals.shape))
+            assert (cost(other) >= best * (1.0 - 1e-12)).all()
+    for method in ("fne", "nullvector"):
+        other, valid = normals_from_affines(corners.J1, corners.J2, noisy, method=method)
+        assert (cost(other)[valid] >= best[valid] * (1.0 - 1e-12)).all()
+
+
+def test_all_methods_agree_on_consistent_affinities(scene: Corners, rng: np.random.Generator) -> None:
+    """F2UDIR and F3UDIR fulfil the epipolar equations exactly: then every method has the same answer."""
+    directions = turned(scene.directions(), 2.0, rng)
+    found = affines_from_directions(directions, "F3UDIR", epipolar=scene.epipolar)
+    optimal, valid = normals_from_affines(scene.J1, scene.J2, found.A21)
+    for method in ("fne", "nullvector"):
+        other, _ = normals_from_affines(scene.J1, scene.J2, found.A21, method=method)
+        line = np.minimum(angles_deg(optimal, other), angles_deg(optimal, -other))[valid]
+        assert np.quantile(line, 0.99) < 1e-3
+
+
+def test_fne_is_worse_and_the_null_vector_a_little(scene: Corners, rng: np.random.Generator) -> None:
+    """Isotropic noise of 0.01 on A: in the reference scene 1.6, 1.6 and 3.2 degrees; FNE is about twice as bad."""
+    noisy = scene.A21 + 0.01 * rng.normal(size=scene.A21.shape)
+    median = {}
+    for method in NORMAL_METHODS:
+        normals, valid = normals_from_affines(scene.J1, scene.J2, noisy, method=method)
+        median[method] = np.median(angles_deg(normals, scene.normals)[valid])
+    assert median["optimal"] < 1.01 * median["nullvector"]
+    assert median["fne"] > 1.4 * median["optimal"]
+
+
+def test_depends_on_the_affinity_only_along_the_epipolar_line(corners: Corners, rng: np.random.Generator) -> None:
+    across = rng.normal(size=(len(corners), 2))
+    moved = corners.A21 + 0.2 * unit(corners.n2)[:, :, None] * across[:, None, :]
+    normals, _ = normals_from_affines(corners.J1, corners.J2, moved)
+    assert angles_deg(normals, corners.normals).max() < 1e-9
+
+
+def test_invariant_to_the_pixels_of_image_1(corners: Corners, rng: np.random.Generator) -> None:
+    noisy = corners.A21 + 0.1 * rng.normal(size=corners.A21.shape)
+    L = np.eye(2) + 0.3 * rng.normal(size=(2, 2))
+    if np.linalg.det(L) < 0.0:
+        L = L[::-1]
+    before, _ = normals_from_affines(corners.J1, corners.J2, noisy)
+    after, _ = normals_from_affines(L @ corners.J1, corners.J2, noisy @ np.linalg.inv(L))
+    assert angles_deg(before, after).max() < 1e-9
+
+
+def test_undefined_at_the_epipole_and_without_affinity(corners: Corners) -> None:
+    J2, A21 = corners.J2.copy(), corners.A21.copy()
+    J2[3] = corners.J1[3]  # no parallax
+    A21[4] = np.nan
+    normals, valid = normals_from_affines(corners.J1, J2, A21)
+    assert not valid[3]
+    assert not valid[4]
+    assert np.isnan(normals[4]).all()
+    assert valid.sum() >= len(corners) - 2
+
+
+def test_unknown_method() -> None:
+    with pytest.raises(InputError, match="known: optimal, fne, nullvector"):
+        normals_from_affines(np.zeros((1, 2, 3)), np.zeros((1, 2, 3)), np.zeros((1, 2, 2)), method="best")
+
+
+class TestManyViews:
+    MOTIONS = (POSE, Rigid3(exp_so3(np.array([-0.2, 0.1, 0.0])), [100.0, -220.0, 40.0]), SIDEWAYS)
+
+    def views(self) -> list[Corners]:
+        board = Rigid3(exp_so3(np.array([0.5, -0.4, 0.3])), [-100.0, -140.0, 900.0])
+        out = [see(REGULAR, REGULAR, motion, [board]) for motion in self.MOTIONS]
+        return [v for v in out if v is not None]
+
+    def test_exact(self) -> None:
+        views = self.views()
+        assert len(views) == 3
+        normals, valid = normals_from_views(views[0].J1, [v.J2 for v in views], [v.A21 for v in views])
+        assert valid.all()
+        assert angles_deg(normals, views[0].normals).max() < 1e-9
+
+    def test_is_the_weighted_minimum(self, rng: np.random.Generator) -> None:
+        views, sigmas = self.views(), [0.02, 0.1, 0.05]
+        noisy = [v.A21 + s * rng.normal(size=v.A21.shape) for v, s in zip(views, sigmas, strict=True)]
+        normals, _ = normals_from_views(views[0].J1, [v.J2 for v in views], noisy, sigmas)
+
+        def cost(n: np.ndarray) -> np.ndarray:
+            terms = [
+                np.sum((affines_from_normals(v.J1, v.J2, n)[0] - A) ** 2, axis=(1, 2)) / s**2
+                for v, A, s in zip(views, noisy, sigmas, strict=True)
+            ]
+            return np.sum(terms, axis=0)
+
+        best = cost(normals)
+        for size in (1e-4, 1e-2, 0.3):
+            for _ in range(15):
+                assert (cost(unit(normals + size * rng.normal(size=normals.shape))) >= best * (1.0 - 1e-12)).all()
+
+    def test_more_views_are_better_and_a_missing_view_is_left_out(self, rng: np.random.Generator) -> None:
+        views = self.views()
+        noisy = [v.A21 + 0.02 * rng.normal(size=v.A21.shape) for v in views]
+        noisy[2][:10] = np.nan
+        J_others = [v.J2 for v in views]
+        both, valid = normals_from_views(views[0].J1, J_others, noisy)
+        assert valid.all()
+        two, _ = normals_from_views(views[0].J1, J_others[:2], noisy[:2])
+        one, _ = normals_from_affines(views[0].J1, J_others[0], noisy[0])
+        np.testing.assert_allclose(both[:10], two[:10], atol=1e-12)
+        truth = views[0].normals
+        assert np.median(angles_deg(both, truth)) < np.median(angles_deg(one, truth))
+
+    def test_one_view_is_the_two_view_answer(self, rng: np.random.Generator) -> None:
+        view = self.views()[0]
+        noisy = view.A21 + 0.02 * rng.normal(size=view.A21.shape)
+        many, _ = normals_from_views(view.J1, [view.J2], [noisy])
+        two, _ = normals_from_affines(view.J1, view.J2, noisy)
+        np.testing.assert_allclose(many, two, atol=1e-12)
+
+    def test_numbers_must_agree(self) -> None:
+        with pytest.raises(InputError, match="one Jacobian, one affinity"):
+            normals_from_views(np.zeros((1, 2, 3)), [], [])
+
+
+class TestPredictedSigma:
+    TRIALS = 300
+
+    def rms(
+        self, scene: Corners, method: str, sigma_deg: float, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Measured and predicted rms angle of every fifth corner, radians."""
+        c = scene.select(np.arange(0, len(scene), 5))
+        noise = DirectionNoise.angular(c.directions(), np.radians(sigma_deg), np.radians(sigma_deg))
+        exact = affines_from_directions(c.directions(), method, epipolar=c.epipolar, noise=noise)
+        predicted = estimate_normals(c.J1, c.J2, exact.A21, covariance=exact.covariance).sigma_rad
+        big = c.select(np.repeat(np.arange(len(c)), self.TRIALS))
+        found = affines_from_directions(turned(big.directions(), sigma_deg, rng), method, epipolar=big.epipolar)
+        normals, _ = normals_from_affines(big.J1, big.J2, found.A21)
+        square = np.radians(angles_deg(normals, big.normals)).reshape(len(c), self.TRIALS) ** 2
+        return np.sqrt(np.nanmean(square, axis=1)), predicted
+
+    @pytest.mark.parametrize("method", ["F3UDIR", "DET3UDIR", "2SDIR", "3SDIR"])
+    def test_agrees_with_monte_carlo(self, method: str, scene: Corners, rng: np.random.Generator) -> None:
+        measured, predicted = self.rms(scene, method, 0.3, rng)
+        ratio = (measured / predicted)[np.isfinite(predicted)]
+        assert len(ratio) > 200
+        assert abs(np.median(ratio) - 1.0) < PREDICTED
+        assert np.quantile(ratio, 0.1) > 0.85
+        assert np.quantile(ratio, 0.9) < 1.15
+
+    def test_two_directions_agree_in_the_median(self, scene: Corners, rng: np.random.Generator) -> None:
+        """F2UDIR has heavy tails where a direction is nearly along its epipolar line: the median corner agrees."""
+        measured, predicted = self.rms(scene, "F2UDIR", 0.3, rng)
+        ratio = (measured / predicted)[np.isfinite(predicted)]
+        assert abs(np.median(ratio) - 1.0) < PREDICTED
+
+    def test_closed_form_of_isotropic_affinity_noise(self, scene: Corners, rng: np.random.Generator) -> None:
+        """rms = sigma_A / |h| sqrt(tr(P M M^T P^T)): the covariance and the closed form are the same number."""
+        c = scene
+        x = c.points[:, :2] / c.points[:, 2:]
+        M = np.zeros((len(c), 3, 2))
+        f = REGULAR.focal_px
+        M[:, 0, 0] = M[:, 1, 1] = f / c.points[:, 2]
+        M[:, 2] = -f * x / c.points[:, 2:]
+        d = unit(c.points)
+        h = np.einsum("nij,nj->ni", c.J2, d)
+        gauge = 1.0 / np.abs(np.sum(c.normals * d, axis=1))
+        P = (np.eye(3) - c.normals[:, :, None] * c.normals[:, None, :]) / gauge[:, None, None]
+        PM = P @ M
+        expected = 0.01 / np.linalg.norm(h, axis=1) * np.sqrt(np.einsum("nij,nij->n", PM, PM))
+        predicted = estimate_normals(c.J1, c.J2, c.A21, sigma_A=np.full(len(c), 0.01))
+        np.testing.assert_allclose(np.sqrt(np.trace(predicted.covariance, axis1=1, axis2=2)), expected, rtol=1e-9)
+        np.testing.assert_allclose(predicted.sigma_rad, expected, rtol=1e-2)
+        normals, _ = normals_from_affines(c.J1, c.J2, c.A21 + 0.001 * rng.normal(size=c.A21.shape))
+        ratio = np.radians(angles_deg(normals, c.normals)) / (0.1 * expected)
+        assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=PREDICTED)
+
+    def test_covariance_matrix_of_one_corner(self, scene: Corners, rng: np.random.Generator) -> None:
+        c = scene.select(np.array([101]))
+        noise = DirectionNoise.isotropic(c.directions(), 0.05, 0.08)
+        exact = affines_from_directions(c.directions(), "3SDIR", noise=noise)
+        predicted = estimate_normals(c.J1, c.J2, exact.A21, covariance=exact.covariance)
+        assert np.abs(predicted.covariance[0] @ c.normals[0]).max() < 1e-12
+        many = c.select(np.zeros(4000, dtype=int))
+        images = [e + s * rng.normal(size=e.shape) for e, s in ((many.exact1, 0.05), (many.exact2, 0.08))]
+        found = affines_from_directions(DirectionPairs(*images, np.ones((4000, 3), dtype=bool)), "3SDIR")
+        normals, _ = normals_from_affines(many.J1, many.J2, found.A21)
+        measured = np.cov(normals.T)
+        assert np.abs(measured - predicted.covariance[0]).max() < SINGLE_CORNER * np.trace(measured)
+
+    def test_every_corner_has_its_own(self, scene: Corners) -> None:
+        """Twice the noise at one corner is twice the sigma there and nowhere else."""
+        sigma = np.full((len(scene), 3), 0.1)
+        first = self.sigma_of(scene, sigma)
+        sigma[7] *= 2.0
+        second = self.sigma_of(scene, sigma)
+        assert second[7] == pytest.approx(2.0 * first[7], rel=1e-3)
+        np.testing.assert_array_equal(np.delete(second, 7), np.delete(first, 7))
+
+    @staticmethod
+    def sigma_of(c: Corners, sigma_px: np.ndarray) -> np.ndarray:
+        noise = DirectionNoise.isotropic(c.directions(), sigma_px, sigma_px)
+        found = affines_from_directions(c.directions(), "3SDIR", noise=noise)
+        return estimate_normals(c.J1, c.J2, found.A21, covariance=found.covariance).sigma_rad
+
+    def test_stays_honest_where_the_normal_is_lost(self, rng: np.random.Generator) -> None:
+        """A board in front and a forward motion: errors of 60 degrees and more must be announced at every corner."""
+        boards = special_boards(25.0)[:1]
+        lost = see(REGULAR, REGULAR, Rigid3(np.eye(3), [0.0, 0.0, -300.0]), boards)
+        assert lost is not None
+        directions = turned(lost.directions(), 3.0, rng)
+        noise = DirectionNoise.angular(directions, np.radians(3.0), np.radians(3.0))
+        found = affines_from_directions(directions, "3SDIR", noise=noise)
+        estimate = estimate_normals(lost.J1, lost.J2, found.A21, covariance=found.covariance)
+        error = np.radians(angles_deg(estimate.normals, lost.normals))
+        assert np.median(error) > 0.5
+        assert (estimate.sigma_rad < np.pi / 2.0).all()
+        assert 0.7 < np.sqrt(np.mean(error**2) / np.mean(estimate.sigma_rad**2)) < 1.4
+
+    def test_unknown_without_noise(self, scene: Corners) -> None:
+        estimate = estimate_normals(scene.J1, scene.J2, scene.A21)
+        assert estimate.valid.all()
+        assert np.isnan(estimate.sigma_rad).all()
+
+
+class TestWeighted:
+    """With its covariance the affinity's error across the epipolar line, which is known, corrects that along it."""
+
+    def test_better_than_unweighted_and_predicted(self, scene: Corners, rng: np.random.Generator) -> None:
+        c = scene.select(np.repeat(np.arange(0, len(scene), 5), 200))
+        directions = c.directions()
+        noise = DirectionNoise.isotropic(directions, 0.1, 0.1)
+        images = [e + 0.1 * rng.normal(size=e.shape) for e in (c.exact1, c.exact2)]
+        found = affines_from_directions(DirectionPairs(*images, directions.valid), "2SDIR", noise=noise)
+        rms = {}
+        for weighted in (False, True):
+            estimate = estimate_normals(c.J1, c.J2, found.A21, covariance=found.covariance, weighted=weighted)
+            error = np.radians(angles_deg(estimate.normals, c.normals))
+            rms[weighted] = np.sqrt(np.mean(error**2))
+            assert np.sqrt(np.mean((error / estimate.sigma_rad) ** 2)) == pytest.approx(1.0, abs=PREDICTED)
+        assert rms[True] < 0.97 * rms[False]
+
+    def test_the_same_for_affinities_without_error_across(self, scene: Corners, rng: np.random.Generator) -> None:
+        directions = turned(scene.directions(), 0.5, rng)
+        noise = DirectionNoise.angular(directions, 0.01, 0.01)
+        found = affines_from_directions(directions, "F3UDIR", epipolar=scene.epipolar, noise=noise)
+        plain, valid = normals_from_affines(scene.J1, scene.J2, found.A21)
+        weighted, _ = normals_from_affines(scene.J1, scene.J2, found.A21, covariance=found.covariance)
+        assert angles_deg(plain, weighted)[valid].max() < 1e-4
+
+    def test_isotropic_noise_needs_no_weights(self, scene: Corners, rng: np.random.Generator) -> None:
+        noisy = scene.A21 + 0.02 * rng.normal(size=scene.A21.shape)
+        covariance = np.broadcast_to(4e-4 * np.eye(4), (len(scene), 4, 4))
+        plain, _ = normals_from_affines(scene.J1, scene.J2, noisy)
+        weighted, _ = normals_from_affines(scene.J1, scene.J2, noisy, covariance=covariance)
+        assert angles_deg(plain, weighted).max() < 1e-9
+        by_weights = normal_covariance(scene.J1, scene.J2, plain, covariance, weighted=True)
+        np.testing.assert_allclose(by_weights, normal_covariance(scene.J1, scene.J2, plain, covariance), atol=1e-12)
