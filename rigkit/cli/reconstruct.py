@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
         for outcome in outcomes:
             r = outcome.result
             print(
-                f"{out / r['ply']}: {r['points']} points on {len(r['boards'])} boards, baseline {r['baseline_mm']:.3f} ± "
+                f"{out / r['ply']}: {r['points']} points, {len(r['boards'])} boards, baseline {r['baseline_mm']:.3f} ± "
                 f"{r['baseline_sigma_mm']:.3f} mm, Sampson rms {r['sampson_rms_px']:.3f} px, {r['pose_type']}"
             )
     return 0
