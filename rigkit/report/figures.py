@@ -180,7 +180,10 @@ def _draw_boards(axis: Any, reconstruction: Reconstruction, pixels: Pixels) -> N
         order = on[np.lexsort((matches.grid[on, 0], matches.grid[on, 1]))]
         p = pixels[order]
         colour = board_colour(index)
-        axis.plot(p[:, 0], p[:, 1], color=colour, linewidth=0.6, alpha=0.8)
+        # A gap after every row: lines along the rows show which way the board is indexed.
+        ends = np.flatnonzero(np.diff(matches.grid[order, 1])) + 1
+        rows = np.insert(p, ends, np.nan, axis=0)
+        axis.plot(rows[:, 0], rows[:, 1], color=colour, linewidth=0.8, alpha=0.8)
         axis.scatter(p[:, 0], p[:, 1], s=7, color=colour, linewidths=0)
         axis.plot(*p[0], marker="o", markersize=9, markerfacecolor="none", markeredgecolor=colour, markeredgewidth=1.5)
         label = {"boxstyle": "round,pad=0.2", "facecolor": "white", "alpha": 0.75, "linewidth": 0}
