@@ -52,6 +52,7 @@ class EdgeStart:
     pixels : (N, 2)
     sides : (N, 2, 2) the cell's sides along column and row, px: directions of line 1 and 2, and the window.
     curvature : (N, 2) of the two lines, 1/px, positive towards +90 degrees.
+    gaps : (N, 2, 2) distance of the neighbouring lines before and after line 1 and line 2 (along +90 degrees), px.
     sign : (N,) +1 where brightness grows with the angle across the +column edge.
     blur : (N,) s.
     angle_sigma, log_blur_sigma, light_sigma : how well angles (rad), log s and g (1 per window) are known beforehand;
@@ -61,6 +62,7 @@ class EdgeStart:
     pixels: FloatArray
     sides: FloatArray
     curvature: FloatArray
+    gaps: FloatArray
     sign: FloatArray
     blur: FloatArray
     angle_sigma: float = 0.1
@@ -128,7 +130,7 @@ def fit_edges(image: FloatImage, start: EdgeStart) -> EdgeFit:
     active = np.ones(count, bool)
     for _ in range(ITERATIONS):
         part = window.of(active) if not active.all() else window
-        jacobian, residual = _linearise(values[active], part, start.curvature[active])
+        jacobian, residual = _linearise(values[active], part, start.curvature[active], start.gaps[active])
         free = np.maximum(part.weight.sum(axis=1) - PARAMETERS, 1.0)
         variance[active] = np.maximum((residual**2).sum(axis=1) / free, 1e-6)
         pull = prior[active] * variance[active, None]
@@ -182,7 +184,7 @@ def _brightness(values: FloatArray, window: _Window, start: EdgeStart) -> None:
     """Set a and b of `values` by linear least squares with everything else as it stands."""
     values[:, B] = start.sign
     values[:, A] = 0.0
-    pattern = _model(values, window, start.curvature)[0]
+    pattern = _model(values, window, start.curvature, start.gaps)[0]
     total = np.maximum(window.weight.sum(axis=1), 1.0)
     mean_p = (window.weight * pattern).sum(axis=1) / total
     mean_i = (window.weight * window.value).sum(axis=1) / total
@@ -194,48 +196,76 @@ def _brightness(values: FloatArray, window: _Window, start: EdgeStart) -> None:
     values[:, A] = mean_i - slope * mean_p
 
 
-def _step(distance: FloatArray, blur: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return F, its slope dF/du, and u = distance / (3 s), clipped to +-1."""
-    u = np.clip(distance / (STEP_WIDTH * blur[:, None]), -1.0, 1.0)
+def _step(distance: FloatArray, blur: FloatArray, gaps: FloatArray) -> tuple[FloatArray, ...]:
+    """Return the blurred step S over the line, S' and S'' (with respect to distance / s), and u S' summed for dS/ds.
+
+    S is F at the line itself less F at the parallel neighbouring lines `gaps` (N, 2) before and after it: where squares
+    are small against the blur their edges reach into the window.
+    """
+    wide = STEP_WIDTH * blur[:, None]
+    total = _smooth_step(distance / wide)
+    if (gaps < 2.0 * STEP_WIDTH * blur[:, None]).any():
+        for place in (-gaps[:, :1], gaps[:, 1:]):
+            other = _smooth_step((distance - place) / wide)
+            total = tuple(mine - theirs for mine, theirs in zip(total, other, strict=True))
+            # Far from both lines the neighbours' steps add up to a constant of 0: one is -1, the other +1.
+    return total
+
+
+def _smooth_step(u: FloatArray) -> tuple[FloatArray, ...]:
+    """Return F, dF/dx, d2F/dx2 and x dF/dx at x = 3 u."""
+    u = np.clip(u, -1.0, 1.0)
     square = u * u
     rest = 1.0 - square
     value = u * (35.0 - square * (35.0 - square * (21.0 - 5.0 * square))) / 16.0
-    return value, (35.0 / 16.0) * rest * rest * rest, u
+    rest2 = rest * rest
+    slope = (35.0 / 16.0 / STEP_WIDTH) * rest2 * rest
+    bend = (-105.0 / 8.0 / STEP_WIDTH**2) * u * rest2
+    return value, slope, bend, STEP_WIDTH * u * slope
 
 
-def _model(values: FloatArray, window: _Window, curvature: FloatArray) -> tuple[FloatArray, tuple[FloatArray, ...]]:
-    """Return the modelled brightness (N, P) and what its derivatives need."""
+def _model(
+    values: FloatArray, window: _Window, curvature: FloatArray, gaps: FloatArray
+) -> tuple[FloatArray, tuple[FloatArray, ...]]:
+    """Return the modelled brightness (N, P) and what its derivatives need.
+
+    The blur mixes the two steps where the lines cross aslant: for a Gaussian, E[sign d1 sign d2] is the sum over k of
+    rho^k / k! S1^(k) S2^(k) (Mehler) with rho the cosine between the lines; two terms are kept.
+    """
     qu, qv = window.u - values[:, X, None], window.v - values[:, Y, None]
     parts: list[FloatArray] = []
-    for angle, bend in ((T1, 0), (T2, 1)):
+    for angle, line in ((T1, 0), (T2, 1)):
         cosine, sine = np.cos(values[:, angle, None]), np.sin(values[:, angle, None])
         along, aside = cosine * qu + sine * qv, cosine * qv - sine * qu
-        kappa = curvature[:, bend, None]
-        value, slope, u = _step(aside - 0.5 * kappa * along**2, values[:, S])
-        parts += [value, slope, u, along, aside, cosine, sine, kappa]
+        kappa = curvature[:, line, None]
+        parts += [*_step(aside - 0.5 * kappa * along**2, values[:, S], gaps[:, line])]
+        parts += [along, aside, cosine, sine, kappa]
     light = 1.0 + (values[:, GX, None] * window.u + values[:, GY, None] * window.v) / window.size[:, None]
+    rho = np.cos(values[:, T1] - values[:, T2])[:, None]
     # Brightness grows with the angle across line 1 where the sign is +: that is d1 > 0, d2 < 0 bright.
-    pattern = -parts[0] * parts[8]
+    pattern = -(parts[0] * parts[9] + rho * parts[1] * parts[10] + (0.5 * rho**2) * parts[2] * parts[11])
     plain = values[:, A, None] + values[:, B, None] * pattern
-    return light * plain, (*parts, light, pattern, plain)
+    return light * plain, (*parts, rho, light, pattern, plain)
 
 
-def _linearise(values: FloatArray, window: _Window, curvature: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _linearise(
+    values: FloatArray, window: _Window, curvature: FloatArray, gaps: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Return the Jacobian (N, 9, P) and the residuals (N, P), both zero in the padding."""
-    model, parts = _model(values, window, curvature)
-    f1, slope1, u1, along1, aside1, cos1, sin1, kappa1 = parts[:8]
-    f2, slope2, u2, along2, aside2, cos2, sin2, kappa2 = parts[8:16]
-    light, pattern, plain = parts[16:]
+    model, parts = _model(values, window, curvature, gaps)
+    f1, slope1, bow1, grown1, along1, aside1, cos1, sin1, kappa1 = parts[:9]
+    f2, slope2, bow2, grown2, along2, aside2, cos2, sin2, kappa2 = parts[9:18]
+    rho, light, pattern, plain = parts[18:]
     weight = window.weight
-    scale = -(values[:, B] / (STEP_WIDTH * values[:, S]))[:, None] * light * weight
-    by_d1, by_d2 = scale * slope1 * f2, scale * slope2 * f1
+    scale = -(values[:, B] / values[:, S])[:, None] * light * weight
+    by_d1, by_d2 = scale * (slope1 * f2 + rho * bow1 * slope2), scale * (slope2 * f1 + rho * bow2 * slope1)
     bend1, bend2 = kappa1 * along1, kappa2 * along2
     jacobian = np.empty((len(values), PARAMETERS, weight.shape[1]))
     jacobian[:, X] = by_d1 * (sin1 + bend1 * cos1) + by_d2 * (sin2 + bend2 * cos2)
     jacobian[:, Y] = by_d1 * (bend1 * sin1 - cos1) + by_d2 * (bend2 * sin2 - cos2)
     jacobian[:, T1] = -by_d1 * (along1 + bend1 * aside1)
     jacobian[:, T2] = -by_d2 * (along2 + bend2 * aside2)
-    jacobian[:, S] = -STEP_WIDTH * (by_d1 * u1 + by_d2 * u2)
+    jacobian[:, S] = -scale * (grown1 * f2 + grown2 * f1)
     jacobian[:, A] = light * weight
     jacobian[:, B] = jacobian[:, A] * pattern
     shaded = plain * weight / window.size[:, None]

@@ -42,10 +42,30 @@ class LocalFit:
             [_curvature(self.along_column, self.bend_column), _curvature(self.along_row, self.bend_row)], axis=-1
         )
 
+    def gaps(self) -> FloatArray:
+        """Return how far the neighbouring column and row lines lie from those through the cells, (M, 2, 2) px.
+
+        First index: the column line, the row line; second: before and after, in the direction of +90 degrees.
+        """
+        a, b = self.along_column, self.along_row
+        rows = [np.abs(_cross(a, b + sign * self.bend_row)) for sign in (-0.5, 0.5)]
+        columns = [np.abs(_cross(b, a + sign * self.bend_column)) for sign in (0.5, -0.5)]
+        return np.stack(
+            [
+                np.stack(rows, axis=-1) / np.linalg.norm(a, axis=1)[:, None],
+                np.stack(columns, axis=-1) / np.linalg.norm(b, axis=1)[:, None],
+            ],
+            axis=1,
+        )
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    cross: FloatArray = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    return cross
+
 
 def _curvature(first: FloatArray, second: FloatArray) -> FloatArray:
-    cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
-    curvature: FloatArray = cross / np.maximum((first**2).sum(axis=1), 1e-12) ** 1.5
+    curvature: FloatArray = _cross(first, second) / np.maximum((first**2).sum(axis=1), 1e-12) ** 1.5
     return curvature
 
 
@@ -54,7 +74,7 @@ def fit_cells(
     cells: BoolArray,
     *,
     degree: int = 3,
-    radius: int = 2,
+    radius: int = 3,
     width: float = 2.0,
     ridge: tuple[float, float] = (1e-8, 1e-6),
     leave_out: bool = False,

@@ -94,7 +94,7 @@ def _pass(image: FloatImage, lattices: Sequence[Lattice], blurs: Sequence[FloatA
         known = item.known
         shape = fit_cells(item.pixels, known)
         sides = np.stack([shape.along_column, shape.along_row], axis=1)
-        starts.append((item.pixels[known], sides, shape.curvature(), item.signs()[known], blur[known]))
+        starts.append((item.pixels[known], sides, shape.curvature(), shape.gaps(), item.signs()[known], blur[known]))
     fit = fit_edges(image, EdgeStart(*(np.concatenate(part) for part in zip(*starts, strict=True))))
     ends = np.cumsum([item.count for item in lattices])
     return [_filled(item, fit, slice(end - item.count, end)) for item, end in zip(lattices, ends, strict=True)]
