@@ -10,7 +10,7 @@ import numpy as np
 
 from rigkit.arrays import FloatArray, Mat3
 from rigkit.errors import DegenerateError
-from rigkit.fundamental.rows import affinity_rows, point_rows
+from rigkit.fundamental.rows import affinity_rows, point_rows, right_singular
 from rigkit.fundamental.weights import RowWeights
 from rigkit.matches import Matches
 
@@ -50,9 +50,7 @@ def linear_epipolar(rows: NormalisedRows, weights: RowWeights) -> Mat3:
 
     Raises DegenerateError where a second solution fits exactly too (all points on one plane, or no baseline).
     """
-    stacked = rows.weighted(weights)
-    # With eight rows the ninth right singular vector exists only in the full basis.
-    _, s, vt = np.linalg.svd(stacked, full_matrices=True)
+    s, vt = right_singular(rows.weighted(weights))
     if s[7] < 1e-9 * s[0]:
         raise DegenerateError(
             "the matches do not determine a general epipolar geometry (all on one plane, or no baseline); "

@@ -18,7 +18,7 @@ import numpy as np
 
 from rigkit.arrays import Affines, FloatArray, RayJacobians, Rays
 
-__all__ = ["PLANAR_ENTRIES", "affinity_rows", "essential_from_planar", "planar_angles", "point_rows"]
+__all__ = ["PLANAR_ENTRIES", "affinity_rows", "essential_from_planar", "planar_angles", "point_rows", "right_singular"]
 
 PLANAR_ENTRIES = (1, 3, 5, 7)
 """Entries of the row-major E that planar motion leaves: E = [[0, e1, 0], [e2, 0, e3], [0, e4, 0]]."""
@@ -52,3 +52,15 @@ def planar_angles(e: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     phi = np.arctan2(e[..., 3], -e[..., 0])
     return phi - np.arctan2(-e[..., 2], e[..., 1]), phi
+
+
+def right_singular(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return all singular values (K,), zeros included, and right singular vectors (K, K) of rows (M, K).
+
+    The triangular factor first: the left vectors of thousands of rows are never formed. With fewer rows than columns
+    the last vectors exist only in the full basis.
+    """
+    columns = rows.shape[1]
+    square = np.linalg.qr(rows, mode="r") if len(rows) > columns else rows
+    _, s, vt = np.linalg.svd(square, full_matrices=True)
+    return np.concatenate([s, np.zeros(columns - len(s))]), vt

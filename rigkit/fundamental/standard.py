@@ -14,6 +14,7 @@ from rigkit.arrays import FloatArray
 from rigkit.errors import DegenerateError, InputError
 from rigkit.fundamental.eight_point import essential_nearest
 from rigkit.fundamental.estimate import EpipolarEstimate, check_baseline, finish
+from rigkit.fundamental.rows import right_singular
 from rigkit.fundamental.weights import RowWeights, WeightRule, assumed_sigma_A, noise_weights
 from rigkit.geometry.rotation import skew
 from rigkit.matches import Matches
@@ -65,8 +66,8 @@ class StandardSolver:
                     np.stack([a4, one, zero], axis=1) / sigma[:, None],
                 ]
             )
-        _, s, vt = np.linalg.svd(system, full_matrices=True)
-        if len(s) < 2 or s[1] < 1e-12 * s[0]:
+        s, vt = right_singular(system)
+        if s[1] < 1e-12 * s[0]:
             raise DegenerateError("the relation between the images' rows is not determined: all points lie on one row")
         a, b, c = vt[2] * [scale, scale, 1.0]
         F21 = np.zeros((3, 3))

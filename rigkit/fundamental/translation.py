@@ -12,6 +12,7 @@ import numpy as np
 from rigkit.arrays import FloatArray
 from rigkit.errors import DegenerateError
 from rigkit.fundamental.estimate import EpipolarEstimate, check_baseline, check_count, finish, reweighted
+from rigkit.fundamental.rows import right_singular
 from rigkit.fundamental.weights import RowWeights, WeightRule
 from rigkit.geometry.rotation import skew
 from rigkit.matches import Matches
@@ -44,7 +45,7 @@ class TranslationSolver:
             check_count(matches, row_weights, self.degrees_of_freedom, "pure translation")
             more = affinities * row_weights.affinities[:, None, None]
             rows = np.concatenate([points * row_weights.points[:, None], more.reshape(-1, 3)])[:, columns]
-            _, s, vt = np.linalg.svd(rows, full_matrices=True)
+            s, vt = right_singular(rows)
             if s[len(columns) - 2] < 1e-12 * np.abs(row_weights.points).max():
                 raise DegenerateError("the translation is not determined: the two images show the same rays")
             t = np.zeros(3)
