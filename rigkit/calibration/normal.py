@@ -38,6 +38,8 @@ class Normal:
     Attributes
     ----------
     gg (G, G), gp (V, G, 6), pp (V, 6, 6), g (G,), p (V, 6).
+    points_from : the globals from here on are released board points: three each, coupled within a point only. None
+        where there are none.
     """
 
     gg: FloatArray
@@ -45,6 +47,7 @@ class Normal:
     pp: FloatArray
     g: FloatArray
     p: FloatArray
+    points_from: int | None = None
 
     def with_prior(self, weight: FloatArray, unknowns: FloatArray) -> Normal:
         """Add zero-mean priors of squared weight (B,) on the last B globals, which are now at `unknowns`."""
@@ -58,25 +61,49 @@ class Normal:
 
     def step(self, damping: float) -> Step | None:
         """Return the damped Gauss-Newton step, None where the damped system is not positive definite."""
-        scale_g, scale_p = _diagonal(self.gg), _diagonal(self.pp)
-        pp = self.pp.copy()
-        pp[:, np.arange(6), np.arange(6)] += damping * scale_p
+        damping_g, damping_p = damping * _diagonal(self.gg), damping * _diagonal(self.pp)
+        first = self.points_from
+        many = first is not None and len(self.g) - first > 6 * len(self.pp)
         try:
-            inverse = np.linalg.inv(pp)
-            back = inverse @ np.swapaxes(self.gp, -1, -2)
-            reduced = self.gg + np.diag(damping * scale_g) - _gemm(self.gp, back)
-            free = (inverse @ self.p[..., None])[..., 0]
-            rhs = self.g - np.einsum("vgi,vi->g", self.gp, free)
-            step_g = _solve_positive(reduced, rhs)
+            solve = self._eliminate_points if many else self._eliminate_poses
+            step_g, step_p = solve(damping_g, damping_p)
         except np.linalg.LinAlgError:
             return None
-        step_p = free - back @ step_g
         if not (np.isfinite(step_g).all() and np.isfinite(step_p).all()):
             return None
         # Decrease of the undamped model for the damped step: h^T (mu D h + b).
-        predicted = float(step_g @ (damping * scale_g * step_g + self.g))
-        predicted += float((step_p * (damping * scale_p * step_p + self.p)).sum())
+        predicted = float(step_g @ (damping_g * step_g + self.g))
+        predicted += float((step_p * (damping_p * step_p + self.p)).sum())
         return Step(step_g, step_p, predicted)
+
+    def _eliminate_poses(self, damping_g: FloatArray, damping_p: FloatArray) -> tuple[FloatArray, FloatArray]:
+        inverse = np.linalg.inv(self.pp + damping_p[..., None] * np.eye(6))
+        back = inverse @ np.swapaxes(self.gp, -1, -2)
+        reduced = self.gg + np.diag(damping_g) - _gemm(self.gp, back)
+        free = (inverse @ self.p[..., None])[..., 0]
+        step_g = _solve_positive(reduced, self.g - np.einsum("vgi,vi->g", self.gp, free))
+        return step_g, free - back @ step_g
+
+    def _eliminate_points(self, damping_g: FloatArray, damping_p: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Eliminate the released points by their 3x3 blocks: with many points and few views the system of the other
+        globals and all poses is the smaller one."""
+        p, views = int(self.points_from or 0), len(self.pp)
+        count = (len(self.g) - p) // 3
+        each = np.arange(count)
+        own = self.gg[p:, p:].reshape(count, 3, count, 3)[each, :, each, :]
+        inverse = np.linalg.inv(own + damping_g[p:].reshape(count, 3, 1) * np.eye(3))
+        system = np.zeros((p + 6 * views, p + 6 * views))
+        system[:p, :p] = self.gg[:p, :p] + np.diag(damping_g[:p])
+        system[:p, p:] = np.moveaxis(self.gp[:, :p], 0, 1).reshape(p, -1)
+        system[p:, :p] = system[:p, p:].T
+        blocks = system[p:, p:].reshape(views, 6, views, 6)
+        blocks[np.arange(views), :, np.arange(views), :] = self.pp + damping_p[..., None] * np.eye(6)
+        coupling = np.concatenate([self.gg[:p, p:], np.moveaxis(self.gp[:, p:], 1, 2).reshape(-1, 3 * count)])
+        back = np.einsum("amk,mkl->aml", coupling.reshape(-1, count, 3), inverse).reshape(len(coupling), -1)
+        rhs = np.concatenate([self.g[:p], self.p.ravel()]) - back @ self.g[p:]
+        step = _solve_positive(system - back @ coupling.T, rhs)
+        points = (inverse @ (self.g[p:] - coupling.T @ step).reshape(count, 3, 1)).reshape(-1)
+        return np.concatenate([step[:p], points]), step[p:].reshape(views, 6)
 
     def covariance(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return S^-1 (G, G), W = pp^-1 gp^T (V, 6, G) and pp^-1 (V, 6, 6): the covariance of globals g and poses p
@@ -194,4 +221,4 @@ def _released(normal: Normal, rows: FloatArray, by_board: FloatArray, observatio
     blocks[np.arange(count), :, np.arange(count), :] = by_point[..., p : p + 3]
     g[p:] = by_point[..., -1].reshape(-1)
     gp = np.concatenate([normal.gp, dense.reshape(views, -1, 6)], axis=1)
-    return Normal(gg, gp, normal.pp, g, normal.p)
+    return Normal(gg, gp, normal.pp, g, normal.p, p)

@@ -23,10 +23,10 @@ SHEAR_SIGMA = 1e-3
 """Prior of the print's shear, rad."""
 BOW_SIGMA = 1e-2
 """Prior of a bow, as a fraction of the board's half diagonal: weak, a board bent by more is visibly bent."""
-RELEASED_SIGMA_XY = 3e-4
-"""Prior of a released corner in the plane, as a fraction of the board's half diagonal (0.05 mm on 9x6 x 30 mm)."""
-RELEASED_SIGMA_Z = 1.5e-3
-"""Prior of a released corner out of the plane, same unit (0.2 mm on 9x6 x 30 mm)."""
+RELEASED_SIGMA_XY = 6e-4
+"""Prior of a released corner in the plane, as a fraction of the board's half diagonal (0.09 mm on 9x6 x 30 mm)."""
+RELEASED_SIGMA_Z = 3e-3
+"""Prior of a released corner out of the plane, same unit (0.4 mm on 9x6 x 30 mm)."""
 
 MIN_VIEWS = 3
 """A board in fewer views stays flat."""
