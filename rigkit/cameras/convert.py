@@ -1,0 +1,200 @@
+"""The nearest camera of another model: for exchange with programs that lack the model, and for comparisons."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.arrays import FloatArray, Pixels, Rays
+from rigkit.cameras.base import Camera
+from rigkit.cameras.registry import camera_model
+from rigkit.errors import InputError
+
+__all__ = ["Conversion", "convert_camera", "fit_camera"]
+
+GRID = (64, 48)
+"""Pixels of the source at which the two cameras are held against each other."""
+CURVE_SAMPLES = 60
+LIMITS_RAD = (np.pi, *np.radians([80.0, 70.0, 60.0, 50.0, 40.0]))
+"""Angles from the axis out to which a model is fitted: the widest at which it follows the lens."""
+FOLLOWS_PX = 1.0
+"""A model follows the lens where its largest error is below this."""
+WIDE_RAD = np.radians(60.0)
+"""Narrower limits are tried for perspective models of lenses that reach beyond this; others are to hold everywhere."""
+STEPS = 60
+HALVINGS = 8
+SETTLED = 1e-10
+"""The fit stops where a step gains less than this share of the cost, or the cost is rounding."""
+INSIDE = 0.995
+"""Rays within this share of the start's field of view take part: at its edge the derivatives have no end."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Conversion:
+    """A camera in place of another one.
+
+    Attributes
+    ----------
+    max_px, rms_px : error of projection over the part of the image that the new camera covers.
+    covered : that part, as a share of the pixels that the source covers.
+    reach_rad : that part, as an angle from the optical axis; pi where nothing was left out.
+    """
+
+    camera: Camera
+    max_px: float
+    rms_px: float
+    covered: float
+    reach_rad: float
+
+
+def convert_camera(camera: Camera, model: str, *, order: int | None = None, fixed: Sequence[str] = ()) -> Conversion:
+    """Return the camera of `model` nearest to `camera` over its image, in the same frame: poses stay as they are.
+
+    Parameters
+    ----------
+    order : Brown's number of terms or Scaramuzza's degree, as in `Camera.from_radial_curve`.
+    fixed : names of parameters kept as a radial curve leaves them (k3 and the tangential terms: 0).
+
+    Raises
+    ------
+    InputError
+        `model` or a name in `fixed` is unknown, or the model cannot follow the lens at all.
+    """
+    pixels = _grid(camera)
+    rays, valid = camera.unproject(pixels)
+    pixels, rays = pixels[valid], rays[valid]
+    if len(pixels) < CURVE_SAMPLES:
+        raise InputError("camera conversion: the source sees next to nothing of its own image; calibrate it again")
+    theta = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
+    centre, _ = camera.project(np.array([0.0, 0.0, 1.0]))
+    found: Conversion | None = None
+    for limit in LIMITS_RAD:
+        near = theta <= limit
+        if near.sum() < CURVE_SAMPLES or (found is not None and near.mean() == found.covered):
+            continue
+        try:
+            fitted = fit_camera(
+                camera_model(model), camera.size_px, rays[near], pixels[near], centre, order=order, fixed=fixed
+            )
+        except InputError as error:
+            if not isinstance(error, _NoStart):
+                raise
+            continue
+        projected, seen = fitted.project(rays[near])
+        error_px = np.linalg.norm((projected - pixels[near])[seen], axis=-1)
+        trial = Conversion(
+            fitted, float(error_px.max()), float(np.sqrt(np.mean(error_px**2))), seen.sum() / near.size, float(limit)
+        )
+        if found is None or trial.max_px < found.max_px:
+            found = trial
+        if found.max_px < FOLLOWS_PX or fitted.max_angle_rad > np.pi / 2 or theta.max() < WIDE_RAD:
+            return found
+    if found is None:
+        raise InputError(f"camera conversion: a {model} camera cannot follow this lens")
+    return found
+
+
+class _NoStart(InputError):
+    """The model cannot follow the radial curve."""
+
+
+def fit_camera(
+    model: type[Camera],
+    size_px: tuple[int, int],
+    rays: Rays,
+    pixels: Pixels,
+    centre_px: FloatArray,
+    *,
+    order: int | None = None,
+    fixed: Sequence[str] = (),
+) -> Camera:
+    """Return the camera of `model` that projects `rays` (N, 3) nearest to `pixels` (N, 2), by least squares.
+
+    Started from the radial curve around `centre_px`. Rays that the model cannot see are left out.
+    Raises InputError where the model has no start for this lens.
+    """
+    theta = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
+    start = _start(model, size_px, theta, pixels, centre_px, order)
+    free = _free(start, fixed)
+    used = theta < INSIDE * start.max_angle_rad
+    used[used] &= start.project(rays[used])[1]
+    return _descend(start, rays[used], pixels[used], free)
+
+
+def _grid(camera: Camera) -> Pixels:
+    u, v = (np.linspace(0.0, size - 1.0, count) for size, count in zip(camera.size_px, GRID, strict=True))
+    return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+
+
+def _free(camera: Camera, fixed: Sequence[str]) -> FloatArray:
+    """Return the matrix (P, F) of the free directions in parameter space."""
+    names = camera.parameter_names()
+    unknown = set(fixed) - set(names)
+    if unknown:
+        raise InputError(f"{camera.model} camera: no parameter {', '.join(sorted(unknown))}; it has {', '.join(names)}")
+    return np.eye(len(names))[:, [name not in fixed for name in names]]
+
+
+def _start(
+    model: type[Camera],
+    size_px: tuple[int, int],
+    theta: FloatArray,
+    pixels: Pixels,
+    centre: FloatArray,
+    order: int | None,
+) -> Camera:
+    """Return a first camera from the radial curve: means over rings of equal width in the angle."""
+    radius = np.linalg.norm(pixels - centre, axis=-1)
+    edges = np.linspace(0.0, theta.max() * (1.0 + 1e-9), CURVE_SAMPLES + 1)
+    ring = np.digitize(theta, edges) - 1
+    count = np.bincount(ring, minlength=CURVE_SAMPLES)
+    kept = count > 0
+    mean = [np.bincount(ring, v, CURVE_SAMPLES)[kept] / count[kept] for v in (theta, radius)]
+    rising = np.append(True, np.diff(np.maximum.accumulate(mean[1])) > 0.0)
+    try:
+        return model.from_radial_curve(size_px, centre, mean[0][rising], mean[1][rising], order=order)
+    except InputError as error:
+        raise _NoStart(f"camera conversion: a {model.model} camera cannot follow this lens ({error})") from error
+
+
+def _descend(camera: Camera, rays: Rays, pixels: Pixels, free: FloatArray) -> Camera:
+    """Return the camera after a damped Gauss-Newton descent of the projection error over the free directions."""
+    cost, damping = _cost(camera, rays, pixels), 1e-6
+    for _ in range(STEPS):
+        projected, _, _, by_parameter = camera.project_with_jacobians(rays)
+        j = (by_parameter @ free).reshape(-1, free.shape[1])
+        size = np.maximum(np.linalg.norm(j, axis=0), 1e-300)
+        j /= size
+        residual = (pixels - projected).reshape(-1)
+        step = free @ (np.linalg.solve(j.T @ j + damping * np.eye(size.size), j.T @ residual) / size)
+        moved, new_cost = _moved(camera, step, rays, pixels)
+        if not new_cost < cost:
+            damping *= 10.0
+            if damping > 1e6:
+                break
+            continue
+        done = cost - new_cost <= SETTLED * cost or new_cost < 1e-20 * residual.size
+        camera, cost, damping = moved, new_cost, 0.1 * damping
+        if done:
+            break
+    return camera
+
+
+def _moved(camera: Camera, step: FloatArray, rays: Rays, pixels: Pixels) -> tuple[Camera, float]:
+    """Return the camera after the step and its cost; a step out of the model's domain is halved until it is inside."""
+    for _ in range(HALVINGS):
+        try:
+            moved = camera.with_parameters(camera.parameters + step)
+        except InputError:
+            step = 0.5 * step
+            continue
+        return moved, _cost(moved, rays, pixels)
+    return camera, np.inf
+
+
+def _cost(camera: Camera, rays: Rays, pixels: Pixels) -> float:
+    """Sum of squared projection errors, infinite where a ray is not seen."""
+    projected, valid = camera.project(rays)
+    return float(np.sum((projected - pixels) ** 2)) if valid.all() else float("inf")
