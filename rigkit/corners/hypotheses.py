@@ -7,6 +7,7 @@ all their corners scores it.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -28,8 +29,8 @@ JOINT_GATE = 0.25
 """Squares by which a board may miss the joint fit and still count as seen there."""
 REJOIN_GATE = 0.5
 """Squares by which a board may miss the prediction of a joint fit to be tried as part of it."""
-MAX_SEEDS = 400
-MAX_SOLUTIONS = 40
+MAX_SEEDS = 300
+MAX_SOLUTIONS = 20
 MAX_ROUNDS = 4
 TILT_RMS_RATIO = 3.0
 TILT_RMS_PX = 0.5
@@ -202,10 +203,9 @@ def _links_of_pair(i: int, j: int, k: int, kind: BoardKind, poses1: GridPoses, p
 def solutions(links: Sequence[Link], view1: View, view2: View, kinds: Sequence[BoardKind]) -> list[Solution]:
     """Return distinct assignments with their joint fits, best first."""
     predictor = _Predictor.build(links, view2, kinds)
-    whole = [
-        n for n, s in enumerate(links) if view1.detections[s.first].complete and view2.detections[s.second].complete
-    ]
-    seeds = np.array((whole or list(range(len(links))))[:MAX_SEEDS])
+    # Whole boards first: a part whose place on the board is open makes many links, most of them wrong.
+    open_places = Counter((s.first, s.second) for s in links)
+    seeds = np.array(sorted(range(len(links)), key=lambda n: open_places[links[n].first, links[n].second])[:MAX_SEEDS])
     motions = predictor.cam2_from_board[seeds] @ np.linalg.inv(predictor.cam1_from_board[seeds])
     misses = predictor.misses(motions)
     starts: dict[frozenset[tuple[int, tuple[int, ...]]], tuple[float, FloatArray, list[int]]] = {}

@@ -85,8 +85,9 @@ def identify_pair(
 def identify_single(detections: Sequence[BoardDetection], boards: Sequence[Board]) -> tuple[BoardDetection, ...]:
     """Return the detections of one image (a calibration image) that are listed boards, named, on the board's grid.
 
-    A board of which only a part is seen is placed at the first position that fits: its pose takes up the difference.
-    Of several detections of one board the one with the most corners is kept; what fits no board is left out.
+    Of several whole detections of one board the one with the most corners is kept. A part of a grid counts where only
+    one board not seen whole can hold it; it takes the first position that fits, its pose takes up the difference. What
+    fits no board is left out.
 
     Raises
     ------
@@ -94,21 +95,25 @@ def identify_single(detections: Sequence[BoardDetection], boards: Sequence[Board
         No boards, or a detection without a name that may be any of several boards of one size.
     """
     kinds = _checked_kinds(boards)
+    by_id = {b.board_id: BoardKind((b,)) for b in boards}
     out: dict[str, BoardDetection] = {}
-    for detection, possible in zip(detections, possible_kinds(detections, kinds), strict=True):
-        if not possible:
-            continue
+
+    def whole(detection: BoardDetection) -> bool:
+        return any(sorted(k.board.size) == sorted((detection.columns, detection.rows)) for k in kinds)
+
+    candidates = list(zip(detections, possible_kinds(detections, kinds), strict=True))
+    for detection, possible in sorted(candidates, key=lambda c: (not whole(c[0]), -len(c[0].grid))):
         ids = [i for k in possible for i in kinds[k].ids]
-        name = detection.board_id if detection.board_id in ids else ids[0]
-        if detection.board_id not in ids and len(kinds[possible[0]].ids) > 1:
+        if detection.board_id in ids:
+            ids = [str(detection.board_id)]
+        elif possible and whole(detection) and len(kinds[possible[0]].ids) > 1:
             raise InputError(
                 f"boards {', '.join(ids)} look alike: one image cannot tell them apart; list only the one that it shows"
             )
-        kind = BoardKind(tuple(b for b in boards if b.board_id == name))
-        fitting = placements(detection, kind)
-        placed = fitting[0].apply(detection, kind.board).named(str(name))
-        if str(name) not in out or len(placed.grid) > len(out[str(name)].grid):
-            out[str(name)] = placed
+        vacant = [i for i in (ids[:1] if whole(detection) else ids) if i not in out]
+        if len(vacant) == 1:
+            kind = by_id[vacant[0]]
+            out[vacant[0]] = placements(detection, kind)[0].apply(detection, kind.board).named(vacant[0])
     return tuple(out[b.board_id] for b in boards if b.board_id in out)
 
 
@@ -156,7 +161,7 @@ def _tie_note(winner: Solution, others: Sequence[Solution]) -> str:
     what = "one board alone" if len(winner.links) == 1 else "the arrangement of the boards"
     return (
         f"ambiguous: {what} cannot tell {len(others) + 1} assignments apart; took the one with the smallest roll "
-        f"between the cameras ({roll:.1f} degrees, next {next_roll:.1f}); use boards of different or odd + even size to be sure"
+        f"between the cameras ({roll:.1f} degrees, next {next_roll:.1f}); boards of different sizes would settle it"
     )
 
 

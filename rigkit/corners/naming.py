@@ -45,8 +45,9 @@ class Located:
 
     @property
     def face(self) -> FloatArray:
-        """The normal that looks at the viewer."""
-        return -self.cam1_from_board[:3, 2]
+        """The normal that looks at the viewer, whatever the hand of the grid."""
+        normal = self.cam1_from_board[:3, 2]
+        return np.asarray(-np.sign(normal @ self.cam1_from_board[:3, 3]) * normal)
 
 
 def name_boards(

@@ -33,6 +33,7 @@ class Scene:
     cam2_from_cam1: Rigid3
     pixels1: dict[str, np.ndarray]
     pixels2: dict[str, np.ndarray]
+    cam1_from_world: Rigid3 | None = None
 
 
 def regular_camera() -> Camera:
@@ -68,7 +69,7 @@ def trihedral_scene(rng: np.random.Generator, boards: tuple[Board, ...], camera:
         whole = all(np.isfinite(p).all() for p in [*pixels1.values(), *pixels2.values()])
         if whole and all(_facing(p) for p in [*poses1.values(), *poses2.values()]):
             cam2_from_cam1 = cam2_from_world @ cam1_from_world.inverse()
-            return Scene(boards, camera, camera, poses1, cam2_from_cam1, pixels1, pixels2)
+            return Scene(boards, camera, camera, poses1, cam2_from_cam1, pixels1, pixels2, cam1_from_world)
     raise AssertionError("no scene fits into the image")
 
 
@@ -131,11 +132,40 @@ def lab_scene(name: str) -> Scene:
     ids = sorted(truth["view1"])
     boards = tuple(Board(i, size["cols"], size["rows"], size["square_mm"], size["square_mm"]) for i in ids)
     camera = lab_camera(truth)
+    # The captures number rows upwards; a detector's grids are right-handed, rows down.
+    order = np.arange(size["rows"] * size["cols"]).reshape(size["rows"], size["cols"])[::-1].ravel()
     poses = {}
     for i in ids:
-        x = np.array(truth["view1"][i]["cam_xyz_mm"]).reshape(size["rows"], size["cols"], 3)
+        x = np.array(truth["view1"][i]["cam_xyz_mm"])[order].reshape(size["rows"], size["cols"], 3)
         across, down = x[0, -1] - x[0, 0], x[-1, 0] - x[0, 0]
         across, down = across / np.linalg.norm(across), down / np.linalg.norm(down)
         poses[i] = Rigid3(np.stack([across, down, np.cross(across, down)], axis=1), x[0, 0])
-    pixels = [{i: np.array(truth[v][i]["uv_px"]) for i in ids} for v in ("view1", "view2")]
+        assert poses[i].rotation[:, 2] @ x[0, 0] > 0.0
+    pixels = [{i: np.array(truth[v][i]["uv_px"])[order] for i in ids} for v in ("view1", "view2")]
     return Scene(boards, camera, camera, poses, Rigid3.from_matrix(truth["cam2_from_cam1"]), pixels[0], pixels[1])
+
+
+def scrambled(detections: list[BoardDetection], rng: np.random.Generator) -> list[BoardDetection]:
+    """The detections in random order, each that looks the same turned by 180 degrees turned at random."""
+    return [
+        d.turned(2 * int(rng.integers(2))) if (d.columns + d.rows) % 2 == 0 else d
+        for d in (detections[k] for k in rng.permutation(len(detections)))
+    ]
+
+
+def both_views(
+    scene: Scene, rng: np.random.Generator, sigma_px: float = 0.05
+) -> tuple[list[BoardDetection], list[BoardDetection]]:
+    """Nameless, shuffled detections of all boards in both images."""
+    views = []
+    for pixels in (scene.pixels1, scene.pixels2):
+        found = [detection(b, pixels[b.board_id], rng, sigma_px) for b in scene.boards]
+        views.append(scrambled(found, rng))
+    return views[0], views[1]
+
+
+def true_corners(found: BoardDetection, pixels: dict[str, np.ndarray]) -> tuple[str, np.ndarray]:
+    """Which board a detection really is, and which of its corners each corner is; found by position."""
+    distance = {i: np.linalg.norm(p[:, None] - found.pixels[None], axis=-1) for i, p in pixels.items()}
+    board_id = min(distance, key=lambda i: np.nanmax(np.nanmin(distance[i], axis=0)))
+    return board_id, np.nanargmin(distance[board_id], axis=0)
