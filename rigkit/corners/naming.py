@@ -130,12 +130,17 @@ def _clock(located: Sequence[Located], kinds: Sequence[BoardKind]) -> FloatArray
     """Return where each board lies round the common centre, radians clockwise from twelve o'clock in camera 1."""
     centres = np.array([item.centre(kinds[item.kind].board) for item in located]).reshape(-1, 3)
     rays = centres / np.linalg.norm(centres, axis=1, keepdims=True)
-    middle = rays.mean(axis=0)
-    middle = middle / np.linalg.norm(middle)
-    right = np.cross([0.0, 1.0, 0.0], middle)
-    right = right / np.linalg.norm(right) if np.linalg.norm(right) > 1e-9 else np.array([1.0, 0.0, 0.0])
-    down = np.cross(middle, right)
+    right, down = _image_axes(rays.mean(axis=0))
     return np.asarray(np.arctan2(rays @ right, -(rays @ down)) % (2.0 * np.pi))
+
+
+def _image_axes(towards: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the unit vectors to the right and down, across the line of sight `towards` (3,)."""
+    sight = towards / np.linalg.norm(towards)
+    right = np.cross([0.0, 1.0, 0.0], sight)
+    length = np.linalg.norm(right)
+    right = right / length if length > 1e-9 else np.array([1.0, 0.0, 0.0])
+    return right, np.cross(sight, right)
 
 
 def _from_opposite_level(free: list[int], located: Sequence[Located], clock: FloatArray) -> list[int]:
@@ -168,8 +173,9 @@ def _by_shape(order: list[int], ids: list[str], located: Sequence[Located], kind
         return list(zip(ids, order, strict=False))
 
     def tilt(n: int) -> float:
-        x, y = located[n].cam1_from_board[:2, 0]
-        return float(abs(y) / np.hypot(x, y))
+        right, down = _image_axes(located[n].centre(kind.board))
+        along = located[n].cam1_from_board[:3, 0]
+        return float(np.arctan2(abs(along @ down), abs(along @ right)))
 
     lying = set(sorted(order, key=tilt)[: len(alike)])
     first = [n for n in order if n in lying]
