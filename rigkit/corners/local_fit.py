@@ -24,6 +24,7 @@ class LocalFit:
     along_column, along_row : first derivatives: the cell's sides.
     bend_column, bend_row : second derivatives along the column direction and along the row direction.
     support : (M,) number of corners behind the fit.
+    gain : (M,) standard deviation of `pixels` for corners of standard deviation 1.
     """
 
     pixels: FloatArray
@@ -32,6 +33,7 @@ class LocalFit:
     bend_column: FloatArray
     bend_row: FloatArray
     support: FloatArray
+    gain: FloatArray
 
     def curvature(self) -> FloatArray:
         """Return the curvature of the column and the row line at the cells, (M, 2) 1/px, positive towards +90 degrees.
@@ -111,7 +113,11 @@ def fit_cells(
     pull = np.array([(1e-12, 1e-9, ridge[0], ridge[1])[i + j] for i, j in powers])
     normal = normal + np.diag(pull)
     right = np.swapaxes(weights[..., None] * (near - centre[:, None]), 1, 2) @ design
-    solution = np.swapaxes(np.linalg.solve(normal, np.swapaxes(right, 1, 2)), 1, 2)
+    constant = np.zeros((len(row), size, 1))
+    constant[:, 0] = 1.0
+    solved = np.linalg.solve(normal, np.concatenate([np.swapaxes(right, 1, 2), constant], axis=2))
+    solution = np.swapaxes(solved[..., :2], 1, 2)
+    gain = np.sqrt(((weights * (solved[..., 2] @ design.T)) ** 2).sum(axis=1))
     zero = np.zeros((len(row), 2))
     return LocalFit(
         solution[..., 0] + centre,
@@ -120,4 +126,5 @@ def fit_cells(
         2.0 * solution[..., 3] if degree > 1 else zero,
         2.0 * solution[..., 5] if degree > 1 else zero,
         known.sum(axis=1).astype(np.float64),
+        gain,
     )

@@ -7,7 +7,8 @@ corners are, and so gives a better lattice for a second pass, which also tries t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import comb
 
 import numpy as np
 
@@ -33,8 +34,15 @@ relative to the typical corner of the board."""
 
 ASTRAY_CELLS = 0.06
 ASTRAY_FACTOR = 8.0
-"""A corner further than both of these from where its neighbours say (cells; times the board's typical deviation) is
-something else: a finger, a glint, the end of a ruler."""
+"""A corner further than this from where its neighbours say (in cells; and times the board's typical deviation; and
+times the standard deviation expected of it) is something else: a finger, a glint, the end of a ruler."""
+
+DIFFERENCE = 5
+UNEXPLAINED = 1.25
+"""A scatter about the lattice less than this times the expected one is what chance makes of fifty corners."""
+
+MEDIAN_OF_NORMAL = 0.6745
+"""Median of the absolute value of a standard normal variable."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -75,9 +83,7 @@ def refine(image: FloatImage, lattices: Sequence[Lattice]) -> list[RefinedLattic
     refined = _pass(image, lattices, first)
     current = [_with_holes(item) for item in refined]
     second = _pass(image, [item[0] for item in current], [_typical_blur(item) for item in refined])
-    return [
-        _without_astray(_confirmed(item, start, holes)) for item, (start, holes) in zip(second, current, strict=True)
-    ]
+    return [_checked(_confirmed(item, start, holes)) for item, (start, holes) in zip(second, current, strict=True)]
 
 
 def _typical_blur(item: RefinedLattice) -> FloatArray:
@@ -153,19 +159,49 @@ def _confirmed(item: RefinedLattice, start: Lattice, holes: BoolArray) -> Refine
     return item.without(holes & ~good)
 
 
-def _without_astray(item: RefinedLattice) -> RefinedLattice:
-    """Return `item` without corners that lie where their neighbours say they cannot."""
+def _checked(item: RefinedLattice) -> RefinedLattice:
+    """Return `item` without corners that lie where their neighbours say they cannot, and with honest sigmas.
+
+    Where the corners scatter about the lattice by more than the noise in the image explains (JPEG blocks, aliasing,
+    wavy paper), the board's sigmas are raised to what is seen.
+    """
     known = item.lattice.known
     if known.sum() < 12:
         return item
     shape = fit_cells(item.lattice.pixels, known, leave_out=True)
     off = item.lattice.pixels[known] - shape.pixels
+    expected = item.sigma_px[known] * np.hypot(1.0, shape.gain)
+    # A prediction from a few corners on one side is no judge of another.
+    judged = (shape.support >= 12) & (shape.gain < 1.5)
+    if judged.sum() < 9:
+        return item
     area = shape.along_column[:, 0] * shape.along_row[:, 1] - shape.along_column[:, 1] * shape.along_row[:, 0]
-    # A prediction from one side only is no better than its neighbours are far.
-    trusted = shape.support >= 12
-    cells = np.linalg.norm(off, axis=1) / np.sqrt(np.maximum(area, 1.0))
-    typical = float(np.median(cells[trusted])) if trusted.any() else 0.0
-    astray = trusted & (cells > max(ASTRAY_CELLS, ASTRAY_FACTOR * typical))
+    distance = np.linalg.norm(off, axis=1)
+    cells = distance / np.sqrt(np.maximum(area, 1.0))
+    limit = max(ASTRAY_CELLS, ASTRAY_FACTOR * float(np.median(cells[judged])))
+    astray = judged & (cells > limit) & (distance > ASTRAY_FACTOR * expected)
     drop = np.zeros_like(known)
     drop[known] = astray
-    return item.without(drop)
+    out = item.without(drop)
+    scatter = _scatter(out)
+    return replace(out, sigma_px=out.sigma_px * scatter) if scatter > UNEXPLAINED else out
+
+
+def _scatter(item: RefinedLattice) -> float:
+    """Return how much more the corners scatter about smooth rows and columns than their sigmas say (1: as they say).
+
+    Judged by the differences of order DIFFERENCE along rows and columns: they are blind to perspective and, nearly, to
+    a fisheye's bend.
+    """
+    ratios = []
+    for axis in (0, 1):
+        if item.sigma_px.shape[axis] <= DIFFERENCE:
+            continue
+        difference = np.diff(item.lattice.pixels, DIFFERENCE, axis=axis)
+        factors = np.array([float(comb(DIFFERENCE, k)) for k in range(DIFFERENCE + 1)])
+        windows = np.lib.stride_tricks.sliding_window_view(item.sigma_px, DIFFERENCE + 1, axis=axis)
+        expected = np.sqrt(((windows * factors) ** 2).sum(axis=-1))
+        ratio = np.abs(difference) / expected[..., None]
+        ratios.append(ratio[np.isfinite(ratio)])
+    every = np.concatenate(ratios) if ratios else np.zeros(0)
+    return float(np.median(every)) / MEDIAN_OF_NORMAL if len(every) >= 16 else 1.0
