@@ -106,7 +106,7 @@ def general_pairs(
     kept: list[tuple[FloatArray, FloatArray]] = []
     found = 0
     for _ in range(MAX_DRAWS):
-        eyes = _octant_eyes(corners, facing, n, rng)
+        eyes = _octant_eyes(corners, facing, board, rng)
         first, second = eyes[: len(eyes) // 2], eyes[len(eyes) // 2 : 2 * (len(eyes) // 2)]
         cosine = np.sum(unit(first) * unit(second), axis=1)
         low, high = np.cos(np.radians(parallax_deg[::-1]))
@@ -188,14 +188,15 @@ def _corner_boards(board: Board, margin_squares: float) -> tuple[Points, Normals
     return np.concatenate(corners), away[[2, 1, 0]]
 
 
-def _octant_eyes(corners: Points, facing: Normals, per_board: int, rng: np.random.Generator) -> Points:
+def _octant_eyes(corners: Points, facing: Normals, board: Board, rng: np.random.Generator) -> Points:
     """Return random camera centres (M, 3) in the room from which every corner is seen well enough."""
     direction = unit(-np.abs(rng.standard_normal((DRAWS, 3))))
     eyes = direction * rng.uniform(*CAMERA_RANGE_MM, (DRAWS, 1))
     good = np.ones(DRAWS, dtype=bool)
+    outer = np.array([0, board.columns - 1, board.corner_count - board.columns, board.corner_count - 1])
     for k, normal in enumerate(facing):
-        # Incidence is smallest at a corner of the board's outline, but all corners are cheap enough.
-        rays = unit(corners[k * per_board : (k + 1) * per_board] - eyes[:, None, :])
+        # |cosine| = height / distance is smallest at the farthest point, one of the four outer corners.
+        rays = unit(corners[k * board.corner_count + outer] - eyes[:, None, :])
         good &= (rays @ normal).max(axis=1) < -MIN_INCIDENCE
     return eyes[good]
 

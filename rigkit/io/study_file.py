@@ -1,0 +1,117 @@
+"""Study files: what `rigkit simulate` computes, written by a person."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rigkit.boards import Board
+from rigkit.io.toml_reader import TomlTable, read_toml
+from rigkit.posetype import PoseType
+from rigkit.synthetic.noise import NoisyImages
+from rigkit.validation.study import NOISE_KINDS, Claim, Study
+from rigkit.validation.study_table import CELL_KEYS
+
+__all__ = ["SCHEMA", "load_study"]
+
+SCHEMA = "rigkit.study/1"
+POSE_TYPES = tuple(str(p) for p in PoseType if p is not PoseType.AUTO)
+
+
+def load_study(path: str | Path) -> Study:
+    """Read a study.
+
+    Raises
+    ------
+    InputError
+        Unknown keys or values, or one of name, trials, seed, pose_types, methods and noise is missing.
+    """
+    source = Path(path)
+    top = read_toml(source, SCHEMA)
+    name = top.text("name", hint='name = "general-motion"')
+    options: dict[str, Any] = {
+        "title": top.text("title", hint='title = "..."') if top.has("title") else name,
+        "trials": top.integer("trials", hint="trials = 100", at_least=1),
+        "seed": top.integer("seed", hint="seed = 1"),
+        "methods": top.texts("methods", hint='methods = ["F2UDIR", "3SDIR"]'),
+    }
+    kinds = top.texts("pose_types", hint='pose_types = ["general"]')
+    for kind in kinds:
+        if kind not in POSE_TYPES:
+            raise top.error(f"'pose_types' names '{kind}', which is unknown; known: {', '.join(POSE_TYPES)}")
+    options["pose_types"] = tuple(PoseType(kind) for kind in kinds)
+    options |= _noise(top.table("noise", hint='[noise] with on = "directions" and sigma_deg = [0, 3, 10]'))
+    if top.has("estimation"):
+        options |= _estimation(top.table("estimation", hint="[estimation]"))
+    if top.has("scene"):
+        options |= _scene(top.table("scene", hint="[scene]"))
+    if top.has("claims"):
+        options["claims"] = tuple(_claim(t) for t in top.tables("claims", hint='[[claims]] with text = "..."'))
+    top.done()
+    return Study(name=name, **options)
+
+
+def _noise(table: TomlTable) -> dict[str, Any]:
+    kind = table.text("on", hint='on = "directions" (or "corners")', choices=tuple(NOISE_KINDS))
+    key = f"sigma_{NOISE_KINDS[kind]}"
+    out: dict[str, Any] = {"noise": kind, "sigmas": table.numbers(key, hint=f"{key} = [0.0, 1.0]")}
+    if table.has("images"):
+        images = tuple(str(i) for i in NoisyImages)
+        out["images"] = NoisyImages(table.text("images", hint='images = "both"', choices=images))
+    table.done()
+    return out
+
+
+def _estimation(table: TomlTable) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for key in ("lengths", "det_scale", "epipolar"):
+        if table.has(key):
+            out[key] = table.text(key, hint=f'{key} = "..."')
+    if table.has("min_conditioning"):
+        out["min_conditioning"] = table.number("min_conditioning", hint="min_conditioning = 0.05", positive=False)
+    table.done()
+    return out
+
+
+def _scene(table: TomlTable) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    if table.has("board"):
+        inner = table.table("board", hint="board = { columns = 6, rows = 8, square_mm = 40 }")
+        columns = inner.integer("columns", hint="columns = 6", at_least=3)
+        rows = inner.integer("rows", hint="rows = 8", at_least=3)
+        square = inner.number("square_mm", hint="square_mm = 40")
+        inner.done()
+        out["board"] = Board("study", columns, rows, square, square)
+    for key in ("focal_px", "baseline_mm"):
+        if table.has(key):
+            out[key] = table.number(key, hint=f"{key} = 300.0")
+    if table.has("in_plane_deg"):
+        out["in_plane_deg"] = table.number("in_plane_deg", hint="in_plane_deg = 25.0", positive=False)
+    for key in ("centre_px", "parallax_deg"):
+        if table.has(key):
+            values = table.numbers(key, hint=f"{key} = [40.0, 70.0]")
+            if len(values) != 2:
+                raise table.error(f"'{key}' must be two numbers, got {len(values)}")
+            out[key] = values
+    table.done()
+    return out
+
+
+def _claim(table: TomlTable) -> Claim:
+    text = table.text("text", hint='text = "3SDIR is better than F2UDIR"')
+    sides = []
+    for side in ("smaller", "larger"):
+        inner = table.table(side, hint=f'{side} = {{ method = "3SDIR" }}')
+        which: dict[str, Any] = {}
+        for key in CELL_KEYS:
+            if inner.has(key):
+                if key == "plane":
+                    which[key] = inner.integer(key, hint="plane = 1", at_least=1)
+                elif key == "sigma":
+                    which[key] = inner.number(key, hint="sigma = 3.0", positive=False)
+                else:
+                    which[key] = inner.text(key, hint=f'{key} = "..."')
+        inner.done()
+        sides.append(which)
+    table.done()
+    return Claim(text, sides[0], sides[1])
