@@ -1,0 +1,156 @@
+"""calibrate(): from views without any guess to a camera that is right, or to a message that says why not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.calibration_scenes import (
+    BOARD,
+    REACH_DEG,
+    SIZE,
+    lens,
+    projection_difference,
+    random_views,
+    with_outliers,
+)
+
+from rigkit.boards import Board
+from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.initialise import initialise, start_error
+from rigkit.calibration.observations import Observations
+from rigkit.cameras.registry import MODELS
+from rigkit.detections import BoardView
+from rigkit.errors import DegenerateError, InputError
+
+NOISE_PX = 0.2
+START_PX = 2.0
+"""Median error of the start before any iteration: measured 0.2 to 0.6 px; a wrong sign of one tilt gives tens."""
+DIFFERENCE_PX = {"reg": 3.0, "wide": 1.5, "fish": 0.6, "fish200": 0.6}
+"""Largest RMS difference to the true lens over its field, 12 views, 0.2 px noise: three times the median."""
+MODEL = {"reg": "brown", "wide": "kannala_brandt", "fish": "kannala_brandt", "fish200": "kannala_brandt"}
+
+
+@pytest.mark.parametrize("count", [1, 2, 12])
+@pytest.mark.parametrize("name", ["reg", "wide", "fish", "fish200"])
+def test_start_needs_no_guess(name: str, count: int, rng: np.random.Generator) -> None:
+    views, _, _ = random_views(lens(name), count, rng, reach_deg=REACH_DEG[name])
+    observations = Observations.from_views(views)
+    best = initialise(observations, SIZE, MODELS[MODEL[name]], None)[0]
+    assert start_error(best, observations) < START_PX
+
+
+@pytest.mark.parametrize("name", ["reg", "wide", "fish", "fish200"])
+def test_recovers_the_lens(name: str, rng: np.random.Generator) -> None:
+    views, rotation, translation = random_views(lens(name), 12, rng, reach_deg=REACH_DEG[name])
+    result = calibrate(views, SIZE, model=MODEL[name], board="flat")
+    difference = projection_difference(result.camera, lens(name), REACH_DEG[name])
+    assert np.sqrt((difference**2).mean()) < DIFFERENCE_PX[name]
+    assert result.sigma_px == pytest.approx(NOISE_PX, rel=0.08)
+    assert result.heldout_rms_px is not None
+    assert result.heldout_rms_px > result.rms_px
+    assert result.dropped == () and len(result.views) == 12
+    for view, r, t in zip(result.views, rotation, translation, strict=True):
+        assert np.abs(view.cam_from_board.rotation - r).max() < 0.02
+        assert np.linalg.norm(view.cam_from_board.translation_mm - t) < 0.02 * np.linalg.norm(t)
+
+
+def test_scaramuzza_degree_by_heldout_error(rng: np.random.Generator) -> None:
+    """Degree 4 cannot follow 185 degrees; the choice must see that, and not take more than it needs."""
+    views, _, _ = random_views(lens("fish"), 15, rng, reach_deg=92.5, noise_px=0.05)
+    result = calibrate(views, SIZE, board="flat")
+    tried = {c.name: c for c in result.candidates}
+    assert tried["scaramuzza 4"].heldout_rms_px > 1.2 * result.heldout_rms_px
+    assert result.camera.model == "scaramuzza"
+    assert sum(c.chosen for c in result.candidates) == 1
+    assert np.sqrt((projection_difference(result.camera, lens("fish"), 90.0) ** 2).mean()) < 0.2
+
+
+def test_exact_corners_give_the_exact_lens(rng: np.random.Generator) -> None:
+    views, _, _ = random_views(lens("fish"), 6, rng, reach_deg=92.5, noise_px=0.0)
+    result = calibrate(views, SIZE, model="kannala_brandt", board="flat", folds=0)
+    assert projection_difference(result.camera, lens("fish"), 90.0).max() < 1e-5
+
+
+def test_outliers_are_found_listed_and_harmless(rng: np.random.Generator) -> None:
+    clean, _, _ = random_views(lens("fish"), 10, rng, reach_deg=92.5)
+    views = with_outliers(clean, 0.05, 40.0, rng)
+    moved = {
+        (a.image, *cell)
+        for a, b in zip(views, clean, strict=True)
+        for cell in a.grid[np.linalg.norm(a.pixels - b.pixels, axis=1) > 5.0].tolist()
+    }
+    assert len(moved) > 10
+    result = calibrate(views, SIZE, model="kannala_brandt", board="flat", folds=0)
+    assert {(o.image, o.column, o.row) for o in result.outliers} == moved
+    assert np.sqrt((projection_difference(result.camera, lens("fish"), 90.0) ** 2).mean()) < DIFFERENCE_PX["fish"]
+
+
+def test_view_that_disagrees_is_dropped_with_the_reason(rng: np.random.Generator) -> None:
+    views, _, _ = random_views(lens("wide"), 8, rng, reach_deg=55.0)
+    scrambled = replace(views[3], pixels=views[3].pixels[rng.permutation(54)])
+    result = calibrate([*views[:3], scrambled, *views[4:]], SIZE, model="kannala_brandt", board="flat", folds=0)
+    assert [image for image, _ in result.dropped] == ["003.png"]
+    assert "agree" in result.dropped[0][1]
+    assert len(result.views) == 7
+
+
+def test_partial_views_and_unequal_sigmas(rng: np.random.Generator) -> None:
+    views, _, _ = random_views(lens("fish"), 10, rng, reach_deg=92.5, noise_px=0.1)
+    some = []
+    for k, view in enumerate(views):
+        seen = rng.permutation(54)[: 20 + 3 * k]
+        extra = np.where(np.arange(len(seen)) % 2 == 0, 0.0, 0.5)
+        pixels = view.pixels[seen] + extra[:, None] * rng.normal(size=(len(seen), 2))
+        some.append(BoardView(view.image, BOARD, view.grid[seen], pixels, np.hypot(0.1, extra)))
+    weighted = calibrate(some, SIZE, model="kannala_brandt", board="flat", folds=0)
+    blind = [BoardView(v.image, BOARD, v.grid, v.pixels, np.full(len(v.grid), 0.3)) for v in some]
+    unweighted = calibrate(blind, SIZE, model="kannala_brandt", board="flat", folds=0)
+    errors = [
+        np.sqrt((projection_difference(c.camera, lens("fish"), 90.0) ** 2).mean()) for c in (weighted, unweighted)
+    ]
+    assert errors[0] < errors[1]
+
+
+def test_input_is_not_modified(rng: np.random.Generator) -> None:
+    views, _, _ = random_views(lens("wide"), 6, rng, reach_deg=55.0)
+    before = [v.pixels.copy() for v in views]
+    calibrate(views, SIZE, model="kannala_brandt", board="warp")
+    assert all((v.pixels == b).all() for v, b in zip(views, before, strict=True))
+
+
+def test_too_few_images_for_folds(rng: np.random.Generator) -> None:
+    views, _, _ = random_views(lens("wide"), 3, rng, reach_deg=55.0)
+    assert calibrate(views, SIZE, model="kannala_brandt").heldout_rms_px is None
+
+
+def test_bad_input_says_what_to_do(rng: np.random.Generator) -> None:
+    views, _, _ = random_views(lens("wide"), 3, rng, reach_deg=55.0)
+    with pytest.raises(InputError, match="no views"):
+        calibrate([], SIZE)
+    with pytest.raises(InputError, match="corners outside 640x480"):
+        calibrate(views, (640, 480))
+    with pytest.raises(InputError, match="unknown; known"):
+        calibrate(views, SIZE, model="thin_lens")
+    with pytest.raises(InputError, match="board shape 'bent'"):
+        calibrate(views, SIZE, board="bent")
+    row = BoardView("row.png", BOARD, views[0].grid[:9], views[0].pixels[:9], views[0].sigma_px[:9])
+    with pytest.raises(InputError, match="one line"):
+        calibrate([row], SIZE)
+    few = BoardView("few.png", BOARD, views[0].grid[:4], views[0].pixels[:4], views[0].sigma_px[:4])
+    assert calibrate([*views, few], SIZE, model="kannala_brandt").dropped[0][0] == "few.png"
+    other = BoardView("other.png", Board("9x6", 9, 6, 25.0, 25.0), views[0].grid, views[0].pixels, views[0].sigma_px)
+    with pytest.raises(InputError, match="another size in another view"):
+        calibrate([*views, other], SIZE)
+
+
+def test_boards_parallel_to_the_image_leave_the_focal_length_open(rng: np.random.Generator) -> None:
+    camera = MODELS["pinhole"](SIZE, np.array([1364.0, 1364.0, 808.0, 615.0]))
+    views = []
+    for k in range(8):
+        points = BOARD.points() + np.array([rng.uniform(-250, 0), rng.uniform(-150, 0), 600.0 + 40.0 * k])
+        pixels = camera.project(points)[0] + 0.1 * rng.normal(size=(54, 2))
+        views.append(BoardView(f"{k}.png", BOARD, BOARD.grid(), pixels, np.full(54, 0.1)))
+    with pytest.raises(DegenerateError, match="tilted"):
+        calibrate(views, SIZE, model="pinhole", board="flat")

@@ -1,0 +1,160 @@
+"""The solver: its derivatives, its optimum, and what it does with data that determine little."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.calibration_scenes import REACH_DEG, lens, random_views
+from scipy.optimize import least_squares
+
+from rigkit.calibration.normal import normal_equations
+from rigkit.calibration.observations import Observations
+from rigkit.calibration.shape import shape_model
+from rigkit.calibration.solver import State, evaluate, solve
+from rigkit.cameras.scaramuzza import Scaramuzza
+from rigkit.geometry.rotation import exp_so3
+
+GRADIENT_REL = 1e-5
+"""Central differences of a sum of squares of about 1e3 px^2 lose five digits more than those of a residual."""
+COST_REL = 1e-8
+"""The optimum of another solver from the same start: both stop where the cost no longer changes."""
+
+
+def scene(name: str, rng: np.random.Generator, count: int = 4) -> tuple[Observations, State]:
+    camera = lens(name)
+    views, rotation, translation = random_views(camera, count, rng, reach_deg=REACH_DEG[name])
+    observations = Observations.from_views(views)
+    return observations, State.start(camera, rotation, translation, observations)
+
+
+def disturbed(state: State, rng: np.random.Generator, size: float) -> State:
+    views = len(state.rotation)
+    return replace(
+        state,
+        camera=state.camera.with_parameters(
+            state.camera.parameters * (1.0 + size * rng.normal(size=state.camera.parameters.size))
+        ),
+        rotation=exp_so3(size * rng.normal(size=(views, 3))) @ state.rotation,
+        translation_mm=state.translation_mm * (1.0 + size * rng.normal(size=(views, 3))),
+    )
+
+
+@pytest.mark.parametrize("kind", ["flat", "warp", "released"])
+@pytest.mark.parametrize("name", ["reg", "fish"])
+def test_gradient_of_every_unknown(name: str, kind: str, rng: np.random.Generator) -> None:
+    """J^T r against central differences of the cost, for intrinsics, shape and poses at once."""
+    observations, state = scene(name, rng)
+    shape = shape_model(kind, observations)
+    state = replace(disturbed(state, rng, 1e-3), shape=shape, unknowns=0.1 * shape.sigma * rng.normal(size=shape.count))
+    weight = observations.weight * rng.uniform(0.5, 1.5, observations.weight.shape)
+    points, lever = state.points_in_cam(observations)
+    normal = normal_equations(state.camera, points, lever, state.rotation, shape, observations, weight, None)
+    p = state.camera.parameters.size
+    analytic = -2.0 * np.concatenate([normal.g, normal.p.ravel()])
+
+    def cost(x: np.ndarray) -> float:
+        poses = x[p + shape.count :].reshape(-1, 6)
+        moved = replace(
+            state,
+            camera=state.camera.with_parameters(state.camera.parameters + x[:p]),
+            unknowns=state.unknowns + x[p : p + shape.count],
+            rotation=exp_so3(poses[:, :3]) @ state.rotation,
+            translation_mm=state.translation_mm + poses[:, 3:],
+        )
+        return float(((evaluate(moved, observations).px ** 2).sum(axis=-1) * weight**2).sum())
+
+    step = np.full(analytic.size, 1e-5)
+    step[:p] = 1e-6 * np.maximum(np.abs(state.camera.parameters), 1e-2)
+    # All intrinsics and poses, and a dozen of the shape's unknowns.
+    chosen = np.concatenate([np.arange(p), np.arange(p + shape.count, analytic.size)])
+    chosen = np.concatenate([chosen, p + rng.permutation(shape.count)[:12]])
+    numeric = np.array(
+        [
+            (cost(step[k] * np.eye(1, analytic.size, k)[0]) - cost(-step[k] * np.eye(1, analytic.size, k)[0]))
+            / (2 * step[k])
+            for k in chosen
+        ]
+    )
+    size = np.sqrt(np.concatenate([np.diag(normal.gg), np.einsum("vii->vi", normal.pp).ravel()]))[chosen]
+    # The gradient in units of its own curvature: px, whatever the unknown's unit.
+    error = np.abs(analytic[chosen] - numeric) / size
+    assert error.max() < GRADIENT_REL * np.abs(analytic[chosen] / size).max()
+
+
+def test_second_derivative_blocks(rng: np.random.Generator) -> None:
+    """The Gauss-Newton step of a released board is the same whichever block is eliminated first."""
+    observations, state = scene("fish", rng)
+    shape = shape_model("released", observations)
+    state = replace(disturbed(state, rng, 1e-3), shape=shape, unknowns=np.zeros(shape.count))
+    points, lever = state.points_in_cam(observations)
+    normal = normal_equations(
+        state.camera, points, lever, state.rotation, shape, observations, observations.weight, None
+    )
+    normal = normal.with_prior((0.2 / shape.sigma) ** 2, state.unknowns)
+    first, second = normal.step(1e-6), replace(normal, points_from=None).step(1e-6)
+    assert first is not None and second is not None
+    assert np.abs(first.poses - second.poses).max() < 1e-7 * np.abs(second.poses).max()
+    assert first.predicted == pytest.approx(second.predicted, rel=1e-7)
+
+
+@pytest.mark.parametrize("name", ["reg", "fish"])
+def test_optimum_is_that_of_scipy(name: str, rng: np.random.Generator) -> None:
+    observations, truth = scene(name, rng)
+    start = disturbed(truth, rng, 1e-3)
+    state, convergence = solve(observations, start)
+    assert convergence.converged
+    p = start.camera.parameters.size
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        poses = x[p:].reshape(-1, 6)
+        moved = replace(
+            start,
+            camera=start.camera.with_parameters(start.camera.parameters * (1.0 + 1e-2 * x[:p])),
+            rotation=exp_so3(1e-2 * poses[:, :3]) @ start.rotation,
+            translation_mm=start.translation_mm + poses[:, 3:],
+        )
+        return evaluate(moved, observations).px.ravel()
+
+    theirs = least_squares(
+        residuals, np.zeros(p + 6 * len(start.rotation)), x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14
+    )
+    ours = float((evaluate(state, observations).px ** 2).sum())
+    assert ours <= 2.0 * theirs.cost * (1.0 + COST_REL)
+
+
+def test_cauchy_ignores_outliers(rng: np.random.Generator) -> None:
+    observations, truth = scene("fish", rng, count=6)
+    clean, _ = solve(observations, truth)
+    pixels = observations.pixels.copy()
+    pixels[:, ::17] += 30.0
+    spoilt = replace(observations, pixels=pixels)
+    plain, _ = solve(spoilt, truth)
+    robust, _ = solve(spoilt, truth, loss_px=0.5)
+
+    def away(state: State) -> float:
+        return float(np.abs(state.camera.parameters[:4] - clean.camera.parameters[:4]).max())
+
+    assert away(robust) < 1.0 < away(plain)
+
+
+def test_corners_outside_the_field_of_view_do_no_harm(rng: np.random.Generator) -> None:
+    """A start that sees the board behind the camera ends without an exception and without losing more corners."""
+    observations, truth = scene("reg", rng)
+    start = replace(truth, translation_mm=truth.translation_mm * np.array([1.0, 1.0, -1.0]))
+    state, convergence = solve(observations, start)
+    assert convergence.reason
+    assert np.isfinite(state.camera.parameters).all()
+
+
+def test_scaramuzza_converges_quickly(rng: np.random.Generator) -> None:
+    """The monomials are nearly dependent; damping must not hold their combinations back."""
+    observations, truth = scene("fish", rng, count=10)
+    theta = np.linspace(0.02, 1.62, 80)
+    radius = truth.camera.project(np.stack([np.sin(theta), 0 * theta, np.cos(theta)], -1))[0][:, 0] - 808.0
+    camera = Scaramuzza.from_radial_curve(truth.camera.size_px, [808.0, 615.0], theta, 1.05 * radius, order=6)
+    state, convergence = solve(observations, replace(truth, camera=camera))
+    assert convergence.converged
+    assert convergence.iterations <= 12
+    assert np.sqrt((evaluate(state, observations).px ** 2).mean()) < 0.21
