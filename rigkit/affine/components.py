@@ -14,7 +14,7 @@ import numpy as np
 from rigkit.arrays import BoolArray, FloatArray
 from rigkit.matches import DirectionPairs
 
-__all__ = ["PlanarDirections", "blocks", "finite", "first_of", "smallest_singular", "unit_weights"]
+__all__ = ["PlanarDirections", "blocks", "finite", "first_of", "smallest_singular", "solve_each", "unit_weights"]
 
 BLOCK = 8192
 """Corners worked on at a time: about fifty rows of this length fit a second-level cache."""
@@ -79,6 +79,15 @@ def unit_weights(directions: PlanarDirections) -> tuple[FloatArray, FloatArray]:
         return np.asarray(directions.use / square)
 
     return inverse_square(directions.x1, directions.y1), inverse_square(directions.x2, directions.y2)
+
+
+def solve_each(matrices: FloatArray, right: FloatArray) -> FloatArray:
+    """Return the solutions of N square systems (N, M, M), (N, M, R); one that is singular is NaN, not an error."""
+    determinant = np.linalg.det(matrices)
+    good = np.isfinite(determinant) & (determinant != 0.0)
+    out = np.full(right.shape, np.nan)
+    out[good] = np.linalg.solve(matrices[good], right[good])
+    return out
 
 
 def smallest_singular(m11: FloatArray, m12: FloatArray, m22: FloatArray) -> FloatArray:

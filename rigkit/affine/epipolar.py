@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.affine.affinities import EpipolarNormals
-from rigkit.affine.components import PlanarDirections, finite, first_of, smallest_singular, unit_weights
+from rigkit.affine.components import PlanarDirections, finite, first_of, smallest_singular, solve_each, unit_weights
 from rigkit.arrays import Affines, BoolArray, FloatArray
 from rigkit.matches import DirectionPairs
 
@@ -91,7 +91,7 @@ def epipolar_sensitivity(
     weight = c / (square1 * square2)
     normal = np.einsum("nk,nki,nkj->nij", weight * c, d1, d1)
     # dy = -normal^-1 sum_k weight_k d1_k (d2_k x A dd1_k - alpha_k d2_k x dd2_k)
-    gain = -np.linalg.solve(normal, np.einsum("nk,nkj->njk", weight, d1))  # (N, 2, K)
+    gain = -solve_each(normal, np.einsum("nk,nkj->njk", weight, d1))  # (N, 2, K)
     across2 = np.stack([-d2[..., 1], d2[..., 0]], axis=-1)
     stretch = np.linalg.norm(np.einsum("nij,nkj->nki", A21, d1), axis=-1) / np.sqrt(square2)
     by1 = np.einsum("ni,njk,nkr,nrl->nijkl", m, gain, across2, A21, optimize=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.affine.components import PlanarDirections, smallest_singular, unit_weights
+from rigkit.affine.components import PlanarDirections, smallest_singular, solve_each, unit_weights
 from rigkit.arrays import Affines, BoolArray, FloatArray
 from rigkit.matches import DirectionPairs
 
@@ -45,7 +45,7 @@ def scaled_sensitivity(directions: DirectionPairs, use: BoolArray, A21: Affines)
     From A M = D2 D1^T with M = D1 D1^T: dA = sum_k (dd2_k - A dd1_k) (M^-1 d1_k)^T.
     """
     d1 = np.where(use[..., None], directions.image1, 0.0)
-    gain = np.linalg.solve(np.einsum("nki,nkj->nij", d1, d1), np.swapaxes(d1, 1, 2))  # (N, 2, K)
+    gain = solve_each(np.einsum("nki,nkj->nij", d1, d1), np.swapaxes(d1, 1, 2))  # (N, 2, K)
     by2 = np.einsum("il,njk->nijkl", np.eye(2), gain)
     by1 = -np.einsum("nil,njk->nijkl", A21, gain)
     n, k = use.shape

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigkit.affine.components import PlanarDirections, first_of, unit_weights
+from rigkit.affine.components import PlanarDirections, first_of, solve_each, unit_weights
 from rigkit.arrays import Affines, BoolArray, FloatArray
 from rigkit.errors import InputError
 from rigkit.matches import DirectionPairs
@@ -270,8 +270,8 @@ def determinant_sensitivity(
     system = np.zeros((n, 5, 5))
     system[:, :4, :4] = np.einsum("nki,nkj->nij", rows, rows)
     system[:, 4, :4] = system[:, :4, 4] = constraint
-    by1 = np.asarray(np.linalg.solve(system, right1.reshape(n, 5, 2 * k)))[:, :4]
-    by2 = np.asarray(np.linalg.solve(system, right2.reshape(n, 5, 2 * k)))[:, :4]
+    by1 = solve_each(system, right1.reshape(n, 5, 2 * k))[:, :4]
+    by2 = solve_each(system, right2.reshape(n, 5, 2 * k))[:, :4]
     return by1.reshape(n, 4, k, 2), by2.reshape(n, 4, k, 2)
 
 

@@ -1,0 +1,123 @@
+"""Affinities from any mix of directions with and without lengths, with and without epipolar geometry.
+
+The estimators of the registry are the pure cases: all with lengths (2SDIR, 3SDIR), all without and the epipolar
+geometry (F2UDIR, F3UDIR). Here every direction says for itself whether its length counts.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.affine.affinities import Affinities, DirectionNoise, EpipolarNormals
+from rigkit.affine.components import finite
+from rigkit.affine.registry import MIN_CONDITIONING
+from rigkit.arrays import BoolArray, FloatArray
+from rigkit.errors import InputError
+from rigkit.matches import DirectionPairs
+
+__all__ = ["affines_from_mixed_directions"]
+
+
+def affines_from_mixed_directions(
+    directions: DirectionPairs,
+    scaled: BoolArray,
+    *,
+    epipolar: EpipolarNormals | None = None,
+    noise: DirectionNoise | None = None,
+    min_conditioning: float = MIN_CONDITIONING,
+) -> Affinities:
+    """Return the affinities of N corners by least squares over all valid directions.
+
+    Parameters
+    ----------
+    directions : N corners, K directions each.
+    scaled : bool, broadcast to (N, K): whether the length of a direction counts. A direction with length gives two
+        equations, one without gives one; without epipolar geometry four are needed, one of them with length, and
+        with it two.
+    epipolar : hard constraint A^T n2 + n1 = 0 where given.
+    noise : of the directions; then each affinity has a covariance.
+    min_conditioning : affinities whose system has a smaller smallest singular value are invalid.
+
+    Raises
+    ------
+    InputError
+        Shapes that do not fit.
+
+    Notes
+    -----
+    Rows in unit directions: perp(u2)^T A u1 = 0, and u2^T A u1 = |d2| / |d1| where the length counts: both angles and
+    relative lengths are pure numbers, so they are weighted alike.
+    """
+    n, k = directions.valid.shape
+    try:
+        counts = np.broadcast_to(scaled, (n, k))
+    except ValueError as error:
+        raise InputError(f"mixed directions: scaled must broadcast to {n}x{k}, got {np.shape(scaled)}") from error
+    if epipolar is not None and len(epipolar) != n:
+        raise InputError(f"mixed directions: {n} corners but epipolar normals of {len(epipolar)}")
+    length1, length2 = (np.linalg.norm(d, axis=-1) for d in (directions.image1, directions.image2))
+    use = directions.valid & (length1 > 0.0) & (length2 > 0.0)
+    length1, length2 = np.where(use, length1, 1.0), np.where(use, length2, 1.0)
+    u1 = np.where(use[..., None], directions.image1, 0.0) / length1[..., None]
+    u2 = np.where(use[..., None], directions.image2, 0.0) / length2[..., None]
+    weight = np.stack([use, use & counts], axis=-1).astype(np.float64)
+    left = np.stack([np.stack([-u2[..., 1], u2[..., 0]], axis=-1), u2], axis=-2)  # (N, K, 2 rows, 2)
+    rows = (weight[..., None, None] * left[..., :, None] * u1[:, :, None, None, :]).reshape(n, 2 * k, 4)
+    right = np.zeros((n, k, 2))
+    right[..., 1] = weight[..., 1] * length2 / length1
+    base, free = _unknowns(n, epipolar)
+    a, gain, conditioning = _least_squares(rows @ free, right.reshape(n, 2 * k) - np.einsum("nrj,nj->nr", rows, base))
+    A21 = (base + np.einsum("nij,nj->ni", free, a)).reshape(n, 2, 2)
+    valid = finite(A21) & (conditioning >= min_conditioning)
+    A21[~valid] = np.nan
+    covariance = None
+    if noise is not None:
+        # Residuals change by left . (A dd1 - alpha dd2) / |d1|, alpha = |A d1| / |d2|, which is 1 where lengths count.
+        mapped = np.linalg.norm(np.einsum("nij,nkj->nki", A21, u1), axis=-1) * length1
+        scale = (weight / length1[..., None])[..., None]
+        by1 = scale * np.einsum("nkri,nij->nkrj", left, A21)
+        by2 = -scale * np.where(counts, 1.0, mapped / length2)[..., None, None] * left
+        covariance = _propagate(free @ gain, by1, by2, use, noise)
+        covariance[~valid] = np.nan
+    return Affinities(A21, valid, conditioning, covariance)
+
+
+def _unknowns(n: int, epipolar: EpipolarNormals | None) -> tuple[FloatArray, FloatArray]:
+    """Return base (N, 4) and basis (N, 4, U) of the affinities allowed: all, or those of the epipolar geometry."""
+    if epipolar is None:
+        return np.zeros((n, 4)), np.broadcast_to(np.eye(4), (n, 4, 4))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        n2, n1 = (v / np.linalg.norm(epipolar.n2, axis=-1, keepdims=True) for v in (epipolar.n2, epipolar.n1))
+    m = np.stack([-n2[:, 1], n2[:, 0]], axis=-1)
+    base = -(n2[:, :, None] * n1[:, None, :]).reshape(n, 4)
+    return base, np.einsum("ni,jl->nijl", m, np.eye(2)).reshape(n, 4, 2)
+
+
+def _least_squares(system: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the solutions (N, U), d solution / d right (N, U, R), and the smallest singular values (N,)."""
+    n, _, unknowns = system.shape
+    normal = np.swapaxes(system, -1, -2) @ system
+    good = finite(normal) & finite(right)
+    conditioning = np.full(n, np.nan)
+    conditioning[good] = np.sqrt(np.maximum(np.linalg.eigvalsh(normal[good])[:, 0], 0.0))
+    good &= np.nan_to_num(conditioning) > SINGULAR
+    gain = np.full((n, unknowns, system.shape[1]), np.nan)
+    gain[good] = np.linalg.solve(normal[good], np.swapaxes(system[good], -1, -2))
+    return np.einsum("nur,nr->nu", gain, right), gain, conditioning
+
+
+def _propagate(gain: FloatArray, by1: FloatArray, by2: FloatArray, use: BoolArray, noise: DirectionNoise) -> FloatArray:
+    """Return the covariance (N, 4, 4) of vec(A) from d residual / d direction, (N, K, 2 rows, 2) in either image."""
+    n, k = use.shape
+    spread = gain.reshape(n, 4, k, 2)
+    unused = np.repeat(~use, 2, axis=1)
+    ignore = unused[:, :, None] | unused[:, None, :]
+    total = np.zeros((n, 4, 4))
+    for by, covariance in ((by1, noise.covariance1), (by2, noise.covariance2)):
+        flat = np.einsum("nakr,nkrj->nakj", spread, by).reshape(n, 4, 2 * k)
+        total += flat @ np.where(ignore, 0.0, covariance) @ np.swapaxes(flat, 1, 2)
+    return total
+
+
+SINGULAR = 1e-6
+"""Below this the normal equations have no digits left."""
