@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -91,6 +92,7 @@ def match_pair(
     DegenerateError
         `chain` is "rectified" and a corner lies too far off the axis.
     """
+    _check_sizes(pair_id, (*detections1, *detections2), boards)
     identity = identify_pair(detections1, detections2, boards, camera1, camera2, layout=layout)
     pairs, unseen = _with_rays(identity.pairs(), camera1, camera2)
     if not pairs:
@@ -122,6 +124,25 @@ def match_pair(
         noise,
         (*notes, *identity.notes),
     )
+
+
+def _check_sizes(pair_id: str, detections: Sequence[BoardDetection], boards: Sequence[Board]) -> None:
+    """Refuse boards of another size than declared.
+
+    A part of a larger board may be seen; but where nothing has a declared size, and complete grids of one other size
+    come again and again, the boards are of that size.
+    """
+    declared = {frozenset(board.size) for board in boards}
+    sizes = Counter(f"{d.columns}x{d.rows}" for d in detections if d.complete)
+    if any(frozenset((d.columns, d.rows)) in declared for d in detections) or not sizes:
+        return
+    size, count = sizes.most_common(1)[0]
+    if count >= 2:
+        listed = ", ".join(sorted({f"{board.columns}x{board.rows}" for board in boards}))
+        raise InputError(
+            f"pair '{pair_id}': the boards listed have {listed} inner corners, but {count} complete grids of {size} "
+            "were found; correct columns and rows in the board file"
+        )
 
 
 def _with_rays(

@@ -18,10 +18,14 @@ as_root() {
 # Install Debian packages, or say exactly what to type.
 system_packages() {
     say "installing from the system's packages: $*"
+    log=$(mktemp)
     if command -v apt-get >/dev/null 2>&1 &&
-        as_root sh -c 'apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@"' sh "$@" >&2; then
+        as_root sh -c 'apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@"' sh "$@" >"$log" 2>&1; then
+        rm -f "$log"
         return 0
     fi
+    cat "$log" >&2
+    rm -f "$log"
     say "could not install them. As root, type:  apt-get update && apt-get install $*"
     exit 2
 }

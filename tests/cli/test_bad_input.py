@@ -1,0 +1,190 @@
+"""Bad input: one line that says what, where and what to do; the right exit code; nothing lost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from helpers.data import REPOSITORY
+
+from rigkit.cli.main import main
+
+IMAGES = REPOSITORY / "datasets" / "lab-a" / "images" / "fisheye-general"
+CALIBRATION = REPOSITORY / "calib" / "cameras" / "mvca020_fe185" / "calibration.json"
+
+MANIFEST = """
+schema = "rigkit.dataset/1"
+name = "bad"
+{extra}
+[[boards]]
+id = "a"
+columns = {columns}
+rows = {rows}
+square_mm = 50.0
+
+[[boards]]
+id = "b"
+columns = {columns}
+rows = {rows}
+square_mm = 50.0
+
+[[boards]]
+id = "c"
+columns = {columns}
+rows = {rows}
+square_mm = 50.0
+
+[[cameras]]
+id = "fisheye"
+calibration = "{calibration}"
+
+[[pairs]]
+id = "pair"
+camera1 = "fisheye"
+camera2 = "fisheye"
+image1 = "{image1}"
+image2 = "{image2}"
+{pose_type}
+boards = ["a", "b", "c"]
+
+[pairs.truth]
+angles = [ {{ a = "a", b = "b", value_deg = 90.0, sigma_deg = 0.3, how = "set square" }} ]
+"""
+
+Write = Callable[..., Path]
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Write:
+    """Return a function that writes a manifest; what is not given is right."""
+
+    def manifest(**changes: object) -> Path:
+        facts: dict[str, object] = {
+            "extra": "",
+            "columns": 8,
+            "rows": 6,
+            "calibration": CALIBRATION,
+            "image1": IMAGES / "view1.jpg",
+            "image2": IMAGES / "view2.jpg",
+            "pose_type": 'pose_type = "general"',
+        }
+        (tmp_path / "dataset.toml").write_text(MANIFEST.format(**(facts | changes)))
+        return tmp_path
+
+    return manifest
+
+
+def run(folder: Path, capsys: pytest.CaptureFixture[str], *more: str) -> tuple[int, str]:
+    """Run `validate`; return the exit code and the line that says what is wrong."""
+    code = main(["validate", str(folder), "-o", str(folder / "out"), "--no-pictures", "-j", "1", *more])
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("rigkit: ")]
+    return code, "\n".join(lines)
+
+
+def check(code: int, line: str, expected: int, *words: str) -> None:
+    assert code == expected
+    assert len(line.splitlines()) == 1
+    for word in words:
+        assert word in line
+
+
+def test_the_data_set_of_these_tests_is_right(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
+    code, line = run(write(), capsys)
+    assert (code, line) == (0, "")
+
+
+def test_no_such_data_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    check(*run(tmp_path / "nowhere", capsys), 2, "nowhere")
+
+
+def test_missing_image(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
+    check(*run(write(image2="gone.jpg"), capsys), 2, "gone.jpg", "pair", "does not exist")
+
+
+def test_truncated_image(write: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = (IMAGES / "view1.jpg").read_bytes()
+    (tmp_path / "cut.jpg").write_bytes(data[: len(data) // 2])
+    check(*run(write(image1="cut.jpg"), capsys), 2, "cut.jpg", "cut off")
+
+
+def test_wrong_board_size(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
+    check(*run(write(columns=11, rows=9), capsys), 2, "11x9", "8x6", "board file")
+    check(*run(write(columns=7, rows=5), capsys), 2, "7x5", "8x6", "board file")
+
+
+def test_other_image_size(write: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    image = cv2.imread(str(IMAGES / "view1.jpg"), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(tmp_path / "small.png"), cv2.resize(np.asarray(image), (812, 620)))
+    check(*run(write(image1="small.png"), capsys), 2, "812x620", "1624x1240", "fisheye")
+
+
+def test_unknown_key(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
+    check(*run(write(extra="colour = 3"), capsys), 2, "colour", "dataset.toml")
+
+
+def test_missing_fact(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
+    check(*run(write(pose_type=""), capsys), 2, "pose_type", "pairs")
+
+
+def test_not_toml(write: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write()
+    (folder / "dataset.toml").write_text("schema = [")
+    check(*run(folder, capsys), 2, "dataset.toml")
+
+
+def test_identical_images_have_no_baseline(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
+    check(*run(write(image2=IMAGES / "view1.jpg"), capsys), 3, "pair", "no baseline")
+
+
+def test_calibration_that_is_no_calibration(write: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "camera.json").write_text('{"schema": "rigkit.calibration/1", "camera": {"model": "nonsense"}}')
+    check(*run(write(calibration="camera.json"), capsys), 2, "camera.json")
+
+
+def test_unknown_pair(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
+    check(*run(write(), capsys, "-p", "nobody"), 2, "nobody", "known: pair")
+
+
+def test_results_are_not_overwritten(write: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "tables.md").write_text("mine")
+    check(*run(folder, capsys), 2, "out", "--force")
+    assert (tmp_path / "out" / "tables.md").read_text() == "mine"
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["tables.md"]
+
+
+def test_a_failed_run_leaves_old_results(write: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "tables.md").write_text("mine")
+    check(*run(write(image2=IMAGES / "view1.jpg"), capsys, "--force"), 3, "no baseline")
+    assert (tmp_path / "out" / "tables.md").read_text() == "mine"
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["tables.md"]
+
+
+def test_two_boards_are_reconstructed_and_the_third_is_said_to_be_missing(
+    write: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from rigkit.corners.detect import detect_boards
+
+    image = np.asarray(cv2.imread(str(IMAGES / "view2.jpg"), cv2.IMREAD_GRAYSCALE))
+    lost = min(detect_boards(image), key=lambda d: d.pixels[:, 0].mean())
+    hull = cv2.convexHull(lost.pixels.astype(np.float32)).astype(np.int32)
+    cv2.imwrite(str(tmp_path / "two.png"), cv2.fillConvexPoly(image.copy(), hull, 90))
+    folder = write(image2="two.png")
+    code = main(["reconstruct", str(folder), "-o", str(folder / "out"), "--no-pictures", "-j", "1"])
+    said = capsys.readouterr()
+    assert code == 0
+    assert "96 points, 2 boards" in said.out
+    assert "seen in image 1 only" in said.err
+
+
+def test_unknown_verb_and_no_verb(capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments in (["nonsense"], []):
+        with pytest.raises(SystemExit) as stop:
+            main(arguments)
+        assert stop.value.code == 2
+        assert "usage: rigkit" in capsys.readouterr().err
