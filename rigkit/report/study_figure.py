@@ -31,7 +31,7 @@ def study_figure(table: StudyTable, file_format: str = "png") -> bytes:
     width = max(4.2, 0.28 * len(study.sigmas) * len(study.methods) + 1.5)
     figure = Figure(figsize=(min(width * columns, 13.0), 3.0 * rows + 0.8), layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(rows, columns, squeeze=False, sharex=True)
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     for r, pose_type in enumerate(study.pose_types):
         for c, plane in enumerate(planes):
             axis = axes[r, c]

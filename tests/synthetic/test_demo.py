@@ -1,0 +1,75 @@
+"""The demo capture is complete, readable, and its truth is the truth of its images."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rigkit.errors import InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.io.board_file import load_board
+from rigkit.io.manifest import load_dataset
+from rigkit.io.session import load_session
+from rigkit.synthetic.demo import VIEWS, build_demo, demo_camera
+
+CORNER_PX = 0.08
+"""cv2.cornerSubPix on images with noise 1.5 and squares seen at a slant, rms; a wrong pose would be tens of pixels."""
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("demo") / "capture"
+    assert build_demo(root, np.random.default_rng(1)) == root / "dataset.toml"
+    return root
+
+
+def refined(image: Path, corners: list[list[float]]) -> float:
+    """Return the rms distance of OpenCV's corners from the true ones."""
+    grey = cv2.imread(str(image), cv2.IMREAD_GRAYSCALE)
+    assert grey.shape == (720, 960)
+    truth = np.array(corners)
+    start = truth.astype(np.float32).reshape(-1, 1, 2)
+    found = cv2.cornerSubPix(grey, start, (3, 3), (-1, -1), (3, 50, 1e-4)).reshape(-1, 2)
+    return float(np.sqrt(np.median(np.sum((found - truth) ** 2, axis=1))))
+
+
+def test_truth_belongs_to_the_images(demo: Path) -> None:
+    truth = json.loads((demo / "truth.json").read_text())
+    assert len(truth["calibration"]) == VIEWS
+    for name, view in truth["calibration"].items():
+        assert refined(demo / "cameras/fisheye/images" / name, view["corners_px"]) < CORNER_PX
+    camera = demo_camera()
+    for name, pair in truth["pairs"].items():
+        move = Rigid3.from_matrix(pair["cam2_from_cam1"])
+        assert abs(np.linalg.norm(move.translation_mm) - pair["baseline_mm"]) < 1e-9
+        for board in pair["boards"].values():
+            points = np.array(board["points_in_cam1_mm"])
+            np.testing.assert_allclose(camera.project(points)[0], board["corners1_px"], atol=1e-9)
+            np.testing.assert_allclose(camera.project(move.apply(points))[0], board["corners2_px"], atol=1e-9)
+            for k in (1, 2):
+                assert refined(demo / f"images/{name}/view{k}.png", board[f"corners{k}_px"]) < CORNER_PX
+
+
+def test_manifest_boards_and_session_are_read(demo: Path) -> None:
+    dataset = load_dataset(demo)
+    assert [str(p.pose_type) for p in dataset.pairs] == ["general", "standard"]
+    assert [b.size for b in dataset.boards] == [(8, 6), (7, 6), (6, 9)]
+    for pair in dataset.pairs:
+        pair.require_images()
+        assert pair.truth.baseline is not None
+        assert len(pair.truth.angles) == 3
+    session = dataset.camera("fisheye").session
+    assert session is not None
+    assert load_session(session) is not None
+    assert load_board(demo / "boards/target.toml").square_x_mm == 30.0
+
+
+def test_a_folder_with_something_in_it_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("keep")
+    with pytest.raises(InputError, match="not empty"):
+        build_demo(tmp_path, np.random.default_rng(1))
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
