@@ -23,7 +23,7 @@ MAX_RINGS = 60
 
 STIFF = (2, (0.02, 1.0))
 PLIANT = (3, (1e-3, 1e-2))
-"""Degree and ridge of the prediction: the first is steady with few neighbours, the second follows the rim of a fisheye."""
+"""Degree and ridge of the prediction: one is steady with few neighbours, the other follows the rim of a fisheye."""
 
 REACH = 0.25
 """A corner lies within this of its prediction, in cells."""

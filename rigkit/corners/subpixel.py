@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import comb
 
+import cv2
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray
@@ -190,18 +191,30 @@ def _checked(item: RefinedLattice) -> RefinedLattice:
 def _scatter(item: RefinedLattice) -> float:
     """Return how much more the corners scatter about smooth rows and columns than their sigmas say (1: as they say).
 
-    Judged by the differences of order DIFFERENCE along rows and columns: they are blind to perspective and, nearly, to
-    a fisheye's bend.
+    Judged by the differences of order DIFFERENCE along rows and columns, with and without the best perspective taken
+    away first: the one is blind to strong perspective, the other to a fisheye's bend.
     """
-    ratios = []
+    row, column = np.nonzero(item.lattice.known)
+    grid = np.stack([column, row], axis=-1).astype(np.float64)
+    plane, _ = cv2.findHomography(grid, item.lattice.pixels[row, column], 0)
+    flat = np.full(item.lattice.pixels.shape, np.nan)
+    if plane is not None:
+        flat[row, column] = cv2.perspectiveTransform(grid[None], plane)[0]
+    bent = _roughness(item.lattice.pixels, item.sigma_px)
+    straight = _roughness(item.lattice.pixels - flat, item.sigma_px)
+    scatter = float(np.fmin(bent, straight))
+    return scatter if np.isfinite(scatter) else 1.0
+
+
+def _roughness(values: FloatArray, sigma: FloatArray) -> float:
+    """Return the typical difference of order DIFFERENCE of `values` (R, C, 2) over the expected one; NaN for too few."""
+    factors = np.array([float(comb(DIFFERENCE, k)) for k in range(DIFFERENCE + 1)])
+    ratios = [np.zeros(0)]
     for axis in (0, 1):
-        if item.sigma_px.shape[axis] <= DIFFERENCE:
-            continue
-        difference = np.diff(item.lattice.pixels, DIFFERENCE, axis=axis)
-        factors = np.array([float(comb(DIFFERENCE, k)) for k in range(DIFFERENCE + 1)])
-        windows = np.lib.stride_tricks.sliding_window_view(item.sigma_px, DIFFERENCE + 1, axis=axis)
-        expected = np.sqrt(((windows * factors) ** 2).sum(axis=-1))
-        ratio = np.abs(difference) / expected[..., None]
-        ratios.append(ratio[np.isfinite(ratio)])
-    every = np.concatenate(ratios) if ratios else np.zeros(0)
-    return float(np.median(every)) / MEDIAN_OF_NORMAL if len(every) >= 16 else 1.0
+        if sigma.shape[axis] > DIFFERENCE:
+            windows = np.lib.stride_tricks.sliding_window_view(sigma, DIFFERENCE + 1, axis=axis)
+            expected = np.sqrt(((windows * factors) ** 2).sum(axis=-1))
+            ratio = np.abs(np.diff(values, DIFFERENCE, axis=axis)) / expected[..., None]
+            ratios.append(ratio[np.isfinite(ratio)])
+    every = np.concatenate(ratios)
+    return float(np.median(every)) / MEDIAN_OF_NORMAL if len(every) >= 16 else np.nan
