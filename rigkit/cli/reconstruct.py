@@ -14,6 +14,7 @@ from rigkit.cli.workflow import (
     match_images,
     output_folder,
     over_pairs,
+    reconstruct_with,
     select_dataset,
     write_results,
 )
@@ -91,18 +92,12 @@ class PairOutcome:
 
 def reconstruct_files(job: PairJob) -> PairOutcome:
     """Reconstruct one pair and render its files."""
-    import numpy as np
-
     from rigkit.io.ply import ply_bytes
-    from rigkit.reconstruct import reconstruct_pair
     from rigkit.report.figures import cloud_png, corners_png, epipolar_png
 
     pair = job.pair
     matched, image1, image2 = match_images(pair, job.camera1, job.camera2, job.chain)
-    level = None if pair.level_sigma_deg is None else float(np.deg2rad(pair.level_sigma_deg))
-    r = reconstruct_pair(
-        matched, pose_type=pair.pose_type, affine_method=job.method, level_sigma_rad=level, image1=image1
-    )
+    r = reconstruct_with(matched, pair, job.method, image1)
     ply = f"{pair.pair_id}/{job.method}.ply"
     files = {ply: ply_bytes(r.cloud)}
     if job.pictures:

@@ -16,6 +16,8 @@ from rigkit.cli.workflow import (
     match_images,
     output_folder,
     over_pairs,
+    reconstruct_other_chain,
+    reconstruct_with,
     select_dataset,
     write_results,
 )
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
     from rigkit.io.manifest import Dataset, Pair
     from rigkit.report.page import PairSection
     from rigkit.validation.checks import ValidationReport
+    from rigkit.validation.crosscheck import CrossCheckReport
     from rigkit.validation.tables import PaperTables
 
 HELP = "the tables against measured truth, report and PLY; exit code 1 if a check fails"
@@ -85,46 +88,44 @@ class PairOutcome:
     pair_id: str
     reports: tuple[ValidationReport, ...]
     best: ValidationReport
+    other_ways: CrossCheckReport | None
     files: Mapping[str, bytes]
     section: PairSection | None
 
 
 def validate_pair(job: PairJob) -> PairOutcome:
     """Reconstruct one pair with every estimator and judge each."""
-    import numpy as np
-
     from rigkit.affine.registry import AFFINE_METHODS
     from rigkit.io.ply import ply_bytes
-    from rigkit.reconstruct import reconstruct_pair
     from rigkit.report.validation_page import best_report
     from rigkit.validation.checks import validate
+    from rigkit.validation.crosscheck import crosscheck
 
     pair = job.pair
     matched, image1, image2 = match_images(pair, job.camera1, job.camera2, job.chain)
-    level = None if pair.level_sigma_deg is None else float(np.deg2rad(pair.level_sigma_deg))
-    reconstructions = {
-        method: reconstruct_pair(
-            matched, pose_type=pair.pose_type, affine_method=method, level_sigma_rad=level, image1=image1
-        )
-        for method in AFFINE_METHODS
-    }
+    reconstructions = {method: reconstruct_with(matched, pair, method, image1) for method in AFFINE_METHODS}
     reports = tuple(validate(r, pair.truth) for r in reconstructions.values())
     best = best_report(reports)
     files: dict[str, bytes] = {
         f"{pair.pair_id}/{method}.ply": ply_bytes(r.cloud) for method, r in reconstructions.items()
     }
-    section = None
-    if job.pictures:
-        section = _pictures(reconstructions[best.affine_method], reports, image1, image2, files)
-    return PairOutcome(pair.pair_id, reports, best, files, section)
+    shown = reconstructions[best.affine_method]
+    other_ways = crosscheck(shown, other_chain=reconstruct_other_chain(matched, pair)) if job.crosscheck else None
+    section = _pictures(shown, reports, other_ways, image1, image2, files) if job.pictures else None
+    return PairOutcome(pair.pair_id, reports, best, other_ways, files, section)
 
 
 def _pictures(
-    reconstruction: Any, reports: tuple[ValidationReport, ...], image1: Any, image2: Any, files: dict[str, bytes]
+    reconstruction: Any,
+    reports: tuple[ValidationReport, ...],
+    other_ways: CrossCheckReport | None,
+    image1: Any,
+    image2: Any,
+    files: dict[str, bytes],
 ) -> PairSection:
     """Draw the pair's pictures into `files`; return the section of the page, with the same pictures as JPEG."""
     from rigkit.report.figures import as_jpeg, cloud_png, corners_png, epipolar_png
-    from rigkit.report.validation_page import pair_section
+    from rigkit.report.validation_page import crosscheck_table, pair_section
 
     drawn = {
         "corners": corners_png(reconstruction, image1, image2),
@@ -137,20 +138,24 @@ def _pictures(
         ("Corners as found and matched", "image/jpeg", as_jpeg(drawn["corners"])),
         ("Epipolar curves of every seventh corner", "image/jpeg", as_jpeg(drawn["epipolar"])),
     ]
-    return pair_section(reconstruction, reports, shown)
+    extra = [] if other_ways is None else [crosscheck_table([other_ways])]
+    return pair_section(reconstruction, reports, shown, extra)
 
 
 def finish(args: argparse.Namespace, dataset: Dataset, outcomes: list[PairOutcome], out: Path, seconds: float) -> int:
     """Write tables, clouds, pictures and the page; print the summary; return the exit code."""
     from rigkit.report.page import build_page
     from rigkit.report.tables import tables_to_csv, tables_to_json, tables_to_latex, tables_to_markdown, tables_to_text
-    from rigkit.report.validation_page import summary_table
+    from rigkit.report.validation_page import crosscheck_table, summary_table
     from rigkit.validation.tables import build_tables
 
     reports = [report for outcome in outcomes for report in outcome.reports]
     passed = all(report.passed for report in reports)
     summary = summary_table([outcome.best for outcome in outcomes])
-    tables = (summary, *build_tables(reports, _paper_tables(dataset)))
+    tables = [summary, *build_tables(reports, _paper_tables(dataset))]
+    other_ways = [outcome.other_ways for outcome in outcomes if outcome.other_ways is not None]
+    if other_ways:
+        tables.insert(-2, crosscheck_table(other_ways))
     files: dict[str, str | bytes] = {
         "tables.md": tables_to_markdown(tables),
         "tables.csv": tables_to_csv(tables),

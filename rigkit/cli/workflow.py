@@ -14,13 +14,15 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from rigkit.errors import InputError
+from rigkit.errors import DegenerateError, InputError
 
 if TYPE_CHECKING:
     from rigkit.cameras.base import Camera
+    from rigkit.detections import BoardDetection
     from rigkit.io.manifest import Dataset, Pair
     from rigkit.pairing import MatchedPair
     from rigkit.progress import Progress
+    from rigkit.reconstruct import Reconstruction
 
 __all__ = [
     "add_dataset_arguments",
@@ -119,7 +121,6 @@ def match_images(pair: Pair, camera1: Camera, camera2: Camera, chain: str) -> tu
     """Return the matched corners of a pair, and its two images."""
     from rigkit.corners.detect import detect_boards
     from rigkit.io.images import read_image, to_grey
-    from rigkit.pairing import match_pair
 
     images = []
     found = []
@@ -131,25 +132,60 @@ def match_images(pair: Pair, camera1: Camera, camera2: Camera, chain: str) -> tu
                 f"pair '{pair.pair_id}': image '{path}' is {size[0]}x{size[1]} px but camera '{entry.camera_id}' was "
                 f"calibrated at {camera.size_px[0]}x{camera.size_px[1]}; use images of that size, or recalibrate"
             )
-        images.append(image)
-        found.append(detect_boards(to_grey(image), pair.boards))
-    for path, detections in zip((pair.image1, pair.image2), found, strict=True):
+        detections = detect_boards(to_grey(image), pair.boards)
         if not detections:
             sizes = ", ".join(sorted({f"{b.columns}x{b.rows}" for b in pair.boards}))
             raise InputError(
                 f"pair '{pair.pair_id}': no board ({sizes}) found in '{path}'; check the image and the boards"
             )
-    matched = match_pair(
+        images.append(image)
+        found.append(detections)
+    return _matched(pair, camera1, camera2, found[0], found[1], chain), images[0], images[1]
+
+
+def _matched(
+    pair: Pair,
+    camera1: Camera,
+    camera2: Camera,
+    detections1: Sequence[BoardDetection],
+    detections2: Sequence[BoardDetection],
+    chain: str,
+) -> MatchedPair:
+    from rigkit.pairing import match_pair
+
+    return match_pair(
         pair.pair_id,
         camera1,
         camera2,
-        found[0],
-        found[1],
+        detections1,
+        detections2,
         pair.boards,
         layout=pair.layout or None,
         chain="rectified" if chain == "rectified" else "raw",
     )
-    return matched, images[0], images[1]
+
+
+def reconstruct_with(matched: MatchedPair, pair: Pair, method: str, image1: Any = None) -> Reconstruction:
+    """Reconstruct matched corners as the manifest declares the pair."""
+    import numpy as np
+
+    from rigkit.reconstruct import reconstruct_pair
+
+    level = None if pair.level_sigma_deg is None else float(np.deg2rad(pair.level_sigma_deg))
+    return reconstruct_pair(
+        matched, pose_type=pair.pose_type, affine_method=method, level_sigma_rad=level, image1=image1
+    )
+
+
+def reconstruct_other_chain(matched: MatchedPair, pair: Pair) -> Reconstruction | None:
+    """Reconstruct the same corners in the other pixels (rectified for raw, raw for rectified); None if they don't fit."""
+    identity = matched.identity
+    other = "rectified" if matched.chain == "raw" else "raw"
+    try:
+        again = _matched(pair, matched.camera1, matched.camera2, identity.detections1, identity.detections2, other)
+        return reconstruct_with(again, pair, "3SDIR")
+    except DegenerateError:
+        return None
 
 
 def over_pairs(

@@ -9,9 +9,10 @@ import numpy as np
 from rigkit.reconstruct import Reconstruction
 from rigkit.report.page import PairSection, scene_of
 from rigkit.validation.checks import ValidationReport
+from rigkit.validation.crosscheck import CrossCheckReport
 from rigkit.validation.tables import Cell, Column, Table, check_table, estimator_table
 
-__all__ = ["best_report", "pair_section", "summary_table"]
+__all__ = ["best_report", "crosscheck_table", "pair_section", "summary_table"]
 
 
 def best_report(reports: Sequence[ValidationReport]) -> ValidationReport:
@@ -78,6 +79,42 @@ def pair_section(
     tables = (check_table([shown]), estimator_table(reports), *extra)
     notes = (*shown.notes, *(f"not checked: {words}" for words in shown.unchecked))
     return PairSection(shown.pair_id, lead, tables, tuple(images), scene_of(reconstruction), notes)
+
+
+def crosscheck_table(reports: Sequence[CrossCheckReport]) -> Table:
+    """Return what every other way found of every pair, and whether it agrees with ours."""
+    columns = (
+        Column("pair"),
+        Column("way"),
+        Column("rotation difference", "deg", 4),
+        Column("direction difference", "deg", 4),
+        Column("baseline", "mm", 2),
+        Column("rms", "px"),
+        Column("used", "", 0),
+        Column("excluded", "", 0),
+        Column("disagrees in"),
+    )
+    rows = []
+    for report in reports:
+        for way in report.ways:
+            failed = [c.name for c in report.checks if c.how == way.name and not c.passed]
+            compared = any(c.how == way.name for c in report.checks)
+            rows.append(
+                (
+                    Cell(report.pair_id),
+                    Cell(way.name),
+                    Cell(way.rotation_difference_deg),
+                    Cell(way.direction_difference_deg),
+                    Cell(way.baseline_mm),
+                    Cell(way.rms_px),
+                    Cell(float(way.used)),
+                    Cell(float(way.excluded)),
+                    Cell(", ".join(failed) or ("nothing" if compared else "-"), failed=bool(failed)),
+                )
+            )
+    limits = sorted({c.limit_k for r in reports for c in r.checks})
+    note = f"Agreement: within k = {', '.join(f'{k:g}' for k in limits)} combined sigmas."
+    return Table("crosscheck", "The same pairs by other ways", columns, tuple(rows), note)
 
 
 def _mean_normal_error(report: ValidationReport) -> float:

@@ -1,0 +1,82 @@
+"""`rigkit crosscheck`: the same pairs through pycolmap, planar PnP and the other chain."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from rigkit.cli.console import note, print_json, progress_on_stderr
+from rigkit.cli.workflow import (
+    add_dataset_arguments,
+    load_cameras,
+    match_images,
+    output_folder,
+    over_pairs,
+    reconstruct_other_chain,
+    reconstruct_with,
+    select_dataset,
+    write_results,
+)
+
+if TYPE_CHECKING:
+    from rigkit.cameras.base import Camera
+    from rigkit.io.manifest import Pair
+    from rigkit.validation.crosscheck import CrossCheckReport
+
+HELP = "the same pairs through pycolmap, planar PnP and the other chain; exit 1 if they disagree"
+
+EXIT_CHECK_FAILED = 1
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_dataset_arguments(parser)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PairJob:
+    """What one process needs to know of one pair."""
+
+    pair: Pair
+    camera1: Camera
+    camera2: Camera
+    chain: str
+
+
+def crosscheck_pair(job: PairJob) -> CrossCheckReport:
+    """Reconstruct one pair and compare it with every other way."""
+    from rigkit.validation.crosscheck import crosscheck
+
+    matched, _, _ = match_images(job.pair, job.camera1, job.camera2, job.chain)
+    other = reconstruct_other_chain(matched, job.pair)
+    return crosscheck(reconstruct_with(matched, job.pair, "3SDIR"), other_chain=other)
+
+
+def run(args: argparse.Namespace) -> int:
+    from rigkit.report.tables import tables_to_json, tables_to_markdown, tables_to_text
+    from rigkit.report.validation_page import crosscheck_table
+
+    dataset = select_dataset(args)
+    out = output_folder(args, dataset)
+    progress = progress_on_stderr()
+    cameras = load_cameras(dataset, recalibrate=args.recalibrate, progress=progress)
+    jobs = [PairJob(p, cameras[p.camera1.camera_id], cameras[p.camera2.camera_id], args.chain) for p in dataset.pairs]
+    reports = list(over_pairs(crosscheck_pair, jobs, args.jobs, "cross-checking pairs", progress))
+    table = crosscheck_table(reports)
+    files: dict[str, str | bytes] = {
+        "crosscheck.md": tables_to_markdown([table]),
+        "crosscheck.json": tables_to_json([table]),
+    }
+    write_results(out, files, force=args.force)
+    passed = all(report.passed for report in reports)
+    if args.json:
+        print_json({"passed": passed, "output": str(out), "pairs": [report.to_dict() for report in reports]})
+    else:
+        print(tables_to_text([table]))
+        for report in reports:
+            for words in report.suspects:
+                print(f"{report.pair_id}: suspect {words}")
+    for report in reports:
+        for words in report.skipped:
+            note(f"{report.pair_id}: {words}")
+    return 0 if passed else EXIT_CHECK_FAILED
