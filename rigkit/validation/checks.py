@@ -20,7 +20,7 @@ from rigkit.truth import PairTruth
 from rigkit.validation.boards import BoardResult
 from rigkit.validation.measure import measure
 
-__all__ = ["COVERAGE", "AngleResult", "Check", "ValidationReport", "judge", "validate"]
+__all__ = ["COVERAGE", "AngleResult", "Check", "ValidationReport", "judge", "validate", "without_nan"]
 
 COVERAGE = 2.0
 
@@ -142,7 +142,7 @@ class ValidationReport:
             "boards": [_board_dict(board) for board in self.boards],
             "notes": list(self.notes),
         }
-        cleaned: dict[str, Any] = _without_nan(out)
+        cleaned: dict[str, Any] = without_nan(out)
         return cleaned
 
     def to_json(self) -> str:
@@ -265,9 +265,10 @@ def _board_dict(result: BoardResult) -> dict[str, Any]:
     }
 
 
-def _without_nan(value: Any) -> Any:
+def without_nan(value: Any) -> Any:
+    """Return nested dicts and lists with None for every number that is not finite: JSON has no NaN."""
     if isinstance(value, dict):
-        return {key: _without_nan(inner) for key, inner in value.items()}
+        return {key: without_nan(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_without_nan(inner) for inner in value]
+        return [without_nan(inner) for inner in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -58,10 +58,10 @@ class Measured:
     def angle_deg(self, a: str, b: str) -> tuple[float, float]:
         """Return the angle between two faces and its sigma, degrees."""
         one, two = self.boards[a].plane, self.boards[b].plane
-        by_a, by_b = angle_jacobian(one, two)
+        by_a, by_b = angle_jacobian(one.normal, two.normal)
         scatter = by_a @ one.normal_covariance @ by_a + by_b @ two.normal_covariance @ by_b
-        pose = self._pose_variance(lambda boards: face_angle(boards[a].plane, boards[b].plane))
-        return float(np.rad2deg(face_angle(one, two))), float(np.rad2deg(np.sqrt(scatter + pose)))
+        pose = self._pose_variance(lambda boards: face_angle(boards[a].plane.normal, boards[b].plane.normal))
+        return float(np.rad2deg(face_angle(one.normal, two.normal))), float(np.rad2deg(np.sqrt(scatter + pose)))
 
     def distance_mm(self, distance: MeasuredDistance) -> tuple[float, float]:
         """Return a distance between features and its sigma, mm."""

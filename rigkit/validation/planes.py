@@ -123,22 +123,21 @@ def fit_plane(points_mm: Points, covariance_mm2: FloatArray | None = None) -> Pl
     )
 
 
-def face_angle(a: Plane, b: Plane) -> float:
+def face_angle(normal_a: FloatArray, normal_b: FloatArray) -> float:
     """Return the angle between two faces, radians, as a protractor laid across them shows it.
 
     It is pi minus the angle between the normals that face the camera.
     """
-    return float(np.pi - angle_between(a.normal, b.normal))
+    return float(np.pi - angle_between(normal_a, normal_b))
 
 
-def angle_jacobian(a: Plane, b: Plane) -> tuple[FloatArray, FloatArray]:
+def angle_jacobian(normal_a: FloatArray, normal_b: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return d face angle / d normal of `a` and of `b`, (3,) each; zero where the planes are parallel."""
-    across = np.cross(a.normal, b.normal)
-    sine = float(np.linalg.norm(across))
+    sine = float(np.linalg.norm(np.cross(normal_a, normal_b)))
     if sine < 1e-12:
         return np.zeros(3), np.zeros(3)
-    cosine = float(a.normal @ b.normal)
-    return (b.normal - cosine * a.normal) / sine, (a.normal - cosine * b.normal) / sine
+    cosine = float(normal_a @ normal_b)
+    return (normal_b - cosine * normal_a) / sine, (normal_a - cosine * normal_b) / sine
 
 
 def normal_errors(normals: Normals, plane: Plane) -> NormalErrors:

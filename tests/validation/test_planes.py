@@ -73,7 +73,7 @@ def test_face_angle_is_what_a_protractor_shows(angles: tuple[float, ...]) -> Non
     planes = [
         fit_plane(pose.apply(b.points())) for b, pose in zip(BOARDS, trihedral_poses(BOARDS, angles), strict=True)
     ]
-    found = [face_angle(planes[i], planes[j]) for i, j in ((0, 1), (0, 2), (1, 2))]
+    found = [face_angle(planes[i].normal, planes[j].normal) for i, j in ((0, 1), (0, 2), (1, 2))]
     assert np.rad2deg(found) == pytest.approx(angles, abs=1e-9)
 
 
@@ -83,7 +83,9 @@ def test_a_corner_that_opens_wider_than_a_right_angle_is_more_than_90_degrees() 
         out = np.deg2rad(half)
         along = np.arange(3.0)[:, None] * 100.0 * np.array([-np.sin(out), 0.0, -np.cos(out)]) + [-50.0, 0.0, 2000.0]
         left = np.concatenate([along + np.array([0.0, y, 0.0]) for y in (0.0, 100.0, 200.0)])
-        assert np.rad2deg(face_angle(fit_plane(left), fit_plane(left * [-1.0, 1.0, 1.0]))) == pytest.approx(2.0 * half)
+        assert np.rad2deg(
+            face_angle(fit_plane(left).normal, fit_plane(left * [-1.0, 1.0, 1.0]).normal)
+        ) == pytest.approx(2.0 * half)
 
 
 def test_normal_errors_are_angles_to_the_plane() -> None:

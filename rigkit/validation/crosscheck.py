@@ -1,0 +1,341 @@
+"""The same pair by ways that share nothing with the main path but corners and calibration.
+
+pycolmap: two-view geometry, triangulation and bundle adjustment; scale from the squares. Planar PnP: every board's own
+pose, no epipolar geometry at all. Another chain: the same pair reconstructed in other pixels (raw or rectified).
+A difference beyond the combined sigmas is a failed check; which ways agree among each other says what to suspect.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from rigkit.arrays import FloatArray, IntArray, Points
+from rigkit.errors import DegenerateError, InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import angle_between, rotation_angle
+from rigkit.geometry.scale import metric_scale
+from rigkit.geometry.triangulation import point_covariances
+from rigkit.interop.colmap import ColmapPair, ColmapResult, colmap_pair, solve_pair
+from rigkit.reconstruct import Reconstruction
+from rigkit.validation.checks import COVERAGE, Check, judge, without_nan
+from rigkit.validation.measure import Measured, measure, points_by_pose
+from rigkit.validation.pnp import planar_pnp
+
+__all__ = ["CrossCheckReport", "OtherWay", "compare_chains", "crosscheck"]
+
+ADJUSTED = "pycolmap bundle adjustment"
+PNP = "planar PnP"
+OTHER_CHAIN = "other chain"
+BEST_CORNER_PX = 1e-3
+"""No corner is known better than this, however well a few of them happen to fit."""
+PER_POINT = ("normals", "colours", "board_index", "grid", "sigma_mm", "normal_sigma_rad")
+
+Angles = dict[tuple[str, str], tuple[float, float]]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class OtherWay:
+    """What another way found, beside ours.
+
+    Attributes
+    ----------
+    name : "pycolmap two-view", "pycolmap bundle adjustment", "planar PnP", "rectified chain".
+    cam2_from_cam1 : its relative pose, mm.
+    covariance : (6, 6) of (left rotation perturbation rad, translation mm), NaN where that way has none.
+    rotation_difference_deg, direction_difference_deg : angle between its rotation, translation direction, and ours.
+    baseline_mm : its baseline, scaled by the squares.
+    angles_deg : (a, b) -> (angle between the faces, sigma).
+    rms_px : its root mean square reprojection error, 2-D per observation; NaN where that way has none.
+    used, excluded : matches that took part; matches beyond what that way can represent.
+    """
+
+    name: str
+    cam2_from_cam1: Rigid3
+    covariance: FloatArray
+    rotation_difference_deg: float
+    direction_difference_deg: float
+    baseline_mm: float
+    angles_deg: Angles
+    rms_px: float
+    used: int
+    excluded: int
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CrossCheckReport:
+    """All ways of one pair; cannot be built without a check.
+
+    Attributes
+    ----------
+    pair_id, affine_method : of the reconstruction.
+    ways : what each found.
+    checks : differences against combined sigmas; `how` names the way.
+    skipped : ways that could not be gone, and why.
+    suspects : what to look at where a check failed, in words.
+    """
+
+    pair_id: str
+    affine_method: str
+    ways: tuple[OtherWay, ...]
+    checks: tuple[Check, ...]
+    skipped: tuple[str, ...]
+    suspects: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        if not self.checks:
+            raise InputError(f"pair '{self.pair_id}': no cross-check could be made: {'; '.join(self.skipped)}")
+
+    @property
+    def passed(self) -> bool:
+        return all(check.passed for check in self.checks)
+
+    def way(self, name: str) -> OtherWay:
+        """Return the way of that name; raises InputError that lists those gone."""
+        for way in self.ways:
+            if way.name == name:
+                return way
+        raise InputError(f"no way is called '{name}'; known: {', '.join(w.name for w in self.ways)}")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain numbers, strings and lists; NaN becomes None."""
+        return {
+            "schema": "rigkit.crosscheck/1",
+            "pair": self.pair_id,
+            "affine_method": self.affine_method,
+            "passed": self.passed,
+            "ways": [
+                {
+                    "name": way.name,
+                    "rotation_difference_deg": way.rotation_difference_deg,
+                    "direction_difference_deg": way.direction_difference_deg,
+                    "baseline_mm": way.baseline_mm,
+                    "angles_deg": [
+                        {"a": a, "b": b, "angle": angle, "sigma": sigma if np.isfinite(sigma) else None}
+                        for (a, b), (angle, sigma) in way.angles_deg.items()
+                    ],
+                    "rms_px": way.rms_px if np.isfinite(way.rms_px) else None,
+                    "used": way.used,
+                    "excluded": way.excluded,
+                }
+                for way in self.ways
+            ],
+            "checks": [without_nan(asdict(check)) for check in self.checks],
+            "skipped": list(self.skipped),
+            "suspects": list(self.suspects),
+        }
+
+    def to_json(self) -> str:
+        """Return `to_dict()` as JSON text."""
+        return json.dumps(self.to_dict(), indent=2, allow_nan=False)
+
+
+def crosscheck(
+    reconstruction: Reconstruction,
+    *,
+    other_chain: Reconstruction | None = None,
+    coverage: float = COVERAGE,
+    seed: int = 0,
+) -> CrossCheckReport:
+    """Compare a reconstruction with pycolmap, planar PnP, and the same pair through another chain if given.
+
+    Parameters
+    ----------
+    reconstruction : of one pair.
+    other_chain : the same pair reconstructed in other pixels (rectified where this one is raw, or the reverse).
+    coverage : largest |difference| / combined sigma that passes.
+    seed : of COLMAP's RANSAC.
+
+    Raises InputError where none of the ways could be gone.
+    """
+    ways: list[OtherWay] = []
+    skipped: list[str] = []
+    attempts: dict[str, Callable[[], list[OtherWay]]] = {
+        "pycolmap": lambda: _colmap_ways(reconstruction, seed),
+        "planar PnP": lambda: [_pnp_way(reconstruction)],
+    }
+    for name, attempt in attempts.items():
+        try:
+            ways += attempt()
+        except DegenerateError as error:
+            skipped.append(f"{name}: {error}")
+    if other_chain is not None:
+        ways.append(compare_chains(reconstruction, other_chain, OTHER_CHAIN))
+    ours = _angles(measure(reconstruction))
+    checks = [check for way in ways for check in _checks(reconstruction, ours, way, coverage)]
+    return CrossCheckReport(
+        reconstruction.pair_id,
+        reconstruction.affine_method,
+        tuple(ways),
+        tuple(checks),
+        tuple(skipped),
+        _suspects(reconstruction, checks),
+    )
+
+
+def compare_chains(reconstruction: Reconstruction, other: Reconstruction, name: str) -> OtherWay:
+    """Return another reconstruction of the same pair as one of the ways."""
+    covariance = np.full((6, 6), np.nan) if other.pose_covariance is None else other.pose_covariance
+    angles = _angles(measure(other))
+    rms = other.sampson_rms_px
+    return _way(name, reconstruction, other.cam2_from_cam1, covariance, angles, rms, len(other.cloud), 0)
+
+
+def _colmap_ways(reconstruction: Reconstruction, seed: int) -> list[OtherWay]:
+    pixels = (reconstruction.pixels1, reconstruction.pixels2)
+    pair = colmap_pair(reconstruction.camera1, reconstruction.camera2, *pixels)
+    excluded = int((~pair.used).sum())
+    result = solve_pair(pair, seed=seed)
+    adjusted = _colmap_reconstruction(reconstruction, pair, result)
+    baseline = adjusted.baseline_mm
+    two_view = Rigid3(result.two_view.rotation, result.two_view.translation_mm * baseline)
+    unknown = np.full((6, 6), np.nan)
+    found = (adjusted.cam2_from_cam1, adjusted.pose_covariance)
+    covariance = unknown if found[1] is None else found[1]
+    return [
+        _way("pycolmap two-view", reconstruction, two_view, unknown, {}, np.nan, result.inliers, excluded),
+        _way(
+            ADJUSTED,
+            reconstruction,
+            found[0],
+            covariance,
+            _angles(measure(adjusted)),
+            result.rms_px,
+            result.inliers,
+            excluded,
+        ),
+    ]
+
+
+def _colmap_reconstruction(reconstruction: Reconstruction, pair: ColmapPair, result: ColmapResult) -> Reconstruction:
+    """Return COLMAP's adjusted pose and points as a reconstruction in mm, scaled by the squares."""
+    which = np.flatnonzero(pair.used)
+    seen = np.isfinite(result.points).all(axis=1)
+    which, unit_points = which[seen], result.points[seen]
+    cloud = reconstruction.cloud
+    known = (cloud.board_index[which], cloud.grid[which], reconstruction.boards)
+    # COLMAP's covariance is for corners of 1 px; 4N residuals fix 3N + 5 unknowns.
+    variance = max(result.rms_px**2 * 2.0 * len(which) / max(len(which) - 5, 1), BEST_CORNER_PX**2)
+    spread = variance * _spread(reconstruction, which, unit_points, result.adjusted)
+    scale, scale_sigma = metric_scale(unit_points, *known, spread)
+    picked = {name: getattr(cloud, name)[which] for name in PER_POINT}
+    metric = replace(
+        reconstruction,
+        matches=reconstruction.matches.select(which),
+        pixels1=reconstruction.pixels1[which],
+        pixels2=reconstruction.pixels2[which],
+        cam2_from_cam1=Rigid3(result.adjusted.rotation, scale * result.adjusted.translation_mm),
+        cloud=replace(cloud, **picked, points_mm=scale * unit_points),
+        baseline_mm=scale,
+        pose_covariance=None,
+    )
+    if not np.isfinite(result.adjusted_covariance).all():
+        return metric
+    # t = s u: its direction moves with the pose, its length with the scale that this pose gives to the squares.
+    across = np.diag([1.0] * 3 + [scale] * 3) @ result.adjusted_covariance @ np.diag([1.0] * 3 + [scale] * 3)
+    slope = np.zeros(6)
+    for k, (motion, step) in enumerate(points_by_pose(metric)):
+        moved = (metric_scale(unit_points + sign * motion / scale, *known, spread)[0] for sign in (1.0, -1.0))
+        slope[k] = (next(moved) - next(moved)) / (2.0 * step)
+    along = np.eye(6)
+    along[3:] += np.outer(result.adjusted.translation_mm, slope)
+    covariance = along @ across @ along.T * variance
+    covariance[3:, 3:] += scale_sigma**2 * np.outer(result.adjusted.translation_mm, result.adjusted.translation_mm)
+    return replace(metric, pose_covariance=covariance)
+
+
+def _spread(reconstruction: Reconstruction, which: IntArray, points: Points, pose: Rigid3) -> FloatArray:
+    """Return the covariances of triangulated points for corners of 1 px: what weighs them in the scale."""
+    camera1, camera2 = reconstruction.camera1, reconstruction.camera2
+    pixels1, pixels2 = reconstruction.pixels1[which], reconstruction.pixels2[which]
+    rays = (camera1.unproject(pixels1)[0], camera2.unproject(pixels2)[0])
+    return point_covariances(points, pose, *rays, camera1.ray_jacobian(pixels1), camera2.ray_jacobian(pixels2))
+
+
+def _pnp_way(reconstruction: Reconstruction) -> OtherWay:
+    found = planar_pnp(reconstruction)
+    rms = found.rms_rad * reconstruction.camera1.focal_px
+    pose, covariance = found.cam2_from_cam1, found.covariance
+    return _way(PNP, reconstruction, pose, covariance, found.angles_deg, rms, found.count, 0)
+
+
+def _way(
+    name: str,
+    reconstruction: Reconstruction,
+    pose: Rigid3,
+    covariance: FloatArray,
+    angles: Angles,
+    rms_px: float,
+    used: int,
+    excluded: int,
+) -> OtherWay:
+    ours = reconstruction.cam2_from_cam1
+    turn = float(np.rad2deg(rotation_angle(pose.rotation @ ours.rotation.T)))
+    direction = float(np.rad2deg(angle_between(pose.translation_mm, ours.translation_mm)))
+    baseline = float(np.linalg.norm(pose.translation_mm))
+    return OtherWay(name, pose, covariance, turn, direction, baseline, angles, rms_px, used, excluded)
+
+
+def _angles(measured: Measured) -> Angles:
+    return {two: measured.angle_deg(*two) for two in combinations(measured.boards, 2)}
+
+
+def _checks(reconstruction: Reconstruction, ours: Angles, way: OtherWay, coverage: float) -> list[Check]:
+    """Return the checks of one way; none for what that way gives without uncertainty."""
+    checks = []
+    sigma = _pose_sigmas(way.cam2_from_cam1, way.covariance)
+    if all(np.isfinite(value) for value in sigma):
+        unknown = np.full((6, 6), np.nan)
+        covariance = unknown if reconstruction.pose_covariance is None else reconstruction.pose_covariance
+        own = _pose_sigmas(reconstruction.cam2_from_cam1, covariance)
+        rows = (
+            ("rotation", "deg", 0.0, way.rotation_difference_deg),
+            ("translation direction", "deg", 0.0, way.direction_difference_deg),
+            ("baseline", "mm", way.baseline_mm, reconstruction.baseline_mm),
+        )
+        for (name, unit, other, value), theirs, mine in zip(rows, sigma, own, strict=True):
+            known = (other, theirs, way.name)
+            checks.append(judge(name, name, unit, known, (value, mine), coverage, way.used))
+    for (a, b), (angle, angle_sigma) in way.angles_deg.items():
+        if (a, b) in ours:
+            known = (angle, angle_sigma, way.name)
+            checks.append(judge(f"angle {a}-{b}", "angle", "deg", known, ours[a, b], coverage, way.used))
+    return checks
+
+
+def _pose_sigmas(pose: Rigid3, covariance: FloatArray) -> tuple[float, float, float]:
+    """Return the rms angle of the rotation and of the translation's direction, deg, and the sigma of its length, mm."""
+    length = float(np.linalg.norm(pose.translation_mm))
+    along = pose.translation_mm / length
+    translation = covariance[3:, 3:]
+    lengthwise = float(along @ translation @ along)
+    crosswise = max(float(np.trace(translation)) - lengthwise, 0.0)
+    turn = np.rad2deg(np.sqrt(np.trace(covariance[:3, :3])))
+    return float(turn), float(np.rad2deg(np.sqrt(crosswise) / length)), float(np.sqrt(lengthwise))
+
+
+def _suspects(reconstruction: Reconstruction, checks: Sequence[Check]) -> tuple[str, ...]:
+    """Return which stage to look at, from which ways disagree with ours."""
+    failed = {way: {c.kind for c in checks if c.how == way and not c.passed} for way in {c.how for c in checks}}
+    colmap, pnp, chain = (failed.get(way, set()) for way in (ADJUSTED, PNP, OTHER_CHAIN))
+    out = []
+    if colmap and pnp:
+        out.append(
+            f"relative pose: pycolmap and planar PnP both contradict it; does pose type '{reconstruction.pose_type}' "
+            "(and the level's sigma) hold for this pair?"
+        )
+    elif colmap:
+        out.append("epipolar geometry: pycolmap finds another pose from the same corners, the boards' own poses agree")
+    elif pnp:
+        out.append(
+            "calibration or board: the boards' own poses disagree where epipolar geometry agrees; look at square "
+            "sizes, flatness and the calibration of this lens"
+        )
+    if chain:
+        out.append("rectification: raw and rectified pixels give different results; look at the rectified views")
+    return tuple(out)

@@ -1,0 +1,106 @@
+"""The relative pose without any epipolar geometry: from every board's own pose in each view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.arrays import FloatArray
+from rigkit.errors import DegenerateError
+from rigkit.geometry.board_pose import BoardPose, board_pose
+from rigkit.geometry.relative_pose import relative_pose, relative_pose_covariance
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3, log_so3, skew
+from rigkit.reconstruct import Reconstruction
+from rigkit.validation.planes import angle_jacobian, face_angle
+
+__all__ = ["PnpResult", "planar_pnp"]
+
+MIN_CORNERS = 8
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PnpResult:
+    """What the boards' own poses say.
+
+    Attributes
+    ----------
+    cam2_from_cam1 : mean over the boards, weighted by their covariances, mm.
+    covariance : (6, 6) of (left rotation perturbation rad, translation mm).
+    angles_deg : (a, b) -> (angle between the faces, sigma), mean of both views.
+    rms_rad : root mean square angle between rays and corners, over all boards and both views.
+    count : corners used.
+    boards : how many boards took part.
+    """
+
+    cam2_from_cam1: Rigid3
+    covariance: FloatArray
+    angles_deg: dict[tuple[str, str], tuple[float, float]]
+    rms_rad: float
+    count: int
+    boards: int
+
+
+def planar_pnp(reconstruction: Reconstruction) -> PnpResult:
+    """Return relative pose and face angles from planar PnP of each board in each view; any field of view.
+
+    Raises DegenerateError where no board has eight corners.
+    """
+    rays1, _ = reconstruction.camera1.unproject(reconstruction.pixels1)
+    rays2, _ = reconstruction.camera2.unproject(reconstruction.pixels2)
+    poses: dict[str, tuple[BoardPose, BoardPose]] = {}
+    counts: dict[str, int] = {}
+    for index, board in enumerate(reconstruction.boards):
+        on = reconstruction.cloud.board_index == index
+        if int(on.sum()) >= MIN_CORNERS:
+            points = board.points(reconstruction.cloud.grid[on])
+            poses[board.board_id] = (board_pose(rays1[on], points), board_pose(rays2[on], points))
+            counts[board.board_id] = int(on.sum())
+    if not poses:
+        raise DegenerateError(f"pair '{reconstruction.pair_id}': no board has {MIN_CORNERS} corners for its own pose")
+    pose, covariance = _mean_pose([_relative(*both) for both in poses.values()], reconstruction.cam2_from_cam1)
+    total = sum(counts.values())
+    square = sum(counts[b] * (one.rms_rad**2 + two.rms_rad**2) / 2.0 for b, (one, two) in poses.items()) / total
+    return PnpResult(pose, covariance, _angles(poses), float(np.sqrt(square)), total, len(poses))
+
+
+def _relative(one: BoardPose, two: BoardPose) -> tuple[Rigid3, FloatArray]:
+    joint = np.zeros((12, 12))
+    joint[:6, :6], joint[6:, 6:] = one.covariance, two.covariance
+    pose = relative_pose(one.cam_from_board, two.cam_from_board)
+    return pose, relative_pose_covariance(one.cam_from_board, two.cam_from_board, joint)
+
+
+def _mean_pose(found: list[tuple[Rigid3, FloatArray]], near: Rigid3) -> tuple[Rigid3, FloatArray]:
+    """Return the mean weighted by information, in the tangent space at `near`."""
+    information, pull = np.zeros((6, 6)), np.zeros(6)
+    for pose, covariance in found:
+        inverse = np.linalg.inv(covariance)
+        information += inverse
+        turn = log_so3(pose.rotation @ near.rotation.T)
+        pull += inverse @ np.concatenate([turn, pose.translation_mm - near.translation_mm])
+    mean: FloatArray = np.asarray(np.linalg.solve(information, pull), dtype=np.float64)
+    pose = Rigid3(exp_so3(mean[:3]) @ near.rotation, near.translation_mm + mean[3:])
+    return pose, np.asarray(np.linalg.inv(information), dtype=np.float64)
+
+
+def _angles(poses: dict[str, tuple[BoardPose, BoardPose]]) -> dict[tuple[str, str], tuple[float, float]]:
+    """Return face angles, the mean of both views weighted by variance."""
+    out = {}
+    ids = list(poses)
+    for i, a in enumerate(ids):
+        for b in ids[i + 1 :]:
+            weights, values = [], []
+            for view in (0, 1):
+                one, two = poses[a][view], poses[b][view]
+                normals = (-one.cam_from_board.rotation[:, 2], -two.cam_from_board.rotation[:, 2])
+                variance = 0.0
+                for slope, normal, pose in zip(angle_jacobian(*normals), normals, (one, two), strict=True):
+                    by_turn = slope @ -skew(normal)
+                    variance += float(by_turn @ pose.covariance[:3, :3] @ by_turn)
+                values.append(face_angle(*normals))
+                weights.append(1.0 / variance)
+            mean = float(np.average(values, weights=weights))
+            out[a, b] = (float(np.rad2deg(mean)), float(np.rad2deg(1.0 / np.sqrt(sum(weights)))))
+    return out

@@ -1,0 +1,205 @@
+"""The other ways find what the geometry is, agree with a right reconstruction, and contradict a wrong one."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.board_scenes import fisheye_camera, regular_camera
+from helpers.reconstructions import BOARDS, CAM2_FROM_CAM1, make_reconstruction, trihedral_poses
+
+from rigkit.cameras.base import Camera
+from rigkit.cameras.brown import Brown
+from rigkit.cameras.eucm import EUCM
+from rigkit.errors import DegenerateError
+from rigkit.geometry.relative_pose import relative_pose, relative_pose_covariance
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3, log_so3
+from rigkit.interop.colmap import colmap_pair, solve_pair
+from rigkit.reconstruct import Reconstruction
+from rigkit.validation.crosscheck import ADJUSTED, PNP, crosscheck
+from rigkit.validation.pnp import planar_pnp
+
+EXACT_RAD = 1e-6
+"""Exact corners: what COLMAP's stopping rule and our 1e-9 leave, with a margin."""
+EXACT_MM = 1e-3
+SIGMA_RATIO = (0.85, 1.15)
+"""Observed over predicted spread of 200 draws: its own standard deviation is 1 / sqrt(400) = 5 %."""
+PNP_DRAWS = 50
+PNP_SIGMA_RATIO = (0.7, 1.3)
+"""50 draws: 10 %."""
+POSE_COVARIANCE = np.diag([1e-5] * 3 + [0.02] * 3) ** 2
+
+CAMERAS = {
+    "pinhole": regular_camera(),
+    "brown": Brown((1624, 1240), np.array([1356.0, 1350.0, 820.5, 605.5, -0.1, 0.03, 1e-3, -5e-4, 0.01])),
+    "kannala_brandt": fisheye_camera(),
+    "eucm": EUCM((1624, 1240), np.array([600.0, 600.0, 811.5, 619.5, 0.6, 1.1])),
+}
+
+
+def made(camera: Camera, **options: object) -> Reconstruction:
+    return make_reconstruction(camera=camera, pose_covariance=POSE_COVARIANCE, baseline_sigma_mm=0.02, **options)
+
+
+def noisy(exact: Reconstruction, rng: np.random.Generator, sigma_px: float = 0.05) -> Reconstruction:
+    noise = rng.normal(size=(2, len(exact.pixels1), 2)) * sigma_px
+    return replace(exact, pixels1=exact.pixels1 + noise[0], pixels2=exact.pixels2 + noise[1])
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_every_way_finds_the_exact_geometry(name: str) -> None:
+    report = crosscheck(made(CAMERAS[name]))
+    assert report.passed
+    assert not report.skipped
+    assert len(report.checks) == 12
+    for way in report.ways:
+        assert way.used == 144
+        assert np.deg2rad(way.rotation_difference_deg) < EXACT_RAD
+        assert np.deg2rad(way.direction_difference_deg) < EXACT_RAD
+        assert way.baseline_mm == pytest.approx(np.linalg.norm(CAM2_FROM_CAM1.translation_mm), abs=EXACT_MM)
+        for angle, _ in way.angles_deg.values():
+            assert angle == pytest.approx(90.0, abs=1e-4)
+    assert json.loads(report.to_json())["passed"] is True
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_the_half_pixel_is_handled(name: str) -> None:
+    # COLMAP must see the same rays in its own pixels: an origin off by half a pixel is 4e-4 rad here.
+    exact = made(CAMERAS[name])
+    pair = colmap_pair(exact.camera1, exact.camera2, exact.pixels1, exact.pixels2)
+    seen = np.asarray(pair.cameras[0].cam_from_img(pair.pixels1))
+    rays, _ = exact.camera1.unproject(exact.pixels1)
+    assert np.abs(seen - rays[:, :2] / rays[:, 2:]).max() < 1e-9
+    if name != "eucm":
+        assert (pair.pixels1 == exact.pixels1 + 0.5).all()
+
+
+def test_rays_beyond_90_degrees_are_left_out_and_counted() -> None:
+    exact = made(fisheye_camera())
+    # The same scene seen by a camera turned aside: some corners lie behind its image plane.
+    aside = Rigid3(exp_so3(np.array([0.0, 1.42, 0.0])), np.zeros(3))
+    points = aside.apply(exact.cloud.points_mm)
+    camera = fisheye_camera()
+    pixels1, valid = camera.project(points)
+    cam2_from_aside = CAM2_FROM_CAM1 @ aside.inverse()
+    behind = points[:, 2] < 0.0
+    assert valid.all()
+    assert 5 < behind.sum() < 40
+    turned = replace(
+        exact,
+        pixels1=pixels1,
+        cam2_from_cam1=cam2_from_aside,
+        cloud=replace(exact.cloud, points_mm=points, normals=exact.cloud.normals @ aside.rotation.T),
+    )
+    report = crosscheck(turned)
+    assert report.passed
+    assert behind.sum() <= report.way(ADJUSTED).excluded < 144
+    assert report.way(ADJUSTED).used + report.way(ADJUSTED).excluded == 144
+    # The boards' own poses need no image plane.
+    assert report.way(PNP).used == 144
+
+
+def test_colmap_covariance_is_the_observed_one(rng: np.random.Generator) -> None:
+    exact = made(regular_camera())
+    unit_direction = CAM2_FROM_CAM1.translation_mm / np.linalg.norm(CAM2_FROM_CAM1.translation_mm)
+    turns, moves, variances = [], [], []
+    for _ in range(200):
+        drawn = noisy(exact, rng)
+        found = solve_pair(colmap_pair(drawn.camera1, drawn.camera2, drawn.pixels1, drawn.pixels2))
+        turns.append(log_so3(found.adjusted.rotation @ CAM2_FROM_CAM1.rotation.T))
+        moves.append(found.adjusted.translation_mm - unit_direction)
+        variances.append(np.diag(found.adjusted_covariance) * 0.05**2)
+    ratio = np.std(np.hstack([turns, moves]), axis=0) / np.sqrt(np.mean(variances, axis=0))
+    assert (ratio > SIGMA_RATIO[0]).all(), ratio
+    assert (ratio < SIGMA_RATIO[1]).all(), ratio
+
+
+def test_pnp_covariance_is_the_observed_one(rng: np.random.Generator) -> None:
+    exact = made(regular_camera())
+    offsets, variances, angles = [], [], []
+    for _ in range(PNP_DRAWS):
+        found = planar_pnp(noisy(exact, rng))
+        turn = log_so3(found.cam2_from_cam1.rotation @ CAM2_FROM_CAM1.rotation.T)
+        offsets.append(np.hstack([turn, found.cam2_from_cam1.translation_mm - CAM2_FROM_CAM1.translation_mm]))
+        variances.append(np.diag(found.covariance))
+        angles.append([value for pair in found.angles_deg.values() for value in pair])
+    spread = np.std(angles, axis=0)[::2] / np.mean(angles, axis=0)[1::2]
+    ratio = np.concatenate([np.std(offsets, axis=0) / np.sqrt(np.mean(variances, axis=0)), spread])
+    assert (ratio > PNP_SIGMA_RATIO[0]).all(), ratio
+    assert (ratio < PNP_SIGMA_RATIO[1]).all(), ratio
+
+
+def test_one_seed_gives_one_answer(rng: np.random.Generator) -> None:
+    drawn = noisy(made(regular_camera()), rng)
+    assert crosscheck(drawn).to_json() == crosscheck(drawn).to_json()
+
+
+def test_a_wrong_pose_is_contradicted_by_both_ways(rng: np.random.Generator) -> None:
+    exact = made(regular_camera())
+    wrong = Rigid3(exp_so3(np.array([0.0, 0.002, 0.0])) @ CAM2_FROM_CAM1.rotation, CAM2_FROM_CAM1.translation_mm)
+    report = crosscheck(noisy(replace(exact, cam2_from_cam1=wrong), rng))
+    failed = {(c.how, c.kind) for c in report.checks if not c.passed}
+    assert {(ADJUSTED, "rotation"), (PNP, "rotation")} <= failed
+    assert "relative pose" in report.suspects[0]
+
+
+def test_a_bent_board_is_contradicted_by_pnp_only(rng: np.random.Generator) -> None:
+    # The epipolar ways measure the faces as they stand; the boards' own poses trust the print.
+    exact = made(regular_camera())
+    board = replace(BOARDS[1], square_y_mm=BOARDS[1].square_y_mm * 1.01)
+    report = crosscheck(noisy(replace(exact, boards=(BOARDS[0], board, BOARDS[2])), rng))
+    assert any(c.how == PNP and not c.passed for c in report.checks)
+    assert all(c.passed for c in report.checks if c.how == ADJUSTED)
+    assert "calibration or board" in report.suspects[0]
+
+
+def test_another_chain_is_compared(rng: np.random.Generator) -> None:
+    exact = made(regular_camera())
+    report = crosscheck(exact, other_chain=exact)
+    assert report.passed
+    assert len(report.checks) == 18
+    moved = replace(exact, cam2_from_cam1=Rigid3(CAM2_FROM_CAM1.rotation, CAM2_FROM_CAM1.translation_mm * 1.01))
+    report = crosscheck(exact, other_chain=moved)
+    assert not report.passed
+    assert "rectification" in report.suspects[-1]
+
+
+def test_no_way_at_all_is_an_error() -> None:
+    exact = make_reconstruction()
+    few = np.arange(5)
+    cut = replace(
+        exact,
+        pixels1=exact.pixels1[few],
+        pixels2=exact.pixels2[few],
+        cloud=replace(
+            exact.cloud,
+            **{
+                name: getattr(exact.cloud, name)[few]
+                for name in ("points_mm", "normals", "colours", "board_index", "grid", "sigma_mm", "normal_sigma_rad")
+            },
+        ),
+    )
+    with pytest.raises(DegenerateError, match="8 corners"):
+        planar_pnp(cut)
+    with pytest.raises(DegenerateError, match="no relative pose"):
+        solve_pair(colmap_pair(cut.camera1, cut.camera2, cut.pixels1, cut.pixels2))
+
+
+def test_relative_covariance_is_the_sampled_one(rng: np.random.Generator) -> None:
+    one, two = trihedral_poses()[:2]
+    half = rng.normal(size=(12, 12)) * np.array(([1e-4] * 3 + [0.1] * 3) * 2)[:, None]
+    pose = relative_pose(one, two)
+    samples = []
+    for move in rng.normal(size=(4000, 12)) @ half.T:
+        shaken = [
+            Rigid3(exp_so3(m[:3]) @ p.rotation, p.translation_mm + m[3:]) for p, m in ((one, move[:6]), (two, move[6:]))
+        ]
+        found = relative_pose(*shaken)
+        turn = log_so3(found.rotation @ pose.rotation.T)
+        samples.append(np.hstack([turn, found.translation_mm - pose.translation_mm]))
+    predicted = relative_pose_covariance(one, two, half @ half.T)
+    # 4000 draws: 1.1 % per standard deviation.
+    assert np.std(samples, axis=0) == pytest.approx(np.sqrt(np.diag(predicted)), rel=0.05)
