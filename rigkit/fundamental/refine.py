@@ -14,12 +14,13 @@ import numpy as np
 
 from rigkit.arrays import FloatArray, IntArray
 from rigkit.errors import DegenerateError, InputError
+from rigkit.fundamental.one_plane import one_plane_poses
 from rigkit.fundamental.pose import choose_pose, essential_from_pose, translation_basis
 from rigkit.fundamental.registry import fundamental_for
 from rigkit.fundamental.residuals import affinity_terms, level_terms, point_terms
 from rigkit.fundamental.weights import RowWeights, WeightRule, estimate_sigma_A, usable_affinities
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3, unit
+from rigkit.geometry.rotation import exp_so3, rotation_angle, unit
 from rigkit.geometry.sampson import sampson_distances
 from rigkit.matches import Matches
 from rigkit.posetype import PoseType
@@ -28,6 +29,10 @@ __all__ = ["RefinedPose", "cauchy_weights", "estimate_pose", "project_to_type", 
 
 MAX_ITERATIONS = 60
 STEP_TOLERANCE = 1e-10
+SAME_POSE = 5e-3
+"""Two minima nearer than this (rad, and share of the baseline) mislead nobody."""
+SIGNIFICANT_COST = 9.0
+"""A cost (chi square) higher by this rules a pose out: three standard deviations."""
 CAUCHY_SCALE = 2.385
 """In standard deviations: 95 % efficient for Gaussian noise."""
 
@@ -124,22 +129,44 @@ def estimate_pose(
     """
     if str(pose_type) == PoseType.GENERAL:
         level_sigma_rad = None
-    kinds = [str(pose_type)]
-    if level_sigma_rad is not None:
-        kinds.append("general")
-    ends: list[RefinedPose] = []
+    kinds = [str(pose_type)] if level_sigma_rad is None else [str(pose_type), "general"]
+    starts: list[tuple[Rigid3, Matches]] = []
     failure: DegenerateError | InputError | None = None
     for kind in kinds:
         try:
             estimate = fundamental_for(kind).solve(matches, weights)
             start = choose_pose(estimate.E21, matches.rays1, matches.rays2, kind)
-            usable = _with_sigma(matches, estimate.E21, weights)
-            ends.append(refine_pose(usable, start, pose_type, level_sigma_rad, robust=robust))
+            starts.append((start, _with_sigma(matches, estimate.E21, weights)))
         except (DegenerateError, InputError) as error:
+            failure = failure or error
+    flat = one_plane_poses(matches) if "general" in kinds else ()
+    starts += [(pose, _with_sigma(matches, essential_from_pose(pose), weights)) for pose in flat]
+    ends: list[RefinedPose] = []
+    for start, usable in starts:
+        try:
+            ends.append(refine_pose(usable, start, pose_type, level_sigma_rad, robust=robust))
+        except DegenerateError as error:
             failure = failure or error
     if not ends:
         raise failure or DegenerateError("no pose found")
-    return min(ends, key=lambda end: end.cost)
+    best = min(ends, key=lambda end: end.cost)
+    if flat:
+        _refuse_ambiguity(best, ends)
+    return best
+
+
+def _refuse_ambiguity(best: RefinedPose, ends: list[RefinedPose]) -> None:
+    """Raise DegenerateError if another pose explains the points of one plane as well as the best one."""
+    scale = max(best.variance_factor, 1.0)
+    for end in ends:
+        difference = best.cam2_from_cam1 @ end.cam2_from_cam1.inverse()
+        turn, shift = float(rotation_angle(difference.rotation)), float(np.linalg.norm(difference.translation_mm))
+        same = max(turn, shift) < SAME_POSE
+        if not same and end.cost - best.cost < SIGNIFICANT_COST * scale:
+            raise DegenerateError(
+                f"all {len(best.weights)} points lie on one plane and two poses {np.degrees(turn):.1f} deg apart "
+                "explain them equally well; add a board that is not parallel to it, or declare the pose type"
+            )
 
 
 def project_to_type(pose: Rigid3, pose_type: PoseType | str) -> tuple[FloatArray, FloatArray]:

@@ -1,0 +1,186 @@
+"""What every epipolar solver must do, over the registry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.epipolar_scenes import FISHEYE, REGULAR, pair, pose_errors_deg
+from tolerances import EXACT_REL
+
+from rigkit.errors import DegenerateError, InputError
+from rigkit.fundamental.pose import choose_pose, essential_from_pose, hypothesis_poses
+from rigkit.fundamental.registry import SOLVERS, fundamental_for
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3, skew, unit
+from rigkit.matches import Matches
+
+CAMERAS = {"pinhole": REGULAR, "fisheye": FISHEYE}
+KINDS = sorted(SOLVERS)
+SAMPLE = {"general": 12, "planar": 8, "translation": 6, "standard": 5, "forward": 5}
+
+
+def same_up_to_sign(a, b):
+    return min(np.abs(a - b).max(), np.abs(a + b).max())
+
+
+def swapped(m: Matches) -> Matches:
+    """The same pair with the images exchanged."""
+    return Matches(
+        m.pixels2, m.pixels1, m.rays2, m.rays1, m.jacobians2, m.jacobians1, m.sigma2_px, m.sigma1_px,
+        m.board_index, m.grid, m.K2, m.K1, None if m.A21 is None else np.linalg.inv(m.A21), m.sigma_A,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("weights", ["points", "noise", "auto", "equal"])
+def test_exact_data_give_the_exact_geometry(rng, kind, camera, weights):
+    matches, pose, _ = pair(rng, SAMPLE[kind], kind, sigma_A=0.0, camera=camera)
+    estimate = fundamental_for(kind).solve(matches, weights)
+    assert same_up_to_sign(estimate.E21, essential_from_pose(pose)) < EXACT_REL
+    assert np.linalg.norm(estimate.E21) == pytest.approx(1.0)
+    assert np.abs(estimate.residuals_px).max() < 1e-6
+    assert max(pose_errors_deg(choose_pose(estimate.E21, matches.rays1, matches.rays2, kind), pose)) < 1e-6
+    if camera is FISHEYE:
+        assert estimate.F21 is None
+    else:
+        h1, h2 = (np.concatenate([q, np.ones((len(q), 1))], axis=1) for q in (matches.pixels1, matches.pixels2))
+        assert np.linalg.norm(estimate.F21) == pytest.approx(1.0)
+        line = h1 @ estimate.F21.T
+        assert np.abs(np.sum(h2 * line, axis=1) / np.linalg.norm(line[:, :2], axis=1)).max() < 1e-6
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_affinities_obey_the_estimated_geometry(rng, kind):
+    """A^T n2 + n1 = 0 with the normals of F21 in pixels: the rows are those of the literature."""
+    matches, _, _ = pair(rng, SAMPLE[kind], kind, sigma_A=0.0)
+    F21 = fundamental_for(kind).solve(matches).F21
+    h1, h2 = (np.concatenate([q, np.ones((len(q), 1))], axis=1) for q in (matches.pixels1, matches.pixels2))
+    n2, n1 = (h1 @ F21.T)[:, :2], (h2 @ F21)[:, :2]
+    violation = np.einsum("nji,nj->ni", matches.A21, n2) + n1
+    assert np.abs(violation).max() < EXACT_REL * np.abs(n1).max()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_degrees_of_freedom(rng, kind):
+    """The rank of dE over random members of the solver's set is its number of degrees of freedom."""
+    freedom = fundamental_for(kind).degrees_of_freedom
+    if kind == "general":
+        assert freedom == 7  # F; the essential projection has five
+        return
+    _, pose, _ = pair(rng, 3, kind)
+    e0 = essential_from_pose(pose)
+    step, tangents = 1e-6, []
+    y = np.array([0.0, 1.0, 0.0])
+    for _ in range(8):
+        a, b, v = *rng.normal(size=2), rng.normal(size=3)
+        R, t = pose.rotation, unit(pose.translation_mm)
+        if kind == "planar":
+            R, t = exp_so3(step * a * y) @ R, exp_so3(step * b * y) @ t
+        elif kind == "translation":
+            t = t + step * v
+        moved = essential_from_pose(Rigid3(R, t))
+        matches, _, _ = pair(rng, 12, kind, pose=Rigid3(R, 300.0 * unit(t)))
+        # The solver's set contains the moved geometry: it recovers it exactly.
+        found = fundamental_for(kind).solve(matches).E21
+        assert same_up_to_sign(found, moved) < EXACT_REL
+        tangents.append((moved - e0).ravel() / step)
+    rank = np.linalg.matrix_rank(np.array(tangents), tol=1e-3)
+    assert rank == freedom
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_swapping_the_images_transposes(rng, kind):
+    matches, _, _ = pair(rng, 40, kind, noise_px=0.5)
+    forward = fundamental_for(kind).solve(matches).E21
+    back = fundamental_for(kind).solve(swapped(matches)).E21
+    assert same_up_to_sign(forward.T, back) < 1e-6
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_scale_of_the_scene_and_of_the_sigmas_does_not_matter(rng, kind):
+    pose = pair(rng, 3, kind)[1]
+    seed = int(rng.integers(1 << 30))
+    first, _, _ = pair(np.random.default_rng(seed), 20, kind, noise_px=0.5, sigma_A=0.05, pose=pose)
+    from dataclasses import replace
+
+    second = replace(first, sigma1_px=10 * first.sigma1_px, sigma2_px=10 * first.sigma2_px, sigma_A=10 * first.sigma_A)
+    a, b = (fundamental_for(kind).solve(m).E21 for m in (first, second))
+    assert same_up_to_sign(a, b) < 1e-9
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_identical_images_have_no_baseline(rng, kind):
+    matches, _, _ = pair(rng, 20, kind, noise_px=0.1)
+    from dataclasses import replace
+
+    same = replace(matches, pixels2=matches.pixels1, rays2=matches.rays1, jacobians2=matches.jacobians1)
+    with pytest.raises(DegenerateError, match=r"no baseline|do not determine|not determined"):
+        fundamental_for(kind).solve(same)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("noise_px", [0.0, 0.3])
+def test_pure_rotation_is_refused(rng, kind, noise_px):
+    matches, _, _ = pair(rng, 40, "general", noise_px=0.0)
+    R = exp_so3(np.array([0.02, 0.1, -0.05]))
+    target = REGULAR.project(matches.rays1 @ R.T)[0] + rng.normal(size=(40, 2)) * noise_px
+    sigma = np.full(40, max(noise_px, 0.01))
+    turned = Matches.from_cameras(REGULAR, REGULAR, matches.pixels1, target, sigma1_px=sigma, sigma2_px=sigma)
+    with pytest.raises(DegenerateError, match=r"no baseline|do not determine|not determined"):
+        fundamental_for(kind).solve(turned)
+
+
+@pytest.mark.parametrize(("kind", "count"), [("general", 7), ("planar", 2), ("translation", 1)])
+def test_too_few_matches_are_refused_with_the_number(rng, kind, count):
+    matches, _, _ = pair(rng, count, kind)
+    with pytest.raises(InputError, match="are needed"):
+        fundamental_for(kind).solve(matches, "points")
+
+
+def test_affine_correspondences_need_fewer(rng):
+    for kind, count in (("general", 3), ("planar", 1), ("translation", 1)):
+        matches, pose, _ = pair(rng, count, kind, sigma_A=0.0)
+        found = fundamental_for(kind).solve(matches).E21
+        assert same_up_to_sign(found, essential_from_pose(pose)) < 1e-6, kind
+
+
+def test_inputs_are_left_alone_and_affinities_without_sigma_ignored(rng):
+    from dataclasses import replace
+
+    matches, _, _ = pair(rng, 20, noise_px=0.5, sigma_A=0.05)
+    wild = replace(matches, A21=np.full_like(matches.A21, 7.0), sigma_A=None)
+    without = fundamental_for("general").solve(replace(matches, A21=None, sigma_A=None)).E21
+    assert np.array_equal(fundamental_for("general").solve(wild).E21, without)
+    assert np.array_equal(fundamental_for("general").solve(matches, "points").E21, without)
+    some = np.array(matches.A21)
+    some[::2] = np.nan
+    assert np.isfinite(fundamental_for("general").solve(replace(matches, A21=some)).E21).all()
+
+
+def test_planar_solver_on_standard_and_forward(rng):
+    for kind in ("standard", "forward"):
+        matches, pose, _ = pair(rng, 20, kind)
+        solver = fundamental_for(kind, motion="planar")
+        assert same_up_to_sign(solver.solve(matches).E21, essential_from_pose(pose)) < EXACT_REL
+
+
+def test_unknown_names_are_refused():
+    with pytest.raises(InputError, match="known: forward, general"):
+        fundamental_for("circular")
+    with pytest.raises(InputError, match="pose_type_evidence"):
+        fundamental_for("auto")
+
+
+def test_planar_poses_are_two_and_planar(rng):
+    _, pose, _ = pair(rng, 3, "planar")
+    E = essential_from_pose(pose)
+    assert len(hypothesis_poses(E)) == 4
+    planar = hypothesis_poses(E, "planar")
+    assert len(planar) == 2
+    for candidate in planar:
+        assert np.abs(candidate.rotation[:, 1] - [0, 1, 0]).max() < 1e-9
+        assert (
+            same_up_to_sign(unit(skew(candidate.translation_mm).ravel()), unit(skew(pose.translation_mm).ravel()))
+            < 1e-9
+        )
