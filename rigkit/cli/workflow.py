@@ -178,7 +178,7 @@ def reconstruct_with(matched: MatchedPair, pair: Pair, method: str, image1: Any 
 
 
 def reconstruct_other_chain(matched: MatchedPair, pair: Pair) -> Reconstruction | None:
-    """Reconstruct the same corners in the other pixels (rectified for raw, raw for rectified); None if they don't fit."""
+    """Reconstruct the same corners in the other pixels (raw or rectified); None where they do not fit."""
     identity = matched.identity
     other = "rectified" if matched.chain == "raw" else "raw"
     try:

@@ -1,0 +1,177 @@
+"""Accuracy on lab-a against its exact truth: corners, calibration, pose, baseline, planes and normals, as Markdown.
+
+The truth (truth.json of each capture) is not part of the repository:
+
+    python scripts/accuracy.py FOLDER     # a folder with captures/<pair>/truth.json and calibration/<lens>/truth.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rigkit.affine.registry import AFFINE_METHODS
+from rigkit.cameras.base import Camera
+from rigkit.cli.console import progress_on_stderr
+from rigkit.cli.workflow import load_cameras, match_images, over_pairs, reconstruct_with
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import angle_between, nearest_rotation, rotation_angle
+from rigkit.io.manifest import Pair, load_dataset
+from rigkit.pairing import MatchedPair
+from rigkit.validation.planes import fit_plane, normal_errors
+
+ROOT = Path(__file__).resolve().parents[1]
+
+NEAR_PX = 3.0
+"""A corner further than this from every true corner is no corner."""
+
+
+def nearest_true(pixels: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the index of the nearest true corner and the error vector of each pixel (N, 2)."""
+    index = np.linalg.norm(pixels[:, None] - truth[None], axis=2).argmin(axis=1)
+    return index, pixels - truth[index]
+
+
+def corner_figures(matched: MatchedPair, truth: Mapping[str, Any]) -> dict[str, Any]:
+    """Corner errors, and whether every corner has the same physical partner and board in both images."""
+    names = sorted(truth["view1"])
+    true = [np.concatenate([np.array(truth[view][n]["uv_px"]) for n in names]) for view in ("view1", "view2")]
+    of_board = np.repeat(np.arange(len(names)), [len(truth["view1"][n]["uv_px"]) for n in names])
+    first, error1 = nearest_true(matched.captured.pixels1, true[0])
+    second, error2 = nearest_true(matched.captured.pixels2, true[1])
+    errors = np.concatenate([error1, error2])
+    # One board of ours is one true board.
+    boards = {(int(a), int(b)) for a, b in zip(matched.captured.board_index, of_board[first], strict=True)}
+    return {
+        "corners": len(first),
+        "matched": bool((first == second).all() and len(set(first)) == len(first) and len(boards) == len(names)),
+        "corner_rms_px": float(np.sqrt((errors**2).sum(axis=1).mean())),
+        "corner_max_px": float(np.linalg.norm(errors, axis=1).max()),
+        "sigma_ratio": float(
+            np.sqrt(
+                np.mean(
+                    (errors / np.concatenate([matched.captured.sigma1_px, matched.captured.sigma2_px])[:, None]) ** 2
+                )
+            )
+        ),
+    }
+
+
+def measure_pair(job: tuple[Pair, Camera, Camera, Path, str]) -> dict[str, Any]:
+    """All figures of one pair."""
+    pair, camera1, camera2, folder, chain = job
+    truth = json.loads((folder / "truth.json").read_text())
+    true_pose = Rigid3.from_matrix(truth["cam2_from_cam1"])
+    matched, _, _ = match_images(pair, camera1, camera2, chain)
+    out: dict[str, Any] = {"pair": pair.pair_id, **corner_figures(matched, truth), "methods": {}}
+    for method in AFFINE_METHODS:
+        r = reconstruct_with(matched, pair, method)
+        planes = [fit_plane(r.cloud.points_mm[r.cloud.on_board(name)]) for name in r.cloud.board_ids]
+        angles = [np.rad2deg(angle_between(a.normal, b.normal)) for a, b in combinations(planes, 2)]
+        normals = [
+            normal_errors(r.cloud.normals[r.cloud.on_board(n)], p)
+            for n, p in zip(r.cloud.board_ids, planes, strict=True)
+        ]
+        out["methods"][method] = {
+            "orthogonality_deg": [float(abs(a - 90.0)) for a in angles],
+            "mean_normal_deg": [n.mean_deg for n in normals],
+            "baseline_percent": float(100.0 * (r.baseline_mm / truth["baseline_mm"] - 1.0)),
+            "rotation_deg": float(np.rad2deg(rotation_angle(r.cam2_from_cam1.rotation @ true_pose.rotation.T))),
+            "direction_deg": float(
+                np.rad2deg(angle_between(r.cam2_from_cam1.translation_mm, true_pose.translation_mm))
+            ),
+            "baseline_mm": r.baseline_mm,
+            "baseline_sigma_mm": r.baseline_sigma_mm,
+            "true_baseline_mm": truth["baseline_mm"],
+        }
+    return out
+
+
+def true_rays(lens: Mapping[str, Any], pixels: np.ndarray) -> np.ndarray:
+    """Rays of the true lens: theta = k1 r + k2 r^2 + k3 r^3 + k4 r^4 with r in mm on the sensor."""
+    offset = (pixels - np.array(lens["centre_px"])) * lens["pixel_mm"]
+    r = np.linalg.norm(offset, axis=1)
+    theta = sum(k * r ** (i + 1) for i, k in enumerate(lens["k"]))
+    ring = offset / np.maximum(r, 1e-12)[:, None]
+    return np.concatenate([np.sin(theta)[:, None] * ring, np.cos(theta)[:, None]], axis=1)
+
+
+def calibration_difference_px(camera: Camera, truth: Mapping[str, Any]) -> tuple[float, float]:
+    """RMS and largest difference to the true lens, px, where the boards were, after the best rotation."""
+    seen = np.concatenate([np.array(view["uv_px"]) for view in truth["views"]])
+    width, height = camera.size_px
+    step = 16
+    u, v = np.meshgrid(np.arange(step / 2, width, step), np.arange(step / 2, height, step))
+    grid = np.stack([u.ravel(), v.ravel()], axis=1)
+    near = np.array([np.linalg.norm(seen - g, axis=1).min() < 2.0 * step for g in grid])
+    pixels = grid[near]
+    rays = true_rays(truth["lens_truth"], pixels)
+    ours, _ = camera.unproject(pixels)
+    rotation = nearest_rotation(ours.T @ rays)
+    projected, valid = camera.project(rays @ rotation.T)
+    difference = np.linalg.norm(projected - pixels, axis=1)[valid]
+    return float(np.sqrt(np.mean(difference**2))), float(difference.max())
+
+
+def measure(folder: Path, *, pairs: Sequence[str] = (), chain: str = "raw", jobs: int | None = None) -> dict[str, Any]:
+    """Measure all pairs and both calibrations of datasets/lab-a against the truth under `folder`."""
+    progress = progress_on_stderr()
+    dataset = load_dataset(ROOT / "datasets" / "lab-a").select(pairs)
+    cameras = load_cameras(dataset, recalibrate=False, progress=progress)
+    work = [
+        (p, cameras[p.camera1.camera_id], cameras[p.camera2.camera_id], folder / "captures" / p.pair_id, chain)
+        for p in dataset.pairs
+    ]
+    results = list(over_pairs(measure_pair, work, jobs, "pairs against truth", progress))
+    lenses = {}
+    for name, camera in cameras.items():
+        truth = json.loads((folder / "calibration" / name / "truth.json").read_text())
+        lenses[name] = calibration_difference_px(camera, truth)
+    return {"pairs": results, "calibration_px": lenses}
+
+
+def best_method(methods: Mapping[str, Mapping[str, Any]]) -> str:
+    """The estimator with the smallest mean normal error over the planes."""
+    return min(methods, key=lambda m: float(np.mean(methods[m]["mean_normal_deg"])))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--chain", choices=("raw", "rectified"), default="raw")
+    args = parser.parse_args()
+    result = measure(args.folder, chain=args.chain)
+    print(
+        "| pair | corners | corner rms, px | actual / predicted sigma | orthogonality, deg | normals, deg | baseline |"
+    )
+    print("| :-- | --: | --: | --: | :-- | :-- | --: |")
+    for pair in result["pairs"]:
+        method = best_method(pair["methods"])
+        m = pair["methods"][method]
+        orthogonality = " / ".join(f"{v:.3f}" for v in m["orthogonality_deg"])
+        normals = " / ".join(f"{v:.3f}" for v in m["mean_normal_deg"])
+        print(
+            f"| {pair['pair']} | {pair['corners']}{'' if pair['matched'] else ' WRONG'} | {pair['corner_rms_px']:.4f} "
+            f"| {pair['sigma_ratio']:.2f} | {orthogonality} | {normals} ({method}) | {m['baseline_percent']:+.3f} % |"
+        )
+    print("\n| pair | rotation error, deg | direction error, deg | baseline, mm | true, mm |")
+    print("| :-- | --: | --: | --: | --: |")
+    for pair in result["pairs"]:
+        m = pair["methods"][best_method(pair["methods"])]
+        print(
+            f"| {pair['pair']} | {m['rotation_deg']:.4f} | {m['direction_deg']:.4f} | {m['baseline_mm']:.3f} ± "
+            f"{m['baseline_sigma_mm']:.3f} | {m['true_baseline_mm']:.3f} |"
+        )
+    print()
+    for lens, (rms, largest) in result["calibration_px"].items():
+        print(f"calibration of {lens}: {rms:.4f} px rms, {largest:.4f} px at most, from the true lens")
+
+
+if __name__ == "__main__":
+    main()

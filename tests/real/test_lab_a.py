@@ -1,0 +1,53 @@
+"""lab-a from its images, with cameras calibrated from its images, against the exact truth of the captures."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.data import REPOSITORY, shared_data
+
+CORNER_RMS_PX = 0.05
+"""2-D; 0.03 is what the images' noise allows, the rest is JPEG."""
+ORTHOGONALITY_DEG = {"general": 0.12, "planar": 0.12, "standard": 0.12, "forward": 0.9}
+MEAN_NORMAL_DEG = {"general": 0.4, "planar": 0.4, "standard": 0.4, "forward": 3.5}
+"""Forward motion has an effective baseline of the distance from the focus of expansion: the plane ahead is lost first."""
+BASELINE_PERCENT = 0.15
+ROTATION_DEG = 0.015
+
+PAIRS = [f"{lens}-{pose}" for lens in ("regular", "fisheye") for pose in ORTHOGONALITY_DEG]
+
+
+def load_accuracy() -> Any:
+    path = REPOSITORY / "scripts" / "accuracy.py"
+    spec = importlib.util.spec_from_file_location("accuracy", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module", params=["raw", "rectified"])
+def measured(request: pytest.FixtureRequest) -> dict[str, Any]:
+    folder: Path = shared_data("lab-a")
+    found = load_accuracy().measure(folder, chain=request.param, jobs=1)
+    return {pair["pair"]: pair for pair in found["pairs"]}
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("pair_id", PAIRS)
+def test_pair_against_truth(measured: dict[str, Any], pair_id: str) -> None:
+    pair = measured[pair_id]
+    pose = pair_id.split("-")[1]
+    assert pair["corners"] == 144
+    assert pair["matched"]
+    assert pair["corner_rms_px"] <= CORNER_RMS_PX
+    assert set(pair["methods"]) == {"F2UDIR", "F3UDIR", "DET3UDIR", "2SDIR", "3SDIR"}
+    best = pair["methods"][load_accuracy().best_method(pair["methods"])]
+    assert max(best["orthogonality_deg"]) <= ORTHOGONALITY_DEG[pose]
+    assert max(best["mean_normal_deg"]) <= MEAN_NORMAL_DEG[pose]
+    assert abs(best["baseline_percent"]) <= BASELINE_PERCENT
+    assert best["rotation_deg"] <= ROTATION_DEG
