@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from rigkit.calibration.poses import find_poses, refine_poses
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.solver import State, evaluate, solve
 from rigkit.cameras.base import Camera
+from rigkit.errors import DegenerateError
 
 __all__ = ["OUTLIER_SIGMAS", "Fit", "fit_kept", "fit_model", "heldout_rms", "inliers", "rms", "robust_sigma"]
 
@@ -24,8 +25,10 @@ RAYLEIGH_MEDIAN = 1.17741
 CAUCHY_SIGMAS = 2.5
 SIGMA_FLOOR_PX = 1e-4
 """Exact corners have no scatter to judge outliers by: below this rounding would make them."""
-SECOND_START = 1.3
-"""Another start is tried when the first ends with a robust sigma this many times the one its views reach singly."""
+GOOD_ENOUGH = 1e-3
+"""A scatter of this part of the image's width ends the search for a better start: 1.6 px of 1600."""
+BAD_VIEW = 2.0
+"""A view with this many times the scatter of all gets its pose found anew: perhaps its tilt has the wrong sign."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -68,17 +71,20 @@ def fit_model(observations: Observations, size_px: tuple[int, int], model: type[
     Raises DegenerateError where no start explains the views.
     """
     best: tuple[float, State] | None = None
-    starts = initialise(observations, size_px, model, order)
-    error = [start_error(s, observations) for s in starts]
-    for start, e in zip(starts, error, strict=True):
+    for start in initialise(observations, size_px, model, order):
+        if not np.isfinite(start_error(start, observations)):
+            continue
         state = _robust(observations, start)
         sigma = robust_sigma(state, observations)
         if best is None or sigma < best[0]:
             best = (sigma, state)
-        # A start that the solver took to a much smaller error found its valley: no need for the next.
-        if sigma * SECOND_START < e or sigma < 0.5:
+        if sigma < GOOD_ENOUGH * size_px[0]:
             break
-    assert best is not None
+    if best is None:
+        raise DegenerateError(
+            f"calibration: no {model.model} camera explains the views even roughly; take views in which the board is "
+            "tilted, and check the board's size"
+        )
     sigma, state = best
     kept = inliers(state, observations, sigma)
     return fit_kept(observations, state, kept, settle=True)
@@ -90,15 +96,17 @@ def _robust(observations: Observations, state: State) -> State:
     state, _ = solve(observations, state, loss_px=loss, max_iterations=15, cost_tolerance=1e-3)
     norm = evaluate(state, observations).norm(observations)
     sigma = robust_sigma(state, observations)
+    if not float(np.nanmax(norm * observations.weight)) > OUTLIER_SIGMAS * sigma:
+        return state  # nothing for a robust loss to do
     with np.errstate(invalid="ignore"):
         of_view = np.nanmedian(norm, axis=1) / RAYLEIGH_MEDIAN
-    bad = np.flatnonzero(of_view > 2.0 * sigma)
+    bad = np.flatnonzero(of_view > BAD_VIEW * sigma)
     if bad.size:
         part = observations.subset(bad)
         found = find_poses(part, state.subset(bad), part.weight, CAUCHY_SIGMAS * sigma)
         rotation, translation = state.rotation.copy(), state.translation_mm.copy()
         rotation[bad], translation[bad] = found.rotation, found.translation_mm
-        state = State(state.camera, rotation, translation, state.shape, state.unknowns)
+        state = replace(state, rotation=rotation, translation_mm=translation)
     state, _ = solve(observations, state, loss_px=CAUCHY_SIGMAS * sigma, max_iterations=30, cost_tolerance=1e-5)
     return state
 

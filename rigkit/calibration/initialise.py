@@ -22,7 +22,7 @@ from rigkit.calibration.observations import Observations
 from rigkit.calibration.radial_alignment import Alignment, align, distortion_centre
 from rigkit.calibration.solver import State, evaluate
 from rigkit.cameras.base import Camera, image_center
-from rigkit.errors import DegenerateError, InputError
+from rigkit.errors import InputError
 from rigkit.geometry.rotation import nearest_rotation
 
 __all__ = ["initialise", "start_error"]
@@ -41,27 +41,17 @@ SAMPLES = 96
 
 def initialise(
     observations: Observations, size_px: tuple[int, int], model: type[Camera], order: int | None
-) -> list[State]:
-    """Return start states for `model`, best first.
-
-    Raises DegenerateError where no start projects the corners at all.
-    """
+) -> Iterator[State]:
+    """Yield start states for `model`: around the middle of the image, then around the centre of distortion that the
+    views give (better for a lens far off the middle, useless for one without distortion). None where no camera of the
+    model comes near."""
     weight = observations.weight
     board = observations.table()[observations.corner][..., :2]
     middle = image_center(size_px)
-    centres = [middle]
+    yield from _starts(observations, board, middle, size_px, model, order)
     epipole = distortion_centre(observations.pixels, board, weight, middle)
     if (np.abs(epipole - middle) < 0.5 * np.array(size_px)).all():
-        centres.append(epipole)
-    states = [state for centre in centres for state in _starts(observations, board, centre, size_px, model, order)]
-    ranked = sorted(((start_error(s, observations), i) for i, s in enumerate(states)))
-    ranked = [(error, i) for error, i in ranked if np.isfinite(error)]
-    if not ranked:
-        raise DegenerateError(
-            f"calibration: no {model.model} camera explains the views even roughly; take views in which the board is "
-            "tilted, and check the board's size"
-        )
-    return [states[i] for _, i in ranked]
+        yield from _starts(observations, board, epipole, size_px, model, order)
 
 
 def start_error(state: State, observations: Observations) -> float:
@@ -150,9 +140,9 @@ def _curve(
     # d rho / d z of the lens turns residuals of z into residuals of rho; at first for a lens of 45 degrees.
     slope = safe**2 / (np.maximum(s, 1e-9) * (1.0 + safe**2))
     weight = np.where(used, alignment.weight * slope, 0.0)
-    a, sign = np.zeros(len(exponents)), np.ones(len(rho))
+    a, sign = _joint(design, depth, weight, None)
     for _ in range(ROUNDS):
-        a, sign = _joint(design, depth, weight)
+        a, sign = _joint(design, depth, weight, sign)
         z = design @ a
         mean = (weight**2 * (z - sign[:, None] * depth)).sum(axis=1) / np.maximum((weight**2).sum(axis=1), 1e-300)
         slope = s / np.maximum(s**2 + z**2, 1e-300)
@@ -166,8 +156,13 @@ def _curve(
     return theta, sign
 
 
-def _joint(design: FloatArray, depth: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the polynomial a and the signs (V,) that minimise sum weight^2 (design a - t3_v - sign_v depth)^2."""
+def _joint(
+    design: FloatArray, depth: FloatArray, weight: FloatArray, sign: FloatArray | None
+) -> tuple[FloatArray, FloatArray]:
+    """Return the polynomial a and the signs (V,) that minimise sum weight^2 (design a - t3_v - sign_v depth)^2.
+
+    `sign` is where the search for the signs starts; None: from scratch.
+    """
     total = np.maximum((weight**2).sum(axis=1), 1e-300)
     centred = (design - ((weight**2)[..., None] * design).sum(axis=1)[:, None] / total[:, None, None]) * weight[
         ..., None
@@ -177,9 +172,8 @@ def _joint(design: FloatArray, depth: FloatArray, weight: FloatArray) -> tuple[F
     centred = centred / scale
     normal = np.einsum("vci,vcj->ij", centred, centred) + 1e-12 * np.eye(len(scale))
     cross = np.einsum("vci,vc->iv", centred, right)
-    explained = cross.T @ np.linalg.solve(normal, cross)
-    open_part = np.diag((right**2).sum(axis=1)) - explained
-    sign = _signs(open_part)
+    if sign is None:
+        sign = _signs(np.linalg.solve(np.linalg.cholesky(normal), cross), (right**2).sum(axis=1))
     a = np.linalg.solve(normal, cross @ sign)
     for _ in range(10):
         flipped = np.where(cross.T @ a < 0.0, -1.0, 1.0)
@@ -192,12 +186,13 @@ def _joint(design: FloatArray, depth: FloatArray, weight: FloatArray) -> tuple[F
     return a / scale, sign
 
 
-def _signs(quadratic: FloatArray) -> FloatArray:
-    """Return the signs s that make s^T Q s small: all patterns for few views, the lowest eigenvector for many."""
-    views = len(quadratic)
+def _signs(explained: FloatArray, size2: FloatArray) -> FloatArray:
+    """Return the signs s that make s^T (diag(size2) - E^T E) s small, E (4, V) = `explained`: all patterns for few
+    views; for many the lowest eigenvector of the form scaled to unit diagonal, which E E^T gives in four dimensions."""
+    views = len(size2)
     if views <= ENUMERATE:
         patterns = np.array([(1.0, *p) for p in itertools.product((1.0, -1.0), repeat=views - 1)])
-        return np.asarray(patterns[np.einsum("pi,ij,pj->p", patterns, quadratic, patterns).argmin()])
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(quadratic), 1e-300))
-    vector = np.linalg.eigh(quadratic * scale[:, None] * scale)[1][:, 0]
-    return np.where(vector < 0.0, -1.0, 1.0)
+        return np.asarray(patterns[((patterns @ explained.T) ** 2).sum(axis=1).argmax()])
+    scaled = explained / np.sqrt(np.maximum(size2, 1e-300))
+    vector = np.linalg.eigh(scaled @ scaled.T)[1][:, -1]
+    return np.where(vector @ scaled < 0.0, -1.0, 1.0)

@@ -123,9 +123,10 @@ def _residual(h: FloatArray, offset: FloatArray, local: FloatArray) -> FloatArra
 
 def _sigma(residual: FloatArray, used: np.ndarray) -> FloatArray:
     """Return a robust standard deviation of each view's residuals (V,), never zero."""
-    with np.errstate(invalid="ignore"):
-        median = np.nanmedian(np.where(used, residual, np.nan), axis=1) if used.any() else np.zeros(len(used))
-    return np.asarray(np.maximum(1.4826 * np.nan_to_num(median), 1e-6))
+    ordered = np.sort(np.where(used, residual, np.inf), axis=1)
+    middle = np.maximum(used.sum(axis=1) - 1, 0) // 2
+    median = ordered[np.arange(len(used)), middle]
+    return np.maximum(1.4826 * np.where(np.isfinite(median), median, 0.0), 1e-6)
 
 
 def _best_subset(offset: FloatArray, local: FloatArray, used: np.ndarray) -> FloatArray:

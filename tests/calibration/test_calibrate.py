@@ -37,7 +37,7 @@ MODEL = {"reg": "brown", "wide": "kannala_brandt", "fish": "kannala_brandt", "fi
 def test_start_needs_no_guess(name: str, count: int, rng: np.random.Generator) -> None:
     views, _, _ = random_views(lens(name), count, rng, reach_deg=REACH_DEG[name])
     observations = Observations.from_views(views)
-    best = initialise(observations, SIZE, MODELS[MODEL[name]], None)[0]
+    best = next(initialise(observations, SIZE, MODELS[MODEL[name]], None))
     assert start_error(best, observations) < START_PX
 
 
