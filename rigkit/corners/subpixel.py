@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray
-from rigkit.corners.edge_model import BLUR_RANGE, EdgeFit, EdgeStart, fit_edges
+from rigkit.corners.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
+from rigkit.corners.edge_model import Geometry
 from rigkit.corners.lattice import Lattice
 from rigkit.corners.local_fit import fit_cells
 from rigkit.corners.response import FloatImage
@@ -22,6 +23,11 @@ from rigkit.corners.response import FloatImage
 __all__ = ["RefinedLattice", "refine"]
 
 FIRST_BLUR = 1.0
+"""s that the first pass starts from, px."""
+
+FIRST_PASS = (9.0, 4)
+LAST_PASS = (18.0, 8)
+"""Radius in px and Gauss-Newton steps: the first pass only has to bring the lattice to a few hundredths of a pixel."""
 
 FEWEST_NEIGHBOURS = 4
 """An empty cell is tried if so many of its eight neighbours are known."""
@@ -81,9 +87,9 @@ def refine(image: FloatImage, lattices: Sequence[Lattice]) -> list[RefinedLattic
     if not lattices:
         return []
     first = [np.full(item.known.shape, FIRST_BLUR) for item in lattices]
-    refined = _pass(image, lattices, first)
+    refined = _pass(image, lattices, first, *FIRST_PASS)
     current = [_with_holes(item) for item in refined]
-    second = _pass(image, [item[0] for item in current], [_typical_blur(item) for item in refined])
+    second = _pass(image, [item[0] for item in current], [_typical_blur(item) for item in refined], *LAST_PASS)
     return [_checked(_confirmed(item, start, holes)) for item, (start, holes) in zip(second, current, strict=True)]
 
 
@@ -94,15 +100,25 @@ def _typical_blur(item: RefinedLattice) -> FloatArray:
     return blur
 
 
-def _pass(image: FloatImage, lattices: Sequence[Lattice], blurs: Sequence[FloatArray]) -> list[RefinedLattice]:
+def _pass(
+    image: FloatImage,
+    lattices: Sequence[Lattice],
+    blurs: Sequence[FloatArray],
+    radius_px: float,
+    iterations: int,
+) -> list[RefinedLattice]:
     """Fit all corners of all lattices in one batch."""
-    starts = []
-    for item, blur in zip(lattices, blurs, strict=True):
-        known = item.known
-        shape = fit_cells(item.pixels, known)
-        sides = np.stack([shape.along_column, shape.along_row], axis=1)
-        starts.append((item.pixels[known], sides, shape.curvature(), shape.gaps(), item.signs()[known], blur[known]))
-    fit = fit_edges(image, EdgeStart(*(np.concatenate(part) for part in zip(*starts, strict=True))))
+    shapes = [fit_cells(item.pixels, item.known) for item in lattices]
+    geometry = Geometry(
+        np.concatenate([np.stack([shape.along_column, shape.along_row], axis=1) for shape in shapes]),
+        np.concatenate([shape.curvature() for shape in shapes]),
+        np.concatenate([shape.gaps() for shape in shapes]),
+    )
+    pixels, sign, blur = (
+        np.concatenate([values[item.known] for item, values in zip(lattices, part, strict=True)])
+        for part in ([item.pixels for item in lattices], [item.signs() for item in lattices], blurs)
+    )
+    fit = fit_edges(image, pixels, geometry, sign, blur, radius_px=radius_px, iterations=iterations)
     ends = np.cumsum([item.count for item in lattices])
     return [_filled(item, fit, slice(end - item.count, end)) for item, end in zip(lattices, ends, strict=True)]
 
@@ -207,7 +223,7 @@ def _scatter(item: RefinedLattice) -> float:
 
 
 def _roughness(values: FloatArray, sigma: FloatArray) -> float:
-    """Return the typical difference of order DIFFERENCE of `values` (R, C, 2) over the expected one; NaN for too few."""
+    """Return the typical difference of order DIFFERENCE of `values` (R, C, 2), over the expected one; NaN if few."""
     factors = np.array([float(comb(DIFFERENCE, k)) for k in range(DIFFERENCE + 1)])
     ratios = [np.zeros(0)]
     for axis in (0, 1):

@@ -1,0 +1,187 @@
+"""Chessboard corners by maximum likelihood: Gauss-Newton on the edge model, all corners of an image at once.
+
+For noise that is independent and equal in all pixels, least squares is maximum likelihood and reaches the Cramer-Rao
+bound; the same normal equations predict the standard deviation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.arrays import BoolArray, FloatArray
+from rigkit.corners.edge_model import (
+    GX,
+    GY,
+    PARAMETERS,
+    T1,
+    T2,
+    A,
+    B,
+    Geometry,
+    S,
+    Window,
+    X,
+    Y,
+    collect,
+    linearise,
+    pattern_of,
+)
+from rigkit.corners.response import FloatImage
+
+__all__ = ["BLUR_RANGE", "EdgeFit", "fit_edges"]
+
+BLUR_RANGE = (0.28, 5.0)
+"""s of a perfectly sharp image is the pixel's own 0.29; above 5 px there is no edge to speak of."""
+
+ANGLE_SIGMA_RAD = 0.1
+LOG_BLUR_SIGMA = 0.7
+LIGHT_SIGMA = 0.3
+"""How well the lattice's angles, the start's log s and an even light (g = 0, per window) are known beforehand. These
+matter only where squares are so small that the pixels cannot tell."""
+
+CONVERGED_PX = 1e-3
+"""A Gauss-Newton step shorter than this leaves the next one below 1e-5 px."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class EdgeFit:
+    """The fitted corners.
+
+    Attributes
+    ----------
+    pixels : (N, 2)
+    sigma_px : (N,) predicted standard deviation per axis, from the residuals and the curvature of the likelihood.
+    blur : (N,) s, px.
+    contrast : (N,) 2 b, negative if bright and dark are the other way round than expected.
+    residual : (N,) root mean square, grey levels.
+    valid : (N,) the fit converged near its start, with pixels on all sides.
+    """
+
+    pixels: FloatArray
+    sigma_px: FloatArray
+    blur: FloatArray
+    contrast: FloatArray
+    residual: FloatArray
+    valid: BoolArray
+
+
+def fit_edges(
+    image: FloatImage,
+    pixels: FloatArray,
+    geometry: Geometry,
+    sign: FloatArray,
+    blur: FloatArray,
+    *,
+    radius_px: float,
+    iterations: int,
+) -> EdgeFit:
+    """Fit the edge model to `image` (grey float32) around the corners that are near `pixels` (N, 2).
+
+    Parameters
+    ----------
+    sign : (N,) +1 where brightness grows with the angle across line 1.
+    blur : (N,) expected s.
+    radius_px : pixels further from the corner are not used.
+    iterations : Gauss-Newton steps at most.
+    """
+    window = collect(image, pixels, geometry, blur, radius_px)
+    prior_mean, prior = _prior(geometry, blur)
+    values = prior_mean.copy()
+    values[:, [X, Y]] = pixels - window.centre
+    _brightness(values, window, geometry, sign)
+    used = window.weight.sum(axis=1, dtype=np.float64)
+    free = np.maximum(used - PARAMETERS, 1.0)
+    variance = np.full(len(pixels), np.inf)
+    normal = np.zeros((len(pixels), PARAMETERS, PARAMETERS))
+    active = np.ones(len(pixels), bool)
+    diagonal = range(PARAMETERS)
+    for _ in range(iterations):
+        every = bool(active.all())
+        rows = linearise(
+            values[active], window if every else window.of(active), geometry if every else geometry.of(active)
+        )
+        products = (rows @ np.swapaxes(rows, 1, 2)).astype(np.float64)
+        variance[active] = np.maximum(products[:, -1, -1] / free[active], 1e-6)
+        pull = prior[active] * variance[active, None]
+        hessian = products[:, :-1, :-1]
+        hessian[:, diagonal, diagonal] += pull + 1e-9
+        gradient = products[:, :-1, -1] + pull * (prior_mean - values)[active]
+        step = np.linalg.solve(hessian, gradient[..., None])[..., 0]
+        normal[active] = hessian
+        values[active] += _limited(step, values[active])
+        active[np.flatnonzero(active)[np.abs(step[:, [X, Y]]).max(axis=1) <= CONVERGED_PX]] = False
+        if not active.any():
+            break
+    return _result(values, variance, normal, window, pixels, geometry, sign)
+
+
+def _prior(geometry: Geometry, blur: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the parameters as known beforehand (N, 9) and one over their variances, 0 for unknown."""
+    mean = np.zeros((len(blur), PARAMETERS))
+    mean[:, [T1, T2]] = np.arctan2(geometry.sides[..., 1], geometry.sides[..., 0])
+    mean[:, S] = blur
+    weight = np.zeros_like(mean)
+    weight[:, [T1, T2]] = ANGLE_SIGMA_RAD**-2
+    weight[:, S] = (LOG_BLUR_SIGMA * blur) ** -2
+    weight[:, [GX, GY]] = LIGHT_SIGMA**-2
+    return mean, weight
+
+
+def _brightness(values: FloatArray, window: Window, geometry: Geometry, sign: FloatArray) -> None:
+    """Set a and b of `values` by linear least squares with everything else as it stands."""
+    pattern = pattern_of(values, window, geometry) * sign[:, None].astype(np.float32)
+    total = np.maximum(window.weight.sum(axis=1, dtype=np.float64), 1.0)
+    mean_p = (window.weight * pattern).sum(axis=1, dtype=np.float64) / total
+    mean_i = (window.weight * window.value).sum(axis=1, dtype=np.float64) / total
+    spread = (pattern - mean_p[:, None].astype(np.float32)) * window.weight
+    slope = (spread * window.value).sum(axis=1) / np.maximum((spread**2).sum(axis=1), 1e-9)
+    values[:, B] = slope * sign
+    values[:, A] = mean_i - slope * mean_p
+
+
+def _limited(step: FloatArray, values: FloatArray) -> FloatArray:
+    """Return the step, cut where it would leave the region in which the model is nearly linear."""
+    limit = np.full(step.shape, np.inf)
+    limit[:, [X, Y]] = 1.0
+    limit[:, [T1, T2]] = 0.2
+    limit[:, S] = 0.3 * values[:, S]
+    limit[:, [GX, GY]] = 0.3
+    out = np.clip(step, -limit, limit)
+    out[:, S] = np.clip(values[:, S] + out[:, S], *BLUR_RANGE) - values[:, S]
+    return out
+
+
+def _surrounded(pixels: FloatArray, window: Window) -> BoolArray:
+    """Return whether there are pixels on all sides of the corner: it is not cut off by the frame."""
+    off = (window.centre - pixels).astype(np.float32)
+    u, v = (window.u + off[:, :1]) * window.weight, (window.v + off[:, 1:]) * window.weight
+    surrounded: BoolArray = np.all([(part > 0.5).sum(axis=1) >= 2 for part in (u, -u, v, -v)], axis=0)
+    return surrounded
+
+
+def _result(
+    values: FloatArray,
+    variance: FloatArray,
+    normal: FloatArray,
+    window: Window,
+    start: FloatArray,
+    geometry: Geometry,
+    sign: FloatArray,
+) -> EdgeFit:
+    covariance = np.linalg.inv(normal) * variance[:, None, None]
+    pixels = window.centre + values[:, [X, Y]]
+    spread = 0.5 * (covariance[:, X, X] + covariance[:, Y, Y])
+    moved = np.linalg.norm(pixels - start, axis=1)
+    longest = np.linalg.norm(geometry.sides, axis=2).max(axis=1)
+    valid = (moved < np.maximum(1.5, 0.2 * longest)) & (spread > 0.0) & np.isfinite(spread)
+    valid &= (window.weight.sum(axis=1) > PARAMETERS) & _surrounded(pixels, window)
+    return EdgeFit(
+        pixels,
+        np.sqrt(np.where(valid, spread, 0.0)),
+        values[:, S],
+        2.0 * values[:, B] * sign,
+        np.sqrt(variance),
+        valid,
+    )
