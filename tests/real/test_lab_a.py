@@ -13,7 +13,7 @@ CORNER_RMS_PX = 0.05
 """2-D; 0.03 is what the images' noise allows, the rest is JPEG."""
 ORTHOGONALITY_DEG = {"general": 0.12, "planar": 0.12, "standard": 0.12, "forward": 0.9}
 MEAN_NORMAL_DEG = {"general": 0.4, "planar": 0.4, "standard": 0.4, "forward": 3.5}
-"""Forward motion has an effective baseline of the distance from the focus of expansion: the plane ahead is lost first."""
+"""Forward motion: the effective baseline is the distance from the focus of expansion; the plane ahead is lost first."""
 BASELINE_PERCENT = 0.15
 ROTATION_DEG = 0.015
 
