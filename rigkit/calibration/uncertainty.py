@@ -1,0 +1,67 @@
+"""How far a calibrated projection may be off, over the image, in pixels.
+
+The covariance of the parameters alone says too much: a changed principal point and a turned camera are the same image
+of the world. What counts is where a point that is fixed to the boards appears. The boards' solved motions, averaged,
+are the motion of the world (W, T) that goes with a change dk of the parameters, and
+
+    dq = d q / d k  dk + d q / d x (W x x + T)
+
+has the covariance M F M^T, with F the joint covariance of (k, W, T) (`Calibration.frame_covariance`).
+
+Reference: D. Kogan, mrcal, "Projection uncertainty" (the mean over the frames is the same; here in closed form).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.arrays import BoolArray, FloatArray, Pixels
+from rigkit.calibration.result import Calibration
+
+__all__ = ["Uncertainty", "projection_uncertainty", "uncertainty_map"]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Uncertainty:
+    """Covariance of the projection.
+
+    Attributes
+    ----------
+    pixels : (..., 2) where.
+    covariance : (..., 2, 2) px^2, NaN where the pixel has no ray.
+    valid : (...,)
+    """
+
+    pixels: Pixels
+    covariance: FloatArray
+    valid: BoolArray
+
+    @property
+    def worst_px(self) -> FloatArray:
+        """Standard deviation in the worst direction, (...,) px, NaN where invalid."""
+        a, b, c = self.covariance[..., 0, 0], self.covariance[..., 0, 1], self.covariance[..., 1, 1]
+        return np.sqrt(0.5 * (a + c) + np.hypot(0.5 * (a - c), b))
+
+
+def projection_uncertainty(calibration: Calibration, pixels: Pixels, *, range_mm: float = np.inf) -> Uncertainty:
+    """Return the uncertainty of the projection at `pixels` (..., 2) of points `range_mm` away (infinity by default)."""
+    camera = calibration.camera
+    pixels = np.asarray(pixels, dtype=np.float64)
+    rays, valid = camera.unproject(pixels)
+    _, _, by_point, by_camera = camera.project_with_jacobians(np.where(valid[..., None], rays, [0.0, 0.0, 1.0]))
+    turn = np.cross(np.where(valid[..., None], rays, 0.0)[..., None, :], by_point)
+    shift = by_point / range_mm
+    design = np.concatenate([by_camera, turn, shift], axis=-1)
+    covariance = design @ calibration.frame_covariance @ np.swapaxes(design, -1, -2)
+    return Uncertainty(pixels, np.where(valid[..., None, None], covariance, np.nan), valid)
+
+
+def uncertainty_map(
+    calibration: Calibration, *, grid: tuple[int, int] = (40, 30), range_mm: float = np.inf
+) -> Uncertainty:
+    """Return the uncertainty over the image at `grid` (columns, rows) pixels, as arrays (rows, columns, ...)."""
+    width, height = calibration.camera.size_px
+    u, v = np.meshgrid(np.linspace(0.0, width - 1.0, grid[0]), np.linspace(0.0, height - 1.0, grid[1]))
+    return projection_uncertainty(calibration, np.stack([u, v], axis=-1), range_mm=range_mm)
