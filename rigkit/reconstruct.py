@@ -131,7 +131,7 @@ def _reconstruct(
 ) -> Reconstruction:
     notes = list(pair.notes)
     by_points = fundamental_for(PoseType.GENERAL).solve(pair.matches)
-    pose_type, remark = _decide(pair.captured, pose_type, level_sigma_rad)
+    pose_type, level_sigma_rad, remark = _decide(pair.captured, pose_type, level_sigma_rad)
     notes += remark
     affinities = _affinities(pair, affine_method, by_points.E21, scale)
     matches = pair.matches.with_affinities(affinities.A21, affinities.sigma_A)
@@ -139,7 +139,7 @@ def _reconstruct(
     rule: WeightRule = "points" if needs_epipolar(affine_method) else "noise"
     estimate = fundamental_for(pose_type).solve(matches, rule)
     start = choose_pose(estimate.E21, matches.rays1, matches.rays2, pose_type)
-    refined = refine_pose(pair.captured, start, pose_type, level_sigma_rad)
+    refined = refine_pose(pair.captured, start, pose_type, None if pose_type is PoseType.GENERAL else level_sigma_rad)
     metric = metric_pose(pair.captured, refined.cam2_from_cam1, refined.covariance, pair.boards)
     if metric.baseline_sigma_mm > MAX_BASELINE_SIGMA * metric.baseline_mm:
         raise DegenerateError(
@@ -175,16 +175,20 @@ def _reconstruct(
     )
 
 
-def _decide(captured: Matches, declared: PoseType, level_sigma_rad: float | None) -> tuple[PoseType, tuple[str, ...]]:
-    """Return the pose type to use, and what there is to say about it."""
+def _decide(
+    captured: Matches, declared: PoseType, level_sigma_rad: float | None
+) -> tuple[PoseType, float | None, tuple[str, ...]]:
+    """Return the pose type to use, how exact it is, and what there is to say about it."""
     if declared is PoseType.GENERAL:
-        return declared, ()
+        return declared, None, ()
     evidence = pose_type_evidence(captured, level_sigma_rad)
     if declared is PoseType.AUTO:
         chosen = evidence.types[0]
-        return chosen.pose_type, (f"pose type '{chosen.pose_type}' chosen (probability {chosen.probability:.3f})",)
+        # The evidence is for the type up to a level's accuracy, not for an exact one that nobody declared.
+        words = f"pose type '{chosen.pose_type}' chosen (probability {chosen.probability:.3f})"
+        return chosen.pose_type, evidence.level_sigma_rad, (words,)
     contradiction = evidence.contradiction(declared)
-    return declared, () if contradiction is None else (contradiction,)
+    return declared, level_sigma_rad, () if contradiction is None else (contradiction,)
 
 
 def _affinities(pair: MatchedPair, method: str, E21: Mat3, scale: str) -> Affinities:

@@ -26,6 +26,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "validate": ("rigkit.cli.validate", "the tables against measured truth, report and PLY; exit 1 if a check fails"),
     "simulate": ("rigkit.cli.simulate", "the synthetic study: sweeps over noise, box plots, tables"),
     "crosscheck": ("rigkit.cli.crosscheck", "the same pairs through pycolmap and other ways"),
+    "init": ("rigkit.cli.init", "write a manifest from a folder of images"),
     "board": ("rigkit.cli.board", "a board to print, true to scale"),
 }
 """Verb -> (module, one-line help)."""

@@ -177,7 +177,8 @@ def finish(args: argparse.Namespace, dataset: Dataset, outcomes: list[PairOutcom
         print(tables_to_text([summary]))
         _say_failures(reports)
         words = "all checks passed" if passed else "a check FAILED"
-        print(f"{words}; {out}/report.html and tables.md, {seconds:.1f} s")
+        where = out / ("report.html" if sections else "tables.md")
+        print(f"{words}; {where}, {seconds:.1f} s")
     return 0 if passed else EXIT_CHECK_FAILED
 
 

@@ -1,0 +1,98 @@
+"""`rigkit init`: a manifest from a folder of images, asking only for what images cannot tell."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rigkit.cli.console import note, progress_on_stderr
+from rigkit.errors import InputError
+
+if TYPE_CHECKING:
+    from rigkit.io.manifest_writer import FoundPair
+
+HELP = "write a manifest from a folder of images"
+
+POSE_TYPES = ("general", "planar", "standard", "forward", "auto")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", type=Path, help="folder with the images of the pairs")
+    parser.add_argument("--name", help="name of the data set (default: the folder's)")
+    parser.add_argument("--square-mm", type=float, help="side of a square, as measured on the printed board")
+    parser.add_argument("--calibration", metavar="FILE", help="calibration.json of the camera")
+    parser.add_argument("--pose-type", choices=POSE_TYPES, help="pose type of all pairs")
+    parser.add_argument(
+        "--baseline-mm",
+        action="append",
+        default=[],
+        metavar="PAIR=MM+-SIGMA",
+        help="measured baseline of a pair, such as first=300+-2 (repeatable)",
+    )
+    parser.add_argument("-o", "--output", type=Path, help="default: dataset.toml in the folder")
+    parser.add_argument("--force", action="store_true", help="replace an existing manifest")
+
+
+def run(args: argparse.Namespace) -> int:
+    from rigkit.corners.detect import detect_boards
+    from rigkit.io.files import ensure_writable, write_atomic
+    from rigkit.io.images import read_image, to_grey
+    from rigkit.io.manifest import load_dataset
+    from rigkit.io.manifest_writer import Sighting, board_sizes, find_images, group_pairs, manifest_text
+
+    root = args.folder.resolve()
+    target = args.output or root / "dataset.toml"
+    ensure_writable(target, force=args.force)
+    images = find_images(root)
+    progress = progress_on_stderr()
+    sightings = []
+    for done, path in enumerate(images, start=1):
+        image = read_image(path)
+        sizes = board_sizes(detect_boards(to_grey(image)))
+        sightings.append(Sighting(path, (image.shape[1], image.shape[0]), sizes))
+        progress("looking for boards", done, len(images))
+    pairs = group_pairs(sightings, root)
+    for pair in pairs:
+        note(f"pair '{pair.name}': {pair.first.image.name}, {pair.second.image.name}")
+    square_mm = args.square_mm or float(_ask("side of a square, mm", "--square-mm"))
+    calibration = args.calibration or _ask("path of calibration.json (relative to the manifest)", "--calibration")
+    poses = {p.name: args.pose_type or _ask(f"pose type of '{p.name}'", "--pose-type", POSE_TYPES) for p in pairs}
+    text = manifest_text(
+        args.name or root.name, target.parent.resolve(), pairs, square_mm, calibration, poses, _baselines(args, pairs)
+    )
+    write_atomic(target, text, force=args.force)
+    print(target)
+    try:
+        load_dataset(target)
+    except InputError as error:
+        note(f"to be completed: {error}")
+    return 0
+
+
+def _ask(question: str, option: str, choices: tuple[str, ...] = ()) -> str:
+    """Ask at the terminal; where there is none, say which option tells it."""
+    if not sys.stdin.isatty():
+        raise InputError(f"init: images cannot tell the {question}; say it with {option}")
+    hint = f" ({', '.join(choices)})" if choices else ""
+    while True:
+        print(f"{question}{hint}: ", end="", file=sys.stderr, flush=True)
+        answer = sys.stdin.readline().strip()
+        if answer and (not choices or answer in choices):
+            return answer
+
+
+def _baselines(args: argparse.Namespace, pairs: list[FoundPair]) -> dict[str, tuple[float, float]]:
+    out = {}
+    known = {pair.name for pair in pairs}
+    for text in args.baseline_mm:
+        name, _, value = text.partition("=")
+        number, _, sigma = value.partition("+-")
+        if name not in known:
+            raise InputError(f"init: --baseline-mm names '{name}'; pairs found: {', '.join(sorted(known))}")
+        try:
+            out[name] = (float(number), float(sigma))
+        except ValueError as error:
+            raise InputError(f"init: --baseline-mm '{text}': write PAIR=MM+-SIGMA, such as {name}=300+-2") from error
+    return out

@@ -1,0 +1,50 @@
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from helpers.data import REPOSITORY
+
+from rigkit.cli.main import main
+from rigkit.io.manifest import load_dataset
+
+IMAGES = REPOSITORY / "datasets" / "lab-a" / "images"
+CALIBRATION = REPOSITORY / "calib" / "cameras" / "mvca020_fe185" / "calibration.json"
+
+
+def test_a_folder_becomes_a_manifest_that_loads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(IMAGES / "fisheye-general", tmp_path / "images" / "first")
+    for side, number in (("left", 1), ("right", 2)):
+        shutil.copy(IMAGES / "fisheye-standard" / f"view{number}.jpg", tmp_path / f"second_{side}.jpg")
+    options = ["--square-mm", "50", "--pose-type", "general", "--calibration", str(CALIBRATION)]
+    assert main(["init", str(tmp_path), *options, "--baseline-mm", "second=300+-2", "--name", "mine"]) == 0
+    dataset = load_dataset(tmp_path)
+    assert dataset.name == "mine"
+    assert [pair.pair_id for pair in dataset.pairs] == ["first", "second"]
+    assert [board.size for board in dataset.boards] == [(8, 6)] * 3
+    second = dataset.pair("second")
+    assert (second.image1.name, second.image2.name) == ("second_left.jpg", "second_right.jpg")
+    assert second.truth.baseline is not None
+    assert (second.truth.baseline.value_mm, second.truth.baseline.sigma_mm) == (300.0, 2.0)
+    before = (tmp_path / "dataset.toml").read_text()
+    assert main(["init", str(tmp_path), *options]) == 2
+    assert (tmp_path / "dataset.toml").read_text() == before
+
+
+def test_what_images_cannot_tell_must_be_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import io
+    import sys
+
+    monkeypatch.setattr(sys, "stdin", io.StringIO(""))
+    shutil.copytree(IMAGES / "fisheye-general", tmp_path / "first")
+    assert main(["init", str(tmp_path)]) == 2
+    assert "--square-mm" in capsys.readouterr().err
+    assert not (tmp_path / "dataset.toml").exists()
+
+
+def test_an_empty_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["init", str(tmp_path)]) == 2
+    assert "no images" in capsys.readouterr().err
