@@ -1,0 +1,191 @@
+"""The tables hold what the reports and the paper say, and come back from every format."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.reconstructions import make_reconstruction
+
+from rigkit.errors import InputError
+from rigkit.io.paper_tables import load_paper_tables
+from rigkit.report.tables import tables_to_csv, tables_to_json, tables_to_latex, tables_to_markdown
+from rigkit.truth import MeasuredAngle, MeasuredLength, PairTruth
+from rigkit.validation.checks import ValidationReport, validate
+from rigkit.validation.tables import Cell, Column, PaperTables, Table, best_method, build_tables
+
+REPO = Path(__file__).parents[2]
+PAPER = REPO / "datasets" / "hajder2021"
+METHODS = ("F2UDIR", "3SDIR")
+PAIRS = ("regular-general", "regular-standard", "my_own-pair")
+TILT_DEG = {"F2UDIR": 2.0, "3SDIR": 0.5}
+BASELINE_MM = {"F2UDIR": 310.0, "3SDIR": 301.0}
+
+
+def report(pair_id: str, method: str, keep: tuple[int, ...] = (0, 1, 2)) -> ValidationReport:
+    angles = tuple(
+        MeasuredAngle(a, b, 90.0, 0.3, "set square")
+        for a, b in (("plane1", "plane2"), ("plane1", "plane3"), ("plane2", "plane3"))
+    )
+    length = MeasuredLength(300.0, 2.0, "steel rule") if "standard" in pair_id else None
+    made = make_reconstruction(
+        angles_deg=(90.5, 90.0, 90.0), keep=keep, normal_tilt_rad=np.deg2rad(TILT_DEG[method]), baseline_sigma_mm=0.5
+    )
+    return validate(
+        replace(made, pair_id=pair_id, affine_method=method, baseline_mm=BASELINE_MM[method]), PairTruth(length, angles)
+    )
+
+
+@pytest.fixture(scope="module")
+def reports() -> list[ValidationReport]:
+    return [report(pair_id, method) for pair_id in PAIRS for method in METHODS]
+
+
+@pytest.fixture(scope="module")
+def tables(reports: list[ValidationReport]) -> tuple[Table, ...]:
+    return build_tables(reports, load_paper_tables(PAPER))
+
+
+def by_key(tables: tuple[Table, ...], key: str) -> Table:
+    return next(table for table in tables if table.key == key)
+
+
+def cell(table: Table, row: str, column: str) -> Cell:
+    labels = [c.label for c in table.columns]
+    return next(r for r in table.rows if r[0].value == row)[labels.index(column)]
+
+
+def test_plane_table_is_ours_beside_the_papers(tables: tuple[Table, ...]) -> None:
+    planes = by_key(tables, "planes")
+    assert [c.label for c in planes.columns[1:]] == list(PAIRS)
+    assert len(planes.rows) == 9
+    tilted = cell(planes, "orthogonality error plane1, plane2", "regular-general")
+    assert tilted.value == pytest.approx(0.5)
+    assert tilted.paper == "3.6010"
+    assert cell(planes, "mean normal error plane3", "regular-standard").value == pytest.approx(0.5)
+    assert cell(planes, "mean normal error plane3", "regular-standard").paper == "0.2025"
+    assert cell(planes, "median normal error plane2", "my_own-pair").paper is None
+
+
+def test_the_estimator_with_the_best_normals_is_shown(reports: list[ValidationReport]) -> None:
+    assert best_method(reports) == "3SDIR"
+    assert best_method([r for r in reports if r.affine_method == "F2UDIR"]) == "F2UDIR"
+
+
+def test_baselines_mark_the_nearest_and_the_failed(tables: tuple[Table, ...]) -> None:
+    baselines = by_key(tables, "baselines")
+    assert [row[0].value for row in baselines.rows] == ["regular-standard"]
+    worse, better = (cell(baselines, "regular-standard", m) for m in METHODS)
+    assert (worse.value, worse.paper, worse.best, worse.failed) == (310.0, "292.90", False, True)
+    assert (better.value, better.paper, better.best, better.failed) == (301.0, "290.70", True, False)
+    assert cell(baselines, "regular-standard", "measured").value == 300.0
+
+
+def test_averages_are_over_the_cells_that_the_paper_has(tables: tuple[Table, ...]) -> None:
+    averages = by_key(tables, "averages")
+    row = next(r for r in averages.rows if str(r[0].value).startswith("orthogonality"))
+    # Two of the three pairs are the paper's, three angles each; ours is half a degree in one of three.
+    assert row[2].value == 6.0
+    assert row[3].value == pytest.approx(0.5 / 3.0)
+    assert row[4].value == pytest.approx(np.mean([3.6010, 0.2599, 4.1743, 0.5946, 1.1304, 0.6968]))
+    baseline = averages.rows[-1]
+    assert (baseline[3].value, baseline[4].value) == pytest.approx((5.5, (7.10 + 9.30) / 2.0))
+
+
+def test_without_the_paper_nothing_of_it_is_there(reports: list[ValidationReport]) -> None:
+    tables = build_tables(reports)
+    assert [t.key for t in tables] == ["planes", "baselines", "checks", "estimators"]
+    assert "paper" not in tables_to_markdown(tables)
+
+
+def test_checks_hold_every_check_and_what_could_not_be_checked() -> None:
+    lost = report("regular-standard", "3SDIR", keep=(0, 1))
+    checks = by_key(build_tables([lost]), "checks")
+    assert len(checks.rows) == len(lost.checks) + 2
+    verdict = [c.label for c in checks.columns].index("verdict")
+    assert [row[verdict].value for row in checks.rows] == ["pass", "pass", "NOT CHECKED", "NOT CHECKED"]
+    assert "k = 2" in checks.note
+
+
+def test_no_rows_no_table() -> None:
+    with pytest.raises(InputError, match="no report"):
+        build_tables([])
+    with pytest.raises(InputError, match="no rows"):
+        Table("x", "x", (Column("a"),), ())
+
+
+def test_csv_has_full_precision_and_columns_for_paper_and_sigma(tables: tuple[Table, ...]) -> None:
+    text = tables_to_csv(tables)
+    blocks = [block.splitlines() for block in text.split("\n\n")]
+    assert [block[0] for block in blocks] == [f"# {t.title}" for t in tables]
+    rows = list(csv.DictReader(io.StringIO("\n".join(blocks[1][1:]))))
+    assert rows[0]["3SDIR [mm]"] == "301"
+    assert rows[0]["3SDIR sigma [mm]"] == "0.5"
+    assert rows[0]["3SDIR paper [mm]"] == "290.70"
+    planes = list(csv.DictReader(io.StringIO("\n".join(blocks[0][1:]))))
+    assert float(planes[0]["regular-general"]) == cell(tables[0], planes[0]["deg"], "regular-general").value
+
+
+def test_json_is_the_same_numbers(tables: tuple[Table, ...]) -> None:
+    data = json.loads(tables_to_json(tables))
+    assert [t["key"] for t in data["tables"]] == [t.key for t in tables]
+    baseline = data["tables"][1]["rows"][0]
+    assert baseline["3SDIR"] == {"value": 301.0, "sigma": 0.5, "paper": 290.7, "best": True}
+    assert data["tables"][1]["units"]["3SDIR"] == "mm"
+
+
+def test_markdown_rows_have_the_cells_of_their_head(tables: tuple[Table, ...]) -> None:
+    text = tables_to_markdown(tables)
+    for block in text.split("## ")[1:]:
+        bars = {line.replace(r"\|", "").count("|") for line in block.splitlines() if line.startswith("|")}
+        assert len(bars) == 1
+    assert "**301.00 ± 0.50 (290.70)**" in text
+
+
+def test_latex_is_latex(tables: tuple[Table, ...], tmp_path: Path) -> None:
+    text = tables_to_latex(tables)
+    assert text.count(r"\begin{table}") == text.count(r"\end{table}") == len(tables)
+    assert r"my\_own-pair" in text
+    assert "±" not in text
+    for table, block in zip(tables, text.split(r"\toprule")[1:], strict=True):
+        cells = {line.replace(r"\&", "").count("&") + 1 for line in block.splitlines() if line.endswith(r"\\")}
+        assert cells == {len(table.columns)}
+    if shutil.which("pdflatex"):
+        preamble = "\\documentclass{article}\\usepackage{booktabs,graphicx}\\begin{document}\n"
+        (tmp_path / "t.tex").write_text(preamble + text + "\\end{document}\n")
+        subprocess.run(["pdflatex", "-halt-on-error", "t.tex"], cwd=tmp_path, check=True, capture_output=True)
+
+
+def test_the_papers_tables_are_as_printed() -> None:
+    paper = load_paper_tables(PAPER)
+    assert len(paper.planes) == 9
+    assert all(len(row) == 8 for row in paper.planes.values())
+    assert paper.plane("mean normal error 3", "fisheye-forward") == "1.334"
+    assert paper.baseline("fisheye-forward", "DET3UDIR") == "179.5"
+    assert paper.baseline("fisheye-planar", "DET3UDIR") is None
+    # Checksums of the design's table: a mistyped cell changes them.
+    assert sum(float(v) for row in paper.planes.values() for v in row.values()) == pytest.approx(204.6419, abs=1e-9)
+    assert sum(float(v) for row in paper.baselines.values() for v in row.values()) == pytest.approx(5579.56, abs=1e-9)
+
+
+def test_a_spoiled_paper_table_is_refused(tmp_path: Path) -> None:
+    for name in ("planes.csv", "baselines.csv"):
+        shutil.copy(PAPER / name, tmp_path / name)
+    for text, words in (
+        ("a,b\nx,1,2\n", "line 2 has 3 cells"),
+        ("a,b\nx,one\n", "'one' is not a number"),
+        ("a,b\n", "no rows"),
+    ):
+        (tmp_path / "planes.csv").write_text(text)
+        with pytest.raises(InputError, match=words):
+            load_paper_tables(tmp_path)
+    with pytest.raises(InputError, match="cannot be read"):
+        load_paper_tables(tmp_path / "none")
+    assert isinstance(load_paper_tables(PAPER), PaperTables)
