@@ -32,8 +32,9 @@ NORMAL_METHODS = ("optimal", "fne", "nullvector")
 MIN_PARALLAX = 1e-9
 """Smallest |h| / |J2|, about the angle between the two viewing rays in radians: below, it is rounding."""
 
-RIDGE = 1e-6
-"""Relative variance added across h: affinities that fulfil the epipolar geometry exactly have none there."""
+RIDGE = 1e-2
+"""Relative variance added across h, where epipolar lines have errors of their own: affinities that fulfil the epipolar
+geometry by construction have no other there, and must not be divided by it."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -98,6 +99,7 @@ def estimate_normals(
     covariance: FloatArray | None = None,
     sigma_A: FloatArray | None = None,
     weighted: bool = False,
+    geometry: FloatArray | None = None,
 ) -> NormalEstimate:
     """Return the optimal normals with their covariance.
 
@@ -107,6 +109,7 @@ def estimate_normals(
     covariance : (N, 4, 4) of vec(A21), from `Affinities.covariance`; or
     sigma_A : (N,) or a scalar, standard deviation of independent entries of A21.
     weighted : use `covariance` also to weight the fit.
+    geometry : (N, 3, 3) share of corners and pose, from `geometry_covariance`; it is added.
     """
     if covariance is None and sigma_A is not None:
         variance = np.broadcast_to(np.asarray(sigma_A, dtype=np.float64) ** 2, (len(A21),))
@@ -118,7 +121,11 @@ def estimate_normals(
     by_affinity = _solution(linear_gauge(J1, J2).h, fit)
     spread_y = by_affinity @ covariance @ np.swapaxes(by_affinity, -1, -2)
     spread = normal_covariance(J1, J2, normals, covariance, weighted=weighted)
-    return NormalEstimate(normals, valid, spread, _rms_angle(J1, normals, spread_y))
+    square = _rms_angle(J1, normals, spread_y) ** 2
+    if geometry is not None:
+        spread = spread + geometry
+        square = square + np.trace(geometry, axis1=-2, axis2=-1)
+    return NormalEstimate(normals, valid, spread, np.sqrt(square))
 
 
 def normal_covariance(

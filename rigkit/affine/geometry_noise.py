@@ -1,0 +1,108 @@
+"""What the errors of the corners and of the pose do to normals, besides the errors of the affinities.
+
+Usually little; but near an epipole and with very accurate directions the parallax, and with it range, epipolar line and
+normal, is known no better than the corners.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from rigkit.affine.affinities import EpipolarNormals
+from rigkit.affine.normal import normals_from_affines
+from rigkit.arrays import Affines, FloatArray, RayJacobians, Rays
+from rigkit.geometry.projection_jacobian import pair_projection_jacobians
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3, skew, unit
+from rigkit.geometry.triangulation import triangulate_midpoint
+
+__all__ = ["geometry_covariance"]
+
+STEP_PX = 1e-3
+STEP_RAD = 1e-7
+STEP_REL = 1e-6
+"""Steps of the central differences: far above rounding, far below where the second order shows."""
+
+
+def geometry_covariance(
+    rays1: Rays,
+    ray_jacobians1: RayJacobians,
+    rays2: Rays,
+    ray_jacobians2: RayJacobians,
+    cam2_from_cam1: Rigid3,
+    A21: Affines | Callable[[EpipolarNormals], Affines],
+    *,
+    sigma1_px: FloatArray | float,
+    sigma2_px: FloatArray | float,
+    pose_covariance: FloatArray | None = None,
+    covariance: FloatArray | None = None,
+) -> FloatArray:
+    """Return the covariance (N, 3, 3) of the unit normals, rad^2, from corner and pose errors at fixed directions.
+
+    To be added to that from the affinities (`estimate_normals(..., geometry=)`).
+
+    Parameters
+    ----------
+    rays1, rays2 : (N, 3); ray_jacobians1, ray_jacobians2 : (N, 3, 2)
+    cam2_from_cam1 : relative pose; points are triangulated with it.
+    A21 : (N, 2, 2), or for F2UDIR and F3UDIR the function that gives them for an epipolar geometry, because those
+        affinities move with it.
+    sigma1_px, sigma2_px : (N,) or scalars, corner standard deviation per axis.
+    pose_covariance : (6, 6) of (left rotation perturbation rad, translation), or None: the pose is exact.
+    covariance : (N, 4, 4) of vec(A21) where the normals are weighted by it.
+    """
+    f1, f2 = np.asarray(rays1, dtype=np.float64), np.asarray(rays2, dtype=np.float64)
+    b1, b2 = np.asarray(ray_jacobians1, dtype=np.float64), np.asarray(ray_jacobians2, dtype=np.float64)
+    n = len(f1)
+
+    def normals(corner1: FloatArray, corner2: FloatArray, pose: Rigid3) -> FloatArray:
+        g1, c1 = _moved(f1, b1, corner1)
+        g2, c2 = _moved(f2, b2, corner2)
+        affines = A21
+        if callable(affines):
+            E21 = skew(pose.translation_mm) @ pose.rotation
+            affines = affines(EpipolarNormals.from_rays(g1, c1, g2, c2, E21))
+        points, _ = triangulate_midpoint(g1, g2, pose)
+        J1, J2 = pair_projection_jacobians(points, g1, c1, g2, c2, pose)
+        return normals_from_affines(J1, J2, affines, covariance=covariance)[0]
+
+    still = np.zeros(2)
+    total = np.zeros((n, 3, 3))
+    for axis in np.eye(2):
+        step = STEP_PX * axis
+        for sigma, plus, minus in (
+            (sigma1_px, normals(step, still, cam2_from_cam1), normals(-step, still, cam2_from_cam1)),
+            (sigma2_px, normals(still, step, cam2_from_cam1), normals(still, -step, cam2_from_cam1)),
+        ):
+            change = (plus - minus) / (2.0 * STEP_PX) * np.broadcast_to(sigma, (n,))[:, None]
+            total += change[:, :, None] * change[:, None, :]
+    if pose_covariance is not None:
+        steps = np.repeat([STEP_RAD, STEP_REL * np.linalg.norm(cam2_from_cam1.translation_mm)], 3)
+        columns = []
+        for k, size in enumerate(steps):
+            plus, minus = (
+                normals(still, still, _perturbed(cam2_from_cam1, sign * size * np.eye(6)[k])) for sign in (1.0, -1.0)
+            )
+            columns.append((plus - minus) / (2.0 * size))
+        by_pose = np.stack(columns, axis=-1)
+        total += by_pose @ pose_covariance @ np.swapaxes(by_pose, -1, -2)
+    return total
+
+
+def _moved(rays: Rays, jacobians: RayJacobians, step_px: FloatArray) -> tuple[Rays, RayJacobians]:
+    """Return rays and Jacobians at pixels `step_px` away; the Jacobian turns with the ray.
+
+    How the lens magnifies there is left out: it changes a Jacobian by step / focal length, which is nothing beside the
+    noise of any direction.
+    """
+    if not step_px.any():
+        return rays, jacobians
+    moved = unit(rays + jacobians @ step_px)
+    turn = exp_so3(np.cross(rays, moved))
+    return moved, turn @ jacobians
+
+
+def _perturbed(pose: Rigid3, change: FloatArray) -> Rigid3:
+    return Rigid3(exp_so3(change[:3]) @ pose.rotation, pose.translation_mm + change[3:])
