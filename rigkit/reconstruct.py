@@ -25,7 +25,7 @@ from rigkit.fundamental.metric import MetricPose, metric_pose, triangulate_match
 from rigkit.fundamental.pose import choose_pose, essential_from_pose
 from rigkit.fundamental.refine import refine_pose
 from rigkit.fundamental.registry import fundamental_for
-from rigkit.fundamental.select import pose_type_evidence
+from rigkit.fundamental.select import DEFAULT_LEVEL_RAD, pose_type_evidence
 from rigkit.fundamental.weights import WeightRule
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
@@ -101,7 +101,8 @@ def reconstruct_pair(
     pose_type : as a person declared it; AUTO takes the type that the data support best. A declared type that the data
         contradict is used as told, and `notes` gives the figure.
     affine_method : see `rigkit.affine.registry.AFFINE_METHODS`.
-    level_sigma_rad : how well the spirit level held: makes the pose type a soft prior in the refinement. None: exact.
+    level_sigma_rad : how well the spirit level held: the pose type is a soft prior in the refinement. None: as well as
+        a carefully set level does (DEFAULT_LEVEL_RAD); 0: the pose type is exact.
     scale : of DET3UDIR, see `affines_from_directions`.
     image1 : image of camera 1, (H, W) or (H, W, 3) RGB, uint8 or uint16: colours of the cloud.
 
@@ -139,7 +140,7 @@ def _reconstruct(
     rule: WeightRule = "points" if needs_epipolar(affine_method) else "noise"
     estimate = fundamental_for(pose_type).solve(matches, rule)
     start = choose_pose(estimate.E21, matches.rays1, matches.rays2, pose_type)
-    refined = refine_pose(pair.captured, start, pose_type, None if pose_type is PoseType.GENERAL else level_sigma_rad)
+    refined = refine_pose(pair.captured, start, pose_type, level_sigma_rad)
     metric = metric_pose(pair.captured, refined.cam2_from_cam1, refined.covariance, pair.boards)
     if metric.baseline_sigma_mm > MAX_BASELINE_SIGMA * metric.baseline_mm:
         raise DegenerateError(
@@ -178,17 +179,19 @@ def _reconstruct(
 def _decide(
     captured: Matches, declared: PoseType, level_sigma_rad: float | None
 ) -> tuple[PoseType, float | None, tuple[str, ...]]:
-    """Return the pose type to use, how exact it is, and what there is to say about it."""
+    """Return the pose type to use, the level's sigma (None: exact, or nothing to hold), and what there is to say."""
     if declared is PoseType.GENERAL:
         return declared, None, ()
-    evidence = pose_type_evidence(captured, level_sigma_rad)
+    level = DEFAULT_LEVEL_RAD if level_sigma_rad is None else level_sigma_rad
+    evidence = pose_type_evidence(captured, level or None)
     if declared is PoseType.AUTO:
         chosen = evidence.types[0]
-        # The evidence is for the type up to a level's accuracy, not for an exact one that nobody declared.
         words = f"pose type '{chosen.pose_type}' chosen (probability {chosen.probability:.3f})"
-        return chosen.pose_type, evidence.level_sigma_rad, (words,)
+        # The evidence is for the type up to a level's accuracy, not for an exact one that nobody declared.
+        soft = None if chosen.pose_type is PoseType.GENERAL else evidence.level_sigma_rad
+        return chosen.pose_type, soft, (words,)
     contradiction = evidence.contradiction(declared)
-    return declared, level_sigma_rad, () if contradiction is None else (contradiction,)
+    return declared, level or None, () if contradiction is None else (contradiction,)
 
 
 def _affinities(pair: MatchedPair, method: str, E21: Mat3, scale: str) -> Affinities:
