@@ -86,8 +86,9 @@ class Chart:
 
     def __init__(self, camera: Camera, u: FloatArray, v: FloatArray, field_deg: float | None) -> None:
         self.shape = (len(v), len(u))
-        node_u, self.weight_u = _chebyshev(u)
+        node_u, weight_u = _chebyshev(u)
         node_v, self.weight_v = _chebyshev(v)
+        self.weight_u = np.ascontiguousarray(weight_u.T)
         self.nodes, valid = _unproject(camera, node_u, node_v, field_deg)
         self.lit: BoolArray | None = None
         self.rays: FloatArray | None = None
@@ -114,15 +115,21 @@ class Chart:
         inside = ((low - pad >= surface.low) & (high + pad <= surface.high)).all()
         return FULL if inside else PART
 
-    def locate(self, matrix: FloatArray) -> FloatArray:
-        """Return x and y in the plane for every sub-sample, (2, rows, columns); FAR where the plane is not met."""
+    def locate(self, matrix: FloatArray, rows: slice, columns: slice) -> FloatArray:
+        """Return x and y in the plane for some rows and columns of sub-samples, (2, rows, columns).
+
+        FAR where the plane is not met.
+        """
         if self.rays is not None:
-            return _divide(np.einsum("kc,vuc->kvu", matrix, self.rays))
+            return _divide(np.einsum("kc,vuc->kvu", matrix, self.rays[rows, columns]))
         plane = np.einsum("kc,ijc->kij", matrix, self.nodes)
-        if plane[2].min() > SMOOTH_DEPTH_RATIO * plane[2].max():
-            # The horizon is far: x and y are polynomials themselves.
-            return np.asarray(self.weight_v @ (plane[:2] / plane[2]) @ self.weight_u.T)
-        return _divide(self.weight_v @ plane @ self.weight_u.T)
+        # The horizon is far: then x and y are polynomials themselves.
+        smooth = plane[2].min() > SMOOTH_DEPTH_RATIO * plane[2].max()
+        nodes = plane[:2] / plane[2] if smooth else plane
+        # einsum, not @: BLAS starts threads for matrices of this size, which cost far more than they gain.
+        lines = np.einsum("vi,kij->kvj", self.weight_v[rows], nodes)
+        out = np.asarray(np.einsum("kvj,ju->kvu", lines, self.weight_u[:, columns]))
+        return out if smooth else _divide(out)
 
 
 def _unproject(camera: Camera, u: FloatArray, v: FloatArray, field_deg: float | None) -> tuple[FloatArray, BoolArray]:
@@ -154,11 +161,12 @@ def _chebyshev(samples: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def paint(fine: Float32, surface: Surface, chart: Chart, per_pixel: int) -> None:
     """Lay a rectangle and its pattern over `fine` in place."""
-    x, y = chart.locate(surface.plane_from_ray)
-    box = _bounding_box(x, y, surface, per_pixel)
+    every = slice(None, None, per_pixel)
+    coarse_x, coarse_y = chart.locate(surface.plane_from_ray, every, every)
+    box = _bounding_box(coarse_x, coarse_y, surface, per_pixel)
     if box is None:
         return
-    axes = [np.ascontiguousarray(axis[box], dtype=np.float32) for axis in (x, y)]
+    axes = chart.locate(surface.plane_from_ray, *box).astype(np.float32)
     widths = [_cell_width(axis, per_pixel) for axis in axes]
     target = fine[box]
     sheet = [_inside(a, w, surface.low[k], surface.high[k]) for k, (a, w) in enumerate(zip(axes, widths, strict=True))]
@@ -178,9 +186,11 @@ def paint(fine: Float32, surface: Surface, chart: Chart, per_pixel: int) -> None
     target += wave_x
 
 
-def _bounding_box(x: FloatArray, y: FloatArray, surface: Surface, per_pixel: int) -> tuple[slice, slice] | None:
-    """Return the part of a tile that can meet the rectangle, in whole pixels, or None; judged once a pixel."""
-    cx, cy = x[::per_pixel, ::per_pixel], y[::per_pixel, ::per_pixel]
+def _bounding_box(cx: FloatArray, cy: FloatArray, surface: Surface, per_pixel: int) -> tuple[slice, slice] | None:
+    """Return the sub-samples of a tile that can meet the rectangle, in whole pixels, or None.
+
+    `cx`, `cy` : where the first sub-sample of every pixel meets the plane.
+    """
     near = (cx >= surface.low[0]) & (cx <= surface.high[0]) & (cy >= surface.low[1]) & (cy <= surface.high[1])
     if min(cx.shape) < 2:
         return (slice(None), slice(None))

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from rigkit.arrays import FloatArray
 from rigkit.cameras.base import Camera
@@ -123,7 +124,8 @@ class _Reduction:
         self.reach = optics.reach_px
         n = (TILE + 2 * self.reach) * self.count
         self.offsets: FloatArray = np.asarray((np.arange(n) + 0.5) * self.step - 0.5 - self.reach, dtype=np.float64)
-        self.matrix = _reduction_matrix(self.offsets, self.step, optics.blur_px).astype(np.float32)
+        # Sparse: a pixel needs few sub-samples, and BLAS would start threads for these small matrices.
+        self.matrix = csr_array(_reduction_matrix(self.offsets, self.step, optics.blur_px).astype(np.float32))
         self.spread = _spread_kernel(optics)
 
     def grid(self, corner: tuple[int, int], shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
@@ -137,7 +139,7 @@ class _Reduction:
             fine = np.asarray(cv2.filter2D(fine, cv2.CV_32F, self.spread, borderType=cv2.BORDER_REPLICATE))
         rows = self.matrix[: shape[0], : fine.shape[0]]
         columns = self.matrix[: shape[1], : fine.shape[1]]
-        return np.asarray(rows @ fine @ columns.T, dtype=np.float64)
+        return np.asarray((columns @ (rows @ fine).T).T, dtype=np.float64)
 
 
 def _reduction_matrix(offsets: FloatArray, step: float, sigma: float) -> FloatArray:

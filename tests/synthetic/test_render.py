@@ -21,10 +21,10 @@ from rigkit.synthetic.render import Optics, radiance, render
 from rigkit.synthetic.scene import Panel, PlacedBoard, room_walls, trihedral
 
 SAMPLING_LEVELS = 0.6
-"""Point sampling with 4096 symmetric samples a pixel is right to about 0.15 grey levels of 255 (rms 0.03 to 0.1)."""
+"""Point sampling with 2048 symmetric samples a pixel is right to about 0.15 grey levels of 255 (rms 0.03 to 0.1)."""
 SAMPLING_MAX_LEVELS = 4.0
-SHIFT_PX = 1.5e-3
-"""Shift of the sampled image against the rendered one, rms over corners; the sampling's own error is 0.7e-3 px."""
+SHIFT_PX = 2.5e-3
+"""Shift of the sampled image against the rendered one, rms over corners; the sampling alone is wrong by 1e-3 px."""
 CV_BIAS_PX = 0.01
 """Mean over a board's corners of cv2.cornerSubPix against truth; half a pixel of a convention would be 0.5."""
 CV_RMS_PX = 0.05
@@ -33,16 +33,16 @@ CV_RMS_PX = 0.05
 BOARD = PlacedBoard(
     Board("a", 6, 5, 50.0, 50.0), Rigid3(exp_so3(np.array([0.5, 0.3, 0.2])), [-130.3, -110.7, 500.0]), 0.5
 )
-PINHOLE = Pinhole((96, 80), np.array([90.0, 92.0, 47.3, 40.2]))
-FISHEYE = KannalaBrandt((96, 80), np.array([50.0, 51.0, 47.3, 40.2, -0.03, 0.004, 0.0, 0.0]))
+PINHOLE = Pinhole((72, 60), np.array([70.0, 71.5, 35.3, 30.2]))
+FISHEYE = KannalaBrandt((72, 60), np.array([66.0, 67.0, 35.3, 30.2, -0.03, 0.004, 0.0, 0.0]))
 
 
 def sampled(placed: PlacedBoard, camera: Camera, blur_px: float, background: float) -> np.ndarray:
-    """Average 4096 point samples a pixel: the pixel's square and the blur by a symmetric low-discrepancy sequence."""
+    """Average 2048 point samples a pixel: the pixel's square and the blur by a symmetric low-discrepancy sequence."""
     from scipy.special import ndtri
     from scipy.stats import qmc
 
-    sequence = qmc.Sobol(4, seed=3).random_base2(11)
+    sequence = qmc.Sobol(4, seed=3).random_base2(10)
     offsets = sequence[:, :2] - 0.5 + blur_px * ndtri(np.clip(sequence[:, 2:], 1e-6, 1 - 1e-6))
     offsets = np.concatenate([offsets, -offsets])
     width, height = camera.size_px
@@ -73,7 +73,7 @@ def test_equals_point_sampling(camera: Camera, blur_px: float) -> None:
     down, right = np.gradient(reference)
     shifts = []
     for u, v in np.rint(pixels).astype(int):
-        window = (slice(v - 4, v + 5), slice(u - 4, u + 5))
+        window = (slice(v - 3, v + 4), slice(u - 3, u + 4))
         slopes = np.stack([right[window].ravel(), down[window].ravel()], axis=1)
         shifts.append(np.linalg.lstsq(slopes, (image - reference)[window].ravel(), rcond=None)[0])
     assert len(shifts) == 30
@@ -123,11 +123,11 @@ def test_nearer_board_hides_the_farther_one_and_a_back_shows_no_pattern() -> Non
 
 def test_outside_the_lens_is_black_and_panels_lie_behind_boards() -> None:
     wall = Panel(Rigid3(np.eye(3), [0.0, 0.0, 400.0]), 4e4, 4e4, 0.6)
-    image = radiance([BOARD], FISHEYE, Rigid3.identity(), panels=[wall], optics=Optics(0.5, field_deg=90.0))
-    radius = np.hypot(*(np.indices(image.shape)[::-1] - np.array([47.3, 40.2])[:, None, None]))
-    assert image[radius > 44].max() < 1e-6
-    bare = radiance([BOARD], FISHEYE, Rigid3.identity(), optics=Optics(0.5, field_deg=90.0), background=0.6)
-    np.testing.assert_allclose(image[radius < 30], bare[radius < 30], atol=1e-6)
+    image = radiance([BOARD], FISHEYE, Rigid3.identity(), panels=[wall], optics=Optics(0.5, field_deg=50.0))
+    radius = np.hypot(*(np.indices(image.shape)[::-1] - np.array([35.3, 30.2])[:, None, None]))
+    assert image[radius > 34].max() < 1e-6
+    bare = radiance([BOARD], FISHEYE, Rigid3.identity(), optics=Optics(0.5, field_deg=50.0), background=0.6)
+    np.testing.assert_allclose(image[radius < 24], bare[radius < 24], atol=1e-6)
 
 
 def test_motion_and_defocus_keep_the_mean_position() -> None:
