@@ -59,12 +59,12 @@ class Brown(Camera):
         order: int | None = None,
     ) -> Self:
         count = 5 if order is None else order
-        if count not in (5, 8):
-            raise InputError(f"brown camera: {count} distortion terms; choose 5 or 8")
+        if count not in (4, 5, 8):
+            raise InputError(f"brown camera: {count} distortion terms; choose 4 (k3 stays 0), 5 or 8")
         centre, theta, radius = checked_curve(centre_px, theta_rad, radius_px, cls.model, below_rad=np.pi / 2)
         r = np.tan(theta)
         # A curve with noise may be fitted best by a polynomial that turns down just outside it: then fewer terms.
-        for top, bottom in ((3, 3), (3, 0), (2, 0), (1, 0), (0, 0))[0 if count == 8 else 1 :]:
+        for top, bottom in ((3, 3), (3, 0), (2, 0), (1, 0), (0, 0))[{8: 0, 5: 1, 4: 2}[count] :]:
             # radius (1 + k4 t + ...) = f r (1 + k1 t + ...) is linear in f, f k1, ..., k4, ...
             columns = np.concatenate(
                 [
@@ -77,7 +77,7 @@ class Brown(Camera):
             a = np.linalg.lstsq(columns / size, radius, rcond=None)[0] / size
             k = np.zeros(6)
             k[:top], k[3 : 3 + bottom] = a[1 : top + 1] / a[0], a[top + 1 :]
-            shape = np.array([k[0], k[1], 0.0, 0.0, *k[2:]])[:count]
+            shape = np.array([k[0], k[1], 0.0, 0.0, *k[2:]])[: max(count, 5)]
             camera = cls(size_px, np.array([a[0], a[0], *centre, *shape]))
             if a[0] > 0.0 and camera.max_angle_rad > theta[-1]:
                 return camera

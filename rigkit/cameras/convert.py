@@ -55,7 +55,7 @@ def convert_camera(camera: Camera, model: str, *, order: int | None = None, fixe
     Parameters
     ----------
     order : Brown's number of terms or Scaramuzza's degree, as in `Camera.from_radial_curve`.
-    fixed : names of parameters kept as a radial curve leaves them (k3 and the tangential terms: 0).
+    fixed : names of parameters that keep the values of the start, which has no tangential terms and no skew.
 
     Raises
     ------

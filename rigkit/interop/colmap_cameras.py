@@ -1,0 +1,120 @@
+"""COLMAP's cameras.txt, without COLMAP. Pixel (0.5, 0.5) is the centre of its first pixel: cx and cy move by that."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from rigkit.arrays import FloatArray
+from rigkit.cameras.base import Camera
+from rigkit.cameras.registry import camera_model
+from rigkit.errors import InputError
+from rigkit.interop.colmap import HALF_PIXEL
+from rigkit.interop.exchange import Accepted, Written, best_accepted
+
+__all__ = ["read_colmap_cameras", "write_colmap_cameras"]
+
+ACCEPTED = (
+    Accepted("pinhole"),
+    Accepted("brown", 5),
+    Accepted("brown", 8),
+    Accepted("kannala_brandt"),
+    Accepted("eucm"),
+)
+BEHIND = "COLMAP projects no point at or beyond 90 degrees"
+
+# COLMAP's model -> our model, and where its parameters go in ours; f1 stands for one focal length used twice.
+LAYOUTS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "SIMPLE_PINHOLE": ("pinhole", ("f", "cx", "cy")),
+    "PINHOLE": ("pinhole", ("fx", "fy", "cx", "cy")),
+    "SIMPLE_RADIAL": ("brown", ("f", "cx", "cy", "k1")),
+    "RADIAL": ("brown", ("f", "cx", "cy", "k1", "k2")),
+    "OPENCV": ("brown", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
+    "FULL_OPENCV": (
+        "brown",
+        ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    ),
+    "SIMPLE_FISHEYE": ("kannala_brandt", ("f", "cx", "cy")),
+    "FISHEYE": ("kannala_brandt", ("fx", "fy", "cx", "cy")),
+    "SIMPLE_RADIAL_FISHEYE": ("kannala_brandt", ("f", "cx", "cy", "k1")),
+    "RADIAL_FISHEYE": ("kannala_brandt", ("f", "cx", "cy", "k1", "k2")),
+    "OPENCV_FISHEYE": ("kannala_brandt", ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")),
+    "EUCM": ("eucm", ("fx", "fy", "cx", "cy", "alpha", "beta")),
+}
+
+
+def write_colmap_cameras(cameras: Mapping[int, Camera]) -> tuple[str, dict[int, Written]]:
+    """Return cameras.txt of cameras by COLMAP's id (from 1), and per camera what was lost (`text` is its line)."""
+    written: dict[int, Written] = {}
+    for camera_id, camera in cameras.items():
+        chosen = best_accepted(camera, ACCEPTED, "COLMAP")
+        c = chosen.camera
+        name = {"pinhole": "PINHOLE", "kannala_brandt": "OPENCV_FISHEYE", "eucm": "EUCM"}.get(c.model)
+        if name is None:
+            name = "FULL_OPENCV" if c.parameters[8:].any() else "OPENCV"
+        ours = dict(zip(c.parameter_names(), c.parameters.tolist(), strict=True))
+        ours["cx"] += HALF_PIXEL
+        ours["cy"] += HALF_PIXEL
+        values = " ".join(repr(ours.get(key, 0.0)) for key in LAYOUTS[name][1])
+        line = chosen.written(f"{camera_id} {name} {c.size_px[0]} {c.size_px[1]} {values}\n")
+        if c.model in ("kannala_brandt", "eucm") and _sees_behind(c):
+            note = f"{line.note}; {BEHIND}" if line.note else BEHIND
+            line = Written(line.text, c, line.max_error_px, line.rms_error_px, line.covered, note)
+        written[camera_id] = line
+    header = (
+        "# Camera list with one line of data per camera:\n"
+        "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
+        f"# Number of cameras: {len(written)}\n"
+    )
+    return header + "".join(line.text for line in written.values()), written
+
+
+def read_colmap_cameras(text: str, name: str = "cameras.txt") -> dict[int, Camera]:
+    """Return the cameras of cameras.txt by id; raises InputError for models that are not here and damaged lines."""
+    cameras: dict[int, Camera] = {}
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        where = f"'{name}', line {number}"
+        if len(words) < 5 or words[1] not in LAYOUTS:
+            model = words[1] if len(words) > 1 else ""
+            raise InputError(f"{where}: camera model '{model}' is unknown; known: {', '.join(LAYOUTS)}")
+        model, keys = LAYOUTS[words[1]]
+        try:
+            camera_id, width, height = int(words[0]), int(words[2]), int(words[3])
+            values = [float(w) for w in words[4:]]
+        except ValueError as error:
+            raise InputError(f"{where}: not a camera ({error})") from error
+        if len(values) != len(keys):
+            raise InputError(f"{where}: {words[1]} has {len(keys)} parameters, found {len(values)}")
+        cameras[camera_id] = camera_model(model)(
+            (width, height), _parameters(model, dict(zip(keys, values, strict=True)))
+        )
+    if not cameras:
+        raise InputError(f"'{name}': no camera in it; is it COLMAP's cameras.txt?")
+    return cameras
+
+
+def _parameters(model: str, theirs: dict[str, float]) -> FloatArray:
+    names = {
+        "pinhole": ("fx", "fy", "cx", "cy"),
+        "brown": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"),
+        "kannala_brandt": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+        "eucm": ("fx", "fy", "cx", "cy", "alpha", "beta"),
+    }[model]
+    if any(theirs.get(k, 0.0) != 0.0 for k in ("k4", "k5", "k6")) and model == "brown":
+        names = (*names, "k4", "k5", "k6")
+    if "f" in theirs:
+        theirs = {"fx": theirs["f"], "fy": theirs["f"], **theirs}
+    theirs = {**theirs, "cx": theirs["cx"] - HALF_PIXEL, "cy": theirs["cy"] - HALF_PIXEL}
+    return np.array([theirs.get(key, 0.0) for key in names])
+
+
+def _sees_behind(camera: Camera) -> bool:
+    """Say whether a corner of the image looks 90 degrees or more off the axis."""
+    width, height = camera.size_px
+    corners = np.array([[0.0, 0.0], [width - 1.0, 0.0], [0.0, height - 1.0], [width - 1.0, height - 1.0]])
+    rays, valid = camera.unproject(corners)
+    return bool((~valid | (rays[:, 2] <= 0.0)).any())

@@ -1,0 +1,134 @@
+"""What the camera formats of other programs have in common: the camera as written, and what was lost on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rigkit.arrays import FloatArray
+from rigkit.cameras.base import Camera
+from rigkit.cameras.convert import convert_camera
+from rigkit.cameras.ucm import UCM
+from rigkit.errors import InputError
+
+__all__ = ["Accepted", "Written", "best_accepted", "field", "numbers", "unified_from_xi", "unified_with_xi"]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Accepted:
+    """A model that a format can hold: `order` terms, parameters in `zero` kept at zero, largest angle it can hold."""
+
+    model: str
+    order: int | None = None
+    zero: tuple[str, ...] = ()
+
+    def holds(self, camera: Camera) -> bool:
+        """Say whether the camera goes in as it is."""
+        if camera.model != self.model:
+            return False
+        names = camera.parameter_names()
+        if self.order is not None and camera.model == "brown" and len(names) - 4 != max(self.order, 5):
+            return False
+        return all(camera.parameters[names.index(name)] == 0.0 for name in self.zero)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Written:
+    """A camera in another program's format.
+
+    Attributes
+    ----------
+    text : the file.
+    camera : the camera as the file describes it.
+    max_error_px, rms_error_px : its projection against the camera given, over the part of the image it covers; 0 where
+        the format has the model.
+    covered : that part, as a share of the image.
+    note : in words, what a user of the file should know; empty where nothing was lost.
+    """
+
+    text: str
+    camera: Camera
+    max_error_px: float
+    rms_error_px: float
+    covered: float
+    note: str
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Chosen:
+    """The camera that goes into the file, with what `Written` says of it."""
+
+    camera: Camera
+    accepted: Accepted
+    max_error_px: float = 0.0
+    rms_error_px: float = 0.0
+    covered: float = 1.0
+    note: str = ""
+
+    def written(self, text: str) -> Written:
+        return Written(text, self.camera, self.max_error_px, self.rms_error_px, self.covered, self.note)
+
+
+def best_accepted(camera: Camera, accepted: Sequence[Accepted], format_name: str) -> Chosen:
+    """Return the camera itself where the format has its model, else the nearest of those that it has.
+
+    Nearest: the one that covers most of the image, then the one with the smallest largest error.
+    Raises InputError where none can follow the lens.
+    """
+    for kind in accepted:
+        if kind.holds(camera):
+            return Chosen(camera, kind)
+    found: list[Chosen] = []
+    for kind in accepted:
+        try:
+            c = convert_camera(camera, kind.model, order=kind.order, fixed=kind.zero)
+        except InputError:
+            continue
+        note = f"{format_name} has no {camera.model} model: refitted as {kind.model}, off by {c.max_px:.3g} px at most"
+        if c.covered < 1.0:
+            reach = min(np.degrees(c.reach_rad), np.degrees(c.camera.max_angle_rad))
+            note += f" within {reach:.0f} degrees of the axis ({100.0 * c.covered:.0f} % of the image); wrong beyond"
+        found.append(Chosen(c.camera, kind, c.max_px, c.rms_px, c.covered, note))
+    if not found:
+        raise InputError(f"{format_name}: none of its models can follow this {camera.model} camera")
+    widest = max(c.covered for c in found)
+    return min((c for c in found if c.covered >= widest - 0.01), key=lambda c: c.max_error_px)
+
+
+def field(data: dict[str, Any], key: str, name: str) -> Any:
+    """Return data[key]; raises InputError that names file and key."""
+    if not isinstance(data, dict) or key not in data:
+        raise InputError(f"'{name}': '{key}' is missing; is it the calibration file of another program?")
+    return data[key]
+
+
+def numbers(value: Any, name: str, key: str, count: int | None = None) -> FloatArray:
+    """Return `value` as finite numbers (N,); raises InputError that names file and key."""
+    try:
+        array = np.asarray(value, dtype=np.float64).reshape(-1)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"'{name}': '{key}' is not a list of numbers") from error
+    if not np.isfinite(array).all() or (count is not None and array.size != count):
+        wanted = "finite numbers" if count is None else f"{count} finite numbers"
+        raise InputError(f"'{name}': '{key}' should have {wanted}, has {array.size}")
+    return array
+
+
+def unified_with_xi(camera: Camera) -> tuple[float, FloatArray]:
+    """Return xi and gamma_x, gamma_y, cx, cy of a unified camera as Mei writes it: gamma = f (1 + xi).
+
+    Raises InputError at alpha = 1, where xi is infinite.
+    """
+    *core, alpha = camera.parameters.tolist()
+    if alpha >= 1.0:
+        raise InputError("ucm camera: alpha = 1 has no xi; export it as another model")
+    xi = alpha / (1.0 - alpha)
+    return xi, np.array([core[0] * (1.0 + xi), core[1] * (1.0 + xi), core[2], core[3]])
+
+
+def unified_from_xi(size_px: tuple[int, int], xi: float, core: FloatArray) -> Camera:
+    """Return the unified camera of xi and gamma_x, gamma_y, cx, cy; the reverse of `unified_with_xi`."""
+    return UCM(size_px, np.array([*(core[:2] / (1.0 + xi)), *core[2:], xi / (1.0 + xi)]))

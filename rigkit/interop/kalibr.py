@@ -1,0 +1,145 @@
+"""Kalibr's camchain YAML: one camera or a rig. Pixels as ours, lengths in metres, T_cn_cnm1 = cam_n from cam_(n-1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rigkit.arrays import FloatArray
+from rigkit.cameras.base import Camera
+from rigkit.cameras.registry import camera_model
+from rigkit.errors import InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.interop.exchange import (
+    Accepted,
+    Written,
+    best_accepted,
+    field,
+    numbers,
+    unified_from_xi,
+    unified_with_xi,
+)
+from rigkit.interop.simple_yaml import flow, parse_yaml
+
+__all__ = ["KalibrChain", "read_kalibr", "write_kalibr"]
+
+ACCEPTED = (
+    Accepted("pinhole"),
+    Accepted("brown", 4, ("k3",)),
+    Accepted("kannala_brandt"),
+    Accepted("ucm"),
+    Accepted("eucm"),
+    Accepted("double_sphere"),
+)
+MM_PER_M = 1000.0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class KalibrChain:
+    """A camchain file: `text`, and per camera what was lost (`cameras[i].text` is its own part)."""
+
+    text: str
+    cameras: tuple[Written, ...]
+
+
+def write_kalibr(cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3] | None = None) -> KalibrChain:
+    """Return the cameras as a camchain.
+
+    Parameters
+    ----------
+    cam_from_rig : one pose a camera, in mm; needed for more than one camera.
+
+    Raises InputError where poses are missing, or Kalibr has no model that follows a lens.
+    """
+    if not cameras or (len(cameras) > 1 and cam_from_rig is None):
+        raise InputError("camchain: give at least one camera, and for several the pose of each (cam_from_rig)")
+    if cam_from_rig is not None and len(cam_from_rig) != len(cameras):
+        raise InputError(f"camchain: {len(cameras)} cameras, but {len(cam_from_rig)} poses")
+    parts = []
+    for i, camera in enumerate(cameras):
+        chosen = best_accepted(camera, ACCEPTED, "Kalibr")
+        model, intrinsics, distortion_model, distortion = _described(chosen.camera)
+        lines = [f"cam{i}:"]
+        if i and cam_from_rig is not None:
+            matrix = (cam_from_rig[i] @ cam_from_rig[i - 1].inverse()).matrix()
+            matrix[:3, 3] /= MM_PER_M
+            lines += ["  T_cn_cnm1:", *(f"  - {flow(row)}" for row in matrix)]
+        lines += [
+            f"  camera_model: {model}",
+            f"  distortion_coeffs: {flow(distortion)}",
+            f"  distortion_model: {distortion_model}",
+            f"  intrinsics: {flow(intrinsics)}",
+            f"  resolution: {flow(list(camera.size_px))}",
+            f"  rostopic: /cam{i}/image_raw",
+        ]
+        parts.append(chosen.written("\n".join(lines) + "\n"))
+    return KalibrChain("".join(part.text for part in parts), tuple(parts))
+
+
+def read_kalibr(text: str, name: str = "camchain") -> tuple[tuple[Camera, ...], tuple[Rigid3, ...]]:
+    """Return the cameras of a camchain and cam_from_rig of each; the rig's frame is that of cam0.
+
+    A camera without T_cn_cnm1 behind cam0 is an error. Raises InputError for models that are not here ("fov",
+    "omni" with distortion) and for damaged files.
+    """
+    data = parse_yaml(text, name)
+    keys = sorted((k for k in data if k.startswith("cam") and k[3:].isdigit()), key=lambda k: int(k[3:]))
+    if not keys:
+        raise InputError(f"'{name}': no cam0; is it a camchain of Kalibr?")
+    cameras, poses = [], [Rigid3.identity()]
+    for key in keys:
+        block = field(data, key, name)
+        cameras.append(_camera(block, f"{name}, {key}"))
+        if len(cameras) > 1:
+            matrix = numbers(field(block, "T_cn_cnm1", f"{name}, {key}"), name, f"{key}: T_cn_cnm1", 16).reshape(4, 4)
+            step = Rigid3(matrix[:3, :3], matrix[:3, 3] * MM_PER_M)
+            poses.append(step @ poses[-1])
+    return tuple(cameras), tuple(poses)
+
+
+def _described(camera: Camera) -> tuple[str, FloatArray, str, FloatArray]:
+    """Return camera_model, intrinsics, distortion_model, distortion_coeffs."""
+    p = camera.parameters
+    nothing = np.zeros(0)
+    if camera.model == "pinhole":
+        return "pinhole", p, "radtan", np.zeros(4)
+    if camera.model == "brown":
+        return "pinhole", p[:4], "radtan", p[4:8]
+    if camera.model == "kannala_brandt":
+        return "pinhole", p[:4], "equidistant", p[4:8]
+    if camera.model == "ucm":
+        xi, core = unified_with_xi(camera)
+        return "omni", np.array([xi, *core]), "none", nothing
+    return {"eucm": "eucm", "double_sphere": "ds"}[camera.model], np.array([*p[4:], *p[:4]]), "none", nothing
+
+
+def _camera(block: Any, name: str) -> Camera:
+    model = field(block, "camera_model", name)
+    distortion_model = str(block.get("distortion_model", "none"))
+    size_px = tuple(int(v) for v in numbers(field(block, "resolution", name), name, "resolution", 2))
+    size = (size_px[0], size_px[1])
+    intrinsics = numbers(field(block, "intrinsics", name), name, "intrinsics")
+    distortion = numbers(block.get("distortion_coeffs") or [], name, "distortion_coeffs")
+    expected = {"pinhole": 4, "omni": 5, "eucm": 6, "ds": 6}
+    if model not in expected:
+        raise InputError(f"'{name}': camera_model '{model}' is unknown; known: {', '.join(expected)}")
+    if intrinsics.size != expected[model]:
+        raise InputError(f"'{name}': {model} has {expected[model]} intrinsics, found {intrinsics.size}")
+    if model == "pinhole" and distortion_model == "equidistant":
+        return camera_model("kannala_brandt")(size, np.concatenate([intrinsics, distortion]))
+    if model == "pinhole" and distortion_model == "radtan" and distortion.any():
+        return camera_model("brown")(size, np.concatenate([intrinsics, distortion, [0.0]]))
+    if distortion.any():
+        raise InputError(
+            f"'{name}': {model} with distortion_model '{distortion_model}' is not supported; calibrate with radtan or "
+            "equidistant on a pinhole, or without distortion"
+        )
+    if model == "pinhole":
+        return camera_model("pinhole")(size, intrinsics)
+    if model == "omni":
+        return unified_from_xi(size, float(intrinsics[0]), intrinsics[1:])
+    ours = {"eucm": "eucm", "ds": "double_sphere"}[model]
+    return camera_model(ours)(size, np.concatenate([intrinsics[2:], intrinsics[:2]]))

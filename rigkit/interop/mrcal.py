@@ -1,0 +1,218 @@
+"""mrcal's .cameramodel: pinhole, OpenCV models of 4, 5 and 8 terms, and its splined stereographic model.
+
+Pixels as ours; lengths in metres; the pose is rt_cam_ref, a rotation vector and a translation. The splined model is a
+table of control points of a bicubic B-spline: it is written for fisheye lenses, of which mrcal has no other model that
+fits, and reproduces any smooth lens.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from typing import Any
+
+import numpy as np
+
+from rigkit.arrays import BoolArray, FloatArray, Pixels, Rays
+from rigkit.cameras.base import Camera
+from rigkit.cameras.convert import fit_camera
+from rigkit.cameras.registry import camera_model
+from rigkit.errors import InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3, log_so3
+from rigkit.interop.exchange import Accepted, Written, best_accepted, field, numbers
+
+__all__ = ["read_cameramodel", "write_cameramodel"]
+
+ACCEPTED = (Accepted("pinhole"), Accepted("brown", 5), Accepted("brown", 8))
+SPLINED = re.compile(
+    r"^LENSMODEL_SPLINED_STEREOGRAPHIC_(?:spline_)?order=(?P<order>\d)_Nx=(?P<nx>\d+)_Ny=(?P<ny>\d+)_fov_x_deg=(?P<fov>\d+)$"
+)
+MM_PER_M = 1000.0
+KNOTS_X = 40
+SMOOTHING = 1e-6
+"""Weight of the second differences of the control points: it carries the surface smoothly over the image's border."""
+GRID = (161, 121)
+"""Pixels at which the spline is fitted and read."""
+CHECK_GRID = (233, 187)
+"""Pixels at which its error is measured: others."""
+SPLINE_DEGREE = 10
+"""Of the polynomial camera in whose form a spline is read: the highest, there is no noise to follow."""
+CLOSE_ENOUGH_PX = 0.1
+"""A parametric model that is off by less is preferred to the spline: other programs can read it."""
+
+
+def write_cameramodel(camera: Camera, cam_from_ref: Rigid3 | None = None) -> Written:
+    """Return the camera as a .cameramodel file; `cam_from_ref` is its pose, by default the identity."""
+    pose = Rigid3.identity() if cam_from_ref is None else cam_from_ref
+    try:
+        chosen = best_accepted(camera, ACCEPTED, "mrcal")
+    except InputError:
+        chosen = None
+    if chosen is not None and chosen.covered == 1.0 and chosen.max_error_px < CLOSE_ENOUGH_PX:
+        p = chosen.camera.parameters
+        lens = {4: "PINHOLE", 9: "OPENCV5", 12: "OPENCV8"}[p.size]
+        return chosen.written(_text(f"LENSMODEL_{lens}", p, camera.size_px, pose))
+    lens, intrinsics = _spline_of(camera)
+    pixels, rays = _samples(camera, CHECK_GRID)
+    projected, inside = _spline_project(rays, lens, intrinsics)
+    error = np.linalg.norm(projected - pixels, axis=-1)[inside]
+    note = f"written as a spline of {(intrinsics.size - 4) // 2} knots, off by {error.max():.2g} px at most"
+    text = _text(lens, intrinsics, camera.size_px, pose)
+    return Written(text, camera, float(error.max()), float(np.sqrt(np.mean(error**2))), float(inside.mean()), note)
+
+
+def read_cameramodel(
+    text: str, name: str = "cameramodel", *, spline_as: str = "scaramuzza"
+) -> tuple[Camera, Rigid3, float]:
+    """Return the camera, cam_from_ref and the largest error, px: 0 unless a spline was refitted as `spline_as`.
+
+    Raises InputError for damaged files and for lens models that are not here (CAHVOR, panoramas).
+    """
+    try:
+        data = ast.literal_eval(text[text.index("{") :])
+    except (ValueError, SyntaxError, MemoryError, RecursionError) as error:
+        raise InputError(f"'{name}': not a .cameramodel of mrcal ({error.__class__.__name__})") from error
+    lens = str(data.get("lensmodel", data.get("lens_model", "")))
+    size_px = numbers(field(data, "imagersize", name), name, "imagersize", 2)
+    size = (int(size_px[0]), int(size_px[1]))
+    intrinsics = numbers(field(data, "intrinsics", name), name, "intrinsics")
+    pose_key = "rt_cam_ref" if "rt_cam_ref" in data else "extrinsics"
+    rt = numbers(field(data, pose_key, name), name, pose_key, 6)
+    pose = Rigid3(exp_so3(rt[:3]), rt[3:] * MM_PER_M)
+    counts = {"PINHOLE": 4, "OPENCV4": 8, "OPENCV5": 9, "OPENCV8": 12}
+    kind = lens.removeprefix("LENSMODEL_")
+    if kind in counts:
+        if intrinsics.size != counts[kind]:
+            raise InputError(f"'{name}': {lens} has {counts[kind]} intrinsics, found {intrinsics.size}")
+        if kind == "PINHOLE":
+            return camera_model("pinhole")(size, intrinsics), pose, 0.0
+        padded = np.append(intrinsics, 0.0) if kind == "OPENCV4" else intrinsics
+        return camera_model("brown")(size, padded), pose, 0.0
+    if SPLINED.match(lens) is None:
+        raise InputError(f"'{name}': lens model '{lens}' is not supported; known: {', '.join(counts)}, splined (cubic)")
+    camera, error_px = _from_spline(lens, intrinsics, size, spline_as, name)
+    return camera, pose, error_px
+
+
+def _text(lens: str, intrinsics: FloatArray, size_px: tuple[int, int], pose: Rigid3) -> str:
+    rt = [*log_so3(pose.rotation).tolist(), *(pose.translation_mm / MM_PER_M).tolist()]
+    return (
+        "# lengths in metres, pixels with (0, 0) at the centre of the top-left one\n"
+        "{\n"
+        f"    'lensmodel':  '{lens}',\n\n"
+        f"    'intrinsics': [ {', '.join(repr(float(v)) for v in intrinsics)},],\n\n"
+        "    # rotation vector and translation of the camera against the reference\n"
+        f"    'extrinsics': [ {', '.join(repr(float(v)) for v in rt)},],\n\n"
+        f"    'imagersize': [ {size_px[0]}, {size_px[1]},],\n"
+        "}\n"
+    )
+
+
+def _samples(camera: Camera, grid: tuple[int, int]) -> tuple[Pixels, Rays]:
+    u, v = (np.linspace(-0.5, size - 0.5, count) for size, count in zip(camera.size_px, grid, strict=True))
+    pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    rays, valid = camera.unproject(pixels)
+    return pixels[valid], rays[valid]
+
+
+def _stereographic(rays: Rays) -> FloatArray:
+    """Return 2 tan(theta / 2) (x, y) / r of unit rays."""
+    return np.asarray(2.0 * rays[..., :2] / (1.0 + rays[..., 2:]))
+
+
+def _spline_of(camera: Camera) -> tuple[str, FloatArray]:
+    """Return lens model and intrinsics of the spline through the camera's own rays, by linear least squares."""
+    pixels, rays = _samples(camera, GRID)
+    u = _stereographic(rays)
+    # The spline covers fov_x_deg on the horizontal, and as much as its knots reach on the vertical.
+    fov_x = int(np.ceil(np.degrees(4.0 * np.arctan(np.abs(u).max(axis=0)[0] / 2.0)))) + 2
+    reach = 2.0 * np.tan(np.radians(fov_x) / 4.0)
+    ny = int(np.ceil((KNOTS_X - 3) * np.abs(u).max(axis=0)[1] / reach)) + 4
+    lens = f"LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_Nx={KNOTS_X}_Ny={ny}_fov_x_deg={fov_x}"
+    centre, _ = camera.project(np.array([0.0, 0.0, 1.0]))
+    focal = camera.focal_px
+    basis, inside = _basis(u, lens)
+    target = ((pixels - centre) / focal - u)[inside]
+    normal = (basis[inside].T @ basis[inside]).toarray()
+    normal += SMOOTHING * _roughness(KNOTS_X, ny)
+    control = np.linalg.solve(normal, basis[inside].T @ target)
+    return lens, np.concatenate([[focal, focal, *centre], control.reshape(-1)])
+
+
+def _roughness(nx: int, ny: int) -> FloatArray:
+    """Return the matrix of the sum of squared second differences of control points along both directions."""
+    dx, dy = (np.diff(np.eye(n), 2, axis=0) for n in (nx, ny))
+    return np.asarray(np.kron(np.eye(ny), dx.T @ dx) + np.kron(dy.T @ dy, np.eye(nx)))
+
+
+def _spline_project(rays: Rays, lens: str, intrinsics: FloatArray) -> tuple[Pixels, BoolArray]:
+    """Return pixels = f (u + surface(u)) + centre, and where the spline's knots reach."""
+    u = _stereographic(rays)
+    basis, inside = _basis(u, lens)
+    surface = basis @ intrinsics[4:].reshape(-1, 2)
+    return intrinsics[:2] * (u + surface) + intrinsics[2:4], inside
+
+
+def _basis(u: FloatArray, lens: str) -> tuple[Any, BoolArray]:
+    """Return the sparse matrix (N, Ny Nx) of the bicubic B-spline at u, and where all its 4x4 knots exist."""
+    from scipy import sparse
+
+    match = SPLINED.match(lens)
+    if match is None or match["order"] != "3":
+        raise InputError(f"lens model '{lens}': only cubic splines are supported")
+    count = np.array([int(match["nx"]), int(match["ny"])])
+    if (count < 4).any() or not 0 < int(match["fov"]) < 360:
+        raise InputError(f"lens model '{lens}': at least 4 knots each way and a field of view below 360 degrees")
+    segments_per_u = (count[0] - 3) / (4.0 * np.tan(np.radians(int(match["fov"])) / 4.0))
+    position = u * segments_per_u + (count - 1) / 2.0
+    cell = np.floor(position)
+    inside = ((cell >= 1) & (cell + 2 <= count - 1)).all(axis=-1)
+    cell = np.clip(np.nan_to_num(cell), 1, count - 3).astype(np.int64)
+    t = position - cell
+    weights = (
+        np.stack(
+            [(1.0 - t) ** 3, 3.0 * t**3 - 6.0 * t**2 + 4.0, -3.0 * t**3 + 3.0 * t**2 + 3.0 * t + 1.0, t**3], axis=-1
+        )
+        / 6.0
+    )
+    step = np.arange(4)
+    columns = (cell[:, 1, None, None] + step[:, None] - 1) * count[0] + cell[:, 0, None, None] + step - 1
+    values = weights[:, 1, :, None] * weights[:, 0, None, :]
+    rows = np.repeat(np.arange(len(u)), 16)
+    shape = (len(u), int(count.prod()))
+    return sparse.csr_array((values.reshape(-1), (rows, columns.reshape(-1))), shape=shape), inside
+
+
+def _from_spline(
+    lens: str, intrinsics: FloatArray, size_px: tuple[int, int], model: str, name: str
+) -> tuple[Camera, float]:
+    """Return the camera of `model` nearest to the spline over the image, and its largest error, px."""
+    match = SPLINED.match(lens)
+    assert match is not None
+    if intrinsics.size != 4 + 2 * int(match["nx"]) * int(match["ny"]):
+        raise InputError(f"'{name}': {lens} needs {int(match['nx'])} x {int(match['ny'])} knots; is the file whole?")
+    rays, pixels = _spline_samples(lens, intrinsics, size_px, GRID[0])
+    if len(rays) < GRID[0]:
+        raise InputError(f"'{name}': the spline shows next to nothing on the image; is the file whole?")
+    centre = _spline_project(np.array([[0.0, 0.0, 1.0]]), lens, intrinsics)[0][0]
+    camera = fit_camera(
+        camera_model(model), size_px, rays, pixels, centre, order=SPLINE_DEGREE if model == "scaramuzza" else None
+    )
+    rays, pixels = _spline_samples(lens, intrinsics, size_px, 3 * GRID[0])
+    projected, seen = camera.project(rays)
+    return camera, float(np.linalg.norm((projected - pixels)[seen], axis=-1).max())
+
+
+def _spline_samples(lens: str, intrinsics: FloatArray, size_px: tuple[int, int], count: int) -> tuple[Rays, Pixels]:
+    """Return rays on a square grid of `count` a side in u, and their pixels, where they fall on the image."""
+    match = SPLINED.match(lens)
+    assert match is not None
+    reach = 2.0 * np.tan(np.radians(int(match["fov"])) / 4.0)
+    u, v = np.meshgrid(np.linspace(-reach, reach, count), np.linspace(-reach, reach, count))
+    plane = np.stack([u, v], axis=-1).reshape(-1, 2)
+    rho2 = 0.25 * np.sum(plane**2, axis=-1, keepdims=True)
+    rays = np.concatenate([plane, 1.0 - rho2], axis=-1) / (1.0 + rho2)
+    pixels, inside = _spline_project(rays, lens, intrinsics)
+    inside &= ((pixels >= -0.5) & (pixels <= np.array(size_px) - 0.5)).all(axis=-1)
+    return rays[inside], pixels[inside]

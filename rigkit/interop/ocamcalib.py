@@ -1,0 +1,159 @@
+"""OCamCalib's calib_results.txt (also written by ImprovedOcamCalib), and the JSON of py-OCamCalib.
+
+Their conventions end here. Pixels are (row, column) from 0; the frame is x down, y right, z backwards, so that the
+polynomial is negative on the axis: (x, y, z) of theirs = (y, x, -z) of ours. Their affine part [[c, d], [e, 1]] maps
+(down, right) to (row, column) and has one freedom too many: it is turned about the axis into ours, which has e = 0.
+"""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+
+from rigkit.arrays import FloatArray, Mat3
+from rigkit.cameras.base import Camera
+from rigkit.cameras.scaramuzza import DEGREES, Scaramuzza
+from rigkit.errors import InputError
+from rigkit.interop.exchange import Accepted, Chosen, Written, best_accepted, numbers
+
+__all__ = ["read_ocamcalib", "read_py_ocamcalib", "write_ocamcalib"]
+
+ENOUGH_PX = 0.02
+"""A polynomial of a higher degree is taken only where the lower one is off by more."""
+INVERSE_ENOUGH_PX = 1e-3
+INVERSE_DEGREES = range(4, 23, 2)
+"""OCamCalib raises the degree of the inverse polynomial until it fits, in the same way."""
+TITLES = (
+    "#polynomial coefficients for the DIRECT mapping function (ocam_model.ss in MATLAB). These are used by cam2world",
+    "#polynomial coefficients for the inverse mapping function (ocam_model.invpol in MATLAB). "
+    "These are used by world2cam",
+    '#center: "row" and "column", starting from 0 (C convention)',
+    '#affine parameters "c", "d", "e"',
+    '#image size: "height" and "width"',
+)
+
+
+def write_ocamcalib(camera: Camera) -> Written:
+    """Return the camera as calib_results.txt.
+
+    The note says how well their inverse polynomial follows, which only their world2cam uses.
+    """
+    chosen = _scaramuzza(camera)
+    c = chosen.camera
+    polynomial = np.insert(c.parameters[:-4], 1, 0.0)
+    cx, cy, stretch, shear = c.parameters[-4:]
+    # (row, col) = [[1/c, 0], [d/c, 1]] (down, right) of theirs, which is ours times c.
+    ss = -polynomial * stretch ** (1.0 - np.arange(polynomial.size))
+    inverse, error_px = _inverse_polynomial(ss, c, stretch)
+    values = (
+        [ss.size, *ss],
+        [inverse.size, *inverse],
+        [cy, cx],
+        [1.0 / stretch, 0.0, shear / stretch],
+        [c.size_px[1], c.size_px[0]],
+    )
+    text = "".join(
+        f"{title}\n\n{' '.join(str(v) if isinstance(v, int) else repr(float(v)) for v in row)}\n\n"
+        for title, row in zip(TITLES, values, strict=True)
+    )
+    written = chosen.written(text)
+    note = f"the inverse polynomial of {inverse.size} terms follows to {error_px:.2g} px"
+    note = f"{written.note}; {note}" if written.note else note
+    return Written(text, c, written.max_error_px, written.rms_error_px, written.covered, note)
+
+
+def read_ocamcalib(text: str, name: str = "calib_results.txt") -> tuple[Scaramuzza, Mat3]:
+    """Return the camera and cam_from_ocam: x_in_cam = cam_from_ocam @ x_in_ocam, poses of the file need it.
+
+    Raises InputError for a damaged file, or a polynomial that looks backwards or has a linear term.
+    """
+    rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    if len(rows) < 5:
+        raise InputError(f"'{name}': {len(rows)} lines of numbers, expected 5; is it OCamCalib's calib_results.txt?")
+    ss_row = numbers(rows[0], name, "polynomial")
+    ss = numbers(rows[0][1:], name, "polynomial", int(ss_row[0]))
+    row, column = numbers(rows[2], name, "center", 2)
+    c, d, e = numbers(rows[3], name, "affine parameters", 3)
+    height, width = (int(v) for v in numbers(rows[4], name, "image size", 2))
+    affine = np.array([[c, d], [e, 1.0]])
+    return _from_ocam((width, height), -ss, np.array([column, row]), affine[::-1, ::-1], name)
+
+
+def read_py_ocamcalib(text: str, size_px: tuple[int, int], name: str = "calibration.json") -> tuple[Scaramuzza, Mat3]:
+    """Return the camera of py-OCamCalib's JSON and cam_from_file, which has no image size and looks forward.
+
+    Its centre is (column, row), its stretch matrix acts on (right, down), its frame is x right, y down, z forward.
+    """
+    try:
+        data = json.loads(text)
+        polynomial = numbers(data["taylor_coefficient"], name, "taylor_coefficient")
+        centre = numbers(data["distortion_center"], name, "distortion_center", 2)
+        stretch = numbers(data["stretch_matrix"], name, "stretch_matrix", 4).reshape(2, 2)
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"'{name}': not a calibration of py-OCamCalib ({error})") from error
+    camera, turn = _from_ocam(size_px, polynomial, centre, stretch, name)
+    return camera, turn @ np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+def _from_ocam(
+    size_px: tuple[int, int], polynomial: FloatArray, centre: FloatArray, affine: FloatArray, name: str
+) -> tuple[Scaramuzza, Mat3]:
+    """Build from a forward polynomial and (u, v) = affine (right, down) + centre; return also cam_from_ocam."""
+    if polynomial.size - 1 not in DEGREES:
+        degrees = f"{DEGREES[0]} to {DEGREES[-1]}"
+        raise InputError(f"'{name}': a polynomial of degree {polynomial.size - 1}; rigkit takes {degrees}")
+    if polynomial[0] <= 0.0 or polynomial[1] != 0.0:
+        raise InputError(f"'{name}': the polynomial must look forward and have no linear term; is it OCamCalib's?")
+    # affine = [[c, d], [0, 1]] scale rotation: the last row of the triangle is (0, scale).
+    scale = float(np.linalg.norm(affine[1]))
+    cosine, sine = affine[1, 1] / scale, -affine[1, 0] / scale
+    rotation = np.array([[cosine, sine], [-sine, cosine]])
+    triangle = affine @ rotation.T / scale
+    shape = polynomial * scale ** (1.0 - np.arange(polynomial.size))
+    parameters = np.array([*np.delete(shape, 1), *centre, triangle[0, 0], triangle[0, 1]])
+    cam_from_ocam = np.zeros((3, 3))
+    cam_from_ocam[:2, :2] = rotation @ np.array([[0.0, 1.0], [1.0, 0.0]])
+    cam_from_ocam[2, 2] = -1.0
+    return Scaramuzza(size_px, parameters), cam_from_ocam
+
+
+def _scaramuzza(camera: Camera) -> Chosen:
+    """Return the camera itself, or the refit of the lowest degree that follows it."""
+    best: Chosen | None = None
+    for degree in (4, 6, 8, 10):
+        chosen = best_accepted(camera, (Accepted("scaramuzza", degree),), "OCamCalib")
+        if best is None or chosen.max_error_px < 0.5 * best.max_error_px:
+            best = chosen
+        if best.max_error_px <= ENOUGH_PX:
+            break
+    assert best is not None
+    return best
+
+
+def _inverse_polynomial(ss: FloatArray, camera: Camera, stretch: float) -> tuple[FloatArray, float]:
+    """Return rho as a polynomial of atan(z / r), z backwards, over the image, and its largest error in px."""
+    width, height = camera.size_px
+    edge = np.linspace(0.0, 1.0, 50)
+    border = np.concatenate(
+        [np.stack([edge * (width - 1.0), np.full(50, y)], axis=-1) for y in (0.0, height - 1.0)]
+        + [np.stack([np.full(50, x), edge * (height - 1.0)], axis=-1) for x in (0.0, width - 1.0)]
+    )
+    centre = camera.parameters[-4:-2]
+    farthest = float(np.linalg.norm(border - centre, axis=-1).max()) * max(abs(stretch), 1.0)
+    rho = np.linspace(0.0, farthest, 300)
+    z = np.polynomial.polynomial.polyval(rho, ss)
+    angle = np.arctan2(z, rho)
+    # Beyond the fold the angle turns back: no polynomial of it can be a function there.
+    rising = np.append(True, np.diff(np.maximum.accumulate(angle)) > 0.0)
+    rho, angle = rho[rising], angle[rising]
+    best: tuple[FloatArray, float] = (np.zeros(1), np.inf)
+    for degree in INVERSE_DEGREES:
+        fitted = np.polynomial.Polynomial.fit(angle, rho, degree)
+        coefficients = np.asarray(fitted.convert().coef, dtype=np.float64)
+        error = float(np.abs(np.polynomial.polynomial.polyval(angle, coefficients) - rho).max())
+        if error < best[1]:
+            best = (coefficients, error)
+        if error <= INVERSE_ENOUGH_PX:
+            break
+    return best

@@ -1,0 +1,73 @@
+"""ROS camera_info YAML, as camera_calibration_parsers reads it: plumb_bob, rational_polynomial, equidistant.
+
+Pixels as ours. The rectification matrix is the identity and the projection matrix the camera matrix: a single camera.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.arrays import FloatArray
+from rigkit.cameras.base import Camera
+from rigkit.cameras.registry import camera_model
+from rigkit.errors import InputError
+from rigkit.interop.exchange import Accepted, Written, best_accepted, field, numbers
+from rigkit.interop.simple_yaml import flow, parse_yaml
+
+__all__ = ["read_camera_info", "write_camera_info"]
+
+ACCEPTED = (Accepted("pinhole"), Accepted("brown", 5), Accepted("brown", 8), Accepted("kannala_brandt"))
+
+
+def write_camera_info(camera: Camera, camera_name: str = "camera") -> Written:
+    """Return the camera as a camera_info YAML file called `camera_name` inside."""
+    if not camera_name or not camera_name.replace("_", "").isalnum():
+        raise InputError(f"camera_info: name '{camera_name}'; ROS takes letters, digits and underscores")
+    chosen = best_accepted(camera, ACCEPTED, "ROS")
+    c = chosen.camera
+    p = c.parameters
+    fx, fy, cx, cy = p[:4].tolist()
+    distortion = p[4:] if p.size > 4 else np.zeros(5)
+    model = {4: "equidistant", 5: "plumb_bob", 8: "rational_polynomial"}[distortion.size]
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    text = (
+        f"image_width: {c.size_px[0]}\nimage_height: {c.size_px[1]}\ncamera_name: {camera_name}\n"
+        f"camera_matrix:\n{_matrix(K)}"
+        f"distortion_model: {model}\n"
+        f"distortion_coefficients:\n{_matrix(distortion.reshape(1, -1))}"
+        f"rectification_matrix:\n{_matrix(np.eye(3))}"
+        f"projection_matrix:\n{_matrix(np.hstack([K, np.zeros((3, 1))]))}"
+    )
+    return chosen.written(text)
+
+
+def read_camera_info(text: str, name: str = "camera_info") -> Camera:
+    """Return the camera of a camera_info file; raises InputError for other distortion models and damaged files."""
+    data = parse_yaml(text, name)
+    size = (int(field(data, "image_width", name)), int(field(data, "image_height", name)))
+    K = numbers(field(field(data, "camera_matrix", name), "data", name), name, "camera_matrix", 9)
+    if K[1] != 0.0:
+        raise InputError(f"'{name}': camera_matrix has skew {K[1]:g}, which no model here has")
+    core = K[[0, 4, 2, 5]]
+    distortion = numbers(field(field(data, "distortion_coefficients", name), "data", name), name, "distortion")
+    model = field(data, "distortion_model", name)
+    ours, count = {
+        "plumb_bob": ("brown", 5),
+        "rational_polynomial": ("brown", 8),
+        "equidistant": ("kannala_brandt", 4),
+    }.get(model, ("", 0))
+    if not ours:
+        raise InputError(
+            f"'{name}': distortion_model '{model}' is unknown; known: plumb_bob, rational_polynomial, equidistant"
+        )
+    if distortion.size > count and distortion[count:].any():
+        raise InputError(f"'{name}': {model} has {count} coefficients, found {distortion.size}")
+    distortion = np.concatenate([distortion[:count], np.zeros(max(count - distortion.size, 0))])
+    if ours == "brown" and not distortion.any():
+        return camera_model("pinhole")(size, core)
+    return camera_model(ours)(size, np.concatenate([core, distortion]))
+
+
+def _matrix(array: FloatArray) -> str:
+    rows, columns = array.shape
+    return f"  rows: {rows}\n  cols: {columns}\n  data: {flow(array.reshape(-1))}\n"

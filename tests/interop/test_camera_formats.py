@@ -1,0 +1,422 @@
+"""Camera files of other programs: written, read back, and read by the programs themselves where they are at hand."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from helpers.cameras import image_pixels, rays_within, sample_cameras
+from helpers.data import shared_data
+
+from rigkit.cameras.base import Camera
+from rigkit.cameras.compare import compare_cameras
+from rigkit.cameras.pinhole import Pinhole
+from rigkit.cameras.scaramuzza import Scaramuzza
+from rigkit.errors import InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
+from rigkit.interop.colmap_cameras import read_colmap_cameras, write_colmap_cameras
+from rigkit.interop.exchange import Written
+from rigkit.interop.kalibr import read_kalibr, write_kalibr
+from rigkit.interop.mrcal import _spline_project, read_cameramodel, write_cameramodel
+from rigkit.interop.ocamcalib import read_ocamcalib, read_py_ocamcalib, write_ocamcalib
+from rigkit.interop.opencv import read_opencv, write_opencv
+from rigkit.interop.ros import read_camera_info, write_camera_info
+
+CAMERAS = sample_cameras()
+SAME_PX = 1e-9
+"""Text holds every digit of a double: reading back loses nothing but the rounding of a change of parameters."""
+STATED_REL = 1e-3
+"""The error that the writer states is the one found on reading the file back, on nearly the same pixels."""
+
+SPLINE_PX = 0.01
+"""A lens without a fold in its image is followed by knots 30 px apart to thousandths of a pixel."""
+SPLINE_FOLD_PX = 0.5
+"""Where the image reaches the fold, d pixel / d angle goes to zero and the spline in the angle misses a little."""
+BETWEEN_SAMPLES = 1.1
+"""The largest error stated is that of samples; at the very corner it may be a little larger."""
+
+
+def _colmap(camera: Camera) -> Written:
+    text, cameras = write_colmap_cameras({1: camera})
+    assert text.endswith(cameras[1].text)
+    return cameras[1]
+
+
+FORMATS = {
+    "opencv": (write_opencv, read_opencv),
+    "kalibr": (lambda c: write_kalibr([c]).cameras[0], lambda t: read_kalibr(t)[0][0]),
+    "ros": (write_camera_info, read_camera_info),
+    "colmap": (_colmap, lambda t: read_colmap_cameras(t)[1]),
+    "ocamcalib": (write_ocamcalib, lambda t: read_ocamcalib(t)[0]),
+    "mrcal": (write_cameramodel, lambda t: read_cameramodel(t)[0]),
+}
+NATIVE = {
+    "opencv": {"pinhole", "brown", "brown_rational", "kannala_brandt", "kannala_brandt_folding", "ucm", "ucm_narrow"},
+    "kalibr": {
+        "pinhole", "kannala_brandt", "kannala_brandt_folding", "ucm", "ucm_narrow", "eucm", "double_sphere",
+        "double_sphere_positive",
+    },
+    "ros": {"pinhole", "brown", "brown_rational", "kannala_brandt", "kannala_brandt_folding"},
+    "colmap": {"pinhole", "brown", "brown_rational", "kannala_brandt", "kannala_brandt_folding", "eucm"},
+    "ocamcalib": {"scaramuzza", "scaramuzza_3"},
+    "mrcal": {"pinhole", "brown", "brown_rational"},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "label"), [(f, label) for f in sorted(NATIVE) for label in sorted(NATIVE[f])])
+def test_native_models_come_back_unchanged(name: str, label: str) -> None:
+    write, read = FORMATS[name]
+    camera = CAMERAS[label]
+    written = write(camera)
+    assert written.max_error_px == 0.0
+    assert written.covered == 1.0
+    again = read(written.text)
+    assert again.size_px == camera.size_px
+    assert compare_cameras(camera, again, fit_rotation=name == "ocamcalib").max_px < SAME_PX
+
+
+@pytest.mark.parametrize("name", sorted(set(FORMATS) - {"mrcal"}))
+@pytest.mark.parametrize("label", sorted(CAMERAS))
+def test_what_is_lost_is_stated(name: str, label: str) -> None:
+    """Other models are refitted; the largest error stated is what a user of the file gets."""
+    write, read = FORMATS[name]
+    camera = CAMERAS[label]
+    if name == "ocamcalib" and label == "pinhole":
+        pytest.skip("exact: nothing to state")
+    written = write(camera)
+    again = read(written.text)
+    pixels = image_pixels(camera, 64, 48)
+    rays, valid = camera.unproject(pixels)
+    if label not in NATIVE[name]:
+        assert "refitted" in written.note
+        match = re.search(r"within (\d+) degrees", written.note)
+        if match is not None:
+            theta = np.degrees(np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]))
+            valid &= theta < float(match[1]) - 0.5
+    projected, seen = again.project(rays[valid])
+    assert seen.mean() > 0.9
+    found = np.linalg.norm((projected - pixels[valid])[seen], axis=-1)
+    assert found.max() <= written.max_error_px * (1.0 + STATED_REL) + SAME_PX
+    assert found.max() >= 0.3 * written.max_error_px - 1e-6
+    assert written.rms_error_px <= written.max_error_px
+
+
+@pytest.mark.parametrize("label", ["pinhole", "brown", "brown_rational", "kannala_brandt", "ucm"])
+def test_opencv_reads_what_we_write(label: str, tmp_path: Path, rng: np.random.Generator) -> None:
+    camera = CAMERAS[label]
+    path = tmp_path / "camera.yml"
+    path.write_text(write_opencv(camera).text)
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    K, d = (storage.getNode(key).mat() for key in ("camera_matrix", "distortion_coefficients"))
+    assert int(storage.getNode("image_width").real()) == camera.size_px[0]
+    points = rays_within(min(0.95 * camera.max_angle_rad, np.radians(75.0)), 300, rng)
+    still = (np.zeros(3), np.zeros(3))
+    if label == "kannala_brandt":
+        theirs = cv2.fisheye.projectPoints(points[:, None], *still, K, d)[0][:, 0]
+    elif label == "ucm":
+        theirs = cv2.omnidir.projectPoints(points[None], *still, K, storage.getNode("xi").real(), d)[0][0]
+    else:
+        theirs = cv2.projectPoints(points, *still, K, d)[0][:, 0]
+    assert np.abs(theirs - camera.project(points)[0]).max() < SAME_PX
+
+
+def test_we_read_what_opencv_writes(tmp_path: Path) -> None:
+    camera = CAMERAS["brown"]
+    p = camera.parameters
+    path = tmp_path / "camera.yml"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("calibration_time", "Sat Nov 21 2026")
+    storage.write("image_width", 1280)
+    storage.write("image_height", 960)
+    storage.write("flags", 0)
+    storage.write("fisheye_model", 0)
+    storage.write("camera_matrix", np.array([[p[0], 0.0, p[2]], [0.0, p[1], p[3]], [0.0, 0.0, 1.0]]))
+    storage.write("distortion_coefficients", p[4:].reshape(5, 1))
+    storage.write("avg_reprojection_error", 0.2)
+    storage.release()
+    again = read_opencv(path.read_text())
+    assert again.model == "brown"
+    assert np.allclose(again.parameters, p, rtol=1e-14)
+
+
+@pytest.mark.parametrize("label", ["pinhole", "brown", "brown_rational", "kannala_brandt", "eucm", "ucm"])
+def test_colmap_reads_what_we_write(label: str, tmp_path: Path, rng: np.random.Generator) -> None:
+    """Through COLMAP's own reader: its pixels are ours plus one half."""
+    camera = CAMERAS[label]
+    text, written = write_colmap_cameras({3: camera})
+    for name in ("images.txt", "points3D.txt", "rigs.txt", "frames.txt"):
+        (tmp_path / name).write_text("")
+    (tmp_path / "cameras.txt").write_text(text)
+    model = pycolmap.Reconstruction()
+    model.read_text(tmp_path)
+    theirs = model.cameras[3]
+    points = rays_within(min(0.95 * camera.max_angle_rad, np.radians(75.0)), 300, rng)
+    assert np.abs(theirs.img_from_cam(points) - 0.5 - camera.project(points)[0]).max() < 1e-6
+    assert (written[3].note != "") == (label in ("kannala_brandt", "eucm", "ucm"))
+
+
+@pytest.mark.parametrize(
+    ("line", "parameters"),
+    [
+        ("SIMPLE_PINHOLE 640 480 500 320.5 240.5", [500.0, 320.5, 240.5]),
+        ("SIMPLE_RADIAL 640 480 500 320.5 240.5 -0.1", [500.0, 320.5, 240.5, -0.1]),
+        ("RADIAL 640 480 500 320.5 240.5 -0.1 0.02", [500.0, 320.5, 240.5, -0.1, 0.02]),
+        ("SIMPLE_FISHEYE 640 480 300 320.5 240.5", [300.0, 320.5, 240.5]),
+        ("FISHEYE 640 480 300 301 320.5 240.5", [300.0, 301.0, 320.5, 240.5]),
+        ("SIMPLE_RADIAL_FISHEYE 640 480 300 320.5 240.5 -0.02", [300.0, 320.5, 240.5, -0.02]),
+        ("RADIAL_FISHEYE 640 480 300 320.5 240.5 -0.02 0.003", [300.0, 320.5, 240.5, -0.02, 0.003]),
+        ("OPENCV 640 480 500 501 320.5 240.5 -0.1 0.02 1e-3 -2e-3",
+         [500.0, 501.0, 320.5, 240.5, -0.1, 0.02, 1e-3, -2e-3]),
+    ],
+)  # fmt: skip
+def test_we_read_colmap_models(line: str, parameters: list[float], rng: np.random.Generator) -> None:
+    camera = read_colmap_cameras(f"# comment\n7 {line}\n")[7]
+    theirs = pycolmap.Camera(model=line.split()[0], width=640, height=480, params=np.array(parameters))
+    points = rays_within(np.radians(40.0), 200, rng)
+    ours, valid = camera.project(points)
+    assert valid.all()
+    assert np.abs(theirs.img_from_cam(points) - 0.5 - ours).max() < SAME_PX
+
+
+def test_kalibr_rig_poses_in_metres() -> None:
+    poses = [
+        Rigid3.identity(),
+        Rigid3(exp_so3(np.array([0.1, -0.2, 0.05])), [-300.0, 10.0, 5.0]),
+        Rigid3(exp_so3(np.array([0.3, 0.1, 0.0])), [-600.0, 0.0, 50.0]),
+    ]
+    cameras = [CAMERAS[k] for k in ("pinhole", "double_sphere", "eucm")]
+    text = write_kalibr(cameras, poses).text
+    assert re.search(r"cam1:\n  T_cn_cnm1:", text)
+    again, cam_from_rig = read_kalibr(text)
+    assert [c.model for c in again] == ["pinhole", "double_sphere", "eucm"]
+    for a, b in zip(poses, cam_from_rig, strict=True):
+        assert a.allclose(b, translation_tol_mm=1e-9)
+    row = next(line for line in text.splitlines() if line.startswith("  - ["))
+    assert abs(float(row.rstrip("]").split(",")[-1]) + 0.3) < 1e-12
+    with pytest.raises(InputError, match="pose"):
+        write_kalibr(cameras)
+
+
+def test_kalibr_file_as_kalibr_writes_it() -> None:
+    """Block and flow lists mixed, as in camchain files; radtan has four terms."""
+    text = """cam0:
+  cam_overlaps: [1]
+  camera_model: pinhole
+  distortion_coeffs: [-0.28, 0.07, 0.0002,
+    1.7e-05]
+  distortion_model: radtan
+  intrinsics: [458.6, 457.2, 367.2, 248.3]
+  resolution: [752, 480]
+  rostopic: /cam0/image_raw
+cam1:
+  T_cn_cnm1:
+  - [1.0, 0.0, 0.0, -0.11]
+  - [0.0, 1.0, 0.0, 0.0]
+  - [0.0, 0.0, 1.0, 0.0]
+  - [0.0, 0.0, 0.0, 1.0]
+  cam_overlaps: [0]
+  camera_model: omni
+  distortion_coeffs: []
+  distortion_model: none
+  intrinsics: [0.9, 700.0, 701.0, 370.0, 240.0]
+  resolution: [752, 480]
+  rostopic: /cam1/image_raw
+"""
+    cameras, poses = read_kalibr(text)
+    assert cameras[0].parameters.tolist() == [458.6, 457.2, 367.2, 248.3, -0.28, 0.07, 0.0002, 1.7e-05, 0.0]
+    assert cameras[1].model == "ucm"
+    assert cameras[1].focal_px == pytest.approx(np.sqrt(700.0 * 701.0) / 1.9)
+    assert poses[1].translation_mm.tolist() == pytest.approx([-110.0, 0.0, 0.0])
+
+
+def test_ros_file_as_ros_writes_it() -> None:
+    text = """image_width: 640
+image_height: 480
+camera_name: narrow
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [500.5, 0, 320.25, 0, 501.5, 240.75, 0, 0, 1]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [-0.2, 0.05, 0.001, -0.002, 0]
+rectification_matrix:
+  rows: 3
+  cols: 3
+  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]
+projection_matrix:
+  rows: 3
+  cols: 4
+  data: [500.5, 0, 320.25, 0, 0, 501.5, 240.75, 0, 0, 0, 1, 0]
+"""
+    camera = read_camera_info(text)
+    assert camera.parameters.tolist() == [500.5, 501.5, 320.25, 240.75, -0.2, 0.05, 0.001, -0.002, 0.0]
+
+
+def _cam2world(text: str, pixels: np.ndarray) -> np.ndarray:
+    """OCamCalib's cam2world, from the toolbox's description: (row, column) to a ray, x down, y right, z backwards."""
+    rows = [line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    ss = np.array(rows[0][1:], dtype=float)
+    xc, yc = (float(v) for v in rows[2])
+    c, d, e = (float(v) for v in rows[3])
+    offset = pixels[:, ::-1] - [xc, yc]
+    plane = offset @ np.linalg.inv(np.array([[c, d], [e, 1.0]])).T
+    rho = np.linalg.norm(plane, axis=-1)
+    ray = np.concatenate([plane, np.polynomial.polynomial.polyval(rho, ss)[:, None]], axis=-1)
+    return ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+
+
+def _world2cam(text: str, rays: np.ndarray) -> np.ndarray:
+    """OCamCalib's world2cam through the inverse polynomial; returns (column, row)."""
+    rows = [line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    inverse = np.array(rows[1][1:], dtype=float)
+    xc, yc = (float(v) for v in rows[2])
+    c, d, e = (float(v) for v in rows[3])
+    norm = np.linalg.norm(rays[:, :2], axis=-1)
+    rho = np.polynomial.polynomial.polyval(np.arctan(rays[:, 2] / norm), inverse)
+    x, y = (rays[:, :2] / norm[:, None] * rho[:, None]).T
+    return np.stack([x * e + y + yc, x * c + y * d + xc], axis=-1)
+
+
+OCAM_FILE = """#polynomial coefficients for the DIRECT mapping function
+
+5 -3.377168e+02 0.000000e+00 1.223832e-03 -1.380400e-06 3.010617e-09
+
+#polynomial coefficients for the inverse mapping function
+
+2 1.0 2.0
+
+#center: "row" and "column", starting from 0 (C convention)
+
+377.648825 543.986151
+
+#affine parameters "c", "d", "e"
+
+1.003296 0.003148 -0.004177
+
+#image size: "height" and "width"
+
+778 1032
+"""
+
+
+def test_ocamcalib_file_gives_the_same_rays() -> None:
+    camera, cam_from_ocam = read_ocamcalib(OCAM_FILE)
+    assert camera.size_px == (1032, 778)
+    assert np.allclose(cam_from_ocam @ cam_from_ocam.T, np.eye(3), atol=1e-14)
+    assert np.linalg.det(cam_from_ocam) == pytest.approx(1.0)
+    pixels = image_pixels(camera)
+    rays, valid = camera.unproject(pixels)
+    assert valid.mean() > 0.9
+    assert np.abs(rays - _cam2world(OCAM_FILE, pixels) @ cam_from_ocam.T)[valid].max() < 1e-12
+
+
+@pytest.mark.parametrize("label", ["scaramuzza", "scaramuzza_3", "kannala_brandt_folding", "eucm", "brown"])
+def test_ocamcalib_sees_the_rays_that_we_see(label: str) -> None:
+    camera = CAMERAS[label]
+    written = write_ocamcalib(camera)
+    stated = float(re.search(r"follows to ([\d.e+-]+) px", written.note)[1])  # type: ignore[index]
+    pixels = image_pixels(camera)
+    rays, valid = written.camera.unproject(pixels)
+    assert valid.mean() > 0.9
+    pixels, rays = pixels[valid], rays[valid]
+    down_right_back = rays[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
+    assert np.abs(_cam2world(written.text, pixels) - down_right_back).max() < 1e-10
+    assert np.abs(_world2cam(written.text, down_right_back) - pixels).max() < 2.0 * stated + 1e-6
+    assert stated < 0.5
+
+
+@pytest.mark.real
+def test_published_calibration_of_py_ocamcalib() -> None:
+    """The published polynomial, evaluated by hand at the published centre and along a row."""
+    text = next(shared_data("real/ocam-fisheye1").glob("calibration_fisheye_1_*.json")).read_text()
+    camera, _ = read_py_ocamcalib(text, (1032, 778))
+    assert isinstance(camera, Scaramuzza)
+    centre, _ = camera.project(np.array([0.0, 0.0, 1.0]))
+    assert centre == pytest.approx([543.986, 377.649], abs=1e-3)
+    ray, _ = camera.unproject(centre + np.array([0.0, 300.0]))
+    rho = 300.0
+    f = 337.71684 - 1.22383e-3 * rho**2 + 1.38040e-6 * rho**3 - 3.01062e-9 * rho**4
+    assert ray[2] / np.linalg.norm(ray[:2]) == pytest.approx(f / rho, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("label", "limit_px"),
+    [("kannala_brandt_folding", SPLINE_FOLD_PX), ("scaramuzza", SPLINE_PX), ("double_sphere", SPLINE_PX)],
+)
+def test_mrcal_spline_of_a_fisheye(label: str, limit_px: float) -> None:
+    """A fisheye goes into mrcal as a spline and comes back as a polynomial."""
+    camera = CAMERAS[label]
+    written = write_cameramodel(camera)
+    assert "SPLINED_STEREOGRAPHIC" in written.text
+    assert written.max_error_px < limit_px
+    assert written.covered > 0.99
+    again, pose, error_px = read_cameramodel(written.text)
+    assert pose.allclose(Rigid3.identity())
+    assert compare_cameras(camera, again, fit_rotation=False).max_px < BETWEEN_SAMPLES * error_px + limit_px
+
+
+def test_mrcal_spline_is_mrcals() -> None:
+    """Pixels as mrcal 2.2 itself projects these rays (mrcal.project), the third near the edge of the knots."""
+    lens = "LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_Nx=8_Ny=6_fov_x_deg=150"
+    intrinsics = np.concatenate([[300.0, 310.0, 640.0, 480.0], 0.05 * np.sin(np.arange(96))])
+    rays = np.array([[0.0, 0.0, 1.0], [0.5, -0.2, 1.0], [-1.5, 0.6, 1.0]])
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    pixels, inside = _spline_project(rays, lens, intrinsics)
+    theirs = [
+        [639.8924447898148, 480.6909602676],
+        [781.5908149961523, 420.9743781906921],
+        [331.82264976261104, 610.1345402377215],
+    ]
+    assert inside.all()
+    assert np.abs(pixels - theirs).max() < SAME_PX
+
+
+def test_mrcal_pose_is_in_metres() -> None:
+    pose = Rigid3(exp_so3(np.array([0.1, -0.2, 0.05])), [-300.0, 10.0, 5.0])
+    camera, again, error_px = read_cameramodel(write_cameramodel(CAMERAS["brown"], pose).text)
+    assert again.allclose(pose)
+    assert error_px == 0.0
+    assert camera.model == "brown"
+    newer = write_cameramodel(CAMERAS["brown"], pose).text.replace("'extrinsics'", "'rt_cam_ref'")
+    assert read_cameramodel(newer)[1].allclose(pose)
+
+
+@pytest.mark.parametrize("name", sorted(FORMATS))
+@pytest.mark.parametrize(
+    "text", ["", "nonsense", "a: [1, 2", "cam0:\n  x: 1\n", "1 PINHOLE 640\n", "{'lensmodel': 'X'}"]
+)
+def test_damaged_files_are_refused_with_a_reason(name: str, text: str) -> None:
+    with pytest.raises(InputError) as caught:
+        FORMATS[name][1](text)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("name", sorted(FORMATS))
+def test_cut_files_are_refused(name: str) -> None:
+    """Cut anywhere: an error of ours, or (where only comments or optional keys were lost) still a camera."""
+    write, read = FORMATS[name]
+    text = write(CAMERAS["scaramuzza" if name == "ocamcalib" else "brown"]).text
+    refused = 0
+    for cut in range(0, len(text) - 2, 37):
+        try:
+            read(text[:cut])
+        except InputError:
+            refused += 1
+    assert refused > 0.5 * len(range(0, len(text) - 2, 37)) or name == "ros"
+
+
+def test_a_pinhole_stays_a_pinhole() -> None:
+    camera = Pinhole((640, 480), np.array([500.0, 501.0, 320.0, 240.0]))
+    for name in ("opencv", "kalibr", "ros", "colmap", "mrcal"):
+        write, read = FORMATS[name]
+        again = read(write(camera).text)
+        assert again.model == "pinhole"
+        assert again.parameters == pytest.approx(camera.parameters, abs=1e-12)
