@@ -18,6 +18,7 @@ from rigkit.errors import InputError
 from rigkit.reconstruct import Reconstruction
 from rigkit.truth import PairTruth
 from rigkit.validation.boards import BoardResult
+from rigkit.validation.intrinsics import CalibrationShifts
 from rigkit.validation.measure import measure
 
 __all__ = ["COVERAGE", "AngleResult", "Check", "ValidationReport", "judge", "validate", "without_nan"]
@@ -150,13 +151,20 @@ class ValidationReport:
         return json.dumps(self.to_dict(), indent=2, allow_nan=False)
 
 
-def validate(reconstruction: Reconstruction, truth: PairTruth, *, coverage: float = COVERAGE) -> ValidationReport:
+def validate(
+    reconstruction: Reconstruction,
+    truth: PairTruth,
+    *,
+    shifts: CalibrationShifts | None = None,
+    coverage: float = COVERAGE,
+) -> ValidationReport:
     """Judge a reconstruction against measured truth.
 
     Parameters
     ----------
     reconstruction : of one pair.
     truth : what a person measured of that pair.
+    shifts : from `calibration_shifts`: what the calibrations' uncertainty adds to every sigma; None: exact intrinsics.
     coverage : largest |difference| / combined sigma that passes.
 
     Raises
@@ -166,13 +174,16 @@ def validate(reconstruction: Reconstruction, truth: PairTruth, *, coverage: floa
     DegenerateError
         A board has too few points for a plane.
     """
-    measured = measure(reconstruction)
+    measured = measure(reconstruction, shifts)
+    baseline_sigma_mm = reconstruction.baseline_sigma_mm
+    if shifts is not None:
+        baseline_sigma_mm = float(np.hypot(baseline_sigma_mm, np.sqrt(shifts.variance(lambda r: r.baseline_mm))))
     cloud = reconstruction.cloud
     checks: list[Check] = []
     unchecked: list[str] = []
     if truth.baseline is not None:
         known = (truth.baseline.value_mm, truth.baseline.sigma_mm, truth.baseline.how)
-        ours = (reconstruction.baseline_mm, reconstruction.baseline_sigma_mm)
+        ours = (reconstruction.baseline_mm, baseline_sigma_mm)
         checks.append(judge("baseline", "baseline", "mm", known, ours, coverage, len(cloud)))
     angles = {frozenset(two): measured.angle_deg(*two) for two in combinations(measured.boards, 2)}
     for angle in truth.angles:
@@ -204,7 +215,7 @@ def validate(reconstruction: Reconstruction, truth: PairTruth, *, coverage: floa
             for a, b in combinations(measured.boards, 2)
         ),
         reconstruction.baseline_mm,
-        reconstruction.baseline_sigma_mm,
+        baseline_sigma_mm,
         reconstruction.sampson_rms_px,
         len(cloud),
         reconstruction.notes,

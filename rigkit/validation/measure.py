@@ -2,7 +2,8 @@
 
 The corners' own scatter about plane and lattice is observed. The relative pose moves all points together, which no
 scatter shows: its covariance is carried through triangulation by central differences. Both parts are independent,
-because the residuals that fix the pose are orthogonal to those that fix the points. Intrinsics are taken as exact.
+because the residuals that fix the pose are orthogonal to those that fix the points. The calibrations' uncertainty is
+the third part, where they come with their covariances; else intrinsics are taken as exact.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from rigkit.geometry.triangulation import point_covariances, triangulate_rays
 from rigkit.reconstruct import Reconstruction
 from rigkit.truth import MeasuredDistance
 from rigkit.validation.boards import BoardResult, measure_board
+from rigkit.validation.intrinsics import CalibrationShifts
 from rigkit.validation.planes import angle_jacobian, face_angle
 
 __all__ = ["Measured", "measure", "points_by_pose"]
@@ -40,11 +42,14 @@ class Measured:
     shaken : for each of the six pose parameters (rotation rad, translation mm) the boards after a small step forward
         and backward, and the step.
     pose_covariance : (6, 6), or None: then only the scatter counts.
+    shifted : the boards estimated again, first with the calibrations as they are, then moved along each principal axis
+        of their covariance; empty where that is not known.
     """
 
     boards: Boards
     shaken: tuple[tuple[Boards, Boards, float], ...]
     pose_covariance: FloatArray | None
+    shifted: tuple[Boards, ...] = ()
 
     def absent(self, *board_ids: str) -> str:
         """Return in words which of the boards were not reconstructed; empty if all were."""
@@ -60,24 +65,29 @@ class Measured:
         one, two = self.boards[a].plane, self.boards[b].plane
         by_a, by_b = angle_jacobian(one.normal, two.normal)
         scatter = by_a @ one.normal_covariance @ by_a + by_b @ two.normal_covariance @ by_b
-        pose = self._pose_variance(lambda boards: face_angle(boards[a].plane.normal, boards[b].plane.normal))
-        return float(np.rad2deg(face_angle(one.normal, two.normal))), float(np.rad2deg(np.sqrt(scatter + pose)))
+        common = self._common_variance(lambda boards: face_angle(boards[a].plane.normal, boards[b].plane.normal))
+        return float(np.rad2deg(face_angle(one.normal, two.normal))), float(np.rad2deg(np.sqrt(scatter + common)))
 
     def distance_mm(self, distance: MeasuredDistance) -> tuple[float, float]:
         """Return a distance between features and its sigma, mm."""
         scatter = _distance_scatter(self.boards, distance)
-        pose = self._pose_variance(lambda boards: _distance(boards, distance))
-        return _distance(self.boards, distance), float(np.sqrt(scatter + pose))
+        common = self._common_variance(lambda boards: _distance(boards, distance))
+        return _distance(self.boards, distance), float(np.sqrt(scatter + common))
 
-    def _pose_variance(self, quantity: Callable[[Boards], float]) -> float:
-        if self.pose_covariance is None:
-            return 0.0
-        slope = np.array([(quantity(ahead) - quantity(back)) / (2.0 * step) for ahead, back, step in self.shaken])
-        return float(slope @ self.pose_covariance @ slope)
+    def _common_variance(self, quantity: Callable[[Boards], float]) -> float:
+        """Return the variance from what moves all points together: the pose, and the calibrations."""
+        variance = 0.0
+        if self.pose_covariance is not None:
+            slope = np.array([(quantity(ahead) - quantity(back)) / (2.0 * step) for ahead, back, step in self.shaken])
+            variance += float(slope @ self.pose_covariance @ slope)
+        if self.shifted:
+            base, *moved = (quantity(boards) for boards in self.shifted)
+            variance += float(sum((value - base) ** 2 for value in moved))
+        return variance
 
 
-def measure(reconstruction: Reconstruction) -> Measured:
-    """Fit plane and lattice of every board, and again for each small step of the pose.
+def measure(reconstruction: Reconstruction, shifts: CalibrationShifts | None = None) -> Measured:
+    """Fit plane and lattice of every board, again for each small step of the pose, and of the calibrations if given.
 
     Raises DegenerateError where a board has too few points.
     """
@@ -109,7 +119,13 @@ def measure(reconstruction: Reconstruction) -> Measured:
     if reconstruction.pose_covariance is not None:
         for motion, step in points_by_pose(reconstruction):
             shaken.append((boards_of(cloud.points_mm + motion), boards_of(cloud.points_mm - motion), step))
-    return Measured(boards_of(cloud.points_mm), tuple(shaken), reconstruction.pose_covariance)
+    shifted = () if shifts is None else (shifts.base, *shifts.moved)
+    return Measured(
+        boards_of(cloud.points_mm),
+        tuple(shaken),
+        reconstruction.pose_covariance,
+        tuple(boards_of(moved.cloud.points_mm) for moved in shifted),
+    )
 
 
 def points_by_pose(reconstruction: Reconstruction) -> tuple[tuple[FloatArray, float], ...]:

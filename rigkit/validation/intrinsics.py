@@ -1,0 +1,108 @@
+"""What the uncertainty of the calibrations does to a reconstruction.
+
+A calibration is one error for a whole pair: it tilts planes and stretches baselines without leaving any scatter behind.
+So each principal axis of the parameters' covariance is tried: the cameras moved by one standard deviation along it, the
+pose, the scale and the points estimated again from the same corners. The axes are independent, so the squares of what
+they change in a quantity add up to its variance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rigkit.arrays import FloatArray
+from rigkit.cameras.base import Camera
+from rigkit.fundamental.metric import metric_pose, triangulate_matches
+from rigkit.fundamental.refine import refine_pose
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.matches import Matches
+from rigkit.reconstruct import Reconstruction
+
+__all__ = ["CalibrationShifts", "calibration_shifts"]
+
+NEGLIGIBLE = 1e-12
+"""Principal axes with less than this part of the largest variance (parameters scaled to one sigma) are left out."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CalibrationShifts:
+    """A reconstruction estimated again with the calibrations as they are, and moved along each principal axis."""
+
+    base: Reconstruction
+    moved: tuple[Reconstruction, ...]
+
+    def variance(self, quantity: Callable[[Reconstruction], float]) -> float:
+        """Return the variance of a quantity from the calibrations' uncertainty."""
+        at_base = quantity(self.base)
+        return float(sum((quantity(moved) - at_base) ** 2 for moved in self.moved))
+
+
+def calibration_shifts(
+    reconstruction: Reconstruction,
+    covariance1: FloatArray,
+    covariance2: FloatArray | None = None,
+    *,
+    level_sigma_rad: float | None = None,
+) -> CalibrationShifts:
+    """Return the reconstruction with its cameras moved by one standard deviation along every principal axis.
+
+    Parameters
+    ----------
+    reconstruction : of one pair.
+    covariance1 : (P, P) of camera 1's parameters.
+    covariance2 : (Q, Q) of camera 2's, or None where both images are of one camera: then both move together.
+    level_sigma_rad : as in the reconstruction.
+    """
+    camera1, camera2 = reconstruction.camera1, reconstruction.camera2
+    cameras: list[tuple[Camera, Camera]] = []
+    for axis in principal_axes(covariance1):
+        moved = camera1.with_parameters(camera1.parameters + axis)
+        cameras.append((moved, moved if covariance2 is None else camera2))
+    for axis in [] if covariance2 is None else principal_axes(covariance2):
+        cameras.append((camera1, camera2.with_parameters(camera2.parameters + axis)))
+    base = _again(reconstruction, camera1, camera2, level_sigma_rad)
+    return CalibrationShifts(base, tuple(_again(reconstruction, *both, level_sigma_rad) for both in cameras))
+
+
+def principal_axes(covariance: FloatArray) -> FloatArray:
+    """Return rows (K, P) with sum of outer products equal to `covariance`: independent moves of one sigma each."""
+    sigma = np.sqrt(np.diag(covariance))
+    safe = np.where(sigma > 0.0, sigma, 1.0)
+    values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
+    kept = values > NEGLIGIBLE * values[-1]
+    return np.asarray((vectors[:, kept] * np.sqrt(values[kept])).T * sigma)
+
+
+def _again(
+    reconstruction: Reconstruction, camera1: Camera, camera2: Camera, level_sigma_rad: float | None
+) -> Reconstruction:
+    """Estimate pose, scale and points again from the same corners; normals stay, they are not asked for."""
+    known = reconstruction.matches
+    matches = Matches.from_cameras(
+        camera1,
+        camera2,
+        reconstruction.pixels1,
+        reconstruction.pixels2,
+        sigma1_px=known.sigma1_px,
+        sigma2_px=known.sigma2_px,
+        board_index=known.board_index,
+        grid=known.grid,
+    )
+    pose = reconstruction.cam2_from_cam1
+    start = Rigid3(pose.rotation, pose.translation_mm / np.linalg.norm(pose.translation_mm))
+    refined = refine_pose(matches, start, reconstruction.pose_type, level_sigma_rad)
+    metric = metric_pose(matches, refined.cam2_from_cam1, refined.covariance, reconstruction.boards)
+    points, _, valid = triangulate_matches(matches, metric.cam2_from_cam1)
+    cloud = reconstruction.cloud
+    return replace(
+        reconstruction,
+        camera1=camera1,
+        camera2=camera2,
+        cam2_from_cam1=metric.cam2_from_cam1,
+        pose_covariance=None,
+        cloud=replace(cloud, points_mm=np.where(valid[:, None], points, cloud.points_mm)),
+        baseline_mm=metric.baseline_mm,
+    )
