@@ -32,7 +32,7 @@ def find_lattices(image: NDArray[np.generic], min_corners: int) -> list[RefinedL
     corners, saddles = find_corners(levels)
     lattices = build_lattices(corners, find_links(corners, levels[0]))
     index = SaddleIndex(saddles)
-    grown = [tidy(grow(lattice, index, levels[0]), size_px) for lattice in lattices]
+    grown = [tidy(lattice, size_px) for lattice in grow(lattices, index, levels[0])]
     boards = separate(grown, min_corners)
     refined = zip(boards, refine(grey, boards), strict=True)
     return [after for before, after in refined if trustworthy(after, before.count, min_corners)]

@@ -6,10 +6,12 @@ is a corner with the polarity and the directions that the lattice demands and if
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray
-from rigkit.corners.lattice import STEPS, Lattice
+from rigkit.corners.lattice import STEPS, Lattice, Sheet
 from rigkit.corners.links import CONTRAST_RATIO, MOST, edge_contrast
 from rigkit.corners.local_fit import LocalFit, fit_cells
 from rigkit.corners.response import Level
@@ -58,49 +60,64 @@ class SaddleIndex:
         return np.where(found, index, 0), found
 
 
-def grow(lattice: Lattice, saddles: SaddleIndex, level: Level) -> Lattice:
-    """Return `lattice` with all corners that can be added one after the other; the brightness is read from `level`."""
+def grow(lattices: Sequence[Lattice], saddles: SaddleIndex, level: Level) -> list[Lattice]:
+    """Return `lattices` with all corners that can be added one after the other; brightness is read from `level`."""
+    grown = list(lattices)
+    growing = list(range(len(grown)))
     for _ in range(MAX_RINGS):
-        wide = lattice.padded()
-        added = _ring(wide, saddles, level, *STIFF) or _ring(wide, saddles, level, *PLIANT)
-        if added is None:
-            return lattice
-        lattice = added.trimmed()
-    return lattice
+        if not growing:
+            break
+        added: list[int] = []
+        for how in (STIFF, PLIANT):
+            todo = [number for number in growing if number not in added]
+            wide = [grown[number].padded(2) for number in todo]
+            for number, before, after in zip(todo, wide, _ring(wide, saddles, level, *how), strict=True):
+                if after.count > before.count:
+                    grown[number] = after.trimmed()
+                    added.append(number)
+        growing = added
+    return grown
 
 
 def _ring(
-    lattice: Lattice, saddles: SaddleIndex, level: Level, degree: int, ridge: tuple[float, float]
-) -> Lattice | None:
-    """Return `lattice` with the empty cells filled that can be, None if there are none."""
-    known = lattice.known
-    beside = np.zeros_like(known)
-    beside[1:] |= known[:-1]
-    beside[:-1] |= known[1:]
-    beside[:, 1:] |= known[:, :-1]
-    beside[:, :-1] |= known[:, 1:]
-    cells = beside & ~known
-    fit = fit_cells(lattice.pixels, cells, degree=degree, radius=3, width=1.3, ridge=ridge)
-    height = np.linalg.norm(level.smooth.shape)
-    usable = (fit.support >= 3) & (np.abs(fit.pixels) < 4.0 * level.scale * height).all(axis=1)
+    lattices: list[Lattice], saddles: SaddleIndex, level: Level, degree: int, ridge: tuple[float, float]
+) -> list[Lattice]:
+    """Return `lattices` (with two empty outer rows and columns) with those empty cells filled that can be."""
+    if not lattices:
+        return []
+    sheet = Sheet.of(lattices)
+    cells = _beside(sheet.known)
+    fit = fit_cells(sheet.pixels, cells, degree=degree, width=1.3, ridge=ridge)
     cell = np.argwhere(cells)
-    index, found = saddles.nearest(fit.pixels, REACH * _longest(fit))
+    height, width = level.smooth.shape
+    place = level.to_level(fit.pixels)
+    usable = (fit.support >= 3) & (place > 0.0).all(axis=1) & (place < [width - 1, height - 1]).all(axis=1)
+    index, found = saddles.nearest(fit.pixels, np.where(usable, REACH * _longest(fit), 0.0))
     owner, slot = np.nonzero(found & usable[:, None])
     pixels = saddles.pixels[index[owner, slot]]
     distance = _in_cells(fit, owner, pixels)
     near = distance < REACH
     owner, pixels, distance = owner[near], pixels[near], distance[near]
-    contrast, good = _fits(lattice, level, fit, cell, owner, pixels)
-    owner, pixels, distance, contrast = owner[good], pixels[good], distance[good], contrast[good]
     if not len(owner):
-        return None
+        return lattices
+    contrast, good = _fits(sheet, level, fit, cell, owner, pixels)
+    owner, pixels, distance, contrast = owner[good], pixels[good], distance[good], contrast[good]
     order = np.lexsort((distance, owner))
     chosen, first = np.unique(owner[order], return_index=True)
     best = order[first]
-    new_pixels, new_contrast = lattice.pixels.copy(), lattice.contrast.copy()
-    new_pixels[cell[chosen, 0], cell[chosen, 1]] = pixels[best]
-    new_contrast[cell[chosen, 0], cell[chosen, 1]] = contrast[best]
-    return Lattice(new_pixels, new_contrast, lattice.rising)
+    sheet.pixels[cell[chosen, 0], cell[chosen, 1]] = pixels[best]
+    sheet.contrast[cell[chosen, 0], cell[chosen, 1]] = contrast[best]
+    return sheet.lattices(lattices)
+
+
+def _beside(known: BoolArray) -> BoolArray:
+    """Return the empty cells next to known ones."""
+    beside = np.zeros_like(known)
+    beside[1:] |= known[:-1]
+    beside[:-1] |= known[1:]
+    beside[:, 1:] |= known[:, :-1]
+    beside[:, :-1] |= known[:, 1:]
+    return beside & ~known
 
 
 def _longest(fit: LocalFit) -> FloatArray:
@@ -125,13 +142,13 @@ def _in_cells(fit: LocalFit, owner: IntArray, pixels: FloatArray) -> FloatArray:
 
 
 def _fits(
-    lattice: Lattice, level: Level, fit: LocalFit, cell: IntArray, owner: IntArray, pixels: FloatArray
+    sheet: Sheet, level: Level, fit: LocalFit, cell: IntArray, owner: IntArray, pixels: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
     """Return the contrast at `pixels` and whether they can be the corners of the cells `owner`."""
     local = level.to_level(pixels)
     height = _area(fit)[owner] / np.maximum(_longest(fit)[owner], 1e-9) / level.scale
     rings = read_rings(level.smooth, local, np.clip(RING * height, MIN_RING_PX, MAX_RING_PX))
-    sign = lattice.signs()[cell[owner, 0], cell[owner, 1]]
+    sign = sheet.signs[cell[owner, 0], cell[owner, 1]]
     a, b = fit.along_column[owner], fit.along_row[owner]
     first = np.where((sign > 0)[:, None], a, b)
     second = np.where((sign > 0)[:, None], b, a)
@@ -139,15 +156,13 @@ def _fits(
     seen = np.zeros(len(owner), np.int64)
     for direction in range(4):
         beside = cell[owner] + STEPS[direction][::-1]
-        inside = ((beside >= 0) & (beside < lattice.known.shape)).all(axis=1)
-        beside = np.where(inside[:, None], beside, 0)
-        neighbour = lattice.pixels[beside[:, 0], beside[:, 1]]
-        there = inside & np.isfinite(neighbour[:, 0])
+        neighbour = sheet.pixels[beside[:, 0], beside[:, 1]]
+        there = np.isfinite(neighbour[:, 0])
         end = level.to_level(np.where(there[:, None], neighbour, pixels))
         length = np.linalg.norm(end - local, axis=1)
         side = sign if direction % 2 == 0 else -sign
         difference = edge_contrast(level.smooth, local, end, side, np.clip(0.12 * length, 1.0, 4.0))
-        known = np.nan_to_num(lattice.contrast[beside[:, 0], beside[:, 1]], nan=0.0)
+        known = np.nan_to_num(sheet.contrast[beside[:, 0], beside[:, 1]], nan=0.0)
         weakest = CONTRAST_RATIO * np.minimum(known, rings.contrast)
         edge = (difference > weakest[:, None]).sum(axis=1) >= MOST
         good &= edge | ~there

@@ -6,7 +6,9 @@ like the arms of a corner, so every lattice comes out right-handed (columns, row
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -14,7 +16,7 @@ from rigkit.arrays import BoolArray, FloatArray, IntArray
 from rigkit.corners.links import Links, quads
 from rigkit.corners.saddle import Corners
 
-__all__ = ["STEPS", "Lattice", "build_lattices"]
+__all__ = ["STEPS", "Lattice", "Sheet", "build_lattices"]
 
 STEPS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
 """(column, row) of the four grid directions."""
@@ -97,6 +99,48 @@ class Lattice:
                 bool(signs.size and signs[0, 0] > 0),
             )
         return out
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Sheet:
+    """Several lattices one below the other in common arrays, with GAP empty rows between: one call serves them all.
+
+    Attributes
+    ----------
+    pixels : (R, C, 2), contrast : (R, C), NaN where unknown; signs : (R, C) as `Lattice.signs`, 0 outside.
+    parts : where each lattice lies.
+    """
+
+    GAP: ClassVar[int] = 4
+
+    pixels: FloatArray
+    contrast: FloatArray
+    signs: FloatArray
+    parts: tuple[tuple[slice, slice], ...]
+
+    @classmethod
+    def of(cls, lattices: Sequence[Lattice]) -> Sheet:
+        tops = np.cumsum([0, *(item.pixels.shape[0] + cls.GAP for item in lattices)])
+        columns = max((item.pixels.shape[1] for item in lattices), default=0)
+        pixels = np.full((int(tops[-1]), columns, 2), np.nan)
+        contrast, signs = np.full(pixels.shape[:2], np.nan), np.zeros(pixels.shape[:2])
+        parts = []
+        for top, item in zip(tops, lattices, strict=False):
+            part = (slice(int(top), int(top) + item.pixels.shape[0]), slice(0, item.pixels.shape[1]))
+            pixels[part], contrast[part], signs[part] = item.pixels, item.contrast, item.signs()
+            parts.append(part)
+        return cls(pixels, contrast, signs, tuple(parts))
+
+    @property
+    def known(self) -> BoolArray:
+        return np.isfinite(self.pixels[..., 0])
+
+    def lattices(self, like: Sequence[Lattice]) -> list[Lattice]:
+        """Return the lattices as they are in the sheet now; `like` are those it was made of."""
+        return [
+            Lattice(self.pixels[part], self.contrast[part], item.rising)
+            for part, item in zip(self.parts, like, strict=True)
+        ]
 
 
 def build_lattices(corners: Corners, links: Links) -> list[Lattice]:

@@ -20,20 +20,26 @@ __all__ = ["quarter_turns"]
 
 def quarter_turns(lattice: Lattice, sizes: Sequence[tuple[int, int]] = ()) -> int:
     """Return by how many quarter turns `lattice` follows the convention; `sizes` are the known (columns, rows)."""
-    turns = [lattice.turned(quarter) for quarter in range(4)]
-    fits = [turn.size in sizes for turn in turns]
+    columns, rows = lattice.size
+    turned = [(columns, rows), (rows, columns), (columns, rows), (rows, columns)]
+    fits = [size in sizes for size in turned]
     if not any(fits):
-        fits = [turn.size[0] >= turn.size[1] for turn in turns]
-    dark = [fit and not turn.rising for fit, turn in zip(fits, turns, strict=True)]
+        fits = [size[0] >= size[1] for size in turned]
+    # The first corners of the four turns, and whether the edge that becomes +column has the sign of the old +column.
+    signs = lattice.signs()
+    rising = [signs[0, 0] > 0.0, signs[-1, 0] < 0.0, signs[-1, -1] > 0.0, signs[0, -1] < 0.0]
+    dark = [fit and not bright for fit, bright in zip(fits, rising, strict=True)]
     allowed = dark if any(dark) else fits
-    return max((q for q in range(4) if allowed[q]), key=lambda q: (_downwards(turns[q]), -q))
+    downwards = _downwards(lattice)
+    return max((q for q in range(4) if allowed[q]), key=lambda q: (downwards[q], -q))
 
 
-def _downwards(lattice: Lattice) -> float:
-    """Return how far columns and rows run to the right and down: mean step along (1, 1), in the larger mean step."""
+def _downwards(lattice: Lattice) -> list[float]:
+    """Return how far columns and rows together run to the right and down after 0 to 3 quarter turns, in cells."""
     column, row = (_mean_step(np.diff(lattice.pixels, axis=axis)) for axis in (1, 0))
     longest = max(float(np.linalg.norm(column)), float(np.linalg.norm(row)), 1e-9)
-    return round(float((column + row).sum()) / longest, 9)
+    along, down = float(column.sum()) / longest, float(row.sum()) / longest
+    return [round(value, 9) for value in (along + down, along - down, -along - down, down - along)]
 
 
 def _mean_step(steps: FloatArray) -> FloatArray:

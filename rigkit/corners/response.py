@@ -121,11 +121,13 @@ def _level(image: FloatImage, scale: float, offset: float) -> Level:
     smooth = cv2.sepFilter2D(image, cv2.CV_32F, SMOOTH, SMOOTH, borderType=cv2.BORDER_REPLICATE)
     second = np.array([1.0, -2.0, 1.0], np.float32)
     first = np.array([-0.5, 0.0, 0.5], np.float32)
-    one = np.array([1.0], np.float32)
-    lxx = cv2.sepFilter2D(smooth, cv2.CV_32F, second, one)
-    lyy = cv2.sepFilter2D(smooth, cv2.CV_32F, one, second)
+    lxx = cv2.filter2D(smooth, cv2.CV_32F, second[None])
+    lyy = cv2.filter2D(smooth, cv2.CV_32F, second[:, None])
     lxy = cv2.sepFilter2D(smooth, cv2.CV_32F, first, first)
-    response = cv2.subtract(cv2.multiply(lxy, lxy), cv2.multiply(lxx, lyy))
+    # In place: fresh pages of memory cost as much as the arithmetic.
+    cv2.multiply(lxx, lyy, dst=lxx)
+    cv2.multiply(lxy, lxy, dst=lxy)
+    response = cv2.subtract(lxy, lxx, dst=lxy)
     step = max(1, int(np.sqrt(response.size / 3e4)))
     typical = float(np.median(np.abs(response[::step, ::step])))
     return Level(smooth, response, float(np.clip(NOISE_FACTOR * typical, FLOOR, CEILING)), scale, offset)
@@ -144,12 +146,12 @@ def peaks(level: Level) -> IntArray:
     return np.stack([u, v], axis=-1)
 
 
-def sample(image: FloatImage, pixels: FloatArray) -> FloatArray:
-    """Return `image` at `pixels` (..., 2), bilinear, the border repeated; (...) float64."""
+def sample(image: FloatImage, pixels: NDArray[np.floating]) -> FloatImage:
+    """Return `image` at `pixels` (..., 2), bilinear, the border repeated; (...) float32."""
     flat = np.asarray(pixels, np.float32).reshape(-1, 2)
     width = 1024
     padded = np.zeros((-(-max(len(flat), 1) // width) * width, 2), np.float32)
     padded[: len(flat)] = flat
     grid = padded.reshape(-1, width, 2)
-    values = cv2.remap(image, grid, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return values.reshape(-1)[: len(flat)].reshape(pixels.shape[:-1]).astype(np.float64)
+    values = cv2.remap(image, grid[..., 0], grid[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(values, np.float32).reshape(-1)[: len(flat)].reshape(pixels.shape[:-1])

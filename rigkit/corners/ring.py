@@ -42,13 +42,13 @@ class Rings:
 def read_rings(image: FloatImage, pixels: FloatArray, radius_px: FloatArray | float) -> Rings:
     """Return what rings of `radius_px` (scalar or (N,)) around `pixels` (N, 2) of `image` look like."""
     turn = np.arange(2 * HALF) * (np.pi / HALF)
-    circle = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    radius = np.broadcast_to(np.asarray(radius_px, np.float64), pixels.shape[:1])
-    values = sample(image, pixels[:, None, :] + radius[:, None, None] * circle)
+    circle = np.stack([np.cos(turn), np.sin(turn)], axis=-1).astype(np.float32)
+    radius = np.broadcast_to(np.asarray(radius_px, np.float32), pixels.shape[:1])
+    values = sample(image, pixels[:, None, :].astype(np.float32) + radius[:, None, None] * circle)
     even = 0.5 * (values[:, :HALF] + values[:, HALF:])
     odd = 0.5 * (values[:, :HALF] - values[:, HALF:])
     low, high = even.min(axis=1), even.max(axis=1)
-    contrast = high - low
+    contrast = (high - low).astype(np.float64)
     middle = 0.5 * (low + high)
     spread = even - even.mean(axis=1, keepdims=True)
     symmetric = (odd**2).sum(axis=1) < MAX_ODD * (spread**2).sum(axis=1)

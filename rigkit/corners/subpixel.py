@@ -16,7 +16,7 @@ import numpy as np
 from rigkit.arrays import BoolArray, FloatArray
 from rigkit.corners.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
 from rigkit.corners.edge_model import Geometry
-from rigkit.corners.lattice import Lattice
+from rigkit.corners.lattice import Lattice, Sheet
 from rigkit.corners.local_fit import fit_cells
 from rigkit.corners.response import FloatImage
 
@@ -108,16 +108,13 @@ def _pass(
     iterations: int,
 ) -> list[RefinedLattice]:
     """Fit all corners of all lattices in one batch."""
-    shapes = [fit_cells(item.pixels, item.known) for item in lattices]
-    geometry = Geometry(
-        np.concatenate([np.stack([shape.along_column, shape.along_row], axis=1) for shape in shapes]),
-        np.concatenate([shape.curvature() for shape in shapes]),
-        np.concatenate([shape.gaps() for shape in shapes]),
-    )
-    pixels, sign, blur = (
-        np.concatenate([values[item.known] for item, values in zip(lattices, part, strict=True)])
-        for part in ([item.pixels for item in lattices], [item.signs() for item in lattices], blurs)
-    )
+    sheet = Sheet.of(lattices)
+    known = sheet.known
+    shape = fit_cells(sheet.pixels, known)
+    sides = np.stack([shape.along_column, shape.along_row], axis=1)
+    geometry = Geometry(sides, shape.curvature(), shape.gaps())
+    blur = np.concatenate([values[item.known] for item, values in zip(lattices, blurs, strict=True)])
+    pixels, sign = sheet.pixels[known], sheet.signs[known]
     fit = fit_edges(image, pixels, geometry, sign, blur, radius_px=radius_px, iterations=iterations)
     ends = np.cumsum([item.count for item in lattices])
     return [_filled(item, fit, slice(end - item.count, end)) for item, end in zip(lattices, ends, strict=True)]
