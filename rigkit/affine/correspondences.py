@@ -1,0 +1,80 @@
+"""Point correspondences of any scene with affinities or directions: what a pair without chessboards offers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.arrays import Affines, BoolArray, FloatArray, IntArray, Pixels, as_array
+from rigkit.cameras.base import Camera
+from rigkit.errors import InputError
+from rigkit.matches import DirectionPairs, Matches
+
+__all__ = ["Correspondences"]
+
+DEFAULT_SIGMA_PX = 0.5
+"""Where nobody said how accurate the points are: about what a good feature detector reaches."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Correspondences:
+    """N points seen in two images.
+
+    Attributes
+    ----------
+    pixels1, pixels2 : (N, 2)
+    A21 : (N, 2, 2) d pixel2 / d pixel1, NaN where unknown; or None.
+    directions : corresponding directions at the points, or None.
+    sigma_px : (N,) standard deviation of the points per axis, or None.
+    sigma_A : (N,) standard deviation of an entry of A21, or None.
+    """
+
+    pixels1: Pixels
+    pixels2: Pixels
+    A21: Affines | None = None
+    directions: DirectionPairs | None = None
+    sigma_px: FloatArray | None = None
+    sigma_A: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        n = len(np.asarray(self.pixels1))
+        object.__setattr__(self, "pixels1", as_array(self.pixels1, (n, 2), "correspondences, pixels1"))
+        object.__setattr__(self, "pixels2", as_array(self.pixels2, (n, 2), "correspondences, pixels2"))
+        shapes: dict[str, tuple[int | None, ...]] = {"A21": (n, 2, 2), "sigma_px": (n,), "sigma_A": (n,)}
+        for name, shape in shapes.items():
+            if getattr(self, name) is not None:
+                array = as_array(getattr(self, name), shape, f"correspondences, {name}", finite=name == "sigma_px")
+                object.__setattr__(self, name, array)
+        if self.sigma_px is not None and (self.sigma_px <= 0.0).any():
+            raise InputError("correspondences, sigma_px: standard deviations must be positive")
+        if self.directions is not None and len(self.directions.valid) != n:
+            raise InputError(f"correspondences: {n} points but directions at {len(self.directions.valid)}")
+
+    def __len__(self) -> int:
+        return len(self.pixels1)
+
+    def select(self, which: BoolArray | IntArray) -> Correspondences:
+        """Return those picked by a mask or by indices."""
+        d = self.directions
+        if d is not None:
+            d = DirectionPairs(d.image1[which], d.image2[which], d.valid[which], d.scaled, d.kinds)
+        A21, sigma_px, sigma_A = (None if v is None else v[which] for v in (self.A21, self.sigma_px, self.sigma_A))
+        return Correspondences(self.pixels1[which], self.pixels2[which], A21, d, sigma_px, sigma_A)
+
+    def matches(self, camera1: Camera, camera2: Camera) -> tuple[Matches, BoolArray]:
+        """Return matches with rays and Jacobians, and which of the N points they are: those that both cameras see."""
+        seen = camera1.unproject(self.pixels1)[1] & camera2.unproject(self.pixels2)[1]
+        kept = self.select(seen)
+        sigma = np.full(len(kept), DEFAULT_SIGMA_PX) if kept.sigma_px is None else kept.sigma_px
+        matches = Matches.from_cameras(
+            camera1,
+            camera2,
+            kept.pixels1,
+            kept.pixels2,
+            sigma1_px=sigma,
+            sigma2_px=sigma,
+            A21=kept.A21,
+            sigma_A=kept.sigma_A,
+        )
+        return matches, np.asarray(seen)

@@ -1,0 +1,214 @@
+"""Correspondences on disk: CSV with a header, NPZ, and the headerless text of AffineExtractor.
+
+CSV: u1_px, v1_px, u2_px, v2_px; optionally a11, a12, a21, a22; optionally du1_1, dv1_1, du2_1, dv2_1, du1_2, ... for
+the directions; optionally sigma_px and sigma_A. An empty field is unknown. Columns come in any order, other columns are
+an error. NPZ: arrays pixels1, pixels2 and optionally A21, directions1, directions2 (N, K, 2), sigma_px, sigma_A.
+
+AffineExtractor (https://github.com/LeventeHajder/AffineExtractor): ten numbers a line, a11 a21 a12 a22 tx ty x1 y1 x2
+y2, with q2 = A q1 + t. Its refinement moves t and leaves x2, y2 as they were matched, so the point in image 2 is
+A q1 + t.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from rigkit.affine.correspondences import Correspondences
+from rigkit.arrays import FloatArray
+from rigkit.errors import InputError
+from rigkit.io.files import write_atomic
+from rigkit.matches import DirectionPairs
+
+__all__ = ["correspondences_text", "read_correspondences", "write_correspondences"]
+
+POINTS = ("u1_px", "v1_px", "u2_px", "v2_px")
+AFFINE = ("a11", "a12", "a21", "a22")
+SIGMAS = ("sigma_px", "sigma_A")
+DIRECTION = re.compile(r"^(du1|dv1|du2|dv2)_([1-9]\d*)$")
+ARRAYS = ("pixels1", "pixels2", "A21", "directions1", "directions2", *SIGMAS)
+
+EXTRACTOR_COLUMNS = "a11 a21 a12 a22 tx ty x1 y1 x2 y2"
+MAX_REFINEMENT_PX = 30.0
+"""AffineExtractor refines within patches of this half width: a point further from its match means other columns."""
+
+
+def read_correspondences(path: str | Path) -> Correspondences:
+    """Return the correspondences of a .csv, .npz or AffineExtractor text file, told apart by their content.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read or understood; says where and what was expected.
+    """
+    source = Path(path)
+    try:
+        payload = source.read_bytes()
+    except OSError as error:
+        raise InputError(f"correspondences '{source}' cannot be read ({error.strerror}); check the path") from error
+    if payload[:2] == b"PK":
+        return _from_npz(source)
+    try:
+        text = payload.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"correspondences '{source}': neither text nor NPZ; expected .csv or .npz") from error
+    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    if not lines:
+        raise InputError(f"correspondences '{source}': the file is empty")
+    if _is_number(re.split(r"[\s,;]+", lines[0].strip())[0]):
+        return _from_extractor(source, lines)
+    return _from_csv(source, text)
+
+
+def correspondences_text(found: Correspondences) -> str:
+    """Return the CSV text; numbers as exact as needed to read back the same correspondences."""
+    columns: dict[str, FloatArray] = dict(zip(POINTS, np.hstack([found.pixels1, found.pixels2]).T, strict=True))
+    if found.A21 is not None:
+        columns |= dict(zip(AFFINE, found.A21.reshape(-1, 4).T, strict=True))
+    if found.directions is not None:
+        for k in range(found.directions.valid.shape[1]):
+            for image, d in ((1, found.directions.image1), (2, found.directions.image2)):
+                valid = found.directions.valid[:, k]
+                columns[f"du{image}_{k + 1}"] = np.where(valid, d[:, k, 0], np.nan)
+                columns[f"dv{image}_{k + 1}"] = np.where(valid, d[:, k, 1], np.nan)
+    for name in SIGMAS:
+        if getattr(found, name) is not None:
+            columns[name] = getattr(found, name)
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(columns)
+    for row in zip(*columns.values(), strict=True):
+        writer.writerow(["" if np.isnan(value) else repr(float(value)) for value in row])
+    return stream.getvalue()
+
+
+def write_correspondences(path: str | Path, found: Correspondences, *, force: bool = False) -> None:
+    """Write CSV; raises InputError as `write_atomic` does."""
+    write_atomic(path, correspondences_text(found), force=force)
+
+
+def _from_csv(source: Path, text: str) -> Correspondences:
+    lines = csv.reader(io.StringIO(text))
+    header = [name.strip() for name in next(lines)]
+    unknown = [name for name in header if name not in (*POINTS, *AFFINE, *SIGMAS) and not DIRECTION.match(name)]
+    if unknown or len(set(header)) != len(header):
+        what = f"unknown column '{unknown[0]}'" if unknown else "a column appears twice"
+        raise InputError(
+            f"correspondences '{source}': {what}; known: {', '.join((*POINTS, *AFFINE, 'du1_1', '...', *SIGMAS))}"
+        )
+    rows = []
+    for line in lines:
+        if not line or line[0].lstrip().startswith("#"):
+            continue
+        try:
+            rows.append([float(field) if field.strip() else np.nan for field in line])
+        except ValueError as error:
+            raise InputError(f"correspondences '{source}', line {lines.line_num}: {error}") from error
+        if len(line) != len(header):
+            raise InputError(
+                f"correspondences '{source}', line {lines.line_num}: {len(line)} fields for {len(header)} columns"
+            )
+    table = dict(zip(header, np.array(rows, dtype=np.float64).reshape(-1, len(header)).T, strict=True))
+    for group in (POINTS, AFFINE):
+        lacking = [name for name in group if name not in table]
+        if lacking and (group == POINTS or len(lacking) < len(group)):
+            raise InputError(f"correspondences '{source}': column '{lacking[0]}' is missing")
+    points = np.stack([table[name] for name in POINTS], axis=1)
+    A21 = np.stack([table[name] for name in AFFINE], axis=1).reshape(-1, 2, 2) if AFFINE[0] in table else None
+    return _built(source, points[:, :2], points[:, 2:], A21, _directions(source, table), table)
+
+
+def _directions(source: Path, table: dict[str, FloatArray]) -> tuple[FloatArray, FloatArray] | None:
+    numbers = sorted({int(found.group(2)) for name in table if (found := DIRECTION.match(name))})
+    if not numbers:
+        return None
+    images = []
+    for image in (1, 2):
+        each = []
+        for k in range(1, numbers[-1] + 1):
+            names = (f"du{image}_{k}", f"dv{image}_{k}")
+            for name in names:
+                if name not in table:
+                    raise InputError(f"correspondences '{source}': column '{name}' is missing")
+            each.append(np.stack([table[name] for name in names], axis=1))
+        images.append(np.stack(each, axis=1))
+    return images[0], images[1]
+
+
+def _from_extractor(source: Path, lines: list[str]) -> Correspondences:
+    rows = []
+    for number, line in enumerate(lines, 1):
+        try:
+            rows.append([float(field) for field in re.split(r"[\s,;]+", line.strip()) if field])
+        except ValueError as error:
+            raise InputError(f"correspondences '{source}', line {number}: {error}") from error
+        if len(rows[-1]) != 10:
+            raise InputError(
+                f"correspondences '{source}', line {number}: {len(rows[-1])} numbers; without a header line ten are "
+                f"expected: {EXTRACTOR_COLUMNS}"
+            )
+    table = np.array(rows)
+    A21 = table[:, [0, 2, 1, 3]].reshape(-1, 2, 2)
+    pixels1 = table[:, 6:8]
+    pixels2 = np.einsum("nij,nj->ni", A21, pixels1) + table[:, 4:6]
+    off = np.linalg.norm(pixels2 - table[:, 8:10], axis=1)
+    if np.median(off) > MAX_REFINEMENT_PX:
+        raise InputError(
+            f"correspondences '{source}': A q1 + t misses x2, y2 by {np.median(off):.0f} px; the columns must be "
+            f"{EXTRACTOR_COLUMNS}"
+        )
+    good = off <= MAX_REFINEMENT_PX
+    return _built(source, pixels1[good], pixels2[good], A21[good], None, {})
+
+
+def _from_npz(source: Path) -> Correspondences:
+    try:
+        with np.load(source, allow_pickle=False) as archive:
+            table = {name: np.asarray(archive[name], dtype=np.float64) for name in archive.files}
+    except (ValueError, OSError, KeyError, zipfile.BadZipFile) as error:
+        raise InputError(f"correspondences '{source}': damaged NPZ, or not of numbers ({error})") from error
+    unknown = [name for name in table if name not in ARRAYS]
+    if unknown:
+        raise InputError(f"correspondences '{source}': unknown array '{unknown[0]}'; known: {', '.join(ARRAYS)}")
+    needed = ["pixels1", "pixels2"]
+    if "directions1" in table or "directions2" in table:
+        needed += ["directions1", "directions2"]
+    for name in needed:
+        if name not in table:
+            raise InputError(f"correspondences '{source}': array '{name}' is missing")
+    directions = (table["directions1"], table["directions2"]) if "directions1" in table else None
+    return _built(source, table["pixels1"], table["pixels2"], table.get("A21"), directions, table)
+
+
+def _built(
+    source: Path,
+    pixels1: FloatArray,
+    pixels2: FloatArray,
+    A21: FloatArray | None,
+    directions: tuple[FloatArray, FloatArray] | None,
+    table: dict[str, FloatArray],
+) -> Correspondences:
+    try:
+        pairs = None
+        if directions is not None:
+            first, second = directions
+            if first.ndim != 3:
+                raise InputError(f"directions: expected shape NxKx2, got {first.shape}")
+            kinds = tuple(f"direction {k + 1}" for k in range(first.shape[1]))
+            pairs = DirectionPairs(first, second, np.ones(first.shape[:2], dtype=bool), False, kinds)
+        return Correspondences(pixels1, pixels2, A21, pairs, table.get("sigma_px"), table.get("sigma_A"))
+    except InputError as error:
+        raise InputError(f"correspondences '{source}': {error}") from error
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
