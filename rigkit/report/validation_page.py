@@ -10,7 +10,7 @@ from rigkit.reconstruct import Reconstruction
 from rigkit.report.page import PairSection, scene_of
 from rigkit.validation.checks import ValidationReport
 from rigkit.validation.crosscheck import CrossCheckReport
-from rigkit.validation.tables import Cell, Column, Table, check_table, estimator_table
+from rigkit.validation.tables import Cell, Column, Table, check_table
 
 __all__ = ["best_report", "crosscheck_table", "pair_section", "summary_table"]
 
@@ -76,7 +76,7 @@ def pair_section(
         f"shown: {shown.affine_method}; baseline {shown.baseline_mm:.2f} ± {shown.baseline_sigma_mm:.2f} mm; "
         f"Sampson rms {shown.sampson_rms_px:.3f} px"
     )
-    tables = (check_table([shown]), estimator_table(reports), *extra)
+    tables = (check_table([shown]), _by_estimator(reports), *extra)
     notes = (*shown.notes, *(f"not checked: {words}" for words in shown.unchecked))
     return PairSection(shown.pair_id, lead, tables, tuple(images), scene_of(reconstruction), notes)
 
@@ -115,6 +115,24 @@ def crosscheck_table(reports: Sequence[CrossCheckReport]) -> Table:
     limits = sorted({c.limit_k for r in reports for c in r.checks})
     note = f"Agreement: within k = {', '.join(f'{k:g}' for k in limits)} combined sigmas."
     return Table("crosscheck", "The same pairs by other ways", columns, tuple(rows), note)
+
+
+def _by_estimator(reports: Sequence[ValidationReport]) -> Table:
+    """Return normal errors, flatness and baseline of one pair with a column an estimator: it fits a page."""
+    columns = (Column(""), *(Column(report.affine_method, "", 3) for report in reports))
+    ids = list(dict.fromkeys(board.board.board_id for report in reports for board in report.boards))
+    boards = [{board.board.board_id: board for board in report.boards} for report in reports]
+    rows: list[tuple[Cell, ...]] = [(Cell("points"), *(Cell(f"{report.count}") for report in reports))]
+    for statistic in ("mean", "median"):
+        for board_id in ids:
+            errors = [b[board_id].normal_errors if board_id in b else None for b in boards]
+            cells = [Cell(None if e is None else float(getattr(e, f"{statistic}_deg"))) for e in errors]
+            rows.append((Cell(f"{statistic} normal error of {board_id}, deg"), *cells))
+    for board_id in ids:
+        flat = [b[board_id].plane.rms_mm if board_id in b else None for b in boards]
+        rows.append((Cell(f"flatness of {board_id}, rms mm"), *(Cell(value) for value in flat)))
+    rows.append((Cell("baseline, mm"), *(Cell(r.baseline_mm, sigma=r.baseline_sigma_mm) for r in reports)))
+    return Table("by_estimator", "Affine estimators", columns, tuple(rows))
 
 
 def _mean_normal_error(report: ValidationReport) -> float:

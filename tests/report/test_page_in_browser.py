@@ -1,0 +1,80 @@
+"""The report in a real browser: no error in the console, nothing from the network, and a 3D view that turns."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.reconstructions import make_reconstruction
+
+from rigkit.report.figures import as_jpeg, cloud_png
+from rigkit.report.page import build_page
+from rigkit.report.validation_page import pair_section, summary_table
+from rigkit.truth import MeasuredAngle, PairTruth
+from rigkit.validation.checks import validate
+
+QUIET = [
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--enable-logging=stderr",
+    "--virtual-time-budget=3000",
+    "--window-size=1366,900",
+]
+
+PROBE = """<script>
+const canvas = document.querySelector("canvas[data-scene]");
+const before = canvas.dataset.view;
+const painted = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data.some((v) => v > 0);
+const at = (type, x) => canvas.dispatchEvent(
+  new PointerEvent(type, {clientX: x, clientY: 100, pointerId: 1, bubbles: true, isPrimary: true}));
+canvas.setPointerCapture = () => {};
+at("pointerdown", 100); at("pointermove", 160); at("pointerup", 160);
+document.body.dataset.probe = [before, canvas.dataset.view, painted, document.body.scrollWidth <= innerWidth].join("|");
+</script></body>"""
+
+
+def chromium() -> str:
+    for name in ("chromium", "chromium-browser", "google-chrome"):
+        found = shutil.which(name)
+        if found:
+            return found
+    pytest.skip("no Chromium on this machine (apt-get install chromium)")
+
+
+def test_the_page_works_without_network(tmp_path: Path) -> None:
+    browser = chromium()
+    reconstruction = make_reconstruction()
+    truth = PairTruth(angles=(MeasuredAngle("plane1", "plane2", 90.0, 0.3, "set <square>"),))
+    report = validate(reconstruction, truth)
+    picture = ("The cloud", "image/jpeg", as_jpeg(cloud_png(reconstruction)))
+    section = pair_section(reconstruction, [report], [picture])
+    page = build_page("A & B", "lead", report.passed, [summary_table([report])], [section], {"rigkit": "x"})
+    assert not re.search(r"""(src|href)=["']?https?:""", page)
+    assert "set &lt;square&gt;" in page
+    path = tmp_path / "report.html"
+    path.write_text(page.replace("</body>", PROBE), encoding="utf-8")
+    done = subprocess.run(
+        [browser, *QUIET, f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", path.as_uri()],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    assert "CONSOLE" not in done.stderr, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+    probe = re.search(r'data-probe="([^"]*)"', done.stdout)
+    assert probe is not None
+    before, after, painted, fits = probe[1].split("|")
+    assert painted == "true"
+    assert fits == "true"
+    first, second = (np.array([float(v) for v in text.split()]) for text in (before, after))
+    assert abs(first[0] - second[0]) > 0.1
