@@ -12,7 +12,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigkit.arrays import BoolArray, FloatArray
+from rigkit.arrays import BoolArray, FloatArray, IntArray
 from rigkit.cameras.monotone import first_root, horner, invert_increasing
 from rigkit.cameras.radial import FocalCamera, ScaleDerivatives, checked_curve
 
@@ -111,7 +111,7 @@ class KannalaBrandt(FocalCamera):
         radius = np.where(valid, radius, 0.0)
         slope = self._slope_coefficients()
 
-        def residual(theta: FloatArray, index: np.ndarray | None) -> tuple[FloatArray, FloatArray]:
+        def residual(theta: FloatArray, index: IntArray | None) -> tuple[FloatArray, FloatArray]:
             theta2 = theta * theta
             wanted = radius if index is None else radius[index]
             return theta * self._factor(theta2) - wanted, horner(slope, theta2)

@@ -6,18 +6,21 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
+from rigkit.arrays import FloatArray, IntArray
 
 __all__ = ["first_root", "horner", "invert_increasing"]
 
 REAL_ROOT = 1e-7
 """A computed root whose imaginary part is below this share of its size is real: rounding splits a double root."""
+LAST_STEP_REL = 1e-9
+"""Newton doubles the digits at each step: after one this small, as a share of the range, all are right."""
+QUICK_STEPS = 3
+"""Newton steps from the table for all points; nearly all are done after two."""
 STEP_REL = 1e-14
-"""Newton stops at steps of a few units in the last place."""
-ALL_STEPS = 4
-"""Nearly all points converge in this many steps; later steps only touch the rest."""
 MAX_STEPS = 60
-"""Bisection alone reaches double precision in this many."""
+"""The rest is bracketed: bisection alone reaches double precision in this many steps."""
+CELLS_PER_KNOT = 4
+"""The table is looked up in equal cells of the target, found by a division instead of a search."""
 
 
 def horner(coefficients: FloatArray, x: FloatArray) -> FloatArray:
@@ -40,7 +43,7 @@ def first_root(coefficients: FloatArray, limit: float) -> float:
 
 
 def invert_increasing(
-    function: Callable[[FloatArray, FloatArray | None], tuple[FloatArray, FloatArray]],
+    function: Callable[[FloatArray, IntArray | None], tuple[FloatArray, FloatArray]],
     target: FloatArray,
     knots: FloatArray,
     values: FloatArray,
@@ -54,28 +57,40 @@ def invert_increasing(
     target : (N,) values in [values[0], values[-1]]; the caller replaces what is outside, and NaN.
     knots, values : (K,) a table of the function, both increasing: it gives the bracket and the start.
     """
-    cell = np.clip(np.searchsorted(values, target, side="right") - 1, 0, knots.size - 2)
-    low, high = knots[cell], knots[cell + 1]
-    share = (target - values[cell]) / (values[cell + 1] - values[cell])
-    x = low + np.clip(share, 0.0, 1.0) * (high - low)
-    scale = STEP_REL * knots[-1]
-    index: np.ndarray | None = None
-    for step in range(MAX_STEPS):
-        old = x if index is None else x[index]
+    x = _looked_up(target, knots, values)
+    first, last = float(knots[0]), float(knots[-1])
+    for step in range(QUICK_STEPS):
+        residual, slope = function(x, None)
+        move = residual / slope
+        done = np.abs(move) <= LAST_STEP_REL * (last - first)
+        x = np.clip(x - move, first, last)
+        if step and done.all():
+            return x
+    index = np.flatnonzero(~done)
+    low, high = np.full(index.size, first), np.full(index.size, last)
+    # NaN (a slope of zero) must not be the start.
+    x[index] = np.where(np.isfinite(x[index]), x[index], 0.5 * (first + last))
+    for _ in range(MAX_STEPS):
+        old = x[index]
         residual, slope = function(old, index)
         above = residual > 0.0
         high = np.where(above, old, high)
         low = np.where(above, low, old)
         new = old - residual / slope
         new = np.where((new >= low) & (new <= high), new, 0.5 * (low + high))
-        if index is None:
-            x = new
-        else:
-            x[index] = new
-        moving = np.abs(new - old) > scale
+        x[index] = new
+        moving = np.abs(new - old) > STEP_REL * (last - first)
         if not moving.any():
             break
-        if step >= ALL_STEPS:
-            index = np.flatnonzero(moving) if index is None else index[moving]
-            low, high = low[moving], high[moving]
+        index, low, high = index[moving], low[moving], high[moving]
     return x
+
+
+def _looked_up(target: FloatArray, knots: FloatArray, values: FloatArray) -> FloatArray:
+    """Return x from the table by linear interpolation in equal cells of the target."""
+    cells = CELLS_PER_KNOT * (knots.size - 1)
+    table = np.interp(np.linspace(values[0], values[-1], cells + 1), values, knots)
+    position = (target - values[0]) * (cells / (values[-1] - values[0]))
+    cell = np.clip(position.astype(np.int64), 0, cells - 1)
+    left = table[cell]
+    return np.asarray(left + (position - cell) * (table[cell + 1] - left))

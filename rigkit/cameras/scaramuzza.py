@@ -13,7 +13,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigkit.arrays import BoolArray, FloatArray
+from rigkit.arrays import BoolArray, FloatArray, IntArray
 from rigkit.cameras.base import image_center
 from rigkit.cameras.monotone import first_root, horner, invert_increasing
 from rigkit.cameras.radial import RadialCamera, ScaleDerivatives, checked_curve
@@ -133,7 +133,7 @@ class Scaramuzza(RadialCamera):
         theta = np.where(valid, theta, 0.0)
         sine, cosine = np.where(valid, r / length, 0.0), np.where(valid, z / length, 1.0)
 
-        def residual(rho: FloatArray, index: np.ndarray | None) -> tuple[FloatArray, FloatArray]:
+        def residual(rho: FloatArray, index: IntArray | None) -> tuple[FloatArray, FloatArray]:
             s, c = (sine, cosine) if index is None else (sine[index], cosine[index])
             return c * rho - s * horner(self._polynomial, rho), c - s * horner(self._slope, rho)
 

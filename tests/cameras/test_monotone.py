@@ -1,0 +1,55 @@
+"""Inverting increasing functions: also where the slope vanishes and where a table is coarse."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rigkit.cameras.monotone import first_root, horner, invert_increasing
+
+
+@pytest.mark.parametrize(
+    ("function", "slope", "end"),
+    [
+        (lambda x: x**3, lambda x: 3.0 * x**2, 2.0),
+        (np.sin, np.cos, np.pi / 2),
+        (lambda x: x + 0.999 * np.sin(x), lambda x: 1.0 + 0.999 * np.cos(x), 20.0),
+        (np.tanh, lambda x: 1.0 / np.cosh(x) ** 2, 15.0),
+    ],
+)
+@pytest.mark.parametrize("count", [3, 129])
+def test_inverse(function, slope, end, count, rng: np.random.Generator) -> None:  # type: ignore[no-untyped-def]
+    """Values come back even through a table of three points; the slope is zero at an end or in the middle."""
+    knots = np.linspace(0.0, end, count)
+    values = function(knots)
+    target = np.concatenate([values[[0, -1]], rng.uniform(values[0], values[-1], 1000)])
+
+    def residual(x, index):  # type: ignore[no-untyped-def]
+        return function(x) - (target if index is None else target[index]), slope(x)
+
+    with np.errstate(all="ignore"):
+        x = invert_increasing(residual, target, knots, values)
+    assert ((x >= 0.0) & (x <= end)).all()
+    assert np.abs(function(x) - target).max() < 1e-13 * max(values[-1], 1.0)
+
+
+def test_first_root() -> None:
+    # (x - 2)(x - 3)(x + 1) = 6 + x - 4 x^2 + x^3
+    cubic = np.array([6.0, 1.0, -4.0, 1.0])
+    assert first_root(cubic, 10.0) == pytest.approx(2.0, abs=1e-12)
+    assert first_root(cubic, 1.5) == 1.5
+    assert first_root(np.array([1.0, 0.0, 0.0]), 7.0) == 7.0
+    # A double root touches zero without crossing: there the derivative vanishes, which is an end as well.
+    assert first_root(np.array([4.0, -4.0, 1.0]), 10.0) == pytest.approx(2.0, abs=1e-6)
+
+
+def test_first_root_of_coefficients_in_pixels() -> None:
+    """As in a lens polynomial: 1 - (x / 900)^8 has coefficients over 24 orders of magnitude."""
+    coefficients = np.zeros(9)
+    coefficients[[0, 8]] = 1.0, -(900.0**-8.0)
+    assert first_root(coefficients, 2000.0) == pytest.approx(900.0, rel=1e-12)
+
+
+def test_horner() -> None:
+    x = np.array([0.5, -2.0])
+    assert horner(np.array([1.0, 2.0, 3.0]), x).tolist() == [1.0 + 1.0 + 0.75, 1.0 - 4.0 + 12.0]
