@@ -74,11 +74,12 @@ def essential_from_six_rows(rows: FloatArray) -> Mat3:
     basis = _null_space(rows, 3)
     coefficients = _constraint_coefficients(basis, _DEGREES2)
     monomials = np.linalg.svd(coefficients)[2][:, -1]
-    one = monomials[:, 9]
-    real = np.abs(one) > 1e-9
-    xy = monomials[:, 7:9] / np.where(real, one, 1.0)[:, None]
-    weights = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
-    return _unit(np.einsum("bk,bkij->bij", weights, basis)[:, None], real[:, None])
+    # x3, y3 and 1 = z3 with their neighbours: divide by the largest, which no bad choice of the basis can make small.
+    cubes = monomials[:, [[0, 1, 4], [2, 3, 6], [7, 8, 9]]]
+    pick = np.argmax(np.abs(monomials[:, [0, 3, 9]]), axis=1)
+    weights = cubes[np.arange(len(rows)), pick]
+    real = np.ones((len(rows), 1), dtype=bool)
+    return _unit(np.einsum("bk,bkij->bij", weights, basis)[:, None], real)
 
 
 def planar_from_two_rows(rows: FloatArray) -> Mat3:

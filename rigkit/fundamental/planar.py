@@ -63,7 +63,7 @@ class PlanarSolver:
                 rows = np.concatenate([rows, more.reshape(-1, 4)])
             gram = rows.T @ rows
             values = np.linalg.eigvalsh(gram)
-            if values[2] < 1e-14 * values[3]:
+            if values[2] <= 1e-14 * values[3]:
                 raise DegenerateError(
                     "planar motion is not determined: the points lie on the horizon or there is no baseline; "
                     "use points above or below the camera's height"

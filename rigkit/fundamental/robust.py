@@ -34,10 +34,13 @@ Sample = Literal["points", "affine", "mixed"]
 """What minimal samples consist of: points only; affine correspondences only; one affine correspondence and points."""
 
 QUANTILE = 2.576
+MEDIAN_OF_NORMAL = 0.6745
 BATCH = 64
 WIDE = 4.0
-LOCAL_TRIES = 3
+LOCAL_TRIES = 2
 PROMISING = 0.6
+FINALISTS = 6
+LEAST_NOISE = 1.5
 GOOD_AFFINE = 0.1
 """Share of clean samples with an affinity that lead to the optimum (measured: a third at 0.05 noise of A)."""
 
@@ -49,9 +52,9 @@ class RobustPose:
     Attributes
     ----------
     refined : the pose, refined on the weighted matches.
-    inliers : (N,) bool, matches that fit at the highest noise level considered and lie in front of both cameras.
+    inliers : (N,) bool, matches that fit at twice the noise that the fitting ones show.
     weights : (N,) of the last local optimisation.
-    quality : sum of q over the matches.
+    quality : sum of q over the matches at that noise.
     trials : samples drawn.
     """
 
@@ -106,67 +109,81 @@ def robust_pose(
     """
     kind = str(pose_type)
     if kind in (PoseType.STANDARD, PoseType.FORWARD):
-        best: Mat3 | None = fundamental_for(kind).solve(matches, "points").E21
-        trials = 0
+        finalists, trials = [fundamental_for(kind).solve(matches, "points").E21], 0
     else:
         size = _sample_size(matches, kind, sample)
-        best, trials = _search(matches, rng, kind, sample, size, max_noise, confidence, max_trials)
-    if best is None:
+        search = _Search(matches, kind, sample, size, max_noise)
+        finalists, trials = search.run(rng, confidence, max_trials)
+    if not finalists:
         raise DegenerateError(f"no pose in {trials} samples of {len(matches)} matches; check how they were matched")
-    end = _local(matches, best, kind, level_sigma_rad, max_noise)
-    E21 = essential_from_pose(end.cam2_from_cam1)
-    r = _residuals(matches, E21[None])[0]
-    return RobustPose(
-        end,
-        np.asarray(np.abs(r) < QUANTILE * max_noise),
-        marginal_weights(r, max_noise),
-        float(marginal_quality(r, max_noise).sum()),
-        trials,
-    )
-
-
-def _search(
-    matches: Matches,
-    rng: np.random.Generator,
-    kind: str,
-    sample: Sample,
-    size: int,
-    max_noise: float,
-    confidence: float,
-    max_trials: int,
-) -> tuple[Mat3 | None, int]:
-    """Return the best essential matrix, locally optimised, and the number of samples drawn."""
-    best, best_quality, best_rank, trials, needed = None, 0.0, 0.0, 0, float(max_trials)
-    affine = np.flatnonzero(usable_affinities(matches))
-    points = replace(matches, A21=None, sigma_A=None)
-    while trials < needed:
-        trials += BATCH
-        candidates = _hypotheses(matches, _draw(rng, len(matches), affine, sample, size), kind, sample)
-        if not len(candidates):
+    # The search allowed for much noise; what the matches that fit show is the noise there is. At that level the local
+    # optima, nearly equal before, part company.
+    fitting = np.abs(_residuals(matches, finalists[0][None])[0])
+    fitting = fitting[fitting < QUANTILE * max_noise]
+    shown = float(np.median(fitting)) / MEDIAN_OF_NORMAL if fitting.size else max_noise
+    final = min(max_noise, max(2.0 * shown, LEAST_NOISE))
+    ends: list[tuple[float, RefinedPose, FloatArray]] = []
+    for E21 in finalists:
+        try:
+            end = _local(matches, E21, kind, level_sigma_rad, final)
+        except RigkitError:
             continue
-        # A sample's own noise can hide a good hypothesis at the final noise level: rank at a wider one.
-        rank = marginal_quality(_residuals(matches, candidates), WIDE * max_noise).sum(axis=1)
-        for index in np.argsort(-rank)[:LOCAL_TRIES]:
-            if rank[index] < PROMISING * best_rank:
-                break
-            candidate = candidates[index]
-            better = _improved(points, candidate, kind, max_noise)
-            quality = float(marginal_quality(_residuals(matches, better[None])[0], max_noise).sum())
-            if quality > best_quality:
-                best, best_quality = better, quality
-                best_rank = float(marginal_quality(_residuals(matches, better[None])[0], WIDE * max_noise).sum())
-        if best is None:
-            continue
-        share = float(np.mean(np.abs(_residuals(matches, best[None])[0]) < QUANTILE * max_noise))
-        # Affinities are noisy: of the samples without outliers only some are good enough to start from.
-        hit = min(max(share**size * (1.0 if sample == "points" else GOOD_AFFINE), 1e-12), 1.0 - 1e-12)
-        needed = min(float(max_trials), float(np.log(1.0 - confidence) / np.log1p(-hit)))
-    return best, trials
+        r = _residuals(matches, essential_from_pose(end.cam2_from_cam1)[None])[0]
+        ends.append((float(marginal_quality(r, final).sum()), end, r))
+    if not ends:
+        raise DegenerateError(f"no pose that puts the matches in front of both cameras among {len(finalists)} found")
+    quality, end, r = max(ends, key=lambda entry: entry[0])
+    return RobustPose(end, np.asarray(np.abs(r) < QUANTILE * final), marginal_weights(r, final), quality, trials)
 
 
-def _improved(matches: Matches, E21: Mat3, kind: str, max_noise: float) -> Mat3:
-    """Return the essential matrix after local optimisation at the wide noise level, then at the final one."""
-    for level in (WIDE * max_noise, max_noise):
+@dataclass(frozen=True, eq=False, slots=True)
+class _Search:
+    """Sampling with local optimisation of promising hypotheses."""
+
+    matches: Matches
+    kind: str
+    sample: Sample
+    size: int
+    max_noise: float
+
+    def run(self, rng: np.random.Generator, confidence: float, max_trials: int) -> tuple[list[Mat3], int]:
+        """Return the best essential matrices, locally optimised, best first, and the number of samples drawn."""
+        found: list[tuple[float, Mat3]] = []
+        trials, needed, best_rank = 0, float(max_trials), 0.0
+        affine = np.flatnonzero(usable_affinities(self.matches))
+        points = replace(self.matches, A21=None, sigma_A=None)
+        while trials < needed:
+            trials += BATCH
+            index = _draw(rng, len(self.matches), affine, self.sample, self.size)
+            candidates = _hypotheses(self.matches, index, self.kind, self.sample)
+            if not len(candidates):
+                continue
+            # A sample's own noise can hide a good hypothesis at the final noise level: rank at a wider one.
+            rank = self.quality(candidates, WIDE * self.max_noise)
+            for k in np.argsort(-rank)[:LOCAL_TRIES]:
+                if rank[k] < PROMISING * best_rank:
+                    break
+                # Widely first, which forgives a poor start; and at once, which an outlier with leverage cannot lure.
+                for levels in ((WIDE * self.max_noise, self.max_noise), (self.max_noise, LEAST_NOISE)):
+                    better = _improved(points, candidates[k], self.kind, levels)
+                    found.append((float(self.quality(better[None], self.max_noise)[0]), better))
+            found = sorted(found, key=lambda entry: -entry[0])[:FINALISTS]
+            best = found[0][1][None]
+            best_rank = float(self.quality(best, WIDE * self.max_noise)[0])
+            share = float(np.mean(np.abs(_residuals(self.matches, best)[0]) < QUANTILE * self.max_noise))
+            # Affinities are noisy: of the samples without outliers only some are good enough to start from.
+            hit = share**self.size * (1.0 if self.sample == "points" else GOOD_AFFINE)
+            needed = min(float(max_trials), float(np.log(1.0 - confidence) / np.log1p(-np.clip(hit, 1e-12, 1 - 1e-12))))
+        return [E21 for _, E21 in found], trials
+
+    def quality(self, E21: Mat3, noise: float) -> FloatArray:
+        """Return the sum of q over the matches of hypotheses (H, 3, 3)."""
+        return np.asarray(marginal_quality(_residuals(self.matches, E21), noise).sum(axis=1))
+
+
+def _improved(matches: Matches, E21: Mat3, kind: str, levels: tuple[float, ...]) -> Mat3:
+    """Return the essential matrix after local optimisation at one noise level after the other."""
+    for level in levels:
         try:
             E21 = essential_from_pose(_local(matches, E21, kind, None, level).cam2_from_cam1)
         except RigkitError:
