@@ -15,7 +15,7 @@ from rigkit.arrays import FloatArray, IntArray
 from rigkit.boards import Board
 from rigkit.detections import BoardDetection
 
-__all__ = ["BoardKind", "Placement", "board_kinds", "placements", "possible_kinds"]
+__all__ = ["BoardKind", "Placement", "board_kinds", "describe", "placements", "possible_kinds"]
 
 SAME_SQUARE_REL = 0.03
 """Squares that differ by less are not told apart by their size."""
@@ -145,3 +145,9 @@ def placements(detection: BoardDetection, kind: BoardKind) -> list[Placement]:
             Placement(turn, right, down) for down in range(rows - size[1] + 1) for right in range(columns - size[0] + 1)
         ]
     return out
+
+
+def describe(detection: BoardDetection) -> str:
+    """Return words by which a person finds a detection in the image."""
+    u, v = detection.pixels.mean(axis=0)
+    return f"the {detection.columns}x{detection.rows} grid round ({u:.0f}, {v:.0f})"

@@ -15,9 +15,10 @@ import numpy as np
 from rigkit.arrays import FloatArray
 from rigkit.boards import Board
 from rigkit.cameras.base import Camera
-from rigkit.corners.candidates import BoardKind, Placement, board_kinds, placements, possible_kinds
-from rigkit.corners.hypotheses import GridPoses, Solution, View, links_between, solutions
+from rigkit.corners.candidates import BoardKind, Placement, board_kinds, describe, placements, possible_kinds
+from rigkit.corners.hypotheses import Solution, forced_rms_px, solutions
 from rigkit.corners.joint_pose import JointPose, Sight, refine_joint
+from rigkit.corners.links import GridPoses, Link, View, links_between
 from rigkit.corners.naming import Located, first_corner_turn, name_boards
 from rigkit.corners.pair_identity import PairIdentity, common_corners
 from rigkit.detections import BoardDetection
@@ -30,6 +31,8 @@ LOG_ODDS = float(np.log(1000.0))
 """Odds of a thousand to one decide between two assignments; below, the geometry leaves a tie."""
 FLOOR_PX = 0.01
 """No camera and no printed board is truer than this: smaller misfits decide nothing."""
+MAX_RIVALS = 6
+"""Rivals that are made to explain all boards, for the runner-up's residual."""
 
 
 def identify_pair(
@@ -54,7 +57,7 @@ def identify_pair(
     Raises
     ------
     InputError
-        No boards, unknown names in `layout`, corners outside a camera's field of view.
+        No boards, unknown names in `layout`, one name for two detections of an image.
     DegenerateError
         No listed board is seen in both images.
 
@@ -79,7 +82,8 @@ def identify_pair(
     tied = [s for s in ranked if s is best or _log_odds(best, s, free1, free2, views) < LOG_ODDS]
     winner = min(tied, key=lambda s: (-len(s.links), sum(x.against_colour for x in s.links), _roll_rad(s)))
     rivals = [s for s in ranked if s.differs_from(winner)]
-    return _result(winner, rivals, tied, views, kinds, boards, layout)
+    runner_up_px = _runner_up_px(winner, rivals, links, views, kinds)
+    return _result(winner, runner_up_px, tied, views, kinds, boards, layout)
 
 
 def identify_single(detections: Sequence[BoardDetection], boards: Sequence[Board]) -> tuple[BoardDetection, ...]:
@@ -192,7 +196,9 @@ def _seen(
         taken = {s.index[v] for s in out}
         poses = GridPoses(view)
         for n in sorted(set(range(len(view.detections))) - taken, key=lambda n: -len(view.detections[n].grid)):
-            k = next((k for k in view.kinds[n] if vacant[k] > 0), None)
+            taken_names = {s.located.board_id for s in out} - {None}
+            free = [] if view.detections[n].board_id in taken_names else view.kinds[n]
+            k = next((k for k in free if vacant[k] > 0), None)
             where = placements(view.detections[n], kinds[k])[0] if k is not None else None
             found = poses.placed(n, kinds[k], where) if k is not None and where is not None else []
             if k is None or where is None or not found:
@@ -206,7 +212,7 @@ def _seen(
 
 def _result(
     winner: Solution,
-    rivals: Sequence[Solution],
+    runner_up_px: float,
     tied: Sequence[Solution],
     views: tuple[View, View],
     kinds: Sequence[BoardKind],
@@ -238,7 +244,7 @@ def _result(
     corners = np.array([[len(d[i].grid) for d in detections] for i in both])
     per_board = np.sqrt(pose.squared_px.sum(axis=1) / corners.sum(axis=1))
     contradicting = [s for s in tied if s.differs_from(winner)]
-    lost = [f"image {v + 1}: {_describe(views[v].detections[n])} is none of the boards listed" for v, n in left_over]
+    lost = [_why_left_over(v, views[v], n) for v, n in left_over]
     ordered = [[*both, *(b.board_id for b in boards if b.board_id in d and b.board_id not in both)] for d in detections]
     return PairIdentity(
         tuple(detections[0][i] for i in ordered[0]),
@@ -246,11 +252,17 @@ def _result(
         Rigid3.from_matrix(pose.cam2_from_cam1),
         {i: Rigid3.from_matrix(m) for i, m in start.items()},
         float(np.sqrt(pose.squared_px.sum() / corners.sum())),
-        _runner_up_px(winner, rivals, views),
+        runner_up_px,
         dict(zip(both, per_board.tolist(), strict=True)),
         bool(contradicting),
         _missing(boards, detections, both),
-        (*notes, *lost, *([_tie_note(winner, contradicting)] if contradicting else [])),
+        (
+            *views[0].notes,
+            *views[1].notes,
+            *notes,
+            *lost,
+            *([_tie_note(winner, contradicting)] if contradicting else []),
+        ),
     )
 
 
@@ -272,14 +284,27 @@ def _refined(
     )
 
 
-def _runner_up_px(winner: Solution, rivals: Sequence[Solution], views: tuple[View, View]) -> float:
-    """Return the rms distance of the best rival over the winner's corners, in px of their mean sigma."""
-    if not rivals:
-        return float("inf")
-    first, second = [s.first for s in winner.links], [s.second for s in winner.links]
-    sigma = np.concatenate([views[0].sights[i].sigma_px for i in first] + [views[1].sights[j].sigma_px for j in second])
-    chi2 = min(float(s.chi2_1[first].sum() + s.chi2_2[second].sum()) for s in rivals)
-    return float(np.sqrt(chi2 / (sigma**-2.0).sum()))
+def _runner_up_px(
+    winner: Solution,
+    rivals: Sequence[Solution],
+    links: Sequence[Link],
+    views: tuple[View, View],
+    kinds: Sequence[BoardKind],
+) -> float:
+    """Return the smallest rms of a joint fit of at least as many boards among the best rivals."""
+    enough = len(winner.links)
+    fits = [
+        (enough, s.rms_px(*views)) if len(s.links) >= enough else forced_rms_px(s, links, *views, kinds)
+        for s in rivals[:MAX_RIVALS]
+    ]
+    return min((rms for count, rms in fits if count >= enough), default=float("inf"))
+
+
+def _why_left_over(image: int, view: View, index: int) -> str:
+    what = f"image {image + 1}: {describe(view.detections[index])}"
+    if view.kinds[index]:
+        return f"{what} fits no board still free: one too many, or moved between the images"
+    return f"{what} is none of the boards listed"
 
 
 def _missing(
@@ -300,8 +325,3 @@ def _missing(
         else:
             out[i] = f"{size}: not seen in either image"
     return out
-
-
-def _describe(detection: BoardDetection) -> str:
-    u, v = detection.pixels.mean(axis=0)
-    return f"a {detection.columns}x{detection.rows} grid round ({u:.0f}, {v:.0f})"

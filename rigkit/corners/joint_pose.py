@@ -16,8 +16,6 @@ from rigkit.geometry.rotation import exp_so3, skew
 __all__ = ["JointPose", "Sight", "refine_joint"]
 
 MAX_STEPS = 30
-GAIN_TOLERANCE = 1e-9
-"""Stop when a step gains less than this part of the cost."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -88,6 +86,8 @@ def refine_joint(
     points1: Sequence[Points],
     sights2: Sequence[Sight],
     points2: Sequence[Points],
+    *,
+    tolerance: float = 1e-9,
 ) -> JointPose:
     """Return relative pose and board poses that minimise the whitened distances of all corners in both images.
 
@@ -96,6 +96,7 @@ def refine_joint(
     cam2_from_cam1, cam1_from_board : (4, 4) and (B, 4, 4) where to start.
     sights1, sights2 : B boards as either image sees them.
     points1, points2 : their corners in the frame of their board, mm; the two images need not see the same ones.
+    tolerance : stop when a step gains less than this part of the cost.
     """
     images = _Observations.stack(sights1, points1), _Observations.stack(sights2, points2)
     motion, boards = cam2_from_cam1.copy(), cam1_from_board.copy()
@@ -109,7 +110,7 @@ def refine_joint(
         trial_residual, trial_jacobian = _evaluate(images, *trial)
         trial_cost = float(trial_residual @ trial_residual)
         if trial_cost < cost:
-            settled = cost - trial_cost <= GAIN_TOLERANCE * cost
+            settled = cost - trial_cost <= tolerance * cost
             (motion, boards), residual, jacobian, cost = trial, trial_residual, trial_jacobian, trial_cost
             damping = max(damping * 0.1, 1e-9)
             if settled:

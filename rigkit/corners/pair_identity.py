@@ -25,8 +25,8 @@ class PairIdentity:
     cam2_from_cam1 : relative pose, metric, refined over all corners of the boards seen in both images.
     cam1_from_board : pose of every named board, from both images where both see it.
     residual_px : rms distance (2-D per corner, both images) of the corners from the rigid scene of the winner.
-    runner_up_px : the same for the best clearly different assignment, over the same corners; a board that does not
-        fit counts as a quarter of a square. Infinite where there is no other assignment.
+    runner_up_px : the same for the best clearly different assignment of as many boards, however badly it fits;
+        infinite where there is none.
     board_residual_px : `residual_px` board by board.
     ambiguous : whether geometry alone cannot tell the winner from another assignment; the one with the smallest roll
         between the cameras was then taken, and `notes` says so.

@@ -14,6 +14,8 @@ from rigkit.geometry.rotation import exp_so3, log_so3, rotation_angle, unit
 EXACT_ROTATION_RAD = 1e-9
 """Noise-free and well-conditioned; measured 1e-14 over 200 poses."""
 EXACT_TRANSLATION_REL = 1e-9
+TELEPHOTO_RAD = 1e-6
+"""Rounding of the rays, 1e-16, in the 3e-3 by which perspective shows the tilt of a board at 100 m, squared."""
 JACOBIAN_REL = 1e-6
 """Central differences with steps of 1e-6 are right to about 1e-9."""
 OPENCV_RATIO = 1.02
@@ -53,6 +55,14 @@ def test_rays_wider_apart_than_a_right_angle() -> None:
     assert (rays @ rays.T).min() < -0.9
     pose = board_pose(rays, board.points()).cam_from_board
     assert rotation_angle(pose.rotation @ rotation.T) < EXACT_ROTATION_RAD
+
+
+def test_telephoto() -> None:
+    """A board that fills a fifth of a degree: conditioning, not the field of view, sets the accuracy."""
+    rotation, translation = exp_so3(np.array([0.5, 0.4, 1.0])), np.array([3.0e3, -2.0e3, 1.0e5])
+    rays = unit(BOARD.points() @ rotation.T + translation)
+    pose = board_pose(rays, BOARD.points()).cam_from_board
+    assert rotation_angle(pose.rotation @ rotation.T) < TELEPHOTO_RAD
 
 
 def test_partial_and_tilted_targets(rng: np.random.Generator) -> None:
