@@ -16,7 +16,7 @@ import numpy as np
 from rigkit.arrays import FloatArray, IntArray, Points
 from rigkit.corners.candidates import BoardKind
 from rigkit.corners.joint_pose import JointPose, refine_joint
-from rigkit.corners.links import Link, View
+from rigkit.corners.sightings import Link, View
 from rigkit.detections import BoardDetection
 
 __all__ = ["Solution", "forced_rms_px", "solutions"]

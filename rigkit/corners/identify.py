@@ -18,9 +18,9 @@ from rigkit.cameras.base import Camera
 from rigkit.corners.candidates import BoardKind, Placement, board_kinds, describe, placements, possible_kinds
 from rigkit.corners.hypotheses import Solution, forced_rms_px, solutions
 from rigkit.corners.joint_pose import JointPose, Sight, refine_joint
-from rigkit.corners.links import GridPoses, Link, View, links_between
 from rigkit.corners.naming import Located, first_corner_turn, name_boards
 from rigkit.corners.pair_identity import PairIdentity, common_corners
+from rigkit.corners.sightings import GridPoses, Link, View, links_between
 from rigkit.detections import BoardDetection
 from rigkit.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3

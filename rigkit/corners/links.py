@@ -1,191 +1,157 @@
-"""Two detections taken for one board: every way in which a detection of image 1 can be one of image 2.
+"""Which corners are neighbours along an edge of a chessboard.
 
-What a view of an image holds for that: rays, poses of each detection from its own corners, the kinds that it may be.
+Only local evidence counts, so any number of boards, any perspective and any lens will do: the two corners lie in the
+direction of each other's arms, one sees the edge rise where the other sees it fall, and the brightness along the way is
+dark on one side and bright on the other as the arms say.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
-from rigkit.cameras.base import Camera
-from rigkit.corners.candidates import BoardKind, Placement, describe, placements, possible_kinds
-from rigkit.corners.joint_pose import Sight
-from rigkit.detections import BoardDetection
-from rigkit.errors import DegenerateError, InputError
-from rigkit.geometry.board_pose import board_poses, ray_residuals
+from rigkit.arrays import BoolArray, FloatArray, IntArray
+from rigkit.corners.response import FloatImage, Level, sample
+from rigkit.corners.ring import arm_vectors
+from rigkit.corners.saddle import Corners
 
-__all__ = ["GridPoses", "Link", "View", "links_between"]
+__all__ = ["Links", "edge_contrast", "find_links", "quads"]
 
-GATE_SQUARES = 0.1
-GATE_PX = 2.0
-GATE_SMALL_SQUARES = 0.25
-"""How far (rms) a board may miss the joint fit and still count as seen there: a tenth of a square; on small squares
-2 px, for noise and calibration errors, but never more than a quarter of a square."""
-MIN_CORNERS = 4
-TILT_RMS_RATIO = 3.0
-TILT_RMS_PX = 0.5
-"""The reversed tilt of a board is tried too where its rms is within this ratio, or this many px, of the better one."""
+NEIGHBOURS = 32
+"""Nearest corners looked at: enough to reach across a board that is foreshortened four times."""
 
+ARM_COSINE = np.cos(np.radians(18.0))
+"""How well the chord must follow the arms at both ends; fisheye rows bend by less within a square."""
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Link:
-    """Detection `first` of image 1 and `second` of image 2 taken for one board of a kind.
+CONTRAST_RATIO = 0.25
+"""Neighbours differ less than this in contrast, also across a shadow's edge."""
 
-    Attributes
-    ----------
-    key : what is claimed: equal for all placements (and tilts) that say the same of the two images.
-    placement1, placement2 : grids of the detections to the grid of the board.
-    cam1_from_board, cam2_from_board : (4, 4)
-    against_colour : whether the two are turned by 90 degrees against each other although the colours of a square board
-        should have prevented that.
-    """
+LENGTH_RATIO = 2.1
+"""Opposite neighbours differ less than this in distance, in any perspective a board can be read in."""
 
-    first: int
-    second: int
-    kind: int
-    key: tuple[int, ...]
-    placement1: Placement
-    placement2: Placement
-    cam1_from_board: FloatArray
-    cam2_from_board: FloatArray
-    against_colour: bool
+ALONG = np.array([0.2, 0.35, 0.5, 0.65, 0.8])
+MOST = 4
+"""An edge shows the right side dark at this many of the places `ALONG` it."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class View:
-    """The detections of one image with all that does not depend on the other image.
+class Links:
+    """Mutual neighbours.
 
     Attributes
     ----------
-    detections : without names that are not listed and corners that have no ray.
-    sights, spacing_px, kinds : by detection: rays, distance of neighbours, the kinds that it may be.
-    notes : what was left out.
+    corner : (N, 4) index of the neighbour along each arm, -1 for none.
+    arm : (N, 4) the neighbour's arm that points back.
     """
 
-    camera: Camera
-    detections: tuple[BoardDetection, ...]
-    sights: tuple[Sight, ...]
-    spacing_px: FloatArray
-    kinds: list[list[int]]
-    notes: tuple[str, ...]
-
-    @classmethod
-    def of(cls, detections: Sequence[BoardDetection], kinds: Sequence[BoardKind], camera: Camera, image: str) -> View:
-        """Build for the detections of `image` (its name in messages); raises InputError where a name comes twice."""
-        listed = {board_id for kind in kinds for board_id in kind.ids}
-        kept: list[BoardDetection] = []
-        notes = []
-        for found in detections:
-            name = found.board_id if found.board_id in listed else None
-            if name is not None and any(name == d.board_id for d in kept):
-                raise InputError(f"{image}: two detections are called '{name}'; name each board once")
-            _, seen = camera.unproject(found.pixels)
-            if not seen.all():
-                notes.append(
-                    f"{image}: {int((~seen).sum())} corners of {describe(found)} lie outside the camera's calibrated "
-                    "field of view: left out"
-                )
-            part = BoardDetection(
-                name, found.columns, found.rows, found.grid[seen], found.pixels[seen], found.sigma_px[seen]
-            )
-            if len(part.grid) >= MIN_CORNERS:
-                kept.append(part)
-        sights = tuple(Sight.of(camera, d.pixels, d.sigma_px, image) for d in kept)
-        spacing = np.array([_spacing(d) for d in kept])
-        return cls(camera, tuple(kept), sights, spacing, possible_kinds(kept, kinds), tuple(notes))
-
-    @property
-    def gate_px(self) -> FloatArray:
-        """How far (rms px) each detection (D,) may miss the joint fit."""
-        small = np.minimum(GATE_PX, GATE_SMALL_SQUARES * self.spacing_px)
-        return np.asarray(np.maximum(GATE_SQUARES * self.spacing_px, small))
-
-    def give_up(self) -> FloatArray:
-        """Return the chi2 (D,) of each detection when all its corners miss by the gate."""
-        both = zip(self.gate_px, self.sights, strict=True)
-        return np.array([((gate / sight.sigma_px) ** 2).sum() for gate, sight in both])
+    corner: IntArray
+    arm: IntArray
 
 
-def _spacing(detection: BoardDetection) -> float:
-    """Return the smaller of the median distances between neighbours along rows and columns, px."""
-    lattice = detection.lattice()
-    steps = [np.linalg.norm(np.diff(lattice, axis=a), axis=-1).ravel() for a in (0, 1)]
-    medians = [float(np.median(s[np.isfinite(s)])) for s in steps if np.isfinite(s).any()]
-    return min(medians) if medians else float(np.ptp(detection.pixels, axis=0).max())
+def edge_contrast(
+    image: FloatImage, start: FloatArray, end: FloatArray, sign: FloatArray, offset_px: FloatArray
+) -> FloatArray:
+    """Return how much brighter the expected side of the edges `start` -> `end` (M, 2) is, at the places ALONG, (M, 5).
+
+    `sign` is +1 where brightness grows with the angle (from u to v) around the start; `offset_px` (M,) is how far from
+    the chord both sides are sampled.
+    """
+    chord = end - start
+    length = np.maximum(np.linalg.norm(chord, axis=1), 1e-9)
+    normal = np.stack([-chord[:, 1], chord[:, 0]], axis=1) / length[:, None]
+    along = start[:, None] + ALONG[:, None] * chord[:, None]
+    aside = (sign * offset_px)[:, None, None] * normal[:, None]
+    difference: FloatArray = sample(image, along + aside) - sample(image, along - aside)
+    return difference
 
 
-class GridPoses:
-    """Poses of detections in the frame of their own grid, each computed once."""
-
-    def __init__(self, view: View) -> None:
-        self.view = view
-        self.known: dict[tuple[int, float, float], list[tuple[FloatArray, float]]] = {}
-
-    def of(self, index: int, step_x_mm: float, step_y_mm: float) -> list[tuple[FloatArray, float]]:
-        """Return [(cam_from_grid (4, 4), chi2)] of the plausible tilts, best first; none where degenerate."""
-        name = (index, step_x_mm, step_y_mm)
-        if name not in self.known:
-            detection, sight = self.view.detections[index], self.view.sights[index]
-            points = np.column_stack([detection.grid * [step_x_mm, step_y_mm], np.zeros(len(detection.grid))])
-            try:
-                found = board_poses(sight.rays, points, sight.sigma_px, bases=sight.bases)
-            except DegenerateError:
-                found = ()
-            limit = max(TILT_RMS_RATIO * found[0].rms_rad, TILT_RMS_PX) if found else 0.0
-            self.known[name] = []
-            for pose in (p for p in found if p.rms_rad <= limit):
-                rigid = pose.cam_from_board
-                residual, _ = ray_residuals(sight.rays, sight.bases, points, rigid.rotation, rigid.translation_mm)
-                chi2 = float(((residual / sight.sigma_px[:, None]) ** 2).sum())
-                self.known[name].append((rigid.matrix(), chi2))
-        return self.known[name]
-
-    def placed(self, index: int, kind: BoardKind, placement: Placement) -> list[tuple[FloatArray, float]]:
-        """Return [(cam_from_board (4, 4), chi2)] of a detection placed on a board."""
-        board = kind.board
-        steps = (board.square_x_mm, board.square_y_mm)
-        steps = steps if placement.quarter_turns % 2 == 0 else steps[::-1]
-        grid_from_board = np.linalg.inv(placement.board_from_grid(self.view.detections[index], board))
-        return [(pose @ grid_from_board, chi2) for pose, chi2 in self.of(index, *steps)]
+def find_links(corners: Corners, level: Level) -> Links:
+    """Return the mutual neighbours among `corners`; the brightness is read from `level` (the finest)."""
+    count = len(corners)
+    nobody = Links(np.full((count, 4), -1), np.full((count, 4), -1))
+    if count < 4:
+        return nobody
+    start, arm, end, back, distance = _candidates(corners)
+    seen = _edge_seen(corners, level, start, arm, end)
+    start, arm, end, back, distance = start[seen], arm[seen], end[seen], back[seen], distance[seen]
+    state = 4 * start + arm
+    order = np.lexsort((distance, state))
+    state, first = np.unique(state[order], return_index=True)
+    chosen = order[first]
+    to = np.full(4 * count, -1)
+    to[state] = 4 * end[chosen] + back[chosen]
+    linked = np.flatnonzero(to >= 0)
+    mutual = linked[to[to[linked]] == linked]
+    both = np.full(4 * count, -1)
+    both[mutual] = to[mutual]
+    both = _without_long(both, corners.pixels)
+    return Links(np.where(both >= 0, both // 4, -1).reshape(-1, 4), np.where(both >= 0, both % 4, -1).reshape(-1, 4))
 
 
-def links_between(view1: View, view2: View, kinds: Sequence[BoardKind]) -> tuple[list[Link], FloatArray, FloatArray]:
-    """Return all links, and the free chi2 of each detection (its own pose, its best kind; NaN where it has none)."""
-    poses1, poses2 = GridPoses(view1), GridPoses(view2)
-    links: list[Link] = []
-    for i, detection1 in enumerate(view1.detections):
-        for j, detection2 in enumerate(view2.detections):
-            if len({detection1.board_id, detection2.board_id} - {None}) > 1:
-                continue
-            for k in sorted(set(view1.kinds[i]) & set(view2.kinds[j])):
-                links += _links_of_pair(i, j, k, kinds[k], poses1, poses2)
-    free = []
-    for view, poses in ((view1, poses1), (view2, poses2)):
-        best = np.full(len(view.detections), np.nan)
-        for (index, _, _), found in poses.known.items():
-            for _, chi2 in found:
-                best[index] = np.fmin(best[index], chi2)
-        free.append(best)
-    return links, free[0], free[1]
+def _candidates(corners: Corners) -> tuple[IntArray, IntArray, IntArray, IntArray, FloatArray]:
+    """Return (start, its arm, end, its arm, distance) of the pairs whose arms point at each other."""
+    from scipy.spatial import cKDTree
+
+    pixels = corners.pixels
+    near = min(NEIGHBOURS + 1, len(pixels))
+    distance, other = cKDTree(pixels).query(pixels, k=near)
+    start = np.repeat(np.arange(len(pixels)), near)
+    end, distance = other.ravel(), distance.ravel()
+    apart = distance > 1e-6
+    start, end, distance = start[apart], end[apart], distance[apart]
+    ratio = corners.contrast[start] / corners.contrast[end]
+    alike = (ratio > CONTRAST_RATIO) & (ratio < 1.0 / CONTRAST_RATIO)
+    start, end, distance = start[alike], end[alike], distance[alike]
+    chord = (pixels[end] - pixels[start]) / distance[:, None]
+    arms = arm_vectors(corners.angles)
+    out = (arms[start] * chord[:, None]).sum(axis=2)
+    arm = out.argmax(axis=1)
+    good = out[np.arange(len(out)), arm] > ARM_COSINE
+    start, end, distance, chord, arm = start[good], end[good], distance[good], chord[good], arm[good]
+    home = -(arms[end] * chord[:, None]).sum(axis=2)
+    back = home.argmax(axis=1)
+    good = (home[np.arange(len(home)), back] > ARM_COSINE) & ((arm + back) % 2 == 1)
+    return start[good], arm[good], end[good], back[good], distance[good]
 
 
-def _links_of_pair(i: int, j: int, k: int, kind: BoardKind, poses1: GridPoses, poses2: GridPoses) -> list[Link]:
-    detection1, detection2 = poses1.view.detections[i], poses2.view.detections[j]
-    square = kind.board.columns == kind.board.rows and detection1.complete and detection2.complete
-    links, keys = [], set()
-    for placement1 in placements(detection1, kind):
-        for placement2 in placements(detection2, kind):
-            key = (k, *placement2.relative_to(placement1, detection1, detection2))
-            if key in keys:
-                continue
-            keys.add(key)
-            odd = (placement1.quarter_turns + placement2.quarter_turns) % 2 == 1
-            against = square and kind.board.columns % 2 == 0 and odd
-            for pose1, _ in poses1.placed(i, kind, placement1):
-                for pose2, _ in poses2.placed(j, kind, placement2):
-                    links.append(Link(i, j, k, key, placement1, placement2, pose1, pose2, against))
-    return links
+def _edge_seen(corners: Corners, level: Level, start: IntArray, arm: IntArray, end: IntArray) -> BoolArray:
+    """Return whether the edge between the corners is there, with the polarity of the arm."""
+    first, last = level.to_level(corners.pixels[start]), level.to_level(corners.pixels[end])
+    length = np.linalg.norm(last - first, axis=1)
+    offset = np.clip(0.12 * length, 1.0, 4.0 * corners.scale[start] / level.scale)
+    sign = np.where(arm % 2 == 0, 1.0, -1.0)
+    difference = edge_contrast(level.smooth, first, last, sign, offset)
+    weakest = CONTRAST_RATIO * np.minimum(corners.contrast[start], corners.contrast[end])
+    seen: BoolArray = (difference > weakest[:, None]).sum(axis=1) >= MOST
+    return seen
+
+
+def _without_long(to: IntArray, pixels: FloatArray) -> IntArray:
+    """Drop links more than LENGTH_RATIO times as long as the link of the opposite arm."""
+    there = to >= 0
+    length = np.where(
+        there, np.linalg.norm(pixels[np.where(there, to, 0) // 4] - np.repeat(pixels, 4, axis=0), axis=1), 0
+    )
+    opposite = np.roll(length.reshape(-1, 4), 2, axis=1).ravel()
+    drop = there & (opposite > 0) & (length > LENGTH_RATIO * opposite)
+    out = to.copy()
+    out[to[drop]] = -1
+    out[drop] = -1
+    return out
+
+
+def quads(links: Links) -> BoolArray:
+    """Return which links (N, 4) bound a closed square of four corners, on either side."""
+    count = len(links.corner)
+    there = links.corner >= 0
+    state = np.where(there, 4 * links.corner + links.arm, -1).ravel()
+    turned = np.where(there, 4 * links.corner + (links.arm - 1) % 4, -1).ravel()
+    start = np.arange(4 * count)
+    walk = start
+    for _ in range(4):
+        walk = np.where(walk >= 0, turned[walk], -1)
+    closed = (walk == start) & there.ravel()
+    other = np.zeros_like(closed)
+    other[state[closed]] = True
+    return (closed | other).reshape(-1, 4)
