@@ -7,7 +7,7 @@ its image and `BenchScene.truth` says where every visible corner is.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,17 +23,19 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.posetype import PoseType
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
-from rigkit.synthetic.photometry import Photometry
+from rigkit.synthetic.photometry import Photometry, Shadow
 from rigkit.synthetic.placing import place_board, sees_paper
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import Panel, PlacedBoard, exact_detection
 
 __all__ = [
     "BENCH_PHOTOMETRY",
+    "CONDITIONS",
     "LENSES",
     "SCENES",
     "BenchScene",
     "bench_camera",
+    "covered_board",
     "empty",
     "one_board",
     "partial_board",
@@ -46,6 +48,21 @@ LENSES = ("regular", "fisheye")
 FISHEYE_FIELD_DEG = 185.0
 BENCH_PHOTOMETRY = Photometry(exposure=0.95, vignetting=0.25, gradient=(0.12, -0.08))
 """Contrast of about 15 to 205 grey levels under uneven light, before noise."""
+CONDITIONS: dict[str, tuple[Optics, Photometry]] = {
+    "plain": (Optics(0.7), BENCH_PHOTOMETRY),
+    "defocus": (Optics(0.3, defocus_px=1.6), BENCH_PHOTOMETRY),
+    "motion": (Optics(0.5, motion_px=(2.6, 1.5)), BENCH_PHOTOMETRY),
+    "dark": (Optics(0.7), replace(BENCH_PHOTOMETRY, exposure=0.15, noise_levels=2.0)),
+    "low contrast": (Optics(0.7), replace(BENCH_PHOTOMETRY, exposure=0.3, gamma=0.5, noise_levels=2.0)),
+    "saturated": (Optics(0.7), replace(BENCH_PHOTOMETRY, exposure=1.8, noise_levels=2.0)),
+    "gamma": (Optics(0.7), replace(BENCH_PHOTOMETRY, gamma=1.0 / 2.2, noise_levels=2.0)),
+    "sharpened": (Optics(0.7), replace(BENCH_PHOTOMETRY, sharpen=0.8, noise_levels=2.0)),
+    "shadow": (Optics(0.7), replace(BENCH_PHOTOMETRY, shadow=Shadow(), noise_levels=2.0)),
+    "vignetted": (Optics(0.7), replace(BENCH_PHOTOMETRY, vignetting=0.9, noise_levels=2.0)),
+    "jpeg 75": (Optics(0.7), replace(BENCH_PHOTOMETRY, jpeg_quality=75)),
+    "16 bit": (Optics(0.7), replace(BENCH_PHOTOMETRY, bits=16, noise_levels=2.0)),
+}
+"""Light, lens and sensor by name, for `BenchScene.render(optics=, photometry=)`."""
 TRIES = 500
 
 
@@ -56,7 +73,7 @@ class BenchScene:
     Attributes
     ----------
     name : kind of scene and lens.
-    boards, panels : in the frame of the camera.
+    boards, panels, occluders : in the frame of the camera; occluders lie in front of the boards.
     camera : the lens.
     field_deg : its field of view, None for a regular lens.
     """
@@ -66,9 +83,10 @@ class BenchScene:
     panels: tuple[Panel, ...]
     camera: Camera
     field_deg: float | None = None
+    occluders: tuple[Panel, ...] = ()
 
     def truth(self) -> tuple[BoardDetection, ...]:
-        """Return the exact corners of every board of which any are visible; corners outside the image are left out."""
+        """Return the exact corners of every board of which any are in the image, hidden by an occluder or not."""
         found = (exact_detection(b, self.camera, Rigid3.identity()) for b in self.boards)
         return tuple(d for d in found if len(d.grid))
 
@@ -82,16 +100,14 @@ class BenchScene:
         optics: Optics | None = None,
     ) -> NDArray[np.uint8] | NDArray[np.uint16]:
         """Return the image; `optics` and `photometry` win over `blur_px` and `noise_levels`."""
-        if optics is None:
-            optics = Optics(blur_px, field_deg=self.field_deg)
-        if photometry is None:
-            p = BENCH_PHOTOMETRY
-            photometry = Photometry(p.exposure, p.vignetting, p.gradient, noise_levels=noise_levels)
+        optics = replace(optics or Optics(blur_px), field_deg=self.field_deg)
+        photometry = photometry or replace(BENCH_PHOTOMETRY, noise_levels=noise_levels)
         return render(
             self.boards,
             self.camera,
             Rigid3.identity(),
             panels=self.panels,
+            occluders=self.occluders,
             optics=optics,
             photometry=photometry,
             rng=rng,
@@ -194,6 +210,21 @@ def partial_board(
     raise DegenerateError("partial board: no view cuts the board as asked for")
 
 
+def covered_board(
+    rng: np.random.Generator, *, lens: str = "regular", size_px: tuple[int, int] = (640, 480)
+) -> BenchScene:
+    """Return one whole board with a ruler lying across it, about a row of corners hidden."""
+    scene = one_board(rng, lens=lens, size_px=size_px)
+    placed = scene.boards[0]
+    board = placed.board
+    # Beside the middle, at any angle, a millimetre above the paper.
+    spot = np.array([board.columns, board.rows]) * board.square_x_mm * rng.uniform(0.3, 0.6, 2)
+    turn = exp_so3(np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]))
+    ruler = placed.world_from_board @ Rigid3(turn, np.array([*spot, -1.0]))
+    occluder = Panel(ruler, 1.6 * max(board.size) * board.square_x_mm, 0.8 * board.square_x_mm, 0.5)
+    return BenchScene(f"covered {lens}", (placed,), (), scene.camera, scene.field_deg, (occluder,))
+
+
 def empty(
     rng: np.random.Generator, *, lens: str = "regular", size_px: tuple[int, int] = (640, 480), count: int = 60
 ) -> BenchScene:
@@ -215,6 +246,7 @@ SCENES: dict[str, Callable[..., BenchScene]] = {
     "three": three_boards,
     "room": room,
     "partial": partial_board,
+    "covered": covered_board,
     "empty": empty,
 }
 """Every kind of scene by name; each takes (rng, lens=, size_px=)."""

@@ -71,6 +71,7 @@ def render(
     cam_from_world: Rigid3,
     *,
     panels: Sequence[Panel] = (),
+    occluders: Sequence[Panel] = (),
     optics: Optics | None = None,
     photometry: Photometry | None = None,
     background: float = 0.35,
@@ -78,14 +79,17 @@ def render(
 ) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """Return the grey image (height, width) of boards and panels, uint8 or uint16 as `photometry.bits` says.
 
-    Panels are drawn in the given order behind all boards; boards from the farthest to the nearest.
+    Panels are drawn in the given order behind all boards; boards from the farthest to the nearest; occluders in the
+    given order in front of all.
 
     Parameters
     ----------
     background : reflectance where nothing is.
     rng : source of the sensor noise; needed where `photometry.noise_levels` is not zero.
     """
-    image = radiance(boards, camera, cam_from_world, panels=panels, optics=optics, background=background)
+    image = radiance(
+        boards, camera, cam_from_world, panels=panels, occluders=occluders, optics=optics, background=background
+    )
     return develop(image, photometry or Photometry(), rng)
 
 
@@ -95,6 +99,7 @@ def radiance(
     cam_from_world: Rigid3,
     *,
     panels: Sequence[Panel] = (),
+    occluders: Sequence[Panel] = (),
     optics: Optics | None = None,
     background: float = 0.35,
 ) -> FloatArray:
@@ -104,6 +109,7 @@ def radiance(
     surfaces = [panel_surface(p, cam_from_world) for p in panels]
     placed = [board_surface(b, cam_from_world) for b in boards]
     surfaces += sorted(placed, key=lambda s: -s.distance_mm)
+    surfaces += [panel_surface(p, cam_from_world) for p in occluders]
     reduce = _Reduction(optics)
     out = np.empty((height, width))
     for top in range(0, height, TILE):

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
 from rigkit.boards import Board
 from rigkit.errors import InputError
 from rigkit.synthetic.bench_scenes import (
+    CONDITIONS,
     LENSES,
     SCENES,
     bench_camera,
+    covered_board,
     empty,
     one_board,
     partial_board,
@@ -55,3 +58,30 @@ def test_scenes_are_reproducible_and_lenses_are_known() -> None:
         np.testing.assert_array_equal(first, second)
     with pytest.raises(InputError, match="known: regular, fisheye"):
         bench_camera("telephoto")
+
+
+def test_a_ruler_hides_part_of_a_board(rng: np.random.Generator) -> None:
+    scene = covered_board(rng)
+    (found,) = scene.truth()
+    assert found.complete
+    hidden = 0
+    image = scene.render(blur_px=0.3)
+    for u, v in np.rint(found.pixels).astype(int):
+        patch = image[v - 2 : v + 3, u - 2 : u + 3].astype(int)
+        # A corner has black and white round it, a ruler is one grey.
+        hidden += int(patch.max() - patch.min() < 40)
+    assert 2 <= hidden <= 30
+
+
+@pytest.mark.parametrize("name", list(CONDITIONS))
+def test_every_condition_leaves_a_readable_board(name: str) -> None:
+    optics, photometry = CONDITIONS[name]
+    rng = np.random.default_rng(5)
+    scene = one_board(rng, size_px=(320, 240), board=Board("b", 5, 4, 30.0, 30.0))
+    image = scene.render(optics=optics, photometry=photometry, rng=rng)
+    assert image.dtype == (np.uint16 if name == "16 bit" else np.uint8)
+    grey = np.clip(image / (257.0 if name == "16 bit" else 1.0), 0, 255).astype(np.uint8)
+    (found,) = scene.truth()
+    corners = found.pixels.astype(np.float32).reshape(-1, 1, 2)
+    refined = cv2.cornerSubPix(grey, corners.copy(), (3, 3), (-1, -1), (3, 50, 1e-4))
+    assert np.median(np.linalg.norm(refined - corners, axis=2)) < 0.25
