@@ -165,7 +165,9 @@ def _homography(rays: Rays, flat: FloatArray, weight: FloatArray) -> FloatArray:
     spread_rays = rays @ spread.T
     norm = np.linalg.norm(spread_rays, axis=1, keepdims=True)
     rows = tangent_bases(spread_rays / norm)[:, :, :, None] * target[:, None, None, :] * weight[:, None, None, None]
-    _, singular, vt = np.linalg.svd(rows.reshape(-1, 9), full_matrices=True)
+    rows = rows.reshape(-1, 9)
+    # Four corners give eight rows: only then is the null vector outside of the reduced decomposition.
+    _, singular, vt = np.linalg.svd(rows, full_matrices=len(rows) < 9)
     if singular[7] < MIN_HOMOGRAPHY_GAP * singular[0]:
         raise DegenerateError("board pose: all corners but one lie on one line; corners of two full rows are needed")
     h = np.linalg.inv(spread) @ vt[-1].reshape(3, 3)

@@ -15,16 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, IntArray, Points
+from rigkit.arrays import FloatArray
 from rigkit.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import angle_between, rotation_angle
-from rigkit.geometry.scale import metric_scale
-from rigkit.geometry.triangulation import point_covariances
-from rigkit.interop.colmap import ColmapPair, ColmapResult, colmap_pair, solve_pair
+from rigkit.geometry.rotation import angle_between, log_so3, rotation_angle, unit
+from rigkit.interop.colmap import colmap_pair, solve_pair
 from rigkit.reconstruct import Reconstruction
-from rigkit.validation.checks import COVERAGE, Check, judge, without_nan
-from rigkit.validation.measure import Measured, measure, points_by_pose
+from rigkit.validation.checks import Check, judge, without_nan
+from rigkit.validation.colmap_way import colmap_reconstruction
+from rigkit.validation.intrinsics import CalibrationShifts
+from rigkit.validation.measure import Measured, measure
 from rigkit.validation.pnp import planar_pnp
 
 __all__ = ["CrossCheckReport", "OtherWay", "compare_chains", "crosscheck"]
@@ -32,9 +32,8 @@ __all__ = ["CrossCheckReport", "OtherWay", "compare_chains", "crosscheck"]
 ADJUSTED = "pycolmap bundle adjustment"
 PNP = "planar PnP"
 OTHER_CHAIN = "other chain"
-BEST_CORNER_PX = 1e-3
-"""No corner is known better than this, however well a few of them happen to fit."""
-PER_POINT = ("normals", "colours", "board_index", "grid", "sigma_mm", "normal_sigma_rad")
+CROSS_COVERAGE = 3.0
+"""A data set makes a hundred comparisons: at two sigmas five of them would fail though nothing is wrong."""
 
 Angles = dict[tuple[str, str], tuple[float, float]]
 
@@ -53,6 +52,7 @@ class OtherWay:
     angles_deg : (a, b) -> (angle between the faces, sigma).
     rms_px : its root mean square reprojection error, 2-D per observation; NaN where that way has none.
     used, excluded : matches that took part; matches beyond what that way can represent.
+    variance_factor : observed over predicted variance of the corners, where that way can tell; else NaN.
     """
 
     name: str
@@ -65,6 +65,7 @@ class OtherWay:
     rms_px: float
     used: int
     excluded: int
+    variance_factor: float = np.nan
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -120,6 +121,7 @@ class CrossCheckReport:
                         for (a, b), (angle, sigma) in way.angles_deg.items()
                     ],
                     "rms_px": way.rms_px if np.isfinite(way.rms_px) else None,
+                    "variance_factor": way.variance_factor if np.isfinite(way.variance_factor) else None,
                     "used": way.used,
                     "excluded": way.excluded,
                 }
@@ -139,7 +141,8 @@ def crosscheck(
     reconstruction: Reconstruction,
     *,
     other_chain: Reconstruction | None = None,
-    coverage: float = COVERAGE,
+    shifts: CalibrationShifts | None = None,
+    coverage: float = CROSS_COVERAGE,
     seed: int = 0,
 ) -> CrossCheckReport:
     """Compare a reconstruction with pycolmap, planar PnP, and the same pair through another chain if given.
@@ -148,6 +151,7 @@ def crosscheck(
     ----------
     reconstruction : of one pair.
     other_chain : the same pair reconstructed in other pixels (rectified where this one is raw, or the reverse).
+    shifts : from `calibration_shifts`: a wrong calibration moves the ways apart; None: exact intrinsics.
     coverage : largest |difference| / combined sigma that passes.
     seed : of COLMAP's RANSAC.
 
@@ -166,8 +170,9 @@ def crosscheck(
             skipped.append(f"{name}: {error}")
     if other_chain is not None:
         ways.append(compare_chains(reconstruction, other_chain, OTHER_CHAIN))
-    ours = _angles(measure(reconstruction))
-    checks = [check for way in ways for check in _checks(reconstruction, ours, way, coverage)]
+    own = _with_observed_corners(reconstruction, ways)
+    ours = _angles(measure(own))
+    checks = [check for way in ways for check in _checks(own, ours, way, coverage, shifts)]
     return CrossCheckReport(
         reconstruction.pair_id,
         reconstruction.affine_method,
@@ -191,7 +196,7 @@ def _colmap_ways(reconstruction: Reconstruction, seed: int) -> list[OtherWay]:
     pair = colmap_pair(reconstruction.camera1, reconstruction.camera2, *pixels)
     excluded = int((~pair.used).sum())
     result = solve_pair(pair, seed=seed)
-    adjusted = _colmap_reconstruction(reconstruction, pair, result)
+    adjusted = colmap_reconstruction(reconstruction, pair, result)
     baseline = adjusted.baseline_mm
     two_view = Rigid3(result.two_view.rotation, result.two_view.translation_mm * baseline)
     unknown = np.full((6, 6), np.nan)
@@ -212,56 +217,27 @@ def _colmap_ways(reconstruction: Reconstruction, seed: int) -> list[OtherWay]:
     ]
 
 
-def _colmap_reconstruction(reconstruction: Reconstruction, pair: ColmapPair, result: ColmapResult) -> Reconstruction:
-    """Return COLMAP's adjusted pose and points as a reconstruction in mm, scaled by the squares."""
-    which = np.flatnonzero(pair.used)
-    seen = np.isfinite(result.points).all(axis=1)
-    which, unit_points = which[seen], result.points[seen]
-    cloud = reconstruction.cloud
-    known = (cloud.board_index[which], cloud.grid[which], reconstruction.boards)
-    # COLMAP's covariance is for corners of 1 px; 4N residuals fix 3N + 5 unknowns.
-    variance = max(result.rms_px**2 * 2.0 * len(which) / max(len(which) - 5, 1), BEST_CORNER_PX**2)
-    spread = variance * _spread(reconstruction, which, unit_points, result.adjusted)
-    scale, scale_sigma = metric_scale(unit_points, *known, spread)
-    picked = {name: getattr(cloud, name)[which] for name in PER_POINT}
-    metric = replace(
-        reconstruction,
-        matches=reconstruction.matches.select(which),
-        pixels1=reconstruction.pixels1[which],
-        pixels2=reconstruction.pixels2[which],
-        cam2_from_cam1=Rigid3(result.adjusted.rotation, scale * result.adjusted.translation_mm),
-        cloud=replace(cloud, **picked, points_mm=scale * unit_points),
-        baseline_mm=scale,
-        pose_covariance=None,
-    )
-    if not np.isfinite(result.adjusted_covariance).all():
-        return metric
-    # t = s u: its direction moves with the pose, its length with the scale that this pose gives to the squares.
-    across = np.diag([1.0] * 3 + [scale] * 3) @ result.adjusted_covariance @ np.diag([1.0] * 3 + [scale] * 3)
-    slope = np.zeros(6)
-    for k, (motion, step) in enumerate(points_by_pose(metric)):
-        moved = (metric_scale(unit_points + sign * motion / scale, *known, spread)[0] for sign in (1.0, -1.0))
-        slope[k] = (next(moved) - next(moved)) / (2.0 * step)
-    along = np.eye(6)
-    along[3:] += np.outer(result.adjusted.translation_mm, slope)
-    covariance = along @ across @ along.T * variance
-    covariance[3:, 3:] += scale_sigma**2 * np.outer(result.adjusted.translation_mm, result.adjusted.translation_mm)
-    return replace(metric, pose_covariance=covariance)
-
-
-def _spread(reconstruction: Reconstruction, which: IntArray, points: Points, pose: Rigid3) -> FloatArray:
-    """Return the covariances of triangulated points for corners of 1 px: what weighs them in the scale."""
-    camera1, camera2 = reconstruction.camera1, reconstruction.camera2
-    pixels1, pixels2 = reconstruction.pixels1[which], reconstruction.pixels2[which]
-    rays = (camera1.unproject(pixels1)[0], camera2.unproject(pixels2)[0])
-    return point_covariances(points, pose, *rays, camera1.ray_jacobian(pixels1), camera2.ray_jacobian(pixels2))
-
-
 def _pnp_way(reconstruction: Reconstruction) -> OtherWay:
     found = planar_pnp(reconstruction)
     rms = found.rms_rad * reconstruction.camera1.focal_px
     pose, covariance = found.cam2_from_cam1, found.covariance
-    return _way(PNP, reconstruction, pose, covariance, found.angles_deg, rms, found.count, 0)
+    way = _way(PNP, reconstruction, pose, covariance, found.angles_deg, rms, found.count, 0)
+    return replace(way, variance_factor=found.variance_factor)
+
+
+def _with_observed_corners(reconstruction: Reconstruction, ways: Sequence[OtherWay]) -> Reconstruction:
+    """Return the reconstruction with its pose's covariance for the corner errors that the boards' shapes show.
+
+    It is never made smaller: errors that all corners share do not show in a board's shape.
+    """
+    factor = max([1.0, *(way.variance_factor for way in ways if np.isfinite(way.variance_factor))])
+    if reconstruction.pose_covariance is None:
+        return reconstruction
+    return replace(
+        reconstruction,
+        pose_covariance=factor * reconstruction.pose_covariance,
+        baseline_sigma_mm=float(np.sqrt(factor)) * reconstruction.baseline_sigma_mm,
+    )
 
 
 def _way(
@@ -285,9 +261,15 @@ def _angles(measured: Measured) -> Angles:
     return {two: measured.angle_deg(*two) for two in combinations(measured.boards, 2)}
 
 
-def _checks(reconstruction: Reconstruction, ours: Angles, way: OtherWay, coverage: float) -> list[Check]:
-    """Return the checks of one way; none for what that way gives without uncertainty."""
+def _checks(
+    reconstruction: Reconstruction, ours: Angles, way: OtherWay, coverage: float, shifts: CalibrationShifts | None
+) -> list[Check]:
+    """Return the checks of one way; none for what that way gives without uncertainty.
+
+    Epipolar ways take the same calibration in the same manner; only the boards' own poses move apart from ours.
+    """
     checks = []
+    apart = _apart(shifts) if shifts is not None and way.name == PNP else {}
     sigma = _pose_sigmas(way.cam2_from_cam1, way.covariance)
     if all(np.isfinite(value) for value in sigma):
         unknown = np.full((6, 6), np.nan)
@@ -300,12 +282,39 @@ def _checks(reconstruction: Reconstruction, ours: Angles, way: OtherWay, coverag
         )
         for (name, unit, other, value), theirs, mine in zip(rows, sigma, own, strict=True):
             known = (other, theirs, way.name)
-            checks.append(judge(name, name, unit, known, (value, mine), coverage, way.used))
+            sigma_ours = float(np.hypot(mine, apart.get(name, 0.0)))
+            checks.append(judge(name, name, unit, known, (value, sigma_ours), coverage, way.used))
     for (a, b), (angle, angle_sigma) in way.angles_deg.items():
         if (a, b) in ours:
             known = (angle, angle_sigma, way.name)
-            checks.append(judge(f"angle {a}-{b}", "angle", "deg", known, ours[a, b], coverage, way.used))
+            name = f"angle {a}-{b}"
+            mine_and_shift = (ours[a, b][0], float(np.hypot(ours[a, b][1], apart.get(name, 0.0))))
+            checks.append(judge(name, "angle", "deg", known, mine_and_shift, coverage, way.used))
     return checks
+
+
+def _apart(shifts: CalibrationShifts) -> dict[str, float]:
+    """Return how far the calibrations' uncertainty moves our quantities and those of planar PnP apart, one sigma."""
+
+    def differences(moved: Reconstruction) -> dict[str, FloatArray]:
+        pnp = planar_pnp(moved)
+        ours = moved.cam2_from_cam1
+        out = {
+            "rotation": log_so3(pnp.cam2_from_cam1.rotation @ ours.rotation.T),
+            "translation direction": unit(pnp.cam2_from_cam1.translation_mm) - unit(ours.translation_mm),
+        }
+        angles = _angles(measure(moved))
+        out |= {f"angle {a}-{b}": np.deg2rad([angles[a, b][0] - v]) for (a, b), (v, _) in pnp.angles_deg.items()}
+        out = {name: np.rad2deg(value) for name, value in out.items()}
+        baseline = float(np.linalg.norm(pnp.cam2_from_cam1.translation_mm))
+        return out | {"baseline": np.array([moved.baseline_mm - baseline])}
+
+    base = differences(shifts.base)
+    squares = dict.fromkeys(base, 0.0)
+    for moved in shifts.moved:
+        for name, value in differences(moved).items():
+            squares[name] += float(np.sum((value - base[name]) ** 2))
+    return {name: float(np.sqrt(square)) for name, square in squares.items()}
 
 
 def _pose_sigmas(pose: Rigid3, covariance: FloatArray) -> tuple[float, float, float]:

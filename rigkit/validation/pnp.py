@@ -30,6 +30,8 @@ class PnpResult:
     covariance : (6, 6) of (left rotation perturbation rad, translation mm).
     angles_deg : (a, b) -> (angle between the faces, sigma), mean of both views.
     rms_rad : root mean square angle between rays and corners, over all boards and both views.
+    variance_factor : observed over predicted variance of the corners. The residuals of a board of known shape show
+        errors along epipolar lines too, which epipolar geometry cannot see: 1 where the corners' sigmas are honest.
     count : corners used.
     boards : how many boards took part.
     """
@@ -38,6 +40,7 @@ class PnpResult:
     covariance: FloatArray
     angles_deg: dict[tuple[str, str], tuple[float, float]]
     rms_rad: float
+    variance_factor: float
     count: int
     boards: int
 
@@ -62,7 +65,20 @@ def planar_pnp(reconstruction: Reconstruction) -> PnpResult:
     pose, covariance = _mean_pose([_relative(*both) for both in poses.values()], reconstruction.cam2_from_cam1)
     total = sum(counts.values())
     square = sum(counts[b] * (one.rms_rad**2 + two.rms_rad**2) / 2.0 for b, (one, two) in poses.items()) / total
-    return PnpResult(pose, covariance, _angles(poses), float(np.sqrt(square)), total, len(poses))
+    # Every pose takes six degrees of freedom from 2N residuals.
+    free = 1.0 - 3.0 * len(poses) / total
+    factor = square / free / _predicted_square(reconstruction, list(poses))
+    return PnpResult(pose, covariance, _angles(poses), float(np.sqrt(square)), factor, total, len(poses))
+
+
+def _predicted_square(reconstruction: Reconstruction, board_ids: list[str]) -> float:
+    """Return the mean square angle between rays and corners that the corners' sigmas predict."""
+    m = reconstruction.matches
+    names = np.array([board.board_id for board in reconstruction.boards])[reconstruction.cloud.board_index]
+    on = np.isin(names, board_ids)
+    square1 = m.sigma1_px[on] ** 2 * np.sum(m.jacobians1[on] ** 2, axis=(1, 2))
+    square2 = m.sigma2_px[on] ** 2 * np.sum(m.jacobians2[on] ** 2, axis=(1, 2))
+    return float(np.mean(square1 + square2) / 2.0)
 
 
 def _relative(one: BoardPose, two: BoardPose) -> tuple[Rigid3, FloatArray]:
