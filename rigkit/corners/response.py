@@ -32,10 +32,13 @@ SMOOTH = np.array([1.0, 4.0, 6.0, 4.0, 1.0], np.float32) / 16.0
 NOISE_FACTOR = 8.0
 """A peak stands out of the noise from this multiple of the median |D| upwards."""
 
-FLOOR = 2.0
-CEILING = 16.0
-"""Bounds of the threshold on D, in (grey levels of 255 per px^2)^2: below the floor there is only quantisation, and the
-median of a richly textured image must not hide the corners of a board in it."""
+FLOOR, CEILING = 2.0, 16.0
+"""Bounds of the threshold on D for an image that spans 200 grey levels, in (grey levels per px^2)^2; they go with the
+square of the span. Below the floor is only quantisation and compression, and the median of a richly textured image must
+not hide the corners of a board in it."""
+
+LEAST_SPAN = 2.5
+"""An image that spans fewer grey levels shows nothing but its quantisation."""
 
 MAX_PEAKS = 20000
 """Keep the strongest peaks of a level: texture may have more, a board never."""
@@ -130,7 +133,10 @@ def _level(image: FloatImage, scale: float, offset: float) -> Level:
     response = cv2.subtract(lxy, lxx, dst=lxy)
     step = max(1, int(np.sqrt(response.size / 3e4)))
     typical = float(np.median(np.abs(response[::step, ::step])))
-    return Level(smooth, response, float(np.clip(NOISE_FACTOR * typical, FLOOR, CEILING)), scale, offset)
+    low, high = np.quantile(smooth[::step, ::step], (0.002, 0.998))
+    contrast = (max(float(high - low), LEAST_SPAN) / 200.0) ** 2
+    threshold = float(np.clip(NOISE_FACTOR * typical, FLOOR * contrast, CEILING * contrast))
+    return Level(smooth, response, threshold, scale, offset)
 
 
 def peaks(level: Level) -> IntArray:
