@@ -15,9 +15,11 @@ import numpy as np
 
 from rigkit.arrays import FloatArray
 from rigkit.cameras.base import Camera
-from rigkit.fundamental.metric import metric_pose, triangulate_matches
+from rigkit.fundamental.metric import triangulate_matches
 from rigkit.fundamental.refine import refine_pose
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.scale import metric_scale
+from rigkit.geometry.scale import metric_scale
 from rigkit.matches import Matches
 from rigkit.reconstruct import Reconstruction
 
@@ -94,15 +96,15 @@ def _again(
     pose = reconstruction.cam2_from_cam1
     start = Rigid3(pose.rotation, pose.translation_mm / np.linalg.norm(pose.translation_mm))
     refined = refine_pose(matches, start, reconstruction.pose_type, level_sigma_rad)
-    metric = metric_pose(matches, refined.cam2_from_cam1, refined.covariance, reconstruction.boards)
-    points, _, valid = triangulate_matches(matches, metric.cam2_from_cam1)
+    points, covariance, valid = triangulate_matches(matches, refined.cam2_from_cam1)
+    scale, _ = metric_scale(points, matches.board_index, matches.grid, reconstruction.boards, covariance)
     cloud = reconstruction.cloud
     return replace(
         reconstruction,
         camera1=camera1,
         camera2=camera2,
-        cam2_from_cam1=metric.cam2_from_cam1,
+        cam2_from_cam1=Rigid3(refined.cam2_from_cam1.rotation, scale * refined.cam2_from_cam1.translation_mm),
         pose_covariance=None,
-        cloud=replace(cloud, points_mm=np.where(valid[:, None], points, cloud.points_mm)),
-        baseline_mm=metric.baseline_mm,
+        cloud=replace(cloud, points_mm=np.where(valid[:, None], scale * points, cloud.points_mm)),
+        baseline_mm=scale,
     )
