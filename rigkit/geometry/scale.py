@@ -120,7 +120,7 @@ def _similarity_scale(points: Points, model: Points, covariances: FloatArray | N
         gram = np.einsum("n,nij,nik->jk", w, J, J)
         step = np.linalg.solve(gram, np.einsum("n,nij,ni->j", w, J, residual))
         k, R, c = k + step[0], exp_so3(step[1:4]) @ R, c + step[4:]
-        if iteration > 2 and abs(step[0]) < 1e-12 * k:
+        if iteration > 1 and abs(step[0]) < 1e-10 * k:
             break
     if not k > 0.0:
         return float("nan"), float("nan")
