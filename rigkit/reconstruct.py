@@ -63,6 +63,7 @@ class Reconstruction:
     baseline_mm, baseline_sigma_mm : length of the translation and its predicted standard deviation.
     sampson_rms_px : rms Sampson distance of the corners from the epipolar geometry.
     notes : what was dropped, assumed or contradicted, in words.
+    level_sigma_rad : how well the pose type was taken to hold in the refinement; None: exactly, or it is general.
     """
 
     pair_id: str
@@ -82,6 +83,7 @@ class Reconstruction:
     baseline_sigma_mm: float
     sampson_rms_px: float
     notes: tuple[str, ...] = ()
+    level_sigma_rad: float | None = None
 
 
 def reconstruct_pair(
@@ -173,6 +175,7 @@ def _reconstruct(
         metric.baseline_sigma_mm,
         refined.sampson_rms_px,
         tuple(notes),
+        level_sigma_rad,
     )
 
 

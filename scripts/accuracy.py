@@ -123,7 +123,7 @@ def measure(folder: Path, *, pairs: Sequence[str] = (), chain: str = "raw", jobs
     """Measure all pairs and both calibrations of datasets/lab-a against the truth under `folder`."""
     progress = progress_on_stderr()
     dataset = load_dataset(ROOT / "datasets" / "lab-a").select(pairs)
-    cameras = load_cameras(dataset, recalibrate=False, progress=progress)
+    cameras = {k: v.camera for k, v in load_cameras(dataset, recalibrate=False, progress=progress).items()}
     work = [
         (p, cameras[p.camera1.camera_id], cameras[p.camera2.camera_id], folder / "captures" / p.pair_id, chain)
         for p in dataset.pairs

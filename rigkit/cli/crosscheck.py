@@ -60,7 +60,10 @@ def run(args: argparse.Namespace) -> int:
     out = output_folder(args, dataset)
     progress = progress_on_stderr()
     cameras = load_cameras(dataset, recalibrate=args.recalibrate, progress=progress)
-    jobs = [PairJob(p, cameras[p.camera1.camera_id], cameras[p.camera2.camera_id], args.chain) for p in dataset.pairs]
+    jobs = [
+        PairJob(p, cameras[p.camera1.camera_id].camera, cameras[p.camera2.camera_id].camera, args.chain)
+        for p in dataset.pairs
+    ]
     reports = list(over_pairs(crosscheck_pair, jobs, args.jobs, "cross-checking pairs", progress))
     table = crosscheck_table(reports)
     files: dict[str, str | bytes] = {

@@ -42,8 +42,8 @@ def run(args: argparse.Namespace) -> int:
     jobs = [
         PairJob(
             pair,
-            cameras[pair.camera1.camera_id],
-            cameras[pair.camera2.camera_id],
+            cameras[pair.camera1.camera_id].camera,
+            cameras[pair.camera2.camera_id].camera,
             args.chain,
             args.method,
             not args.no_pictures,

@@ -19,15 +19,18 @@ from rigkit.cli.workflow import (
     reconstruct_other_chain,
     reconstruct_with,
     select_dataset,
+    shifts_of,
     write_results,
 )
 
 if TYPE_CHECKING:
-    from rigkit.cameras.base import Camera
+    from rigkit.cli.workflow import LoadedCamera
     from rigkit.io.manifest import Dataset, Pair
+    from rigkit.reconstruct import Reconstruction
     from rigkit.report.page import PairSection
     from rigkit.validation.checks import ValidationReport
     from rigkit.validation.crosscheck import CrossCheckReport
+    from rigkit.validation.intrinsics import CalibrationShifts
     from rigkit.validation.tables import PaperTables
 
 HELP = "the tables against measured truth, report and PLY; exit code 1 if a check fails"
@@ -74,8 +77,8 @@ class PairJob:
     """What one process needs to know of one pair."""
 
     pair: Pair
-    camera1: Camera
-    camera2: Camera
+    camera1: LoadedCamera
+    camera2: LoadedCamera
     chain: str
     pictures: bool
     crosscheck: bool
@@ -102,9 +105,9 @@ def validate_pair(job: PairJob) -> PairOutcome:
     from rigkit.validation.crosscheck import crosscheck
 
     pair = job.pair
-    matched, image1, image2 = match_images(pair, job.camera1, job.camera2, job.chain)
+    matched, image1, image2 = match_images(pair, job.camera1.camera, job.camera2.camera, job.chain)
     reconstructions = {method: reconstruct_with(matched, pair, method, image1) for method in AFFINE_METHODS}
-    reports = tuple(validate(r, pair.truth) for r in reconstructions.values())
+    reports = tuple(validate(r, pair.truth, shifts=s) for r, s in _with_shifts(reconstructions, job))
     best = best_report(reports)
     files: dict[str, bytes] = {
         f"{pair.pair_id}/{method}.ply": ply_bytes(r.cloud) for method, r in reconstructions.items()
@@ -113,6 +116,23 @@ def validate_pair(job: PairJob) -> PairOutcome:
     other_ways = crosscheck(shown, other_chain=reconstruct_other_chain(matched, pair)) if job.crosscheck else None
     section = _pictures(shown, reports, other_ways, image1, image2, files) if job.pictures else None
     return PairOutcome(pair.pair_id, reports, best, other_ways, files, section)
+
+
+def _with_shifts(
+    reconstructions: Mapping[str, Reconstruction], job: PairJob
+) -> list[tuple[Reconstruction, CalibrationShifts | None]]:
+    """Return each reconstruction with what the calibrations' uncertainty does to it.
+
+    The likelihood sees the corners, not the affinities: estimators that kept the same corners share the answer.
+    """
+    known: dict[bytes, CalibrationShifts | None] = {}
+    out = []
+    for reconstruction in reconstructions.values():
+        corners = reconstruction.pixels1.tobytes()
+        if corners not in known:
+            known[corners] = shifts_of(reconstruction, job.camera1, job.camera2)
+        out.append((reconstruction, known[corners]))
+    return out
 
 
 def _pictures(

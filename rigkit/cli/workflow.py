@@ -7,30 +7,38 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import json
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rigkit.errors import DegenerateError, InputError
 
 if TYPE_CHECKING:
+    from rigkit.arrays import FloatArray
     from rigkit.cameras.base import Camera
     from rigkit.detections import BoardDetection
     from rigkit.io.manifest import Dataset, Pair
     from rigkit.pairing import MatchedPair
     from rigkit.progress import Progress
     from rigkit.reconstruct import Reconstruction
+    from rigkit.validation.intrinsics import CalibrationShifts
 
 __all__ = [
+    "LoadedCamera",
     "add_dataset_arguments",
     "load_cameras",
     "match_images",
     "output_folder",
     "over_pairs",
+    "reconstruct_other_chain",
+    "reconstruct_with",
     "select_dataset",
+    "shifts_of",
     "write_results",
 ]
 
@@ -89,22 +97,30 @@ def write_results(folder: Path, files: Mapping[str, str | bytes], *, force: bool
         write_atomic(folder / name, data, force=force)
 
 
-def load_cameras(dataset: Dataset, *, recalibrate: bool, progress: Progress) -> dict[str, Camera]:
+@dataclass(frozen=True, eq=False, slots=True)
+class LoadedCamera:
+    """A camera and the covariance of its parameters; None where the file does not say (another tool's camera)."""
+
+    camera: Camera
+    covariance: FloatArray | None
+
+
+def load_cameras(dataset: Dataset, *, recalibrate: bool, progress: Progress) -> dict[str, LoadedCamera]:
     """Return the cameras that the pairs use, calibrating from their sessions where no calibration is there yet.
 
     A new calibration is kept beside its session.
     """
     from rigkit.cli.calibrate import calibrate_session
-    from rigkit.io.calibration_file import load_camera, save_calibration
+    from rigkit.io.calibration_file import save_calibration
     from rigkit.io.session import load_session
 
-    cameras: dict[str, Camera] = {}
+    cameras: dict[str, LoadedCamera] = {}
     used = {name for pair in dataset.pairs for name in (pair.camera1.camera_id, pair.camera2.camera_id)}
     for entry in dataset.cameras:
         if entry.camera_id not in used:
             continue
         if entry.calibration.is_file() and not recalibrate:
-            cameras[entry.camera_id] = load_camera(entry.calibration)
+            cameras[entry.camera_id] = _load(entry.calibration)
             continue
         if entry.session is None:
             raise InputError(
@@ -113,8 +129,17 @@ def load_cameras(dataset: Dataset, *, recalibrate: bool, progress: Progress) -> 
             )
         calibration = calibrate_session(load_session(entry.session), progress)
         save_calibration(entry.calibration, calibration, force=True)
-        cameras[entry.camera_id] = calibration.camera
+        cameras[entry.camera_id] = LoadedCamera(calibration.camera, calibration.covariance)
     return cameras
+
+
+def _load(path: Path) -> LoadedCamera:
+    from rigkit.io.calibration_file import load_calibration, load_camera
+
+    camera = load_camera(path)
+    if "covariance" not in json.loads(path.read_text(encoding="utf-8")):
+        return LoadedCamera(camera, None)
+    return LoadedCamera(camera, load_calibration(path).covariance)
 
 
 def match_images(pair: Pair, camera1: Camera, camera2: Camera, chain: str) -> tuple[MatchedPair, Any, Any]:
@@ -174,6 +199,20 @@ def reconstruct_with(matched: MatchedPair, pair: Pair, method: str, image1: Any 
     level = None if pair.level_sigma_deg is None else float(np.deg2rad(pair.level_sigma_deg))
     return reconstruct_pair(
         matched, pose_type=pair.pose_type, affine_method=method, level_sigma_rad=level, image1=image1
+    )
+
+
+def shifts_of(reconstruction: Reconstruction, camera1: LoadedCamera, camera2: LoadedCamera) -> CalibrationShifts | None:
+    """Return what the calibrations' uncertainty does to a reconstruction; None where a camera has no covariance."""
+    from rigkit.validation.intrinsics import calibration_shifts
+
+    if camera1.covariance is None or camera2.covariance is None:
+        return None
+    return calibration_shifts(
+        reconstruction,
+        camera1.covariance,
+        None if camera1 is camera2 else camera2.covariance,
+        level_sigma_rad=reconstruction.level_sigma_rad,
     )
 
 
