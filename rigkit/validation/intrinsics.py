@@ -19,7 +19,6 @@ from rigkit.fundamental.metric import triangulate_matches
 from rigkit.fundamental.refine import refine_pose
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.scale import metric_scale
-from rigkit.geometry.scale import metric_scale
 from rigkit.matches import Matches
 from rigkit.reconstruct import Reconstruction
 
