@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from rigkit.arrays import FloatArray
@@ -10,6 +12,7 @@ from rigkit.calibration.normal import Normal, normal_equations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import BoardShape, Calibration, Candidate, Outlier, ViewResult
 from rigkit.calibration.solver import State, evaluate
+from rigkit.calibration.verdicts import judge
 from rigkit.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
@@ -47,7 +50,7 @@ def assemble(
             length = float(np.linalg.norm(px[i, j]))
             outliers.append(Outlier(view.image, view.board.board_id, int(column), int(row), length))
     p = state.camera.parameters.size
-    return Calibration(
+    result = Calibration(
         camera=state.camera,
         rms_px=rms(state, observations, fit.kept),
         heldout_rms_px=heldout_px,
@@ -61,6 +64,7 @@ def assemble(
         convergence=fit.convergence,
         boards=_boards(observations, state),
     )
+    return replace(result, verdicts=judge(result))
 
 
 def solution_normal(observations: Observations, fit: Fit) -> Normal:
@@ -119,5 +123,8 @@ def _boards(observations: Observations, state: State) -> tuple[BoardShape, ...]:
         own = points[observations.first_row[i] : observations.first_row[i + 1]]
         centred = own - own.mean(axis=0)
         normal = np.linalg.svd(centred, full_matrices=False)[2][2]
-        out.append(BoardShape(board.board_id, state.shape.kind, own, float(np.abs(centred @ normal).max())))
+        flat = board.points() - board.points().mean(axis=0)
+        scale = (flat * centred).sum(axis=0)[:2] / (flat**2).sum(axis=0)[:2]
+        bow = float(np.abs(centred @ normal).max())
+        out.append(BoardShape(board.board_id, state.shape.kind, own, bow, float(scale[0] / scale[1] - 1.0)))
     return tuple(out)

@@ -14,6 +14,7 @@ import numpy as np
 from rigkit.arrays import BoolArray
 from rigkit.calibration.assemble import assemble
 from rigkit.calibration.fit import Fit, fit_kept, fit_model, heldout_rms, rms, robust_sigma
+from rigkit.calibration.moved import moved_lens
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.shape import SHAPES, shape_model
@@ -104,7 +105,8 @@ def calibrate(
             shapes = [chosen, *shapes]
         chosen = _choose(observations, shapes, SHAPE_MARGIN)
         candidates += [c for c in _described(observations, shapes, chosen, SHAPE_MARGIN) if "board" in c.name]
-    return assemble(observations, chosen.fit, chosen.heldout_px, dropped, tuple(candidates))
+    result = assemble(observations, chosen.fit, chosen.heldout_px, dropped, tuple(candidates))
+    return replace(result, verdicts=(*result.verdicts, *moved_lens(observations, chosen.fit, result)))
 
 
 def _wanted(model: str, degree: int | None) -> list[tuple[str, type[Camera], int | None]]:

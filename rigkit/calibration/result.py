@@ -101,12 +101,14 @@ class BoardShape:
     kind : "flat", "warp" (print scale and a low-order bow) or "released" (every corner free under a prior).
     points_mm : (columns * rows, 3) corners in the board frame, row by row.
     bow_mm : largest departure from a plane.
+    aspect : how much longer the squares are along x than stated, against y (0.001: by 0.1 %).
     """
 
     board_id: str
     kind: str
     points_mm: Points
     bow_mm: float = 0.0
+    aspect: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points_mm", as_array(self.points_mm, (None, 3), "points_mm"))

@@ -49,7 +49,13 @@ def save_calibration(path: str | Path, calibration: Calibration, *, force: bool 
         "covariance": c.covariance.tolist(),
         "frame_covariance": c.frame_covariance.tolist(),
         "boards": [
-            {"board_id": b.board_id, "kind": b.kind, "bow_mm": b.bow_mm, "points_mm": b.points_mm.tolist()}
+            {
+                "board_id": b.board_id,
+                "kind": b.kind,
+                "bow_mm": b.bow_mm,
+                "aspect": b.aspect,
+                "points_mm": b.points_mm.tolist(),
+            }
             for b in c.boards
         ],
         "views": [_view_out(v) for v in c.views],

@@ -51,12 +51,14 @@ def random_views(
     middle = board.points().mean(axis=0)
     extent = float(np.ptp(board.points(), axis=0).max())
     views, rotations, translations = [], [], []
-    while len(views) < count:
+    for _ in range(20000):
+        if len(views) == count:
+            break
         # Uniform in the image's radius, so that the rim is visited as often as it is large.
         angle = np.radians(reach_deg) * np.sqrt(rng.random())
         about = rng.uniform(-np.pi, np.pi)
         direction = np.array([np.sin(angle) * np.cos(about), np.sin(angle) * np.sin(about), np.cos(angle)])
-        distance = extent * rng.uniform(0.9, 2.2)
+        distance = extent * rng.uniform(0.9, 2.2) * max(1.0, 30.0 / reach_deg)
         facing = _facing(direction) @ exp_so3(np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]))
         axis = rng.uniform(-np.pi, np.pi)
         tilt = np.radians(rng.uniform(*tilt_deg))
@@ -73,6 +75,7 @@ def random_views(
         views.append(BoardView(f"{len(views):03d}.png", board, board.grid(), noisy, sigma))
         rotations.append(rotation)
         translations.append(translation)
+    assert len(views) == count, "the board does not fit into that part of the view"
     return views, np.array(rotations), np.array(translations)
 
 
