@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers.cameras import rays_within, sample_cameras
 
+from rigkit.cameras.pinhole import Pinhole
 from rigkit.cameras.views import perspective_view, smallest_cone
 from rigkit.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import exp_so3
@@ -39,6 +40,13 @@ def test_view_has_the_resolution_of_the_source(rng: np.random.Generator) -> None
     assert area[1] == pytest.approx(area[0], rel=0.05)
     double, _ = perspective_view(rays, FISHEYE, focal_scale=2.0)
     assert double.focal_px == pytest.approx(2.0 * view.focal_px, rel=1e-9)
+
+
+def test_view_of_a_perspective_image_keeps_its_focal_length(rng: np.random.Generator) -> None:
+    """Also far off the axis, where a pinhole itself has more pixels per radian."""
+    source = Pinhole((2000, 2000), np.array([500.0, 500.0, 999.5, 999.5]))
+    view, _ = perspective_view(rays_within(np.radians(55.0), 400, rng), source)
+    assert view.focal_px == pytest.approx(500.0, rel=0.01)
 
 
 def test_smallest_cone(rng: np.random.Generator) -> None:
