@@ -1,0 +1,221 @@
+"""Affine correspondences of two images of a textured scene: SIFT in simulated views, frames refined on the images.
+
+Each image is also seen from the side, by simulated tilts (ASIFT, Morel and Yu 2009): features of a surface that the two
+cameras see at different slants match there. A match gives a first affinity from the two features' scale, orientation
+and tilt; aligning the patches makes it accurate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.affine.correspondences import Correspondences
+from rigkit.affine.refine_patches import refine_patches
+from rigkit.arrays import BoolArray, FloatArray, IntArray, Pixels
+from rigkit.errors import DegenerateError, InputError
+
+__all__ = ["match_affine_features"]
+
+TILTS = (1.0, np.sqrt(2.0), 2.0)
+"""Simulated tilts: together with those of the other image they cover slants of 60 degrees and more."""
+ROLL_STEP_DEG = 72.0
+"""Step of the tilts' direction, over the tilt (as in ASIFT)."""
+SAME_POINT_PX = 8.0
+"""Features of different simulated views this near are one point: no rivals in the ratio test."""
+RIVALS = 8
+MIN_CORRELATION = 0.9
+MIN_SIZE_PX = 64
+
+
+class _Features(NamedTuple):
+    pixels: Pixels
+    frames: FloatArray
+    descriptors: NDArray[np.float32]
+
+
+def match_affine_features(
+    image1: NDArray[Any],
+    image2: NDArray[Any],
+    *,
+    tilts: Sequence[float] = TILTS,
+    features_per_view: int = 600,
+    ratio: float = 0.85,
+    half_width_px: float = 12.0,
+    min_correlation: float = MIN_CORRELATION,
+) -> Correspondences:
+    """Return affine correspondences of two images; contaminated by some wrong ones, as matches are.
+
+    Parameters
+    ----------
+    image1, image2 : (H, W) or (H, W, 3) RGB, uint8 or uint16.
+    tilts : simulated tilts, 1 (none) and above; (1.0,) for nearly equal views is fastest.
+    features_per_view : strongest SIFT features kept in each simulated view.
+    ratio : a match must be nearer than this times its best rival elsewhere in the image.
+    half_width_px : of the patches aligned; surfaces are taken as flat within.
+    min_correlation : of two aligned patches.
+
+    Raises
+    ------
+    InputError
+        Not images, or too small.
+    DegenerateError
+        No correspondences: no texture, or images of different scenes.
+    """
+    grey1, grey2 = _grey(image1, "image1"), _grey(image2, "image2")
+    first, second = (_features(grey, tilts, features_per_view) for grey in (grey1, grey2))
+    i, j, rank = _match(first, second, ratio)
+    once = _unrepeated(first.pixels[i], second.pixels[j], rank)
+    i, j = i[once], j[once]
+    A21 = second.frames[j] @ np.linalg.inv(first.frames[i]) if i.size else np.zeros((0, 2, 2))
+    refined = refine_patches(
+        grey1.astype(np.float32),
+        grey2.astype(np.float32),
+        first.pixels[i],
+        second.pixels[j],
+        A21,
+        half_width_px=half_width_px,
+    )
+    with np.errstate(invalid="ignore"):
+        good = refined.valid & (refined.correlation >= min_correlation)
+    if not good.any():
+        raise DegenerateError(
+            f"affine features: none of {i.size} matches could be aligned; check that the images show one textured scene"
+        )
+    good[good] = _unrepeated(first.pixels[i][good], refined.pixels2[good], refined.sigma_A[good])
+    return Correspondences(
+        first.pixels[i][good],
+        refined.pixels2[good],
+        refined.A21[good],
+        None,
+        refined.sigma_px[good],
+        refined.sigma_A[good],
+    )
+
+
+def _grey(image: NDArray[Any], name: str) -> NDArray[np.uint8]:
+    import cv2
+
+    array = np.asarray(image)
+    if (
+        array.ndim not in (2, 3)
+        or array.dtype not in (np.uint8, np.uint16)
+        or (array.ndim == 3 and array.shape[2] != 3)
+    ):
+        raise InputError(
+            f"affine features, {name}: expected HxW or HxWx3 of uint8 or uint16, got {array.shape} {array.dtype}"
+        )
+    if min(array.shape[:2]) < MIN_SIZE_PX:
+        raise InputError(f"affine features, {name}: at least {MIN_SIZE_PX} px a side, got {array.shape[:2]}")
+    if array.dtype == np.uint16:
+        array = (array >> 8).astype(np.uint8)
+    if array.ndim == 3:
+        array = cv2.cvtColor(np.ascontiguousarray(array), cv2.COLOR_RGB2GRAY)
+    return np.ascontiguousarray(array)
+
+
+def _features(grey: NDArray[np.uint8], tilts: Sequence[float], count: int) -> _Features:
+    """Return the features of all simulated views in the pixels of the image itself."""
+    import cv2
+
+    detector = cv2.SIFT.create(nfeatures=count)
+    parts = []
+    for tilt in tilts:
+        if tilt < 1.0:
+            raise InputError(f"affine features: tilts are 1 and above, got {tilt}")
+        rolls = np.arange(0.0, 180.0, ROLL_STEP_DEG / tilt) if tilt > 1.0 else [0.0]
+        for roll in rolls:
+            view, mask, view_from_image = _simulated(grey, float(tilt), float(np.radians(roll)))
+            keypoints, descriptors = detector.detectAndCompute(view, mask)
+            if not keypoints:
+                continue
+            inverse = np.linalg.inv(view_from_image[:, :2])
+            pixels = (np.array([k.pt for k in keypoints]) - view_from_image[:, 2]) @ inverse.T
+            angle = np.radians([k.angle for k in keypoints])
+            c, s = np.cos(angle), np.sin(angle)
+            turn = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
+            size = np.array([k.size for k in keypoints])[:, None, None]
+            # RootSIFT: Euclidean distances of square roots compare histograms better.
+            root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6))
+            parts.append(_Features(pixels, inverse @ (size * turn), root.astype(np.float32)))
+    if not parts:
+        return _Features(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 128), dtype=np.float32))
+    return _Features(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def _simulated(
+    grey: NDArray[np.uint8], tilt: float, roll: float
+) -> tuple[NDArray[Any], NDArray[Any] | None, FloatArray]:
+    """Return the image turned by `roll` and squeezed by `tilt` along x, its mask, and view_from_image (2, 3)."""
+    import cv2
+
+    if tilt == 1.0:
+        return grey, None, np.eye(2, 3)
+    height, width = grey.shape
+    c, s = np.cos(roll), np.sin(roll)
+    turn = np.array([[c, -s], [s, c]])
+    corners = np.array([[0.0, 0.0], [width - 1.0, 0.0], [0.0, height - 1.0], [width - 1.0, height - 1.0]]) @ turn.T
+    low, size = corners.min(axis=0), np.ceil(np.ptp(corners, axis=0)).astype(int) + 1
+    # The border goes on outside: an edge between image and nothing would be full of features.
+    outside = cv2.BORDER_REPLICATE
+    turned = cv2.warpAffine(grey, np.column_stack([turn, -low]), size.tolist(), borderMode=outside)
+    blurred = cv2.GaussianBlur(turned, (0, 0), sigmaX=0.8 * np.sqrt(tilt**2 - 1.0), sigmaY=0.01)
+    squeeze = np.diag([1.0 / tilt, 1.0])
+    out = (int(np.ceil(size[0] / tilt)), int(size[1]))
+    view = cv2.warpAffine(blurred, np.column_stack([squeeze, np.zeros(2)]), out, borderMode=outside)
+    view_from_image = np.column_stack([squeeze @ turn, -squeeze @ low])
+    mask = cv2.warpAffine(np.full_like(grey, 255), view_from_image, out, flags=cv2.INTER_NEAREST)
+    return view, cv2.erode(mask, np.ones((9, 9), np.uint8), borderValue=0), view_from_image
+
+
+def _match(first: _Features, second: _Features, ratio: float) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return index pairs of features that choose each other and have no rival elsewhere, with their distances."""
+    forward, distance, clear = _nearest(first, second, ratio)
+    backward, _, _ = _nearest(second, first, ratio)
+    if not forward.size or not backward.size:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0)
+    returned = first.pixels[backward[forward]]
+    mutual = np.linalg.norm(returned - first.pixels, axis=1) < SAME_POINT_PX
+    i = np.flatnonzero(clear & mutual)
+    return i, forward[i], distance[i]
+
+
+def _nearest(
+    first: _Features, second: _Features, ratio: float, block: int = 1024
+) -> tuple[IntArray, FloatArray, BoolArray]:
+    """Return the nearest feature of `second` for each of `first`, how near, and whether no other point comes near."""
+    n, m = len(first.pixels), len(second.pixels)
+    if m <= RIVALS or n == 0:
+        return np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dtype=bool)
+    nearest = np.empty(n)
+    best = np.empty(n, dtype=np.int64)
+    clear = np.empty(n, dtype=bool)
+    for start in range(0, n, block):
+        rows = slice(start, min(start + block, n))
+        similarity = first.descriptors[rows] @ second.descriptors.T
+        top = np.argpartition(-similarity, RIVALS, axis=1)[:, :RIVALS]
+        values = np.take_along_axis(similarity, top, axis=1)
+        order = np.argsort(-values, axis=1)
+        top, values = np.take_along_axis(top, order, axis=1), np.take_along_axis(values, order, axis=1)
+        distance = np.sqrt(np.maximum(2.0 - 2.0 * values, 0.0))
+        apart = np.linalg.norm(second.pixels[top] - second.pixels[top[:, :1]], axis=-1) > SAME_POINT_PX
+        rival = np.where(apart, distance, np.inf).min(axis=1)
+        # No rival among the nearest ones: the furthest of them is a bound.
+        rival = np.where(np.isfinite(rival), rival, distance[:, -1])
+        best[rows], nearest[rows], clear[rows] = top[:, 0], distance[:, 0], distance[:, 0] < ratio * rival
+    return best, nearest, clear
+
+
+def _unrepeated(pixels1: Pixels, pixels2: Pixels, rank: FloatArray, cell_px: float = 4.0) -> BoolArray:
+    """Return which to keep so that every cell of either image has one point, the one of lowest rank."""
+    keep = np.zeros(len(pixels1), dtype=bool)
+    order = np.argsort(rank, kind="stable")
+    for pixels in (pixels1, pixels2):
+        cell = np.floor(pixels[order] / cell_px).astype(np.int64)
+        _, position = np.unique(cell, axis=0, return_index=True)
+        order = order[np.sort(position)]
+    keep[order] = True
+    return keep
