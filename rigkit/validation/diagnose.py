@@ -1,0 +1,197 @@
+"""What a failed check most probably comes from, in words: a wrong square, a wrong rule, the wrong calibration."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from rigkit.boards import Board
+from rigkit.cameras.base import Camera
+from rigkit.detections import BoardDetection
+from rigkit.errors import DegenerateError, InputError
+from rigkit.geometry.board_pose import board_pose
+from rigkit.validation.checks import Check, ValidationReport
+
+__all__ = ["camera_fit", "camera_suspects", "suspects"]
+
+CLEARLY_BETTER = 4.0
+"""Another calibration fits clearly better if it leaves this many times less. Two calibrations of one lens differ by far
+less, two lenses by far more."""
+MISFIT_PX = 0.5
+"""Below this no calibration is called wrong: corners of a blurred or bent board leave as much."""
+SAME_RATIO = 0.005
+"""Baselines that are off by one factor, to half a percent, share a cause."""
+ODD_BOARD = 0.003
+"""A board whose squares come out of this much another size than those of the other boards was measured wrongly."""
+MIN_CORNERS = 12
+
+
+def camera_fit(camera: Camera, detections: Sequence[BoardDetection], boards: Sequence[Board]) -> float:
+    """Return the root mean square misfit (px, 2-D) of boards of known shape seen through a camera.
+
+    Nothing but the boards' shape is used: no epipolar geometry, no identity, no scale. NaN where no board of a known
+    size has enough corners; infinite where the camera cannot see the corners at all.
+    """
+    square, count = 0.0, 0
+    for detection in detections:
+        board = _of_that_shape(detection, boards)
+        if board is None or len(detection.grid) < MIN_CORNERS:
+            continue
+        # A quarter turn where the board's columns are the image's rows; which way round does not matter to its shape.
+        seen = detection if board.size == (detection.columns, detection.rows) else detection.turned(1)
+        rays, valid = camera.unproject(seen.pixels)
+        if not valid.all():
+            return float("inf")
+        try:
+            rms = board_pose(rays, board.points(seen.grid)).rms_rad
+        except (DegenerateError, InputError):
+            return float("inf")
+        square += len(seen.grid) * (rms * camera.focal_px) ** 2
+        count += len(seen.grid)
+    return float(np.sqrt(square / count)) if count else float("nan")
+
+
+def camera_suspects(
+    pair_id: str,
+    declared: tuple[str, str],
+    detections: tuple[Sequence[BoardDetection], Sequence[BoardDetection]],
+    boards: Sequence[Board],
+    cameras: Mapping[str, Camera],
+) -> tuple[str, ...]:
+    """Return what is wrong with the calibrations that a pair declares; empty where they fit.
+
+    Parameters
+    ----------
+    pair_id : for the message.
+    declared : names of the cameras of image 1 and image 2.
+    detections : boards found in image 1 and image 2; names are not needed.
+    boards : that may be there.
+    cameras : all calibrated cameras of the data set, by name.
+    """
+    fits = [{name: camera_fit(camera, found, boards) for name, camera in cameras.items()} for found in detections]
+    better = [_clearly_better(fit, name) for fit, name in zip(fits, declared, strict=True)]
+    one, two = declared
+    if one != two and better == [two, one]:
+        return (
+            f"pair '{pair_id}': image 1 fits camera '{two}' ({fits[0][two]:.2f} px, '{one}' {fits[0][one]:.2f} px) and "
+            f"image 2 fits '{one}': the two images, or camera1 and camera2, are swapped",
+        )
+    out = []
+    for number, (fit, name, other) in enumerate(zip(fits, declared, better, strict=True), start=1):
+        if other is not None:
+            out.append(
+                f"pair '{pair_id}': image {number} fits camera '{other}' ({fit[other]:.2f} px), not the declared "
+                f"'{name}' ({fit[name]:.2f} px): the calibration of another lens?"
+            )
+        elif fit[name] > MISFIT_PX:
+            out.append(
+                f"pair '{pair_id}': image {number} does not fit the calibration of '{name}': the boards' own shapes "
+                f"leave {fit[name]:.2f} px; was the lens changed or refocused since?"
+            )
+    return tuple(out)
+
+
+def suspects(reports: Sequence[ValidationReport]) -> tuple[str, ...]:
+    """Return the probable causes of the checks that failed in a data set; give one report a pair."""
+    if all(report.passed for report in reports):
+        return ()
+    out: list[str] = []
+    for report in reports:
+        out += _board_suspects(report)
+    odd = bool(out)
+    failed = [(r.pair_id, c) for r in reports for c in r.checks if c.kind in ("baseline", "distance") and not c.passed]
+    if failed and not odd:
+        out += _length_suspects(failed, reports)
+    for report in reports:
+        out += _angle_suspects(report)
+    return tuple(dict.fromkeys(out))
+
+
+def _of_that_shape(detection: BoardDetection, boards: Sequence[Board]) -> Board | None:
+    for size in ((detection.columns, detection.rows), (detection.rows, detection.columns)):
+        for board in boards:
+            if board.size == size:
+                return board
+    return None
+
+
+def _clearly_better(fit: Mapping[str, float], declared: str) -> str | None:
+    known = {name: value for name, value in fit.items() if np.isfinite(value)}
+    if not known or np.isnan(fit[declared]):
+        return None
+    best = min(known, key=lambda name: known[name])
+    worse = fit[declared] > MISFIT_PX and fit[declared] > CLEARLY_BETTER * known[best]
+    return best if worse and best != declared else None
+
+
+def _board_suspects(report: ValidationReport) -> list[str]:
+    """Return boards whose squares do not agree with those of the others, or that are mirrored."""
+    out = []
+    ratios = {b.board.board_id: float(np.sqrt(b.square_x_ratio * b.square_y_ratio)) for b in report.boards}
+    middle = float(np.median(list(ratios.values())))
+    for result in report.boards:
+        name, board = result.board.board_id, result.board
+        if not result.right_handed:
+            out.append(f"board '{name}' comes out mirrored: its corners are numbered the wrong way round")
+        off = ratios[name] / middle - 1.0
+        if len(ratios) >= 3 and abs(off) > ODD_BOARD:
+            out.append(
+                f"board '{name}': its squares come out {100.0 * off:+.1f} % against the other boards; measure them "
+                f"again ({board.square_x_mm * (1.0 + off):.2f} mm would fit, {board.square_x_mm:g} is declared)"
+            )
+        aspect = result.square_x_ratio / result.square_y_ratio - 1.0
+        if abs(aspect) > ODD_BOARD:
+            out.append(
+                f"board '{name}': its squares come out {100.0 * aspect:+.1f} % wider than high against what is "
+                "declared; measure square_x_mm and square_y_mm, or look at the calibration's aspect"
+            )
+    return out
+
+
+def _length_suspects(failed: Sequence[tuple[str, Check]], reports: Sequence[ValidationReport]) -> list[str]:
+    """Return whether the squares or the rule are to blame: wrong squares change every length by one factor."""
+    ratios = np.array([check.ours / check.measured for _, check in failed])
+    lengths = [c for r in reports for c in r.checks if c.kind in ("baseline", "distance")]
+    common = float(np.average(ratios, weights=[check.measured**2 for _, check in failed]))
+    # What passed must not contradict the factor: a length that would be off by it and is not clears the squares.
+    agree = [abs(c.ours / c.measured - common) * c.measured <= c.limit_k * c.combined_sigma for c in lengths]
+    board = reports[0].boards[0].board
+    squares = f"{board.square_x_mm / common:.2f} mm instead of {board.square_x_mm:g}"
+    percent = 100.0 * (common - 1.0)
+    if len(lengths) > 1 and all(agree) and np.ptp(ratios) < SAME_RATIO + 4.0 * _ratio_sigma(failed):
+        return [f"square size: all {len(lengths)} lengths come out {percent:+.1f} %; {squares} would explain them"]
+    if len(lengths) == 1:
+        return [
+            f"pair '{failed[0][0]}': {failed[0][1].name} comes out {percent:+.1f} %: it was misread, or the squares "
+            f"are {squares}"
+        ]
+    return [
+        f"pair '{pair}': {check.name} comes out {100.0 * (check.ours / check.measured - 1.0):+.1f} % while other "
+        "lengths hold: it was probably misread"
+        for pair, check in failed
+    ]
+
+
+def _ratio_sigma(failed: Sequence[tuple[str, Check]]) -> float:
+    return float(max(check.combined_sigma / check.measured for _, check in failed))
+
+
+def _angle_suspects(report: ValidationReport) -> list[str]:
+    failed = [check for check in report.checks if check.kind == "angle" and not check.passed]
+    if not failed:
+        return []
+    names = [check.name.removeprefix("angle ") for check in failed]
+    supplement = [c for c in failed if abs(180.0 - c.ours - c.measured) <= c.limit_k * c.combined_sigma]
+    if supplement:
+        return [
+            f"pair '{report.pair_id}': {c.name} comes out {c.ours:.2f} deg, the supplement of what is written: an "
+            "angle is measured across the faces, on the cameras' side"
+            for c in supplement
+        ]
+    ids = [result.board.board_id for result in report.boards]
+    involved = Counter(b for name in names for b in ids if b in name.split("-") or name.startswith(f"{b}-"))
+    common = [b for b, count in involved.items() if count == len(failed)]
+    where = f"board '{common[0]}' does not stand as measured" if len(failed) > 1 and common else "the boards' angle"
+    return [f"pair '{report.pair_id}': {', '.join(names)}: {where}; measure it again, or look at the calibration"]

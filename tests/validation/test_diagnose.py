@@ -1,0 +1,153 @@
+"""Each mistake that a person can make is named, and nothing is named where nothing is wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.board_scenes import detection, fisheye_camera, regular_camera, trihedral_scene
+from helpers.reconstructions import BOARDS, CAM2_FROM_CAM1, make_reconstruction
+
+from rigkit.boards import Board
+from rigkit.cameras.base import Camera
+from rigkit.detections import BoardDetection
+from rigkit.truth import Feature, MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
+from rigkit.validation.checks import ValidationReport, validate
+from rigkit.validation.diagnose import camera_fit, camera_suspects, suspects
+
+BASELINE_MM = float(np.linalg.norm(CAM2_FROM_CAM1.translation_mm))
+CENTRES_MM = 330.0
+"""Between two boards' centres in the made scene: their distance from the corner times sqrt(3) sqrt(1/3)."""
+SIGMA_PX = 0.02
+
+CAMERAS: dict[str, Camera] = {"regular": regular_camera(), "fisheye": fisheye_camera()}
+
+
+def reported(
+    *,
+    boards: tuple[Board, ...] = BOARDS,
+    scale: float = 1.0,
+    angles: tuple[float, ...] = (90.0, 90.0, 90.0),
+    stated_mm: float = BASELINE_MM,
+    stated_deg: float = 90.0,
+    distances: bool = True,
+    pair_id: str = "made",
+) -> ValidationReport:
+    """The exact scene, its lengths `scale` times too long, against what was stated."""
+    made = make_reconstruction(angles_deg=angles, baseline_sigma_mm=0.2)
+    made = replace(
+        made,
+        pair_id=pair_id,
+        boards=boards,
+        baseline_mm=scale * made.baseline_mm,
+        cloud=replace(made.cloud, points_mm=scale * made.cloud.points_mm),
+    )
+    stated = tuple(
+        MeasuredAngle(a, b, stated_deg if (a, b) == ("plane1", "plane2") else 90.0, 0.3, "set square")
+        for a, b in (("plane1", "plane2"), ("plane1", "plane3"), ("plane2", "plane3"))
+    )
+    ends = [(Feature.parse("plane1.centre"), Feature.parse(f"plane{k}.centre")) for k in (2, 3)]
+    lengths = tuple(MeasuredDistance(a, b, CENTRES_MM, 1.0, "steel rule") for a, b in ends)
+    return validate(made, PairTruth(MeasuredLength(stated_mm, 1.0, "rule"), stated, lengths if distances else ()))
+
+
+def test_nothing_is_suspected_where_all_is_well() -> None:
+    report = reported()
+    assert report.passed
+    assert suspects([report]) == ()
+
+
+@pytest.mark.parametrize("scale", [0.97, 1.03])
+def test_wrong_squares_change_all_lengths(scale: float) -> None:
+    found = suspects([reported(scale=scale)])
+    assert len(found) == 1
+    assert "square size" in found[0]
+    assert f"{50.0 / scale:.2f} mm instead of 50" in found[0]
+
+
+def test_wrong_squares_show_in_several_pairs() -> None:
+    found = suspects([reported(scale=1.03, distances=False, pair_id=name) for name in ("a", "b")])
+    assert len(found) == 1
+    assert "square size: all 2 lengths" in found[0]
+
+
+def test_a_misread_baseline_is_told_by_the_other_lengths() -> None:
+    found = suspects([reported(stated_mm=BASELINE_MM / 1.03)])
+    assert len(found) == 1
+    assert "baseline comes out +3.0 %" in found[0]
+    assert "misread" in found[0]
+    both = suspects([reported(stated_mm=BASELINE_MM / 1.03, distances=False, pair_id="a"), reported(pair_id="b")])
+    assert len(both) == 1
+    assert both[0].startswith("pair 'a'")
+
+
+def test_one_length_alone_leaves_both_possible() -> None:
+    found = suspects([reported(stated_mm=BASELINE_MM / 1.03, distances=False)])
+    assert len(found) == 1
+    assert "misread, or the squares" in found[0]
+
+
+def test_one_board_of_another_size_is_named() -> None:
+    wrong = replace(BOARDS[1], square_x_mm=48.0, square_y_mm=48.0)
+    found = suspects([reported(boards=(BOARDS[0], wrong, BOARDS[2]), scale=1.01)])
+    assert len(found) == 1
+    assert "board 'plane2'" in found[0]
+    assert "50.00 mm would fit" in found[0]
+
+
+def test_a_board_that_stands_otherwise_is_named() -> None:
+    found = suspects([reported(angles=(91.6, 90.0, 88.4), distances=False)])
+    assert len(found) == 1
+    assert "'plane2' does not stand as measured" in found[0]
+
+
+def test_a_supplement_is_recognised() -> None:
+    found = suspects([reported(angles=(91.6, 90.0, 90.0), stated_deg=88.4, distances=False)])
+    assert len(found) == 1
+    assert "supplement" in found[0]
+
+
+def detected(rng: np.random.Generator, camera: Camera) -> list[list[BoardDetection]]:
+    scene = trihedral_scene(rng, BOARDS, camera)
+    return [
+        [detection(b, pixels[b.board_id], rng, SIGMA_PX) for b in BOARDS] for pixels in (scene.pixels1, scene.pixels2)
+    ]
+
+
+def test_the_right_calibration_fits_to_the_noise(rng: np.random.Generator) -> None:
+    for camera in CAMERAS.values():
+        for found in detected(rng, camera):
+            # 2-D, six of 96 degrees of freedom go into the pose: within 20 % for 144 corners.
+            assert camera_fit(camera, found, BOARDS) == pytest.approx(SIGMA_PX * np.sqrt(2.0 * 90 / 96), rel=0.2)
+            turned = [one.turned(1) for one in found]
+            assert camera_fit(camera, turned, BOARDS) == pytest.approx(camera_fit(camera, found, BOARDS), rel=1e-6)
+
+
+@pytest.mark.parametrize("true", CAMERAS)
+def test_the_other_lens_is_named(rng: np.random.Generator, true: str) -> None:
+    one, two = detected(rng, CAMERAS[true])
+    wrong = next(name for name in CAMERAS if name != true)
+    assert camera_suspects("p", (true, true), (one, two), BOARDS, CAMERAS) == ()
+    found = camera_suspects("p", (wrong, wrong), (one, two), BOARDS, CAMERAS)
+    assert len(found) == 2
+    for number, words in enumerate(found, start=1):
+        assert f"image {number} fits camera '{true}'" in words
+    # With no other calibration to compare, it still does not fit.
+    alone = camera_suspects("p", (wrong, wrong), (one, two), BOARDS, {wrong: CAMERAS[wrong]})
+    assert len(alone) == 2
+    assert "does not fit the calibration" in alone[0]
+
+
+def test_swapped_images_or_cameras_are_named(rng: np.random.Generator) -> None:
+    one, two = detected(rng, CAMERAS["regular"])[0], detected(rng, CAMERAS["fisheye"])[1]
+    assert camera_suspects("p", ("regular", "fisheye"), (one, two), BOARDS, CAMERAS) == ()
+    found = camera_suspects("p", ("regular", "fisheye"), (two, one), BOARDS, CAMERAS)
+    assert len(found) == 1
+    assert "swapped" in found[0]
+
+
+def test_no_board_of_known_size_says_nothing(rng: np.random.Generator) -> None:
+    found = detected(rng, CAMERAS["regular"])[0]
+    assert np.isnan(camera_fit(CAMERAS["regular"], found, [Board("other", 5, 4, 10.0, 10.0)]))
+    assert camera_suspects("p", ("regular", "regular"), (found, []), [Board("x", 5, 4, 1.0, 1.0)], CAMERAS) == ()
