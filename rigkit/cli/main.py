@@ -27,6 +27,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "simulate": ("rigkit.cli.simulate", "the synthetic study: sweeps over noise, box plots, tables"),
     "crosscheck": ("rigkit.cli.crosscheck", "the same pairs through pycolmap and other ways"),
     "init": ("rigkit.cli.init", "write a manifest from a folder of images"),
+    "export": ("rigkit.cli.export", "cameras in other tools' formats; clouds as PLY, npz or a COLMAP model"),
     "board": ("rigkit.cli.board", "a board to print, true to scale"),
 }
 """Verb -> (module, one-line help)."""

@@ -1,0 +1,159 @@
+"""`rigkit export`: cameras to and from other tools' formats; clouds as PLY, npz or a COLMAP model."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rigkit.cli.console import note
+from rigkit.errors import InputError
+
+if TYPE_CHECKING:
+    from rigkit.cameras.base import Camera
+
+HELP = "cameras in other tools' formats; clouds as PLY, npz or a COLMAP model"
+
+CAMERA_FORMATS = ("rigkit", "opencv", "kalibr", "ros", "colmap", "ocamcalib", "mrcal")
+CLOUD_FORMATS = ("ply", "npz", "colmap")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("source", type=Path, help="a camera file, or a data set (then --pair)")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="file to write (a folder for a COLMAP model)")
+    parser.add_argument(
+        "--to", choices=sorted({*CAMERA_FORMATS, *CLOUD_FORMATS}), help="format (default: by the ending)"
+    )
+    parser.add_argument(
+        "--from", dest="source_format", choices=CAMERA_FORMATS, default="rigkit", help="of a camera file"
+    )
+    parser.add_argument("-p", "--pair", help="pair of the data set whose cloud is exported")
+    parser.add_argument("--method", default="3SDIR", help="affine estimator of the normals (default 3SDIR)")
+    parser.add_argument("--force", action="store_true", help="replace existing files")
+
+
+def run(args: argparse.Namespace) -> int:
+    if args.source.is_dir() or args.source.suffix == ".toml":
+        return _export_cloud(args)
+    return _export_camera(args)
+
+
+def _export_camera(args: argparse.Namespace) -> int:
+    from rigkit.io.calibration_file import save_camera
+    from rigkit.io.files import ensure_writable, write_atomic
+
+    kind = args.to or ("rigkit" if args.output.suffix == ".json" else None)
+    if kind not in CAMERA_FORMATS:
+        raise InputError(f"export: say the camera's format with --to, one of {', '.join(CAMERA_FORMATS)}")
+    ensure_writable(args.output, force=args.force)
+    camera = _read_camera(args.source, args.source_format)
+    if kind == "rigkit":
+        save_camera(args.output, camera, force=args.force)
+        print(args.output)
+        return 0
+    text, worst_px, words = _written(camera, kind)
+    write_atomic(args.output, text, force=args.force)
+    print(f"{args.output}: {kind}, at most {worst_px:.4g} px from the camera given")
+    if words:
+        note(words)
+    return 0
+
+
+def _read_camera(path: Path, kind: str) -> Camera:
+    from rigkit.interop.colmap_cameras import read_colmap_cameras
+    from rigkit.interop.kalibr import read_kalibr
+    from rigkit.interop.mrcal import read_cameramodel
+    from rigkit.interop.ocamcalib import read_ocamcalib
+    from rigkit.interop.opencv import read_opencv
+    from rigkit.interop.ros import read_camera_info
+    from rigkit.io.calibration_file import load_camera
+
+    if kind == "rigkit":
+        return load_camera(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"camera file '{path}' cannot be read ({error}); check the path") from error
+    name = str(path)
+    if kind == "kalibr":
+        cameras, _ = read_kalibr(text, name)
+        return _only(cameras, name)
+    if kind == "colmap":
+        return _only(tuple(read_colmap_cameras(text, name).values()), name)
+    if kind == "mrcal":
+        camera, _, worst = read_cameramodel(text, name)
+        if worst > 0.0:
+            note(f"the spline was refitted as '{camera.model}', at most {worst:.4g} px away")
+        return camera
+    if kind == "ocamcalib":
+        return read_ocamcalib(text, name)[0]
+    return read_opencv(text, name) if kind == "opencv" else read_camera_info(text, name)
+
+
+def _only(cameras: tuple[Camera, ...], name: str) -> Camera:
+    if len(cameras) != 1:
+        raise InputError(f"'{name}' holds {len(cameras)} cameras; leave the one that you want in it")
+    return cameras[0]
+
+
+def _written(camera: Camera, kind: str) -> tuple[str, float, str]:
+    """Return the file's text, its largest error in px, and what a user should know."""
+    from rigkit.interop.colmap_cameras import write_colmap_cameras
+    from rigkit.interop.kalibr import write_kalibr
+    from rigkit.interop.mrcal import write_cameramodel
+    from rigkit.interop.ocamcalib import write_ocamcalib
+    from rigkit.interop.opencv import write_opencv
+    from rigkit.interop.ros import write_camera_info
+
+    if kind == "kalibr":
+        chain = write_kalibr([camera])
+        one = chain.cameras[0]
+        return chain.text, one.max_error_px, one.note
+    if kind == "colmap":
+        text, lines = write_colmap_cameras({1: camera})
+        return text, lines[1].max_error_px, lines[1].note
+    write = {
+        "opencv": write_opencv,
+        "ros": write_camera_info,
+        "ocamcalib": write_ocamcalib,
+        "mrcal": write_cameramodel,
+    }[kind]
+    done = write(camera)
+    return done.text, done.max_error_px, done.note
+
+
+def _export_cloud(args: argparse.Namespace) -> int:
+    from rigkit.cli.console import progress_on_stderr
+    from rigkit.cli.workflow import load_cameras, match_images, reconstruct_with, write_results
+    from rigkit.io.colmap_model import colmap_model
+    from rigkit.io.files import ensure_writable
+    from rigkit.io.manifest import load_dataset
+    from rigkit.io.npz import cloud_npz
+    from rigkit.io.ply import ply_bytes
+
+    dataset = load_dataset(args.source)
+    kind = args.to or args.output.suffix.lstrip(".") or "colmap"
+    if kind not in CLOUD_FORMATS:
+        raise InputError(f"export: a cloud is written as {', '.join(CLOUD_FORMATS)}, not as '{kind}'; use --to")
+    if args.pair is None and len(dataset.pairs) != 1:
+        raise InputError(f"export: say which pair with --pair: {', '.join(p.pair_id for p in dataset.pairs)}")
+    pair = dataset.pair(args.pair) if args.pair else dataset.pairs[0]
+    if kind != "colmap":
+        ensure_writable(args.output, force=args.force)
+    pair.require_images()
+    cameras = load_cameras(dataset.select([pair.pair_id]), recalibrate=False, progress=progress_on_stderr())
+    camera1, camera2 = cameras[pair.camera1.camera_id].camera, cameras[pair.camera2.camera_id].camera
+    matched, image1, _ = match_images(pair, camera1, camera2, "raw")
+    reconstruction = reconstruct_with(matched, pair, args.method, image1)
+    files: dict[str, str | bytes] = {}
+    if kind == "colmap":
+        model, notes = colmap_model(reconstruction, (pair.image1.name, pair.image2.name))
+        files |= model
+        for words in notes:
+            note(words)
+        write_results(args.output, files, force=args.force)
+    else:
+        data = ply_bytes(reconstruction.cloud) if kind == "ply" else cloud_npz(reconstruction)
+        write_results(args.output.parent, {args.output.name: data}, force=args.force)
+    print(f"{args.output}: {len(reconstruction.cloud)} points of pair '{pair.pair_id}'")
+    return 0

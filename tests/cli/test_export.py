@@ -1,0 +1,55 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.data import REPOSITORY
+
+from rigkit.cli.main import main
+from rigkit.io.calibration_file import load_camera
+
+CALIBRATION = REPOSITORY / "calib" / "cameras" / "mvca020_fe185" / "calibration.json"
+LAB = REPOSITORY / "datasets" / "lab-a"
+
+REFIT_PX = 0.05
+"""What another model may be off by and still be called the same lens here; the largest measured was 0.015."""
+
+
+@pytest.mark.parametrize("kind", ["opencv", "kalibr", "ros", "colmap", "ocamcalib", "mrcal"])
+def test_a_camera_goes_out_and_comes_back(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    there, back = tmp_path / "there", tmp_path / "back.json"
+    assert main(["export", str(CALIBRATION), "--to", kind, "-o", str(there)]) == 0
+    assert "px from the camera given" in capsys.readouterr().out
+    assert main(["export", str(there), "--from", kind, "-o", str(back)]) == 0
+    ours, theirs = load_camera(CALIBRATION), load_camera(back)
+    u, v = np.meshgrid(np.linspace(300, 1300, 21), np.linspace(200, 1000, 17))
+    pixels = np.stack([u, v], axis=-1)
+    rays, valid = ours.unproject(pixels)
+    assert valid.all()
+    again, seen = theirs.project(rays)
+    assert seen.all()
+    assert np.abs(again - pixels).max() < REFIT_PX
+
+
+def test_a_cloud_as_colmap_model_and_npz(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import pycolmap
+
+    source = [str(LAB), "-p", "regular-general"]
+    assert main(["export", *source, "-o", str(tmp_path / "model"), "--to", "colmap"]) == 0
+    model = pycolmap.Reconstruction(str(tmp_path / "model"))
+    assert model.num_points3D() == 144
+    # COLMAP computes the error itself, from its own projection of our points with our poses.
+    assert model.compute_mean_reprojection_error() < REFIT_PX
+    assert main(["export", *source, "-o", str(tmp_path / "cloud.npz")]) == 0
+    data = np.load(tmp_path / "cloud.npz")
+    theirs = np.stack([model.points3D[i].xyz for i in sorted(model.points3D)])
+    assert np.abs(theirs - data["points_mm"]).max() < 1e-9
+    assert main(["export", *source, "-o", str(tmp_path / "cloud.npz")]) == 2
+
+
+def test_what_is_missing_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", str(LAB), "-o", str(tmp_path / "x.ply")]) == 2
+    assert "--pair" in capsys.readouterr().err
+    assert main(["export", str(tmp_path / "none.yaml"), "--from", "opencv", "-o", str(tmp_path / "x.json")]) == 2
+    assert "none.yaml" in capsys.readouterr().err
