@@ -29,7 +29,7 @@ def study_figure(table: StudyTable, file_format: str = "png") -> bytes:
     planes = [ALL_PLANES] if len(study.pose_types) == 1 else [*range(1, PLANES + 1)]
     rows, columns = len(study.pose_types), len(planes)
     width = max(4.2, 0.28 * len(study.sigmas) * len(study.methods) + 1.5)
-    figure = Figure(figsize=(min(width * columns, 13.0), 3.0 * rows + 0.8), layout="constrained")
+    figure = Figure(figsize=(min(max(width * columns, 6.2), 13.0), 3.0 * rows + 0.8), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     for r, pose_type in enumerate(study.pose_types):

@@ -95,18 +95,24 @@ class StereoScene:
         return first, second
 
 
-def relative_pose(pose_type: PoseType, baseline_mm: float, rng: np.random.Generator) -> Rigid3:
-    """Return cam2_from_cam1 of a planar, standard or forward pair; raises InputError for the other types."""
-    if pose_type is PoseType.STANDARD:
-        return Rigid3(np.eye(3), np.array([-baseline_mm, 0.0, 0.0]))
-    if pose_type is PoseType.FORWARD:
-        return Rigid3(np.eye(3), np.array([0.0, 0.0, -baseline_mm]))
-    if pose_type is not PoseType.PLANAR:
+def relative_pose(
+    pose_type: PoseType, baseline_mm: float, rng: np.random.Generator, *, level_sigma_deg: float = 0.0
+) -> Rigid3:
+    """Return cam2_from_cam1 of a planar, standard or forward pair; raises InputError for the other types.
+
+    `level_sigma_deg` is how well the spirit level held: the second camera is tilted by that much about x and about z.
+    """
+    heading, yaw = -np.pi / 2.0, 0.0
+    if pose_type is PoseType.PLANAR:
+        yaw = np.radians(rng.uniform(-PLANAR_YAW_DEG, PLANAR_YAW_DEG))
+        heading = rng.uniform(0.0, 2.0 * np.pi)
+    elif pose_type is PoseType.FORWARD:
+        heading = np.pi
+    elif pose_type is not PoseType.STANDARD:
         raise InputError(f"relative pose: no single relative pose belongs to pose type '{pose_type}'")
-    yaw = np.radians(rng.uniform(-PLANAR_YAW_DEG, PLANAR_YAW_DEG))
-    heading = rng.uniform(0.0, 2.0 * np.pi)
-    rotation = exp_so3(np.array([0.0, yaw, 0.0]))
-    return Rigid3(rotation, baseline_mm * np.array([np.sin(heading), 0.0, np.cos(heading)]))
+    moved = Rigid3(exp_so3(np.array([0.0, yaw, 0.0])), baseline_mm * np.array([np.sin(heading), 0.0, np.cos(heading)]))
+    tilt = np.radians(level_sigma_deg) * rng.standard_normal(2) if level_sigma_deg > 0.0 else np.zeros(2)
+    return Rigid3(exp_so3(np.array([tilt[0], 0.0, tilt[1]])), np.zeros(3)) @ moved
 
 
 def trihedral_pair(
@@ -120,6 +126,7 @@ def trihedral_pair(
     baseline_mm: float = 300.0,
     parallax_deg: tuple[float, float] = (10.0, 35.0),
     distance: tuple[float, float] = (0.9, 1.5),
+    level_sigma_deg: float = 0.0,
     walls: bool = True,
 ) -> StereoScene:
     """Return a random pair that sees all corners of three boards in the corner of a room.
@@ -130,6 +137,7 @@ def trihedral_pair(
     pose_type : GENERAL draws two free views `parallax_deg` apart as seen from the boards; the others move the second
         camera by `baseline_mm`.
     distance : range of the cameras' distance, as a multiple of the shortest at which the boards fill the image.
+    level_sigma_deg : spirit-level error of all but general pairs.
     walls : whether walls and a floor stand behind the boards.
 
     Raises
@@ -153,7 +161,7 @@ def trihedral_pair(
             parallax = np.degrees(np.arccos(np.clip(rays[0] @ rays[1], -1.0, 1.0)))
             fits = parallax_deg[0] <= parallax <= parallax_deg[1]
         else:
-            second = relative_pose(pose_type, baseline_mm, rng) @ first
+            second = relative_pose(pose_type, baseline_mm, rng, level_sigma_deg=level_sigma_deg) @ first
             fits = True
         if fits and _sees_all(placed, second_camera, second):
             panels = room_walls(12.0 * reach, angles_deg=angles_deg) if walls else ()

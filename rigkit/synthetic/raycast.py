@@ -20,6 +20,8 @@ NODES = 9
 """Chebyshev nodes a side on which a tile's rays are fitted: error below 1e-6 px for lenses with f >= 100 px."""
 FAR_SQUARES = 1e4
 """Board coordinate given to rays that miss a board's plane."""
+RIM_MARGIN = 0.1
+"""Cosine by which the nodes must clear the lens's rim for a whole tile to be lit: they stop short of its edge."""
 MAX_CELL = 2.0
 """Widest cell, in squares or panel sides: beyond, the plane is seen edge on and differences mean nothing."""
 SMOOTH_DEPTH_RATIO = 0.5
@@ -89,12 +91,24 @@ class Chart:
         node_u, weight_u = _chebyshev(u)
         node_v, self.weight_v = _chebyshev(v)
         self.weight_u = np.ascontiguousarray(weight_u.T)
-        self.nodes, valid = _unproject(camera, node_u, node_v, field_deg)
+        self.nodes, valid = _unproject(camera, node_u, node_v)
         self.lit: BoolArray | None = None
         self.rays: FloatArray | None = None
         if not valid.all():
-            self.rays, self.lit = _unproject(camera, u, v, field_deg)
+            self.rays, self.lit = _unproject(camera, u, v)
+        if field_deg is not None:
+            self._limit(np.cos(np.radians(0.5 * field_deg)))
         self.dark = self.lit is not None and not self.lit.any()
+
+    def _limit(self, cosine: float) -> None:
+        """Darken what lies farther from the axis than the lens reaches."""
+        if self.rays is None and self.nodes[..., 2].min() > cosine + RIM_MARGIN:
+            return
+        forward = self._interpolate(self.nodes[None, ..., 2])[0] if self.rays is None else self.rays[..., 2]
+        with np.errstate(invalid="ignore"):
+            inside = forward >= cosine
+        if not inside.all():
+            self.lit = inside if self.lit is None else self.lit & inside
 
     def cover(self, surface: Surface) -> int:
         """Say how much of the tile the rectangle may cover; errs towards a part."""
@@ -126,18 +140,18 @@ class Chart:
         # The horizon is far: then x and y are polynomials themselves.
         smooth = plane[2].min() > SMOOTH_DEPTH_RATIO * plane[2].max()
         nodes = plane[:2] / plane[2] if smooth else plane
-        # einsum, not @: BLAS starts threads for matrices of this size, which cost far more than they gain.
-        lines = np.einsum("vi,kij->kvj", self.weight_v[rows], nodes)
-        out = np.asarray(np.einsum("kvj,ju->kvu", lines, self.weight_u[:, columns]))
+        out = self._interpolate(nodes, rows, columns)
         return out if smooth else _divide(out)
 
+    def _interpolate(self, nodes: FloatArray, rows: slice = slice(None), columns: slice = slice(None)) -> FloatArray:
+        """Return (k, rows, columns) from values at the nodes, (k, NODES, NODES)."""
+        # einsum, not @: BLAS starts threads for matrices of this size, which cost far more than they gain.
+        lines = np.einsum("vi,kij->kvj", self.weight_v[rows], nodes)
+        return np.asarray(np.einsum("kvj,ju->kvu", lines, self.weight_u[:, columns]))
 
-def _unproject(camera: Camera, u: FloatArray, v: FloatArray, field_deg: float | None) -> tuple[FloatArray, BoolArray]:
-    rays, valid = camera.unproject(np.stack(np.meshgrid(u, v), axis=-1))
-    if field_deg is not None:
-        with np.errstate(invalid="ignore"):
-            valid = valid & (rays[..., 2] >= np.cos(np.radians(0.5 * field_deg)))
-    return rays, valid
+
+def _unproject(camera: Camera, u: FloatArray, v: FloatArray) -> tuple[FloatArray, BoolArray]:
+    return camera.unproject(np.stack(np.meshgrid(u, v), axis=-1))
 
 
 def _divide(plane: FloatArray) -> FloatArray:
