@@ -1,8 +1,6 @@
-"""Putting a solved model together as a result: residuals, covariances, outliers, verdicts."""
+"""Putting a solved model together as a result: residuals, covariances, outliers."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 
@@ -12,7 +10,6 @@ from rigkit.calibration.normal import Normal, normal_equations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import BoardShape, Calibration, Candidate, Outlier, ViewResult
 from rigkit.calibration.solver import State, evaluate
-from rigkit.calibration.verdicts import judge
 from rigkit.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
@@ -50,7 +47,7 @@ def assemble(
             length = float(np.linalg.norm(px[i, j]))
             outliers.append(Outlier(view.image, view.board.board_id, int(column), int(row), length))
     p = state.camera.parameters.size
-    result = Calibration(
+    return Calibration(
         camera=state.camera,
         rms_px=rms(state, observations, fit.kept),
         heldout_rms_px=heldout_px,
@@ -64,7 +61,6 @@ def assemble(
         convergence=fit.convergence,
         boards=_boards(observations, state),
     )
-    return replace(result, verdicts=judge(result))
 
 
 def solution_normal(observations: Observations, fit: Fit) -> Normal:

@@ -20,6 +20,7 @@ from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.shape import SHAPES, shape_model
 from rigkit.calibration.solver import evaluate
 from rigkit.calibration.usable import usable_views
+from rigkit.calibration.verdicts import judge
 from rigkit.cameras.base import Camera
 from rigkit.cameras.registry import MODELS, camera_model
 from rigkit.detections import BoardView
@@ -106,7 +107,7 @@ def calibrate(
         chosen = _choose(observations, shapes, SHAPE_MARGIN)
         candidates += [c for c in _described(observations, shapes, chosen, SHAPE_MARGIN) if "board" in c.name]
     result = assemble(observations, chosen.fit, chosen.heldout_px, dropped, tuple(candidates))
-    return replace(result, verdicts=(*result.verdicts, *moved_lens(observations, chosen.fit, result)))
+    return replace(result, verdicts=judge(result, moved_lens(observations, chosen.fit)))
 
 
 def _wanted(model: str, degree: int | None) -> list[tuple[str, type[Camera], int | None]]:

@@ -10,12 +10,14 @@ c^2 log(1 + |r|^2 / c^2) of the 2-D residual, as iteratively reweighted least sq
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray, Mat3, Points
-from rigkit.calibration.normal import Normal, normal_equations
+from rigkit.calibration.normal import Normal, Step, normal_equations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.shape import ShapeModel, shape_model
@@ -23,7 +25,9 @@ from rigkit.cameras.base import Camera
 from rigkit.errors import RigkitError
 from rigkit.geometry.rotation import exp_so3
 
-__all__ = ["Residuals", "State", "evaluate", "solve"]
+__all__ = ["Residuals", "State", "evaluate", "minimise", "solve"]
+
+S = TypeVar("S")
 
 MAX_ITERATIONS = 60
 COST_TOLERANCE = 1e-11
@@ -113,7 +117,7 @@ def solve(
     """
     weight = observations.weight if weight is None else weight
     solver = _Solver(observations, weight, loss_px, prior_sigma_px)
-    return solver.run(start, max_iterations, cost_tolerance)
+    return minimise(start, solver.cost, solver.linearise, _moved, max_iterations, cost_tolerance)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -147,46 +151,58 @@ class _Solver:
             self.loss_px,
         ).with_prior(self.prior(state), state.unknowns)
 
-    def run(self, state: State, max_iterations: int, tolerance: float) -> tuple[State, Convergence]:
-        cost, damping, growth = self.cost(state), DAMPING_START, DAMPING_GROWTH
-        normal = self.linearise(state)
-        for iteration in range(1, max_iterations + 1):
-            step = normal.step(damping)
-            if step is None:
-                damping, growth = damping * growth, growth * 2.0
-                if damping > DAMPING_MAX:
-                    return state, Convergence(iteration, False, "the normal equations are singular")
-                continue
-            if step.predicted <= tolerance * cost:
+
+def minimise(
+    state: S,
+    cost_of: Callable[[S], float],
+    linearise: Callable[[S], Normal],
+    moved: Callable[[S, Step], S | None],
+    max_iterations: int = MAX_ITERATIONS,
+    tolerance: float = COST_TOLERANCE,
+) -> tuple[S, Convergence]:
+    """Return the state of least cost near `state`, by Levenberg-Marquardt, and how it ended.
+
+    `moved` returns the state after a step, None where there is no such state.
+    """
+    cost, damping, growth = cost_of(state), DAMPING_START, DAMPING_GROWTH
+    normal = linearise(state)
+    for iteration in range(1, max_iterations + 1):
+        step = normal.step(damping)
+        if step is None:
+            damping, growth = damping * growth, growth * 2.0
+            if damping > DAMPING_MAX:
+                return state, Convergence(iteration, False, "the normal equations are singular")
+            continue
+        if step.predicted <= tolerance * cost:
+            return state, Convergence(iteration, True, "cost stationary")
+        trial = moved(state, step)
+        trial_cost = np.inf if trial is None else cost_of(trial)
+        gain = (cost - trial_cost) / step.predicted
+        if trial is not None and gain > 0.0:
+            stationary = cost - trial_cost <= tolerance * cost and gain > 0.5
+            state, cost = trial, trial_cost
+            if stationary:
                 return state, Convergence(iteration, True, "cost stationary")
-            trial = _moved(state, step.globals, step.poses)
-            trial_cost = np.inf if trial is None else self.cost(trial)
-            gain = (cost - trial_cost) / step.predicted
-            if trial is not None and gain > 0.0:
-                stationary = cost - trial_cost <= tolerance * cost and gain > 0.5
-                state, cost = trial, trial_cost
-                if stationary:
-                    return state, Convergence(iteration, True, "cost stationary")
-                damping, growth = damping * max(DAMPING_SHRINK, 1.0 - (2.0 * gain - 1.0) ** 3), DAMPING_GROWTH
-                normal = self.linearise(state)
-            else:
-                damping, growth = damping * growth, growth * 2.0
-                if damping > DAMPING_MAX:
-                    return state, Convergence(iteration, True, "no smaller cost nearby")
-        return state, Convergence(max_iterations, False, f"stopped after {max_iterations} iterations")
+            damping, growth = damping * max(DAMPING_SHRINK, 1.0 - (2.0 * gain - 1.0) ** 3), DAMPING_GROWTH
+            normal = linearise(state)
+        else:
+            damping, growth = damping * growth, growth * 2.0
+            if damping > DAMPING_MAX:
+                return state, Convergence(iteration, True, "no smaller cost nearby")
+    return state, Convergence(max_iterations, False, f"stopped after {max_iterations} iterations")
 
 
-def _moved(state: State, step_globals: FloatArray, step_poses: FloatArray) -> State | None:
+def _moved(state: State, step: Step) -> State | None:
     """Return the state after a step, None where the parameters make no camera."""
     p = state.camera.parameters.size
     try:
-        camera = state.camera.with_parameters(state.camera.parameters + step_globals[:p])
+        camera = state.camera.with_parameters(state.camera.parameters + step.globals[:p])
     except RigkitError:
         return None
     return replace(
         state,
         camera=camera,
-        rotation=exp_so3(step_poses[:, :3]) @ state.rotation,
-        translation_mm=state.translation_mm + step_poses[:, 3:],
-        unknowns=state.unknowns + step_globals[p:],
+        rotation=exp_so3(step.poses[:, :3]) @ state.rotation,
+        translation_mm=state.translation_mm + step.poses[:, 3:],
+        unknowns=state.unknowns + step.globals[p:],
     )

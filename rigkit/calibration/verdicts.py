@@ -6,6 +6,8 @@ result that it judges.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from rigkit.calibration.result import Calibration, ViewResult
@@ -35,9 +37,10 @@ NAMES_U = ("left", "centre left", "centre right", "right")
 NAMES_V = ("top", "middle", "bottom")
 
 
-def judge(calibration: Calibration) -> tuple[str, ...]:
-    """Return the verdicts, the headline first."""
+def judge(calibration: Calibration, also: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return the verdicts, the headline first; `also` are verdicts found elsewhere."""
     found = [
+        *also,
         *_tilts(calibration),
         *_images(calibration),
         *_coverage(calibration),
@@ -107,7 +110,7 @@ def _views(c: Calibration) -> list[str]:
     middle = np.array([float(np.nanmedian(np.linalg.norm(v.residuals_px, axis=1))) for v in c.views])
     if len(middle) < 3:
         return []
-    usual = float(np.median(middle))
+    usual = max(float(np.median(middle)), np.finfo(float).tiny)
     return [
         f"look: image '{view.image}' has a median residual of {value:.3f} px, {value / usual:.1f} times the usual one; "
         "look whether the board or the camera moved, and retake it"
