@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.affine_scenes import FISHEYE, REGULAR, Corners, angles_deg, see
+from helpers.affine_scenes import FISHEYE, REGULAR, Corners, angles_deg, see, turned
 
-from rigkit.affine.affinities import EpipolarNormals
+from rigkit.affine.affinities import DirectionNoise, EpipolarNormals
 from rigkit.affine.geometry_noise import geometry_covariance
 from rigkit.affine.normal import estimate_normals, normals_from_affines
 from rigkit.affine.registry import affines_from_directions
@@ -113,3 +113,25 @@ def test_is_added_to_the_estimate() -> None:
     with_it = estimate_normals(c.J1, c.J2, c.A21, sigma_A=sigma_A, geometry=share)
     np.testing.assert_allclose(with_it.covariance - without.covariance, share, atol=1e-15)
     np.testing.assert_allclose(with_it.sigma_rad**2 - without.sigma_rad**2, 4e-4, rtol=1e-9)
+
+
+def test_weights_do_not_blow_up_errors_of_the_corners(rng: np.random.Generator) -> None:
+    """F3UDIR's covariance is singular across the epipolar line; noisy corners leave a difference there all the same."""
+    c = see(REGULAR, REGULAR, SIDE, [BOARD])
+    assert c is not None
+    noisy = [q + SIGMA_PX * rng.normal(size=q.shape) for q in (c.pixels1, c.pixels2)]
+    m = Matches.from_cameras(REGULAR, REGULAR, *noisy)
+    e = EpipolarNormals.from_rays(
+        m.rays1, m.jacobians1, m.rays2, m.jacobians2, skew(SIDE.translation_mm) @ SIDE.rotation
+    )
+    directions = turned(c.directions(), 0.3, rng)
+    noise = DirectionNoise.angular(directions, np.radians(0.3), np.radians(0.3))
+    found = affines_from_directions(directions, "F3UDIR", epipolar=e, noise=noise)
+    points, _ = triangulate_rays(m.rays1, m.rays2, SIDE, jacobians1=m.jacobians1, jacobians2=m.jacobians2)
+    J1, J2 = pair_projection_jacobians(points, m.rays1, m.jacobians1, m.rays2, m.jacobians2, SIDE)
+    plain, weighted = (
+        estimate_normals(J1, J2, found.A21, covariance=found.covariance, weighted=w).normals for w in (False, True)
+    )
+    ok = found.valid
+    error = angles_deg(plain, c.normals)[ok]
+    assert np.median(angles_deg(plain, weighted)[ok]) < 0.2 * np.median(error)
