@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.boards import Board
-from rigkit.corners.grow import SaddleIndex, grow
+from rigkit.corners.grow import SaddleIndex, grow_all
 from rigkit.corners.lattice import build_lattices
 from rigkit.corners.links import find_links
 from rigkit.corners.origin import quarter_turns
@@ -32,7 +32,7 @@ def find_lattices(image: NDArray[np.generic], min_corners: int) -> list[RefinedL
     corners, saddles = find_corners(levels)
     lattices = build_lattices(corners, find_links(corners, levels[0]))
     index = SaddleIndex(saddles)
-    grown = [tidy(lattice, size_px) for lattice in grow(lattices, index, levels[0])]
+    grown = [tidy(lattice, size_px) for lattice in grow_all(lattices, index, levels[0])]
     boards = separate(grown, min_corners)
     refined = zip(boards, refine(grey, boards), strict=True)
     return [after for before, after in refined if trustworthy(after, before.count, min_corners)]

@@ -18,7 +18,7 @@ from rigkit.corners.response import Level
 from rigkit.corners.ring import read_rings
 from rigkit.corners.saddle import Saddles
 
-__all__ = ["SaddleIndex", "grow"]
+__all__ = ["SaddleIndex", "grow", "grow_all"]
 
 MAX_RINGS = 60
 """More rings than any board has rows or columns."""
@@ -26,6 +26,9 @@ MAX_RINGS = 60
 STIFF = (2, (0.02, 1.0))
 PLIANT = (3, (1e-3, 1e-2))
 """Degree and ridge of the prediction: one is steady with few neighbours, the other follows the rim of a fisheye."""
+
+BATCH, MAX_BATCHES = 16, 6
+"""So many lattices grow at a time, so many times: a cluttered image has hundreds of seeds, most of them of one square."""
 
 REACH = 0.25
 """A corner lies within this of its prediction, in cells."""
@@ -58,6 +61,26 @@ class SaddleIndex:
         distance, index = self._tree.query(pixels, k=TRIED)
         found = distance <= reach_px[:, None]
         return np.where(found, index, 0), found
+
+
+def grow_all(lattices: Sequence[Lattice], saddles: SaddleIndex, level: Level) -> list[Lattice]:
+    """Return the lattices grown from `lattices`, the largest first; those that others have grown over are left out."""
+    pending = sorted(lattices, key=lambda item: -item.count)
+    grown: list[Lattice] = []
+    for _ in range(MAX_BATCHES):
+        if not pending:
+            break
+        fresh = grow(pending[:BATCH], saddles, level)
+        grown += fresh
+        corners = np.concatenate([item.pixels[item.known] for item in fresh])
+        pending = [item for item in pending[BATCH:] if not _covered(item, corners)]
+    return grown
+
+
+def _covered(lattice: Lattice, corners: FloatArray) -> bool:
+    """Return whether most of the corners of `lattice` are among `corners` (M, 2)."""
+    gaps = lattice.pixels[lattice.known][:, None] - corners
+    return bool(((np.abs(gaps).max(axis=2) < 1.0).any(axis=1)).mean() > 0.5)
 
 
 def grow(lattices: Sequence[Lattice], saddles: SaddleIndex, level: Level) -> list[Lattice]:

@@ -147,9 +147,19 @@ def peaks(level: Level) -> IntArray:
     mask[:3] = mask[-3:] = False
     mask[:, :3] = mask[:, -3:] = False
     flat = np.flatnonzero(mask)
+    flat = flat[~_repeated(response.ravel(), flat, response.shape[1])]
     flat = flat[np.argsort(-response.ravel()[flat], kind="stable")][:MAX_PEAKS]
     v, u = np.divmod(flat, response.shape[1])
     return np.stack([u, v], axis=-1)
+
+
+def _repeated(response: FloatImage, flat: IntArray, width: int) -> NDArray[np.bool_]:
+    """Return which peaks have an equal one before them in their neighbourhood: a corner between pixels makes two."""
+    value = response[flat]
+    repeated = np.zeros(len(flat), bool)
+    for dv, du in ((0, -1), (0, -2), *((dv, du) for dv in (-1, -2) for du in (-2, -1, 0, 1, 2))):
+        repeated |= response[flat + dv * width + du] == value
+    return repeated
 
 
 def sample(image: FloatImage, pixels: NDArray[np.floating]) -> FloatImage:

@@ -22,6 +22,9 @@ FRAME_CELLS = 0.5
 MAX_RELATIVE_SIGMA = 0.015
 """Corners more uncertain than this, in cells, make no board: keys, letters, weave."""
 
+MAX_RESIDUAL = 0.25
+"""Largest typical residual of the edge model, relative to the contrast: dots in rows have saddles between them, too."""
+
 MAX_LOST = 0.25
 """Largest part of a lattice's corners that the sub-pixel fit may refuse."""
 
@@ -106,6 +109,8 @@ def trustworthy(refined: RefinedLattice, before: int, least: int) -> bool:
     """Return whether what the fit left of a lattice of `before` corners is a board."""
     lattice = refined.lattice
     if lattice.count < max(least, (1.0 - MAX_LOST) * before) or min(lattice.size) < 3:
+        return False
+    if float(np.nanmedian(refined.residual / np.where(lattice.known, lattice.contrast, 1.0))) > MAX_RESIDUAL:
         return False
     shape = fit_cells(lattice.pixels, lattice.known, degree=1)
     area = shape.along_column[:, 0] * shape.along_row[:, 1] - shape.along_column[:, 1] * shape.along_row[:, 0]
