@@ -11,6 +11,7 @@ from rigkit.boards import Board
 from rigkit.errors import InputError
 from rigkit.io.board_file import board_from_table, load_board
 from rigkit.io.toml_reader import TomlTable, read_toml
+from rigkit.io.truth_csv import load_truth_csv
 from rigkit.io.truth_file import truth_from_table
 from rigkit.posetype import PoseType
 from rigkit.truth import PairTruth
@@ -127,6 +128,8 @@ def load_dataset(path: str | Path) -> Dataset:
     _refuse_twice(top, "cameras", [c.camera_id for c in cameras])
     pairs = tuple(_pair(t, boards, cameras) for t in top.tables("pairs", hint='[[pairs]] with id = "first"'))
     _refuse_twice(top, "pairs", [p.pair_id for p in pairs])
+    if top.has("truth_table"):
+        pairs = _with_table(top, pairs)
     top.done()
     return Dataset(name, source.parent, source, boards, cameras, pairs)
 
@@ -198,6 +201,16 @@ def _layout(table: TomlTable, names: Sequence[str]) -> dict[str, str]:
         _named(board_id, dict.fromkeys(names, 0), f"{inner.path}: {inner.where}: board")
         out[board_id] = inner.text(board_id, hint=f'{board_id} = "left"', choices=PLACES)
     return out
+
+
+def _with_table(top: TomlTable, pairs: tuple[Pair, ...]) -> tuple[Pair, ...]:
+    """Add what a spreadsheet says to the pairs; a pair's truth is either there or in the manifest."""
+    source = top.path_to("truth_table", hint='truth_table = "truth.csv"')
+    stated = load_truth_csv(source, {pair.pair_id: pair.boards for pair in pairs})
+    for pair in pairs:
+        if pair.truth.count and pair.pair_id in stated:
+            raise top.error(f"pair '{pair.pair_id}' has its truth both here and in '{source}'; keep one of them")
+    return tuple(replace(pair, truth=stated.get(pair.pair_id, pair.truth)) for pair in pairs)
 
 
 def _named(name: str, known: Mapping[str, Entry], where: str) -> Entry:

@@ -1,0 +1,167 @@
+"""Measured truth kept in a spreadsheet: one row a measurement, units in the head of the table.
+
+::
+
+    pair,quantity,a,b,value [mm],sigma [mm],value [deg],sigma [deg],how
+    first,baseline,,,300,2,,,steel rule between tripod marks
+    first,angle,plane1,plane2,,,90,0.3,set square
+    first,distance,plane1.centre,plane2,412.5,1,,,steel rule
+
+Lengths may be in mm, cm or m and angles in deg, but value and sigma must be in one unit. Columns may be separated by
+commas or semicolons; numbers have a decimal point.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from rigkit.boards import Board
+from rigkit.errors import InputError
+from rigkit.io.truth_file import make_angle, make_distance
+from rigkit.truth import MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
+
+__all__ = ["load_truth_csv"]
+
+TO_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
+TO_DEG = {"deg": 1.0}
+PLAIN = ("pair", "quantity", "a", "b", "how")
+QUANTITIES = ("baseline", "angle", "distance")
+HEAD = re.compile(r"^(value|sigma)\s*\[\s*([^\]\s]+)\s*\]$")
+EXAMPLE = "pair,quantity,a,b,value [mm],sigma [mm],value [deg],sigma [deg],how"
+
+Row = dict[str, str]
+Units = dict[str, tuple[str, float]]
+
+
+def load_truth_csv(path: str | Path, boards: Mapping[str, Sequence[Board]]) -> dict[str, PairTruth]:
+    """Return what was measured of each pair that the table names.
+
+    Parameters
+    ----------
+    path : the CSV file.
+    boards : pair -> the boards that stand there; a row about any other pair is an error.
+
+    Raises
+    ------
+    InputError
+        With the line: a unit that is missing, unknown or mixed, an unknown column, pair, board or quantity, a value or
+        sigma that is no number or left out, a baseline stated twice.
+    """
+    source = Path(path)
+    head, rows = _read(source)
+    units = _units(source, head)
+    baselines: dict[str, MeasuredLength] = {}
+    angles: dict[str, list[MeasuredAngle]] = {}
+    distances: dict[str, list[MeasuredDistance]] = {}
+    for line, row in rows:
+        pair, quantity = row.get("pair", ""), row.get("quantity", "")
+        try:
+            if pair not in boards:
+                raise InputError(f"pair '{pair}' is not in the manifest; known: {', '.join(boards)}")
+            if quantity not in QUANTITIES:
+                raise InputError(f"quantity '{quantity}' is unknown; known: {', '.join(QUANTITIES)}")
+            value, sigma, how = _measured(row, units, "deg" if quantity == "angle" else "mm")
+            a, b = row.get("a", ""), row.get("b", "")
+            if quantity == "baseline":
+                if pair in baselines:
+                    raise InputError(f"the baseline of pair '{pair}' is stated twice; keep one row")
+                baselines[pair] = MeasuredLength(value, sigma, how)
+            elif quantity == "angle":
+                angles.setdefault(pair, []).append(make_angle(a, b, value, sigma, how, boards[pair]))
+            else:
+                distances.setdefault(pair, []).append(make_distance(a, b, value, sigma, how, boards[pair]))
+        except InputError as error:
+            raise InputError(f"{source}: line {line}: {error}") from error
+    named = dict.fromkeys([*baselines, *angles, *distances])
+    return {p: PairTruth(baselines.get(p), tuple(angles.get(p, ())), tuple(distances.get(p, ()))) for p in named}
+
+
+def _read(source: Path) -> tuple[list[str], list[tuple[int, Row]]]:
+    """Return the head and the rows that are not empty, each with its line."""
+    try:
+        # Spreadsheets put a byte order mark in front.
+        text = source.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(f"truth table '{source}' cannot be read: {error.strerror}; check the path") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{source}: not UTF-8 text; save it as CSV UTF-8") from error
+    first = text.partition("\n")[0]
+    reader = csv.reader(io.StringIO(text), delimiter=";" if first.count(";") > first.count(",") else ",")
+    head: list[str] = []
+    rows: list[tuple[int, Row]] = []
+    for cells in reader:
+        cleaned = [cell.strip() for cell in cells]
+        if not any(cleaned):
+            continue
+        if not head:
+            head = cleaned
+            continue
+        if len(cleaned) != len(head):
+            raise InputError(
+                f"{source}: line {reader.line_num}: {len(cleaned)} cells, but the head has {len(head)}; put quotes "
+                "around text with a comma, and write numbers with a decimal point"
+            )
+        rows.append((reader.line_num, dict(zip(head, cleaned, strict=True))))
+    if not rows:
+        raise InputError(f"{source}: no measurements; start with the head {EXAMPLE} and add a row each")
+    return head, rows
+
+
+def _units(source: Path, head: Sequence[str]) -> Units:
+    """Return for each of "value mm", "sigma mm", "value deg", "sigma deg" its column and the factor to mm or deg."""
+    units: Units = {}
+    for name in head:
+        if name in PLAIN:
+            continue
+        match = HEAD.match(name)
+        if match is None:
+            fault = "has no unit" if name in ("value", "sigma") else "is unknown"
+            raise InputError(f"{source}: column '{name}' {fault}; write {EXAMPLE}")
+        what, unit = match[1], match[2]
+        kind, factors = ("deg", TO_DEG) if unit in TO_DEG else ("mm", TO_MM)
+        if unit not in factors:
+            raise InputError(f"{source}: column '{name}': unknown unit; known: {', '.join([*TO_MM, *TO_DEG])}")
+        if f"{what} {kind}" in units:
+            raise InputError(
+                f"{source}: columns '{units[f'{what} {kind}'][0]}' and '{name}' mix units; keep one of them"
+            )
+        units[f"{what} {kind}"] = (name, factors[unit])
+    for kind in ("mm", "deg"):
+        pair = [units.get(f"{what} {kind}") for what in ("value", "sigma")]
+        if pair[0] is not None and pair[1] is not None and pair[0][1] != pair[1][1]:
+            raise InputError(f"{source}: columns '{pair[0][0]}' and '{pair[1][0]}' mix units; give both in one")
+    if len(set(head)) != len(head):
+        raise InputError(f"{source}: a column is there twice; the head is {', '.join(head)}")
+    return units
+
+
+def _measured(row: Row, units: Units, kind: str) -> tuple[float, float, str]:
+    """Return (value, sigma, how) of a row in mm or deg."""
+    other = "deg" if kind == "mm" else "mm"
+    for what in ("value", "sigma"):
+        column = units.get(f"{what} {other}")
+        if column is not None and row[column[0]]:
+            raise InputError(f"'{column[0]}' is filled in for a {row['quantity']}; leave it empty")
+    numbers = []
+    for what in ("value", "sigma"):
+        column = units.get(f"{what} {kind}")
+        if column is None:
+            raise InputError(f"a {row['quantity']} needs a column '{what} [{kind}]'; add it to the head")
+        text = row[column[0]]
+        try:
+            number = float(text)
+        except ValueError as error:
+            fault = f"'{text}' is no number" if text else "is empty"
+            raise InputError(f"'{column[0]}' {fault}; write it with a decimal point and without unit") from error
+        if not np.isfinite(number):
+            raise InputError(f"'{column[0]}' is {text}; write a number")
+        numbers.append(number * column[1])
+    if not row.get("how"):
+        raise InputError("'how' is empty; say by what it was measured")
+    return numbers[0], numbers[1], row["how"]
