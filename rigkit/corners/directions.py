@@ -112,6 +112,10 @@ def direction_field(
     Notes
     -----
     Weights follow the corners' `sigma_px` through the derivative of the tangent plane by each corner's pixel.
+
+    Why a patch of 5 x 5 by default: rms angle errors of 8x6 boards in random corners, degrees, for "neighbours" and
+    "patch" with window 1, 2, 3 and all: corner noise 0.05 px, regular lens .054 .028 .010 .006 .005, fisheye
+    .101 .053 .020 .012 .012; a board of 350 mm bent by 0.5 mm, no noise, .021 .022 .049 .082 .099.
     """
     if window is not None and window < 1:
         raise InputError(f"directions: the window must be at least 1 square, got {window}")

@@ -156,21 +156,11 @@ def _homography(rays: Rays, flat: FloatArray, weight: FloatArray) -> FloatArray:
     """Return H (3, 3), ray ~ H (x, y, 1), signed so that the target lies along the rays."""
     scale = np.sqrt((flat[:, :2] ** 2).sum(axis=1).mean())
     target = np.concatenate([flat[:, :2] / scale, np.ones((len(flat), 1))], axis=1)
-    # Spreading the rays evenly over all directions conditions the system as centring and scaling do in a plane, and
-    # keeps their signs, so that no ray is too far off axis.
-    values, vectors = np.linalg.eigh(rays.T @ rays / len(rays))
-    if values[0] < MIN_SPREAD**2 * values[2]:
-        raise DegenerateError("board pose: the rays lie in one plane; the target is seen edge-on")
-    spread = (vectors / np.sqrt(values)) @ vectors.T
-    spread_rays = rays @ spread.T
-    norm = np.linalg.norm(spread_rays, axis=1, keepdims=True)
-    rows = tangent_bases(spread_rays / norm)[:, :, :, None] * target[:, None, None, :] * weight[:, None, None, None]
-    rows = rows.reshape(-1, 9)
-    # Four corners give eight rows: only then is the null vector outside of the reduced decomposition.
-    _, singular, vt = np.linalg.svd(rows, full_matrices=len(rows) < 9)
+    rows = tangent_bases(rays)[:, :, :, None] * target[:, None, None, :] * weight[:, None, None, None]
+    _, singular, vt = np.linalg.svd(rows.reshape(-1, 9), full_matrices=True)
     if singular[7] < MIN_HOMOGRAPHY_GAP * singular[0]:
         raise DegenerateError("board pose: all corners but one lie on one line; corners of two full rows are needed")
-    h = np.linalg.inv(spread) @ vt[-1].reshape(3, 3)
+    h = vt[-1].reshape(3, 3)
     along = ((target @ h.T) * rays).sum()
     return np.asarray(h * np.sign(along) / np.array([scale, scale, 1.0]))
 
