@@ -21,6 +21,7 @@ from rigkit.errors import InputError
 __all__ = ["FocalCamera", "RadialCamera", "ScaleDerivatives", "checked_curve", "fit_shape"]
 
 FIT_STEPS = 40
+FIT_MAX_DAMPING = 1e3
 FIT_SETTLED = 1e-6
 """The descent stops where a step gains less than this share of the cost."""
 
@@ -199,6 +200,8 @@ def _descend(camera: _Focal, points: FloatArray, radius: FloatArray) -> tuple[fl
             continue
         new_cost = _curve_cost(moved, points, radius)
         if not new_cost < cost:
+            if damping > FIT_MAX_DAMPING:
+                break
             damping *= 10.0
             continue
         done = cost - new_cost <= FIT_SETTLED * cost
