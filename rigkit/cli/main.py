@@ -21,6 +21,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "demo": ("rigkit.cli.demo", "render a small fisheye capture and run the whole job on it; needs no data"),
     "detect": ("rigkit.cli.detect", "corners of every chessboard in the images"),
     "calibrate": ("rigkit.cli.calibrate", "calibrate a camera from images of chessboards"),
+    "diff": ("rigkit.cli.diff", "difference of two calibrations over the image; same camera or not"),
     "rectify": ("rigkit.cli.rectify", "perspective, cylindrical or equirectangular image from any camera's image"),
     "reconstruct": ("rigkit.cli.reconstruct", "oriented clouds (PLY) and pictures of every pair"),
     "validate": ("rigkit.cli.validate", "the tables against measured truth, report and PLY; exit 1 if a check fails"),

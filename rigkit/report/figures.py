@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from rigkit.arrays import FloatArray, Pixels
 from rigkit.cameras.base import Camera
+from rigkit.cameras.compare import CameraDifference
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruct import Reconstruction
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["BOARD_COLOURS", "as_jpeg", "cloud_png", "corners_png", "epipolar_curves", "epipolar_png"]
+__all__ = ["BOARD_COLOURS", "as_jpeg", "cloud_png", "corners_png", "difference_png", "epipolar_curves", "epipolar_png"]
 
 BOARD_COLOURS = ("#e6550d", "#1f77b4", "#2ca02c", "#9467bd", "#d6b300", "#17becf", "#e377c2", "#7f7f7f")
 """One colour a board, the same in every picture; readable on dark and light images."""
@@ -132,6 +133,28 @@ def cloud_png(reconstruction: Reconstruction) -> bytes:
     axis.legend(fontsize=7, loc="upper right")
     title = f"{reconstruction.pair_id}, {reconstruction.affine_method}: {len(cloud)} points, "
     figure.suptitle(f"{title}baseline {reconstruction.baseline_mm:.2f} mm", fontsize=10)
+    return _png(figure)
+
+
+def difference_png(difference: CameraDifference) -> bytes:
+    """Draw the difference of two cameras over the image: its length as colour, its direction as arrows."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 5.6), dpi=DPI)
+    FigureCanvasAgg(figure)
+    axis: Any = figure.subplots()
+    u, v = difference.pixels[..., 0], difference.pixels[..., 1]
+    mesh = axis.pcolormesh(u, v, difference.map_px, shading="nearest", cmap="viridis")
+    some = np.s_[::3, ::3]
+    arrows = difference.difference_px[some]
+    axis.quiver(u[some], v[some], arrows[..., 0], arrows[..., 1], angles="xy", color="white", width=0.002)
+    axis.set_aspect("equal")
+    axis.invert_yaxis()
+    figure.colorbar(mesh, ax=axis, label="px", shrink=0.85)
+    axis.set_title(
+        f"difference {difference.rms_px:.4f} px rms, {difference.max_px:.4f} px at most (arrows magnified)", fontsize=9
+    )
     return _png(figure)
 
 

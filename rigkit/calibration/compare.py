@@ -1,0 +1,109 @@
+"""Two calibrations: is their difference what their uncertainties predict, or are these two cameras?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.arrays import FloatArray, Pixels
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.uncertainty import projection_uncertainty
+from rigkit.cameras.compare import CameraDifference, compare_cameras
+
+__all__ = ["CalibrationComparison", "compare_calibrations"]
+
+SAMPLES = 2000
+"""Draws of the null distribution: the chance is then known to 0.005 near 0.05."""
+SAME_CHANCE = 0.01
+"""A difference this unlikely for one and the same camera makes it two."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CalibrationComparison:
+    """The difference of two calibrations beside what their uncertainties predict.
+
+    Attributes
+    ----------
+    difference : over the image, after the best rotation.
+    predicted_px : (rows, columns) predicted rms difference of two calibrations of one camera, NaN where not covered.
+    ratio : rms over the image of difference / predicted: about 1 for one and the same camera.
+    chance : probability of a ratio at least this large if both were calibrations of the same, unchanged camera.
+    """
+
+    difference: CameraDifference
+    predicted_px: FloatArray
+    ratio: float
+    chance: float
+
+    @property
+    def same(self) -> bool:
+        return self.chance >= SAME_CHANCE
+
+
+def compare_calibrations(
+    a: Calibration, b: Calibration, *, grid: tuple[int, int] = (40, 30), seed: int = 0
+) -> CalibrationComparison:
+    """Compare two calibrations over the image of `a`.
+
+    Raises InputError or DegenerateError where the images differ in size or the cameras share no view.
+
+    Notes
+    -----
+    The null distribution of the ratio is sampled: both calibrations' errors are drawn from their covariances, turned
+    into differences over the image by the projection's derivatives, and the best rotation is taken out of each with the
+    same weights as it is taken out of the difference found.
+    """
+    difference = compare_cameras(a.camera, b.camera, grid=grid)
+    # The rotation is fitted where both calibrations know what they say: extrapolated corners must not turn it.
+    weights = np.zeros(difference.covered.shape)
+    weights[difference.covered] = 1.0 / _variance(a, b, difference)[0]
+    difference = compare_cameras(a.camera, b.camera, grid=grid, weights=weights)
+    covered = difference.covered
+    pixels = difference.pixels[covered]
+    variance, seen = _variance(a, b, difference)
+    found = float(np.mean((difference.difference_px[covered] ** 2).sum(axis=-1) / variance))
+    # The rotation that the comparison fits, at first order. In two calibrations of one camera both are the same.
+    root = np.repeat(1.0 / np.sqrt(variance), 2)[:, None]
+    turn = root * np.concatenate([_turn(a, pixels), _turn(b, seen)], axis=1)
+    rng = np.random.default_rng(seed)
+    drawn = root * (_draw(a, pixels, rng) - _draw(b, seen, rng))
+    drawn = drawn - turn @ np.linalg.lstsq(turn, drawn, rcond=None)[0]
+    null = (drawn.reshape(len(pixels), 2, SAMPLES) ** 2).sum(axis=1).mean(axis=0)
+    predicted = np.full(covered.shape, np.nan)
+    predicted[covered] = np.sqrt(variance)
+    chance = float((1 + np.count_nonzero(null >= found)) / (SAMPLES + 1))
+    return CalibrationComparison(difference, predicted, float(np.sqrt(found)), chance)
+
+
+def _variance(a: Calibration, b: Calibration, difference: CameraDifference) -> tuple[FloatArray, Pixels]:
+    """Return the predicted variance (M,) of the difference at the covered pixels, and the pixels in `b`."""
+    pixels = difference.pixels[difference.covered]
+    seen, _ = b.camera.project(_rays(a, pixels) @ difference.b_from_a.T)
+    covariance = projection_uncertainty(a, pixels).covariance + projection_uncertainty(b, seen).covariance
+    return np.trace(covariance, axis1=-2, axis2=-1), seen
+
+
+def _rays(calibration: Calibration, pixels: Pixels) -> FloatArray:
+    return calibration.camera.unproject(pixels)[0]
+
+
+def _turn(calibration: Calibration, pixels: Pixels) -> FloatArray:
+    """Return d pixel / d turn of the ray (2 N, 3)."""
+    rays = _rays(calibration, pixels)
+    _, _, by_point, _ = calibration.camera.project_with_jacobians(rays)
+    return np.cross(rays[:, None, :], by_point).reshape(-1, 3)
+
+
+def _draw(calibration: Calibration, pixels: Pixels, rng: np.random.Generator) -> FloatArray:
+    """Return errors of the projection at `pixels` (2 N, SAMPLES), drawn from the calibration's covariance."""
+    _, _, _, by_camera = calibration.camera.project_with_jacobians(_rays(calibration, pixels))
+    p = calibration.camera.parameters.size
+    covariance = calibration.frame_covariance[: p + 3, : p + 3]
+    # Scaled to correlations first: parameters differ by twenty orders of magnitude.
+    sigma = np.sqrt(np.diag(covariance))
+    safe = np.where(sigma > 0.0, sigma, 1.0)
+    values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
+    root = safe[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    design = np.concatenate([by_camera.reshape(-1, p), _turn(calibration, pixels)], axis=1)
+    return np.asarray(design @ root @ rng.normal(size=(p + 3, SAMPLES)))
