@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from rigkit.arrays import Affines, BoolArray, FloatArray, Mat3, Pixels, RayJacobians, Rays, as_array
 from rigkit.errors import InputError
+from rigkit.geometry.sampson import epipolar_normals
 from rigkit.matches import DirectionPairs
 
 __all__ = ["Affinities", "DirectionNoise", "EpipolarNormals"]
@@ -48,11 +49,8 @@ class EpipolarNormals:
         cls, rays1: Rays, ray_jacobians1: RayJacobians, rays2: Rays, ray_jacobians2: RayJacobians, E21: Mat3
     ) -> EpipolarNormals:
         """Build from unit rays (N, 3), ray Jacobians (N, 3, 2) and the essential matrix: any central camera."""
-        e = np.asarray(E21, dtype=np.float64)
-        line1 = np.asarray(rays2, dtype=np.float64) @ e
-        line2 = np.asarray(rays1, dtype=np.float64) @ e.T
-        n1 = np.einsum("nij,ni->nj", ray_jacobians1, line1)
-        return cls(n1, np.einsum("nij,ni->nj", ray_jacobians2, line2))
+        _, n1, n2 = epipolar_normals(E21, rays1, rays2, ray_jacobians1, ray_jacobians2)
+        return cls(n1, n2)
 
     @classmethod
     def from_F(cls, F21: Mat3, pixels1: Pixels, pixels2: Pixels) -> EpipolarNormals:
