@@ -22,7 +22,15 @@ from rigkit.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.files import write_atomic
 
-__all__ = ["SCHEMA", "load_calibration", "load_camera", "save_calibration", "save_camera"]
+__all__ = [
+    "SCHEMA",
+    "camera_from_json",
+    "camera_to_json",
+    "load_calibration",
+    "load_camera",
+    "save_calibration",
+    "save_camera",
+]
 
 SCHEMA = "rigkit.calibration/1"
 CAMERA_KEYS = {"model", "size_px", "parameters"}
@@ -37,7 +45,7 @@ def save_calibration(path: str | Path, calibration: Calibration, *, force: bool 
     c = calibration
     data = {
         "schema": SCHEMA,
-        "camera": _camera_out(c.camera),
+        "camera": camera_to_json(c.camera),
         "rms_px": c.rms_px,
         "heldout_rms_px": c.heldout_rms_px,
         "sigma_px": c.sigma_px,
@@ -65,7 +73,7 @@ def save_calibration(path: str | Path, calibration: Calibration, *, force: bool 
 
 def save_camera(path: str | Path, camera: Camera, *, force: bool = False) -> None:
     """Write a camera without the calibration that it came from."""
-    write_atomic(path, _dumps({"schema": SCHEMA, "camera": _camera_out(camera)}), force=force)
+    write_atomic(path, _dumps({"schema": SCHEMA, "camera": camera_to_json(camera)}), force=force)
 
 
 def load_camera(path: str | Path) -> Camera:
@@ -74,7 +82,7 @@ def load_camera(path: str | Path) -> Camera:
     Raises InputError for a missing or damaged file, another schema, an unknown key or model, or wrong parameters.
     """
     data = _read(path)
-    return _camera_in(_field(data, "camera", path), path)
+    return camera_from_json(_field(data, "camera", path), path)
 
 
 def load_calibration(path: str | Path) -> Calibration:
@@ -85,7 +93,7 @@ def load_calibration(path: str | Path) -> Calibration:
         raise InputError(f"'{path}': no {', '.join(missing)}: a camera without its calibration; calibrate again")
     try:
         return Calibration(
-            camera=_camera_in(data["camera"], path),
+            camera=camera_from_json(data["camera"], path),
             rms_px=float(data["rms_px"]),
             heldout_rms_px=None if data["heldout_rms_px"] is None else float(data["heldout_rms_px"]),
             covariance=_array(data["covariance"]),
@@ -128,12 +136,14 @@ def _field(data: dict[str, Any], key: str, path: str | Path) -> Any:
     return data[key]
 
 
-def _camera_out(camera: Camera) -> dict[str, Any]:
+def camera_to_json(camera: Camera) -> dict[str, Any]:
+    """Return the camera as it stands in files."""
     values = dict(zip(camera.parameter_names(), camera.parameters.tolist(), strict=True))
     return {"model": camera.model, "size_px": list(camera.size_px), "parameters": values}
 
 
-def _camera_in(data: Any, path: str | Path) -> Camera:
+def camera_from_json(data: Any, path: str | Path) -> Camera:
+    """Return the camera that `camera_to_json` wrote; raises InputError that names the file `path`."""
     if not isinstance(data, dict) or set(data) != CAMERA_KEYS or not isinstance(data["parameters"], dict):
         raise InputError(f"'{path}': 'camera' must have the keys {', '.join(sorted(CAMERA_KEYS))}, and no others")
     model = camera_model(str(data["model"]))
