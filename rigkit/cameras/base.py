@@ -56,7 +56,8 @@ class Camera(ABC):
             raise InputError(
                 f"{self.model} camera: {len(names)} parameters expected ({', '.join(names)}), got {array.size}"
             )
-        self._prepare()
+        with np.errstate(all="ignore"):
+            self._prepare()
 
     def _prepare(self) -> None:
         """Check the values of the parameters and compute what the formulas need of them."""

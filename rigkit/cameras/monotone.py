@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from rigkit.arrays import FloatArray, IntArray
+from rigkit.errors import InputError
 
 __all__ = ["first_root", "horner", "invert_increasing"]
 
@@ -33,9 +34,14 @@ def horner(coefficients: FloatArray, x: FloatArray) -> FloatArray:
 
 
 def first_root(coefficients: FloatArray, limit: float) -> float:
-    """Return the smallest root in (0, `limit`] of sum_k coefficients[k] x^k, or `limit` where there is none."""
+    """Return the smallest root in (0, `limit`] of sum_k coefficients[k] x^k, or `limit` where there is none.
+
+    Raises InputError where the polynomial overflows: what a solver tries may be far from any lens.
+    """
     # Scaled to x in (0, 1] so that coefficients of high powers of pixels are not lost beside the others.
     scaled = np.asarray(coefficients, dtype=np.float64) * limit ** np.arange(len(coefficients), dtype=np.float64)
+    if not np.isfinite(scaled).all():
+        raise InputError("lens polynomial: its coefficients are too large for any lens")
     roots = np.roots(np.trim_zeros(scaled[::-1], "f"))
     real = roots.real[np.abs(roots.imag) <= REAL_ROOT * np.abs(roots)]
     real = real[(real > 0.0) & (real < 1.0)]

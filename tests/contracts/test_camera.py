@@ -279,3 +279,20 @@ def test_radial_curve_gives_the_camera_back(camera: Camera) -> None:
     assert np.abs(error).max() < CURVE_PX
     with pytest.raises(InputError, match="increase"):
         type(camera).from_radial_curve(camera.size_px, centre, theta[::-1], radius, order=order)
+
+
+def test_parameters_of_no_lens_are_refused_or_harmless(camera: Camera, rng: np.random.Generator) -> None:
+    """A solver may try anything: an error of ours, or a camera that does not crash and says what is invalid."""
+    points, pixels = rays_within(1.0, 20, rng), image_pixels(camera, 5, 5)
+    made = 0
+    for _ in range(60):
+        scale = 10.0 ** rng.uniform(-3.0, 160.0, camera.parameters.size)
+        try:
+            wild = camera.with_parameters(camera.parameters * rng.choice([1.0, -1.0, 0.0], scale.size) * scale)
+        except InputError:
+            continue
+        made += 1
+        for values, valid in (wild.project(points), wild.unproject(pixels)):
+            assert (np.isnan(values).any(axis=-1) | valid).all()
+        wild.project_with_jacobians(points)
+    assert made > 0 or camera.model not in ("pinhole", "brown", "kannala_brandt")
