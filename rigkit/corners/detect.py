@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.boards import Board
+from rigkit.corners.fold import join_parts, split_folds
 from rigkit.corners.grow import SaddleIndex, grow_all
 from rigkit.corners.lattice import build_lattices
 from rigkit.corners.links import find_links
@@ -23,6 +24,9 @@ from rigkit.detections import BoardDetection
 
 __all__ = ["detect_boards"]
 
+FEWEST_OF_PART = 6
+"""Corners of the smallest part of a board that something lies across."""
+
 
 def find_lattices(image: NDArray[np.generic], min_corners: int) -> list[RefinedLattice]:
     """Return the lattices of all boards of `image`, refined, in no particular order and orientation."""
@@ -32,8 +36,9 @@ def find_lattices(image: NDArray[np.generic], min_corners: int) -> list[RefinedL
     corners, saddles = find_corners(levels)
     lattices = build_lattices(corners, find_links(corners, levels[0]))
     index = SaddleIndex(saddles)
-    grown = [tidy(lattice, size_px) for lattice in grow_all(lattices, index, levels[0])]
-    boards = separate(grown, min_corners)
+    grown = [part for lattice in grow_all(lattices, index, levels[0]) for part in split_folds(lattice)]
+    parts = separate([tidy(part, size_px) for part in grown], FEWEST_OF_PART)
+    boards = separate(join_parts(parts), min_corners)
     refined = zip(boards, refine(grey, boards), strict=True)
     return [after for before, after in refined if trustworthy(after, before.count, min_corners)]
 

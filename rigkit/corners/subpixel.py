@@ -29,7 +29,7 @@ FIRST_PASS = (9.0, 4)
 LAST_PASS = (18.0, 8)
 """Radius in px and Gauss-Newton steps: the first pass only has to bring the lattice to a few hundredths of a pixel."""
 
-FEWEST_NEIGHBOURS = 4
+FEWEST_NEIGHBOURS = 3
 """An empty cell is tried if so many of its eight neighbours are known."""
 
 HOLE_MOVE = 0.12
@@ -37,7 +37,7 @@ HOLE_CONTRAST = 0.3
 HOLE_RESIDUAL = 2.0
 HOLE_SIGMA = 3.0
 """What a corner in an empty cell must show: how far from its prediction (cells); contrast, relative residual and sigma
-relative to the typical corner of the board."""
+relative to the corners around it."""
 
 ASTRAY_CELLS = 0.06
 ASTRAY_FACTOR = 8.0
@@ -161,16 +161,25 @@ def _confirmed(item: RefinedLattice, start: Lattice, holes: BoolArray) -> Refine
     if not (holes & known).any() or not settled.any():
         return item.without(holes)
     contrast = item.lattice.contrast
-    relative = item.residual / np.where(known, contrast, 1.0)
     moved = np.linalg.norm(item.lattice.pixels - start.pixels, axis=2)
     shape = fit_cells(start.pixels, np.ones_like(known), degree=1)
     area = shape.along_column[:, 0] * shape.along_row[:, 1] - shape.along_column[:, 1] * shape.along_row[:, 0]
     cell = np.sqrt(np.maximum(area, 1.0)).reshape(known.shape)
     with np.errstate(invalid="ignore"):
-        good = (moved < HOLE_MOVE * cell) & (contrast > HOLE_CONTRAST * np.median(contrast[settled]))
-        good &= relative < HOLE_RESIDUAL * np.median(relative[settled])
-        good &= item.sigma_px < HOLE_SIGMA * np.median(item.sigma_px[settled])
+        good = (moved < HOLE_MOVE * cell) & (contrast > HOLE_CONTRAST * _around(contrast, settled))
+        good &= item.residual < HOLE_RESIDUAL * _around(item.residual, settled)
+        good &= item.sigma_px < HOLE_SIGMA * _around(item.sigma_px, settled)
     return item.without(holes & ~good)
+
+
+def _around(values: FloatArray, known: BoolArray) -> FloatArray:
+    """Return the mean of `values` (R, C) over the `known` among each cell and its eight neighbours, NaN for none."""
+    box = np.ones((3, 3))
+    total, count = (
+        cv2.filter2D(part, cv2.CV_64F, box, borderType=cv2.BORDER_CONSTANT)
+        for part in (np.where(known, values, 0.0), known.astype(np.float64))
+    )
+    return np.where(count > 0.5, total / np.maximum(count, 0.5), np.nan)
 
 
 def _checked(item: RefinedLattice) -> RefinedLattice:

@@ -88,10 +88,13 @@ def _stray_row(lattice: Lattice, size_px: tuple[int, int]) -> BoolArray | None:
 
 
 def separate(lattices: Sequence[Lattice], least: int) -> list[Lattice]:
-    """Return the boards among `lattices`: `least` corners, 3x3 or more, and no corners shared with a larger one."""
+    """Return those of `lattices` with at least `least` corners that share no corners with a larger one.
+
+    What is to be a board (from 9 corners) has three rows and three columns.
+    """
     kept: list[Lattice] = []
     for lattice in sorted(lattices, key=lambda item: -item.count):
-        if lattice.count < max(least, 9) or min(lattice.size) < 3:
+        if lattice.count < least or min(lattice.size) < (3 if least >= 9 else 2):
             continue
         if not any(_overlap(lattice, other) for other in kept):
             kept.append(lattice)
