@@ -142,12 +142,23 @@ def _header(data: bytes, source: Path) -> tuple[int, list[tuple[str, str]], tupl
     lines = data[:end].decode("utf-8", errors="replace").splitlines()
     if "format binary_little_endian 1.0" not in lines:
         raise InputError(f"'{source}': only binary little-endian PLY is read; convert it, for example with Open3D")
+    try:
+        count, fields, boards = _declared(lines, source)
+    except (IndexError, ValueError) as error:
+        raise InputError(f"'{source}': the PLY header is damaged ({error}); write or copy it again") from error
+    if count < 0 or not fields:
+        raise InputError(f"'{source}': the PLY declares no points; give a point cloud")
+    return count, fields, tuple(boards[i] for i in sorted(boards)), end + len(b"end_header\n")
+
+
+def _declared(lines: list[str], source: Path) -> tuple[int, list[tuple[str, str]], dict[int, str]]:
+    """Return the number of points, their fields, and the boards named in comments; -1 points where none are declared."""
     count = -1
     fields: list[tuple[str, str]] = []
     boards: dict[int, str] = {}
     for line in lines:
         words = line.split()
-        if words[:1] == ["comment"] and line.startswith(f"comment {BOARD_COMMENT}") and words[2].isdigit():
+        if line.startswith(f"comment {BOARD_COMMENT}") and len(words) > 3 and words[2].isdigit():
             boards[int(words[2])] = " ".join(words[3:])
         elif words[:2] == ["element", "vertex"]:
             count = int(words[2])
@@ -159,6 +170,4 @@ def _header(data: bytes, source: Path) -> tuple[int, list[tuple[str, str]], tupl
             if words[1] not in TYPES:
                 raise InputError(f"'{source}': a point has a property of type '{words[1]}', which is not read")
             fields.append((words[2], TYPES[words[1]]))
-    if count < 0 or not fields:
-        raise InputError(f"'{source}': the PLY declares no points; give a point cloud")
-    return count, fields, tuple(boards[i] for i in sorted(boards)), end + len(b"end_header\n")
+    return count, fields, boards

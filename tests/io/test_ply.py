@@ -80,6 +80,8 @@ def test_what_is_not_a_whole_cloud_is_refused(cloud_file: Path) -> None:
     for old, new in (
         (b"property double sigma_mm", b"property list uchar int i"),
         (b"element vertex 144", b"element v 1"),
+        (b"element vertex 144", b"element vertex many"),
+        (b"property double x", b"property double"),
     ):
         cloud_file.write_bytes(data.replace(old, new))
         with pytest.raises(InputError):
