@@ -10,16 +10,19 @@ from rigkit.calibration.normal import Normal, normal_equations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import BoardShape, Calibration, Candidate, Outlier, ViewResult
 from rigkit.calibration.solver import State, evaluate
+from rigkit.calibration.uncertainty import projection_uncertainty
 from rigkit.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
 
 __all__ = ["assemble", "solution_normal"]
 
-FOCAL_UNKNOWN = 0.3
-"""A focal length known to 30 % only is not known: the views leave it open."""
+UNKNOWN_SHARE = 0.05
+"""A projection that is uncertain by this part of the image's width, where the boards were, is not determined."""
 LEAST_SIGMA_PX = 0.02
 """No corner is better than this: keeps data without noise from looking determined by rounding."""
+CHECK_EVERY = 5
+"""One corner in so many is enough to see whether the lens is determined."""
 
 
 def assemble(
@@ -33,7 +36,6 @@ def assemble(
     state = fit.state
     sigma = fit.sigma_px if np.isfinite(fit.sigma_px) else 0.0
     covariance = frame_covariance(solution_normal(observations, fit), state)
-    _require_focal(state, covariance * max(sigma, LEAST_SIGMA_PX) ** 2)
     residuals = evaluate(state, observations)
     px = np.where(residuals.valid[..., None], residuals.px, np.nan)
     views, outliers = [], []
@@ -47,7 +49,7 @@ def assemble(
             length = float(np.linalg.norm(px[i, j]))
             outliers.append(Outlier(view.image, view.board.board_id, int(column), int(row), length))
     p = state.camera.parameters.size
-    return Calibration(
+    result = Calibration(
         camera=state.camera,
         rms_px=rms(state, observations, fit.kept),
         heldout_rms_px=heldout_px,
@@ -61,6 +63,8 @@ def assemble(
         convergence=fit.convergence,
         boards=_boards(observations, state),
     )
+    _require_determined(result)
+    return result
 
 
 def solution_normal(observations: Observations, fit: Fit) -> Normal:
@@ -97,15 +101,14 @@ def frame_covariance(normal: Normal, state: State) -> FloatArray:
     return 0.5 * (out + out.T)
 
 
-def _require_focal(state: State, covariance: FloatArray) -> None:
-    """Raise DegenerateError where the scale of the image is not determined."""
-    camera = state.camera
-    _, _, by_point, by_parameter = camera.project_with_jacobians(np.array([0.02, 0.0, 1.0]))
-    p = camera.parameters.size
-    centre = camera.project_with_jacobians(np.array([0.0, 0.0, 1.0]))[3]
-    change = (by_parameter - centre)[0] / 0.02
-    sigma = float(np.sqrt(max(change @ covariance[:p, :p] @ change, 0.0)))
-    if not sigma < FOCAL_UNKNOWN * abs(float(by_point[0, 0])):
+def _require_determined(result: Calibration) -> None:
+    """Raise DegenerateError where the views leave the lens open, even at the corners that they have."""
+    pixels = np.concatenate([view.pixels[view.kept] for view in result.views])[::CHECK_EVERY]
+    worst = projection_uncertainty(result, pixels).worst_px
+    sigma = float(np.nanmedian(worst)) if np.isfinite(worst).any() else np.inf
+    if result.sigma_px > 0.0:
+        sigma *= max(result.sigma_px, LEAST_SIGMA_PX) / result.sigma_px
+    if not sigma < UNKNOWN_SHARE * result.camera.size_px[0]:
         raise DegenerateError(
             "calibration: the views leave the focal length open (all boards nearly parallel to the image, or too few "
             "corners); take views in which the board is tilted by 20 to 50 degrees in several directions"
