@@ -35,6 +35,7 @@ class DirectionPairs:
     valid : (N, K) bool; invalid directions are ignored by every estimator.
     scaled : whether |image2| / |image1| is the true local stretch (harmonic lengths on a chessboard).
     kinds : K names, here ("horizontal", "vertical", "diagonal").
+    pixels1, pixels2 : (N, 2) where the directions are, or None.
     """
 
     HORIZONTAL: ClassVar[int] = 0
@@ -46,6 +47,8 @@ class DirectionPairs:
     valid: BoolArray
     scaled: bool = True
     kinds: tuple[str, ...] = ("horizontal", "vertical", "diagonal")
+    pixels1: Pixels | None = None
+    pixels2: Pixels | None = None
 
     def __post_init__(self) -> None:
         first = np.asarray(self.image1)
@@ -63,6 +66,9 @@ class DirectionPairs:
         object.__setattr__(self, "valid", valid)
         if len(self.kinds) != k:
             raise InputError(f"directions: {k} directions a point but {len(self.kinds)} kinds")
+        for name in ("pixels1", "pixels2"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, as_array(getattr(self, name), (n, 2), f"directions' {name}"))
 
 
 @dataclass(frozen=True, eq=False, slots=True)

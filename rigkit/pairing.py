@@ -107,7 +107,7 @@ def match_pair(
         view1, view2 = _axis_view(camera1, captured.rays1, pair_id), _axis_view(camera2, captured.rays2, pair_id)
         viewed = tuple((_in_view(a, camera1, view1), _in_view(b, camera2, view2)) for a, b in pairs)
     matches = captured if chain == "raw" else _gather(view1, view2, viewed)
-    directions, noise = _directions(viewed, view1, view2, support, window)
+    directions, noise = _directions(viewed, view1, view2, support, window, matches)
     notes = [f"board '{name}': {why}" for name, why in identity.missing.items()]
     if unseen:
         notes.append(f"{unseen} corners lie outside the calibrated field of view and were left out")
@@ -183,6 +183,7 @@ def _directions(
     view2: Camera,
     support: Support,
     window: int | None,
+    matches: Matches,
 ) -> tuple[DirectionPairs, DirectionNoise]:
     vectors: tuple[list[FloatArray], list[FloatArray]] = ([], [])
     covariances: tuple[list[FloatArray], list[FloatArray]] = ([], [])
@@ -195,7 +196,13 @@ def _directions(
             vectors[k].append(field.vectors[index])
             covariances[k].append(field.covariance[index, :2])
         valid.append(field1.valid[i] & field2.valid[j])
-    directions = DirectionPairs(np.concatenate(vectors[0]), np.concatenate(vectors[1]), np.concatenate(valid))
+    directions = DirectionPairs(
+        np.concatenate(vectors[0]),
+        np.concatenate(vectors[1]),
+        np.concatenate(valid),
+        pixels1=matches.pixels1,
+        pixels2=matches.pixels2,
+    )
     # The diagonal is the sum of the other two, so its noise is not independent of theirs.
     noise = DirectionNoise.independent(np.concatenate(covariances[0]), np.concatenate(covariances[1])).with_sum(0, 1)
     return directions, noise

@@ -170,6 +170,11 @@ class Affinities:
         return len(self.A21)
 
     @property
+    def sigma(self) -> FloatArray | None:
+        """The same as `sigma_A`."""
+        return self.sigma_A
+
+    @property
     def sigma_A(self) -> FloatArray | None:
         """(N,) root mean square standard deviation of the four entries of A21, or None."""
         if self.covariance is None:

@@ -9,7 +9,7 @@ from rigkit.affine.components import PlanarDirections, blocks, finite, first_of
 from rigkit.affine.epipolar import epipolar_block, epipolar_sensitivity, soft_epipolar, usable_directions
 from rigkit.affine.scaled import scaled_block, scaled_sensitivity
 from rigkit.affine.unscaled import SCALES, determinant_block, determinant_sensitivity
-from rigkit.arrays import Affines, BoolArray, FloatArray, as_array
+from rigkit.arrays import Affines, BoolArray, FloatArray, Mat3, as_array
 from rigkit.errors import InputError
 from rigkit.matches import DirectionPairs
 
@@ -37,6 +37,7 @@ def needs_lengths(method: str) -> bool:
 def affines_from_directions(
     directions: DirectionPairs,
     method: str,
+    F21: Mat3 | None = None,
     *,
     epipolar: EpipolarNormals | None = None,
     scale: str = "area",
@@ -53,7 +54,8 @@ def affines_from_directions(
     method : "F2UDIR" or "2SDIR" use the first two usable directions of a corner, "F3UDIR", "DET3UDIR" and "3SDIR" all.
         Usable: valid, and for F2UDIR not along the epipolar line (|unit(d2) . unit(n2)| >= min_conditioning), so that
         the diagonal of a board steps in for an edge that is parallel to the baseline.
-    epipolar : for F2UDIR and F3UDIR: epipolar normals in the same pixels as the directions.
+    F21 : for F2UDIR and F3UDIR in perspective images: the fundamental matrix; `directions` must have pixels then.
+    epipolar : the same for any central camera: epipolar normals in the same pixels as the directions.
     scale : for DET3UDIR: "area" (exact, default), "ls" (exact) or "sqmean" (the paper's; biased).
     noise : of the directions; then each affinity has a covariance.
     determinant : (N,) for DET3UDIR: det A where it is known otherwise; then lengths are not used.
@@ -71,6 +73,8 @@ def affines_from_directions(
     InputError
         Unknown method or option, no epipolar geometry or no lengths where the method needs them, lengths that differ.
     """
+    if F21 is not None and epipolar is None and needs_epipolar(method):
+        epipolar = _epipolar_of(directions, F21)
     _check(directions, method, epipolar, scale, determinant, epipolar_rows, noise)
     n = len(directions.valid)
     A21 = np.full((n, 2, 2), np.nan)
@@ -142,6 +146,12 @@ def _covariance(
         total += flat @ np.where(ignore, 0.0, covariance[valid]) @ np.swapaxes(flat, 1, 2)
     out[valid] = total
     return out
+
+
+def _epipolar_of(directions: DirectionPairs, F21: Mat3) -> EpipolarNormals:
+    if directions.pixels1 is None or directions.pixels2 is None:
+        raise InputError("affinities from F21: the directions have no pixels; give pixels1 and pixels2, or epipolar=")
+    return EpipolarNormals.from_F(F21, directions.pixels1, directions.pixels2)
 
 
 def _known(method: str) -> str:
