@@ -1,0 +1,81 @@
+"""`rigkit calibrate` from images on disk to the file, and what it says to bad input."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.data import REPOSITORY
+
+from rigkit.cli.main import main
+from rigkit.io.calibration_file import load_calibration
+
+IMAGES = REPOSITORY / "datasets" / "lab-a" / "calibration" / "fisheye"
+SESSION = 'schema = "rigkit.session/1"\nimages = "*.jpg"\nboard = "board.toml"\nmodel = "kannala_brandt"\n'
+BOARD = 'schema = "rigkit.board/1"\ncolumns = 9\nrows = 6\nsquare_mm = 30.0\n'
+GOOD_RMS_PX = 0.1
+"""Ray-traced images, corners to about 0.02 px per axis; a wrong corner order gives tens of pixels."""
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Path:
+    for k, path in enumerate(sorted(IMAGES.glob("*.jpg"))[:5]):
+        shutil.copy(path, tmp_path / f"{k:02d}.jpg")
+    (tmp_path / "board.toml").write_text(BOARD)
+    path = tmp_path / "session.toml"
+    path.write_text(SESSION)
+    return path
+
+
+def test_from_images_to_file_and_again_without_images(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["calibrate", str(session), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    result = load_calibration(session.parent / "calibration.json")
+    assert told["model"] == "kannala_brandt" and told["rms_px"] == result.rms_px < GOOD_RMS_PX
+    assert len(result.views) == 5 and result.dropped == ()
+    assert result.heldout_rms_px is not None
+
+    before = (session.parent / "calibration.json").read_bytes()
+    assert main(["calibrate", str(session)]) == 2
+    assert "--force" in capsys.readouterr().err
+    assert (session.parent / "calibration.json").read_bytes() == before
+
+    # The corners are kept: the same result without the images.
+    for path in session.parent.glob("*.jpg"):
+        path.unlink()
+    assert main(["calibrate", str(session), "--force"]) == 0
+    assert "held-out RMS" in capsys.readouterr().out
+    again = load_calibration(session.parent / "calibration.json")
+    assert np.array_equal(again.camera.parameters, result.camera.parameters)
+
+
+def test_bad_input(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    board = session.parent / "board.toml"
+    board.write_text(BOARD.replace("columns = 9", "columns = 7"))
+    assert main(["calibrate", str(session)]) == 2
+    assert "check columns and rows" in capsys.readouterr().err
+
+    board.write_text(BOARD)
+    whole = (session.parent / "02.jpg").read_bytes()
+    (session.parent / "02.jpg").write_bytes(whole[: len(whole) // 2])
+    assert main(["calibrate", str(session)]) == 2
+    assert "02.jpg" in capsys.readouterr().err
+    assert not (session.parent / "calibration.json").exists()
+
+    session.write_text(SESSION.replace("*.jpg", "*.tif"))
+    (session.parent / "corners.json").unlink(missing_ok=True)
+    assert main(["calibrate", str(session)]) == 2
+    assert "no image matches" in capsys.readouterr().err
+
+
+def test_image_of_another_size_is_dropped_with_the_reason(session: Path) -> None:
+    cv2 = pytest.importorskip("cv2")
+    path = session.parent / "01.jpg"
+    cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (812, 620)))
+    assert main(["calibrate", str(session)]) == 0
+    result = load_calibration(session.parent / "calibration.json")
+    assert [image for image, _ in result.dropped] == ["01.jpg"]
+    assert "812x620" in result.dropped[0][1]
