@@ -152,7 +152,7 @@ def _header(data: bytes, source: Path) -> tuple[int, list[tuple[str, str]], tupl
 
 
 def _declared(lines: list[str], source: Path) -> tuple[int, list[tuple[str, str]], dict[int, str]]:
-    """Return the number of points, their fields, and the boards named in comments; -1 points where none are declared."""
+    """Return the number of points (-1 where none are declared), their fields, and the boards named in comments."""
     count = -1
     fields: list[tuple[str, str]] = []
     boards: dict[int, str] = {}
