@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Measure corner detection on rendered scenes with exact truth: ours beside OpenCV's detectors and, where importable, others.
+"""Measure corner detection on rendered scenes with exact truth: ours beside OpenCV's detectors and libcbdetect.
 
     python scripts/benchmark_detection.py [--scenes single trihedral fisheye room] [--poses 8] [--peers] [--json FILE]
 

@@ -134,13 +134,11 @@ def _step(distance: Float32, blur: Float32, gaps: Float32) -> tuple[Float32, ...
 
 def _smooth_step(u: Float32) -> tuple[Float32, ...]:
     """Return F, dF/dx, d2F/dx2 and x dF/dx at x = 3 u."""
-    u = np.clip(u, np.float32(-1.0), np.float32(1.0))
+    one, first, third, fifth = (np.float32(c) for c in (1.0, 35.0 / 16.0, 21.0 / 16.0, 5.0 / 16.0))
+    u = np.clip(u, -one, one)
     square = u * u
-    value = u * (
-        np.float32(35 / 16)
-        - square * (np.float32(35 / 16) - square * (np.float32(21 / 16) - np.float32(5 / 16) * square))
-    )
-    rest = np.float32(1.0) - square
+    value = u * (first - square * (first - square * (third - fifth * square)))
+    rest = one - square
     bend = rest * rest
     slope = bend * rest
     slope *= np.float32(35.0 / 48.0)
@@ -148,7 +146,7 @@ def _smooth_step(u: Float32) -> tuple[Float32, ...]:
     bend *= np.float32(-35.0 / 24.0)
     u *= slope
     u *= STEP_WIDTH
-    return value, slope, bend, u
+    return np.asarray(value, np.float32), np.asarray(slope, np.float32), np.asarray(bend, np.float32), u
 
 
 def _parts(values: FloatArray, window: Window, geometry: Geometry) -> tuple[tuple[Float32, ...], ...]:
@@ -187,7 +185,7 @@ def _mixed(one: tuple[Float32, ...], two: tuple[Float32, ...], rho: Float32) -> 
     mixed = one[0] * two[0]
     mixed += rho * one[1] * two[1]
     mixed += (np.float32(0.5) * rho * rho) * one[2] * two[2]
-    return np.negative(mixed, out=mixed)
+    return np.asarray(np.negative(mixed, out=mixed), np.float32)
 
 
 def linearise(values: FloatArray, window: Window, geometry: Geometry) -> Float32:

@@ -7,6 +7,7 @@ cuts its lattice in two that continue each other: they are joined.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 
 import cv2
 import numpy as np
@@ -103,13 +104,21 @@ def join_parts(lattices: Sequence[Lattice]) -> list[Lattice]:
     done = False
     while not done:
         done = True
-        for i, j in ((i, j) for i in range(len(parts)) for j in range(i + 1, len(parts))):
-            joined = _joined(parts[i], parts[j])
+        for i, j in combinations(range(len(parts)), 2):
+            joined = _joined(parts[i], parts[j]) if _near(parts[i], parts[j]) else None
             if joined is not None:
                 parts = [joined, *(item for k, item in enumerate(parts) if k not in (i, j))]
                 done = False
                 break
     return parts
+
+
+def _near(one: Lattice, two: Lattice) -> bool:
+    """Return whether the lattices' bounding boxes come within GAP sides of a cell, at its largest."""
+    boxes = [(np.nanmin(item.pixels, axis=(0, 1)), np.nanmax(item.pixels, axis=(0, 1))) for item in (one, two)]
+    reach = GAP * float(np.nanmax(np.abs(np.diff(one.pixels, axis=1)), initial=0.0))
+    reach = max(reach, GAP * float(np.nanmax(np.abs(np.diff(one.pixels, axis=0)), initial=0.0)))
+    return bool((np.maximum(boxes[0][0], boxes[1][0]) - np.minimum(boxes[0][1], boxes[1][1])).max() < reach)
 
 
 def _joined(one: Lattice, two: Lattice) -> Lattice | None:
@@ -147,7 +156,7 @@ def _turned_grid(grid: IntArray, size: tuple[int, int], quarter_turns: int) -> I
 
 
 def _united(one: Lattice, two: Lattice, shift: IntArray) -> Lattice | None:
-    """Return `two`, moved by `shift` (columns, rows), put into `one`; None if they overlap, differ, or are far apart."""
+    """Return `two`, moved by `shift` (columns, rows), put into `one`; None if they overlap, differ or are far apart."""
     low = np.minimum(0, shift)
     high = np.maximum(one.size, shift + np.array(two.size))
     columns, rows = high - low

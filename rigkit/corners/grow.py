@@ -28,7 +28,7 @@ PLIANT = (3, (1e-3, 1e-2))
 """Degree and ridge of the prediction: one is steady with few neighbours, the other follows the rim of a fisheye."""
 
 BATCH, MAX_BATCHES = 16, 6
-"""So many lattices grow at a time, so many times: a cluttered image has hundreds of seeds, most of them of one square."""
+"""So many lattices grow at a time, so many times: clutter makes hundreds of seeds, most of them of one square."""
 
 REACH = 0.25
 """A corner lies within this of its prediction, in cells."""

@@ -149,7 +149,7 @@ def build_lattices(corners: Corners, links: Links) -> list[Lattice]:
     links = Links(np.where(bound, links.corner, -1), links.arm)
     for _ in range(3):
         component, grid, turn = _walk(links)
-        wrong = _contradictions(links, component, grid, turn)
+        wrong = _contradictions(links, grid, turn)
         if not wrong.any():
             break
         links = Links(np.where(wrong, -1, links.corner), links.arm)
@@ -182,7 +182,7 @@ def _walk(links: Links) -> tuple[IntArray, IntArray, IntArray]:
     end = links.corner[start, arm]
     graph = coo_matrix((np.ones(len(start), np.int8), (start, end)), shape=(count, count))
     _, label = connected_components(graph, directed=False)
-    linked = (links.corner >= 0).any(axis=1)
+    linked = np.asarray((links.corner >= 0).any(axis=1), dtype=np.bool_)
     _, component = np.unique(np.where(linked, label, -1), return_inverse=True)
     component = component - (0 if linked.all() else 1)
     grid, turn = np.zeros((count, 2), np.int64), np.zeros(count, np.int64)
@@ -209,12 +209,11 @@ def _walk(links: Links) -> tuple[IntArray, IntArray, IntArray]:
     return component, grid, turn
 
 
-def _contradictions(links: Links, component: IntArray, grid: IntArray, turn: IntArray) -> BoolArray:
+def _contradictions(links: Links, grid: IntArray, turn: IntArray) -> BoolArray:
     """Return the links (N, 4) that do not agree with the rows and columns given to their ends."""
-    del component
     there = links.corner >= 0
     end = np.where(there, links.corner, 0)
     direction = (np.arange(4) - turn[:, None]) % 4
     moved = (grid[end] == grid[:, None] + STEPS[direction]).all(axis=2)
     facing = (turn[end] - (links.arm - direction - 2)) % 4 == 0
-    return there & ~(moved & facing)
+    return np.asarray(there & ~(moved & facing), dtype=np.bool_)

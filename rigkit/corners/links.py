@@ -62,8 +62,7 @@ def edge_contrast(
     normal = np.stack([-chord[:, 1], chord[:, 0]], axis=1) / length[:, None]
     along = start[:, None] + ALONG[:, None] * chord[:, None]
     aside = (sign * offset_px)[:, None, None] * normal[:, None]
-    difference: FloatArray = sample(image, along + aside) - sample(image, along - aside)
-    return difference
+    return np.asarray(sample(image, along + aside) - sample(image, along - aside), dtype=np.float64)
 
 
 def find_links(corners: Corners, level: Level) -> Links:
@@ -123,8 +122,7 @@ def _edge_seen(corners: Corners, level: Level, start: IntArray, arm: IntArray, e
     sign = np.where(arm % 2 == 0, 1.0, -1.0)
     difference = edge_contrast(level.smooth, first, last, sign, offset)
     weakest = CONTRAST_RATIO * np.minimum(corners.contrast[start], corners.contrast[end])
-    seen: BoolArray = (difference > weakest[:, None]).sum(axis=1) >= MOST
-    return seen
+    return np.asarray((difference > weakest[:, None]).sum(axis=1) >= MOST, dtype=np.bool_)
 
 
 def _without_long(to: IntArray, pixels: FloatArray) -> IntArray:
@@ -154,4 +152,4 @@ def quads(links: Links) -> BoolArray:
     closed = (walk == start) & there.ravel()
     other = np.zeros_like(closed)
     other[state[closed]] = True
-    return (closed | other).reshape(-1, 4)
+    return np.asarray((closed | other).reshape(-1, 4), dtype=np.bool_)

@@ -1,8 +1,9 @@
-"""Where an image could have a chessboard corner: an image pyramid, its saddle response, and the peaks of that response.
+"""Where an image could have a chessboard corner: an image pyramid, its saddle response, and the peaks of the response.
 
-A chessboard corner is a saddle of the brightness. On an image L smoothed a little, the response is minus the determinant
-of the Hessian, D = Lxy^2 - Lxx Lyy: large at saddles, zero along straight edges, negative at blobs, and indifferent to
-the direction of the lines. What counts as large follows from the image's own median response, that is its noise.
+A chessboard corner is a saddle of the brightness. On an image L smoothed a little, the response is minus the
+determinant of the Hessian, D = Lxy^2 - Lxx Lyy: large at saddles, zero along straight edges, negative at blobs, and
+indifferent to the direction of the lines. What counts as large follows from the image's own median response, that is
+its noise.
 """
 
 from __future__ import annotations
@@ -108,7 +109,8 @@ def pyramid(grey: FloatImage) -> list[Level]:
     base, scale = grey, 1.0
     while base.size > BASE_PIXELS:
         half = (base.shape[1] // 2, base.shape[0] // 2)
-        base = cv2.resize(base[: 2 * half[1], : 2 * half[0]], half, interpolation=cv2.INTER_AREA)
+        smaller = cv2.resize(base[: 2 * half[1], : 2 * half[0]], half, interpolation=cv2.INTER_AREA)
+        base = np.asarray(smaller, np.float32)
         scale *= 2.0
     offset = 0.5 * (scale - 1.0)
     levels: list[Level] = []
@@ -136,7 +138,7 @@ def _level(image: FloatImage, scale: float, offset: float) -> Level:
     low, high = np.quantile(smooth[::step, ::step], (0.002, 0.998))
     contrast = (max(float(high - low), LEAST_SPAN) / 200.0) ** 2
     threshold = float(np.clip(NOISE_FACTOR * typical, FLOOR * contrast, CEILING * contrast))
-    return Level(smooth, response, threshold, scale, offset)
+    return Level(np.asarray(smooth, np.float32), np.asarray(response, np.float32), threshold, scale, offset)
 
 
 def peaks(level: Level) -> IntArray:

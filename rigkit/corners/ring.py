@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rigkit.arrays import BoolArray, FloatArray
 from rigkit.corners.response import FloatImage, sample
@@ -56,14 +57,13 @@ def read_rings(image: FloatImage, pixels: FloatArray, radius_px: FloatArray | fl
     following = np.roll(above, -1, axis=1)
     rising, falling = ~above & following, above & ~following
     valid = symmetric & (rising.sum(axis=1) == 1) & (contrast > 0.0)
-    angle_a = _crossing(even, middle, rising)
-    angle_b = _crossing(even, middle, falling)
+    angle_a, angle_b = (_crossing(even, middle, where) for where in (rising, falling))
     angle_a %= np.pi
     angle_b = angle_a + (angle_b - angle_a) % np.pi
     return Rings(np.stack([angle_a, angle_b], axis=-1), contrast, valid)
 
 
-def _crossing(even: FloatArray, middle: FloatArray, where: BoolArray) -> FloatArray:
+def _crossing(even: NDArray[np.floating], middle: NDArray[np.floating], where: BoolArray) -> FloatArray:
     """Return the angle at which each row of `even` passes `middle` in the interval marked by `where` (the first)."""
     row = np.arange(len(even))
     start = where.argmax(axis=1)

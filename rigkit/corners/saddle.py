@@ -16,7 +16,7 @@ RADII = (4.6, 2.6)
 """Ring radii in pixels of the level: the larger gives the better directions, the smaller fits squares of 6 px."""
 
 MAX_STEP = 1.5
-"""A Newton step to the saddle that leads further than this from the peak of the response went astray, px of the level."""
+"""A Newton step to the saddle that leads further than this from the peak of the response went astray, level px."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -49,7 +49,7 @@ class Corners:
 
 
 def saddle_step(smooth: FloatImage, at: IntArray) -> tuple[FloatArray, BoolArray]:
-    """Return the stationary point next to the pixels `at` (N, 2) by one Newton step, and whether it is a near saddle."""
+    """Return the stationary point next to each of the pixels `at` (N, 2), and whether it is a saddle and near."""
     u, v = at[:, 0], at[:, 1]
     patch = {(i, j): smooth[v + j, u + i].astype(np.float64) for i in (-1, 0, 1) for j in (-1, 0, 1)}
     gu, gv = 0.5 * (patch[1, 0] - patch[-1, 0]), 0.5 * (patch[0, 1] - patch[0, -1])
