@@ -194,7 +194,7 @@ def _directions(
         field2 = direction_field(second, view2, support=support, window=window)
         for k, (field, index) in enumerate(((field1, i), (field2, j))):
             vectors[k].append(field.vectors[index])
-            covariances[k].append(field.covariance[index, :2])
+            covariances[k].append(field.covariance[index])
         valid.append(field1.valid[i] & field2.valid[j])
     directions = DirectionPairs(
         np.concatenate(vectors[0]),
@@ -203,8 +203,7 @@ def _directions(
         pixels1=matches.pixels1,
         pixels2=matches.pixels2,
     )
-    # The diagonal is the sum of the other two, so its noise is not independent of theirs.
-    noise = DirectionNoise.independent(np.concatenate(covariances[0]), np.concatenate(covariances[1])).with_sum(0, 1)
+    noise = DirectionNoise.of_board(np.concatenate(covariances[0]), np.concatenate(covariances[1]))
     return directions, noise
 
 

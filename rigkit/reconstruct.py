@@ -7,6 +7,7 @@ likelihood refines the pose; rays are intersected optimally, affinities give nor
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -14,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.affine.affinities import Affinities, EpipolarNormals
-from rigkit.affine.normal import NormalEstimate, estimate_normals
+from rigkit.affine.geometry_noise import geometry_covariance
+from rigkit.affine.normal import estimate_normals
 from rigkit.affine.registry import affines_from_directions, needs_epipolar
-from rigkit.arrays import BoolArray, FloatArray, Mat3, Pixels
+from rigkit.arrays import Affines, BoolArray, FloatArray, Mat3, Pixels
 from rigkit.boards import Board
 from rigkit.cameras.base import Camera
 from rigkit.cloud import OrientedCloud
@@ -153,7 +155,13 @@ def _reconstruct(
     if needs_epipolar(affine_method):
         affinities = _affinities(pair, affine_method, E21, scale)
         matches = pair.matches.with_affinities(affinities.A21, affinities.sigma_A)
-    cloud, kept = _cloud(pair, metric, affinities, image1)
+    affines: Callable[[EpipolarNormals], Affines] | None = None
+    if needs_epipolar(affine_method):
+
+        def affines(epipolar: EpipolarNormals) -> Affines:
+            return affines_from_directions(pair.directions, affine_method, epipolar=epipolar).A21
+
+    cloud, kept = _cloud(pair, metric, affinities, affines, image1)
     if not kept.all():
         lost = int((~kept).sum())
         notes.append(f"{lost} of {len(kept)} corners have no {affine_method} normal or point and were left out")
@@ -206,14 +214,30 @@ def _affinities(pair: MatchedPair, method: str, E21: Mat3, scale: str) -> Affini
 
 
 def _cloud(
-    pair: MatchedPair, metric: MetricPose, affinities: Affinities, image1: NDArray[np.generic] | None
+    pair: MatchedPair,
+    metric: MetricPose,
+    affinities: Affinities,
+    affines: Callable[[EpipolarNormals], Affines] | None,
+    image1: NDArray[np.generic] | None,
 ) -> tuple[OrientedCloud, BoolArray]:
     """Return the oriented cloud and which of the matches are in it."""
     pose = metric.cam2_from_cam1
     points, covariance, seen = triangulate_matches(pair.captured, pose, metric.covariance)
     m = pair.matches
     J1, J2 = pair_projection_jacobians(points, m.rays1, m.jacobians1, m.rays2, m.jacobians2, pose)
-    normals: NormalEstimate = estimate_normals(J1, J2, affinities.A21, covariance=affinities.covariance)
+    geometry = geometry_covariance(
+        m.rays1,
+        m.jacobians1,
+        m.rays2,
+        m.jacobians2,
+        pose,
+        # Affinities that follow from the epipolar geometry move with it.
+        affines if affines is not None else affinities.A21,
+        sigma1_px=m.sigma1_px,
+        sigma2_px=m.sigma2_px,
+        pose_covariance=metric.covariance,
+    )
+    normals = estimate_normals(J1, J2, affinities.A21, covariance=affinities.covariance, geometry=geometry)
     kept = seen & normals.valid & np.isfinite(covariance).all(axis=(1, 2))
     if not kept.any():
         raise DegenerateError("no corner has both a point and a normal; check directions and baseline")
