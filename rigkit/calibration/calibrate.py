@@ -75,7 +75,7 @@ def calibrate(
     degree : size of a model that comes in several (degree of "scaramuzza", terms of "brown"); by default chosen by
         held-out error.
     board : "flat", "warp", "released", or "auto": chosen by held-out error.
-    folds : of the cross-validation over images; 0 for none (choices then rest on BIC).
+    folds : of the cross-validation over images; 0 for none: choices then rest on BIC, and halves are not compared.
     progress : told of the models tried.
 
     Raises
@@ -107,7 +107,7 @@ def calibrate(
         chosen = _choose(observations, shapes, SHAPE_MARGIN)
         candidates += [c for c in _described(observations, shapes, chosen, SHAPE_MARGIN) if "board" in c.name]
     result = assemble(observations, chosen.fit, chosen.heldout_px, dropped, tuple(candidates))
-    return replace(result, verdicts=judge(result, moved_lens(observations, chosen.fit)))
+    return replace(result, verdicts=judge(result, moved_lens(observations, chosen.fit) if folds else ()))
 
 
 def _wanted(model: str, degree: int | None) -> list[tuple[str, type[Camera], int | None]]:
