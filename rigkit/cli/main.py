@@ -22,7 +22,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "detect": ("rigkit.cli.detect", "corners of every chessboard in the images"),
     "calibrate": ("rigkit.cli.calibrate", "calibrate a camera from images of chessboards"),
     "diff": ("rigkit.cli.diff", "difference of two calibrations over the image; same camera or not"),
-    "rectify": ("rigkit.cli.rectify", "perspective, cylindrical or equirectangular image from any camera's image"),
+    "rectify": ("rigkit.cli.rectify", "perspective, cylindrical, equirectangular or stereo images from any camera's"),
     "reconstruct": ("rigkit.cli.reconstruct", "oriented clouds (PLY) and pictures of every pair"),
     "validate": ("rigkit.cli.validate", "the tables against measured truth, report and PLY; exit 1 if a check fails"),
     "simulate": ("rigkit.cli.simulate", "the synthetic study: sweeps over noise, box plots, tables"),

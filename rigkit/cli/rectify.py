@@ -1,24 +1,36 @@
-"""`rigkit rectify`: an image as an ideal camera would have taken it."""
+"""`rigkit rectify`: an image as an ideal camera would have taken it, or two whose rows correspond."""
 
 from __future__ import annotations
 
 import argparse
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rigkit.errors import InputError
 
-HELP = "perspective, cylindrical or equirectangular image from any camera's image"
+if TYPE_CHECKING:
+    from rigkit.cameras.rectify import RectifyMap
+
+HELP = "perspective, cylindrical or equirectangular image from any camera's image, or a stereo pair"
 
 IMAGE_SIZE = re.compile(r"^(\d+)[xX](\d+)$")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("image", metavar="IMAGE", help="an image as the camera took it")
-    parser.add_argument("--camera", required=True, metavar="CALIB", help="the camera's calibration.json")
+    parser.add_argument(
+        "image2", metavar="IMAGE2", nargs="?", help="taken at once by another camera of the rig: stereo"
+    )
+    parser.add_argument("--camera", metavar="CALIB", help="the camera's calibration.json")
     parser.add_argument("-o", "--output", required=True, metavar="OUT", help="the image to write (.png, .tif, .jpg)")
     parser.add_argument("--force", action="store_true", help="replace an existing file")
     parser.add_argument("--json", action="store_true", help="the result for programs, on stdout")
+    stereo = parser.add_argument_group("stereo", "writes OUT-1 and OUT-2, in which a point has the same row")
+    stereo.add_argument("--rig", metavar="RIG", help="the rig's file, instead of --camera")
+    stereo.add_argument(
+        "--names", nargs=2, metavar=("ONE", "TWO"), help="cameras of the two images (default: the rig's first two)"
+    )
     view = parser.add_argument_group("view")
     view.add_argument("--projection", choices=("perspective", "cylindrical", "equirectangular"), default="perspective")
     view.add_argument("--hfov-deg", type=float, metavar="DEG", help="from the left edge to the right (default: suits)")
@@ -35,15 +47,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    if args.image2 is not None or args.rig is not None:
+        return _run_stereo(args)
     import numpy as np
 
     from rigkit.cameras.rectify import rectify_map, rotation_from_view_angles
     from rigkit.cameras.targets import target_camera
-    from rigkit.cli.console import print_json
     from rigkit.io.calibration_file import load_camera
-    from rigkit.io.files import ensure_writable, write_atomic
-    from rigkit.io.images import read_image
+    from rigkit.io.files import ensure_writable
 
+    if args.camera is None:
+        raise InputError("rectify: --camera is missing; give the camera's calibration.json")
     ensure_writable(args.output, force=args.force)
     camera = load_camera(args.camera)
     target = target_camera(
@@ -53,28 +67,69 @@ def run(args: argparse.Namespace) -> int:
         size_px=_size(args.size),
     )
     rotation = rotation_from_view_angles(*np.radians([args.yaw_deg, args.pitch_deg, args.roll_deg]))
-    remap = rectify_map(camera, target, target_from_cam=rotation)
+    return _report(args, [_write(args, args.image, rectify_map(camera, target, target_from_cam=rotation), args.output)])
+
+
+def _run_stereo(args: argparse.Namespace) -> int:
+    from rigkit.cameras.stereo import rectify_pair
+    from rigkit.io.files import ensure_writable
+    from rigkit.io.rig_file import load_rig
+
+    if args.image2 is None or args.rig is None:
+        raise InputError("rectify: a stereo pair needs two images and --rig RIG.json")
+    if args.hfov_deg is not None or args.size is not None or args.yaw_deg or args.pitch_deg or args.roll_deg:
+        raise InputError("rectify: the baseline decides the view of a stereo pair; leave out its angles and its size")
+    rig = load_rig(args.rig)
+    names = list(args.names or list(rig)[:2])
+    missing = [name for name in names if name not in rig]
+    if missing or len(names) != 2:
+        raise InputError(f"'{args.rig}': no camera '{', '.join(missing)}'; there are {', '.join(rig)}")
+    (camera1, cam1_from_rig), (camera2, cam2_from_rig) = (rig[name] for name in names)
+    out = Path(args.output)
+    outputs = [str(out.with_name(f"{out.stem}-{i}{out.suffix}")) for i in (1, 2)]
+    ensure_writable(outputs, force=args.force)
+    pair = rectify_pair(camera1, camera2, cam2_from_rig @ cam1_from_rig.inverse(), projection=args.projection)
+    images, maps = (args.image, args.image2), (pair.map1, pair.map2)
+    done = [_write(args, image, remap, o) for image, remap, o in zip(images, maps, outputs, strict=True)]
+    return _report(args, done, {"rect2_from_rect1_mm": pair.rect2_from_rect1.translation_mm.tolist()})
+
+
+def _write(args: argparse.Namespace, image: str, remap: RectifyMap, output: str) -> dict[str, Any]:
+    """Resample, write, and return what to say of it."""
+    from rigkit.io.files import write_atomic
+    from rigkit.io.images import read_image
+
     covered = float(remap.coverage().mean())
     if covered == 0.0:
         raise InputError("rectify: the camera sees nothing of this view; change --yaw-deg, --pitch-deg or --hfov-deg")
-    image = remap.image(read_image(args.image), interpolation=args.interpolation)
-    write_atomic(args.output, _encoded(image, args.output), force=args.force)
+    pixels = remap.image(read_image(image), interpolation=args.interpolation)
+    write_atomic(output, _encoded(pixels, output), force=args.force)
+    target = remap.target
+    return {
+        "image": output,
+        "projection": args.projection,
+        "model": target.model,
+        "size_px": list(target.size_px),
+        "parameters": dict(zip(target.parameter_names(), target.parameters.tolist(), strict=True)),
+        "target_from_cam": remap.target_from_cam.tolist(),
+        "covered": covered,
+    }
+
+
+def _report(args: argparse.Namespace, done: list[dict[str, Any]], stereo: dict[str, Any] | None = None) -> int:
+    from rigkit.cli.console import print_json
+
     if args.json:
-        result = {
-            "image": args.output,
-            "projection": args.projection,
-            "size_px": list(target.size_px),
-            "parameters": dict(zip(target.parameter_names(), target.parameters.tolist(), strict=True)),
-            "target_from_cam": rotation.tolist(),
-            "covered": covered,
-        }
-        print_json(result)
-    else:
-        width, height = target.size_px
+        print_json(done[0] if stereo is None else {"images": done, **stereo})
+        return 0
+    for one in done:
+        (width, height), focal = one["size_px"], one["parameters"]["fx"]
         print(
-            f"{args.output}: {args.projection}, {width} x {height} px, focal length {target.parameters[0]:.2f} px, "
-            f"{100.0 * covered:.1f} % of it seen by the camera"
+            f"{one['image']}: {one['projection']}, {width} x {height} px, focal length {focal:.2f} px, "
+            f"{100.0 * one['covered']:.1f} % of it seen by the camera"
         )
+    if stereo is not None:
+        print(f"baseline {abs(stereo['rect2_from_rect1_mm'][0]):.3f} mm along the rows")
     return 0
 
 

@@ -85,6 +85,16 @@ def test_terms_of_brown() -> None:
         Scaramuzza.from_radial_curve(SIZE_PX, CENTRE_PX, theta, radius, order=12)
 
 
+@pytest.mark.parametrize(("model", "squeeze"), [("kannala_brandt", 1.0), ("scaramuzza", 1.0), ("brown", 0.7)])
+def test_a_curve_that_flattens_at_its_end_does_not_fold_the_camera(model: str, squeeze: float) -> None:
+    """The polynomial of most terms would turn down just inside such a curve, and the corners would be lost."""
+    theta = squeeze * np.linspace(0.0, 1.4, 60)
+    radius = np.linspace(0.0, 560.0, 60)
+    radius[-8:] = radius[-9] + np.linspace(0.01, 0.5, 8)
+    camera = MODELS[model].from_radial_curve(SIZE_PX, CENTRE_PX, theta, radius)
+    assert camera.max_angle_rad > theta[-1]
+
+
 def test_curves_that_make_no_camera() -> None:
     theta, radius = _curve(60)
     for bad_theta, bad_radius, words in (

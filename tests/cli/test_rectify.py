@@ -11,8 +11,12 @@ import pytest
 
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cli.main import main
-from rigkit.io.calibration_file import save_camera
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
+from rigkit.io.calibration_file import camera_to_json, save_camera
 
+ROW_PX = 0.2
+"""Centre of a blob of 3 px in 8-bit pixels, thresholded: the frame of the blob is distorted between the views."""
 CAMERA = KannalaBrandt((160, 120), np.array([48.0, 48.0, 79.5, 59.5, 0.0, 0.0, 0.0, 0.0]))
 
 
@@ -78,3 +82,40 @@ def test_nothing_is_overwritten_and_errors_are_one_line(
     assert not (tmp_path / "a.png").exists()
     assert main([*start, "-o", str(out), "--force"]) == 0
     assert cv2.imread(str(out)) is not None
+
+
+@pytest.mark.parametrize("projection", ["perspective", "equirectangular"])
+def test_a_pair_gets_the_same_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str], projection: str) -> None:
+    """A bright blob in both images, where each camera sees one point: after rectification on one row."""
+    poses = {"left": Rigid3.identity(), "right": Rigid3(exp_so3(np.array([0.05, -0.1, 0.2])), [-200.0, 20.0, 10.0])}
+    entries = []
+    for name, pose in poses.items():
+        blob, _ = CAMERA.project(pose.apply(np.array([150.0, 200.0, 900.0])))
+        v, u = np.mgrid[0:120, 0:160]
+        image = 30.0 + 200.0 * np.exp(-((u - blob[0]) ** 2 + (v - blob[1]) ** 2) / 18.0)
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.rint(image).astype(np.uint8))
+        matrix = pose.matrix()[:3].tolist()
+        entries.append({"name": name, "camera": camera_to_json(CAMERA), "cam_from_rig": matrix, "rms_px": 0.1})
+    rig = tmp_path / "rig.json"
+    rig.write_text(json.dumps({"schema": "rigkit.rig/1", "cameras": entries}))
+    images = [str(tmp_path / "left.png"), str(tmp_path / "right.png")]
+    arguments = ["rectify", *images, "--rig", str(rig), "-o", str(tmp_path / "r.png"), "--projection", projection]
+    assert main([*arguments, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert abs(result["rect2_from_rect1_mm"][0]) == pytest.approx(np.linalg.norm(poses["right"].translation_mm))
+    centres = []
+    for i in (1, 2):
+        image = cv2.imread(str(tmp_path / f"r-{i}.png"), 0)
+        assert image is not None
+        weight = np.clip(image.astype(float) - 60.0, 0.0, None)
+        v, u = np.mgrid[0 : image.shape[0], 0 : image.shape[1]]
+        centres.append([(u * weight).sum() / weight.sum(), (v * weight).sum() / weight.sum()])
+    assert centres[0][1] == pytest.approx(centres[1][1], abs=ROW_PX)
+    assert abs(centres[0][0] - centres[1][0]) > 3.0
+    assert main(arguments) == 2
+    assert "exists" in capsys.readouterr().err
+    for extra, words in ((["--hfov-deg", "60"], "baseline"), (["--names", "left", "up"], "no camera 'up'")):
+        assert main([*arguments, "--force", *extra]) == 2
+        assert words in capsys.readouterr().err
+    assert main(["rectify", *images, "--camera", str(rig), "-o", str(tmp_path / "x.png")]) == 2
+    assert "--rig" in capsys.readouterr().err
