@@ -74,7 +74,7 @@ def solution_normal(observations: Observations, fit: Fit) -> Normal:
     weight = fit.weight(observations)
     normal = normal_equations(state.camera, points, lever, state.rotation, state.shape, observations, weight, None)
     sigma = fit.sigma_px if np.isfinite(fit.sigma_px) else 1.0
-    return normal.with_prior((sigma / state.shape.sigma) ** 2, state.unknowns)
+    return normal.with_priors(state.camera, sigma, state.shape.sigma, state.unknowns)
 
 
 def frame_covariance(normal: Normal, state: State) -> FloatArray:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.arrays import FloatArray, Mat3, Points
+from rigkit.calibration.camera_prior import camera_prior
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.shape import ShapeModel
 from rigkit.cameras.base import Camera
@@ -49,14 +50,21 @@ class Normal:
     p: FloatArray
     points_from: int | None = None
 
-    def with_prior(self, weight: FloatArray, unknowns: FloatArray) -> Normal:
-        """Add zero-mean priors of squared weight (B,) on the last B globals, which are now at `unknowns`."""
-        if not weight.size:
-            return self
-        first = len(self.g) - weight.size
+    def with_priors(self, camera: Camera, sigma_px: float, shape_sigma: FloatArray, unknowns: FloatArray) -> Normal:
+        """Add the prior of the camera on the first globals, and zero-mean priors of the shape's unknowns on the last.
+
+        `sigma_px` is the standard deviation of a corner: what a residual of one px weighs against a prior.
+        """
         gg, g = self.gg.copy(), self.g.copy()
-        gg[np.arange(first, len(g)), np.arange(first, len(g))] += weight
-        g[first:] -= weight * unknowns
+        rows, residual = camera_prior(camera)
+        p = camera.parameters.size
+        gg[:p, :p] += sigma_px**2 * rows.T @ rows
+        g[:p] -= sigma_px**2 * rows.T @ residual
+        if unknowns.size:
+            weight = (sigma_px / shape_sigma) ** 2
+            own = np.arange(len(g) - unknowns.size, len(g))
+            gg[own, own] += weight
+            g[own] -= weight * unknowns
         return replace(self, gg=gg, g=g)
 
     def step(self, damping: float) -> Step | None:

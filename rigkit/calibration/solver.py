@@ -17,6 +17,7 @@ from typing import TypeVar
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray, Mat3, Points
+from rigkit.calibration.camera_prior import camera_prior
 from rigkit.calibration.normal import Normal, Step, normal_equations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Convergence
@@ -113,7 +114,8 @@ def solve(
     weight : (V, C) weights of the residuals (not squared), zero for corners to ignore; the observations' own by
         default.
     loss_px : scale of the Cauchy loss; None for least squares.
-    prior_sigma_px : standard deviation of a corner, which sets residuals against the prior of the shape.
+    prior_sigma_px : standard deviation of a corner, which sets residuals against the priors of shape and camera; zero
+        for none.
     """
     weight = observations.weight if weight is None else weight
     solver = _Solver(observations, weight, loss_px, prior_sigma_px)
@@ -133,7 +135,9 @@ class _Solver:
         squared = (residuals.px**2).sum(axis=-1) * self.weight**2
         if self.loss_px is not None:
             squared = self.loss_px**2 * np.log1p(squared / self.loss_px**2)
+        _, camera = camera_prior(state.camera)
         total = float(squared.sum()) + float((self.prior(state) * state.unknowns**2).sum())
+        total += self.prior_sigma_px**2 * float(camera @ camera)
         return total if np.isfinite(total) else np.inf
 
     def prior(self, state: State) -> FloatArray:
@@ -149,7 +153,7 @@ class _Solver:
             self.observations,
             self.weight,
             self.loss_px,
-        ).with_prior(self.prior(state), state.unknowns)
+        ).with_priors(state.camera, self.prior_sigma_px, state.shape.sigma, state.unknowns)
 
 
 def minimise(
