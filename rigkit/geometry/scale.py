@@ -19,8 +19,8 @@ from rigkit.geometry.rotation import exp_so3, nearest_rotation, skew
 __all__ = ["board_scales", "metric_scale"]
 
 MIN_CORNERS = 4
-CAUCHY_SCALE = 3.0
-"""In standard deviations of a point (three components): Gaussian corners are hardly touched."""
+OUTLYING = 14.2
+"""Squared distance in sigmas (three components) from which a corner loses weight: one in 400 Gaussian ones does."""
 ITERATIONS = 15
 
 
@@ -114,7 +114,7 @@ def _similarity_scale(points: Points, model: Points, covariances: FloatArray | N
         if covariances is None:
             # Three components of a point; the median of their sum of squares is 2.37 variances.
             noise = max(float(np.median(square)) / 2.366, 1e-300)
-        w = 1.0 / (1.0 + square / (noise * CAUCHY_SCALE**2))
+        w = np.minimum(1.0, noise * OUTLYING / np.maximum(square, 1e-300)) ** 2
         J = np.concatenate([turned[:, :, None], -k * skew(turned), np.broadcast_to(np.eye(3), whiten.shape)], axis=2)
         J = whiten @ J
         gram = np.einsum("n,nij,nik->jk", w, J, J)
@@ -124,7 +124,6 @@ def _similarity_scale(points: Points, model: Points, covariances: FloatArray | N
             break
     if not k > 0.0:
         return float("nan"), float("nan")
-    # Sandwich over model variance would need the weights' derivative; the weighted residual variance is enough here.
     spread = float(np.sum(w * square)) / max(3.0 * w.sum() - 7.0, 1.0)
     spread = spread if covariances is None else max(spread, 1.0)
     return 1.0 / k, float(np.sqrt(spread * np.linalg.inv(gram)[0, 0])) / k**2
