@@ -189,7 +189,10 @@ def _mixed(one: tuple[Float32, ...], two: tuple[Float32, ...], rho: Float32) -> 
 
 
 def linearise(values: FloatArray, window: Window, geometry: Geometry) -> Float32:
-    """Return the derivatives (N, 9, P) of the brightness and, as a tenth row, the residuals; zero in the padding."""
+    """Return the derivatives (N, 9, P) of the brightness and, as a tenth row, the residuals; zero in the padding.
+
+    How the blur mixes lines that cross aslant is differentiated to first order in their cosine.
+    """
     one, two = _parts(values, window, geometry)
     rho = _oblique(values)
     f1, slope1, bow1, grown1, along1, aside1, cos1, sin1, kappa1 = one

@@ -5,8 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-
 from helpers.detection_scenes import corner_scene, errors_by_position, fisheye, match, regular, single
+
 from rigkit.boards import Board
 from rigkit.corners.detect import detect_boards
 from rigkit.errors import InputError
@@ -112,7 +112,9 @@ def test_ruler_across_a_board_leaves_one_board_with_a_gap(rng: np.random.Generat
     scene = single(Board("a", 9, 6, 30.0, 30.0), [0.2, 0.25, 0.1], 600.0)
     image = scene.image(rng)
     middle = image.shape[0] // 2
-    cv2.fillConvexPoly(image, np.array([[0, middle - 70], [639, middle + 40], [639, middle + 62], [0, middle - 48]]), 180)
+    cv2.fillConvexPoly(
+        image, np.array([[0, middle - 70], [639, middle + 40], [639, middle + 62], [0, middle - 48]]), 180
+    )
     (found,) = detect_boards(image)
     assert (found.columns, found.rows) == (9, 6)
     assert 35 < len(found.grid) < 54

@@ -1,0 +1,85 @@
+"""`rigkit detect` from the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from helpers.detection_scenes import single
+
+from rigkit.boards import Board
+from rigkit.cli.main import main
+from rigkit.io.corners_file import read_corners
+
+BOARD_TOML = """schema = "rigkit.board/1"
+columns = 9
+rows = 6
+square_x_mm = 30.0
+square_y_mm = 30.0
+"""
+
+
+@pytest.fixture
+def images(tmp_path: Path) -> Path:
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for number, turn in enumerate((0.1, 0.4, -0.3)):
+        scene = single(Board("a", 9, 6, 30.0, 30.0), [0.2, turn, turn], 600.0)
+        cv2.imwrite(str(folder / f"{number}.png"), scene.image(np.random.default_rng(number)))
+    (tmp_path / "a9x6.toml").write_text(BOARD_TOML)
+    return folder
+
+
+def test_folder_to_corners_and_overlays_whatever_the_number_of_processes(images: Path, tmp_path: Path) -> None:
+    texts = []
+    for jobs in ("1", "2"):
+        corners = tmp_path / f"corners{jobs}.csv"
+        overlays = tmp_path / f"overlay{jobs}"
+        arguments = [str(images), "--board", str(tmp_path / "a9x6.toml"), "-o", str(corners)]
+        assert main(["detect", *arguments, "--overlay", str(overlays), "--jobs", jobs]) == 0
+        texts.append(corners.read_text())
+        assert sorted(p.name for p in overlays.iterdir()) == ["0.png", "1.png", "2.png"]
+    assert texts[0] == texts[1]
+    found = read_corners(tmp_path / "corners1.csv", [Board("a9x6", 9, 6, 30.0, 30.0)])
+    assert [len(items) for items in found.values()] == [1, 1, 1]
+    assert all(items[0].complete and items[0].board_id for items in found.values())
+
+
+def test_json_is_the_result_on_stdout(images: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["detect", str(images / "0.png"), "--json", "--jobs", "1"]) == 0
+    (items,) = json.loads(capsys.readouterr().out).values()
+    assert [len(item["pixels"]) for item in items] == [54]
+
+
+def test_existing_output_stays(images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    corners = tmp_path / "corners.csv"
+    corners.write_text("mine")
+    assert main(["detect", str(images), "-o", str(corners), "--jobs", "1"]) == 2
+    assert corners.read_text() == "mine"
+    assert "--force" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("what", ["missing", "empty folder", "truncated", "jobs"])
+def test_bad_input_is_one_line(what: str, images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "empty").mkdir()
+    cut = tmp_path / "cut.png"
+    cut.write_bytes((images / "0.png").read_bytes()[:5000])
+    arguments = {
+        "missing": ["no/such.png"],
+        "empty folder": [str(tmp_path / "empty")],
+        "truncated": [str(cut), "--jobs", "1"],
+        "jobs": [str(images), "--jobs", "0"],
+    }[what]
+    assert main(["detect", *arguments]) == 2
+    error = [line for line in capsys.readouterr().err.splitlines() if line.startswith("rigkit:")]
+    assert len(error) == 1
+
+
+def test_no_board_anywhere_fails_the_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cv2.imwrite(str(tmp_path / "flat.png"), np.full((100, 120), 90, np.uint8))
+    assert main(["detect", str(tmp_path / "flat.png"), "-o", str(tmp_path / "c.csv"), "--jobs", "1"]) == 1
+    assert "no chessboard" in capsys.readouterr().err
+    assert not (tmp_path / "c.csv").exists()

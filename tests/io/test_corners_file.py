@@ -1,0 +1,62 @@
+"""Corners files: what was written comes back; what cannot be understood is refused with its line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rigkit.boards import Board
+from rigkit.detections import BoardDetection
+from rigkit.errors import InputError
+from rigkit.io.corners_file import COLUMNS, read_corners, write_corners
+
+WRITTEN_PX = 1e-5
+"""Five decimals."""
+
+
+def detections() -> dict[str, tuple[BoardDetection, ...]]:
+    board = Board("a", 4, 3, 30.0, 30.0)
+    grid = board.grid()
+    pixels = 12.345678 * grid + 100.0
+    named = BoardDetection("a", 4, 3, grid, pixels, np.full(12, 0.0123))
+    partial = BoardDetection(None, 5, 4, grid[:7], pixels[:7] + 200.0, np.full(7, 0.02))
+    return {"one, with comma.png": (named, partial), "two.png": (partial,)}
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    path = tmp_path / "corners.csv"
+    write_corners(path, detections())
+    assert path.read_text().splitlines()[0] == ",".join(COLUMNS)
+    back = read_corners(path, [Board("a", 4, 3, 30.0, 30.0)])
+    assert list(back) == list(detections())
+    for image, expected in detections().items():
+        for one, two in zip(back[image], expected, strict=True):
+            assert (one.board_id, one.columns, one.rows) == (two.board_id, two.columns, two.rows)
+            assert np.array_equal(one.grid, two.grid)
+            assert np.abs(one.pixels - two.pixels).max() <= WRITTEN_PX
+            assert np.abs(one.sigma_px - two.sigma_px).max() <= WRITTEN_PX
+
+
+def test_existing_file_is_left(tmp_path: Path) -> None:
+    path = tmp_path / "corners.csv"
+    path.write_text("mine")
+    with pytest.raises(InputError, match="--force"):
+        write_corners(path, detections())
+    assert path.read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    "text, word",
+    [
+        ("image,board\n", "first line"),
+        (",".join(COLUMNS) + "\na.png,b,0,zero,1,2,0.1\n", "line 2"),
+        (",".join(COLUMNS) + "\na.png,b,0,0,1\n", "line 2"),
+    ],
+)
+def test_bad_files_are_refused(text: str, word: str, tmp_path: Path) -> None:
+    path = tmp_path / "corners.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=word):
+        read_corners(path)

@@ -1,0 +1,23 @@
+"""The overlay draws each board over a copy of the image."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.boards import Board
+from rigkit.detections import BoardDetection
+from rigkit.report.overlay import COLOURS, draw_boards
+
+
+def test_rows_are_drawn_through_the_corners() -> None:
+    board = Board("a", 4, 3, 30.0, 30.0)
+    pixels = 30.0 * board.grid() + 40.0
+    found = BoardDetection("a", 4, 3, board.grid(), pixels, np.full(12, 0.01))
+    for image in (np.full((150, 200), 128, np.uint8), np.full((150, 200, 3), 30000, np.uint16)):
+        before = image.copy()
+        picture = draw_boards(image, [found])
+        assert np.array_equal(image, before)
+        assert picture.shape == (150, 200, 3)
+        middles = (0.5 * (pixels[:-1] + pixels[1:]))[[0, 1, 4, 5, 8, 9]].astype(int)
+        assert all((picture[v, u] == COLOURS[0]).all() for u, v in middles)
+        assert (picture[140, 190] == picture[5, 190]).all()
