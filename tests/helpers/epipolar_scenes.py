@@ -42,9 +42,14 @@ def pair(
     pose: Rigid3 | None = None,
 ) -> tuple[Matches, Rigid3, np.ndarray]:
     """Matches, true pose, points. `sigma_A` 0 gives exact affinities with a nominal sigma; None gives none."""
+    given, points = pose, []
     pose = pose_of(kind, rng) if pose is None else pose
-    points: list[np.ndarray] = []
+    drawn = 0
     while len(points) < count:
+        drawn += 1
+        if given is None and drawn > 40 * (len(points) + 5):
+            # The two views hardly overlap: another pose.
+            pose, points, drawn = pose_of(kind, rng), [], 0
         if camera is FISHEYE:
             x = unit(rng.normal(size=3) * [1, 1, 0.7]) * rng.uniform(600, 2000)
         else:
