@@ -23,7 +23,7 @@ from rigkit.boards import Board
 from rigkit.cameras.base import Camera
 from rigkit.cloud import OrientedCloud
 from rigkit.errors import DegenerateError
-from rigkit.fundamental.metric import MetricPose, metric_pose, triangulate_matches
+from rigkit.fundamental.metric import metric_pose, triangulate_matches
 from rigkit.fundamental.pose import choose_pose, essential_from_pose
 from rigkit.fundamental.refine import refine_pose
 from rigkit.fundamental.registry import fundamental_for
@@ -37,7 +37,7 @@ from rigkit.posetype import PoseType
 if TYPE_CHECKING:
     from rigkit.pairing import MatchedPair
 
-__all__ = ["Reconstruction", "reconstruct_pair"]
+__all__ = ["Reconstruction", "decide_pose_type", "oriented_cloud", "reconstruct_pair"]
 
 MAX_BASELINE_SIGMA = 0.2
 """A baseline known to no better than a fifth of itself is no baseline: whatever is built on it is noise."""
@@ -136,7 +136,7 @@ def _reconstruct(
 ) -> Reconstruction:
     notes = list(pair.notes)
     by_points = fundamental_for(PoseType.GENERAL).solve(pair.matches)
-    pose_type, level_sigma_rad, remark = _decide(pair.captured, pose_type, level_sigma_rad)
+    pose_type, level_sigma_rad, remark = decide_pose_type(pair.captured, pose_type, level_sigma_rad)
     notes += remark
     affinities = _affinities(pair, affine_method, by_points.E21, scale)
     matches = pair.matches.with_affinities(affinities.A21, affinities.sigma_A)
@@ -161,7 +161,16 @@ def _reconstruct(
         def affines(epipolar: EpipolarNormals) -> Affines:
             return affines_from_directions(pair.directions, affine_method, epipolar=epipolar).A21
 
-    cloud, kept = _cloud(pair, metric, affinities, affines, image1)
+    cloud, kept = oriented_cloud(
+        pair.captured,
+        pair.matches,
+        metric.cam2_from_cam1,
+        metric.covariance,
+        affinities,
+        affines=affines,
+        image1=image1,
+        board_ids=tuple(board.board_id for board in pair.boards),
+    )
     if not kept.all():
         lost = int((~kept).sum())
         notes.append(f"{lost} of {len(kept)} corners have no {affine_method} normal or point and were left out")
@@ -187,7 +196,7 @@ def _reconstruct(
     )
 
 
-def _decide(
+def decide_pose_type(
     captured: Matches, declared: PoseType, level_sigma_rad: float | None
 ) -> tuple[PoseType, float | None, tuple[str, ...]]:
     """Return the pose type to use, the level's sigma (None: exact, or nothing to hold), and what there is to say."""
@@ -213,44 +222,60 @@ def _affinities(pair: MatchedPair, method: str, E21: Mat3, scale: str) -> Affini
     return affines_from_directions(pair.directions, method, epipolar=epipolar, scale=scale, noise=pair.noise)
 
 
-def _cloud(
-    pair: MatchedPair,
-    metric: MetricPose,
+def oriented_cloud(
+    captured: Matches,
+    matches: Matches,
+    cam2_from_cam1: Rigid3,
+    pose_covariance: FloatArray,
     affinities: Affinities,
-    affines: Callable[[EpipolarNormals], Affines] | None,
-    image1: NDArray[np.generic] | None,
+    *,
+    affines: Callable[[EpipolarNormals], Affines] | None = None,
+    image1: NDArray[np.generic] | None = None,
+    board_ids: tuple[str, ...] = (),
 ) -> tuple[OrientedCloud, BoolArray]:
-    """Return the oriented cloud and which of the matches are in it."""
-    pose = metric.cam2_from_cam1
-    points, covariance, seen = triangulate_matches(pair.captured, pose, metric.covariance)
-    m = pair.matches
-    J1, J2 = pair_projection_jacobians(points, m.rays1, m.jacobians1, m.rays2, m.jacobians2, pose)
+    """Return the oriented cloud, and which (N,) of the matches are in it: those with a point and a normal.
+
+    Parameters
+    ----------
+    captured : the points in captured pixels; they are triangulated.
+    matches : the same points in the coordinates of the affinities.
+    cam2_from_cam1, pose_covariance : the cloud has the unit of its translation.
+    affinities : of the points.
+    affines : affinities for an epipolar geometry, where they follow from it and so move with it.
+    image1 : colours.
+
+    Raises
+    ------
+    DegenerateError
+        No match has both a point and a normal.
+    """
+    points, covariance, seen = triangulate_matches(captured, cam2_from_cam1, pose_covariance)
+    m = matches
+    J1, J2 = pair_projection_jacobians(points, m.rays1, m.jacobians1, m.rays2, m.jacobians2, cam2_from_cam1)
     geometry = geometry_covariance(
         m.rays1,
         m.jacobians1,
         m.rays2,
         m.jacobians2,
-        pose,
-        # Affinities that follow from the epipolar geometry move with it.
+        cam2_from_cam1,
         affines if affines is not None else affinities.A21,
         sigma1_px=m.sigma1_px,
         sigma2_px=m.sigma2_px,
-        pose_covariance=metric.covariance,
+        pose_covariance=pose_covariance,
     )
     normals = estimate_normals(J1, J2, affinities.A21, covariance=affinities.covariance, geometry=geometry)
     kept = seen & normals.valid & np.isfinite(covariance).all(axis=(1, 2))
     if not kept.any():
-        raise DegenerateError("no corner has both a point and a normal; check directions and baseline")
-    sigma_mm = np.sqrt(np.linalg.eigvalsh(covariance[kept])[:, -1])
+        raise DegenerateError("no match has both a point and a normal; check affinities and baseline")
     cloud = OrientedCloud(
         points[kept],
         normals.normals[kept],
-        _colours(image1, pair.captured.pixels1[kept]),
+        _colours(image1, captured.pixels1[kept]),
         m.board_index[kept],
         m.grid[kept],
-        sigma_mm,
+        np.sqrt(np.linalg.eigvalsh(covariance[kept])[:, -1]),
         normals.sigma_rad[kept],
-        tuple(board.board_id for board in pair.boards),
+        board_ids,
     )
     return cloud, kept
 
