@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from rigkit.cli.console import note, print_json, progress_on_stderr
 from rigkit.cli.workflow import (
+    CROSSCHECK_COVERAGE,
     add_dataset_arguments,
     load_cameras,
     match_images,
@@ -49,7 +50,7 @@ def crosscheck_pair(job: PairJob) -> CrossCheckReport:
 
     matched, _, _ = match_images(job.pair, job.camera1, job.camera2, job.chain)
     other = reconstruct_other_chain(matched, job.pair)
-    return crosscheck(reconstruct_with(matched, job.pair, "3SDIR"), other_chain=other)
+    return crosscheck(reconstruct_with(matched, job.pair, "3SDIR"), other_chain=other, coverage=CROSSCHECK_COVERAGE)
 
 
 def run(args: argparse.Namespace) -> int:

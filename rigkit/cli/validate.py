@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 from rigkit.cli.console import note, print_json, progress_on_stderr
 from rigkit.cli.workflow import (
+    CROSSCHECK_COVERAGE,
     add_dataset_arguments,
+    find_boards,
     load_cameras,
-    match_images,
+    match_found,
     output_folder,
     over_pairs,
     reconstruct_other_chain,
@@ -26,6 +28,7 @@ from rigkit.cli.workflow import (
 if TYPE_CHECKING:
     from rigkit.cli.workflow import LoadedCamera
     from rigkit.io.manifest import Dataset, Pair
+    from rigkit.pairing import MatchedPair
     from rigkit.reconstruct import Reconstruction
     from rigkit.report.page import PairSection
     from rigkit.validation.checks import ValidationReport
@@ -60,8 +63,7 @@ def validate_dataset(args: argparse.Namespace, dataset: Dataset, out: Path) -> i
     jobs = [
         PairJob(
             pair,
-            cameras[pair.camera1.camera_id],
-            cameras[pair.camera2.camera_id],
+            cameras,
             args.chain,
             not args.no_pictures,
             not args.no_crosscheck,
@@ -77,8 +79,7 @@ class PairJob:
     """What one process needs to know of one pair."""
 
     pair: Pair
-    camera1: LoadedCamera
-    camera2: LoadedCamera
+    cameras: Mapping[str, LoadedCamera]
     chain: str
     pictures: bool
     crosscheck: bool
@@ -92,12 +93,31 @@ class PairOutcome:
     reports: tuple[ValidationReport, ...]
     best: ValidationReport
     other_ways: CrossCheckReport | None
+    causes: tuple[str, ...]
     files: Mapping[str, bytes]
     section: PairSection | None
 
 
 def validate_pair(job: PairJob) -> PairOutcome:
     """Reconstruct one pair with every estimator and judge each."""
+    from rigkit.errors import RigkitError
+    from rigkit.validation.diagnose import camera_suspects
+
+    pair = job.pair
+    names = (pair.camera1.camera_id, pair.camera2.camera_id)
+    camera1, camera2 = (job.cameras[name].camera for name in names)
+    found1, found2, image1, image2 = find_boards(pair, camera1, camera2)
+    known = {name: loaded.camera for name, loaded in job.cameras.items() if loaded.camera.size_px == camera1.size_px}
+    causes = camera_suspects(pair.pair_id, names, (found1, found2), pair.boards, known)
+    try:
+        return _judge(job, match_found(pair, camera1, camera2, found1, found2, job.chain), image1, image2, causes)
+    except RigkitError as error:
+        if not causes:
+            raise
+        raise type(error)(f"{error}; probable cause: {'; '.join(causes)}") from error
+
+
+def _judge(job: PairJob, matched: MatchedPair, image1: Any, image2: Any, causes: tuple[str, ...]) -> PairOutcome:
     from rigkit.affine.registry import AFFINE_METHODS
     from rigkit.io.ply import ply_bytes
     from rigkit.report.validation_page import best_report
@@ -105,7 +125,6 @@ def validate_pair(job: PairJob) -> PairOutcome:
     from rigkit.validation.crosscheck import crosscheck
 
     pair = job.pair
-    matched, image1, image2 = match_images(pair, job.camera1.camera, job.camera2.camera, job.chain)
     reconstructions = {method: reconstruct_with(matched, pair, method, image1) for method in AFFINE_METHODS}
     reports = tuple(validate(r, pair.truth, shifts=s) for r, s in _with_shifts(reconstructions, job))
     best = best_report(reports)
@@ -113,9 +132,12 @@ def validate_pair(job: PairJob) -> PairOutcome:
         f"{pair.pair_id}/{method}.ply": ply_bytes(r.cloud) for method, r in reconstructions.items()
     }
     shown = reconstructions[best.affine_method]
-    other_ways = crosscheck(shown, other_chain=reconstruct_other_chain(matched, pair)) if job.crosscheck else None
+    other_ways = None
+    if job.crosscheck:
+        other = reconstruct_other_chain(matched, pair)
+        other_ways = crosscheck(shown, other_chain=other, coverage=CROSSCHECK_COVERAGE)
     section = _pictures(shown, reports, other_ways, image1, image2, files) if job.pictures else None
-    return PairOutcome(pair.pair_id, reports, best, other_ways, files, section)
+    return PairOutcome(pair.pair_id, reports, best, other_ways, causes, files, section)
 
 
 def _with_shifts(
@@ -125,12 +147,13 @@ def _with_shifts(
 
     The likelihood sees the corners, not the affinities: estimators that kept the same corners share the answer.
     """
+    cameras = (job.cameras[job.pair.camera1.camera_id], job.cameras[job.pair.camera2.camera_id])
     known: dict[bytes, CalibrationShifts | None] = {}
     out = []
     for reconstruction in reconstructions.values():
         corners = reconstruction.pixels1.tobytes()
         if corners not in known:
-            known[corners] = shifts_of(reconstruction, job.camera1, job.camera2)
+            known[corners] = shifts_of(reconstruction, *cameras)
         out.append((reconstruction, known[corners]))
     return out
 
@@ -167,15 +190,19 @@ def finish(args: argparse.Namespace, dataset: Dataset, outcomes: list[PairOutcom
     from rigkit.report.page import build_page
     from rigkit.report.tables import tables_to_csv, tables_to_json, tables_to_latex, tables_to_markdown, tables_to_text
     from rigkit.report.validation_page import crosscheck_table, summary_table
+    from rigkit.validation.diagnose import suspects
     from rigkit.validation.tables import build_tables
 
     reports = [report for outcome in outcomes for report in outcome.reports]
-    passed = all(report.passed for report in reports)
+    compared = [outcome.other_ways for outcome in outcomes if outcome.other_ways is not None]
+    passed = all(report.passed for report in reports) and all(report.passed for report in compared)
+    causes = [cause for outcome in outcomes for cause in outcome.causes]
+    causes += suspects([outcome.best for outcome in outcomes])
+    causes += [f"pair '{report.pair_id}': {words}" for report in compared for words in report.suspects]
     summary = summary_table([outcome.best for outcome in outcomes])
     tables = [summary, *build_tables(reports, _paper_tables(dataset))]
-    other_ways = [outcome.other_ways for outcome in outcomes if outcome.other_ways is not None]
-    if other_ways:
-        tables.insert(-2, crosscheck_table(other_ways))
+    if compared:
+        tables.insert(-2, crosscheck_table(compared))
     files: dict[str, str | bytes] = {
         "tables.md": tables_to_markdown(tables),
         "tables.csv": tables_to_csv(tables),
@@ -192,17 +219,26 @@ def finish(args: argparse.Namespace, dataset: Dataset, outcomes: list[PairOutcom
         files["report.html"] = build_page(title, lead, passed, shown, sections, _provenance(args, dataset))
     write_results(out, files, force=args.force)
     if args.json:
-        print_json({"passed": passed, "output": str(out), "reports": [report.to_dict() for report in reports]})
+        print_json(
+            {
+                "passed": passed,
+                "output": str(out),
+                "causes": causes,
+                "reports": [report.to_dict() for report in reports],
+            }
+        )
     else:
         print(tables_to_text([summary]))
-        _say_failures(reports)
+        _say_failures(reports, compared)
+        for cause in causes:
+            print(f"probable cause: {cause}")
         words = "all checks passed" if passed else "a check FAILED"
         where = out / ("report.html" if sections else "tables.md")
         print(f"{words}; {where}, {seconds:.1f} s")
     return 0 if passed else EXIT_CHECK_FAILED
 
 
-def _say_failures(reports: list[ValidationReport]) -> None:
+def _say_failures(reports: list[ValidationReport], compared: list[CrossCheckReport]) -> None:
     for report in reports:
         for c in report.checks:
             if not c.passed:
@@ -212,6 +248,13 @@ def _say_failures(reports: list[ValidationReport]) -> None:
                 )
         for words in report.unchecked:
             print(f"NOT CHECKED {report.pair_id} {report.affine_method} {words}")
+    for other in compared:
+        for c in other.checks:
+            if not c.passed:
+                print(
+                    f"DISAGREES {other.pair_id} {c.name}: {c.ours:.4f} {c.unit}, {c.how} {c.measured:.4f}, "
+                    f"{c.k:.1f} combined sigmas apart"
+                )
     for words in dict.fromkeys(f"{report.pair_id}: {n}" for report in reports for n in report.notes):
         note(words)
 

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from rigkit.errors import DegenerateError, InputError
 
@@ -29,9 +29,12 @@ if TYPE_CHECKING:
     from rigkit.validation.intrinsics import CalibrationShifts
 
 __all__ = [
+    "CROSSCHECK_COVERAGE",
     "LoadedCamera",
     "add_dataset_arguments",
+    "find_boards",
     "load_cameras",
+    "match_found",
     "match_images",
     "output_folder",
     "over_pairs",
@@ -43,6 +46,10 @@ __all__ = [
 ]
 
 Result = TypeVar("Result")
+
+CROSSCHECK_COVERAGE = 4.0
+"""Other ways are compared in some twenty figures a pair: at two sigmas every pair would have a false alarm."""
+Detections: TypeAlias = "tuple[BoardDetection, ...]"
 
 
 def add_dataset_arguments(parser: argparse.ArgumentParser) -> None:
@@ -142,13 +149,13 @@ def _load(path: Path) -> LoadedCamera:
     return LoadedCamera(camera, load_calibration(path).covariance)
 
 
-def match_images(pair: Pair, camera1: Camera, camera2: Camera, chain: str) -> tuple[MatchedPair, Any, Any]:
-    """Return the matched corners of a pair, and its two images."""
+def find_boards(pair: Pair, camera1: Camera, camera2: Camera) -> tuple[Detections, Detections, Any, Any]:
+    """Return the boards found in either image of a pair, and the images; raises InputError where there are none."""
     from rigkit.corners.detect import detect_boards
     from rigkit.io.images import read_image, to_grey
 
     images = []
-    found = []
+    found: list[Detections] = []
     for path, camera, entry in ((pair.image1, camera1, pair.camera1), (pair.image2, camera2, pair.camera2)):
         image = read_image(path)
         size = (image.shape[1], image.shape[0])
@@ -165,10 +172,16 @@ def match_images(pair: Pair, camera1: Camera, camera2: Camera, chain: str) -> tu
             )
         images.append(image)
         found.append(detections)
-    return _matched(pair, camera1, camera2, found[0], found[1], chain), images[0], images[1]
+    return found[0], found[1], images[0], images[1]
 
 
-def _matched(
+def match_images(pair: Pair, camera1: Camera, camera2: Camera, chain: str) -> tuple[MatchedPair, Any, Any]:
+    """Return the matched corners of a pair, and its two images."""
+    found1, found2, image1, image2 = find_boards(pair, camera1, camera2)
+    return match_found(pair, camera1, camera2, found1, found2, chain), image1, image2
+
+
+def match_found(
     pair: Pair,
     camera1: Camera,
     camera2: Camera,
@@ -176,6 +189,7 @@ def _matched(
     detections2: Sequence[BoardDetection],
     chain: str,
 ) -> MatchedPair:
+    """Match the boards found in the two images of a pair as the manifest declares it."""
     from rigkit.pairing import match_pair
 
     return match_pair(
@@ -221,7 +235,7 @@ def reconstruct_other_chain(matched: MatchedPair, pair: Pair) -> Reconstruction 
     identity = matched.identity
     other = "rectified" if matched.chain == "raw" else "raw"
     try:
-        again = _matched(pair, matched.camera1, matched.camera2, identity.detections1, identity.detections2, other)
+        again = match_found(pair, matched.camera1, matched.camera2, identity.detections1, identity.detections2, other)
         return reconstruct_with(again, pair, "3SDIR")
     except DegenerateError:
         return None
