@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -196,10 +197,14 @@ def _reconstruct(
     )
 
 
+@lru_cache(maxsize=4)
 def decide_pose_type(
     captured: Matches, declared: PoseType, level_sigma_rad: float | None
 ) -> tuple[PoseType, float | None, tuple[str, ...]]:
-    """Return the pose type to use, the level's sigma (None: exact, or nothing to hold), and what there is to say."""
+    """Return the pose type to use, the level's sigma (None: exact, or nothing to hold), and what there is to say.
+
+    Remembered for the matches last asked about: the answer is the same for every affine estimator of a pair.
+    """
     if declared is PoseType.GENERAL:
         return declared, None, ()
     level = DEFAULT_LEVEL_RAD if level_sigma_rad is None else level_sigma_rad
