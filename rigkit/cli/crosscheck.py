@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     from rigkit.report.validation_page import crosscheck_table
 
     dataset = select_dataset(args)
-    out = output_folder(args, dataset)
+    out = output_folder(args, dataset.name)
     progress = progress_on_stderr()
     cameras = load_cameras(dataset, recalibrate=args.recalibrate, progress=progress)
     jobs = [

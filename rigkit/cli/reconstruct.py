@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     dataset = select_dataset(args)
-    out = output_folder(args, dataset)
+    out = output_folder(args, dataset.name)
     progress = progress_on_stderr()
     cameras = load_cameras(dataset, recalibrate=args.recalibrate, progress=progress)
     jobs = [

@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     dataset = select_dataset(args)
-    return validate_dataset(args, dataset, output_folder(args, dataset))
+    return validate_dataset(args, dataset, output_folder(args, dataset.name))
 
 
 def validate_dataset(args: argparse.Namespace, dataset: Dataset, out: Path) -> int:

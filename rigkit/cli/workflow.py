@@ -52,9 +52,12 @@ CROSSCHECK_COVERAGE = 4.0
 Detections: TypeAlias = "tuple[BoardDetection, ...]"
 
 
-def add_dataset_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what every verb on a data set takes."""
-    parser.add_argument("dataset", metavar="DATASET", help="folder with a dataset.toml, or the file itself")
+def add_dataset_arguments(parser: argparse.ArgumentParser, *, optional: bool = False) -> None:
+    """Add what every verb on a data set takes; `optional`: the verb also works on something else."""
+    number = "?" if optional else None
+    parser.add_argument(
+        "dataset", metavar="DATASET", nargs=number, help="folder with a dataset.toml, or the file itself"
+    )
     parser.add_argument("-p", "--pair", action="append", default=[], metavar="ID", help="only this pair (repeatable)")
     parser.add_argument("-o", "--output", metavar="DIR", help="folder for results (default: a new one, out/<data set>)")
     parser.add_argument("--force", action="store_true", help="replace existing results")
@@ -76,7 +79,7 @@ def select_dataset(args: argparse.Namespace) -> Dataset:
     return dataset
 
 
-def output_folder(args: argparse.Namespace, dataset: Dataset) -> Path:
+def output_folder(args: argparse.Namespace, name: str) -> Path:
     """Return the folder for results: the one asked for, or the first of out/NAME, out/NAME-2, ... that is free.
 
     Raises InputError, before the work, where the folder asked for holds results and `--force` is not given.
@@ -88,7 +91,7 @@ def output_folder(args: argparse.Namespace, dataset: Dataset) -> Path:
         if folder.exists() and not folder.is_dir():
             raise InputError(f"'{folder}' is a file, not a folder; give another name with -o")
         return folder
-    base = Path("out") / dataset.name
+    base = Path("out") / name
     if args.force:
         return base
     names = itertools.chain([base], (base.with_name(f"{base.name}-{number}") for number in itertools.count(2)))
