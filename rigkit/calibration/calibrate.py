@@ -145,7 +145,7 @@ def _fit_all(
 
 def _agreeing(observations: Observations, options: list[_Option]) -> tuple[BoolArray, tuple[tuple[str, str], ...]]:
     """Return which views to keep, and the reason for each that goes, judged by the model with the least scatter."""
-    best = min(options, key=lambda o: robust_sigma(o.fit.state, observations))
+    best = _best(observations, options)
     kept = best.fit.kept.sum(axis=1)
     total = observations.present.sum(axis=1)
     keep = kept >= np.maximum(MIN_KEPT_SHARE * total, 4)
@@ -159,16 +159,25 @@ def _agreeing(observations: Observations, options: list[_Option]) -> tuple[BoolA
     return keep, reasons
 
 
+def _best(observations: Observations, options: list[_Option]) -> _Option:
+    """Return the option with the least scatter."""
+    if len(options) == 1:
+        return options[0]
+    return min(options, key=lambda o: robust_sigma(o.fit.state, observations))
+
+
 def _reweighted(observations: Observations, options: list[_Option]) -> Observations:
     """Return the observations with weights that count the error which the best model leaves to all corners alike."""
-    best = min(options, key=lambda o: robust_sigma(o.fit.state, observations))
+    if float(np.ptp(observations.sigma_px[observations.present])) == 0.0:
+        return observations
+    best = _best(observations, options)
     squared = (evaluate(best.fit.state, observations).px ** 2).sum(axis=-1)
     return observations.with_common_error(squared, best.fit.kept)
 
 
 def _compared(observations: Observations, options: list[_Option], folds: int, progress: Progress) -> list[_Option]:
     """Return the options refitted to the same corners, with their held-out errors."""
-    sigma = [robust_sigma(o.fit.state, observations) for o in options]
+    sigma = [robust_sigma(o.fit.state, observations) for o in options] if len(options) > 1 else [0.0]
     near = [o.fit.kept for o, s in zip(options, sigma, strict=True) if s <= COMPARABLE * min(sigma)]
     kept = np.any(near, axis=0)
     out = []

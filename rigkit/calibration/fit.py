@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray
-from rigkit.calibration.initialise import initialise, start_error
+from rigkit.calibration.initialise import initialise
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.poses import find_poses, refine_poses
 from rigkit.calibration.result import Convergence
@@ -45,18 +45,28 @@ class Fit:
         return np.where(self.kept, observations.weight, 0.0)
 
 
-def robust_sigma(state: State, observations: Observations, used: BoolArray | None = None) -> float:
-    """Return median |weighted residual| / 1.177 in px over the corners `used` (all by default)."""
-    used = observations.present if used is None else used & observations.present
-    norm = evaluate(state, observations).norm(observations) * observations.weight
-    return max(float(np.median(norm[used])) / RAYLEIGH_MEDIAN, SIGMA_FLOOR_PX) if used.any() else SIGMA_FLOOR_PX
+def weighted_norm(state: State, observations: Observations) -> FloatArray:
+    """Return the weighted 2-D residuals (V, C) in px, infinite where a corner does not project, zero where padded."""
+    residuals = evaluate(state, observations)
+    u, v = residuals.px[..., 0], residuals.px[..., 1]
+    length = np.sqrt(u * u + v * v) * observations.weight
+    return length if residuals.valid.all() else np.where(residuals.valid | ~observations.present, length, np.inf)
 
 
-def inliers(state: State, observations: Observations, sigma_px: float) -> BoolArray:
-    """Return which corners the rule keeps, (V, C)."""
-    norm = evaluate(state, observations).norm(observations) * observations.weight
-    with np.errstate(invalid="ignore"):
-        return np.asarray(observations.present & (norm <= OUTLIER_SIGMAS * sigma_px))
+def sigma_of(norm: FloatArray, used: BoolArray) -> float:
+    """Return the robust standard deviation per coordinate, median |r| / 1.177, of the corners `used`."""
+    chosen = norm[used]
+    return max(float(np.median(chosen)) / RAYLEIGH_MEDIAN, SIGMA_FLOOR_PX) if chosen.size else SIGMA_FLOOR_PX
+
+
+def robust_sigma(state: State, observations: Observations) -> float:
+    """Return the robust standard deviation of all corners, weighted, px."""
+    return sigma_of(weighted_norm(state, observations), observations.present)
+
+
+def inliers(norm: FloatArray, observations: Observations, sigma_px: float) -> BoolArray:
+    """Return which corners the rule keeps, (V, C), from their weighted residuals."""
+    return np.asarray(observations.present & (norm <= OUTLIER_SIGMAS * sigma_px))
 
 
 def rms(state: State, observations: Observations, kept: BoolArray) -> float:
@@ -70,14 +80,15 @@ def fit_model(observations: Observations, size_px: tuple[int, int], model: type[
 
     Raises DegenerateError where no start explains the views.
     """
-    best: tuple[float, State] | None = None
+    best: tuple[float, State, FloatArray] | None = None
     for start in initialise(observations, size_px, model, order):
-        if not np.isfinite(start_error(start, observations)):
+        norm = weighted_norm(start, observations)
+        if not np.isfinite(np.median(norm[observations.present])):
             continue
-        state = _robust(observations, start)
-        sigma = robust_sigma(state, observations)
+        state, norm = _robust(observations, start, norm)
+        sigma = sigma_of(norm, observations.present)
         if best is None or sigma < best[0]:
-            best = (sigma, state)
+            best = (sigma, state, norm)
         if sigma < GOOD_ENOUGH * size_px[0]:
             break
     if best is None:
@@ -85,21 +96,23 @@ def fit_model(observations: Observations, size_px: tuple[int, int], model: type[
             f"calibration: no {model.model} camera explains the views even roughly; take views in which the board is "
             "tilted, and check the board's size"
         )
-    sigma, state = best
-    kept = inliers(state, observations, sigma)
-    return fit_kept(observations, state, kept, settle=True)
+    sigma, state, norm = best
+    return fit_kept(observations, state, inliers(norm, observations, sigma), settle=True)
 
 
-def _robust(observations: Observations, state: State) -> State:
-    """Return the state after a coarse and a fine robust solve; views that fit badly get their pose found anew."""
-    loss = CAUCHY_SIGMAS * robust_sigma(state, observations)
+def _robust(observations: Observations, state: State, norm: FloatArray) -> tuple[State, FloatArray]:
+    """Return the state after a coarse and a fine robust solve, and its weighted residuals; views that fit badly get
+    their pose found anew. `norm` are the residuals of `state`."""
+    present = observations.present
+    loss = CAUCHY_SIGMAS * sigma_of(norm, present)
     state, _ = solve(observations, state, loss_px=loss, max_iterations=15, cost_tolerance=1e-3)
-    norm = evaluate(state, observations).norm(observations)
-    sigma = robust_sigma(state, observations)
-    if not float(np.nanmax(norm * observations.weight)) > OUTLIER_SIGMAS * sigma:
-        return state  # nothing for a robust loss to do
-    with np.errstate(invalid="ignore"):
-        of_view = np.nanmedian(norm, axis=1) / RAYLEIGH_MEDIAN
+    norm = weighted_norm(state, observations)
+    sigma = sigma_of(norm, present)
+    if not norm.max() > OUTLIER_SIGMAS * sigma:
+        return state, norm  # nothing for a robust loss to do
+    # Padding is left out of the medians by standing beyond all corners.
+    ordered = np.sort(np.where(present, norm, np.inf), axis=1)
+    of_view = ordered[np.arange(len(norm)), np.maximum(present.sum(axis=1) - 1, 0) // 2] / RAYLEIGH_MEDIAN
     bad = np.flatnonzero(of_view > BAD_VIEW * sigma)
     if bad.size:
         part = observations.subset(bad)
@@ -108,31 +121,32 @@ def _robust(observations: Observations, state: State) -> State:
         rotation[bad], translation[bad] = found.rotation, found.translation_mm
         state = replace(state, rotation=rotation, translation_mm=translation)
     state, _ = solve(observations, state, loss_px=CAUCHY_SIGMAS * sigma, max_iterations=30, cost_tolerance=1e-5)
-    return state
+    return state, weighted_norm(state, observations)
 
 
 def fit_kept(observations: Observations, state: State, kept: BoolArray, *, settle: bool = False) -> Fit:
     """Return the least-squares solution on the kept corners; with `settle` the rule is applied again to the result,
     until the set of kept corners no longer changes (three rounds at most)."""
+    norm = weighted_norm(state, observations)
     for _ in range(3):
-        sigma = robust_sigma(state, observations, kept)
         weight = np.where(kept, observations.weight, 0.0)
-        state, convergence = solve(observations, state, weight=weight, prior_sigma_px=sigma)
-        again = inliers(state, observations, robust_sigma(state, observations, kept)) if settle else kept
+        prior_sigma = sigma_of(norm, kept)
+        state, convergence = solve(observations, state, weight=weight, prior_sigma_px=prior_sigma)
+        norm = weighted_norm(state, observations)
+        again = inliers(norm, observations, sigma_of(norm, kept)) if settle else kept
         if (again == kept).all():
             break
         kept = again
-    return Fit(state, kept, _sigma(observations, state, kept), convergence)
+    return Fit(state, kept, _sigma(state, norm, kept), convergence)
 
 
-def _sigma(observations: Observations, state: State, kept: BoolArray) -> float:
+def _sigma(state: State, norm: FloatArray, kept: BoolArray) -> float:
     """Return the standard deviation per coordinate of a corner of median quality, degrees of freedom counted."""
-    squared = (evaluate(state, observations).px ** 2).sum(axis=-1) * observations.weight**2
     prior = float(((state.unknowns / state.shape.sigma) ** 2).sum()) if state.shape.count else 0.0
     views = int(kept.any(axis=1).sum())
     # Each prior is a measurement too: it pays for the unknown that it holds.
     freedom = 2 * int(kept.sum()) - state.camera.parameters.size - 6 * views
-    total = float(squared[kept].sum())
+    total = float((norm[kept] ** 2).sum())
     if freedom <= 0:
         return float("nan")
     sigma = np.sqrt(total / freedom)

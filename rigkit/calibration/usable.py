@@ -14,8 +14,8 @@ __all__ = ["MIN_CORNERS", "usable_views", "views_of_image"]
 
 MIN_CORNERS = 6
 """A pose has six numbers: fewer than six corners leave hardly anything to check it by."""
-MIN_SPREAD = 1e-3
-"""Corners of a row only: their second extent, as a part of the first, is rounding."""
+MIN_SPREAD = 1e-6
+"""Corners of a row only: the determinant of their scatter, as a part of its squared trace, is rounding."""
 
 
 def usable_views(
@@ -53,8 +53,9 @@ def _inside(view: BoardView, size_px: tuple[int, int]) -> bool:
 def _reason(view: BoardView) -> str | None:
     if len(view.grid) < MIN_CORNERS:
         return f"{len(view.grid)} corners of board '{view.board.board_id}', at least {MIN_CORNERS} are needed"
-    extent = np.linalg.svd(view.grid - view.grid.mean(axis=0), compute_uv=False)
-    if extent[1] < MIN_SPREAD * extent[0]:
+    x, y = (view.grid - view.grid.mean(axis=0)).T
+    xx, yy, xy = float(x @ x), float(y @ y), float(x @ y)
+    if xx * yy - xy * xy < MIN_SPREAD * (xx + yy) ** 2:
         return f"the corners of board '{view.board.board_id}' lie on one line"
     return None
 
