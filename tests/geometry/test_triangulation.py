@@ -100,6 +100,22 @@ def test_correction_is_the_optimum_over_points(rng, pose):
         assert cost == pytest.approx(2.0 * best.cost, rel=1e-6)
 
 
+def test_global_optimum_near_the_epipole_with_much_noise(rng):
+    """Where the cost has several minima: every epipolar line of a fine pencil is tried."""
+    pose = POSES["forward"]
+    F = fundamental(pose)
+    epipole = np.array([800.0, 620.0])
+    q1, q2 = (epipole + rng.normal(size=(200, 2)) * 30.0 for _ in range(2))
+    p1, p2 = correct_hartley_sturm(q1, q2, F)
+    ours = np.sum((p1 - q1) ** 2, 1) + np.sum((p2 - q2) ** 2, 1)
+    # Forward motion without rotation: the same line through the same epipole in both images.
+    angle = np.linspace(0.0, np.pi, 20001)
+    normal = np.stack([-np.sin(angle), np.cos(angle)])
+    brute = (((q1 - epipole) @ normal) ** 2 + ((q2 - epipole) @ normal) ** 2).min(axis=1)
+    assert np.all(ours <= brute * (1 + 1e-9) + 1e-9)
+    assert np.allclose(ours, brute, rtol=1e-4, atol=1e-3)
+
+
 def test_opencv_correct_matches_has_the_same_cost(rng):
     pose = POSES["general"]
     _, q1, q2 = scene(rng, pose, noise_px=3.0)
