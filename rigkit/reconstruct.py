@@ -26,7 +26,7 @@ from rigkit.cloud import OrientedCloud
 from rigkit.errors import DegenerateError
 from rigkit.fundamental.metric import metric_pose, triangulate_matches
 from rigkit.fundamental.pose import choose_pose, essential_from_pose
-from rigkit.fundamental.refine import refine_pose
+from rigkit.fundamental.refine import RefinedPose, refine_pose
 from rigkit.fundamental.registry import fundamental_for
 from rigkit.fundamental.select import DEFAULT_LEVEL_RAD, pose_type_evidence
 from rigkit.fundamental.weights import WeightRule
@@ -143,9 +143,7 @@ def _reconstruct(
     matches = pair.matches.with_affinities(affinities.A21, affinities.sigma_A)
     # Affinities computed from an epipolar geometry satisfy it exactly: estimating it from them again is circular.
     rule: WeightRule = "points" if needs_epipolar(affine_method) else "noise"
-    estimate = fundamental_for(pose_type).solve(matches, rule)
-    start = choose_pose(estimate.E21, matches.rays1, matches.rays2, pose_type)
-    refined = refine_pose(pair.captured, start, pose_type, level_sigma_rad)
+    refined = _likeliest_pose(pair, matches, rule, by_points.E21, pose_type, level_sigma_rad)
     metric = metric_pose(pair.captured, refined.cam2_from_cam1, refined.covariance, pair.boards)
     if metric.baseline_sigma_mm > MAX_BASELINE_SIGMA * metric.baseline_mm:
         raise DegenerateError(
@@ -217,6 +215,39 @@ def decide_pose_type(
         return chosen.pose_type, soft, (words,)
     contradiction = evidence.contradiction(declared)
     return declared, level or None, () if contradiction is None else (contradiction,)
+
+
+def _likeliest_pose(
+    pair: MatchedPair,
+    matches: Matches,
+    rule: WeightRule,
+    by_points: Mat3,
+    pose_type: PoseType,
+    level_sigma_rad: float | None,
+) -> RefinedPose:
+    """Return the pose of maximum likelihood among the ends of the refinement from every start there is.
+
+    The linear solution of a pose type holds it exactly: where a level is off by half a degree and the corners are good,
+    it can land in another valley. The general solution and the pose by which the boards were told apart cannot.
+    """
+
+    def of_type() -> Rigid3:
+        estimate = fundamental_for(pose_type).solve(matches, rule)
+        return choose_pose(estimate.E21, matches.rays1, matches.rays2, pose_type)
+
+    def general() -> Rigid3:
+        return choose_pose(by_points, matches.rays1, matches.rays2)
+
+    ends: list[RefinedPose] = []
+    failure: DegenerateError | None = None
+    for start in (of_type, general, lambda: pair.identity.cam2_from_cam1):
+        try:
+            ends.append(refine_pose(pair.captured, start(), pose_type, level_sigma_rad))
+        except DegenerateError as error:
+            failure = failure or error
+    if not ends:
+        raise failure or DegenerateError("no pose found")
+    return min(ends, key=lambda end: end.cost)
 
 
 def _affinities(pair: MatchedPair, method: str, E21: Mat3, scale: str) -> Affinities:
