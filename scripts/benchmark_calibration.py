@@ -107,7 +107,7 @@ def speed(count: int, repeats: int) -> None:
                 first = first or spent
                 error = f"{np.sqrt((difference**2).mean()):14.3f}"
             except (cv2.error, RigkitError, AssertionError) as failed:
-                print(f"{name:8} {solver:28} failed: {(str(failed) or "no sensible camera").splitlines()[0][:70]}")
+                print(f"{name:8} {solver:28} failed: {(str(failed) or 'no sensible camera').splitlines()[0][:70]}")
                 continue
             print(f"{name:8} {solver:28} {1000 * spent:8.1f} {spent / first:6.1f} {rms:8.4f} {error}")
 
