@@ -6,7 +6,7 @@ Layers, each importing only rows below it (tests/test_architecture.py reads the 
     7  report        figures, HTML report, tables in Markdown, CSV and LaTeX
     6  io            manifests, calibration files, corner files, PLY, images
     5  validation    planes, angles, baseline, cross-check, tables as data
-    4  pairing | reconstruct   the pipeline from detections to a Reconstruction
+    4  pairing | reconstruct | scene   the pipeline from detections, or correspondences, to a Reconstruction
     3  corners | affine | fundamental | calibration | synthetic | interop
     2  cameras       protocol, models, rectification, registry
     1  geometry | boards | detections | matches | cloud | posetype | progress
@@ -62,6 +62,7 @@ _PUBLIC = {
     "read_image": "rigkit.io.images",
     "read_ply": "rigkit.io.ply",
     "reconstruct_pair": "rigkit.reconstruct",
+    "reconstruct_scene": "rigkit.scene",
     "rectify_map": "rigkit.cameras.rectify",
     "save_calibration": "rigkit.io.calibration_file",
     "validate": "rigkit.validation.checks",

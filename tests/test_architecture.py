@@ -17,7 +17,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("geometry", "boards", "detections", "matches", "cloud", "posetype", "progress", "truth"),
     ("cameras",),
     ("corners", "affine", "fundamental", "calibration", "synthetic", "interop"),
-    ("reconstruct", "pairing"),
+    ("reconstruct", "pairing", "scene"),
     ("validation",),
     ("io",),
     ("report",),

@@ -1,4 +1,4 @@
-"""`rigkit reconstruct`: oriented clouds of every pair; needs no measured truth."""
+"""`rigkit reconstruct`: oriented clouds of every pair of a data set, or of one scene; needs no measured truth."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from rigkit.cli.console import note, print_json, progress_on_stderr
+from rigkit.cli.reconstruct_scene import add_scene_arguments, is_scene, run_scene
 from rigkit.cli.workflow import (
     add_dataset_arguments,
     load_cameras,
@@ -29,12 +30,15 @@ METHODS = ("F2UDIR", "F3UDIR", "DET3UDIR", "2SDIR", "3SDIR")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_dataset_arguments(parser)
+    add_dataset_arguments(parser, optional=True)
+    add_scene_arguments(parser)
     parser.add_argument("--method", choices=METHODS, default="3SDIR", help="affine estimator (default 3SDIR)")
     parser.add_argument("--no-pictures", action="store_true", help="leave out PNG pictures")
 
 
 def run(args: argparse.Namespace) -> int:
+    if is_scene(args):
+        return run_scene(args)
     dataset = select_dataset(args)
     out = output_folder(args, dataset.name)
     progress = progress_on_stderr()

@@ -67,7 +67,9 @@ def write_ply(
     write_atomic(path, ply_bytes(cloud, single_precision=single_precision, comments=comments), force=force)
 
 
-def ply_bytes(cloud: OrientedCloud, *, single_precision: bool = False, comments: Iterable[str] = ()) -> bytes:
+def ply_bytes(
+    cloud: OrientedCloud, *, single_precision: bool = False, comments: Iterable[str] = (), unit: str = "mm"
+) -> bytes:
     """Return the file's content; raises InputError for an empty cloud."""
     if len(cloud) == 0:
         raise InputError("point cloud: it has no points, so there is nothing to write; see what was dropped, and why")
@@ -85,7 +87,7 @@ def ply_bytes(cloud: OrientedCloud, *, single_precision: bool = False, comments:
     table = np.empty(len(cloud), dtype=[(name, TYPES[kind]) for name, kind, _ in columns])
     for name, _, values in columns:
         table[name] = values
-    notes = ["rigkit oriented point cloud", "units mm", "frame camera 1: x right, y down, z forward"]
+    notes = ["rigkit oriented point cloud", f"units {unit}", "frame camera 1: x right, y down, z forward"]
     notes += [f"{BOARD_COMMENT}{i} {board_id}" for i, board_id in enumerate(cloud.board_ids)]
     notes += [" ".join(str(line).split()) for line in comments]
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in notes)]

@@ -21,39 +21,56 @@ from rigkit.reconstruct import Reconstruction
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["BOARD_COLOURS", "as_jpeg", "cloud_png", "corners_png", "difference_png", "epipolar_curves", "epipolar_png"]
+__all__ = [
+    "BOARD_COLOURS",
+    "as_jpeg",
+    "as_png",
+    "board_colour",
+    "cloud_png",
+    "corners_png",
+    "difference_png",
+    "epipolar_curves",
+    "epipolar_png",
+    "pair_axes",
+]
 
 BOARD_COLOURS = ("#e6550d", "#1f77b4", "#2ca02c", "#9467bd", "#d6b300", "#17becf", "#e377c2", "#7f7f7f")
 """One colour a board, the same in every picture; readable on dark and light images."""
 
 DPI = 110
 NORMAL_LENGTH_SQUARES = 0.8
+BARE_NORMAL = 0.08
+"""Length of a drawn normal where there are no squares, relative to the median distance of the points."""
 PYRAMID_DEPTH = 0.18
 """Depth of a drawn camera pyramid, relative to the median distance of the points."""
+
+FAR = 4.0
+"""Points this many times farther than the median one do not set the limits of the picture."""
 
 CURVE_SAMPLES = 240
 JPEG_QUALITY = 85
 
 
 def board_colour(index: int) -> str:
+    """Return the colour of a board, the same in every picture."""
     return BOARD_COLOURS[index % len(BOARD_COLOURS)]
 
 
 def corners_png(reconstruction: Reconstruction, image1: NDArray[Any], image2: NDArray[Any]) -> bytes:
     """Draw the matched corners over both images: rows joined, first corner marked, boards named."""
-    figure, axes = _pair_axes(image1, image2)
+    figure, axes = pair_axes(image1, image2)
     for axis, pixels in zip(axes, (reconstruction.pixels1, reconstruction.pixels2), strict=True):
         _draw_boards(axis, reconstruction, pixels)
     axes[0].set_title(f"{reconstruction.pair_id}: corners, view 1", fontsize=9)
     axes[1].set_title("view 2 (ring: first corner)", fontsize=9)
-    return _png(figure)
+    return as_png(figure)
 
 
 def epipolar_png(
     reconstruction: Reconstruction, image1: NDArray[Any], image2: NDArray[Any], *, every: int = 7
 ) -> bytes:
     """Draw every `every`-th corner and its epipolar curve over both images; the curve passes through the corner."""
-    figure, axes = _pair_axes(image1, image2)
+    figure, axes = pair_axes(image1, image2)
     chosen = np.arange(0, len(reconstruction.pixels1), every)
     pose = reconstruction.cam2_from_cam1
     for axis, camera, other, pixels, other_pixels, motion in (
@@ -78,7 +95,7 @@ def epipolar_png(
         axis.set_ylim(camera.size_px[1] - 0.5, -0.5)
     rms = reconstruction.sampson_rms_px
     axes[0].set_title(f"{reconstruction.pair_id}: epipolar curves, Sampson rms {rms:.3f} px", fontsize=9)
-    return _png(figure)
+    return as_png(figure)
 
 
 def epipolar_curves(camera1: Camera, camera2: Camera, cam2_from_cam1: Rigid3, pixels1: Pixels) -> FloatArray:
@@ -99,7 +116,7 @@ def epipolar_curves(camera1: Camera, camera2: Camera, cam2_from_cam1: Rigid3, pi
     return np.where(inside[..., None], pixels, np.nan)
 
 
-def cloud_png(reconstruction: Reconstruction) -> bytes:
+def cloud_png(reconstruction: Reconstruction, *, unit: str = "mm") -> bytes:
     """Render the oriented cloud: points and normals by board, both cameras as pyramids, from two directions."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -109,11 +126,15 @@ def cloud_png(reconstruction: Reconstruction) -> bytes:
     cloud = reconstruction.cloud
     scene = cloud.points_mm
     reach = float(np.median(np.linalg.norm(scene, axis=1)))
-    square = float(np.mean([b.square_x_mm for b in reconstruction.boards])) if reconstruction.boards else reach / 20
+    square = (
+        float(np.mean([b.square_x_mm for b in reconstruction.boards])) if reconstruction.boards else reach * BARE_NORMAL
+    )
     for place, (elevation, azimuth) in enumerate(((18.0, -70.0), (65.0, -90.0))):
         axis: Any = figure.add_subplot(1, 2, place + 1, projection="3d")
-        for index, name in enumerate(cloud.board_ids):
-            on = cloud.board_index == index
+        for index, name in enumerate((*cloud.board_ids, "no board")):
+            on = cloud.board_index == (index if index < len(cloud.board_ids) else -1)
+            if not on.any():
+                continue
             p, n = _upright(scene[on]), _upright(cloud.normals[on]) * square * NORMAL_LENGTH_SQUARES
             colour = board_colour(index)
             axis.scatter(*p.T, s=5, color=colour, label=name, depthshade=False)
@@ -123,17 +144,17 @@ def cloud_png(reconstruction: Reconstruction) -> bytes:
             _draw_pyramid(axis, cam1_from_cam, reach * PYRAMID_DEPTH, name)
         axis.set_box_aspect(_equal_limits(axis, reconstruction), zoom=1.25)
         axis.view_init(elev=elevation, azim=azimuth)
-        axis.set_xlabel("x mm", fontsize=7)
-        axis.set_ylabel("z mm", fontsize=7)
+        axis.set_xlabel(f"x {unit}", fontsize=7)
+        axis.set_ylabel(f"z {unit}", fontsize=7)
         if from_above := elevation > 45.0:
             axis.set_zticks([])
-        axis.set_zlabel("" if from_above else "-y mm", fontsize=7)
+        axis.set_zlabel("" if from_above else f"-y {unit}", fontsize=7)
         axis.tick_params(labelsize=6)
     figure.subplots_adjust(left=0.0, right=0.97, bottom=0.02, top=0.94, wspace=0.0)
     axis.legend(fontsize=7, loc="upper right")
     title = f"{reconstruction.pair_id}, {reconstruction.affine_method}: {len(cloud)} points, "
-    figure.suptitle(f"{title}baseline {reconstruction.baseline_mm:.2f} mm", fontsize=10)
-    return _png(figure)
+    figure.suptitle(f"{title}baseline {reconstruction.baseline_mm:.2f} {unit}", fontsize=10)
+    return as_png(figure)
 
 
 def difference_png(difference: CameraDifference) -> bytes:
@@ -155,7 +176,7 @@ def difference_png(difference: CameraDifference) -> bytes:
     axis.set_title(
         f"difference {difference.rms_px:.4f} px rms, {difference.max_px:.4f} px at most (arrows magnified)", fontsize=9
     )
-    return _png(figure)
+    return as_png(figure)
 
 
 def as_jpeg(png: bytes) -> bytes:
@@ -184,7 +205,10 @@ def _draw_pyramid(axis: Any, cam1_from_cam: Rigid3, depth: float, name: str) -> 
 def _equal_limits(axis: Any, reconstruction: Reconstruction) -> FloatArray:
     """Set limits around cloud and cameras; return the box aspect that keeps millimetres equal on all axes."""
     centres = np.stack([np.zeros(3), reconstruction.cam2_from_cam1.inverse().translation_mm])
-    everything = _upright(np.concatenate([reconstruction.cloud.points_mm, centres]))
+    points = reconstruction.cloud.points_mm
+    distance = np.linalg.norm(points, axis=1)
+    points = points[distance < FAR * np.median(distance)]
+    everything = _upright(np.concatenate([points, centres]))
     low, high = everything.min(axis=0), everything.max(axis=0)
     margin = 0.05 * (high - low).max()
     low, high = low - margin, high + margin
@@ -213,7 +237,7 @@ def _draw_boards(axis: Any, reconstruction: Reconstruction, pixels: Pixels) -> N
         axis.text(*p.mean(axis=0), board.board_id, color=colour, fontsize=8, ha="center", va="center", bbox=label)
 
 
-def _pair_axes(image1: NDArray[Any], image2: NDArray[Any]) -> tuple[Figure, Sequence[Any]]:
+def pair_axes(image1: NDArray[Any], image2: NDArray[Any]) -> tuple[Figure, Sequence[Any]]:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -228,7 +252,7 @@ def _pair_axes(image1: NDArray[Any], image2: NDArray[Any]) -> tuple[Figure, Sequ
     return figure, axes
 
 
-def _png(figure: Figure) -> bytes:
+def as_png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     return buffer.getvalue()
