@@ -136,7 +136,7 @@ def _judge(job: PairJob, matched: MatchedPair, image1: Any, image2: Any, causes:
     if job.crosscheck:
         other = reconstruct_other_chain(matched, pair)
         other_ways = crosscheck(shown, other_chain=other, coverage=CROSSCHECK_COVERAGE)
-    section = _pictures(shown, reports, other_ways, image1, image2, files) if job.pictures else None
+    section = _pictures(reconstructions, shown, reports, other_ways, image1, image2, files) if job.pictures else None
     return PairOutcome(pair.pair_id, reports, best, other_ways, causes, files, section)
 
 
@@ -159,7 +159,8 @@ def _with_shifts(
 
 
 def _pictures(
-    reconstruction: Any,
+    reconstructions: Mapping[str, Reconstruction],
+    reconstruction: Reconstruction,
     reports: tuple[ValidationReport, ...],
     other_ways: CrossCheckReport | None,
     image1: Any,
@@ -167,6 +168,7 @@ def _pictures(
     files: dict[str, bytes],
 ) -> PairSection:
     """Draw the pair's pictures into `files`; return the section of the page, with the same pictures as JPEG."""
+    from rigkit.report.drawings import normal_errors_svg, residuals_svg
     from rigkit.report.figures import as_jpeg, cloud_png, corners_png, epipolar_png
     from rigkit.report.validation_page import crosscheck_table, pair_section
 
@@ -180,6 +182,8 @@ def _pictures(
     shown = [
         ("Corners as found and matched", "image/jpeg", as_jpeg(drawn["corners"])),
         ("Epipolar curves of every seventh corner", "image/jpeg", as_jpeg(drawn["epipolar"])),
+        ("What the corners leave over", "image/svg+xml", residuals_svg(reconstruction).encode()),
+        ("Normal errors of the estimators", "image/svg+xml", normal_errors_svg(reconstructions, reports).encode()),
     ]
     extra = [] if other_ways is None else [crosscheck_table([other_ways])]
     return pair_section(reconstruction, reports, shown, extra)

@@ -25,7 +25,11 @@ PYRAMID_DEPTH = 0.15
 
 def table_html(table: Table) -> str:
     """Return a table of plain data as HTML: sigmas after ±, the paper's number in brackets, verdicts in colour."""
-    head = "".join(f"<th>{html.escape(f'{c.label}, {c.unit}' if c.unit else c.label)}</th>" for c in table.columns)
+    words = [any(isinstance(row[j].value, str) for row in table.rows) for j in range(len(table.columns))]
+    head = "".join(
+        f"<th{' class=text' if text else ''}>{html.escape(f'{c.label}, {c.unit}' if c.unit else c.label)}</th>"
+        for c, text in zip(table.columns, words, strict=True)
+    )
     body = "".join(
         f"<tr>{''.join(_cell(c, column) for c, column in zip(row, table.columns, strict=True))}</tr>"
         for row in table.rows

@@ -119,10 +119,10 @@ def crosscheck_table(reports: Sequence[CrossCheckReport]) -> Table:
 
 def _by_estimator(reports: Sequence[ValidationReport]) -> Table:
     """Return normal errors, flatness and baseline of one pair with a column an estimator: it fits a page."""
-    columns = (Column(""), *(Column(report.affine_method, "", 3) for report in reports))
+    columns = (Column("normals"), *(Column(report.affine_method, "", 3) for report in reports))
     ids = list(dict.fromkeys(board.board.board_id for report in reports for board in report.boards))
     boards = [{board.board.board_id: board for board in report.boards} for report in reports]
-    rows: list[tuple[Cell, ...]] = [(Cell("points"), *(Cell(f"{report.count}") for report in reports))]
+    rows: list[tuple[Cell, ...]] = []
     for statistic in ("mean", "median"):
         for board_id in ids:
             errors = [b[board_id].normal_errors if board_id in b else None for b in boards]

@@ -1,0 +1,138 @@
+"""Small drawings as SVG for the page: box plots of normal errors, residuals of the corners."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from html import escape
+
+import numpy as np
+
+from rigkit.arrays import FloatArray
+from rigkit.geometry.rotation import angle_between
+from rigkit.geometry.triangulation import correct_rays_px
+from rigkit.reconstruct import Reconstruction
+from rigkit.report.figures import board_colour
+from rigkit.validation.checks import ValidationReport
+
+__all__ = ["boxplot_svg", "normal_errors_svg", "residuals_svg"]
+
+WHISKER = 1.5
+"""Whiskers reach to the last value within this many interquartile ranges, as in the paper's figures."""
+
+WIDTH, HEIGHT = 1100.0, 300.0
+LEFT, BOTTOM, TOP = 60.0, 46.0, 26.0
+
+RESIDUAL_LENGTH = 0.04
+"""The root mean square residual is drawn as long as this part of the image's width."""
+
+
+def normal_errors_svg(reconstructions: Mapping[str, Reconstruction], reports: Sequence[ValidationReport]) -> str:
+    """Draw the angles between each normal and its plane's, a box a board and estimator."""
+    groups: list[tuple[str, list[tuple[str, FloatArray]]]] = []
+    for report in reports:
+        cloud = reconstructions[report.affine_method].cloud
+        boxes = []
+        for board in report.boards:
+            on = cloud.on_board(board.board.board_id)
+            errors = np.rad2deg(angle_between(cloud.normals[on], board.plane.normal))
+            boxes.append((board.board.board_id, errors))
+        groups.append((report.affine_method, boxes))
+    return boxplot_svg(groups, "angle between normal and plane, deg")
+
+
+def boxplot_svg(groups: Sequence[tuple[str, Sequence[tuple[str, FloatArray]]]], label: str) -> str:
+    """Draw groups of named samples as boxes (median, quartiles, whiskers, outliers) with one colour a name."""
+    names = list(dict.fromkeys(name for _, boxes in groups for name, _ in boxes))
+    highest = max((float(np.max(v)) for _, boxes in groups for _, v in boxes if len(v)), default=1.0)
+    top = _round_up(highest)
+    plot = HEIGHT - BOTTOM - TOP
+    step = (WIDTH - LEFT - 10.0) / max(len(groups), 1)
+    slot = step * 0.8 / max(len(names), 1)
+
+    def y(value: float) -> float:
+        return TOP + plot * (1.0 - value / top)
+
+    out = [_head(WIDTH, HEIGHT, label)]
+    for tick in np.linspace(0.0, top, 5):
+        out.append(f'<line x1="{LEFT}" x2="{WIDTH - 10}" y1="{y(tick):.1f}" y2="{y(tick):.1f}" stroke="#e3e7ee"/>')
+        out.append(_text(LEFT - 6, y(tick) + 4, f"{tick:.3g}", "end"))
+    for g, (group, boxes) in enumerate(groups):
+        start = LEFT + g * step + 0.1 * step
+        out.append(_text(start + 0.4 * step, HEIGHT - BOTTOM + 18, group, "middle"))
+        for name, values in boxes:
+            index = names.index(name)
+            out += _box(start + slot * (index + 0.5), 0.7 * slot, values, board_colour(index), y)
+    for index, name in enumerate(names):
+        x = LEFT + 110.0 * index
+        out.append(f'<rect x="{x}" y="{HEIGHT - 18}" width="10" height="10" fill="{board_colour(index)}"/>')
+        out.append(_text(x + 15, HEIGHT - 9, name, "start"))
+    out.append(_text(LEFT, 14, label, "start"))
+    return "".join([*out, "</svg>"])
+
+
+def residuals_svg(reconstruction: Reconstruction) -> str:
+    """Draw how far each corner is from where the two rays would meet, magnified, in both images."""
+    camera1, camera2 = reconstruction.camera1, reconstruction.camera2
+    rays1, _ = camera1.unproject(reconstruction.pixels1)
+    rays2, _ = camera2.unproject(reconstruction.pixels2)
+    jacobians = camera1.ray_jacobian(reconstruction.pixels1), camera2.ray_jacobian(reconstruction.pixels2)
+    _, _, moved1, moved2 = correct_rays_px(rays1, rays2, reconstruction.E21, *jacobians)
+    rms = float(np.sqrt(np.mean(np.concatenate([moved1, moved2]) ** 2) * 2.0))
+    width = 540.0
+    height = max(width * c.size_px[1] / c.size_px[0] for c in (camera1, camera2))
+    scale_of_arrows = RESIDUAL_LENGTH * width / max(rms, 1e-12)
+    words = f"residuals, {rms:.4f} px rms, magnified {scale_of_arrows * camera1.size_px[0] / width:.0f} times"
+    out = [_head(2 * width + 20, height + 30, words)]
+    for offset, camera, pixels, moved in (
+        (0.0, camera1, reconstruction.pixels1, moved1),
+        (width + 20, camera2, reconstruction.pixels2, moved2),
+    ):
+        zoom = width / camera.size_px[0]
+        frame = (
+            f'<rect x="{offset:.1f}" y="0" width="{width}" height="{zoom * camera.size_px[1]:.1f}" fill="none" '
+            'stroke="#b8c0cc"/>'
+        )
+        out.append(frame)
+        for q, d, board in zip(pixels, moved, reconstruction.matches.board_index, strict=True):
+            x, y = offset + zoom * q[0], zoom * q[1]
+            ex, ey = x + scale_of_arrows * d[0], y + scale_of_arrows * d[1]
+            colour = board_colour(int(board))
+            out.append(f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{ex:.1f}" y2="{ey:.1f}" stroke="{colour}"/>')
+            out.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="1.6" fill="{colour}"/>')
+    out.append(_text(0.0, height + 20, words, "start"))
+    return "".join([*out, "</svg>"])
+
+
+def _box(x: float, width: float, values: FloatArray, colour: str, y: Callable[[float], float]) -> list[str]:
+    if not len(values):
+        return []
+    low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
+    reach = WHISKER * (high - low)
+    inside = values[(values >= low - reach) & (values <= high + reach)]
+    left, right = x - width / 2, x + width / 2
+    out = [
+        f'<line x1="{x:.1f}" x2="{x:.1f}" y1="{y(inside.max()):.1f}" y2="{y(inside.min()):.1f}" stroke="{colour}"/>',
+        f'<rect x="{left:.1f}" y="{y(high):.1f}" width="{width:.1f}" height="{max(y(low) - y(high), 0.5):.1f}" '
+        f'fill="{colour}" fill-opacity="0.25" stroke="{colour}"/>',
+        f'<line x1="{left:.1f}" x2="{right:.1f}" y1="{y(middle):.1f}" y2="{y(middle):.1f}" stroke="{colour}" '
+        'stroke-width="2"/>',
+    ]
+    outside = values[(values < low - reach) | (values > high + reach)]
+    return [*out, *(f'<circle cx="{x:.1f}" cy="{y(v):.1f}" r="1.3" fill="{colour}"/>' for v in outside)]
+
+
+def _round_up(value: float) -> float:
+    """Return the next of 1, 2, 5 times a power of ten."""
+    power = 10.0 ** np.floor(np.log10(max(value, 1e-9)))
+    return float(next(m * power for m in (1.0, 2.0, 5.0, 10.0) if m * power >= value))
+
+
+def _head(width: float, height: float, title: str) -> str:
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:g}" '
+        f'font-family="sans-serif" font-size="12"><title>{escape(title)}</title>'
+    )
+
+
+def _text(x: float, y: float, words: str, anchor: str) -> str:
+    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="#333">{escape(words)}</text>'
