@@ -114,7 +114,7 @@ def _check_view(view: BoardView) -> None:
             f"image '{view.image}': corners outside board '{board.board_id}' ({board.columns}x{board.rows} inner "
             "corners); check the board's size"
         )
-    if len(np.unique(grid[:, 1] * board.columns + grid[:, 0])) != len(grid):
+    if len(grid) and np.bincount(grid[:, 1] * board.columns + grid[:, 0]).max() > 1:
         raise InputError(f"image '{view.image}': a corner of board '{board.board_id}' comes twice")
     if (view.sigma_px <= 0.0).any():
         raise InputError(f"image '{view.image}': corner sigmas must be positive")

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigkit.calibration.result import Calibration, ViewResult
+from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import projection_uncertainty, uncertainty_map
 
 __all__ = ["judge"]
@@ -69,20 +69,16 @@ def _headline(c: Calibration, found: list[str]) -> str:
 
 def _tilts(c: Calibration) -> list[str]:
     """A board that faces the camera says nothing about the focal length."""
-    tilted = sum(_tilt_deg(v) > TILTED_DEG for v in c.views)
+    axes = np.array([v.cam_from_board.rotation[:, 2] for v in c.views])
+    places = np.array([v.cam_from_board.translation_mm for v in c.views])
+    facing = np.abs((axes * places).sum(axis=1)) / np.linalg.norm(places, axis=1)
+    tilted = int((facing < np.cos(np.radians(TILTED_DEG))).sum())
     if tilted >= min(TILTED_VIEWS, len(c.views)):
         return []
     return [
         f"bad: the board is tilted by more than {TILTED_DEG:.0f} degrees in {tilted} of {len(c.views)} views only; "
         f"take at least {TILTED_VIEWS} with the board tilted by 20 to 50 degrees, about different axes"
     ]
-
-
-def _tilt_deg(view: ViewResult) -> float:
-    """Return the angle between the board's normal and the direction from the camera to it."""
-    pose = view.cam_from_board
-    direction = pose.translation_mm / np.linalg.norm(pose.translation_mm)
-    return float(np.degrees(np.arccos(np.clip(abs(pose.rotation[:, 2] @ direction), 0.0, 1.0))))
 
 
 def _images(c: Calibration) -> list[str]:
@@ -96,9 +92,10 @@ def _coverage(c: Calibration) -> list[str]:
     """Name the cells of the image that no board reached, where the lens has an image at all."""
     width, height = c.camera.size_px
     pixels = np.concatenate([v.pixels[v.kept] for v in c.views])
-    edges_u, edges_v = np.linspace(0, width, CELLS[0] + 1), np.linspace(0, height, CELLS[1] + 1)
-    count, _, _ = np.histogram2d(pixels[:, 0], pixels[:, 1], bins=[edges_u, edges_v])
-    u, v = np.meshgrid(0.5 * (edges_u[1:] + edges_u[:-1]), 0.5 * (edges_v[1:] + edges_v[:-1]), indexing="ij")
+    size = np.array([width / CELLS[0], height / CELLS[1]])
+    cell = np.clip((pixels / size).astype(np.int64), 0, np.array(CELLS) - 1)
+    count = np.bincount(cell[:, 0] * CELLS[1] + cell[:, 1], minlength=CELLS[0] * CELLS[1]).reshape(CELLS)
+    u, v = np.meshgrid((np.arange(CELLS[0]) + 0.5) * size[0], (np.arange(CELLS[1]) + 0.5) * size[1], indexing="ij")
     rays, valid = c.camera.unproject(np.stack([u, v], axis=-1))
     empty = (count < CELL_CORNERS) & valid & (np.where(valid, rays[..., 2], -1.0) > np.cos(np.radians(95.0)))
     if not empty.any():
@@ -123,15 +120,16 @@ def _views(c: Calibration) -> list[str]:
 
 def _pattern(c: Calibration) -> list[str]:
     """Residuals of neighbours agree where a lens or a board is not what the model says."""
+    grid = np.concatenate([v.grid for v in c.views])
+    kept = np.concatenate([v.kept for v in c.views])
+    view = np.repeat(np.arange(len(c.views)), [len(v.grid) for v in c.views])
+    columns, rows = (grid.max(axis=0) + 1).tolist()
+    lattice = np.full((len(c.views), rows, columns, 2), np.nan)
+    lattice[view[kept], grid[kept, 1], grid[kept, 0]] = np.concatenate([v.residuals_px for v in c.views])[kept]
     products, power = 0.0, 0.0
-    for view in c.views:
-        columns, rows = (view.grid.max(axis=0) + 1).tolist()
-        lattice = np.full((rows, columns, 2), np.nan)
-        lattice[view.grid[view.kept, 1], view.grid[view.kept, 0]] = view.residuals_px[view.kept]
-        for a, b in ((lattice[:, 1:], lattice[:, :-1]), (lattice[1:], lattice[:-1])):
-            both = np.isfinite(a) & np.isfinite(b)
-            products += float((a[both] * b[both]).sum())
-            power += float(0.5 * (a[both] ** 2 + b[both] ** 2).sum())
+    for a, b in ((lattice[:, :, 1:], lattice[:, :, :-1]), (lattice[:, 1:], lattice[:, :-1])):
+        products += float(np.nansum(a * b))
+        power += 0.5 * float(np.nansum(a**2 + b**2))
     if not power > 0.0 or products / power < PATTERN:
         return []
     return [
