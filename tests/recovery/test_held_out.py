@@ -24,7 +24,7 @@ NOISE_PX = 0.05
 SIGMAS = 4.0
 """One correct figure in 16000 lies further from the truth, if its sigma is honest."""
 RMS_FACTOR = 1.5
-"""The rms of some hundred Sampson distances over the noise's: 1 but for 6 % of chance; a wrong pose gives 20 and more."""
+"""Rms of a hundred Sampson distances over the noise: 1 but for 6 % of chance; a wrong pose gives 20 and more."""
 
 
 def regular_lens(
