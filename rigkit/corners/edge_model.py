@@ -122,14 +122,23 @@ def _step(distance: Float32, blur: Float32, gaps: Float32) -> tuple[Float32, ...
     Where squares are small against the blur, the edges of the parallel lines at `gaps` (N, 2) before and after reach
     into the window: their steps are taken away. Far from both they add up to nothing: one is -1, the other +1.
     """
-    wide = STEP_WIDTH * blur
-    total = _smooth_step(distance / wide)
-    tight = (gaps * (1.0 - REACH) < wide).any(axis=1)
+    total = _smooth_step(distance / (STEP_WIDTH * blur))
+    tight = (gaps * (1.0 - REACH) < STEP_WIDTH * blur).any(axis=1)
     if tight.any():
-        for place in (-gaps[tight, :1], gaps[tight, 1:]):
-            for mine, theirs in zip(total, _smooth_step((distance[tight] - place) / wide[tight]), strict=True):
-                mine[tight] -= theirs
+        near, sigma, beside = distance[tight], blur[tight], gaps[tight]
+        lines = [_gaussian_step((near - place) / sigma) for place in (0.0, -beside[:, :1], beside[:, 1:])]
+        for kind, (own, before, after) in enumerate(zip(*lines, strict=True)):
+            total[kind][tight] = own - before - after
     return total
+
+
+def _gaussian_step(x: Float32) -> tuple[Float32, ...]:
+    """Return what `_smooth_step` does, of the Gaussian's own step: its tails matter where lines are close."""
+    from scipy.special import erf
+
+    slope = np.float32(np.sqrt(2.0 / np.pi)) * np.exp(np.float32(-0.5) * x * x)
+    rising = x * slope
+    return erf(x * np.float32(np.sqrt(0.5))), slope, -rising, rising
 
 
 def _smooth_step(u: Float32) -> tuple[Float32, ...]:

@@ -94,24 +94,29 @@ def _candidates(corners: Corners) -> tuple[IntArray, IntArray, IntArray, IntArra
 
     pixels = corners.pixels
     near = min(NEIGHBOURS + 1, len(pixels))
-    distance, other = cKDTree(pixels).query(pixels, k=near)
-    start = np.repeat(np.arange(len(pixels)), near)
-    end, distance = other.ravel(), distance.ravel()
-    apart = distance > 1e-6
-    start, end, distance = start[apart], end[apart], distance[apart]
-    ratio = corners.contrast[start] / corners.contrast[end]
-    alike = (ratio > CONTRAST_RATIO) & (ratio < 1.0 / CONTRAST_RATIO)
-    start, end, distance = start[alike], end[alike], distance[alike]
-    chord = (pixels[end] - pixels[start]) / distance[:, None]
-    arms = arm_vectors(corners.angles)
-    out = (arms[start] * chord[:, None]).sum(axis=2)
-    arm = out.argmax(axis=1)
-    good = out[np.arange(len(out)), arm] > ARM_COSINE
-    start, end, distance, chord, arm = start[good], end[good], distance[good], chord[good], arm[good]
-    home = -(arms[end] * chord[:, None]).sum(axis=2)
-    back = home.argmax(axis=1)
-    good = (home[np.arange(len(home)), back] > ARM_COSINE) & ((arm + back) % 2 == 1)
+    length, other = cKDTree(pixels).query(pixels, k=near)
+    length = np.maximum(length, 1e-6)
+    chord_u = (pixels[other, 0] - pixels[:, :1]) / length
+    chord_v = (pixels[other, 1] - pixels[:, 1:]) / length
+    lines = arm_vectors(corners.angles)[:, :2]
+    along = [chord_u * lines[:, k, :1] + chord_v * lines[:, k, 1:] for k in (0, 1)]
+    ratio = corners.contrast[:, None] / corners.contrast[other]
+    alike = (ratio > CONTRAST_RATIO) & (ratio < 1.0 / CONTRAST_RATIO) & (other != np.arange(len(pixels))[:, None])
+    start, slot = np.nonzero(alike & ((np.abs(along[0]) > ARM_COSINE) | (np.abs(along[1]) > ARM_COSINE)))
+    end, distance = other[start, slot], length[start, slot]
+    arm = _arm(along[0][start, slot], along[1][start, slot])
+    chord = np.stack([chord_u[start, slot], chord_v[start, slot]], axis=-1)
+    home = -(lines[end] * chord[:, None]).sum(axis=2)
+    back = _arm(home[:, 0], home[:, 1])
+    good = (np.abs(home).max(axis=1) > ARM_COSINE) & ((arm + back) % 2 == 1)
     return start[good], arm[good], end[good], back[good], distance[good]
+
+
+def _arm(along_a: FloatArray, along_b: FloatArray) -> IntArray:
+    """Return the arm (A, B, -A, -B) that points most along, given the cosines to A and B."""
+    second = np.abs(along_b) > np.abs(along_a)
+    backwards = np.where(second, along_b, along_a) < 0.0
+    return second.astype(np.int64) + 2 * backwards.astype(np.int64)
 
 
 def _edge_seen(corners: Corners, level: Level, start: IntArray, arm: IntArray, end: IntArray) -> BoolArray:

@@ -142,7 +142,7 @@ def test_foreshortened_by_75_degrees(rng: np.random.Generator) -> None:
     assert found.complete
 
 
-@pytest.mark.parametrize("change", [{"exposure": 0.06, "noise_levels": 0.7}, {"jpeg_quality": 60}, {"exposure": 1.6}])
+@pytest.mark.parametrize("change", [{"exposure": 0.025, "noise_levels": 0.3}, {"jpeg_quality": 60}, {"exposure": 1.6}])
 def test_light_and_compression(change: dict[str, object], rng: np.random.Generator) -> None:
     scene = single(Board("a", 9, 6, 30.0, 30.0), [0.3, 0.2, 0.1], 600.0)
     (found,) = detect_boards(scene.image(rng, **change))

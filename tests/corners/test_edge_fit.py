@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from rigkit.corners.edge_fit import fit_edges
@@ -91,6 +93,30 @@ def test_finds_its_own_corners(rng: np.random.Generator) -> None:
         blind = fit_edges(image, start, straight, np.ones(6), np.full(6, 1.2), radius_px=18.0, iterations=12)
         moved = np.abs(blind.pixels - pixels).max()
         assert (moved > 0.1) == (bend > 0.0), "curvature is what keeps a bent row from pulling the corner aside"
+
+
+def test_neighbouring_edges_in_the_blur_do_not_pull() -> None:
+    """A Gaussian-blurred chessboard with lines 7 px before and 8.5 px after the corner, at s = 1.9."""
+    blur, before, after = 1.9, 7.0, 8.5
+
+    def wave(x: np.ndarray) -> np.ndarray:
+        lines = ((-2, -15.0), (-1, -before), (0, 0.0), (1, after), (2, 18.0))
+        return sum((-1.0) ** k * np.vectorize(math.erf)((x - at) / (math.sqrt(2.0) * blur)) for k, at in lines)
+
+    u, v = np.arange(64.0) - 32.3, np.arange(64.0) - 31.8
+    image = (120.0 - 70.0 * wave(v)[:, None] * -wave(u)).astype(np.float32)
+    sides = np.array([[[7.7, 0.0], [0.0, 7.7]]])
+    # Line 1 runs along u: its neighbours lie before and after in v. For line 2 +90 degrees is -u.
+    gaps = np.array([[[before, after], [after, before]]])
+    off = []
+    for known in (gaps, gaps + 1e3):
+        shape = Geometry(sides, np.zeros((1, 2)), known)
+        start = np.array([[32.0, 32.0]])
+        fit = fit_edges(image, start, shape, np.ones(1), np.full(1, 1.9), radius_px=18.0, iterations=12)
+        assert fit.contrast[0] > 100.0
+        off.append(float(np.abs(fit.pixels - [32.3, 31.8]).max()))
+    assert off[0] < 0.01
+    assert off[1] > 0.03
 
 
 def test_wrong_polarity_shows_as_negative_contrast(rng: np.random.Generator) -> None:
