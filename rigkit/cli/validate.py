@@ -235,7 +235,11 @@ def finish(args: argparse.Namespace, dataset: Dataset, outcomes: list[PairOutcom
         print(tables_to_text([summary]))
         _say_failures(reports, compared)
         for cause in causes:
-            print(f"probable cause: {cause}")
+            # Where everything passed it explains nothing, but a person should know.
+            if passed:
+                note(f"to look at: {cause}")
+            else:
+                print(f"probable cause: {cause}")
         words = "all checks passed" if passed else "a check FAILED"
         where = out / ("report.html" if sections else "tables.md")
         print(f"{words}; {where}, {seconds:.1f} s")
