@@ -128,6 +128,24 @@ def test_gradient_of_frames_and_mounts(rng: np.random.Generator) -> None:
     assert np.abs(numeric - analytic).max() < 1e-5 * np.abs(analytic).max()
 
 
+def test_baseline_sigma_is_that_of_moved_mounts(rng: np.random.Generator) -> None:
+    """The variance of a baseline against mounts drawn from the covariance."""
+    rig = calibrate_rig(rig_views(rng, 20), sizes(), model=MODELS)
+    length, sigma = rig.baseline_mm("wide", "fish")
+    count = sum(c.camera.parameters.size for c in rig.cameras)
+    drawn = rng.multivariate_normal(np.zeros(12), rig.covariance[count:, count:], size=4000)
+    centres = []
+    for k, camera in enumerate(rig.cameras[1:]):
+        moved = drawn[:, 6 * k : 6 * k + 6]
+        rotation = exp_so3(moved[:, :3]) @ camera.cam_from_rig.rotation
+        translation = camera.cam_from_rig.translation_mm + moved[:, 3:]
+        centres.append(-np.einsum("nji,nj->ni", rotation, translation))
+    lengths = np.linalg.norm(centres[1] - centres[0], axis=1)
+    # 4000 draws know a standard deviation to 1.1 %.
+    assert lengths.std() == pytest.approx(sigma, rel=0.05)
+    assert lengths.mean() == pytest.approx(length, abs=sigma)
+
+
 def test_cameras_that_share_nothing_are_named(rng: np.random.Generator) -> None:
     views = rig_views(rng, 16)
     views["fish"] = [(f"other{frame}", view) for frame, view in views["fish"]]

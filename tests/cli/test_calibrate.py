@@ -52,6 +52,16 @@ def test_from_images_to_file_and_again_without_images(session: Path, capsys: pyt
     assert np.array_equal(again.camera.parameters, result.camera.parameters)
 
 
+def test_a_changed_image_is_looked_at_again(session: Path) -> None:
+    assert main(["calibrate", str(session)]) == 0
+    before = load_calibration(session.parent / "calibration.json")
+    shutil.copy(session.parent / "00.jpg", session.parent / "01.jpg")
+    assert main(["calibrate", str(session), "--force"]) == 0
+    after = load_calibration(session.parent / "calibration.json")
+    assert not np.array_equal(before.views[1].pixels, after.views[1].pixels)
+    assert np.array_equal(after.views[0].pixels, after.views[1].pixels)
+
+
 def test_bad_input(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
     board = session.parent / "board.toml"
     board.write_text(BOARD.replace("columns = 9", "columns = 7"))
