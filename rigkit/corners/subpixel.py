@@ -44,6 +44,11 @@ ASTRAY_FACTOR = 8.0
 """A corner further than this from where its neighbours say (in cells; and times the board's typical deviation; and
 times the standard deviation expected of it) is something else: a finger, a glint, the end of a ruler."""
 
+COVERED = 0.15
+COVERED_FACTOR = 3.5
+"""A corner whose residual, relative to its contrast, exceeds this and this times the board's typical one, and that lies
+off by this times the typical deviation, is covered in part, by the edge of a ruler or of a hand."""
+
 DIFFERENCE = 5
 UNEXPLAINED = 1.25
 """A scatter about the lattice less than this times the expected one is what chance makes of fifty corners."""
@@ -203,6 +208,9 @@ def _checked(item: RefinedLattice) -> RefinedLattice:
     cells = distance / np.sqrt(np.maximum(area, 1.0))
     limit = max(ASTRAY_CELLS, ASTRAY_FACTOR * float(np.median(cells[judged])))
     astray = judged & (cells > limit) & (distance > ASTRAY_FACTOR * expected)
+    relative = item.residual[known] / item.lattice.contrast[known]
+    covered = relative > max(COVERED, COVERED_FACTOR * float(np.median(relative)))
+    astray |= judged & covered & (cells > COVERED_FACTOR * float(np.median(cells[judged])))
     drop = np.zeros_like(known)
     drop[known] = astray
     out = item.without(drop)
