@@ -73,6 +73,8 @@ def select_dataset(args: argparse.Namespace) -> Dataset:
     """Load the manifest, keep the pairs asked for, and make sure that their images are there."""
     from rigkit.io.manifest import load_dataset
 
+    if args.jobs is not None and args.jobs < 1:
+        raise InputError(f"--jobs {args.jobs}: at least one process is needed")
     dataset = load_dataset(args.dataset).select(args.pair)
     for pair in dataset.pairs:
         pair.require_images()
@@ -122,6 +124,7 @@ def load_cameras(dataset: Dataset, *, recalibrate: bool, progress: Progress) -> 
     """
     from rigkit.cli.calibrate import calibrate_session
     from rigkit.io.calibration_file import save_calibration
+    from rigkit.io.files import ensure_writable
     from rigkit.io.session import load_session
 
     cameras: dict[str, LoadedCamera] = {}
@@ -137,6 +140,7 @@ def load_cameras(dataset: Dataset, *, recalibrate: bool, progress: Progress) -> 
                 f"{dataset.manifest}: camera '{entry.camera_id}' has no session to calibrate from; "
                 'add session = "session.toml" to its table'
             )
+        ensure_writable(entry.calibration, force=True)
         calibration = calibrate_session(load_session(entry.session), progress)
         save_calibration(entry.calibration, calibration, force=True)
         cameras[entry.camera_id] = LoadedCamera(calibration.camera, calibration.covariance)

@@ -107,8 +107,9 @@ def load_calibration(path: str | Path) -> Calibration:
             boards=tuple(BoardShape(**v) for v in data["boards"]),
             verdicts=tuple(str(v) for v in data["verdicts"]),
         )
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"'{path}': damaged ({error}); calibrate again") from error
+    except (KeyError, TypeError, ValueError, InputError) as error:
+        words = str(error)
+        raise InputError(words if str(path) in words else f"'{path}': damaged ({words}); calibrate again") from error
 
 
 def _read(path: str | Path) -> dict[str, Any]:
@@ -146,13 +147,15 @@ def camera_from_json(data: Any, path: str | Path) -> Camera:
     """Return the camera that `camera_to_json` wrote; raises InputError that names the file `path`."""
     if not isinstance(data, dict) or set(data) != CAMERA_KEYS or not isinstance(data["parameters"], dict):
         raise InputError(f"'{path}': 'camera' must have the keys {', '.join(sorted(CAMERA_KEYS))}, and no others")
-    model = camera_model(str(data["model"]))
     try:
         width, height = (int(v) for v in data["size_px"])
         values = np.array([float(v) for v in data["parameters"].values()])
     except (TypeError, ValueError) as error:
         raise InputError(f"'{path}': camera: {error}; size_px is [width, height], parameters are numbers") from error
-    camera = model((width, height), values)
+    try:
+        camera = camera_model(str(data["model"]))((width, height), values)
+    except InputError as error:
+        raise InputError(f"'{path}': camera: {error}; calibrate again") from error
     names = camera.parameter_names()
     if tuple(data["parameters"]) != names:
         raise InputError(f"'{path}': parameters of a {camera.model} camera must be {', '.join(names)}, in this order")

@@ -77,7 +77,8 @@ class Pair:
         """Raise InputError if an image is not there: worth knowing before the work starts."""
         for number, path in ((1, self.image1), (2, self.image2)):
             if not path.is_file():
-                raise InputError(f"pair '{self.pair_id}': image{number} '{path}' does not exist; correct the manifest")
+                what = "is a folder" if path.is_dir() else "does not exist"
+                raise InputError(f"pair '{self.pair_id}': image{number} '{path}' {what}; correct the manifest")
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +123,7 @@ def load_dataset(path: str | Path) -> Dataset:
     source = source.resolve()
     top = read_toml(source, SCHEMA)
     name = top.text("name", hint='name = "my-lab"')
+    _refuse_no_folder(top, "name", name)
     boards = tuple(_board(t) for t in top.tables("boards", hint='[[boards]] with id = "plane1" and file or sizes'))
     cameras = tuple(_camera(t) for t in top.tables("cameras", hint='[[cameras]] with id = "left" and calibration'))
     _refuse_twice(top, "boards", [b.board_id for b in boards])
@@ -164,8 +166,7 @@ def _camera(table: TomlTable) -> CameraEntry:
 
 def _pair(table: TomlTable, boards: Sequence[Board], cameras: Sequence[CameraEntry]) -> Pair:
     pair_id = table.text("id", hint='id = "left-right"')
-    if Path(pair_id).name != pair_id or pair_id in (".", ".."):
-        raise table.error("'id' names a folder of results: use letters, digits, '-' and '_'")
+    _refuse_no_folder(table, "id", pair_id)
     by_camera = {c.camera_id: c for c in cameras}
     by_board = {b.board_id: b for b in boards}
     place = f"{table.path}: {table.where}"
@@ -217,6 +218,12 @@ def _named(name: str, known: Mapping[str, Entry], where: str) -> Entry:
     if name not in known:
         raise InputError(f"{where} '{name}' is not declared; known: {', '.join(known)}")
     return known[name]
+
+
+def _refuse_no_folder(table: TomlTable, key: str, value: str) -> None:
+    """Refuse what cannot be one folder of results: it would be written elsewhere."""
+    if Path(value).name != value or value == "..":
+        raise table.error(f"'{key}' names a folder of results: use letters, digits, '-' and '_'")
 
 
 def _refuse_twice(table: TomlTable, what: str, names: Sequence[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -142,6 +143,29 @@ def test_identical_images_have_no_baseline(write: Write, capsys: pytest.CaptureF
 def test_calibration_that_is_no_calibration(write: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "camera.json").write_text('{"schema": "rigkit.calibration/1", "camera": {"model": "nonsense"}}')
     check(*run(write(calibration="camera.json"), capsys), 2, "camera.json")
+
+
+def test_calibration_with_nan_is_named(write: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    known = json.loads(CALIBRATION.read_text())
+    for place in ("parameter", "covariance"):
+        spoilt = json.loads(json.dumps(known))
+        if place == "parameter":
+            spoilt["camera"]["parameters"][next(iter(spoilt["camera"]["parameters"]))] = float("nan")
+        else:
+            spoilt["covariance"][0][0] = float("nan")
+        (tmp_path / "camera.json").write_text(json.dumps(spoilt))
+        check(*run(write(calibration="camera.json"), capsys), 2, "camera.json", "NaN", "calibrate again")
+
+
+def test_name_that_is_no_folder(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write()
+    manifest = folder / "dataset.toml"
+    manifest.write_text(manifest.read_text().replace('name = "bad"', 'name = "../../elsewhere"'))
+    check(*run(folder, capsys), 2, "dataset.toml", "'name'", "folder of results")
+
+
+def test_no_process(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
+    check(*run(write(), capsys, "-j", "0"), 2, "--jobs 0", "at least one")
 
 
 def test_unknown_pair(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
