@@ -10,6 +10,7 @@ predicted against actual error, CPU milliseconds of one thread. A corner counts 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import os
 import sys
@@ -157,11 +158,20 @@ def opencv(image: np.ndarray, sizes: list[tuple[int, int]], *, sector: bool) -> 
 
 
 def libcbdetect(image: np.ndarray, sizes: list[tuple[int, int]]) -> Found:
-    import libcbdetect
+    """libcbdetect as PyPI has it (pip install libcbdetect): it returns one board."""
+    from libCBDetect import Checkerboard
 
     del sizes
-    boards = libcbdetect.boards_from_corners(libcbdetect.find_corners(image))
-    return Found([np.asarray(board, np.float64).reshape(-1, 2) for board in boards])
+    board = Checkerboard()
+    board.show_processing = False
+    board.array_norm_to_image(image / 255.0, *image.shape)
+    board.find_corners()
+    board.find_board_from_corners()
+    u, v = np.zeros(board.rows * board.cols), np.zeros(board.rows * board.cols)
+    if not len(u):
+        return Found([])
+    board.get_board_corners(u, v)
+    return Found([np.stack([u, v], axis=1)])
 
 
 def detectors(peers: bool) -> dict[str, Callable[[np.ndarray, list[tuple[int, int]]], Found]]:
@@ -169,12 +179,10 @@ def detectors(peers: bool) -> dict[str, Callable[[np.ndarray, list[tuple[int, in
     if peers:
         out["opencv classic + cornerSubPix"] = lambda image, sizes: opencv(image, sizes, sector=False)
         out["opencv SB"] = lambda image, sizes: opencv(image, sizes, sector=True)
-        try:
-            import libcbdetect as _  # noqa: F401
-
+        if importlib.util.find_spec("libCBDetect"):
             out["libcbdetect"] = libcbdetect
-        except ImportError:
-            print("libcbdetect is not importable: left out", file=sys.stderr)
+        else:
+            print("libCBDetect is not importable (pip install libcbdetect): left out", file=sys.stderr)
     return out
 
 
@@ -226,11 +234,11 @@ def judge(score: Score, truth: list[np.ndarray], result: Found) -> None:
     score.images += 1
 
 
-def conditions(poses: list[Scene]) -> Iterator[tuple[str, list[np.ndarray]]]:
+def conditions(poses: list[Scene], only: list[int] | None) -> Iterator[tuple[str, list[np.ndarray]]]:
     """Yield (name, images) for every blur and noise."""
     for blur, noises in NOISES.items():
         light = [radiance(s.boards, s.camera, s.cam_from_world, optics=Optics(blur_px=blur)) for s in poses]
-        for noise in noises:
+        for noise in noises if only is None else [n for n in noises if n in only]:
             photometry = Photometry(exposure=0.95, vignetting=0.25, gradient=(0.1, -0.05), noise_levels=float(noise))
             rng = np.random.default_rng(1000 + noise)
             yield f"blur {blur} noise {noise}", [np.asarray(develop(x, photometry, rng)) for x in light]
@@ -240,18 +248,20 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scenes", nargs="+", default=["single", "trihedral", "fisheye"], choices=list(SCENES))
     parser.add_argument("--poses", type=int, default=6)
+    parser.add_argument("--noise", nargs="+", type=int, help="only these noise levels")
     parser.add_argument("--peers", action="store_true", help="also run OpenCV's detectors and libcbdetect")
     parser.add_argument("--json", metavar="FILE", help="write the figures for programs")
     args = parser.parse_args()
     cv2.setNumThreads(1)
+    chosen = detectors(args.peers)
     table: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
     for name in args.scenes:
         rng = np.random.default_rng(7)
         poses = [SCENES[name](rng) for _ in range(args.poses)]
         print(f"\n## {name}, {args.poses} poses\n")
         head = None
-        for condition, images in conditions(poses):
-            for detector, run in detectors(args.peers).items():
+        for condition, images in conditions(poses, args.noise):
+            for detector, run in chosen.items():
                 score = Score([], [])
                 for scene, image in zip(poses, images, strict=True):
                     truth = scene.truth()
