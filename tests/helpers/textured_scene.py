@@ -75,25 +75,12 @@ class Corner:
         for k in range(3):
             on = (plane == k) & seen
             first, second = (at[on][:, [i for i in range(3) if i != k]] / TEXEL_MM).astype(np.float32).T
-            # Mirrored beyond its border.
-            out[on] = (
-                cv2.remap(self.textures[k], first[None], second[None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)[
-                    0
-                ]
-                if on.sum() < 32767
-                else np.concatenate(
-                    [
-                        cv2.remap(self.textures[k], a[None], b[None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)[
-                            0
-                        ]
-                        for a, b in zip(
-                            np.array_split(first, len(first) // 30000 + 1),
-                            np.array_split(second, len(first) // 30000 + 1),
-                            strict=True,
-                        )
-                    ]
-                )
-            )
+            # OpenCV's maps may not be wider than 32767.
+            for part in np.array_split(np.flatnonzero(on), len(first) // 30000 + 1):
+                places = np.searchsorted(np.flatnonzero(on), part)
+                maps = first[None, places], second[None, places]
+                # Mirrored beyond its border.
+                out[part] = cv2.remap(self.textures[k], *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)[0]
         fine = out.reshape(height * s, width * s)
         image = cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA)
         return np.clip(image + rng.normal(0.0, 1.0, image.shape), 0, 255).astype(np.uint8)
