@@ -18,6 +18,10 @@ CENTRE_SIGMA = 0.15
 SQUARE_SIGMA = 0.01
 """Of the ratio of the pixel's sides, and of its skew."""
 
+DENOMINATOR_SIGMA = 1.0
+"""Of the denominator's coefficients in the rational distortion: numerator and denominator can grow together for ever
+(to 1e3, without convergence) while their ratio stays."""
+
 
 def camera_prior(camera: Camera) -> tuple[FloatArray, FloatArray]:
     """Return d r / d parameters (m, P) and r (m,): departures from what is expected, in standard deviations."""
@@ -46,4 +50,7 @@ def camera_prior(camera: Camera) -> tuple[FloatArray, FloatArray]:
         fx, fy = values[names.index("fx")], values[names.index("fy")]
         size = SQUARE_SIGMA * 0.5 * (abs(fx) + abs(fy))
         add({"fx": 1.0 / size, "fy": -1.0 / size}, float(fx - fy) / size)
+    if "k6" in names:
+        for name in ("k4", "k5", "k6"):
+            add({name: 1.0 / DENOMINATOR_SIGMA}, float(values[names.index(name)]) / DENOMINATOR_SIGMA)
     return np.array(rows).reshape(-1, len(names)), np.array(residuals)

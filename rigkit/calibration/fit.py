@@ -150,7 +150,7 @@ def _sigma(state: State, norm: FloatArray, kept: BoolArray) -> float:
     if freedom <= 0:
         return float("nan")
     sigma = np.sqrt(total / freedom)
-    return float(np.sqrt((total + prior * sigma**2) / freedom))
+    return float(np.sqrt((total + prior * sigma**2) / freedom)) if prior else float(sigma)
 
 
 def heldout_rms(observations: Observations, fit: Fit, folds: int) -> float | None:

@@ -67,6 +67,16 @@ def test_scaramuzza_degree_by_heldout_error(rng: np.random.Generator) -> None:
     assert np.sqrt((projection_difference(result.camera, lens("fish"), 90.0) ** 2).mean()) < 0.2
 
 
+def test_rational_brown_converges(rng: np.random.Generator) -> None:
+    """Numerator and denominator of the rational distortion must not run away together."""
+    views, _, _ = random_views(lens("reg"), 20, rng, reach_deg=33.0)
+    result = calibrate(views, SIZE, model="brown", degree=8, board="flat")
+    assert result.convergence.converged
+    assert np.abs(result.camera.parameters[4:]).max() < 10.0
+    five = calibrate(views, SIZE, model="brown", degree=5, board="flat")
+    assert result.heldout_rms_px < 1.02 * five.heldout_rms_px
+
+
 def test_exact_corners_give_the_exact_lens(rng: np.random.Generator) -> None:
     views, _, _ = random_views(lens("fish"), 6, rng, reach_deg=92.5, noise_px=0.0)
     result = calibrate(views, SIZE, model="kannala_brandt", board="flat", folds=0)
