@@ -107,7 +107,7 @@ def validate_pair(job: PairJob) -> PairOutcome:
     names = (pair.camera1.camera_id, pair.camera2.camera_id)
     camera1, camera2 = (job.cameras[name].camera for name in names)
     found1, found2, image1, image2 = find_boards(pair, camera1, camera2)
-    known = {name: loaded.camera for name, loaded in job.cameras.items() if loaded.camera.size_px == camera1.size_px}
+    known = {name: loaded.camera for name, loaded in job.cameras.items()}
     causes = camera_suspects(pair.pair_id, names, (found1, found2), pair.boards, known)
     try:
         return _judge(job, match_found(pair, camera1, camera2, found1, found2, job.chain), image1, image2, causes)

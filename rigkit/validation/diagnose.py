@@ -68,9 +68,13 @@ def camera_suspects(
     declared : names of the cameras of image 1 and image 2.
     detections : boards found in image 1 and image 2; names are not needed.
     boards : that may be there.
-    cameras : all calibrated cameras of the data set, by name.
+    cameras : all calibrated cameras of the data set, by name; those of another image size than the declared one
+        cannot have taken the image.
     """
-    fits = [{name: camera_fit(camera, found, boards) for name, camera in cameras.items()} for found in detections]
+    fits = []
+    for found, own in zip(detections, declared, strict=True):
+        size_px = cameras[own].size_px
+        fits.append({n: camera_fit(c, found, boards) for n, c in cameras.items() if c.size_px == size_px})
     better = [_clearly_better(fit, name) for fit, name in zip(fits, declared, strict=True)]
     one, two = declared
     if one != two and better == [two, one]:

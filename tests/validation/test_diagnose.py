@@ -11,6 +11,7 @@ from helpers.reconstructions import BOARDS, CAM2_FROM_CAM1, make_reconstruction
 
 from rigkit.boards import Board
 from rigkit.cameras.base import Camera
+from rigkit.cameras.pinhole import Pinhole
 from rigkit.detections import BoardDetection
 from rigkit.truth import Feature, MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
 from rigkit.validation.checks import ValidationReport, validate
@@ -145,6 +146,18 @@ def test_swapped_images_or_cameras_are_named(rng: np.random.Generator) -> None:
     found = camera_suspects("p", ("regular", "fisheye"), (two, one), BOARDS, CAMERAS)
     assert len(found) == 1
     assert "swapped" in found[0]
+
+
+def test_cameras_of_two_image_sizes_in_one_pair(rng: np.random.Generator) -> None:
+    small, large = CAMERAS["regular"], CAMERAS["fisheye"]
+    doubled = Pinhole((2 * small.size_px[0], 2 * small.size_px[1]), np.array([1500.0, 1500.0, 700.0, 500.0]))
+    one, two = detected(rng, small)[0], detected(rng, large)[1]
+    cameras = CAMERAS | {"large": doubled}
+    assert camera_suspects("p", ("regular", "fisheye"), (one, two), BOARDS, cameras) == ()
+    # What was declared does not fit, and no camera of another image size is proposed for it.
+    found = camera_suspects("p", ("large", "fisheye"), (one, two), BOARDS, cameras)
+    assert len(found) == 1
+    assert "does not fit the calibration of 'large'" in found[0]
 
 
 def test_no_board_of_known_size_says_nothing(rng: np.random.Generator) -> None:
