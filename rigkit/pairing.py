@@ -59,6 +59,15 @@ class MatchedPair:
     noise: DirectionNoise
     notes: tuple[str, ...] = ()
 
+    def noisier(self, factor: float) -> MatchedPair:
+        """Return the same pair with all standard deviations of corners and directions multiplied by `factor`."""
+
+        def scaled(matches: Matches) -> Matches:
+            return replace(matches, sigma1_px=matches.sigma1_px * factor, sigma2_px=matches.sigma2_px * factor)
+
+        noise = DirectionNoise(self.noise.covariance1 * factor**2, self.noise.covariance2 * factor**2)
+        return replace(self, captured=scaled(self.captured), matches=scaled(self.matches), noise=noise)
+
 
 def match_pair(
     pair_id: str,

@@ -43,6 +43,9 @@ __all__ = ["Reconstruction", "decide_pose_type", "oriented_cloud", "reconstruct_
 MAX_BASELINE_SIGMA = 0.2
 """A baseline known to no better than a fifth of itself is no baseline: whatever is built on it is noise."""
 
+NOTABLE_SCATTER = 2.0
+"""Corners that scatter this many times more than predicted are worth a word: blur, JPEG, a bad calibration."""
+
 GREY = 160
 
 
@@ -144,6 +147,15 @@ def _reconstruct(
     # Affinities computed from an epipolar geometry satisfy it exactly: estimating it from them again is circular.
     rule: WeightRule = "points" if needs_epipolar(affine_method) else "noise"
     refined = _likeliest_pose(pair, matches, rule, by_points.E21, pose_type, level_sigma_rad)
+    scatter = float(np.sqrt(refined.variance_factor))
+    if scatter > 1.0:
+        # The corners miss the epipolar geometry by more than their sigmas promise: believe what is seen.
+        pair = pair.noisier(scatter)
+        affinities = _affinities(pair, affine_method, by_points.E21, scale)
+        matches = pair.matches.with_affinities(affinities.A21, affinities.sigma_A)
+        refined = refine_pose(pair.captured, refined.cam2_from_cam1, pose_type, level_sigma_rad)
+    if scatter > NOTABLE_SCATTER:
+        notes.append(f"corners scatter {scatter:.1f} times as much as predicted; all sigmas were enlarged to match")
     metric = metric_pose(pair.captured, refined.cam2_from_cam1, refined.covariance, pair.boards)
     if metric.baseline_sigma_mm > MAX_BASELINE_SIGMA * metric.baseline_mm:
         raise DegenerateError(
