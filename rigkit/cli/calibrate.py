@@ -22,9 +22,7 @@ HELP = "calibrate a camera from images of chessboards"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("session", type=Path, metavar="SESSION.toml", help="what to calibrate (rigkit.session/1)")
-    parser.add_argument(
-        "-o", "--output", type=Path, help="default: calibration.json beside the session"
-    )
+    parser.add_argument("-o", "--output", type=Path, help="default: calibration.json beside the session")
     parser.add_argument("--force", action="store_true", help="replace an existing calibration")
     parser.add_argument("--json", action="store_true", help="print the result for programs")
 
