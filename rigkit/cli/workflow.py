@@ -63,7 +63,7 @@ def add_dataset_arguments(parser: argparse.ArgumentParser, *, optional: bool = F
     parser.add_argument("--force", action="store_true", help="replace existing results")
     parser.add_argument("--recalibrate", action="store_true", help="calibrate from the images even if that was done")
     parser.add_argument(
-        "--chain", choices=("raw", "rectified"), default="raw", help="work in captured pixels (default)"
+        "--chain", choices=("raw", "rectified"), default="raw", help="captured pixels or perspective views"
     )
     parser.add_argument("-j", "--jobs", type=int, metavar="N", help="processes (default: one a core)")
     parser.add_argument("--json", action="store_true", help="print the result for programs")
