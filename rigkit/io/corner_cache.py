@@ -18,6 +18,7 @@ import numpy as np
 import rigkit.corners
 from rigkit.boards import Board
 from rigkit.detections import BoardDetection
+from rigkit.errors import InputError
 from rigkit.io.files import write_atomic
 
 __all__ = ["CornerCache", "FoundCorners", "image_hash"]
@@ -43,11 +44,13 @@ class CornerCache:
         self._changed = False
         try:
             data = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            if isinstance(data, dict) and data.get("schema") == SCHEMA and data.get("detector") == self.detector:
+                for entry in data["images"].values():
+                    str(entry["sha256"]), _found_in(entry)
+                self._entries = data["images"]
+        except (OSError, ValueError, TypeError, KeyError, AttributeError, InputError):
             # A cache that cannot be read is as good as none: it is written anew.
             return
-        if isinstance(data, dict) and data.get("schema") == SCHEMA and data.get("detector") == self.detector:
-            self._entries = data["images"]
 
     @property
     def images(self) -> list[str]:
@@ -60,8 +63,7 @@ class CornerCache:
         entry = self._entries.get(name)
         if entry is None or (digest is not None and entry["sha256"] != digest):
             return None
-        width, height = entry["size_px"]
-        return FoundCorners((int(width), int(height)), tuple(_detection_in(v) for v in entry["boards"]))
+        return _found_in(entry)
 
     def put(self, name: str, digest: str, found: FoundCorners) -> None:
         """Remember the corners of an image."""
@@ -97,6 +99,11 @@ def _detection_out(d: BoardDetection) -> dict[str, Any]:
         "pixels": d.pixels.tolist(),
         "sigma_px": d.sigma_px.tolist(),
     }
+
+
+def _found_in(entry: dict[str, Any]) -> FoundCorners:
+    width, height = entry["size_px"]
+    return FoundCorners((int(width), int(height)), tuple(_detection_in(v) for v in entry["boards"]))
 
 
 def _detection_in(data: dict[str, Any]) -> BoardDetection:

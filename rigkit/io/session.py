@@ -82,9 +82,14 @@ def _images(table: TomlTable) -> tuple[Path, ...]:
     except InputError:
         patterns = table.texts("images", hint=hint)
     found: dict[Path, None] = {}
+    absent = []
     for pattern in patterns:
-        matches = sorted(glob.glob(str(table.path.parent / pattern)))
-        found |= {Path(m).resolve(): None for m in matches}
+        matches = [Path(m) for m in sorted(glob.glob(str(table.path.parent / pattern)))]
+        found |= {m.resolve(): None for m in matches if m.is_file()}
+        absent += [pattern] if not matches else []
+    # No image at all is well where corners are kept; one of several is a mistake.
+    if found and absent:
+        raise table.error(f"'images': nothing matches '{absent[0]}'; correct or remove it")
     return tuple(found)
 
 

@@ -12,6 +12,8 @@ from helpers.data import REPOSITORY
 
 from rigkit.cli.main import main
 from rigkit.io.calibration_file import load_calibration
+from rigkit.io.corner_cache import CornerCache
+from rigkit.io.session import load_session
 
 IMAGES = REPOSITORY / "datasets" / "lab-a" / "calibration" / "fisheye"
 SESSION = 'schema = "rigkit.session/1"\nimages = "*.jpg"\nboard = "board.toml"\nmodel = "kannala_brandt"\n'
@@ -79,6 +81,27 @@ def test_bad_input(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (session.parent / "corners.json").unlink(missing_ok=True)
     assert main(["calibrate", str(session)]) == 2
     assert "no image matches" in capsys.readouterr().err
+
+
+def test_what_is_no_image(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A folder that the pattern meets is passed over; a listed image that is not there is a mistake."""
+    (session.parent / "old.jpg").mkdir()
+    assert main(["calibrate", str(session)]) == 0
+    session.write_text(SESSION.replace('"*.jpg"', '["0*.jpg", "gone.jpg"]'))
+    assert main(["calibrate", str(session), "--force"]) == 2
+    assert "gone.jpg" in capsys.readouterr().err
+
+
+def test_damaged_corners_are_found_again(session: Path) -> None:
+    assert main(["calibrate", str(session)]) == 0
+    kept = session.parent / "corners.json"
+    good = kept.read_text()
+    for bad in (good[: len(good) // 2], "[]", '{"images": 3}', good.replace('"sigma_px": [', '"sigma_px": [NaN, ', 1)):
+        kept.write_text(bad)
+        cache = CornerCache(kept, load_session(session).boards)
+        assert cache.images == []
+    assert main(["calibrate", str(session), "--force"]) == 0
+    assert json.loads(kept.read_text()) == json.loads(good)
 
 
 def test_image_of_another_size_is_dropped_with_the_reason(session: Path) -> None:
