@@ -49,7 +49,7 @@ COVERED_FACTOR = 3.5
 """A corner whose residual, relative to its contrast, exceeds this and this times the board's typical one, and that lies
 off by this times the typical deviation, is covered in part, by the edge of a ruler or of a hand."""
 
-DIFFERENCE = 5
+DIFFERENCES = (5, 6)
 UNEXPLAINED = 1.25
 """A scatter about the lattice less than this times the expected one is what chance makes of fifty corners."""
 
@@ -221,8 +221,8 @@ def _checked(item: RefinedLattice) -> RefinedLattice:
 def _scatter(item: RefinedLattice) -> float:
     """Return how much more the corners scatter about smooth rows and columns than their sigmas say (1: as they say).
 
-    Judged by the differences of order DIFFERENCE along rows and columns, with and without the best perspective taken
-    away first: the one is blind to strong perspective, the other to a fisheye's bend.
+    Judged by the DIFFERENCES along rows and columns, with and without the best perspective taken away first: the one is
+    blind to strong perspective, the other to a fisheye's bend, and the calmest of them is right.
     """
     row, column = np.nonzero(item.lattice.known)
     grid = np.stack([column, row], axis=-1).astype(np.float64)
@@ -230,21 +230,21 @@ def _scatter(item: RefinedLattice) -> float:
     flat = np.full(item.lattice.pixels.shape, np.nan)
     if plane is not None:
         flat[row, column] = cv2.perspectiveTransform(grid[None], plane)[0]
-    bent = _roughness(item.lattice.pixels, item.sigma_px)
-    straight = _roughness(item.lattice.pixels - flat, item.sigma_px)
-    scatter = float(np.fmin(bent, straight))
+    curved = (item.lattice.pixels, item.lattice.pixels - flat)
+    ratios = [_roughness(values, item.sigma_px, order) for values in curved for order in DIFFERENCES]
+    scatter = float(np.fmin.reduce(ratios))
     return scatter if np.isfinite(scatter) else 1.0
 
 
-def _roughness(values: FloatArray, sigma: FloatArray) -> float:
-    """Return the typical difference of order DIFFERENCE of `values` (R, C, 2), over the expected one; NaN if few."""
-    factors = np.array([float(comb(DIFFERENCE, k)) for k in range(DIFFERENCE + 1)])
+def _roughness(values: FloatArray, sigma: FloatArray, order: int) -> float:
+    """Return the typical difference of `order` of `values` (R, C, 2) over the expected one; NaN if there are few."""
+    factors = np.array([float(comb(order, k)) for k in range(order + 1)])
     ratios = [np.zeros(0)]
     for axis in (0, 1):
-        if sigma.shape[axis] > DIFFERENCE:
-            windows = np.lib.stride_tricks.sliding_window_view(sigma, DIFFERENCE + 1, axis=axis)
+        if sigma.shape[axis] > order:
+            windows = np.lib.stride_tricks.sliding_window_view(sigma, order + 1, axis=axis)
             expected = np.sqrt(((windows * factors) ** 2).sum(axis=-1))
-            ratio = np.abs(np.diff(values, DIFFERENCE, axis=axis)) / expected[..., None]
+            ratio = np.abs(np.diff(values, order, axis=axis)) / expected[..., None]
             ratios.append(ratio[np.isfinite(ratio)])
     every = np.concatenate(ratios)
     return float(np.median(every)) / MEDIAN_OF_NORMAL if len(every) >= 16 else np.nan
