@@ -68,7 +68,12 @@ def corner_scene(
 
 
 def single(
-    board: Board, rotation: np.ndarray, distance_mm: float, *, shift_mm: tuple[float, float] = (0.0, 0.0), **kwargs: object
+    board: Board,
+    rotation: np.ndarray,
+    distance_mm: float,
+    *,
+    shift_mm: tuple[float, float] = (0.0, 0.0),
+    **kwargs: object,
 ) -> Scene:
     """Return one board, its middle at `distance_mm` before the regular camera, turned by the rotation vector."""
     turn = exp_so3(np.asarray(rotation, dtype=np.float64))
@@ -85,4 +90,6 @@ def errors_by_position(found: BoardDetection, truth: np.ndarray) -> np.ndarray:
 
 def match(found: tuple[BoardDetection, ...], truth: list[tuple[np.ndarray, np.ndarray]]) -> list[BoardDetection]:
     """Return the detection of each true board: the one whose middle is nearest."""
-    return [min(found, key=lambda d: np.linalg.norm(d.pixels.mean(axis=0) - pixels.mean(axis=0))) for _, pixels in truth]
+    return [
+        min(found, key=lambda d: np.linalg.norm(d.pixels.mean(axis=0) - pixels.mean(axis=0))) for _, pixels in truth
+    ]
