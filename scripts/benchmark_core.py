@@ -1,0 +1,444 @@
+"""Speed of the affine and epipolar core on one core, beside a plain loop, OpenCV, COLMAP and PoseLib.
+
+python scripts/benchmark_core.py [--only affine|epipolar|robust] [--corners 1000000] [--json]
+
+Times are of the processor: other programs on the machine hardly change them. Ratios are to the other's rate at the same problems: above 1 rigkit is faster. PoseLib is optional (pip install
+poselib). Where two programs estimate the same pose the median errors are shown as well.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import cv2
+import numpy as np
+
+from rigkit.affine.affinities import EpipolarNormals
+from rigkit.affine.normal import normals_from_affines
+from rigkit.affine.registry import AFFINE_METHODS, affines_from_directions
+from rigkit.affine.surface import affines_from_normals
+from rigkit.cameras.pinhole import Pinhole
+from rigkit.fundamental.minimal import essential_from_five_rows, essential_from_six_rows, fundamental_from_seven_rows
+from rigkit.fundamental.planar import solve_planar_batch
+from rigkit.fundamental.pose import essential_from_pose
+from rigkit.fundamental.refine import estimate_pose, refine_pose
+from rigkit.fundamental.registry import fundamental_for
+from rigkit.fundamental.robust import robust_pose
+from rigkit.fundamental.rows import PLANAR_ENTRIES, affinity_rows, point_rows
+from rigkit.geometry.projection_jacobian import pair_projection_jacobians
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import angle_between, exp_so3, rotation_angle, unit
+from rigkit.geometry.triangulation import correct_hartley_sturm, correct_lindstrom, triangulate_rays
+from rigkit.matches import DirectionPairs, Matches
+
+CAMERA = Pinhole((1624, 1240), np.array([1350.0, 1350.0, 800.0, 620.0]))
+POSE = Rigid3(exp_so3(np.array([0.0, 0.1, 0.0])), [-290.0, 0.0, -70.0])
+NOISE_PX, SIGMA_A = 0.3, 0.02
+DIRECTION_NOISE_RAD = np.radians(0.3)
+REPEATS = 3
+LOOPED = 300
+"""Problems that are enough to time a plain loop."""
+OUTLIERS = 0.4
+ROBUST_SCENES = 12
+
+
+@dataclass
+class Row:
+    """One line of the benchmark; `ratios` maps another way of doing the same to rigkit's rate over its."""
+
+    name: str
+    per_second: float
+    ratios: dict[str, float] = field(default_factory=dict)
+    remark: str = ""
+
+
+def rate(count: int, run: Callable[[], object]) -> float:
+    """Return problems a second, best of a few runs."""
+    times = []
+    for _ in range(REPEATS):
+        start = time.process_time()
+        run()
+        times.append(time.process_time() - start)
+    return count / min(times)
+
+
+def row(name: str, count: int, run: Callable[[], object], remark: str = "", **others: Any) -> Row:
+    """Time `run` and its rivals, given as name=(count, run); None stands for a rival that is not installed."""
+    own = rate(count, run)
+    ratios = {label.replace("_", " "): own / rate(*rival) for label, rival in others.items() if rival is not None}
+    return Row(name, own, ratios, remark)
+
+
+def scene(rng: np.random.Generator, count: int) -> Matches:
+    """Return matches in view of both cameras with noisy affinities of random facets."""
+    X = rng.uniform([-350, -300, 900], [350, 300, 1800], (count, 3))
+    q1, q2 = CAMERA.project(X)[0], CAMERA.project(POSE.apply(X))[0]
+    exact = Matches.from_cameras(CAMERA, CAMERA, q1, q2)
+    facets = unit(-unit(X) + 0.4 * rng.normal(size=X.shape))
+    A21 = affines_from_normals(*jacobians(exact, X), facets)[0] + rng.normal(size=(count, 2, 2)) * SIGMA_A
+    noise1, noise2 = (rng.normal(size=q1.shape) * NOISE_PX for _ in range(2))
+    sigma = np.full(count, NOISE_PX)
+    return Matches.from_cameras(
+        CAMERA,
+        CAMERA,
+        q1 + noise1,
+        q2 + noise2,
+        sigma1_px=sigma,
+        sigma2_px=sigma,
+        A21=A21,
+        sigma_A=np.full(count, SIGMA_A),
+    )
+
+
+def jacobians(m: Matches, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return pair_projection_jacobians(points, m.rays1, m.jacobians1, m.rays2, m.jacobians2, POSE)
+
+
+def noisy_directions(rng: np.random.Generator, A21: np.ndarray, count: int) -> DirectionPairs:
+    angle = np.arange(count) * np.pi / count + rng.uniform(-0.2, 0.2, (len(A21), count))
+    d1 = 40.0 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    d2 = d1 @ np.swapaxes(A21, 1, 2)
+    turn = DIRECTION_NOISE_RAD * rng.normal(size=angle.shape)
+    c, s = np.cos(turn), np.sin(turn)
+    d2 = np.stack([c * d2[..., 0] - s * d2[..., 1], s * d2[..., 0] + c * d2[..., 1]], axis=-1)
+    return DirectionPairs(d1, d2, np.ones(angle.shape, dtype=bool), kinds=tuple(map(str, range(count))))
+
+
+def affine_rows(corners: int) -> Iterator[Row]:
+    """Affine estimators and normals; remark: the largest difference to the loop's answers."""
+    rng = np.random.default_rng(1)
+    m = scene(rng, corners)
+    epipolar = EpipolarNormals.from_rays(m.rays1, m.jacobians1, m.rays2, m.jacobians2, essential_from_pose(POSE))
+    assert m.A21 is not None
+    for count in (3, 6):
+        d = noisy_directions(rng, m.A21, count)
+        for method in AFFINE_METHODS:
+
+            def batched(method: str = method, d: DirectionPairs = d) -> np.ndarray:
+                return affines_from_directions(d, method, epipolar=epipolar, min_conditioning=0.0).A21
+
+            def loop(method: str = method, d: DirectionPairs = d) -> np.ndarray:
+                each = zip(d.image1[:LOOPED], d.image2[:LOOPED], epipolar.n1, epipolar.n2, strict=False)
+                return np.array([loop_affine(method, *one) for one in each])
+
+            off = float(np.nanmax(np.abs(loop() - batched()[:LOOPED])))
+            name = f"{method}, {count} directions"
+            yield row(name, corners, batched, f"difference {off:.0e}", loop=(LOOPED, loop))
+    points, _ = triangulate_rays(m.rays1, m.rays2, POSE)
+    J1, J2 = jacobians(m, points)
+    A21 = m.A21
+
+    def loop_normals() -> np.ndarray:
+        return np.array([loop_normal(*one) for one in zip(J1[:LOOPED], J2, A21, strict=False)])
+
+    off = float(np.abs(loop_normals() - normals_from_affines(J1, J2, A21)[0][:LOOPED]).max())
+    yield row(
+        "normals",
+        corners,
+        lambda: normals_from_affines(J1, J2, A21),
+        f"difference {off:.0e}",
+        loop=(LOOPED, loop_normals),
+    )
+
+
+def loop_affine(method: str, d1: np.ndarray, d2: np.ndarray, n1: np.ndarray, n2: np.ndarray) -> np.ndarray:
+    """One corner as one would write it from the paper, with numpy's dense solvers."""
+    if method in ("2SDIR", "3SDIR"):
+        k = 2 if method == "2SDIR" else len(d1)
+        return np.linalg.lstsq(d1[:k], d2[:k], rcond=None)[0].T
+    rows = np.array(
+        [np.outer([-b[1], b[0]], a).ravel() / np.hypot(*a) / np.hypot(*b) for a, b in zip(d1, d2, strict=True)]
+    )
+    if method == "DET3UDIR":
+        B = np.fliplr(np.diag([1.0, -1.0, -1.0, 1.0]))
+        values, vectors = np.linalg.eig(B @ (rows.T @ rows))
+        shapes = np.real(vectors).T.reshape(-1, 2, 2)
+        determinants = np.linalg.det(shapes)
+        best = min((v, i) for i, v in enumerate(np.real(values)) if determinants[i] > 0.0)[1]
+        area = np.linalg.det(d2[:2]) / np.linalg.det(d1[:2])
+        # Noise can reverse the order of two directions; then there is no scale, here as in rigkit.
+        A = shapes[best] * np.sqrt(area / determinants[best] if area > 0.0 else np.nan)
+        return A * np.sign(np.sum(d2 * (d1 @ A.T)))
+    k = 2 if method == "F2UDIR" else len(d1)
+    A0 = -np.outer(n2, n1) / (n2 @ n2)
+    m = np.array([-n2[1], n2[0]]) / np.hypot(*n2)
+    free = np.stack([np.outer(m, [1.0, 0.0]).ravel(), np.outer(m, [0.0, 1.0]).ravel()], axis=1)
+    y = np.linalg.lstsq(rows[:k] @ free, -rows[:k] @ A0.ravel(), rcond=None)[0]
+    return A0 + np.outer(m, y)
+
+
+def loop_normal(J1: np.ndarray, J2: np.ndarray, A: np.ndarray) -> np.ndarray:
+    """One normal with numpy's dense solvers."""
+    d = np.cross(J1[0], J1[1])
+    d /= np.linalg.norm(d)
+    h = J2 @ d
+    y = (J2 @ np.linalg.pinv(J1) - A).T @ h / (h @ h)
+    n = -(J1.T @ y + d)
+    return n / np.linalg.norm(n)
+
+
+def epipolar_rows() -> Iterator[Row]:
+    """Planar and minimal solvers, poses, corrections and triangulation."""
+    rng = np.random.default_rng(0)
+    yield from planar_rows(rng)
+    yield from minimal_rows(rng)
+    m = scene(rng, 150)
+    for kind in ("general", "planar"):
+        yield row(f"{kind}, 150 matches, linear", 1, lambda kind=kind: fundamental_for(kind).solve(m))
+    points = Matches.from_cameras(CAMERA, CAMERA, m.pixels1, m.pixels2, sigma1_px=m.sigma1_px, sigma2_px=m.sigma2_px)
+    yield row(
+        "general, 150 points, maximum likelihood from a pose",
+        1,
+        lambda: refine_pose(points, POSE),
+        PoseLib=poselib_refine(points),
+    )
+    yield row("planar, 150 points and affinities, from scratch", 1, lambda: estimate_pose(m, "planar"))
+    yield from triangulation_rows(rng)
+
+
+def planar_rows(rng: np.random.Generator, problems: int = 20000, each: int = 10) -> Iterator[Row]:
+    m = scene(rng, problems * each)
+    entries = np.array(PLANAR_ENTRIES)
+
+    def grams() -> np.ndarray:
+        points = point_rows(m.rays1, m.rays2)[:, None, entries]
+        affine = affinity_rows(m.rays1, m.rays2, m.jacobians1, m.jacobians2, m.A21)[..., entries]
+        rows = np.concatenate([points, affine * (NOISE_PX / SIGMA_A)], axis=1).reshape(problems, 3 * each, 4)
+        return np.asarray(np.swapaxes(rows, 1, 2) @ rows)
+
+    made = grams()
+
+    def loop() -> None:
+        for gram in made[:LOOPED]:
+            loop_planar(gram)
+
+    def best_cost(gram: np.ndarray) -> float:
+        e = loop_planar(gram)
+        return float(e @ gram @ e)
+
+    ours = solve_planar_batch(made[:LOOPED])[1]
+    worse = float(np.max(ours / np.array([best_cost(gram) for gram in made[:LOOPED]]))) - 1.0
+    remark = f"cost at most {worse:+.0e} of the loop's"
+    yield row(
+        f"planar, {each} correspondences", problems, lambda: solve_planar_batch(made), remark, loop=(LOOPED, loop)
+    )
+    yield row("the same with making the equations", problems, lambda: solve_planar_batch(grams()))
+
+
+def loop_planar(gram: np.ndarray) -> np.ndarray:
+    """One planar problem: the concave dual by golden section, then both pairs of entries scaled to length one."""
+    J = np.diag([1.0, -1.0, -1.0, 1.0])
+    low, high = -2.0 * np.trace(gram), 2.0 * np.trace(gram)
+    golden = (np.sqrt(5.0) - 1.0) / 2.0
+    for _ in range(60):
+        a, b = high - golden * (high - low), low + golden * (high - low)
+        if np.linalg.eigvalsh(gram + a * J)[0] < np.linalg.eigvalsh(gram + b * J)[0]:
+            low = a
+        else:
+            high = b
+    e = np.linalg.eigh(gram + 0.5 * (low + high) * J)[1][:, 0]
+    return e / np.sqrt([e[0] ** 2 + e[3] ** 2, e[1] ** 2 + e[2] ** 2, e[1] ** 2 + e[2] ** 2, e[0] ** 2 + e[3] ** 2])
+
+
+def minimal_rows(rng: np.random.Generator, problems: int = 2000) -> Iterator[Row]:
+    m = scene(rng, 7 * problems)
+    points = point_rows(m.rays1, m.rays2).reshape(problems, 7, 9)
+    affine = affinity_rows(m.rays1, m.rays2, m.jacobians1, m.jacobians2, m.A21).reshape(problems, 14, 9)
+    pixels = [q.reshape(problems, 7, 2)[:LOOPED] for q in (m.pixels1, m.pixels2)]
+    rays = [np.ascontiguousarray(f.reshape(problems, 7, 3)[:LOOPED, :5]) for f in (m.rays1, m.rays2)]
+
+    def opencv_seven() -> None:
+        for a, b in zip(*pixels, strict=True):
+            cv2.findFundamentalMat(a, b, cv2.FM_7POINT)
+
+    def opencv_five() -> None:
+        for a, b in zip(*pixels, strict=True):
+            cv2.findEssentialMat(a[:5], b[:5], CAMERA.K, method=0)
+
+    def poselib_five(poselib: Any) -> None:
+        for a, b in zip(*rays, strict=True):
+            poselib.essential_matrix_5pt(a, b)
+
+    poselib = optional("poselib")
+    yield row(
+        "minimal F, 7 points", problems, lambda: fundamental_from_seven_rows(points), OpenCV=(LOOPED, opencv_seven)
+    )
+    yield row(
+        "minimal E, 5 points",
+        problems,
+        lambda: essential_from_five_rows(points[:, :5]),
+        OpenCV=(LOOPED, opencv_five),
+        PoseLib=poselib and (LOOPED, lambda: poselib_five(poselib)),
+    )
+    mixed = np.concatenate([points[:, :2], affine[:, :4]], axis=1)
+    yield row("minimal E, 2 affine correspondences", problems, lambda: essential_from_six_rows(mixed))
+
+
+def triangulation_rows(rng: np.random.Generator, count: int = 100_000, few: int = 2000) -> Iterator[Row]:
+    m = scene(rng, count)
+    inverse = np.linalg.inv(CAMERA.K)
+    F21 = inverse.T @ essential_from_pose(POSE) @ inverse
+    F21 /= np.linalg.norm(F21)
+    q1, q2 = m.pixels1, m.pixels2
+
+    def opencv() -> object:
+        return cv2.correctMatches(F21, q1[None, :few], q2[None, :few])
+
+    yield row(
+        "Lindstrom correction", count, lambda: correct_lindstrom(q1, q2, F21), OpenCV_correctMatches=(few, opencv)
+    )
+    yield row(
+        "Hartley-Sturm correction",
+        few,
+        lambda: correct_hartley_sturm(q1[:few], q2[:few], F21),
+        OpenCV_correctMatches=(few, opencv),
+    )
+    P1, P2 = CAMERA.K @ np.eye(3, 4), CAMERA.K @ POSE.matrix()[:3]
+    yield row(
+        "triangulation, optimum in pixels on rays",
+        count,
+        lambda: triangulate_rays(m.rays1, m.rays2, POSE, jacobians1=m.jacobians1, jacobians2=m.jacobians2),
+        OpenCV_linear=(count, lambda: cv2.triangulatePoints(P1, P2, q1.T, q2.T)),
+    )
+
+
+def robust_rows() -> Iterator[Row]:
+    """Contaminated matches: median errors over a few scenes, and the time of one."""
+    ways: dict[str, Callable[[Matches], Rigid3 | None]] = {
+        "rigkit, points": lambda m: robust_pose(m, np.random.default_rng(0)).refined.cam2_from_cam1,
+        "rigkit, affine samples": lambda m: (
+            robust_pose(m, np.random.default_rng(0), sample="affine").refined.cam2_from_cam1
+        ),
+        "OpenCV MAGSAC": opencv_robust,
+        "COLMAP": colmap_robust,
+        "PoseLib": poselib_robust,
+    }
+    rng = np.random.default_rng(3)
+    scenes = [contaminated(rng, 300) for _ in range(ROBUST_SCENES)]
+    for name, way in ways.items():
+        start = time.process_time()
+        poses = [way(m) for m in scenes]
+        spent = (time.process_time() - start) / len(scenes)
+        if any(pose is None for pose in poses):
+            continue
+        errors = np.degrees([pose_errors(pose) for pose in poses if pose is not None])
+        turn, lean = np.median(errors, axis=0)
+        label = f"robust pose, {OUTLIERS:.0%} wrong: {name}"
+        yield Row(label, 1.0 / spent, {}, f"rotation {turn:.4f}, direction {lean:.4f} deg")
+
+
+def contaminated(rng: np.random.Generator, count: int) -> Matches:
+    m = scene(rng, count)
+    wrong = rng.random(count) < OUTLIERS
+    q2, A21 = np.array(m.pixels2), np.array(m.A21)
+    q2[wrong] = rng.uniform([0, 0], CAMERA.size_px, (wrong.sum(), 2))
+    A21[wrong] = np.eye(2) + 0.4 * rng.normal(size=(wrong.sum(), 2, 2))
+    sigma = m.sigma1_px
+    return Matches.from_cameras(
+        CAMERA, CAMERA, m.pixels1, q2, sigma1_px=sigma, sigma2_px=sigma, A21=A21, sigma_A=m.sigma_A
+    )
+
+
+def pose_errors(pose: Rigid3) -> tuple[float, float]:
+    turn = float(rotation_angle(pose.rotation @ POSE.rotation.T))
+    return turn, float(angle_between(pose.translation_mm, POSE.translation_mm))
+
+
+def opencv_robust(m: Matches) -> Rigid3:
+    E21, mask = cv2.findEssentialMat(
+        m.pixels1, m.pixels2, CAMERA.K, method=cv2.USAC_MAGSAC, prob=0.999, threshold=3.0 * NOISE_PX
+    )
+    _, R, t, _ = cv2.recoverPose(E21, m.pixels1, m.pixels2, CAMERA.K, mask=mask)
+    return Rigid3(R, t[:, 0])
+
+
+def colmap_robust(m: Matches) -> Rigid3 | None:
+    pycolmap = optional("pycolmap")
+    if pycolmap is None:
+        return None
+    fx, fy, cx, cy = CAMERA.parameters
+    # COLMAP puts (0.5, 0.5) at the centre of the first pixel.
+    size = dict(zip(("width", "height"), CAMERA.size_px, strict=True))
+    camera = pycolmap.Camera(model="PINHOLE", params=[fx, fy, cx + 0.5, cy + 0.5], **size)
+    options = pycolmap.TwoViewGeometryOptions()
+    options.compute_relative_pose = True
+    options.ransac.random_seed = 0
+    options.ransac.max_error = 3.0 * NOISE_PX
+    pairs = np.repeat(np.arange(len(m), dtype=np.uint32)[:, None], 2, axis=1)
+    found = pycolmap.estimate_calibrated_two_view_geometry(
+        camera, m.pixels1 + 0.5, camera, m.pixels2 + 0.5, pairs, options
+    )
+    return Rigid3.from_matrix(found.cam2_from_cam1.matrix())
+
+
+def poselib_robust(m: Matches) -> Rigid3 | None:
+    poselib = optional("poselib")
+    if poselib is None:
+        return None
+    options = {"max_epipolar_error": 3.0 * NOISE_PX, "seed": 0}
+    pose, _ = poselib.estimate_relative_pose(m.pixels1, m.pixels2, poselib_camera(), poselib_camera(), options)
+    return Rigid3(pose.R, pose.t)
+
+
+def poselib_refine(m: Matches) -> tuple[int, Callable[[], object]] | None:
+    poselib = optional("poselib")
+    if poselib is None:
+        return None
+    start = poselib.CameraPose()
+    start.R, start.t = POSE.rotation, unit(POSE.translation_mm)
+    camera = poselib_camera()
+    return 1, lambda: poselib.refine_relative_pose(m.pixels1, m.pixels2, start, camera, camera)
+
+
+def poselib_camera() -> dict[str, Any]:
+    return {
+        "model": "PINHOLE",
+        "width": CAMERA.size_px[0],
+        "height": CAMERA.size_px[1],
+        "params": CAMERA.parameters.tolist(),
+    }
+
+
+def optional(name: str) -> Any:
+    """Return a module, or None where it is not installed."""
+    try:
+        return __import__(name)
+    except ImportError:
+        return None
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--only", choices=("affine", "epipolar", "robust"))
+    parser.add_argument("--corners", type=int, default=1_000_000)
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args()
+    parts: dict[str, Callable[[], Iterator[Row]]] = {
+        "affine": lambda: affine_rows(args.corners),
+        "epipolar": epipolar_rows,
+        "robust": robust_rows,
+    }
+    rows = []
+    for part, make in parts.items():
+        for made in make() if args.only in (None, part) else ():
+            rows.append(made)
+            if not args.json:
+                ratios = ", ".join(f"{value:.3g} x {other}" for other, value in made.ratios.items())
+                print(f"{made.name:<52}{made.per_second:>12,.0f} /s   {ratios:<32} {made.remark}".rstrip(), flush=True)
+    if args.json:
+        print(json.dumps([asdict(made) for made in rows], indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
