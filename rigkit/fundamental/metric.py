@@ -12,7 +12,7 @@ from rigkit.boards import Board
 from rigkit.fundamental.pose import translation_basis
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit
-from rigkit.geometry.scale import board_scales, metric_scale
+from rigkit.geometry.scale import scale_and_gradient
 from rigkit.geometry.triangulation import point_covariances, triangulate_rays
 from rigkit.matches import Matches
 
@@ -31,16 +31,12 @@ class MetricPose:
     cam2_from_cam1 : metric pose.
     covariance : (6, 6) of (left rotation perturbation rad, translation mm), the scale's uncertainty included.
     baseline_mm, baseline_sigma_mm : length of the translation; sigma from corners, pose, and the squares' own sigma.
-    board_scales_mm, board_sigmas_mm : (B,) the baseline that each board by itself would give, and its sigma at this
-        pose; NaN where a board is not seen enough.
     """
 
     cam2_from_cam1: Rigid3
     covariance: FloatArray
     baseline_mm: float
     baseline_sigma_mm: float
-    board_scales_mm: FloatArray
-    board_sigmas_mm: FloatArray
 
 
 def triangulate_matches(
@@ -103,17 +99,17 @@ def metric_pose(
     R, t = cam2_from_cam1.rotation, unit(cam2_from_cam1.translation_mm)
     points, covariance, _ = triangulate_matches(matches, Rigid3(R, t))
 
-    def scale_at(step: FloatArray) -> float:
-        moved = Rigid3(exp_so3(step[:3]) @ R, unit(t + step[3:]))
-        at, _ = _points(matches, moved)
-        return metric_scale(at, matches.board_index, matches.grid, boards, covariance)[0]
+    def points_at(step: FloatArray) -> Points:
+        return _points(matches, Rigid3(exp_so3(step[:3]) @ R, unit(t + step[3:])))[0]
 
-    scale, sigma = metric_scale(points, matches.board_index, matches.grid, boards, covariance)
+    scale, sigma, by_point = scale_and_gradient(points, matches.board_index, matches.grid, boards, covariance)
     directions = np.zeros((5, 6))
     directions[:3, :3], directions[3:, 3:] = np.eye(3), translation_basis(t)
-    by_direction = [
-        (scale_at(POSE_STEP_RAD * d) - scale_at(-POSE_STEP_RAD * d)) / (2.0 * POSE_STEP_RAD) for d in directions
-    ]
+    by_direction = []
+    for d in directions:
+        motion = (points_at(POSE_STEP_RAD * d) - points_at(-POSE_STEP_RAD * d)) / (2.0 * POSE_STEP_RAD)
+        # A point without a triangulation takes no part.
+        by_direction.append(float(np.sum(by_point * np.nan_to_num(motion))))
     gradient = np.array(by_direction) @ directions
     to_metric = np.zeros((6, 6))
     to_metric[:3, :3] = np.eye(3)
@@ -121,6 +117,5 @@ def metric_pose(
     to_metric[3:, 3:] += scale * np.eye(3)
     full = to_metric @ pose_covariance @ to_metric.T
     full[3:, 3:] += sigma**2 * np.outer(t, t)
-    each, each_sigma = board_scales(points, matches.board_index, matches.grid, boards, covariance)
     baseline_sigma = float(np.sqrt(sigma**2 + gradient @ pose_covariance @ gradient))
-    return MetricPose(Rigid3(R, scale * t), full, scale, baseline_sigma, each, each_sigma)
+    return MetricPose(Rigid3(R, scale * t), full, scale, baseline_sigma)

@@ -16,7 +16,7 @@ from rigkit.boards import Board
 from rigkit.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import exp_so3, nearest_rotation, skew
 
-__all__ = ["board_scales", "metric_scale"]
+__all__ = ["board_scales", "metric_scale", "scale_and_gradient"]
 
 MIN_CORNERS = 4
 OUTLYING = 14.2
@@ -51,7 +51,23 @@ def metric_scale(
     The standard deviation holds for the given pose of the cameras; what the uncertainty of the pose adds is the
     business of whoever knows it.
     """
-    scales, sigmas = board_scales(points_unit, board_index, grid, boards, covariances)
+    scale, sigma, _ = scale_and_gradient(points_unit, board_index, grid, boards, covariances)
+    return scale, sigma
+
+
+def scale_and_gradient(
+    points_unit: Points,
+    board_index: IntArray,
+    grid: IntArray,
+    boards: Sequence[Board],
+    covariances: FloatArray | None = None,
+) -> tuple[float, float, FloatArray]:
+    """Return what `metric_scale` returns, and how the scale moves with every point, (N, 3).
+
+    The derivative is that of the least-squares problem with the weights as they ended: zero for points that took no
+    part, and for those that lost all their weight.
+    """
+    scales, sigmas, slopes = _fit_boards(points_unit, board_index, grid, boards, covariances)
     known = np.isfinite(scales)
     if not known.any():
         raise DegenerateError(
@@ -61,7 +77,8 @@ def metric_scale(
     variance = sigmas**2 + (scales * np.array(square)) ** 2
     weights = np.where(known, 1.0 / np.maximum(np.where(known, variance, 1.0), 1e-300), 0.0)
     total = weights.sum()
-    return float(np.sum(weights * np.where(known, scales, 0.0)) / total), float(total**-0.5)
+    gradient = np.einsum("b,bni->ni", weights, slopes) / total
+    return float(np.sum(weights * np.where(known, scales, 0.0)) / total), float(total**-0.5), gradient
 
 
 def board_scales(
@@ -76,6 +93,18 @@ def board_scales(
     Boards that disagree by many standard deviations have a wrong square size or a wrong pose under them. Parameters as
     in `metric_scale`; the squares' own sigma is not included here.
     """
+    scales, sigmas, _ = _fit_boards(points_unit, board_index, grid, boards, covariances)
+    return scales, sigmas
+
+
+def _fit_boards(
+    points_unit: Points,
+    board_index: IntArray,
+    grid: IntArray,
+    boards: Sequence[Board],
+    covariances: FloatArray | None,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return scale and sigma of every board (B,), NaN where it has none, and the scales' gradients (B, N, 3)."""
     points = np.asarray(points_unit, dtype=np.float64)
     index, cells = np.asarray(board_index), np.asarray(grid)
     if len(index) != len(points) or len(cells) != len(points):
@@ -84,6 +113,7 @@ def board_scales(
     if covariances is not None:
         finite &= np.isfinite(covariances).all(axis=(-2, -1))
     scales, sigmas = np.full(len(boards), np.nan), np.full(len(boards), np.nan)
+    slopes = np.zeros((len(boards), len(points), 3))
     for b, board in enumerate(boards):
         on = finite & (index == b)
         if on.sum() < MIN_CORNERS:
@@ -93,12 +123,16 @@ def board_scales(
         # same, because a single row is what a wrong detection looks like.
         if np.linalg.matrix_rank(model - model.mean(axis=0)) < 2:
             continue
-        scales[b], sigmas[b] = _similarity_scale(points[on], model, None if covariances is None else covariances[on])
-    return scales, sigmas
+        found = _similarity_scale(points[on], model, None if covariances is None else covariances[on])
+        if found is not None:
+            scales[b], sigmas[b], slopes[b, on] = found
+    return scales, sigmas, slopes
 
 
-def _similarity_scale(points: Points, model: Points, covariances: FloatArray | None) -> tuple[float, float]:
-    """Return mm per unit and its standard deviation for one board."""
+def _similarity_scale(
+    points: Points, model: Points, covariances: FloatArray | None
+) -> tuple[float, float, FloatArray] | None:
+    """Return mm per unit, its standard deviation and its gradient (N, 3) for one board; None without a scale."""
     centred = model - model.mean(axis=0)
     k, R, c = _robust_start(points, centred)
     if covariances is None:
@@ -123,10 +157,12 @@ def _similarity_scale(points: Points, model: Points, covariances: FloatArray | N
         if iteration > 1 and abs(step[0]) < 1e-10 * k:
             break
     if not k > 0.0:
-        return float("nan"), float("nan")
+        return None
     spread = float(np.sum(w * square)) / max(3.0 * w.sum() - 7.0, 1.0)
     spread = spread if covariances is None else max(spread, 1.0)
-    return 1.0 / k, float(np.sqrt(spread * np.linalg.inv(gram)[0, 0])) / k**2
+    inverse = np.linalg.inv(gram)
+    by_point = np.einsum("j,n,nij,nik->nk", inverse[0], w, J, whiten)
+    return 1.0 / k, float(np.sqrt(spread * inverse[0, 0])) / k**2, -by_point / k**2
 
 
 def _robust_start(points: Points, centred: Points) -> tuple[float, FloatArray, FloatArray]:

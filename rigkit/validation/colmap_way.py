@@ -8,7 +8,7 @@ import numpy as np
 
 from rigkit.arrays import FloatArray, IntArray, Points
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.scale import metric_scale
+from rigkit.geometry.scale import scale_and_gradient
 from rigkit.geometry.triangulation import point_covariances
 from rigkit.interop.colmap import ColmapPair, ColmapResult
 from rigkit.reconstruct import Reconstruction
@@ -31,7 +31,7 @@ def colmap_reconstruction(reconstruction: Reconstruction, pair: ColmapPair, resu
     # COLMAP's covariance is for corners of 1 px; 4N residuals fix 3N + 5 unknowns.
     variance = max(result.rms_px**2 * 2.0 * len(which) / max(len(which) - 5, 1), BEST_CORNER_PX**2)
     spread = variance * _spread(reconstruction, which, unit_points, result.adjusted)
-    scale, scale_sigma = metric_scale(unit_points, *known, spread)
+    scale, scale_sigma, by_point = scale_and_gradient(unit_points, *known, spread)
     picked = {name: getattr(cloud, name)[which] for name in PER_POINT}
     metric = replace(
         reconstruction,
@@ -47,10 +47,7 @@ def colmap_reconstruction(reconstruction: Reconstruction, pair: ColmapPair, resu
         return metric
     # t = s u: its direction moves with the pose, its length with the scale that this pose gives to the squares.
     across = np.diag([1.0] * 3 + [scale] * 3) @ result.adjusted_covariance @ np.diag([1.0] * 3 + [scale] * 3)
-    slope = np.zeros(6)
-    for k, (motion, step) in enumerate(points_by_pose(metric)):
-        moved = (metric_scale(unit_points + sign * motion / scale, *known, spread)[0] for sign in (1.0, -1.0))
-        slope[k] = (next(moved) - next(moved)) / (2.0 * step)
+    slope = np.array([np.sum(by_point * motion) / (scale * step) for motion, step in points_by_pose(metric)])
     along = np.eye(6)
     along[3:] += np.outer(result.adjusted.translation_mm, slope)
     covariance = along @ across @ along.T * variance

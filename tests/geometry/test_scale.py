@@ -10,7 +10,7 @@ import pytest
 from rigkit.boards import Board
 from rigkit.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import exp_so3
-from rigkit.geometry.scale import board_scales, metric_scale
+from rigkit.geometry.scale import board_scales, metric_scale, scale_and_gradient
 
 BOARDS = (Board("a", 8, 6, 40.0, 40.0), Board("b", 7, 5, 30.0, 31.0))
 TRUE = 250.0
@@ -101,3 +101,16 @@ def test_too_few_corners_is_an_error(rng):
         metric_scale(points[row], index[row], grid[row], BOARDS)
     with pytest.raises(InputError, match="board indices"):
         metric_scale(points, index[:5], grid, BOARDS)
+
+
+@pytest.mark.parametrize("weighted", [True, False])
+def test_the_gradient_is_that_of_differences(rng, weighted):
+    points, index, grid, covariance = reconstruction(rng, 1e-4)
+    known = (index, grid, BOARDS, covariance if weighted else None)
+    scale, sigma, gradient = scale_and_gradient(points, *known)
+    assert (scale, sigma) == metric_scale(points, *known)
+    # Smooth motions, as those of a pose are: a turn of the depths and a stretch.
+    for motion in (points * [0.3, 0.1, -0.2], np.cross(points, [0.2, -0.4, 0.1])):
+        step = 1e-6
+        ahead, back = (metric_scale(points + sign * step * motion, *known)[0] for sign in (1.0, -1.0))
+        assert np.sum(gradient * motion) == pytest.approx((ahead - back) / (2.0 * step), rel=0.01, abs=1e-3 * scale)
