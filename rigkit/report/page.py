@@ -17,7 +17,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruct import Reconstruction
 from rigkit.validation.tables import Cell, Column, Table
 
-__all__ = ["PairSection", "build_page", "scene_of", "table_html"]
+__all__ = ["PairSection", "build_page", "facts_html", "page_html", "scene_of", "table_html"]
 
 PYRAMID_DEPTH = 0.15
 """Depth of a drawn camera pyramid, relative to the median distance of the points."""
@@ -78,26 +78,36 @@ def build_page(
     provenance: Mapping[str, str],
 ) -> str:
     """Return the page as text; everything it needs is inside it."""
-    package = resources.files("rigkit.report")
-    style = package.joinpath("page.css").read_text(encoding="utf-8")
-    script = package.joinpath("viewer.js").read_text(encoding="utf-8")
+    script = resources.files("rigkit.report").joinpath("viewer.js").read_text(encoding="utf-8")
     verdict = "pass" if passed else "fail"
     words = "all checks passed" if passed else "a check failed"
     links = "".join(f'<a href="#{html.escape(p.pair_id)}">{html.escape(p.pair_id)}</a>' for p in pairs)
-    facts = "".join(
-        f'<tr><td>{html.escape(k)}</td><td class="text">{html.escape(v)}</td></tr>' for k, v in provenance.items()
+    return page_html(
+        title,
+        f'<p class="lead">{html.escape(lead)}</p>'
+        f'<p><span class="verdict {verdict}">{words}</span></p><nav>{links}</nav>'
+        f'<section id="summary"><h2>Summary</h2>{"".join(table_html(t) for t in summary)}</section>'
+        f"{''.join(_section(p, i) for i, p in enumerate(pairs))}{facts_html(provenance)}<script>{script}</script>",
     )
+
+
+def page_html(title: str, body: str) -> str:
+    """Return a whole page around `body`, with the style of all pages inside it."""
+    style = resources.files("rigkit.report").joinpath("page.css").read_text(encoding="utf-8")
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         f'<meta name="viewport" content="width=device-width, initial-scale=1"><link rel="icon" href="data:,">'
         f"<title>{html.escape(title)}</title><style>{style}</style></head><body>"
-        f'<h1>{html.escape(title)}</h1><p class="lead">{html.escape(lead)}</p>'
-        f'<p><span class="verdict {verdict}">{words}</span></p><nav>{links}</nav>'
-        f'<section id="summary"><h2>Summary</h2>{"".join(table_html(t) for t in summary)}</section>'
-        f"{''.join(_section(p, i) for i, p in enumerate(pairs))}"
-        f'<section id="provenance"><h2>Provenance</h2><table><tbody>{facts}</tbody></table></section>'
-        f"<script>{script}</script></body></html>\n"
+        f"<h1>{html.escape(title)}</h1>{body}</body></html>\n"
     )
+
+
+def facts_html(provenance: Mapping[str, str]) -> str:
+    """Return the section that says what a page was made from."""
+    facts = "".join(
+        f'<tr><td>{html.escape(k)}</td><td class="text">{html.escape(v)}</td></tr>' for k, v in provenance.items()
+    )
+    return f'<section id="provenance"><h2>Provenance</h2><table><tbody>{facts}</tbody></table></section>'
 
 
 def _section(pair: PairSection, number: int) -> str:
