@@ -157,7 +157,8 @@ def _homography(rays: Rays, flat: FloatArray, weight: FloatArray) -> FloatArray:
     scale = np.sqrt((flat[:, :2] ** 2).sum(axis=1).mean())
     target = np.concatenate([flat[:, :2] / scale, np.ones((len(flat), 1))], axis=1)
     rows = tangent_bases(rays)[:, :, :, None] * target[:, None, None, :] * weight[:, None, None, None]
-    _, singular, vt = np.linalg.svd(rows.reshape(-1, 9), full_matrices=True)
+    # Nine columns: only four corners (eight rows) leave the null vector out of a reduced decomposition.
+    _, singular, vt = np.linalg.svd(rows.reshape(-1, 9), full_matrices=2 * len(rows) < 9)
     if singular[7] < MIN_HOMOGRAPHY_GAP * singular[0]:
         raise DegenerateError("board pose: all corners but one lie on one line; corners of two full rows are needed")
     h = vt[-1].reshape(3, 3)
