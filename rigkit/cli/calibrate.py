@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rigkit.io.corner_cache import FoundCorners
     from rigkit.io.session import Session
 
-__all__ = ["HELP", "add_arguments", "calibrate_session", "run"]
+__all__ = ["HELP", "add_arguments", "calibrate_session", "page_path", "run"]
 
 HELP = "calibrate a camera from images of chessboards"
 
@@ -23,7 +23,15 @@ HELP = "calibrate a camera from images of chessboards"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("session", type=Path, metavar="SESSION.toml", help="what to calibrate (rigkit.session/1)")
     parser.add_argument("-o", "--output", type=Path, help="default: calibration.json beside the session")
-    parser.add_argument("--force", action="store_true", help="replace an existing calibration")
+    parser.add_argument(
+        "-r",
+        "--report",
+        nargs="?",
+        const="",
+        metavar="FILE.html",
+        help="write a page to look at; without a name beside the output",
+    )
+    parser.add_argument("--force", action="store_true", help="replace existing results")
     parser.add_argument("--json", action="store_true", help="print the result for programs")
 
 
@@ -35,16 +43,28 @@ def run(args: argparse.Namespace) -> int:
 
     session = load_session(args.session)
     target = args.output or session.calibration_path
-    ensure_writable(target, force=args.force)
+    page = page_path(args.report, target)
+    ensure_writable([target, *page], force=args.force)
     started = time.monotonic()
     calibration = calibrate_session(session, progress_on_stderr())
     save_calibration(target, calibration, force=args.force)
-    note(f"{target} written, {time.monotonic() - started:.1f} s")
+    for path in page:
+        from rigkit.cli.calibration_report import write_report
+
+        write_report(path, session, calibration, target, force=args.force)
+    note(f"{', '.join(str(p) for p in (target, *page))} written, {time.monotonic() - started:.1f} s")
     if args.json:
         print_json(summary(calibration))
     else:
         print(describe(calibration))
     return 0
+
+
+def page_path(asked: str | None, target: Path) -> list[Path]:
+    """Return where the page goes, or nothing where none is asked for."""
+    if asked is None:
+        return []
+    return [Path(asked) if asked else target.with_suffix(".html")]
 
 
 def calibrate_session(session: Session, progress: Progress = silent) -> Calibration:

@@ -33,8 +33,9 @@ def session(tmp_path: Path) -> Path:
 
 
 def test_from_images_to_file_and_again_without_images(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["calibrate", str(session), "--json"]) == 0
+    assert main(["calibrate", str(session), "--json", "--report"]) == 0
     told = json.loads(capsys.readouterr().out)
+    assert (session.parent / "calibration.html").read_text().count("data:image/jpeg") == 5
     result = load_calibration(session.parent / "calibration.json")
     assert told["model"] == "kannala_brandt" and told["rms_px"] == result.rms_px < GOOD_RMS_PX
     assert len(result.views) == 5 and result.dropped == ()
@@ -48,7 +49,8 @@ def test_from_images_to_file_and_again_without_images(session: Path, capsys: pyt
     # The corners are kept: the same result without the images.
     for path in session.parent.glob("*.jpg"):
         path.unlink()
-    assert main(["calibrate", str(session), "--force"]) == 0
+    assert main(["calibrate", str(session), "--force", "-r", str(session.parent / "page.html")]) == 0
+    assert "gone; the corners kept" in (session.parent / "page.html").read_text()
     assert "held-out RMS" in capsys.readouterr().out
     again = load_calibration(session.parent / "calibration.json")
     assert np.array_equal(again.camera.parameters, result.camera.parameters)

@@ -1,0 +1,73 @@
+"""What the page of a calibration needs from the disk: thumbnails of the images, versions and hashes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rigkit.calibration.result import Calibration, ViewResult
+    from rigkit.io.session import Session
+
+__all__ = ["provenance", "thumbnails", "write_report"]
+
+
+def write_report(path: Path, session: Session, calibration: Calibration, target: Path, *, force: bool) -> None:
+    """Write the page of a session's calibration, which was saved as `target`."""
+    from rigkit.io.files import write_atomic
+    from rigkit.report.calibration_page import CalibrationSection, build_calibration_page
+
+    name = session.path.resolve().parent.name
+    section = CalibrationSection(name, calibration, thumbnails(session.images, calibration))
+    boards = ", ".join(
+        f"{b.board_id} ({b.columns} x {b.rows} corners, {b.square_x_mm:g} x {b.square_y_mm:g} mm)"
+        for b in session.boards
+    )
+    lead = f"{session.path.name} with board {boards}"
+    facts = provenance([session.path, target], {"images": session.images})
+    write_atomic(path, build_calibration_page(f"rigkit calibration: {name}", lead, [section], facts), force=force)
+
+
+def thumbnails(images: Sequence[Path], calibration: Calibration) -> dict[str, bytes]:
+    """Return a small picture of every image that is there, used or left out, with the corners found in it."""
+    from rigkit.errors import InputError
+    from rigkit.io.images import read_image
+    from rigkit.report.calibration_page import thumbnail_jpeg
+
+    views: dict[str, list[ViewResult]] = {image: [] for image, _ in calibration.dropped}
+    for view in calibration.views:
+        views.setdefault(view.image, []).append(view)
+    out = {}
+    for path in images:
+        if path.name in views:
+            try:
+                out[path.name] = thumbnail_jpeg(read_image(path), views[path.name])
+            except InputError:
+                # Corners are kept beside the session: the image itself may have gone bad since.
+                continue
+    return out
+
+
+def provenance(files: Sequence[Path], images: Mapping[str, Sequence[Path]]) -> dict[str, str]:
+    """Return what somebody needs to know to get the same page again."""
+    import hashlib
+    import platform
+    from datetime import UTC, datetime
+    from importlib.metadata import version
+
+    from rigkit.io.corner_cache import image_hash
+
+    facts = {"rigkit": version("rigkit"), "Python": platform.python_version()}
+    facts |= {name: version(name) for name in ("numpy", "opencv-contrib-python-headless")}
+    facts["written"] = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    for path in files:
+        facts[path.name] = f"SHA-256 {image_hash(path)}"
+    for name, paths in images.items():
+        if paths:
+            digests = "".join(f"{image_hash(p)}  {p.name}\n" for p in paths)
+            digest = hashlib.sha256(digests.encode()).hexdigest()
+            facts[name] = f"{len(paths)} files; SHA-256 of what `sha256sum` prints of them: {digest}"
+        else:
+            facts[name] = "gone; the corners kept beside the session were used"
+    return facts

@@ -1,0 +1,230 @@
+"""Drawings of a calibration as SVG: residuals, what they have in common, coverage, and the uncertainty map."""
+
+from __future__ import annotations
+
+from html import escape
+
+import cv2
+import numpy as np
+
+from rigkit.arrays import FloatArray, Pixels
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.uncertainty import projection_uncertainty, uncertainty_map
+
+__all__ = ["coverage_svg", "pattern_svg", "residuals_svg", "uncertainty_svg"]
+
+WIDTH = 600.0
+"""Width of the drawn image, in units of the drawing."""
+FOOT = 44.0
+MAX_VECTORS = 5000
+"""More residuals make the drawing black and the page heavy: of more, every second, third, ... is drawn."""
+RESIDUAL_LENGTH = 0.02
+"""The RMS residual is drawn about as long as this part of the image's width."""
+CELLS_ACROSS = 16
+MIN_IN_CELL = 4
+"""Corners that make a mean worth drawing."""
+CHANCE = 0.01
+"""Share of cells whose mean is drawn as beyond chance where there is chance only."""
+MAP_GRID = (40, 30)
+DYNAMIC = 100.0
+"""The colours of the uncertainty map end at this many times its smallest value."""
+VIRIDIS = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], dtype=float)
+INK, MARK, BAD, SOFT = "#1f4e8c", "#e6550d", "#b3261e", "#8a94a3"
+
+
+def residuals_svg(calibration: Calibration) -> str:
+    """Draw how far each corner was measured from where the calibration puts it, magnified; outliers as crosses."""
+    pixels, residuals, kept = _corners(calibration)
+    times = _magnification(calibration, RESIDUAL_LENGTH * calibration.camera.size_px[0] / max(calibration.rms_px, 1e-9))
+    step = -(-int(kept.sum()) // MAX_VECTORS)
+    q, d = pixels[kept][::step], residuals[kept][::step]
+    words = f"{len(q)} residuals, measured minus projected, magnified {times:g} times"
+    words += f" (every {_ordinal(step)} drawn)" if step > 1 else ""
+    crossed = pixels[~kept]
+    zoom = _zoom(calibration)
+    out = [
+        _open(calibration, words),
+        f'<path d="{_vectors(zoom * q, zoom * times * d)}" stroke="{INK}" stroke-width="1" fill="none"/>',
+        f'<path d="{_dots(zoom * q)}" stroke="{INK}" stroke-width="2.2" stroke-linecap="round"/>',
+        f'<path d="{_crosses(zoom * crossed)}" stroke="{BAD}" stroke-width="1.2" fill="none"/>',
+        _foot(
+            calibration, words, f"crosses: {len(crossed)} corners left out" if len(crossed) else "no corner left out"
+        ),
+    ]
+    return "".join(out)
+
+
+def pattern_svg(calibration: Calibration) -> str:
+    """Draw the mean residual of each part of the image: chance leaves short grey arrows, a lens or board that the
+    model does not follow long coloured ones that agree with their neighbours."""
+    pixels, residuals, kept = _corners(calibration)
+    width, height = calibration.camera.size_px
+    size = width / CELLS_ACROSS
+    cell = (pixels[kept] / size).astype(np.int64).clip(0)
+    rows = int(np.ceil(height / size))
+    index = cell[:, 1].clip(max=rows - 1) * CELLS_ACROSS + cell[:, 0].clip(max=CELLS_ACROSS - 1)
+    cells = rows * CELLS_ACROSS
+    count = np.bincount(index, minlength=cells)
+    total = np.stack([np.bincount(index, weights=r, minlength=cells) for r in residuals[kept].T], axis=-1)
+    squared = np.bincount(index, weights=(residuals[kept] ** 2).sum(axis=1), minlength=cells)
+    enough = count >= MIN_IN_CELL
+    mean = total[enough] / count[enough, None]
+    # Corners far out scatter more: each cell is judged by its own scatter about its mean.
+    freedom = 2.0 * (count[enough] - 1.0)
+    own = np.sqrt((squared[enough] - count[enough] * (mean**2).sum(axis=1)).clip(0.0) / freedom)
+    reach = np.sqrt(freedom * (CHANCE ** (-2.0 / freedom) - 1.0))
+    beyond = np.linalg.norm(mean, axis=1) > own / np.sqrt(count[enough]) * reach
+    row, column = np.divmod(np.flatnonzero(enough), CELLS_ACROSS)
+    places = (np.stack([column, row], axis=-1) + 0.5) * size
+    longest = float(np.linalg.norm(mean, axis=1).max(initial=1e-9))
+    times = _magnification(calibration, 0.9 * size / longest)
+    words = f"mean residual by part of the image, magnified {times:g} times"
+    zoom = _zoom(calibration)
+    dots = "".join(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="1.4" fill="{SOFT}"/>' for x, y in zoom * places)
+    out = [_open(calibration, words), dots]
+    for chosen, colour in ((~beyond, SOFT), (beyond, MARK)):
+        path = _vectors(zoom * places[chosen], zoom * times * mean[chosen])
+        out.append(f'<path d="{path}" stroke="{colour}" stroke-width="1.6" fill="none"/>')
+    expected = f"{int(beyond.sum())} of {len(beyond)} coloured: beyond chance, which makes {CHANCE * len(beyond):.1f}"
+    return "".join([*out, _foot(calibration, words, expected)])
+
+
+def coverage_svg(calibration: Calibration) -> str:
+    """Draw where corners were seen: every corner used, over cells as dark as they hold corners."""
+    pixels, _, kept = _corners(calibration)
+    width, height = calibration.camera.size_px
+    columns, rows = 12, max(round(12 * height / width), 1)
+    size = np.array([width / columns, height / rows])
+    i, j = ((pixels[kept] + 0.5) / size).astype(np.int64).clip(0, [columns - 1, rows - 1]).T
+    count = np.bincount(i * rows + j, minlength=columns * rows).reshape(columns, rows)
+    zoom = _zoom(calibration)
+    w, h = zoom * width / columns, zoom * height / rows
+    out = [_open(calibration, "coverage of the image by corners")]
+    for i, j in np.ndindex(columns, rows):
+        if count[i, j]:
+            shade = 0.08 + 0.42 * min(count[i, j] / max(np.quantile(count[count > 0], 0.9), 1.0), 1.0)
+            place = f'x="{i * w:.1f}" y="{j * h:.1f}" width="{w:.1f}" height="{h:.1f}"'
+            out.append(f'<rect {place} fill="{INK}" fill-opacity="{shade:.2f}"/>')
+    step = -(-int(kept.sum()) // MAX_VECTORS)
+    out.append(
+        f'<path d="{_dots(zoom * pixels[kept][::step])}" stroke="{MARK}" stroke-width="2.2" stroke-linecap="round"/>'
+    )
+    empty = int((count == 0).sum())
+    words = f"{int(kept.sum())} corners of {len(calibration.views)} boards seen"
+    return "".join([*out, _foot(calibration, words, f"{empty} of {columns * rows} cells are empty")])
+
+
+def uncertainty_svg(calibration: Calibration) -> str:
+    """Draw how uncertain the projection of a far point is over the image: one standard deviation, worst direction."""
+    width, height = calibration.camera.size_px
+    grid = uncertainty_map(calibration, grid=MAP_GRID)
+    known = np.isfinite(grid.worst_px)
+    if not known.any() or not np.nanmin(grid.worst_px) > 0.0:
+        return "".join([_open(calibration, "uncertainty"), _foot(calibration, "the projection has no uncertainty", "")])
+    low = float(np.nanmin(grid.worst_px))
+    high = min(float(np.nanmax(grid.worst_px)), DYNAMIC * low) * (1.0 + 1e-9)
+    level = np.log(np.where(known, grid.worst_px, low) / low) / max(np.log(high / low), 1e-9)
+    zoom = _zoom(calibration)
+    w, h = zoom * width / MAP_GRID[0], zoom * height / MAP_GRID[1]
+    words = f"{low:.3g} px at best, {np.nanmax(grid.worst_px):.3g} px at worst (a point at infinity, worst direction)"
+    out = [_open(calibration, "projection uncertainty, px"), '<g shape-rendering="crispEdges">']
+    for j, i in np.argwhere(known):
+        place = f'x="{i * w:.1f}" y="{j * h:.1f}" width="{w:.1f}" height="{h:.1f}"'
+        out.append(f'<rect {place} fill="{_colour(float(level[j, i]))}"/>')
+    out += ["</g>", _colour_bar(zoom * height + 26.0, low, high)]
+    pixels, _, kept = _corners(calibration)
+    hull = cv2.convexHull(pixels[kept].astype(np.float32))[:, 0]
+    outline = " ".join(f"{x:.1f},{y:.1f}" for x, y in zoom * hull)
+    out.append(f'<polygon points="{outline}" fill="none" stroke="#fff" stroke-width="1.5" stroke-dasharray="6 4"/>')
+    out += _numbers(calibration)
+    return "".join([*out, _foot(calibration, words, "dashed: around all corners that were seen")])
+
+
+def _colour_bar(y: float, low: float, high: float) -> str:
+    """Return a strip with the colours of the map, from `low` to `high` px in equal ratios."""
+    levels = np.linspace(0.0, 1.0, 24)
+    strip = "".join(
+        f'<rect x="{380 + 6 * k}" y="{y:.1f}" width="7" height="10" fill="{_colour(v)}"/>' for k, v in enumerate(levels)
+    )
+    return (
+        f'<text x="374" y="{y + 10:.1f}" text-anchor="end" fill="#333">{low:.3g}</text>{strip}'
+        f'<text x="530" y="{y + 10:.1f}" fill="#333">{high:.3g} px</text>'
+    )
+
+
+def _numbers(calibration: Calibration) -> list[str]:
+    """Return the uncertainty in figures at the centre, the corners and the middles of the sides."""
+    width, height = calibration.camera.size_px
+    u, v = np.meshgrid(np.linspace(0.0, width - 1.0, 3), np.linspace(0.0, height - 1.0, 3))
+    at = np.stack([u, v], axis=-1)
+    worst = projection_uncertainty(calibration, at).worst_px
+    zoom = _zoom(calibration)
+    out = []
+    for j, i in np.ndindex(3, 3):
+        words = f"{worst[j, i]:.3g}" if np.isfinite(worst[j, i]) else "no ray"
+        x, y = (float(c) for c in zoom * at[j, i])
+        anchor = ("start", "middle", "end")[i]
+        out.append(
+            f'<text x="{x + (6, 0, -6)[i]:.1f}" y="{y + (17, 5, -8)[j]:.1f}" text-anchor="{anchor}" font-size="14" '
+            f'font-weight="600" fill="#111" stroke="#fff" stroke-width="3" paint-order="stroke">{words}</text>'
+        )
+    return out
+
+
+def _corners(calibration: Calibration) -> tuple[Pixels, FloatArray, np.ndarray]:
+    """Return pixels, residuals and kept of all corners of all views."""
+    pixels = np.concatenate([v.pixels for v in calibration.views])
+    residuals = np.concatenate([v.residuals_px for v in calibration.views])
+    return pixels, residuals, np.concatenate([v.kept for v in calibration.views])
+
+
+def _zoom(calibration: Calibration) -> float:
+    return WIDTH / calibration.camera.size_px[0]
+
+
+def _magnification(calibration: Calibration, wanted: float) -> float:
+    """Return the next of 1, 2, 5 times a power of ten below `wanted`."""
+    power = 10.0 ** np.floor(np.log10(wanted))
+    return float(max(m * power for m in (1.0, 2.0, 5.0) if m * power <= wanted))
+
+
+def _ordinal(number: int) -> str:
+    return {2: "second", 3: "third"}.get(number, f"{number}th")
+
+
+def _vectors(start: FloatArray, by: FloatArray) -> str:
+    return "".join(f"M{x:.1f} {y:.1f}l{dx:.1f} {dy:.1f}" for (x, y), (dx, dy) in zip(start, by, strict=True))
+
+
+def _dots(at: FloatArray) -> str:
+    return "".join(f"M{x:.1f} {y:.1f}h0" for x, y in at)
+
+
+def _crosses(at: FloatArray, half: float = 4.0) -> str:
+    return "".join(
+        f"M{x - half:.1f} {y - half:.1f}l{2 * half} {2 * half}m0 {-2 * half}l{-2 * half} {2 * half}" for x, y in at
+    )
+
+
+def _colour(level: float) -> str:
+    place = np.clip(level, 0.0, 1.0) * (len(VIRIDIS) - 1)
+    red, green, blue = (np.interp(place, np.arange(len(VIRIDIS)), channel) for channel in VIRIDIS.T)
+    return f"#{round(float(red)):02x}{round(float(green)):02x}{round(float(blue)):02x}"
+
+
+def _open(calibration: Calibration, title: str) -> str:
+    height = _zoom(calibration) * calibration.camera.size_px[1]
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="-1 -1 {WIDTH + 2:g} {height + FOOT:.1f}" role="img" '
+        f'font-family="sans-serif" font-size="13"><title>{escape(title)}</title>'
+        f'<rect width="{WIDTH:g}" height="{height:.1f}" fill="#fbfcfd"/>'
+    )
+
+
+def _foot(calibration: Calibration, *lines: str) -> str:
+    """Close the drawing: a frame over what sticks out, and lines of text below it."""
+    height = _zoom(calibration) * calibration.camera.size_px[1]
+    words = "".join(
+        f'<text x="0" y="{height + 18 + 18 * k:.1f}" fill="#333">{escape(line)}</text>' for k, line in enumerate(lines)
+    )
+    return f'<rect width="{WIDTH:g}" height="{height:.1f}" fill="none" stroke="#b8c0cc"/>{words}</svg>'

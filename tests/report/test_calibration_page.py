@@ -1,0 +1,117 @@
+"""The page of a calibration: in a browser, and what its drawings say against what is known."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.calibration_scenes import BOARD, lens, random_views, with_outliers
+from report.test_page_in_browser import QUIET, chromium
+
+from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.uncertainty import projection_uncertainty
+from rigkit.report.calibration_drawings import pattern_svg, residuals_svg, uncertainty_svg
+from rigkit.report.calibration_page import CalibrationSection, build_calibration_page, thumbnail_jpeg
+
+NOISE_PX = 0.2
+IMAGES = 20
+MAX_BYTES = 5e6
+
+PROBE = """<script>
+const drawn = [...document.querySelectorAll(".drawings svg")].map((s) => s.getBoundingClientRect().height > 100);
+const loaded = [...document.images].map((i) => i.complete && i.naturalWidth > 0);
+document.body.dataset.probe = [drawn.length, drawn.every((v) => v), loaded.length, loaded.every((v) => v),
+  document.body.scrollWidth <= innerWidth].join("|");
+</script></body>"""
+
+
+@pytest.fixture(scope="module")
+def calibration() -> Calibration:
+    rng = np.random.default_rng(5)
+    camera = lens("reg")
+    views = with_outliers(random_views(camera, IMAGES, rng, reach_deg=33.0, noise_px=NOISE_PX)[0], 0.01, 40.0, rng)
+    result = calibrate(views, camera.size_px, model="brown", board="flat")
+    return replace(result, dropped=(("<b>.jpg", "no board & nothing"),))
+
+
+def page(calibration: Calibration) -> str:
+    rng = np.random.default_rng(1)
+    image = rng.integers(0, 255, (1240, 1624), dtype=np.uint8)
+    thumbnails = {v.image: thumbnail_jpeg(image, [v]) for v in calibration.views}
+    sections = [CalibrationSection("A & B", calibration, thumbnails)]
+    return build_calibration_page("title", "lead", sections, {"session.toml": "x"})
+
+
+def test_works_without_network(calibration: Calibration, tmp_path: Path) -> None:
+    browser = chromium()
+    text = page(calibration)
+    assert not re.search(r"""(src|href)=["']?https?:""", text)
+    assert len(text) < MAX_BYTES
+    assert "&lt;b&gt;.jpg" in text and "<b>.jpg" not in text
+    path = tmp_path / "calibration.html"
+    path.write_text(text.replace("</body>", PROBE).replace('loading="lazy"', ""), encoding="utf-8")
+    done = subprocess.run(
+        [browser, *QUIET, f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", path.as_uri()],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    assert "CONSOLE" not in done.stderr, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+    probe = re.search(r'data-probe="([^"]*)"', done.stdout)
+    assert probe is not None
+    assert probe[1] == f"4|true|{IMAGES}|true|true"
+
+
+def test_says_what_the_calibration_says(calibration: Calibration) -> None:
+    text = re.sub(r'src="data:[^"]*"', "", page(calibration))
+    assert f"held-out RMS <b>{calibration.heldout_rms_px:.3f} px</b>" in text
+    assert f"training RMS {calibration.rms_px:.3f} px" in text
+    for verdict in calibration.verdicts:
+        assert verdict.partition(": ")[2].split("'")[0] in text
+    for view in calibration.views:
+        assert re.search(
+            rf'<td class="text">{view.image}</td>.*?{view.rms_px:.3f}</td><td>{int(view.kept.sum())}</td>', text
+        )
+
+
+def test_residual_vectors_are_true_to_their_magnification(calibration: Calibration) -> None:
+    svg = residuals_svg(calibration)
+    times = float(re.search(r"magnified ([\d.e+]+) times", svg)[1])  # type: ignore[index]
+    drawn = np.array(re.findall(r"M([-\d.]+) ([-\d.]+)l([-\d.]+) ([-\d.]+)", svg.split(" stroke")[0]), dtype=float)
+    kept = np.concatenate([v.kept for v in calibration.views])
+    residuals = np.concatenate([v.residuals_px for v in calibration.views])[kept]
+    zoom = 600.0 / calibration.camera.size_px[0]
+    assert len(drawn) == kept.sum() < len(kept)
+    # Drawn to a tenth of a unit.
+    assert np.abs(drawn[:, 2:] / (zoom * times) - residuals).max() < 0.06 / (zoom * times)
+    assert f"crosses: {(~kept).sum()} corners" in svg
+
+
+def test_numbers_on_the_uncertainty_map(calibration: Calibration) -> None:
+    svg = uncertainty_svg(calibration)
+    width, height = calibration.camera.size_px
+    for u, v in ((0.0, 0.0), (width - 1.0, 0.0), (0.5 * (width - 1), 0.5 * (height - 1)), (width - 1.0, height - 1.0)):
+        worst = float(projection_uncertainty(calibration, np.array([u, v])).worst_px)
+        assert f">{worst:.3g}<" in svg
+
+
+def test_pattern_tells_chance_from_a_lens_that_does_not_fit(calibration: Calibration) -> None:
+    def coloured(c: Calibration) -> tuple[int, int]:
+        found = re.search(r"(\d+) of (\d+) coloured", pattern_svg(c))
+        assert found is not None
+        return int(found[1]), int(found[2])
+
+    beyond, cells = coloured(calibration)
+    # One per cent by chance; ten times that would not be chance in a hundred cells.
+    assert cells > 50 and beyond <= 0.1 * cells
+    camera = lens("reg")
+    views = random_views(camera, IMAGES, np.random.default_rng(6), reach_deg=33.0, noise_px=0.02, board=BOARD)[0]
+    wrong = calibrate(views, camera.size_px, model="ucm", board="flat", folds=0)
+    beyond, cells = coloured(wrong)
+    assert beyond > 0.3 * cells
