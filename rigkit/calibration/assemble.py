@@ -70,9 +70,16 @@ def assemble(
 def solution_normal(observations: Observations, fit: Fit) -> Normal:
     """Return the normal equations at the solution, in px^-2, priors of the shape included."""
     state = fit.state
-    points, lever = state.points_in_cam(observations)
-    weight = fit.weight(observations)
-    normal = normal_equations(state.camera, points, lever, state.rotation, state.shape, observations, weight, None)
+    normal = normal_equations(
+        state.camera,
+        state.rotation,
+        state.translation_mm,
+        state.shape,
+        state.unknowns,
+        observations,
+        fit.weight(observations),
+        None,
+    )
     sigma = fit.sigma_px if np.isfinite(fit.sigma_px) else 1.0
     return normal.with_priors(state.camera, sigma, state.shape.sigma, state.unknowns)
 

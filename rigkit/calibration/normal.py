@@ -11,13 +11,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, Mat3, Points
+from rigkit.arrays import BoolArray, FloatArray, IntArray, Mat3, Points
 from rigkit.calibration.camera_prior import camera_prior
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.shape import ShapeModel
 from rigkit.cameras.base import Camera
 
-__all__ = ["Normal", "Step", "normal_equations"]
+__all__ = ["Normal", "Step", "Workspace", "lost_px", "normal_equations"]
+
+BLOCK = 4096
+"""Corners linearised at a time: their derivatives then stay in the cache, and memory does not grow with the views."""
 
 FLOOR = 1e-24
 """Diagonal entries below this part of the largest are lifted to it: a polynomial's entries span many powers of ten."""
@@ -39,6 +42,7 @@ class Normal:
     Attributes
     ----------
     gg (G, G), gp (V, G, 6), pp (V, 6, 6), g (G,), p (V, 6).
+    costs : (V,) cost of each view's residuals, px^2.
     points_from : the globals from here on are released board points: three each, coupled within a point only. None
         where there are none.
     """
@@ -48,6 +52,7 @@ class Normal:
     pp: FloatArray
     g: FloatArray
     p: FloatArray
+    costs: FloatArray
     points_from: int | None = None
 
     def with_priors(self, camera: Camera, sigma_px: float, shape_sigma: FloatArray, unknowns: FloatArray) -> Normal:
@@ -157,76 +162,167 @@ def _solve_positive(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.solve(scaled, rhs * scale) * scale)
 
 
+class Workspace:
+    """Memory for the derivatives of one block of views, kept from one linearisation to the next: pages fresh from the
+    system would cost more than the arithmetic. To be used with one kind of camera, whose zeros it keeps."""
+
+    def __init__(self) -> None:
+        self._rows: FloatArray = np.zeros((0, 2, 0, 0))
+
+    def rows(self, count: int, views: int, corners: int) -> FloatArray:
+        """Return (count, 2, views, corners)."""
+        have = self._rows.shape
+        if have[0] != count or have[2] < views or have[3] != corners:
+            self._rows = np.zeros((count, 2, views, corners))
+        return self._rows[:, :, :views]
+
+
+def lost_px(camera: Camera) -> float:
+    """Return the residual per coordinate of a corner outside the model's field of view: worse than any other, so that
+    no step gains by losing corners."""
+    return float(np.hypot(*camera.size_px))
+
+
 def normal_equations(
     camera: Camera,
-    points: Points,
-    lever: Points,
     rotation: Mat3,
+    translation_mm: Points,
     shape: ShapeModel,
+    unknowns: FloatArray,
     observations: Observations,
     weight: FloatArray,
     loss_px: float | None,
+    workspace: Workspace | None = None,
 ) -> Normal:
-    """Return the normal equations at corners `points` (V, C, 3) in the camera frame with lever arms R X."""
-    with np.errstate(all="ignore"):
-        pixels, valid, by_point, by_camera = camera.project_with_jacobians(points)
-    residual = observations.pixels - pixels
+    """Return the normal equations and the cost for boards at the poses (V, 3, 3), (V, 3) with the shape's `unknowns`.
+
+    `weight` (V, C) multiplies the residuals; `loss_px` is the scale of the Cauchy loss, None for least squares.
+    """
+    workspace = workspace or Workspace()
+    table = np.ascontiguousarray(shape.points(unknowns).T)
+    views, corners = weight.shape
+    count = camera.parameters.size + shape.basis.shape[-1]
+    gg, g = np.zeros((count, count)), np.zeros(count)
+    gp, pp = np.empty((views, count, 6)), np.empty((views, 6, 6))
+    p, costs = np.empty((views, 6)), np.empty(views)
+    released = _Released(len(shape.flat), views, count) if shape.kind == "released" else None
+    step = max(1, BLOCK // max(corners, 1))
+    for first in range(0, views, step):
+        block = slice(first, min(first + step, views))
+        part = _Part(
+            rotation[block],
+            translation_mm[block],
+            observations.corner[block],
+            observations.pixels[block],
+            weight[block],
+        )
+        rows = workspace.rows(count + 7, len(part.weight), corners)
+        costs[block] = _linearise(rows, camera, table, shape, part, loss_px)
+        # Per view only what involves its pose; the globals among themselves in one product over all corners.
+        each = np.moveaxis(rows, (1, 2), (0, 1))
+        product = (each @ np.swapaxes(each[:, :, count:], -1, -2)).sum(axis=0)
+        flat = rows[:count].reshape(count, -1)
+        gg += flat @ flat.T
+        g += product[:, :count, 6].sum(axis=0)
+        gp[block], pp[block], p[block] = product[:, :count, :6], product[:, count:-1, :6], product[:, count:-1, 6]
+        if released is not None:
+            released.add(rows, _by_board(rows, part.rotation), part.corner, observations.present[block], first)
+    normal = Normal(gg, gp, pp, g, p, costs)
+    return normal if released is None else released.appended(normal)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Part:
+    """What is known of a block of views."""
+
+    rotation: Mat3
+    translation_mm: Points
+    corner: IntArray
+    pixels: FloatArray
+    weight: FloatArray
+
+
+def _linearise(
+    rows: FloatArray, camera: Camera, table: FloatArray, shape: ShapeModel, part: _Part, loss_px: float | None
+) -> FloatArray:
+    """Fill `rows` (K, 2, V, C) with the weighted derivatives by camera, warp and pose, the residual last; return the
+    cost of each view (V,).
+
+    `table` (3, M) are the boards' corners. Rows of unknowns come first: long contiguous runs.
+    """
+    weight = part.weight
+    p, b = camera.parameters.size, shape.basis.shape[-1]
+    by_camera, translation, residual = rows[:p], rows[p + b + 3 : p + b + 6], rows[-1]
+    board = np.take(table, part.corner, axis=1)
+    lever = np.empty_like(board)
+    np.matmul(part.rotation, np.swapaxes(board, 0, 1), out=np.swapaxes(lever, 0, 1))
+    x, y, z = (lever + part.translation_mm.T[:, :, None]).reshape(3, -1)
+    u, v, valid = camera.derivatives(
+        x, y, z, _by_coordinate(translation, weight.size), _by_coordinate(by_camera, weight.size)
+    )
+    np.subtract(part.pixels[..., 0], u.reshape(weight.shape), out=residual[0])
+    np.subtract(part.pixels[..., 1], v.reshape(weight.shape), out=residual[1])
+    squared = residual[0] ** 2 + residual[1] ** 2
     if not valid.all():
         # A corner outside the model's field of view has no derivative; it waits until a step brings it back.
-        residual = np.where(valid[..., None], residual, 0.0)
-        by_point = np.where(valid[..., None, None], by_point, 0.0)
-        by_camera = np.where(valid[..., None, None], by_camera, 0.0)
+        lost = ~valid.reshape(weight.shape)
+        rows[..., lost] = 0.0
+        squared[lost] = 2.0 * lost_px(camera) ** 2
+    squared *= weight**2
     if loss_px is not None:
-        squared = (residual**2).sum(axis=-1) * weight**2
-        weight = weight / np.sqrt(1.0 + squared / loss_px**2)
-    # Rows of unknowns first: long contiguous runs for the products below.
-    by_point, by_camera = np.moveaxis(by_point, (-2, -1), (1, 0)), np.moveaxis(by_camera, (-2, -1), (1, 0))
-    p, b = len(by_camera), shape.basis.shape[-1]
-    rows = np.empty((p + b + 7, 2, *weight.shape))
-    np.multiply(by_camera, weight, out=rows[:p])
-    translation = np.multiply(by_point, weight, out=rows[p + b + 3 : p + b + 6])
-    by_board = np.einsum("jivc,vjk->kivc", translation, rotation) if shape.count else translation
+        squared /= loss_px**2
+        weight = weight / np.sqrt(1.0 + squared)
+        squared = loss_px**2 * np.log1p(squared)
+    by_camera *= weight
+    translation *= weight
+    residual *= weight
     if b:
-        np.einsum("kivc,vckb->bivc", by_board, shape.basis[observations.corner], out=rows[p : p + b])
-    q0, q1, q2 = np.moveaxis(lever, -1, 0)
-    rows[p + b] = q1 * translation[2] - q2 * translation[1]
-    rows[p + b + 1] = q2 * translation[0] - q0 * translation[2]
-    rows[p + b + 2] = q0 * translation[1] - q1 * translation[0]
-    np.multiply(np.moveaxis(residual, -1, 0), weight, out=rows[-1])
-    normal = _blocks(_gram(rows), p + b)
-    return _released(normal, rows, by_board, observations) if shape.kind == "released" else normal
+        np.einsum("kivc,vckb->bivc", _by_board(rows, part.rotation), shape.basis[part.corner], out=rows[p : p + b])
+    q0, q1, q2 = lever
+    for row, (one, k, two, j) in enumerate(((q1, 2, q2, 1), (q2, 0, q0, 2), (q0, 1, q1, 0)), start=p + b):
+        np.multiply(one, translation[k], out=rows[row])
+        rows[row] -= two * translation[j]
+    return np.asarray(squared.sum(axis=-1))
 
 
-def _gram(rows: FloatArray) -> FloatArray:
-    """Return sum over corners and coordinates of the products of rows (K, 2, V, C): (V, K, K)."""
-    u, v = np.moveaxis(rows, (1, 2), (0, 1))
-    return np.asarray(u @ np.swapaxes(u, -1, -2) + v @ np.swapaxes(v, -1, -2))
+def _by_coordinate(rows: FloatArray, corners: int) -> FloatArray:
+    """Return rows (K, 2, V, C) as (2, K, V C), the same memory."""
+    return np.swapaxes(rows.reshape(len(rows), 2, corners), 0, 1)
 
 
-def _blocks(product: FloatArray, g: int) -> Normal:
-    total = product[:, :g].sum(axis=0)
-    return Normal(total[:, :g], product[:, :g, g:-1], product[:, g:-1, g:-1], total[:, -1], product[:, g:-1, -1])
+def _by_board(rows: FloatArray, rotation: Mat3) -> FloatArray:
+    """Return d pixel / d board point, J R (3, 2, V, C), from the rows of the translation."""
+    return np.asarray(np.einsum("jivc,vjk->kivc", rows[-4:-1], rotation))
 
 
-def _released(normal: Normal, rows: FloatArray, by_board: FloatArray, observations: Observations) -> Normal:
-    """Append three unknowns for every board point; a corner touches only those of its own point."""
-    views, count, p = observations.pixels.shape[0], int(observations.first_row[-1]), len(normal.g)
-    cross = np.einsum("jivc,kivc->vcjk", by_board, rows, optimize=True)
-    own = np.einsum("jivc,kivc->vcjk", by_board, by_board, optimize=True)
-    present = observations.present
-    index = observations.corner[present]
-    dense = np.zeros((views, count, 3, 6))
-    view_of = np.broadcast_to(np.arange(views)[:, None], present.shape)[present]
-    dense[view_of, index] = cross[present][..., p : p + 6]
-    by_point = np.zeros((count, 3, p + 4))
-    np.add.at(by_point, index, np.concatenate([cross[present][..., :p], own[present], cross[present][..., -1:]], -1))
-    total = p + 3 * count
-    gg, g = np.zeros((total, total)), np.zeros(total)
-    gg[:p, :p], g[:p] = normal.gg, normal.g
-    gg[p:, :p] = by_point[..., :p].reshape(-1, p)
-    gg[:p, p:] = gg[p:, :p].T
-    blocks = gg[p:, p:].reshape(count, 3, count, 3)
-    blocks[np.arange(count), :, np.arange(count), :] = by_point[..., p : p + 3]
-    g[p:] = by_point[..., -1].reshape(-1)
-    gp = np.concatenate([normal.gp, dense.reshape(views, -1, 6)], axis=1)
-    return Normal(gg, gp, normal.pp, g, normal.p, p)
+class _Released:
+    """Three unknowns for every board point; a corner touches only those of its own point."""
+
+    def __init__(self, points: int, views: int, count: int) -> None:
+        self._pose = np.zeros((views, points, 3, 6))
+        self._own = np.zeros((points, 3, count + 4))
+
+    def add(
+        self, rows: FloatArray, by_board: FloatArray, corner: IntArray, present: BoolArray, first: int
+    ) -> None:
+        """Add a block of views, the first of them number `first`."""
+        count = len(rows) - 7
+        cross = np.einsum("jivc,kivc->vcjk", by_board, rows, optimize=True)[present]
+        own = np.einsum("jivc,kivc->vcjk", by_board, by_board, optimize=True)[present]
+        index, view = corner[present], first + np.nonzero(present)[0]
+        self._pose[view, index] = cross[..., count : count + 6]
+        np.add.at(self._own, index, np.concatenate([cross[..., :count], own, cross[..., -1:]], axis=-1))
+
+    def appended(self, normal: Normal) -> Normal:
+        """Return the normal equations with these unknowns after the others."""
+        points, p = len(self._own), len(normal.g)
+        total = p + 3 * points
+        gg, g = np.zeros((total, total)), np.zeros(total)
+        gg[:p, :p], g[:p] = normal.gg, normal.g
+        gg[p:, :p] = self._own[..., :p].reshape(-1, p)
+        gg[:p, p:] = gg[p:, :p].T
+        blocks = gg[p:, p:].reshape(points, 3, points, 3)
+        blocks[np.arange(points), :, np.arange(points), :] = self._own[..., p : p + 3]
+        g[p:] = self._own[..., -1].reshape(-1)
+        gp = np.concatenate([normal.gp, self._pose.reshape(len(normal.pp), -1, 6)], axis=1)
+        return replace(normal, gg=gg, gp=gp, g=g, points_from=p)

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.arrays import FloatArray
-from rigkit.calibration.normal import normal_equations
+from rigkit.calibration.normal import Normal, Workspace, normal_equations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.radial_alignment import align
-from rigkit.calibration.solver import State, evaluate
+from rigkit.calibration.solver import State
 from rigkit.geometry.rotation import exp_so3, nearest_rotation
 
 __all__ = ["find_poses", "refine_poses"]
@@ -28,39 +28,46 @@ def refine_poses(
     Levenberg-Marquardt with a damping of its own for each view. `loss_px` is the scale of the Cauchy loss.
     """
 
-    def costs(s: State) -> FloatArray:
-        squared = (evaluate(s, observations).px ** 2).sum(axis=-1) * weight**2
-        if loss_px is not None:
-            squared = loss_px**2 * np.log1p(squared / loss_px**2)
-        return np.asarray(squared.sum(axis=-1))
+    workspace = Workspace()
 
-    cost = costs(state)
+    def linearise(s: State) -> Normal:
+        return normal_equations(
+            s.camera,
+            s.rotation,
+            s.translation_mm,
+            s.shape,
+            s.unknowns,
+            observations,
+            weight,
+            loss_px,
+            workspace,
+        )
+
+    normal = linearise(state)
+    pp, p, cost = normal.pp, normal.p, normal.costs
     damping = np.full(len(cost), DAMPING_START)
     active = np.ones(len(cost), dtype=bool)
     for _ in range(MAX_ITERATIONS):
-        points, lever = state.points_in_cam(observations)
-        normal = normal_equations(
-            state.camera, points, lever, state.rotation, state.shape, observations, weight, loss_px
-        )
-        diagonal = np.diagonal(normal.pp, axis1=-2, axis2=-1)
+        diagonal = np.diagonal(pp, axis1=-2, axis2=-1)
         diagonal = np.where(diagonal > 0.0, diagonal, 1.0)
-        damped = normal.pp + (damping[:, None] * diagonal)[..., None] * np.eye(6)
-        step: FloatArray = np.asarray(np.linalg.solve(damped, normal.p[..., None])[..., 0] * active[:, None], float)
-        predicted = (step * (damping[:, None] * diagonal * step + normal.p)).sum(axis=-1)
+        damped = pp + (damping[:, None] * diagonal)[..., None] * np.eye(6)
+        step: FloatArray = np.asarray(np.linalg.solve(damped, p[..., None])[..., 0] * active[:, None], float)
+        predicted = (step * (damping[:, None] * diagonal * step + p)).sum(axis=-1)
         trial = replace(
             state,
             rotation=exp_so3(step[:, :3]) @ state.rotation,
             translation_mm=state.translation_mm + step[:, 3:],
         )
-        trial_cost = costs(trial)
-        better = active & (trial_cost < cost)
+        normal = linearise(trial)
+        better = active & (normal.costs < cost)
         state = replace(
             state,
             rotation=np.where(better[:, None, None], trial.rotation, state.rotation),
             translation_mm=np.where(better[:, None], trial.translation_mm, state.translation_mm),
         )
         active &= (predicted > TOLERANCE * cost) & (damping < 1e10)
-        cost = np.where(better, trial_cost, cost)
+        pp, p = np.where(better[:, None, None], normal.pp, pp), np.where(better[:, None], normal.p, p)
+        cost = np.where(better, normal.costs, cost)
         damping = np.where(better, damping * 0.1, damping * 10.0)
         if not active.any():
             break

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.arrays import FloatArray, IntArray, Mat3, Points
-from rigkit.calibration.normal import Normal, Step, normal_equations
+from rigkit.calibration.normal import Normal, Step, Workspace, normal_equations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.shape import ShapeModel
@@ -95,7 +95,9 @@ def rig_residuals(observations: RigObservations, state: RigState) -> list[Residu
     return [evaluate(state.of_camera(c, observations), o) for c, o in enumerate(observations.cameras)]
 
 
-def rig_normal(observations: RigObservations, state: RigState) -> Normal:
+def rig_normal(
+    observations: RigObservations, state: RigState, workspaces: Sequence[Workspace] | None = None
+) -> Normal:
     """Return the normal equations: globals are all intrinsics, then the mounts of all cameras but the first."""
     sizes = [c.parameters.size for c in state.cameras]
     first = np.concatenate([[0], np.cumsum(sizes)])
@@ -103,11 +105,20 @@ def rig_normal(observations: RigObservations, state: RigState) -> Normal:
     frames = len(observations.keys)
     gg, g = np.zeros((count, count)), np.zeros(count)
     gp, pp, p = np.zeros((frames, count, 6)), np.zeros((frames, 6, 6)), np.zeros((frames, 6))
+    costs = np.zeros(frames)
     for c, own in enumerate(observations.cameras):
         alone = state.of_camera(c, observations)
-        points, lever = alone.points_in_cam(own)
-        weight = observations.weights[c]
-        n = normal_equations(alone.camera, points, lever, alone.rotation, alone.shape, own, weight, None)
+        n = normal_equations(
+            alone.camera,
+            alone.rotation,
+            alone.translation_mm,
+            alone.shape,
+            alone.unknowns,
+            own,
+            observations.weights[c],
+            None,
+            workspaces[c] if workspaces else None,
+        )
         f = observations.frame[c]
         k = slice(int(first[c]), int(first[c + 1]))
         by_frame = np.zeros((6, 6))
@@ -117,6 +128,7 @@ def rig_normal(observations: RigObservations, state: RigState) -> Normal:
         gp[f, k] += n.gp @ by_frame
         pp[f] += by_frame.T @ n.pp @ by_frame
         p[f] += n.p @ by_frame
+        costs[f] += n.costs
         if c > 0:
             m = slice(int(first[-1]) + 6 * (c - 1), int(first[-1]) + 6 * c)
             by_mount = np.zeros((len(f), 6, 6))
@@ -128,20 +140,19 @@ def rig_normal(observations: RigObservations, state: RigState) -> Normal:
             gg[m, m] += (turned @ n.pp @ by_mount).sum(axis=0)
             g[m] += (turned @ n.p[..., None]).sum(axis=0)[:, 0]
             gp[f, m] += turned @ n.pp @ by_frame
-    return Normal(gg, gp, pp, g, p)
+    return Normal(gg, gp, pp, g, p, costs)
 
 
 def solve_rig(observations: RigObservations, start: RigState) -> tuple[RigState, Convergence]:
     """Return the state of least weighted squares from `start`, and how the solver ended."""
 
-    def cost(state: RigState) -> float:
-        residuals = rig_residuals(observations, state)
-        total = sum(
-            float(((r.px**2).sum(axis=-1) * w**2).sum()) for r, w in zip(residuals, observations.weights, strict=True)
-        )
-        return total if np.isfinite(total) else np.inf
+    workspaces = [Workspace() for _ in observations.cameras]
 
-    return minimise(start, cost, lambda state: rig_normal(observations, state), _moved)
+    def linearise(state: RigState) -> tuple[float, Normal]:
+        normal = rig_normal(observations, state, workspaces)
+        return float(normal.costs.sum()), normal
+
+    return minimise(start, linearise, _moved)
 
 
 def _moved(state: RigState, step: Step) -> RigState | None:

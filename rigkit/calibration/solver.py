@@ -18,7 +18,7 @@ import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray, Mat3, Points
 from rigkit.calibration.camera_prior import camera_prior
-from rigkit.calibration.normal import Normal, Step, normal_equations
+from rigkit.calibration.normal import Normal, Step, Workspace, lost_px, normal_equations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.shape import ShapeModel, shape_model
@@ -90,12 +90,6 @@ def evaluate(state: State, observations: Observations) -> Residuals:
     return Residuals(np.where(valid[..., None], residuals, lost_px(state.camera)), valid)
 
 
-def lost_px(camera: Camera) -> float:
-    """Return the residual per coordinate of a corner outside the model's field of view: worse than any other, so that
-    no step gains by losing corners."""
-    return float(np.hypot(*camera.size_px))
-
-
 def solve(
     observations: Observations,
     start: State,
@@ -118,8 +112,8 @@ def solve(
         for none.
     """
     weight = observations.weight if weight is None else weight
-    solver = _Solver(observations, weight, loss_px, prior_sigma_px)
-    return minimise(start, solver.cost, solver.linearise, _moved, max_iterations, cost_tolerance)
+    solver = _Solver(observations, weight, loss_px, prior_sigma_px, Workspace())
+    return minimise(start, solver.linearise, _moved, max_iterations, cost_tolerance)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -128,48 +122,44 @@ class _Solver:
     weight: FloatArray
     loss_px: float | None
     prior_sigma_px: float
+    workspace: Workspace
 
-    def cost(self, state: State) -> float:
-        """Return the cost, infinite where the state makes no camera."""
-        residuals = evaluate(state, self.observations)
-        squared = (residuals.px**2).sum(axis=-1) * self.weight**2
-        if self.loss_px is not None:
-            squared = self.loss_px**2 * np.log1p(squared / self.loss_px**2)
-        _, camera = camera_prior(state.camera)
-        total = float(squared.sum()) + float((self.prior(state) * state.unknowns**2).sum())
-        total += self.prior_sigma_px**2 * float(camera @ camera)
-        return total if np.isfinite(total) else np.inf
-
-    def prior(self, state: State) -> FloatArray:
-        """Return the weight of each shape unknown squared, in px^2."""
-        return np.asarray((self.prior_sigma_px / state.shape.sigma) ** 2)
-
-    def linearise(self, state: State) -> Normal:
-        return normal_equations(
+    def linearise(self, state: State) -> tuple[float, Normal]:
+        """Return the cost and the normal equations, priors included."""
+        normal = normal_equations(
             state.camera,
-            *state.points_in_cam(self.observations),
             state.rotation,
+            state.translation_mm,
             state.shape,
+            state.unknowns,
             self.observations,
             self.weight,
             self.loss_px,
-        ).with_priors(state.camera, self.prior_sigma_px, state.shape.sigma, state.unknowns)
+            self.workspace,
+        )
+        _, camera = camera_prior(state.camera)
+        prior = float(camera @ camera)
+        if state.shape.count:
+            prior += float(((state.unknowns / state.shape.sigma) ** 2).sum())
+        cost = float(normal.costs.sum()) + self.prior_sigma_px**2 * prior
+        cost = cost if np.isfinite(cost) else np.inf
+        return cost, normal.with_priors(state.camera, self.prior_sigma_px, state.shape.sigma, state.unknowns)
 
 
 def minimise(
     state: S,
-    cost_of: Callable[[S], float],
-    linearise: Callable[[S], Normal],
+    linearise: Callable[[S], tuple[float, Normal]],
     moved: Callable[[S, Step], S | None],
     max_iterations: int = MAX_ITERATIONS,
     tolerance: float = COST_TOLERANCE,
 ) -> tuple[S, Convergence]:
     """Return the state of least cost near `state`, by Levenberg-Marquardt, and how it ended.
 
+    `linearise` returns cost and normal equations together: nearly every step is taken, so hardly any are in vain.
     `moved` returns the state after a step, None where there is no such state.
     """
-    cost, damping, growth = cost_of(state), DAMPING_START, DAMPING_GROWTH
-    normal = linearise(state)
+    cost, normal = linearise(state)
+    damping, growth = DAMPING_START, DAMPING_GROWTH
     for iteration in range(1, max_iterations + 1):
         step = normal.step(damping)
         if step is None:
@@ -180,15 +170,14 @@ def minimise(
         if step.predicted <= tolerance * cost:
             return state, Convergence(iteration, True, "cost stationary")
         trial = moved(state, step)
-        trial_cost = np.inf if trial is None else cost_of(trial)
+        trial_cost, trial_normal = (np.inf, normal) if trial is None else linearise(trial)
         gain = (cost - trial_cost) / step.predicted
         if trial is not None and gain > 0.0:
             stationary = cost - trial_cost <= tolerance * cost and gain > 0.5
-            state, cost = trial, trial_cost
+            state, cost, normal = trial, trial_cost, trial_normal
             if stationary:
                 return state, Convergence(iteration, True, "cost stationary")
             damping, growth = damping * max(DAMPING_SHRINK, 1.0 - (2.0 * gain - 1.0) ** 3), DAMPING_GROWTH
-            normal = linearise(state)
         else:
             damping, growth = damping * growth, growth * 2.0
             if damping > DAMPING_MAX:

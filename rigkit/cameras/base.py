@@ -186,6 +186,18 @@ class Camera(ABC):
             np.moveaxis(by_parameter.reshape(2, self.parameters.size, *batch), (0, 1), (-2, -1)),
         )
 
+    def derivatives(
+        self, x: FloatArray, y: FloatArray, z: FloatArray, by_point: FloatArray, by_parameter: FloatArray
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Project N points given by flat coordinates and write the Jacobians into `by_point` (2, 3, N) and
+        `by_parameter` (2, P, N): `project_with_jacobians` into memory that the caller keeps.
+
+        Return u, v and valid, each (N,); what is not valid is left arbitrary, NaN too. Entries of `by_parameter` that
+        are zero for every camera of the model are not written: the caller provides the zeros.
+        """
+        with np.errstate(all="ignore"):
+            return self._derivatives(x, y, z, by_point, by_parameter)
+
     def with_parameters(self, parameters: ArrayLike) -> Self:
         """Return the same model and size with other parameters.
 

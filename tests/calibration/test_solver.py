@@ -9,7 +9,7 @@ import pytest
 from helpers.calibration_scenes import REACH_DEG, lens, random_views
 from scipy.optimize import least_squares
 
-from rigkit.calibration.normal import normal_equations
+from rigkit.calibration.normal import Normal, normal_equations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.shape import shape_model
 from rigkit.calibration.solver import State, evaluate, solve
@@ -41,6 +41,11 @@ def disturbed(state: State, rng: np.random.Generator, size: float) -> State:
     )
 
 
+def normals(state: State, observations: Observations, weight: np.ndarray) -> Normal:
+    poses = state.rotation, state.translation_mm
+    return normal_equations(state.camera, *poses, state.shape, state.unknowns, observations, weight, None)
+
+
 @pytest.mark.parametrize("kind", ["flat", "warp", "released"])
 @pytest.mark.parametrize("name", ["reg", "fish"])
 def test_gradient_of_every_unknown(name: str, kind: str, rng: np.random.Generator) -> None:
@@ -49,8 +54,7 @@ def test_gradient_of_every_unknown(name: str, kind: str, rng: np.random.Generato
     shape = shape_model(kind, observations)
     state = replace(disturbed(state, rng, 1e-3), shape=shape, unknowns=0.1 * shape.sigma * rng.normal(size=shape.count))
     weight = observations.weight * rng.uniform(0.5, 1.5, observations.weight.shape)
-    points, lever = state.points_in_cam(observations)
-    normal = normal_equations(state.camera, points, lever, state.rotation, shape, observations, weight, None)
+    normal = normals(state, observations, weight)
     p = state.camera.parameters.size
     analytic = -2.0 * np.concatenate([normal.g, normal.p.ravel()])
 
@@ -88,10 +92,7 @@ def test_second_derivative_blocks(rng: np.random.Generator) -> None:
     observations, state = scene("fish", rng)
     shape = shape_model("released", observations)
     state = replace(disturbed(state, rng, 1e-3), shape=shape, unknowns=np.zeros(shape.count))
-    points, lever = state.points_in_cam(observations)
-    normal = normal_equations(
-        state.camera, points, lever, state.rotation, shape, observations, observations.weight, None
-    )
+    normal = normals(state, observations, observations.weight)
     normal = normal.with_priors(state.camera, 0.2, shape.sigma, state.unknowns)
     first, second = normal.step(1e-6), replace(normal, points_from=None).step(1e-6)
     assert first is not None and second is not None
