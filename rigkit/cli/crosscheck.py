@@ -17,11 +17,12 @@ from rigkit.cli.workflow import (
     reconstruct_other_chain,
     reconstruct_with,
     select_dataset,
+    shifts_of,
     write_results,
 )
 
 if TYPE_CHECKING:
-    from rigkit.cameras.base import Camera
+    from rigkit.cli.workflow import LoadedCamera
     from rigkit.io.manifest import Pair
     from rigkit.validation.crosscheck import CrossCheckReport
 
@@ -39,8 +40,8 @@ class PairJob:
     """What one process needs to know of one pair."""
 
     pair: Pair
-    camera1: Camera
-    camera2: Camera
+    camera1: LoadedCamera
+    camera2: LoadedCamera
     chain: str
 
 
@@ -48,9 +49,11 @@ def crosscheck_pair(job: PairJob) -> CrossCheckReport:
     """Reconstruct one pair and compare it with every other way."""
     from rigkit.validation.crosscheck import crosscheck
 
-    matched, _, _ = match_images(job.pair, job.camera1, job.camera2, job.chain)
+    matched, _, _ = match_images(job.pair, job.camera1.camera, job.camera2.camera, job.chain)
     other = reconstruct_other_chain(matched, job.pair)
-    return crosscheck(reconstruct_with(matched, job.pair, "3SDIR"), other_chain=other, coverage=CROSSCHECK_COVERAGE)
+    ours = reconstruct_with(matched, job.pair, "3SDIR")
+    shifts = shifts_of(ours, job.camera1, job.camera2)
+    return crosscheck(ours, other_chain=other, shifts=shifts, coverage=CROSSCHECK_COVERAGE)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -61,10 +64,7 @@ def run(args: argparse.Namespace) -> int:
     out = output_folder(args, dataset.name)
     progress = progress_on_stderr()
     cameras = load_cameras(dataset, recalibrate=args.recalibrate, progress=progress)
-    jobs = [
-        PairJob(p, cameras[p.camera1.camera_id].camera, cameras[p.camera2.camera_id].camera, args.chain)
-        for p in dataset.pairs
-    ]
+    jobs = [PairJob(p, cameras[p.camera1.camera_id], cameras[p.camera2.camera_id], args.chain) for p in dataset.pairs]
     reports = list(over_pairs(crosscheck_pair, jobs, args.jobs, "cross-checking pairs", progress))
     table = crosscheck_table(reports)
     files: dict[str, str | bytes] = {

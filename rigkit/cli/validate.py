@@ -126,7 +126,8 @@ def _judge(job: PairJob, matched: MatchedPair, image1: Any, image2: Any, causes:
 
     pair = job.pair
     reconstructions = {method: reconstruct_with(matched, pair, method, image1) for method in AFFINE_METHODS}
-    reports = tuple(validate(r, pair.truth, shifts=s) for r, s in _with_shifts(reconstructions, job))
+    shifts = _shifts(reconstructions, job)
+    reports = tuple(validate(r, pair.truth, shifts=shifts[method]) for method, r in reconstructions.items())
     best = best_report(reports)
     files: dict[str, bytes] = {
         f"{pair.pair_id}/{method}.ply": ply_bytes(r.cloud) for method, r in reconstructions.items()
@@ -135,27 +136,25 @@ def _judge(job: PairJob, matched: MatchedPair, image1: Any, image2: Any, causes:
     other_ways = None
     if job.crosscheck:
         other = reconstruct_other_chain(matched, pair)
-        other_ways = crosscheck(shown, other_chain=other, coverage=CROSSCHECK_COVERAGE)
+        other_ways = crosscheck(
+            shown, other_chain=other, shifts=shifts[best.affine_method], coverage=CROSSCHECK_COVERAGE
+        )
     section = _pictures(reconstructions, shown, reports, other_ways, image1, image2, files) if job.pictures else None
     return PairOutcome(pair.pair_id, reports, best, other_ways, causes, files, section)
 
 
-def _with_shifts(
-    reconstructions: Mapping[str, Reconstruction], job: PairJob
-) -> list[tuple[Reconstruction, CalibrationShifts | None]]:
-    """Return each reconstruction with what the calibrations' uncertainty does to it.
+def _shifts(reconstructions: Mapping[str, Reconstruction], job: PairJob) -> dict[str, CalibrationShifts | None]:
+    """Return what the calibrations' uncertainty does to each reconstruction, by estimator.
 
     The likelihood sees the corners, not the affinities: estimators that kept the same corners share the answer.
     """
     cameras = (job.cameras[job.pair.camera1.camera_id], job.cameras[job.pair.camera2.camera_id])
     known: dict[bytes, CalibrationShifts | None] = {}
-    out = []
     for reconstruction in reconstructions.values():
         corners = reconstruction.pixels1.tobytes()
         if corners not in known:
             known[corners] = shifts_of(reconstruction, *cameras)
-        out.append((reconstruction, known[corners]))
-    return out
+    return {method: known[r.pixels1.tobytes()] for method, r in reconstructions.items()}
 
 
 def _pictures(
