@@ -9,6 +9,7 @@ unless the baseline is known.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import lgamma
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from rigkit.errors import DegenerateError, InputError, RigkitError
 from rigkit.fundamental.estimate import check_baseline
 from rigkit.fundamental.pose import essential_from_pose
 from rigkit.fundamental.refine import RefinedPose, cauchy_weights, refine_pose
+from rigkit.fundamental.registry import fundamental_for
 from rigkit.fundamental.robust import RobustPose, Sample, marginal_quality, robust_pose
 from rigkit.fundamental.weights import affinity_residuals, usable_affinities
 from rigkit.geometry.rigid3 import Rigid3
@@ -44,6 +46,8 @@ AFFINITY_GATE = 3.7
 MEDIAN_OF_NORMAL = 0.6745
 MEDIAN_OF_RAYLEIGH = 1.1774
 ROUNDS = 4
+SHIFTS = 40
+MAX_FALSE_ALARMS = 1e-2
 MAX_RANGE_SIGMA = 0.3
 """A point whose distance is known no better than this share of it is left out: it could be anywhere along its ray."""
 SAMPLES: tuple[Sample, ...] = ("points", "affine")
@@ -193,6 +197,7 @@ def _fit(matches: Matches, declared: PoseType, level_sigma_rad: float | None, rn
         pose = refined.cam2_from_cam1
         inliers = _agreeing(matches, pose)
         _require(inliers)
+    _refuse_chance(matches, pose, inliers, fundamental_for(pose_type).degrees_of_freedom)
     return _Fit(matches, refined, inliers, pose_type, level_sigma_rad, tuple(notes))
 
 
@@ -226,6 +231,35 @@ def _require(inliers: BoolArray) -> None:
             f"only {int(inliers.sum())} of {len(inliers)} correspondences agree with one pose; check that the images "
             "show the same scene, and the cameras"
         )
+
+
+def _refuse_chance(matches: Matches, pose: Rigid3, inliers: BoolArray, freedom: int) -> None:
+    """Raise DegenerateError where as many of so many wrong matches would be expected to agree with some pose.
+
+    The expected number of poses through a minimal sample that do as well among wrong matches (Moisan and Stival,
+    "A probabilistic criterion to detect rigid point matches"). How often a wrong match fits by chance is seen from the
+    points themselves, partnered wrongly on purpose: on boards and facades it is often.
+    """
+    n, k = len(inliers), int(inliers.sum())
+    fitting = total = 0
+    for shift in range(1, min(n, SHIFTS + 1)):
+        other = matches.select(np.roll(np.arange(n), shift))
+        wrong = replace(
+            matches, rays2=other.rays2, jacobians2=other.jacobians2, sigma2_px=other.sigma2_px, pixels2=other.pixels2
+        )
+        fitting += int((np.abs(_in_sigmas(wrong, pose)) < GATE).sum())
+        total += n
+    log_chance = np.log((fitting + 1.0) / (total + 1.0))
+    log_expected = np.log(n) + _log_choose(n, k) + _log_choose(k, freedom) + (k - freedom) * log_chance
+    if log_expected > np.log(MAX_FALSE_ALARMS):
+        raise DegenerateError(
+            f"{k} of {n} correspondences agree with one pose, as many as wrong ones might by chance; the scene has too "
+            "little texture, or looks the same in many places"
+        )
+
+
+def _log_choose(n: int, k: int) -> float:
+    return lgamma(n + 1.0) - lgamma(k + 1.0) - lgamma(n - k + 1.0)
 
 
 def _in_sigmas(matches: Matches, pose: Rigid3) -> FloatArray:
