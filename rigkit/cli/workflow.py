@@ -118,9 +118,10 @@ class LoadedCamera:
 
 
 def load_cameras(dataset: Dataset, *, recalibrate: bool, progress: Progress) -> dict[str, LoadedCamera]:
-    """Return the cameras that the pairs use, calibrating from their sessions where no calibration is there yet.
+    """Return the cameras of a data set, calibrating those in use from their sessions where that was not done yet.
 
-    A new calibration is kept beside its session.
+    A new calibration is kept beside its session. Cameras that no pair uses come along where they are calibrated: an
+    image may fit one of them better than the camera that it is said to be from.
     """
     from rigkit.cli.calibrate import calibrate_session
     from rigkit.io.calibration_file import save_calibration
@@ -130,10 +131,11 @@ def load_cameras(dataset: Dataset, *, recalibrate: bool, progress: Progress) -> 
     cameras: dict[str, LoadedCamera] = {}
     used = {name for pair in dataset.pairs for name in (pair.camera1.camera_id, pair.camera2.camera_id)}
     for entry in dataset.cameras:
-        if entry.camera_id not in used:
-            continue
-        if entry.calibration.is_file() and not recalibrate:
+        unused = entry.camera_id not in used
+        if entry.calibration.is_file() and (unused or not recalibrate):
             cameras[entry.camera_id] = _load(entry.calibration)
+            continue
+        if unused:
             continue
         if entry.session is None:
             raise InputError(

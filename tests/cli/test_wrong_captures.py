@@ -1,0 +1,208 @@
+"""Captures with one thing wrong, from rendered images through the command: the right check fails, and says why."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rigkit.boards import Board
+from rigkit.cameras.base import Camera
+from rigkit.cameras.brown import Brown
+from rigkit.cameras.kannala_brandt import KannalaBrandt
+from rigkit.cli.main import main
+from rigkit.io.calibration_file import save_camera
+from rigkit.posetype import PoseType
+from rigkit.synthetic.pairs import StereoScene, trihedral_pair
+from rigkit.synthetic.photometry import Photometry
+from rigkit.synthetic.render import Optics
+
+SIZE = (960, 720)
+BOARDS = (Board("plane1", 8, 6, 50.0, 50.0), Board("plane2", 7, 6, 50.0, 50.0), Board("plane3", 6, 9, 50.0, 50.0))
+ANGLES = ("angle plane1-plane2", "angle plane1-plane3", "angle plane2-plane3")
+CAMERAS: dict[str, Camera] = {
+    "regular": Brown(SIZE, np.array([800.0, 801.0, 485.5, 350.5, -0.15, 0.08, 2e-4, -1e-4, 0.0])),
+    "fisheye": KannalaBrandt(SIZE, np.array([352.0, 352.0, 484.3, 355.8, -0.021, 0.0012, 0.0, 0.0])),
+}
+PHOTOMETRY = Photometry(vignetting=0.3, gradient=(0.1, -0.06), noise_levels=1.5)
+SCENES: dict[str, tuple[str, str, tuple[float, float, float]]] = {
+    "same": ("regular", "regular", (90.0, 90.0, 90.0)),
+    "mixed": ("regular", "fisheye", (90.0, 90.0, 90.0)),
+    "leaning": ("regular", "regular", (90.0, 91.6, 90.0)),
+}
+"""Name of a pair: its two cameras and how its boards really stand."""
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, StereoScene]]:
+    """A folder with the images of all pairs, boards and calibrations; no manifest yet."""
+    root = tmp_path_factory.mktemp("capture")
+    rng = np.random.default_rng(11)
+    scenes = {}
+    for name, (first, second, angles) in SCENES.items():
+        scene = trihedral_pair(
+            BOARDS,
+            CAMERAS[first],
+            PoseType.GENERAL,
+            rng,
+            camera2=CAMERAS[second],
+            angles_deg=angles,
+            distance=(0.8, 1.1),
+            parallax_deg=(15.0, 40.0),
+        )
+        images = scene.images(optics=Optics(0.6, supersample=2), photometry=PHOTOMETRY, rng=rng)
+        for number, image in enumerate(images, start=1):
+            cv2.imwrite(str(root / f"{name}{number}.png"), image)
+        scenes[name] = scene
+    for board in BOARDS:
+        (root / f"{board.board_id}.toml").write_text(
+            f'schema = "rigkit.board/1"\nid = "{board.board_id}"\ncolumns = {board.columns}\nrows = {board.rows}\n'
+            "square_mm = 50.0\n"
+        )
+    for name, camera in CAMERAS.items():
+        save_camera(root / f"{name}.json", camera)
+    return root, scenes
+
+
+def pair_toml(scene: StereoScene, name: str, cameras: tuple[str, str], baseline_factor: float = 1.0) -> str:
+    ids = ", ".join(f'"{b.board_id}"' for b in BOARDS)
+    lines = ["[[pairs]]", f'id = "{name}"', 'pose_type = "general"', f"boards = [{ids}]"]
+    lines += [f'camera{k} = "{camera}"\nimage{k} = "{name}{k}.png"' for k, camera in enumerate(cameras, start=1)]
+    baseline = f'value_mm = {baseline_factor * scene.baseline_mm:.1f}, sigma_mm = 1.0, how = "rule"'
+    lines += ["[pairs.truth]", f"baseline = {{ {baseline} }}", "angles = ["]
+    for a, b in ((1, 2), (1, 3), (2, 3)):
+        lines += [f'  {{ a = "plane{a}", b = "plane{b}", value_deg = 90.0, sigma_deg = 0.3, how = "set square" }},']
+    return "\n".join([*lines, "]", ""])
+
+
+def write_manifest(root: Path, *pairs: str, cameras: Iterable[str] = tuple(CAMERAS)) -> None:
+    lines = ['schema = "rigkit.dataset/1"', 'name = "made"']
+    for board in BOARDS:
+        lines += ["[[boards]]", f'id = "{board.board_id}"', f'file = "{board.board_id}.toml"']
+    for name in cameras:
+        lines += ["[[cameras]]", f'id = "{name}"', f'calibration = "{name}.json"']
+    (root / "dataset.toml").write_text("\n".join([*lines, *pairs]))
+
+
+@pytest.fixture
+def folder(capture: tuple[Path, dict[str, StereoScene]], tmp_path: Path) -> Path:
+    return Path(shutil.copytree(capture[0], tmp_path / "capture"))
+
+
+def validate(folder: Path, capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, str, set[str]]:
+    """Return the exit code, all that was printed, and the names of the checks that failed with any estimator."""
+    out = folder / "out"
+    code = main(["validate", str(folder), "-o", str(out), "-j", "1", "--no-pictures", *options])
+    captured = capsys.readouterr()
+    text = captured.out + captured.err
+    failed = {line.split(" ", 3)[3].split(":")[0] for line in text.splitlines() if line.startswith("FAILED")}
+    assert "DISAGREES" not in text
+    return code, text, failed
+
+
+def test_a_right_capture_passes(
+    capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scenes = capture[1]
+    write_manifest(
+        folder,
+        pair_toml(scenes["same"], "same", ("regular", "regular")),
+        pair_toml(scenes["mixed"], "mixed", ("regular", "fisheye")),
+    )
+    code, text, failed = validate(folder, capsys)
+    assert (code, failed) == (0, set())
+    assert "probable cause" not in text
+    assert json.loads((folder / "out" / "tables.json").read_text())
+
+
+def test_boards_that_lean_fail_their_angle_and_nothing_else(
+    capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_manifest(folder, pair_toml(capture[1]["leaning"], "leaning", ("regular", "regular")))
+    code, text, failed = validate(folder, capsys)
+    assert (code, failed) == (1, {"angle plane1-plane3"})
+    assert "probable cause: pair 'leaning': plane1-plane3" in text
+
+
+def test_a_misread_rule_fails_the_baseline_and_nothing_else(
+    capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_manifest(
+        folder,
+        pair_toml(capture[1]["same"], "same", ("regular", "regular"), 1.03),
+        pair_toml(capture[1]["mixed"], "mixed", ("regular", "fisheye")),
+    )
+    code, text, failed = validate(folder, capsys, "--no-crosscheck")
+    assert (code, failed) == (1, {"baseline"})
+    assert "pair 'same': baseline comes out -2.9 % while other lengths hold: it was probably misread" in text
+
+
+def test_wrong_squares_are_named(
+    capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for board in BOARDS:
+        path = folder / f"{board.board_id}.toml"
+        path.write_text(path.read_text().replace("50.0", "51.5"))
+    write_manifest(
+        folder,
+        pair_toml(capture[1]["same"], "same", ("regular", "regular")),
+        pair_toml(capture[1]["mixed"], "mixed", ("regular", "fisheye")),
+    )
+    code, text, failed = validate(folder, capsys, "--no-crosscheck")
+    assert (code, failed) == (1, {"baseline"})
+    assert "probable cause: square size: all 2 lengths come out +3.0 %" in text
+    assert "50.0" in text
+
+
+def test_one_board_with_wrong_squares_is_named(
+    capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = folder / "plane2.toml"
+    path.write_text(path.read_text().replace("50.0", "51.5"))
+    write_manifest(folder, pair_toml(capture[1]["same"], "same", ("regular", "regular")))
+    code, text, failed = validate(folder, capsys, "--no-crosscheck")
+    assert code == 1
+    assert failed <= {"baseline"}
+    assert "board 'plane2': its squares come out -2.9 % against the other boards" in text
+
+
+@pytest.mark.parametrize("what", ["images", "cameras"])
+def test_swapped_images_and_cameras_are_named(
+    capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str], what: str
+) -> None:
+    order = ("regular", "fisheye")
+    if what == "images":
+        first, second, spare = (folder / name for name in ("mixed1.png", "mixed2.png", "spare.png"))
+        first.rename(spare)
+        second.rename(first)
+        spare.rename(second)
+    else:
+        order = ("fisheye", "regular")
+    write_manifest(folder, pair_toml(capture[1]["mixed"], "mixed", order))
+    code, text, _ = validate(folder, capsys, "--no-crosscheck")
+    assert code in (1, 2, 3)
+    assert "the two images, or camera1 and camera2, are swapped" in text
+
+
+def test_the_other_lens_s_calibration_is_named(
+    capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_manifest(folder, pair_toml(capture[1]["mixed"], "mixed", ("regular", "regular")))
+    code, text, _ = validate(folder, capsys, "--no-crosscheck")
+    assert code in (1, 2, 3)
+    assert "pair 'mixed': image 2 fits camera 'fisheye'" in text
+    assert "the calibration of another lens?" in text
+
+
+def test_a_lens_that_is_in_no_calibration_is_named(
+    capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_manifest(folder, pair_toml(capture[1]["mixed"], "mixed", ("regular", "regular")), cameras=["regular"])
+    code, text, _ = validate(folder, capsys, "--no-crosscheck")
+    assert code in (1, 2, 3)
+    assert "image 2 does not fit the calibration of 'regular'" in text
