@@ -18,8 +18,9 @@ from rigkit.corners.saddle import Corners
 
 __all__ = ["Links", "edge_contrast", "find_links", "quads"]
 
-NEIGHBOURS = 32
-"""Nearest corners looked at: enough to reach across a board that is foreshortened four times."""
+NEIGHBOURS = 48
+"""Nearest corners looked at: enough to reach across a board that is foreshortened four times, past those that noise
+adds along its narrow squares."""
 
 ARM_COSINE = np.cos(np.radians(18.0))
 """How well the chord must follow the arms at both ends; fisheye rows bend by less within a square."""
@@ -90,12 +91,8 @@ def find_links(corners: Corners, level: Level) -> Links:
 
 def _candidates(corners: Corners) -> tuple[IntArray, IntArray, IntArray, IntArray, FloatArray]:
     """Return (start, its arm, end, its arm, distance) of the pairs whose arms point at each other."""
-    from scipy.spatial import cKDTree
-
     pixels = corners.pixels
-    near = min(NEIGHBOURS + 1, len(pixels))
-    length, other = cKDTree(pixels).query(pixels, k=near)
-    length = np.maximum(length, 1e-6)
+    length, other = _nearest_alike(pixels, corners.contrast)
     chord_u = (pixels[other, 0] - pixels[:, :1]) / length
     chord_v = (pixels[other, 1] - pixels[:, 1:]) / length
     lines = arm_vectors(corners.angles)[:, :2]
@@ -110,6 +107,29 @@ def _candidates(corners: Corners) -> tuple[IntArray, IntArray, IntArray, IntArra
     back = _arm(home[:, 0], home[:, 1])
     good = (np.abs(home).max(axis=1) > ARM_COSINE) & ((arm + back) % 2 == 1)
     return start[good], arm[good], end[good], back[good], distance[good]
+
+
+def _nearest_alike(pixels: FloatArray, contrast: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Return distance and index of the NEIGHBOURS nearest corners of like contrast, (N, K); the corner itself fills up.
+
+    Noise makes hundreds of faint corners: they must not crowd out the neighbours of the clear ones. So each half octave
+    of contrast is looked up among those that it may be linked with.
+    """
+    from scipy.spatial import cKDTree
+
+    near = min(NEIGHBOURS + 1, len(pixels))
+    length = np.ones((len(pixels), near))
+    other = np.repeat(np.arange(len(pixels))[:, None], near, axis=1)
+    band = np.floor(2.0 * np.log2(np.maximum(contrast, 1e-6)))
+    for low in np.unique(band):
+        mine = np.flatnonzero(band == low)
+        least, most = CONTRAST_RATIO * 2.0 ** (low / 2), 2.0 ** ((low + 1) / 2) / CONTRAST_RATIO
+        pool = np.flatnonzero((contrast > least) & (contrast < most))
+        distance, found = cKDTree(pixels[pool]).query(pixels[mine], k=np.arange(1, near + 1))
+        there = np.isfinite(distance)
+        length[mine] = np.where(there, np.maximum(distance, 1e-6), 1.0)
+        other[mine] = np.where(there, pool[np.where(there, found, 0)], mine[:, None])
+    return length, other
 
 
 def _arm(along_a: FloatArray, along_b: FloatArray) -> IntArray:

@@ -41,7 +41,7 @@ class Link:
     placement1, placement2 : grids of the detections to the grid of the board.
     cam1_from_board, cam2_from_board : (4, 4)
     against_colour : whether the two are turned by 90 degrees against each other although the colours of a square board
-        should have prevented that.
+        with an odd number of corners a side (a quarter turn exchanges them) should have prevented that.
     """
 
     first: int
@@ -184,7 +184,7 @@ def _links_of_pair(i: int, j: int, k: int, kind: BoardKind, poses1: GridPoses, p
                 continue
             keys.add(key)
             odd = (placement1.quarter_turns + placement2.quarter_turns) % 2 == 1
-            against = square and kind.board.columns % 2 == 0 and odd
+            against = square and kind.board.columns % 2 == 1 and odd
             for pose1, _ in poses1.placed(i, kind, placement1):
                 for pose2, _ in poses2.placed(j, kind, placement2):
                     links.append(Link(i, j, k, key, placement1, placement2, pose1, pose2, against))

@@ -181,17 +181,24 @@ def test_one_board_alone(rng: np.random.Generator) -> None:
     assert not identity.ambiguous and identity.runner_up_px == np.inf
 
 
-def test_colour_goes_before_roll_on_an_even_square(rng: np.random.Generator) -> None:
-    """6x6 corners differ in colour when turned by 90 degrees, so that a camera rolled by 80 degrees is not mistaken."""
-    boards = (Board("s", 6, 6, 40.0, 40.0),)
-    roll = Rigid3(exp_so3(np.array([0.0, 0.0, 1.4])), np.zeros(3))
+@pytest.mark.parametrize(("side", "roll_rad", "turns"), [(7, 1.4, 0), (6, 0.3, 1)])
+def test_colour_goes_before_roll_on_an_odd_square(
+    side: int, roll_rad: float, turns: int, rng: np.random.Generator
+) -> None:
+    """A quarter turn exchanges the colours of 8x8 squares, 7x7 corners: a camera rolled by 80 degrees is not mistaken.
+
+    It leaves 7x7 squares as they are, whose grids so start at any corner: there the smaller roll decides.
+    """
+    boards = (Board("s", side, side, 40.0, 40.0),)
+    roll = Rigid3(exp_so3(np.array([0.0, 0.0, roll_rad])), np.zeros(3))
     for _ in range(100):
         scene = trihedral_scene(rng, boards, regular_camera())
         poses = {"s": roll @ scene.cam1_from_board["s"]}
         rolled = replace(scene, pixels2=view(boards, scene.camera1, poses), cam2_from_cam1=roll)
         if np.isfinite(rolled.pixels2["s"]).all():
             break
-    identity = identify_pair(*both_views(rolled, rng), boards, scene.camera1, scene.camera2)
+    one, two = both_views(rolled, rng)
+    identity = identify_pair(one, [d.turned(turns) for d in two], boards, scene.camera1, scene.camera2)
     assert_right(identity, rolled, 1)
     assert identity.ambiguous
 
