@@ -82,9 +82,12 @@ def as_indices(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> In
 
 
 def _check_shape(array: NDArray[Any], shape: tuple[int | None, ...], name: str) -> None:
-    fits = array.ndim == len(shape) and all(
-        want is None or want == have for want, have in zip(shape, array.shape, strict=True)
-    )
+    # Written out: this runs for every array of every view.
+    fits = array.ndim == len(shape)
+    if fits:
+        for want, have in zip(shape, array.shape, strict=True):
+            if want is not None and want != have:
+                fits = False
     if not fits:
         wanted = "x".join("N" if want is None else str(want) for want in shape) or "a scalar"
         raise InputError(f"{name}: expected shape {wanted}, got {'x'.join(map(str, array.shape)) or 'a scalar'}")

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.arrays import FloatArray
-from rigkit.calibration.fit import Fit, rms
+from rigkit.calibration.fit import Fit
 from rigkit.calibration.normal import Normal, normal_equations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import BoardShape, Calibration, Candidate, Outlier, ViewResult
-from rigkit.calibration.solver import State, evaluate
+from rigkit.calibration.solver import State
 from rigkit.calibration.uncertainty import projection_uncertainty
 from rigkit.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
@@ -36,35 +36,41 @@ def assemble(
     state = fit.state
     sigma = fit.sigma_px if np.isfinite(fit.sigma_px) else 0.0
     covariance = frame_covariance(solution_normal(observations, fit), state)
-    residuals = evaluate(state, observations)
-    px = np.where(residuals.valid[..., None], residuals.px, np.nan)
-    views, outliers = [], []
-    for i, view in enumerate(observations.views):
+    px = np.where(fit.residuals.valid[..., None], fit.residuals.px, np.nan)
+    poses = Rigid3.stack(state.rotation, state.translation_mm)
+    views = []
+    for view, pose, residuals, kept in zip(observations.views, poses, px, fit.kept, strict=True):
         n = len(view.grid)
-        kept = fit.kept[i, :n]
-        pose = Rigid3(state.rotation[i], state.translation_mm[i])
-        views.append(ViewResult(view.image, view.board.board_id, pose, view.grid, view.pixels, px[i, :n], kept))
-        for j in np.flatnonzero(~kept):
-            column, row = view.grid[j]
-            length = float(np.linalg.norm(px[i, j]))
-            outliers.append(Outlier(view.image, view.board.board_id, int(column), int(row), length))
+        board_id = view.board.board_id
+        views.append(ViewResult(view.image, board_id, pose, view.grid, view.pixels, residuals[:n], kept[:n]))
     p = state.camera.parameters.size
     result = Calibration(
         camera=state.camera,
-        rms_px=rms(state, observations, fit.kept),
+        rms_px=fit.rms_px,
         heldout_rms_px=heldout_px,
         covariance=covariance[:p, :p] * sigma**2,
         frame_covariance=covariance * sigma**2,
         sigma_px=sigma,
         views=tuple(views),
         dropped=dropped,
-        outliers=tuple(outliers),
+        outliers=_outliers(observations, fit),
         candidates=candidates,
         convergence=fit.convergence,
         boards=_boards(observations, state),
     )
     _require_determined(result)
     return result
+
+
+def _outliers(observations: Observations, fit: Fit) -> tuple[Outlier, ...]:
+    out = []
+    for i, j in np.argwhere(observations.present & ~fit.kept).tolist():
+        view = observations.views[i]
+        column, row = view.grid[j].tolist()
+        # NaN where the corner does not project.
+        length = float(np.linalg.norm(fit.residuals.px[i, j])) if fit.residuals.valid[i, j] else float("nan")
+        out.append(Outlier(view.image, view.board.board_id, column, row, length))
+    return tuple(out)
 
 
 def solution_normal(observations: Observations, fit: Fit) -> Normal:

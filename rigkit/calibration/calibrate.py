@@ -13,12 +13,11 @@ import numpy as np
 
 from rigkit.arrays import BoolArray
 from rigkit.calibration.assemble import assemble
-from rigkit.calibration.fit import Fit, fit_kept, fit_model, heldout_rms, rms, robust_sigma
+from rigkit.calibration.fit import Fit, fit_kept, fit_model, heldout_rms, robust_sigma
 from rigkit.calibration.moved import moved_lens
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.shape import SHAPES, shape_model
-from rigkit.calibration.solver import evaluate
 from rigkit.calibration.usable import usable_views
 from rigkit.calibration.verdicts import judge
 from rigkit.cameras.base import Camera
@@ -99,13 +98,13 @@ def calibrate(
     observations = _reweighted(observations, options)
     options = _compared(observations, options, folds, progress)
     chosen = _choose(observations, options, MARGIN)
-    candidates = [*_described(observations, options, chosen, MARGIN), *failed]
+    candidates = [*_described(options, chosen, MARGIN), *failed]
     if board != "flat":
         shapes = _shapes(observations, chosen, SHAPES[1:] if board == "auto" else (board,), folds, progress)
         if board == "auto":
             shapes = [chosen, *shapes]
         chosen = _choose(observations, shapes, SHAPE_MARGIN)
-        candidates += [c for c in _described(observations, shapes, chosen, SHAPE_MARGIN) if "board" in c.name]
+        candidates += [c for c in _described(shapes, chosen, SHAPE_MARGIN) if "board" in c.name]
     result = assemble(observations, chosen.fit, chosen.heldout_px, dropped, tuple(candidates))
     return replace(result, verdicts=judge(result, moved_lens(observations, chosen.fit) if folds else ()))
 
@@ -163,7 +162,7 @@ def _best(observations: Observations, options: list[_Option]) -> _Option:
     """Return the option with the least scatter."""
     if len(options) == 1:
         return options[0]
-    return min(options, key=lambda o: robust_sigma(o.fit.state, observations))
+    return min(options, key=lambda o: robust_sigma(o.fit, observations))
 
 
 def _reweighted(observations: Observations, options: list[_Option]) -> Observations:
@@ -171,13 +170,13 @@ def _reweighted(observations: Observations, options: list[_Option]) -> Observati
     if float(np.ptp(observations.sigma_px[observations.present])) == 0.0:
         return observations
     best = _best(observations, options)
-    squared = (evaluate(best.fit.state, observations).px ** 2).sum(axis=-1)
+    squared = (best.fit.residuals.px**2).sum(axis=-1)
     return observations.with_common_error(squared, best.fit.kept)
 
 
 def _compared(observations: Observations, options: list[_Option], folds: int, progress: Progress) -> list[_Option]:
     """Return the options refitted to the same corners, with their held-out errors."""
-    sigma = [robust_sigma(o.fit.state, observations) for o in options] if len(options) > 1 else [0.0]
+    sigma = [robust_sigma(o.fit, observations) for o in options] if len(options) > 1 else [0.0]
     near = [o.fit.kept for o, s in zip(options, sigma, strict=True) if s <= COMPARABLE * min(sigma)]
     kept = np.any(near, axis=0)
     out = []
@@ -215,11 +214,11 @@ def _choose(observations: Observations, options: list[_Option], margin: float) -
 def _bic(observations: Observations, option: _Option) -> float:
     """Return Schwarz's criterion, n log(mean squared residual) + parameters log n."""
     n = 2 * int(option.fit.kept.sum())
-    error = rms(option.fit.state, observations, option.fit.kept)
+    error = option.fit.rms_px
     return float(n * np.log(error**2 + np.finfo(float).tiny) + option.count * np.log(n))
 
 
-def _described(observations: Observations, options: list[_Option], chosen: _Option, margin: float) -> list[Candidate]:
+def _described(options: list[_Option], chosen: _Option, margin: float) -> list[Candidate]:
     out = []
     for o in options:
         if len(options) == 1:
@@ -230,6 +229,5 @@ def _described(observations: Observations, options: list[_Option], chosen: _Opti
             reason = f"fewest numbers within {100 * margin:g} % of the smallest held-out error"
         else:
             reason = f"held-out error {100.0 * (o.heldout_px / chosen.heldout_px - 1.0):+.1f} % against the chosen one"
-        error = rms(o.fit.state, observations, o.fit.kept)
-        out.append(Candidate(o.name, o.count, error, o.heldout_px, o is chosen, reason))
+        out.append(Candidate(o.name, o.count, o.fit.rms_px, o.heldout_px, o is chosen, reason))
     return out

@@ -11,11 +11,11 @@ from rigkit.calibration.initialise import initialise
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.poses import find_poses, refine_poses
 from rigkit.calibration.result import Convergence
-from rigkit.calibration.solver import State, evaluate, solve
+from rigkit.calibration.solver import Residuals, State, evaluate, solve
 from rigkit.cameras.base import Camera
 from rigkit.errors import DegenerateError
 
-__all__ = ["OUTLIER_SIGMAS", "Fit", "fit_kept", "fit_model", "heldout_rms", "inliers", "rms", "robust_sigma"]
+__all__ = ["OUTLIER_SIGMAS", "Fit", "fit_kept", "fit_model", "heldout_rms", "inliers", "robust_sigma"]
 
 OUTLIER_SIGMAS = 5.0
 """A corner is an outlier when its weighted 2-D residual exceeds this many robust standard deviations per coordinate,
@@ -33,9 +33,11 @@ BAD_VIEW = 2.0
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Fit:
-    """A solved model: its state, the corners kept (V, C), sigma per coordinate of a corner, how the solver ended."""
+    """A solved model: its state with the residuals, the corners kept (V, C), sigma per coordinate of a corner, how the
+    solver ended."""
 
     state: State
+    residuals: Residuals
     kept: BoolArray
     sigma_px: float
     convergence: Convergence
@@ -44,10 +46,23 @@ class Fit:
         """Return the weights of the kept corners, zero elsewhere."""
         return np.where(self.kept, observations.weight, 0.0)
 
+    def norm(self, observations: Observations) -> FloatArray:
+        """Return the weighted 2-D residuals (V, C) as `weighted_norm`."""
+        return _weighted(self.residuals, observations)
+
+    @property
+    def rms_px(self) -> float:
+        """2-D RMS over the kept corners, px."""
+        squared = (self.residuals.px**2).sum(axis=-1)[self.kept]
+        return float(np.sqrt(squared.mean())) if squared.size else float("nan")
+
 
 def weighted_norm(state: State, observations: Observations) -> FloatArray:
     """Return the weighted 2-D residuals (V, C) in px, infinite where a corner does not project, zero where padded."""
-    residuals = evaluate(state, observations)
+    return _weighted(evaluate(state, observations), observations)
+
+
+def _weighted(residuals: Residuals, observations: Observations) -> FloatArray:
     u, v = residuals.px[..., 0], residuals.px[..., 1]
     length = np.sqrt(u * u + v * v) * observations.weight
     return length if residuals.valid.all() else np.where(residuals.valid | ~observations.present, length, np.inf)
@@ -59,20 +74,14 @@ def sigma_of(norm: FloatArray, used: BoolArray) -> float:
     return max(float(np.median(chosen)) / RAYLEIGH_MEDIAN, SIGMA_FLOOR_PX) if chosen.size else SIGMA_FLOOR_PX
 
 
-def robust_sigma(state: State, observations: Observations) -> float:
+def robust_sigma(fit: Fit, observations: Observations) -> float:
     """Return the robust standard deviation of all corners, weighted, px."""
-    return sigma_of(weighted_norm(state, observations), observations.present)
+    return sigma_of(fit.norm(observations), observations.present)
 
 
 def inliers(norm: FloatArray, observations: Observations, sigma_px: float) -> BoolArray:
     """Return which corners the rule keeps, (V, C), from their weighted residuals."""
     return np.asarray(observations.present & (norm <= OUTLIER_SIGMAS * sigma_px))
-
-
-def rms(state: State, observations: Observations, kept: BoolArray) -> float:
-    """Return the 2-D RMS in px over the kept corners."""
-    squared = (evaluate(state, observations).px[kept] ** 2).sum(axis=-1)
-    return float(np.sqrt(squared.mean())) if squared.size else float("nan")
 
 
 def fit_model(observations: Observations, size_px: tuple[int, int], model: type[Camera], order: int | None) -> Fit:
@@ -132,12 +141,13 @@ def fit_kept(observations: Observations, state: State, kept: BoolArray, *, settl
         weight = np.where(kept, observations.weight, 0.0)
         prior_sigma = sigma_of(norm, kept)
         state, convergence = solve(observations, state, weight=weight, prior_sigma_px=prior_sigma)
-        norm = weighted_norm(state, observations)
+        residuals = evaluate(state, observations)
+        norm = _weighted(residuals, observations)
         again = inliers(norm, observations, sigma_of(norm, kept)) if settle else kept
         if (again == kept).all():
             break
         kept = again
-    return Fit(state, kept, _sigma(state, norm, kept), convergence)
+    return Fit(state, residuals, kept, _sigma(state, norm, kept), convergence)
 
 
 def _sigma(state: State, norm: FloatArray, kept: BoolArray) -> float:

@@ -50,11 +50,24 @@ def projection_uncertainty(calibration: Calibration, pixels: Pixels, *, range_mm
     camera = calibration.camera
     pixels = np.asarray(pixels, dtype=np.float64)
     rays, valid = camera.unproject(pixels)
-    _, _, by_point, by_camera = camera.project_with_jacobians(np.where(valid[..., None], rays, [0.0, 0.0, 1.0]))
-    turn = np.cross(np.where(valid[..., None], rays, 0.0)[..., None, :], by_point)
-    shift = by_point / range_mm
-    design = np.concatenate([by_camera, turn, shift], axis=-1)
-    covariance = design @ calibration.frame_covariance @ np.swapaxes(design, -1, -2)
+    flat = np.where(valid[..., None], rays, [0.0, 0.0, 1.0]).reshape(-1, 3)
+    _, _, by_point, by_camera = camera.project_with_jacobians(flat)
+    # Unknowns first, pixels last: one matrix product for each coordinate. At infinity the world's shift shows nothing.
+    p = by_camera.shape[-1]
+    count = p + 3 if np.isinf(range_mm) else p + 6
+    design = np.empty((2, count, len(flat)))
+    design[:, :p] = np.moveaxis(by_camera, 0, -1)
+    ray, by_x = flat.T, np.moveaxis(by_point, 0, -1)
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        design[:, p + k] = ray[i] * by_x[:, j] - ray[j] * by_x[:, i]
+    if count > p + 3:
+        design[:, p + 3 :] = by_x / range_mm
+    moved = calibration.frame_covariance[:count, :count] @ design
+    covariance = np.empty((len(flat), 2, 2))
+    for i, j in ((0, 0), (0, 1), (1, 1)):
+        covariance[:, i, j] = covariance[:, j, i] = np.einsum("kn,kn->n", design[i], moved[j])
+    covariance = covariance.reshape(*valid.shape, 2, 2)
     return Uncertainty(pixels, np.where(valid[..., None, None], covariance, np.nan), valid)
 
 

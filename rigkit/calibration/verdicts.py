@@ -106,9 +106,16 @@ def _coverage(c: Calibration) -> list[str]:
 
 def _views(c: Calibration) -> list[str]:
     # Medians over all corners: a view that is bad throughout has its worst corners among the outliers.
-    middle = np.sqrt([float(np.median(np.nan_to_num((v.residuals_px**2).sum(axis=1)))) for v in c.views])
-    if len(middle) < 3:
+    if len(c.views) < 3:
         return []
+    count = np.array([len(v.grid) for v in c.views])
+    squared = np.full((len(count), int(count.max())), np.inf)
+    squared[np.arange(squared.shape[1]) < count[:, None]] = np.nan_to_num(
+        (np.concatenate([v.residuals_px for v in c.views]) ** 2).sum(axis=1)
+    )
+    squared.sort(axis=1)
+    view = np.arange(len(count))
+    middle = np.sqrt(0.5 * (squared[view, (count - 1) // 2] + squared[view, count // 2]))
     usual = max(float(np.median(middle)), np.finfo(float).tiny)
     return [
         f"look: image '{view.image}' has a median residual of {value:.3f} px, {value / usual:.1f} times the usual one; "

@@ -39,11 +39,23 @@ class Rigid3:
 
     def __post_init__(self) -> None:
         matrix = as_array(self.rotation, (3, 3), "rotation")
-        nearest = nearest_rotation(matrix)
-        if np.abs(nearest - matrix).max() > ROTATION_TOLERANCE:
-            raise InputError("rotation: not a rotation matrix (orthonormal, determinant +1); check scale and order")
-        object.__setattr__(self, "rotation", as_array(nearest, (3, 3), "rotation"))
+        object.__setattr__(self, "rotation", as_array(_checked(matrix), (3, 3), "rotation"))
         object.__setattr__(self, "translation_mm", as_array(self.translation_mm, (3,), "translation_mm"))
+
+    @classmethod
+    def stack(cls, rotation: Mat3, translation_mm: FloatArray) -> tuple[Rigid3, ...]:
+        """Return the motions of rotations (N, 3, 3) and translations (N, 3), checked together as one is alone."""
+        rotation = as_array(rotation, (None, 3, 3), "rotation")
+        translation = as_array(translation_mm, (len(rotation), 3), "translation_mm")
+        nearest = _checked(rotation)
+        nearest.flags.writeable = False
+        out = []
+        for one, shift in zip(nearest, translation, strict=True):
+            motion = object.__new__(cls)
+            object.__setattr__(motion, "rotation", one)
+            object.__setattr__(motion, "translation_mm", shift)
+            out.append(motion)
+        return tuple(out)
 
     @classmethod
     def identity(cls) -> Rigid3:
@@ -81,6 +93,14 @@ class Rigid3:
             np.allclose(self.rotation, other.rotation, rtol=0.0, atol=rotation_tol)
             and np.allclose(self.translation_mm, other.translation_mm, rtol=0.0, atol=translation_tol_mm)
         )
+
+
+def _checked(matrix: Mat3) -> Mat3:
+    """Return the rotations nearest to `matrix` (..., 3, 3); raises InputError where one is further than rounding."""
+    nearest = nearest_rotation(matrix)
+    if np.abs(nearest - matrix).max(initial=0.0) > ROTATION_TOLERANCE:
+        raise InputError("rotation: not a rotation matrix (orthonormal, determinant +1); check scale and order")
+    return nearest
 
 
 def cam_from_world_look_at(eye_mm: ArrayLike, target_mm: ArrayLike, down: ArrayLike = (0.0, 1.0, 0.0)) -> Rigid3:
