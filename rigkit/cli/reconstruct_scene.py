@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rigkit.cli.console import note, print_json, progress_on_stderr
-from rigkit.cli.workflow import output_folder, write_results
+from rigkit.cli.workflow import output_folder, read_for, write_results
 from rigkit.errors import InputError
 
 if TYPE_CHECKING:
     from rigkit.affine.correspondences import Correspondences
-    from rigkit.cameras.base import Camera
 
 __all__ = ["add_scene_arguments", "is_scene", "run_scene"]
 
@@ -56,7 +55,9 @@ def run_scene(args: argparse.Namespace) -> int:
     out = output_folder(args, name)
     camera1 = load_camera(args.camera)
     camera2 = load_camera(args.camera2) if args.camera2 else camera1
-    images = _images(args.images, camera1, camera2)
+    images = None
+    if args.images:
+        images = (read_for(camera1, args.images[0], "image A"), read_for(camera2, args.images[1], "image B"))
     found = _correspondences(args, images)
     level = None if args.level_sigma_deg is None else float(np.deg2rad(args.level_sigma_deg))
     scene = reconstruct_scene(
@@ -96,24 +97,6 @@ def run_scene(args: argparse.Namespace) -> int:
             f"{result['inliers']} of which agree, Sampson rms {r.sampson_rms_px:.3f} px, {r.pose_type}"
         )
     return 0
-
-
-def _images(paths: list[str] | None, camera1: Camera, camera2: Camera) -> tuple[Any, Any] | None:
-    from rigkit.io.images import read_image
-
-    if not paths:
-        return None
-    images = []
-    for path, camera in zip(paths, (camera1, camera2), strict=True):
-        image = read_image(path)
-        size = (image.shape[1], image.shape[0])
-        if size != camera.size_px:
-            raise InputError(
-                f"image '{path}' is {size[0]}x{size[1]} px but its camera was calibrated at "
-                f"{camera.size_px[0]}x{camera.size_px[1]}; use images of that size, or recalibrate"
-            )
-        images.append(image)
-    return images[0], images[1]
 
 
 def _correspondences(args: argparse.Namespace, images: tuple[Any, Any] | None) -> Correspondences:

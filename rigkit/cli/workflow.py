@@ -38,6 +38,7 @@ __all__ = [
     "match_images",
     "output_folder",
     "over_pairs",
+    "read_for",
     "reconstruct_other_chain",
     "reconstruct_with",
     "select_dataset",
@@ -161,18 +162,12 @@ def _load(path: Path) -> LoadedCamera:
 def find_boards(pair: Pair, camera1: Camera, camera2: Camera) -> tuple[Detections, Detections, Any, Any]:
     """Return the boards found in either image of a pair, and the images; raises InputError where there are none."""
     from rigkit.corners.detect import detect_boards
-    from rigkit.io.images import read_image, to_grey
+    from rigkit.io.images import to_grey
 
     images = []
     found: list[Detections] = []
     for path, camera, entry in ((pair.image1, camera1, pair.camera1), (pair.image2, camera2, pair.camera2)):
-        image = read_image(path)
-        size = (image.shape[1], image.shape[0])
-        if size != camera.size_px:
-            raise InputError(
-                f"pair '{pair.pair_id}': image '{path}' is {size[0]}x{size[1]} px but camera '{entry.camera_id}' was "
-                f"calibrated at {camera.size_px[0]}x{camera.size_px[1]}; use images of that size, or recalibrate"
-            )
+        image = read_for(camera, path, f"pair '{pair.pair_id}', camera '{entry.camera_id}'")
         detections = detect_boards(to_grey(image), pair.boards)
         if not detections:
             sizes = ", ".join(sorted({f"{b.columns}x{b.rows}" for b in pair.boards}))
@@ -182,6 +177,20 @@ def find_boards(pair: Pair, camera1: Camera, camera2: Camera) -> tuple[Detection
         images.append(image)
         found.append(detections)
     return found[0], found[1], images[0], images[1]
+
+
+def read_for(camera: Camera, path: str | Path, whose: str) -> Any:
+    """Return an image; raises InputError also where it is of another size than the camera was calibrated at."""
+    from rigkit.io.images import read_image
+
+    image = read_image(path)
+    size = (image.shape[1], image.shape[0])
+    if size != camera.size_px:
+        raise InputError(
+            f"{whose}: image '{path}' is {size[0]}x{size[1]} px but the calibration is for "
+            f"{camera.size_px[0]}x{camera.size_px[1]}; use images of that size, or recalibrate"
+        )
+    return image
 
 
 def match_images(pair: Pair, camera1: Camera, camera2: Camera, chain: str) -> tuple[MatchedPair, Any, Any]:
