@@ -11,16 +11,24 @@ from rigkit.arrays import FloatArray
 from rigkit.boards import Board
 from rigkit.cameras.base import Camera, image_center
 from rigkit.cameras.brown import Brown
+from rigkit.cameras.pinhole import Pinhole
+from rigkit.corners.detect import detect_boards
 from rigkit.detections import BoardDetection
-from rigkit.geometry.rotation import rotation_angle
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3, rotation_angle
 from rigkit.pairing import match_pair
 from rigkit.posetype import PoseType
 from rigkit.reconstruct import Reconstruction, reconstruct_pair
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
+from rigkit.synthetic.photometry import Photometry
+from rigkit.synthetic.render import Optics, render
+from rigkit.synthetic.scene import PlacedBoard, exact_detection
 
 SIZE = (960, 720)
 MIXED = (Board("plane1", 8, 6, 50.0, 50.0), Board("plane2", 7, 6, 50.0, 50.0), Board("plane3", 6, 9, 50.0, 50.0))
 NOISE_PX = 0.05
+CORNER_PX = 1.0
+"""Every corner is the right one; how good it is, is measured elsewhere."""
 SIGMAS = 4.0
 """One correct figure in 16000 lies further from the truth, if its sigma is honest."""
 RMS_FACTOR = 1.5
@@ -67,3 +75,25 @@ def test_a_level_that_held_badly_does_not_mislead_a_long_lens(seed: int) -> None
     camera = regular_lens(45.0, off_px=(30.0, -20.0))
     scene = trihedral_pair(MIXED, camera, PoseType.PLANAR, rng, level_sigma_deg=0.5, angles_deg=(91.6, 88.0, 90.0))
     assert_pose_is_true(reconstructed(scene, MIXED, rng), scene)
+
+
+@pytest.mark.parametrize(
+    ("size", "tilt_deg", "distance_mm", "exposure", "noise_levels", "seed"),
+    [((6, 4), 76.0, 850.0, 0.9, 5.0, 0), ((5, 5), 76.0, 850.0, 0.9, 8.0, 1), ((5, 5), 75.0, 520.0, 0.45, 7.0, 1)],
+)
+def test_a_board_seen_at_a_flat_angle_in_a_noisy_image(
+    size: tuple[int, int], tilt_deg: float, distance_mm: float, exposure: float, noise_levels: float, seed: int
+) -> None:
+    """Noise makes more loose corners than the board has: they lie between neighbours four times as far as others."""
+    rng = np.random.default_rng(seed)
+    camera = Pinhole(SIZE, np.array([1000.0, 1000.0, 480.0, 360.0]))
+    board = Board("floor", *size, 40.0, 40.0)
+    turn = exp_so3(np.array([np.radians(tilt_deg), 0.0, 0.0])) @ exp_so3(np.array([0.0, 0.0, rng.uniform(-0.3, 0.3)]))
+    placed = PlacedBoard(board, Rigid3(turn, np.array([0.0, 0.0, distance_mm]) - turn @ board.points().mean(axis=0)))
+    photometry = Photometry(noise_levels=noise_levels, exposure=exposure)
+    image = render([placed], camera, Rigid3.identity(), optics=Optics(0.7), photometry=photometry, rng=rng)
+    (found,) = detect_boards(image, [board])
+    assert found.complete
+    # Either way round, where the board looks the same turned.
+    truth = exact_detection(placed, camera, Rigid3.identity()).pixels
+    assert np.linalg.norm(found.pixels[:, None] - truth, axis=2).min(axis=1).max() < CORNER_PX
