@@ -18,7 +18,7 @@ from rigkit.cli.main import main
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.io.calibration_file import save_camera
-from rigkit.io.correspondences import write_correspondences
+from rigkit.io.correspondences import read_correspondences, write_correspondences
 from rigkit.io.ply import read_ply
 
 SMALL = Pinhole((320, 240), np.array([280.0, 280.0, 159.5, 119.5]))
@@ -55,6 +55,25 @@ def test_a_file_of_correspondences(files: tuple[Path, Rigid3], capsys: pytest.Ca
     assert "(baselines)" in said.out
     assert "lengths are in baselines" in said.err
     assert b"units baselines" in (folder / "out" / "scene.ply").read_bytes()[:300]
+
+
+@pytest.mark.parametrize("layout", ["npz", "extractor"])
+def test_other_layouts_of_the_file(files: tuple[Path, Rigid3], layout: str, capsys: pytest.CaptureFixture[str]) -> None:
+    folder, _ = files
+    found = read_correspondences(folder / "found.csv")
+    assert found.A21 is not None
+    if layout == "npz":
+        np.savez(folder / "other.npz", pixels1=found.pixels1, pixels2=found.pixels2, A21=found.A21)
+    else:
+        shift = found.pixels2 - np.einsum("nij,nj->ni", found.A21, found.pixels1)
+        # a11 a21 a12 a22 tx ty x1 y1 x2 y2
+        columns = [np.swapaxes(found.A21, 1, 2).reshape(-1, 4), shift, found.pixels1, found.pixels2]
+        np.savetxt(folder / "other.npz", np.hstack(columns), fmt="%.17g")
+    results = []
+    for name in ("found.csv", "other.npz"):
+        assert run(folder, "--correspondences", str(folder / name), "--json", "--no-pictures", "--force") == 0
+        results.append(np.array(json.loads(capsys.readouterr().out)["cam2_from_cam1"]))
+    np.testing.assert_allclose(results[0], results[1], atol=1e-7)
 
 
 def test_two_images(tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]) -> None:
