@@ -127,7 +127,10 @@ def reconstruct_pair(
     try:
         return _reconstruct(pair, PoseType(pose_type), affine_method, level_sigma_rad, scale, image1)
     except DegenerateError as error:
-        raise DegenerateError(f"pair '{pair.pair_id}': {error}") from error
+        words = f"pair '{pair.pair_id}': {error}"
+        raise DegenerateError(
+            "; ".join((words, *_contradiction(pair, PoseType(pose_type), level_sigma_rad)))
+        ) from error
 
 
 def _reconstruct(
@@ -205,6 +208,16 @@ def _reconstruct(
         tuple(notes),
         level_sigma_rad,
     )
+
+
+def _contradiction(pair: MatchedPair, declared: PoseType, level_sigma_rad: float | None) -> tuple[str, ...]:
+    """Return what speaks against the declared pose type: the likeliest reason of a pose that makes no sense."""
+    if declared is PoseType.AUTO:
+        return ()
+    try:
+        return decide_pose_type(pair.captured, declared, level_sigma_rad)[2]
+    except DegenerateError:
+        return ()
 
 
 @lru_cache(maxsize=4)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,10 +11,12 @@ from rigkit.boards import Board
 from rigkit.detections import BoardDetection, BoardView
 from rigkit.errors import InputError
 
-__all__ = ["MIN_CORNERS", "usable_views", "views_of_image"]
+__all__ = ["MIN_CORNERS", "other_size", "usable_views", "views_of_image"]
 
 MIN_CORNERS = 6
 """A pose has six numbers: fewer than six corners leave hardly anything to check it by."""
+OFTEN = 3
+"""Whole grids of one size: parts of a larger board, as the frame cuts them, come in many sizes."""
 MIN_SPREAD = 1e-6
 """Corners of a row only: the determinant of their scatter, as a part of its squared trace, is rounding."""
 
@@ -58,6 +61,24 @@ def _reason(view: BoardView) -> str | None:
     if xx * yy - xy * xy < MIN_SPREAD * (xx + yy) ** 2:
         return f"the corners of board '{view.board.board_id}' lie on one line"
     return None
+
+
+def other_size(detections: Sequence[BoardDetection], boards: Sequence[Board]) -> str | None:
+    """Return in words which size the boards of a session's images have, where it is clearly none of those listed.
+
+    Where no grid is of a listed size, and most are whole grids of one other size, the boards are of that size.
+    """
+    listed = {frozenset(board.size) for board in boards}
+    if any(frozenset((d.columns, d.rows)) in listed for d in detections):
+        return None
+    counts = Counter(f"{d.columns}x{d.rows}" for d in detections if d.complete)
+    size, count = counts.most_common(1)[0] if counts else ("", 0)
+    if count < OFTEN or 2 * count <= len(detections):
+        return None
+    sizes = ", ".join(sorted({f"{b.columns}x{b.rows}" for b in boards}))
+    return (
+        f"the boards listed have {sizes} inner corners, but {count} whole grids of {size} were found and none of those"
+    )
 
 
 def views_of_image(

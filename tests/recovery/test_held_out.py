@@ -14,6 +14,7 @@ from rigkit.cameras.brown import Brown
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.corners.detect import detect_boards
 from rigkit.detections import BoardDetection
+from rigkit.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, rotation_angle
 from rigkit.pairing import match_pair
@@ -75,6 +76,16 @@ def test_a_level_that_held_badly_does_not_mislead_a_long_lens(seed: int) -> None
     camera = regular_lens(45.0, off_px=(30.0, -20.0))
     scene = trihedral_pair(MIXED, camera, PoseType.PLANAR, rng, level_sigma_deg=0.5, angles_deg=(91.6, 88.0, 90.0))
     assert_pose_is_true(reconstructed(scene, MIXED, rng), scene)
+
+
+def test_a_wrongly_declared_pose_type_is_named_where_nothing_comes_out() -> None:
+    rng = np.random.default_rng(5)
+    boards = tuple(Board(f"plane{k}", *size, 25.0, 25.0) for k, size in enumerate(((11, 8), (9, 6), (10, 7)), start=1))
+    scene = trihedral_pair(boards, regular_lens(30.0), PoseType.GENERAL, rng, parallax_deg=(10.0, 20.0))
+    first, second = (noisy(d, rng) for d in scene.detections())
+    pair = match_pair("held out", scene.camera1, scene.camera2, first, second, boards)
+    with pytest.raises(DegenerateError, match=r"no scale.*declared 'standard'.* speak for 'general'"):
+        reconstruct_pair(pair, pose_type="standard", level_sigma_rad=np.radians(0.2))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,33 @@
+"""A wrong size in the board file is told from boards that the frame cuts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.boards import Board
+from rigkit.calibration.usable import other_size
+from rigkit.detections import BoardDetection
+
+STATED = (Board("stated", 9, 7, 30.0, 30.0),)
+
+
+def grid(columns: int, rows: int, *, corners: int | None = None) -> BoardDetection:
+    cells = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2)
+    # The outer corners stay, so that the size does.
+    kept = np.r_[np.arange(columns * rows - 1)[:corners], columns * rows - 1]
+    return BoardDetection(None, columns, rows, cells[kept], 20.0 * cells[kept] + 50.0, np.full(len(kept), 0.05))
+
+
+def test_whole_grids_of_another_size_are_other_boards() -> None:
+    words = other_size([grid(9, 6), grid(9, 6), grid(9, 6), grid(9, 6), grid(8, 5)], STATED)
+    assert words is not None
+    for word in ("9x7", "9x6"):
+        assert word in words
+
+
+def test_parts_of_the_stated_board_are_not() -> None:
+    assert other_size([grid(9, 6), grid(8, 7), grid(9, 5), grid(7, 7), grid(9, 6)], STATED) is None
+    assert other_size([grid(9, 6)] * 4 + [grid(7, 9, corners=40)], STATED) is None
+    assert other_size([grid(9, 6)] * 2, STATED) is None
+    assert other_size([grid(9, 6, corners=50)] * 5, STATED) is None
+    assert other_size([], STATED) is None
