@@ -6,7 +6,7 @@ import numpy as np
 
 from rigkit.arrays import FloatArray
 from rigkit.calibration.fit import Fit
-from rigkit.calibration.normal import Normal, normal_equations
+from rigkit.calibration.normal import Normal
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import BoardShape, Calibration, Candidate, Outlier, ViewResult
 from rigkit.calibration.solver import State
@@ -35,7 +35,7 @@ def assemble(
     """Return the result; raises DegenerateError where the views leave the focal length open."""
     state = fit.state
     sigma = fit.sigma_px if np.isfinite(fit.sigma_px) else 0.0
-    covariance = frame_covariance(solution_normal(observations, fit), state)
+    covariance = frame_covariance(solution_normal(fit), state)
     px = np.where(fit.residuals.valid[..., None], fit.residuals.px, np.nan)
     poses = Rigid3.stack(state.rotation, state.translation_mm)
     views = []
@@ -73,21 +73,10 @@ def _outliers(observations: Observations, fit: Fit) -> tuple[Outlier, ...]:
     return tuple(out)
 
 
-def solution_normal(observations: Observations, fit: Fit) -> Normal:
+def solution_normal(fit: Fit) -> Normal:
     """Return the normal equations at the solution, in px^-2, priors of the shape included."""
-    state = fit.state
-    normal = normal_equations(
-        state.camera,
-        state.rotation,
-        state.translation_mm,
-        state.shape,
-        state.unknowns,
-        observations,
-        fit.weight(observations),
-        None,
-    )
     sigma = fit.sigma_px if np.isfinite(fit.sigma_px) else 1.0
-    return normal.with_priors(state.camera, sigma, state.shape.sigma, state.unknowns)
+    return fit.data.with_priors(fit.state.camera, sigma, fit.state.shape.sigma, fit.state.unknowns)
 
 
 def frame_covariance(normal: Normal, state: State) -> FloatArray:

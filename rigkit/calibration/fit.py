@@ -8,10 +8,11 @@ import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray
 from rigkit.calibration.initialise import initialise
+from rigkit.calibration.normal import Normal, Residuals
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.poses import find_poses, refine_poses
 from rigkit.calibration.result import Convergence
-from rigkit.calibration.solver import Residuals, State, evaluate, solve
+from rigkit.calibration.solver import State, evaluate, solve
 from rigkit.cameras.base import Camera
 from rigkit.errors import DegenerateError
 
@@ -23,21 +24,26 @@ sigma = median |r| / 1.177: by chance alone 4 corners in a million do."""
 RAYLEIGH_MEDIAN = 1.17741
 """Median of |r| of a 2-D Gaussian with unit standard deviation per coordinate."""
 CAUCHY_SIGMAS = 2.5
+COARSE = 1e-2
+FINE = 1e-5
+"""The robust solves stop where a step promises less than this part of the cost: they only tell outliers from the rest,
+and the least squares that follow begin where they end."""
 SIGMA_FLOOR_PX = 1e-4
 """Exact corners have no scatter to judge outliers by: below this rounding would make them."""
 GOOD_ENOUGH = 1e-3
 """A scatter of this part of the image's width ends the search for a better start: 1.6 px of 1600."""
+SETTLE_ROUNDS = 3
 BAD_VIEW = 2.0
 """A view with this many times the scatter of all gets its pose found anew: perhaps its tilt has the wrong sign."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Fit:
-    """A solved model: its state with the residuals, the corners kept (V, C), sigma per coordinate of a corner, how the
-    solver ended."""
+    """A solved model: its state, the normal equations of the corners there, without priors, the corners kept (V, C),
+    sigma per coordinate of a corner, how the solver ended."""
 
     state: State
-    residuals: Residuals
+    data: Normal
     kept: BoolArray
     sigma_px: float
     convergence: Convergence
@@ -47,25 +53,19 @@ class Fit:
         return np.where(self.kept, observations.weight, 0.0)
 
     def norm(self, observations: Observations) -> FloatArray:
-        """Return the weighted 2-D residuals (V, C) as `weighted_norm`."""
-        return _weighted(self.residuals, observations)
+        """Return the weighted 2-D residuals (V, C) in px."""
+        return self.residuals.weighted(observations)
+
+    @property
+    def residuals(self) -> Residuals:
+        """Residuals of all corners."""
+        return self.data.residuals[0]
 
     @property
     def rms_px(self) -> float:
         """2-D RMS over the kept corners, px."""
         squared = (self.residuals.px**2).sum(axis=-1)[self.kept]
         return float(np.sqrt(squared.mean())) if squared.size else float("nan")
-
-
-def weighted_norm(state: State, observations: Observations) -> FloatArray:
-    """Return the weighted 2-D residuals (V, C) in px, infinite where a corner does not project, zero where padded."""
-    return _weighted(evaluate(state, observations), observations)
-
-
-def _weighted(residuals: Residuals, observations: Observations) -> FloatArray:
-    u, v = residuals.px[..., 0], residuals.px[..., 1]
-    length = np.sqrt(u * u + v * v) * observations.weight
-    return length if residuals.valid.all() else np.where(residuals.valid | ~observations.present, length, np.inf)
 
 
 def sigma_of(norm: FloatArray, used: BoolArray) -> float:
@@ -91,7 +91,7 @@ def fit_model(observations: Observations, size_px: tuple[int, int], model: type[
     """
     best: tuple[float, State, FloatArray] | None = None
     for start in initialise(observations, size_px, model, order):
-        norm = weighted_norm(start, observations)
+        norm = evaluate(start, observations).weighted(observations)
         if not np.isfinite(np.median(norm[observations.present])):
             continue
         state, norm = _robust(observations, start, norm)
@@ -106,7 +106,7 @@ def fit_model(observations: Observations, size_px: tuple[int, int], model: type[
             "tilted, and check the board's size"
         )
     sigma, state, norm = best
-    return fit_kept(observations, state, inliers(norm, observations, sigma), settle=True)
+    return _settled(observations, state, norm, inliers(norm, observations, sigma), SETTLE_ROUNDS)
 
 
 def _robust(observations: Observations, state: State, norm: FloatArray) -> tuple[State, FloatArray]:
@@ -114,8 +114,8 @@ def _robust(observations: Observations, state: State, norm: FloatArray) -> tuple
     their pose found anew. `norm` are the residuals of `state`."""
     present = observations.present
     loss = CAUCHY_SIGMAS * sigma_of(norm, present)
-    state, _ = solve(observations, state, loss_px=loss, max_iterations=15, cost_tolerance=1e-3)
-    norm = weighted_norm(state, observations)
+    coarse = solve(observations, state, loss_px=loss, max_iterations=15, cost_tolerance=COARSE)
+    state, norm = coarse.state, coarse.data.residuals[0].weighted(observations)
     sigma = sigma_of(norm, present)
     if not norm.max() > OUTLIER_SIGMAS * sigma:
         return state, norm  # nothing for a robust loss to do
@@ -129,25 +129,28 @@ def _robust(observations: Observations, state: State, norm: FloatArray) -> tuple
         rotation, translation = state.rotation.copy(), state.translation_mm.copy()
         rotation[bad], translation[bad] = found.rotation, found.translation_mm
         state = replace(state, rotation=rotation, translation_mm=translation)
-    state, _ = solve(observations, state, loss_px=CAUCHY_SIGMAS * sigma, max_iterations=30, cost_tolerance=1e-5)
-    return state, weighted_norm(state, observations)
+    fine = solve(observations, state, loss_px=CAUCHY_SIGMAS * sigma, max_iterations=30, cost_tolerance=FINE)
+    return fine.state, fine.data.residuals[0].weighted(observations)
 
 
 def fit_kept(observations: Observations, state: State, kept: BoolArray, *, settle: bool = False) -> Fit:
     """Return the least-squares solution on the kept corners; with `settle` the rule is applied again to the result,
-    until the set of kept corners no longer changes (three rounds at most)."""
-    norm = weighted_norm(state, observations)
-    for _ in range(3):
+    until the set of kept corners no longer changes."""
+    norm = evaluate(state, observations).weighted(observations)
+    return _settled(observations, state, norm, kept, SETTLE_ROUNDS if settle else 1)
+
+
+def _settled(observations: Observations, state: State, norm: FloatArray, kept: BoolArray, rounds: int) -> Fit:
+    """As `fit_kept`, with the weighted residuals `norm` of the state."""
+    for again in range(1, rounds + 1):
         weight = np.where(kept, observations.weight, 0.0)
-        prior_sigma = sigma_of(norm, kept)
-        state, convergence = solve(observations, state, weight=weight, prior_sigma_px=prior_sigma)
-        residuals = evaluate(state, observations)
-        norm = _weighted(residuals, observations)
-        again = inliers(norm, observations, sigma_of(norm, kept)) if settle else kept
-        if (again == kept).all():
+        solution = solve(observations, state, weight=weight, prior_sigma_px=sigma_of(norm, kept))
+        state, norm = solution.state, solution.data.residuals[0].weighted(observations)
+        agree = inliers(norm, observations, sigma_of(norm, kept))
+        if again == rounds or (agree == kept).all():
             break
-        kept = again
-    return Fit(state, residuals, kept, _sigma(state, norm, kept), convergence)
+        kept = agree
+    return Fit(state, solution.data, kept, _sigma(state, norm, kept), solution.convergence)
 
 
 def _sigma(state: State, norm: FloatArray, kept: BoolArray) -> float:
@@ -174,16 +177,16 @@ def heldout_rms(observations: Observations, fit: Fit, folds: int) -> float | Non
     weight = fit.weight(observations)
     for k in range(folds):
         train, test = np.flatnonzero(fold != k), np.flatnonzero(fold == k)
-        state, _ = solve(
+        solved = solve(
             observations.subset(train),
             fit.state.subset(train),
             weight=weight[train],
             prior_sigma_px=fit.sigma_px if np.isfinite(fit.sigma_px) else 1.0,
             cost_tolerance=1e-6,
-        )
+        ).state
         part = observations.subset(test)
         start = fit.state.subset(test)
-        moved = State(state.camera, start.rotation, start.translation_mm, state.shape, state.unknowns)
+        moved = replace(solved, rotation=start.rotation, translation_mm=start.translation_mm)
         found, _ = refine_poses(part, moved, weight[test])
         kept = fit.kept[test]
         squared += float((evaluate(found, part).px[kept] ** 2).sum())

@@ -17,7 +17,7 @@ from rigkit.calibration.observations import Observations
 from rigkit.calibration.shape import ShapeModel
 from rigkit.cameras.base import Camera
 
-__all__ = ["Normal", "Step", "Workspace", "lost_px", "normal_equations"]
+__all__ = ["Normal", "Residuals", "Step", "lost_px", "normal_equations"]
 
 BLOCK = 4096
 """Corners linearised at a time: their derivatives then stay in the cache, and memory does not grow with the views."""
@@ -36,6 +36,28 @@ class Step:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class Residuals:
+    """Measured minus projected, (V, C, 2) px, and where the corner projects at all.
+
+    Where it does not, `px` is the diagonal of the image: worse than any other, so that no step gains by losing corners.
+    """
+
+    px: FloatArray
+    valid: BoolArray
+
+    def norm(self, observations: Observations) -> FloatArray:
+        """Return |r| (V, C), infinite where the corner does not project, NaN where padded."""
+        length = np.where(self.valid, np.linalg.norm(self.px, axis=-1), np.inf)
+        return np.where(observations.present, length, np.nan)
+
+    def weighted(self, observations: Observations) -> FloatArray:
+        """Return |r| (V, C) times the weight, infinite where the corner does not project, zero where padded."""
+        u, v = self.px[..., 0], self.px[..., 1]
+        length = np.sqrt(u * u + v * v) * observations.weight
+        return length if self.valid.all() else np.where(self.valid | ~observations.present, length, np.inf)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class Normal:
     """Blocks of J^T W J and J^T W r: g for the G globals, p for the 6 numbers of each of V poses.
 
@@ -43,6 +65,7 @@ class Normal:
     ----------
     gg (G, G), gp (V, G, 6), pp (V, 6, 6), g (G,), p (V, 6).
     costs : (V,) cost of each view's residuals, px^2.
+    residuals : of the corners, not weighted; those of all cameras of a rig one after the other.
     points_from : the globals from here on are released board points: three each, coupled within a point only. None
         where there are none.
     """
@@ -53,6 +76,7 @@ class Normal:
     g: FloatArray
     p: FloatArray
     costs: FloatArray
+    residuals: tuple[Residuals, ...]
     points_from: int | None = None
 
     def with_priors(self, camera: Camera, sigma_px: float, shape_sigma: FloatArray, unknowns: FloatArray) -> Normal:
@@ -162,24 +186,8 @@ def _solve_positive(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.solve(scaled, rhs * scale) * scale)
 
 
-class Workspace:
-    """Memory for the derivatives of one block of views, kept from one linearisation to the next: pages fresh from the
-    system would cost more than the arithmetic. To be used with one kind of camera, whose zeros it keeps."""
-
-    def __init__(self) -> None:
-        self._rows: FloatArray = np.zeros((0, 2, 0, 0))
-
-    def rows(self, count: int, views: int, corners: int) -> FloatArray:
-        """Return (count, 2, views, corners)."""
-        have = self._rows.shape
-        if have[0] != count or have[2] < views or have[3] != corners:
-            self._rows = np.zeros((count, 2, views, corners))
-        return self._rows[:, :, :views]
-
-
 def lost_px(camera: Camera) -> float:
-    """Return the residual per coordinate of a corner outside the model's field of view: worse than any other, so that
-    no step gains by losing corners."""
+    """Return the residual per coordinate of a corner outside the model's field of view: the diagonal of the image."""
     return float(np.hypot(*camera.size_px))
 
 
@@ -192,19 +200,18 @@ def normal_equations(
     observations: Observations,
     weight: FloatArray,
     loss_px: float | None,
-    workspace: Workspace | None = None,
 ) -> Normal:
     """Return the normal equations and the cost for boards at the poses (V, 3, 3), (V, 3) with the shape's `unknowns`.
 
     `weight` (V, C) multiplies the residuals; `loss_px` is the scale of the Cauchy loss, None for least squares.
     """
-    workspace = workspace or Workspace()
     table = np.ascontiguousarray(shape.points(unknowns).T)
     views, corners = weight.shape
     count = camera.parameters.size + shape.basis.shape[-1]
     gg, g = np.zeros((count, count)), np.zeros(count)
     gp, pp = np.empty((views, count, 6)), np.empty((views, 6, 6))
     p, costs = np.empty((views, 6)), np.empty(views)
+    residuals = Residuals(np.empty((views, corners, 2)), np.empty((views, corners), dtype=bool))
     released = _Released(len(shape.flat), views, count) if shape.kind == "released" else None
     step = max(1, BLOCK // max(corners, 1))
     for first in range(0, views, step):
@@ -215,8 +222,9 @@ def normal_equations(
             observations.corner[block],
             observations.pixels[block],
             weight[block],
+            Residuals(residuals.px[block], residuals.valid[block]),
         )
-        rows = workspace.rows(count + 7, len(part.weight), corners)
+        rows = observations.workspace.array(count + 7, 2, len(part.weight), corners)
         costs[block] = _linearise(rows, camera, table, shape, part, loss_px)
         # Per view only what involves its pose; the globals among themselves in one product over all corners.
         each = np.moveaxis(rows, (1, 2), (0, 1))
@@ -227,32 +235,34 @@ def normal_equations(
         gp[block], pp[block], p[block] = product[:, :count, :6], product[:, count:-1, :6], product[:, count:-1, 6]
         if released is not None:
             released.add(rows, _by_board(rows, part.rotation), part.corner, observations.present[block], first)
-    normal = Normal(gg, gp, pp, g, p, costs)
+    normal = Normal(gg, gp, pp, g, p, costs, (residuals,))
     return normal if released is None else released.appended(normal)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Part:
-    """What is known of a block of views."""
+    """What is known of a block of views, and where its residuals go."""
 
     rotation: Mat3
     translation_mm: Points
     corner: IntArray
     pixels: FloatArray
     weight: FloatArray
+    residuals: Residuals
 
 
 def _linearise(
     rows: FloatArray, camera: Camera, table: FloatArray, shape: ShapeModel, part: _Part, loss_px: float | None
 ) -> FloatArray:
-    """Fill `rows` (K, 2, V, C) with the weighted derivatives by camera, warp and pose, the residual last; return the
-    cost of each view (V,).
+    """Fill `rows` (K, 2, V, C) with the weighted derivatives by camera, warp and pose, the weighted residual last, and
+    the residuals of `part`; return the cost of each view (V,).
 
     `table` (3, M) are the boards' corners. Rows of unknowns come first: long contiguous runs.
     """
     weight = part.weight
     p, b = camera.parameters.size, shape.basis.shape[-1]
     by_camera, translation, residual = rows[:p], rows[p + b + 3 : p + b + 6], rows[-1]
+    by_camera.fill(0.0)
     board = np.take(table, part.corner, axis=1)
     lever = np.empty_like(board)
     np.matmul(part.rotation, np.swapaxes(board, 0, 1), out=np.swapaxes(lever, 0, 1))
@@ -263,10 +273,13 @@ def _linearise(
     np.subtract(part.pixels[..., 0], u.reshape(weight.shape), out=residual[0])
     np.subtract(part.pixels[..., 1], v.reshape(weight.shape), out=residual[1])
     squared = residual[0] ** 2 + residual[1] ** 2
+    part.residuals.px[..., 0], part.residuals.px[..., 1] = residual
+    part.residuals.valid[...] = valid.reshape(weight.shape)
     if not valid.all():
         # A corner outside the model's field of view has no derivative; it waits until a step brings it back.
-        lost = ~valid.reshape(weight.shape)
+        lost = ~part.residuals.valid
         rows[..., lost] = 0.0
+        part.residuals.px[lost] = lost_px(camera)
         squared[lost] = 2.0 * lost_px(camera) ** 2
     squared *= weight**2
     if loss_px is not None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -16,6 +17,21 @@ __all__ = ["Observations"]
 
 SIGMA_RANGE = 8.0
 """Corner sigmas are believed within this factor of their median: a predicted 0.001 px must not rule the solution."""
+
+
+class Workspace:
+    """Memory for the derivatives of a block of views, kept from one linearisation to the next: pages fresh from the
+    system would cost more than the arithmetic."""
+
+    def __init__(self) -> None:
+        self._memory: FloatArray = np.empty(0)
+
+    def array(self, *shape: int) -> FloatArray:
+        """Return an array of that shape with arbitrary values; it is valid until the next call."""
+        size = math.prod(shape)
+        if self._memory.size < size:
+            self._memory = np.empty(size)
+        return self._memory[:size].reshape(shape)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -33,6 +49,7 @@ class Observations:
     boards : the boards, in the order of the table.
     first_row : (len(boards) + 1,) first row of each board in the table.
     board : (V,) int, board of each view.
+    workspace : of the solver; subsets share it.
     """
 
     views: tuple[BoardView, ...]
@@ -44,6 +61,7 @@ class Observations:
     boards: tuple[Board, ...]
     first_row: IntArray
     board: IntArray
+    workspace: Workspace = field(default_factory=Workspace, repr=False)
 
     @classmethod
     def from_views(cls, views: Sequence[BoardView]) -> Observations:
@@ -51,24 +69,27 @@ class Observations:
         boards of two sizes."""
         boards: dict[str, Board] = {}
         for view in views:
-            _check_view(view)
             known = boards.setdefault(view.board.board_id, view.board)
             if known.size != view.board.size or known.square_x_mm != view.board.square_x_mm:
                 raise InputError(f"image '{view.image}': board '{known.board_id}' has another size in another view")
-        ids = list(boards)
+        place = {name: i for i, name in enumerate(boards)}
         counts = [b.corner_count for b in boards.values()]
         first_row = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        board = np.array([ids.index(view.board.board_id) for view in views], dtype=np.int64)
-        shape = (len(views), max((len(view.grid) for view in views), default=0))
-        pixels, corner = np.zeros((*shape, 2)), np.zeros(shape, dtype=np.int64)
-        sigma, present = np.ones(shape), np.zeros(shape, dtype=bool)
-        for i, view in enumerate(views):
-            n = len(view.grid)
-            pixels[i, :n] = view.pixels
-            corner[i] = first_row[board[i]]
-            corner[i, :n] += view.grid[:, 1] * view.board.columns + view.grid[:, 0]
-            sigma[i, :n] = view.sigma_px
-            present[i, :n] = True
+        board = np.array([place[view.board.board_id] for view in views], dtype=np.int64)
+        length = np.array([len(view.grid) for view in views], dtype=np.int64)
+        present = np.arange(length.max(initial=0)) < length[:, None]
+        pixels, corner = np.zeros((*present.shape, 2)), np.zeros(present.shape, dtype=np.int64)
+        sigma = np.ones(present.shape)
+        corner += first_row[board][:, None]
+        if views:
+            pixels[present] = np.concatenate([view.pixels for view in views])
+            sigma[present] = np.concatenate([view.sigma_px for view in views])
+            size = np.array([view.board.size for view in views])
+            grid = np.concatenate([view.grid for view in views])
+            view_of = np.nonzero(present)[0]
+            _check(views, view_of, grid, size[view_of], sigma[present])
+            corner[present] += grid[:, 1] * size[view_of, 0] + grid[:, 0]
+            _check_once(views, view_of, corner[present], int(first_row[-1]))
         weight = _weights(sigma, present)
         table = tuple(boards.values())
         return cls(tuple(views), pixels, corner, sigma, weight, present, table, first_row, board)
@@ -106,18 +127,23 @@ class Observations:
         return [view.image for view in self.views]
 
 
-def _check_view(view: BoardView) -> None:
-    board, grid = view.board, view.grid
-    inside = (grid >= 0).all() and (grid < [board.columns, board.rows]).all()
-    if not inside:
+def _check(views: Sequence[BoardView], view_of: IntArray, grid: IntArray, size: IntArray, sigma: FloatArray) -> None:
+    outside = ((grid < 0) | (grid >= size)).any(axis=1)
+    if outside.any():
+        view = views[view_of[outside.argmax()]]
         raise InputError(
-            f"image '{view.image}': corners outside board '{board.board_id}' ({board.columns}x{board.rows} inner "
-            "corners); check the board's size"
+            f"image '{view.image}': corners outside board '{view.board.board_id}' ({view.board.columns}x"
+            f"{view.board.rows} inner corners); check the board's size"
         )
-    if len(grid) and np.bincount(grid[:, 1] * board.columns + grid[:, 0]).max() > 1:
-        raise InputError(f"image '{view.image}': a corner of board '{board.board_id}' comes twice")
-    if (view.sigma_px <= 0.0).any():
-        raise InputError(f"image '{view.image}': corner sigmas must be positive")
+    if (sigma <= 0.0).any():
+        raise InputError(f"image '{views[view_of[(sigma <= 0.0).argmax()]].image}': corner sigmas must be positive")
+
+
+def _check_once(views: Sequence[BoardView], view_of: IntArray, corner: IntArray, total: int) -> None:
+    count = np.bincount(view_of * total + corner)
+    if count.max(initial=0) > 1:
+        view = views[int(count.argmax()) // total]
+        raise InputError(f"image '{view.image}': a corner of board '{view.board.board_id}' comes twice")
 
 
 def _weights(sigma: FloatArray, present: BoolArray) -> FloatArray:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.arrays import FloatArray
-from rigkit.calibration.normal import Normal, Workspace, normal_equations
+from rigkit.calibration.normal import Normal, normal_equations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.radial_alignment import align
 from rigkit.calibration.solver import State
@@ -28,8 +28,6 @@ def refine_poses(
     Levenberg-Marquardt with a damping of its own for each view. `loss_px` is the scale of the Cauchy loss.
     """
 
-    workspace = Workspace()
-
     def linearise(s: State) -> Normal:
         return normal_equations(
             s.camera,
@@ -40,7 +38,6 @@ def refine_poses(
             observations,
             weight,
             loss_px,
-            workspace,
         )
 
     normal = linearise(state)

@@ -16,17 +16,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.arrays import FloatArray, IntArray, Mat3, Points
-from rigkit.calibration.normal import Normal, Step, Workspace, normal_equations
+from rigkit.calibration.normal import Normal, Residuals, Step, normal_equations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.shape import ShapeModel
-from rigkit.calibration.solver import Residuals, State, evaluate, minimise
+from rigkit.calibration.solver import Linearised, State, minimise
 from rigkit.cameras.base import Camera
 from rigkit.detections import BoardView
 from rigkit.errors import RigkitError
 from rigkit.geometry.rotation import exp_so3, skew
 
-__all__ = ["RigObservations", "RigState", "rig_normal", "rig_residuals", "solve_rig"]
+__all__ = ["RigObservations", "RigState", "rig_normal", "solve_rig"]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -90,14 +90,7 @@ class RigState:
         return State(self.cameras[c], rotation, translation, observations.shapes[c], np.zeros(0))
 
 
-def rig_residuals(observations: RigObservations, state: RigState) -> list[Residuals]:
-    """Return the residuals of every camera."""
-    return [evaluate(state.of_camera(c, observations), o) for c, o in enumerate(observations.cameras)]
-
-
-def rig_normal(
-    observations: RigObservations, state: RigState, workspaces: Sequence[Workspace] | None = None
-) -> Normal:
+def rig_normal(observations: RigObservations, state: RigState, workspaces: Sequence[Workspace] | None = None) -> Normal:
     """Return the normal equations: globals are all intrinsics, then the mounts of all cameras but the first."""
     sizes = [c.parameters.size for c in state.cameras]
     first = np.concatenate([[0], np.cumsum(sizes)])
@@ -106,6 +99,7 @@ def rig_normal(
     gg, g = np.zeros((count, count)), np.zeros(count)
     gp, pp, p = np.zeros((frames, count, 6)), np.zeros((frames, 6, 6)), np.zeros((frames, 6))
     costs = np.zeros(frames)
+    residuals: tuple[Residuals, ...] = ()
     for c, own in enumerate(observations.cameras):
         alone = state.of_camera(c, observations)
         n = normal_equations(
@@ -117,7 +111,6 @@ def rig_normal(
             own,
             observations.weights[c],
             None,
-            workspaces[c] if workspaces else None,
         )
         f = observations.frame[c]
         k = slice(int(first[c]), int(first[c + 1]))
@@ -129,6 +122,7 @@ def rig_normal(
         pp[f] += by_frame.T @ n.pp @ by_frame
         p[f] += n.p @ by_frame
         costs[f] += n.costs
+        residuals += n.residuals
         if c > 0:
             m = slice(int(first[-1]) + 6 * (c - 1), int(first[-1]) + 6 * c)
             by_mount = np.zeros((len(f), 6, 6))
@@ -140,19 +134,18 @@ def rig_normal(
             gg[m, m] += (turned @ n.pp @ by_mount).sum(axis=0)
             g[m] += (turned @ n.p[..., None]).sum(axis=0)[:, 0]
             gp[f, m] += turned @ n.pp @ by_frame
-    return Normal(gg, gp, pp, g, p, costs)
+    return Normal(gg, gp, pp, g, p, costs, residuals)
 
 
-def solve_rig(observations: RigObservations, start: RigState) -> tuple[RigState, Convergence]:
-    """Return the state of least weighted squares from `start`, and how the solver ended."""
+def solve_rig(observations: RigObservations, start: RigState) -> tuple[RigState, Normal, Convergence]:
+    """Return the state of least weighted squares from `start`, its normal equations, and how the solver ended."""
 
-    workspaces = [Workspace() for _ in observations.cameras]
+    def linearise(state: RigState) -> Linearised:
+        normal = rig_normal(observations, state)
+        return Linearised(float(normal.costs.sum()), normal, normal)
 
-    def linearise(state: RigState) -> tuple[float, Normal]:
-        normal = rig_normal(observations, state, workspaces)
-        return float(normal.costs.sum()), normal
-
-    return minimise(start, linearise, _moved)
+    state, last, convergence = minimise(start, linearise, _moved)
+    return state, last.normal, convergence
 
 
 def _moved(state: RigState, step: Step) -> RigState | None:

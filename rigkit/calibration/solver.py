@@ -18,7 +18,7 @@ import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray, Mat3, Points
 from rigkit.calibration.camera_prior import camera_prior
-from rigkit.calibration.normal import Normal, Step, Workspace, lost_px, normal_equations
+from rigkit.calibration.normal import Normal, Residuals, Step, lost_px, normal_equations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.shape import ShapeModel, shape_model
@@ -26,7 +26,7 @@ from rigkit.cameras.base import Camera
 from rigkit.errors import RigkitError
 from rigkit.geometry.rotation import exp_so3
 
-__all__ = ["Residuals", "State", "evaluate", "minimise", "solve"]
+__all__ = ["Linearised", "Residuals", "Solution", "State", "evaluate", "minimise", "solve"]
 
 S = TypeVar("S")
 
@@ -34,10 +34,11 @@ MAX_ITERATIONS = 60
 COST_TOLERANCE = 1e-11
 """Stop when the quadratic model promises less than this part of the cost: Gauss-Newton converges quadratically here, so
 the optimum is then known to about 1e-10 in cost."""
-DAMPING_START = 1e-8
+DAMPING_START = 1e-13
+"""Monomials of a polynomial are nearly dependent (eigenvalues down to 1e-12 of the scaled system at degree 6): more would
+hold their combinations back. A step that goes too far is refused and the damping grows quickly."""
 DAMPING_SHRINK = 0.01
-"""Monomials of a polynomial are nearly dependent: damping that shrinks by Nielsen's 1/3 would hold their combinations
-back for dozens of steps (25 instead of 7 at degree 6)."""
+"""For the same reason; with Nielsen's 1/3 it would be dozens of steps."""
 DAMPING_GROWTH = 4.0
 DAMPING_MAX = 1e12
 
@@ -69,16 +70,21 @@ class State:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Residuals:
-    """Measured minus projected, (V, C, 2) px, and where the corner projects at all."""
+class Linearised:
+    """The problem around a state: its cost, the normal equations of the corners, and those with all priors added."""
 
-    px: FloatArray
-    valid: BoolArray
+    cost: float
+    data: Normal
+    normal: Normal
 
-    def norm(self, observations: Observations) -> FloatArray:
-        """Return |r| (V, C), infinite where the corner does not project, NaN where padded."""
-        length = np.where(self.valid, np.linalg.norm(self.px, axis=-1), np.inf)
-        return np.where(observations.present, length, np.nan)
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Solution:
+    """The state found, the normal equations of its corners (without priors), and how the solver ended."""
+
+    state: State
+    data: Normal
+    convergence: Convergence
 
 
 def evaluate(state: State, observations: Observations) -> Residuals:
@@ -99,7 +105,7 @@ def solve(
     prior_sigma_px: float = 0.2,
     max_iterations: int = MAX_ITERATIONS,
     cost_tolerance: float = COST_TOLERANCE,
-) -> tuple[State, Convergence]:
+) -> Solution:
     """Return the state that minimises the weighted residuals from `start`, and how the solver ended. Never raises for
     lack of data: what is not determined stays where it started.
 
@@ -112,8 +118,9 @@ def solve(
         for none.
     """
     weight = observations.weight if weight is None else weight
-    solver = _Solver(observations, weight, loss_px, prior_sigma_px, Workspace())
-    return minimise(start, solver.linearise, _moved, max_iterations, cost_tolerance)
+    solver = _Solver(observations, weight, loss_px, prior_sigma_px)
+    state, last, convergence = minimise(start, solver.linearise, _moved, max_iterations, cost_tolerance)
+    return Solution(state, last.data, convergence)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -122,10 +129,8 @@ class _Solver:
     weight: FloatArray
     loss_px: float | None
     prior_sigma_px: float
-    workspace: Workspace
 
-    def linearise(self, state: State) -> tuple[float, Normal]:
-        """Return the cost and the normal equations, priors included."""
+    def linearise(self, state: State) -> Linearised:
         normal = normal_equations(
             state.camera,
             state.rotation,
@@ -135,7 +140,6 @@ class _Solver:
             self.observations,
             self.weight,
             self.loss_px,
-            self.workspace,
         )
         _, camera = camera_prior(state.camera)
         prior = float(camera @ camera)
@@ -143,46 +147,47 @@ class _Solver:
             prior += float(((state.unknowns / state.shape.sigma) ** 2).sum())
         cost = float(normal.costs.sum()) + self.prior_sigma_px**2 * prior
         cost = cost if np.isfinite(cost) else np.inf
-        return cost, normal.with_priors(state.camera, self.prior_sigma_px, state.shape.sigma, state.unknowns)
+        priors = state.camera, self.prior_sigma_px, state.shape.sigma, state.unknowns
+        return Linearised(cost, normal, normal.with_priors(*priors))
 
 
 def minimise(
     state: S,
-    linearise: Callable[[S], tuple[float, Normal]],
+    linearise: Callable[[S], Linearised],
     moved: Callable[[S, Step], S | None],
     max_iterations: int = MAX_ITERATIONS,
     tolerance: float = COST_TOLERANCE,
-) -> tuple[S, Convergence]:
-    """Return the state of least cost near `state`, by Levenberg-Marquardt, and how it ended.
+) -> tuple[S, Linearised, Convergence]:
+    """Return the state of least cost near `state`, the problem around it, and how it ended: Levenberg-Marquardt.
 
-    `linearise` returns cost and normal equations together: nearly every step is taken, so hardly any are in vain.
+    `linearise` gives cost and normal equations together: nearly every step is taken, so hardly any are in vain.
     `moved` returns the state after a step, None where there is no such state.
     """
-    cost, normal = linearise(state)
+    here = linearise(state)
     damping, growth = DAMPING_START, DAMPING_GROWTH
     for iteration in range(1, max_iterations + 1):
-        step = normal.step(damping)
+        step = here.normal.step(damping)
         if step is None:
             damping, growth = damping * growth, growth * 2.0
             if damping > DAMPING_MAX:
-                return state, Convergence(iteration, False, "the normal equations are singular")
+                return state, here, Convergence(iteration, False, "the normal equations are singular")
             continue
-        if step.predicted <= tolerance * cost:
-            return state, Convergence(iteration, True, "cost stationary")
+        if step.predicted <= tolerance * here.cost:
+            return state, here, Convergence(iteration, True, "cost stationary")
         trial = moved(state, step)
-        trial_cost, trial_normal = (np.inf, normal) if trial is None else linearise(trial)
-        gain = (cost - trial_cost) / step.predicted
-        if trial is not None and gain > 0.0:
-            stationary = cost - trial_cost <= tolerance * cost and gain > 0.5
-            state, cost, normal = trial, trial_cost, trial_normal
+        there = None if trial is None else linearise(trial)
+        gain = -np.inf if there is None else (here.cost - there.cost) / step.predicted
+        if trial is not None and there is not None and gain > 0.0:
+            stationary = here.cost - there.cost <= tolerance * here.cost and gain > 0.5
+            state, here = trial, there
             if stationary:
-                return state, Convergence(iteration, True, "cost stationary")
+                return state, here, Convergence(iteration, True, "cost stationary")
             damping, growth = damping * max(DAMPING_SHRINK, 1.0 - (2.0 * gain - 1.0) ** 3), DAMPING_GROWTH
         else:
             damping, growth = damping * growth, growth * 2.0
             if damping > DAMPING_MAX:
-                return state, Convergence(iteration, True, "no smaller cost nearby")
-    return state, Convergence(max_iterations, False, f"stopped after {max_iterations} iterations")
+                return state, here, Convergence(iteration, True, "no smaller cost nearby")
+    return state, here, Convergence(max_iterations, False, f"stopped after {max_iterations} iterations")
 
 
 def _moved(state: State, step: Step) -> State | None:

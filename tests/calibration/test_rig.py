@@ -7,7 +7,8 @@ import pytest
 from helpers.calibration_scenes import BOARD, lens
 
 from rigkit.calibration.rig import calibrate_rig
-from rigkit.calibration.rig_solver import RigObservations, RigState, rig_normal, rig_residuals
+from rigkit.calibration.rig_solver import RigObservations, RigState, rig_normal
+from rigkit.calibration.solver import evaluate
 from rigkit.cameras.base import Camera
 from rigkit.detections import BoardView
 from rigkit.errors import InputError
@@ -116,11 +117,9 @@ def test_gradient_of_frames_and_mounts(rng: np.random.Generator) -> None:
             exp_so3(frame[:, :3]) @ state.frame_rotation,
             state.frame_mm + frame[:, 3:],
         )
-        return float(
-            sum(
-                ((r.px**2).sum(axis=-1) * w**2).sum()
-                for r, w in zip(rig_residuals(observations, moved), observations.weights, strict=True)
-            )
+        return sum(
+            float(((evaluate(moved.of_camera(c, observations), own).px ** 2).sum(axis=-1) * w**2).sum())
+            for c, (own, w) in enumerate(zip(observations.cameras, observations.weights, strict=True))
         )
 
     h = 1e-5

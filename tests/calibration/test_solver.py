@@ -104,8 +104,9 @@ def test_second_derivative_blocks(rng: np.random.Generator) -> None:
 def test_optimum_is_that_of_scipy(name: str, rng: np.random.Generator) -> None:
     observations, truth = scene(name, rng)
     start = disturbed(truth, rng, 1e-3)
-    state, convergence = solve(observations, start, prior_sigma_px=0.0)
-    assert convergence.converged
+    solution = solve(observations, start, prior_sigma_px=0.0)
+    state = solution.state
+    assert solution.convergence.converged
     p = start.camera.parameters.size
 
     def residuals(x: np.ndarray) -> np.ndarray:
@@ -127,12 +128,12 @@ def test_optimum_is_that_of_scipy(name: str, rng: np.random.Generator) -> None:
 
 def test_cauchy_ignores_outliers(rng: np.random.Generator) -> None:
     observations, truth = scene("fish", rng, count=6)
-    clean, _ = solve(observations, truth)
+    clean = solve(observations, truth).state
     pixels = observations.pixels.copy()
     pixels[:, ::17] += 30.0
     spoilt = replace(observations, pixels=pixels)
-    plain, _ = solve(spoilt, truth)
-    robust, _ = solve(spoilt, truth, loss_px=0.5)
+    plain = solve(spoilt, truth).state
+    robust = solve(spoilt, truth, loss_px=0.5).state
 
     def away(state: State) -> float:
         return float(np.abs(state.camera.parameters[:4] - clean.camera.parameters[:4]).max())
@@ -144,9 +145,9 @@ def test_corners_outside_the_field_of_view_do_no_harm(rng: np.random.Generator) 
     """A start that sees the board behind the camera ends without an exception and without losing more corners."""
     observations, truth = scene("reg", rng)
     start = replace(truth, translation_mm=truth.translation_mm * np.array([1.0, 1.0, -1.0]))
-    state, convergence = solve(observations, start)
-    assert convergence.reason
-    assert np.isfinite(state.camera.parameters).all()
+    solution = solve(observations, start)
+    assert solution.convergence.reason
+    assert np.isfinite(solution.state.camera.parameters).all()
 
 
 def test_scaramuzza_converges_quickly(rng: np.random.Generator) -> None:
@@ -155,7 +156,7 @@ def test_scaramuzza_converges_quickly(rng: np.random.Generator) -> None:
     theta = np.linspace(0.02, 1.62, 80)
     radius = truth.camera.project(np.stack([np.sin(theta), 0 * theta, np.cos(theta)], -1))[0][:, 0] - 808.0
     camera = Scaramuzza.from_radial_curve(truth.camera.size_px, [808.0, 615.0], theta, 1.05 * radius, order=6)
-    state, convergence = solve(observations, replace(truth, camera=camera))
-    assert convergence.converged
-    assert convergence.iterations <= 12
-    assert np.sqrt((evaluate(state, observations).px ** 2).mean()) < 0.21
+    solution = solve(observations, replace(truth, camera=camera))
+    assert solution.convergence.converged
+    assert solution.convergence.iterations <= 12
+    assert np.sqrt((evaluate(solution.state, observations).px ** 2).mean()) < 0.21

@@ -32,7 +32,7 @@ def observed_over_predicted(
     views, _, _ = random_views(camera, 20, rng, reach_deg=REACH_DEG[name], noise_px=0.0)
     exact = Observations.from_views(views)
     # The optimum on exact corners is the truth as far as the model can follow it.
-    truth, _ = solve(exact, next(initialise(exact, SIZE, MODELS[model], order)))
+    truth = solve(exact, next(initialise(exact, SIZE, MODELS[model], order))).state
     u, v = np.meshgrid(np.linspace(300.0, 1320.0, 7), np.linspace(200.0, 1030.0, 5))
     pixels = np.stack([u.ravel(), v.ravel()], axis=-1)
     points, valid = truth.camera.unproject(pixels)

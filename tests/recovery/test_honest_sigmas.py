@@ -74,7 +74,7 @@ def recalibration(camera: Camera, reach_deg: float, rng: np.random.Generator) ->
     """Return a source of calibrations of `camera`, each from the same views with new noise, and their covariances."""
     views, _, _ = random_views(camera, CALIBRATION_VIEWS, rng, reach_deg=reach_deg, noise_px=0.0)
     exact = Observations.from_views(views)
-    start, _ = solve(exact, next(initialise(exact, SIZE, MODELS[camera.model], None)))
+    start = solve(exact, next(initialise(exact, SIZE, MODELS[camera.model], None))).state
 
     def calibrate() -> tuple[Camera, FloatArray]:
         noisy = replace(exact, pixels=exact.pixels + CALIBRATION_PX * rng.normal(size=exact.pixels.shape))
