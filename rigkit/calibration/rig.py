@@ -7,23 +7,35 @@ board on its own; the boards may move between frames.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, Mat3, Points, as_array
+from rigkit.arrays import FloatArray, Points, as_array
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.normal import Normal
 from rigkit.calibration.result import Calibration, Convergence
-from rigkit.calibration.rig_solver import RigObservations, RigState, rig_normal, rig_residuals, solve_rig
+from rigkit.calibration.rig_frames import Key, Seen, apart, first_frames, mounts_of, seen_by, turned_alike
+from rigkit.calibration.rig_solver import RigObservations, RigState, solve_rig
 from rigkit.cameras.base import Camera
 from rigkit.detections import BoardView
 from rigkit.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import nearest_rotation, skew
+from rigkit.geometry.rotation import skew
 from rigkit.progress import Progress, silent
 
 __all__ = ["RigCalibration", "RigCamera", "calibrate_rig"]
+
+FAR_APART = 12.0
+"""Before the joint solve a board's pose in one image may be off by some pixels in the other: only more than this many
+times the usual distance is a board that moved."""
+DISAGREES = 3.5
+"""After it sharing a pose costs a board little: by chance seldom more than twice what it usually costs."""
+LEAST_PX = 0.02
+"""Without noise the usual residual is rounding, and many times that is rounding as well."""
+MAX_ROUNDS = 8
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -49,6 +61,11 @@ class RigCalibration:
     sigma_px : standard deviation of a corner per coordinate.
     single : each camera calibrated alone, with its own verdicts.
     convergence : of the joint solve.
+    corner_count : corners used.
+    shared_count : boards, counted in every frame, that several cameras saw at once.
+    left_out : (frame, board, reason) of boards on which the cameras disagree: each camera's own calibration uses them,
+        the mounts do not.
+    scale_sigma : relative standard deviation of all lengths, from how well the boards' squares were measured.
     """
 
     cameras: tuple[RigCamera, ...]
@@ -57,6 +74,10 @@ class RigCalibration:
     sigma_px: float
     single: tuple[Calibration, ...]
     convergence: Convergence
+    corner_count: int = 0
+    shared_count: int = 0
+    left_out: tuple[tuple[str, str, str], ...] = ()
+    scale_sigma: float = 0.0
 
     def __post_init__(self) -> None:
         count = sum(c.camera.parameters.size for c in self.cameras) + 6 * (len(self.cameras) - 1)
@@ -75,7 +96,10 @@ class RigCalibration:
         return second.cam_from_rig @ first.cam_from_rig.inverse()
 
     def baseline_mm(self, name1: str, name2: str) -> tuple[float, float]:
-        """Return the distance between the centres of two cameras and its standard deviation, mm."""
+        """Return the distance between the centres of two cameras and its standard deviation, mm.
+
+        The deviation is that of the corners' noise and of how well the boards' squares were measured.
+        """
         first, second = self.index(name1), self.index(name2)
         difference = self._centre(second) - self._centre(first)
         length = float(np.linalg.norm(difference))
@@ -86,7 +110,7 @@ class RigCalibration:
             if k > 0:
                 row[self._mount(k)] += sign * (difference / length @ self._centre_jacobian(k))
         variance = float(row @ self.covariance @ row)
-        return length, max(variance, 0.0) ** 0.5
+        return length, float(np.sqrt(max(variance, 0.0) + (length * self.scale_sigma) ** 2))
 
     def _mount(self, k: int) -> slice:
         first = sum(c.camera.parameters.size for c in self.cameras) + 6 * (k - 1)
@@ -107,7 +131,7 @@ def calibrate_rig(
     sizes_px: Mapping[str, tuple[int, int]],
     *,
     model: str | Mapping[str, str] = "scaramuzza",
-    degree: int | None = None,
+    degree: int | Mapping[str, int | None] | None = None,
     board: str = "flat",
     progress: Progress = silent,
 ) -> RigCalibration:
@@ -117,8 +141,8 @@ def calibrate_rig(
     ----------
     views : camera name -> (frame, view) pairs; what was taken at the same moment has the same frame.
     sizes_px : camera name -> (width, height).
-    model : one camera model for all, or one for each.
-    degree, board : as for `calibrate`; a warped or released board keeps the shape that the cameras found alone, on
+    model, degree : as for `calibrate`, one for all cameras or one for each.
+    board : as for `calibrate`; a warped or released board keeps the shape that the cameras found alone, on
         average.
 
     Raises
@@ -136,79 +160,102 @@ def calibrate_rig(
         wanted = model if isinstance(model, str) else model[name]
         try:
             only = [view for _, view in own]
-            single.append(calibrate(only, sizes_px[name], model=wanted, degree=degree, board=board))
+            size = degree[name] if isinstance(degree, Mapping) else degree
+            single.append(calibrate(only, sizes_px[name], model=wanted, degree=size, board=board))
         except (InputError, DegenerateError) as error:
             raise type(error)(f"camera '{name}': {error}") from error
     progress("cameras", len(views), len(views))
-    seen = [_kept_views(own, result) for own, result in zip(views.values(), single, strict=True)]
-    mounts = _mounts(list(views), seen)
-    observations = RigObservations.from_views(
-        [[(key, entry.view) for key, entry in s.items()] for s in seen],
-        [[entry.kept for entry in s.values()] for s in seen],
-        _board_points(single),
-    )
-    start = RigState(
-        tuple(result.camera for result in single),
-        np.array([m.rotation for m in mounts]),
-        np.array([m.translation_mm for m in mounts]),
-        *_frames(observations.keys, seen, mounts),
-    )
-    state, convergence = solve_rig(observations, start)
-    return _result(tuple(views), tuple(single), observations, state, convergence)
+    seen = [seen_by(own, result) for own, result in zip(views.values(), single, strict=True)]
+    return _joint(list(views), seen, tuple(single), progress)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Seen:
-    view: BoardView
-    kept: np.ndarray
-    cam_from_board: Rigid3
+def _joint(
+    names: list[str], seen: list[dict[Key, Seen]], single: tuple[Calibration, ...], progress: Progress
+) -> RigCalibration:
+    """Solve for everything together, leaving out boards on which the cameras disagree."""
+    mounts = mounts_of(names, seen)
+    seen = turned_alike(seen, mounts)
+    left_out = _parted(seen, apart(seen, mounts, [result.camera for result in single]), FAR_APART)
+    points = _board_points(single)
+    for i in range(MAX_ROUNDS):
+        progress("rig", i, MAX_ROUNDS)
+        _require_linked(names, seen, len(left_out))
+        observations = RigObservations.from_views(
+            [[(key, entry.view) for key, entry in s.items()] for s in seen],
+            [[entry.kept for entry in s.values()] for s in seen],
+            points,
+        )
+        start = RigState(
+            tuple(result.camera for result in single),
+            np.array([m.rotation for m in mounts]),
+            np.array([m.translation_mm for m in mounts]),
+            *first_frames(observations.keys, seen, mounts),
+        )
+        state, normal, convergence = solve_rig(observations, start)
+        worse = _parted(seen, _excess_px(observations, normal, seen), DISAGREES) if i < MAX_ROUNDS - 1 else []
+        left_out += worse
+        if not worse:
+            break
+        mounts = [Rigid3(r, t) for r, t in zip(state.mount_rotation, state.mount_mm, strict=True)]
+    progress("rig", MAX_ROUNDS, MAX_ROUNDS)
+    result = _result(tuple(names), single, observations, state, normal, convergence)
+    boards = {entry.view.board.board_id: entry.view.board for own in seen for entry in own.values()}.values()
+    # One ruler has measured all of them: its error does not average out.
+    scale_sigma = max((b.square_sigma_mm or 0.0) / min(b.square_x_mm, b.square_y_mm) for b in boards)
+    return replace(result, shared_count=len(_shared(seen)), left_out=tuple(left_out), scale_sigma=scale_sigma)
 
 
-_Key = tuple[str, str]
+def _require_linked(names: list[str], seen: list[dict[Key, Seen]], left_out: int) -> None:
+    """Raise DegenerateError where so much was left out that a camera hangs together with no other."""
+    try:
+        mounts_of(names, seen)
+    except InputError as error:
+        raise DegenerateError(
+            f"{error}; {left_out} boards were left out because the cameras disagree on them: check that the images of "
+            "a frame were taken at one moment"
+        ) from error
 
 
-def _kept_views(own: Sequence[tuple[str, BoardView]], result: Calibration) -> dict[_Key, _Seen]:
-    """Return the views that the camera's own calibration used, by (frame, board)."""
-    used = {(v.image, v.board_id): v for v in result.views}
-    out = {}
-    for frame, view in own:
-        entry = used.get((view.image, view.board.board_id))
-        if entry is not None:
-            out[(frame, view.board.board_id)] = _Seen(view, entry.kept, entry.cam_from_board)
+def _shared(seen: Sequence[Mapping[Key, Seen]]) -> set[Key]:
+    """Return the boards that several cameras see at once."""
+    count = Counter(key for own in seen for key in own)
+    return {key for key, n in count.items() if n > 1}
+
+
+def _excess_px(observations: RigObservations, normal: Normal, seen: Sequence[Mapping[Key, Seen]]) -> dict[Key, float]:
+    """Return the 2-D RMS that every board in every frame has only because the cameras share its pose: a view that is
+    bad in itself is no reason to distrust the moment."""
+    excess, count = np.zeros(len(observations.keys)), np.zeros(len(observations.keys))
+    for c, (r, frame) in enumerate(zip(normal.residuals, observations.frame, strict=True)):
+        used = observations.weights[c] > 0.0
+        alone = np.array([seen[c][observations.keys[f]].squared_px for f in frame])
+        np.add.at(excess, frame, ((r.px**2).sum(axis=-1) * used).sum(axis=1) - alone)
+        np.add.at(count, frame, used.sum(axis=1))
+    rms = np.sqrt(np.maximum(excess, 0.0) / np.maximum(count, 1.0))
+    return dict(zip(observations.keys, rms.tolist(), strict=True))
+
+
+def _parted(seen: list[dict[Key, Seen]], off_px: Mapping[Key, float], limit: float) -> list[tuple[str, str, str]]:
+    """Give every camera its own board where `off_px` is more than `limit` times the usual one; return which and why.
+
+    `seen` is changed: the views stay, so that they support each camera's intrinsics.
+    """
+    shared = _shared(seen)
+    usual = float(np.median([off_px[key] for key in shared])) if shared else 0.0
+    # The worst ones first: they may be why the others look bad.
+    worst = max((off_px[key] for key in shared), default=0.0)
+    out = []
+    for key in sorted(shared):
+        if off_px[key] <= max(limit * max(usual, LEAST_PX), 0.5 * worst):
+            continue
+        for k, own in enumerate(seen):
+            if key in own:
+                own[(f"{key[0]}, camera {k + 1} alone", key[1])] = own.pop(key)
+        reason = (
+            f"the cameras disagree by {off_px[key]:.2g} px ({off_px[key] / max(usual, LEAST_PX):.1f} times the usual)"
+        )
+        out.append((*key, reason + "; the board or the rig moved between the exposures, or they are not of one moment"))
     return out
-
-
-def _mounts(names: list[str], seen: list[dict[_Key, _Seen]]) -> list[Rigid3]:
-    """Return cam_from_rig of every camera, along a tree of pairs that share the most boards."""
-    mounts: dict[int, Rigid3] = {0: Rigid3.identity()}
-    shared = {(i, j): sorted(seen[i].keys() & seen[j].keys()) for i in range(len(seen)) for j in range(len(seen))}
-    while len(mounts) < len(seen):
-        i, j = max(((i, j) for i in mounts for j in range(len(seen)) if j not in mounts), key=lambda e: len(shared[e]))
-        if not shared[i, j]:
-            raise InputError(
-                f"rig: camera '{names[j]}' shares no board in any frame with '{names[0]}' or the cameras that hang "
-                "together with it; take frames in which both see a board, and check the names of the frames"
-            )
-        pairs = [seen[j][key].cam_from_board @ seen[i][key].cam_from_board.inverse() for key in shared[i, j]]
-        mounts[j] = _median(pairs) @ mounts[i]
-    return [mounts[k] for k in range(len(seen))]
-
-
-def _median(poses: Sequence[Rigid3]) -> Rigid3:
-    """Return a pose in the middle of the poses: entries' medians, made a rotation again."""
-    rotation = nearest_rotation(np.median([p.rotation for p in poses], axis=0))
-    return Rigid3(rotation, np.median([p.translation_mm for p in poses], axis=0))
-
-
-def _frames(keys: Sequence[_Key], seen: list[dict[_Key, _Seen]], mounts: list[Rigid3]) -> tuple[Mat3, Points]:
-    """Return rig_from_board of every (frame, board), from the camera that sees most of its corners."""
-    rotation, translation = [], []
-    for key in keys:
-        k = max((k for k in range(len(seen)) if key in seen[k]), key=lambda k: int(seen[k][key].kept.sum()))
-        pose = mounts[k].inverse() @ seen[k][key].cam_from_board
-        rotation.append(pose.rotation)
-        translation.append(pose.translation_mm)
-    return np.array(rotation), np.array(translation)
 
 
 def _board_points(single: Sequence[Calibration]) -> dict[str, Points]:
@@ -225,21 +272,20 @@ def _result(
     single: tuple[Calibration, ...],
     observations: RigObservations,
     state: RigState,
+    normal: Normal,
     convergence: Convergence,
 ) -> RigCalibration:
-    residuals = rig_residuals(observations, state)
-    squared = [(r.px**2).sum(axis=-1)[weight > 0.0] for r, weight in zip(residuals, observations.weights, strict=True)]
-    weighted = sum(
-        float(((r.px**2).sum(axis=-1) * weight**2).sum())
-        for r, weight in zip(residuals, observations.weights, strict=True)
-    )
+    squared = [
+        (r.px**2).sum(axis=-1)[weight > 0.0] for r, weight in zip(normal.residuals, observations.weights, strict=True)
+    ]
+    weighted = float(normal.costs.sum())
     everything = np.concatenate(squared)
     unknowns = sum(c.parameters.size for c in state.cameras) + 6 * (len(names) - 1 + len(observations.keys))
     freedom = 2 * everything.size - unknowns
     if freedom <= 0:
         raise DegenerateError("rig: fewer corners than unknowns; take more frames")
     sigma = float(np.sqrt(weighted / freedom))
-    covariance = rig_normal(observations, state).covariance()[0] * sigma**2
+    covariance = normal.covariance()[0] * sigma**2
     cameras = tuple(
         RigCamera(name, camera, Rigid3(r, t), float(np.sqrt(own.mean())))
         for name, camera, r, t, own in zip(
@@ -247,4 +293,4 @@ def _result(
         )
     )
     rms_px = float(np.sqrt(everything.mean()))
-    return RigCalibration(cameras, rms_px, covariance, sigma, single, convergence)
+    return RigCalibration(cameras, rms_px, covariance, sigma, single, convergence, everything.size)

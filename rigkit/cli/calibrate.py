@@ -1,10 +1,11 @@
-"""`rigkit calibrate SESSION.toml`: from a folder of images to calibration.json."""
+"""`rigkit calibrate SESSION.toml`: from a folder of images to calibration.json, or from several to rig.json."""
 
 from __future__ import annotations
 
 import argparse
 import time
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,17 +13,18 @@ from rigkit.progress import Progress, silent
 
 if TYPE_CHECKING:
     from rigkit.calibration.result import Calibration
+    from rigkit.detections import BoardView
     from rigkit.io.corner_cache import FoundCorners
     from rigkit.io.session import Session
 
-__all__ = ["HELP", "add_arguments", "calibrate_session", "page_path", "run"]
+__all__ = ["HELP", "add_arguments", "calibrate_session", "page_path", "run", "session_corners", "session_views"]
 
-HELP = "calibrate a camera from images of chessboards"
+HELP = "calibrate a camera, or several on one mount, from images of chessboards"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("session", type=Path, metavar="SESSION.toml", help="what to calibrate (rigkit.session/1)")
-    parser.add_argument("-o", "--output", type=Path, help="default: calibration.json beside the session")
+    parser.add_argument("-o", "--output", type=Path, help="default: calibration.json (rig.json) beside the session")
     parser.add_argument(
         "-r",
         "--report",
@@ -39,8 +41,13 @@ def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import note, print_json, progress_on_stderr
     from rigkit.io.calibration_file import save_calibration
     from rigkit.io.files import ensure_writable
+    from rigkit.io.rig_session import is_rig_session
     from rigkit.io.session import load_session
 
+    if is_rig_session(args.session):
+        from rigkit.cli.calibrate_rig import run_rig
+
+        return run_rig(args)
     session = load_session(args.session)
     target = args.output or session.calibration_path
     page = page_path(args.report, target)
@@ -76,10 +83,29 @@ def calibrate_session(session: Session, progress: Progress = silent) -> Calibrat
     from dataclasses import replace
 
     from rigkit.calibration.calibrate import calibrate
+
+    views, size_px, dropped = session_views(session, session_corners(session, progress))
+    result = calibrate(
+        views,
+        size_px,
+        model=session.model,
+        degree=session.degree,
+        board=session.board_shape,
+        progress=progress,
+    )
+    return replace(result, dropped=(*dropped, *result.dropped))
+
+
+def session_views(
+    session: Session, found: Mapping[str, FoundCorners]
+) -> tuple[list[BoardView], tuple[int, int], list[tuple[str, str]]]:
+    """Return the views that the corners found give, the images' size, and (image, reason) of those that give none.
+
+    Raises InputError where there is no view.
+    """
     from rigkit.calibration.usable import views_of_image
     from rigkit.errors import InputError
 
-    found = _corners(session, progress)
     size_px = Counter(f.size_px for f in found.values()).most_common(1)[0][0]
     views, dropped = [], []
     for name, item in found.items():
@@ -93,36 +119,31 @@ def calibrate_session(session: Session, progress: Progress = silent) -> Calibrat
             dropped.append((name, reason))
     if not views:
         reasons = Counter(reason for _, reason in dropped).most_common(1)[0]
+        camera = "" if session.camera is None else f" of camera '{session.camera}'"
         raise InputError(
-            f"{session.path}: no board can be used in {len(found)} images; {reasons[1]} times: {reasons[0]}; check "
-            "columns and rows in the board file"
+            f"{session.path}: no board can be used in {len(found)} images{camera}; {reasons[1]} times: {reasons[0]}; "
+            "check columns and rows in the board file"
         )
-    result = calibrate(
-        views,
-        size_px,
-        model=session.model,
-        degree=session.degree,
-        board=session.board_shape,
-        progress=progress,
-    )
-    return replace(result, dropped=(*dropped, *result.dropped))
+    return views, size_px, dropped
 
 
-def _corners(session: Session, progress: Progress) -> dict[str, FoundCorners]:
+def session_corners(session: Session, progress: Progress) -> dict[str, FoundCorners]:
     """Return the corners of every image by name, from the images or from the cache."""
     from rigkit.corners.detect import detect_boards
     from rigkit.errors import InputError
     from rigkit.io.corner_cache import CornerCache, FoundCorners, image_hash
     from rigkit.io.images import read_image
 
+    what = "corners" if session.camera is None else f"corners of {session.camera}"
     cache = CornerCache(session.corners_path, session.boards)
     found: dict[str, FoundCorners] = {}
     if not session.images:
         found = {name: item for name in cache.images if (item := cache.get(name, None)) is not None}
         if not found:
-            raise InputError(f"{session.path}: no image matches 'images', and no corners are kept beside it")
+            camera = "" if session.camera is None else f" of camera '{session.camera}'"
+            raise InputError(f"{session.path}: no image matches 'images'{camera}, and no corners are kept beside it")
     for i, path in enumerate(session.images):
-        progress("corners", i, len(session.images))
+        progress(what, i, len(session.images))
         digest = image_hash(path)
         item = cache.get(path.name, digest)
         if item is None:
@@ -130,7 +151,7 @@ def _corners(session: Session, progress: Progress) -> dict[str, FoundCorners]:
             item = FoundCorners((image.shape[1], image.shape[0]), detect_boards(image, session.boards))
             cache.put(path.name, digest, item)
         found[path.name] = item
-    progress("corners", len(session.images), len(session.images))
+    progress(what, len(session.images), len(session.images))
     cache.save()
     return found
 

@@ -7,10 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from rigkit.boards import Board
     from rigkit.calibration.result import Calibration, ViewResult
+    from rigkit.calibration.rig import RigCalibration
+    from rigkit.io.rig_session import RigSession
     from rigkit.io.session import Session
+    from rigkit.validation.checks import Check
 
-__all__ = ["provenance", "thumbnails", "write_report"]
+__all__ = ["write_report", "write_rig_report"]
 
 
 def write_report(path: Path, session: Session, calibration: Calibration, target: Path, *, force: bool) -> None:
@@ -19,17 +23,39 @@ def write_report(path: Path, session: Session, calibration: Calibration, target:
     from rigkit.report.calibration_page import CalibrationSection, build_calibration_page
 
     name = session.path.resolve().parent.name
-    section = CalibrationSection(name, calibration, thumbnails(session.images, calibration))
-    boards = ", ".join(
-        f"{b.board_id} ({b.columns} x {b.rows} corners, {b.square_x_mm:g} x {b.square_y_mm:g} mm)"
-        for b in session.boards
-    )
-    lead = f"{session.path.name} with board {boards}"
-    facts = provenance([session.path, target], {"images": session.images})
+    section = CalibrationSection(name, calibration, _thumbnails(session.images, calibration))
+    lead = f"{session.path.name} with {_boards_in_words(session.boards)}"
+    facts = _provenance([session.path, target], {"images": session.images})
     write_atomic(path, build_calibration_page(f"rigkit calibration: {name}", lead, [section], facts), force=force)
 
 
-def thumbnails(images: Sequence[Path], calibration: Calibration) -> dict[str, bytes]:
+def write_rig_report(
+    path: Path, session: RigSession, rig: RigCalibration, checks: Sequence[Check], target: Path, *, force: bool
+) -> None:
+    """Write the page of a rig, which was saved as `target`: what the cameras share, then each camera alone."""
+    from rigkit.io.files import write_atomic
+    from rigkit.report.calibration_page import CalibrationSection, build_calibration_page
+    from rigkit.report.rig_tables import rig_tables
+
+    name = session.path.resolve().parent.name
+    sections = [
+        CalibrationSection(own, alone, _thumbnails(session.cameras[own].images, alone))
+        for own, alone in zip(session.cameras, rig.single, strict=True)
+    ]
+    boards = _boards_in_words(next(iter(session.cameras.values())).boards)
+    lead = f"{session.path.name} with {boards}: the rig first, then every camera as calibrated alone"
+    facts = _provenance([session.path, target], {f"images of {own}": s.images for own, s in session.cameras.items()})
+    page = build_calibration_page(f"rigkit rig calibration: {name}", lead, sections, facts, rig_tables(rig, checks))
+    write_atomic(path, page, force=force)
+
+
+def _boards_in_words(boards: Sequence[Board]) -> str:
+    return "board " + ", ".join(
+        f"{b.board_id} ({b.columns} x {b.rows} corners, {b.square_x_mm:g} x {b.square_y_mm:g} mm)" for b in boards
+    )
+
+
+def _thumbnails(images: Sequence[Path], calibration: Calibration) -> dict[str, bytes]:
     """Return a small picture of every image that is there, used or left out, with the corners found in it."""
     from rigkit.errors import InputError
     from rigkit.io.images import read_image
@@ -49,7 +75,7 @@ def thumbnails(images: Sequence[Path], calibration: Calibration) -> dict[str, by
     return out
 
 
-def provenance(files: Sequence[Path], images: Mapping[str, Sequence[Path]]) -> dict[str, str]:
+def _provenance(files: Sequence[Path], images: Mapping[str, Sequence[Path]]) -> dict[str, str]:
     """Return what somebody needs to know to get the same page again."""
     import hashlib
     import platform

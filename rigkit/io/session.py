@@ -8,6 +8,8 @@
     model = "scaramuzza"                 # a camera model, or "auto"
     degree = 6                           # optional: of the polynomial; by default chosen by held-out error
     board_shape = "auto"                 # optional: flat, warp, released, or auto (chosen by held-out error)
+
+Sessions of several cameras on one mount have [[cameras]] instead of `images`: see `rigkit.io.rig_session`.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from rigkit.errors import InputError
 from rigkit.io.board_file import load_board
 from rigkit.io.toml_reader import TomlTable, read_toml
 
-__all__ = ["SCHEMA", "Session", "load_session"]
+__all__ = ["SCHEMA", "Session", "boards_of", "images_of", "load_session", "options_of"]
 
 SCHEMA = "rigkit.session/1"
 
@@ -40,6 +42,7 @@ class Session:
     model : name of a camera model, or "auto".
     degree : size of the model, or None to choose.
     board_shape : "flat", "warp", "released" or "auto".
+    camera : name of the camera where the session is one of a rig's, else None.
     """
 
     path: Path
@@ -48,6 +51,7 @@ class Session:
     model: str
     degree: int | None
     board_shape: str
+    camera: str | None = None
 
     @property
     def calibration_path(self) -> Path:
@@ -57,25 +61,35 @@ class Session:
     @property
     def corners_path(self) -> Path:
         """Where the corners found are kept, so that calibrating again needs no images."""
-        return self.path.parent / "corners.json"
+        name = "corners.json" if self.camera is None else f"corners-{self.camera}.json"
+        return self.path.parent / name
 
 
 def load_session(path: str | Path) -> Session:
     """Return the session; raises InputError for a missing file or board, or an unknown key."""
     source = Path(path)
     table = read_toml(source, SCHEMA)
-    images = _images(table)
-    boards = _boards(table)
+    if table.has("cameras"):
+        raise table.error("has several [[cameras]]; where one camera is asked for, give the session of that one")
+    images = images_of(table)
+    boards = boards_of(table)
+    model, degree, shape = options_of(table)
+    table.done()
+    return Session(source, images, boards, model, degree, shape)
+
+
+def options_of(table: TomlTable) -> tuple[str, int | None, str]:
+    """Return model, degree and board shape that a table asks for."""
     model = table.text("model", hint='model = "scaramuzza"', choices=("auto", *MODELS))
     degree = table.integer("degree", hint="degree = 6", at_least=1) if table.has("degree") else None
     shape = "auto"
     if table.has("board_shape"):
         shape = table.text("board_shape", hint='board_shape = "auto"', choices=("auto", *SHAPES))
-    table.done()
-    return Session(source, images, boards, model, degree, shape)
+    return model, degree, shape
 
 
-def _images(table: TomlTable) -> tuple[Path, ...]:
+def images_of(table: TomlTable) -> tuple[Path, ...]:
+    """Return the image files that are there, of the patterns that a table lists."""
     hint = 'images = "images/*.jpg" (or a list of files and patterns)'
     try:
         patterns: tuple[str, ...] = (table.text("images", hint=hint),)
@@ -93,7 +107,8 @@ def _images(table: TomlTable) -> tuple[Path, ...]:
     return tuple(found)
 
 
-def _boards(table: TomlTable) -> tuple[Board, ...]:
+def boards_of(table: TomlTable) -> tuple[Board, ...]:
+    """Return the boards that a table lists by file."""
     hint = 'board = "board.toml" (or boards = ["a.toml", "b.toml"])'
     if table.has("boards"):
         if table.has("board"):

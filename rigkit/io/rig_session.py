@@ -1,0 +1,186 @@
+"""Session files of several cameras on one mount (schema "rigkit.session/1" with [[cameras]] instead of `images`).
+
+::
+
+    schema = "rigkit.session/1"
+    board = "board.toml"             # or boards = [...]
+    model = "brown"                  # of all cameras; a camera may have its own `model` and `degree`
+    frames = "number"                # optional: which images were taken at the same moment (below)
+
+    [[cameras]]
+    id = "left"
+    images = "left*.jpg"
+
+    [[cameras]]
+    id = "right"
+    images = "right*.jpg"
+
+    [[baselines]]                    # optional: what a person measured between two lenses
+    a = "left"
+    b = "right"
+    value_mm = 100.0
+    sigma_mm = 1.0
+    how = "steel rule"
+
+Images of one moment have the same file name without its ending in every camera's folder (frames = "name"), the same
+number at the end of that name ("number": left07 and right07), or the same place in the sorted list ("order"). Where
+`frames` is not given, it is the first of name and number that any two cameras share.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path, PurePath
+
+from rigkit.errors import InputError
+from rigkit.io.session import SCHEMA, Session, boards_of, images_of, options_of
+from rigkit.io.toml_reader import TomlTable, read_toml
+from rigkit.truth import MeasuredLength
+
+__all__ = ["FRAMES", "MeasuredBaseline", "RigSession", "frames_of_images", "is_rig_session", "load_rig_session"]
+
+FRAMES = ("name", "number", "order")
+HINT_ID = 'id = "left"'
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredBaseline:
+    """The distance between the centres of cameras `a` and `b` as a person measured it."""
+
+    a: str
+    b: str
+    length: MeasuredLength
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RigSession:
+    """What to calibrate together.
+
+    Attributes
+    ----------
+    path : the session file.
+    cameras : one session a camera, by its name, in the order of the file; the first is the rig's frame.
+    frames : "name", "number" or "order"; None to choose.
+    baselines : what was measured.
+    """
+
+    path: Path
+    cameras: Mapping[str, Session]
+    frames: str | None
+    baselines: tuple[MeasuredBaseline, ...]
+
+    @property
+    def rig_path(self) -> Path:
+        """Where the rig goes: beside the session."""
+        return self.path.parent / "rig.json"
+
+
+def is_rig_session(path: str | Path) -> bool:
+    """Say whether the session file has several cameras; raises InputError like `load_session`."""
+    return read_toml(path, SCHEMA).has("cameras")
+
+
+def load_rig_session(path: str | Path) -> RigSession:
+    """Return the session of a rig.
+
+    Raises InputError for a missing file or board, an unknown key, one camera only or two of one name, and a baseline
+    between cameras that are not there.
+    """
+    source = Path(path)
+    table = read_toml(source, SCHEMA)
+    if table.has("images"):
+        raise table.error("'images' together with [[cameras]]; give every camera its own images")
+    boards = boards_of(table)
+    model, degree, shape = options_of(table)
+    frames = None
+    if table.has("frames"):
+        frames = table.text("frames", hint='frames = "number"', choices=FRAMES)
+    cameras: dict[str, Session] = {}
+    for entry in table.tables("cameras", hint='[[cameras]] with id = "left" and images = "left*.jpg"'):
+        name = entry.text("id", hint=HINT_ID)
+        if name in cameras or re.search(r"[/\\]", name):
+            raise entry.error("its id must be its own and without slashes; give it another")
+        own, own_degree = model, degree
+        if entry.has("model"):
+            own, own_degree, _ = options_of(entry)
+        images = images_of(entry)
+        entry.done()
+        cameras[name] = Session(source, images, boards, own, own_degree, shape, name)
+    if len(cameras) < 2:
+        raise table.error("a rig has at least two [[cameras]]; for one, write its `images` without [[cameras]]")
+    baselines = _baselines(table, tuple(cameras))
+    table.done()
+    return RigSession(source, cameras, frames, baselines)
+
+
+def _baselines(table: TomlTable, names: Sequence[str]) -> tuple[MeasuredBaseline, ...]:
+    if not table.has("baselines"):
+        return ()
+    out = []
+    for entry in table.tables("baselines", hint="[[baselines]] with a, b, value_mm, sigma_mm and how"):
+        a, b = (entry.text(key, hint=f'{key} = "{names[0]}"', choices=names) for key in "ab")
+        if a == b:
+            raise entry.error(f"'a' and 'b' are both '{a}'; name two cameras")
+        value = entry.number("value_mm", hint="value_mm = 300.0")
+        sigma = entry.number("sigma_mm", hint="sigma_mm = 0.5: how far off the measurement may well be")
+        how = entry.text("how", hint='how = "steel rule": by what it was measured')
+        entry.done()
+        out.append(MeasuredBaseline(a, b, MeasuredLength(value, sigma, how)))
+    return tuple(out)
+
+
+def frames_of_images(images: Mapping[str, Sequence[str]], how: str | None = None) -> dict[str, dict[str, str]]:
+    """Return camera -> image -> frame: images of one moment have the same frame.
+
+    Parameters
+    ----------
+    images : camera -> names of its images, in their order.
+    how : "name", "number" or "order" (see above); by default the first of name and number that two cameras share.
+
+    Raises
+    ------
+    InputError
+        Two images of a camera would be of one frame, the numbers of images differ ("order"), or no two cameras share a
+        frame.
+    """
+    if how == "order":
+        counts = {name: len(own) for name, own in images.items()}
+        if len(set(counts.values())) > 1:
+            words = ", ".join(f"{n} of '{name}'" for name, n in counts.items())
+            raise InputError(f'frames = "order" needs as many images of every camera, there are {words}')
+        return {name: {image: f"{k:04d}" for k, image in enumerate(own)} for name, own in images.items()}
+    for key in (how,) if how else ("name", "number"):
+        frames = {name: {image: KEYS[key](image) for image in own} for name, own in images.items()}
+        twice = _twice(frames)
+        known = sorted(frame for own in frames.values() for frame in set(own.values()))
+        if twice is None and any(a == b for a, b in pairwise(known)):
+            return frames
+        if how and twice is not None:
+            raise InputError(f'frames = "{how}": {twice} are of one frame; rename them, or use frames = "order"')
+    raise InputError(
+        "no two cameras have an image of the same name or number, so nothing says what was taken at the same moment; "
+        'rename the images, or write frames = "order" if the sorted lists belong together one by one'
+    )
+
+
+def _number(image: str) -> str:
+    """Return the last number in the name, without leading zeros; the name itself where it has none."""
+    numbers = re.findall(r"\d+", PurePath(image).stem)
+    return str(int(numbers[-1])) if numbers else image
+
+
+KEYS: dict[str, Callable[[str], str]] = {"name": lambda image: PurePath(image).stem, "number": _number}
+
+
+def _twice(frames: Mapping[str, Mapping[str, str]]) -> str | None:
+    """Return two images of one camera that have the same frame, in words."""
+    for name, own in frames.items():
+        seen: dict[str, str] = {}
+        for image, frame in own.items():
+            if frame in seen:
+                return f"images '{seen[frame]}' and '{image}' of camera '{name}'"
+            seen[frame] = image
+    return None

@@ -1,0 +1,82 @@
+"""Sessions of several cameras: which images belong together, and what is wrong with a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rigkit.cli.main import main
+from rigkit.errors import InputError
+from rigkit.io.rig_session import frames_of_images, is_rig_session, load_rig_session
+from rigkit.io.session import load_session
+
+BOARD = 'schema = "rigkit.board/1"\ncolumns = 9\nrows = 6\nsquare_mm = 30.0\n'
+HEAD = 'schema = "rigkit.session/1"\nboard = "board.toml"\nmodel = "brown"\n'
+LEFT = '[[cameras]]\nid = "left"\nimages = "left*.jpg"\n'
+RIGHT = '[[cameras]]\nid = "right"\nimages = "right*.jpg"\nmodel = "scaramuzza"\ndegree = 5\n'
+BASELINE = '[[baselines]]\na = "left"\nb = "right"\nvalue_mm = 100.0\nsigma_mm = 1.0\nhow = "steel rule"\n'
+
+
+def session(tmp_path: Path, text: str) -> Path:
+    (tmp_path / "board.toml").write_text(BOARD)
+    path = tmp_path / "session.toml"
+    path.write_text(text)
+    return path
+
+
+def test_reads_what_is_written(tmp_path: Path) -> None:
+    for name in ("left2.jpg", "left1.jpg", "right1.jpg"):
+        (tmp_path / name).touch()
+    path = session(tmp_path, HEAD + 'frames = "number"\n' + LEFT + RIGHT + BASELINE)
+    assert is_rig_session(path)
+    rig = load_rig_session(path)
+    assert [p.name for p in rig.cameras["left"].images] == ["left1.jpg", "left2.jpg"]
+    assert (rig.cameras["left"].model, rig.cameras["right"].model, rig.cameras["right"].degree) == (
+        "brown",
+        "scaramuzza",
+        5,
+    )
+    assert rig.cameras["left"].corners_path != rig.cameras["right"].corners_path
+    assert rig.frames == "number" and rig.baselines[0].length.value_mm == 100.0
+    with pytest.raises(InputError, match="several"):
+        load_session(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (HEAD + LEFT, "at least two"),
+        (HEAD + LEFT + LEFT, "its own"),
+        (HEAD + 'images = "*.jpg"\n' + LEFT + RIGHT, "together with"),
+        (HEAD + 'frames = "clock"\n' + LEFT + RIGHT, "known: name, number, order"),
+        (HEAD + LEFT + RIGHT + BASELINE.replace('b = "right"', 'b = "rihgt"'), "known: left, right"),
+        (HEAD + LEFT + RIGHT + BASELINE.replace('b = "right"', 'b = "left"'), "name two cameras"),
+        (HEAD + LEFT + RIGHT + BASELINE.replace("sigma_mm = 1.0\n", ""), "sigma_mm"),
+        (HEAD + LEFT + RIGHT.replace("images", "image"), "images"),
+        (HEAD + LEFT.replace('"left"', '"a/b"') + RIGHT, "slashes"),
+    ],
+)
+def test_bad_files_are_explained(text: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["calibrate", str(session(tmp_path, text))]) == 2
+    said = capsys.readouterr().err
+    assert words in said and said.count("\n") == 1
+
+
+def test_frames() -> None:
+    by_name = frames_of_images({"a": ["0001.png", "0002.png"], "b": ["0002.jpg", "0003.jpg"]})
+    assert by_name["a"]["0002.png"] == by_name["b"]["0002.jpg"] != by_name["b"]["0003.jpg"]
+    by_number = frames_of_images({"l": ["left01.jpg", "left02.jpg"], "r": ["right2.jpg", "right10.jpg"]})
+    assert by_number["l"]["left02.jpg"] == by_number["r"]["right2.jpg"]
+    assert by_number["r"]["right10.jpg"] not in by_number["l"].values()
+    by_order = frames_of_images({"l": ["x", "y"], "r": ["p", "q"]}, "order")
+    assert by_order["l"]["y"] == by_order["r"]["q"] != by_order["r"]["p"]
+
+
+def test_frames_that_nothing_tells() -> None:
+    with pytest.raises(InputError, match='frames = "order"'):
+        frames_of_images({"l": ["a.jpg", "b.jpg"], "r": ["c.jpg", "d.jpg"]})
+    with pytest.raises(InputError, match="2 of 'l', 1 of 'r'"):
+        frames_of_images({"l": ["a.jpg", "b.jpg"], "r": ["c.jpg"]}, "order")
+    with pytest.raises(InputError, match=r"'a1\.jpg' and 'b1\.jpg' of camera 'l'"):
+        frames_of_images({"l": ["a1.jpg", "b1.jpg"], "r": ["c1.jpg"]}, "number")
