@@ -32,7 +32,7 @@ SIGMA_FLOOR_PX = 1e-4
 """Exact corners have no scatter to judge outliers by: below this rounding would make them."""
 GOOD_ENOUGH = 1e-3
 """A scatter of this part of the image's width ends the search for a better start: 1.6 px of 1600."""
-SETTLE_ROUNDS = 3
+SETTLE_ROUNDS = 8
 BAD_VIEW = 2.0
 """A view with this many times the scatter of all gets its pose found anew: perhaps its tilt has the wrong sign."""
 
