@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from rigkit.errors import InputError
+
 HELP = "render a small fisheye capture and run the whole job on it; needs no data"
 
 
@@ -27,6 +29,8 @@ def run(args: argparse.Namespace) -> int:
     from rigkit.io.manifest import load_dataset
     from rigkit.synthetic.demo import build_demo
 
+    if args.seed < 0:
+        raise InputError(f"demo: --seed {args.seed}: a number from 0 upwards is needed")
     root = Path(args.output)
     manifest = build_demo(root, np.random.default_rng(args.seed), progress_on_stderr())
     note(f"capture written to {root}: images, boards, {manifest.name}, and truth.json, which rigkit does not read")

@@ -134,7 +134,10 @@ def detect_one(task: tuple[Path, Path | None, list[Board], int, bool]) -> tuple[
     path, overlay, boards, min_corners, force = task
     cv2.setNumThreads(1)
     image = read_image(path)
-    found = detect_boards(image, boards, min_corners=min_corners)
+    try:
+        found = detect_boards(image, boards, min_corners=min_corners)
+    except InputError as error:
+        raise InputError(f"'{path}': {error}") from error
     if overlay is not None:
         picture = cv2.cvtColor(draw_boards(image, found), cv2.COLOR_RGB2BGR)
         write_atomic(overlay, cv2.imencode(".png", picture)[1].tobytes(), force=force)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -42,6 +43,8 @@ def run(args: argparse.Namespace) -> int:
     from rigkit.io.manifest import load_dataset
     from rigkit.io.manifest_writer import Sighting, board_sizes, find_images, group_pairs, manifest_text
 
+    if args.square_mm is not None:
+        _length("--square-mm", args.square_mm)
     root = args.folder.resolve()
     target = args.output or root / "dataset.toml"
     ensure_writable(target, force=args.force)
@@ -56,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     pairs = group_pairs(sightings, root)
     for pair in pairs:
         note(f"pair '{pair.name}': {pair.first.image.name}, {pair.second.image.name}")
-    square_mm = args.square_mm or float(_ask("side of a square, mm", "--square-mm"))
+    square_mm = args.square_mm or _length("--square-mm", _ask("side of a square, mm", "--square-mm"))
     calibration = args.calibration or _ask("path of calibration.json (relative to the manifest)", "--calibration")
     poses = {p.name: args.pose_type or _ask(f"pose type of '{p.name}'", "--pose-type", POSE_TYPES) for p in pairs}
     text = manifest_text(
@@ -91,8 +94,17 @@ def _baselines(args: argparse.Namespace, pairs: list[FoundPair]) -> dict[str, tu
         number, _, sigma = value.partition("+-")
         if name not in known:
             raise InputError(f"init: --baseline-mm names '{name}'; pairs found: {', '.join(sorted(known))}")
-        try:
-            out[name] = (float(number), float(sigma))
-        except ValueError as error:
-            raise InputError(f"init: --baseline-mm '{text}': write PAIR=MM+-SIGMA, such as {name}=300+-2") from error
+        what = f"--baseline-mm '{text}': write PAIR=MM+-SIGMA, such as {name}=300+-2"
+        out[name] = (_length(what, number), _length(what, sigma))
     return out
+
+
+def _length(what: str, value: str | float) -> float:
+    """Return a length in mm; raises InputError where it is no positive number."""
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    if not (math.isfinite(number) and number > 0.0):
+        raise InputError(f"init: {what}: a positive number of mm is needed, got '{value}'")
+    return number

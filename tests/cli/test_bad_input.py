@@ -206,6 +206,18 @@ def test_two_boards_are_reconstructed_and_the_third_is_said_to_be_missing(
     assert "seen in image 1 only" in said.err
 
 
+def test_negative_seed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["demo", "-o", str(tmp_path / "demo"), "--seed", "-1"]) == 2
+    assert "--seed" in capsys.readouterr().err
+    assert not (tmp_path / "demo").exists()
+
+
+def test_image_of_a_few_pixels_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cv2.imwrite(str(tmp_path / "tiny.png"), np.zeros((8, 8), np.uint8))
+    assert main(["detect", str(tmp_path / "tiny.png")]) == 2
+    assert "tiny.png" in capsys.readouterr().err
+
+
 def test_unknown_verb_and_no_verb(capsys: pytest.CaptureFixture[str]) -> None:
     for arguments in (["nonsense"], []):
         with pytest.raises(SystemExit) as stop:

@@ -48,3 +48,13 @@ def test_what_images_cannot_tell_must_be_said(
 def test_an_empty_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["init", str(tmp_path)]) == 2
     assert "no images" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "options", [["--square-mm", "nan"], ["--square-mm", "-5"], ["--square-mm", "50", "--baseline-mm", "first=300+-0"]]
+)
+def test_lengths_that_are_none(options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(IMAGES / "fisheye-general", tmp_path / "first")
+    assert main(["init", str(tmp_path), "--calibration", "c.json", "--pose-type", "general", *options]) == 2
+    assert "positive number" in capsys.readouterr().err
+    assert not (tmp_path / "dataset.toml").exists()
