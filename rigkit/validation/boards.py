@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, IntArray, Mat3, Normals, Points
+from rigkit.arrays import BoolArray, FloatArray, IntArray, Mat3, Normals, Points
 from rigkit.boards import Board
 from rigkit.errors import DegenerateError
 from rigkit.truth import Feature
@@ -85,15 +85,23 @@ def fit_lattice(points_mm: Points, grid: IntArray) -> Lattice:
 
 
 def measure_board(
-    board: Board, points_mm: Points, normals: Normals, grid: IntArray, covariance_mm2: FloatArray | None = None
+    board: Board,
+    points_mm: Points,
+    normals: Normals,
+    grid: IntArray,
+    covariance_mm2: FloatArray | None = None,
+    used: BoolArray | None = None,
 ) -> BoardResult:
     """Return plane, lattice and normal errors of one board's points (N, 3), normals (N, 3) and grid (N, 2).
+
+    Gross outliers (see `fit_plane`) take no part in plane and lattice; all normals are judged. `used` (N,) says which
+    points are none, where that was decided before.
 
     Raises DegenerateError where too few corners are left; the message names the board.
     """
     try:
-        plane = fit_plane(points_mm, covariance_mm2)
-        lattice = fit_lattice(points_mm, grid)
+        plane = fit_plane(points_mm, covariance_mm2, used)
+        lattice = fit_lattice(points_mm[plane.used], grid[plane.used])
     except DegenerateError as error:
         raise DegenerateError(f"board '{board.board_id}': {error}") from error
     _, along, down = lattice.steps_mm

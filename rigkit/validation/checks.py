@@ -8,6 +8,7 @@ sigma is honest, and fewer where people state theirs generously.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from itertools import combinations
 from typing import Any
@@ -89,7 +90,7 @@ class ValidationReport:
     boards : plane, normal errors and frame of each board.
     angles : between each two boards.
     baseline_mm, baseline_sigma_mm, sampson_rms_px, count : of the reconstruction.
-    notes : the reconstruction's notes.
+    notes : the reconstruction's notes, and boards with gross outliers.
     """
 
     pair_id: str
@@ -218,8 +219,17 @@ def validate(
         baseline_sigma_mm,
         reconstruction.sampson_rms_px,
         len(cloud),
-        reconstruction.notes,
+        (*reconstruction.notes, *_outlier_notes(measured.boards.values())),
     )
+
+
+def _outlier_notes(boards: Iterable[BoardResult]) -> list[str]:
+    lost = {b.board.board_id: int((~b.plane.used).sum()) for b in boards}
+    return [
+        f"board '{name}': {count} corners lie far off its plane and were left out of it; is something in front of it?"
+        for name, count in lost.items()
+        if count
+    ]
 
 
 def judge(

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
+from rigkit.arrays import BoolArray, FloatArray
 from rigkit.cameras.base import Camera
 from rigkit.fundamental.metric import triangulate_matches
 from rigkit.fundamental.refine import refine_pose
@@ -60,12 +60,21 @@ def calibration_shifts(
     camera1, camera2 = reconstruction.camera1, reconstruction.camera2
     cameras: list[tuple[Camera, Camera]] = []
     for axis in principal_axes(covariance1):
-        moved = camera1.with_parameters(camera1.parameters + axis)
-        cameras.append((moved, moved if covariance2 is None else camera2))
+        shifted = camera1.with_parameters(camera1.parameters + axis)
+        cameras.append((shifted, shifted if covariance2 is None else camera2))
     for axis in [] if covariance2 is None else principal_axes(covariance2):
         cameras.append((camera1, camera2.with_parameters(camera2.parameters + axis)))
-    base = _again(reconstruction, camera1, camera2, level_sigma_rad)
-    return CalibrationShifts(base, tuple(_again(reconstruction, *both, level_sigma_rad) for both in cameras))
+    cameras.insert(0, (camera1, camera2))
+    # A corner at the rim of the field can lie outside a moved camera's: then it says nothing here, of no camera.
+    seen = np.logical_and.reduce(
+        [
+            camera.unproject(pixels)[1]
+            for both in cameras
+            for camera, pixels in zip(both, (reconstruction.pixels1, reconstruction.pixels2), strict=True)
+        ]
+    )
+    base, *moved = (_again(reconstruction, *both, level_sigma_rad, seen) for both in cameras)
+    return CalibrationShifts(base, tuple(moved))
 
 
 def principal_axes(covariance: FloatArray) -> FloatArray:
@@ -78,15 +87,15 @@ def principal_axes(covariance: FloatArray) -> FloatArray:
 
 
 def _again(
-    reconstruction: Reconstruction, camera1: Camera, camera2: Camera, level_sigma_rad: float | None
+    reconstruction: Reconstruction, camera1: Camera, camera2: Camera, level_sigma_rad: float | None, seen: BoolArray
 ) -> Reconstruction:
-    """Estimate pose, scale and points again from the same corners; normals stay, they are not asked for."""
-    known = reconstruction.matches
+    """Estimate pose, scale and points again from the corners `seen`; the others, and all normals, stay."""
+    known = reconstruction.matches.select(seen)
     matches = Matches.from_cameras(
         camera1,
         camera2,
-        reconstruction.pixels1,
-        reconstruction.pixels2,
+        reconstruction.pixels1[seen],
+        reconstruction.pixels2[seen],
         sigma1_px=known.sigma1_px,
         sigma2_px=known.sigma2_px,
         board_index=known.board_index,
@@ -98,12 +107,15 @@ def _again(
     points, covariance, valid = triangulate_matches(matches, refined.cam2_from_cam1)
     scale, _ = metric_scale(points, matches.board_index, matches.grid, reconstruction.boards, covariance)
     cloud = reconstruction.cloud
+    found = np.flatnonzero(seen)[valid]
+    again = np.array(cloud.points_mm)
+    again[found] = scale * points[valid]
     return replace(
         reconstruction,
         camera1=camera1,
         camera2=camera2,
         cam2_from_cam1=Rigid3(refined.cam2_from_cam1.rotation, scale * refined.cam2_from_cam1.translation_mm),
         pose_covariance=None,
-        cloud=replace(cloud, points_mm=np.where(valid[:, None], scale * points, cloud.points_mm)),
+        cloud=replace(cloud, points_mm=again),
         baseline_mm=scale,
     )

@@ -105,26 +105,35 @@ def measure(reconstruction: Reconstruction, shifts: CalibrationShifts | None = N
     )
     usable = bool(np.isfinite(covariances).all())
 
-    def boards_of(points: Points) -> Boards:
+    def boards_of(points: Points, as_in: Boards | None = None) -> Boards:
         out: Boards = {}
         for index, board in enumerate(reconstruction.boards):
             on = cloud.board_index == index
             if on.any():
                 out[board.board_id] = measure_board(
-                    board, points[on], cloud.normals[on], cloud.grid[on], covariances[on] if usable else None
+                    board,
+                    points[on],
+                    cloud.normals[on],
+                    cloud.grid[on],
+                    covariances[on] if usable else None,
+                    None if as_in is None else as_in[board.board_id].plane.used,
                 )
         return out
+
+    found = boards_of(cloud.points_mm)
 
     shaken: list[tuple[Boards, Boards, float]] = []
     if reconstruction.pose_covariance is not None:
         for motion, step in points_by_pose(reconstruction):
-            shaken.append((boards_of(cloud.points_mm + motion), boards_of(cloud.points_mm - motion), step))
+            shaken.append(
+                (boards_of(cloud.points_mm + motion, found), boards_of(cloud.points_mm - motion, found), step)
+            )
     shifted = () if shifts is None else (shifts.base, *shifts.moved)
     return Measured(
-        boards_of(cloud.points_mm),
+        found,
         tuple(shaken),
         reconstruction.pose_covariance,
-        tuple(boards_of(moved.cloud.points_mm) for moved in shifted),
+        tuple(boards_of(moved.cloud.points_mm, found) for moved in shifted),
     )
 
 

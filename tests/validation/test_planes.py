@@ -151,3 +151,37 @@ def test_open3d_gets_the_cloud_unchanged() -> None:
     assert (np.asarray(out.points) == cloud.points_mm).all()
     assert (np.asarray(out.normals) == cloud.normals).all()
     assert (np.rint(np.asarray(out.colors) * 255) == cloud.colours).all()
+
+
+def test_corners_that_are_none_do_not_tilt_the_plane(rng: np.random.Generator) -> None:
+    """Five of 48 corners, all on one side, are the edge of something 15 to 40 mm in front of the board."""
+    points, normal = board_points()
+    sigma = np.linspace(0.1, 0.4, 48)
+    points = points + (rng.normal(size=48) * sigma)[:, None] * normal
+    covariance = 25.0 * sigma[:, None, None] ** 2 * np.eye(3)
+    clean = fit_plane(points, covariance)
+    assert clean.used.all()
+    bad = np.array([40, 41, 42, 46, 47])
+    spoiled = points.copy()
+    spoiled[bad] += np.linspace(15.0, 40.0, 5)[:, None] * normal
+    plane = fit_plane(spoiled, covariance)
+    assert (np.flatnonzero(~plane.used) == bad).all()
+    assert plane.count == 43
+    # What the others alone give, nothing else.
+    rest = np.delete(np.arange(48), bad)
+    alone = fit_plane(points[rest], covariance[rest])
+    assert angle_between(plane.normal, alone.normal) < EXACT_RAD
+    assert angle_between(fit_plane(spoiled).normal, normal) > 30.0 * angle_between(alone.normal, normal)
+    result = measure_board(BOARDS[0], spoiled, np.tile(normal, (48, 1)), BOARDS[0].grid(), covariance)
+    assert result.square_x_ratio == pytest.approx(1.0, abs=1e-3)
+    assert result.lattice.at(np.array([7.0, 5.0]))[0] @ normal == pytest.approx(points[47] @ normal, abs=1.0)
+
+
+def test_ordinary_scatter_loses_no_corner(rng: np.random.Generator) -> None:
+    points, normal = board_points()
+    sigma = np.linspace(0.1, 1.0, 48)
+    covariance = sigma[:, None, None] ** 2 * np.eye(3)
+    for scatter in (0.0, 1.0):
+        for _ in range(200):
+            noisy = points + (scatter * rng.normal(size=48) * sigma)[:, None] * normal
+            assert fit_plane(noisy, covariance).used.all()
