@@ -101,9 +101,9 @@ def session_views(
 ) -> tuple[list[BoardView], tuple[int, int], list[tuple[str, str]]]:
     """Return the views that the corners found give, the images' size, and (image, reason) of those that give none.
 
-    Raises InputError where there is no view.
+    Raises InputError where there is no view, or the boards clearly have another size than stated.
     """
-    from rigkit.calibration.usable import views_of_image
+    from rigkit.calibration.usable import other_size, views_of_image
     from rigkit.errors import InputError
 
     size_px = Counter(f.size_px for f in found.values()).most_common(1)[0][0]
@@ -124,6 +124,9 @@ def session_views(
             f"{session.path}: no board can be used in {len(found)} images{camera}; {reasons[1]} times: {reasons[0]}; "
             "check columns and rows in the board file"
         )
+    wrong = other_size([d for item in found.values() for d in item.detections], session.boards)
+    if wrong is not None:
+        raise InputError(f"{session.path}: {wrong}; correct columns and rows in the board file")
     return views, size_px, dropped
 
 

@@ -72,6 +72,11 @@ def test_bad_input(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["calibrate", str(session)]) == 2
     assert "check columns and rows" in capsys.readouterr().err
 
+    board.write_text(BOARD.replace("rows = 6", "rows = 7"))
+    assert main(["calibrate", str(session)]) == 2
+    said = capsys.readouterr().err
+    assert "9x7" in said and "9x6" in said and "board file" in said
+
     board.write_text(BOARD)
     whole = (session.parent / "02.jpg").read_bytes()
     (session.parent / "02.jpg").write_bytes(whole[: len(whole) // 2])
