@@ -238,7 +238,8 @@ def _refuse_chance(matches: Matches, pose: Rigid3, inliers: BoolArray, freedom: 
 
     The expected number of poses through a minimal sample that do as well among wrong matches (Moisan and Stival,
     "A probabilistic criterion to detect rigid point matches"). How often a wrong match fits by chance is seen from the
-    points themselves, partnered wrongly on purpose: on boards and facades it is often.
+    points themselves, partnered wrongly on purpose: on boards and facades it is often; and how often its affinity does,
+    from the matches whose points do not fit.
     """
     n, k = len(inliers), int(inliers.sum())
     fitting = total = 0
@@ -249,13 +250,21 @@ def _refuse_chance(matches: Matches, pose: Rigid3, inliers: BoolArray, freedom: 
         )
         fitting += int((np.abs(_in_sigmas(wrong, pose)) < GATE).sum())
         total += n
-    log_chance = np.log((fitting + 1.0) / (total + 1.0))
+    log_chance = np.log((fitting + 1.0) / (total + 1.0)) + np.log(_affinities_by_chance(matches, pose))
     log_expected = np.log(n) + _log_choose(n, k) + _log_choose(k, freedom) + (k - freedom) * log_chance
     if log_expected > np.log(MAX_FALSE_ALARMS):
         raise DegenerateError(
             f"{k} of {n} correspondences agree with one pose, as many as wrong ones might by chance; the scene has too "
             "little texture, or looks the same in many places"
         )
+
+
+def _affinities_by_chance(matches: Matches, pose: Rigid3) -> float:
+    """Return how often the affinity of a wrong match fits."""
+    wrong = np.abs(_in_sigmas(matches, pose)) >= GATE
+    doubt = _affinity_in_sigmas(matches, pose)[wrong]
+    # Without an affinity nothing is tested: such a match always fits.
+    return float((np.sum(~(np.nan_to_num(doubt) >= AFFINITY_GATE)) + 1.0) / (wrong.sum() + 1.0))
 
 
 def _log_choose(n: int, k: int) -> float:
