@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 from rigkit.cli.console import note, print_json, progress_on_stderr
 from rigkit.cli.workflow import (
-    CROSSCHECK_COVERAGE,
     add_dataset_arguments,
     load_cameras,
     match_images,
@@ -53,7 +52,7 @@ def crosscheck_pair(job: PairJob) -> CrossCheckReport:
     other = reconstruct_other_chain(matched, job.pair)
     ours = reconstruct_with(matched, job.pair, "3SDIR")
     shifts = shifts_of(ours, job.camera1, job.camera2)
-    return crosscheck(ours, other_chain=other, shifts=shifts, coverage=CROSSCHECK_COVERAGE)
+    return crosscheck(ours, other_chain=other, shifts=shifts)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 from rigkit.cli.console import note, print_json, progress_on_stderr
 from rigkit.cli.workflow import (
-    CROSSCHECK_COVERAGE,
     add_dataset_arguments,
     find_boards,
     load_cameras,
@@ -136,9 +135,7 @@ def _judge(job: PairJob, matched: MatchedPair, image1: Any, image2: Any, causes:
     other_ways = None
     if job.crosscheck:
         other = reconstruct_other_chain(matched, pair)
-        other_ways = crosscheck(
-            shown, other_chain=other, shifts=shifts[best.affine_method], coverage=CROSSCHECK_COVERAGE
-        )
+        other_ways = crosscheck(shown, other_chain=other, shifts=shifts[best.affine_method])
     section = _pictures(reconstructions, shown, reports, other_ways, image1, image2, files) if job.pictures else None
     return PairOutcome(pair.pair_id, reports, best, other_ways, causes, files, section)
 

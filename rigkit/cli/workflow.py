@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from rigkit.validation.intrinsics import CalibrationShifts
 
 __all__ = [
-    "CROSSCHECK_COVERAGE",
     "LoadedCamera",
     "add_dataset_arguments",
     "find_boards",
@@ -48,8 +47,6 @@ __all__ = [
 
 Result = TypeVar("Result")
 
-CROSSCHECK_COVERAGE = 4.0
-"""Other ways are compared in some twenty figures a pair: at two sigmas every pair would have a false alarm."""
 Detections: TypeAlias = "tuple[BoardDetection, ...]"
 
 

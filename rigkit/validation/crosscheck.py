@@ -32,8 +32,9 @@ __all__ = ["CrossCheckReport", "OtherWay", "compare_chains", "crosscheck"]
 ADJUSTED = "pycolmap bundle adjustment"
 PNP = "planar PnP"
 OTHER_CHAIN = "other chain"
-CROSS_COVERAGE = 3.0
-"""A data set makes a hundred comparisons: at two sigmas five of them would fail though nothing is wrong."""
+CROSS_COVERAGE = 4.0
+"""A data set of eight pairs makes a hundred and fifty comparisons: at four sigmas one such data set in a hundred has a
+false alarm, at three every third, at two each."""
 
 Angles = dict[tuple[str, str], tuple[float, float]]
 

@@ -50,12 +50,12 @@ def planar_pnp(reconstruction: Reconstruction) -> PnpResult:
 
     Raises DegenerateError where no board has eight corners.
     """
-    rays1, _ = reconstruction.camera1.unproject(reconstruction.pixels1)
-    rays2, _ = reconstruction.camera2.unproject(reconstruction.pixels2)
+    rays1, seen1 = reconstruction.camera1.unproject(reconstruction.pixels1)
+    rays2, seen2 = reconstruction.camera2.unproject(reconstruction.pixels2)
     poses: dict[str, tuple[BoardPose, BoardPose]] = {}
     counts: dict[str, int] = {}
     for index, board in enumerate(reconstruction.boards):
-        on = reconstruction.cloud.board_index == index
+        on = (reconstruction.cloud.board_index == index) & seen1 & seen2
         if int(on.sum()) >= MIN_CORNERS:
             points = board.points(reconstruction.cloud.grid[on])
             poses[board.board_id] = (board_pose(rays1[on], points), board_pose(rays2[on], points))
