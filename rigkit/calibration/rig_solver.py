@@ -90,7 +90,7 @@ class RigState:
         return State(self.cameras[c], rotation, translation, observations.shapes[c], np.zeros(0))
 
 
-def rig_normal(observations: RigObservations, state: RigState, workspaces: Sequence[Workspace] | None = None) -> Normal:
+def rig_normal(observations: RigObservations, state: RigState) -> Normal:
     """Return the normal equations: globals are all intrinsics, then the mounts of all cameras but the first."""
     sizes = [c.parameters.size for c in state.cameras]
     first = np.concatenate([[0], np.cumsum(sizes)])
