@@ -70,7 +70,7 @@ def _starts(
 ) -> Iterator[State]:
     offset = observations.pixels - centre
     alignment = align(offset, board, observations.weight)
-    rho = np.linalg.norm(offset, axis=-1)
+    rho = np.sqrt(offset[..., 0] ** 2 + offset[..., 1] ** 2)
     rho_max = float(rho[alignment.weight > 0.1].max())
     tried = (_curve(alignment, rho / rho_max, board, offset, exponents) for exponents in EXPONENTS)
     curve = next((c for c in tried if c is not None), None)
@@ -111,12 +111,13 @@ def _posed(
     observations: Observations,
 ) -> State:
     """Complete the poses with the third row: t3 is the weighted mean of z - r3 x over the corners."""
-    s = np.linalg.norm(alignment.camera_xy(board), axis=-1)
+    x, y = np.moveaxis(alignment.camera_xy(board), -1, 0)
+    s = np.sqrt(x * x + y * y)
     angle = np.interp(rho, radius, theta)
     z = s / np.tan(np.maximum(angle, 1e-6))
     tilt = alignment.tilt * depth_sign[:, None]
     weight = alignment.weight * np.sin(angle) ** 2
-    t3 = (weight * (z - (board @ tilt[..., None])[..., 0])).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-12)
+    t3 = (weight * (z - _depth(tilt, board))).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-12)
     columns = np.concatenate([alignment.rows[..., :2], tilt[:, None, :]], axis=1)
     third = np.cross(columns[..., 0], columns[..., 1])
     rotation = nearest_rotation(np.concatenate([columns, third[..., None]], axis=-1))
@@ -131,24 +132,31 @@ def _curve(
 
     `rho` (V, C) is relative to the largest used.
     """
-    direction = offset / np.maximum(np.linalg.norm(offset, axis=-1, keepdims=True), 1e-9)
-    s = (alignment.camera_xy(board) * direction).sum(axis=-1)
+    length = np.maximum(np.sqrt(offset[..., 0] ** 2 + offset[..., 1] ** 2), 1e-9)
+    x, y = np.moveaxis(alignment.camera_xy(board), -1, 0)
+    s = (x * offset[..., 0] + y * offset[..., 1]) / length
     safe = np.maximum(rho, 1e-4)
-    design = s[..., None] * safe[..., None] ** (np.array(exponents) - 1.0)
-    depth = (board @ alignment.tilt[..., None])[..., 0]
+    # One contiguous array for each coefficient: s rho^(k - 1).
+    powers = {0: s / safe, 2: s * safe}
+    powers[3] = powers[2] * safe
+    powers[4] = powers[3] * safe
+    design = np.stack([powers[k] for k in exponents])
+    depth = _depth(alignment.tilt, board)
     used = (alignment.weight > 0.0) & (s > 0.0) & (rho > 1e-3)
     # d rho / d z of the lens turns residuals of z into residuals of rho; at first for a lens of 45 degrees.
     slope = safe**2 / (np.maximum(s, 1e-9) * (1.0 + safe**2))
     weight = np.where(used, alignment.weight * slope, 0.0)
     a, sign = _joint(design, depth, weight, None)
-    for _ in range(ROUNDS):
-        a, sign = _joint(design, depth, weight, sign)
-        z = design @ a
-        mean = (weight**2 * (z - sign[:, None] * depth)).sum(axis=1) / np.maximum((weight**2).sum(axis=1), 1e-300)
+    for _ in range(ROUNDS - 1):
+        z = np.tensordot(a, design, 1)
+        residual = z - sign[:, None] * depth
+        squared = weight**2
+        residual -= ((squared * residual).sum(axis=1) / np.maximum(squared.sum(axis=1), 1e-300))[:, None]
         slope = s / np.maximum(s**2 + z**2, 1e-300)
-        residual = np.abs(z - sign[:, None] * depth - mean[:, None]) * slope
+        residual = np.abs(residual) * slope
         scale = 2.5 * 1.4826 * float(np.median(residual[used])) + 1e-9
         weight = np.where(used, alignment.weight * slope / (1.0 + (residual / scale) ** 2), 0.0)
+        a, sign = _joint(design, depth, weight, sign)
     radius = np.linspace(0.0, 1.0, SAMPLES)
     theta = np.arctan2(radius, (radius[:, None] ** np.array(exponents)) @ a)
     if a[0] <= 0.0 or (np.diff(theta) <= 0.0).any():
@@ -156,22 +164,27 @@ def _curve(
     return theta, sign
 
 
+def _depth(tilt: FloatArray, board: FloatArray) -> FloatArray:
+    """Return r31 x + r32 y of the corners, (V, C)."""
+    return np.asarray(tilt[:, :1] * board[..., 0] + tilt[:, 1:] * board[..., 1])
+
+
 def _joint(
     design: FloatArray, depth: FloatArray, weight: FloatArray, sign: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the polynomial a and the signs (V,) that minimise sum weight^2 (design a - t3_v - sign_v depth)^2.
+    """Return the polynomial a and the signs (V,) that minimise sum weight^2 (a design - t3_v - sign_v depth)^2.
 
-    `sign` is where the search for the signs starts; None: from scratch.
+    `design` is (coefficients, V, C). `sign` is where the search for the signs starts; None: from scratch.
     """
-    total = np.maximum((weight**2).sum(axis=1), 1e-300)
-    centred = (design - ((weight**2)[..., None] * design).sum(axis=1)[:, None] / total[:, None, None]) * weight[
-        ..., None
-    ]
-    right = (depth - ((weight**2) * depth).sum(axis=1)[:, None] / total[:, None]) * weight
-    scale = np.sqrt((centred**2).sum(axis=(0, 1))) + 1e-300
-    centred = centred / scale
-    normal = np.einsum("vci,vcj->ij", centred, centred) + 1e-12 * np.eye(len(scale))
-    cross = np.einsum("vci,vc->iv", centred, right)
+    squared = weight**2
+    total = np.maximum(squared.sum(axis=1), 1e-300)
+    centred = (design - ((squared * design).sum(axis=2) / total)[..., None]) * weight
+    right = (depth - ((squared * depth).sum(axis=1) / total)[:, None]) * weight
+    flat = centred.reshape(len(design), -1)
+    normal = flat @ flat.T
+    scale = np.sqrt(np.diag(normal)) + 1e-300
+    normal = normal / scale[:, None] / scale + 1e-12 * np.eye(len(scale))
+    cross = (centred * right).sum(axis=2) / scale[:, None]
     if sign is None:
         sign = _signs(np.linalg.solve(np.linalg.cholesky(normal), cross), (right**2).sum(axis=1))
     a = np.linalg.solve(normal, cross @ sign)

@@ -46,7 +46,7 @@ class Alignment:
 
     def camera_xy(self, board: FloatArray) -> FloatArray:
         """Return (X, Y) of the corners (V, C, 2) in the camera frame, mm."""
-        return np.asarray(board @ np.swapaxes(self.rows[..., :2], -1, -2) + self.rows[:, None, :, 2])
+        return np.stack(_camera_xy(self.rows.reshape(-1, 6), board), axis=-1)
 
 
 def align(offset: FloatArray, board: FloatArray, weight: FloatArray) -> Alignment:
@@ -60,22 +60,23 @@ def align(offset: FloatArray, board: FloatArray, weight: FloatArray) -> Alignmen
     """
     local, mean, size = _normalised(board, weight)
     used = weight > 0.0
-    h = _fit(offset, local, weight**2)
-    residual = _residual(h, offset, local)
+    h = _fit(offset, local, weight)
+    residual, radius = _residual(h, offset, local)
     sigma = _sigma(residual, used)
     bad = (np.where(used, residual, 0.0).max(axis=1) > SUSPICIOUS * sigma) & (used.sum(axis=1) > SUBSET_SIZE)
     if bad.any():
         h[bad] = _best_subset(offset[bad], local[bad], used[bad])
+        residual, radius = _residual(h, offset, local)
     robust = weight
     for _ in range(ROUNDS):
-        residual = _residual(h, offset, local)
         sigma = _sigma(residual, used)
         robust = np.where(used, weight / (1.0 + (residual / (2.5 * sigma[:, None])) ** 2), 0.0)
-        h = _fit(offset, local, (robust / _radius(h, local)) ** 2)
+        h = _fit(offset, local, robust / radius)
+        residual, radius = _residual(h, offset, local)
         if not bad.any():
             break
-    residual = _residual(h, offset, local)
-    agree = (robust * (_camera_xy(h, local) * offset).sum(axis=-1)).sum(axis=1)
+    x, y = _camera_xy(h, local)
+    agree = (robust * (x * offset[..., 0] + y * offset[..., 1])).sum(axis=1)
     h *= np.where(agree < 0.0, -1.0, 1.0)[:, None]
     share = np.divide(robust, weight, out=np.zeros_like(weight), where=used)
     rows, tilt = _orthonormal(h, mean, size)
@@ -91,40 +92,36 @@ def _normalised(board: FloatArray, weight: FloatArray) -> tuple[FloatArray, Floa
     return local / size[:, None, None], mean, size
 
 
-def _design(offset: FloatArray, local: FloatArray) -> FloatArray:
-    one = np.ones_like(local[..., :1])
-    homogeneous = np.concatenate([local, one], axis=-1)
-    return np.concatenate([-offset[..., 1:] * homogeneous, offset[..., :1] * homogeneous], axis=-1)
+def _fit(offset: FloatArray, local: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return the unit h (V, 6) that minimises sum weight^2 (u Y - v X)^2."""
+    u, v = weight * offset[..., 0], weight * offset[..., 1]
+    x, y = local[..., 0], local[..., 1]
+    # Unknowns before corners: every row of the design is one contiguous run.
+    design = np.empty((*u.shape[:-1], 6, u.shape[-1]))
+    for k, (left, right) in enumerate(((-v, x), (-v, y), (-v, None), (u, x), (u, y), (u, None))):
+        design[..., k, :] = left if right is None else left * right
+    return np.asarray(np.linalg.eigh(design @ np.swapaxes(design, -1, -2))[1][..., 0])
 
 
-def _fit(offset: FloatArray, local: FloatArray, weight2: FloatArray) -> FloatArray:
-    """Return the unit h (V, 6) that minimises sum weight2 (u Y - v X)^2."""
-    design = _design(offset, local) * np.sqrt(weight2)[..., None]
-    return np.asarray(np.linalg.eigh(np.swapaxes(design, -1, -2) @ design)[1][..., 0])
+def _camera_xy(h: FloatArray, local: FloatArray) -> tuple[FloatArray, FloatArray]:
+    x, y = local[..., 0], local[..., 1]
+    h = h[..., None]
+    return h[..., 0, :] * x + h[..., 1, :] * y + h[..., 2, :], h[..., 3, :] * x + h[..., 4, :] * y + h[..., 5, :]
 
 
-def _camera_xy(h: FloatArray, local: FloatArray) -> FloatArray:
-    rows = h.reshape(*h.shape[:-1], 2, 3)
-    return np.asarray(local @ np.swapaxes(rows[..., :2], -1, -2) + rows[..., None, :, 2])
-
-
-def _radius(h: FloatArray, local: FloatArray) -> FloatArray:
-    """Return |(X, Y)|, kept off zero for corners that lie on the axis."""
-    radius = np.linalg.norm(_camera_xy(h, local), axis=-1)
-    return np.asarray(np.maximum(radius, 1e-3 * radius.max(axis=-1, keepdims=True) + np.finfo(float).tiny))
-
-
-def _residual(h: FloatArray, offset: FloatArray, local: FloatArray) -> FloatArray:
-    """Return the distance in px of each pixel from the radial line through its corner."""
-    xy = _camera_xy(h, local)
-    cross = np.abs(offset[..., 0] * xy[..., 1] - offset[..., 1] * xy[..., 0])
-    return np.asarray(cross / _radius(h, local))
+def _residual(h: FloatArray, offset: FloatArray, local: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the distance in px of each pixel from the radial line through its corner, and the corner's |(X, Y)|, kept
+    off zero for corners that lie on the axis."""
+    x, y = _camera_xy(h, local)
+    radius = np.sqrt(x * x + y * y)
+    radius = np.maximum(radius, 1e-3 * radius.max(axis=-1, keepdims=True) + np.finfo(float).tiny)
+    return np.abs(offset[..., 0] * y - offset[..., 1] * x) / radius, radius
 
 
 def _sigma(residual: FloatArray, used: np.ndarray) -> FloatArray:
     """Return a robust standard deviation of each view's residuals (V,), never zero."""
-    ordered = np.sort(np.where(used, residual, np.inf), axis=1)
     middle = np.maximum(used.sum(axis=1) - 1, 0) // 2
+    ordered = np.partition(np.where(used, residual, np.inf), np.unique(middle), axis=1)
     median = ordered[np.arange(len(used)), middle]
     return np.maximum(1.4826 * np.where(np.isfinite(median), median, 0.0), 1e-6)
 
@@ -136,7 +133,7 @@ def _best_subset(offset: FloatArray, local: FloatArray, used: np.ndarray) -> Flo
     chosen = order[..., :SUBSET_SIZE]
     view = np.arange(len(used))[:, None, None]
     h = _fit(offset[view, chosen], local[view, chosen], np.ones(chosen.shape))
-    residual = _residual(h, offset[:, None], local[:, None])
+    residual, _ = _residual(h, offset[:, None], local[:, None])
     median = np.nanmedian(np.where(used[:, None], residual, np.nan), axis=-1)
     return np.asarray(h[np.arange(len(used)), median.argmin(axis=1)])
 
