@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import time
 from collections import Counter
 from collections.abc import Mapping
@@ -132,6 +133,7 @@ def session_views(
 
 def session_corners(session: Session, progress: Progress) -> dict[str, FoundCorners]:
     """Return the corners of every image by name, from the images or from the cache."""
+    from rigkit.cli.console import note
     from rigkit.corners.detect import detect_boards
     from rigkit.errors import InputError
     from rigkit.io.corner_cache import CornerCache, FoundCorners, image_hash
@@ -145,18 +147,30 @@ def session_corners(session: Session, progress: Progress) -> dict[str, FoundCorn
         if not found:
             camera = "" if session.camera is None else f" of camera '{session.camera}'"
             raise InputError(f"{session.path}: no image matches 'images'{camera}, and no corners are kept beside it")
-    for i, path in enumerate(session.images):
+    for i, (path, name) in enumerate(zip(session.images, _image_names(session), strict=True)):
         progress(what, i, len(session.images))
         digest = image_hash(path)
-        item = cache.get(path.name, digest)
+        item = cache.get(name, digest)
         if item is None:
             image = read_image(path)
             item = FoundCorners((image.shape[1], image.shape[0]), detect_boards(image, session.boards))
-            cache.put(path.name, digest, item)
-        found[path.name] = item
+            cache.put(name, digest, item)
+        found[name] = item
     progress(what, len(session.images), len(session.images))
-    cache.save()
+    try:
+        cache.save()
+    except InputError as error:
+        note(f"{error}; the corners are used, but not kept")
     return found
+
+
+def _image_names(session: Session) -> list[str]:
+    """Return a name for each image: of two that are called alike in several folders, with the folder."""
+    common = Counter(path.name for path in session.images)
+    home = session.path.resolve().parent
+    return [
+        path.name if common[path.name] == 1 else Path(os.path.relpath(path, home)).as_posix() for path in session.images
+    ]
 
 
 def summary(calibration: Calibration) -> dict[str, Any]:

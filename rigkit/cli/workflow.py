@@ -118,12 +118,12 @@ class LoadedCamera:
 def load_cameras(dataset: Dataset, *, recalibrate: bool, progress: Progress) -> dict[str, LoadedCamera]:
     """Return the cameras of a data set, calibrating those in use from their sessions where that was not done yet.
 
-    A new calibration is kept beside its session. Cameras that no pair uses come along where they are calibrated: an
-    image may fit one of them better than the camera that it is said to be from.
+    A new calibration is kept beside its session where files can be written there. Cameras that no pair uses come along
+    where they are calibrated: an image may fit one of them better than the camera that it is said to be from.
     """
     from rigkit.cli.calibrate import calibrate_session
+    from rigkit.cli.console import note
     from rigkit.io.calibration_file import save_calibration
-    from rigkit.io.files import ensure_writable
     from rigkit.io.session import load_session
 
     cameras: dict[str, LoadedCamera] = {}
@@ -140,9 +140,13 @@ def load_cameras(dataset: Dataset, *, recalibrate: bool, progress: Progress) -> 
                 f"{dataset.manifest}: camera '{entry.camera_id}' has no session to calibrate from; "
                 'add session = "session.toml" to its table'
             )
-        ensure_writable(entry.calibration, force=True)
+        if entry.calibration.is_dir():
+            raise InputError(f"camera '{entry.camera_id}': '{entry.calibration}' is a folder; correct the manifest")
         calibration = calibrate_session(load_session(entry.session), progress)
-        save_calibration(entry.calibration, calibration, force=True)
+        try:
+            save_calibration(entry.calibration, calibration, force=True)
+        except InputError as error:
+            note(f"{error}; the new calibration is used, but not kept")
         cameras[entry.camera_id] = LoadedCamera(calibration.camera, calibration.covariance)
     return cameras
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -88,6 +89,36 @@ def test_bad_input(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (session.parent / "corners.json").unlink(missing_ok=True)
     assert main(["calibrate", str(session)]) == 2
     assert "no image matches" in capsys.readouterr().err
+
+
+def test_images_of_one_name_in_two_folders(session: Path) -> None:
+    for k, path in enumerate(sorted(session.parent.glob("*.jpg"))):
+        folder = session.parent / f"day{k % 2}"
+        folder.mkdir(exist_ok=True)
+        path.rename(folder / f"{k // 2}.jpg")
+    session.write_text(SESSION.replace('"*.jpg"', '"day*/*.jpg"'))
+    assert main(["calibrate", str(session)]) == 0
+    views = load_calibration(session.parent / "calibration.json").views
+    assert sorted(v.image for v in views) == ["2.jpg", "day0/0.jpg", "day0/1.jpg", "day1/0.jpg", "day1/1.jpg"]
+
+
+def test_session_where_nothing_can_be_written(
+    session: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A capture on a read-only medium: the result goes elsewhere, only the corners are not kept."""
+    allowed = os.access
+
+    def access(path: str | Path, mode: int) -> bool:
+        return not (Path(path) == session.parent and mode & os.W_OK) and allowed(path, mode)
+
+    monkeypatch.setattr(os, "access", access)
+    target = tmp_path_factory.mktemp("elsewhere") / "calibration.json"
+    assert main(["calibrate", str(session), "-o", str(target)]) == 0
+    assert "not kept" in capsys.readouterr().err
+    assert target.is_file() and not (session.parent / "corners.json").exists()
 
 
 def test_what_is_no_image(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
