@@ -10,7 +10,7 @@ from rigkit.calibration.normal import Normal
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import BoardShape, Calibration, Candidate, Outlier, ViewResult
 from rigkit.calibration.solver import State
-from rigkit.calibration.uncertainty import projection_uncertainty
+from rigkit.calibration.uncertainty import uncertainty_at_corners
 from rigkit.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
@@ -21,8 +21,6 @@ UNKNOWN_SHARE = 0.05
 """A projection that is uncertain by this part of the image's width, where the boards were, is not determined."""
 LEAST_SIGMA_PX = 0.02
 """No corner is better than this: keeps data without noise from looking determined by rounding."""
-CHECK_EVERY = 5
-"""One corner in so many is enough to see whether the lens is determined."""
 
 
 def assemble(
@@ -105,8 +103,7 @@ def frame_covariance(normal: Normal, state: State) -> FloatArray:
 
 def _require_determined(result: Calibration) -> None:
     """Raise DegenerateError where the views leave the lens open, even at the corners that they have."""
-    pixels = np.concatenate([view.pixels[view.kept] for view in result.views])[::CHECK_EVERY]
-    worst = projection_uncertainty(result, pixels).worst_px
+    worst = uncertainty_at_corners(result)
     sigma = float(np.nanmedian(worst)) if np.isfinite(worst).any() else np.inf
     if result.sigma_px > 0.0:
         sigma *= max(result.sigma_px, LEAST_SIGMA_PX) / result.sigma_px

@@ -20,7 +20,10 @@ import numpy as np
 from rigkit.arrays import BoolArray, FloatArray, Pixels
 from rigkit.calibration.result import Calibration
 
-__all__ = ["Uncertainty", "projection_uncertainty", "uncertainty_map"]
+__all__ = ["Uncertainty", "projection_uncertainty", "uncertainty_at_corners", "uncertainty_map"]
+
+CORNERS = 400
+"""So many corners, spread over all views, are enough to see how sure the projection is where the boards were."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -69,6 +72,13 @@ def projection_uncertainty(calibration: Calibration, pixels: Pixels, *, range_mm
         covariance[:, i, j] = covariance[:, j, i] = np.einsum("kn,kn->n", design[i], moved[j])
     covariance = covariance.reshape(*valid.shape, 2, 2)
     return Uncertainty(pixels, np.where(valid[..., None, None], covariance, np.nan), valid)
+
+
+def uncertainty_at_corners(calibration: Calibration) -> FloatArray:
+    """Return the standard deviation in the worst direction, (M,) px, at up to 400 of the corners used."""
+    pixels = np.concatenate([view.pixels[view.kept] for view in calibration.views])
+    chosen = np.linspace(0, len(pixels) - 1, min(CORNERS, len(pixels))).astype(np.int64)
+    return projection_uncertainty(calibration, pixels[chosen]).worst_px
 
 
 def uncertainty_map(

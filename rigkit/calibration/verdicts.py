@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.uncertainty import projection_uncertainty, uncertainty_map
+from rigkit.calibration.uncertainty import uncertainty_at_corners, uncertainty_map
 
 __all__ = ["judge"]
 
@@ -28,8 +28,6 @@ PATTERN = 0.35
 """Correlation of residuals of neighbouring corners: noise has 0 (a fitted pose makes it slightly negative)."""
 OVERFIT = 1.25
 """Held-out over training RMS."""
-SAMPLE = 5
-"""One corner in so many is enough to see how sure the projection is."""
 UNSURE_PX = 1.0
 """Worst-direction standard deviation of a projection, in the covered part of the image."""
 ASPECT = 2e-3
@@ -155,8 +153,7 @@ def _overfit(c: Calibration) -> list[str]:
 
 
 def _unsure(c: Calibration) -> list[str]:
-    pixels = np.concatenate([v.pixels[v.kept] for v in c.views])[::SAMPLE]
-    inside = projection_uncertainty(c, pixels).worst_px
+    inside = uncertainty_at_corners(c)
     worst = float(np.nanmax(inside)) if np.isfinite(inside).any() else np.inf
     if worst <= UNSURE_PX:
         return []
