@@ -17,6 +17,9 @@ MEAN_NORMAL_DEG = {"general": 0.4, "planar": 0.4, "standard": 0.4, "forward": 3.
 BASELINE_PERCENT = 0.15
 ROTATION_DEG = 0.015
 
+PAPER_OVER_OURS = {"orthogonality_deg": 12.0, "mean_normal_deg": 4.0, "baseline_mm": 20.0}
+"""What the averages over the cells of the paper's tables should gain by at least."""
+
 PAIRS = [f"{lens}-{pose}" for lens in ("regular", "fisheye") for pose in ORTHOGONALITY_DEG]
 
 
@@ -51,3 +54,11 @@ def test_pair_against_truth(measured: dict[str, Any], pair_id: str) -> None:
     assert max(best["mean_normal_deg"]) <= MEAN_NORMAL_DEG[pose]
     assert abs(best["baseline_percent"]) <= BASELINE_PERCENT
     assert best["rotation_deg"] <= ROTATION_DEG
+
+
+@pytest.mark.real
+def test_averages_against_those_of_the_paper(measured: dict[str, Any]) -> None:
+    found = load_accuracy().averages(list(measured.values()))
+    assert found.keys() == PAPER_OVER_OURS.keys()
+    for what, (ours, paper) in found.items():
+        assert paper / ours >= PAPER_OVER_OURS[what], (what, ours, paper)
