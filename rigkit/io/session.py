@@ -98,7 +98,11 @@ def images_of(table: TomlTable) -> tuple[Path, ...]:
     found: dict[Path, None] = {}
     absent = []
     for pattern in patterns:
-        matches = [Path(m) for m in sorted(glob.glob(str(table.path.parent / pattern)))]
+        # Only what the person wrote is a pattern, and no file's own name: both may have brackets in them.
+        root = table.path.parent
+        matches = [root / m for m in sorted(glob.glob(pattern, root_dir=root))]
+        if not matches and (root / pattern).is_file():
+            matches = [root / pattern]
         found |= {m.resolve(): None for m in matches if m.is_file()}
         absent += [pattern] if not matches else []
     # No image at all is well where corners are kept; one of several is a mistake.

@@ -91,6 +91,17 @@ def test_bad_input(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "no image matches" in capsys.readouterr().err
 
 
+def test_paths_with_brackets_blanks_and_umlauts(session: Path) -> None:
+    folder = session.parent / "Messung ä 測 [1]"
+    folder.mkdir()
+    for path in (*session.parent.glob("*.jpg"), session, session.parent / "board.toml"):
+        path.rename(folder / path.name)
+    (folder / "04.jpg").rename(folder / "Bild [4].jpg")
+    (folder / "session.toml").write_text(SESSION.replace('"*.jpg"', '["0*.jpg", "Bild [4].jpg"]'), encoding="utf-8")
+    assert main(["calibrate", str(folder / "session.toml")]) == 0
+    assert len(load_calibration(folder / "calibration.json").views) == 5
+
+
 def test_images_of_one_name_in_two_folders(session: Path) -> None:
     for k, path in enumerate(sorted(session.parent.glob("*.jpg"))):
         folder = session.parent / f"day{k % 2}"
