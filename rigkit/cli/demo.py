@@ -16,7 +16,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-j", "--jobs", type=int, metavar="N", help="processes (default: one a core)")
     parser.add_argument("--json", action="store_true", help="print the result for programs")
     # The rest of what `rigkit validate` takes, at its defaults.
-    parser.set_defaults(force=False, recalibrate=False, chain="raw", no_pictures=False, no_crosscheck=False)
+    parser.set_defaults(
+        force=False, recalibrate=False, chain="raw", no_pictures=False, no_crosscheck=False, figures="png"
+    )
 
 
 def run(args: argparse.Namespace) -> int:

@@ -46,6 +46,9 @@ PAPER = "hajder2021"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_dataset_arguments(parser)
     parser.add_argument("--no-pictures", action="store_true", help="leave out PNG pictures and the HTML report")
+    parser.add_argument(
+        "--figures", choices=("png", "pdf"), default="png", help="pdf: the pictures for a paper as well (vectors)"
+    )
     parser.add_argument("--no-crosscheck", action="store_true", help="leave out the comparison with pycolmap")
 
 
@@ -66,6 +69,7 @@ def validate_dataset(args: argparse.Namespace, dataset: Dataset, out: Path) -> i
             args.chain,
             not args.no_pictures,
             not args.no_crosscheck,
+            args.figures == "pdf",
         )
         for pair in dataset.pairs
     ]
@@ -82,6 +86,7 @@ class PairJob:
     chain: str
     pictures: bool
     crosscheck: bool
+    pdf: bool = False
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -136,7 +141,9 @@ def _judge(job: PairJob, matched: MatchedPair, image1: Any, image2: Any, causes:
     if job.crosscheck:
         other = reconstruct_other_chain(matched, pair)
         other_ways = crosscheck(shown, other_chain=other, shifts=shifts[best.affine_method])
-    section = _pictures(reconstructions, shown, reports, other_ways, image1, image2, files) if job.pictures else None
+    section = (
+        _pictures(reconstructions, shown, reports, other_ways, image1, image2, files, job.pdf) if job.pictures else None
+    )
     return PairOutcome(pair.pair_id, reports, best, other_ways, causes, files, section)
 
 
@@ -162,19 +169,23 @@ def _pictures(
     image1: Any,
     image2: Any,
     files: dict[str, bytes],
+    pdf: bool,
 ) -> PairSection:
     """Draw the pair's pictures into `files`; return the section of the page, with the same pictures as JPEG."""
     from rigkit.report.drawings import normal_errors_svg, residuals_svg
-    from rigkit.report.figures import as_jpeg, cloud_png, corners_png, epipolar_png
+    from rigkit.report.figures import as_jpeg, as_pdf, as_png, cloud_figure, corners_figure, epipolar_figure
     from rigkit.report.validation_page import crosscheck_table, pair_section
 
-    drawn = {
-        "corners": corners_png(reconstruction, image1, image2),
-        "epipolar": epipolar_png(reconstruction, image1, image2),
-        "cloud": cloud_png(reconstruction),
+    figures = {
+        "corners": corners_figure(reconstruction, image1, image2),
+        "epipolar": epipolar_figure(reconstruction, image1, image2),
+        "cloud": cloud_figure(reconstruction),
     }
-    for name, data in drawn.items():
-        files[f"{reconstruction.pair_id}/{name}.png"] = data
+    drawn = {name: as_png(figure) for name, figure in figures.items()}
+    for name, figure in figures.items():
+        files[f"{reconstruction.pair_id}/{name}.png"] = drawn[name]
+        if pdf:
+            files[f"{reconstruction.pair_id}/{name}.pdf"] = as_pdf(figure)
     shown = [
         ("Corners as found and matched", "image/jpeg", as_jpeg(drawn["corners"])),
         ("Epipolar curves of every seventh corner", "image/jpeg", as_jpeg(drawn["epipolar"])),

@@ -1,6 +1,6 @@
 """Pictures of a reconstructed pair: corners, epipolar curves, and the oriented cloud with both cameras.
 
-All figures are drawn with matplotlib's object interface (no global state, no display) and returned as PNG bytes.
+All figures are drawn with matplotlib's object interface (no global state, no display).
 """
 
 from __future__ import annotations
@@ -24,12 +24,16 @@ if TYPE_CHECKING:
 __all__ = [
     "BOARD_COLOURS",
     "as_jpeg",
+    "as_pdf",
     "as_png",
     "board_colour",
+    "cloud_figure",
     "cloud_png",
+    "corners_figure",
     "corners_png",
     "difference_png",
     "epipolar_curves",
+    "epipolar_figure",
     "epipolar_png",
     "pair_axes",
 ]
@@ -56,19 +60,24 @@ def board_colour(index: int) -> str:
     return BOARD_COLOURS[index % len(BOARD_COLOURS)]
 
 
-def corners_png(reconstruction: Reconstruction, image1: NDArray[Any], image2: NDArray[Any]) -> bytes:
+def corners_figure(reconstruction: Reconstruction, image1: NDArray[Any], image2: NDArray[Any]) -> Figure:
     """Draw the matched corners over both images: rows joined, first corner marked, boards named."""
     figure, axes = pair_axes(image1, image2)
     for axis, pixels in zip(axes, (reconstruction.pixels1, reconstruction.pixels2), strict=True):
         _draw_boards(axis, reconstruction, pixels)
     axes[0].set_title(f"{reconstruction.pair_id}: corners, view 1", fontsize=9)
     axes[1].set_title("view 2 (ring: first corner)", fontsize=9)
-    return as_png(figure)
+    return figure
 
 
-def epipolar_png(
+def corners_png(reconstruction: Reconstruction, image1: NDArray[Any], image2: NDArray[Any]) -> bytes:
+    """Return `corners_figure` as PNG."""
+    return as_png(corners_figure(reconstruction, image1, image2))
+
+
+def epipolar_figure(
     reconstruction: Reconstruction, image1: NDArray[Any], image2: NDArray[Any], *, every: int = 7
-) -> bytes:
+) -> Figure:
     """Draw every `every`-th corner and its epipolar curve over both images; the curve passes through the corner."""
     figure, axes = pair_axes(image1, image2)
     chosen = np.arange(0, len(reconstruction.pixels1), every)
@@ -95,7 +104,14 @@ def epipolar_png(
         axis.set_ylim(camera.size_px[1] - 0.5, -0.5)
     rms = reconstruction.sampson_rms_px
     axes[0].set_title(f"{reconstruction.pair_id}: epipolar curves, Sampson rms {rms:.3f} px", fontsize=9)
-    return as_png(figure)
+    return figure
+
+
+def epipolar_png(
+    reconstruction: Reconstruction, image1: NDArray[Any], image2: NDArray[Any], *, every: int = 7
+) -> bytes:
+    """Return `epipolar_figure` as PNG."""
+    return as_png(epipolar_figure(reconstruction, image1, image2, every=every))
 
 
 def epipolar_curves(camera1: Camera, camera2: Camera, cam2_from_cam1: Rigid3, pixels1: Pixels) -> FloatArray:
@@ -116,7 +132,7 @@ def epipolar_curves(camera1: Camera, camera2: Camera, cam2_from_cam1: Rigid3, pi
     return np.where(inside[..., None], pixels, np.nan)
 
 
-def cloud_png(reconstruction: Reconstruction, *, unit: str = "mm") -> bytes:
+def cloud_figure(reconstruction: Reconstruction, *, unit: str = "mm") -> Figure:
     """Render the oriented cloud: points and normals by board, both cameras as pyramids, from two directions."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -154,7 +170,12 @@ def cloud_png(reconstruction: Reconstruction, *, unit: str = "mm") -> bytes:
     axis.legend(fontsize=7, loc="upper right")
     title = f"{reconstruction.pair_id}, {reconstruction.affine_method}: {len(cloud)} points, "
     figure.suptitle(f"{title}baseline {reconstruction.baseline_mm:.2f} {unit}", fontsize=10)
-    return as_png(figure)
+    return figure
+
+
+def cloud_png(reconstruction: Reconstruction, *, unit: str = "mm") -> bytes:
+    """Return `cloud_figure` as PNG."""
+    return as_png(cloud_figure(reconstruction, unit=unit))
 
 
 def difference_png(difference: CameraDifference) -> bytes:
@@ -256,6 +277,17 @@ def as_png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     # Photographs hardly get smaller by packing harder, but it takes three times as long.
     figure.savefig(buffer, format="png", pil_kwargs={"compress_level": 2})
+    return buffer.getvalue()
+
+
+def as_pdf(figure: Figure) -> bytes:
+    """Return a figure as PDF for a paper: lines and text stay vectors, photographs are embedded."""
+    import matplotlib
+
+    buffer = io.BytesIO()
+    # TrueType fonts: publishers refuse Type 3. No date: the same figure gives the same file.
+    with matplotlib.rc_context({"pdf.fonttype": 42}):
+        figure.savefig(buffer, format="pdf", metadata={"CreationDate": None})
     return buffer.getvalue()
 
 
