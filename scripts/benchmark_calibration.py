@@ -15,6 +15,8 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -25,7 +27,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from helpers.calibration_scenes import REACH_DEG, SIZE, lens, projection_difference, random_views
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.initialise import initialise
+from rigkit.calibration.observations import Observations
 from rigkit.calibration.rig import calibrate_rig
+from rigkit.calibration.solver import State, solve
 from rigkit.cameras.base import Camera
 from rigkit.cameras.brown import Brown
 from rigkit.cameras.kannala_brandt import KannalaBrandt
@@ -112,6 +117,94 @@ def speed(count: int, repeats: int) -> None:
             print(f"{name:8} {solver:28} {1000 * spent:8.1f} {spent / first:6.1f} {rms:8.4f} {error}")
 
 
+def ceres(count: int, repeats: int) -> None:
+    """The solver alone beside Ceres through pycolmap, from the same start: same cameras, poses and corners."""
+    try:
+        import pycolmap
+    except ImportError:
+        print("\nSolver alone: pycolmap is not installed, no comparison with Ceres")
+        return
+    views, _, _ = random_views(lens("wide"), count, np.random.default_rng(1), reach_deg=REACH_DEG["wide"])
+    observations = Observations.from_views(views)
+    start = next(initialise(observations, SIZE, KannalaBrandt, None))
+    found = solve(observations, start, prior_sigma_px=0.0)
+    own = timed(lambda: solve(observations, start, prior_sigma_px=0.0), repeats)
+    spent = []
+    for _ in range(repeats + 1):
+        model = colmap_model(pycolmap, views, start)
+        options = pycolmap.BundleAdjustmentOptions()
+        options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = True
+        options.print_summary = False
+        options.ceres.solver_options.num_threads = 1
+        config = pycolmap.BundleAdjustmentConfig()
+        for image_id in model.images:
+            config.add_image(image_id)
+        for point_id in model.points3D:
+            config.add_constant_point(point_id)
+        adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
+        begin = time.process_time()
+        adjuster.solve()
+        spent.append(time.process_time() - begin)
+    theirs = statistics.median(spent[1:])
+    camera = model.cameras[1]
+    fitted = camera.params - np.array([0.0, 0.0, 0.5, 0.5, 0.0, 0.0, 0.0, 0.0])
+    squared = sum(
+        float(((camera.img_from_cam(v.points() @ R.T + t) - 0.5 - v.pixels) ** 2).sum())
+        for v, (R, t) in zip(views, _colmap_poses(model), strict=True)
+    )
+    cost = float(found.data.costs.sum())
+    print(
+        f"\nSolver alone from the same start, kannala_brandt, {count} views of 54: rigkit {1000 * own:.1f} ms, Ceres "
+        f"{1000 * theirs:.1f} ms ({theirs / own:.1f} times); cost {cost:.8f} and {squared:.8f}, relative difference "
+        f"{(cost - squared) / squared:.1e}; focal lengths apart by {np.abs(found.state.camera.parameters - fitted)[:2].max():.1e} px"
+    )
+
+
+def colmap_model(pycolmap: ModuleType, views: list[BoardView], start: State) -> Any:
+    """Return a pycolmap reconstruction of the views at the start: one camera, the board's corners as fixed points."""
+    model = pycolmap.Reconstruction()
+    parameters = start.camera.parameters.copy()
+    parameters[2:4] += 0.5
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=1, model="OPENCV_FISHEYE", width=SIZE[0], height=SIZE[1], params=parameters.tolist())
+    )
+    for k, view in enumerate(views):
+        image = pycolmap.Image(name=f"{k}", keypoints=view.pixels + 0.5, camera_id=1, image_id=k + 1)
+        pose = np.column_stack([start.rotation[k], start.translation_mm[k]])
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
+    for j, point in enumerate(views[0].points()):
+        track = pycolmap.Track()
+        for k in range(len(views)):
+            track.add_element(k + 1, j)
+        model.add_point3D(point, track)
+    return model
+
+
+def _colmap_poses(model: Any) -> list[tuple[np.ndarray, np.ndarray]]:
+    matrices = [model.images[k].cam_from_world().matrix() for k in sorted(model.images)]
+    return [(m[:, :3], m[:, 3]) for m in matrices]
+
+
+def multiview(views: dict[str, list[tuple[str, BoardView]]], frames: int) -> list[np.ndarray]:
+    """Return the mounts' translations by cv2.calibrateMultiview, which is given each camera's own calibration."""
+    seen = {name: dict(own) for name, own in views.items()}
+    used = [str(f) for f in range(frames) if any(str(f) in own for own in seen.values())]
+    board = next(iter(views.values()))[0][1].board
+    K, D = [], []
+    for own in views.values():
+        objects, images = opencv_points([v for _, v in own])
+        _, k, d, _, _ = cv2.calibrateCamera([o[0] for o in objects], [i[0] for i in images], SIZE, None, None)
+        K.append(k)
+        D.append(d)
+    blank = np.full((board.corner_count, 2), -1.0, np.float32)
+    pixels = [[own[f].pixels.astype(np.float32) if f in own else blank for f in used] for own in seen.values()]
+    mask = np.array([[255 * (f in own) for f in used] for own in seen.values()], dtype=np.uint8)
+    objects3 = [board.points().astype(np.float32)] * len(used)
+    sizes = [SIZE] * len(seen)
+    *_, T = cv2.calibrateMultiview(objects3, pixels, sizes, mask, np.zeros(len(seen), np.uint8), K, D, None, None)
+    return [np.ravel(t) for t in T]
+
+
 def failures(seeds: int) -> None:
     print(f"\nFailures out of {seeds}: 20 views of a 185-degree lens, boards out to the angle given, no guess")
     for reach in (60.0, 75.0, 85.0, 92.5):
@@ -175,8 +268,12 @@ def rig(frames: int, repeats: int) -> None:
         for c, m in zip(result.cameras, mounts, strict=True)
     ]
     count = sum(len(v) for v in views.values())
+    moved = np.array([m.translation_mm for m in mounts])
+    theirs = timed(lambda: multiview(views, frames), repeats)
+    apart = float(np.linalg.norm(np.array(multiview(views, frames)) - moved, axis=1).max())
     print(
         f"\nRig of 4 cameras, {frames} frames, {count} views: {1000 * spent:.0f} ms, mounts off by {max(errors):.3f} mm"
+        f"; cv2.calibrateCamera and calibrateMultiview {1000 * theirs:.0f} ms ({theirs / spent:.1f} times), {apart:.3f} mm"
     )
     print(opencv_rig(views, frames, mounts))
 
@@ -188,11 +285,11 @@ def opencv_rig(views: dict[str, list[tuple[str, BoardView]]], frames: int, mount
     # It wants a point list for every frame; the mask says which ones count.
     empty = np.zeros((board.corner_count, 2), np.float32)
     pixels = [
-        [own[str(f)].pixels[::-1].astype(np.float32) if str(f) in own else empty for f in range(frames)] for own in seen
+        [own[str(f)].pixels.astype(np.float32) if str(f) in own else empty for f in range(frames)] for own in seen
     ]
     mask = np.array([[str(f) in own for f in range(frames)] for own in seen], dtype=np.uint8)
-    # In squares, and backwards: it takes a board in mm, or one that starts at the origin, for a line.
-    objects = [(board.points()[::-1] / board.square_x_mm).astype(np.float32)] * frames
+    # In squares: it takes a board in mm for a line.
+    objects = [(board.points() / board.square_x_mm).astype(np.float32)] * frames
     start = time.process_time()
     try:
         _, _, _, _, ts = cv2.calibrateMultiview(
@@ -215,6 +312,7 @@ def main() -> None:
     args = parser.parse_args()
     cv2.setNumThreads(1)
     speed(args.views, args.repeats)
+    ceres(args.views, args.repeats)
     scale(args.repeats)
     rig(60, max(1, args.repeats // 2))
     if args.failures:
