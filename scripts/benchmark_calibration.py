@@ -199,10 +199,11 @@ def multiview(views: dict[str, list[tuple[str, BoardView]]], frames: int) -> lis
     blank = np.full((board.corner_count, 2), -1.0, np.float32)
     pixels = [[own[f].pixels.astype(np.float32) if f in own else blank for f in used] for own in seen.values()]
     mask = np.array([[255 * (f in own) for f in used] for own in seen.values()], dtype=np.uint8)
-    objects3 = [board.points().astype(np.float32)] * len(used)
+    # In squares: it takes a board in mm for a line.
+    objects3 = [(board.points() / board.square_x_mm).astype(np.float32)] * len(used)
     sizes = [SIZE] * len(seen)
     *_, T = cv2.calibrateMultiview(objects3, pixels, sizes, mask, np.zeros(len(seen), np.uint8), K, D, None, None)
-    return [np.ravel(t) for t in T]
+    return [np.ravel(t) * board.square_x_mm for t in T]
 
 
 def failures(seeds: int) -> None:
@@ -275,33 +276,6 @@ def rig(frames: int, repeats: int) -> None:
         f"\nRig of 4 cameras, {frames} frames, {count} views: {1000 * spent:.0f} ms, mounts off by {max(errors):.3f} mm"
         f"; cv2.calibrateCamera and calibrateMultiview {1000 * theirs:.0f} ms ({theirs / spent:.1f} times), {apart:.3f} mm"
     )
-    print(opencv_rig(views, frames, mounts))
-
-
-def opencv_rig(views: dict[str, list[tuple[str, BoardView]]], frames: int, mounts: list[Rigid3]) -> str:
-    """Say what cv2.calibrateMultiview makes of the same views (once: it takes seconds)."""
-    board = next(iter(views.values()))[0][1].board
-    seen = [dict(own) for own in views.values()]
-    # It wants a point list for every frame; the mask says which ones count.
-    empty = np.zeros((board.corner_count, 2), np.float32)
-    pixels = [
-        [own[str(f)].pixels.astype(np.float32) if str(f) in own else empty for f in range(frames)] for own in seen
-    ]
-    mask = np.array([[str(f) in own for f in range(frames)] for own in seen], dtype=np.uint8)
-    # In squares: it takes a board in mm for a line.
-    objects = [(board.points() / board.square_x_mm).astype(np.float32)] * frames
-    start = time.process_time()
-    try:
-        _, _, _, _, ts = cv2.calibrateMultiview(
-            objects, pixels, [SIZE] * len(seen), mask, np.zeros(len(seen), np.uint8), None, None, None, None
-        )
-    except cv2.error as error:
-        return f"cv2.calibrateMultiview: failed ({error.err or error})"
-    spent = time.process_time() - start
-    worst = max(
-        float(np.linalg.norm(t.ravel() * board.square_x_mm - m.translation_mm)) for t, m in zip(ts, mounts, strict=True)
-    )
-    return f"cv2.calibrateMultiview, the same views: {1000 * spent:.0f} ms, mounts off by {worst:.3f} mm"
 
 
 def main() -> None:
