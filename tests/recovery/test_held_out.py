@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -11,23 +13,30 @@ from rigkit.arrays import FloatArray
 from rigkit.boards import Board
 from rigkit.cameras.base import Camera, image_center
 from rigkit.cameras.brown import Brown
+from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
+from rigkit.cli.main import main
 from rigkit.corners.detect import detect_boards
 from rigkit.detections import BoardDetection
 from rigkit.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, rotation_angle
+from rigkit.io.calibration_file import save_camera
 from rigkit.pairing import match_pair
 from rigkit.posetype import PoseType
 from rigkit.reconstruct import Reconstruction, reconstruct_pair
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
-from rigkit.synthetic.photometry import Photometry
+from rigkit.synthetic.photometry import Photometry, Shadow
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard, exact_detection
 
 SIZE = (960, 720)
 MIXED = (Board("plane1", 8, 6, 50.0, 50.0), Board("plane2", 7, 6, 50.0, 50.0), Board("plane3", 6, 9, 50.0, 50.0))
 NOISE_PX = 0.05
+RULER_MM, SQUARE_DEG = 0.5, 0.1
+"""What a careful person's rule and protractor would do; the images are good to a few hundredths of that."""
+MOST_CORNERS = 0.95
+"""A few at the rim of a fisheye or in a shadow's edge may be refused."""
 CORNER_PX = 1.0
 """Every corner is the right one; how good it is, is measured elsewhere."""
 SIGMAS = 4.0
@@ -108,3 +117,82 @@ def test_a_board_seen_at_a_flat_angle_in_a_noisy_image(
     # Either way round, where the board looks the same turned.
     truth = exact_detection(placed, camera, Rigid3.identity()).pixels
     assert np.linalg.norm(found.pixels[:, None] - truth, axis=2).min(axis=1).max() < CORNER_PX
+
+
+def fisheye_lens(field_deg: float, size_px: tuple[int, int] = SIZE) -> Camera:
+    """Return a lens whose field of view fills nine tenths of the image's width."""
+    half = np.radians(0.5 * field_deg)
+    focal = 0.45 * size_px[0] / (half - 0.021 * half**3 + 0.0012 * half**5)
+    centre = image_center(size_px) + np.array([-6.0, 4.0])
+    return KannalaBrandt(size_px, np.array([focal, focal, *centre, -0.021, 0.0012, 0.0, 0.0]))
+
+
+def test_two_different_cameras_in_one_pair(tmp_path: Path) -> None:
+    """A regular and a 190 degree lens, images of two sizes, a wall that is not perpendicular; as people run it."""
+    rng = np.random.default_rng(11)
+    cameras = {"one": regular_lens(55.0, size_px=(640, 480)), "two": fisheye_lens(190.0, (800, 600))}
+    scene = trihedral_pair(
+        MIXED, cameras["one"], PoseType.GENERAL, rng, camera2=cameras["two"], angles_deg=(91.6, 90.0, 90.0)
+    )
+    images = scene.images(optics=Optics(0.6), photometry=Photometry(exposure=0.9, noise_levels=3.0), rng=rng)
+    for name, image in zip(cameras, images, strict=True):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), image)
+        save_camera(tmp_path / f"{name}.json", cameras[name])
+    lines = ['schema = "rigkit.dataset/1"', 'name = "two"']
+    for board in MIXED:
+        lines += ["[[boards]]", f'id = "{board.board_id}"', f"columns = {board.columns}", f"rows = {board.rows}"]
+        lines += [f"square_mm = {board.square_x_mm}"]
+    for name in cameras:
+        lines += ["[[cameras]]", f'id = "{name}"', f'calibration = "{name}.json"']
+    lines += ["[[pairs]]", 'id = "pair"', 'camera1 = "one"', 'camera2 = "two"', 'image1 = "one.png"']
+    lines += ['image2 = "two.png"', 'pose_type = "general"', 'boards = ["plane1", "plane2", "plane3"]', "[pairs.truth]"]
+    lines += [f'baseline = {{ value_mm = {scene.baseline_mm}, sigma_mm = {RULER_MM}, how = "exact" }}', "angles = ["]
+    for a, b, angle_deg in (("plane1", "plane2", 88.4), ("plane1", "plane3", 90.0), ("plane2", "plane3", 90.0)):
+        lines += [f'{{ a = "{a}", b = "{b}", value_deg = {angle_deg}, sigma_deg = {SQUARE_DEG}, how = "exact" }},']
+    (tmp_path / "dataset.toml").write_text("\n".join([*lines, "]", ""]))
+    out = tmp_path / "out"
+    assert main(["validate", str(tmp_path), "-o", str(out), "-j", "1", "--no-pictures", "--no-crosscheck"]) == 0
+
+
+BOARDS = {
+    "mixed": MIXED,
+    "equal": tuple(Board(f"plane{k}", 9, 6, 40.0, 40.0) for k in (1, 2, 3)),
+    "two equal": tuple(Board(f"plane{k}", *size, 30.0, 30.0) for k, size in ((1, (6, 5)), (2, (6, 5)), (3, (7, 7)))),
+}
+LENSES = {"long": regular_lens(35.0), "wide": regular_lens(85.0), "fisheye": fisheye_lens(190.0)}
+BAD_IMAGES = {
+    "noise": (Optics(0.6), Photometry(exposure=0.8, vignetting=0.4, noise_levels=8.0)),
+    "blur": (Optics(1.7), Photometry(exposure=0.8, vignetting=0.4, noise_levels=4.0)),
+    "faint": (Optics(0.8), Photometry(exposure=0.3, gamma=0.5, noise_levels=4.0, shadow=Shadow())),
+    "compressed": (Optics(0.8), Photometry(exposure=0.8, noise_levels=4.0, jpeg_quality=60)),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pose_type", [PoseType.GENERAL, PoseType.PLANAR, PoseType.STANDARD, PoseType.FORWARD])
+@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("boards", BOARDS)
+def test_images_of_every_kind(boards: str, lens: str, pose_type: PoseType) -> None:
+    """All boards are found and matched corner by corner in bad images, and the pose is as true as it says."""
+    kinds = list(BAD_IMAGES)
+    number = 12 * list(BOARDS).index(boards) + 4 * list(LENSES).index(lens) + list(PoseType).index(pose_type)
+    rng = np.random.default_rng(number)
+    optics, photometry = BAD_IMAGES[kinds[number % len(kinds)]]
+    distance = (0.6, 0.95) if lens == "fisheye" else (0.9, 1.3)
+    scene = trihedral_pair(
+        BOARDS[boards], LENSES[lens], pose_type, rng, baseline_mm=150.0, level_sigma_deg=0.3, distance=distance
+    )
+    found = [
+        detect_boards(image, BOARDS[boards]) for image in scene.images(optics=optics, photometry=photometry, rng=rng)
+    ]
+    pair = match_pair("held out", scene.camera1, scene.camera2, *found, BOARDS[boards])
+    result = reconstruct_pair(pair, pose_type=pose_type, level_sigma_rad=np.radians(0.3))
+    corners = sum(board.corner_count for board in BOARDS[boards])
+    assert len(result.boards) == 3
+    assert len(pair.captured) > MOST_CORNERS * corners
+    points = [np.concatenate(scene.points_in_cam1())]
+    points.append(scene.cam2_from_cam1.apply(points[0]))
+    pixels = [c.project(p)[0] for c, p in zip((scene.camera1, scene.camera2), points, strict=True)]
+    nearest = np.linalg.norm(pair.captured.pixels1[:, None] - pixels[0], axis=2).argmin(axis=1)
+    assert np.linalg.norm(pair.captured.pixels2 - pixels[1][nearest], axis=1).max() < CORNER_PX
+    assert abs(result.baseline_mm - scene.baseline_mm) < SIGMAS * result.baseline_sigma_mm
