@@ -9,7 +9,6 @@ unless the baseline is known.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import lgamma
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +20,7 @@ from rigkit.arrays import BoolArray, FloatArray
 from rigkit.cameras.base import Camera
 from rigkit.cloud import OrientedCloud
 from rigkit.errors import DegenerateError, InputError, RigkitError
+from rigkit.fundamental.chance import log_false_alarms
 from rigkit.fundamental.estimate import check_baseline
 from rigkit.fundamental.pose import essential_from_pose
 from rigkit.fundamental.refine import RefinedPose, cauchy_weights, refine_pose
@@ -46,7 +46,6 @@ AFFINITY_GATE = 3.7
 MEDIAN_OF_NORMAL = 0.6745
 MEDIAN_OF_RAYLEIGH = 1.1774
 ROUNDS = 4
-SHIFTS = 40
 MAX_FALSE_ALARMS = 1e-2
 MAX_RANGE_SIGMA = 0.3
 """A point whose distance is known no better than this share of it is left out: it could be anywhere along its ray."""
@@ -107,13 +106,7 @@ def reconstruct_scene(
     DegenerateError
         Too few of them agree with any pose; no baseline.
     """
-    if baseline_mm is not None and not (np.isfinite(baseline_mm) and baseline_mm > 0.0):
-        raise InputError(f"'{pair_id}': the baseline must be positive, got {baseline_mm} mm")
-    if correspondences.A21 is None and correspondences.directions is None:
-        raise InputError(
-            f"'{pair_id}': the correspondences have neither affinities nor directions, without which there are no "
-            "normals; add columns a11, a12, a21, a22 or du1_1, dv1_1, ..."
-        )
+    _check(correspondences, baseline_mm, pair_id)
     matches, seen = correspondences.matches(camera1, camera2)
     if len(matches) < MIN_MATCHES:
         raise InputError(
@@ -165,6 +158,16 @@ def reconstruct_scene(
         float(np.median(fit.matches.sigma1_px[fit.inliers])),
         float("nan") if sigma_A is None else float(np.median(sigma_A[fit.inliers])),
     )
+
+
+def _check(correspondences: Correspondences, baseline_mm: float | None, pair_id: str) -> None:
+    if baseline_mm is not None and not (np.isfinite(baseline_mm) and baseline_mm > 0.0):
+        raise InputError(f"'{pair_id}': the baseline must be positive, got {baseline_mm} mm")
+    if correspondences.A21 is None and correspondences.directions is None:
+        raise InputError(
+            f"'{pair_id}': the correspondences have neither affinities nor directions, without which there are no "
+            "normals; add columns a11, a12, a21, a22 or du1_1, dv1_1, ..."
+        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -234,41 +237,15 @@ def _require(inliers: BoolArray) -> None:
 
 
 def _refuse_chance(matches: Matches, pose: Rigid3, inliers: BoolArray, freedom: int) -> None:
-    """Raise DegenerateError where as many of so many wrong matches would be expected to agree with some pose.
-
-    The expected number of poses through a minimal sample that do as well among wrong matches (Moisan and Stival,
-    "A probabilistic criterion to detect rigid point matches"). How often a wrong match fits by chance is seen from the
-    points themselves, partnered wrongly on purpose: on boards and facades it is often; and how often its affinity does,
-    from the matches whose points do not fit.
-    """
-    n, k = len(inliers), int(inliers.sum())
-    fitting = total = 0
-    for shift in range(1, min(n, SHIFTS + 1)):
-        other = matches.select(np.roll(np.arange(n), shift))
-        wrong = replace(
-            matches, rays2=other.rays2, jacobians2=other.jacobians2, sigma2_px=other.sigma2_px, pixels2=other.pixels2
-        )
-        fitting += int((np.abs(_in_sigmas(wrong, pose)) < GATE).sum())
-        total += n
-    log_chance = np.log((fitting + 1.0) / (total + 1.0)) + np.log(_affinities_by_chance(matches, pose))
-    log_expected = np.log(n) + _log_choose(n, k) + _log_choose(k, freedom) + (k - freedom) * log_chance
-    if log_expected > np.log(MAX_FALSE_ALARMS):
+    """Raise DegenerateError where as many of so many wrong matches would be expected to agree with some pose."""
+    affinity = _affinity_in_sigmas(matches, pose)
+    # A match without an affinity always passes that test.
+    fits = ~(np.nan_to_num(affinity) >= AFFINITY_GATE)
+    if log_false_alarms(matches, pose, inliers, fits, freedom, GATE) > np.log(MAX_FALSE_ALARMS):
         raise DegenerateError(
-            f"{k} of {n} correspondences agree with one pose, as many as wrong ones might by chance; the scene has too "
-            "little texture, or looks the same in many places"
+            f"{int(inliers.sum())} of {len(inliers)} correspondences agree with one pose, as many as wrong ones might "
+            "by chance; the scene has too little texture, or looks the same in many places"
         )
-
-
-def _affinities_by_chance(matches: Matches, pose: Rigid3) -> float:
-    """Return how often the affinity of a wrong match fits."""
-    wrong = np.abs(_in_sigmas(matches, pose)) >= GATE
-    doubt = _affinity_in_sigmas(matches, pose)[wrong]
-    # Without an affinity nothing is tested: such a match always fits.
-    return float((np.sum(~(np.nan_to_num(doubt) >= AFFINITY_GATE)) + 1.0) / (wrong.sum() + 1.0))
-
-
-def _log_choose(n: int, k: int) -> float:
-    return lgamma(n + 1.0) - lgamma(k + 1.0) - lgamma(n - k + 1.0)
 
 
 def _in_sigmas(matches: Matches, pose: Rigid3) -> FloatArray:
