@@ -315,9 +315,7 @@ class _Released:
         self._pose = np.zeros((views, points, 3, 6))
         self._own = np.zeros((points, 3, count + 4))
 
-    def add(
-        self, rows: FloatArray, by_board: FloatArray, corner: IntArray, present: BoolArray, first: int
-    ) -> None:
+    def add(self, rows: FloatArray, by_board: FloatArray, corner: IntArray, present: BoolArray, first: int) -> None:
         """Add a block of views, the first of them number `first`."""
         count = len(rows) - 7
         cross = np.einsum("jivc,kivc->vcjk", by_board, rows, optimize=True)[present]

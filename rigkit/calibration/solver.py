@@ -16,7 +16,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, IntArray, Mat3, Points
+from rigkit.arrays import FloatArray, IntArray, Mat3, Points
 from rigkit.calibration.camera_prior import camera_prior
 from rigkit.calibration.normal import Normal, Residuals, Step, lost_px, normal_equations
 from rigkit.calibration.observations import Observations
@@ -35,8 +35,8 @@ COST_TOLERANCE = 1e-11
 """Stop when the quadratic model promises less than this part of the cost: Gauss-Newton converges quadratically here, so
 the optimum is then known to about 1e-10 in cost."""
 DAMPING_START = 1e-13
-"""Monomials of a polynomial are nearly dependent (eigenvalues down to 1e-12 of the scaled system at degree 6): more would
-hold their combinations back. A step that goes too far is refused and the damping grows quickly."""
+"""Monomials of a polynomial are nearly dependent (eigenvalues down to 1e-12 of the scaled system at degree 6): more
+would hold their combinations back. A step that goes too far is refused and the damping grows quickly."""
 DAMPING_SHRINK = 0.01
 """For the same reason; with Nielsen's 1/3 it would be dozens of steps."""
 DAMPING_GROWTH = 4.0
