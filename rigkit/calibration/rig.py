@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.arrays import FloatArray, Points, as_array
-from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.calibrate import FOLDS, calibrate
 from rigkit.calibration.normal import Normal
 from rigkit.calibration.result import Calibration, Convergence
 from rigkit.calibration.rig_frames import Key, Seen, apart, first_frames, mounts_of, seen_by, turned_alike
@@ -133,6 +133,7 @@ def calibrate_rig(
     model: str | Mapping[str, str] = "scaramuzza",
     degree: int | Mapping[str, int | None] | None = None,
     board: str = "flat",
+    folds: int = FOLDS,
     progress: Progress = silent,
 ) -> RigCalibration:
     """Return the calibration of a rig.
@@ -161,7 +162,7 @@ def calibrate_rig(
         try:
             only = [view for _, view in own]
             size = degree[name] if isinstance(degree, Mapping) else degree
-            single.append(calibrate(only, sizes_px[name], model=wanted, degree=size, board=board))
+            single.append(calibrate(only, sizes_px[name], model=wanted, degree=size, board=board, folds=folds))
         except (InputError, DegenerateError) as error:
             raise type(error)(f"camera '{name}': {error}") from error
     progress("cameras", len(views), len(views))
@@ -179,7 +180,8 @@ def _joint(
     points = _board_points(single)
     for i in range(MAX_ROUNDS):
         progress("rig", i, MAX_ROUNDS)
-        _require_linked(names, seen, len(left_out))
+        if left_out:
+            _require_linked(names, seen, len(left_out))
         observations = RigObservations.from_views(
             [[(key, entry.view) for key, entry in s.items()] for s in seen],
             [[entry.kept for entry in s.values()] for s in seen],

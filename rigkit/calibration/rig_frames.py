@@ -91,27 +91,30 @@ def mounts_of(names: Sequence[str], seen: Sequence[Mapping[Key, Seen]]) -> list[
 def _motion(pairs: Sequence[tuple[Seen, Seen]]) -> Rigid3:
     """Return cam2_from_cam1: of the motions of the single boards, turned in all ways that look the same, the one that
     most boards agree on, and then the middle of those that do."""
-    owner, motions, first, second = [], [], [], []
+    owner, poses, corners = [], [], []
     for k, (a, b) in enumerate(pairs):
-        corners = a.view.board.points()[[0, a.view.board.columns - 1, -a.view.board.columns, -1]]
-        for turns in _same_looks(a.view.board):
-            pose = b.turned(turns).cam_from_board
+        board = a.view.board
+        for turns in _same_looks(board):
             owner.append(k)
-            motions.append(pose @ a.cam_from_board.inverse())
-            first.append(a.cam_from_board.apply(corners))
-            second.append(pose.apply(corners))
-    x1, x2 = np.array(first), np.array(second)
+            poses.append((a.cam_from_board, b.turned(turns).cam_from_board))
+            corners.append(board.points()[[0, board.columns - 1, -board.columns, -1]])
+    r1, r2 = (np.array([p[i].rotation for p in poses]) for i in (0, 1))
+    t1, t2 = (np.array([p[i].translation_mm for p in poses]) for i in (0, 1))
+    rotation = r2 @ np.swapaxes(r1, -1, -2)
+    shift = t2 - np.einsum("nij,nj->ni", rotation, t1)
+    points = np.array(corners)
+    x1, x2 = (np.einsum("nij,ncj->nci", r, points) + t[:, None] for r, t in ((r1, t1), (r2, t2)))
+    distance = np.linalg.norm(x2, axis=-1).mean(axis=-1)
     starts = np.flatnonzero(np.diff([-1, *owner]))
-    best, gap = None, np.zeros(0)
-    for motion in motions[:: -(-len(motions) // MAX_TRIED)]:
-        off = np.linalg.norm(motion.apply(x1) - x2, axis=-1).mean(axis=-1) / np.linalg.norm(x2, axis=-1).mean(axis=-1)
-        nearest = np.minimum.reduceat(off, starts)
-        if best is None or np.median(nearest) < np.median(gap):
-            best, gap = off, nearest
-    assert best is not None
-    near = [m for m, off in zip(motions, best, strict=True) if off <= AGREE * np.median(gap) + 1e-12]
-    rotation = nearest_rotation(np.median([m.rotation for m in near], axis=0))
-    return Rigid3(rotation, np.median([m.translation_mm for m in near], axis=0))
+    best, usual = np.zeros(0), np.inf
+    for k in range(0, len(owner), -(-len(owner) // MAX_TRIED)):
+        off = np.linalg.norm(x1 @ rotation[k].T + shift[k] - x2, axis=-1).mean(axis=-1) / distance
+        typical = float(np.median(np.minimum.reduceat(off, starts)))
+        if typical < usual:
+            best, usual = off, typical
+    near = best <= AGREE * usual + 1e-12
+    middle = nearest_rotation(np.median(rotation[near], axis=0))
+    return Rigid3(middle, np.median(shift[near], axis=0))
 
 
 def _same_looks(board: Board) -> tuple[int, ...]:
@@ -129,12 +132,13 @@ def turned_alike(seen: Sequence[Mapping[Key, Seen]], mounts: Sequence[Rigid3]) -
         mine: dict[Key, Seen] = {}
         for key, entry in own.items():
             before = next((i for i in range(k) if key in seen[i]), None)
-            if before is None:
+            looks = _same_looks(entry.view.board)
+            if before is None or len(looks) == 1:
                 mine[key] = entry
                 continue
             expected = mounts[k] @ mounts[before].inverse() @ out[before][key].cam_from_board
             points = entry.view.board.points()
-            ways = [entry.turned(turns) for turns in _same_looks(entry.view.board)]
+            ways = [entry.turned(turns) for turns in looks]
             off = [float(np.linalg.norm(w.cam_from_board.apply(points) - expected.apply(points))) for w in ways]
             mine[key] = ways[int(np.argmin(off))]
         out.append(mine)
@@ -148,19 +152,30 @@ def apart(seen: Sequence[Mapping[Key, Seen]], mounts: Sequence[Rigid3], cameras:
     for i in range(len(seen)):
         for j in range(i + 1, len(seen)):
             motion = mounts[j] @ mounts[i].inverse()
-            for key in seen[i].keys() & seen[j].keys():
-                there = _transfer_px(seen[i][key], seen[j][key], motion, cameras[j])
-                back = _transfer_px(seen[j][key], seen[i][key], motion.inverse(), cameras[i])
-                out[key] = max(out.get(key, 0.0), min(there, back))
+            shared = sorted(seen[i].keys() & seen[j].keys())
+            if not shared:
+                continue
+            first, second = ([own[key] for key in shared] for own in (seen[i], seen[j]))
+            there = _transfer_px(first, second, motion, cameras[j])
+            back = _transfer_px(second, first, motion.inverse(), cameras[i])
+            for key, off in zip(shared, np.minimum(there, back).tolist(), strict=True):
+                out[key] = max(out.get(key, 0.0), off)
     return out
 
 
-def _transfer_px(first: Seen, second: Seen, motion: Rigid3, camera: Camera) -> float:
-    pixels, valid = camera.project((motion @ first.cam_from_board).apply(second.view.points()))
-    use = valid & second.kept
-    if not use.any():
-        return float("inf")
-    return float(np.sqrt(((pixels - second.view.pixels)[use] ** 2).sum(axis=-1).mean()))
+def _transfer_px(first: Sequence[Seen], second: Sequence[Seen], motion: Rigid3, camera: Camera) -> FloatArray:
+    """Return the RMS distance of each board's corners in the second camera from where the first one's pose puts them."""
+    counts = [len(s.view.grid) for s in second]
+    rotation = np.repeat(motion.rotation @ np.array([s.cam_from_board.rotation for s in first]), counts, axis=0)
+    shift = np.repeat(motion.apply(np.array([s.cam_from_board.translation_mm for s in first])), counts, axis=0)
+    points = np.concatenate([s.view.points() for s in second])
+    pixels, valid = camera.project((rotation @ points[..., None])[..., 0] + shift)
+    use = valid & np.concatenate([s.kept for s in second])
+    off = pixels - np.concatenate([s.view.pixels for s in second])
+    squared = np.where(use, np.einsum("ni,ni->n", off, off), 0.0)
+    starts = np.cumsum([0, *counts[:-1]])
+    number = np.add.reduceat(use.astype(np.float64), starts)
+    return np.where(number > 0, np.sqrt(np.add.reduceat(squared, starts) / np.maximum(number, 1.0)), np.inf)
 
 
 def first_frames(
