@@ -164,7 +164,7 @@ def apart(seen: Sequence[Mapping[Key, Seen]], mounts: Sequence[Rigid3], cameras:
 
 
 def _transfer_px(first: Sequence[Seen], second: Sequence[Seen], motion: Rigid3, camera: Camera) -> FloatArray:
-    """Return the RMS distance of each board's corners in the second camera from where the first one's pose puts them."""
+    """Return the RMS distance of each board's corners in the second camera from where the first's pose puts them."""
     counts = [len(s.view.grid) for s in second]
     rotation = np.repeat(motion.rotation @ np.array([s.cam_from_board.rotation for s in first]), counts, axis=0)
     shift = np.repeat(motion.apply(np.array([s.cam_from_board.translation_mm for s in first])), counts, axis=0)
