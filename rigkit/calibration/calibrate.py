@@ -26,7 +26,7 @@ from rigkit.detections import BoardView
 from rigkit.errors import DegenerateError, InputError
 from rigkit.progress import Progress, silent
 
-__all__ = ["DEGREES_TRIED", "calibrate"]
+__all__ = ["DEGREES_TRIED", "FOLDS", "calibrate"]
 
 FOLDS = 5
 MARGIN = 0.005

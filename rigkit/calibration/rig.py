@@ -145,6 +145,7 @@ def calibrate_rig(
     model, degree : as for `calibrate`, one for all cameras or one for each.
     board : as for `calibrate`; a warped or released board keeps the shape that the cameras found alone, on
         average.
+    folds : of each camera's cross-validation, 0 for none.
 
     Raises
     ------

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rigkit.arrays import Pixels
 from rigkit.boards import Board
 from rigkit.detections import BoardDetection, BoardView
 from rigkit.errors import InputError
@@ -30,8 +31,9 @@ def usable_views(
     """
     if not views:
         raise InputError("calibration: no views; at least one image in which a board was found is needed")
-    outside = [view.image for view in views if not _inside(view, size_px)]
-    if outside:
+    corners = np.concatenate([view.pixels for view in views])
+    if not _inside(corners, size_px):
+        outside = [view.image for view in views if not _inside(view.pixels, size_px)]
         more = f" and {len(outside) - 1} more" if len(outside) > 1 else ""
         raise InputError(
             f"image '{outside[0]}'{more}: corners outside {size_px[0]}x{size_px[1]} px; all images of a session must "
@@ -49,15 +51,16 @@ def usable_views(
     return used, tuple(dropped)
 
 
-def _inside(view: BoardView, size_px: tuple[int, int]) -> bool:
-    return bool(((view.pixels >= -0.5) & (view.pixels <= np.array(size_px) - 0.5)).all())
+def _inside(pixels: Pixels, size_px: tuple[int, int]) -> bool:
+    return bool(((pixels >= -0.5) & (pixels <= np.array(size_px) - 0.5)).all())
 
 
 def _reason(view: BoardView) -> str | None:
     if len(view.grid) < MIN_CORNERS:
         return f"{len(view.grid)} corners of board '{view.board.board_id}', at least {MIN_CORNERS} are needed"
-    x, y = (view.grid - view.grid.mean(axis=0)).T
-    xx, yy, xy = float(x @ x), float(y @ y), float(x @ y)
+    grid = view.grid.astype(np.float64)
+    grid -= grid.sum(axis=0) / len(grid)
+    (xx, xy), (_, yy) = (grid.T @ grid).tolist()
     if xx * yy - xy * xy < MIN_SPREAD * (xx + yy) ** 2:
         return f"the corners of board '{view.board.board_id}' lie on one line"
     return None
