@@ -109,9 +109,13 @@ def coverage_svg(calibration: Calibration) -> str:
     out.append(
         f'<path d="{_dots(zoom * pixels[kept][::step])}" stroke="{MARK}" stroke-width="2.2" stroke-linecap="round"/>'
     )
-    empty = int((count == 0).sum())
+    middles = (np.stack(np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij"), axis=-1) + 0.5) * size - 0.5
+    seen = calibration.camera.unproject(middles)[1] | (count > 0)
+    empty = int((seen & (count == 0)).sum())
     words = f"{int(kept.sum())} corners of {len(calibration.views)} boards seen"
-    return "".join([*out, _foot(calibration, words, f"{empty} of {columns * rows} cells are empty")])
+    return "".join(
+        [*out, _foot(calibration, words, f"{empty} of the {int(seen.sum())} cells that the lens sees are empty")]
+    )
 
 
 def uncertainty_svg(calibration: Calibration) -> str:
