@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from rigkit.validation.checks import ValidationReport
     from rigkit.validation.crosscheck import CrossCheckReport
     from rigkit.validation.intrinsics import CalibrationShifts
-    from rigkit.validation.tables import PaperTables
+    from rigkit.validation.tables import PaperTables, Table
 
 HELP = "the tables against measured truth, report and PLY; exit code 1 if a check fails"
 
@@ -225,7 +225,7 @@ def finish(args: argparse.Namespace, dataset: Dataset, outcomes: list[PairOutcom
     sections = [outcome.section for outcome in outcomes if outcome.section is not None]
     if sections:
         lead = f"{len(outcomes)} pairs, {len(reports)} reconstructions, {seconds:.0f} s"
-        shown = [table for table in tables if table.key not in ("checks", "estimators")]
+        shown = [table for table in tables if table.key not in ("checks", "estimators")] + _calibrations(dataset)
         title = f"rigkit validation: {dataset.name}"
         files["report.html"] = build_page(title, lead, passed, shown, sections, _provenance(args, dataset))
     write_results(out, files, force=args.force)
@@ -272,6 +272,24 @@ def _say_failures(reports: list[ValidationReport], compared: list[CrossCheckRepo
                 )
     for words in dict.fromkeys(f"{report.pair_id}: {n}" for report in reports for n in report.notes):
         note(words)
+
+
+def _calibrations(dataset: Dataset) -> list[Table]:
+    """Return the table of the cameras in use; none where their files say no more than the camera."""
+    from rigkit.errors import InputError
+    from rigkit.io.calibration_file import load_calibration
+    from rigkit.report.validation_page import camera_table
+
+    used = {name for pair in dataset.pairs for name in (pair.camera1.camera_id, pair.camera2.camera_id)}
+    known = {}
+    for entry in dataset.cameras:
+        if entry.camera_id in used:
+            try:
+                known[entry.camera_id] = load_calibration(entry.calibration)
+            except InputError:
+                # Another tool's camera, or a calibration that could not be kept: the reconstruction did without.
+                continue
+    return [camera_table(known)] if known else []
 
 
 def _paper_tables(dataset: Dataset) -> PaperTables | None:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.uncertainty import uncertainty_at_corners
 from rigkit.reconstruct import Reconstruction
 from rigkit.report.page import PairSection, scene_of
 from rigkit.validation.checks import ValidationReport
 from rigkit.validation.crosscheck import CrossCheckReport
 from rigkit.validation.tables import Cell, Column, Table, check_table
 
-__all__ = ["best_report", "crosscheck_table", "pair_section", "summary_table"]
+__all__ = ["best_report", "camera_table", "crosscheck_table", "pair_section", "summary_table"]
 
 
 def best_report(reports: Sequence[ValidationReport]) -> ValidationReport:
@@ -53,6 +55,41 @@ def summary_table(reports: Sequence[ValidationReport]) -> Table:
             )
         )
     return Table("summary", "Every pair with its best estimator", columns, tuple(rows))
+
+
+def camera_table(calibrations: Mapping[str, Calibration]) -> Table:
+    """Return one line a calibrated camera: what it rests on and how good it is."""
+    columns = (
+        Column("camera"),
+        Column("model"),
+        Column("images", "", 0),
+        Column("corners", "", 0),
+        Column("held-out RMS", "px"),
+        Column("training RMS", "px"),
+        Column("uncertainty, median", "px", 4),
+        Column("uncertainty, 95 %", "px", 4),
+        Column("remarks"),
+    )
+    rows = []
+    for name, c in calibrations.items():
+        uncertainty = uncertainty_at_corners(c)
+        middle, high = np.nanquantile(uncertainty, [0.5, 0.95])
+        remarks = sum(not verdict.startswith("good") for verdict in c.verdicts)
+        rows.append(
+            (
+                Cell(name),
+                Cell(c.camera.model),
+                Cell(float(len({view.image for view in c.views}))),
+                Cell(float(c.corner_count)),
+                Cell(c.heldout_rms_px),
+                Cell(c.rms_px),
+                Cell(float(middle)),
+                Cell(float(high)),
+                Cell(f"{remarks}: see its own report" if remarks else "none"),
+            )
+        )
+    note = "Uncertainty: of the projection where the boards were, standard deviation in the worst direction."
+    return Table("cameras", "Calibrations", columns, tuple(rows), note)
 
 
 def pair_section(
