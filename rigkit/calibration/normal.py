@@ -66,6 +66,7 @@ class Normal:
     gg (G, G), gp (V, G, 6), pp (V, 6, 6), g (G,), p (V, 6).
     costs : (V,) cost of each view's residuals, px^2.
     residuals : of the corners, not weighted; those of all cameras of a rig one after the other.
+    prior_cost : what the priors add to the cost, px^2.
     points_from : the globals from here on are released board points: three each, coupled within a point only. None
         where there are none.
     """
@@ -77,6 +78,7 @@ class Normal:
     p: FloatArray
     costs: FloatArray
     residuals: tuple[Residuals, ...]
+    prior_cost: float = 0.0
     points_from: int | None = None
 
     def with_priors(self, camera: Camera, sigma_px: float, shape_sigma: FloatArray, unknowns: FloatArray) -> Normal:
@@ -89,12 +91,20 @@ class Normal:
         p = camera.parameters.size
         gg[:p, :p] += sigma_px**2 * rows.T @ rows
         g[:p] -= sigma_px**2 * rows.T @ residual
+        cost = sigma_px**2 * float(residual @ residual)
         if unknowns.size:
             weight = (sigma_px / shape_sigma) ** 2
             own = np.arange(len(g) - unknowns.size, len(g))
             gg[own, own] += weight
             g[own] -= weight * unknowns
-        return replace(self, gg=gg, g=g)
+            cost += float((weight * unknowns**2).sum())
+        return replace(self, gg=gg, g=g, prior_cost=cost)
+
+    @property
+    def cost(self) -> float:
+        """The cost, priors included, infinite where the state makes no camera."""
+        total = float(self.costs.sum()) + self.prior_cost
+        return total if np.isfinite(total) else np.inf
 
     def step(self, damping: float) -> Step | None:
         """Return the damped Gauss-Newton step, None where the damped system is not positive definite."""

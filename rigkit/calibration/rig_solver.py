@@ -142,7 +142,7 @@ def solve_rig(observations: RigObservations, start: RigState) -> tuple[RigState,
 
     def linearise(state: RigState) -> Linearised:
         normal = rig_normal(observations, state)
-        return Linearised(float(normal.costs.sum()), normal, normal)
+        return Linearised(normal, normal)
 
     state, last, convergence = minimise(start, linearise, _moved)
     return state, last.normal, convergence

@@ -17,7 +17,6 @@ from typing import TypeVar
 import numpy as np
 
 from rigkit.arrays import FloatArray, IntArray, Mat3, Points
-from rigkit.calibration.camera_prior import camera_prior
 from rigkit.calibration.normal import Normal, Residuals, Step, lost_px, normal_equations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Convergence
@@ -71,9 +70,8 @@ class State:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Linearised:
-    """The problem around a state: its cost, the normal equations of the corners, and those with all priors added."""
+    """The problem around a state: the normal equations of the corners, and those with all priors added."""
 
-    cost: float
     data: Normal
     normal: Normal
 
@@ -141,14 +139,8 @@ class _Solver:
             self.weight,
             self.loss_px,
         )
-        _, camera = camera_prior(state.camera)
-        prior = float(camera @ camera)
-        if state.shape.count:
-            prior += float(((state.unknowns / state.shape.sigma) ** 2).sum())
-        cost = float(normal.costs.sum()) + self.prior_sigma_px**2 * prior
-        cost = cost if np.isfinite(cost) else np.inf
         priors = state.camera, self.prior_sigma_px, state.shape.sigma, state.unknowns
-        return Linearised(cost, normal, normal.with_priors(*priors))
+        return Linearised(normal, normal.with_priors(*priors))
 
 
 def minimise(
@@ -172,13 +164,13 @@ def minimise(
             if damping > DAMPING_MAX:
                 return state, here, Convergence(iteration, False, "the normal equations are singular")
             continue
-        if step.predicted <= tolerance * here.cost:
+        if step.predicted <= tolerance * here.normal.cost:
             return state, here, Convergence(iteration, True, "cost stationary")
         trial = moved(state, step)
         there = None if trial is None else linearise(trial)
-        gain = -np.inf if there is None else (here.cost - there.cost) / step.predicted
+        gain = -np.inf if there is None else (here.normal.cost - there.normal.cost) / step.predicted
         if trial is not None and there is not None and gain > 0.0:
-            stationary = here.cost - there.cost <= tolerance * here.cost and gain > 0.5
+            stationary = here.normal.cost - there.normal.cost <= tolerance * here.normal.cost and gain > 0.5
             state, here = trial, there
             if stationary:
                 return state, here, Convergence(iteration, True, "cost stationary")
