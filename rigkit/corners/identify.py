@@ -163,8 +163,9 @@ def _tie_note(winner: Solution, others: Sequence[Solution]) -> str:
     roll = np.degrees(_roll_rad(winner))
     next_roll = np.degrees(min(_roll_rad(s) for s in others))
     what = "one board alone" if len(winner.links) == 1 else "the arrangement of the boards"
+    why = "with the smallest roll" if roll <= next_roll else "that the boards' colours speak for, not the smallest roll"
     return (
-        f"ambiguous: {what} cannot tell {len(others) + 1} assignments apart; took the one with the smallest roll "
+        f"ambiguous: {what} cannot tell {len(others) + 1} assignments apart; took the one {why} "
         f"between the cameras ({roll:.1f} degrees, next {next_roll:.1f}); boards of different sizes would settle it"
     )
 
