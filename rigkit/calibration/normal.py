@@ -19,7 +19,7 @@ from rigkit.cameras.base import Camera
 
 __all__ = ["Normal", "Residuals", "Step", "lost_px", "normal_equations"]
 
-BLOCK = 4096
+BLOCK = 8192
 """Corners linearised at a time: their derivatives then stay in the cache, and memory does not grow with the views."""
 
 FLOOR = 1e-24
