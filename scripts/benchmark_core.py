@@ -2,8 +2,9 @@
 
 python scripts/benchmark_core.py [--only affine|epipolar|robust] [--corners 1000000] [--json]
 
-Times are of the processor: other programs on the machine hardly change them. Ratios are to the other's rate at the same problems: above 1 rigkit is faster. PoseLib is optional (pip install
-poselib). Where two programs estimate the same pose the median errors are shown as well.
+Times are of the processor: other programs on the machine hardly change them. Ratios are to the other's rate at the
+same problems: above 1 rigkit is faster. PoseLib is optional (pip install poselib). Where two programs estimate the same
+pose the median errors are shown as well.
 """
 
 from __future__ import annotations
