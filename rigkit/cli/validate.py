@@ -224,7 +224,7 @@ def finish(args: argparse.Namespace, dataset: Dataset, outcomes: list[PairOutcom
         files.update(outcome.files)
     sections = [outcome.section for outcome in outcomes if outcome.section is not None]
     if sections:
-        lead = f"{len(outcomes)} pairs, {len(reports)} reconstructions, {seconds:.0f} s"
+        lead = f"pairs: {len(outcomes)}; reconstructions: {len(reports)}; {seconds:.0f} s"
         shown = [table for table in tables if table.key not in ("checks", "estimators")] + _calibrations(dataset)
         title = f"rigkit validation: {dataset.name}"
         files["report.html"] = build_page(title, lead, passed, shown, sections, _provenance(args, dataset))
