@@ -10,7 +10,7 @@ Layers, each importing only rows below it (tests/test_architecture.py reads the 
     3  corners | affine | fundamental | calibration | synthetic | interop
     2  cameras       protocol, models, rectification, registry
     1  geometry | boards | detections | matches | cloud | posetype | progress
-    0  errors | arrays
+    0  errors | arrays | native (compiled kernels, optional)
 
 Conventions: `b_from_a` maps a to b, `x_in_a` lives in a, touching names match; camera x right, y down, z forward; pixel
 (0, 0) is the centre of the top-left pixel; `x2.T @ F21 @ x1 = 0`, `d2 ~ A21 @ d1`; lengths in mm; angles in radians

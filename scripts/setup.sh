@@ -1,6 +1,6 @@
 # Sourced by scripts/run and scripts/test: makes .venv and installs what is missing.
 # By hand on Debian or Ubuntu:
-#   apt-get install python3 python3-venv libegl1 libgl1 libusb-1.0-0
+#   apt-get install python3 python3-venv gcc libc6-dev libegl1 libgl1 libusb-1.0-0
 #   python3 -m venv .venv && .venv/bin/pip install -e '.[dev]'
 
 say() { printf 'rigkit set-up: %s\n' "$*" >&2; }
@@ -58,10 +58,13 @@ set_up() {
         rm -rf "$venv"
         "$python" -m venv "$venv"
     fi
-    wanted="$extras $(cat "$root/pyproject.toml" "$root/scripts/setup.sh" | cksum)"
+    wanted="$extras $(cat "$root/pyproject.toml" "$root/setup.py" "$root/scripts/setup.sh" "$root"/rigkit/native/*.[ch] | cksum)"
     stamp="$venv/.rigkit-installed"
     # The tests' set-up contains the plain one.
     if ! { [ -x "$venv/bin/rigkit" ] && grep -qxF -e "$wanted" -e "[dev] ${wanted#* }" "$stamp" 2>/dev/null; }; then
+        if ! command -v gcc >/dev/null 2>&1 && ! command -v cc >/dev/null 2>&1; then
+            (system_packages gcc libc6-dev) || say "going on without a C compiler: detection will be several times slower"
+        fi
         say "installing Python packages (about 600 MB the first time)"
         "$venv/bin/python" -m pip install --quiet --disable-pip-version-check -e "$root$extras" >&2 ||
             { say "pip could not install the packages; see above"; exit 2; }

@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "rigkit"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
 LAYERS: tuple[tuple[str, ...], ...] = (
-    ("errors", "arrays"),
+    ("errors", "arrays", "native"),
     ("geometry", "boards", "detections", "matches", "cloud", "posetype", "progress", "truth"),
     ("cameras",),
     ("corners", "affine", "fundamental", "calibration", "synthetic", "interop"),
