@@ -1,4 +1,4 @@
-"""Compiled kernels for the loops that numpy is slow at, used where they are there; without them everything works, slower.
+"""Compiled kernels for the loops that numpy is slow at. Without them everything works, slower.
 
 They are plain C called through ctypes, one library a C file, built when the package is installed (setup.py) if the
 machine has a C compiler. Every kernel repeats one function of the package that is written in numpy, gives the same
