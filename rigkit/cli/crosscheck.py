@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 from rigkit.cli.console import note, print_json, progress_on_stderr
 from rigkit.cli.workflow import (
     add_dataset_arguments,
+    exit_code_of,
+    failed_pairs,
     load_cameras,
     match_images,
     output_folder,
@@ -64,16 +66,17 @@ def run(args: argparse.Namespace) -> int:
     progress = progress_on_stderr()
     cameras = load_cameras(dataset, recalibrate=args.recalibrate, progress=progress)
     jobs = [PairJob(p, cameras[p.camera1.camera_id], cameras[p.camera2.camera_id], args.chain) for p in dataset.pairs]
-    reports = list(over_pairs(crosscheck_pair, jobs, args.jobs, "cross-checking pairs", progress))
+    reports, failures = over_pairs(crosscheck_pair, jobs, args.jobs, "cross-checking pairs", progress)
     table = crosscheck_table(reports)
     files: dict[str, str | bytes] = {
         "crosscheck.md": tables_to_markdown([table]),
         "crosscheck.json": tables_to_json([table]),
     }
     write_results(out, files, force=args.force)
-    passed = all(report.passed for report in reports)
+    passed = not failures and all(report.passed for report in reports)
     if args.json:
-        print_json({"passed": passed, "output": str(out), "pairs": [report.to_dict() for report in reports]})
+        pairs = [report.to_dict() for report in reports]
+        print_json({"passed": passed, "output": str(out), "pairs": pairs} | failed_pairs(failures))
     else:
         print(tables_to_text([table]))
         for report in reports:
@@ -82,4 +85,4 @@ def run(args: argparse.Namespace) -> int:
     for report in reports:
         for words in report.skipped:
             note(f"{report.pair_id}: {words}")
-    return 0 if passed else EXIT_CHECK_FAILED
+    return exit_code_of(failures, 0 if passed else EXIT_CHECK_FAILED)

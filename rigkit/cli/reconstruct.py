@@ -11,6 +11,8 @@ from rigkit.cli.console import note, print_json, progress_on_stderr
 from rigkit.cli.reconstruct_scene import add_scene_arguments, is_scene, run_scene
 from rigkit.cli.workflow import (
     add_dataset_arguments,
+    exit_code_of,
+    failed_pairs,
     load_cameras,
     match_images,
     output_folder,
@@ -54,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
         )
         for pair in dataset.pairs
     ]
-    outcomes = list(over_pairs(reconstruct_files, jobs, args.jobs, "reconstructing pairs", progress))
+    outcomes, failures = over_pairs(reconstruct_files, jobs, args.jobs, "reconstructing pairs", progress)
     files: dict[str, str | bytes] = {}
     for outcome in outcomes:
         files.update(outcome.files)
@@ -63,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
         for words in outcome.result["notes"]:
             note(f"{outcome.result['pair']}: {words}")
     if args.json:
-        print_json({"output": str(out), "pairs": [outcome.result for outcome in outcomes]})
+        print_json({"output": str(out), "pairs": [outcome.result for outcome in outcomes]} | failed_pairs(failures))
     else:
         for outcome in outcomes:
             r = outcome.result
@@ -71,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
                 f"{out / r['ply']}: {r['points']} points, {len(r['boards'])} boards, baseline {r['baseline_mm']:.3f} ± "
                 f"{r['baseline_sigma_mm']:.3f} mm, Sampson rms {r['sampson_rms_px']:.3f} px, {r['pose_type']}"
             )
-    return 0
+    return exit_code_of(failures, 0)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

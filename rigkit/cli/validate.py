@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 from rigkit.cli.console import note, print_json, progress_on_stderr
 from rigkit.cli.workflow import (
     add_dataset_arguments,
+    exit_code_of,
+    failed_pairs,
     find_boards,
     load_cameras,
     match_found,
@@ -25,7 +27,7 @@ from rigkit.cli.workflow import (
 )
 
 if TYPE_CHECKING:
-    from rigkit.cli.workflow import LoadedCamera
+    from rigkit.cli.workflow import LoadedCamera, PairFailure
     from rigkit.io.manifest import Dataset, Pair
     from rigkit.pairing import MatchedPair
     from rigkit.reconstruct import Reconstruction
@@ -73,8 +75,8 @@ def validate_dataset(args: argparse.Namespace, dataset: Dataset, out: Path) -> i
         )
         for pair in dataset.pairs
     ]
-    outcomes = list(over_pairs(validate_pair, jobs, args.jobs, "reconstructing and validating pairs", progress))
-    return finish(args, dataset, outcomes, out, time.monotonic() - started)
+    outcomes, failures = over_pairs(validate_pair, jobs, args.jobs, "reconstructing and validating pairs", progress)
+    return finish(args, dataset, outcomes, failures, out, time.monotonic() - started)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -196,7 +198,14 @@ def _pictures(
     return pair_section(reconstruction, reports, shown, extra)
 
 
-def finish(args: argparse.Namespace, dataset: Dataset, outcomes: list[PairOutcome], out: Path, seconds: float) -> int:
+def finish(
+    args: argparse.Namespace,
+    dataset: Dataset,
+    outcomes: list[PairOutcome],
+    failures: tuple[PairFailure, ...],
+    out: Path,
+    seconds: float,
+) -> int:
     """Write tables, clouds, pictures and the page; print the summary; return the exit code."""
     from rigkit.report.page import build_page
     from rigkit.report.tables import tables_to_csv, tables_to_json, tables_to_latex, tables_to_markdown, tables_to_text
@@ -206,7 +215,7 @@ def finish(args: argparse.Namespace, dataset: Dataset, outcomes: list[PairOutcom
 
     reports = [report for outcome in outcomes for report in outcome.reports]
     compared = [outcome.other_ways for outcome in outcomes if outcome.other_ways is not None]
-    passed = all(report.passed for report in reports) and all(report.passed for report in compared)
+    passed = not failures and all(r.passed for r in reports) and all(r.passed for r in compared)
     causes = [cause for outcome in outcomes for cause in outcome.causes]
     causes += suspects([outcome.best for outcome in outcomes])
     causes += [f"pair '{report.pair_id}': {words}" for report in compared for words in report.suspects]
@@ -225,6 +234,7 @@ def finish(args: argparse.Namespace, dataset: Dataset, outcomes: list[PairOutcom
     sections = [outcome.section for outcome in outcomes if outcome.section is not None]
     if sections:
         lead = f"pairs: {len(outcomes)}; reconstructions: {len(reports)}; {seconds:.0f} s"
+        lead += "".join(f"; not validated: {failure}" for failure in failures)
         shown = [table for table in tables if table.key not in ("checks", "estimators")] + _calibrations(dataset)
         title = f"rigkit validation: {dataset.name}"
         files["report.html"] = build_page(title, lead, passed, shown, sections, _provenance(args, dataset))
@@ -237,6 +247,7 @@ def finish(args: argparse.Namespace, dataset: Dataset, outcomes: list[PairOutcom
                 "causes": causes,
                 "reports": [report.to_dict() for report in reports],
             }
+            | failed_pairs(failures)
         )
     else:
         print(tables_to_text([summary]))
@@ -247,10 +258,10 @@ def finish(args: argparse.Namespace, dataset: Dataset, outcomes: list[PairOutcom
                 note(f"to look at: {cause}")
             else:
                 print(f"probable cause: {cause}")
-        words = "all checks passed" if passed else "a check FAILED"
+        words = "all checks passed" if passed else "NOT every pair was validated" if failures else "a check FAILED"
         where = out / ("report.html" if sections else "tables.md")
         print(f"{words}; {where}, {seconds:.1f} s")
-    return 0 if passed else EXIT_CHECK_FAILED
+    return exit_code_of(failures, 0 if passed else EXIT_CHECK_FAILED)
 
 
 def _say_failures(reports: list[ValidationReport], compared: list[CrossCheckReport]) -> None:

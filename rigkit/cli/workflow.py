@@ -6,17 +6,20 @@ Cameras are calibrated first where a calibration file is missing; pairs are inde
 from __future__ import annotations
 
 import argparse
+import contextlib
+import functools
 import itertools
 import json
 import multiprocessing
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
-from rigkit.errors import DegenerateError, InputError
+from rigkit.cli.console import note
+from rigkit.errors import DegenerateError, InputError, RigkitError
 
 if TYPE_CHECKING:
     from rigkit.arrays import FloatArray
@@ -30,7 +33,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "LoadedCamera",
+    "PairFailure",
     "add_dataset_arguments",
+    "exit_code_of",
+    "failed_pairs",
     "find_boards",
     "load_cameras",
     "match_found",
@@ -122,7 +128,6 @@ def load_cameras(dataset: Dataset, *, recalibrate: bool, progress: Progress) -> 
     where they are calibrated: an image may fit one of them better than the camera that it is said to be from.
     """
     from rigkit.cli.calibrate import calibrate_session
-    from rigkit.cli.console import note
     from rigkit.io.calibration_file import save_calibration
     from rigkit.io.session import load_session
 
@@ -260,20 +265,67 @@ def reconstruct_other_chain(matched: MatchedPair, pair: Pair) -> Reconstruction 
         return None
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class PairFailure:
+    """A pair that came to nothing, and why."""
+
+    pair_id: str
+    error: RigkitError
+
+    def __str__(self) -> str:
+        words = str(self.error)
+        return words if f"'{self.pair_id}'" in words else f"pair '{self.pair_id}': {words}"
+
+
 def over_pairs(
     work: Callable[[Any], Result], jobs: Sequence[Any], processes: int | None, what: str, progress: Progress
-) -> Iterator[Result]:
-    """Yield `work(job)` for every job, in their order, from several processes where that helps."""
+) -> tuple[list[Result], tuple[PairFailure, ...]]:
+    """Return `work(job)` for every job, in their order, and the pairs that came to nothing.
+
+    Several processes work where that helps. A pair that cannot be done does not take the others with it; only if there
+    is no result at all is the first pair's error raised.
+    """
     count = min(len(jobs), processes or os.cpu_count() or 1)
     progress(what, 0, len(jobs))
-    if count <= 1:
-        for done, job in enumerate(jobs, start=1):
-            result = work(job)
+    outcomes: list[Result | RigkitError] = []
+    with contextlib.ExitStack() as stack:
+        attempt = functools.partial(_attempt, work)
+        results: Iterable[Result | RigkitError]
+        if count <= 1:
+            results = map(attempt, jobs)
+        else:
+            # Fresh processes: threads of OpenCV do not survive a fork.
+            context = multiprocessing.get_context("spawn")
+            results = stack.enter_context(ProcessPoolExecutor(count, mp_context=context)).map(attempt, jobs)
+        for done, outcome in enumerate(results, start=1):
             progress(what, done, len(jobs))
-            yield result
-        return
-    # Fresh processes: threads of OpenCV do not survive a fork.
-    with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
-        for done, result in enumerate(pool.map(work, jobs), start=1):
-            progress(what, done, len(jobs))
-            yield result
+            outcomes.append(outcome)
+    failures = tuple(
+        PairFailure(job.pair.pair_id, outcome)
+        for job, outcome in zip(jobs, outcomes, strict=True)
+        if isinstance(outcome, RigkitError)
+    )
+    if failures and len(failures) == len(jobs):
+        for failure in failures[1:]:
+            note(str(failure))
+        raise failures[0].error
+    return [outcome for outcome in outcomes if not isinstance(outcome, RigkitError)], failures
+
+
+def _attempt(work: Callable[[Any], Result], job: Any) -> Result | RigkitError:
+    try:
+        return work(job)
+    except RigkitError as error:
+        return error
+
+
+def failed_pairs(failures: Sequence[PairFailure]) -> dict[str, dict[str, str]]:
+    """Return what a program needs to know of `failures`; nothing where there are none."""
+    return {"failed": {failure.pair_id: str(failure.error) for failure in failures}} if failures else {}
+
+
+def exit_code_of(failures: Sequence[PairFailure], otherwise: int) -> int:
+    """Say which pairs came to nothing; return the exit code that the first of them asks for, else `otherwise`."""
+    for failure in failures:
+        note(str(failure))
+    return failures[0].error.exit_code if failures else otherwise

@@ -206,3 +206,25 @@ def test_a_lens_that_is_in_no_calibration_is_named(
     code, text, _ = validate(folder, capsys, "--no-crosscheck")
     assert code in (1, 2, 3)
     assert "image 2 does not fit the calibration of 'regular'" in text
+
+
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_a_pair_without_a_baseline_does_not_take_the_others_with_it(
+    capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str], jobs: str
+) -> None:
+    scenes = capture[1]
+    shutil.copy(folder / "leaning1.png", folder / "leaning2.png")
+    write_manifest(
+        folder,
+        pair_toml(scenes["leaning"], "leaning", ("regular", "regular")),
+        pair_toml(scenes["same"], "same", ("regular", "regular")),
+    )
+    out = folder / "results"
+    code = main(["validate", str(folder), "-o", str(out), "-j", jobs, "--no-crosscheck"])
+    captured = capsys.readouterr()
+    assert code == 3
+    assert "NOT every pair was validated" in captured.out
+    assert any("leaning" in line and "baseline" in line for line in captured.err.splitlines())
+    assert "leaning" in (out / "report.html").read_text()
+    assert (out / "same" / "3SDIR.ply").is_file()
+    assert "| same" in (out / "tables.md").read_text()
