@@ -16,6 +16,125 @@
 #define FOR_EACH_PROCESSOR
 #endif
 
+/* What a small function that hot loops call needs to be vectorised with them. */
+#if defined(__GNUC__)
+#define INLINE static inline __attribute__((always_inline, unused))
+#else
+#define INLINE static inline
+#endif
+
+/* An image of brightness. */
+typedef struct {
+    const float *brightness;
+    int64_t width, height;
+} image_t;
+
+/* Return `image` at (u, v), bilinear, the border repeated (corners.response.sample). */
+INLINE float brightness_at(const image_t image, float u, float v)
+{
+    const int32_t width = (int32_t)image.width;
+    const float most_u = (float)(image.width - 1), most_v = (float)(image.height - 1);
+    u = u > 0.0f ? u : 0.0f;
+    v = v > 0.0f ? v : 0.0f;
+    u = u < most_u ? u : most_u;
+    v = v < most_v ? v : most_v;
+    int32_t left = (int32_t)u, top = (int32_t)v;
+    left = left < width - 2 ? left : width - 2;
+    top = top < (int32_t)image.height - 2 ? top : (int32_t)image.height - 2;
+    const float right = u - (float)left, below = v - (float)top;
+    const float *at = image.brightness + (ptrdiff_t)top * width + left;
+    const float upper = at[0] + right * (at[1] - at[0]);
+    const float lower = at[width] + right * (at[width + 1] - at[width]);
+    return upper + below * (lower - upper);
+}
+
+#define PI 3.14159265358979323846
+#define MOST_HALF 32
+
+/* How rings are read (corners.ring): `circle` holds the (u, v) of `half` samples in half a turn and of their opposites. */
+typedef struct {
+    const float *circle;
+    int64_t half;
+    double most_odd;
+} ring_rules_t;
+
+/* Return the angle at which `even` passes `middle` between the samples `start` and the next. */
+INLINE double ring_crossing(const float *even, int64_t half, float middle, int64_t start)
+{
+    const float here = even[start], there = even[(start + 1) % half];
+    const float step = there == here ? 1.0f : there - here;
+    float part = (middle - here) / step;
+    part = part > 0.0f ? part : 0.0f;
+    part = part < 1.0f ? part : 1.0f;
+    return ((double)start + (double)part) * (PI / (double)half);
+}
+
+/* Return whether the ring around (u, v) is that of a chessboard corner; if so, its two angles and its contrast
+ * (corners.ring.read_rings). At most MOST_HALF samples in half a turn. */
+INLINE int read_ring(
+    const image_t image, const ring_rules_t rules, float u, float v, float radius, double angles[2], double *contrast)
+{
+    float ring[2 * MOST_HALF], even[MOST_HALF];
+    const int64_t half = rules.half;
+    for (int64_t k = 0; k < 2 * half; k++)
+        ring[k] = brightness_at(image, u + radius * rules.circle[2 * k], v + radius * rules.circle[2 * k + 1]);
+    float low = 1e30f, high = -1e30f, mean = 0.0f, odd_energy = 0.0f, energy = 0.0f;
+    for (int64_t k = 0; k < half; k++) {
+        even[k] = 0.5f * (ring[k] + ring[half + k]);
+        low = even[k] < low ? even[k] : low;
+        high = even[k] > high ? even[k] : high;
+        mean += even[k];
+    }
+    mean /= (float)half;
+    for (int64_t k = 0; k < half; k++) {
+        const float odd = 0.5f * (ring[k] - ring[half + k]);
+        odd_energy += odd * odd;
+        energy += (even[k] - mean) * (even[k] - mean);
+    }
+    if (!(odd_energy < (float)rules.most_odd * energy) || !(high > low))
+        return 0;
+    const float middle = 0.5f * (low + high);
+    int64_t rises = 0, rise = 0, fall = 0;
+    for (int64_t k = 0; k < half; k++) {
+        const int here = even[k] > middle, there = even[k + 1 < half ? k + 1 : 0] > middle;
+        if (there && !here) {
+            rise = k;
+            rises++;
+        }
+        if (here && !there)
+            fall = k;
+    }
+    if (rises != 1)
+        return 0;
+    const double a = fmod(ring_crossing(even, half, middle, rise), PI);
+    double to_b = fmod(ring_crossing(even, half, middle, fall) - a, PI);
+    to_b += to_b < 0.0 ? PI : 0.0;
+    angles[0] = a;
+    angles[1] = a + to_b;
+    *contrast = (double)high - (double)low;
+    return 1;
+}
+
+/* Return at how many of the `places` `along` the edge from (u, v) to (end_u, end_v) the side that should be brighter
+ * (sign +1: where angles grow from u to v, seen from the start) is so by more than `weakest` (corners.links.edge_contrast). */
+INLINE int64_t edge_seen(
+    const image_t image, const double *along, int64_t places, double u, double v, double end_u, double end_v,
+    double sign, double offset, double weakest)
+{
+    const double chord_u = end_u - u, chord_v = end_v - v;
+    double length = sqrt(chord_u * chord_u + chord_v * chord_v);
+    length = length > 1e-9 ? length : 1e-9;
+    const double aside_u = -sign * offset * chord_v / length, aside_v = sign * offset * chord_u / length;
+    int64_t seen = 0;
+    for (int64_t k = 0; k < places; k++) {
+        const double at_u = u + along[k] * chord_u, at_v = v + along[k] * chord_v;
+        const float bright = brightness_at(image, (float)(at_u + aside_u), (float)(at_v + aside_v));
+        const float dark = brightness_at(image, (float)(at_u - aside_u), (float)(at_v - aside_v));
+        seen += (double)(bright - dark) > weakest;
+    }
+    return seen;
+}
+
 /* The source that this library was built from (setup.py). */
 const char *rigkit_source(void);
 const char *rigkit_source(void) { return RIGKIT_SOURCE; }
