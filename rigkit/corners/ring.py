@@ -1,6 +1,7 @@
 """Whether a saddle is a chessboard corner: the brightness on a ring around it.
 
-Around a corner the brightness is the same on opposite sides and changes exactly twice in half a turn. Where it rises
+Around a corner the brightness is the same on opposite sides and changes exactly twice in half a turn, and the corner
+itself is as bright as the ring on average, whatever the angles, the blur and the slope of the light. Where it rises
 (angle counted from u to v) lies line A, where it falls line B; so the ring gives the two line directions and the
 polarity: which quadrants are bright.
 """
@@ -22,6 +23,10 @@ HALF = 16
 
 MAX_ODD = 0.35
 """Largest energy of the part that changes sign on opposite sides, relative to the part that does not."""
+
+MAX_CENTRE = 0.16
+"""Largest difference of the centre from the mean of the ring, relative to the contrast. Rings inside the four squares
+show less than 0.06; more where they reach beyond, which spoils the directions as well, and between dots or letters."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -51,12 +56,14 @@ def read_rings(image: FloatImage, pixels: FloatArray, radius_px: FloatArray | fl
     low, high = even.min(axis=1), even.max(axis=1)
     contrast = (high - low).astype(np.float64)
     middle = 0.5 * (low + high)
-    spread = even - even.mean(axis=1, keepdims=True)
+    mean = even.mean(axis=1)
+    spread = even - mean[:, None]
     symmetric = (odd**2).sum(axis=1) < MAX_ODD * (spread**2).sum(axis=1)
+    balanced = np.abs(sample(image, pixels) - mean) < MAX_CENTRE * (high - low)
     above = even > middle[:, None]
     following = np.roll(above, -1, axis=1)
     rising, falling = ~above & following, above & ~following
-    valid = symmetric & (rising.sum(axis=1) == 1) & (contrast > 0.0)
+    valid = symmetric & balanced & (rising.sum(axis=1) == 1) & (contrast > 0.0)
     angle_a, angle_b = (_crossing(even, middle, where) for where in (rising, falling))
     angle_a %= np.pi
     angle_b = angle_a + (angle_b - angle_a) % np.pi

@@ -12,8 +12,9 @@ from rigkit.corners.ring import read_rings
 
 __all__ = ["Corners", "Saddles", "find_corners", "find_saddles", "saddle_step"]
 
-RADII = (4.6, 2.6)
-"""Ring radii in pixels of the level: the larger gives the better directions, the smaller fits squares of 6 px."""
+RADII = (2.6, 4.6)
+"""Ring radii in pixels of the level: the smaller decides, since it fits squares of 6 px; the larger, where it fits too,
+gives the better directions."""
 
 MAX_STEP = 1.5
 """A Newton step to the saddle that leads further than this from the peak of the response went astray, level px."""
@@ -80,12 +81,12 @@ def find_corners(levels: list[Level]) -> tuple[Corners, Saddles]:
         angles = np.zeros((len(local), 2))
         contrast = np.zeros(len(local))
         valid = np.zeros(len(local), bool)
+        todo = np.arange(len(local))
         for radius in RADII:
-            todo = np.flatnonzero(~valid)
             rings = read_rings(level.smooth, local[todo], radius)
-            good = todo[rings.valid]
-            angles[good], contrast[good] = rings.angles[rings.valid], rings.contrast[rings.valid]
-            valid[good] = True
+            todo = todo[rings.valid]
+            angles[todo], contrast[todo] = rings.angles[rings.valid], rings.contrast[rings.valid]
+            valid[todo] |= radius == RADII[0]
         fresh = Corners(full[valid], angles[valid], contrast[valid], np.full(int(valid.sum()), level.scale))
         kept.append(_without_known(fresh, kept))
     return _joined(kept), Saddles(

@@ -55,7 +55,7 @@ INLINE float brightness_at(const image_t image, float u, float v)
 typedef struct {
     const float *circle;
     int64_t half;
-    double most_odd;
+    double most_odd, most_centre;
 } ring_rules_t;
 
 /* Return the angle at which `even` passes `middle` between the samples `start` and the next. */
@@ -92,6 +92,8 @@ INLINE int read_ring(
         energy += (even[k] - mean) * (even[k] - mean);
     }
     if (!(odd_energy < (float)rules.most_odd * energy) || !(high > low))
+        return 0;
+    if (!(fabsf(brightness_at(image, u, v) - mean) < (float)rules.most_centre * (high - low)))
         return 0;
     const float middle = 0.5f * (low + high);
     int64_t rises = 0, rise = 0, fall = 0;
