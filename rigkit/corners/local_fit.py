@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray
+from rigkit.native import kernels
+from rigkit.native.growth import FitRules, fit
 
 __all__ = ["LocalFit", "fit_cells"]
 
@@ -92,6 +94,10 @@ def fit_cells(
         neighbours leave open from running wild.
     leave_out : ignore the corner of the cell itself, to predict it from its neighbours.
     """
+    library = kernels("growth")
+    if library is not None:
+        rules = FitRules(degree, radius, leave_out, width, ridge)
+        return _local_fit(fit(library, lattice, cells, rules))
     side = 2 * radius + 1
     step_r, step_c = (a.ravel() - radius for a in np.divmod(np.arange(side * side), side))
     powers = POWERS[: TERMS[degree]]
@@ -119,12 +125,12 @@ def fit_cells(
     solution = np.swapaxes(solved[..., :2], 1, 2)
     gain = np.sqrt(((weights * (solved[..., 2] @ design.T)) ** 2).sum(axis=1))
     zero = np.zeros((len(row), 2))
-    return LocalFit(
-        solution[..., 0] + centre,
-        solution[..., 1],
-        solution[..., 2],
-        2.0 * solution[..., 3] if degree > 1 else zero,
-        2.0 * solution[..., 5] if degree > 1 else zero,
-        known.sum(axis=1).astype(np.float64),
-        gain,
-    )
+    bend_column, bend_row = (2.0 * solution[..., k] if degree > 1 else zero for k in (3, 5))
+    position = solution[..., 0] + centre
+    single = np.stack([known.sum(axis=1), gain], axis=1)
+    return _local_fit(np.hstack([position, solution[..., 1], solution[..., 2], bend_column, bend_row, single]))
+
+
+def _local_fit(rows: FloatArray) -> LocalFit:
+    """Return the fit from `rows` (M, 12): the fields of `LocalFit` one after the other."""
+    return LocalFit(rows[:, :2], rows[:, 2:4], rows[:, 4:6], rows[:, 6:8], rows[:, 8:10], rows[:, 10], rows[:, 11])

@@ -1,0 +1,185 @@
+"""Calls of the kernels in growth.c: plain arrays in, plain arrays out; all tolerances come from the callers."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from ctypes import POINTER, Structure, byref, c_double, c_int64, c_void_p, pointer
+from typing import ClassVar
+
+import numpy as np
+
+from rigkit.arrays import BoolArray, FloatArray, IntArray
+
+__all__ = ["Buckets", "FitRules", "GrowthRules", "components_of", "fit", "grown"]
+
+FIT_COLUMNS = 12
+POINTS_A_BUCKET = 2.0
+"""Buckets of so many points on average cost the least to fill and to search."""
+
+
+class FitRules(Structure):
+    """fit_rules_t."""
+
+    _fields_: ClassVar = [
+        ("degree", c_int64),
+        ("radius", c_int64),
+        ("leave_out", c_int64),
+        ("width", c_double),
+        ("ridge", c_double * 2),
+    ]
+
+
+class _RingRules(Structure):
+    _fields_: ClassVar = [
+        ("circle", c_void_p),
+        ("half", c_int64),
+        *((name, c_double) for name in ("most_odd", "most_centre")),
+    ]
+
+
+class GrowthRules(Structure):
+    """growth_rules_t; `make` also keeps the arrays that it points to."""
+
+    _fields_: ClassVar = [
+        ("predictions", FitRules * 2),
+        ("ring", POINTER(_RingRules)),
+        ("along", c_void_p),
+        *((name, c_int64) for name in ("places", "most", "tried", "fewest")),
+        *(
+            (name, c_double)
+            for name in (
+                *("reach", "ring_part", "min_ring", "max_ring", "line_sine", "contrast_ratio"),
+                *("aside", "min_aside", "max_aside", "least_area"),
+            )
+        ),
+    ]
+
+    @classmethod
+    def make(
+        cls,
+        predictions: Sequence[FitRules],
+        circle: np.ndarray,
+        most_odd: float,
+        most_centre: float,
+        along: np.ndarray,
+        **numbers: float,
+    ) -> GrowthRules:
+        """Return the rules; `circle` (2 * half, 2) are the samples of a ring of radius 1."""
+        kept = np.ascontiguousarray(circle, np.float32), np.ascontiguousarray(along, np.float64)
+        rules = cls(**numbers)
+        rules.predictions = (FitRules * 2)(*predictions)
+        rules.ring = pointer(_RingRules(kept[0].ctypes.data, len(kept[0]) // 2, most_odd, most_centre))
+        rules.along, rules.places = kept[1].ctypes.data, len(kept[1])
+        rules.kept = kept
+        return rules
+
+
+class _Level(Structure):
+    _fields_: ClassVar = [
+        ("brightness", c_void_p),
+        *((name, c_int64) for name in ("width", "height")),
+        *((name, c_double) for name in ("scale", "offset")),
+    ]
+
+
+class _Sheet(Structure):
+    _fields_: ClassVar = [
+        *((name, c_void_p) for name in ("pixels", "contrast", "due_first", "due_second")),
+        *((name, c_int64) for name in ("rows", "columns")),
+        ("sign", c_double),
+    ]
+
+
+class Buckets(Structure):
+    """buckets_t: points (N, 2), N > 0, sorted into squares, to find those near a place."""
+
+    _fields_: ClassVar = [
+        *((name, c_void_p) for name in ("points", "first", "order")),
+        *((name, c_int64) for name in ("count", "columns", "rows")),
+        *((name, c_double) for name in ("left", "top", "side")),
+    ]
+
+    @classmethod
+    def of(cls, library: ctypes.CDLL, points: FloatArray) -> Buckets:
+        points = np.ascontiguousarray(points, np.float64)
+        low, high = points.min(axis=0), points.max(axis=0)
+        span = np.maximum(high - low, 1.0)
+        side = float(np.sqrt(POINTS_A_BUCKET * span[0] * span[1] / len(points))) + 1e-9
+        columns, rows = int(span[0] / side) + 1, int(span[1] / side) + 1
+        first, order = np.empty(columns * rows + 1, np.int64), np.empty(len(points), np.int64)
+        where = (points.ctypes.data, first.ctypes.data, order.ctypes.data)
+        buckets = cls(*where, len(points), columns, rows, float(low[0]), float(low[1]), side)
+        buckets.kept = (points, first, order)
+        library.fill_buckets(byref(buckets))
+        return buckets
+
+
+def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
+    """Declare the arguments, once a library."""
+    if library.fit_cells.argtypes is None:
+        library.fit_cells.argtypes = [c_void_p, c_int64, c_int64, c_void_p, POINTER(FitRules), c_void_p]
+        library.fit_cells.restype = None
+        library.grow_lattice.argtypes = [
+            *(POINTER(kind) for kind in (_Sheet, _Level, Buckets, GrowthRules)),
+            *(c_int64, c_void_p, c_void_p),
+        ]
+        library.grow_lattice.restype = c_int64
+        library.find_components.argtypes = [c_int64, c_void_p, c_int64, *[c_void_p] * 6]
+        library.find_components.restype = c_int64
+    return library
+
+
+def fit(library: ctypes.CDLL, lattice: FloatArray, cells: BoolArray, rules: FitRules) -> FloatArray:
+    """Return the fits of M `cells` (R, C) of `lattice` (R, C, 2): (M, 12), in the order of `LocalFit`."""
+    lattice = np.ascontiguousarray(lattice, np.float64)
+    cells = np.ascontiguousarray(cells, np.bool_)
+    out = np.empty((int(np.count_nonzero(cells)), FIT_COLUMNS))
+    rows, columns = cells.shape
+    _declared(library).fit_cells(lattice.ctypes.data, rows, columns, cells.ctypes.data, byref(rules), out.ctypes.data)
+    return out
+
+
+def grown(
+    library: ctypes.CDLL,
+    pixels: FloatArray,
+    contrast: FloatArray,
+    sign: float,
+    image: np.ndarray,
+    scale: float,
+    offset: float,
+    saddles: Buckets,
+    rules: GrowthRules,
+    rings: int,
+) -> int:
+    """Grow the lattice `pixels` (R, C, 2), `contrast` (R, C) in place; both contiguous float64, NaN where unknown.
+
+    Returns the rings that are left if the lattice has reached the border of its arrays, -1 if it has grown all it can.
+    """
+    rows, columns = contrast.shape
+    image = np.ascontiguousarray(image, np.float32)
+    due = np.ones((2, rows, columns), np.uint8)
+    fresh, where = np.empty((rows * columns, 3)), np.empty(rows * columns, np.int64)
+    start = due.ctypes.data
+    sheet = _Sheet(pixels.ctypes.data, contrast.ctypes.data, start, start + rows * columns, rows, columns, sign)
+    level = _Level(image.ctypes.data, image.shape[1], image.shape[0], scale, offset)
+    call = _declared(library).grow_lattice
+    return int(
+        call(byref(sheet), byref(level), byref(saddles), byref(rules), rings, fresh.ctypes.data, where.ctypes.data)
+    )
+
+
+def components_of(
+    library: ctypes.CDLL, links: IntArray, tries: int
+) -> tuple[int, IntArray, IntArray, IntArray, IntArray]:
+    """Return the number of lattices that mutual `links` make up, and label, grid (N, 2), turn, members of the corners.
+
+    `links` (N, 4) are 4 * the neighbour + its arm, -1 for none.
+    """
+    count = len(links)
+    links = np.array(links, np.int64, order="C")
+    label, grid, turn = np.empty(count, np.int64), np.empty((count, 2), np.int64), np.empty(count, np.int64)
+    members, queue, marks = np.empty(count, np.int64), np.empty(2 * count, np.int64), np.empty(4 * count, np.uint8)
+    arrays = (label, grid, turn, members, queue, marks)
+    found = _declared(library).find_components(count, links.ctypes.data, tries, *(a.ctypes.data for a in arrays))
+    return int(found), label, grid, turn, members
