@@ -7,7 +7,7 @@ import numpy as np
 from rigkit.arrays import FloatArray, Mat3, Rays
 from rigkit.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import log_so3, skew
+from rigkit.geometry.rotation import cross, log_so3, skew
 from rigkit.geometry.triangulation import ray_ranges
 from rigkit.posetype import PoseType
 
@@ -78,4 +78,4 @@ def translation_basis(direction: FloatArray) -> FloatArray:
     first = np.array([t[2], 0.0, -t[0]])
     size = np.linalg.norm(first)
     first = first / size if size > 1e-9 else np.array([1.0, 0.0, 0.0])
-    return np.stack([first, np.cross(t, first)])
+    return np.stack([first, cross(t, first)])

@@ -15,7 +15,7 @@ import numpy as np
 
 from rigkit.arrays import FloatArray, IntArray
 from rigkit.fundamental.weights import usable_affinities
-from rigkit.geometry.rotation import log_so3, skew
+from rigkit.geometry.rotation import cross, log_so3, skew
 from rigkit.geometry.sampson import epipolar_normals
 from rigkit.geometry.triangulation import correct_rays_px
 from rigkit.matches import Matches
@@ -37,8 +37,8 @@ def point_terms(matches: Matches, R: FloatArray, t: FloatArray, basis: FloatArra
     sigma = np.sqrt(s1**2 * np.sum(n1 * n1, axis=-1) + s2**2 * np.sum(n2 * n2, axis=-1))
     sigma = np.where(sigma > 0.0, sigma, np.inf)
     turned = f1 @ R.T
-    by_rotation = np.cross(turned, np.cross(f2, t))
-    by_direction = np.cross(turned, f2) @ basis.T
+    by_rotation = cross(turned, cross(f2, t))
+    by_direction = cross(turned, f2) @ basis.T
     jacobian = np.concatenate([by_rotation, by_direction], axis=1) / sigma[:, None]
     return at_measured / sigma, jacobian
 
@@ -66,7 +66,7 @@ def affinity_terms(
     b1, b2, A = matches.jacobians1[which], matches.jacobians2[which], matches.A21[which]
     turned = f1 @ R.T
     # E f1 = t x (R f1) and E^T f2 = R^T (f2 x t), and their derivatives by (w, b).
-    line2, line1 = np.cross(t, turned), np.cross(f2, t)
+    line2, line1 = cross(t, turned), cross(f2, t)
     by2 = np.concatenate([-skew(t) @ skew(turned), -skew(turned) @ basis.T], axis=-1)
     by1 = np.concatenate([skew(line1), skew(f2) @ basis.T], axis=-1)
     n2 = (line2[:, None, :] @ b2)[:, 0]

@@ -9,7 +9,7 @@ refinement itself. Deterministic under a seeded generator. References: Fischler 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -17,6 +17,7 @@ import numpy as np
 from rigkit.arrays import BoolArray, FloatArray, IntArray, Mat3
 from rigkit.errors import DegenerateError, InputError, RigkitError
 from rigkit.fundamental.eight_point import essential_nearest
+from rigkit.fundamental.local import SampsonRows
 from rigkit.fundamental.minimal import essential_from_five_rows, essential_from_six_rows, planar_from_two_rows
 from rigkit.fundamental.planar import solve_planar_batch
 from rigkit.fundamental.pose import choose_pose, essential_from_pose
@@ -24,7 +25,6 @@ from rigkit.fundamental.refine import RefinedPose, refine_pose
 from rigkit.fundamental.registry import fundamental_for
 from rigkit.fundamental.rows import PLANAR_ENTRIES, affinity_rows, essential_from_planar, point_rows
 from rigkit.fundamental.weights import usable_affinities
-from rigkit.geometry.sampson import sampson_distances
 from rigkit.matches import Matches
 from rigkit.posetype import PoseType
 
@@ -65,15 +65,15 @@ class RobustPose:
     trials: int
 
 
-def marginal_quality(r: FloatArray, max_noise: float) -> FloatArray:
-    """Return q (0 to 1) of residuals in sigmas."""
+def marginal_quality(r: FloatArray, max_noise: FloatArray | float) -> FloatArray:
+    """Return q (0 to 1) of residuals in sigmas; `max_noise` may be an array that broadcasts with `r`."""
     rho = np.abs(r) / QUANTILE
     low = np.clip(rho, 1.0, max_noise)
     value = (max_noise - low - rho**2 * (1.0 / low - 1.0 / max_noise)) / (max_noise - 1.0)
     return np.asarray(np.where(rho < max_noise, value, 0.0))
 
 
-def marginal_weights(r: FloatArray, max_noise: float) -> FloatArray:
+def marginal_weights(r: FloatArray, max_noise: FloatArray | float) -> FloatArray:
     """Return the weights -q'(r) / r, 1 for small residuals and 0 beyond the highest noise level."""
     low = np.clip(np.abs(r) / QUANTILE, 1.0, max_noise)
     return np.asarray((1.0 / low - 1.0 / max_noise) / (1.0 - 1.0 / max_noise))
@@ -108,32 +108,32 @@ def robust_pose(
         No sample gave a pose.
     """
     kind = str(pose_type)
+    rows = SampsonRows.of(matches)
     if kind in (PoseType.STANDARD, PoseType.FORWARD):
-        finalists, trials = [fundamental_for(kind).solve(matches, "points").E21], 0
+        finalists, trials = fundamental_for(kind).solve(matches, "points").E21[None], 0
     else:
         size = _sample_size(matches, kind, sample)
-        search = _Search(matches, kind, sample, size, max_noise)
+        search = _Search(matches, rows, kind, sample, size, max_noise)
         finalists, trials = search.run(rng, confidence, max_trials)
-    if not finalists:
+    if not len(finalists):
         raise DegenerateError(f"no pose in {trials} samples of {len(matches)} matches; check how they were matched")
     # The search allowed for much noise; what the matches that fit show is the noise there is. At that level the local
     # optima, nearly equal before, part company.
-    fitting = np.abs(_residuals(matches, finalists[0][None])[0])
+    fitting = np.abs(rows.residuals(finalists[:1])[0])
     fitting = fitting[fitting < QUANTILE * max_noise]
     shown = float(np.median(fitting)) / MEDIAN_OF_NORMAL if fitting.size else max_noise
     final = min(max_noise, max(2.0 * shown, LEAST_NOISE))
-    ends: list[tuple[float, RefinedPose, FloatArray]] = []
-    for E21 in finalists:
+    finalists = rows.improved(finalists, kind, np.full(len(finalists), final), _loss)
+    order = np.argsort(-marginal_quality(rows.residuals(finalists), final).sum(axis=1), kind="stable")
+    for E21 in finalists[order]:
         try:
-            end = _local(matches, E21, kind, level_sigma_rad, final)
+            end = _refined(matches, rows, E21, kind, level_sigma_rad, final)
         except RigkitError:
             continue
-        r = _residuals(matches, essential_from_pose(end.cam2_from_cam1)[None])[0]
-        ends.append((float(marginal_quality(r, final).sum()), end, r))
-    if not ends:
-        raise DegenerateError(f"no pose that puts the matches in front of both cameras among {len(finalists)} found")
-    quality, end, r = max(ends, key=lambda entry: entry[0])
-    return RobustPose(end, np.asarray(np.abs(r) < QUANTILE * final), marginal_weights(r, final), quality, trials)
+        r = rows.residuals(essential_from_pose(end.cam2_from_cam1)[None])[0]
+        q, weights = _loss(r, final)
+        return RobustPose(end, np.asarray(np.abs(r) < QUANTILE * final), weights, float(q.sum()), trials)
+    raise DegenerateError(f"no pose that puts the matches in front of both cameras among {len(finalists)} found")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -141,17 +141,17 @@ class _Search:
     """Sampling with local optimisation of promising hypotheses."""
 
     matches: Matches
+    rows: SampsonRows
     kind: str
     sample: Sample
     size: int
     max_noise: float
 
-    def run(self, rng: np.random.Generator, confidence: float, max_trials: int) -> tuple[list[Mat3], int]:
-        """Return the best essential matrices, locally optimised, best first, and the number of samples drawn."""
-        found: list[tuple[float, Mat3]] = []
+    def run(self, rng: np.random.Generator, confidence: float, max_trials: int) -> tuple[Mat3, int]:
+        """Return the best essential matrices (H, 3, 3), locally optimised, best first, and the number of samples."""
+        best, quality = np.zeros((0, 3, 3)), np.zeros(0)
         trials, needed, best_rank = 0, float(max_trials), 0.0
         affine = np.flatnonzero(usable_affinities(self.matches))
-        points = replace(self.matches, A21=None, sigma_A=None)
         while trials < needed:
             trials += BATCH
             index = _draw(rng, len(self.matches), affine, self.sample, self.size)
@@ -160,55 +160,52 @@ class _Search:
                 continue
             # A sample's own noise can hide a good hypothesis at the final noise level: rank at a wider one.
             rank = self.quality(candidates, WIDE * self.max_noise)
-            for k in np.argsort(-rank)[:LOCAL_TRIES]:
-                if rank[k] < PROMISING * best_rank:
-                    break
-                # Widely first, which forgives a poor start; and at once, which an outlier with leverage cannot lure.
-                for levels in ((WIDE * self.max_noise, self.max_noise), (self.max_noise, LEAST_NOISE)):
-                    better = _improved(points, candidates[k], self.kind, levels)
-                    found.append((float(self.quality(better[None], self.max_noise)[0]), better))
-            found = sorted(found, key=lambda entry: -entry[0])[:FINALISTS]
-            best = found[0][1][None]
-            best_rank = float(self.quality(best, WIDE * self.max_noise)[0])
-            share = float(np.mean(np.abs(_residuals(self.matches, best)[0]) < QUANTILE * self.max_noise))
+            tried = np.argsort(-rank, kind="stable")[:LOCAL_TRIES]
+            tried = tried[rank[tried] >= PROMISING * best_rank]
+            if len(tried):
+                better = self.improved(candidates[tried])
+                best, quality = np.concatenate([best, better]), np.append(quality, self.quality(better, self.max_noise))
+                order = np.argsort(-quality, kind="stable")[:FINALISTS]
+                best, quality = best[order], quality[order]
+                best_rank = float(self.quality(best[:1], WIDE * self.max_noise)[0])
+            share = float(np.mean(np.abs(self.rows.residuals(best[:1])[0]) < QUANTILE * self.max_noise))
             # Affinities are noisy: of the samples without outliers only some are good enough to start from.
             hit = share**self.size * (1.0 if self.sample == "points" else GOOD_AFFINE)
             needed = min(float(max_trials), float(np.log(1.0 - confidence) / np.log1p(-np.clip(hit, 1e-12, 1 - 1e-12))))
-        return [E21 for _, E21 in found], trials
+        return best, trials
 
     def quality(self, E21: Mat3, noise: float) -> FloatArray:
         """Return the sum of q over the matches of hypotheses (H, 3, 3)."""
-        return np.asarray(marginal_quality(_residuals(self.matches, E21), noise).sum(axis=1))
+        return np.asarray(marginal_quality(self.rows.residuals(E21), noise).sum(axis=1))
+
+    def improved(self, E21: Mat3) -> Mat3:
+        """Return what `E21` (H, 3, 3) lead to, each twice, (2 H, 3, 3).
+
+        Widely first, which forgives a poor start; and at once, which an outlier with leverage cannot lure.
+        """
+        out, count = np.concatenate([E21, E21]), len(E21)
+        for wide, narrow in ((WIDE * self.max_noise, self.max_noise), (self.max_noise, LEAST_NOISE)):
+            out = self.rows.improved(out, self.kind, np.repeat([wide, narrow], count), _loss)
+        return out
 
 
-def _improved(matches: Matches, E21: Mat3, kind: str, levels: tuple[float, ...]) -> Mat3:
-    """Return the essential matrix after local optimisation at one noise level after the other."""
-    for level in levels:
-        try:
-            E21 = essential_from_pose(_local(matches, E21, kind, None, level).cam2_from_cam1)
-        except RigkitError:
-            return E21
-    return E21
+def _loss(r: FloatArray, max_noise: FloatArray | float) -> tuple[FloatArray, FloatArray]:
+    return marginal_quality(r, max_noise), marginal_weights(r, max_noise)
 
 
-def _local(matches: Matches, E21: Mat3, kind: str, level_sigma_rad: float | None, max_noise: float) -> RefinedPose:
+def _refined(
+    matches: Matches, rows: SampsonRows, E21: Mat3, kind: str, level_sigma_rad: float | None, max_noise: float
+) -> RefinedPose:
     """Return the maximum likelihood pose under the marginalised loss, from the essential matrix `E21`."""
-    r = np.abs(_residuals(matches, E21[None])[0])
+    r = np.abs(rows.residuals(E21[None])[0])
     # Cheirality by the matches that fit best: those that only might fit are half in front by chance.
     near = r <= max(QUANTILE, float(np.sort(r)[min(10, len(r)) - 1]))
     start = choose_pose(E21, matches.rays1[near], matches.rays2[near], kind)
 
-    def loss(r: FloatArray) -> FloatArray:
+    def weights(r: FloatArray) -> FloatArray:
         return marginal_weights(r, max_noise)
 
-    return refine_pose(matches, start, kind, level_sigma_rad, robust=loss)
-
-
-def _residuals(matches: Matches, E21: Mat3) -> FloatArray:
-    """Return the Sampson distances (H, N) in sigmas of hypotheses (H, 3, 3)."""
-    return sampson_distances(
-        E21, matches.rays1, matches.rays2, matches.jacobians1, matches.jacobians2, matches.sigma1_px, matches.sigma2_px
-    )
+    return refine_pose(matches, start, kind, level_sigma_rad, robust=weights)
 
 
 def _sample_size(matches: Matches, kind: str, sample: Sample) -> int:

@@ -6,7 +6,7 @@ import numpy as np
 
 from rigkit.arrays import FloatArray, Mat3
 
-__all__ = ["angle_between", "exp_so3", "log_so3", "nearest_rotation", "rotation_angle", "skew", "unit"]
+__all__ = ["angle_between", "cross", "exp_so3", "log_so3", "nearest_rotation", "rotation_angle", "skew", "unit"]
 
 
 def skew(v: FloatArray) -> Mat3:
@@ -16,6 +16,13 @@ def skew(v: FloatArray) -> Mat3:
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
     out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
     return out
+
+
+def cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return a x b of `a` and `b` (..., 3), a good deal faster than numpy's own."""
+    a0, a1, a2 = a[..., 0], a[..., 1], a[..., 2]
+    b0, b1, b2 = b[..., 0], b[..., 1], b[..., 2]
+    return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)
 
 
 def exp_so3(rotation_vector: FloatArray) -> Mat3:
@@ -74,5 +81,5 @@ def unit(v: FloatArray) -> FloatArray:
 
 def angle_between(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return the angle in radians between vectors (..., 3), accurate near 0 and pi (atan2, not acos)."""
-    cross = np.linalg.norm(np.cross(a, b), axis=-1)
-    return np.asarray(np.arctan2(cross, np.sum(np.asarray(a) * np.asarray(b), axis=-1)))
+    a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    return np.asarray(np.arctan2(np.linalg.norm(cross(a, b), axis=-1), np.sum(a * b, axis=-1)))

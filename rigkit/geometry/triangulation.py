@@ -17,7 +17,7 @@ import numpy as np
 from rigkit.arrays import BoolArray, FloatArray, Mat3, Pixels, Points, RayJacobians, Rays
 from rigkit.geometry.projection_jacobian import projection_jacobian
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import skew, unit
+from rigkit.geometry.rotation import cross, skew, unit
 from rigkit.geometry.sampson import epipolar_normals
 
 __all__ = [
@@ -175,12 +175,12 @@ def ray_ranges(rays1: Rays, rays2: Rays, cam2_from_cam1: Rigid3) -> tuple[FloatA
     """
     a, b = np.asarray(rays1) @ cam2_from_cam1.rotation.T, np.asarray(rays2, dtype=np.float64)
     t = cam2_from_cam1.translation_mm
-    axis = np.cross(b, a)
+    axis = cross(b, a)
     square = np.sum(axis * axis, axis=-1)
     defined = square > MIN_PARALLAX_RAD**2
     safe = np.where(defined, square, np.nan)
-    range1 = np.sum(np.cross(t, b) * axis, axis=-1) / safe
-    range2 = np.sum(np.cross(t, a) * axis, axis=-1) / safe
+    range1 = np.sum(cross(t, b) * axis, axis=-1) / safe
+    range2 = np.sum(cross(t, a) * axis, axis=-1) / safe
     return range1, range2, defined
 
 

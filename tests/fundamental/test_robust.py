@@ -9,8 +9,13 @@ import pytest
 from helpers.epipolar_scenes import REGULAR, pair, pose_errors_deg
 
 from rigkit.errors import DegenerateError, InputError
+from rigkit.fundamental.local import SampsonRows
+from rigkit.fundamental.pose import essential_from_pose
 from rigkit.fundamental.refine import refine_pose
 from rigkit.fundamental.robust import marginal_quality, marginal_weights, robust_pose
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
+from rigkit.geometry.sampson import sampson_distances
 from rigkit.matches import Matches
 
 
@@ -77,3 +82,28 @@ def test_nothing_but_outliers_gives_few_inliers_or_an_error(rng):
     except DegenerateError:
         return
     assert found.inliers.mean() < 0.6
+
+
+def test_all_hypotheses_at_once_are_as_one_by_one(rng):
+    wild, pose, _ = contaminated(rng, "general")
+    E21 = np.stack([essential_from_pose(pose), *rng.normal(size=(5, 3, 3))])
+    expected = sampson_distances(
+        E21, wild.rays1, wild.rays2, wild.jacobians1, wild.jacobians2, wild.sigma1_px, wild.sigma2_px
+    )
+    assert SampsonRows.of(wild).residuals(E21) == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["general", "planar"])
+def test_the_batch_ends_near_the_maximum_likelihood_pose(rng, kind):
+    clean, pose, _ = pair(rng, 100, kind, noise_px=0.1)
+    clean = replace(clean, A21=None, sigma_A=None)
+    best = refine_pose(clean, pose, kind)
+    turns = np.zeros((8, 3))
+    turns[:, 1] = rng.normal(0.0, np.radians(1.0), 8)
+    starts = np.stack([essential_from_pose(Rigid3(exp_so3(w) @ pose.rotation, pose.translation_mm)) for w in turns])
+    found = SampsonRows.of(clean).improved(starts, kind, np.full(8, 6.0), lambda r, m: (-(r**2), np.ones_like(r)))
+    truth = essential_from_pose(best.cam2_from_cam1)
+    sign = np.sign(np.sum(found * truth, axis=(1, 2), keepdims=True))
+    # How the distances' own sigmas change with the pose is left out: that is second order in the noise.
+    sigma = np.sqrt(np.diag(best.covariance).max())
+    assert found * sign == pytest.approx(np.broadcast_to(truth, found.shape), abs=0.1 * sigma)
