@@ -9,9 +9,10 @@
 #include <stdlib.h>
 #include <string.h>
 
-/* On a hot function: also compiled for newer processors, chosen when the library is loaded. */
-#if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__gnu_linux__)
-#define FOR_EACH_PROCESSOR __attribute__((target_clones("arch=haswell", "default")))
+/* On a hot function: also compiled for newer processors, chosen when the library is loaded. By what they can do:
+ * "arch=haswell" would be chosen on a Haswell alone. */
+#if defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 12 && defined(__x86_64__) && defined(__gnu_linux__)
+#define FOR_EACH_PROCESSOR __attribute__((target_clones("arch=x86-64-v3", "default")))
 #else
 #define FOR_EACH_PROCESSOR
 #endif
