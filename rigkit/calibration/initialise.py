@@ -17,7 +17,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
+from rigkit.arrays import FloatArray, Mat3, Points
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.radial_alignment import Alignment, align, distortion_centre
 from rigkit.calibration.solver import State, evaluate
@@ -45,13 +45,14 @@ def initialise(
     """Yield start states for `model`: around the middle of the image, then around the centre of distortion that the
     views give (better for a lens far off the middle, useless for one without distortion). None where no camera of the
     model comes near."""
-    weight = observations.weight
-    board = observations.table()[observations.corner][..., :2]
+    table = np.ascontiguousarray(observations.table()[:, :2].T)
+    board = np.ascontiguousarray(np.swapaxes(np.take(table, observations.corner, axis=1), 0, 1))
+    pixels = np.ascontiguousarray(np.swapaxes(observations.pixels, 1, 2))
     middle = image_center(size_px)
-    yield from _starts(observations, board, middle, size_px, model, order)
-    epipole = distortion_centre(observations.pixels, board, weight, middle)
+    yield from _starts(observations, pixels, board, middle, size_px, model, order)
+    epipole = distortion_centre(pixels, board, observations.weight, middle)
     if (np.abs(epipole - middle) < 0.5 * np.array(size_px)).all():
-        yield from _starts(observations, board, epipole, size_px, model, order)
+        yield from _starts(observations, pixels, board, epipole, size_px, model, order)
 
 
 def start_error(state: State, observations: Observations) -> float:
@@ -62,25 +63,28 @@ def start_error(state: State, observations: Observations) -> float:
 
 def _starts(
     observations: Observations,
+    pixels: FloatArray,
     board: FloatArray,
     centre: FloatArray,
     size_px: tuple[int, int],
     model: type[Camera],
     order: int | None,
 ) -> Iterator[State]:
-    offset = observations.pixels - centre
+    """`pixels` and `board` are (V, 2, C)."""
+    offset = pixels - centre[:, None]
     alignment = align(offset, board, observations.weight)
-    rho = np.sqrt(offset[..., 0] ** 2 + offset[..., 1] ** 2)
+    rho = np.sqrt(offset[:, 0] ** 2 + offset[:, 1] ** 2)
     rho_max = float(rho[alignment.weight > 0.1].max())
-    tried = (_curve(alignment, rho / rho_max, board, offset, exponents) for exponents in EXPONENTS)
+    depths = _Depths(alignment, offset, rho / rho_max, board)
+    tried = (depths.curve(exponents) for exponents in EXPONENTS)
     curve = next((c for c in tried if c is not None), None)
-    level = np.ones(len(rho))
-    fallback = [(fov * np.linspace(0.0, 0.5, SAMPLES), level) for fov in FALLBACK_FOV_RAD]
-    for theta, depth_sign in fallback if curve is None else [curve]:
-        radius = np.linspace(0.0, rho_max, SAMPLES)
+    radius = np.linspace(0.0, rho_max, SAMPLES)
+    fallback = (np.linspace(0.0, 0.5 * fov, SAMPLES) for fov in FALLBACK_FOV_RAD)
+    for theta, sign, t3 in map(depths.known, fallback) if curve is None else [curve]:
         camera = _fitted(model, size_px, centre, theta, radius, order)
         if camera is not None:
-            yield _posed(camera, alignment, theta, radius, depth_sign, rho, board, observations)
+            rotation, translation = _posed(alignment, sign, t3)
+            yield State.start(camera, rotation, translation, observations)
 
 
 def _fitted(
@@ -100,103 +104,101 @@ def _fitted(
     return None
 
 
-def _posed(
-    camera: Camera,
-    alignment: Alignment,
-    theta: FloatArray,
-    radius: FloatArray,
-    depth_sign: FloatArray,
-    rho: FloatArray,
-    board: FloatArray,
-    observations: Observations,
-) -> State:
-    """Complete the poses with the third row: t3 is the weighted mean of z - r3 x over the corners."""
-    x, y = np.moveaxis(alignment.camera_xy(board), -1, 0)
-    s = np.sqrt(x * x + y * y)
-    angle = np.interp(rho, radius, theta)
-    z = s / np.tan(np.maximum(angle, 1e-6))
-    tilt = alignment.tilt * depth_sign[:, None]
-    weight = alignment.weight * np.sin(angle) ** 2
-    t3 = (weight * (z - _depth(tilt, board))).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-12)
-    columns = np.concatenate([alignment.rows[..., :2], tilt[:, None, :]], axis=1)
+def _posed(alignment: Alignment, sign: FloatArray, t3: FloatArray) -> tuple[Mat3, Points]:
+    """Complete the poses with the third row."""
+    columns = np.concatenate([alignment.rows[..., :2], (alignment.tilt * sign[:, None])[:, None]], axis=1)
     third = np.cross(columns[..., 0], columns[..., 1])
     rotation = nearest_rotation(np.concatenate([columns, third[..., None]], axis=-1))
-    translation = np.concatenate([alignment.rows[..., 2], t3[:, None]], axis=-1)
-    return State.start(camera, rotation, translation, observations)
+    return rotation, np.concatenate([alignment.rows[..., 2], t3[:, None]], axis=-1)
 
 
-def _curve(
-    alignment: Alignment, rho: FloatArray, board: FloatArray, offset: FloatArray, exponents: tuple[int, ...]
-) -> tuple[FloatArray, FloatArray] | None:
-    """Return the angles at SAMPLES radii in [0, 1] and the signs of the tilts, None where the angle does not increase.
+class _Depths:
+    """What the corners say about depth: s f(rho) / rho - t3 = sign * depth, with f and the signs to be found.
 
-    `rho` (V, C) is relative to the largest used.
+    `rho` (V, C) is relative to the largest used; `offset` and `board` are (V, 2, C).
     """
-    length = np.maximum(np.sqrt(offset[..., 0] ** 2 + offset[..., 1] ** 2), 1e-9)
-    x, y = np.moveaxis(alignment.camera_xy(board), -1, 0)
-    s = (x * offset[..., 0] + y * offset[..., 1]) / length
-    safe = np.maximum(rho, 1e-4)
-    # One contiguous array for each coefficient: s rho^(k - 1).
-    powers = {0: s / safe, 2: s * safe}
-    powers[3] = powers[2] * safe
-    powers[4] = powers[3] * safe
-    design = np.stack([powers[k] for k in exponents])
-    depth = _depth(alignment.tilt, board)
-    used = (alignment.weight > 0.0) & (s > 0.0) & (rho > 1e-3)
-    # d rho / d z of the lens turns residuals of z into residuals of rho; at first for a lens of 45 degrees.
-    slope = safe**2 / (np.maximum(s, 1e-9) * (1.0 + safe**2))
-    weight = np.where(used, alignment.weight * slope, 0.0)
-    a, sign = _joint(design, depth, weight, None)
-    for _ in range(ROUNDS - 1):
-        z = np.tensordot(a, design, 1)
-        residual = z - sign[:, None] * depth
-        squared = weight**2
-        residual -= ((squared * residual).sum(axis=1) / np.maximum(squared.sum(axis=1), 1e-300))[:, None]
-        slope = s / np.maximum(s**2 + z**2, 1e-300)
-        residual = np.abs(residual) * slope
-        scale = 2.5 * 1.4826 * float(np.median(residual[used])) + 1e-9
-        weight = np.where(used, alignment.weight * slope / (1.0 + (residual / scale) ** 2), 0.0)
-        a, sign = _joint(design, depth, weight, sign)
-    radius = np.linspace(0.0, 1.0, SAMPLES)
-    theta = np.arctan2(radius, (radius[:, None] ** np.array(exponents)) @ a)
-    if a[0] <= 0.0 or (np.diff(theta) <= 0.0).any():
-        return None
-    return theta, sign
 
+    def __init__(self, alignment: Alignment, offset: FloatArray, rho: FloatArray, board: FloatArray) -> None:
+        xy = alignment.camera_xy(board)
+        self._safe = np.maximum(rho, 1e-4)
+        self._rho, self._weight = rho, alignment.weight
+        length = np.maximum(np.sqrt(offset[:, 0] ** 2 + offset[:, 1] ** 2), 1e-9)
+        self._s = (xy * offset).sum(axis=1) / length
+        self._used = (alignment.weight > 0.0) & (self._s > 0.0) & (rho > 1e-3)
+        # Of each view: s rho^(k - 1) for each exponent k, the depth, and one for t3.
+        self._rows = rows = np.ones((len(rho), len(EXPONENTS[0]) + 2, rho.shape[1]))
+        np.divide(self._s, self._safe, out=rows[:, 0])
+        np.multiply(self._s, self._safe, out=rows[:, 1])
+        for k in range(2, len(EXPONENTS[0])):
+            np.multiply(rows[:, k - 1], self._safe, out=rows[:, k])
+        np.matmul(alignment.tilt[:, None], board, out=rows[:, -2:-1])
+        # Moments of numbers that are all far from zero would lose their digits: taken around a middle corner.
+        self._middle = rows.mean(axis=-1)
+        self._middle[:, -1] = 0.0
+        rows -= self._middle[..., None]
 
-def _depth(tilt: FloatArray, board: FloatArray) -> FloatArray:
-    """Return r31 x + r32 y of the corners, (V, C)."""
-    return np.asarray(tilt[:, :1] * board[..., 0] + tilt[:, 1:] * board[..., 1])
+    def curve(self, exponents: tuple[int, ...]) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """Return the angles at SAMPLES radii in [0, 1], the signs of the tilts and t3 (V,); None where the angle does
+        not increase."""
+        which = [*(EXPONENTS[0].index(k) for k in exponents), -2]
+        s, depth = self._s, self._rows[:, -2] + self._middle[:, -2, None]
+        # d rho / d z of the lens turns residuals of z into residuals of rho; at first for a lens of 45 degrees.
+        slope = self._safe**2 / (np.maximum(s, 1e-9) * (1.0 + self._safe**2))
+        weight = np.where(self._used, self._weight * slope, 0.0)
+        a, sign, t3 = self._joint(which, weight, None)
+        for _ in range(ROUNDS - 1):
+            z = (a @ self._rows[:, which[:-1]]) + (self._middle[:, which[:-1]] @ a)[:, None]
+            slope = s / np.maximum(s * s + z * z, 1e-300)
+            residual = np.abs(z - t3[:, None] - sign[:, None] * depth) * slope
+            scale = 2.5 * 1.4826 * float(np.median(residual[self._used])) + 1e-9
+            weight = np.where(self._used, self._weight * slope / (1.0 + (residual / scale) ** 2), 0.0)
+            a, sign, t3 = self._joint(which, weight, sign)
+        radius = np.linspace(0.0, 1.0, SAMPLES)
+        theta = np.arctan2(radius, (radius[:, None] ** np.array(exponents)) @ a)
+        if a[0] <= 0.0 or (np.diff(theta) <= 0.0).any():
+            return None
+        return theta, sign, t3
 
+    def known(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return what `curve` does for a curve that is known, with all signs plus."""
+        angle = np.interp(self._rho, np.linspace(0.0, 1.0, SAMPLES), theta)
+        weight = self._weight * np.sin(angle) ** 2
+        z = self._s / np.tan(np.maximum(angle, 1e-6))
+        depth = self._rows[:, -2] + self._middle[:, -2, None]
+        t3 = (weight * (z - depth)).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-12)
+        return theta, np.ones(len(t3)), t3
 
-def _joint(
-    design: FloatArray, depth: FloatArray, weight: FloatArray, sign: FloatArray | None
-) -> tuple[FloatArray, FloatArray]:
-    """Return the polynomial a and the signs (V,) that minimise sum weight^2 (a design - t3_v - sign_v depth)^2.
+    def _joint(
+        self, which: list[int], weight: FloatArray, sign: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the polynomial a, the signs (V,) and t3 (V,) that minimise
+        sum weight^2 (a design - t3_v - sign_v depth)^2 with the rows `which` as design and, last, depth.
 
-    `design` is (coefficients, V, C). `sign` is where the search for the signs starts; None: from scratch.
-    """
-    squared = weight**2
-    total = np.maximum(squared.sum(axis=1), 1e-300)
-    centred = (design - ((squared * design).sum(axis=2) / total)[..., None]) * weight
-    right = (depth - ((squared * depth).sum(axis=1) / total)[:, None]) * weight
-    flat = centred.reshape(len(design), -1)
-    normal = flat @ flat.T
-    scale = np.sqrt(np.diag(normal)) + 1e-300
-    normal = normal / scale[:, None] / scale + 1e-12 * np.eye(len(scale))
-    cross = (centred * right).sum(axis=2) / scale[:, None]
-    if sign is None:
-        sign = _signs(np.linalg.solve(np.linalg.cholesky(normal), cross), (right**2).sum(axis=1))
-    a = np.linalg.solve(normal, cross @ sign)
-    for _ in range(10):
-        flipped = np.where(cross.T @ a < 0.0, -1.0, 1.0)
-        if (flipped == sign).all():
-            break
-        sign = flipped
+        `sign` is where the search for the signs starts; None: from scratch.
+        """
+        moments = (self._rows * (weight * weight)[:, None]) @ np.swapaxes(self._rows, -1, -2)
+        total = np.maximum(moments[:, -1, -1], 1e-300)
+        mean = moments[:, which, -1] / total[:, None]
+        central = moments[:, which][:, :, which] - total[:, None, None] * mean[:, :, None] * mean[:, None]
+        normal = central[:, :-1, :-1].sum(axis=0)
+        scale = np.sqrt(np.diag(normal)) + 1e-300
+        normal = normal / scale[:, None] / scale + 1e-12 * np.eye(len(scale))
+        cross = central[:, :-1, -1].T / scale[:, None]
+        if sign is None:
+            explained = np.asarray(np.linalg.solve(np.linalg.cholesky(normal), cross), dtype=np.float64)
+            sign = _signs(explained, central[:, -1, -1])
         a = np.linalg.solve(normal, cross @ sign)
-    if a[0] < 0.0:
-        a, sign = -a, -sign
-    return a / scale, sign
+        for _ in range(10):
+            flipped = np.where(cross.T @ a < 0.0, -1.0, 1.0)
+            if (flipped == sign).all():
+                break
+            sign = flipped
+            a = np.linalg.solve(normal, cross @ sign)
+        if a[0] < 0.0:
+            a, sign = -a, -sign
+        a = a / scale
+        mean += self._middle[:, which]
+        return a, sign, mean[:, :-1] @ a - sign * mean[:, -1]
 
 
 def _signs(explained: FloatArray, size2: FloatArray) -> FloatArray:

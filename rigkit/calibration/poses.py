@@ -75,10 +75,10 @@ def find_poses(observations: Observations, state: State, weight: FloatArray, los
     """Return the state with every pose found anew from its corners: radial alignment around the camera's centre, both
     signs of the tilt refined, and the pose in `state` as a third start; the cheapest of the three wins."""
     centre, _ = state.camera.project(np.array([0.0, 0.0, 1.0]))
-    board = observations.table()[observations.corner][..., :2]
-    alignment = align(observations.pixels - centre, board, weight)
+    board = np.swapaxes(observations.table()[observations.corner][..., :2], 1, 2)
+    alignment = align(np.swapaxes(observations.pixels - centre, 1, 2), board, weight)
     rays, seen = state.camera.unproject(observations.pixels)
-    s = np.linalg.norm(alignment.camera_xy(board), axis=-1)
+    s = np.linalg.norm(alignment.camera_xy(board), axis=1)
     across = np.maximum(np.linalg.norm(rays[..., :2], axis=-1), 1e-9)
     z = np.where(seen, s * rays[..., 2] / across, 0.0)
     share = np.where(seen, alignment.weight * across**2, 0.0)
@@ -86,7 +86,7 @@ def find_poses(observations: Observations, state: State, weight: FloatArray, los
     best, cost = refine_poses(observations, state, weight, loss_px)
     for sign in (1.0, -1.0):
         tilt = sign * alignment.tilt
-        t3 = (share * (z - (board @ tilt[..., None])[..., 0])).sum(axis=1) / total
+        t3 = (share * (z - (tilt[:, None] @ board)[:, 0])).sum(axis=1) / total
         columns = np.concatenate([alignment.rows[..., :2], tilt[:, None, :]], axis=1)
         third = np.cross(columns[..., 0], columns[..., 1])
         start = replace(

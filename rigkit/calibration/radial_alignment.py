@@ -25,6 +25,10 @@ SUBSET_SIZE = 7
 """With 5 % bad corners 70 % of such subsets are clean; 16 miss once in 10^8 views."""
 SUSPICIOUS = 8.0
 """A largest residual of more than this many robust sigmas sends the view through random subsets."""
+SQUARE_ROW, SQUARE_COLUMN = np.triu_indices(3)
+"""The six different products of two of three numbers."""
+NORMAL = 3 * np.tile([[0, 1, 2], [1, 3, 4], [2, 4, 5]], (2, 2)) + np.kron([[0, 1], [1, 2]], np.ones((3, 3), dtype=int))
+"""Where each entry of the 6x6 normal matrix lies in the (6, 3) moments: by product of (x, y, 1), by one of (-v, u)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -45,8 +49,8 @@ class Alignment:
     residual_px: FloatArray
 
     def camera_xy(self, board: FloatArray) -> FloatArray:
-        """Return (X, Y) of the corners (V, C, 2) in the camera frame, mm."""
-        return np.stack(_camera_xy(self.rows.reshape(-1, 6), board), axis=-1)
+        """Return (X, Y) in the camera frame (V, 2, C) of the corners (V, 2, C), mm."""
+        return np.asarray(self.rows[..., :2] @ board + self.rows[..., 2:])
 
 
 def align(offset: FloatArray, board: FloatArray, weight: FloatArray) -> Alignment:
@@ -54,29 +58,29 @@ def align(offset: FloatArray, board: FloatArray, weight: FloatArray) -> Alignmen
 
     Parameters
     ----------
-    offset : (V, C, 2) pixel minus centre.
-    board : (V, C, 2) mm, corners in the board frame.
+    offset : (V, 2, C) pixel minus centre.
+    board : (V, 2, C) mm, corners in the board frame.
     weight : (V, C) weight of each corner, zero to ignore.
     """
     local, mean, size = _normalised(board, weight)
     used = weight > 0.0
-    h = _fit(offset, local, weight)
-    residual, radius = _residual(h, offset, local)
+    views = _Views(offset, local)
+    h = views.fit(weight)
+    residual, radius = views.residual(h)
     sigma = _sigma(residual, used)
     bad = (np.where(used, residual, 0.0).max(axis=1) > SUSPICIOUS * sigma) & (used.sum(axis=1) > SUBSET_SIZE)
     if bad.any():
         h[bad] = _best_subset(offset[bad], local[bad], used[bad])
-        residual, radius = _residual(h, offset, local)
+        residual, radius = views.residual(h)
     robust = weight
     for _ in range(ROUNDS):
         sigma = _sigma(residual, used)
         robust = np.where(used, weight / (1.0 + (residual / (2.5 * sigma[:, None])) ** 2), 0.0)
-        h = _fit(offset, local, robust / radius)
-        residual, radius = _residual(h, offset, local)
+        h = views.fit(robust / radius)
+        residual, radius = views.residual(h)
         if not bad.any():
             break
-    x, y = _camera_xy(h, local)
-    agree = (robust * (x * offset[..., 0] + y * offset[..., 1])).sum(axis=1)
+    agree = (robust * (views.camera_xy(h) * offset).sum(axis=1)).sum(axis=1)
     h *= np.where(agree < 0.0, -1.0, 1.0)[:, None]
     share = np.divide(robust, weight, out=np.zeros_like(weight), where=used)
     rows, tilt = _orthonormal(h, mean, size)
@@ -84,38 +88,46 @@ def align(offset: FloatArray, board: FloatArray, weight: FloatArray) -> Alignmen
 
 
 def _normalised(board: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    present = (weight > 0.0)[..., None]
-    count = np.maximum(present.sum(axis=1), 1)
-    mean = (board * present).sum(axis=1) / count
-    local = (board - mean[:, None]) * present
-    size = np.sqrt((local**2).sum(axis=(1, 2)) / count[:, 0]) + np.finfo(float).tiny
-    return local / size[:, None, None], mean, size
+    """Return (x, y, 1) of the corners (V, 3, C) with the mean of those used at zero and unit size, that mean and
+    size."""
+    present = (weight > 0.0)[:, None]
+    count = np.maximum(present.sum(axis=-1), 1)
+    mean = (board * present).sum(axis=-1) / count
+    local = np.ones((len(board), 3, board.shape[-1]))
+    xy = local[:, :2]
+    np.multiply(board - mean[..., None], present, out=xy)
+    size = np.sqrt((xy * xy).sum(axis=(1, 2)) / count[:, 0]) + np.finfo(float).tiny
+    xy /= size[:, None, None]
+    return local, mean, size
 
 
-def _fit(offset: FloatArray, local: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return the unit h (V, 6) that minimises sum weight^2 (u Y - v X)^2."""
-    u, v = weight * offset[..., 0], weight * offset[..., 1]
-    x, y = local[..., 0], local[..., 1]
-    # Unknowns before corners: every row of the design is one contiguous run.
-    design = np.empty((*u.shape[:-1], 6, u.shape[-1]))
-    for k, (left, right) in enumerate(((-v, x), (-v, y), (-v, None), (u, x), (u, y), (u, None))):
-        design[..., k, :] = left if right is None else left * right
-    return np.asarray(np.linalg.eigh(design @ np.swapaxes(design, -1, -2))[1][..., 0])
+class _Views:
+    """Corners of views and what all fits to them share: offsets (..., 2, C), (x, y, 1) (..., 3, C)."""
 
+    def __init__(self, offset: FloatArray, local: FloatArray) -> None:
+        self._u, self._v, self._local = offset[..., 0, :], offset[..., 1, :], local
+        # Products of two of (x, y, 1), and of the direction (-v, u).
+        self._squares = local[..., SQUARE_ROW, :] * local[..., SQUARE_COLUMN, :]
+        self._direction = np.stack([self._v * self._v, -self._u * self._v, self._u * self._u], axis=-2)
 
-def _camera_xy(h: FloatArray, local: FloatArray) -> tuple[FloatArray, FloatArray]:
-    x, y = local[..., 0], local[..., 1]
-    h = h[..., None]
-    return h[..., 0, :] * x + h[..., 1, :] * y + h[..., 2, :], h[..., 3, :] * x + h[..., 4, :] * y + h[..., 5, :]
+    def fit(self, weight: FloatArray) -> FloatArray:
+        """Return the unit h (..., 6) that minimises sum weight^2 (u Y - v X)^2."""
+        moments = self._squares @ np.swapaxes(self._direction * (weight * weight)[..., None, :], -1, -2)
+        normal = moments.reshape(*weight.shape[:-1], -1)[..., NORMAL]
+        return np.asarray(np.linalg.eigh(normal)[1][..., 0])
 
+    def camera_xy(self, h: FloatArray) -> FloatArray:
+        """Return (X, Y) (..., 2, C)."""
+        return np.asarray(h.reshape(*h.shape[:-1], 2, 3) @ self._local)
 
-def _residual(h: FloatArray, offset: FloatArray, local: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the distance in px of each pixel from the radial line through its corner, and the corner's |(X, Y)|, kept
-    off zero for corners that lie on the axis."""
-    x, y = _camera_xy(h, local)
-    radius = np.sqrt(x * x + y * y)
-    radius = np.maximum(radius, 1e-3 * radius.max(axis=-1, keepdims=True) + np.finfo(float).tiny)
-    return np.abs(offset[..., 0] * y - offset[..., 1] * x) / radius, radius
+    def residual(self, h: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the distance in px of each pixel from the radial line through its corner, and the corner's |(X, Y)|,
+        kept off zero for corners that lie on the axis."""
+        xy = self.camera_xy(h)
+        x, y = xy[..., 0, :], xy[..., 1, :]
+        radius = np.sqrt(x * x + y * y)
+        radius = np.maximum(radius, 1e-3 * radius.max(axis=-1, keepdims=True) + np.finfo(float).tiny)
+        return np.abs(self._u * y - self._v * x) / radius, radius
 
 
 def _sigma(residual: FloatArray, used: np.ndarray) -> FloatArray:
@@ -130,10 +142,11 @@ def _best_subset(offset: FloatArray, local: FloatArray, used: np.ndarray) -> Flo
     """Return, for each view, the fit to a random subset of its corners with the smallest median residual."""
     rng = np.random.default_rng(0)
     order = np.argsort(np.where(used[:, None], rng.random((len(used), SUBSETS, used.shape[1])), 2.0), axis=-1)
-    chosen = order[..., :SUBSET_SIZE]
-    view = np.arange(len(used))[:, None, None]
-    h = _fit(offset[view, chosen], local[view, chosen], np.ones(chosen.shape))
-    residual, _ = _residual(h, offset[:, None], local[:, None])
+    chosen = order[..., None, :SUBSET_SIZE]
+    offset, local = offset[:, None], local[:, None]
+    subset = _Views(np.take_along_axis(offset, chosen, axis=-1), np.take_along_axis(local, chosen, axis=-1))
+    h = subset.fit(np.ones((*order.shape[:-1], SUBSET_SIZE)))
+    residual, _ = _Views(offset, local).residual(h)
     median = np.nanmedian(np.where(used[:, None], residual, np.nan), axis=-1)
     return np.asarray(h[np.arange(len(used)), median.argmin(axis=1)])
 
@@ -155,16 +168,14 @@ def _orthonormal(h: FloatArray, mean: FloatArray, size: FloatArray) -> tuple[Flo
 
 
 def distortion_centre(pixels: FloatArray, board: FloatArray, weight: FloatArray, guess: FloatArray) -> FloatArray:
-    """Return the centre of distortion, (2,) px, from all views: the common epipole of the radial fundamental matrices
-    (u, v, 1) F_v (x, y, 1)^T = 0. Meaningless without distortion, when every point of the image would do."""
+    """Return the centre of distortion, (2,) px, from all views (V, 2, C): the common epipole of the radial fundamental
+    matrices (u, v, 1) F_v (x, y, 1)^T = 0. Meaningless without distortion, when every point of the image would do."""
     local, _, _ = _normalised(board, weight)
-    used = weight > 0.0
-    size = float(np.abs(np.where(used[..., None], pixels - guess, 0.0)).max()) or 1.0
-    uv = (pixels - guess) / size
-    one = np.ones_like(uv[..., :1])
-    left, right = np.concatenate([uv, one], axis=-1), np.concatenate([local, one], axis=-1)
-    design = (left[..., :, None] * right[..., None, :]).reshape(*weight.shape, 9) * weight[..., None]
-    values, vectors = np.linalg.eigh(np.swapaxes(design, -1, -2) @ design)
+    offset = pixels - guess[:, None]
+    size = float(np.abs(np.where((weight > 0.0)[:, None], offset, 0.0)).max()) or 1.0
+    left = np.concatenate([offset / size, np.ones_like(offset[:, :1])], axis=1)
+    design = (left[:, :, None] * local[:, None]).reshape(len(weight), 9, -1) * weight[:, None]
+    values, vectors = np.linalg.eigh(design @ np.swapaxes(design, -1, -2))
     F = vectors[..., 0].reshape(-1, 3, 3)
     # A view whose second smallest eigenvalue is as small as the first leaves its F open.
     certain = np.clip(1.0 - np.maximum(values[:, 0], 0.0) / np.maximum(values[:, 1], np.finfo(float).tiny), 0.0, 1.0)

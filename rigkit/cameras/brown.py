@@ -99,145 +99,145 @@ class Brown(Camera):
     def _prepare(self) -> None:
         top, bottom = self._polynomials()
         bound = 6.0 * np.hypot(self.parameters[6], self.parameters[7])
-        # d(L r)/dr = L + 2 t L' = [(N + 2 t N') D - 2 t N D'] / D^2, in powers of t and then of r.
+        # d(L r)/dr = L + 2 t L' = [(N + 2 t N') D - 2 t N D'] / D^2, in powers of t; both are to exceed bound * r.
         k, j = np.arange(top.size), np.arange(bottom.size)
         radial = np.convolve(top * (1.0 + 2.0 * k), bottom) - 2.0 * np.convolve(top, bottom * j)
-        bottom2 = np.convolve(bottom, bottom)
-        limit = FARTHEST
-        for value in (_at_squares(radial), _at_squares(np.convolve(top, bottom))):
-            limit = first_root(_minus(value, bound, bottom2), limit)
+        by_r = np.zeros((2, 2 * max(radial.size, 2 * bottom.size) - 1))
+        by_r[0, : 2 * radial.size : 2], by_r[1, : 2 * radial.size : 2] = radial, np.convolve(top, bottom)
+        by_r[:, 1 : 4 * bottom.size - 2 : 2] = -bound * np.convolve(bottom, bottom)
+        limit = first_root(by_r, FARTHEST)
         if bottom.size > 1:
-            limit = first_root(_at_squares(bottom), limit)
+            limit = min(limit, float(np.sqrt(first_root(bottom, FARTHEST**2))))
         object.__setattr__(self, "_max_r", limit)
 
-    def _distort(
-        self, x: FloatArray, y: FloatArray, t: FloatArray, *, slope: bool
-    ) -> tuple[FloatArray, FloatArray, FloatArray, tuple[FloatArray, FloatArray, FloatArray]]:
-        """Return m_x, m_y, L and, where `slope`, the entries xx, xy, yy of the symmetric d m / d (x, y)."""
+    def _radial(self, t: FloatArray) -> tuple[FloatArray, FloatArray | float]:
+        """Return L and its denominator."""
+        top, bottom = self._polynomials()
+        factor = horner(top, t)
+        if bottom.size == 1:
+            return factor, 1.0
+        denominator = horner(bottom, t)
+        factor /= denominator
+        return factor, denominator
+
+    def _distort(self, plane: FloatArray, squares: FloatArray, factor: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return m (2, N) and (t + 2 x^2, 2 x y, t + 2 y^2) from (x, y), (x^2, x y, y^2) and L."""
+        p1, p2 = self.parameters[6:8].tolist()
+        tangential = 2.0 * squares
+        tangential[::2] += squares[0] + squares[2]
+        m = factor * plane
+        m += np.array([[p2, p1, 0.0], [0.0, p2, p1]]) @ tangential
+        return m, tangential
+
+    def _slope(
+        self, plane: FloatArray, squares: FloatArray, t: FloatArray, factor: FloatArray, denominator: FloatArray | float
+    ) -> FloatArray:
+        """Return the entries xx, xy, yy (3, N) of the symmetric d m / d (x, y)."""
         top, bottom = self._polynomials()
         p1, p2 = self.parameters[6:8].tolist()
-        factor, denominator = horner(top, t), horner(bottom, t)
-        factor /= denominator
-        mx = factor * x + p2 * (t + 2.0 * x * x) + 2.0 * p1 * x * y
-        my = factor * y + p1 * (t + 2.0 * y * y) + 2.0 * p2 * x * y
-        if not slope:
-            return mx, my, factor, (t, t, t)
-        by_t = horner(top[1:] * np.arange(1, 4), t)
+        by_t2 = horner(top[1:] * np.array([2.0, 4.0, 6.0]), t)
         if bottom.size > 1:
-            by_t -= factor * horner(bottom[1:] * np.arange(1, 4), t)
-            by_t /= denominator
-        by_t *= 2.0
-        xx = factor + by_t * x * x + 2.0 * p1 * y + 6.0 * p2 * x
-        xy = by_t * x * y + 2.0 * p1 * x + 2.0 * p2 * y
-        yy = factor + by_t * y * y + 6.0 * p1 * y + 2.0 * p2 * x
-        return mx, my, factor, (xx, xy, yy)
+            by_t2 -= factor * horner(bottom[1:] * np.array([2.0, 4.0, 6.0]), t)
+            by_t2 /= denominator
+        slope = np.array([[6.0 * p2, 2.0 * p1], [2.0 * p1, 2.0 * p2], [2.0 * p2, 6.0 * p1]]) @ plane
+        slope += by_t2 * squares
+        slope[::2] += factor
+        return slope
 
     def _plane(
         self, x: FloatArray, y: FloatArray, z: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray]:
-        """Return 1/z, x/z, y/z, t, valid."""
+        """Return 1/z, (x/z, y/z) (2, N), its (x^2, x y, y^2), t, valid."""
         inverse = 1.0 / z
-        x, y = x * inverse, y * inverse
-        t = x * x + y * y
-        return inverse, x, y, t, (z > 0.0) & (t <= self._max_r**2)
+        plane = np.stack([x, y])
+        plane *= inverse
+        squares = _squares(plane)
+        t = squares[0] + squares[2]
+        return inverse, plane, squares, t, (z > 0.0) & (t <= self._max_r**2)
 
     def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        _, x, y, t, valid = self._plane(x, y, z)
-        mx, my, _, _ = self._distort(x, y, t, slope=False)
-        fx, fy, cx, cy = self.parameters[:4]
+        _, plane, squares, t, valid = self._plane(x, y, z)
+        (mx, my), _ = self._distort(plane, squares, self._radial(t)[0])
+        fx, fy, cx, cy = self.parameters[:4].tolist()
         return fx * mx + cx, fy * my + cy, valid
 
     def _unproject(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-        fx, fy, cx, cy = self.parameters[:4]
-        mx, my = (u - cx) / fx, (v - cy) / fy
-        valid = np.isfinite(mx + my)
-        x, y = self._radial_start(np.where(valid, mx, 0.0), np.where(valid, my, 0.0))
+        fx, fy, cx, cy = self.parameters[:4].tolist()
+        m = np.stack([(u - cx) / fx, (v - cy) / fy])
+        valid = np.isfinite(m[0] + m[1])
+        plane = self._radial_start(np.where(valid, m, 0.0))
         moving = np.flatnonzero(valid)
         for _ in range(STEPS):
-            px, py = x[moving], y[moving]
-            gx, gy, _, (xx, xy, yy) = self._distort(px, py, px * px + py * py, slope=True)
-            gx, gy = gx - mx[moving], gy - my[moving]
-            determinant = xx * yy - xy * xy
-            dx, dy = (yy * gx - xy * gy) / determinant, (xx * gy - xy * gx) / determinant
+            here = plane[:, moving]
+            squares = _squares(here)
+            t = squares[0] + squares[2]
+            factor, denominator = self._radial(t)
+            miss = self._distort(here, squares, factor)[0] - m[:, moving]
+            xx, xy, yy = self._slope(here, squares, t, factor, denominator)
+            step = np.stack([yy * miss[0] - xy * miss[1], xx * miss[1] - xy * miss[0]]) / (xx * yy - xy * xy)
             # Kept inside the circle, where the derivative is positive definite: Newton cannot leave for another branch.
-            px, py = px - dx, py - dy
-            pull = np.minimum(1.0, self._max_r / np.sqrt(px * px + py * py + 1e-300))
-            x[moving], y[moving] = pull * px, pull * py
-            moving = moving[~(np.abs(dx) + np.abs(dy) <= SETTLED * (1.0 + np.abs(px) + np.abs(py)))]
+            here -= step
+            length = np.sqrt(here[0] ** 2 + here[1] ** 2 + 1e-300)
+            plane[:, moving] = np.minimum(1.0, self._max_r / length) * here
+            moving = moving[~(np.abs(step).sum(axis=0) <= SETTLED * (1.0 + length))]
             if not moving.size:
                 break
         valid[moving] = False
-        z = 1.0 / np.sqrt(1.0 + x * x + y * y)
-        return x * z, y * z, z, valid
+        z = 1.0 / np.sqrt(1.0 + plane[0] ** 2 + plane[1] ** 2)
+        return plane[0] * z, plane[1] * z, z, valid
 
-    def _radial_start(self, mx: FloatArray, my: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return (x, y) that the radial part alone maps to m, or the edge of the field of view."""
-        top, bottom = self._polynomials()
+    def _radial_start(self, m: FloatArray) -> FloatArray:
+        """Return the (x, y) that the radial part alone maps to m (2, N), or the edge of the field of view."""
         # Even steps of the angle, because r runs away towards 90 degrees.
         knots = np.tan(np.linspace(0.0, np.arctan(self._max_r), KNOTS))
-        values = knots * horner(top, knots * knots) / horner(bottom, knots * knots)
-        radius = np.sqrt(mx * mx + my * my)
-        share = np.interp(radius, values, knots) / np.where(radius > 0.0, radius, 1.0)
-        return share * mx, share * my
+        radius = np.sqrt(m[0] ** 2 + m[1] ** 2)
+        found = np.interp(radius, knots * self._radial(knots * knots)[0], knots)
+        return np.asarray(found / np.where(radius > 0.0, radius, 1.0) * m)
 
     def _derivatives(
         self, x: FloatArray, y: FloatArray, z: FloatArray, by_point: FloatArray, by_parameter: FloatArray | None
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        inverse, x, y, t, valid = self._plane(x, y, z)
-        mx, my, factor, (xx, xy, yy) = self._distort(x, y, t, slope=True)
+        inverse, plane, squares, t, valid = self._plane(x, y, z)
+        factor, denominator = self._radial(t)
+        m, tangential = self._distort(plane, squares, factor)
+        slope = self._slope(plane, squares, t, factor, denominator)
         fx, fy, cx, cy = self.parameters[:4].tolist()
-        for row, (focal, a, b) in enumerate(((fx, xx, xy), (fy, xy, yy))):
-            a, b = focal * inverse * a, focal * inverse * b
-            by_point[row, 0], by_point[row, 1] = a, b
-            by_point[row, 2] = -(a * x + b * y)
+        for row, focal in enumerate((fx, fy)):
+            scale = focal * inverse
+            by_x, by_y, by_z = by_point[row]
+            np.multiply(scale, slope[row], out=by_x)
+            np.multiply(scale, slope[row + 1], out=by_y)
+            np.multiply(by_x, plane[0], out=by_z)
+            by_z += by_y * plane[1]
+            np.negative(by_z, out=by_z)
         if by_parameter is not None:
-            self._fill_parameters(by_parameter, x, y, t, factor, (mx, my))
-        return fx * mx + cx, fy * my + cy, valid
-
-    def _fill_parameters(
-        self,
-        out: FloatArray,
-        x: FloatArray,
-        y: FloatArray,
-        t: FloatArray,
-        factor: FloatArray,
-        m: tuple[FloatArray, ...],
-    ) -> None:
-        fx, fy = self.parameters[:2].tolist()
-        out[0, 0], out[1, 1] = m
-        out[0, 2] = out[1, 3] = 1.0
-        over = 1.0 / horner(self._polynomials()[1], t)
-        self._fill_powers(out, (4, 5, 8), (fx * x * over, fy * y * over), t)
-        if out.shape[1] > 9:
-            over = -factor * over
-            self._fill_powers(out, (9, 10, 11), (fx * x * over, fy * y * over), t)
-        cross = 2.0 * x * y
-        out[0, 6], out[0, 7] = fx * cross, fx * (t + 2.0 * x * x)
-        out[1, 6], out[1, 7] = fy * (t + 2.0 * y * y), fy * cross
-
-    @staticmethod
-    def _fill_powers(
-        out: FloatArray, columns: tuple[int, ...], g: tuple[FloatArray, FloatArray], t: FloatArray
-    ) -> None:
-        """Write g t, g t^2, g t^3 into the columns given."""
-        power = t
-        for column in columns:
-            np.multiply(g[0], power, out=out[0, column])
-            np.multiply(g[1], power, out=out[1, column])
-            power = power * t
+            by_parameter[0, 0], by_parameter[1, 1] = m
+            by_parameter[0, 2] = by_parameter[1, 3] = 1.0
+            # Rows of p1, p2: (2 x y, t + 2 x^2) and (t + 2 y^2, 2 x y).
+            np.multiply(fx, tangential[1::-1], out=by_parameter[0, 6:8])
+            np.multiply(fy, tangential[:0:-1], out=by_parameter[1, 6:8])
+            for ray, out in ((fx * plane[0], by_parameter[0]), (fy * plane[1], by_parameter[1])):
+                _fill_radial(out, ray, t, factor, denominator)
+        return fx * m[0] + cx, fy * m[1] + cy, valid
 
 
-def _at_squares(coefficients: FloatArray) -> FloatArray:
-    """Coefficients in r of a polynomial in t = r^2."""
-    out = np.zeros(2 * coefficients.size - 1)
-    out[::2] = coefficients
-    return out
+def _fill_radial(
+    out: FloatArray, ray: FloatArray, t: FloatArray, factor: FloatArray, denominator: FloatArray | float
+) -> None:
+    """Write d u / d k into `out` (P, N) where `ray` (N,) is fx x, and the same for v."""
+    if len(out) > 9:
+        ray = ray / denominator
+        np.multiply(ray, -factor * t, out=out[9])
+        np.multiply(out[9], t, out=out[10])
+        np.multiply(out[10], t, out=out[11])
+    np.multiply(ray, t, out=out[4])
+    np.multiply(out[4], t, out=out[5])
+    np.multiply(out[5], t, out=out[8])
 
 
-def _minus(value: FloatArray, bound: float, weight: FloatArray) -> FloatArray:
-    """Coefficients in r of value(r) - bound * r * weight(r^2)."""
-    shifted = np.concatenate([[0.0], bound * _at_squares(weight)])
-    out = np.zeros(max(value.size, shifted.size))
-    out[: value.size] += value
-    out[: shifted.size] -= shifted
+def _squares(plane: FloatArray) -> FloatArray:
+    """Return (x^2, x y, y^2) of (x, y) (2, N)."""
+    out = np.empty((3, plane.shape[1]))
+    np.multiply(plane, plane, out=out[::2])
+    np.multiply(plane[0], plane[1], out=out[1])
     return out

@@ -26,26 +26,35 @@ CELLS_PER_KNOT = 4
 
 def horner(coefficients: FloatArray, x: FloatArray) -> FloatArray:
     """Return sum_k coefficients[k] x^k."""
-    value = np.full_like(x, coefficients[-1])
-    for c in coefficients[-2::-1]:
+    *lower, top = coefficients.tolist()
+    if not lower:
+        return np.full_like(x, top)
+    value: FloatArray = top * x
+    value += lower.pop()
+    for c in reversed(lower):
         value *= x
         value += c
     return value
 
 
 def first_root(coefficients: FloatArray, limit: float) -> float:
-    """Return the smallest root in (0, `limit`] of sum_k coefficients[k] x^k, or `limit` where there is none.
+    """Return the smallest root in (0, `limit`] of the polynomials sum_k coefficients[..., k] x^k, (..., K) of them, or
+    `limit` where there is none. They must not vanish at zero.
 
-    Raises InputError where the polynomial overflows: what a solver tries may be far from any lens.
+    Raises InputError where a polynomial overflows: what a solver tries may be far from any lens.
     """
     # Scaled to x in (0, 1] so that coefficients of high powers of pixels are not lost beside the others.
-    scaled = np.asarray(coefficients, dtype=np.float64) * limit ** np.arange(len(coefficients), dtype=np.float64)
+    degree = coefficients.shape[-1] - 1
+    scaled = coefficients * limit ** np.arange(degree + 1.0)
     if not np.isfinite(scaled).all():
         raise InputError("lens polynomial: its coefficients are too large for any lens")
-    roots = np.roots(np.trim_zeros(scaled[::-1], "f"))
-    real = roots.real[np.abs(roots.imag) <= REAL_ROOT * np.abs(roots)]
-    real = real[(real > 0.0) & (real < 1.0)]
-    return float(limit * real.min()) if real.size else float(limit)
+    # Eigenvalues of this companion matrix are 1 / x: a leading coefficient of zero is no special case.
+    companion = np.zeros((*coefficients.shape[:-1], degree, degree))
+    companion.reshape(-1, degree * degree)[:, degree :: degree + 1] = 1.0
+    companion[..., 0, :] = scaled[..., 1:] / -scaled[..., :1]
+    inverse = np.linalg.eigvals(companion)
+    real = inverse.real[np.abs(inverse.imag) <= REAL_ROOT * np.abs(inverse)]
+    return float(limit / real.max(initial=1.0))
 
 
 def invert_increasing(
