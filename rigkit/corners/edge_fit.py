@@ -14,9 +14,14 @@ from rigkit.arrays import BoolArray, FloatArray
 from rigkit.corners.edge_model import (
     GX,
     GY,
+    NEAR_PX,
+    NEAR_SIGMAS,
     PARAMETERS,
+    PIXEL_KURTOSIS,
+    REACH,
     T1,
     T2,
+    TAIL_SIGMAS,
     A,
     B,
     Geometry,
@@ -29,6 +34,7 @@ from rigkit.corners.edge_model import (
     pattern_of,
 )
 from rigkit.corners.response import FloatImage
+from rigkit.native.edges import Rules, fit_corners
 
 __all__ = ["BLUR_RANGE", "EdgeFit", "fit_edges"]
 
@@ -41,8 +47,20 @@ LIGHT_SIGMA = 0.3
 """How well the lattice's angles, the start's log s and an even light (g = 0, per window) are known beforehand. These
 matter only where squares are so small that the pixels cannot tell."""
 
-CONVERGED_PX = 1e-3
-"""A Gauss-Newton step shorter than this leaves the next one below 1e-5 px."""
+MOST_MOVE_PX, MOST_TURN_RAD, MOST_BLUR_CHANGE, MOST_LIGHT_CHANGE = 1.0, 0.2, 0.3, 0.3
+"""A step is cut where it would leave the region in which the model is nearly linear: position, angles, relative blur,
+light."""
+
+BLUR_LAG = 10.0
+"""The last step may change s by so many times what it may move the corner: a wrong s hardly moves the corner, but adds
+to the residuals and so to the predicted sigma."""
+
+LEAST_VARIANCE = 1e-6
+RIDGE = 1e-9
+"""Of grey levels, and on the normal equations' diagonal: keep an image without noise or without contrast solvable."""
+
+VALID_MOVE_PX, VALID_MOVE_CELLS = 1.5, 0.2
+"""A fit that ends further from its start, in px or in sides of its cell, has found something else."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -76,6 +94,7 @@ def fit_edges(
     *,
     radius_px: float,
     iterations: int,
+    converged_px: float = 1e-3,
 ) -> EdgeFit:
     """Fit the edge model to `image` (grey float32) around the corners that are near `pixels` (N, 2).
 
@@ -85,7 +104,21 @@ def fit_edges(
     blur : (N,) expected s.
     radius_px : pixels further from the corner are not used.
     iterations : Gauss-Newton steps at most.
+    converged_px : the last step moves the corner by less than this; the next one would by a hundredth of it.
     """
+    fitted = fit_corners(
+        image,
+        pixels,
+        geometry.sides,
+        geometry.curvature,
+        geometry.gaps,
+        sign,
+        blur,
+        _rules(radius_px, iterations, converged_px),
+    )
+    if fitted is not None:
+        _, _, sigma_px, width, contrast, residual, valid = fitted.T
+        return EdgeFit(fitted[:, :2], sigma_px, width, contrast, residual, valid > 0.5)
     window = collect(image, pixels, geometry, blur, radius_px)
     prior_mean, prior = _prior(geometry, blur)
     values = prior_mean.copy()
@@ -103,18 +136,46 @@ def fit_edges(
             values[active], window if every else window.of(active), geometry if every else geometry.of(active)
         )
         products = (rows @ np.swapaxes(rows, 1, 2)).astype(np.float64)
-        variance[active] = np.maximum(products[:, -1, -1] / free[active], 1e-6)
+        variance[active] = np.maximum(products[:, -1, -1] / free[active], LEAST_VARIANCE)
         pull = prior[active] * variance[active, None]
         hessian = products[:, :-1, :-1]
-        hessian[:, diagonal, diagonal] += pull + 1e-9
+        hessian[:, diagonal, diagonal] += pull + RIDGE
         gradient = products[:, :-1, -1] + pull * (prior_mean - values)[active]
         step = np.linalg.solve(hessian, gradient[..., None])[..., 0]
         normal[active] = hessian
         values[active] += _limited(step, values[active])
-        active[np.flatnonzero(active)[np.abs(step[:, [X, Y]]).max(axis=1) <= CONVERGED_PX]] = False
+        change = np.abs(step[:, [X, Y, S]]) / [1.0, 1.0, BLUR_LAG]
+        active[np.flatnonzero(active)[change.max(axis=1) <= converged_px]] = False
         if not active.any():
             break
     return _result(values, variance, normal, window, pixels, geometry, sign)
+
+
+def _rules(radius_px: float, iterations: int, converged_px: float) -> Rules:
+    return Rules(
+        reach=REACH,
+        near_sigmas=NEAR_SIGMAS,
+        near_px=NEAR_PX,
+        tail_sigmas=TAIL_SIGMAS,
+        pixel_kurtosis=PIXEL_KURTOSIS,
+        least_blur=BLUR_RANGE[0],
+        most_blur=BLUR_RANGE[1],
+        angle_sigma=ANGLE_SIGMA_RAD,
+        log_blur_sigma=LOG_BLUR_SIGMA,
+        light_sigma=LIGHT_SIGMA,
+        most_move_px=MOST_MOVE_PX,
+        most_turn=MOST_TURN_RAD,
+        most_blur_change=MOST_BLUR_CHANGE,
+        most_light_change=MOST_LIGHT_CHANGE,
+        least_variance=LEAST_VARIANCE,
+        ridge=RIDGE,
+        converged_px=converged_px,
+        blur_lag=BLUR_LAG,
+        valid_move_px=VALID_MOVE_PX,
+        valid_move_cells=VALID_MOVE_CELLS,
+        radius_px=radius_px,
+        iterations=iterations,
+    )
 
 
 def _prior(geometry: Geometry, blur: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -144,10 +205,10 @@ def _brightness(values: FloatArray, window: Window, geometry: Geometry, sign: Fl
 def _limited(step: FloatArray, values: FloatArray) -> FloatArray:
     """Return the step, cut where it would leave the region in which the model is nearly linear."""
     limit = np.full(step.shape, np.inf)
-    limit[:, [X, Y]] = 1.0
-    limit[:, [T1, T2]] = 0.2
-    limit[:, S] = 0.3 * values[:, S]
-    limit[:, [GX, GY]] = 0.3
+    limit[:, [X, Y]] = MOST_MOVE_PX
+    limit[:, [T1, T2]] = MOST_TURN_RAD
+    limit[:, S] = MOST_BLUR_CHANGE * values[:, S]
+    limit[:, [GX, GY]] = MOST_LIGHT_CHANGE
     out = np.clip(step, -limit, limit)
     out[:, S] = np.clip(values[:, S] + out[:, S], *BLUR_RANGE) - values[:, S]
     return out
@@ -175,7 +236,7 @@ def _result(
     spread = 0.5 * (covariance[:, X, X] + covariance[:, Y, Y])
     moved = np.linalg.norm(pixels - start, axis=1)
     longest = np.linalg.norm(geometry.sides, axis=2).max(axis=1)
-    valid = (moved < np.maximum(1.5, 0.2 * longest)) & (spread > 0.0) & np.isfinite(spread)
+    valid = (moved < np.maximum(VALID_MOVE_PX, VALID_MOVE_CELLS * longest)) & (spread > 0.0) & np.isfinite(spread)
     valid &= (window.weight.sum(axis=1) > PARAMETERS) & _surrounded(pixels, window)
     return EdgeFit(
         pixels,

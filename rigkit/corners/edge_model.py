@@ -3,11 +3,12 @@
     I(p) = (1 + g . (p - c)) (a + b S(d1 / s) S(d2 / s))
 
 with d1, d2 the distances of pixel p from the two lines through the corner (given curvatures, so that a fisheye's bent
-rows do not pull the corner aside), S a smooth step of width s (blur and pixel together), a and b brightness and half
-contrast, g the gradient of the light. Parameters: corner (2), angles of the lines (2), s, a, b, g (2).
+rows do not pull the corner aside), S the step of an edge as a Gaussian lens and the square of a pixel blur it, of
+standard deviation s together, a and b brightness and half contrast, g the gradient of the light. Parameters: corner
+(2), angles of the lines (2), s, a, b, g (2).
 
 The model is symmetric about the corner but for curvature and light, so what it gets wrong otherwise (the shape of the
-blur, sharpening) does not move the corner.
+blur, sharpening) does not move the corner; but it adds to the residuals, and so to the predicted sigma.
 
 Arrays are float32 here, the one place besides image filters: N corners x P pixels x 9 derivatives, of values 0..255,
 summed in products of P terms; the corner is good to 1e-5 px.
@@ -23,15 +24,30 @@ from numpy.typing import NDArray
 from rigkit.arrays import BoolArray, FloatArray
 from rigkit.corners.response import FloatImage
 
-__all__ = ["PARAMETERS", "REACH", "STEP_WIDTH", "Geometry", "Window", "collect", "linearise", "pattern_of"]
+__all__ = [
+    "NEAR_PX",
+    "NEAR_SIGMAS",
+    "PARAMETERS",
+    "PIXEL_KURTOSIS",
+    "REACH",
+    "TAIL_SIGMAS",
+    "Geometry",
+    "Window",
+    "collect",
+    "linearise",
+    "pattern_of",
+]
 
 Float32 = NDArray[np.float32]
 
 PARAMETERS = 9
 X, Y, T1, T2, S, A, B, GX, GY = range(PARAMETERS)
 
-STEP_WIDTH = np.float32(3.0)
-"""The step rises within +-3 s: its slope (1 - u^2)^3 then has the standard deviation s."""
+TAIL_SIGMAS = 3.0
+"""An edge is felt so far away, s: the edges of the neighbouring lines are reckoned with where they are nearer."""
+
+PIXEL_KURTOSIS = -1.0 / 120.0
+"""Fourth cumulant of a uniform distribution of width 1: of a pixel's square along its sides, px^4."""
 
 REACH = 0.44
 """Pixels are used up to this from the corner along the sides of its cell: short of the neighbouring edges."""
@@ -116,59 +132,57 @@ def collect(image: FloatImage, pixels: FloatArray, geometry: Geometry, blur: Flo
     )
 
 
-def _step(distance: Float32, blur: Float32, gaps: Float32) -> tuple[Float32, ...]:
-    """Return the blurred step S over the line, S' and S'' (with respect to x = distance / s), and x S' (for dS/ds).
+def _step(distance: Float32, blur: Float32, kurtosis: Float32, gaps: Float32) -> tuple[Float32, ...]:
+    """Return the blurred step S over the line, S' and S'' (with respect to x = distance / s), and -s dS/ds.
 
     Where squares are small against the blur, the edges of the parallel lines at `gaps` (N, 2) before and after reach
     into the window: their steps are taken away. Far from both they add up to nothing: one is -1, the other +1.
     """
-    total = _smooth_step(distance / (STEP_WIDTH * blur))
-    tight = (gaps * (1.0 - REACH) < STEP_WIDTH * blur).any(axis=1)
+    total = _blurred_edge(distance / blur, kurtosis)
+    tight = (gaps * (1.0 - REACH) < TAIL_SIGMAS * blur).any(axis=1)
     if tight.any():
-        near, sigma, beside = distance[tight], blur[tight], gaps[tight]
-        lines = [_gaussian_step((near - place) / sigma) for place in (0.0, -beside[:, :1], beside[:, 1:])]
-        for kind, (own, before, after) in enumerate(zip(*lines, strict=True)):
-            total[kind][tight] = own - before - after
+        near, sigma, beside, shape = distance[tight], blur[tight], gaps[tight], kurtosis[tight]
+        for place in (-beside[:, :1], beside[:, 1:]):
+            for mine, other in zip(total, _blurred_edge((near - place) / sigma, shape), strict=True):
+                mine[tight] -= other
     return total
 
 
-def _gaussian_step(x: Float32) -> tuple[Float32, ...]:
-    """Return what `_smooth_step` does, of the Gaussian's own step: its tails matter where lines are close."""
+def _blurred_edge(x: Float32, kurtosis: Float32) -> tuple[Float32, ...]:
+    """Return, as `_step`, an edge from -1 to 1 at x = 0, blurred to standard deviation 1 and excess `kurtosis`.
+
+    The first terms of Edgeworth's series: S = erf(x / sqrt 2) - k / 24 He3 p, with p twice the normal density. k goes
+    with s^-4, so -s dS/ds = x S' - k / 6 He3 p.
+    """
     from scipy.special import erf
 
-    slope = np.float32(np.sqrt(2.0 / np.pi)) * np.exp(np.float32(-0.5) * x * x)
-    rising = x * slope
-    return erf(x * np.float32(np.sqrt(0.5))), slope, -rising, rising
-
-
-def _smooth_step(u: Float32) -> tuple[Float32, ...]:
-    """Return F, dF/dx, d2F/dx2 and x dF/dx at x = 3 u."""
-    one, first, third, fifth = (np.float32(c) for c in (1.0, 35.0 / 16.0, 21.0 / 16.0, 5.0 / 16.0))
-    u = np.clip(u, -one, one)
-    square = u * u
-    value = u * (first - square * (first - square * (third - fifth * square)))
-    rest = one - square
-    bend = rest * rest
-    slope = bend * rest
-    slope *= np.float32(35.0 / 48.0)
-    bend *= u
-    bend *= np.float32(-35.0 / 24.0)
-    u *= slope
-    u *= STEP_WIDTH
-    return np.asarray(value, np.float32), np.asarray(slope, np.float32), np.asarray(bend, np.float32), u
+    one, three, six, ten, fifteen = (np.float32(c) for c in (1.0, 3.0, 6.0, 10.0, 15.0))
+    square = x * x
+    density = np.float32(np.sqrt(2.0 / np.pi)) * np.exp(np.float32(-0.5) * square)
+    part = kurtosis / np.float32(24.0)
+    third = part * x * (square - three) * density
+    slope = density * (one + part * (square * (square - six) + three))
+    bow = -density * x * (one + part * (square * (square - ten) + fifteen))
+    return erf(x * np.float32(np.sqrt(0.5))) - third, slope, bow, x * slope - np.float32(4.0) * third
 
 
 def _parts(values: FloatArray, window: Window, geometry: Geometry) -> tuple[tuple[Float32, ...], ...]:
-    """Return for line 1 and line 2: S, S', S'', x S', along, aside, cosine, sine, curvature; (N, P) or (N, 1)."""
+    """Return for line 1 and line 2: S, S', S'', -s dS/ds, along, aside, cosine, sine, curvature; (N, P) or (N, 1).
+
+    Blur pulls a bent edge towards the inside of the bend: the mean of curvature / 2 t^2 along it is curvature / 2 s^2.
+    """
     known = values.astype(np.float32)
+    blur = known[:, S, None]
     qu, qv = window.u - known[:, X, None], window.v - known[:, Y, None]
     out = []
     for angle, line in ((T1, 0), (T2, 1)):
         cosine, sine = np.cos(known[:, angle, None]), np.sin(known[:, angle, None])
         along, aside = cosine * qu + sine * qv, cosine * qv - sine * qu
         kappa = geometry.curvature[:, line, None].astype(np.float32)
-        distance = aside - (np.float32(0.5) * kappa) * (along * along)
-        step = _step(distance, known[:, S, None], geometry.gaps[:, line].astype(np.float32))
+        distance = aside - (np.float32(0.5) * kappa) * (along * along + blur * blur)
+        kurtosis = np.float32(PIXEL_KURTOSIS) * (cosine**4 + sine**4) / blur**4
+        step = _step(distance, blur, kurtosis, geometry.gaps[:, line].astype(np.float32))
+        step[3][...] += kappa * blur * step[1]
         out.append((*step, along, aside, cosine, sine, kappa))
     return tuple(out)
 

@@ -25,9 +25,10 @@ __all__ = ["RefinedLattice", "refine"]
 FIRST_BLUR = 1.0
 """s that the first pass starts from, px."""
 
-FIRST_PASS = (9.0, 4)
-LAST_PASS = (18.0, 8)
-"""Radius in px and Gauss-Newton steps: the first pass only has to bring the lattice to a few hundredths of a pixel."""
+FIRST_PASS = (9.0, 4, 0.02)
+LAST_PASS = (18.0, 8, 1e-3)
+"""Radius in px, Gauss-Newton steps at most, and the step in px that ends them: the first pass only has to bring the
+lattice to a few hundredths of a pixel."""
 
 FEWEST_NEIGHBOURS = 3
 """An empty cell is tried if so many of its eight neighbours are known."""
@@ -111,6 +112,7 @@ def _pass(
     blurs: Sequence[FloatArray],
     radius_px: float,
     iterations: int,
+    converged_px: float,
 ) -> list[RefinedLattice]:
     """Fit all corners of all lattices in one batch."""
     sheet = Sheet.of(lattices)
@@ -120,7 +122,16 @@ def _pass(
     geometry = Geometry(sides, shape.curvature(), shape.gaps())
     blur = np.concatenate([values[item.known] for item, values in zip(lattices, blurs, strict=True)])
     pixels, sign = sheet.pixels[known], sheet.signs[known]
-    fit = fit_edges(image, pixels, geometry, sign, blur, radius_px=radius_px, iterations=iterations)
+    fit = fit_edges(
+        image,
+        pixels,
+        geometry,
+        sign,
+        blur,
+        radius_px=radius_px,
+        iterations=iterations,
+        converged_px=converged_px,
+    )
     ends = np.cumsum([item.count for item in lattices])
     return [_filled(item, fit, slice(end - item.count, end)) for item, end in zip(lattices, ends, strict=True)]
 

@@ -1,1 +1,478 @@
+/* The fit of the edge model to chessboard corners: corners.edge_model and corners.edge_fit, one corner after the other.
+ *
+ * The pixels of a corner are gathered once. Every Gauss-Newton step evaluates the model and its derivatives in float32,
+ * a block of pixels at a time, which the compiler vectorises; products are summed in float32 lanes, and the nine normal
+ * equations are solved in double. */
 #include "kernels.h"
+
+enum { X, Y, T1, T2, S, A, B, GX, GY, PARAMETERS };
+enum { ROWS = PARAMETERS + 1, LANES = 8, GROUPS = 8, BLOCK = LANES * GROUPS };
+enum { OUTCOMES = 7 };
+
+/* Eight numbers at once, wherever they lie. */
+typedef float lanes_t __attribute__((vector_size(4 * LANES), aligned(4)));
+
+/* The constants of corners.edge_model and corners.edge_fit, under their names there (rigkit.native.edges.Rules). */
+typedef struct {
+    double reach, near_sigmas, near_px, tail_sigmas, pixel_kurtosis;
+    double least_blur, most_blur, angle_sigma, log_blur_sigma, light_sigma;
+    double most_move_px, most_turn, most_blur_change, most_light_change;
+    double least_variance, ridge, converged_px, blur_lag, valid_move_px, valid_move_cells, radius_px;
+    int64_t iterations;
+} rules_t;
+
+/* What the lattice says of a corner: its cell's sides, the curvature of its lines, and where their neighbours are. */
+typedef struct {
+    const double *sides, *curvature, *gaps;
+} geometry_t;
+
+/* The pixels of a corner, relative to (centre_u, centre_v). */
+typedef struct {
+    float *u, *v, *value;
+    int64_t count;
+    double centre_u, centre_v, size;
+} window_t;
+
+/* A line through the corner as float32 arithmetic wants it. */
+typedef struct {
+    float cosine, sine, curvature, kurtosis, before, after;
+    int tight;
+} line_t;
+
+/* The model along one line over a block of pixels: the step, its slopes, -s dS/ds, and the pixel's place. */
+typedef struct {
+    float value[BLOCK], slope[BLOCK], bow[BLOCK], grown[BLOCK], along[BLOCK], aside[BLOCK];
+} edge_t;
+
+typedef struct {
+    double lo, hi;
+} range_t;
+
+/* Return where |slope x + offset| <= limit. */
+INLINE range_t band(double slope, double offset, double limit)
+{
+    const double lo = (-limit - offset) / slope, hi = (limit - offset) / slope;
+    /* A line along the row: dividing by zero has given infinities of both signs, or NaN at the very limit. */
+    if (slope == 0.0)
+        return fabs(offset) <= limit ? (range_t){-1e9, 1e9} : (range_t){1e9, -1e9};
+    return lo < hi ? (range_t){lo, hi} : (range_t){hi, lo};
+}
+
+INLINE range_t both(range_t a, range_t b)
+{
+    return (range_t){a.lo > b.lo ? a.lo : b.lo, a.hi < b.hi ? a.hi : b.hi};
+}
+
+INLINE void take(window_t *window, const image_t image, int64_t v, range_t range)
+{
+    const int64_t first = (int64_t)ceil(range.lo), last = (int64_t)floor(range.hi);
+    const float *row = image.brightness + ((int64_t)window->centre_v + v) * image.width + (int64_t)window->centre_u;
+    for (int64_t u = first; u <= last; u++) {
+        window->u[window->count] = (float)u;
+        window->v[window->count] = (float)v;
+        window->value[window->count++] = row[u];
+    }
+}
+
+/* Gather the pixels near the two lines, inside the cell, the radius and the image (edge_model.collect): of every row
+ * one or two stretches. */
+static void collect(
+    window_t *window, const image_t image, const double pixel[2], const geometry_t at, double blur, const rules_t *rules)
+{
+    const double *a = at.sides, *b = at.sides + 2;
+    double area = a[0] * b[1] - a[1] * b[0];
+    area = fabs(area) > 1.0 ? area : 1.0;
+    window->centre_u = rint(pixel[0]);
+    window->centre_v = rint(pixel[1]);
+    const double off_u = pixel[0] - window->centre_u, off_v = pixel[1] - window->centre_v;
+    const double across_u = fabs(a[0]) + fabs(b[0]), across_v = fabs(a[1]) + fabs(b[1]);
+    double radius = rules->reach * (across_u > across_v ? across_u : across_v);
+    radius = radius < rules->radius_px ? radius : rules->radius_px;
+    window->size = radius > 2.0 ? radius : 2.0;
+    const double near = (rules->near_sigmas * blur + rules->near_px) / fabs(area);
+    const double far1 = near * hypot(b[0], b[1]), far2 = near * hypot(a[0], a[1]);
+    const int64_t most = (int64_t)floor(rules->radius_px);
+    const range_t columns = {-window->centre_u, (double)image.width - 1.0 - window->centre_u};
+    window->count = 0;
+    for (int64_t v = -most; v <= most; v++) {
+        const double row = window->centre_v + (double)v;
+        if (row < 0.0 || row > (double)(image.height - 1))
+            continue;
+        const double half = sqrt(rules->radius_px * rules->radius_px - (double)(v * v));
+        /* Position in cells along side a and along side b, as functions of the column. */
+        const double at1 = (-b[0] * ((double)v - off_v) - b[1] * off_u) / area;
+        const double at2 = (a[0] * ((double)v - off_v) + a[1] * off_u) / area;
+        range_t whole = both(band(b[1] / area, at1, rules->reach), band(-a[1] / area, at2, rules->reach));
+        whole = both(both(whole, columns), (range_t){-half, half});
+        range_t one = both(whole, band(b[1] / area, at1, far1)), two = both(whole, band(-a[1] / area, at2, far2));
+        if (two.lo < one.lo) {
+            const range_t swap = one;
+            one = two;
+            two = swap;
+        }
+        if (one.lo > one.hi) {
+            take(window, image, v, two);
+        } else if (two.lo > two.hi || two.hi <= one.hi) {
+            take(window, image, v, one);
+        } else if (floor(one.hi) >= ceil(two.lo)) {
+            take(window, image, v, (range_t){one.lo, two.hi});
+        } else {
+            take(window, image, v, one);
+            take(window, image, v, two);
+        }
+    }
+}
+
+/* Beyond so many s an edge is flat to float32; the exponential below needs a limit. */
+#define FLAT_SIGMAS 12.0f
+
+/* Return exp(y) for -80 <= y <= 0: 2^n times Taylor's series of the rest, relative error below 2e-7. */
+INLINE float decay(float y)
+{
+    const int32_t n = (int32_t)(y * 1.44269504f - 0.5f);
+    const float r = (y - (float)n * 0.693359375f) + (float)n * 2.12194440e-4f;
+    const float series =
+        1.0f + r * (1.0f + r * (0.5f + r * (1.0f / 6.0f + r * (1.0f / 24.0f + r * (1.0f / 120.0f + r * (1.0f / 720.0f))))));
+    const int32_t bits = (n + 127) * (1 << 23);
+    float power;
+    memcpy(&power, &bits, sizeof power);
+    return series * power;
+}
+
+/* edge_model._blurred_edge, with the error function of Abramowitz and Stegun 7.1.26, right to 1.5e-7. */
+INLINE void blurred_edge(float x, float kurtosis, float out[4])
+{
+    const float square = x * x, gauss = decay(-0.5f * square);
+    const float t = 1.0f / (1.0f + (0.3275911f * 0.70710678f) * fabsf(x));
+    const float tail =
+        t * (0.254829592f + t * (-0.284496736f + t * (1.421413741f + t * (-1.453152027f + t * 1.061405429f)))) * gauss;
+    const float error = copysignf(1.0f - tail, x);
+    const float density = 0.79788456f * gauss, part = kurtosis * (1.0f / 24.0f);
+    const float third = part * x * (square - 3.0f) * density;
+    const float slope = density * (1.0f + part * (square * (square - 6.0f) + 3.0f));
+    out[0] = error - third;
+    out[1] = slope;
+    out[2] = -density * x * (1.0f + part * (square * (square - 10.0f) + 15.0f));
+    out[3] = x * slope - 4.0f * third;
+}
+
+INLINE line_t line_of(double angle, double curvature, const double gaps[2], double blur, const rules_t *rules)
+{
+    const double cosine = cos(angle), sine = sin(angle), c2 = cosine * cosine, s2 = sine * sine, b2 = blur * blur;
+    const double nearest = gaps[0] < gaps[1] ? gaps[0] : gaps[1];
+    const int tight = nearest * (1.0 - rules->reach) < rules->tail_sigmas * blur;
+    const double kurtosis = rules->pixel_kurtosis * (c2 * c2 + s2 * s2) / (b2 * b2);
+    return (line_t){(float)cosine, (float)sine, (float)curvature, (float)kurtosis, (float)gaps[0], (float)gaps[1], tight};
+}
+
+/* Set `x` to the distances, plus `shift`, from a line in s. In a loop of its own: mixed with what follows, the limits
+ * become branches that keep the compiler from vectorising. */
+INLINE void distances(const line_t line, const edge_t *edge, float shift, float blur, float x[BLOCK])
+{
+    const float per_blur = 1.0f / blur;
+    for (int i = 0; i < BLOCK; i++) {
+        const float along = edge->along[i];
+        const float bend = 0.5f * line.curvature * (along * along + blur * blur);
+        const float at = (edge->aside[i] - bend + shift) * per_blur;
+        const float most = at < FLAT_SIGMAS ? at : FLAT_SIGMAS;
+        x[i] = most > -FLAT_SIGMAS ? most : -FLAT_SIGMAS;
+    }
+}
+
+/* Take away what a neighbouring line, `shift` back from this one, adds (edge_model._step). */
+INLINE void without_neighbour(const line_t line, float shift, float blur, edge_t *out)
+{
+    float x[BLOCK];
+    distances(line, out, shift, blur, x);
+    for (int i = 0; i < BLOCK; i++) {
+        float other[4];
+        blurred_edge(x[i], line.kurtosis, other);
+        out->value[i] -= other[0];
+        out->slope[i] -= other[1];
+        out->bow[i] -= other[2];
+        out->grown[i] -= other[3];
+    }
+}
+
+/* Evaluate one line over a block of pixels at (u, v) from the window's centre. */
+INLINE void along_line(const line_t line, const float *u, const float *v, float x, float y, float blur, edge_t *out)
+{
+    for (int i = 0; i < BLOCK; i++) {
+        out->along[i] = line.cosine * (u[i] - x) + line.sine * (v[i] - y);
+        out->aside[i] = line.cosine * (v[i] - y) - line.sine * (u[i] - x);
+    }
+    float at[BLOCK];
+    distances(line, out, 0.0f, blur, at);
+    for (int i = 0; i < BLOCK; i++) {
+        float own[4];
+        blurred_edge(at[i], line.kurtosis, own);
+        out->value[i] = own[0];
+        out->slope[i] = own[1];
+        out->bow[i] = own[2];
+        out->grown[i] = own[3];
+    }
+    if (line.tight) {
+        without_neighbour(line, line.before, blur, out);
+        without_neighbour(line, -line.after, blur, out);
+    }
+    for (int i = 0; i < BLOCK; i++)
+        out->grown[i] += line.curvature * blur * out->slope[i];
+}
+
+/* edge_model._mixed. */
+INLINE float mixed(const edge_t *one, const edge_t *two, float rho, int i)
+{
+    return -(one->value[i] * two->value[i] + rho * one->slope[i] * two->slope[i]
+             + 0.5f * rho * rho * one->bow[i] * two->bow[i]);
+}
+
+/* Add the products of the rows (edge_model.linearise) of all pixels to `products` (ROWS x ROWS, lower half). */
+FOR_EACH_PROCESSOR
+static void normal_equations(
+    const double *values, const window_t *window, const geometry_t at, const rules_t *rules, double *products)
+{
+    const float x = (float)values[X], y = (float)values[Y], blur = (float)values[S];
+    const float base = (float)values[A], half = (float)values[B], per_size = (float)(1.0 / window->size);
+    const float light_u = (float)values[GX] * per_size, light_v = (float)values[GY] * per_size;
+    const float rho = (float)cos(values[T1] - values[T2]);
+    const line_t line1 = line_of(values[T1], at.curvature[0], at.gaps, values[S], rules);
+    const line_t line2 = line_of(values[T2], at.curvature[1], at.gaps + 2, values[S], rules);
+    lanes_t sums[ROWS * (ROWS + 1) / 2];
+    memset(sums, 0, sizeof sums);
+    for (int64_t start = 0; start < window->count; start += BLOCK) {
+        const float *u = window->u + start, *v = window->v + start, *value = window->value + start;
+        edge_t one, two;
+        float rows[ROWS][BLOCK];
+        along_line(line1, u, v, x, y, blur, &one);
+        along_line(line2, u, v, x, y, blur, &two);
+        for (int i = 0; i < BLOCK; i++) {
+            const float pattern = mixed(&one, &two, rho, i);
+            const float plain = base + half * pattern;
+            const float light = 1.0f + light_u * u[i] + light_v * v[i];
+            const float scale = -light * half / blur;
+            const float by_d1 = scale * (one.slope[i] * two.value[i] + rho * one.bow[i] * two.slope[i]);
+            const float by_d2 = scale * (two.slope[i] * one.value[i] + rho * two.bow[i] * one.slope[i]);
+            const float bend1 = line1.curvature * one.along[i], bend2 = line2.curvature * two.along[i];
+            rows[X][i] = by_d1 * (line1.sine + bend1 * line1.cosine) + by_d2 * (line2.sine + bend2 * line2.cosine);
+            rows[Y][i] = by_d1 * (bend1 * line1.sine - line1.cosine) + by_d2 * (bend2 * line2.sine - line2.cosine);
+            rows[T1][i] = -by_d1 * (one.along[i] + bend1 * one.aside[i]);
+            rows[T2][i] = -by_d2 * (two.along[i] + bend2 * two.aside[i]);
+            rows[S][i] = -scale * (one.grown[i] * two.value[i] + two.grown[i] * one.value[i]);
+            rows[A][i] = light;
+            rows[B][i] = light * pattern;
+            rows[GX][i] = plain * per_size * u[i];
+            rows[GY][i] = plain * per_size * v[i];
+            rows[PARAMETERS][i] = value[i] - light * plain;
+        }
+        const int64_t used = window->count - start;
+        for (int row = 0; row < ROWS && used < BLOCK; row++)
+            memset(rows[row] + used, 0, (size_t)(BLOCK - used) * sizeof(float));
+        lanes_t *sum = sums;
+        for (int i = 0; i < ROWS; i++) {
+            const lanes_t *left = (const lanes_t *)rows[i];
+            const lanes_t l0 = left[0], l1 = left[1], l2 = left[2], l3 = left[3];
+            const lanes_t l4 = left[4], l5 = left[5], l6 = left[6], l7 = left[7];
+            for (int j = 0; j <= i; j++, sum++) {
+                const lanes_t *right = (const lanes_t *)rows[j];
+                *sum += ((l0 * right[0] + l1 * right[1]) + (l2 * right[2] + l3 * right[3]))
+                    + ((l4 * right[4] + l5 * right[5]) + (l6 * right[6] + l7 * right[7]));
+            }
+        }
+    }
+    for (int i = 0, k = 0; i < ROWS; i++)
+        for (int j = 0; j <= i; j++, k++) {
+            double total = 0.0;
+            for (int lane = 0; lane < LANES; lane++)
+                total += (double)sums[k][lane];
+            products[i * ROWS + j] = total;
+        }
+}
+
+/* Set a and b by linear least squares with everything else as it stands (edge_fit._brightness). */
+FOR_EACH_PROCESSOR
+static void brightness(double *values, const window_t *window, const geometry_t at, const rules_t *rules, double sign)
+{
+    const float x = (float)values[X], y = (float)values[Y], blur = (float)values[S];
+    const float rho = (float)cos(values[T1] - values[T2]);
+    const line_t line1 = line_of(values[T1], at.curvature[0], at.gaps, values[S], rules);
+    const line_t line2 = line_of(values[T2], at.curvature[1], at.gaps + 2, values[S], rules);
+    double n = (double)window->count, sum_p = 0.0, sum_i = 0.0, sum_pp = 0.0, sum_pi = 0.0;
+    for (int64_t start = 0; start < window->count; start += BLOCK) {
+        edge_t one, two;
+        float pattern[BLOCK];
+        along_line(line1, window->u + start, window->v + start, x, y, blur, &one);
+        along_line(line2, window->u + start, window->v + start, x, y, blur, &two);
+        for (int i = 0; i < BLOCK; i++)
+            pattern[i] = mixed(&one, &two, rho, i);
+        const int64_t used = window->count - start < BLOCK ? window->count - start : BLOCK;
+        for (int64_t i = 0; i < used; i++) {
+            const double p = sign * (double)pattern[i], value = (double)window->value[start + i];
+            sum_p += p;
+            sum_i += value;
+            sum_pp += p * p;
+            sum_pi += p * value;
+        }
+    }
+    n = n > 1.0 ? n : 1.0;
+    const double spread = sum_pp - sum_p * sum_p / n;
+    const double slope = (sum_pi - sum_p * sum_i / n) / (spread > 1e-9 ? spread : 1e-9);
+    values[B] = slope * sign;
+    values[A] = (sum_i - slope * sum_p) / n;
+}
+
+/* Factor the lower half of `matrix` (rows of ROWS) in place, Cholesky; return whether it is positive definite. */
+static int factor(double *matrix)
+{
+    for (int j = 0; j < PARAMETERS; j++) {
+        double *row = matrix + j * ROWS, rest = row[j];
+        for (int k = 0; k < j; k++)
+            rest -= row[k] * row[k];
+        if (!(rest > 0.0))
+            return 0;
+        row[j] = sqrt(rest);
+        const double scale = 1.0 / row[j];
+        for (int i = j + 1; i < PARAMETERS; i++) {
+            double *below = matrix + i * ROWS, sum = below[j];
+            for (int k = 0; k < j; k++)
+                sum -= below[k] * row[k];
+            below[j] = sum * scale;
+        }
+    }
+    return 1;
+}
+
+static void forward(const double *lower, double *right)
+{
+    for (int i = 0; i < PARAMETERS; i++) {
+        double sum = right[i];
+        for (int k = 0; k < i; k++)
+            sum -= lower[i * ROWS + k] * right[k];
+        right[i] = sum / lower[i * ROWS + i];
+    }
+}
+
+static void backward(const double *lower, double *right)
+{
+    for (int i = PARAMETERS - 1; i >= 0; i--) {
+        double sum = right[i];
+        for (int k = i + 1; k < PARAMETERS; k++)
+            sum -= lower[k * ROWS + i] * right[k];
+        right[i] = sum / lower[i * ROWS + i];
+    }
+}
+
+/* Return element (k, k) of the inverse of what `lower` is the factor of. */
+static double inverse_at(const double *lower, int k)
+{
+    double unit[PARAMETERS] = {0.0}, total = 0.0;
+    unit[k] = 1.0;
+    forward(lower, unit);
+    for (int i = k; i < PARAMETERS; i++)
+        total += unit[i] * unit[i];
+    return total;
+}
+
+static double clipped(double value, double low, double high)
+{
+    return value < low ? low : value > high ? high : value;
+}
+
+/* Move `values` by `step`, cut where it would leave the region in which the model is nearly linear (edge_fit._limited). */
+static void move(double *values, const double *step, const rules_t *rules)
+{
+    const double limits[PARAMETERS] = {
+        rules->most_move_px, rules->most_move_px, rules->most_turn, rules->most_turn, rules->most_blur_change * values[S],
+        INFINITY, INFINITY, rules->most_light_change, rules->most_light_change};
+    for (int k = 0; k < PARAMETERS; k++)
+        values[k] += clipped(step[k], -limits[k], limits[k]);
+    values[S] = clipped(values[S], rules->least_blur, rules->most_blur);
+}
+
+/* Return whether there are pixels on all sides of (x, y) (edge_fit._surrounded). */
+static int surrounded(const window_t *window, float x, float y)
+{
+    int32_t right = 0, left = 0, below = 0, above = 0;
+    for (int64_t i = 0; i < window->count; i++) {
+        right += window->u[i] - x > 0.5f;
+        left += x - window->u[i] > 0.5f;
+        below += window->v[i] - y > 0.5f;
+        above += y - window->v[i] > 0.5f;
+    }
+    return right >= 2 && left >= 2 && below >= 2 && above >= 2;
+}
+
+/* Fit one corner; `out` is u, v, sigma, s, 2 b, RMS residual, valid. */
+static void fit_corner(
+    window_t *window, const double pixel[2], const geometry_t at, double sign, double blur, const rules_t *rules, double *out)
+{
+    const double turn = 1.0 / (rules->angle_sigma * rules->angle_sigma);
+    const double width = 1.0 / (rules->log_blur_sigma * rules->log_blur_sigma * blur * blur);
+    const double light = 1.0 / (rules->light_sigma * rules->light_sigma);
+    const double prior[PARAMETERS] = {0.0, 0.0, turn, turn, width, 0.0, 0.0, light, light};
+    const double mean[PARAMETERS] = {
+        0.0, 0.0, atan2(at.sides[1], at.sides[0]), atan2(at.sides[3], at.sides[2]), blur, 0.0, 0.0, 0.0, 0.0};
+    double values[PARAMETERS], products[ROWS * ROWS], variance = INFINITY;
+    memcpy(values, mean, sizeof values);
+    values[X] = pixel[0] - window->centre_u;
+    values[Y] = pixel[1] - window->centre_v;
+    brightness(values, window, at, rules, sign);
+    const int64_t more = window->count - PARAMETERS;
+    int solved = 0;
+    for (int64_t turns = 0; turns < rules->iterations; turns++) {
+        normal_equations(values, window, at, rules, products);
+        variance = products[ROWS * ROWS - 1] / (double)(more > 1 ? more : 1);
+        variance = variance > rules->least_variance ? variance : rules->least_variance;
+        double step[PARAMETERS];
+        for (int k = 0; k < PARAMETERS; k++) {
+            products[k * ROWS + k] += prior[k] * variance + rules->ridge;
+            step[k] = products[PARAMETERS * ROWS + k] + prior[k] * variance * (mean[k] - values[k]);
+        }
+        solved = factor(products);
+        if (!solved)
+            break;
+        forward(products, step);
+        backward(products, step);
+        move(values, step, rules);
+        if (fabs(step[X]) <= rules->converged_px && fabs(step[Y]) <= rules->converged_px
+            && fabs(step[S]) <= rules->blur_lag * rules->converged_px)
+            break;
+    }
+    const double spread = solved ? 0.5 * variance * (inverse_at(products, X) + inverse_at(products, Y)) : NAN;
+    const double u = window->centre_u + values[X], v = window->centre_v + values[Y];
+    const double side1 = hypot(at.sides[0], at.sides[1]), side2 = hypot(at.sides[2], at.sides[3]);
+    double most = rules->valid_move_cells * (side1 > side2 ? side1 : side2);
+    most = most > rules->valid_move_px ? most : rules->valid_move_px;
+    const int valid = hypot(u - pixel[0], v - pixel[1]) < most && spread > 0.0 && isfinite(spread) && more > 0
+        && surrounded(window, (float)values[X], (float)values[Y]);
+    out[0] = u;
+    out[1] = v;
+    out[2] = valid ? sqrt(spread) : 0.0;
+    out[3] = values[S];
+    out[4] = 2.0 * values[B] * sign;
+    out[5] = sqrt(variance);
+    out[6] = (double)valid;
+}
+
+/* Return how many floats of scratch fit_edges needs. */
+int64_t edges_scratch(double radius_px)
+{
+    const int64_t side = 2 * (int64_t)floor(radius_px) + 1;
+    return 3 * (side * side + BLOCK);
+}
+
+/* Fit the edge model around `count` corners (edge_fit.fit_edges). pixels (N, 2), sides (N, 2, 2), curvature (N, 2), gaps
+ * (N, 2, 2), sign (N), blur (N), out (N, OUTCOMES); scratch as `edges_scratch` says, zeroed. */
+void fit_edges(
+    const float *grey, int64_t width, int64_t height, int64_t count, const double *pixels, const double *sides,
+    const double *curvature, const double *gaps, const double *sign, const double *blur, const rules_t *rules,
+    float *scratch, double *out)
+{
+    const image_t image = {grey, width, height};
+    const int64_t room = edges_scratch(rules->radius_px) / 3;
+    window_t window = {scratch, scratch + room, scratch + 2 * room, 0, 0.0, 0.0, 0.0};
+    for (int64_t n = 0; n < count; n++) {
+        const geometry_t at = {sides + 4 * n, curvature + 2 * n, gaps + 4 * n};
+        collect(&window, image, pixels + 2 * n, at, blur[n], rules);
+        fit_corner(&window, pixels + 2 * n, at, sign[n], blur[n], rules, out + OUTCOMES * n);
+    }
+}

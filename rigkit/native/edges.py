@@ -1,0 +1,95 @@
+"""The compiled fit of the edge model (edges.c): what `corners.edge_fit.fit_edges` does, one corner after the other."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.arrays import FloatArray
+from rigkit.native import kernels
+
+__all__ = ["OUTCOMES", "Rules", "fit_corners"]
+
+OUTCOMES = 7
+"""Numbers that come out of a corner: u, v, sigma, s, 2 b, RMS residual, whether it is valid."""
+
+
+class Rules(ctypes.Structure):
+    """The constants of the edge model and its fit, in the order of `rules_t` in edges.c."""
+
+    _fields_ = [
+        *(
+            (name, ctypes.c_double)
+            for name in (
+                "reach",
+                "near_sigmas",
+                "near_px",
+                "tail_sigmas",
+                "pixel_kurtosis",
+                "least_blur",
+                "most_blur",
+                "angle_sigma",
+                "log_blur_sigma",
+                "light_sigma",
+                "most_move_px",
+                "most_turn",
+                "most_blur_change",
+                "most_light_change",
+                "least_variance",
+                "ridge",
+                "converged_px",
+                "blur_lag",
+                "valid_move_px",
+                "valid_move_cells",
+                "radius_px",
+            )
+        ),
+        ("iterations", ctypes.c_int64),
+    ]
+
+
+@functools.cache
+def _library() -> ctypes.CDLL | None:
+    library = kernels("edges")
+    if library is not None:
+        count, array = ctypes.c_int64, ctypes.c_void_p
+        library.edges_scratch.restype = count
+        library.edges_scratch.argtypes = [ctypes.c_double]
+        library.fit_edges.restype = None
+        library.fit_edges.argtypes = [array, count, count, count, *[array] * 9]
+    return library
+
+
+def fit_corners(
+    image: NDArray[np.float32],
+    pixels: FloatArray,
+    sides: FloatArray,
+    curvature: FloatArray,
+    gaps: FloatArray,
+    sign: FloatArray,
+    blur: FloatArray,
+    rules: Rules,
+) -> FloatArray | None:
+    """Return the `OUTCOMES` of N corners, (N, 7), or None without the compiled kernel. Arguments as `fit_edges`."""
+    library = _library()
+    if library is None:
+        return None
+    grey = np.ascontiguousarray(image, np.float32)
+    known = [np.ascontiguousarray(part, np.float64) for part in (pixels, sides, curvature, gaps, sign, blur)]
+    out = np.empty((len(pixels), OUTCOMES))
+    scratch = np.zeros(library.edges_scratch(rules.radius_px), np.float32)
+    height, width = grey.shape
+    library.fit_edges(
+        grey.ctypes.data,
+        width,
+        height,
+        len(pixels),
+        *(part.ctypes.data for part in known),
+        ctypes.addressof(rules),
+        scratch.ctypes.data,
+        out.ctypes.data,
+    )
+    return out

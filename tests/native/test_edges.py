@@ -1,0 +1,94 @@
+"""The compiled edge fit against its definition in numpy, on a rendered chessboard."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rigkit.boards import Board
+from rigkit.cameras.kannala_brandt import KannalaBrandt
+from rigkit.corners import edge_fit
+from rigkit.corners.edge_fit import EdgeFit, fit_edges
+from rigkit.corners.edge_model import Geometry
+from rigkit.corners.local_fit import fit_cells
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
+from rigkit.native import kernels
+from rigkit.synthetic.photometry import Photometry, develop
+from rigkit.synthetic.render import Optics, radiance
+from rigkit.synthetic.scene import PlacedBoard
+
+pytestmark = pytest.mark.skipif(kernels("edges") is None, reason="compiled kernels are not built")
+
+ROUNDING_PX = 5e-5
+"""Both sum some hundred float32 products of 1e-7 relative error, in another order."""
+
+ROUNDING_REL = 2e-3
+"""Of sigma and residual: a pixel whose place on the window's edge is decided by rounding is one of two hundred."""
+
+
+def both(*arguments: object, monkeypatch: pytest.MonkeyPatch, **options: object) -> tuple[EdgeFit, EdgeFit]:
+    compiled = fit_edges(*arguments, **options)  # type: ignore[arg-type]
+    monkeypatch.setattr(edge_fit, "fit_corners", lambda *_: None)
+    plain = fit_edges(*arguments, **options)  # type: ignore[arg-type]
+    monkeypatch.undo()
+    return compiled, plain
+
+
+def scene(blur_px: float, noise: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return an image of a tilted board in a fisheye and its true corners (R, C, 2); some lie at the frame."""
+    board = Board("b", 9, 7, 30.0, 30.0)
+    camera = KannalaBrandt((320, 240), np.array([180.0, 180.0, 161.3, 118.7, -0.01, 0.0, 0.0, 0.0]))
+    turn = exp_so3(np.array([0.5, -0.3, 0.4]))
+    placed = PlacedBoard(board, Rigid3(turn, np.array([20.0, 10.0, 210.0]) - turn @ np.array([120.0, 90.0, 0.0])))
+    optics = Optics(blur_px=blur_px)
+    light = radiance((placed,), camera, Rigid3.identity(), optics=optics)
+    image = np.asarray(develop(light, Photometry(noise_levels=noise), rng)).astype(np.float32)
+    return image, placed.see(camera, Rigid3.identity())[0].reshape(7, 9, 2)
+
+
+@pytest.mark.parametrize(("blur_px", "noise"), [(0.3, 0.0), (0.7, 2.0), (2.0, 5.0)])
+def test_compiled_fit_is_the_numpy_fit(
+    blur_px: float, noise: float, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image, truth = scene(blur_px, noise, rng)
+    shape = fit_cells(truth, np.ones(truth.shape[:2], bool))
+    geometry = Geometry(np.stack([shape.along_column, shape.along_row], axis=1), shape.curvature(), shape.gaps())
+    row, column = np.indices(truth.shape[:2])
+    sign = np.where((row + column) % 2 == 0, 1.0, -1.0).ravel()
+    start = truth.reshape(-1, 2) + rng.uniform(-0.3, 0.3, (truth.size // 2, 2))
+    blur = np.full(len(start), 1.0)
+    options = {"radius_px": 14.0, "iterations": 6}
+    compiled, plain = both(image, start, geometry, sign, blur, monkeypatch=monkeypatch, **options)
+    assert np.array_equal(compiled.valid, plain.valid)
+    good = plain.valid & (np.abs(plain.contrast) > 20.0)
+    assert good.sum() > 40
+    assert np.abs(compiled.pixels - plain.pixels)[good].max() < ROUNDING_PX
+    for name in ("sigma_px", "blur", "contrast", "residual"):
+        ours, theirs = getattr(compiled, name)[good], getattr(plain, name)[good]
+        assert np.abs(ours / theirs - 1.0).max() < ROUNDING_REL, name
+
+
+def test_same_pixels_whatever_the_cell(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Random cells, some slender, some along the rows, some beyond the image: the same windows, so the same fit."""
+    image = rng.uniform(0.0, 255.0, (60, 80)).astype(np.float32)
+    pixels = rng.uniform([-3.0, -3.0], [83.0, 63.0], (300, 2))
+    angle, turn = rng.uniform(-np.pi, np.pi, 300), rng.uniform(0.2, 2.9, 300)
+    angle[:60], turn[:30] = 0.0, 0.5 * np.pi
+    length = rng.uniform(4.0, 40.0, (300, 2))
+    sides = np.stack(
+        [
+            length[:, :1] * np.stack([np.cos(angle), np.sin(angle)], axis=1),
+            length[:, 1:] * np.stack([np.cos(angle + turn), np.sin(angle + turn)], axis=1),
+        ],
+        axis=1,
+    )
+    geometry = Geometry(sides, rng.normal(0.0, 0.01, (300, 2)), rng.uniform(4.0, 30.0, (300, 2, 2)))
+    # One step: on noise, later ones go wherever rounding sends them.
+    options = {"radius_px": 9.0, "iterations": 1}
+    arguments = (image, pixels, geometry, np.ones(300), rng.uniform(0.5, 2.0, 300))
+    compiled, plain = both(*arguments, monkeypatch=monkeypatch, **options)
+    assert np.array_equal(compiled.valid, plain.valid)
+    assert plain.valid.sum() > 100
+    assert np.abs(compiled.pixels - plain.pixels)[plain.valid].max() < 1e-3
+    assert np.abs(compiled.residual / plain.residual - 1.0)[plain.valid].max() < 1e-4
