@@ -7,6 +7,7 @@ dark on one side and bright on the other as the arms say.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from rigkit.arrays import BoolArray, FloatArray, IntArray
 from rigkit.corners.response import FloatImage, Level, sample
 from rigkit.corners.ring import arm_vectors
 from rigkit.corners.saddle import Corners
+from rigkit.native import front
 
 __all__ = ["Links", "edge_contrast", "find_links", "quads"]
 
@@ -34,6 +36,9 @@ LENGTH_RATIO = 2.1
 ALONG = np.array([0.2, 0.35, 0.5, 0.65, 0.8])
 MOST = 4
 """An edge shows the right side dark at this many of the places `ALONG` it."""
+
+ASIDE, LEAST_ASIDE_PX, MOST_ASIDE_PX = 0.12, 1.0, 4.0
+"""How far to the sides of an edge the brightness is read: a part of its length, within bounds."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -72,6 +77,48 @@ def find_links(corners: Corners, level: Level) -> Links:
     nobody = Links(np.full((count, 4), -1), np.full((count, 4), -1))
     if count < 4:
         return nobody
+    to = _compiled(corners, level)
+    if to is None:
+        to = _without_long(_mutual(corners, level), corners.pixels).reshape(-1, 4)
+    return Links(np.where(to >= 0, to // 4, -1), np.where(to >= 0, to % 4, -1))
+
+
+def _compiled(corners: Corners, level: Level) -> IntArray | None:
+    """Return the mutual links by the kernel: 4 * neighbour + its arm, (N, 4); None without it."""
+    library = front.loaded()
+    if library is None:
+        return None
+    return front.links(
+        library,
+        corners.pixels,
+        arm_vectors(corners.angles)[:, :2],
+        corners.contrast,
+        _bounds(corners.contrast),
+        MOST_ASIDE_PX * corners.scale / level.scale,
+        level.smooth,
+        level.scale,
+        level.offset,
+        _link_rules(),
+    )
+
+
+@functools.cache
+def _link_rules() -> front.LinkRules:
+    return front.LinkRules.make(
+        NEIGHBOURS,
+        ALONG,
+        MOST,
+        arm_cosine=ARM_COSINE,
+        contrast_ratio=CONTRAST_RATIO,
+        length_ratio=LENGTH_RATIO,
+        aside=ASIDE,
+        least_aside=LEAST_ASIDE_PX,
+    )
+
+
+def _mutual(corners: Corners, level: Level) -> IntArray:
+    """Return the mutual links as above, before the long ones are dropped; flat."""
+    count = len(corners)
     start, arm, end, back, distance = _candidates(corners)
     seen = _edge_seen(corners, level, start, arm, end)
     start, arm, end, back, distance = start[seen], arm[seen], end[seen], back[seen], distance[seen]
@@ -85,8 +132,7 @@ def find_links(corners: Corners, level: Level) -> Links:
     mutual = linked[to[to[linked]] == linked]
     both = np.full(4 * count, -1)
     both[mutual] = to[mutual]
-    both = _without_long(both, corners.pixels)
-    return Links(np.where(both >= 0, both // 4, -1).reshape(-1, 4), np.where(both >= 0, both % 4, -1).reshape(-1, 4))
+    return both
 
 
 def _candidates(corners: Corners) -> tuple[IntArray, IntArray, IntArray, IntArray, FloatArray]:
@@ -120,16 +166,21 @@ def _nearest_alike(pixels: FloatArray, contrast: FloatArray) -> tuple[FloatArray
     near = min(NEIGHBOURS + 1, len(pixels))
     length = np.ones((len(pixels), near))
     other = np.repeat(np.arange(len(pixels))[:, None], near, axis=1)
-    band = np.floor(2.0 * np.log2(np.maximum(contrast, 1e-6)))
-    for low in np.unique(band):
-        mine = np.flatnonzero(band == low)
-        least, most = CONTRAST_RATIO * 2.0 ** (low / 2), 2.0 ** ((low + 1) / 2) / CONTRAST_RATIO
-        pool = np.flatnonzero((contrast > least) & (contrast < most))
+    least, most = _bounds(contrast)
+    for low in np.unique(least):
+        mine = np.flatnonzero(least == low)
+        pool = np.flatnonzero((contrast > low) & (contrast < most[mine[0]]))
         distance, found = cKDTree(pixels[pool]).query(pixels[mine], k=np.arange(1, near + 1))
         there = np.isfinite(distance)
         length[mine] = np.where(there, np.maximum(distance, 1e-6), 1.0)
         other[mine] = np.where(there, pool[np.where(there, found, 0)], mine[:, None])
     return length, other
+
+
+def _bounds(contrast: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the least and the most contrast of what corners of `contrast` (N,) may be linked with, by half octaves."""
+    band = np.floor(2.0 * np.log2(np.maximum(contrast, 1e-6)))
+    return CONTRAST_RATIO * 2.0 ** (0.5 * band), 2.0 ** (0.5 * (band + 1.0)) / CONTRAST_RATIO
 
 
 def _arm(along_a: FloatArray, along_b: FloatArray) -> IntArray:
@@ -143,7 +194,7 @@ def _edge_seen(corners: Corners, level: Level, start: IntArray, arm: IntArray, e
     """Return whether the edge between the corners is there, with the polarity of the arm."""
     first, last = level.to_level(corners.pixels[start]), level.to_level(corners.pixels[end])
     length = np.linalg.norm(last - first, axis=1)
-    offset = np.clip(0.12 * length, 1.0, 4.0 * corners.scale[start] / level.scale)
+    offset = np.clip(ASIDE * length, LEAST_ASIDE_PX, MOST_ASIDE_PX * corners.scale[start] / level.scale)
     sign = np.where(arm % 2 == 0, 1.0, -1.0)
     difference = edge_contrast(level.smooth, first, last, sign, offset)
     weakest = CONTRAST_RATIO * np.minimum(corners.contrast[start], corners.contrast[end])

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from rigkit.arrays import FloatArray, IntArray
 from rigkit.errors import InputError
+from rigkit.native import front
 
 __all__ = ["FloatImage", "Level", "grey_image", "peaks", "pyramid", "sample"]
 
@@ -41,6 +42,12 @@ not hide the corners of a board in it."""
 LEAST_SPAN = 2.5
 """An image that spans fewer grey levels shows nothing but its quantisation."""
 
+TYPICAL = 1e4
+"""Pixels that the median response and the span of brightness are taken from: they are good to 1 and 2 %."""
+
+EXTREME = 0.002
+"""The span of brightness leaves out this part at either end: glints, dead pixels."""
+
 MAX_PEAKS = 20000
 """Keep the strongest peaks of a level: texture may have more, a board never."""
 
@@ -52,13 +59,11 @@ class Level:
     Attributes
     ----------
     smooth : (H, W) float32, 0..255.
-    response : (H, W) float32, D.
     threshold : smallest D of a peak.
     scale, offset : full-resolution pixel = scale * level pixel + offset.
     """
 
     smooth: FloatImage
-    response: FloatImage
     threshold: float
     scale: float
     offset: float
@@ -106,24 +111,41 @@ def grey_image(image: NDArray[np.generic]) -> FloatImage:
 
 def pyramid(grey: FloatImage) -> list[Level]:
     """Return the levels of the search, the finest first."""
-    base, scale = grey, 1.0
-    while base.size > BASE_PIXELS:
-        half = (base.shape[1] // 2, base.shape[0] // 2)
-        smaller = cv2.resize(base[: 2 * half[1], : 2 * half[0]], half, interpolation=cv2.INTER_AREA)
-        base = np.asarray(smaller, np.float32)
-        scale *= 2.0
-    offset = 0.5 * (scale - 1.0)
+    scale = 1
+    while grey.size > scale**2 * BASE_PIXELS:
+        scale *= 2
+    base, offset = _shrunk(grey, scale), 0.5 * (scale - 1.0)
     levels: list[Level] = []
     while len(levels) < OCTAVES and min(base.shape) >= 16:
-        level = _level(base, scale, offset)
-        levels.append(level)
-        base = np.ascontiguousarray(level.smooth[::2, ::2])
-        scale *= 2.0
+        smooth, base = _smoothed(base)
+        levels.append(Level(smooth, _threshold(smooth), float(scale), offset))
+        scale *= 2
     return levels
 
 
-def _level(image: FloatImage, scale: float, offset: float) -> Level:
-    smooth = cv2.sepFilter2D(image, cv2.CV_32F, SMOOTH, SMOOTH, borderType=cv2.BORDER_REPLICATE)
+def _shrunk(grey: FloatImage, factor: int) -> FloatImage:
+    """Return the means of `factor` x `factor` pixels."""
+    if factor == 1:
+        return grey
+    library = front.loaded()
+    if library is not None:
+        return front.shrunk(library, grey, factor)
+    height, width = grey.shape[0] // factor, grey.shape[1] // factor
+    whole = grey[: factor * height, : factor * width]
+    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _smoothed(image: FloatImage) -> tuple[FloatImage, FloatImage]:
+    """Return `image` smoothed, and every second pixel of every second row of that."""
+    library = front.loaded()
+    if library is not None:
+        return front.smoothed(library, image, SMOOTH)
+    smooth = np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, SMOOTH, SMOOTH, borderType=cv2.BORDER_REPLICATE), np.float32)
+    return smooth, np.ascontiguousarray(smooth[::2, ::2])
+
+
+def _response(smooth: FloatImage) -> FloatImage:
+    """Return D of the inner pixels of `smooth` (H, W), (H - 2, W - 2)."""
     second = np.array([1.0, -2.0, 1.0], np.float32)
     first = np.array([-0.5, 0.0, 0.5], np.float32)
     lxx = cv2.filter2D(smooth, cv2.CV_32F, second[None])
@@ -132,27 +154,45 @@ def _level(image: FloatImage, scale: float, offset: float) -> Level:
     # In place: fresh pages of memory cost as much as the arithmetic.
     cv2.multiply(lxx, lyy, dst=lxx)
     cv2.multiply(lxy, lxy, dst=lxy)
-    response = cv2.subtract(lxy, lxx, dst=lxy)
-    step = max(1, int(np.sqrt(response.size / 3e4)))
-    typical = float(np.median(np.abs(response[::step, ::step])))
-    low, high = np.quantile(smooth[::step, ::step], (0.002, 0.998))
-    contrast = (max(float(high - low), LEAST_SPAN) / 200.0) ** 2
-    threshold = float(np.clip(NOISE_FACTOR * typical, FLOOR * contrast, CEILING * contrast))
-    return Level(np.asarray(smooth, np.float32), np.asarray(response, np.float32), threshold, scale, offset)
+    return np.asarray(cv2.subtract(lxy, lxx, dst=lxy), np.float32)[1:-1, 1:-1]
+
+
+def _threshold(smooth: FloatImage) -> float:
+    """Return the smallest D of a peak."""
+    step = max(1, int(np.sqrt(smooth.size / TYPICAL)))
+    library = front.loaded()
+    if library is not None:
+        response, brightness = front.typical(library, smooth, step)
+    else:
+        response = np.abs(_response(smooth)[::step, ::step]).ravel()
+        brightness = smooth[1:-1:step, 1:-1:step].ravel()
+    middle = len(response) // 2
+    few = int(EXTREME * len(brightness))
+    typical = float(np.partition(response, middle)[middle])
+    ordered = np.partition(brightness, [few, len(brightness) - 1 - few])
+    contrast = (max(float(ordered[-1 - few] - ordered[few]), LEAST_SPAN) / 200.0) ** 2
+    return float(np.clip(NOISE_FACTOR * typical, FLOOR * contrast, CEILING * contrast))
 
 
 def peaks(level: Level) -> IntArray:
-    """Return the local maxima of the response above the threshold, (N, 2) as (u, v) of the level, strongest first."""
-    response = level.response
-    highest = cv2.dilate(response, np.ones((5, 5), np.uint8))
-    mask = (response >= highest) & (response > level.threshold)
-    mask[:3] = mask[-3:] = False
-    mask[:, :3] = mask[:, -3:] = False
-    flat = np.flatnonzero(mask)
-    flat = flat[~_repeated(response.ravel(), flat, response.shape[1])]
-    flat = flat[np.argsort(-response.ravel()[flat], kind="stable")][:MAX_PEAKS]
-    v, u = np.divmod(flat, response.shape[1])
-    return np.stack([u, v], axis=-1)
+    """Return the local maxima of the response above the threshold, (N, 2) as (u, v) of the level, row by row."""
+    library = front.loaded()
+    if library is not None:
+        at, height = front.peaks(library, level.smooth, level.threshold)
+    else:
+        response = _response(level.smooth)
+        highest = cv2.dilate(response, np.ones((5, 5), np.uint8))
+        mask = (response >= highest) & (response > level.threshold)
+        mask[:2] = mask[-2:] = False
+        mask[:, :2] = mask[:, -2:] = False
+        flat = np.flatnonzero(mask)
+        flat = flat[~_repeated(response.ravel(), flat, response.shape[1])]
+        v, u = np.divmod(flat, response.shape[1])
+        at, height = np.stack([u, v], axis=-1) + 1, response.ravel()[flat]
+    if len(at) > MAX_PEAKS:
+        least = np.partition(height, len(at) - MAX_PEAKS)[len(at) - MAX_PEAKS]
+        at = at[height >= least]
+    return np.asarray(at, np.int64)
 
 
 def _repeated(response: FloatImage, flat: IntArray, width: int) -> NDArray[np.bool_]:

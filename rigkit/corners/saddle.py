@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray
 from rigkit.corners.response import FloatImage, Level, peaks
-from rigkit.corners.ring import read_rings
+from rigkit.corners.ring import CIRCLE, MAX_CENTRE, MAX_ODD, read_rings
+from rigkit.native import front
 
-__all__ = ["Corners", "Saddles", "find_corners", "find_saddles", "saddle_step"]
+__all__ = ["Corners", "Saddles", "find_corners", "saddle_step"]
 
 RADII = (2.6, 4.6)
 """Ring radii in pixels of the level: the smaller decides, since it fits squares of 6 px; the larger, where it fits too,
 gives the better directions."""
+
+KNOWN = 2.0
+"""A corner this near to one of a finer level is the same, in pixels of its own level."""
 
 MAX_STEP = 1.5
 """A Newton step to the saddle that leads further than this from the peak of the response went astray, level px."""
@@ -64,44 +69,57 @@ def saddle_step(smooth: FloatImage, at: IntArray) -> tuple[FloatArray, BoolArray
     return at + step, near
 
 
-def find_saddles(level: Level) -> tuple[FloatArray, FloatArray]:
-    """Return the saddles of one level in its own pixels (N, 2), strongest first, and in full-resolution pixels."""
-    found, near = saddle_step(level.smooth, peaks(level))
-    found = found[near]
-    return found, level.to_full(found)
-
-
 def find_corners(levels: list[Level]) -> tuple[Corners, Saddles]:
     """Return the chessboard corners of all levels, each once (the finest level wins), and all saddles."""
     kept: list[Corners] = []
     saddles: list[Saddles] = []
     for level in levels:
-        local, full = find_saddles(level)
+        local, which, angles, contrast = _corners_of(level)
+        full = level.to_full(local)
         saddles.append(Saddles(full, np.full(len(full), level.scale)))
-        angles = np.zeros((len(local), 2))
-        contrast = np.zeros(len(local))
-        valid = np.zeros(len(local), bool)
-        todo = np.arange(len(local))
-        for radius in RADII:
-            rings = read_rings(level.smooth, local[todo], radius)
-            todo = todo[rings.valid]
-            angles[todo], contrast[todo] = rings.angles[rings.valid], rings.contrast[rings.valid]
-            valid[todo] |= radius == RADII[0]
-        fresh = Corners(full[valid], angles[valid], contrast[valid], np.full(int(valid.sum()), level.scale))
+        fresh = Corners(full[which], angles, contrast, np.full(len(which), level.scale))
         kept.append(_without_known(fresh, kept))
     return _joined(kept), Saddles(
         np.concatenate([s.pixels for s in saddles]), np.concatenate([s.scale for s in saddles])
     )
 
 
+def _corners_of(level: Level) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
+    """Return the saddles of `level` in its own pixels, and of those that are corners: which, angles, contrast."""
+    at = peaks(level)
+    library = front.loaded()
+    if library is not None:
+        return front.corners(library, level.smooth, at, RADII, MAX_STEP, _ring_rules())
+    found, near = saddle_step(level.smooth, at)
+    found = found[near]
+    rings = read_rings(level.smooth, found, RADII[0])
+    which = np.flatnonzero(rings.valid)
+    angles, contrast = rings.angles[which], rings.contrast[which]
+    todo = np.arange(len(which))
+    for radius in RADII[1:]:
+        rings = read_rings(level.smooth, found[which[todo]], radius)
+        todo = todo[rings.valid]
+        angles[todo], contrast[todo] = rings.angles[rings.valid], rings.contrast[rings.valid]
+    return found, which, angles, contrast
+
+
+@functools.cache
+def _ring_rules() -> front.RingRules:
+    return front.RingRules.make(CIRCLE, MAX_ODD, MAX_CENTRE)
+
+
 def _without_known(fresh: Corners, known: list[Corners]) -> Corners:
     """Return those of `fresh` that no finer level has found already."""
     if not len(fresh) or not any(len(k) for k in known):
         return fresh
-    from scipy.spatial import cKDTree
+    before, reach = np.concatenate([k.pixels for k in known]), KNOWN * float(fresh.scale[0])
+    library = front.loaded()
+    if library is not None:
+        new = ~front.near_any(library, fresh.pixels, before, reach)
+    else:
+        from scipy.spatial import cKDTree
 
-    distance, _ = cKDTree(np.concatenate([k.pixels for k in known])).query(fresh.pixels)
-    new = distance > 2.0 * fresh.scale
+        new = cKDTree(before).query(fresh.pixels)[0] > reach
     return Corners(fresh.pixels[new], fresh.angles[new], fresh.contrast[new], fresh.scale[new])
 
 

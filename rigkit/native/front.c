@@ -1,0 +1,495 @@
+/* From an image to linked corners: smoothing, saddle response and its peaks, ring tests, links.
+ *
+ * The definitions are in rigkit.corners.response, .saddle, .ring and .links; the numbers come from there. */
+#include "kernels.h"
+
+/* Pixels that the tests of a row are made for at a time: the results stay in registers and the first cache. */
+enum { STRIP = 64 };
+
+/* Return the box means of factor x factor pixels: out (height / factor, width / factor). `sums` (width) is scratch. */
+#define SHRINK(NAME, TYPE, SUM)                                                                                        \
+    void NAME(const TYPE *image, int64_t height, int64_t width, int64_t factor, SUM *sums, float *out);                \
+    FOR_EACH_PROCESSOR void NAME(                                                                                      \
+        const TYPE *restrict image, int64_t height, int64_t width, int64_t factor, SUM *restrict sums,                 \
+        float *restrict out)                                                                                           \
+    {                                                                                                                  \
+        const int64_t rows = height / factor, columns = width / factor;                                                \
+        const float share = 1.0f / (float)(factor * factor);                                                           \
+        for (int64_t row = 0; row < rows; row++) {                                                                     \
+            const TYPE *restrict from = image + row * factor * width;                                                  \
+            for (int64_t u = 0; u < columns * factor; u++)                                                             \
+                sums[u] = from[u];                                                                                     \
+            for (int64_t k = 1; k < factor; k++)                                                                       \
+                for (int64_t u = 0; u < columns * factor; u++)                                                         \
+                    sums[u] = (SUM)(sums[u] + from[k * width + u]);                                                    \
+            float *restrict to = out + row * columns;                                                                  \
+            if (factor == 2)                                                                                           \
+                for (int64_t u = 0; u < columns; u++)                                                                  \
+                    to[u] = share * (float)(sums[2 * u] + sums[2 * u + 1]);                                            \
+            else if (factor == 4)                                                                                      \
+                for (int64_t u = 0; u < columns; u++)                                                                  \
+                    to[u] = share * (float)((sums[4 * u] + sums[4 * u + 1]) + (sums[4 * u + 2] + sums[4 * u + 3]));    \
+            else                                                                                                       \
+                for (int64_t u = 0; u < columns; u++) {                                                                \
+                    float sum = 0.0f;                                                                                  \
+                    for (int64_t k = 0; k < factor; k++)                                                               \
+                        sum += (float)sums[factor * u + k];                                                            \
+                    to[u] = share * sum;                                                                               \
+                }                                                                                                      \
+        }                                                                                                              \
+    }
+SHRINK(shrink_bytes, uint8_t, uint16_t)
+SHRINK(shrink_floats, float, float)
+
+/* Smooth with the binomial (side, middle, centre, middle, side) both ways, the border repeated; `half` (may be NULL) gets
+ * every second pixel of every second row. `column` (width + 4) is scratch. */
+#define SMOOTH(NAME, TYPE)                                                                                             \
+    void NAME(const TYPE *image, int64_t height, int64_t width, const float *kernel, float *column, float *smooth,     \
+              float *half);                                                                                            \
+    FOR_EACH_PROCESSOR void NAME(                                                                                      \
+        const TYPE *restrict image, int64_t height, int64_t width, const float *restrict kernel,                       \
+        float *restrict column, float *restrict smooth, float *restrict half)                                          \
+    {                                                                                                                  \
+        const float outer = kernel[0], inner = kernel[1], centre = kernel[2];                                          \
+        const int64_t half_width = (width + 1) / 2;                                                                    \
+        for (int64_t v = 0; v < height; v++) {                                                                         \
+            const TYPE *restrict above2 = image + (v > 2 ? v - 2 : 0) * width;                                         \
+            const TYPE *restrict above = image + (v > 1 ? v - 1 : 0) * width;                                          \
+            const TYPE *restrict here = image + v * width;                                                             \
+            const TYPE *restrict below = image + (v < height - 1 ? v + 1 : height - 1) * width;                        \
+            const TYPE *restrict below2 = image + (v < height - 2 ? v + 2 : height - 1) * width;                       \
+            float *restrict middle = column + 2;                                                                       \
+            for (int64_t u = 0; u < width; u++)                                                                        \
+                middle[u] = outer * ((float)above2[u] + (float)below2[u]) +                                            \
+                            inner * ((float)above[u] + (float)below[u]) + centre * (float)here[u];                     \
+            column[0] = column[1] = middle[0];                                                                         \
+            middle[width] = middle[width + 1] = middle[width - 1];                                                     \
+            float *restrict to = smooth + v * width;                                                                   \
+            for (int64_t u = 0; u < width; u++)                                                                        \
+                to[u] = outer * (column[u] + column[u + 4]) + inner * (column[u + 1] + column[u + 3]) +                \
+                        centre * column[u + 2];                                                                        \
+            if (half && v % 2 == 0) {                                                                                  \
+                float *restrict every = half + v / 2 * half_width;                                                     \
+                for (int64_t u = 0; u < half_width; u++)                                                               \
+                    every[u] = to[2 * u];                                                                              \
+            }                                                                                                          \
+        }                                                                                                              \
+    }
+SMOOTH(smooth_bytes, uint8_t)
+SMOOTH(smooth_floats, float)
+
+/* Minus the determinant of the Hessian at one pixel. */
+INLINE float saddle_response(const float *at, int64_t width)
+{
+    const float here = 2.0f * at[0];
+    const float uu = at[1] + at[-1] - here, vv = at[width] + at[-width] - here;
+    const float uv = 0.25f * ((at[width + 1] + at[-width - 1]) - (at[-width + 1] + at[width - 1]));
+    return uv * uv - uu * vv;
+}
+
+/* |response| and brightness at every step-th inner pixel of every step-th inner row, row by row. */
+void typical_values(
+    const float *smooth, int64_t height, int64_t width, int64_t step, float *response, float *brightness);
+void typical_values(
+    const float *smooth, int64_t height, int64_t width, int64_t step, float *response, float *brightness)
+{
+    for (int64_t v = 1; v < height - 1; v += step)
+        for (int64_t u = 1; u < width - 1; u += step) {
+            const float *at = smooth + v * width + u;
+            *response++ = fabsf(saddle_response(at, width));
+            *brightness++ = *at;
+        }
+}
+
+/* Mark the peaks among the pixels u to u + STRIP - 1 of a row: not lower than the neighbours that follow within two pixels,
+ * higher than those before (a corner between pixels makes two equal ones), and above the threshold. */
+INLINE void mark_peaks(float *const rows[5], int64_t u, float threshold, uint8_t *restrict peak)
+{
+    float before[STRIP + 4], after[STRIP + 4];
+    const float *above2 = rows[0] + u - 2, *above = rows[1] + u - 2, *here = rows[2] + u;
+    const float *below = rows[3] + u - 2, *below2 = rows[4] + u - 2;
+    for (int k = 0; k < STRIP + 4; k++) {
+        before[k] = above[k] > above2[k] ? above[k] : above2[k];
+        after[k] = below[k] > below2[k] ? below[k] : below2[k];
+    }
+    for (int k = 0; k < STRIP; k++) {
+        float most = before[k];
+        most = before[k + 1] > most ? before[k + 1] : most;
+        most = before[k + 2] > most ? before[k + 2] : most;
+        most = before[k + 3] > most ? before[k + 3] : most;
+        most = before[k + 4] > most ? before[k + 4] : most;
+        most = here[k - 2] > most ? here[k - 2] : most;
+        most = here[k - 1] > most ? here[k - 1] : most;
+        most = threshold > most ? threshold : most;
+        float least = after[k];
+        least = after[k + 1] > least ? after[k + 1] : least;
+        least = after[k + 2] > least ? after[k + 2] : least;
+        least = after[k + 3] > least ? after[k + 3] : least;
+        least = after[k + 4] > least ? after[k + 4] : least;
+        least = here[k + 1] > least ? here[k + 1] : least;
+        least = here[k + 2] > least ? here[k + 2] : least;
+        peak[k] = (here[k] > most) & (here[k] >= least);
+    }
+}
+
+/* corners.response.peaks: (u, v) and response of the peaks, row by row; returns how many. There is at most one peak in
+ * 3x3 pixels. `scratch` holds 5 * (width + STRIP + 4) floats. */
+int64_t find_peaks(
+    const float *smooth, int64_t height, int64_t width, float threshold, float *scratch, int32_t *at, float *response);
+FOR_EACH_PROCESSOR int64_t find_peaks(
+    const float *smooth, int64_t height, int64_t width, float threshold, float *scratch, int32_t *at, float *response)
+{
+    const int64_t stride = width + STRIP + 4;
+    float *rows[5];
+    for (int k = 0; k < 5; k++) {
+        rows[k] = scratch + k * stride;
+        for (int64_t u = 0; u < stride; u++)
+            rows[k][u] = -1e30f;
+    }
+    int64_t count = 0;
+    for (int64_t v = 1; v < height - 1; v++) {
+        float *restrict last = rows[0];
+        for (int k = 0; k < 4; k++)
+            rows[k] = rows[k + 1];
+        rows[4] = last;
+        const float *restrict from = smooth + v * width;
+        for (int64_t u = 1; u < width - 1; u++)
+            last[u] = saddle_response(from + u, width);
+        /* The middle one of the five rows is v - 2. */
+        if (v < 5)
+            continue;
+        for (int64_t u = 3; u < width - 3; u += STRIP) {
+            const int64_t inside = u + STRIP < width - 3 ? STRIP : width - 3 - u;
+            int32_t high = 0;
+            for (int64_t k = 0; k < inside; k++)
+                high += rows[2][u + k] > threshold;
+            if (!high)
+                continue;
+            uint8_t peak[STRIP];
+            mark_peaks(rows, u, threshold, peak);
+            for (int64_t k = 0; k < inside; k++)
+                if (peak[k]) {
+                    at[2 * count] = (int32_t)(u + k);
+                    at[2 * count + 1] = (int32_t)(v - 2);
+                    response[count++] = rows[2][u + k];
+                }
+        }
+    }
+    return count;
+}
+
+/* corners.saddle.saddle_step for one pixel; whether it is a saddle and near. */
+INLINE int saddle_near(const float *smooth, int64_t width, int64_t u, int64_t v, double most_step, double pixel[2])
+{
+    const float *at = smooth + v * width + u;
+    const double here = at[0], left = at[-1], right = at[1], above = at[-width], below = at[width];
+    const double gu = 0.5 * (right - left), gv = 0.5 * (below - above);
+    const double uu = right + left - 2.0 * here, vv = below + above - 2.0 * here;
+    const double uv = 0.25 * (((double)at[width + 1] + at[-width - 1]) - ((double)at[-width + 1] + at[width - 1]));
+    const double det = uu * vv - uv * uv;
+    if (!(det < 0.0))
+        return 0;
+    const double step_u = (uv * gv - vv * gu) / det, step_v = (uv * gu - uu * gv) / det;
+    pixel[0] = (double)u + step_u;
+    pixel[1] = (double)v + step_v;
+    return fabs(step_u) <= most_step && fabs(step_v) <= most_step;
+}
+
+/* The corners of one level among `count` peaks: `saddles` (count, 2) gets those with a saddle nearby, `which`, `angles`
+ * (count, 2) and `contrast` those of them that are corners: valid at the first radius, read at the last valid one.
+ * Returns the number of saddles and, in `found`, of corners. */
+int64_t find_corners(
+    image_t image, const ring_rules_t *rules, const double *radii, int64_t radius_count, double most_step,
+    const int32_t *peaks, int64_t count, double *saddles, int64_t *which, double *angles, double *contrast,
+    int64_t *found);
+FOR_EACH_PROCESSOR int64_t find_corners(
+    image_t image, const ring_rules_t *rules, const double *radii, int64_t radius_count, double most_step,
+    const int32_t *peaks, int64_t count, double *saddles, int64_t *which, double *angles, double *contrast,
+    int64_t *found)
+{
+    int64_t near = 0, corners = 0;
+    for (int64_t k = 0; k < count; k++) {
+        double *pixel = saddles + 2 * near;
+        if (!saddle_near(image.brightness, image.width, peaks[2 * k], peaks[2 * k + 1], most_step, pixel))
+            continue;
+        int64_t good = 0;
+        for (; good < radius_count; good++)
+            if (!read_ring(image, *rules, (float)pixel[0], (float)pixel[1], (float)radii[good], angles + 2 * corners,
+                           contrast + corners))
+                break;
+        if (good > 0)
+            which[corners++] = near;
+        near++;
+    }
+    *found = corners;
+    return near;
+}
+
+/* Points in square buckets: those of bucket b are order[first[b]] to order[first[b + 1] - 1]. */
+typedef struct {
+    const double *points;
+    int32_t *first, *order;
+    int64_t columns, rows;
+    double left, top, side;
+} squares_t;
+
+INLINE int64_t square_at(double position, double least, double side, int64_t count)
+{
+    const double place = (position - least) / side;
+    return place > 0.0 ? (place < (double)count ? (int64_t)place : count - 1) : 0;
+}
+
+/* Sort `count` > 0 points into squares of at least `side`, at most about two a point. Returns 0 without memory. */
+static int fill_squares(const double *points, int64_t count, double side, squares_t *out)
+{
+    double left = points[0], right = left, top = points[1], bottom = top;
+    for (int64_t i = 1; i < count; i++) {
+        const double u = points[2 * i], v = points[2 * i + 1];
+        left = u < left ? u : left;
+        right = u > right ? u : right;
+        top = v < top ? v : top;
+        bottom = v > bottom ? v : bottom;
+    }
+    while ((right - left) / side * ((bottom - top) / side) + (right - left + bottom - top) / side > 2.0 * (double)count + 8.0)
+        side *= 1.4;
+    const squares_t squares = {points, NULL, NULL, (int64_t)((right - left) / side) + 1,
+                               (int64_t)((bottom - top) / side) + 1, left, top, side};
+    const int64_t size = squares.columns * squares.rows;
+    *out = squares;
+    out->first = calloc((size_t)(size + 1 + count), sizeof(int32_t));
+    if (!out->first)
+        return 0;
+    out->order = out->first + size + 1;
+    for (int pass = 0; pass < 2; pass++) {
+        for (int64_t i = count - 1; i >= 0; i--) {
+            const int64_t at = square_at(points[2 * i + 1], top, side, squares.rows) * squares.columns +
+                               square_at(points[2 * i], left, side, squares.columns);
+            if (pass == 0)
+                out->first[at]++;
+            else
+                out->order[--out->first[at]] = (int32_t)i;
+        }
+        /* After the first pass the end of each square; the second moves it to its start. */
+        for (int64_t b = 1; pass == 0 && b <= size; b++)
+            out->first[b] += out->first[b - 1];
+    }
+    return 1;
+}
+
+/* corners.saddle: mark those of `fresh` (count, 2) that lie within `reach` of one of `known`. Returns 0 without memory. */
+int64_t mark_known(
+    const double *fresh, int64_t count, const double *known, int64_t known_count, double reach, uint8_t *mark);
+int64_t mark_known(
+    const double *fresh, int64_t count, const double *known, int64_t known_count, double reach, uint8_t *mark)
+{
+    squares_t squares;
+    if (!fill_squares(known, known_count, reach, &squares))
+        return 0;
+    for (int64_t i = 0; i < count; i++) {
+        const double u = fresh[2 * i], v = fresh[2 * i + 1];
+        const int64_t left = square_at(u - reach, squares.left, squares.side, squares.columns);
+        const int64_t right = square_at(u + reach, squares.left, squares.side, squares.columns);
+        const int64_t bottom = square_at(v + reach, squares.top, squares.side, squares.rows);
+        mark[i] = 0;
+        for (int64_t row = square_at(v - reach, squares.top, squares.side, squares.rows); row <= bottom; row++) {
+            const int32_t *first = squares.first + row * squares.columns;
+            for (int32_t k = first[left]; k < first[right + 1]; k++) {
+                const double du = known[2 * squares.order[k]] - u, dv = known[2 * squares.order[k] + 1] - v;
+                mark[i] |= du * du + dv * dv <= reach * reach;
+            }
+        }
+    }
+    free(squares.first);
+    return 1;
+}
+
+/* The constants of corners.links. */
+typedef struct {
+    int64_t neighbours, places, most;
+    const double *along;
+    double arm_cosine, contrast_ratio, length_ratio, aside, least_aside;
+} link_rules_t;
+
+/* The corners and the level that their edges are read from. */
+typedef struct {
+    const double *pixels, *lines, *contrast, *least, *most, *reach;
+    int64_t count;
+} corners_t;
+
+typedef struct {
+    double square;
+    int64_t arm, end, back;
+} candidate_t;
+
+/* Collect the corners around corner i that are like it in contrast: at least the `wanted` nearest, with the squares of the
+ * distances. Returns how many. */
+static int64_t gather(
+    const corners_t *corners, const squares_t *squares, int64_t i, int64_t wanted, double *square, int32_t *index)
+{
+    const double u = corners->pixels[2 * i], v = corners->pixels[2 * i + 1];
+    const double least = corners->least[i], most = corners->most[i], side = squares->side;
+    const int64_t column = square_at(u, squares->left, side, squares->columns);
+    const int64_t row = square_at(v, squares->top, side, squares->rows);
+    const double in_u = u - squares->left - (double)column * side, in_v = v - squares->top - (double)row * side;
+    double inner = in_u < in_v ? in_u : in_v;
+    inner = side - in_u < inner ? side - in_u : inner;
+    inner = side - in_v < inner ? side - in_v : inner;
+    int64_t count = 0;
+    for (int64_t ring = 0;; ring++) {
+        const int64_t left = column - ring, right = column + ring, top = row - ring, bottom = row + ring;
+        for (int64_t r = top > 0 ? top : 0; r <= bottom && r < squares->rows; r++) {
+            const int32_t *first = squares->first + r * squares->columns;
+            /* Whole rows above and below, the two ends of the others. */
+            const int whole = r == top || r == bottom;
+            for (int part = 0; part < (whole || ring == 0 ? 1 : 2); part++) {
+                int64_t from = part == 0 ? left : right, to = whole ? right : from;
+                if (to < 0 || from >= squares->columns)
+                    continue;
+                from = from > 0 ? from : 0;
+                to = to < squares->columns ? to : squares->columns - 1;
+                for (int32_t k = first[from]; k < first[to + 1]; k++) {
+                    const int32_t j = squares->order[k];
+                    if (!(corners->contrast[j] > least && corners->contrast[j] < most))
+                        continue;
+                    const double du = corners->pixels[2 * j] - u, dv = corners->pixels[2 * j + 1] - v;
+                    square[count] = du * du + dv * dv;
+                    index[count++] = j;
+                }
+            }
+        }
+        if (left <= 0 && top <= 0 && right >= squares->columns - 1 && bottom >= squares->rows - 1)
+            return count;
+        /* All corners within `safe` are among them by now. */
+        const double safe = inner + (double)ring * side;
+        int64_t within = 0;
+        for (int64_t k = 0; k < count; k++)
+            within += square[k] <= safe * safe;
+        if (within >= wanted)
+            return count;
+    }
+}
+
+/* The arm (A, B, -A, -B) that points most along, given the cosines to A and B. */
+INLINE int64_t arm_along(double a, double b)
+{
+    return fabs(b) > fabs(a) ? (b < 0.0 ? 3 : 1) : (a < 0.0 ? 2 : 0);
+}
+
+/* Whether the arms of the corners point at each other, and which. */
+INLINE int arms_meet(const corners_t *corners, int64_t i, int64_t j, double square, double cosine, candidate_t *out)
+{
+    const double length = sqrt(square) > 1e-6 ? sqrt(square) : 1e-6;
+    const double u = (corners->pixels[2 * j] - corners->pixels[2 * i]) / length;
+    const double v = (corners->pixels[2 * j + 1] - corners->pixels[2 * i + 1]) / length;
+    const double *mine = corners->lines + 4 * i, *theirs = corners->lines + 4 * j;
+    const double a = u * mine[0] + v * mine[1], b = u * mine[2] + v * mine[3];
+    if (!(fabs(a) > cosine || fabs(b) > cosine))
+        return 0;
+    const double home_a = -(u * theirs[0] + v * theirs[1]), home_b = -(u * theirs[2] + v * theirs[3]);
+    if (!(fabs(home_a) > cosine || fabs(home_b) > cosine))
+        return 0;
+    const candidate_t found = {square, arm_along(a, b), j, arm_along(home_a, home_b)};
+    *out = found;
+    return (found.arm + found.back) % 2 == 1;
+}
+
+/* Whether the edge from corner i is there (corners.links._edge_seen). */
+INLINE int link_seen(
+    const corners_t *corners, const image_t image, double scale, double offset, const link_rules_t *rules, int64_t i,
+    const candidate_t *link)
+{
+    const int64_t j = link->end;
+    const double u = (corners->pixels[2 * i] - offset) / scale, v = (corners->pixels[2 * i + 1] - offset) / scale;
+    const double end_u = (corners->pixels[2 * j] - offset) / scale, end_v = (corners->pixels[2 * j + 1] - offset) / scale;
+    double aside = rules->aside * sqrt((end_u - u) * (end_u - u) + (end_v - v) * (end_v - v));
+    const double most = corners->reach[i];
+    aside = aside > rules->least_aside ? aside : rules->least_aside;
+    aside = aside < most ? aside : most;
+    const double there = corners->contrast[j], here = corners->contrast[i];
+    const double weakest = rules->contrast_ratio * (there < here ? there : here);
+    return edge_seen(image, rules->along, rules->places, u, v, end_u, end_v, link->arm % 2 ? -1.0 : 1.0, aside,
+                     weakest) >= rules->most;
+}
+
+/* The nearest corner along each of the four arms of corner i whose edge is seen: to[arm] = 4 * corner + arm, or -1. */
+static void link_arms(
+    const corners_t *corners, const squares_t *squares, const image_t image, double scale, double offset,
+    const link_rules_t *rules, int64_t i, double *square, int32_t *index, int64_t *to)
+{
+    enum { MOST_CANDIDATES = 512 };
+    candidate_t candidates[MOST_CANDIDATES];
+    const int64_t wanted = rules->neighbours + 1, count = gather(corners, squares, i, wanted, square, index);
+    int64_t listed = 0;
+    for (int64_t k = 0; k < count; k++) {
+        const int64_t j = index[k];
+        const double ratio = corners->contrast[i] / corners->contrast[j];
+        candidate_t fresh;
+        if (j == i || !(ratio > rules->contrast_ratio && ratio < 1.0 / rules->contrast_ratio))
+            continue;
+        if (!arms_meet(corners, i, j, square[k], rules->arm_cosine, &fresh))
+            continue;
+        int64_t nearer = 0;
+        for (int64_t n = 0; n < count; n++)
+            nearer += square[n] < square[k];
+        if (nearer >= wanted || listed == MOST_CANDIDATES)
+            continue;
+        int64_t at = listed++;
+        for (; at > 0 && candidates[at - 1].square > fresh.square; at--)
+            candidates[at] = candidates[at - 1];
+        candidates[at] = fresh;
+    }
+    for (int64_t k = 0; k < listed; k++) {
+        const candidate_t *link = candidates + k;
+        if (to[link->arm] < 0 && link_seen(corners, image, scale, offset, rules, i, link))
+            to[link->arm] = 4 * link->end + link->back;
+    }
+}
+
+static double link_length(const double *pixels, int64_t i, int64_t to)
+{
+    const double du = pixels[2 * (to / 4)] - pixels[2 * i], dv = pixels[2 * (to / 4) + 1] - pixels[2 * i + 1];
+    return sqrt(du * du + dv * dv);
+}
+
+/* corners.links.find_links: both[4 * i + arm] = 4 * neighbour + its arm, -1 for none. Of the corners, `lines` (count, 4) are
+ * the unit vectors of A and B, `least` and `most` bound the contrast of those looked at, `reach` is the most `aside`.
+ * `nearest` (count, 4) is scratch. Returns 0 without memory. */
+int64_t find_links(
+    const corners_t *corners, image_t image, double scale, double offset, const link_rules_t *rules, int64_t *nearest,
+    int64_t *both);
+FOR_EACH_PROCESSOR int64_t find_links(
+    const corners_t *corners, image_t image, double scale, double offset, const link_rules_t *rules, int64_t *nearest,
+    int64_t *both)
+{
+    const int64_t count = corners->count;
+    squares_t squares;
+    if (!fill_squares(corners->pixels, count, 1.0, &squares))
+        return 0;
+    double *square = malloc((size_t)count * (sizeof(double) + sizeof(int32_t)));
+    if (!square) {
+        free(squares.first);
+        return 0;
+    }
+    for (int64_t k = 0; k < 4 * count; k++)
+        nearest[k] = both[k] = -1;
+    for (int64_t i = 0; i < count; i++)
+        link_arms(corners, &squares, image, scale, offset, rules, i, square, (int32_t *)(square + count), nearest + 4 * i);
+    free(square);
+    free(squares.first);
+    for (int64_t k = 0; k < 4 * count; k++)
+        if (nearest[k] >= 0 && nearest[nearest[k]] == k)
+            both[k] = nearest[k];
+    /* Both halves of a link go, so what is dropped is marked before it is. */
+    for (int64_t k = 0; k < 4 * count; k++) {
+        const int64_t opposite = k / 4 * 4 + (k + 2) % 4;
+        nearest[k] = both[k] >= 0 && both[opposite] >= 0 &&
+                     link_length(corners->pixels, k / 4, both[k]) >
+                         rules->length_ratio * link_length(corners->pixels, k / 4, both[opposite]);
+    }
+    for (int64_t k = 0; k < 4 * count; k++)
+        if (nearest[k] && both[k] >= 0) {
+            both[both[k]] = -1;
+            both[k] = -1;
+        }
+    return 1;
+}

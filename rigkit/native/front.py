@@ -1,0 +1,202 @@
+"""Calls of the kernels in front.c: plain arrays in, plain arrays out; all tolerances come from the callers."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from ctypes import POINTER, Structure, byref, c_double, c_float, c_int64, c_void_p
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.arrays import BoolArray, FloatArray, IntArray
+from rigkit.native import kernels
+
+__all__ = ["LinkRules", "RingRules", "corners", "links", "loaded", "near_any", "peaks", "shrunk", "smoothed", "typical"]
+
+STRIP = 64
+"""As in front.c: rows of scratch memory are longer than the image by this and a peak's neighbourhood."""
+
+Image = NDArray[np.float32]
+
+
+class RingRules(Structure):
+    """ring_rules_t; `make` also keeps the array that it points to."""
+
+    _fields_: ClassVar = [
+        ("circle", c_void_p),
+        ("half", c_int64),
+        *((name, c_double) for name in ("most_odd", "most_centre")),
+    ]
+
+    @classmethod
+    def make(cls, circle: Image, most_odd: float, most_centre: float) -> RingRules:
+        """Return the rules; `circle` (2 * half, 2) are the samples of a ring of radius 1."""
+        kept = np.ascontiguousarray(circle, np.float32)
+        rules = cls(kept.ctypes.data, len(kept) // 2, most_odd, most_centre)
+        rules.kept = kept
+        return rules
+
+
+class LinkRules(Structure):
+    """link_rules_t; `make` also keeps the array that it points to."""
+
+    _fields_: ClassVar = [
+        *((name, c_int64) for name in ("neighbours", "places", "most")),
+        ("along", c_void_p),
+        *((name, c_double) for name in ("arm_cosine", "contrast_ratio", "length_ratio", "aside", "least_aside")),
+    ]
+
+    @classmethod
+    def make(cls, neighbours: int, along: FloatArray, most: int, **numbers: float) -> LinkRules:
+        """Return the rules; `along` are the places of an edge that are looked at."""
+        kept = np.ascontiguousarray(along, np.float64)
+        rules = cls(neighbours, len(kept), most, kept.ctypes.data, **numbers)
+        rules.kept = kept
+        return rules
+
+
+class _Image(Structure):
+    _fields_: ClassVar = [("brightness", c_void_p), ("width", c_int64), ("height", c_int64)]
+
+    @classmethod
+    def of(cls, image: Image) -> _Image:
+        return cls(image.ctypes.data, image.shape[1], image.shape[0])
+
+
+class _Corners(Structure):
+    _fields_: ClassVar = [
+        *((name, c_void_p) for name in ("pixels", "lines", "contrast", "least", "most", "reach")),
+        ("count", c_int64),
+    ]
+
+
+@functools.cache
+def loaded() -> ctypes.CDLL | None:
+    """Return the library, None where the kernels are not to be had."""
+    library = kernels("front")
+    if library is None:
+        return None
+    address, size = c_void_p, c_int64
+    for name in ("shrink_bytes", "shrink_floats"):
+        getattr(library, name).argtypes = [address, size, size, size, address, address]
+        getattr(library, name).restype = None
+    library.smooth_floats.argtypes = [address, size, size, *[address] * 4]
+    library.smooth_floats.restype = None
+    library.typical_values.argtypes = [address, size, size, size, address, address]
+    library.typical_values.restype = None
+    library.find_peaks.argtypes = [address, size, size, c_float, *[address] * 3]
+    library.find_corners.argtypes = [_Image, POINTER(RingRules), address, size, c_double, address, size, *[address] * 5]
+    library.mark_known.argtypes = [address, size, address, size, c_double, address]
+    library.find_links.argtypes = [
+        *(POINTER(_Corners), _Image, c_double, c_double, POINTER(LinkRules)),
+        *(address, address),
+    ]
+    for name in ("find_peaks", "find_corners", "mark_known", "find_links"):
+        getattr(library, name).restype = size
+    return library
+
+
+def shrunk(library: ctypes.CDLL, image: NDArray[np.uint8] | Image, factor: int) -> Image:
+    """Return the means of `factor` x `factor` pixels."""
+    height, width = image.shape
+    out = np.empty((height // factor, width // factor), np.float32)
+    bytes_ = image.dtype == np.uint8
+    sums = np.empty(width, np.uint16 if bytes_ else np.float32)
+    call = library.shrink_bytes if bytes_ else library.shrink_floats
+    call(image.ctypes.data, height, width, factor, sums.ctypes.data, out.ctypes.data)
+    return out
+
+
+def smoothed(library: ctypes.CDLL, image: Image, kernel: Image) -> tuple[Image, Image]:
+    """Return `image` smoothed with the symmetric `kernel` (5,) both ways, and every second of its pixels both ways."""
+    height, width = image.shape
+    smooth, half = np.empty_like(image), np.empty(((height + 1) // 2, (width + 1) // 2), np.float32)
+    column = np.empty(width + 4, np.float32)
+    arrays = (kernel, column, smooth, half)
+    library.smooth_floats(image.ctypes.data, height, width, *(array.ctypes.data for array in arrays))
+    return smooth, half
+
+
+def typical(library: ctypes.CDLL, smooth: Image, step: int) -> tuple[Image, Image]:
+    """Return |response| and brightness at every `step`-th inner pixel of every `step`-th inner row."""
+    height, width = smooth.shape
+    out = np.empty((2, -(-(height - 2) // step) * -(-(width - 2) // step)), np.float32)
+    library.typical_values(smooth.ctypes.data, height, width, step, out[0].ctypes.data, out[1].ctypes.data)
+    return out[0], out[1]
+
+
+def peaks(library: ctypes.CDLL, smooth: Image, threshold: float) -> tuple[NDArray[np.int32], Image]:
+    """Return (u, v) and response of the peaks above `threshold`, row by row."""
+    height, width = smooth.shape
+    most = (height // 3 + 1) * (width // 3 + 1)
+    at, response = np.empty((most, 2), np.int32), np.empty(most, np.float32)
+    scratch = np.empty(5 * (width + STRIP + 4), np.float32)
+    arrays = (scratch, at, response)
+    found = library.find_peaks(smooth.ctypes.data, height, width, threshold, *(array.ctypes.data for array in arrays))
+    return at[:found], response[:found]
+
+
+def corners(
+    library: ctypes.CDLL,
+    smooth: Image,
+    at: IntArray,
+    radii: tuple[float, ...],
+    most_step: float,
+    rules: RingRules,
+) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
+    """Return the saddles next to the peaks `at` (N, 2); of the corners among them: which, angles (M, 2), contrast."""
+    given = np.ascontiguousarray(at, np.int32)
+    count, found = len(given), c_int64()
+    pixels, angles = np.empty((count, 2)), np.empty((count + 1, 2))
+    which, contrast = np.empty(count, np.int64), np.empty(count + 1)
+    radius = np.array(radii)
+    near = library.find_corners(
+        _Image.of(smooth),
+        byref(rules),
+        radius.ctypes.data,
+        len(radius),
+        most_step,
+        given.ctypes.data,
+        count,
+        *(array.ctypes.data for array in (pixels, which, angles, contrast)),
+        byref(found),
+    )
+    size = found.value
+    return pixels[:near], which[:size], angles[:size], contrast[:size]
+
+
+def near_any(library: ctypes.CDLL, fresh: FloatArray, known: FloatArray, reach: float) -> BoolArray:
+    """Return which of `fresh` (N, 2) lie within `reach` of any of `known` (M, 2), M > 0."""
+    fresh, known = np.ascontiguousarray(fresh, np.float64), np.ascontiguousarray(known, np.float64)
+    mark = np.empty(len(fresh), np.bool_)
+    if not library.mark_known(fresh.ctypes.data, len(fresh), known.ctypes.data, len(known), reach, mark.ctypes.data):
+        raise MemoryError
+    return mark
+
+
+def links(
+    library: ctypes.CDLL,
+    pixels: FloatArray,
+    lines: FloatArray,
+    contrast: FloatArray,
+    bounds: tuple[FloatArray, FloatArray],
+    reach: FloatArray,
+    image: Image,
+    scale: float,
+    offset: float,
+    rules: LinkRules,
+) -> IntArray:
+    """Return the mutual neighbours of N corners, (N, 4): 4 * the neighbour + its arm, -1 for none.
+
+    `lines` (N, 2, 2) are the unit vectors of A and B, `bounds` the contrasts (N,) of those looked at, `reach` (N,) the
+    largest distance of the places that are looked at from the edge.
+    """
+    arrays = [np.ascontiguousarray(a, np.float64) for a in (pixels, lines, contrast, *bounds, reach)]
+    given = _Corners(*(array.ctypes.data for array in arrays), len(pixels))
+    out = np.empty((2, len(pixels), 4), np.int64)
+    place = (out[0].ctypes.data, out[1].ctypes.data)
+    if not library.find_links(byref(given), _Image.of(image), scale, offset, byref(rules), *place):
+        raise MemoryError
+    return np.asarray(out[1])

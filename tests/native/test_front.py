@@ -1,0 +1,136 @@
+"""The compiled front of the detector against the numpy one: the same corners and links, to rounding."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import pytest
+from helpers.detection_scenes import corner_scene, fisheye, regular
+
+from rigkit.corners import links, response, saddle
+from rigkit.corners.links import find_links
+from rigkit.corners.response import Level, grey_image, peaks, pyramid
+from rigkit.corners.saddle import Corners, find_corners
+from rigkit.native import front
+
+pytestmark = pytest.mark.skipif(front.loaded() is None, reason="the kernels are not built")
+
+SMOOTH_LEVELS = 1e-4
+"""Sums of 25 single-precision products of grey levels."""
+
+ANGLE_RAD = 1e-3
+"""Where a ring crosses half its contrast with next to no slope, rounding moves the crossing."""
+
+SAME_SHARE = 0.998
+"""Tests against a bound may fall the other way by rounding; in noise a few of thousands do."""
+
+
+def _images() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(5)
+    text = np.full((300, 500), 230, np.uint8)
+    for line in range(13):
+        cv2.putText(text, "HHH ### xxx 8888 +++ %%% mmm " * 2, (3, 20 + 22 * line), 0, 0.5, 20, 1, cv2.LINE_AA)
+    return {
+        "boards": corner_scene(rng, regular(), 1250.0).image(rng),
+        "fisheye": corner_scene(rng, fisheye(), 480.0).image(rng, noise_levels=6.0),
+        "noise": (rng.random((301, 403)) * 255).astype(np.uint8),
+        "small": (rng.random((17, 16)) * 255).astype(np.uint8),
+        "text": text,
+        "black": np.zeros((60, 80), np.uint8),
+    }
+
+
+@pytest.fixture
+def in_numpy(monkeypatch: pytest.MonkeyPatch) -> Callable[..., object]:
+    def run(function: Callable[..., object], *args: object) -> object:
+        with monkeypatch.context() as patch:
+            patch.setattr(front, "loaded", lambda: None)
+            return function(*args)
+
+    return run
+
+
+@pytest.mark.parametrize("name", list(_images()))
+def test_levels(name: str, in_numpy: Callable[..., list[Level]]) -> None:
+    grey = grey_image(_images()[name])
+    for ours, theirs in zip(pyramid(grey), in_numpy(pyramid, grey), strict=True):
+        assert ours.smooth.shape == theirs.smooth.shape
+        assert np.abs(ours.smooth - theirs.smooth).max() < SMOOTH_LEVELS
+        assert ours.threshold == pytest.approx(theirs.threshold, rel=1e-3, abs=1e-6)
+        assert (ours.scale, ours.offset) == (theirs.scale, theirs.offset)
+
+
+@pytest.mark.parametrize("factor", [2, 4, 8])
+def test_shrinking(factor: int, rng: np.random.Generator, in_numpy: Callable[..., np.ndarray]) -> None:
+    image = (rng.random((67, 85)) * 255).astype(np.float32)
+    ours, theirs = response._shrunk(image, factor), in_numpy(response._shrunk, image, factor)
+    assert ours.shape == theirs.shape == (67 // factor, 85 // factor)
+    assert np.abs(ours - theirs).max() < SMOOTH_LEVELS
+
+
+@pytest.mark.parametrize("name", list(_images()))
+def test_peaks(name: str, in_numpy: Callable[..., np.ndarray]) -> None:
+    for level in pyramid(grey_image(_images()[name])):
+        ours, theirs = peaks(level), in_numpy(peaks, level)
+        both = len({tuple(p) for p in ours} & {tuple(p) for p in theirs})
+        assert both >= SAME_SHARE * max(len(ours), len(theirs))
+
+
+def test_equal_neighbours_make_one_peak(in_numpy: Callable[..., np.ndarray]) -> None:
+    board = (((np.arange(240) // 24)[:, None] + np.arange(312) // 24) % 2 * 128 + 64).astype(np.uint8)
+    level = pyramid(grey_image(board))[0]
+    assert np.array_equal(peaks(level), in_numpy(peaks, level))
+    assert len(peaks(level)) == 9 * 12
+
+
+def test_no_more_peaks_than_asked(monkeypatch: pytest.MonkeyPatch, in_numpy: Callable[..., np.ndarray]) -> None:
+    monkeypatch.setattr(response, "MAX_PEAKS", 100)
+    level = pyramid(grey_image(_images()["noise"]))[0]
+    ours = peaks(level)
+    assert len(ours) == 100
+    assert np.array_equal(ours, in_numpy(peaks, level))
+
+
+@pytest.mark.parametrize("name", list(_images()))
+def test_corners(name: str, in_numpy: Callable[..., tuple[Corners, saddle.Saddles]]) -> None:
+    levels = pyramid(grey_image(_images()[name]))
+    (ours, all_ours), (theirs, all_theirs) = find_corners(levels), in_numpy(find_corners, levels)
+    assert abs(len(all_ours.pixels) - len(all_theirs.pixels)) <= (1.0 - SAME_SHARE) * len(all_ours.pixels)
+    mine = {(*np.round(p, 3), s): k for k, (p, s) in enumerate(zip(ours.pixels, ours.scale, strict=True))}
+    yours = {(*np.round(p, 3), s): k for k, (p, s) in enumerate(zip(theirs.pixels, theirs.scale, strict=True))}
+    both = sorted(mine.keys() & yours.keys())
+    assert len(both) >= SAME_SHARE * max(len(ours), len(theirs))
+    if name in ("boards", "fisheye"):
+        assert len(both) >= 144
+    if not both:
+        return
+    one, two = [mine[key] for key in both], [yours[key] for key in both]
+    turn = np.abs(ours.angles[one] - theirs.angles[two])
+    assert np.minimum(turn, np.abs(np.pi - turn)).max() < ANGLE_RAD
+    assert np.abs(ours.contrast[one] - theirs.contrast[two]).max() < 1e-3
+
+
+@pytest.mark.parametrize("name", ["boards", "fisheye", "noise", "text"])
+def test_links(name: str, in_numpy: Callable[..., links.Links]) -> None:
+    levels = pyramid(grey_image(_images()[name]))
+    corners, _ = find_corners(levels)
+    ours, theirs = find_links(corners, levels[0]), in_numpy(find_links, corners, levels[0])
+    same = (ours.corner == theirs.corner) & (ours.arm == theirs.arm)
+    assert same.mean() >= SAME_SHARE
+    if name in ("boards", "fisheye"):
+        assert same.all()
+        assert (ours.corner >= 0).sum() >= 3 * 2 * (7 * 6 + 8 * 5)
+
+
+def test_links_of_a_crowd(rng: np.random.Generator, in_numpy: Callable[..., links.Links]) -> None:
+    """Corners at random, thick here and thin there, of all contrasts: the same nearest ones, the same drops."""
+    image = cv2.GaussianBlur(rng.random((300, 400)).astype(np.float32) * 255, (0, 0), 3.0)
+    pixels = np.concatenate([rng.uniform(20, 280, (800, 2)), rng.uniform(100, 130, (800, 2)), [[399.0, 1.0]]])
+    angles = rng.uniform(0.0, np.pi, (len(pixels), 1)) + np.array([0.0, 0.5 * np.pi])
+    corners = Corners(pixels, angles, np.exp(rng.uniform(0.0, 5.0, len(pixels))), np.ones(len(pixels)))
+    level = Level(image, 1.0, 1.0, 0.0)
+    ours, theirs = find_links(corners, level), in_numpy(find_links, corners, level)
+    assert (theirs.corner >= 0).sum() > 100
+    assert ((ours.corner == theirs.corner) & (ours.arm == theirs.arm)).mean() >= SAME_SHARE
