@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import combinations
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -43,13 +44,14 @@ MEETS_CELLS = 0.15
 
 def split_folds(lattice: Lattice) -> list[Lattice]:
     """Return the parts of `lattice` between its folds; the corners on a fold belong to no board."""
-    for turned in (False, True):
-        upright = lattice.turned(1) if turned else lattice
-        at = _fold(upright.pixels)
-        if at is not None:
-            left, right = _halves(upright, at)
-            parts = split_folds(left) + split_folds(right)
-            return [part.turned(3) for part in parts] if turned else parts
+    at = _fold(lattice.pixels)
+    if at is not None:
+        return [part for half in _halves(lattice, at) for part in split_folds(half)]
+    at = _fold(lattice.pixels.swapaxes(0, 1))
+    if at is not None:
+        # A quarter turn makes the row into a column, counted from the other end.
+        halves = _halves(lattice.turned(1), lattice.size[1] - 1 - at)
+        return [part.turned(3) for half in halves for part in split_folds(half)]
     return [lattice]
 
 
@@ -83,53 +85,69 @@ def _fold(pixels: FloatArray) -> int | None:
     columns = pixels.shape[1]
     if columns < LEAST_FOR_FOLD:
         return None
-    step = np.diff(pixels, axis=1)
-    change = np.linalg.norm(np.diff(step, axis=1), axis=2)
-    length = np.linalg.norm(step, axis=2)
-    relative = change / np.minimum(length[:, 1:], length[:, :-1])
-    seen = np.isfinite(relative)
-    enough = seen.sum(axis=0) >= max(LEAST_ROWS, 0.4 * len(pixels))
-    if enough.sum() < LEAST_FOR_FOLD - 2:
+    step = pixels[:, 1:] - pixels[:, :-1]
+    bend = step[:, 1:] - step[:, :-1]
+    length = np.hypot(step[..., 0], step[..., 1])
+    relative = np.hypot(bend[..., 0], bend[..., 1]) / np.minimum(length[:, 1:], length[:, :-1])
+    seen = np.isfinite(relative).sum(axis=0)
+    enough = np.flatnonzero(seen >= max(LEAST_ROWS, 0.4 * len(pixels)))
+    if len(enough) < LEAST_FOR_FOLD - 2:
         return None
-    typical = np.array([np.median(relative[seen[:, j], j]) if enough[j] else np.nan for j in range(columns - 2)])
-    at = int(np.nanargmax(typical))
-    others = np.delete(typical, at)
-    folds = typical[at] > max(FOLD, FOLD_FACTOR * float(np.nanmedian(others)))
-    return at + 1 if folds else None
+    seen = seen[enough]
+    ranked = np.sort(relative, axis=0)
+    typical = 0.5 * (ranked[(seen - 1) // 2, enough] + ranked[seen // 2, enough])
+    at = int(typical.argmax())
+    others = np.sort(typical)[:-1]
+    middle = 0.5 * (others[(len(others) - 1) // 2] + others[len(others) // 2])
+    return int(enough[at]) + 1 if typical[at] > max(FOLD, FOLD_FACTOR * middle) else None
 
 
 def join_parts(lattices: Sequence[Lattice]) -> list[Lattice]:
     """Return `lattices` with those joined that continue each other's rows and columns across a short gap."""
-    parts = sorted((item for item in lattices if item.count >= 6), key=lambda item: -item.count)
+    parts = [_Part.of(item) for item in sorted(lattices, key=lambda item: -item.count) if item.count >= 6]
     done = False
     while not done:
         done = True
         for i, j in combinations(range(len(parts)), 2):
-            joined = _joined(parts[i], parts[j]) if _near(parts[i], parts[j]) else None
+            joined = _joined(parts[i], parts[j])
             if joined is not None:
-                parts = [joined, *(item for k, item in enumerate(parts) if k not in (i, j))]
+                parts = [_Part.of(joined), *(item for k, item in enumerate(parts) if k not in (i, j))]
                 done = False
                 break
-    return parts
+    return [part.lattice for part in parts]
 
 
-def _near(one: Lattice, two: Lattice) -> bool:
-    """Return whether the lattices' bounding boxes come within GAP sides of a cell, at its largest."""
-    boxes = [(np.nanmin(item.pixels, axis=(0, 1)), np.nanmax(item.pixels, axis=(0, 1))) for item in (one, two)]
-    reach = GAP * float(np.nanmax(np.abs(np.diff(one.pixels, axis=1)), initial=0.0))
-    reach = max(reach, GAP * float(np.nanmax(np.abs(np.diff(one.pixels, axis=0)), initial=0.0)))
-    return bool((np.maximum(boxes[0][0], boxes[1][0]) - np.minimum(boxes[0][1], boxes[1][1])).max() < reach)
+class _Part(NamedTuple):
+    """A lattice with its corners (N, 2), their (column, row), bounding box, and longest side of a cell."""
+
+    lattice: Lattice
+    pixels: FloatArray
+    grid: IntArray
+    low: FloatArray
+    high: FloatArray
+    side_px: float
+
+    @classmethod
+    def of(cls, lattice: Lattice) -> _Part:
+        row, column = np.nonzero(lattice.known)
+        pixels = lattice.pixels[row, column]
+        steps = (lattice.pixels[:, 1:] - lattice.pixels[:, :-1], lattice.pixels[1:] - lattice.pixels[:-1])
+        side = max(float(np.fmax.reduce(np.hypot(s[..., 0], s[..., 1]), axis=None, initial=0.0)) for s in steps)
+        grid = np.stack([column, row], axis=-1)
+        return cls(lattice, pixels, grid, pixels.min(axis=0), pixels.max(axis=0), side)
 
 
-def _joined(one: Lattice, two: Lattice) -> Lattice | None:
+def _joined(one: _Part, two: _Part) -> Lattice | None:
     """Return both lattices in one, None if `two` does not continue `one`."""
-    grid1, grid2 = (np.argwhere(item.known)[:, ::-1] for item in (one, two))
-    pixels1, pixels2 = one.pixels[one.known], two.pixels[two.known]
-    apart = np.linalg.norm(pixels1[:, None] - pixels2, axis=2)
+    reach = GAP * one.side_px
+    if not (np.maximum(one.low, two.low) - np.minimum(one.high, two.high)).max() < reach:
+        return None
+    grid1, grid2, pixels1, pixels2 = one.grid, two.grid, one.pixels, two.pixels
+    gap = pixels1[:, None] - pixels2
+    apart = np.hypot(gap[..., 0], gap[..., 1])
     near2 = np.argsort(apart.min(axis=0), kind="stable")[:NEAREST_OUT]
     near1 = np.argsort(apart[:, near2].min(axis=1), kind="stable")[:NEAREST_IN]
-    side = np.linalg.norm(np.diff(one.pixels, axis=1), axis=2)
-    if not apart.min() < 2.0 * GAP * float(np.nanmax(side, initial=0.0)) or len(np.unique(grid1[near1, 0])) < 2:
+    if not apart.min() < 2.0 * reach or (grid1[near1, 0] == grid1[near1[0], 0]).all():
         return None
     grid_from_pixel, _ = cv2.findHomography(pixels1[near1], grid1[near1].astype(np.float64), 0)
     if grid_from_pixel is None:
@@ -139,11 +157,9 @@ def _joined(one: Lattice, two: Lattice) -> Lattice | None:
     if not np.abs(place - whole).max() < MEETS_CELLS:
         return None
     for quarter in range(4):
-        turned = two.turned(quarter)
-        local = _turned_grid(grid2[near2], two.size, quarter)
-        shift = whole.astype(np.int64) - local
+        shift = whole.astype(np.int64) - _turned_grid(grid2[near2], two.lattice.size, quarter)
         if (shift == shift[0]).all():
-            return _united(one, turned, shift[0])
+            return _united(one.lattice, two.lattice.turned(quarter), shift[0])
     return None
 
 

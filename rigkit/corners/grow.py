@@ -7,28 +7,44 @@ is a corner with the polarity and the directions that the lattice demands and if
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache, cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray
-from rigkit.corners.lattice import STEPS, Lattice, Sheet
-from rigkit.corners.links import CONTRAST_RATIO, MOST, edge_contrast
+from rigkit.corners.lattice import STEPS, Lattice
+from rigkit.corners.links import ALONG, CONTRAST_RATIO, MOST, edge_contrast
 from rigkit.corners.local_fit import LocalFit, fit_cells
 from rigkit.corners.response import Level
-from rigkit.corners.ring import read_rings
+from rigkit.corners.ring import CIRCLE, MAX_CENTRE, MAX_ODD, read_rings
 from rigkit.corners.saddle import Saddles
+from rigkit.native import kernels
+from rigkit.native.growth import Buckets, FitRules, GrowthRules, grown
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 __all__ = ["SaddleIndex", "grow", "grow_all"]
 
 MAX_RINGS = 60
 """More rings than any board has rows or columns."""
 
+ROOM = 6
+"""Empty rows and columns around a lattice for it to grow into, before it is given more."""
+
 STIFF = (2, (0.02, 1.0))
 PLIANT = (3, (1e-3, 1e-2))
 """Degree and ridge of the prediction: one is steady with few neighbours, the other follows the rim of a fisheye."""
 
-BATCH, MAX_BATCHES = 16, 6
-"""So many lattices grow at a time, so many times: clutter makes hundreds of seeds, most of them of one square."""
+WIDTH, RADIUS = 1.3, 3
+"""Standard deviation of the weight and reach of the predictions, cells."""
+
+FEWEST = 3
+"""Known corners that foretell another."""
+
+MAX_SEEDS = 96
+"""So many lattices are grown, the largest first: clutter can make hundreds, of one square each."""
 
 REACH = 0.25
 """A corner lies within this of its prediction, in cells."""
@@ -41,22 +57,41 @@ RING = 0.3
 
 MIN_RING_PX, MAX_RING_PX = 2.2, 9.0
 
-LINE_SINE = np.sin(np.radians(25.0))
+LINE_SINE = float(np.sin(np.radians(25.0)))
 """How well the ring's lines must follow the lattice."""
+
+ASIDE, MIN_ASIDE_PX, MAX_ASIDE_PX = 0.12, 1.0, 4.0
+"""How far from an edge its sides are looked at: part of its length, within bounds."""
+
+LEAST_AREA = 1.0
+"""Cells of fewer px^2 are none."""
+
+SAME_PX = 1.0
+"""Corners nearer than this in both directions are one: found again on a coarser level."""
 
 
 class SaddleIndex:
     """All saddles of an image, ready to be asked for the nearest."""
 
     def __init__(self, saddles: Saddles) -> None:
+        self.pixels = saddles.pixels
+
+    @cached_property
+    def _tree(self) -> cKDTree:
         from scipy.spatial import cKDTree
 
-        self.pixels = saddles.pixels
-        self._tree = cKDTree(saddles.pixels) if len(saddles.pixels) else None
+        return cKDTree(self.pixels)
+
+    @cached_property
+    def buckets(self) -> Buckets:
+        """The saddles as the kernels want them."""
+        library = kernels("growth")
+        assert library is not None
+        return Buckets.of(library, self.pixels)
 
     def nearest(self, pixels: FloatArray, reach_px: FloatArray) -> tuple[IntArray, BoolArray]:
         """Return the TRIED nearest saddles of each of `pixels` (M, 2) and which of them lie within `reach_px` (M,)."""
-        if self._tree is None or not len(pixels):
+        if not len(self.pixels) or not len(pixels):
             return np.zeros((len(pixels), TRIED), np.int64), np.zeros((len(pixels), TRIED), bool)
         distance, index = self._tree.query(pixels, k=TRIED)
         found = distance <= reach_px[:, None]
@@ -65,56 +100,101 @@ class SaddleIndex:
 
 def grow_all(lattices: Sequence[Lattice], saddles: SaddleIndex, level: Level) -> list[Lattice]:
     """Return the lattices grown from `lattices`, the largest first; those that others have grown over are left out."""
-    pending = sorted(lattices, key=lambda item: -item.count)
-    grown: list[Lattice] = []
-    for _ in range(MAX_BATCHES):
-        if not pending:
+    out: list[Lattice] = []
+    taken = np.zeros((0, 2))
+    for lattice in sorted(lattices, key=lambda item: -item.count):
+        if len(out) == MAX_SEEDS:
             break
-        fresh = grow(pending[:BATCH], saddles, level)
-        grown += fresh
-        corners = np.concatenate([item.pixels[item.known] for item in fresh])
-        pending = [item for item in pending[BATCH:] if not _covered(item, corners)]
-    return grown
+        if not _covered(lattice, taken):
+            out.append(grow(lattice, saddles, level))
+            taken = np.concatenate([taken, out[-1].pixels[out[-1].known]])
+    return out
 
 
 def _covered(lattice: Lattice, corners: FloatArray) -> bool:
     """Return whether most of the corners of `lattice` are among `corners` (M, 2)."""
-    gaps = lattice.pixels[lattice.known][:, None] - corners
-    return bool(((np.abs(gaps).max(axis=2) < 1.0).any(axis=1)).mean() > 0.5)
+    mine = lattice.pixels[lattice.known]
+    inside = ((corners > mine.min(axis=0) - SAME_PX) & (corners < mine.max(axis=0) + SAME_PX)).all(axis=1)
+    if not inside.any():
+        return False
+    gaps = np.abs(mine[:, None] - corners[inside]).max(axis=2)
+    return bool((gaps.min(axis=1) < SAME_PX).mean() > 0.5)
 
 
-def grow(lattices: Sequence[Lattice], saddles: SaddleIndex, level: Level) -> list[Lattice]:
-    """Return `lattices` with all corners that can be added one after the other; brightness is read from `level`."""
-    grown = list(lattices)
-    growing = list(range(len(grown)))
-    for _ in range(MAX_RINGS):
-        if not growing:
-            break
-        added: list[int] = []
-        for how in (STIFF, PLIANT):
-            todo = [number for number in growing if number not in added]
-            wide = [grown[number].padded(2) for number in todo]
-            for number, before, after in zip(todo, wide, _ring(wide, saddles, level, *how), strict=True):
-                if after.count > before.count:
-                    grown[number] = after.trimmed()
-                    added.append(number)
-        growing = added
-    return grown
+def grow(lattice: Lattice, saddles: SaddleIndex, level: Level) -> Lattice:
+    """Return `lattice` with all corners that can be added one after the other; brightness is read from `level`."""
+    rings = MAX_RINGS
+    while rings > 0:
+        lattice = lattice.trimmed().padded(ROOM)
+        rings = _grow(lattice, saddles, level, rings)
+    return lattice.trimmed()
 
 
-def _ring(
-    lattices: list[Lattice], saddles: SaddleIndex, level: Level, degree: int, ridge: tuple[float, float]
-) -> list[Lattice]:
-    """Return `lattices` (with two empty outer rows and columns) with those empty cells filled that can be."""
-    if not lattices:
-        return []
-    sheet = Sheet.of(lattices)
-    cells = _beside(sheet.known)
-    fit = fit_cells(sheet.pixels, cells, degree=degree, width=1.3, ridge=ridge)
-    cell = np.argwhere(cells)
+def _grow(lattice: Lattice, saddles: SaddleIndex, level: Level, rings: int) -> int:
+    """Grow `lattice` IN PLACE, by at most so many `rings`, each from all corners known before.
+
+    Returns the rings that are left when it has reached the border of its arrays, -1 when it has grown all it can.
+    """
+    library = kernels("growth")
+    if library is not None:
+        sheet = (lattice.pixels, lattice.contrast, 1.0 if lattice.rising else -1.0)
+        brightness = (level.smooth, level.scale, level.offset)
+        return grown(library, *sheet, *brightness, saddles.buckets, _rules(), rings)
+    due = np.ones((2, *lattice.known.shape), bool)
+    for left in range(rings, 0, -1):
+        known = lattice.known
+        if known[0].any() or known[-1].any() or known[:, 0].any() or known[:, -1].any():
+            return left
+        for way, (degree, ridge) in enumerate((STIFF, PLIANT)):
+            cells = _beside(known) & due[way]
+            due[way] &= ~cells
+            fit = fit_cells(lattice.pixels, cells, degree=degree, radius=RADIUS, width=WIDTH, ridge=ridge)
+            added = _added(lattice, np.argwhere(cells), fit, saddles, level)
+            if added.any():
+                break
+        else:
+            return -1
+        # What failed before may be foretold otherwise now, within the reach of the fits.
+        due |= _widened(added)
+    return -1
+
+
+@cache
+def _rules() -> GrowthRules:
+    numbers: dict[str, float] = {
+        "most": MOST,
+        "tried": TRIED,
+        "fewest": FEWEST,
+        "reach": REACH,
+        "ring_part": RING,
+        "min_ring": MIN_RING_PX,
+        "max_ring": MAX_RING_PX,
+        "line_sine": LINE_SINE,
+        "contrast_ratio": CONTRAST_RATIO,
+        "aside": ASIDE,
+        "min_aside": MIN_ASIDE_PX,
+        "max_aside": MAX_ASIDE_PX,
+        "least_area": LEAST_AREA,
+    }
+    predictions = [FitRules(degree, RADIUS, False, WIDTH, ridge) for degree, ridge in (STIFF, PLIANT)]
+    return GrowthRules.make(predictions, CIRCLE, MAX_ODD, MAX_CENTRE, ALONG, **numbers)
+
+
+def _widened(cells: BoolArray) -> BoolArray:
+    """Return the cells within RADIUS of `cells`."""
+    rows, columns = cells.shape
+    padded = np.pad(cells, RADIUS)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (2 * RADIUS + 1, 2 * RADIUS + 1))
+    widened: BoolArray = windows.any(axis=(2, 3)).reshape(rows, columns)
+    return widened
+
+
+def _added(lattice: Lattice, cell: IntArray, fit: LocalFit, saddles: SaddleIndex, level: Level) -> BoolArray:
+    """Fill those of the cells `cell` (M, 2) of `lattice`, foretold by `fit`, that can be; return which (R, C)."""
+    added = np.zeros(lattice.known.shape, bool)
     height, width = level.smooth.shape
     place = level.to_level(fit.pixels)
-    usable = (fit.support >= 3) & (place > 0.0).all(axis=1) & (place < [width - 1, height - 1]).all(axis=1)
+    usable = (fit.support >= FEWEST) & (place > 0.0).all(axis=1) & (place < [width - 1, height - 1]).all(axis=1)
     index, found = saddles.nearest(fit.pixels, np.where(usable, REACH * _longest(fit), 0.0))
     owner, slot = np.nonzero(found & usable[:, None])
     pixels = saddles.pixels[index[owner, slot]]
@@ -122,15 +202,16 @@ def _ring(
     near = distance < REACH
     owner, pixels, distance = owner[near], pixels[near], distance[near]
     if not len(owner):
-        return lattices
-    contrast, good = _fits(sheet, level, fit, cell, owner, pixels)
+        return added
+    contrast, good = _fits(lattice, level, fit, cell, owner, pixels)
     owner, pixels, distance, contrast = owner[good], pixels[good], distance[good], contrast[good]
     order = np.lexsort((distance, owner))
     chosen, first = np.unique(owner[order], return_index=True)
     best = order[first]
-    sheet.pixels[cell[chosen, 0], cell[chosen, 1]] = pixels[best]
-    sheet.contrast[cell[chosen, 0], cell[chosen, 1]] = contrast[best]
-    return sheet.lattices(lattices)
+    row, column = cell[chosen].T
+    lattice.pixels[row, column], lattice.contrast[row, column] = pixels[best], contrast[best]
+    added[row, column] = True
+    return added
 
 
 def _beside(known: BoolArray) -> BoolArray:
@@ -158,39 +239,37 @@ def _in_cells(fit: LocalFit, owner: IntArray, pixels: FloatArray) -> FloatArray:
     """Return how far `pixels` lie from the predictions of the cells `owner`, in cells (infinite for folded cells)."""
     off = pixels - fit.pixels[owner]
     a, b, area = fit.along_column[owner], fit.along_row[owner], _area(fit)[owner]
-    safe = np.where(area > 1.0, area, np.nan)
+    safe = np.where(area > LEAST_AREA, area, np.nan)
     column = (off[:, 0] * b[:, 1] - off[:, 1] * b[:, 0]) / safe
     row = (a[:, 0] * off[:, 1] - a[:, 1] * off[:, 0]) / safe
     return np.nan_to_num(np.hypot(column, row), nan=np.inf)
 
 
 def _fits(
-    sheet: Sheet, level: Level, fit: LocalFit, cell: IntArray, owner: IntArray, pixels: FloatArray
+    lattice: Lattice, level: Level, fit: LocalFit, cell: IntArray, owner: IntArray, pixels: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
     """Return the contrast at `pixels` and whether they can be the corners of the cells `owner`."""
     local = level.to_level(pixels)
     height = _area(fit)[owner] / np.maximum(_longest(fit)[owner], 1e-9) / level.scale
     rings = read_rings(level.smooth, local, np.clip(RING * height, MIN_RING_PX, MAX_RING_PX))
-    sign = sheet.signs[cell[owner, 0], cell[owner, 1]]
+    sign = lattice.signs()[cell[owner, 0], cell[owner, 1]]
     a, b = fit.along_column[owner], fit.along_row[owner]
     first = np.where((sign > 0)[:, None], a, b)
     second = np.where((sign > 0)[:, None], b, a)
     good = rings.valid & _parallel(rings.angles[:, 0], first) & _parallel(rings.angles[:, 1], second)
-    seen = np.zeros(len(owner), np.int64)
     for direction in range(4):
         beside = cell[owner] + STEPS[direction][::-1]
-        neighbour = sheet.pixels[beside[:, 0], beside[:, 1]]
+        neighbour = lattice.pixels[beside[:, 0], beside[:, 1]]
         there = np.isfinite(neighbour[:, 0])
         end = level.to_level(np.where(there[:, None], neighbour, pixels))
         length = np.linalg.norm(end - local, axis=1)
         side = sign if direction % 2 == 0 else -sign
-        difference = edge_contrast(level.smooth, local, end, side, np.clip(0.12 * length, 1.0, 4.0))
-        known = np.nan_to_num(sheet.contrast[beside[:, 0], beside[:, 1]], nan=0.0)
+        difference = edge_contrast(level.smooth, local, end, side, np.clip(ASIDE * length, MIN_ASIDE_PX, MAX_ASIDE_PX))
+        known = np.nan_to_num(lattice.contrast[beside[:, 0], beside[:, 1]], nan=0.0)
         weakest = CONTRAST_RATIO * np.minimum(known, rings.contrast)
         edge = (difference > weakest[:, None]).sum(axis=1) >= MOST
         good &= edge | ~there
-        seen += there
-    return rings.contrast, good & (seen > 0)
+    return rings.contrast, good
 
 
 def _parallel(angle: FloatArray, vector: FloatArray) -> BoolArray:

@@ -15,11 +15,16 @@ import numpy as np
 from rigkit.arrays import BoolArray, FloatArray, IntArray
 from rigkit.corners.links import Links, quads
 from rigkit.corners.saddle import Corners
+from rigkit.native import kernels
+from rigkit.native.growth import components_of
 
 __all__ = ["STEPS", "Lattice", "Sheet", "build_lattices"]
 
 STEPS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
 """(column, row) of the four grid directions."""
+
+MAX_WALKS = 3
+"""Links that contradict each other are cut, and the rest numbered again, so many times."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -44,7 +49,7 @@ class Lattice:
 
     @property
     def count(self) -> int:
-        return int(self.known.sum())
+        return int(np.count_nonzero(self.known))
 
     @property
     def size(self) -> tuple[int, int]:
@@ -59,11 +64,12 @@ class Lattice:
 
     def padded(self, by: int = 1) -> Lattice:
         """Return the lattice with `by` empty rows and columns on every side."""
-        return Lattice(
-            np.pad(self.pixels, ((by, by), (by, by), (0, 0)), constant_values=np.nan),
-            np.pad(self.contrast, by, constant_values=np.nan),
-            self.rising,
-        )
+        rows, columns = self.pixels.shape[:2]
+        pixels = np.full((rows + 2 * by, columns + 2 * by, 2), np.nan)
+        contrast = np.full(pixels.shape[:2], np.nan)
+        pixels[by : by + rows, by : by + columns] = self.pixels
+        contrast[by : by + rows, by : by + columns] = self.contrast
+        return Lattice(pixels, contrast, self.rising)
 
     def cut(self, rows: slice, columns: slice) -> Lattice:
         """Return the part of `rows` and `columns` (slices with a start and without a step)."""
@@ -80,7 +86,8 @@ class Lattice:
 
     def trimmed(self) -> Lattice:
         """Return the lattice without empty outer rows and columns."""
-        rows, columns = np.flatnonzero(self.known.any(axis=1)), np.flatnonzero(self.known.any(axis=0))
+        known = self.known
+        rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
         if not len(rows):
             return self.cut(slice(0, 0), slice(0, 0))
         return self.cut(slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
@@ -145,31 +152,46 @@ class Sheet:
 
 def build_lattices(corners: Corners, links: Links) -> list[Lattice]:
     """Return the lattices that closed squares of four linked corners make up, in no particular order."""
+    library = kernels("growth")
+    if library is not None:
+        states = np.where(links.corner >= 0, 4 * links.corner + links.arm, -1)
+        count, label, grid, turn, members = components_of(library, states, MAX_WALKS)
+    else:
+        label, grid, turn = _components(links)
+        count = int(label.max(initial=-1)) + 1
+        members = np.argsort(label, kind="stable")[np.count_nonzero(label < 0) :]
+    sizes = np.bincount(label[label >= 0], minlength=count)
+    lattices = []
+    for size, end in zip(sizes, np.cumsum(sizes), strict=True):
+        mine = members[end - size : end]
+        cells = grid[mine]
+        cells = cells - cells.min(axis=0)
+        columns, rows = (int(last) + 1 for last in cells.max(axis=0))
+        flat = cells[:, 1] * columns + cells[:, 0]
+        single = np.bincount(flat)[flat] == 1
+        if np.count_nonzero(single) < 4:
+            continue
+        pixels = np.full((rows * columns, 2), np.nan)
+        contrast = np.full(rows * columns, np.nan)
+        pixels[flat[single]] = corners.pixels[mine[single]]
+        contrast[flat[single]] = corners.contrast[mine[single]]
+        rising = (turn[mine[0]] + cells[0].sum()) % 2 == 0
+        whole = Lattice(pixels.reshape(rows, columns, 2), contrast.reshape(rows, columns), bool(rising))
+        lattices.append(whole if single.all() else whole.trimmed())
+    return lattices
+
+
+def _components(links: Links) -> tuple[IntArray, IntArray, IntArray]:
+    """Return per corner its lattice (-1 alone), its (column, row), and the arm that points to +column."""
     bound = quads(links)
     links = Links(np.where(bound, links.corner, -1), links.arm)
-    for _ in range(3):
+    for _ in range(MAX_WALKS):
         component, grid, turn = _walk(links)
         wrong = _contradictions(links, grid, turn)
         if not wrong.any():
             break
         links = Links(np.where(wrong, -1, links.corner), links.arm)
-    lattices = []
-    for label in range(component.max(initial=-1) + 1):
-        members = np.flatnonzero(component == label)
-        cells = grid[members]
-        _, first, copies = np.unique(cells, axis=0, return_index=True, return_counts=True)
-        members, cells = members[first[copies == 1]], cells[first[copies == 1]]
-        if len(members) < 4:
-            continue
-        cells = cells - cells.min(axis=0)
-        columns, rows = cells.max(axis=0) + 1
-        pixels = np.full((rows, columns, 2), np.nan)
-        contrast = np.full((rows, columns), np.nan)
-        pixels[cells[:, 1], cells[:, 0]] = corners.pixels[members]
-        contrast[cells[:, 1], cells[:, 0]] = corners.contrast[members]
-        rising = (turn[members[0]] + cells[0].sum()) % 2 == 0
-        lattices.append(Lattice(pixels, contrast, bool(rising)))
-    return lattices
+    return component, grid, turn
 
 
 def _walk(links: Links) -> tuple[IntArray, IntArray, IntArray]:

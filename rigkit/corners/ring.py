@@ -21,6 +21,9 @@ __all__ = ["Rings", "arm_vectors", "read_rings"]
 HALF = 16
 """Samples in half a turn."""
 
+CIRCLE = np.stack([f(np.arange(2 * HALF) * (np.pi / HALF)) for f in (np.cos, np.sin)], axis=-1).astype(np.float32)
+"""Where they lie on a ring of radius 1, (2 HALF, 2)."""
+
 MAX_ODD = 0.35
 """Largest energy of the part that changes sign on opposite sides, relative to the part that does not."""
 
@@ -47,10 +50,8 @@ class Rings:
 
 def read_rings(image: FloatImage, pixels: FloatArray, radius_px: FloatArray | float) -> Rings:
     """Return what rings of `radius_px` (scalar or (N,)) around `pixels` (N, 2) of `image` look like."""
-    turn = np.arange(2 * HALF) * (np.pi / HALF)
-    circle = np.stack([np.cos(turn), np.sin(turn)], axis=-1).astype(np.float32)
     radius = np.broadcast_to(np.asarray(radius_px, np.float32), pixels.shape[:1])
-    values = sample(image, pixels[:, None, :].astype(np.float32) + radius[:, None, None] * circle)
+    values = sample(image, pixels[:, None, :].astype(np.float32) + radius[:, None, None] * CIRCLE)
     even = 0.5 * (values[:, :HALF] + values[:, HALF:])
     odd = 0.5 * (values[:, :HALF] - values[:, HALF:])
     low, high = even.min(axis=1), even.max(axis=1)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigkit.arrays import BoolArray
+from rigkit.arrays import BoolArray, FloatArray
 from rigkit.corners.lattice import Lattice
 from rigkit.corners.local_fit import fit_cells
 from rigkit.corners.subpixel import RefinedLattice
@@ -18,6 +18,9 @@ STRAY_ROW = 2
 
 FRAME_CELLS = 0.5
 """A corner predicted nearer than this to the frame may be missing for a good reason, in cells."""
+
+SHARED_PX = 2.0
+"""Corners of two lattices nearer than this are the same."""
 
 MAX_RELATIVE_SIGMA = 0.015
 """Corners more uncertain than this, in cells, make no board: keys, letters, weave."""
@@ -37,6 +40,8 @@ WORSE = 1.5
 
 def largest_part(known: BoolArray) -> BoolArray:
     """Return the largest part of `known` (R, C) that hangs together by closed squares of four corners."""
+    if known.all() and min(known.shape) >= 2:
+        return known
     import cv2
 
     square = known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:] & known[1:, 1:]
@@ -71,11 +76,11 @@ def _stray_row(lattice: Lattice, size_px: tuple[int, int]) -> BoolArray | None:
     if min(known.shape) < 3:
         return None
     for outer in ((0, slice(None)), (-1, slice(None)), (slice(None), 0), (slice(None), -1)):
-        row = np.zeros_like(known)
-        row[outer] = True
-        have = int((row & known).sum())
+        have = int(np.count_nonzero(known[outer]))
         if have > STRAY_ROW:
             continue
+        row = np.zeros_like(known)
+        row[outer] = True
         rest = lattice.without(row)
         missing = row & ~known
         shape = fit_cells(rest.pixels, missing, degree=2, radius=3, ridge=(0.02, 1.0))
@@ -93,19 +98,25 @@ def separate(lattices: Sequence[Lattice], least: int) -> list[Lattice]:
     What is to be a board (from 9 corners) has three rows and three columns.
     """
     kept: list[Lattice] = []
+    corners: list[FloatArray] = []
     for lattice in sorted(lattices, key=lambda item: -item.count):
         if lattice.count < least or min(lattice.size) < (3 if least >= 9 else 2):
             continue
-        if not any(_overlap(lattice, other) for other in kept):
+        mine = lattice.pixels[lattice.known]
+        if not any(_overlap(mine, other) for other in corners):
             kept.append(lattice)
+            corners.append(mine)
     return kept
 
 
-def _overlap(mine: Lattice, theirs: Lattice) -> bool:
-    from scipy.spatial import cKDTree
-
-    distance, _ = cKDTree(theirs.pixels[theirs.known]).query(mine.pixels[mine.known])
-    return bool((distance < 2.0).sum() > 1)
+def _overlap(mine: FloatArray, theirs: FloatArray) -> bool:
+    """Return whether more than one of the corners `mine` (N, 2) is among `theirs` (M, 2)."""
+    low, high = mine.min(axis=0) - SHARED_PX, mine.max(axis=0) + SHARED_PX
+    near = theirs[((theirs > low) & (theirs < high)).all(axis=1)]
+    if not len(near):
+        return False
+    gap = mine[:, None] - near
+    return bool(np.count_nonzero(((gap * gap).sum(axis=2) < SHARED_PX**2).any(axis=1)) > 1)
 
 
 def trustworthy(refined: RefinedLattice, before: int, least: int) -> bool:
@@ -113,11 +124,12 @@ def trustworthy(refined: RefinedLattice, before: int, least: int) -> bool:
     lattice = refined.lattice
     if lattice.count < max(least, (1.0 - MAX_LOST) * before) or min(lattice.size) < 3:
         return False
-    if float(np.nanmedian(refined.residual / np.where(lattice.known, lattice.contrast, 1.0))) > MAX_RESIDUAL:
+    known = lattice.known
+    if float(np.median(refined.residual[known] / lattice.contrast[known])) > MAX_RESIDUAL:
         return False
-    shape = fit_cells(lattice.pixels, lattice.known, degree=1)
+    shape = fit_cells(lattice.pixels, known, degree=1)
     area = shape.along_column[:, 0] * shape.along_row[:, 1] - shape.along_column[:, 1] * shape.along_row[:, 0]
-    relative = refined.sigma_px[lattice.known] / np.sqrt(np.maximum(area, 1e-6))
+    relative = refined.sigma_px[known] / np.sqrt(np.maximum(area, 1e-6))
     return float(np.median(relative)) < MAX_RELATIVE_SIGMA
 
 
