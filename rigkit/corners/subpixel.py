@@ -7,20 +7,22 @@ corners are, and so gives a better lattice for a second pass, which also tries t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import comb
 
 import cv2
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray
-from rigkit.corners.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
+from rigkit.corners.edge_fit import BLUR_RANGE, fit_edges
 from rigkit.corners.edge_model import Geometry
 from rigkit.corners.lattice import Lattice, Sheet
-from rigkit.corners.local_fit import fit_cells
+from rigkit.corners.local_fit import LocalFit, fit_cells
 from rigkit.corners.response import FloatImage
 
 __all__ = ["RefinedLattice", "refine"]
+
+Part = tuple[slice, slice]
 
 FIRST_BLUR = 1.0
 """s that the first pass starts from, px."""
@@ -32,6 +34,10 @@ lattice to a few hundredths of a pixel."""
 
 FEWEST_NEIGHBOURS = 3
 """An empty cell is tried if so many of its eight neighbours are known."""
+
+FEWEST_CHECKED = 12
+FEWEST_JUDGED = 9
+"""A board of fewer corners, or of fewer that so many others predict, is not checked against itself."""
 
 HOLE_MOVE = 0.12
 HOLE_CONTRAST = 0.3
@@ -92,100 +98,114 @@ def refine(image: FloatImage, lattices: Sequence[Lattice]) -> list[RefinedLattic
     """
     if not lattices:
         return []
-    first = [np.full(item.known.shape, FIRST_BLUR) for item in lattices]
-    refined = _pass(image, lattices, first, *FIRST_PASS)
-    current = [_with_holes(item) for item in refined]
-    second = _pass(image, [item[0] for item in current], [_typical_blur(item) for item in refined], *LAST_PASS)
-    return [_checked(_confirmed(item, start, holes)) for item, (start, holes) in zip(second, current, strict=True)]
+    # All lattices lie on one sheet, so that each step is one call.
+    sheet = Sheet.of(lattices)
+    start = Lattice(sheet.pixels, sheet.contrast, True)
+    first = _pass(image, start, sheet.signs, np.full(sheet.signs.shape, FIRST_BLUR), *FIRST_PASS)
+    start, holes = _with_holes(first.lattice, sheet.signs != 0.0)
+    second = _pass(image, start, sheet.signs, _typical_blur(first, sheet.parts), *LAST_PASS)
+    if holes.any():
+        second = _confirmed(second, start, holes)
+    checked = _checked(second, sheet.parts)
+    return [_part_of(checked, part, item.rising) for part, item in zip(sheet.parts, lattices, strict=True)]
 
 
-def _typical_blur(item: RefinedLattice) -> FloatArray:
-    known = np.isfinite(item.blur_px)
-    typical = float(np.median(item.blur_px[known])) if known.any() else FIRST_BLUR
-    blur: FloatArray = np.where(known, np.clip(item.blur_px, 0.7 * typical, 1.4 * typical), typical).clip(*BLUR_RANGE)
-    return blur
+def _part_of(sheet: RefinedLattice, part: Part, rising: bool) -> RefinedLattice:
+    """Return the lattice at `part` of the sheet, with honest sigmas.
+
+    Where the corners scatter about the lattice by more than the noise in the image explains (JPEG blocks, aliasing,
+    wavy paper), the board's sigmas are raised to what is seen.
+    """
+    lattice = Lattice(sheet.lattice.pixels[part], sheet.lattice.contrast[part], rising)
+    sigma_px = sheet.sigma_px[part]
+    if lattice.count >= FEWEST_CHECKED:
+        sigma_px = sigma_px * _scatter(lattice, sigma_px)
+    return RefinedLattice(lattice, sigma_px, sheet.blur_px[part], sheet.residual[part])
+
+
+def _typical_blur(item: RefinedLattice, parts: Sequence[Part]) -> FloatArray:
+    """Return (R, C) the blur of each corner, kept near what is typical of its board."""
+    blur = np.full(item.blur_px.shape, FIRST_BLUR)
+    for part in parts:
+        mine = item.blur_px[part]
+        known = np.isfinite(mine)
+        if known.any():
+            typical = float(np.median(mine[known]))
+            blur[part] = np.where(known, np.clip(mine, 0.7 * typical, 1.4 * typical), typical)
+    return blur.clip(*BLUR_RANGE)
 
 
 def _pass(
     image: FloatImage,
-    lattices: Sequence[Lattice],
-    blurs: Sequence[FloatArray],
+    start: Lattice,
+    signs: FloatArray,
+    blur: FloatArray,
     radius_px: float,
     iterations: int,
     converged_px: float,
-) -> list[RefinedLattice]:
-    """Fit all corners of all lattices in one batch."""
-    sheet = Sheet.of(lattices)
-    known = sheet.known
-    shape = fit_cells(sheet.pixels, known)
+) -> RefinedLattice:
+    """Fit all corners of the sheet `start`; those that fail are left out."""
+    known = start.known
+    shape = fit_cells(start.pixels, known)
     sides = np.stack([shape.along_column, shape.along_row], axis=1)
-    geometry = Geometry(sides, shape.curvature(), shape.gaps())
-    blur = np.concatenate([values[item.known] for item, values in zip(lattices, blurs, strict=True)])
-    pixels, sign = sheet.pixels[known], sheet.signs[known]
     fit = fit_edges(
         image,
-        pixels,
-        geometry,
-        sign,
-        blur,
+        start.pixels[known],
+        Geometry(sides, shape.curvature(), shape.gaps()),
+        signs[known],
+        blur[known],
         radius_px=radius_px,
         iterations=iterations,
         converged_px=converged_px,
     )
-    ends = np.cumsum([item.count for item in lattices])
-    return [_filled(item, fit, slice(end - item.count, end)) for item, end in zip(lattices, ends, strict=True)]
-
-
-def _filled(lattice: Lattice, fit: EdgeFit, mine: slice) -> RefinedLattice:
-    """Return `lattice` with the part `mine` of `fit`, without the corners that failed."""
-    known = lattice.known
-    good = fit.valid[mine] & (fit.contrast[mine] > 0.0)
+    found = known.copy()
+    good = fit.valid & (fit.contrast > 0.0)
+    found[known] = good
 
     def spread(values: FloatArray) -> FloatArray:
         out = np.full(known.shape + values.shape[1:], np.nan)
-        out[known] = np.where(good.reshape(-1, *[1] * (values.ndim - 1)), values[mine], np.nan)
+        out[found] = values[good]
         return out
 
-    refined = Lattice(spread(fit.pixels), spread(fit.contrast), lattice.rising)
-    return RefinedLattice(refined, spread(fit.sigma_px), spread(fit.blur), spread(fit.residual))
+    lattice = Lattice(spread(fit.pixels), spread(fit.contrast), start.rising)
+    return RefinedLattice(lattice, spread(fit.sigma_px), spread(fit.blur), spread(fit.residual))
 
 
-def _with_holes(item: RefinedLattice) -> tuple[Lattice, BoolArray]:
-    """Return the lattice with predictions in the empty cells among known ones, and which cells these are."""
-    known = item.lattice.known
-    padded = np.pad(known.astype(np.int64), 1)
-    rows, columns = known.shape
-    around = sum(
-        padded[1 + i : 1 + i + rows, 1 + j : 1 + j + columns]
-        for i in (-1, 0, 1)
-        for j in (-1, 0, 1)
-        if (i, j) != (0, 0)
-    )
-    holes: BoolArray = ~known & (around >= FEWEST_NEIGHBOURS)
+def _with_holes(lattice: Lattice, inside: BoolArray) -> tuple[Lattice, BoolArray]:
+    """Return the lattice with predictions in the empty cells `inside` among known ones, and which cells these are."""
+    known = lattice.known
+    holes: BoolArray = inside & ~known
+    if holes.any():
+        around = cv2.boxFilter(known.astype(np.uint8), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        holes &= around >= FEWEST_NEIGHBOURS
     if not holes.any():
-        return item.lattice, holes
-    shape = fit_cells(item.lattice.pixels, holes, degree=2, ridge=(1e-3, 1.0))
-    pixels, contrast = item.lattice.pixels.copy(), item.lattice.contrast.copy()
+        return lattice, holes
+    shape = fit_cells(lattice.pixels, holes, degree=2, ridge=(1e-3, 1.0))
+    pixels = lattice.pixels.copy()
     pixels[holes] = shape.pixels
-    return Lattice(pixels, contrast, item.lattice.rising), holes
+    return Lattice(pixels, lattice.contrast, lattice.rising), holes
 
 
 def _confirmed(item: RefinedLattice, start: Lattice, holes: BoolArray) -> RefinedLattice:
     """Return `item` without those of the `holes` where the fit saw no proper corner."""
     known = item.lattice.known
     settled = known & ~holes
-    if not (holes & known).any() or not settled.any():
-        return item.without(holes)
     contrast = item.lattice.contrast
     moved = np.linalg.norm(item.lattice.pixels - start.pixels, axis=2)
-    shape = fit_cells(start.pixels, np.ones_like(known), degree=1)
-    area = shape.along_column[:, 0] * shape.along_row[:, 1] - shape.along_column[:, 1] * shape.along_row[:, 0]
-    cell = np.sqrt(np.maximum(area, 1.0)).reshape(known.shape)
+    cell = np.full(known.shape, np.nan)
+    cell[holes] = _cell_px(fit_cells(start.pixels, holes, degree=1))
     with np.errstate(invalid="ignore"):
         good = (moved < HOLE_MOVE * cell) & (contrast > HOLE_CONTRAST * _around(contrast, settled))
         good &= item.residual < HOLE_RESIDUAL * _around(item.residual, settled)
         good &= item.sigma_px < HOLE_SIGMA * _around(item.sigma_px, settled)
     return item.without(holes & ~good)
+
+
+def _cell_px(shape: LocalFit) -> FloatArray:
+    """Return the side in px of a square as large as the cell (M,)."""
+    area = shape.along_column[:, 0] * shape.along_row[:, 1] - shape.along_column[:, 1] * shape.along_row[:, 0]
+    side: FloatArray = np.sqrt(np.maximum(area, 1.0))
+    return side
 
 
 def _around(values: FloatArray, known: BoolArray) -> FloatArray:
@@ -198,53 +218,61 @@ def _around(values: FloatArray, known: BoolArray) -> FloatArray:
     return np.where(count > 0.5, total / np.maximum(count, 0.5), np.nan)
 
 
-def _checked(item: RefinedLattice) -> RefinedLattice:
-    """Return `item` without corners that lie where their neighbours say they cannot, and with honest sigmas.
-
-    Where the corners scatter about the lattice by more than the noise in the image explains (JPEG blocks, aliasing,
-    wavy paper), the board's sigmas are raised to what is seen.
-    """
+def _checked(item: RefinedLattice, parts: Sequence[Part]) -> RefinedLattice:
+    """Return `item` without corners that lie where their neighbours say they cannot."""
     known = item.lattice.known
-    if known.sum() < 12:
-        return item
     shape = fit_cells(item.lattice.pixels, known, leave_out=True)
-    off = item.lattice.pixels[known] - shape.pixels
-    expected = item.sigma_px[known] * np.hypot(1.0, shape.gain)
+
+    def spread(values: FloatArray) -> FloatArray:
+        out = np.full(known.shape, np.nan)
+        out[known] = values
+        return out
+
+    distance = np.linalg.norm(item.lattice.pixels[known] - shape.pixels, axis=1)
     # A prediction from a few corners on one side is no judge of another.
-    judged = (shape.support >= 12) & (shape.gain < 1.5)
-    if judged.sum() < 9:
-        return item
-    area = shape.along_column[:, 0] * shape.along_row[:, 1] - shape.along_column[:, 1] * shape.along_row[:, 0]
-    distance = np.linalg.norm(off, axis=1)
-    cells = distance / np.sqrt(np.maximum(area, 1.0))
-    limit = max(ASTRAY_CELLS, ASTRAY_FACTOR * float(np.median(cells[judged])))
-    astray = judged & (cells > limit) & (distance > ASTRAY_FACTOR * expected)
-    relative = item.residual[known] / item.lattice.contrast[known]
-    covered = relative > max(COVERED, COVERED_FACTOR * float(np.median(relative)))
-    astray |= judged & covered & (cells > COVERED_FACTOR * float(np.median(cells[judged])))
+    judged = np.zeros_like(known)
+    judged[known] = (shape.support >= FEWEST_CHECKED) & (shape.gain < 1.5)
+    cells = spread(distance / _cell_px(shape))
+    excess = spread(distance / (item.sigma_px[known] * np.hypot(1.0, shape.gain)))
+    relative = item.residual / item.lattice.contrast
     drop = np.zeros_like(known)
-    drop[known] = astray
-    out = item.without(drop)
-    scatter = _scatter(out)
-    return replace(out, sigma_px=out.sigma_px * scatter) if scatter > UNEXPLAINED else out
+    for part in parts:
+        here, sure = known[part], judged[part]
+        if here.sum() < FEWEST_CHECKED or sure.sum() < FEWEST_JUDGED:
+            continue
+        typical = float(np.median(cells[part][sure]))
+        usual = float(np.median(relative[part][here]))
+        astray = (cells[part] > max(ASTRAY_CELLS, ASTRAY_FACTOR * typical)) & (excess[part] > ASTRAY_FACTOR)
+        covered = relative[part] > max(COVERED, COVERED_FACTOR * usual)
+        drop[part] = sure & (astray | (covered & (cells[part] > COVERED_FACTOR * typical)))
+    return item.without(drop) if drop.any() else item
 
 
-def _scatter(item: RefinedLattice) -> float:
-    """Return how much more the corners scatter about smooth rows and columns than their sigmas say (1: as they say).
+def _scatter(lattice: Lattice, sigma_px: FloatArray) -> float:
+    """Return how much more the corners scatter about smooth rows and columns than their sigmas say, at least 1.
 
     Judged by the DIFFERENCES along rows and columns, with and without the best perspective taken away first: the one is
     blind to strong perspective, the other to a fisheye's bend, and the calmest of them is right.
     """
-    row, column = np.nonzero(item.lattice.known)
+    calmest = np.inf
+    for flatten in (False, True):
+        values = lattice.pixels - _best_plane(lattice) if flatten else lattice.pixels
+        for order in DIFFERENCES:
+            calmest = float(np.fmin(calmest, _roughness(values, sigma_px, order)))
+            if calmest <= UNEXPLAINED:
+                return 1.0
+    return calmest if np.isfinite(calmest) else 1.0
+
+
+def _best_plane(lattice: Lattice) -> FloatArray:
+    """Return (R, C, 2) where the corners of the best flat board through a pinhole would be; NaN where unknown."""
+    row, column = np.nonzero(lattice.known)
     grid = np.stack([column, row], axis=-1).astype(np.float64)
-    plane, _ = cv2.findHomography(grid, item.lattice.pixels[row, column], 0)
-    flat = np.full(item.lattice.pixels.shape, np.nan)
+    plane, _ = cv2.findHomography(grid, lattice.pixels[row, column], 0)
+    flat = np.full(lattice.pixels.shape, np.nan)
     if plane is not None:
         flat[row, column] = cv2.perspectiveTransform(grid[None], plane)[0]
-    curved = (item.lattice.pixels, item.lattice.pixels - flat)
-    ratios = [_roughness(values, item.sigma_px, order) for values in curved for order in DIFFERENCES]
-    scatter = float(np.fmin.reduce(ratios))
-    return scatter if np.isfinite(scatter) else 1.0
+    return flat
 
 
 def _roughness(values: FloatArray, sigma: FloatArray, order: int) -> float:
