@@ -19,7 +19,7 @@ from rigkit.corners.origin import quarter_turns
 from rigkit.corners.response import grey_image, pyramid
 from rigkit.corners.saddle import find_corners
 from rigkit.corners.subpixel import RefinedLattice, refine
-from rigkit.corners.validate import known_part, separate, tidy, trustworthy
+from rigkit.corners.validate import known_part, large, separate, tidy, trustworthy
 from rigkit.detections import BoardDetection
 
 __all__ = ["detect_boards"]
@@ -38,7 +38,7 @@ def find_lattices(image: NDArray[np.generic], min_corners: int) -> list[RefinedL
     index = SaddleIndex(saddles)
     grown = [part for lattice in grow_all(lattices, index, levels[0]) for part in split_folds(lattice)]
     parts = separate([tidy(part, size_px) for part in grown], FEWEST_OF_PART)
-    boards = separate(join_parts(parts), min_corners)
+    boards = [board for board in join_parts(parts) if large(board, min_corners)]
     refined = zip(boards, refine(grey, boards), strict=True)
     return [after for before, after in refined if trustworthy(after, before.count, min_corners)]
 

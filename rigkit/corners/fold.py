@@ -39,6 +39,9 @@ GAP = 2
 NEAREST_IN, NEAREST_OUT = 16, 6
 """Corners of the one part that carry its rows over, and of the other that must meet them."""
 
+ALIKE = 0.5
+"""Sides of neighbouring cells across the gap differ less than this, relative to the longer side."""
+
 MEETS_CELLS = 0.15
 
 
@@ -145,9 +148,14 @@ def _joined(one: _Part, two: _Part) -> Lattice | None:
     grid1, grid2, pixels1, pixels2 = one.grid, two.grid, one.pixels, two.pixels
     gap = pixels1[:, None] - pixels2
     apart = np.hypot(gap[..., 0], gap[..., 1])
+    if not apart.min() < 2.0 * reach:
+        return None
+    nearest = divmod(int(apart.argmin()), len(pixels2))
+    if not _alike(*(_cell(part, at) for part, at in zip((one, two), nearest, strict=True))):
+        return None
     near2 = np.argsort(apart.min(axis=0), kind="stable")[:NEAREST_OUT]
     near1 = np.argsort(apart[:, near2].min(axis=1), kind="stable")[:NEAREST_IN]
-    if not apart.min() < 2.0 * reach or (grid1[near1, 0] == grid1[near1[0], 0]).all():
+    if (grid1[near1, 0] == grid1[near1[0], 0]).all():
         return None
     grid_from_pixel, _ = cv2.findHomography(pixels1[near1], grid1[near1].astype(np.float64), 0)
     if grid_from_pixel is None:
@@ -161,6 +169,22 @@ def _joined(one: _Part, two: _Part) -> Lattice | None:
         if (shift == shift[0]).all():
             return _united(one.lattice, two.lattice.turned(quarter), shift[0])
     return None
+
+
+def _cell(part: _Part, corner: int) -> FloatArray:
+    """Return the two sides of the cell at a corner of `part`, (2, 2)."""
+    cells = np.zeros(part.lattice.known.shape, bool)
+    column, row = part.grid[corner]
+    cells[row, column] = True
+    fit = fit_cells(part.lattice.pixels, cells, degree=1)
+    return np.concatenate([fit.along_column, fit.along_row])
+
+
+def _alike(one: FloatArray, two: FloatArray) -> bool:
+    """Return whether the cell `two` (2, 2) is much the same as `one` after some quarter turn."""
+    turns = np.array([two, [two[1], -two[0]], -two, [-two[1], two[0]]])
+    apart = np.abs(turns - one).max(axis=(1, 2)).min()
+    return bool(apart < ALIKE * np.abs(one).max())
 
 
 def _turned_grid(grid: IntArray, size: tuple[int, int], quarter_turns: int) -> IntArray:

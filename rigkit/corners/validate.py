@@ -11,7 +11,7 @@ from rigkit.corners.lattice import Lattice
 from rigkit.corners.local_fit import fit_cells
 from rigkit.corners.subpixel import RefinedLattice
 
-__all__ = ["known_part", "largest_part", "separate", "tidy", "trustworthy"]
+__all__ = ["known_part", "large", "largest_part", "separate", "tidy", "trustworthy"]
 
 STRAY_ROW = 2
 """An outer row of so many corners or fewer, most of whose other corners should be in view too, is not of the board."""
@@ -92,15 +92,17 @@ def _stray_row(lattice: Lattice, size_px: tuple[int, int]) -> BoolArray | None:
     return None
 
 
-def separate(lattices: Sequence[Lattice], least: int) -> list[Lattice]:
-    """Return those of `lattices` with at least `least` corners that share no corners with a larger one.
+def large(lattice: Lattice, least: int) -> bool:
+    """Return whether `lattice` has `least` corners and, if that is to be a board (9), three rows and three columns."""
+    return lattice.count >= least and min(lattice.size) >= (3 if least >= 9 else 2)
 
-    What is to be a board (from 9 corners) has three rows and three columns.
-    """
+
+def separate(lattices: Sequence[Lattice], least: int) -> list[Lattice]:
+    """Return those of `lattices` that are `large` enough and share no corners with a larger one."""
     kept: list[Lattice] = []
     corners: list[FloatArray] = []
     for lattice in sorted(lattices, key=lambda item: -item.count):
-        if lattice.count < least or min(lattice.size) < (3 if least >= 9 else 2):
+        if not large(lattice, least):
             continue
         mine = lattice.pixels[lattice.known]
         if not any(_overlap(mine, other) for other in corners):
