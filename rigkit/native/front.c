@@ -102,8 +102,9 @@ void typical_values(
 }
 
 /* Mark the peaks among the pixels u to u + STRIP - 1 of a row: not lower than the neighbours that follow within two pixels,
- * higher than those before (a corner between pixels makes two equal ones), and above the threshold. */
-INLINE void mark_peaks(float *const rows[5], int64_t u, float threshold, uint8_t *restrict peak)
+ * higher than those before (a corner between pixels makes two equal ones), and above the threshold. Returns whether there
+ * are any. */
+INLINE int32_t mark_peaks(float *const rows[5], int64_t u, float threshold, int32_t *restrict peak)
 {
     float before[STRIP + 4], after[STRIP + 4];
     const float *above2 = rows[0] + u - 2, *above = rows[1] + u - 2, *here = rows[2] + u;
@@ -130,6 +131,10 @@ INLINE void mark_peaks(float *const rows[5], int64_t u, float threshold, uint8_t
         least = here[k + 2] > least ? here[k + 2] : least;
         peak[k] = (here[k] > most) & (here[k] >= least);
     }
+    int32_t any = 0;
+    for (int k = 0; k < STRIP; k++)
+        any |= peak[k];
+    return any;
 }
 
 /* corners.response.peaks: (u, v) and response of the peaks, row by row; returns how many. There is at most one peak in
@@ -159,15 +164,15 @@ FOR_EACH_PROCESSOR int64_t find_peaks(
         if (v < 5)
             continue;
         for (int64_t u = 3; u < width - 3; u += STRIP) {
-            const int64_t inside = u + STRIP < width - 3 ? STRIP : width - 3 - u;
             int32_t high = 0;
-            for (int64_t k = 0; k < inside; k++)
+            for (int64_t k = 0; k < STRIP; k++)
                 high += rows[2][u + k] > threshold;
             if (!high)
                 continue;
-            uint8_t peak[STRIP];
-            mark_peaks(rows, u, threshold, peak);
-            for (int64_t k = 0; k < inside; k++)
+            int32_t peak[STRIP];
+            if (!mark_peaks(rows, u, threshold, peak))
+                continue;
+            for (int64_t k = 0; k < STRIP && u + k < width - 3; k++)
                 if (peak[k]) {
                     at[2 * count] = (int32_t)(u + k);
                     at[2 * count + 1] = (int32_t)(v - 2);
@@ -233,13 +238,16 @@ typedef struct {
     double left, top, side;
 } squares_t;
 
+/* Smaller squares leave more of them to look into, larger ones more points that are too far. */
+static const double SQUARES_A_POINT = 0.5;
+
 INLINE int64_t square_at(double position, double least, double side, int64_t count)
 {
     const double place = (position - least) / side;
     return place > 0.0 ? (place < (double)count ? (int64_t)place : count - 1) : 0;
 }
 
-/* Sort `count` > 0 points into squares of at least `side`, at most about two a point. Returns 0 without memory. */
+/* Sort `count` > 0 points into squares of at least `side`, at least as many points as squares. Returns 0 without memory. */
 static int fill_squares(const double *points, int64_t count, double side, squares_t *out)
 {
     double left = points[0], right = left, top = points[1], bottom = top;
@@ -250,7 +258,7 @@ static int fill_squares(const double *points, int64_t count, double side, square
         top = v < top ? v : top;
         bottom = v > bottom ? v : bottom;
     }
-    while ((right - left) / side * ((bottom - top) / side) + (right - left + bottom - top) / side > 2.0 * (double)count + 8.0)
+    while ((right - left) / side * ((bottom - top) / side) + (right - left + bottom - top) / side > SQUARES_A_POINT * (double)count + 8.0)
         side *= 1.4;
     const squares_t squares = {points, NULL, NULL, (int64_t)((right - left) / side) + 1,
                                (int64_t)((bottom - top) / side) + 1, left, top, side};
@@ -316,18 +324,33 @@ typedef struct {
     int64_t count;
 } corners_t;
 
+/* A corner that may be the neighbour along an arm. */
 typedef struct {
-    double square;
+    float square;
     int64_t arm, end, back;
 } candidate_t;
 
-/* Collect the corners around corner i that are like it in contrast: at least the `wanted` nearest, with the squares of the
- * distances. Returns how many. */
-static int64_t gather(
-    const corners_t *corners, const squares_t *squares, int64_t i, int64_t wanted, double *square, int32_t *index)
+/* A corner in the order of the squares: what the search reads lies side by side. */
+typedef struct {
+    double u, v;
+    float lines[4], contrast;
+    int32_t corner;
+} place_t;
+
+/* The corners around one: square of the distance, chord, both lines' unit vectors, contrast, index; and the test. */
+enum { SQUARE, CHORD_U, CHORD_V, A_U, A_V, B_U, B_V, CONTRAST, COLUMNS };
+typedef struct {
+    float *columns[COLUMNS];
+    int32_t *corner, *meets;
+} near_t;
+
+/* Collect the corners around `home` whose contrast lies within the bounds: at least the `wanted` nearest. Returns how
+ * many. */
+INLINE int64_t gather(
+    const squares_t *squares, const place_t *places, const place_t *home, float least, float most, int64_t wanted,
+    const near_t *near)
 {
-    const double u = corners->pixels[2 * i], v = corners->pixels[2 * i + 1];
-    const double least = corners->least[i], most = corners->most[i], side = squares->side;
+    const double u = home->u, v = home->v, side = squares->side;
     const int64_t column = square_at(u, squares->left, side, squares->columns);
     const int64_t row = square_at(v, squares->top, side, squares->rows);
     const double in_u = u - squares->left - (double)column * side, in_v = v - squares->top - (double)row * side;
@@ -347,50 +370,59 @@ static int64_t gather(
                     continue;
                 from = from > 0 ? from : 0;
                 to = to < squares->columns ? to : squares->columns - 1;
-                for (int32_t k = first[from]; k < first[to + 1]; k++) {
-                    const int32_t j = squares->order[k];
-                    if (!(corners->contrast[j] > least && corners->contrast[j] < most))
-                        continue;
-                    const double du = corners->pixels[2 * j] - u, dv = corners->pixels[2 * j + 1] - v;
-                    square[count] = du * du + dv * dv;
-                    index[count++] = j;
+                for (const place_t *place = places + first[from]; place < places + first[to + 1]; place++) {
+                    const float du = (float)(place->u - u), dv = (float)(place->v - v);
+                    near->columns[SQUARE][count] = du * du + dv * dv;
+                    near->columns[CHORD_U][count] = du;
+                    near->columns[CHORD_V][count] = dv;
+                    for (int k = 0; k < 4; k++)
+                        near->columns[A_U + k][count] = place->lines[k];
+                    near->columns[CONTRAST][count] = place->contrast;
+                    near->corner[count] = place->corner;
+                    count += (place->contrast > least) & (place->contrast < most);
                 }
             }
         }
         if (left <= 0 && top <= 0 && right >= squares->columns - 1 && bottom >= squares->rows - 1)
             return count;
+        if (count < wanted)
+            continue;
         /* All corners within `safe` are among them by now. */
-        const double safe = inner + (double)ring * side;
-        int64_t within = 0;
+        const float safe = (float)((inner + (double)ring * side) * (inner + (double)ring * side));
+        int32_t within = 0;
         for (int64_t k = 0; k < count; k++)
-            within += square[k] <= safe * safe;
+            within += near->columns[SQUARE][k] <= safe;
         if (within >= wanted)
             return count;
     }
 }
 
-/* The arm (A, B, -A, -B) that points most along, given the cosines to A and B. */
+/* Mark which of the corners around `home` are like it in contrast and point arms of the other kind at it, as it at them. */
+INLINE void mark_facing(const place_t *home, const link_rules_t *rules, const near_t *near, int64_t count)
+{
+    const float ratio = (float)rules->contrast_ratio, contrast = home->contrast;
+    const float cosine = (float)(rules->arm_cosine * rules->arm_cosine);
+    const float mine_a_u = home->lines[0], mine_a_v = home->lines[1], mine_b_u = home->lines[2], mine_b_v = home->lines[3];
+    const float *restrict square = near->columns[SQUARE], *restrict theirs = near->columns[CONTRAST];
+    const float *restrict u = near->columns[CHORD_U], *restrict v = near->columns[CHORD_V];
+    const float *restrict a_u = near->columns[A_U], *restrict a_v = near->columns[A_V];
+    const float *restrict b_u = near->columns[B_U], *restrict b_v = near->columns[B_V];
+    int32_t *restrict meets = near->meets;
+    for (int64_t k = 0; k < count; k++) {
+        const float a = u[k] * mine_a_u + v[k] * mine_a_v, b = u[k] * mine_b_u + v[k] * mine_b_v;
+        const float home_a = u[k] * a_u[k] + v[k] * a_v[k], home_b = u[k] * b_u[k] + v[k] * b_v[k];
+        const float along = a * a > b * b ? a * a : b * b;
+        const float back = home_a * home_a > home_b * home_b ? home_a * home_a : home_b * home_b;
+        meets[k] = (along > cosine * square[k]) & (back > cosine * square[k]) &
+                   ((b * b > a * a) != (home_b * home_b > home_a * home_a)) & (contrast > ratio * theirs[k]) &
+                   (theirs[k] > ratio * contrast);
+    }
+}
+
+/* The arm (A, B, -A, -B) that points most along the chord. */
 INLINE int64_t arm_along(double a, double b)
 {
     return fabs(b) > fabs(a) ? (b < 0.0 ? 3 : 1) : (a < 0.0 ? 2 : 0);
-}
-
-/* Whether the arms of the corners point at each other, and which. */
-INLINE int arms_meet(const corners_t *corners, int64_t i, int64_t j, double square, double cosine, candidate_t *out)
-{
-    const double length = sqrt(square) > 1e-6 ? sqrt(square) : 1e-6;
-    const double u = (corners->pixels[2 * j] - corners->pixels[2 * i]) / length;
-    const double v = (corners->pixels[2 * j + 1] - corners->pixels[2 * i + 1]) / length;
-    const double *mine = corners->lines + 4 * i, *theirs = corners->lines + 4 * j;
-    const double a = u * mine[0] + v * mine[1], b = u * mine[2] + v * mine[3];
-    if (!(fabs(a) > cosine || fabs(b) > cosine))
-        return 0;
-    const double home_a = -(u * theirs[0] + v * theirs[1]), home_b = -(u * theirs[2] + v * theirs[3]);
-    if (!(fabs(home_a) > cosine || fabs(home_b) > cosine))
-        return 0;
-    const candidate_t found = {square, arm_along(a, b), j, arm_along(home_a, home_b)};
-    *out = found;
-    return (found.arm + found.back) % 2 == 1;
 }
 
 /* Whether the edge from corner i is there (corners.links._edge_seen). */
@@ -411,30 +443,34 @@ INLINE int link_seen(
                      weakest) >= rules->most;
 }
 
-/* The nearest corner along each of the four arms of corner i whose edge is seen: to[arm] = 4 * corner + arm, or -1. */
-static void link_arms(
-    const corners_t *corners, const squares_t *squares, const image_t image, double scale, double offset,
-    const link_rules_t *rules, int64_t i, double *square, int32_t *index, int64_t *to)
+/* The nearest corner along each of the four arms of `home` whose edge is seen: to[arm] = 4 * corner + arm, or -1. */
+INLINE void link_arms(
+    const corners_t *corners, const squares_t *squares, const place_t *places, const place_t *home, const image_t image,
+    double scale, double offset, const link_rules_t *rules, const near_t *near, int64_t *to)
 {
     enum { MOST_CANDIDATES = 512 };
     candidate_t candidates[MOST_CANDIDATES];
-    const int64_t wanted = rules->neighbours + 1, count = gather(corners, squares, i, wanted, square, index);
+    const int64_t i = home->corner, wanted = rules->neighbours + 1;
+    const int64_t count =
+        gather(squares, places, home, (float)corners->least[i], (float)corners->most[i], wanted, near);
+    mark_facing(home, rules, near, count);
     int64_t listed = 0;
-    for (int64_t k = 0; k < count; k++) {
-        const int64_t j = index[k];
-        const double ratio = corners->contrast[i] / corners->contrast[j];
-        candidate_t fresh;
-        if (j == i || !(ratio > rules->contrast_ratio && ratio < 1.0 / rules->contrast_ratio))
+    for (int64_t k = 0; k < count && listed < MOST_CANDIDATES; k++) {
+        if (!near->meets[k])
             continue;
-        if (!arms_meet(corners, i, j, square[k], rules->arm_cosine, &fresh))
-            continue;
-        int64_t nearer = 0;
+        const float square = near->columns[SQUARE][k], u = near->columns[CHORD_U][k], v = near->columns[CHORD_V][k];
+        int32_t nearer = 0;
         for (int64_t n = 0; n < count; n++)
-            nearer += square[n] < square[k];
-        if (nearer >= wanted || listed == MOST_CANDIDATES)
+            nearer += near->columns[SQUARE][n] < square;
+        if (nearer >= wanted)
             continue;
+        const candidate_t fresh = {
+            square, arm_along(u * home->lines[0] + v * home->lines[1], u * home->lines[2] + v * home->lines[3]),
+            near->corner[k],
+            arm_along(-(u * near->columns[A_U][k] + v * near->columns[A_V][k]),
+                      -(u * near->columns[B_U][k] + v * near->columns[B_V][k]))};
         int64_t at = listed++;
-        for (; at > 0 && candidates[at - 1].square > fresh.square; at--)
+        for (; at > 0 && candidates[at - 1].square > square; at--)
             candidates[at] = candidates[at - 1];
         candidates[at] = fresh;
     }
@@ -465,16 +501,31 @@ FOR_EACH_PROCESSOR int64_t find_links(
     squares_t squares;
     if (!fill_squares(corners->pixels, count, 1.0, &squares))
         return 0;
-    double *square = malloc((size_t)count * (sizeof(double) + sizeof(int32_t)));
-    if (!square) {
+    place_t *places = malloc((size_t)count * (sizeof(place_t) + COLUMNS * sizeof(float) + 2 * sizeof(int32_t)));
+    if (!places) {
         free(squares.first);
         return 0;
     }
+    near_t near;
+    for (int k = 0; k < COLUMNS; k++)
+        near.columns[k] = (float *)(places + count) + k * count;
+    near.corner = (int32_t *)(near.columns[COLUMNS - 1] + count);
+    near.meets = near.corner + count;
+    for (int64_t k = 0; k < count; k++) {
+        const int32_t i = squares.order[k];
+        const double *line = corners->lines + 4 * i;
+        const place_t place = {corners->pixels[2 * i], corners->pixels[2 * i + 1],
+                               {(float)line[0], (float)line[1], (float)line[2], (float)line[3]},
+                               (float)corners->contrast[i], i};
+        places[k] = place;
+    }
     for (int64_t k = 0; k < 4 * count; k++)
         nearest[k] = both[k] = -1;
-    for (int64_t i = 0; i < count; i++)
-        link_arms(corners, &squares, image, scale, offset, rules, i, square, (int32_t *)(square + count), nearest + 4 * i);
-    free(square);
+    /* In the order of the squares: neighbours look at the same corners and pixels. */
+    for (int64_t k = 0; k < count; k++)
+        link_arms(corners, &squares, places, places + k, image, scale, offset, rules, &near,
+                  nearest + 4 * (int64_t)places[k].corner);
+    free(places);
     free(squares.first);
     for (int64_t k = 0; k < 4 * count; k++)
         if (nearest[k] >= 0 && nearest[nearest[k]] == k)

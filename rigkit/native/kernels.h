@@ -75,13 +75,34 @@ INLINE double ring_crossing(const float *even, int64_t half, float middle, int64
 INLINE int read_ring(
     const image_t image, const ring_rules_t rules, float u, float v, float radius, double angles[2], double *contrast)
 {
-    float ring[2 * MOST_HALF], even[MOST_HALF];
+    float ring[2 * MOST_HALF], even[MOST_HALF], right[2 * MOST_HALF], below[2 * MOST_HALF];
+    int32_t at[2 * MOST_HALF];
     const int64_t half = rules.half;
-    for (int64_t k = 0; k < 2 * half; k++)
-        ring[k] = brightness_at(image, u + radius * rules.circle[2 * k], v + radius * rules.circle[2 * k + 1]);
+    const int32_t width = (int32_t)image.width, height = (int32_t)image.height;
+    const float most_u = (float)(width - 1), most_v = (float)(height - 1);
+    /* As brightness_at, but first all places, which vectorises, then all reads. */
+    for (int64_t k = 0; k < 2 * half; k++) {
+        float sample_u = u + radius * rules.circle[2 * k], sample_v = v + radius * rules.circle[2 * k + 1];
+        sample_u = sample_u > 0.0f ? sample_u : 0.0f;
+        sample_v = sample_v > 0.0f ? sample_v : 0.0f;
+        sample_u = sample_u < most_u ? sample_u : most_u;
+        sample_v = sample_v < most_v ? sample_v : most_v;
+        int32_t left = (int32_t)sample_u, top = (int32_t)sample_v;
+        left = left < width - 2 ? left : width - 2;
+        top = top < height - 2 ? top : height - 2;
+        right[k] = sample_u - (float)left;
+        below[k] = sample_v - (float)top;
+        at[k] = top * width + left;
+    }
+    for (int64_t k = 0; k < 2 * half; k++) {
+        const float *upper = image.brightness + at[k], *lower = upper + width;
+        const float above = upper[0] + right[k] * (upper[1] - upper[0]);
+        ring[k] = above + below[k] * (lower[0] + right[k] * (lower[1] - lower[0]) - above);
+    }
     float low = 1e30f, high = -1e30f, mean = 0.0f, odd_energy = 0.0f, energy = 0.0f;
-    for (int64_t k = 0; k < half; k++) {
+    for (int64_t k = 0; k < half; k++)
         even[k] = 0.5f * (ring[k] + ring[half + k]);
+    for (int64_t k = 0; k < half; k++) {
         low = even[k] < low ? even[k] : low;
         high = even[k] > high ? even[k] : high;
         mean += even[k];
