@@ -42,10 +42,10 @@ not hide the corners of a board in it."""
 LEAST_SPAN = 2.5
 """An image that spans fewer grey levels shows nothing but its quantisation."""
 
-TYPICAL = 1e4
-"""Pixels that the median response and the span of brightness are taken from: they are good to 1 and 2 %."""
+TYPICAL = 4e3
+"""Pixels that the median response and the span of brightness are taken from: the median is good to 3 %."""
 
-EXTREME = 0.002
+EXTREME = 0.005
 """The span of brightness leaves out this part at either end: glints, dead pixels."""
 
 MAX_PEAKS = 20000
@@ -174,8 +174,8 @@ def _threshold(smooth: FloatImage) -> float:
     return float(np.clip(NOISE_FACTOR * typical, FLOOR * contrast, CEILING * contrast))
 
 
-def peaks(level: Level) -> IntArray:
-    """Return the local maxima of the response above the threshold, (N, 2) as (u, v) of the level, row by row."""
+def peaks(level: Level) -> tuple[IntArray, FloatImage]:
+    """Return the local maxima of the response above the threshold, (N, 2) as (u, v) of the level, row by row, and D."""
     library = front.loaded()
     if library is not None:
         at, height = front.peaks(library, level.smooth, level.threshold)
@@ -191,8 +191,8 @@ def peaks(level: Level) -> IntArray:
         at, height = np.stack([u, v], axis=-1) + 1, response.ravel()[flat]
     if len(at) > MAX_PEAKS:
         least = np.partition(height, len(at) - MAX_PEAKS)[len(at) - MAX_PEAKS]
-        at = at[height >= least]
-    return np.asarray(at, np.int64)
+        at, height = at[height >= least], height[height >= least]
+    return np.asarray(at, np.int64), np.asarray(height, np.float32)
 
 
 def _repeated(response: FloatImage, flat: IntArray, width: int) -> NDArray[np.bool_]:

@@ -79,15 +79,16 @@ def loaded() -> ctypes.CDLL | None:
     if library is None:
         return None
     address, size = c_void_p, c_int64
-    for name in ("shrink_bytes", "shrink_floats"):
-        getattr(library, name).argtypes = [address, size, size, size, address, address]
-        getattr(library, name).restype = None
-    library.smooth_floats.argtypes = [address, size, size, *[address] * 4]
-    library.smooth_floats.restype = None
+    library.shrink.argtypes = [address, size, size, size, address, address]
+    library.smooth.argtypes = [address, size, size, *[address] * 4]
     library.typical_values.argtypes = [address, size, size, size, address, address]
-    library.typical_values.restype = None
+    for name in ("shrink", "smooth", "typical_values"):
+        getattr(library, name).restype = None
     library.find_peaks.argtypes = [address, size, size, c_float, *[address] * 3]
-    library.find_corners.argtypes = [_Image, POINTER(RingRules), address, size, c_double, address, size, *[address] * 5]
+    library.find_corners.argtypes = [
+        *(_Image, POINTER(RingRules), address, size, c_double, c_double),
+        *(address, address, size, *[address] * 5),
+    ]
     library.mark_known.argtypes = [address, size, address, size, c_double, address]
     library.find_links.argtypes = [
         *(POINTER(_Corners), _Image, c_double, c_double, POINTER(LinkRules)),
@@ -98,14 +99,11 @@ def loaded() -> ctypes.CDLL | None:
     return library
 
 
-def shrunk(library: ctypes.CDLL, image: NDArray[np.uint8] | Image, factor: int) -> Image:
+def shrunk(library: ctypes.CDLL, image: Image, factor: int) -> Image:
     """Return the means of `factor` x `factor` pixels."""
     height, width = image.shape
-    out = np.empty((height // factor, width // factor), np.float32)
-    bytes_ = image.dtype == np.uint8
-    sums = np.empty(width, np.uint16 if bytes_ else np.float32)
-    call = library.shrink_bytes if bytes_ else library.shrink_floats
-    call(image.ctypes.data, height, width, factor, sums.ctypes.data, out.ctypes.data)
+    sums, out = np.empty(width, np.float32), np.empty((height // factor, width // factor), np.float32)
+    library.shrink(image.ctypes.data, height, width, factor, sums.ctypes.data, out.ctypes.data)
     return out
 
 
@@ -115,7 +113,7 @@ def smoothed(library: ctypes.CDLL, image: Image, kernel: Image) -> tuple[Image, 
     smooth, half = np.empty_like(image), np.empty(((height + 1) // 2, (width + 1) // 2), np.float32)
     column = np.empty(width + 4, np.float32)
     arrays = (kernel, column, smooth, half)
-    library.smooth_floats(image.ctypes.data, height, width, *(array.ctypes.data for array in arrays))
+    library.smooth(image.ctypes.data, height, width, *(array.ctypes.data for array in arrays))
     return smooth, half
 
 
@@ -141,25 +139,22 @@ def peaks(library: ctypes.CDLL, smooth: Image, threshold: float) -> tuple[NDArra
 def corners(
     library: ctypes.CDLL,
     smooth: Image,
-    at: IntArray,
+    at: NDArray[np.signedinteger],
+    response: Image,
     radii: tuple[float, ...],
     most_step: float,
+    most_sharp: float,
     rules: RingRules,
 ) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
     """Return the saddles next to the peaks `at` (N, 2); of the corners among them: which, angles (M, 2), contrast."""
-    given = np.ascontiguousarray(at, np.int32)
-    count, found = len(given), c_int64()
-    pixels, angles = np.empty((count, 2)), np.empty((count + 1, 2))
-    which, contrast = np.empty(count, np.int64), np.empty(count + 1)
-    radius = np.array(radii)
+    at, response = np.ascontiguousarray(at, np.int32), np.ascontiguousarray(response, np.float32)
+    count, found, radius = len(at), c_int64(), np.array(radii)
+    pixels, which = np.empty((count, 2)), np.empty(count, np.int64)
+    # A ring is read before it is known whether it is kept.
+    angles, contrast = np.empty((count + 1, 2)), np.empty(count + 1)
     near = library.find_corners(
-        _Image.of(smooth),
-        byref(rules),
-        radius.ctypes.data,
-        len(radius),
-        most_step,
-        given.ctypes.data,
-        count,
+        *(_Image.of(smooth), byref(rules), radius.ctypes.data, len(radius), most_step, most_sharp),
+        *(at.ctypes.data, response.ctypes.data, count),
         *(array.ctypes.data for array in (pixels, which, angles, contrast)),
         byref(found),
     )
