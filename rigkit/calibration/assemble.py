@@ -10,12 +10,11 @@ from rigkit.calibration.normal import Normal
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import BoardShape, Calibration, Candidate, Outlier, ViewResult
 from rigkit.calibration.solver import State
-from rigkit.calibration.uncertainty import uncertainty_at_corners
 from rigkit.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
 
-__all__ = ["assemble", "solution_normal"]
+__all__ = ["assemble", "require_determined", "solution_normal"]
 
 UNKNOWN_SHARE = 0.05
 """A projection that is uncertain by this part of the image's width, where the boards were, is not determined."""
@@ -30,34 +29,27 @@ def assemble(
     dropped: tuple[tuple[str, str], ...],
     candidates: tuple[Candidate, ...],
 ) -> Calibration:
-    """Return the result; raises DegenerateError where the views leave the focal length open."""
+    """Return the result, without verdicts."""
     state = fit.state
     sigma = fit.sigma_px if np.isfinite(fit.sigma_px) else 0.0
     covariance = frame_covariance(solution_normal(fit), state)
     px = np.where(fit.residuals.valid[..., None], fit.residuals.px, np.nan)
     poses = Rigid3.stack(state.rotation, state.translation_mm)
-    views = []
-    for view, pose, residuals, kept in zip(observations.views, poses, px, fit.kept, strict=True):
-        n = len(view.grid)
-        board_id = view.board.board_id
-        views.append(ViewResult(view.image, board_id, pose, view.grid, view.pixels, residuals[:n], kept[:n]))
     p = state.camera.parameters.size
-    result = Calibration(
+    return Calibration(
         camera=state.camera,
         rms_px=fit.rms_px,
         heldout_rms_px=heldout_px,
         covariance=covariance[:p, :p] * sigma**2,
         frame_covariance=covariance * sigma**2,
         sigma_px=sigma,
-        views=tuple(views),
+        views=ViewResult.of_views(observations.views, poses, px, fit.kept),
         dropped=dropped,
         outliers=_outliers(observations, fit),
         candidates=candidates,
         convergence=fit.convergence,
         boards=_boards(observations, state),
     )
-    _require_determined(result)
-    return result
 
 
 def _outliers(observations: Observations, fit: Fit) -> tuple[Outlier, ...]:
@@ -85,13 +77,13 @@ def frame_covariance(normal: Normal, state: State) -> FloatArray:
     """
     p = state.camera.parameters.size
     globals_, back, own = normal.covariance()
-    used = np.einsum("vii->v", normal.pp) > 0.0
+    used = normal.pp.trace(axis1=-2, axis2=-1) > 0.0
     lever = np.zeros((len(used), 6, 6))
     lever[:, :3, :3] = lever[:, 3:, 3:] = np.eye(3)
     lever[:, 3:, :3] = skew(state.translation_mm)
     lever = lever[used] / max(int(used.sum()), 1)
-    through = np.einsum("vij,vjg->ig", lever, back[used])
-    spread = np.einsum("vij,vjk,vlk->il", lever, own[used], lever)
+    through = lever.transpose(1, 0, 2).reshape(6, -1) @ back[used].reshape(-1, len(globals_))
+    spread = (lever @ own[used] @ np.swapaxes(lever, -1, -2)).sum(axis=0)
     chosen = globals_[:p]
     out = np.empty((p + 6, p + 6))
     out[:p, :p] = chosen[:, :p]
@@ -101,10 +93,10 @@ def frame_covariance(normal: Normal, state: State) -> FloatArray:
     return 0.5 * (out + out.T)
 
 
-def _require_determined(result: Calibration) -> None:
-    """Raise DegenerateError where the views leave the lens open, even at the corners that they have."""
-    worst = uncertainty_at_corners(result)
-    sigma = float(np.nanmedian(worst)) if np.isfinite(worst).any() else np.inf
+def require_determined(result: Calibration, at_corners_px: FloatArray) -> None:
+    """Raise DegenerateError where the views leave the lens open, even at the corners that they have: `at_corners_px` is
+    the uncertainty there."""
+    sigma = float(np.nanmedian(at_corners_px)) if np.isfinite(at_corners_px).any() else np.inf
     if result.sigma_px > 0.0:
         sigma *= max(result.sigma_px, LEAST_SIGMA_PX) / result.sigma_px
     if not sigma < UNKNOWN_SHARE * result.camera.size_px[0]:
@@ -119,6 +111,9 @@ def _boards(observations: Observations, state: State) -> tuple[BoardShape, ...]:
     out = []
     for i, board in enumerate(observations.boards):
         own = points[observations.first_row[i] : observations.first_row[i + 1]]
+        if state.shape.kind == "flat":
+            out.append(BoardShape(board.board_id, "flat", own))
+            continue
         centred = own - own.mean(axis=0)
         normal = np.linalg.svd(centred, full_matrices=False)[2][2]
         flat = board.points() - board.points().mean(axis=0)

@@ -12,12 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.arrays import BoolArray
-from rigkit.calibration.assemble import assemble
+from rigkit.calibration.assemble import assemble, require_determined
 from rigkit.calibration.fit import Fit, fit_kept, fit_model, heldout_rms, robust_sigma
 from rigkit.calibration.moved import moved_lens
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.shape import SHAPES, shape_model
+from rigkit.calibration.uncertainty import uncertainty_at_corners
 from rigkit.calibration.usable import usable_views
 from rigkit.calibration.verdicts import judge
 from rigkit.cameras.base import Camera
@@ -106,7 +107,10 @@ def calibrate(
         chosen = _choose(observations, shapes, SHAPE_MARGIN)
         candidates += [c for c in _described(shapes, chosen, SHAPE_MARGIN) if "board" in c.name]
     result = assemble(observations, chosen.fit, chosen.heldout_px, dropped, tuple(candidates))
-    return replace(result, verdicts=judge(result, moved_lens(observations, chosen.fit) if folds else ()))
+    at_corners = uncertainty_at_corners(result)
+    require_determined(result, at_corners)
+    moved = moved_lens(observations, chosen.fit) if folds else ()
+    return replace(result, verdicts=judge(result, moved, at_corners_px=at_corners))
 
 
 def _wanted(model: str, degree: int | None) -> list[tuple[str, type[Camera], int | None]]:

@@ -25,32 +25,25 @@ DENOMINATOR_SIGMA = 1.0
 
 def camera_prior(camera: Camera) -> tuple[FloatArray, FloatArray]:
     """Return d r / d parameters (m, P) and r (m,): departures from what is expected, in standard deviations."""
-    names = camera.parameter_names()
-    values = camera.parameters
-    middle = image_center(camera.size_px)
+    place = {name: i for i, name in enumerate(camera.parameter_names())}
+    values = camera.parameters.tolist()
+    middle = image_center(camera.size_px).tolist()
     reach = CENTRE_SIGMA * max(camera.size_px)
-    rows, residuals = [], []
-
-    def add(entries: dict[str, float], residual: float) -> None:
-        row = np.zeros(len(names))
-        for name, value in entries.items():
-            row[names.index(name)] = value
-        rows.append(row)
-        residuals.append(residual)
-
-    for name, expected, sigma in (
-        ("cx", middle[0], reach),
-        ("cy", middle[1], reach),
-        ("c", 1.0, SQUARE_SIGMA),
-        ("d", 0.0, SQUARE_SIGMA),
-    ):
-        if name in names:
-            add({name: 1.0 / sigma}, float(values[names.index(name)] - expected) / sigma)
-    if "fx" in names and "fy" in names:
-        fx, fy = values[names.index("fx")], values[names.index("fy")]
-        size = SQUARE_SIGMA * 0.5 * (abs(fx) + abs(fy))
-        add({"fx": 1.0 / size, "fy": -1.0 / size}, float(fx - fy) / size)
-    if "k6" in names:
-        for name in ("k4", "k5", "k6"):
-            add({name: 1.0 / DENOMINATOR_SIGMA}, float(values[names.index(name)]) / DENOMINATOR_SIGMA)
-    return np.array(rows).reshape(-1, len(names)), np.array(residuals)
+    expected = {
+        "cx": (middle[0], reach),
+        "cy": (middle[1], reach),
+        "c": (1.0, SQUARE_SIGMA),
+        "d": (0.0, SQUARE_SIGMA),
+    }
+    if "k6" in place:
+        expected |= dict.fromkeys(("k4", "k5", "k6"), (0.0, DENOMINATOR_SIGMA))
+    known = [(place[name], *prior) for name, prior in expected.items() if name in place]
+    square = "fx" in place and "fy" in place
+    rows, residuals = np.zeros((len(known) + square, len(values))), np.zeros(len(known) + square)
+    for row, (k, mean, sigma) in enumerate(known):
+        rows[row, k], residuals[row] = 1.0 / sigma, (values[k] - mean) / sigma
+    if square:
+        x, y = place["fx"], place["fy"]
+        sigma = SQUARE_SIGMA * 0.5 * (abs(values[x]) + abs(values[y]))
+        rows[-1, x], rows[-1, y], residuals[-1] = 1.0 / sigma, -1.0 / sigma, (values[x] - values[y]) / sigma
+    return rows, residuals

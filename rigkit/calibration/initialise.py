@@ -37,6 +37,8 @@ NARROW = 1.45
 FALLBACK_FOV_RAD = (0.7, 1.4, 2.1, 3.1)
 """Fields of view of the equidistant lenses tried where the views do not determine a curve (all boards parallel)."""
 SAMPLES = 96
+ORTHONORMAL = 1e-12
+"""Departure from a rotation that is rounding."""
 
 
 def initialise(
@@ -107,8 +109,13 @@ def _fitted(
 def _posed(alignment: Alignment, sign: FloatArray, t3: FloatArray) -> tuple[Mat3, Points]:
     """Complete the poses with the third row."""
     columns = np.concatenate([alignment.rows[..., :2], (alignment.tilt * sign[:, None])[:, None]], axis=1)
-    third = np.cross(columns[..., 0], columns[..., 1])
-    rotation = nearest_rotation(np.concatenate([columns, third[..., None]], axis=-1))
+    x, y = columns[..., 0], columns[..., 1]
+    third = np.stack([x[:, i] * y[:, j] - x[:, j] * y[:, i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=-1)
+    rotation = np.concatenate([columns, third[..., None]], axis=-1)
+    # The columns are orthonormal as they come, but for views that have no alignment.
+    odd = ~(np.abs(np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)).max(axis=(1, 2)) < ORTHONORMAL)
+    if odd.any():
+        rotation[odd] = nearest_rotation(rotation[odd])
     return rotation, np.concatenate([alignment.rows[..., 2], t3[:, None]], axis=-1)
 
 

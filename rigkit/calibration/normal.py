@@ -22,6 +22,9 @@ __all__ = ["Normal", "Residuals", "Step", "lost_px", "normal_equations"]
 BLOCK = 8192
 """Corners linearised at a time: their derivatives then stay in the cache, and memory does not grow with the views."""
 
+MAX_CONDITION = 1e12
+"""A pose whose scaled block is worse has directions that its corners leave open: fewer than three of them."""
+
 FLOOR = 1e-24
 """Diagonal entries below this part of the largest are lifted to it: a polynomial's entries span many powers of ten."""
 
@@ -124,7 +127,7 @@ class Normal:
         return Step(step_g, step_p, predicted)
 
     def _eliminate_poses(self, damping_g: FloatArray, damping_p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        inverse = np.linalg.inv(self.pp + damping_p[..., None] * np.eye(6))
+        inverse = np.linalg.inv(_damped(self.pp, damping_p))
         back = inverse @ np.swapaxes(self.gp, -1, -2)
         reduced = self.gg + np.diag(damping_g) - _gemm(self.gp, back)
         free = (inverse @ self.p[..., None])[..., 0]
@@ -138,13 +141,13 @@ class Normal:
         count = (len(self.g) - p) // 3
         each = np.arange(count)
         own = self.gg[p:, p:].reshape(count, 3, count, 3)[each, :, each, :]
-        inverse = np.linalg.inv(own + damping_g[p:].reshape(count, 3, 1) * np.eye(3))
+        inverse = np.linalg.inv(_damped(own, damping_g[p:].reshape(count, 3)))
         system = np.zeros((p + 6 * views, p + 6 * views))
         system[:p, :p] = self.gg[:p, :p] + np.diag(damping_g[:p])
         system[:p, p:] = np.moveaxis(self.gp[:, :p], 0, 1).reshape(p, -1)
         system[p:, :p] = system[:p, p:].T
         blocks = system[p:, p:].reshape(views, 6, views, 6)
-        blocks[np.arange(views), :, np.arange(views), :] = self.pp + damping_p[..., None] * np.eye(6)
+        blocks[np.arange(views), :, np.arange(views), :] = _damped(self.pp, damping_p)
         coupling = np.concatenate([self.gg[:p, p:], np.moveaxis(self.gp[:, p:], 1, 2).reshape(-1, 3 * count)])
         back = np.einsum("amk,mkl->aml", coupling.reshape(-1, count, 3), inverse).reshape(len(coupling), -1)
         rhs = np.concatenate([self.g[:p], self.p.ravel()]) - back @ self.g[p:]
@@ -158,7 +161,7 @@ class Normal:
 
         Directions that the data leave open get the pseudo-inverse's zero only after scaling to unit diagonal.
         """
-        inverse = np.linalg.pinv(self.pp, hermitian=True)
+        inverse = _inverse(self.pp)
         back = inverse @ np.swapaxes(self.gp, -1, -2)
         reduced = self.gg - _gemm(self.gp, back)
         scale = 1.0 / np.sqrt(np.maximum(np.diag(reduced), np.finfo(float).tiny))
@@ -177,10 +180,35 @@ def _diagonal(matrix: FloatArray) -> FloatArray:
     return np.maximum(diagonal, np.where(top > 0.0, FLOOR * top, 1.0))
 
 
+def _damped(matrices: FloatArray, damping: FloatArray) -> FloatArray:
+    """Return matrices (N, K, K) with `damping` (N, K) added to their diagonals."""
+    out = np.array(matrices, order="C")
+    count = damping.shape[-1]
+    out.reshape(-1, count * count)[:, :: count + 1] += damping
+    return out
+
+
+def _inverse(pp: FloatArray) -> FloatArray:
+    """Return the inverses of the poses' blocks (V, 6, 6); the pseudo-inverses where the corners leave a pose open."""
+    scale = 1.0 / np.sqrt(_diagonal(pp))
+    scale = scale[:, :, None] * scale[:, None]
+    scaled = pp * scale
+    try:
+        inverse = np.linalg.inv(scaled)
+    except np.linalg.LinAlgError:
+        inverse = np.full_like(pp, np.inf)
+    # The scaled blocks have unit diagonals, so this bounds their condition within a factor of six.
+    doubtful = ~(np.abs(inverse).max(axis=(1, 2)) < MAX_CONDITION)
+    inverse *= scale
+    if doubtful.any():
+        inverse[doubtful] = np.linalg.pinv(pp[doubtful], hermitian=True)
+    return np.asarray(inverse)
+
+
 def _gemm(gp: FloatArray, back: FloatArray) -> FloatArray:
     """Return sum over views of gp_v @ back_v as one matrix product."""
     count = gp.shape[1]
-    return np.asarray(np.moveaxis(gp, 1, 0).reshape(count, -1) @ back.reshape(-1, count))
+    return np.asarray(gp.transpose(1, 0, 2).reshape(count, -1) @ back.reshape(-1, count))
 
 
 def _solve_positive(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
@@ -221,7 +249,9 @@ def normal_equations(
     gg, g = np.zeros((count, count)), np.zeros(count)
     gp, pp = np.empty((views, count, 6)), np.empty((views, 6, 6))
     p, costs = np.empty((views, 6)), np.empty(views)
-    residuals = Residuals(np.empty((views, corners, 2)), np.empty((views, corners), dtype=bool))
+    # Coordinates first in memory: every later step takes u and v apart.
+    px = np.moveaxis(np.empty((2, views, corners)), 0, -1)
+    residuals = Residuals(px, np.empty((views, corners), dtype=bool))
     released = _Released(len(shape.flat), views, count) if shape.kind == "released" else None
     step = max(1, BLOCK // max(corners, 1))
     for first in range(0, views, step):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray, Pixels, Points, as_array, as_indices
 from rigkit.cameras.base import Camera
+from rigkit.detections import BoardView
 from rigkit.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 
@@ -48,6 +50,24 @@ class ViewResult:
             raise InputError(f"view '{self.image}': `kept` must have one entry a corner ({n}), got {kept.shape}")
         kept.flags.writeable = False
         object.__setattr__(self, "kept", kept)
+
+    @classmethod
+    def of_views(
+        cls, views: Sequence[BoardView], poses: Sequence[Rigid3], residuals_px: FloatArray, kept: BoolArray
+    ) -> tuple[ViewResult, ...]:
+        """Return the results of V views padded to C corners, `residuals_px` (V, C, 2) and `kept` (V, C), checked
+        together as one is alone; what the views hold has been checked before."""
+        residuals_px = as_array(residuals_px, (len(views), None, 2), "residuals_px", finite=False)
+        kept = np.array(kept, dtype=bool)
+        kept.flags.writeable = False
+        out = []
+        for view, pose, residuals, keep in zip(views, poses, residuals_px, kept, strict=True):
+            one, n = object.__new__(cls), len(view.grid)
+            values = (view.image, view.board.board_id, pose, view.grid, view.pixels, residuals[:n], keep[:n])
+            for name, value in zip(cls.__slots__, values, strict=True):
+                object.__setattr__(one, name, value)
+            out.append(one)
+        return tuple(out)
 
     @property
     def rms_px(self) -> float:
@@ -168,4 +188,4 @@ class Calibration:
     @property
     def corner_count(self) -> int:
         """Number of corners used."""
-        return int(sum(int(view.kept.sum()) for view in self.views))
+        return sum(int(np.count_nonzero(view.kept)) for view in self.views)

@@ -62,10 +62,13 @@ class State:
         return replace(self, rotation=self.rotation[chosen], translation_mm=self.translation_mm[chosen])
 
     def points_in_cam(self, observations: Observations) -> tuple[Points, Points]:
-        """Return the corners in the camera frame and their lever arms R X, both (V, C, 3) mm."""
-        board = self.shape.points(self.unknowns)[observations.corner]
-        lever = board @ np.swapaxes(self.rotation, -1, -2)
-        return lever + self.translation_mm[:, None, :], lever
+        """Return the corners in the camera frame and their lever arms R X, both (V, C, 3) mm, coordinates first in
+        memory."""
+        board = np.take(self.shape.points(self.unknowns).T, observations.corner, axis=1)
+        lever = np.empty_like(board)
+        np.matmul(self.rotation, np.swapaxes(board, 0, 1), out=np.swapaxes(lever, 0, 1))
+        points = lever + self.translation_mm.T[:, :, None]
+        return np.moveaxis(points, 0, -1), np.moveaxis(lever, 0, -1)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -88,10 +91,9 @@ class Solution:
 def evaluate(state: State, observations: Observations) -> Residuals:
     """Return the residuals of `state`; where a corner does not project, the diagonal of the image."""
     points, _ = state.points_in_cam(observations)
-    with np.errstate(all="ignore"):
-        pixels, valid = state.camera.project(points)
+    pixels, valid = state.camera.project(points)
     residuals = observations.pixels - pixels
-    return Residuals(np.where(valid[..., None], residuals, lost_px(state.camera)), valid)
+    return Residuals(residuals if valid.all() else np.where(valid[..., None], residuals, lost_px(state.camera)), valid)
 
 
 def solve(

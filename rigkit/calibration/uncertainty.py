@@ -76,7 +76,8 @@ def projection_uncertainty(calibration: Calibration, pixels: Pixels, *, range_mm
 
 def uncertainty_at_corners(calibration: Calibration) -> FloatArray:
     """Return the standard deviation in the worst direction, (M,) px, at up to 400 of the corners used."""
-    pixels = np.concatenate([view.pixels[view.kept] for view in calibration.views])
+    kept = np.concatenate([view.kept for view in calibration.views])
+    pixels = np.concatenate([view.pixels for view in calibration.views])[kept]
     chosen = np.linspace(0, len(pixels) - 1, min(CORNERS, len(pixels))).astype(np.int64)
     return projection_uncertainty(calibration, pixels[chosen]).worst_px
 

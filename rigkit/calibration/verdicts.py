@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rigkit.arrays import FloatArray
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import uncertainty_at_corners, uncertainty_map
 
@@ -37,8 +38,11 @@ NAMES_U = ("left", "centre left", "centre right", "right")
 NAMES_V = ("top", "middle", "bottom")
 
 
-def judge(calibration: Calibration, also: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return the verdicts, the headline first; `also` are verdicts found elsewhere."""
+def judge(
+    calibration: Calibration, also: Sequence[str] = (), *, at_corners_px: FloatArray | None = None
+) -> tuple[str, ...]:
+    """Return the verdicts, the headline first; `also` are verdicts found elsewhere, `at_corners_px` is what
+    `uncertainty_at_corners` returns, where it is known already."""
     found = [
         *also,
         *_tilts(calibration),
@@ -47,7 +51,7 @@ def judge(calibration: Calibration, also: Sequence[str] = ()) -> tuple[str, ...]
         *_views(calibration),
         *_pattern(calibration),
         *_overfit(calibration),
-        *_unsure(calibration),
+        *_unsure(calibration, uncertainty_at_corners(calibration) if at_corners_px is None else at_corners_px),
         *_boards(calibration),
         *_outliers(calibration),
     ]
@@ -93,6 +97,8 @@ def _coverage(c: Calibration) -> list[str]:
     size = np.array([width / CELLS[0], height / CELLS[1]])
     cell = np.clip((pixels / size).astype(np.int64), 0, np.array(CELLS) - 1)
     count = np.bincount(cell[:, 0] * CELLS[1] + cell[:, 1], minlength=CELLS[0] * CELLS[1]).reshape(CELLS)
+    if count.min() >= CELL_CORNERS:
+        return []
     u, v = np.meshgrid((np.arange(CELLS[0]) + 0.5) * size[0], (np.arange(CELLS[1]) + 0.5) * size[1], indexing="ij")
     rays, valid = c.camera.unproject(np.stack([u, v], axis=-1))
     empty = (count < CELL_CORNERS) & valid & (np.where(valid, rays[..., 2], -1.0) > np.cos(np.radians(95.0)))
@@ -152,8 +158,7 @@ def _overfit(c: Calibration) -> list[str]:
     ]
 
 
-def _unsure(c: Calibration) -> list[str]:
-    inside = uncertainty_at_corners(c)
+def _unsure(c: Calibration, inside: FloatArray) -> list[str]:
     worst = float(np.nanmax(inside)) if np.isfinite(inside).any() else np.inf
     if worst <= UNSURE_PX:
         return []

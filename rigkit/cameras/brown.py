@@ -165,21 +165,24 @@ class Brown(Camera):
         fx, fy, cx, cy = self.parameters[:4].tolist()
         m = np.stack([(u - cx) / fx, (v - cy) / fy])
         valid = np.isfinite(m[0] + m[1])
-        plane = self._radial_start(np.where(valid, m, 0.0))
-        moving = np.flatnonzero(valid)
+        m = np.where(valid, m, 0.0)
+        plane = here = self._radial_start(m)
+        moving = np.arange(valid.size)
         for _ in range(STEPS):
-            here = plane[:, moving]
             squares = _squares(here)
             t = squares[0] + squares[2]
             factor, denominator = self._radial(t)
-            miss = self._distort(here, squares, factor)[0] - m[:, moving]
+            miss_x, miss_y = self._distort(here, squares, factor)[0] - m
             xx, xy, yy = self._slope(here, squares, t, factor, denominator)
-            step = np.stack([yy * miss[0] - xy * miss[1], xx * miss[1] - xy * miss[0]]) / (xx * yy - xy * xy)
+            step = np.stack([yy * miss_x - xy * miss_y, xx * miss_y - xy * miss_x]) / (xx * yy - xy * xy)
             # Kept inside the circle, where the derivative is positive definite: Newton cannot leave for another branch.
-            here -= step
+            here = here - step
             length = np.sqrt(here[0] ** 2 + here[1] ** 2 + 1e-300)
-            plane[:, moving] = np.minimum(1.0, self._max_r / length) * here
-            moving = moving[~(np.abs(step).sum(axis=0) <= SETTLED * (1.0 + length))]
+            here *= np.minimum(1.0, self._max_r / length)
+            unsettled = ~(np.abs(step[0]) + np.abs(step[1]) <= SETTLED * (1.0 + length))
+            plane[:, moving] = here
+            if not unsettled.all():
+                moving, here, m = moving[unsettled], here[:, unsettled], m[:, unsettled]
             if not moving.size:
                 break
         valid[moving] = False
