@@ -1,4 +1,4 @@
-"""Before a rig is solved: which views show the same board at the same moment, and where the cameras roughly sit.
+"""Before a rig is solved: which views show the same target at the same moment, and where the cameras roughly sit.
 
 A board that looks the same when turned has no first corner that two cameras agree on, and a frame whose images were not
 taken at one moment fits nothing. Both are settled by the mount that most frames agree on.
@@ -7,186 +7,259 @@ taken at one moment fits nothing. Both are settled by the mount that most frames
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, Mat3, Points
-from rigkit.boards import Board
-from rigkit.calibration.result import Calibration
+from rigkit.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points
+from rigkit.calibration.rig_seen import Places, Seen, Sights, same_looks, turns_of
+from rigkit.calibration.rig_state import Key
 from rigkit.cameras.base import Camera
-from rigkit.detections import BoardView
 from rigkit.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import nearest_rotation
+from rigkit.geometry.rotation import nearest_rotation, rotation_angle
 
-__all__ = ["Key", "Seen", "apart", "first_frames", "mounts_of", "seen_by", "turned_alike"]
+__all__ = ["apart", "first_frames", "mounts_of", "turned_alike"]
 
-Key = tuple[str, str]
-"""(frame, board): cameras that have a key in common see the same board in the same place."""
-
-MAX_TRIED = 200
-"""Mounts tried; more of them find no better one."""
+MAX_TRIED = 64
+"""Mounts tried. One of a good target counted rightly is enough: of boards with four ways to count, half of them at
+another moment, 64 tries miss all good ones once in 5000 times."""
 AGREE = 4.0
-"""Frames whose board lies within this many times the typical distance make the first mount."""
+"""Frames whose target lies within this many times the typical distance make the first mount."""
+RIVAL = 3.0
+"""A mount on which the frames agree nearly as well, within this factor, is a rival where it is another one ..."""
+OTHER_RAD = 0.5
+"""... by this angle: boards counted the other way turn the mount by half a turn or lay it over by twice their tilt."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Seen:
-    """A board in an image, as the camera's own calibration left it; `squared_px` is what its kept corners leave."""
+class _Target:
+    """A target before a camera: its pose, points on it to compare by, (4, 3) mm, and the ways to count it."""
 
-    view: BoardView
-    kept: BoolArray
-    cam_from_board: Rigid3
-    squared_px: float
-
-    def turned(self, quarter_turns: int) -> Seen:
-        """Return the same with the corners counted from another corner of the board."""
-        if quarter_turns == 0:
-            return self
-        board = self.view.board
-        (column, row), columns, rows = self.view.grid.T, board.columns, board.rows
-        for _ in range(quarter_turns):
-            column, row = rows - 1 - row, column
-            columns, rows = rows, columns
-        grid = np.stack([column, row], axis=-1)
-        angle = 0.5 * np.pi * quarter_turns
-        turn = np.rint([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
-        shift = board.points(grid[:1])[0] - turn @ board.points(self.view.grid[:1])[0]
-        pose = self.cam_from_board @ Rigid3(turn, shift).inverse()
-        return replace(self, view=replace(self.view, grid=grid), cam_from_board=pose)
+    rotation: Mat3
+    translation_mm: FloatArray
+    points: Points
+    ways: tuple[Rigid3, ...]
 
 
-def seen_by(own: Sequence[tuple[str, BoardView]], result: Calibration) -> dict[Key, Seen]:
-    """Return the views that the camera's own calibration used, by (frame, board)."""
-    used = {(v.image, v.board_id): v for v in result.views}
-    out = {}
-    for frame, view in own:
-        entry = used.get((view.image, view.board.board_id))
-        if entry is not None:
-            left = float((entry.residuals_px[entry.kept] ** 2).sum())
-            out[(frame, view.board.board_id)] = Seen(view, entry.kept, entry.cam_from_board, left)
+def _stack(motions: Sequence[Rigid3]) -> tuple[Mat3, Points]:
+    return np.array([m.rotation for m in motions]), np.array([m.translation_mm for m in motions])
+
+
+def _places_of(entries: Sequence[Seen], places: Places) -> tuple[Mat3, Points]:
+    """Return target_from_board of the board of every entry, (n, 3, 3) and (n, 3)."""
+    alone = ("", Rigid3.identity())
+    return _stack([places.get(e.board_id, alone)[1] for e in entries])
+
+
+def target_poses(entries: Sequence[Seen], places: Places) -> tuple[Mat3, Points]:
+    """Return cam_from_target of every entry, as its board has it, (n, 3, 3) and (n, 3)."""
+    rotation, shift = _stack([e.cam_from_board for e in entries])
+    if places:
+        place, lever = _places_of(entries, places)
+        rotation = rotation @ np.swapaxes(place, -1, -2)
+        shift = shift - (rotation @ lever[..., None])[..., 0]
+    return rotation, shift
+
+
+def _most_seen(own: Sights) -> dict[Key, Seen]:
+    """Return the entry with the most corners of every key."""
+    out: dict[Key, Seen] = {}
+    for entry in own.values():
+        known = out.get(entry.key)
+        if known is None or entry.kept.sum() > known.kept.sum():
+            out[entry.key] = entry
     return out
 
 
-def mounts_of(names: Sequence[str], seen: Sequence[Mapping[Key, Seen]]) -> list[Rigid3]:
-    """Return cam_from_rig of every camera, along a tree of pairs that share the most boards.
+def _targets(own: Sights, places: Places) -> dict[Key, _Target]:
+    best = _most_seen(own)
+    if not best:
+        return {}
+    out = {}
+    for (key, entry), rotation, shift in zip(best.items(), *target_poses(list(best.values()), places), strict=True):
+        board = entry.view.board
+        far = [(board.columns - 1) * board.square_x_mm, (board.rows - 1) * board.square_y_mm]
+        if entry.board_id in places:
+            # Two cameras may know the target by different boards: its own frame has the same points for both.
+            out[key] = _Target(rotation, shift, max(far) * _FRAME, ALONE)
+        else:
+            out[key] = _Target(rotation, shift, np.array([*far, 0.0]) * _CORNERS, turns_of(board))
+    return out
+
+
+_FRAME = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+_CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 0.0]])
+ALONE = (Rigid3.identity(),)
+
+
+def mounts_of(names: Sequence[str], seen: Sequence[Sights], places: Places) -> tuple[list[Rigid3], tuple[str, ...]]:
+    """Return cam_from_rig of every camera, along a tree of pairs that share the most targets, and what is not sure
+    about them, in words.
 
     Raises InputError where a camera shares none.
     """
+    targets = [_targets(own, places) for own in seen]
     mounts: dict[int, Rigid3] = {0: Rigid3.identity()}
+    notes: list[str] = []
     while len(mounts) < len(seen):
         edges = [(i, j) for i in mounts for j in range(len(seen)) if j not in mounts]
-        i, j = max(edges, key=lambda e: len(seen[e[0]].keys() & seen[e[1]].keys()))
-        shared = sorted(seen[i].keys() & seen[j].keys())
+        i, j = max(edges, key=lambda e: len(targets[e[0]].keys() & targets[e[1]].keys()))
+        shared = sorted(targets[i].keys() & targets[j].keys())
         if not shared:
             raise InputError(
                 f"rig: camera '{names[j]}' shares no board in any frame with '{names[0]}' or the cameras that hang "
                 "together with it; take frames in which both see a board, and check the names of the frames"
             )
-        mounts[j] = _motion([(seen[i][key], seen[j][key]) for key in shared]) @ mounts[i]
-    return [mounts[k] for k in range(len(seen))]
+        motion, rival = _motion([(targets[i][key], targets[j][key]) for key in shared])
+        if rival is not None:
+            notes.append(
+                f"look: cameras '{names[i]}' and '{names[j]}' share {len(shared)} boards, which look the same turned: "
+                f"turned by {np.degrees(rotation_angle(rival.rotation @ motion.rotation.T)):.0f} deg the one against "
+                "the other would fit as well; the smaller turn is taken. Tilt the board differently in more frames, or "
+                "use one with an odd and an even number of corners"
+            )
+        mounts[j] = motion @ mounts[i]
+    return [mounts[k] for k in range(len(seen))], tuple(notes)
 
 
-def _motion(pairs: Sequence[tuple[Seen, Seen]]) -> Rigid3:
-    """Return cam2_from_cam1: of the motions of the single boards, turned in all ways that look the same, the one that
-    most boards agree on, and then the middle of those that do."""
-    owner, poses, corners = [], [], []
-    for k, (a, b) in enumerate(pairs):
-        board = a.view.board
-        for turns in _same_looks(board):
-            owner.append(k)
-            poses.append((a.cam_from_board, b.turned(turns).cam_from_board))
-            corners.append(board.points()[[0, board.columns - 1, -board.columns, -1]])
-    r1, r2 = (np.array([p[i].rotation for p in poses]) for i in (0, 1))
-    t1, t2 = (np.array([p[i].translation_mm for p in poses]) for i in (0, 1))
+def _motion(pairs: Sequence[tuple[_Target, _Target]]) -> tuple[Rigid3, Rigid3 | None]:
+    """Return cam2_from_cam1: of the motions of the single targets, counted in all ways that look the same, the one that
+    most targets agree on, and then the middle of those that do; and another one that they agree on as well."""
+    owner = [k for k, (_, b) in enumerate(pairs) for _ in b.ways]
+    ways, levers = _stack([way for _, b in pairs for way in b.ways])
+    r1, r2 = (np.array([pairs[k][i].rotation for k in owner]) for i in (0, 1))
+    t1, t2 = (np.array([pairs[k][i].translation_mm for k in owner]) for i in (0, 1))
+    r2 = r2 @ np.swapaxes(ways, -1, -2)
+    t2 = t2 - np.einsum("nij,nj->ni", r2, levers)
     rotation = r2 @ np.swapaxes(r1, -1, -2)
     shift = t2 - np.einsum("nij,nj->ni", rotation, t1)
-    points = np.array(corners)
+    points = np.array([pairs[k][0].points for k in owner])
     x1, x2 = (np.einsum("nij,ncj->nci", r, points) + t[:, None] for r, t in ((r1, t1), (r2, t2)))
     distance = np.linalg.norm(x2, axis=-1).mean(axis=-1)
     starts = np.flatnonzero(np.diff([-1, *owner]))
-    best, usual = np.zeros(0), np.inf
-    for k in range(0, len(owner), -(-len(owner) // MAX_TRIED)):
-        off = np.linalg.norm(x1 @ rotation[k].T + shift[k] - x2, axis=-1).mean(axis=-1) / distance
-        typical = float(np.median(np.minimum.reduceat(off, starts)))
-        if typical < usual:
-            best, usual = off, typical
-    near = best <= AGREE * usual + 1e-12
-    middle = nearest_rotation(np.median(rotation[near], axis=0))
-    return Rigid3(middle, np.median(shift[near], axis=0))
+    tried = np.arange(0, len(owner), -(-len(owner) // MAX_TRIED))
+    apart_mm = np.einsum("hij,ncj->hnci", rotation[tried], x1) + shift[tried, None, None] - x2
+    offs = np.sqrt(np.einsum("hnci,hnci->hnc", apart_mm, apart_mm)).mean(axis=-1) / distance
+    usual = np.median(np.minimum.reduceat(offs, starts, axis=1), axis=1)
+    angle = rotation_angle(rotation[tried])
+    # Of those that fit alike, cameras are more likely mounted alike than turned against each other.
+    best = int(np.argmin(usual))
+    alike = np.flatnonzero(usual <= RIVAL * usual[best] + 1e-9)
+    turned = rotation_angle(rotation[tried[alike]] @ rotation[tried[best]].T)
+    rivals = alike[turned > OTHER_RAD]
+    ambiguous = len(rivals) > 0 and any(len(b.ways) > 1 for _, b in pairs)
+    if ambiguous:
+        best = int(min([best, *rivals.tolist()], key=lambda m: angle[m]))
+    near = offs[best] <= AGREE * usual[best] + 1e-12
+    middle = Rigid3(nearest_rotation(np.median(rotation[near], axis=0)), np.median(shift[near], axis=0))
+    if not ambiguous:
+        return middle, None
+    others = [m for m in alike.tolist() if rotation_angle(rotation[tried[m]] @ middle.rotation.T) > OTHER_RAD]
+    return middle, Rigid3(rotation[tried[others[0]]], shift[tried[others[0]]]) if others else None
 
 
-def _same_looks(board: Board) -> tuple[int, ...]:
-    """Return the quarter turns after which the board looks as before."""
-    if not board.looks_same_turned:
-        return (0,)
-    square = board.columns == board.rows and board.columns % 2 == 0 and board.square_x_mm == board.square_y_mm
-    return (0, 1, 2, 3) if square else (0, 2)
-
-
-def turned_alike(seen: Sequence[Mapping[Key, Seen]], mounts: Sequence[Rigid3]) -> list[dict[Key, Seen]]:
+def turned_alike(seen: Sequence[Sights], mounts: Sequence[Rigid3], places: Places) -> list[Sights]:
     """Return the views with every board counted from the corner from which the first camera that sees it counts."""
-    out: list[dict[Key, Seen]] = []
+    out: list[Sights] = []
     for k, own in enumerate(seen):
-        mine: dict[Key, Seen] = {}
+        mine: Sights = {}
         for key, entry in own.items():
             before = next((i for i in range(k) if key in seen[i]), None)
-            looks = _same_looks(entry.view.board)
-            if before is None or len(looks) == 1:
+            looks = same_looks(entry.view.board)
+            if before is None or len(looks) == 1 or entry.board_id in places:
                 mine[key] = entry
                 continue
             expected = mounts[k] @ mounts[before].inverse() @ out[before][key].cam_from_board
             points = entry.view.board.points()
-            ways = [entry.turned(turns) for turns in looks]
+            ways = [entry.counted(turns) for turns in looks]
             off = [float(np.linalg.norm(w.cam_from_board.apply(points) - expected.apply(points))) for w in ways]
             mine[key] = ways[int(np.argmin(off))]
         out.append(mine)
     return out
 
 
-def apart(seen: Sequence[Mapping[Key, Seen]], mounts: Sequence[Rigid3], cameras: Sequence[Camera]) -> dict[Key, float]:
-    """Return how far apart two cameras put each board that they share, in px: the worst pair of cameras, the better of
-    its two directions (a board's pose may be bad in one of the images)."""
+def apart(
+    seen: Sequence[Sights], mounts: Sequence[Rigid3], cameras: Sequence[Camera], places: Places
+) -> dict[Key, float]:
+    """Return how far apart the boards that share a pose put each other, in px: of two cameras the better of the two
+    directions (a board's pose may be bad in one of the images), the worst pair of cameras or of boards."""
     out: dict[Key, float] = {}
+    best = [_most_seen(own) for own in seen]
+    all_corners = [_Corners.of(own) for own in seen]
     for i in range(len(seen)):
-        for j in range(i + 1, len(seen)):
-            motion = mounts[j] @ mounts[i].inverse()
-            shared = sorted(seen[i].keys() & seen[j].keys())
-            if not shared:
-                continue
-            first, second = ([own[key] for key in shared] for own in (seen[i], seen[j]))
-            there = _transfer_px(first, second, motion, cameras[j])
-            back = _transfer_px(second, first, motion.inverse(), cameras[i])
-            for key, off in zip(shared, np.minimum(there, back).tolist(), strict=True):
-                out[key] = max(out.get(key, 0.0), off)
+        for j in range(i, len(seen)):
+            there = _transfer_px(best[i], all_corners[j], mounts[j] @ mounts[i].inverse(), cameras[j], places)
+            back = there
+            if i != j:
+                back = _transfer_px(best[j], all_corners[i], mounts[i] @ mounts[j].inverse(), cameras[i], places)
+            for key in there:
+                out[key] = max(out.get(key, 0.0), min(there[key], back[key]))
     return out
 
 
-def _transfer_px(first: Sequence[Seen], second: Sequence[Seen], motion: Rigid3, camera: Camera) -> FloatArray:
-    """Return the RMS distance of each board's corners in the second camera from where the first's pose puts them."""
-    counts = [len(s.view.grid) for s in second]
-    rotation = np.repeat(motion.rotation @ np.array([s.cam_from_board.rotation for s in first]), counts, axis=0)
-    shift = np.repeat(motion.apply(np.array([s.cam_from_board.translation_mm for s in first])), counts, axis=0)
-    points = np.concatenate([s.view.points() for s in second])
-    pixels, valid = camera.project((rotation @ points[..., None])[..., 0] + shift)
-    use = valid & np.concatenate([s.kept for s in second])
-    off = pixels - np.concatenate([s.view.pixels for s in second])
+@dataclass(frozen=True, eq=False, slots=True)
+class _Corners:
+    """All corners that a camera saw, entry by entry: the entries, how many corners each has, the corners on their
+    boards (N, 3) mm and in the image (N, 2), and which were kept (N,)."""
+
+    entries: list[Seen]
+    counts: IntArray
+    points: Points
+    pixels: Pixels
+    kept: BoolArray
+
+    @classmethod
+    def of(cls, own: Sights) -> _Corners:
+        entries = list(own.values())
+        boards = {e.board_id: e.view.board for e in entries}
+        table = {name: board.points() for name, board in boards.items()}
+        rows = [table[e.board_id][e.view.grid[:, 1] * boards[e.board_id].columns + e.view.grid[:, 0]] for e in entries]
+        counts = np.array([len(r) for r in rows], dtype=np.int64)
+        pixels, kept = [e.view.pixels for e in entries], [e.kept for e in entries]
+        return cls(entries, counts, np.concatenate(rows), np.concatenate(pixels), np.concatenate(kept))
+
+
+def _transfer_px(
+    first: Mapping[Key, Seen], second: _Corners, motion: Rigid3, camera: Camera, places: Places
+) -> dict[Key, float]:
+    """Return the RMS distance of each target's corners in the second camera from where the first's pose puts them, the
+    worst board where there are several."""
+    chosen = np.array([first.get(e.key, e) is not e for e in second.entries])
+    if not chosen.any():
+        return {}
+    entries = [e for e, c in zip(second.entries, chosen, strict=True) if c]
+    counts, mask = second.counts[chosen], np.repeat(chosen, second.counts)
+    turn, place = target_poses([first[e.key] for e in entries], places)
+    turn, place = motion.rotation @ turn, motion.apply(place)
+    if places:
+        own, lever = _places_of(entries, places)
+        turn, place = turn @ own, place + (turn @ lever[..., None])[..., 0]
+    in_cam = (np.repeat(turn, counts, axis=0) @ second.points[mask, :, None])[..., 0] + np.repeat(place, counts, axis=0)
+    pixels, valid = camera.project(in_cam)
+    use = valid & second.kept[mask]
+    off = pixels - second.pixels[mask]
     squared = np.where(use, np.einsum("ni,ni->n", off, off), 0.0)
     starts = np.cumsum([0, *counts[:-1]])
     number = np.add.reduceat(use.astype(np.float64), starts)
-    return np.where(number > 0, np.sqrt(np.add.reduceat(squared, starts) / np.maximum(number, 1.0)), np.inf)
+    rms = np.where(number > 0, np.sqrt(np.add.reduceat(squared, starts) / np.maximum(number, 1.0)), np.inf)
+    out: dict[Key, float] = {}
+    for entry, value in zip(entries, rms.tolist(), strict=True):
+        out[entry.key] = max(out.get(entry.key, 0.0), value)
+    return out
 
 
 def first_frames(
-    keys: Sequence[Key], seen: Sequence[Mapping[Key, Seen]], mounts: Sequence[Rigid3]
+    keys: Sequence[Key], seen: Sequence[Sights], mounts: Sequence[Rigid3], places: Places
 ) -> tuple[Mat3, Points]:
-    """Return rig_from_board of every (frame, board), from the camera that sees most of its corners."""
-    rotation: list[FloatArray] = []
-    translation: list[FloatArray] = []
-    for key in keys:
-        k = max((k for k in range(len(seen)) if key in seen[k]), key=lambda k: int(seen[k][key].kept.sum()))
-        pose = mounts[k].inverse() @ seen[k][key].cam_from_board
-        rotation.append(pose.rotation)
-        translation.append(pose.translation_mm)
-    return np.array(rotation), np.array(translation)
+    """Return rig_from_target of every key, from the view that has the most of its corners."""
+    best: dict[Key, tuple[int, int, Seen]] = {}
+    for k, own in enumerate(seen):
+        for key, entry in _most_seen(own).items():
+            count = int(entry.kept.sum())
+            if key not in best or count > best[key][0]:
+                best[key] = (count, k, entry)
+    rotation, shift = target_poses([best[key][2] for key in keys], places)
+    back = [m.inverse() for m in mounts]
+    turn, place = _stack([back[best[key][1]] for key in keys])
+    return turn @ rotation, (turn @ shift[..., None])[..., 0] + place

@@ -1,105 +1,85 @@
 """The joint least squares of a rig, on top of the normal equations of single cameras.
 
-A camera sees a board of frame f at  R = Rc Rf,  t = Rc tf + tc. A perturbation (w, dt) of the frame's pose and (e, ds)
-of the camera's mount, both from the left, move the board in the camera by
+A camera sees board b of the target of frame f at  R = Rc Rf Rb,  t = Rc (Rf tb + tf) + tc. Perturbations from the left,
+(w, dt) of the target's pose, (e, ds) of the camera's mount and (b, du) of the board's place on its target, move the
+board in the camera by
 
-    w_cam = Rc w + e,      dt_cam = Rc dt + e x (Rc tf) + ds,
+    w_cam = Rc w + e + Rc Rf b,      dt_cam = Rc dt + (Rc w) x (Rc Rf tb) + ds + e x (t - tc) + Rc Rf du,
 
-so the six columns of each view's own pose are carried over to frame and mount by two 6x6 matrices.
+so the six columns of each view's own pose are carried over to target, mount and place by 6x6 matrices.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, IntArray, Mat3, Points
-from rigkit.calibration.normal import Normal, Residuals, Step, normal_equations
-from rigkit.calibration.observations import Observations
+from rigkit.arrays import FloatArray, IntArray
+from rigkit.calibration.camera_prior import camera_prior
+from rigkit.calibration.normal import Normal, Residuals, normal_equations
 from rigkit.calibration.result import Convergence
-from rigkit.calibration.shape import ShapeModel
-from rigkit.calibration.solver import Linearised, State, minimise
-from rigkit.cameras.base import Camera
-from rigkit.detections import BoardView
-from rigkit.errors import RigkitError
+from rigkit.calibration.rig_state import RigObservations, RigState
+from rigkit.calibration.solver import COST_TOLERANCE, Linearised, minimise
 from rigkit.geometry.rotation import exp_so3, skew
 
-__all__ = ["RigObservations", "RigState", "rig_normal", "solve_rig"]
+__all__ = ["Carried", "RigSolution", "carried", "refine_frames", "rig_normal", "solve_rig"]
+
+FRAME_ITERATIONS = 30
+FRAME_TOLERANCE = 1e-8
+FRAME_DAMPING = 1e-6
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class RigObservations:
-    """What every camera saw.
+class Carried:
+    """How a view's own pose (w_cam, dt_cam) follows from the poses of target, mount and place: (V, 6, 6) or (6, 6)
+    each; `place` is None where no target has several boards."""
 
-    Attributes
-    ----------
-    cameras : observations of each camera.
-    weights : (V_c, C_c) of each camera, zero for corners to ignore.
-    shapes : points of the boards in the order of each camera's table, as shapes without unknowns.
-    frame : (V_c,) int of each camera, row of each view's (frame, board) in `keys`.
-    keys : (frame, board) of every pose.
+    target: FloatArray
+    mount: FloatArray
+    place: FloatArray | None
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RigSolution:
+    """The state found, the normal equations there with all priors, and how the solver ended."""
+
+    state: RigState
+    normal: Normal
+    convergence: Convergence
+
+
+def carried(observations: RigObservations, state: RigState, c: int, translation_mm: FloatArray) -> Carried:
+    """Return how the views of camera `c`, at `translation_mm` (V, 3) from it, follow from the rig's poses."""
+    turn = state.mount_rotation[c]
+    target = np.zeros((6, 6))
+    target[:3, :3] = target[3:, 3:] = turn
+    mount = np.zeros((len(translation_mm), 6, 6))
+    mount[:] = np.eye(6)
+    mount[:, 3:, :3] = -skew(translation_mm - state.mount_mm[c])
+    if not observations.tied:
+        return Carried(target, mount, None)
+    place = np.zeros_like(mount)
+    place[:, :3, :3] = place[:, 3:, 3:] = turn @ state.frame_rotation[observations.frame[c]]
+    lever = np.einsum("vij,vj->vi", place[:, :3, :3], state.board_mm[observations.cameras[c].board])
+    each = np.broadcast_to(target, mount.shape).copy()
+    each[:, 3:, :3] = -skew(lever) @ turn
+    return Carried(each, mount, place)
+
+
+def rig_normal(observations: RigObservations, state: RigState, sigma_px: float = 0.0) -> Normal:
+    """Return the normal equations over the globals (`RigState.layout`) and the targets' poses.
+
+    `sigma_px`, the standard deviation of a corner, sets residuals against the priors of cameras and shape; zero for no
+    priors.
     """
-
-    cameras: tuple[Observations, ...]
-    weights: tuple[FloatArray, ...]
-    shapes: tuple[ShapeModel, ...]
-    frame: tuple[IntArray, ...]
-    keys: tuple[tuple[str, str], ...]
-
-    @classmethod
-    def from_views(
-        cls,
-        views: Sequence[Sequence[tuple[tuple[str, str], BoardView]]],
-        kept: Sequence[Sequence[np.ndarray]],
-        points: dict[str, Points],
-    ) -> RigObservations:
-        """Build from ((frame, board), view) of each camera, the corners kept of each, and the boards' points."""
-        keys = {key: i for i, key in enumerate(dict.fromkeys(key for own in views for key, _ in own))}
-        cameras, weights, shapes, frame = [], [], [], []
-        for own, masks in zip(views, kept, strict=True):
-            observations = Observations.from_views([view for _, view in own])
-            mask = np.zeros(observations.present.shape, dtype=bool)
-            for i, m in enumerate(masks):
-                mask[i, : len(m)] = m
-            cameras.append(observations)
-            weights.append(np.where(mask, observations.weight, 0.0))
-            table = np.concatenate([points[b.board_id] for b in observations.boards])
-            shapes.append(ShapeModel("flat", table, np.zeros((len(table), 3, 0)), np.zeros(0)))
-            frame.append(np.array([keys[key] for key, _ in own], dtype=np.int64))
-        return cls(tuple(cameras), tuple(weights), tuple(shapes), tuple(frame), tuple(keys))
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class RigState:
-    """Cameras, their mounts cam_from_rig (n, 3, 3), (n, 3) mm, the first the identity, and rig_from_board of every
-    (frame, board): (F, 3, 3), (F, 3) mm."""
-
-    cameras: tuple[Camera, ...]
-    mount_rotation: Mat3
-    mount_mm: Points
-    frame_rotation: Mat3
-    frame_mm: Points
-
-    def of_camera(self, c: int, observations: RigObservations) -> State:
-        """Return the state of camera `c` alone, every view with its pose in that camera."""
-        f = observations.frame[c]
-        rotation = self.mount_rotation[c] @ self.frame_rotation[f]
-        translation = self.frame_mm[f] @ self.mount_rotation[c].T + self.mount_mm[c]
-        return State(self.cameras[c], rotation, translation, observations.shapes[c], np.zeros(0))
-
-
-def rig_normal(observations: RigObservations, state: RigState) -> Normal:
-    """Return the normal equations: globals are all intrinsics, then the mounts of all cameras but the first."""
-    sizes = [c.parameters.size for c in state.cameras]
-    first = np.concatenate([[0], np.cumsum(sizes)])
-    count = int(first[-1]) + 6 * (len(sizes) - 1)
-    frames = len(observations.keys)
+    layout = state.layout(observations)
+    count, poses = layout.count, len(observations.keys)
     gg, g = np.zeros((count, count)), np.zeros(count)
-    gp, pp, p = np.zeros((frames, count, 6)), np.zeros((frames, 6, 6)), np.zeros((frames, 6))
-    costs = np.zeros(frames)
+    gp, pp, p = np.zeros((poses, count, 6)), np.zeros((poses, 6, 6)), np.zeros((poses, 6))
+    costs = np.zeros(poses)
     residuals: tuple[Residuals, ...] = ()
+    prior = 0.0
     for c, own in enumerate(observations.cameras):
         alone = state.of_camera(c, observations)
         n = normal_equations(
@@ -112,57 +92,121 @@ def rig_normal(observations: RigObservations, state: RigState) -> Normal:
             observations.weights[c],
             None,
         )
-        f = observations.frame[c]
-        k = slice(int(first[c]), int(first[c + 1]))
-        by_frame = np.zeros((6, 6))
-        by_frame[:3, :3] = by_frame[3:, 3:] = state.mount_rotation[c]
-        gg[k, k] += n.gg
-        g[k] += n.g
-        gp[f, k] += n.gp @ by_frame
-        pp[f] += by_frame.T @ n.pp @ by_frame
-        p[f] += n.p @ by_frame
-        costs[f] += n.costs
         residuals += n.residuals
-        if c > 0:
-            m = slice(int(first[-1]) + 6 * (c - 1), int(first[-1]) + 6 * c)
-            by_mount = np.zeros((len(f), 6, 6))
-            by_mount[:] = np.eye(6)
-            by_mount[:, 3:, :3] = -skew(alone.translation_mm - state.mount_mm[c])
-            turned = np.swapaxes(by_mount, -1, -2)
-            gg[k, m] += (n.gp @ by_mount).sum(axis=0)
-            gg[m, k] = gg[k, m].T
-            gg[m, m] += (turned @ n.pp @ by_mount).sum(axis=0)
-            g[m] += (turned @ n.p[..., None]).sum(axis=0)[:, 0]
-            gp[f, m] += turned @ n.pp @ by_frame
-    return Normal(gg, gp, pp, g, p, costs, residuals)
+        f = observations.frame[c]
+        by = carried(observations, state, c, alone.translation_mm)
+        k, size = layout.cameras[c], alone.camera.parameters.size
+        parts: list[tuple[slice, slice]] = [(k, slice(0, size))]
+        if layout.shape.stop > layout.shape.start:
+            parts.append((layout.shape, slice(size, None)))
+        for there, here in parts:
+            g[there] += n.g[here]
+            for also, too in parts:
+                gg[there, also] += n.gg[here, too]
+        # Several views of a camera are of one pose only where targets have several boards.
+        add = _add_repeated if observations.tied else _add
+        for there, here in parts:
+            add(gp[:, there], f, n.gp[:, here] @ by.target)
+        by_target = np.swapaxes(by.target, -1, -2)
+        add(pp, f, by_target @ n.pp @ by.target)
+        add(p, f, (by_target @ n.p[..., None])[..., 0])
+        add(costs, f, n.costs)
+        everyone = np.arange(len(f))
+        free = [] if layout.mounts[c] is None else [(layout.mounts[c], by.mount, everyone)]
+        if by.place is not None:
+            boards = [(b, run) for b, run in enumerate(layout.boards) if run is not None]
+            free += [(run, by.place, np.flatnonzero(own.board == b)) for b, run in boards]
+        for run, how, views in free:
+            assert run is not None
+            turned = np.swapaxes(how[views], -1, -2)
+            moved = turned @ n.pp[views]
+            for there, here in parts:
+                gg[there, run] += (n.gp[views, here] @ how[views]).sum(axis=0)
+                gg[run, there] = gg[there, run].T
+            gg[run, run] += (moved @ how[views]).sum(axis=0)
+            g[run] += (turned @ n.p[views, :, None]).sum(axis=0)[:, 0]
+            add(gp[:, run], f[views], moved @ (by.target if by.target.ndim == 2 else by.target[views]))
+        if len(free) > 1 and layout.mounts[c] is not None:
+            m = layout.mounts[c]
+            for run, how, views in free[1:]:
+                gg[m, run] += (np.swapaxes(by.mount[views], -1, -2) @ n.pp[views] @ how[views]).sum(axis=0)
+                gg[run, m] = gg[m, run].T
+        if sigma_px > 0.0:
+            rows, residual = camera_prior(alone.camera)
+            gg[k, k] += sigma_px**2 * rows.T @ rows
+            g[k] -= sigma_px**2 * rows.T @ residual
+            prior += sigma_px**2 * float(residual @ residual)
+    if sigma_px > 0.0 and state.unknowns.size:
+        weight = (sigma_px / observations.shape.sigma) ** 2
+        at = np.arange(layout.shape.start, layout.shape.stop)
+        gg[at, at] += weight
+        g[at] -= weight * state.unknowns
+        prior += float((weight * state.unknowns**2).sum())
+    released = None
+    if observations.shape.kind == "released":
+        released = layout.shape.start + observations.shape.basis.shape[-1]
+    return Normal(gg, gp, pp, g, p, costs, residuals, prior, released)
 
 
-def solve_rig(observations: RigObservations, start: RigState) -> tuple[RigState, Normal, Convergence]:
-    """Return the state of least weighted squares from `start`, its normal equations, and how the solver ended."""
+def _add(total: FloatArray, row: IntArray, values: FloatArray) -> None:
+    total[row] += values
+
+
+def _add_repeated(total: FloatArray, row: IntArray, values: FloatArray) -> None:
+    np.add.at(total, row, values)
+
+
+def solve_rig(
+    observations: RigObservations, start: RigState, sigma_px: float, tolerance: float = COST_TOLERANCE
+) -> RigSolution:
+    """Return the state of least weighted squares from `start`, and how the solver ended.
+
+    `sigma_px` as for `rig_normal`; `tolerance` is the part of the cost that a step must promise to be taken.
+    """
+    layout = start.layout(observations)
 
     def linearise(state: RigState) -> Linearised:
-        normal = rig_normal(observations, state)
+        normal = rig_normal(observations, state, sigma_px)
         return Linearised(normal, normal)
 
-    state, last, convergence = minimise(start, linearise, _moved)
-    return state, last.normal, convergence
-
-
-def _moved(state: RigState, step: Step) -> RigState | None:
-    cameras, at = [], 0
-    for camera in state.cameras:
-        size = camera.parameters.size
-        try:
-            cameras.append(camera.with_parameters(camera.parameters + step.globals[at : at + size]))
-        except RigkitError:
-            return None
-        at += size
-    mounts = np.concatenate([np.zeros((1, 6)), step.globals[at:].reshape(-1, 6)])
-    return replace(
-        state,
-        cameras=tuple(cameras),
-        mount_rotation=exp_so3(mounts[:, :3]) @ state.mount_rotation,
-        mount_mm=state.mount_mm + mounts[:, 3:],
-        frame_rotation=exp_so3(step.poses[:, :3]) @ state.frame_rotation,
-        frame_mm=state.frame_mm + step.poses[:, 3:],
+    state, last, convergence = minimise(
+        start, linearise, lambda state, step: state.moved(step, layout), tolerance=tolerance
     )
+    return RigSolution(state, last.normal, convergence)
+
+
+def refine_frames(observations: RigObservations, state: RigState) -> tuple[RigState, Normal]:
+    """Return the state with the pose of every target at its own minimum, all else as it is, and the normal equations
+    there: Levenberg-Marquardt with a damping of its own for each pose."""
+    normal = rig_normal(observations, state)
+    damping = np.full(len(normal.pp), FRAME_DAMPING)
+    active = normal.costs > 0.0
+    for _ in range(FRAME_ITERATIONS):
+        if not active.any():
+            break
+        diagonal = np.diagonal(normal.pp, axis1=-2, axis2=-1)
+        diagonal = np.where(diagonal > 0.0, diagonal, 1.0)
+        system = normal.pp + (damping[:, None] * diagonal)[..., None] * np.eye(6)
+        step: FloatArray = np.asarray(np.linalg.solve(system, normal.p[..., None])[..., 0] * active[:, None], float)
+        predicted = (step * (damping[:, None] * diagonal * step + normal.p)).sum(axis=-1)
+        trial = replace(
+            state,
+            frame_rotation=exp_so3(step[:, :3]) @ state.frame_rotation,
+            frame_mm=state.frame_mm + step[:, 3:],
+        )
+        there = rig_normal(observations, trial)
+        better = active & (there.costs < normal.costs)
+        active &= (predicted > FRAME_TOLERANCE * normal.costs) & (damping < 1e10)
+        state = replace(
+            state,
+            frame_rotation=np.where(better[:, None, None], trial.frame_rotation, state.frame_rotation),
+            frame_mm=np.where(better[:, None], trial.frame_mm, state.frame_mm),
+        )
+        normal = replace(
+            normal,
+            pp=np.where(better[:, None, None], there.pp, normal.pp),
+            p=np.where(better[:, None], there.p, normal.p),
+            costs=np.where(better, there.costs, normal.costs),
+        )
+        damping = np.where(better, 0.1 * damping, 10.0 * damping)
+    return state, rig_normal(observations, state)

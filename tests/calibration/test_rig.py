@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 from helpers.calibration_scenes import BOARD, lens
 
+from rigkit.boards import Board
+from rigkit.calibration.normal import Step
+from rigkit.calibration.observations import Observations
 from rigkit.calibration.rig import calibrate_rig
-from rigkit.calibration.rig_solver import RigObservations, RigState, rig_normal
+from rigkit.calibration.rig_solver import rig_normal
+from rigkit.calibration.rig_state import RigObservations, RigState
+from rigkit.calibration.shape import shape_model
 from rigkit.calibration.solver import evaluate
 from rigkit.cameras.base import Camera
 from rigkit.detections import BoardView
@@ -91,40 +96,69 @@ def test_joint_solve_is_no_worse_than_single_ones(rng: np.random.Generator) -> N
         assert camera.rms_px < 1.1 * alone.rms_px
 
 
-def test_gradient_of_frames_and_mounts(rng: np.random.Generator) -> None:
-    views = rig_views(rng, 4)
-    kept = [[np.ones(54, dtype=bool) for _ in own] for own in views.values()]
-    keyed = [[((frame, "9x6"), view) for frame, view in own] for own in views.values()]
-    observations = RigObservations.from_views(keyed, kept, {"9x6": BOARD.points()})
-    frames = len(observations.keys)
+@pytest.mark.parametrize("kind", ["flat", "warp", "released"])
+@pytest.mark.parametrize("tied", [False, True])
+def test_gradient_and_gauss_newton_matrix(kind: str, tied: bool, rng: np.random.Generator) -> None:
+    """Central differences of the cost and of the residuals, by every kind of unknown."""
+    boards = [Board("a", 4, 3, 40.0, 40.0), Board("b", 3, 3, 50.0, 50.0)]
+    names = ["reg", "wide"]
+    views = [
+        BoardView(f"{name}{f}", b, b.grid(), 500.0 + 300.0 * rng.random((b.corner_count, 2)), np.ones(b.corner_count))
+        for name in names
+        for f in range(3)
+        for b in boards
+    ]
+    everything = Observations.from_views(views)
+    cameras = [everything.subset(np.arange(6 * c, 6 * c + 6)) for c in range(2)]
+    # Tied: both boards share the frame's pose; else each has its own.
+    frame = np.repeat(np.arange(3), 2) if tied else np.arange(6)
+    keys = tuple((str(k), "") for k in range(int(frame.max()) + 1))
+    weights = [rng.uniform(0.5, 2.0, own.present.shape) * own.present for own in cameras]
+    shape = shape_model(kind, everything)
+    observations = RigObservations(tuple(cameras), tuple(weights), shape, (frame, frame), keys, (False, tied))
+    poses = len(keys)
     state = RigState(
-        tuple(camera for camera, _ in mounts().values()),
-        np.array([m.rotation for _, m in mounts().values()]),
-        np.array([m.translation_mm for _, m in mounts().values()]),
-        exp_so3(0.3 * rng.normal(size=(frames, 3))),
-        np.array([-120.0, -75.0, 600.0]) + 20.0 * rng.normal(size=(frames, 3)),
+        tuple(mounts()[name][0] for name in names),
+        np.array([mounts()[name][1].rotation for name in names]),
+        np.array([mounts()[name][1].translation_mm for name in names]),
+        exp_so3(0.3 * rng.normal(size=(poses, 3))),
+        np.array([-60.0, -40.0, 600.0]) + 20.0 * rng.normal(size=(poses, 3)),
+        np.array([np.eye(3), exp_so3(0.5 * rng.normal(size=3)) if tied else np.eye(3)]),
+        np.array([np.zeros(3), 80.0 * rng.normal(size=3) if tied else np.zeros(3)]),
+        0.3 * rng.normal(size=shape.count),
     )
+    layout = state.layout(observations)
+    assert layout.count == 17 + 6 + (6 if tied else 0) + shape.count
     normal = rig_normal(observations, state)
-    analytic = -2.0 * np.concatenate([normal.g[-12:], normal.p.ravel()])
+    scale = np.ones(layout.count + 6 * poses)
+    for run, camera in zip(layout.cameras, state.cameras, strict=True):
+        scale[run] = 1e-2 * np.maximum(np.abs(camera.parameters), 1e-2)
 
-    def cost(x: np.ndarray) -> float:
-        mount = np.concatenate([np.zeros(6), x[:12]]).reshape(-1, 6)
-        frame = x[12:].reshape(-1, 6)
-        moved = RigState(
-            state.cameras,
-            exp_so3(mount[:, :3]) @ state.mount_rotation,
-            state.mount_mm + mount[:, 3:],
-            exp_so3(frame[:, :3]) @ state.frame_rotation,
-            state.frame_mm + frame[:, 3:],
-        )
-        return sum(
-            float(((evaluate(moved.of_camera(c, observations), own).px ** 2).sum(axis=-1) * w**2).sum())
-            for c, (own, w) in enumerate(zip(observations.cameras, observations.weights, strict=True))
+    def residuals(x: np.ndarray) -> np.ndarray:
+        moved = state.moved(Step(x[: layout.count], x[layout.count :].reshape(-1, 6), 0.0), layout)
+        assert moved is not None
+        return np.concatenate(
+            [
+                (evaluate(moved.of_camera(c, observations), own).px * w[..., None]).ravel()
+                for c, (own, w) in enumerate(zip(observations.cameras, observations.weights, strict=True))
+            ]
         )
 
-    h = 1e-5
-    numeric = np.array([(cost(h * e) - cost(-h * e)) / (2 * h) for e in np.eye(analytic.size)])
-    assert np.abs(numeric - analytic).max() < 1e-5 * np.abs(analytic).max()
+    h = 1e-5 * scale
+    jacobian = np.array(
+        [(residuals(-s * e) - residuals(s * e)) / (2 * s) for s, e in zip(h, np.eye(h.size), strict=True)]
+    )
+    gauss_newton = np.zeros((h.size, h.size))
+    gauss_newton[: layout.count, : layout.count] = normal.gg
+    for f in range(poses):
+        own = slice(layout.count + 6 * f, layout.count + 6 * f + 6)
+        gauss_newton[: layout.count, own] = normal.gp[f]
+        gauss_newton[own, : layout.count] = normal.gp[f].T
+        gauss_newton[own, own] = normal.pp[f]
+    numeric = (jacobian @ jacobian.T) * scale[:, None] * scale
+    assert np.abs(numeric - gauss_newton * scale[:, None] * scale).max() < 1e-5 * np.abs(numeric).max()
+    gradient = (jacobian @ residuals(np.zeros(h.size))) * scale
+    assert np.abs(gradient - np.concatenate([normal.g, normal.p.ravel()]) * scale).max() < 1e-5 * np.abs(gradient).max()
 
 
 def test_baseline_sigma_is_that_of_moved_mounts(rng: np.random.Generator) -> None:

@@ -10,7 +10,7 @@ from calibration.test_rig import NOISE_PX, SIGMAS, Views, mounts, rig_views, siz
 
 from rigkit.boards import Board
 from rigkit.calibration.rig import RigCalibration, calibrate_rig
-from rigkit.calibration.rig_frames import Seen
+from rigkit.calibration.rig_seen import Seen
 from rigkit.detections import BoardView
 from rigkit.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
@@ -82,8 +82,8 @@ def test_nothing_in_common_is_said(rng: np.random.Generator) -> None:
 def test_turned_counts_the_same_corners_from_elsewhere(board: Board, rng: np.random.Generator) -> None:
     pose = Rigid3(exp_so3(rng.normal(size=3)), rng.normal(size=3) * 100.0)
     view = BoardView("i", board, board.grid(), rng.random((board.corner_count, 2)), np.ones(board.corner_count))
-    seen = Seen(view, np.ones(board.corner_count, dtype=bool), pose, 0.0)
+    seen = Seen(view, np.ones(board.corner_count, dtype=bool), pose, np.zeros(board.corner_count), "f", ("f", "b"))
     for turns in (2,) if board.columns != board.rows else (1, 2, 3):
-        other = seen.turned(turns)
+        other = seen.counted(turns)
         assert not np.array_equal(other.view.grid, view.grid)
         assert np.allclose(other.cam_from_board.apply(other.view.points()), pose.apply(view.points()))

@@ -1,0 +1,276 @@
+"""Boards that are mounted to each other: which is which in every image, and where each roughly sits on their target.
+
+Boards that look alike, or that look the same turned, have no name and no first corner of their own; their arrangement
+gives them both. One scene (an image, or a frame of several cameras) that shows most of them is the reference; in every
+other scene all ways of naming and counting one board are tried, each fixes the target, and the one that puts the other
+boards of the scene where they are seen wins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rigkit.arrays import FloatArray
+from rigkit.boards import Board
+from rigkit.calibration.rig_seen import Places, Seen, Sights, same_looks
+from rigkit.errors import InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import nearest_rotation
+
+__all__ = ["board_places"]
+
+REFERENCES = 5
+"""Scenes tried as the reference: a bad one explains the others badly."""
+RIVAL = 3.0
+"""Another naming that fits nearly as well, within this factor, leaves the names of a scene open."""
+FITS = 0.1
+"""A board further from its place than this part of its distance from the camera is not where the target has it."""
+FLOOR = 1e-6
+"""Misfits below this part of the distance are rounding."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Way:
+    """One way of naming and counting a board seen, with its outer corners there, (4, 3) mm."""
+
+    seen: Seen
+    corners: FloatArray
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Entry:
+    """A board of a scene: its camera, its key there, the ways to read it, and its distance."""
+
+    camera: int
+    key: tuple[str, str]
+    ways: tuple[_Way, ...]
+    distance_mm: float
+
+
+def board_places(
+    groups: Sequence[Sequence[str]], seen: Sequence[Sights], boards: Mapping[str, Board]
+) -> tuple[list[Sights], Places, tuple[str, ...]]:
+    """Return the views with the boards of every group named and counted alike and given the key of their target, the
+    places of the boards, and what could not be tied, in words.
+
+    Parameters
+    ----------
+    groups : ids of the boards that are mounted to each other.
+    seen : of every camera.
+    boards : all boards by id.
+
+    Raises
+    ------
+    InputError
+        A board of a group is never seen together with the others, or they cannot be told apart.
+    """
+    out = [dict(own) for own in seen]
+    places: dict[str, tuple[str, Rigid3]] = {}
+    notes: list[str] = []
+    for group in groups:
+        members = [boards[name] for name in group]
+        scenes = _scenes(out, members)
+        found = _best_reference(scenes, members)
+        if found is None:
+            raise InputError(
+                f"rigid boards {', '.join(group)}: no image shows two of them; take images that show several at once"
+            )
+        known, readings = found
+        lonely = _never_read(group, known, scenes, readings)
+        if lonely is not None:
+            raise InputError(
+                f"rigid boards {', '.join(group)}: '{lonely}' is never seen together with the others; take images that "
+                "show it beside one of them"
+            )
+        first = next(name for name in group if name in known)
+        origin = known[first].inverse()
+        for name, pose in known.items():
+            places[name] = (first, origin @ pose)
+        open_scenes = 0
+        for scene, reading in zip(scenes, readings, strict=True):
+            open_scenes += reading is None and len(scene) > 1
+            own = out[scene[0].camera]
+            old = [own.pop(entry.key) for entry in scene]
+            for k, (entry, before) in enumerate(zip(scene, old, strict=True)):
+                frame, board_id = before.frame, entry.key[1]
+                way = None if reading is None else reading.get(k)
+                if way is not None:
+                    own[(frame, way.board_id)] = replace(way, key=(frame, first))
+                    continue
+                # Its place on the target is not known: it stays a view of a board of its own.
+                alone = f"{frame}, camera {entry.camera + 1} alone"
+                own[(alone, board_id)] = replace(before, key=(alone, board_id))
+        if open_scenes:
+            notes.append(
+                f"look: in {open_scenes} of {len(scenes)} images nothing tells which of the boards {', '.join(group)} "
+                "is which; there they count as boards of their own"
+            )
+    return out, places, tuple(notes)
+
+
+def _never_read(
+    group: Sequence[str],
+    known: Mapping[str, Rigid3],
+    scenes: Sequence[list[_Entry]],
+    readings: Sequence[Reading | None],
+) -> str | None:
+    """Return a board that was seen, but in no scene that tells its place."""
+    read: dict[str, bool] = {}
+    for scene, reading in zip(scenes, readings, strict=True):
+        for k, entry in enumerate(scene):
+            name = entry.key[1]
+            read[name] = read.get(name, False) or (reading is not None and k in reading)
+    return next((name for name in group if name not in known and not read.get(name, True)), None)
+
+
+def _scenes(seen: Sequence[Sights], members: Sequence[Board]) -> list[list[_Entry]]:
+    """Return the boards of the group in every image of every camera."""
+    names = {b.board_id for b in members}
+    scenes: dict[tuple[int, str], list[_Entry]] = {}
+    for c, own in enumerate(seen):
+        for key, entry in own.items():
+            if entry.board_id in names:
+                ways = tuple(_ways(entry, members))
+                distance = float(np.linalg.norm(ways[0].corners.mean(axis=0)))
+                scenes.setdefault((c, entry.frame), []).append(_Entry(c, key, ways, distance))
+    return list(scenes.values())
+
+
+def _ways(entry: Seen, members: Sequence[Board]) -> list[_Way]:
+    """Return every way to name and count the board; the one given comes first."""
+    own = entry.view.board
+    found = []
+    for board in sorted(members, key=lambda b: b.board_id != own.board_id):
+        straight = (
+            board.size == own.size and board.square_x_mm == own.square_x_mm and board.square_y_mm == own.square_y_mm
+        )
+        across = board.size == own.size[::-1] and board.square_x_mm == own.square_y_mm
+        across = across and board.square_y_mm == own.square_x_mm
+        turns = [*(same_looks(own) if straight else ()), *((1, 3) if across and own.columns != own.rows else ())]
+        for count in turns:
+            seen = entry.counted(count, board)
+            far = (board.columns - 1) * board.square_x_mm, (board.rows - 1) * board.square_y_mm
+            found.append(_Way(seen, seen.cam_from_board.apply(_corners(far))))
+    return found
+
+
+def _corners(far: tuple[float, float]) -> FloatArray:
+    return np.array([[0.0, 0.0, 0.0], [far[0], 0.0, 0.0], [0.0, far[1], 0.0], [far[0], far[1], 0.0]])
+
+
+Reading = dict[int, Seen]
+"""Number of the board in its scene -> how it is read."""
+
+
+def _best_reference(
+    scenes: Sequence[list[_Entry]], members: Sequence[Board]
+) -> tuple[dict[str, Rigid3], list[Reading | None]] | None:
+    """Return target_from_board of every board found, in the frame of the reference, and how every scene is read; None
+    where no scene has two boards."""
+    order = sorted((s for s in scenes if len(s) > 1), key=lambda s: -len(s))
+    best = None
+    for reference in order[:REFERENCES]:
+        known, readings, misfit = _read(reference, scenes, members)
+        if best is None or (len(known), -misfit) > (len(best[0]), -best[2]):
+            best = known, readings, misfit
+    return None if best is None else (best[0], best[1])
+
+
+def _read(
+    reference: list[_Entry], scenes: Sequence[list[_Entry]], members: Sequence[Board]
+) -> tuple[dict[str, Rigid3], list[Reading | None], float]:
+    """Read all scenes by one of them; the last number is the median misfit, as a part of the distance."""
+    far = {b.board_id: _corners(((b.columns - 1) * b.square_x_mm, (b.rows - 1) * b.square_y_mm)) for b in members}
+    known: dict[str, Rigid3] = {}
+    for entry in reference:
+        way = next((w.seen for w in entry.ways if w.seen.board_id not in known), None)
+        if way is not None:
+            known[way.board_id] = way.cam_from_board
+    readings: dict[int, Reading | None] = {}
+    misfits: list[float] = []
+    # Scenes that add a board to those known are read before the ones that need it.
+    waiting = sorted(range(len(scenes)), key=lambda i: -len(scenes[i]))
+    for last in (False, True):
+        left = []
+        for i in waiting:
+            reading, misfit = _named(scenes[i], known, far)
+            if reading is None and not last:
+                left.append(i)
+                continue
+            readings[i] = reading
+            if reading is not None:
+                misfits.append(misfit)
+        waiting = left
+    middles = _middles([r for r in readings.values() if r is not None], known)
+    return middles, [readings[i] for i in range(len(scenes))], float(np.median(misfits)) if misfits else np.inf
+
+
+def _named(
+    scene: list[_Entry], known: dict[str, Rigid3], far: Mapping[str, FloatArray]
+) -> tuple[Reading | None, float]:
+    """Return how a scene is read, None where nothing tells, and its misfit; boards that were not known are added to
+    `known` where the others fix the target."""
+    names = list(known)
+    ends = np.array([known[name].apply(far[name]) for name in names])
+    flat = [(k, w) for k, entry in enumerate(scene) for w in entry.ways]
+    corners = np.array([w.corners for _, w in flat])
+    reach = np.array([scene[k].distance_mm for k, _ in flat])
+    owner = np.array([k for k, _ in flat])
+    index = np.array([names.index(w.seen.board_id) if w.seen.board_id in known else -1 for _, w in flat])
+    if len(scene) == 1 and len(flat) > 1:
+        return None, np.inf
+    tried: list[tuple[float, dict[int, int], Rigid3]] = []
+    for h, (_, way) in enumerate(flat):
+        if index[h] < 0:
+            continue
+        scene_from_target = way.seen.cam_from_board @ known[way.seen.board_id].inverse()
+        expected = scene_from_target.apply(ends)
+        off = np.linalg.norm(corners - expected[np.maximum(index, 0)], axis=-1).mean(axis=-1) / reach
+        off[index < 0] = np.inf
+        chosen: dict[int, int] = {}
+        for m in np.argsort(off, kind="stable").tolist():
+            taken = {index[v] for v in chosen.values()}
+            if off[m] <= FITS and int(owner[m]) not in chosen and index[m] not in taken:
+                chosen[int(owner[m])] = m
+        total = sum(float(off[m]) for m in chosen.values()) / max(len(chosen) - 1, 1)
+        tried.append((total, chosen, scene_from_target))
+    if not tried:
+        return None, np.inf
+    most = max(len(chosen) for _, chosen, _ in tried)
+    if most < 2 and len(scene) > 1 and len(known) > 1:
+        # Boards of the group that fit no arrangement: they moved, or the scene shows none that is known.
+        unsure = len({tuple(c.items()) for _, c, _ in tried}) > 1
+        if unsure:
+            return None, np.inf
+    tried = sorted((t for t in tried if len(t[1]) == most), key=lambda t: t[0])
+    total, chosen, scene_from_target = tried[0]
+    rival = next((t for t, other, _ in tried if other != chosen), np.inf)
+    if most > 1 and rival <= RIVAL * max(total, FLOOR):
+        return None, np.inf
+    reading = {k: flat[m][1].seen for k, m in chosen.items()}
+    back = scene_from_target.inverse()
+    for k, entry in enumerate(scene):
+        vacant = [w.seen for w in entry.ways if w.seen.board_id not in known]
+        if k not in reading and vacant:
+            reading[k] = vacant[0]
+            known[vacant[0].board_id] = back @ vacant[0].cam_from_board
+    return reading, total
+
+
+def _middles(readings: Sequence[Reading], known: Mapping[str, Rigid3]) -> dict[str, Rigid3]:
+    """Return the places as most scenes have them, in the frame of the board that is seen most."""
+    by_name = [{s.board_id: s.cam_from_board for s in reading.values()} for reading in readings]
+    counts = {name: sum(name in scene for scene in by_name) for name in known}
+    anchor = max(known, key=lambda name: counts[name])
+    out = {}
+    for name, pose in known.items():
+        both = [scene[anchor].inverse() @ scene[name] for scene in by_name if name in scene and anchor in scene]
+        if name == anchor or not both:
+            out[name] = known[anchor].inverse() @ pose
+            continue
+        rotation = nearest_rotation(np.median([m.rotation for m in both], axis=0))
+        out[name] = Rigid3(rotation, np.median([m.translation_mm for m in both], axis=0))
+    return out

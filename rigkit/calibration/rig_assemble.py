@@ -1,0 +1,196 @@
+"""Putting a solved rig together as a result: covariances, each camera as the rig has it, the boards' places."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from rigkit.arrays import FloatArray
+from rigkit.boards import Board
+from rigkit.calibration.board_rig import BoardRig, PlacedBoard
+from rigkit.calibration.result import BoardShape, Calibration, ViewResult
+from rigkit.calibration.rig_joint import JointRig
+from rigkit.calibration.rig_result import RigCalibration, RigCamera
+from rigkit.calibration.rig_seen import Places
+from rigkit.calibration.rig_solver import carried
+from rigkit.calibration.rig_state import Layout, RigObservations
+from rigkit.errors import DegenerateError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import skew
+
+__all__ = ["assemble_rig", "residual_sigma"]
+
+
+def assemble_rig(
+    names: Sequence[str],
+    single: tuple[Calibration, ...],
+    joint: JointRig,
+    places: Places,
+    heldout: tuple[float | None, tuple[float | None, ...]],
+    spread: float,
+) -> RigCalibration:
+    """Return the rig; `heldout` is the error of frames that took no part, over all cameras and of each, and `spread` by
+    how much more the frames disagree than the corners' scatter explains.
+
+    Raises DegenerateError where there are fewer corners than unknowns.
+    """
+    observations, state, normal = joint.observations, joint.solution.state, joint.solution.normal
+    layout = state.layout(observations)
+    sigma = residual_sigma(joint)
+    unit, back, own = normal.covariance()
+    covariance = unit * (sigma * spread) ** 2
+    boards = observations.cameras[0].boards
+    points = observations.shape.points(state.unknowns)
+    first_row = observations.cameras[0].first_row
+    shapes = {b.board_id: points[first_row[i] : first_row[i + 1]] for i, b in enumerate(boards)}
+    cameras, squared = [], []
+    for c, name in enumerate(names):
+        alone = state.of_camera(c, observations)
+        residuals = normal.residuals[c]
+        kept = observations.weights[c] > 0.0
+        squared.append((residuals.px**2).sum(axis=-1)[kept])
+        px = np.where(residuals.valid[..., None], residuals.px, np.nan)
+        views = tuple(
+            ViewResult(v.image, v.board.board_id, pose, v.grid, v.pixels, r[: len(v.grid)], k[: len(v.grid)])
+            for v, pose, r, k in zip(
+                observations.cameras[c].views, Rigid3.stack(alone.rotation, alone.translation_mm), px, kept, strict=True
+            )
+        )
+        frame = _frame_covariance(observations, joint, layout, c, unit, back, own) * (sigma * spread) ** 2
+        p = alone.camera.parameters.size
+        of_camera = replace(
+            single[c],
+            camera=alone.camera,
+            rms_px=float(np.sqrt(squared[-1].mean())),
+            heldout_rms_px=heldout[1][c],
+            covariance=frame[:p, :p],
+            frame_covariance=frame,
+            views=views,
+            convergence=joint.solution.convergence,
+            boards=_shapes(single[c], observations, shapes),
+        )
+        mount = Rigid3(state.mount_rotation[c], state.mount_mm[c])
+        cameras.append(RigCamera(name, mount, of_camera))
+    everything = np.concatenate(squared)
+    last = layout.mounts[-1] or layout.cameras[-1]
+    # One ruler has measured all boards: its error does not average out.
+    scale = max((b.square_sigma_mm or 0.0) / min(b.square_x_mm, b.square_y_mm) for b in boards)
+    return RigCalibration(
+        cameras=tuple(cameras),
+        rms_px=float(np.sqrt(everything.mean())),
+        heldout_rms_px=heldout[0],
+        covariance=covariance[: last.stop, : last.stop],
+        sigma_px=sigma,
+        spread=spread,
+        single=single,
+        convergence=joint.solution.convergence,
+        corner_count=everything.size,
+        shared_count=joint.shared_count,
+        left_out=joint.left_out,
+        scale_sigma=scale,
+        board_rigs=_board_rigs(joint, layout, places, boards, shapes, covariance, scale),
+    )
+
+
+def residual_sigma(joint: JointRig) -> float:
+    """Return the standard deviation of a corner of median quality, degrees of freedom counted.
+
+    Raises DegenerateError where there are none.
+    """
+    observations, normal, state = joint.observations, joint.solution.normal, joint.solution.state
+    layout = state.layout(observations)
+    poses = int((np.einsum("fii->f", normal.pp) > 0.0).sum())
+    # Every unknown of the shape has a prior, which pays for it.
+    unknowns = layout.shape.start + 6 * poses
+    freedom = 2 * observations.corner_count - unknowns
+    if freedom <= 0:
+        raise DegenerateError("rig: fewer corners than unknowns; take more frames")
+    total = float(normal.costs.sum())
+    if state.unknowns.size:
+        total += joint.sigma_px**2 * float(((state.unknowns / observations.shape.sigma) ** 2).sum())
+    return float(np.sqrt(total / freedom))
+
+
+def _frame_covariance(
+    observations: RigObservations,
+    joint: JointRig,
+    layout: Layout,
+    c: int,
+    unit: FloatArray,
+    back: FloatArray,
+    own: FloatArray,
+) -> FloatArray:
+    """Return the covariance, for unit residuals, of the P parameters of camera `c` and of the mean motion of the boards
+    before it, (P + 6, P + 6), as `rigkit.calibration.assemble` has it for a camera alone."""
+    state = joint.solution.state
+    translation = state.of_camera(c, observations).translation_mm
+    f = observations.frame[c]
+    lever = np.zeros((len(f), 6, 6))
+    lever[:, :3, :3] = lever[:, 3:, 3:] = np.eye(3)
+    lever[:, 3:, :3] = skew(translation)
+    lever /= max(len(f), 1)
+    by = carried(observations, state, c, translation)
+    through_target = lever @ by.target
+    # The targets' poses follow the globals, pose = -W globals + what is their own.
+    mean = np.zeros((6, layout.count)) - np.einsum("vij,vjg->ig", through_target, back[f])
+    if layout.mounts[c] is not None:
+        mean[:, layout.mounts[c]] += (lever @ by.mount).sum(axis=0)
+    if by.place is not None:
+        for b, run in enumerate(layout.boards):
+            views = observations.cameras[c].board == b
+            if run is not None and views.any():
+                mean[:, run] += (lever[views] @ by.place[views]).sum(axis=0)
+    each = np.zeros((len(observations.keys), 6, 6))
+    np.add.at(each, f, through_target)
+    design = np.zeros((len(unit[layout.cameras[c]]) + 6, layout.count))
+    design[:-6, layout.cameras[c]] = np.eye(len(design) - 6)
+    design[-6:] = mean
+    out = design @ unit @ design.T
+    out[-6:, -6:] += np.einsum("fij,fjk,flk->il", each, own, each)
+    return np.asarray(0.5 * (out + out.T))
+
+
+def _shapes(alone: Calibration, observations: RigObservations, shapes: dict[str, FloatArray]) -> tuple[BoardShape, ...]:
+    """Return the shapes of the boards that the camera saw, as the rig has them."""
+    known = {b.board_id: b for b in alone.boards}
+    out = []
+    for name, points in shapes.items():
+        before = known.get(name)
+        if before is not None:
+            kind = observations.shape.kind
+            out.append(before if kind == "flat" else replace(before, kind=kind, points_mm=points))
+    return tuple(out)
+
+
+def _board_rigs(
+    joint: JointRig,
+    layout: Layout,
+    places: Places,
+    boards: Sequence[Board],
+    shapes: dict[str, FloatArray],
+    covariance: FloatArray,
+    scale: float,
+) -> tuple[BoardRig, ...]:
+    state = joint.solution.state
+    index = {b.board_id: i for i, b in enumerate(boards)}
+    out = []
+    for target in dict.fromkeys(target for target, _ in places.values()):
+        names = sorted((n for n, (t, _) in places.items() if t == target and n in index), key=lambda n: n != target)
+        placed = tuple(
+            PlacedBoard(boards[index[n]], shapes[n], Rigid3(state.board_rotation[index[n]], state.board_mm[index[n]]))
+            for n in names
+        )
+        runs = [layout.boards[index[n]] for n in names[1:]]
+        chosen = np.concatenate([np.arange(r.start, r.stop) for r in runs if r is not None] or [np.zeros(0)]).astype(
+            int
+        )
+        scenes: dict[tuple[int, str], int] = {}
+        for c, own in enumerate(joint.seen):
+            for entry in own.values():
+                if entry.key[1] == target and entry.board_id in names:
+                    scenes[(c, entry.frame)] = scenes.get((c, entry.frame), 0) + 1
+        count = sum(n > 1 for n in scenes.values())
+        out.append(BoardRig(placed, covariance[np.ix_(chosen, chosen)], count, scale))
+    return tuple(out)

@@ -1,0 +1,278 @@
+"""The joint solve of a rig with whatever does not fit left out, frame by frame."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rigkit.arrays import FloatArray, IntArray, Points
+from rigkit.calibration.observations import Observations
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.rig_frames import apart, first_frames, mounts_of, turned_alike
+from rigkit.calibration.rig_seen import Places, Sights
+from rigkit.calibration.rig_solver import RigSolution, solve_rig
+from rigkit.calibration.rig_state import Key, RigObservations, RigState, shape_unknowns
+from rigkit.calibration.shape import SHAPES, shape_model
+from rigkit.errors import DegenerateError, InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.progress import Progress
+
+__all__ = ["JointRig", "solve_jointly"]
+
+FAR_APART = 12.0
+"""Before the joint solve a board's pose in one image may be off by some pixels in the other: only more than this many
+times the usual distance is a board that moved."""
+DISAGREES = 3.5
+"""After it, sharing a pose costs a target six numbers for every view but one: on average sigma each. More than this
+many times sigma (or the usual, where lens and board are not quite what the models say) is no chance."""
+LEAST_PX = 0.02
+"""No corner is better than this: without noise the usual residual is rounding, and many times that is rounding too."""
+NOTHING_IN_COMMON = 30.0
+"""Where sharing poses usually costs this many sigmas, the cameras do not see the same."""
+MIN_SHARE = 0.5
+"""More of the shared targets must agree than disagree."""
+MAX_ROUNDS = 8
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class JointRig:
+    """A solved rig.
+
+    Attributes
+    ----------
+    observations, solution : what was used and what came out.
+    seen : of every camera, with the keys by which poses are shared.
+    sigma_px : prior standard deviation of a corner of median quality, from the cameras alone.
+    cost_sigmas : how many sigmas sharing a pose usually costs; about 1 where the models hold.
+    left_out : (frame, target, reason).
+    notes : what is not sure, in words.
+    """
+
+    observations: RigObservations
+    solution: RigSolution
+    seen: tuple[Sights, ...]
+    sigma_px: float
+    cost_sigmas: float
+    left_out: tuple[tuple[str, str, str], ...]
+    notes: tuple[str, ...]
+
+    @property
+    def frames(self) -> IntArray:
+        """Number of the frame of every pose, (F,)."""
+        frame = {entry.key: entry.frame for own in self.seen for entry in own.values()}
+        number = {name: i for i, name in enumerate(sorted(set(frame.values())))}
+        return np.array([number[frame[key]] for key in self.observations.keys], dtype=np.int64)
+
+    @property
+    def shared_count(self) -> int:
+        """Targets, counted in every frame, of which several views are tied."""
+        return len(_shared(self.seen))
+
+
+def solve_jointly(
+    names: Sequence[str],
+    seen: Sequence[Sights],
+    single: Sequence[Calibration],
+    places: Places,
+    progress: Progress,
+) -> JointRig:
+    """Solve for everything together, leaving out targets on which the cameras (or the target's boards) disagree.
+
+    Raises InputError where a camera shares nothing with the others, DegenerateError where too little is left.
+    """
+    mounts, notes = mounts_of(names, seen, places)
+    seen = turned_alike(seen, mounts, places)
+    shared = len(_shared(seen))
+    left_out = _part_far(seen, apart(seen, mounts, [result.camera for result in single], places))
+    sigma = _sigma(single)
+    for i in range(MAX_ROUNDS):
+        progress("rig", i, MAX_ROUNDS)
+        _require_agreement(names, seen, places, len(left_out), shared)
+        observations = _observations(seen, single, places, sigma)
+        start = RigState(
+            tuple(result.camera for result in single),
+            np.array([m.rotation for m in mounts]),
+            np.array([m.translation_mm for m in mounts]),
+            *first_frames(observations.keys, seen, mounts, places),
+            *_board_poses(observations.cameras[0], places),
+            _first_unknowns(observations, single),
+        )
+        solution = solve_rig(observations, start, sigma)
+        cost, count = _cost_of_sharing(observations, solution, seen)
+        usual = _usual(cost, sigma)
+        worse = _part_bad(seen, cost, count, usual) if i < MAX_ROUNDS - 1 else []
+        left_out += worse
+        if not worse:
+            break
+        state = solution.state
+        mounts = [Rigid3(r, t) for r, t in zip(state.mount_rotation, state.mount_mm, strict=True)]
+    progress("rig", MAX_ROUNDS, MAX_ROUNDS)
+    usual_sigmas = float(np.sqrt(usual) / max(sigma, LEAST_PX))
+    if usual_sigmas > NOTHING_IN_COMMON:
+        raise DegenerateError(
+            f"rig: that views share their boards' poses costs {usual_sigmas:.0f} times the corners' noise: they "
+            f"disagree on where the boards are; {_advice(seen)}"
+        )
+    return JointRig(observations, solution, tuple(seen), sigma, usual_sigmas, tuple(left_out), notes)
+
+
+def _sigma(single: Sequence[Calibration]) -> float:
+    """Return the standard deviation of a corner of median quality in the median camera."""
+    known = [c.sigma_px for c in single if np.isfinite(c.sigma_px) and c.sigma_px > 0.0]
+    return float(np.median(known)) if known else LEAST_PX
+
+
+def _observations(
+    seen: Sequence[Sights], single: Sequence[Calibration], places: Places, sigma: float
+) -> RigObservations:
+    """Pad the views of all cameras to one table of boards, weighted by how well each camera alone saw its corners."""
+    entries = [list(own.values()) for own in seen]
+    keys = {key: i for i, key in enumerate(dict.fromkeys(e.key for own in entries for e in own))}
+    everything = Observations.from_views([e.view for own in entries for e in own])
+    ends = np.cumsum([0, *(len(own) for own in entries)])
+    cameras, weights, frame = [], [], []
+    for own, first, last, alone in zip(entries, ends[:-1], ends[1:], single, strict=True):
+        observations = everything.subset(np.arange(first, last))
+        kept = np.zeros(observations.present.shape, dtype=bool)
+        squared = np.zeros(observations.present.shape)
+        kept[observations.present] = np.concatenate([e.kept for e in own])
+        squared[observations.present] = np.concatenate([e.squared_px for e in own])
+        if float(np.ptp(observations.sigma_px[observations.present])) > 0.0:
+            observations = observations.with_common_error(squared, kept)
+        # Cameras differ in how sharp they are: a residual counts in its own camera's standard deviations.
+        better = sigma / max(alone.sigma_px, LEAST_PX) if np.isfinite(alone.sigma_px) else 1.0
+        better = 1.0 if sigma <= LEAST_PX else better
+        cameras.append(observations)
+        weights.append(np.where(kept, better * observations.weight, 0.0))
+        frame.append(np.array([keys[e.key] for e in own], dtype=np.int64))
+    kind = max((b.kind for alone in single for b in alone.boards), key=SHAPES.index)
+    first_of = {target for target, _ in places.values()}
+    free = tuple(b.board_id in places and b.board_id not in first_of for b in everything.boards)
+    shape = shape_model(kind, everything)
+    return RigObservations(tuple(cameras), tuple(weights), shape, tuple(frame), tuple(keys), free)
+
+
+def _board_poses(observations: Observations, places: Places) -> tuple[FloatArray, FloatArray]:
+    """Return target_from_board of every board of the table."""
+    alone = ("", Rigid3.identity())
+    poses = [places.get(b.board_id, alone)[1] for b in observations.boards]
+    return np.array([p.rotation for p in poses]), np.array([p.translation_mm for p in poses])
+
+
+def _first_unknowns(observations: RigObservations, single: Sequence[Calibration]) -> FloatArray:
+    """Return the shape's unknowns that come nearest to the boards as the cameras found them alone, on average."""
+    if not observations.shape.count:
+        return np.zeros(0)
+    table = observations.cameras[0]
+    rows = {b.board_id: int(row) for b, row in zip(table.boards, table.first_row, strict=False)}
+    points: dict[int, list[Points]] = {}
+    for result in single:
+        for board in result.boards:
+            if board.board_id in rows:
+                points.setdefault(rows[board.board_id], []).append(board.points_mm)
+    return shape_unknowns(observations.shape, {row: np.mean(found, axis=0) for row, found in points.items()})
+
+
+def _shared(seen: Sequence[Sights]) -> dict[Key, int]:
+    """Return the targets of which several views share a pose, and how many."""
+    count = Counter(entry.key for own in seen for entry in own.values())
+    return {key: n for key, n in count.items() if n > 1}
+
+
+def _require_agreement(names: Sequence[str], seen: Sequence[Sights], places: Places, left: int, shared: int) -> None:
+    """Raise DegenerateError where so much was left out that the rest means nothing."""
+    if not left:
+        return
+    advice = _advice(seen)
+    if left > MIN_SHARE * shared:
+        raise DegenerateError(
+            f"rig: {left} of {shared} boards that several views share had to be left out because the views disagree on "
+            f"where they are; {advice}"
+        )
+    try:
+        mounts_of(names, seen, places)
+    except InputError as error:
+        raise DegenerateError(
+            f"{error}; {left} boards were left out because the cameras disagree on them: {advice}"
+        ) from error
+
+
+def _advice(seen: Sequence[Sights]) -> str:
+    if len(seen) > 1:
+        return "check that the images of a frame were taken at one moment"
+    return "check that the boards do not move against each other"
+
+
+def _cost_of_sharing(
+    observations: RigObservations, solution: RigSolution, seen: Sequence[Sights]
+) -> tuple[dict[Key, float], IntArray]:
+    """Return what it costs every shared target that its views have one pose, px^2 for each of the six numbers that
+    every view but one gives up, and the number of corners. A view that is bad in itself is no reason to distrust the
+    moment."""
+    poses = len(observations.keys)
+    alone, count, views = np.zeros(poses), np.zeros(poses, dtype=np.int64), np.zeros(poses)
+    for own, weight, frame, camera in zip(
+        seen, observations.weights, observations.frame, observations.cameras, strict=True
+    ):
+        squared = np.zeros(weight.shape)
+        squared[camera.present] = np.concatenate([e.squared_px for e in own.values()])
+        np.add.at(alone, frame, (weight**2 * squared).sum(axis=1))
+        np.add.at(count, frame, (weight > 0.0).sum(axis=1))
+        np.add.at(views, frame, 1.0)
+    excess = np.maximum(solution.normal.costs - alone, 0.0) / np.maximum(6.0 * (views - 1.0), 1.0)
+    shared = views > 1.0
+    return {key: float(e) for key, e, s in zip(observations.keys, excess, shared, strict=True) if s}, count
+
+
+def _usual(cost: Mapping[Key, float], sigma: float) -> float:
+    """Return the usual cost, px^2: the lower of two in the middle, so that of two targets the worse is the bad one."""
+    ordered = sorted(cost.values())
+    middle = ordered[(len(ordered) - 1) // 2] if ordered else 0.0
+    return max(middle, max(sigma, LEAST_PX) ** 2)
+
+
+def _part_bad(
+    seen: list[Sights], cost: Mapping[Key, float], count: IntArray, usual: float
+) -> list[tuple[str, str, str]]:
+    worst = max(cost.values(), default=0.0)
+    out = []
+    for key in sorted(cost):
+        # The worst ones first: they may be why the others look bad.
+        if cost[key] > max(DISAGREES**2 * usual, 0.25 * worst):
+            out.append((*key, _why(seen, key, f"{np.sqrt(cost[key] / usual):.1f} times the usual")))
+            _part(seen, key)
+    return out
+
+
+def _part_far(seen: list[Sights], off_px: Mapping[Key, float]) -> list[tuple[str, str, str]]:
+    shared = _shared(seen)
+    usual = max(float(np.median([off_px[key] for key in shared])) if shared else 0.0, LEAST_PX)
+    worst = max((off_px[key] for key in shared), default=0.0)
+    out = []
+    for key in sorted(shared):
+        if off_px[key] > max(FAR_APART * usual, 0.5 * worst):
+            words = f"by {off_px[key]:.2g} px, {off_px[key] / usual:.0f} times the usual"
+            out.append((*key, _why(seen, key, words)))
+            _part(seen, key)
+    return out
+
+
+def _why(seen: Sequence[Sights], key: Key, how: str) -> str:
+    cameras = [k for k, own in enumerate(seen) if any(e.key == key for e in own.values())]
+    if len(cameras) > 1:
+        return (
+            f"the cameras disagree on where it is ({how}); the board or the rig moved between the exposures, or they "
+            "are not of one moment"
+        )
+    return f"its boards disagree on where it is ({how}); one of them was moved against the others"
+
+
+def _part(seen: list[Sights], key: Key) -> None:
+    """Give every view of the target a pose of its own: they still support their camera's intrinsics."""
+    for k, own in enumerate(seen):
+        for place, entry in own.items():
+            if entry.key == key:
+                own[place] = replace(entry, key=(f"{entry.frame}, camera {k + 1} alone", entry.board_id))

@@ -1,0 +1,124 @@
+"""What a calibrated rig is: cameras, where they sit, how sure that is, and boards that were mounted to each other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.arrays import FloatArray, as_array
+from rigkit.calibration.board_rig import BoardRig
+from rigkit.calibration.result import Calibration, Convergence
+from rigkit.cameras.base import Camera
+from rigkit.errors import InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import skew
+
+__all__ = ["RigCalibration", "RigCamera"]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RigCamera:
+    """A camera of a rig: what it is called, where it sits, and its calibration as the rig's solution has it."""
+
+    name: str
+    cam_from_rig: Rigid3
+    calibration: Calibration
+
+    @property
+    def camera(self) -> Camera:
+        return self.calibration.camera
+
+    @property
+    def rms_px(self) -> float:
+        """Its own 2-D RMS in the rig, px."""
+        return self.calibration.rms_px
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RigCalibration:
+    """A calibrated rig.
+
+    Attributes
+    ----------
+    cameras : in the order given; the first is the rig's frame.
+    rms_px : 2-D RMS per corner over all cameras, sqrt(mean |residual|^2).
+    heldout_rms_px : the headline. The same over frames that took no part: k-fold over frames, all intrinsics, mounts
+        and places of boards frozen, only one pose a target refitted, by all cameras at once. None with too few frames.
+    covariance : of all intrinsics, camera by camera, then of the mounts of all cameras but the first: left perturbation
+        (rad) and translation (mm), six each.
+    sigma_px : standard deviation of a corner per coordinate, of median quality.
+    spread : by how much more the frames disagree than the corners' scatter alone explains, as a ratio of standard
+        deviations: 1 where the errors of a frame's corners are independent. All covariances count it in.
+    single : each camera calibrated alone, with its own verdicts.
+    convergence : of the joint solve.
+    corner_count : corners used.
+    shared_count : targets, counted in every frame, that several views share.
+    left_out : (frame, target, reason) of targets on which the views disagree: each camera's own calibration uses them,
+        the mounts do not.
+    scale_sigma : relative standard deviation of all lengths, from how well the boards' squares were measured.
+    board_rigs : boards that are mounted to each other.
+    verdicts : what is good and what is not, in words, the headline first.
+    """
+
+    cameras: tuple[RigCamera, ...]
+    rms_px: float
+    heldout_rms_px: float | None
+    covariance: FloatArray
+    sigma_px: float
+    spread: float
+    single: tuple[Calibration, ...]
+    convergence: Convergence
+    corner_count: int = 0
+    shared_count: int = 0
+    left_out: tuple[tuple[str, str, str], ...] = ()
+    scale_sigma: float = 0.0
+    board_rigs: tuple[BoardRig, ...] = ()
+    verdicts: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        count = sum(c.camera.parameters.size for c in self.cameras) + 6 * (len(self.cameras) - 1)
+        object.__setattr__(self, "covariance", as_array(self.covariance, (count, count), "covariance"))
+
+    def index(self, name: str) -> int:
+        """Return the position of the camera `name`; raises InputError that lists the names."""
+        names = [c.name for c in self.cameras]
+        if name not in names:
+            raise InputError(f"rig: no camera is called '{name}'; there are {', '.join(names)}")
+        return names.index(name)
+
+    def cam2_from_cam1(self, name1: str, name2: str) -> Rigid3:
+        """Return the motion from one camera to another."""
+        first, second = self.cameras[self.index(name1)], self.cameras[self.index(name2)]
+        return second.cam_from_rig @ first.cam_from_rig.inverse()
+
+    def baseline_mm(self, name1: str, name2: str) -> tuple[float, float]:
+        """Return the distance between the centres of two cameras and its standard deviation, mm.
+
+        The deviation is that of the corners' noise and of how well the boards' squares were measured.
+        """
+        first, second = self.index(name1), self.index(name2)
+        difference = self._centre(second) - self._centre(first)
+        length = float(np.linalg.norm(difference))
+        if length == 0.0:
+            raise InputError(f"rig: cameras '{name1}' and '{name2}' have the same centre")
+        row = np.zeros(len(self.covariance))
+        for k, sign in ((first, -1.0), (second, 1.0)):
+            if k > 0:
+                row[self.mount(k)] += sign * (difference / length @ self._centre_jacobian(k))
+        variance = float(row @ self.covariance @ row)
+        return length, float(np.sqrt(max(variance, 0.0) + (length * self.scale_sigma) ** 2))
+
+    def mount(self, k: int) -> slice:
+        """Return where the mount of camera `k` > 0 stands in the covariance."""
+        first = sum(c.camera.parameters.size for c in self.cameras) + 6 * (k - 1)
+        return slice(first, first + 6)
+
+    def _centre(self, k: int) -> FloatArray:
+        return self.cameras[k].cam_from_rig.inverse().translation_mm
+
+    def _centre_jacobian(self, k: int) -> FloatArray:
+        """Return d centre / d (w, dt) of c = -R^T t for R <- exp(w) R, t <- t + dt."""
+        pose = self.cameras[k].cam_from_rig
+        back = pose.rotation.T
+        return np.concatenate([-back @ skew(pose.translation_mm), -back], axis=1)

@@ -1,0 +1,171 @@
+"""What a rig's cameras saw, and everything that is solved for: cameras, mounts, targets and their places.
+
+A target is what keeps its shape while it moves before the cameras: a single board, or several boards mounted to each
+other, whose frame is that of the first of them. The camera c sees board b of the target of frame f at
+
+    cam_from_board = cam_from_rig[c] rig_from_target[f] target_from_board[b].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rigkit.arrays import BoolArray, FloatArray, IntArray, Mat3, Points
+from rigkit.calibration.normal import Step
+from rigkit.calibration.observations import Observations
+from rigkit.calibration.shape import ShapeModel
+from rigkit.calibration.solver import State
+from rigkit.cameras.base import Camera
+from rigkit.errors import RigkitError
+from rigkit.geometry.rotation import exp_so3
+
+__all__ = ["Key", "Layout", "RigObservations", "RigState", "shape_unknowns"]
+
+Key = tuple[str, str]
+"""(frame, target): views that have a key in common see the same target in the same place."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Layout:
+    """Where each kind of unknown stands among the globals: intrinsics of all cameras, mounts of all but the first, the
+    boards that have a place of their own on their target, the boards' shape."""
+
+    cameras: tuple[slice, ...]
+    mounts: tuple[slice | None, ...]
+    boards: tuple[slice | None, ...]
+    shape: slice
+
+    @classmethod
+    def of(cls, sizes: Sequence[int], places: Sequence[bool], shape: int) -> Layout:
+        """Lay out cameras of so many parameters each, boards that have a place to find or not, and the shape."""
+        ends = np.cumsum([*sizes, *[6] * (len(sizes) - 1), *[6] * sum(places), shape]).tolist()
+        runs = iter([slice(a, b) for a, b in zip([0, *ends[:-1]], ends, strict=True)])
+        cameras = tuple(next(runs) for _ in sizes)
+        mounts = (None, *(next(runs) for _ in sizes[1:]))
+        boards = tuple(next(runs) if place else None for place in places)
+        return cls(cameras, mounts, boards, next(runs))
+
+    @property
+    def count(self) -> int:
+        """Number of globals."""
+        return int(self.shape.stop)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RigObservations:
+    """What every camera saw.
+
+    Attributes
+    ----------
+    cameras : observations of each camera; all have the same table of boards.
+    weights : (V_c, C) of each camera, zero for corners to ignore: weighted residuals are in px of a corner of median
+        quality.
+    shape : how the boards' points depend on the shape's unknowns.
+    frame : (V_c,) int of each camera, row of each view's key in `keys`.
+    keys : (frame, target) of every pose.
+    places : (B,) whether a board has a place to find on its target (the first one of a target is its frame).
+    """
+
+    cameras: tuple[Observations, ...]
+    weights: tuple[FloatArray, ...]
+    shape: ShapeModel
+    frame: tuple[IntArray, ...]
+    keys: tuple[Key, ...]
+    places: tuple[bool, ...]
+
+    @property
+    def tied(self) -> bool:
+        """Whether any target has several boards."""
+        return any(self.places)
+
+    @property
+    def corner_count(self) -> int:
+        """Number of corners used."""
+        return int(sum(int((w > 0.0).sum()) for w in self.weights))
+
+    def subset(self, poses: BoolArray) -> RigObservations:
+        """Return the views of the poses chosen (F,); all poses stay in the table."""
+        chosen = [np.flatnonzero(poses[f]) for f in self.frame]
+        return replace(
+            self,
+            cameras=tuple(own.subset(c) for own, c in zip(self.cameras, chosen, strict=True)),
+            weights=tuple(w[c] for w, c in zip(self.weights, chosen, strict=True)),
+            frame=tuple(f[c] for f, c in zip(self.frame, chosen, strict=True)),
+        )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RigState:
+    """Cameras, their mounts cam_from_rig (n, 3, 3), (n, 3) mm, the first the identity, rig_from_target of every key
+    (F, 3, 3), (F, 3) mm, target_from_board of every board (B, 3, 3), (B, 3) mm, and the shape's unknowns."""
+
+    cameras: tuple[Camera, ...]
+    mount_rotation: Mat3
+    mount_mm: Points
+    frame_rotation: Mat3
+    frame_mm: Points
+    board_rotation: Mat3
+    board_mm: Points
+    unknowns: FloatArray
+
+    def layout(self, observations: RigObservations) -> Layout:
+        """Return where the unknowns stand."""
+        return Layout.of([c.parameters.size for c in self.cameras], observations.places, observations.shape.count)
+
+    def of_camera(self, c: int, observations: RigObservations) -> State:
+        """Return the state of camera `c` alone, every view with its pose in that camera."""
+        f = observations.frame[c]
+        rotation, place = self.frame_rotation[f], self.frame_mm[f]
+        if observations.tied:
+            b = observations.cameras[c].board
+            place = place + np.einsum("vij,vj->vi", rotation, self.board_mm[b])
+            rotation = rotation @ self.board_rotation[b]
+        rotation = self.mount_rotation[c] @ rotation
+        translation = place @ self.mount_rotation[c].T + self.mount_mm[c]
+        return State(self.cameras[c], rotation, translation, observations.shape, self.unknowns)
+
+    def moved(self, step: Step, layout: Layout) -> RigState | None:
+        """Return the state after a step, None where the parameters make no camera."""
+        cameras = []
+        for camera, own in zip(self.cameras, layout.cameras, strict=True):
+            try:
+                cameras.append(camera.with_parameters(camera.parameters + step.globals[own]))
+            except RigkitError:
+                return None
+        mounts, boards = _steps(step.globals, layout.mounts), _steps(step.globals, layout.boards)
+        return RigState(
+            tuple(cameras),
+            exp_so3(mounts[:, :3]) @ self.mount_rotation,
+            self.mount_mm + mounts[:, 3:],
+            exp_so3(step.poses[:, :3]) @ self.frame_rotation,
+            self.frame_mm + step.poses[:, 3:],
+            exp_so3(boards[:, :3]) @ self.board_rotation,
+            self.board_mm + boards[:, 3:],
+            self.unknowns + step.globals[layout.shape],
+        )
+
+    def with_frames(self, other: RigState) -> RigState:
+        """Return this state with the poses of the targets of another."""
+        return replace(self, frame_rotation=other.frame_rotation, frame_mm=other.frame_mm)
+
+
+def _steps(step: FloatArray, runs: Sequence[slice | None]) -> FloatArray:
+    return np.array([np.zeros(6) if run is None else step[run] for run in runs]).reshape(-1, 6)
+
+
+def shape_unknowns(shape: ShapeModel, points: Mapping[int, Points]) -> FloatArray:
+    """Return the unknowns whose points come nearest to `points`, by first row in the shape's table: the warp first,
+    then what it leaves to released corners."""
+    off = np.zeros_like(shape.flat)
+    for row, own in points.items():
+        off[row : row + len(own)] = own - shape.flat[row : row + len(own)]
+    count = shape.basis.shape[-1]
+    warp: FloatArray = np.zeros(0)
+    if count:
+        warp = np.asarray(np.linalg.lstsq(shape.basis.reshape(-1, count), off.reshape(-1), rcond=None)[0], float)
+    if shape.kind != "released":
+        return warp
+    return np.concatenate([warp, (off - shape.basis @ warp).reshape(-1)])

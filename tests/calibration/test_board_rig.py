@@ -1,0 +1,194 @@
+"""Boards mounted to each other: their geometry and its sigmas, naming by arrangement, what they do for a camera."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.board_rig_scenes import ALIKE, DIFFERENT, corner_of_a_room, target_views
+from helpers.calibration_scenes import lens
+
+from rigkit.boards import Board
+from rigkit.calibration.rig import RigCalibration, calibrate_rig
+from rigkit.cameras.base import Camera
+from rigkit.detections import BoardView
+from rigkit.errors import DegenerateError, InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import angle_between, exp_so3
+from rigkit.truth import Feature
+
+NOISE_PX = 0.1
+SIGMAS = 4.0
+"""Further from the truth in its own standard deviations is wrong: 1 in 16000 by chance."""
+REG: dict[str, tuple[Camera, Rigid3]] = {"reg": (lens("reg"), Rigid3.identity())}
+PAIR: dict[str, tuple[Camera, Rigid3]] = {
+    **REG,
+    "wide": (lens("wide"), Rigid3(exp_so3(np.array([0.02, -0.1, 0.3])), [-120.0, 15.0, 5.0])),
+}
+MODELS = {"reg": "brown", "wide": "kannala_brandt"}
+Views = dict[str, list[tuple[str, BoardView]]]
+
+
+def solve(views: Views, boards: tuple[Board, ...], board: str = "flat", folds: int = 0) -> RigCalibration:
+    sizes = {name: PAIR[name][0].size_px for name in views}
+    models = {name: MODELS[name] for name in views}
+    return calibrate_rig(
+        views, sizes, model=models, board=board, rigid_boards=[[b.board_id for b in boards]], folds=folds
+    )
+
+
+def true_angle_deg(room: dict[str, Rigid3], a: str, b: str) -> float:
+    return float(180.0 - np.degrees(angle_between(room[a].rotation[:, 2], room[b].rotation[:, 2])))
+
+
+def errors_in_sigmas(rig: RigCalibration, room: dict[str, Rigid3], boards: tuple[Board, ...]) -> list[float]:
+    """Angles, distances of centres, and distances of first corners to the other boards' planes."""
+    found = rig.board_rigs[0]
+    middle = {b.board_id: room[b.board_id].apply(b.points().mean(axis=0)) for b in boards}
+    out = []
+    for a, b in [(a.board_id, b.board_id) for a in boards for b in boards if a is not b]:
+        angle, sigma = found.angle_deg(a, b)
+        out.append((angle - true_angle_deg(room, a, b)) / sigma)
+        length, sigma = found.distance_mm(Feature(a, centre=True), Feature(b, centre=True))
+        out.append((length - float(np.linalg.norm(middle[a] - middle[b]))) / sigma)
+        height, sigma = found.distance_mm(Feature(b), Feature(a, grid=(0, 0)))
+        true = abs(float(room[b].rotation[:, 2] @ (room[a].translation_mm - room[b].translation_mm)))
+        out.append((height - true) / sigma)
+    return out
+
+
+def check_sigmas(cameras: dict[str, tuple[Camera, Rigid3]], frames: int, runs: int, low: float, high: float) -> None:
+    z = []
+    focal = []
+    for seed in range(runs):
+        rng = np.random.default_rng(seed)
+        room = corner_of_a_room(rng, DIFFERENT)
+        views = target_views(rng, cameras, DIFFERENT, room, frames, noise_px=NOISE_PX, distance_mm=1000.0)
+        rig = solve(views, DIFFERENT)
+        assert rig.left_out == () and rig.sigma_px == pytest.approx(NOISE_PX, rel=0.15)
+        z += errors_in_sigmas(rig, room, DIFFERENT)
+        for camera in rig.cameras:
+            off = camera.camera.parameters - cameras[camera.name][0].parameters
+            focal.append(off[0] / camera.calibration.parameter_sigmas[0])
+    assert low < np.sqrt(np.mean(np.square(z))) < high
+    # One number a run, so twice as loose where there are few runs.
+    assert 2.0 * low - 1.0 < np.sqrt(np.mean(np.square(focal))) < 2.0 * high - 1.0
+
+
+def test_sigmas_are_those_of_the_errors() -> None:
+    check_sigmas(REG, 4, 12, 0.75, 1.35)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("cameras", "frames"), [(REG, 1), (REG, 4), (PAIR, 6)], ids=["image", "camera", "rig"])
+def test_sigmas_by_monte_carlo(cameras: dict[str, tuple[Camera, Rigid3]], frames: int) -> None:
+    """100 runs know a standard deviation to 7 %; all of them together promise 15 %."""
+    check_sigmas(cameras, frames, 100, 0.85, 1.15)
+
+
+@pytest.mark.parametrize("board", ["flat", "warp"])
+def test_boards_that_look_alike_are_told_by_their_arrangement(board: str, rng: np.random.Generator) -> None:
+    """Names and first corners are random in every image."""
+    room = corner_of_a_room(rng, ALIKE)
+    views = target_views(rng, REG, ALIKE, room, 8, noise_px=NOISE_PX, distance_mm=1000.0, shuffled=True)
+    rig = solve(views, ALIKE, board)
+    assert rig.left_out == () and rig.verdicts == ()
+    assert rig.sigma_px == pytest.approx(NOISE_PX, rel=0.1)
+    found = rig.board_rigs[0]
+    assert found.image_count == 8
+    pairs = [("plane1", "plane2"), ("plane1", "plane3"), ("plane2", "plane3")]
+    true = sorted(true_angle_deg(room, *pair) for pair in pairs)
+    for (angle, sigma), expected in zip(sorted(found.angle_deg(*pair) for pair in pairs), true, strict=True):
+        assert abs(angle - expected) < SIGMAS * sigma
+
+
+def test_one_image_is_as_good_as_three_boards_alone(rng: np.random.Generator) -> None:
+    """With one image there is nothing to tie: as many unknowns, the same camera; and the boards' geometry."""
+    room = corner_of_a_room(rng, DIFFERENT)
+    views = target_views(rng, REG, DIFFERENT, room, 1, noise_px=NOISE_PX, distance_mm=1000.0)
+    rig = solve(views, DIFFERENT)
+    off = rig.cameras[0].camera.parameters - rig.single[0].camera.parameters
+    # The priors are weighed by two estimates of the noise.
+    assert np.abs(off / rig.single[0].parameter_sigmas).max() < 0.02
+    assert max(abs(e) for e in errors_in_sigmas(rig, room, DIFFERENT)) < SIGMAS
+
+
+def test_ties_make_a_camera_surer() -> None:
+    """Three images: 30 unknown numbers of poses and places instead of 54."""
+    tied, alone = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        room = corner_of_a_room(rng, DIFFERENT)
+        views = target_views(rng, REG, DIFFERENT, room, 3, noise_px=NOISE_PX, distance_mm=1000.0)
+        rig = solve(views, DIFFERENT)
+        truth = lens("reg").parameters
+        tied.append(rig.cameras[0].camera.parameters[:4] - truth[:4])
+        alone.append(rig.single[0].camera.parameters[:4] - truth[:4])
+        assert (rig.cameras[0].calibration.parameter_sigmas[:4] < rig.single[0].parameter_sigmas[:4]).all()
+    assert np.square(tied).mean() < 0.6 * np.square(alone).mean()
+
+
+def test_cameras_that_see_different_boards_of_a_target(rng: np.random.Generator) -> None:
+    """No board is seen by both cameras in one frame; the target links them."""
+    room = corner_of_a_room(rng, DIFFERENT)
+    views = target_views(rng, PAIR, DIFFERENT, room, 12, noise_px=NOISE_PX, distance_mm=1000.0)
+    views["wide"] = [(f, v) for f, v in views["wide"] if v.board.board_id == "floor" or int(f) % 3 == 0]
+    views["reg"] = [(f, v) for f, v in views["reg"] if v.board.board_id != "floor" or int(f) % 3 == 1]
+    views["reg"] = [(f, v) for f, v in views["reg"] if int(f) % 3 != 0]
+    shared = {(f, v.board.board_id) for f, v in views["reg"]} & {(f, v.board.board_id) for f, v in views["wide"]}
+    views["reg"] = [(f, v) for f, v in views["reg"] if (f, v.board.board_id) not in shared]
+    views["reg"] += [
+        (f + "x", v)
+        for f, v in target_views(rng, REG, DIFFERENT, room, 3, noise_px=NOISE_PX, distance_mm=1000.0)["reg"]
+    ]
+    rig = solve(views, DIFFERENT)
+    length, sigma = rig.baseline_mm("reg", "wide")
+    assert abs(length - np.linalg.norm(PAIR["wide"][1].translation_mm)) < SIGMAS * sigma < 4.0
+    assert max(abs(e) for e in errors_in_sigmas(rig, room, DIFFERENT)) < SIGMAS
+
+
+def test_a_board_that_was_moved_once_is_left_out(rng: np.random.Generator) -> None:
+    room = corner_of_a_room(rng, DIFFERENT)
+    views = target_views(rng, REG, DIFFERENT, room, 8, noise_px=NOISE_PX, distance_mm=1000.0)
+    views["reg"] = [
+        (f, replace(v, pixels=v.pixels + 3.0) if (f, v.board.board_id) == ("004", "left") else v)
+        for f, v in views["reg"]
+    ]
+    rig = solve(views, DIFFERENT)
+    assert [(frame, target) for frame, target, _ in rig.left_out] == [("004", "floor")]
+    assert "one of them was moved" in rig.left_out[0][2]
+    assert max(abs(e) for e in errors_in_sigmas(rig, room, DIFFERENT)) < SIGMAS
+
+
+def test_boards_that_are_not_mounted_to_each_other_are_refused(rng: np.random.Generator) -> None:
+    views: Views = {"reg": []}
+    for k in range(6):
+        room = corner_of_a_room(rng, DIFFERENT)
+        room["left"] = Rigid3(room["left"].rotation, room["left"].translation_mm + 20.0 * rng.normal(size=3))
+        own = target_views(rng, REG, DIFFERENT, room, 1, noise_px=NOISE_PX, distance_mm=1000.0)["reg"]
+        views["reg"] += [(f"{k}", replace(view, image=f"{k}.png")) for _, view in own]
+    with pytest.raises(DegenerateError, match="do not move against each other"):
+        solve(views, DIFFERENT)
+
+
+def test_bad_groups_are_explained(rng: np.random.Generator) -> None:
+    room = corner_of_a_room(rng, DIFFERENT)
+    views = target_views(rng, REG, DIFFERENT, room, 6, noise_px=NOISE_PX, distance_mm=1000.0)
+    with pytest.raises(InputError, match="no image shows board 'roof'"):
+        calibrate_rig(views, {"reg": lens("reg").size_px}, model="brown", rigid_boards=[["floor", "roof"]])
+    apart = {"reg": [(f, v) for f, v in views["reg"] if (v.board.board_id == "right") == (int(f) % 2 == 0)]}
+    with pytest.raises(InputError, match="'right' is never seen together"):
+        solve(apart, DIFFERENT)
+    alone = {"reg": [(f, v) for f, v in views["reg"] if v.board.board_id == DIFFERENT[int(f) % 3].board_id]}
+    with pytest.raises(InputError, match="no image shows two of them"):
+        solve(alone, DIFFERENT)
+
+
+def test_held_out_error_of_a_tied_camera(rng: np.random.Generator) -> None:
+    """Frames that took no part fit with one pose for three boards: the noise, a little more."""
+    room = corner_of_a_room(rng, DIFFERENT)
+    views = target_views(rng, PAIR, DIFFERENT, room, 10, noise_px=NOISE_PX, distance_mm=1000.0)
+    rig = solve(views, DIFFERENT, folds=5)
+    assert rig.heldout_rms_px == pytest.approx(np.sqrt(2.0) * NOISE_PX, rel=0.05)
+    assert all(c.calibration.heldout_rms_px is not None for c in rig.cameras)
