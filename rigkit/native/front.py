@@ -85,10 +85,8 @@ def loaded() -> ctypes.CDLL | None:
     for name in ("shrink", "smooth", "typical_values"):
         getattr(library, name).restype = None
     library.find_peaks.argtypes = [address, size, size, c_float, *[address] * 3]
-    library.find_corners.argtypes = [
-        *(_Image, POINTER(RingRules), address, size, c_double, c_double),
-        *(address, address, size, *[address] * 5),
-    ]
+    rings = (_Image, POINTER(RingRules), address, size, c_double, c_double)
+    library.find_corners.argtypes = [*rings, address, address, size, *[address] * 5]
     library.mark_known.argtypes = [address, size, address, size, c_double, address]
     library.find_links.argtypes = [
         *(POINTER(_Corners), _Image, c_double, c_double, POINTER(LinkRules)),
