@@ -13,11 +13,12 @@ import numpy as np
 
 from rigkit.arrays import BoolArray
 from rigkit.calibration.assemble import assemble, require_determined
+from rigkit.calibration.evidence import fit_shape
 from rigkit.calibration.fit import Fit, fit_kept, fit_model, heldout_rms, robust_sigma
 from rigkit.calibration.moved import moved_lens
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration, Candidate
-from rigkit.calibration.shape import SHAPES, shape_model
+from rigkit.calibration.shape import SHAPES
 from rigkit.calibration.uncertainty import uncertainty_at_corners
 from rigkit.calibration.usable import usable_views
 from rigkit.calibration.verdicts import judge
@@ -197,11 +198,7 @@ def _compared(observations: Observations, options: list[_Option], folds: int, pr
 def _shapes(
     observations: Observations, flat: _Option, kinds: Sequence[str], folds: int, progress: Progress
 ) -> list[_Option]:
-    options = []
-    for kind in kinds:
-        shape = shape_model(kind, observations)
-        start = replace(flat.fit.state, shape=shape, unknowns=np.zeros(shape.count))
-        options.append(_Option(f"board {kind}", fit_kept(observations, start, flat.fit.kept, settle=True)))
+    options = [_Option(f"board {kind}", fit_shape(observations, flat.fit, kind)) for kind in kinds]
     return _compared(observations, options, folds, progress)
 
 

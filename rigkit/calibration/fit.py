@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray
+from rigkit.arrays import BoolArray, FloatArray, IntArray
 from rigkit.calibration.initialise import initialise
 from rigkit.calibration.normal import Normal, Residuals
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.poses import find_poses, refine_poses
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.solver import State, evaluate, solve
-from rigkit.cameras.base import Camera
+from rigkit.cameras.base import Camera, image_center
 from rigkit.errors import DegenerateError
 
 __all__ = ["OUTLIER_SIGMAS", "Fit", "fit_kept", "fit_model", "heldout_rms", "inliers", "robust_sigma"]
@@ -21,6 +21,11 @@ __all__ = ["OUTLIER_SIGMAS", "Fit", "fit_kept", "fit_model", "heldout_rms", "inl
 OUTLIER_SIGMAS = 5.0
 """A corner is an outlier when its weighted 2-D residual exceeds this many robust standard deviations per coordinate,
 sigma = median |r| / 1.177: by chance alone 4 corners in a million do."""
+RINGS, RING_CORNERS = 8, 50
+"""Corners scatter more towards the rim of the image, where squares are small and blurred: the rule takes the scatter of
+the ring around the middle that a corner lies in, of so many with as many corners each, but no fewer than 50."""
+RING_FACTOR = 4.0
+"""No ring scatters more than this many times as much as all corners: beyond it the corners in it are bad ones."""
 RAYLEIGH_MEDIAN = 1.17741
 """Median of |r| of a 2-D Gaussian with unit standard deviation per coordinate."""
 CAUCHY_SIGMAS = 2.5
@@ -68,7 +73,7 @@ class Fit:
         return float(np.sqrt(squared.mean())) if squared.size else float("nan")
 
 
-def sigma_of(norm: FloatArray, used: BoolArray) -> float:
+def sigma_of(norm: FloatArray, used: BoolArray | IntArray) -> float:
     """Return the robust standard deviation per coordinate, median |r| / 1.177, of the corners `used`."""
     chosen = norm[used]
     if not chosen.size:
@@ -84,9 +89,21 @@ def robust_sigma(fit: Fit, observations: Observations) -> float:
     return sigma_of(fit.norm(observations), observations.present)
 
 
-def inliers(norm: FloatArray, observations: Observations, sigma_px: float) -> BoolArray:
+def inliers(norm: FloatArray, observations: Observations, sigma_px: float, size_px: tuple[int, int]) -> BoolArray:
     """Return which corners the rule keeps, (V, C), from their weighted residuals."""
-    return np.asarray(observations.present & (norm <= OUTLIER_SIGMAS * sigma_px))
+    present = observations.present
+    kept = present & (norm <= OUTLIER_SIGMAS * sigma_px)
+    if (kept == present).all():
+        return kept
+    own = norm[present]
+    middle = image_center(size_px)
+    order = np.argsort(((observations.pixels[present] - middle) ** 2).sum(axis=-1))
+    limit = np.empty(len(own))
+    for ring in np.array_split(order, min(max(len(own) // RING_CORNERS, 1), RINGS)):
+        scatter = sigma_of(own, ring)
+        limit[ring] = OUTLIER_SIGMAS * min(max(scatter, sigma_px), RING_FACTOR * sigma_px)
+    kept[present] = own <= limit
+    return kept
 
 
 def fit_model(observations: Observations, size_px: tuple[int, int], model: type[Camera], order: int | None) -> Fit:
@@ -111,7 +128,7 @@ def fit_model(observations: Observations, size_px: tuple[int, int], model: type[
             "tilted, and check the board's size"
         )
     sigma, state, norm = best
-    return _settled(observations, state, norm, inliers(norm, observations, sigma), SETTLE_ROUNDS)
+    return _settled(observations, state, norm, inliers(norm, observations, sigma, size_px), SETTLE_ROUNDS)
 
 
 def _robust(observations: Observations, state: State, norm: FloatArray) -> tuple[State, FloatArray]:
@@ -151,7 +168,7 @@ def _settled(observations: Observations, state: State, norm: FloatArray, kept: B
         weight = np.where(kept, observations.weight, 0.0)
         solution = solve(observations, state, weight=weight, prior_sigma_px=sigma_of(norm, kept))
         state, norm = solution.state, solution.data.residuals[0].weighted(observations)
-        agree = inliers(norm, observations, sigma_of(norm, kept))
+        agree = inliers(norm, observations, sigma_of(norm, kept), state.camera.size_px)
         if again == rounds or (agree == kept).all():
             break
         kept = agree

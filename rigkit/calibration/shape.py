@@ -1,7 +1,8 @@
 """The shape of the boards as part of the solution: flat, warped (a few numbers a board), or every corner released.
 
 A shape is linear in its unknowns: points = flat points + basis @ unknowns, each unknown with a Gaussian prior around
-zero in its own unit, so that what the views do not determine stays at the flat board.
+zero in its own unit, so that what the views do not determine stays at the flat board. How far released corners stray
+the views say themselves: see `rigkit.calibration.evidence`.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy as np
 from rigkit.arrays import BoolArray, FloatArray, Points
 from rigkit.calibration.observations import Observations
 
-__all__ = ["SHAPES", "ShapeModel", "shape_model"]
+__all__ = ["BOWS", "SHAPES", "STRETCHES", "WARP_UNKNOWNS", "ShapeModel", "often_seen", "shape_model"]
 
 SHAPES = ("flat", "warp", "released")
 
@@ -21,13 +22,21 @@ ASPECT_SIGMA = 3e-3
 """Prior of the print's aspect ratio: paper feeds are right to a few per mille."""
 SHEAR_SIGMA = 1e-3
 """Prior of the print's shear, rad."""
+STRETCH_SIGMA = 2e-3
+"""Prior of a stretch that changes over the print (a feed that does not run evenly), as a fraction of the board's half
+diagonal."""
 BOW_SIGMA = 1e-2
 """Prior of a bow, as a fraction of the board's half diagonal: weak, a board bent by more is visibly bent."""
 RELEASED_SIGMA_XY = 6e-4
-"""Prior of a released corner in the plane, as a fraction of the board's half diagonal (0.09 mm on 9x6 x 30 mm)."""
+"""Prior of a released corner in the plane before the views have been asked, as a fraction of the board's half diagonal
+(0.09 mm on 9x6 x 30 mm)."""
 RELEASED_SIGMA_Z = 3e-3
 """Prior of a released corner out of the plane, same unit (0.4 mm on 9x6 x 30 mm)."""
 
+WARP_UNKNOWNS = 11
+"""Of a board: aspect, shear, bows, stretches."""
+BOWS, STRETCHES = np.arange(2, 5), np.arange(5, 11)
+"""Which of them are lengths of one kind."""
 MIN_VIEWS = 3
 """A board in fewer views stays flat."""
 HELD = 1e-6
@@ -75,14 +84,14 @@ def shape_model(kind: str, observations: Observations) -> ShapeModel:
     unit = np.array([RELEASED_SIGMA_XY, RELEASED_SIGMA_XY, RELEASED_SIGMA_Z])
     size = [
         np.full(len(points), _half_diagonal(points) if often else HELD)
-        for points, often in zip(_per_board(observations, flat), _often(observations), strict=True)
+        for points, often in zip(_per_board(observations, flat), often_seen(observations), strict=True)
     ]
     released = (np.concatenate(size)[:, None] * unit).reshape(-1)
     return ShapeModel("released", flat, warp.basis, np.concatenate([warp.sigma, released]))
 
 
-def _often(observations: Observations) -> BoolArray:
-    """Say of which boards the shape can be told: those in several views (in one view a bow is a pose)."""
+def often_seen(observations: Observations) -> BoolArray:
+    """Say of which boards, (boards,), the shape can be told: those in several views (in one view a bow is a pose)."""
     return np.bincount(observations.board, minlength=len(observations.boards)) >= MIN_VIEWS
 
 
@@ -96,11 +105,11 @@ def _half_diagonal(points: Points) -> float:
 
 
 def _warp(observations: Observations, flat: Points) -> ShapeModel:
-    """Five unknowns a board: aspect, shear, bow along x, bow along y, twist (bows in mm at the centre, twist in mm at
-    the corner). An overall scale would only move the board away: it is not among them."""
-    per_board = 5
-    often = np.flatnonzero(_often(observations))
-    basis = np.zeros((len(flat), 3, per_board * len(often)))
+    """The unknowns of a board: aspect, shear, bow along x, bow along y, twist (bows in mm at the centre, twist in mm at
+    the corner), and six of a stretch that changes over the print (mm at the rim: x and y, each quadratic in x and y).
+    An overall scale would only move the board away: it is not among them."""
+    often = np.flatnonzero(often_seen(observations))
+    basis = np.zeros((len(flat), 3, WARP_UNKNOWNS * len(often)))
     sigma: list[float] = []
     for i, board in enumerate(often):
         rows = slice(observations.first_row[board], observations.first_row[board + 1])
@@ -108,10 +117,14 @@ def _warp(observations: Observations, flat: Points) -> ShapeModel:
         centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
         half = 0.5 * np.ptp(points, axis=0)
         x, y = ((points - centre)[:, :2]).T
-        block = basis[rows, :, per_board * i : per_board * (i + 1)]
+        block = basis[rows, :, WARP_UNKNOWNS * i : WARP_UNKNOWNS * (i + 1)]
         block[:, 0, 0], block[:, 1, 0] = 0.5 * x, -0.5 * y
         block[:, 0, 1], block[:, 1, 1] = 0.5 * y, 0.5 * x
-        block[:, 2, 2], block[:, 2, 3] = 1.0 - (x / half[0]) ** 2, 1.0 - (y / half[1]) ** 2
-        block[:, 2, 4] = x / half[0] * y / half[1]
-        sigma += [ASPECT_SIGMA, SHEAR_SIGMA, *[BOW_SIGMA * _half_diagonal(points)] * 3]
+        x, y = x / half[0], y / half[1]
+        block[:, 2, 2], block[:, 2, 3], block[:, 2, 4] = 1.0 - x**2, 1.0 - y**2, x * y
+        # Legendre's polynomials: a stretch is not to be taken for a shift.
+        stretch = np.stack([1.5 * x**2 - 0.5, x * y, 1.5 * y**2 - 0.5], axis=-1)
+        block[:, 0, 5:8] = block[:, 1, 8:11] = stretch
+        size = _half_diagonal(points)
+        sigma += [ASPECT_SIGMA, SHEAR_SIGMA, *[BOW_SIGMA * size] * 3, *[STRETCH_SIGMA * size] * 6]
     return ShapeModel("warp", flat, basis, np.array(sigma))
