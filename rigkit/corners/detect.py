@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from rigkit.boards import Board
 from rigkit.corners.fold import join_parts, split_folds
 from rigkit.corners.grow import SaddleIndex, grow_all
-from rigkit.corners.lattice import build_lattices
+from rigkit.corners.lattice import Lattice, build_lattices
 from rigkit.corners.links import find_links
 from rigkit.corners.origin import quarter_turns
-from rigkit.corners.response import grey_image, pyramid
+from rigkit.corners.response import FloatImage, grey_image, pyramid
 from rigkit.corners.saddle import find_corners
 from rigkit.corners.subpixel import RefinedLattice, refine
-from rigkit.corners.validate import known_part, large, separate, tidy, trustworthy
+from rigkit.corners.validate import known_part, large, sample_of, separate, tidy, trustworthy
 from rigkit.detections import BoardDetection
 
 __all__ = ["detect_boards"]
@@ -36,11 +36,22 @@ def find_lattices(image: NDArray[np.generic], min_corners: int) -> list[RefinedL
     corners, saddles = find_corners(levels)
     lattices = build_lattices(corners, find_links(corners, levels[0]))
     index = SaddleIndex(saddles)
-    grown = [part for lattice in grow_all(lattices, index, levels[0]) for part in split_folds(lattice)]
-    parts = separate([tidy(part, size_px) for part in grown], FEWEST_OF_PART)
+    grown = [item for item in grow_all(lattices, index, levels[0]) if item.count >= FEWEST_OF_PART]
+    folded = [part for item in grown for part in split_folds(item)]
+    parts = separate([tidy(part, size_px) for part in folded], FEWEST_OF_PART)
     boards = [board for board in join_parts(parts) if large(board, min_corners)]
+    boards = [board for board in boards if _promising(grey, board)]
     refined = zip(boards, refine(grey, boards), strict=True)
     return [after for before, after in refined if trustworthy(after, before.count, min_corners)]
+
+
+def _promising(grey: FloatImage, lattice: Lattice) -> bool:
+    """Return whether `lattice` is worth to be refined: small, or a board as far as a sample of it tells."""
+    sample = sample_of(lattice)
+    if sample is None:
+        return True
+    (refined,) = refine(grey, [sample])
+    return trustworthy(refined, sample.count, 0)
 
 
 def detect_boards(

@@ -7,7 +7,6 @@ cuts its lattice in two that continue each other: they are joined.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations
 from typing import NamedTuple
 
 import cv2
@@ -111,7 +110,7 @@ def join_parts(lattices: Sequence[Lattice]) -> list[Lattice]:
     done = False
     while not done:
         done = True
-        for i, j in combinations(range(len(parts)), 2):
+        for i, j in _near(parts):
             joined = _joined(parts[i], parts[j])
             if joined is not None:
                 parts = [_Part.of(joined), *(item for k, item in enumerate(parts) if k not in (i, j))]
@@ -140,15 +139,22 @@ class _Part(NamedTuple):
         return cls(lattice, pixels, grid, pixels.min(axis=0), pixels.max(axis=0), side)
 
 
+def _near(parts: Sequence[_Part]) -> list[tuple[int, int]]:
+    """Return the pairs whose bounding boxes come within GAP sides of a cell of the first, at its largest."""
+    if len(parts) < 2:
+        return []
+    low, high = np.array([item.low for item in parts]), np.array([item.high for item in parts])
+    gap = (np.maximum(low[:, None], low) - np.minimum(high[:, None], high)).max(axis=2)
+    near = np.triu(gap < GAP * np.array([[item.side_px] for item in parts]), 1)
+    return [(int(i), int(j)) for i, j in np.argwhere(near)]
+
+
 def _joined(one: _Part, two: _Part) -> Lattice | None:
     """Return both lattices in one, None if `two` does not continue `one`."""
-    reach = GAP * one.side_px
-    if not (np.maximum(one.low, two.low) - np.minimum(one.high, two.high)).max() < reach:
-        return None
     grid1, grid2, pixels1, pixels2 = one.grid, two.grid, one.pixels, two.pixels
     gap = pixels1[:, None] - pixels2
     apart = np.hypot(gap[..., 0], gap[..., 1])
-    if not apart.min() < 2.0 * reach:
+    if not apart.min() < 2.0 * GAP * one.side_px:
         return None
     nearest = divmod(int(apart.argmin()), len(pixels2))
     if not _alike(*(_cell(part, at) for part, at in zip((one, two), nearest, strict=True))):

@@ -6,7 +6,7 @@ is a corner with the polarity and the directions that the lattice demands and if
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from functools import cache, cached_property
 from typing import TYPE_CHECKING
 
@@ -44,7 +44,7 @@ FEWEST = 3
 """Known corners that foretell another."""
 
 MAX_SEEDS = 96
-"""So many lattices are grown, the largest first: clutter can make hundreds, of one square each."""
+"""So many lattices are grown: clutter can make hundreds, of one square each, after those of the boards."""
 
 REACH = 0.25
 """A corner lies within this of its prediction, in cells."""
@@ -98,11 +98,11 @@ class SaddleIndex:
         return np.where(found, index, 0), found
 
 
-def grow_all(lattices: Sequence[Lattice], saddles: SaddleIndex, level: Level) -> list[Lattice]:
-    """Return the lattices grown from `lattices`, the largest first; those that others have grown over are left out."""
+def grow_all(lattices: Iterable[Lattice], saddles: SaddleIndex, level: Level) -> list[Lattice]:
+    """Return the lattices grown from `lattices` one by one; those that others have grown over are left out."""
     out: list[Lattice] = []
     taken = np.zeros((0, 2))
-    for lattice in sorted(lattices, key=lambda item: -item.count):
+    for lattice in lattices:
         if len(out) == MAX_SEEDS:
             break
         if not _covered(lattice, taken):
@@ -125,9 +125,11 @@ def grow(lattice: Lattice, saddles: SaddleIndex, level: Level) -> Lattice:
     """Return `lattice` with all corners that can be added one after the other; brightness is read from `level`."""
     rings = MAX_RINGS
     while rings > 0:
-        lattice = lattice.trimmed().padded(ROOM)
-        rings = _grow(lattice, saddles, level, rings)
-    return lattice.trimmed()
+        wide = lattice.padded(ROOM)
+        rings = _grow(wide, saddles, level, rings)
+        if wide.count > lattice.count:
+            lattice = wide.trimmed()
+    return lattice
 
 
 def _grow(lattice: Lattice, saddles: SaddleIndex, level: Level, rings: int) -> int:

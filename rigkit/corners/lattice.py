@@ -6,7 +6,7 @@ like the arms of a corner, so every lattice comes out right-handed (columns, row
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -87,10 +87,12 @@ class Lattice:
     def trimmed(self) -> Lattice:
         """Return the lattice without empty outer rows and columns."""
         known = self.known
-        rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
-        if not len(rows):
+        rows, columns = known.any(axis=1), known.any(axis=0)
+        if not rows.any():
             return self.cut(slice(0, 0), slice(0, 0))
-        return self.cut(slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+        top, bottom = int(rows.argmax()), len(rows) - int(rows[::-1].argmax())
+        left, right = int(columns.argmax()), len(columns) - int(columns[::-1].argmax())
+        return self.cut(slice(top, bottom), slice(left, right))
 
     def turned(self, quarter_turns: int) -> Lattice:
         """Return the same corners with the first corner moved by `quarter_turns` x 90 degrees (still right-handed).
@@ -150,8 +152,8 @@ class Sheet:
         ]
 
 
-def build_lattices(corners: Corners, links: Links) -> list[Lattice]:
-    """Return the lattices that closed squares of four linked corners make up, in no particular order."""
+def build_lattices(corners: Corners, links: Links) -> Iterator[Lattice]:
+    """Return the lattices that closed squares of four linked corners make up, the largest first."""
     library = kernels("growth")
     if library is not None:
         states = np.where(links.corner >= 0, 4 * links.corner + links.arm, -1)
@@ -161,24 +163,32 @@ def build_lattices(corners: Corners, links: Links) -> list[Lattice]:
         count = int(label.max(initial=-1)) + 1
         members = np.argsort(label, kind="stable")[np.count_nonzero(label < 0) :]
     sizes = np.bincount(label[label >= 0], minlength=count)
-    lattices = []
-    for size, end in zip(sizes, np.cumsum(sizes), strict=True):
-        mine = members[end - size : end]
-        cells = grid[mine]
-        cells = cells - cells.min(axis=0)
-        columns, rows = (int(last) + 1 for last in cells.max(axis=0))
-        flat = cells[:, 1] * columns + cells[:, 0]
-        single = np.bincount(flat)[flat] == 1
-        if np.count_nonzero(single) < 4:
-            continue
-        pixels = np.full((rows * columns, 2), np.nan)
-        contrast = np.full(rows * columns, np.nan)
-        pixels[flat[single]] = corners.pixels[mine[single]]
-        contrast[flat[single]] = corners.contrast[mine[single]]
-        rising = (turn[mine[0]] + cells[0].sum()) % 2 == 0
-        whole = Lattice(pixels.reshape(rows, columns, 2), contrast.reshape(rows, columns), bool(rising))
-        lattices.append(whole if single.all() else whole.trimmed())
-    return lattices
+    ends = np.cumsum(sizes)
+    for k in np.argsort(-sizes, kind="stable"):
+        mine = members[ends[k] - sizes[k] : ends[k]]
+        whole = _lattice(corners, mine, grid[mine], int(turn[mine[0]]))
+        if whole is not None:
+            yield whole
+
+
+def _lattice(corners: Corners, mine: IntArray, cells: IntArray, turn: int) -> Lattice | None:
+    """Return the lattice of the corners `mine` (N,) in the `cells` (N, 2), without those that share one.
+
+    `turn` is the arm of the first corner that points to +column. None where less than a square is left.
+    """
+    cells = cells - cells.min(axis=0)
+    columns, rows = (int(last) + 1 for last in cells.max(axis=0))
+    flat = cells[:, 1] * columns + cells[:, 0]
+    single = np.bincount(flat)[flat] == 1
+    if np.count_nonzero(single) < 4:
+        return None
+    pixels = np.full((rows * columns, 2), np.nan)
+    contrast = np.full(rows * columns, np.nan)
+    pixels[flat[single]] = corners.pixels[mine[single]]
+    contrast[flat[single]] = corners.contrast[mine[single]]
+    rising = (turn + int(cells[0].sum())) % 2 == 0
+    whole = Lattice(pixels.reshape(rows, columns, 2), contrast.reshape(rows, columns), rising)
+    return whole if single.all() else whole.trimmed()
 
 
 def _components(links: Links) -> tuple[IntArray, IntArray, IntArray]:

@@ -11,7 +11,7 @@ from rigkit.corners.lattice import Lattice
 from rigkit.corners.local_fit import fit_cells
 from rigkit.corners.subpixel import RefinedLattice
 
-__all__ = ["known_part", "large", "largest_part", "separate", "tidy", "trustworthy"]
+__all__ = ["known_part", "large", "largest_part", "sample_of", "separate", "tidy", "trustworthy"]
 
 STRAY_ROW = 2
 """An outer row of so many corners or fewer, most of whose other corners should be in view too, is not of the board."""
@@ -26,10 +26,16 @@ MAX_RELATIVE_SIGMA = 0.015
 """Corners more uncertain than this, in cells, make no board: keys, letters, weave."""
 
 MAX_RESIDUAL = 0.25
-"""Largest typical residual of the edge model, relative to the contrast: dots in rows have saddles between them, too."""
+MAX_UNEXPLAINED, NOISE_LEVELS = 0.17, 10.0
+"""Largest typical residual of the edge model, relative to the contrast, and the part of it that noise (of so many grey
+levels) does not explain. Dots in rows have saddles between them, too, and show 0.2; boards 0.03 to 0.07 with motion,
+saturation or compression, 0.13 where a camera sharpens strongly."""
 
 MAX_LOST = 0.25
 """Largest part of a lattice's corners that the sub-pixel fit may refuse."""
+
+MANY, SAMPLE = 200, 7
+"""Lattices of so many corners are judged by so many rows and columns before all of them are fitted."""
 
 MAX_EXTRA = 2
 """Rows and columns that may be too many, when a grid is larger than the board it may be."""
@@ -99,16 +105,16 @@ def large(lattice: Lattice, least: int) -> bool:
 
 def separate(lattices: Sequence[Lattice], least: int) -> list[Lattice]:
     """Return those of `lattices` that are `large` enough and share no corners with a larger one."""
-    kept: list[Lattice] = []
-    corners: list[FloatArray] = []
-    for lattice in sorted(lattices, key=lambda item: -item.count):
-        if not large(lattice, least):
-            continue
-        mine = lattice.pixels[lattice.known]
-        if not any(_overlap(mine, other) for other in corners):
-            kept.append(lattice)
-            corners.append(mine)
-    return kept
+    candidates = sorted((item for item in lattices if large(item, least)), key=lambda item: -item.count)
+    corners = [item.pixels[item.known] for item in candidates]
+    low = np.array([mine.min(axis=0) for mine in corners]) - SHARED_PX
+    high = np.array([mine.max(axis=0) for mine in corners])
+    kept: list[int] = []
+    for k, mine in enumerate(corners):
+        touching = ((low[:k] < high[k]) & (low[k] < high[:k])).all(axis=1)
+        if not any(_overlap(mine, corners[j]) for j in kept if touching[j]):
+            kept.append(k)
+    return [candidates[k] for k in kept]
 
 
 def _overlap(mine: FloatArray, theirs: FloatArray) -> bool:
@@ -121,18 +127,32 @@ def _overlap(mine: FloatArray, theirs: FloatArray) -> bool:
     return bool(np.count_nonzero(((gap * gap).sum(axis=2) < SHARED_PX**2).any(axis=1)) > 1)
 
 
+def sample_of(lattice: Lattice) -> Lattice | None:
+    """Return the fullest block of SAMPLE rows and columns of a lattice that is much larger; None for smaller ones.
+
+    A page of dots makes thousands of corners: a look at a few tells that they are none.
+    """
+    if lattice.count < MANY or min(lattice.size) < SAMPLE:
+        return None
+    full = np.lib.stride_tricks.sliding_window_view(lattice.known, (SAMPLE, SAMPLE)).sum(axis=(2, 3))
+    row, column = (int(at) for at in np.unravel_index(full.argmax(), full.shape))
+    return lattice.cut(slice(row, row + SAMPLE), slice(column, column + SAMPLE))
+
+
 def trustworthy(refined: RefinedLattice, before: int, least: int) -> bool:
     """Return whether what the fit left of a lattice of `before` corners is a board."""
     lattice = refined.lattice
     if lattice.count < max(least, (1.0 - MAX_LOST) * before) or min(lattice.size) < 3:
         return False
     known = lattice.known
-    if float(np.median(refined.residual[known] / lattice.contrast[known])) > MAX_RESIDUAL:
+    relative = refined.residual[known] / lattice.contrast[known]
+    unexplained = relative**2 - (NOISE_LEVELS / lattice.contrast[known]) ** 2
+    if float(np.median(relative)) > MAX_RESIDUAL or float(np.median(unexplained)) > MAX_UNEXPLAINED**2:
         return False
     shape = fit_cells(lattice.pixels, known, degree=1)
     area = shape.along_column[:, 0] * shape.along_row[:, 1] - shape.along_column[:, 1] * shape.along_row[:, 0]
-    relative = refined.sigma_px[known] / np.sqrt(np.maximum(area, 1e-6))
-    return float(np.median(relative)) < MAX_RELATIVE_SIGMA
+    in_cells = refined.sigma_px[known] / np.sqrt(np.maximum(area, 1e-6))
+    return float(np.median(in_cells)) < MAX_RELATIVE_SIGMA
 
 
 def known_part(refined: RefinedLattice, sizes: Sequence[tuple[int, int]]) -> RefinedLattice:

@@ -181,6 +181,10 @@ def _no_boards() -> dict[str, np.ndarray]:
         for u in range(20, 400, 30):
             cv2.circle(dots, (u, v), 9, 30, -1, cv2.LINE_AA)
     row, column = np.arange(300) // 24 % 2, np.arange(400) // 24 % 2
+    large = np.full((600, 800), 220, np.uint8)
+    for v in range(20, 600, 30):
+        for u in range(20, 800, 30):
+            cv2.circle(large, (u, v), 11, 30, -1, cv2.LINE_AA)
     cloth = (120 + 50 * row[:, None] + 50 * column).astype(np.uint8)
     tiles = np.full((300, 400), 60, np.uint8)
     for v in range(0, 300, 40):
@@ -194,6 +198,7 @@ def _no_boards() -> dict[str, np.ndarray]:
         "noise": (rng.random((300, 400)) * 255).astype(np.uint8),
         "text": text,
         "dots": dots,
+        "large dots": large,
         "gingham cloth": cv2.GaussianBlur(cloth, (0, 0), 0.8),
         "tiles": tiles,
         "triangles": triangles,

@@ -70,7 +70,7 @@ def test_growth_of_rendered_boards(lens: str, rng: np.random.Generator, monkeypa
     one_square = (slice(2, 4), slice(3, 5))
 
     def grown_from_squares() -> tuple[list[lattice.Lattice], list[lattice.Lattice]]:
-        found = lattice.build_lattices(corners, links)
+        found = list(lattice.build_lattices(corners, links))
         seeds = [item.cut(*one_square) for item in found if min(item.size) > 4]
         return found, grow.grow_all(seeds, grow.SaddleIndex(saddles), levels[0])
 
@@ -99,9 +99,9 @@ def test_lattices_of_contradicting_links(rng: np.random.Generator, monkeypatch: 
         corner[following], arm[following] = four, out
     pixels = rng.uniform(0.0, 500.0, (count, 2))
     corners = Corners(pixels, np.zeros((count, 2)), np.ones(count), np.ones(count))
-    compiled = lattice.build_lattices(corners, Links(corner, arm))
+    compiled = list(lattice.build_lattices(corners, Links(corner, arm)))
     without_kernels(monkeypatch)
-    plain = lattice.build_lattices(corners, Links(corner, arm))
+    plain = list(lattice.build_lattices(corners, Links(corner, arm)))
     assert len(plain) > 0
     for one, two in zip(compiled, plain, strict=True):
         assert one.rising == two.rising
