@@ -1,7 +1,8 @@
 """Scenes on which corner detectors are measured: one board, three, a room full of them, boards cut by the frame.
 
 Each function draws one scene from `rng`, for a regular or a fisheye lens, at any image size; `BenchScene.render` makes
-its image and `BenchScene.truth` says where every visible corner is.
+its image and `BenchScene.truth` says where every corner is, `BenchScene.clear` which of them a detector must find.
+Pictures without any board are in `rigkit.synthetic.bench_blanks`, pairs of views in `rigkit.synthetic.bench_pairs`.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.arrays import FloatArray
+from rigkit.arrays import BoolArray, FloatArray
 from rigkit.boards import Board
 from rigkit.cameras.base import Camera, image_center
 from rigkit.cameras.kannala_brandt import KannalaBrandt
@@ -23,9 +24,9 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.posetype import PoseType
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
-from rigkit.synthetic.photometry import Photometry, Shadow
+from rigkit.synthetic.photometry import Photometry, Shadow, develop
 from rigkit.synthetic.placing import place_board, sees_paper
-from rigkit.synthetic.render import Optics, render
+from rigkit.synthetic.render import Optics, radiance
 from rigkit.synthetic.scene import Panel, PlacedBoard, exact_detection
 
 __all__ = [
@@ -35,11 +36,13 @@ __all__ = [
     "SCENES",
     "BenchScene",
     "bench_camera",
+    "bench_field_deg",
     "covered_board",
     "empty",
     "one_board",
     "partial_board",
     "room",
+    "small_board",
     "three_boards",
 ]
 
@@ -64,6 +67,8 @@ CONDITIONS: dict[str, tuple[Optics, Photometry]] = {
 }
 """Light, lens and sensor by name, for `BenchScene.render(optics=, photometry=)`."""
 TRIES = 500
+CLEAR_SQUARES = 0.6
+"""A corner is clear of what covers the board if it lies this far from it: then all of its cell is seen."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -90,6 +95,34 @@ class BenchScene:
         found = (exact_detection(b, self.camera, Rigid3.identity()) for b in self.boards)
         return tuple(d for d in found if len(d.grid))
 
+    def clear(self) -> tuple[BoolArray, ...]:
+        """Return for each board of `truth` which of its corners (N,) lie well beside all occluders."""
+        out = []
+        for board in self.boards:
+            found = exact_detection(board, self.camera, Rigid3.identity())
+            if not len(found.grid):
+                continue
+            clear = np.ones(len(found.grid), bool)
+            for occluder in self.occluders:
+                panel_from_board = occluder.world_from_panel.inverse() @ board.world_from_board
+                points = np.abs(panel_from_board.apply(board.board.points(found.grid))[:, :2])
+                margin = CLEAR_SQUARES * board.board.square_x_mm
+                half = 0.5 * np.array([occluder.width_mm, occluder.height_mm])
+                clear &= (points > half + margin).any(axis=1)
+            out.append(clear)
+        return tuple(out)
+
+    def radiance(self, optics: Optics) -> FloatArray:
+        """Return the picture (height, width) before light and sensor (`rigkit.synthetic.photometry.develop`)."""
+        return radiance(
+            self.boards,
+            self.camera,
+            Rigid3.identity(),
+            panels=self.panels,
+            occluders=self.occluders,
+            optics=replace(optics, field_deg=self.field_deg),
+        )
+
     def render(
         self,
         *,
@@ -100,18 +133,8 @@ class BenchScene:
         optics: Optics | None = None,
     ) -> NDArray[np.uint8] | NDArray[np.uint16]:
         """Return the image; `optics` and `photometry` win over `blur_px` and `noise_levels`."""
-        optics = replace(optics or Optics(blur_px), field_deg=self.field_deg)
         photometry = photometry or replace(BENCH_PHOTOMETRY, noise_levels=noise_levels)
-        return render(
-            self.boards,
-            self.camera,
-            Rigid3.identity(),
-            panels=self.panels,
-            occluders=self.occluders,
-            optics=optics,
-            photometry=photometry,
-            rng=rng,
-        )
+        return develop(self.radiance(optics or Optics(blur_px)), photometry, rng)
 
 
 def bench_camera(lens: str, size_px: tuple[int, int] = (640, 480)) -> Camera:
@@ -148,6 +171,16 @@ def one_board(
         if placed is not None and sees_paper(placed, camera, (0.0, 0.0), size_px):
             return _scene("one", lens, camera, [placed])
     raise DegenerateError(f"one board: {board.columns}x{board.rows} corners do not fit a {size_px} image")
+
+
+def small_board(
+    rng: np.random.Generator, *, lens: str = "regular", size_px: tuple[int, int] = (640, 480), square_px: float = 5.0
+) -> BenchScene:
+    """Return one whole board of 8 x 6 corners whose squares are `square_px` wide where seen straight on, tilt to 20
+    degrees."""
+    board = Board("board", 8, 6, 30.0, 30.0)
+    scene = one_board(rng, lens=lens, size_px=size_px, board=board, max_tilt_deg=20.0, square_px=square_px)
+    return replace(scene, name=f"small {lens}")
 
 
 def three_boards(
@@ -238,7 +271,7 @@ def empty(
             width, height = np.exp(rng.uniform(np.log(20.0), np.log(500.0), 2))
             grey = float(rng.uniform(0.05, 0.9))
             panels.append(Panel(Rigid3(rotation, rays * rng.uniform(600.0, 1500.0)), width, height, grey))
-    return BenchScene(f"empty {lens}", (), tuple(panels), camera, _field(lens))
+    return BenchScene(f"empty {lens}", (), tuple(panels), camera, bench_field_deg(lens))
 
 
 SCENES: dict[str, Callable[..., BenchScene]] = {
@@ -247,17 +280,19 @@ SCENES: dict[str, Callable[..., BenchScene]] = {
     "room": room,
     "partial": partial_board,
     "covered": covered_board,
+    "small": small_board,
     "empty": empty,
 }
 """Every kind of scene by name; each takes (rng, lens=, size_px=)."""
 
 
-def _field(lens: str) -> float | None:
+def bench_field_deg(lens: str) -> float | None:
+    """Return the field of view of a `LENSES` entry, None for the regular one."""
     return FISHEYE_FIELD_DEG if lens == "fisheye" else None
 
 
 def _scene(kind: str, lens: str, camera: Camera, placed: Sequence[PlacedBoard]) -> BenchScene:
-    return BenchScene(f"{kind} {lens}", tuple(placed), (), camera, _field(lens))
+    return BenchScene(f"{kind} {lens}", tuple(placed), (), camera, bench_field_deg(lens))
 
 
 def _first_view(kind: str, lens: str, pair: StereoScene) -> BenchScene:
@@ -267,7 +302,7 @@ def _first_view(kind: str, lens: str, pair: StereoScene) -> BenchScene:
         for b in pair.boards
     )
     panels = tuple(Panel(move @ p.world_from_panel, p.width_mm, p.height_mm, p.reflectance) for p in pair.panels)
-    return BenchScene(f"{kind} {lens}", boards, panels, pair.camera1, _field(lens))
+    return BenchScene(f"{kind} {lens}", boards, panels, pair.camera1, bench_field_deg(lens))
 
 
 def _place_in_cell(

@@ -20,7 +20,7 @@ from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import Panel, PlacedBoard, exact_detection, room_walls, trihedral
 
-__all__ = ["StereoScene", "relative_pose", "trihedral_pair"]
+__all__ = ["StereoScene", "random_pair", "relative_pose", "trihedral_pair"]
 
 TRIES = 2000
 MIN_INCIDENCE = 0.2
@@ -146,10 +146,42 @@ def trihedral_pair(
         No such view was found: the lens is too narrow, or the baseline too long.
     """
     placed = trihedral(boards, angles_deg=angles_deg)
+    return random_pair(
+        placed,
+        camera,
+        pose_type,
+        rng,
+        camera2=camera2,
+        panels=(lambda reach_mm: room_walls(12.0 * reach_mm, angles_deg=angles_deg)) if walls else None,
+        baseline_mm=baseline_mm,
+        parallax_deg=parallax_deg,
+        distance=distance,
+        level_sigma_deg=level_sigma_deg,
+    )
+
+
+def random_pair(
+    placed: Sequence[PlacedBoard],
+    camera: Camera,
+    pose_type: PoseType,
+    rng: np.random.Generator,
+    *,
+    camera2: Camera | None = None,
+    panels: Callable[[float], tuple[Panel, ...]] | None = None,
+    baseline_mm: float = 300.0,
+    parallax_deg: tuple[float, float] = (10.0, 35.0),
+    distance: tuple[float, float] = (0.9, 1.5),
+    level_sigma_deg: float = 0.0,
+) -> StereoScene:
+    """Return a random pair that sees all corners of boards that stand in the room x, y, z < 0; see `trihedral_pair`.
+
+    `panels` makes what stands behind the boards, given the radius (mm) of the ball round them.
+    """
     second_camera = camera if camera2 is None else camera2
     corners = np.concatenate([b.points() for b in placed])
     middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
     reach = float(np.linalg.norm(corners - middle, axis=1).max())
+    behind = panels(reach) if panels is not None else ()
     view = _random_view(middle, reach * _fill_factor(camera), distance, rng)
     for _ in range(TRIES):
         first = view()
@@ -164,10 +196,9 @@ def trihedral_pair(
             second = relative_pose(pose_type, baseline_mm, rng, level_sigma_deg=level_sigma_deg) @ first
             fits = True
         if fits and _sees_all(placed, second_camera, second):
-            panels = room_walls(12.0 * reach, angles_deg=angles_deg) if walls else ()
-            return StereoScene(placed, panels, camera, second_camera, first, second, pose_type)
+            return StereoScene(tuple(placed), behind, camera, second_camera, first, second, pose_type)
     raise DegenerateError(
-        f"trihedral pair: in {TRIES} random views no {pose_type} pair saw all corners; "
+        f"random pair: in {TRIES} random views no {pose_type} pair saw all corners; "
         "use a wider lens, a shorter baseline or a larger distance"
     )
 

@@ -8,6 +8,7 @@ import pytest
 
 from rigkit.boards import Board
 from rigkit.errors import InputError
+from rigkit.synthetic.bench_blanks import BLANKS, blank
 from rigkit.synthetic.bench_scenes import (
     CONDITIONS,
     LENSES,
@@ -18,6 +19,7 @@ from rigkit.synthetic.bench_scenes import (
     one_board,
     partial_board,
     room,
+    small_board,
     three_boards,
 )
 
@@ -44,6 +46,25 @@ def test_partial_boards_are_cut_and_empty_scenes_are_empty(lens: str, rng: np.ra
     assert empty(rng, lens=lens).truth() == ()
 
 
+def test_small_boards_are_whole_and_small(rng: np.random.Generator) -> None:
+    scene = small_board(rng, lens="fisheye", square_px=5.0)
+    (found,) = scene.truth()
+    assert found.complete
+    side = [np.linalg.norm(np.diff(found.lattice(), axis=axis), axis=-1) for axis in (0, 1)]
+    assert 4.0 < min(s.mean() for s in side) < 5.3
+
+
+@pytest.mark.parametrize("name", BLANKS)
+def test_blank_pictures_are_sharp_and_reproducible(name: str, rng: np.random.Generator) -> None:
+    picture = blank(name, rng, (320, 240))
+    assert picture.shape == (240, 320)
+    assert picture.dtype == np.uint8
+    assert picture.std() > 15.0
+    np.testing.assert_array_equal(*(blank(name, np.random.default_rng(1), (160, 120)) for _ in range(2)))
+    with pytest.raises(InputError, match="known: noise"):
+        blank("chessboard", rng)
+
+
 def test_square_size_and_image_size_are_kept(rng: np.random.Generator) -> None:
     scene = one_board(rng, board=Board("b", 7, 5, 25.0, 25.0), square_px=12.0, max_tilt_deg=1.0, size_px=(800, 600))
     (found,) = scene.truth()
@@ -62,14 +83,16 @@ def test_scenes_are_reproducible_and_lenses_are_known() -> None:
 
 def test_a_ruler_hides_part_of_a_board(rng: np.random.Generator) -> None:
     scene = covered_board(rng)
-    (found,) = scene.truth()
+    (found,), (clear,) = scene.truth(), scene.clear()
     assert found.complete
     hidden = 0
     image = scene.render(blur_px=0.3)
-    for u, v in np.rint(found.pixels).astype(int):
+    for (u, v), is_clear in zip(np.rint(found.pixels).astype(int), clear, strict=True):
         patch = image[v - 2 : v + 3, u - 2 : u + 3].astype(int)
         # A corner has black and white round it, a ruler is one grey.
-        hidden += int(patch.max() - patch.min() < 40)
+        plain = patch.max() - patch.min() < 40
+        hidden += int(plain)
+        assert not (plain and is_clear)
     assert 2 <= hidden <= 30
 
 

@@ -1,0 +1,122 @@
+"""Pairs of views of boards that look alike, and whether identifying the boards took the same corners for the same.
+
+Three boards of one size, each of which looks the same turned by 180 degrees, are the hardest case: nothing but the
+geometry of both views tells which is which, and which way round.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import StrEnum
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from rigkit.arrays import FloatArray
+from rigkit.boards import Board
+from rigkit.cameras.base import Camera
+from rigkit.detections import BoardDetection
+from rigkit.errors import DegenerateError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
+from rigkit.posetype import PoseType
+from rigkit.synthetic.bench_scenes import bench_camera
+from rigkit.synthetic.pairs import StereoScene, random_pair, trihedral_pair
+from rigkit.synthetic.scene import PlacedBoard, room_walls, wall_axes
+
+__all__ = ["EQUAL_BOARDS", "PairVerdict", "equal_boards_pair", "judge_pair"]
+
+EQUAL_BOARDS = tuple(Board(name, 8, 6, 40.0, 40.0) for name in ("plane1", "plane2", "plane3"))
+"""Columns + rows is even: each looks the same turned by 180 degrees."""
+SAME_PX = 1.0
+"""A corner is the true corner within this distance; neighbours are at least ten times as far."""
+POSE_TYPES = (PoseType.GENERAL, PoseType.PLANAR, PoseType.STANDARD, PoseType.FORWARD)
+TRIES = 50
+RIGHT_ANGLES = (90.0, 90.0, 90.0)
+AWAY_MM = 160.0
+"""Boards that do not stand in the corner of the room are moved away from it by up to this along both walls."""
+PARALLAX_DEG = (8.0, 45.0)
+
+
+class PairVerdict(StrEnum):
+    """How a pair was identified.
+
+    RIGHT: all boards, every corner with its own index. AMBIGUOUS: the tie was stated. INCOMPLETE: what was answered is
+    right, but boards are missing. WRONG: a corner was given another one's index, and no tie was stated.
+    """
+
+    RIGHT = "right"
+    AMBIGUOUS = "ambiguous"
+    INCOMPLETE = "incomplete"
+    WRONG = "wrong"
+
+
+def equal_boards_pair(seed: int, *, size_px: tuple[int, int] = (800, 600)) -> tuple[str, StereoScene]:
+    """Return what a pair is, in words, and the pair: regular and fisheye lenses in turn, two boards' arrangements in
+    turn (in the corner of the room, all pose types; anywhere on the walls, turned by any angle, free views)."""
+    rng = np.random.default_rng(seed)
+    lens = ("regular", "fisheye")[seed % 2]
+    camera = bench_camera(lens, size_px)
+    if seed // 2 % 2 == 0:
+        pose_type = POSE_TYPES[seed // 4 % 4]
+        pair = trihedral_pair(EQUAL_BOARDS, camera, pose_type, rng, baseline_mm=200.0)
+        return f"{lens}, in the corner, {pose_type}", pair
+    return f"{lens}, anywhere on the walls", _anywhere_pair(camera, rng)
+
+
+def _anywhere_pair(camera: Camera, rng: np.random.Generator) -> StereoScene:
+    for _ in range(TRIES):
+        placed = [_on_wall(board, axes, rng) for board, axes in zip(EQUAL_BOARDS, wall_axes(RIGHT_ANGLES), strict=True)]
+        try:
+            return random_pair(
+                placed,
+                camera,
+                PoseType.GENERAL,
+                rng,
+                panels=lambda reach_mm: room_walls(12.0 * reach_mm),
+                parallax_deg=PARALLAX_DEG,
+            )
+        except DegenerateError:
+            continue
+    raise DegenerateError(f"equal boards: no two views of {TRIES} arrangements saw all boards")
+
+
+def _on_wall(board: Board, axes: FloatArray, rng: np.random.Generator) -> PlacedBoard:
+    """Return the board on a wall, turned at random, all of its paper on the room's side of the other walls."""
+    turn = exp_so3(np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]))
+    turned = PlacedBoard(board, Rigid3(axes @ turn, np.zeros(3)))
+    # The room is x, y, z < 0: the paper's highest coordinates along the wall go to a random place below zero.
+    along = np.abs(axes[:, 2]) < 0.5
+    shift = np.where(along, -turned.outline().max(axis=0) - rng.uniform(3.0, AWAY_MM, 3), 0.0)
+    return PlacedBoard(board, Rigid3(axes @ turn, shift))
+
+
+def judge_pair(
+    scene: StereoScene, pairs: Sequence[tuple[BoardDetection, BoardDetection]], ambiguous: bool
+) -> PairVerdict:
+    """Say whether equal indices of `pairs` (boards of image 1 and 2) are the same physical corners."""
+    if ambiguous:
+        return PairVerdict.AMBIGUOUS
+    truth = [_lookup(found) for found in scene.detections()]
+    for one, two in pairs:
+        physical = [
+            {tuple(g): name for g, name in zip(d.grid.tolist(), _physical(d, *known), strict=True) if name is not None}
+            for d, known in zip((one, two), truth, strict=True)
+        ]
+        shared = set(physical[0]) & set(physical[1])
+        if not shared or any(physical[0][g] != physical[1][g] for g in shared):
+            return PairVerdict.WRONG
+    return PairVerdict.RIGHT if len(pairs) == len(scene.boards) else PairVerdict.INCOMPLETE
+
+
+def _lookup(truth: Sequence[BoardDetection]) -> tuple[cKDTree, list[tuple[str | None, int, int]]]:
+    names = [(t.board_id, int(column), int(row)) for t in truth for column, row in t.grid]
+    return cKDTree(np.concatenate([t.pixels for t in truth])), names
+
+
+def _physical(
+    found: BoardDetection, tree: cKDTree, names: Sequence[tuple[str | None, int, int]]
+) -> list[tuple[str | None, int, int] | None]:
+    """Return which true corner each corner is, None where it is none."""
+    distance, index = tree.query(found.pixels)
+    return [names[i] if d < SAME_PX else None for d, i in zip(distance, index, strict=True)]
