@@ -43,9 +43,9 @@ BLUR_RANGE = (0.28, 5.0)
 
 ANGLE_SIGMA_RAD = 0.1
 LOG_BLUR_SIGMA = 0.7
-LIGHT_SIGMA = 0.3
-"""How well the lattice's angles, the start's log s and an even light (g = 0, per window) are known beforehand. These
-matter only where squares are so small that the pixels cannot tell."""
+LIGHT_SIGMA_PER_PX = 0.01
+"""How well the lattice's angles, the start's log s and an even light (g = 0) are known beforehand. These matter only
+where squares are so small that the pixels cannot tell; there, a gradient of the light passes for a shifted corner."""
 
 MOST_MOVE_PX, MOST_TURN_RAD, MOST_BLUR_CHANGE, MOST_LIGHT_CHANGE = 1.0, 0.2, 0.3, 0.3
 """A step is cut where it would leave the region in which the model is nearly linear: position, angles, relative blur,
@@ -120,7 +120,7 @@ def fit_edges(
         _, _, sigma_px, width, contrast, residual, valid = fitted.T
         return EdgeFit(fitted[:, :2], sigma_px, width, contrast, residual, valid > 0.5)
     window = collect(image, pixels, geometry, blur, radius_px)
-    prior_mean, prior = _prior(geometry, blur)
+    prior_mean, prior = _prior(geometry, blur, window.size)
     values = prior_mean.copy()
     values[:, [X, Y]] = pixels - window.centre
     _brightness(values, window, geometry, sign)
@@ -162,7 +162,7 @@ def _rules(radius_px: float, iterations: int, converged_px: float) -> Rules:
         most_blur=BLUR_RANGE[1],
         angle_sigma=ANGLE_SIGMA_RAD,
         log_blur_sigma=LOG_BLUR_SIGMA,
-        light_sigma=LIGHT_SIGMA,
+        light_sigma=LIGHT_SIGMA_PER_PX,
         most_move_px=MOST_MOVE_PX,
         most_turn=MOST_TURN_RAD,
         most_blur_change=MOST_BLUR_CHANGE,
@@ -178,7 +178,7 @@ def _rules(radius_px: float, iterations: int, converged_px: float) -> Rules:
     )
 
 
-def _prior(geometry: Geometry, blur: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _prior(geometry: Geometry, blur: FloatArray, size: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the parameters as known beforehand (N, 9) and one over their variances, 0 for unknown."""
     mean = np.zeros((len(blur), PARAMETERS))
     mean[:, [T1, T2]] = np.arctan2(geometry.sides[..., 1], geometry.sides[..., 0])
@@ -186,7 +186,7 @@ def _prior(geometry: Geometry, blur: FloatArray) -> tuple[FloatArray, FloatArray
     weight = np.zeros_like(mean)
     weight[:, [T1, T2]] = ANGLE_SIGMA_RAD**-2
     weight[:, S] = (LOG_BLUR_SIGMA * blur) ** -2
-    weight[:, [GX, GY]] = LIGHT_SIGMA**-2
+    weight[:, [GX, GY]] = ((LIGHT_SIGMA_PER_PX * size) ** -2)[:, None]
     return mean, weight
 
 

@@ -49,8 +49,9 @@ TAIL_SIGMAS = 3.0
 PIXEL_KURTOSIS = -1.0 / 120.0
 """Fourth cumulant of a uniform distribution of width 1: of a pixel's square along its sides, px^4."""
 
-REACH = 0.44
-"""Pixels are used up to this from the corner along the sides of its cell: short of the neighbouring edges."""
+REACH = 0.5
+"""Pixels are used up to this from the corner along the sides of its cell: the windows of neighbouring corners meet and
+do not overlap, so that every pixel is used and the errors of neighbours are independent."""
 
 NEAR_SIGMAS, NEAR_PX = 3.0, 1.5
 """Pixels are used so near to one of the lines (s and px added up): those beyond only repeat how bright squares are."""

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray
+from rigkit.corners.bends import line_curvature
 from rigkit.corners.edge_fit import BLUR_RANGE, fit_edges
 from rigkit.corners.edge_model import Geometry
 from rigkit.corners.lattice import Lattice, Sheet
@@ -26,6 +27,9 @@ Part = tuple[slice, slice]
 
 FIRST_BLUR = 1.0
 """s that the first pass starts from, px."""
+
+FIRST_SIGMA_PX = 0.1
+"""How well corners are known before the first pass: saddles of a smoothed image."""
 
 FIRST_PASS = (9.0, 4, 0.02)
 LAST_PASS = (18.0, 8, 1e-3)
@@ -101,9 +105,10 @@ def refine(image: FloatImage, lattices: Sequence[Lattice]) -> list[RefinedLattic
     # All lattices lie on one sheet, so that each step is one call.
     sheet = Sheet.of(lattices)
     start = Lattice(sheet.pixels, sheet.contrast, True)
-    first = _pass(image, start, sheet.signs, np.full(sheet.signs.shape, FIRST_BLUR), *FIRST_PASS)
+    blur, unknown = np.full(sheet.signs.shape, FIRST_BLUR), np.full(sheet.signs.shape, FIRST_SIGMA_PX)
+    first = _pass(image, start, sheet.signs, blur, unknown, *FIRST_PASS)
     start, holes = _with_holes(first.lattice, sheet.signs != 0.0)
-    second = _pass(image, start, sheet.signs, _typical_blur(first, sheet.parts), *LAST_PASS)
+    second = _pass(image, start, sheet.signs, _typical_blur(first, sheet.parts), first.sigma_px, *LAST_PASS)
     if holes.any():
         second = _confirmed(second, start, holes)
     checked = _checked(second, sheet.parts)
@@ -140,18 +145,20 @@ def _pass(
     start: Lattice,
     signs: FloatArray,
     blur: FloatArray,
+    sigma_px: FloatArray,
     radius_px: float,
     iterations: int,
     converged_px: float,
 ) -> RefinedLattice:
-    """Fit all corners of the sheet `start`; those that fail are left out."""
+    """Fit all corners of the sheet `start`, known to `sigma_px` (R, C); those that fail are left out."""
     known = start.known
     shape = fit_cells(start.pixels, known)
     sides = np.stack([shape.along_column, shape.along_row], axis=1)
+    lengths = np.maximum(np.sqrt((sides**2).sum(axis=2)), 1.0)
     fit = fit_edges(
         image,
         start.pixels[known],
-        Geometry(sides, shape.curvature(), shape.gaps()),
+        Geometry(sides, line_curvature(start.pixels, sigma_px, known, lengths), shape.gaps()),
         signs[known],
         blur[known],
         radius_px=radius_px,

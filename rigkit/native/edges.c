@@ -1,4 +1,5 @@
-/* The fit of the edge model to chessboard corners: corners.edge_model and corners.edge_fit, one corner after the other.
+/* The fit of the edge model to chessboard corners: corners.edge_model and corners.edge_fit, one corner after the other;
+ * at the end, how the lines of a lattice bend: corners.bends.
  *
  * The pixels of a corner are gathered once. Every Gauss-Newton step evaluates the model and its derivatives in float32,
  * a block of pixels at a time, which the compiler vectorises; products are summed in float32 lanes, and the nine normal
@@ -407,7 +408,7 @@ static void fit_corner(
 {
     const double turn = 1.0 / (rules->angle_sigma * rules->angle_sigma);
     const double width = 1.0 / (rules->log_blur_sigma * rules->log_blur_sigma * blur * blur);
-    const double light = 1.0 / (rules->light_sigma * rules->light_sigma);
+    const double light = 1.0 / (rules->light_sigma * rules->light_sigma * window->size * window->size);
     const double prior[PARAMETERS] = {0.0, 0.0, turn, turn, width, 0.0, 0.0, light, light};
     const double mean[PARAMETERS] = {
         0.0, 0.0, atan2(at.sides[1], at.sides[0]), atan2(at.sides[3], at.sides[2]), blur, 0.0, 0.0, 0.0, 0.0};
@@ -475,4 +476,87 @@ void fit_edges(
         collect(&window, image, pixels + 2 * n, at, blur[n], rules);
         fit_corner(&window, pixels + 2 * n, at, sign[n], blur[n], rules, out + OUTCOMES * n);
     }
+}
+
+enum { TERMS = 6 };
+
+/* The constants of corners.bends (rigkit.native.edges.BendRules). */
+typedef struct {
+    double decay, least_sigma, free;
+    int64_t reach;
+} bend_rules_t;
+
+/* Solve `normal` (lower half) for two right-hand sides in place, Cholesky; the prior keeps it positive definite. */
+static void solve_line(double normal[TERMS][TERMS], double right[TERMS][2])
+{
+    for (int j = 0; j < TERMS; j++) {
+        for (int i = j; i < TERMS; i++) {
+            double sum = normal[i][j];
+            for (int k = 0; k < j; k++)
+                sum -= normal[i][k] * normal[j][k];
+            normal[i][j] = i == j ? sqrt(sum) : sum / normal[j][j];
+        }
+        for (int axis = 0; axis < 2; axis++) {
+            for (int k = 0; k < j; k++)
+                right[j][axis] -= normal[j][k] * right[k][axis];
+            right[j][axis] /= normal[j][j];
+        }
+    }
+    for (int j = TERMS - 1; j >= 0; j--)
+        for (int axis = 0; axis < 2; axis++) {
+            for (int k = j + 1; k < TERMS; k++)
+                right[j][axis] -= normal[k][j] * right[k][axis];
+            right[j][axis] /= normal[j][j];
+        }
+}
+
+/* Return the curvature at place `at` of a line of `count` corners, `stride` cells apart. */
+static double line_bend(
+    const double *pixels, const double *sigma, int64_t stride, int64_t at, int64_t count, double side,
+    const bend_rules_t *rules)
+{
+    double normal[TERMS][TERMS] = {{0.0}}, right[TERMS][2] = {{0.0}};
+    for (int k = 0; k < TERMS; k++)
+        normal[k][k] = k < 2 ? rules->free : 1.0;
+    for (int64_t step = -rules->reach; step <= rules->reach; step++) {
+        if (at + step < 0 || at + step >= count)
+            continue;
+        const double *other = pixels + 2 * step * stride;
+        double wide = sigma[step * stride];
+        if (!isfinite(wide) || !isfinite(other[0]))
+            continue;
+        wide = (wide > rules->least_sigma ? wide : rules->least_sigma) / side;
+        const double weight = 1.0 / (wide * wide);
+        const double off[2] = {(other[0] - pixels[0]) / side, (other[1] - pixels[1]) / side};
+        double power[TERMS] = {1.0};
+        for (int k = 1; k < TERMS; k++)
+            power[k] = power[k - 1] * rules->decay * (double)step;
+        for (int i = 0; i < TERMS; i++) {
+            for (int j = 0; j <= i; j++)
+                normal[i][j] += weight * power[i] * power[j];
+            right[i][0] += weight * power[i] * off[0];
+            right[i][1] += weight * power[i] * off[1];
+        }
+    }
+    solve_line(normal, right);
+    const double decay = rules->decay;
+    const double cross = 2.0 * decay * decay * decay * (right[1][0] * right[2][1] - right[1][1] * right[2][0]);
+    double square = decay * decay * (right[1][0] * right[1][0] + right[1][1] * right[1][1]);
+    square = square > 1e-12 ? square : 1e-12;
+    return cross / (square * sqrt(square) * side);
+}
+
+/* Set `out` (M, 2) to the curvature of row and column at the M wanted cells (corners.bends.line_curvature). */
+void line_bends(
+    const double *pixels, const double *sigma, const uint8_t *wanted, int64_t rows, int64_t columns, const double *sides,
+    const bend_rules_t *rules, double *out)
+{
+    for (int64_t row = 0; row < rows; row++)
+        for (int64_t column = 0; column < columns; column++) {
+            const int64_t cell = row * columns + column;
+            if (!wanted[cell])
+                continue;
+            *out++ = line_bend(pixels + 2 * cell, sigma + cell, 1, column, columns, *sides++, rules);
+            *out++ = line_bend(pixels + 2 * cell, sigma + cell, columns, row, rows, *sides++, rules);
+        }
 }

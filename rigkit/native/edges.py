@@ -1,17 +1,18 @@
-"""The compiled fit of the edge model (edges.c): what `corners.edge_fit.fit_edges` does, one corner after the other."""
+"""The kernels in edges.c: the fit of the edge model to corners, and how the lines of a lattice bend."""
 
 from __future__ import annotations
 
 import ctypes
 import functools
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.arrays import FloatArray
+from rigkit.arrays import BoolArray, FloatArray
 from rigkit.native import kernels
 
-__all__ = ["OUTCOMES", "Rules", "fit_corners"]
+__all__ = ["OUTCOMES", "BendRules", "Rules", "fit_corners", "line_bends"]
 
 OUTCOMES = 7
 """Numbers that come out of a corner: u, v, sigma, s, 2 b, RMS residual, whether it is valid."""
@@ -20,7 +21,7 @@ OUTCOMES = 7
 class Rules(ctypes.Structure):
     """The constants of the edge model and its fit, in the order of `rules_t` in edges.c."""
 
-    _fields_ = [
+    _fields_: ClassVar = [
         *(
             (name, ctypes.c_double)
             for name in (
@@ -51,6 +52,17 @@ class Rules(ctypes.Structure):
     ]
 
 
+class BendRules(ctypes.Structure):
+    """The constants of `corners.bends`, in the order of `bend_rules_t` in edges.c."""
+
+    _fields_: ClassVar = [
+        ("decay", ctypes.c_double),
+        ("least_sigma", ctypes.c_double),
+        ("free", ctypes.c_double),
+        ("reach", ctypes.c_int64),
+    ]
+
+
 @functools.cache
 def _library() -> ctypes.CDLL | None:
     library = kernels("edges")
@@ -60,6 +72,8 @@ def _library() -> ctypes.CDLL | None:
         library.edges_scratch.argtypes = [ctypes.c_double]
         library.fit_edges.restype = None
         library.fit_edges.argtypes = [array, count, count, count, *[array] * 9]
+        library.line_bends.restype = None
+        library.line_bends.argtypes = [array, array, array, count, count, array, array, array]
     return library
 
 
@@ -90,6 +104,30 @@ def fit_corners(
         *(part.ctypes.data for part in known),
         ctypes.addressof(rules),
         scratch.ctypes.data,
+        out.ctypes.data,
+    )
+    return out
+
+
+def line_bends(
+    pixels: FloatArray, sigma_px: FloatArray, cells: BoolArray, sides_px: FloatArray, rules: BendRules
+) -> FloatArray | None:
+    """Return what `corners.bends.line_curvature` does, or None without the compiled kernel."""
+    library = _library()
+    if library is None:
+        return None
+    places, sigmas = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(sigma_px, np.float64)
+    wanted, sides = np.ascontiguousarray(cells, np.bool_), np.ascontiguousarray(sides_px, np.float64)
+    rows, columns = wanted.shape
+    out = np.empty((len(sides), 2))
+    library.line_bends(
+        places.ctypes.data,
+        sigmas.ctypes.data,
+        wanted.ctypes.data,
+        rows,
+        columns,
+        sides.ctypes.data,
+        ctypes.addressof(rules),
         out.ctypes.data,
     )
     return out

@@ -7,7 +7,8 @@ import pytest
 
 from rigkit.boards import Board
 from rigkit.cameras.kannala_brandt import KannalaBrandt
-from rigkit.corners import edge_fit
+from rigkit.corners import bends, edge_fit
+from rigkit.corners.bends import line_curvature
 from rigkit.corners.edge_fit import EdgeFit, fit_edges
 from rigkit.corners.edge_model import Geometry
 from rigkit.corners.local_fit import fit_cells
@@ -92,3 +93,19 @@ def test_same_pixels_whatever_the_cell(rng: np.random.Generator, monkeypatch: py
     assert plain.valid.sum() > 100
     assert np.abs(compiled.pixels - plain.pixels)[plain.valid].max() < 1e-3
     assert np.abs(compiled.residual / plain.residual - 1.0)[plain.valid].max() < 1e-4
+
+
+def test_compiled_bends_are_the_numpy_ones(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With gaps, corners not to be relied on, and corners alone on their line."""
+    pixels = scene(0.7, 0.0, rng)[1] + rng.normal(0.0, 0.02, (7, 9, 2))
+    pixels[rng.random((7, 9)) < 0.2] = np.nan
+    pixels[3, [0, 1, 3, 4, 5, 6, 7, 8]] = np.nan
+    cells = np.isfinite(pixels[..., 0])
+    sigma = np.where(rng.random((7, 9)) < 0.1, np.nan, rng.uniform(1e-4, 0.1, (7, 9)))
+    sides = rng.uniform(10.0, 30.0, (int(cells.sum()), 2))
+    compiled = line_curvature(pixels, sigma, cells, sides)
+    monkeypatch.setattr(bends, "line_bends", lambda *_: None)
+    plain = line_curvature(pixels, sigma, cells, sides)
+    assert np.isfinite(plain).all()
+    assert np.abs(plain).max() > 1e-4
+    assert np.abs(compiled - plain).max() < 1e-9

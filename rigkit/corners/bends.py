@@ -1,0 +1,71 @@
+"""How the rows and columns of a lattice bend at its corners.
+
+The edge model is told the curvature of its two lines: an error of 1e-4 / px moves a corner by some thousandths of a
+pixel. A row is a smooth curve of the column number; its Taylor coefficients at a corner are the most probable ones
+given the corners on the row, with their standard deviations, and that the k-th is about DECAY^k sides of the cell. Few
+or noisy corners leave the high ones near zero; many exact ones are followed to the end of the row, where a polynomial
+of low degree would miss.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.arrays import BoolArray, FloatArray
+from rigkit.corners.lattice import Sheet
+from rigkit.native.edges import BendRules, line_bends
+
+__all__ = ["line_curvature"]
+
+DECAY = 0.1
+"""Boards under strong perspective and in fisheyes have coefficients up to this^k, in sides of the cell."""
+
+LINE_REACH = Sheet.GAP
+"""Corners so many cells away are used: on a sheet, further ones may be another board's."""
+
+TERMS = 6
+"""Coefficients of order 0 to 5."""
+
+LEAST_SIGMA_PX = 1e-3
+"""No corner is taken to be better than this."""
+
+FREE = 1e-6
+"""Weight of the prior on position and direction: none to speak of, but enough for a corner that is alone."""
+
+
+def line_curvature(pixels: FloatArray, sigma_px: FloatArray, cells: BoolArray, sides_px: FloatArray) -> FloatArray:
+    """Return the curvature of row and column at the M `cells`, (M, 2) 1/px, positive towards +90 degrees.
+
+    Parameters
+    ----------
+    pixels : (R, C, 2), finite at the `cells`.
+    sigma_px : (R, C), NaN where the corner is not to be relied on.
+    cells : (R, C) bool, row by row.
+    sides_px : (M, 2) lengths of the cell's sides along row and column.
+    """
+    rules = BendRules(DECAY, LEAST_SIGMA_PX, FREE, LINE_REACH)
+    compiled = line_bends(pixels, sigma_px, cells, sides_px, rules)
+    if compiled is not None:
+        return compiled
+    steps = np.arange(-LINE_REACH, LINE_REACH + 1)
+    design = (DECAY * steps[:, None]) ** np.arange(TERMS)
+    products = (design[:, :, None] * design[:, None, :]).reshape(len(steps), -1)
+    prior = np.diag([FREE, FREE, *[1.0] * (TERMS - 2)])
+    known = np.isfinite(sigma_px) & np.isfinite(pixels[..., 0])
+    weight = np.where(known, np.maximum(sigma_px, LEAST_SIGMA_PX) ** -2.0, 0.0)
+    row, column = np.nonzero(cells)
+    out = np.empty((len(row), 2))
+    for line, (along_row, along_column) in enumerate(((0, 1), (1, 0))):
+        r, c = row[:, None] + along_row * steps, column[:, None] + along_column * steps
+        inside = (r >= 0) & (r < pixels.shape[0]) & (c >= 0) & (c < pixels.shape[1])
+        r, c = np.where(inside, r, row[:, None]), np.where(inside, c, column[:, None])
+        side = sides_px[:, line, None]
+        weights = np.where(inside, weight[r, c], 0.0) * side**2
+        off = np.where((weights > 0.0)[..., None], pixels[r, c] - pixels[row, column][:, None], 0.0) / side[..., None]
+        normal = (weights @ products).reshape(-1, TERMS, TERMS) + prior
+        right = np.swapaxes(design.T @ (weights[..., None] * off), 1, 2)
+        solved = np.linalg.solve(normal, np.swapaxes(right, 1, 2))
+        first, second = DECAY * solved[:, 1], 2.0 * DECAY**2 * solved[:, 2]
+        cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+        out[:, line] = cross / (np.maximum((first**2).sum(axis=1), 1e-12) ** 1.5 * sides_px[:, line])
+    return out
