@@ -1,284 +1,372 @@
 #!/usr/bin/env python3
-"""Measure corner detection on rendered scenes with exact truth: ours beside OpenCV's detectors and libcbdetect.
+"""Measure corner detection on rendered scenes with exact truth, beside other detectors and beside what is possible.
 
-    python scripts/benchmark_detection.py [--scenes single trihedral fisheye room] [--poses 8] [--peers] [--json FILE]
+    python scripts/benchmark_detection.py [--parts accuracy conditions peers speed pairs] [--poses 6] [--pairs 200]
+                                          [--peers-python PYTHON] [--json FILE]
 
-Prints a Markdown table a scene: RMS of the corners found (px, per axis), recall, boards found complete, false boards,
-predicted against actual error, CPU milliseconds of one thread. A corner counts as found within 1 px of the truth.
+accuracy    errors at several blurs and noises beside the Cramer-Rao bound, predicted beside actual errors
+conditions  light, lens and sensor that are not as they should be; boards cut, covered, small, many
+peers       the same images through the detectors of scripts/benchmark_peers.py, each in a process of its own
+speed       image sizes, pictures without a board, memory
+pairs       three boards that look alike, in two rendered views: same corners, same indices
+
+Prints Markdown tables, then a line for every figure that we ask of the detector: asked, measured, met or missed.
+Distances are 2-D per corner (not per axis), in px; times are processor time of one thread, the least of several calls.
+The peers need not be installed, and need not be in this environment (--peers-python says in which they are).
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
 import os
 import sys
-import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree
+from benchmark_peers import DETECTORS, PEERS, Answer, Worker
 
-from rigkit.boards import Board
-from rigkit.cameras.base import Camera
-from rigkit.cameras.kannala_brandt import KannalaBrandt
-from rigkit.cameras.pinhole import Pinhole
 from rigkit.corners.detect import detect_boards
-from rigkit.geometry.rigid3 import Rigid3, cam_from_world_look_at
-from rigkit.geometry.rotation import exp_so3
-from rigkit.synthetic.photometry import Photometry, develop
-from rigkit.synthetic.render import Optics, radiance
-from rigkit.synthetic.scene import PlacedBoard, trihedral
+from rigkit.corners.identify import identify_pair
+from rigkit.errors import RigkitError
+from rigkit.synthetic.bench_blanks import BLANKS, blank
+from rigkit.synthetic.bench_pairs import EQUAL_BOARDS, PairVerdict, equal_boards_pair, judge_pair
+from rigkit.synthetic.bench_scenes import (
+    BENCH_PHOTOMETRY,
+    CONDITIONS,
+    LENSES,
+    SCENES,
+    BenchScene,
+    bench_field_deg,
+    one_board,
+    room,
+    small_board,
+    three_boards,
+)
+from rigkit.synthetic.bench_score import FoundBoard, Score, score
+from rigkit.synthetic.corner_bound import corner_information, position_bound
+from rigkit.synthetic.photometry import develop
+from rigkit.synthetic.render import Optics
 
-FOUND_PX = 1.0
-NOISES = {0.3: (0, 2, 5, 10), 0.7: (0, 2, 5, 10), 1.0: (0, 2, 5), 2.0: (0, 2, 5, 10)}
+PARTS = ("accuracy", "conditions", "peers", "speed", "pairs")
+NOISES = {0.3: (0, 2), 0.7: (0, 2, 5, 10), 1.2: (2,), 2.0: (0, 5, 10)}
+"""Noise levels measured at each blur (sigma, px)."""
+ASKED_RMS_PX = {(0.3, 0): 0.003, (0.7, 0): 0.003, (0.7, 2): 0.008, (0.7, 5): 0.018, (2.0, 10): 0.075}
+BOUND_FACTOR, BOUND_PX = 1.1, 0.002
+SIGMA_BAND = 0.2
+PLAIN = (0.7, 2)
+"""Blur and noise of all parts that do not say otherwise."""
+SIZES = {"640x480": (640, 480), "1600x1200": (1600, 1200), "12 MP": (4000, 3000), "20 MP": (5472, 3648)}
+MOST_MS = {"640x480": 10.0, "1600x1200": 20.0, "12 MP": 60.0}
 
 
 @dataclass(frozen=True)
-class Found:
-    """What a detector returns: corner sets, and sigma if it predicts one."""
+class Asked:
+    """A figure that is asked for, and what was measured."""
 
-    corners: list[np.ndarray]
-    sigma_px: list[np.ndarray] | None = None
+    what: str
+    asked: str
+    measured: str
+    met: bool
 
-
-@dataclass(frozen=True)
-class Scene:
-    boards: tuple[PlacedBoard, ...]
-    camera: Camera
-    cam_from_world: Rigid3
-
-    def truth(self) -> list[np.ndarray]:
-        out = []
-        for placed in self.boards:
-            pixels, valid = placed.see(self.camera, self.cam_from_world)
-            width, height = self.camera.size_px
-            inside = valid & (pixels > 2.0).all(axis=1) & (pixels < [width - 3.0, height - 3.0]).all(axis=1)
-            out.append(pixels[inside])
-        return out
+    def line(self) -> str:
+        return f"- {self.what}: asked {self.asked}, measured {self.measured}: {'met' if self.met else 'MISSED'}"
 
 
-def regular(size_px: tuple[int, int]) -> Camera:
-    width, height = size_px
-    return Pinhole(size_px, np.array([0.85 * width, 0.85 * width, 0.5 * width - 0.5, 0.5 * height - 0.5]))
+def at_most(what: str, limit: float, value: float, unit: str = "") -> Asked:
+    return Asked(what, f"at most {limit:.4g}{unit}", f"{value:.4g}{unit}", value <= limit)
 
 
-def fisheye(size_px: tuple[int, int]) -> Camera:
-    width, height = size_px
-    return KannalaBrandt(
-        size_px,
-        np.array([0.36 * width, 0.36 * width, 0.5 * width + 3.3, 0.5 * height - 2.7, -0.012, -0.004, 0.001, -0.0002]),
-    )
+def at_least(what: str, limit: float, value: float) -> Asked:
+    return Asked(what, f"at least {limit:.4g}", f"{value:.4g}", value >= limit)
 
 
-def single(rng: np.random.Generator, size_px: tuple[int, int]) -> Scene:
-    """One board of 10x10 corners that fills most of the image, tilted up to 40 degrees."""
-    board = Board("b", 10, 10, 30.0, 30.0)
-    while True:
-        turn = exp_so3(np.array([*rng.uniform(-0.65, 0.65, 2), rng.uniform(-np.pi, np.pi)]))
-        distance = rng.uniform(560.0, 720.0)
-        centre = np.array([rng.uniform(-40, 40), rng.uniform(-30, 30), distance])
-        placed = PlacedBoard(board, Rigid3(turn, centre - turn @ np.array([135.0, 135.0, 0.0])))
-        scene = Scene((placed,), regular(size_px), Rigid3.identity())
-        if len(scene.truth()[0]) == board.corner_count:
-            return scene
+class Tables:
+    """Prints tables as they grow and keeps them for `--json`."""
+
+    def __init__(self) -> None:
+        self.rows: dict[str, list[dict[str, str | float]]] = {}
+
+    def row(self, table: str, **cells: str | float) -> None:
+        if table not in self.rows:
+            self.rows[table] = []
+            print(f"\n{table}\n\n| " + " | ".join(name.replace("_", " ") for name in cells) + " |")
+            print("| " + " | ".join(":--" if isinstance(v, str) else "--:" for v in cells.values()) + " |")
+        self.rows[table].append(cells)
+        shown = (v if isinstance(v, str) else "" if np.isnan(v) else f"{v:.4g}" for v in cells.values())
+        print("| " + " | ".join(shown) + " |", flush=True)
 
 
-def corner(rng: np.random.Generator, camera: Camera, near: float, far: float) -> Scene:
-    """Three perpendicular boards of 8x6 corners."""
-    boards = trihedral([Board(name, 8, 6, 50.0, 50.0) for name in "abc"])
-    points = np.concatenate([b.points() for b in boards])
-    while True:
-        outward = np.mean([b.normal() for b in boards], axis=0) + rng.uniform(-0.22, 0.22, 3)
-        target = points.mean(axis=0) + rng.uniform(-40, 40, 3)
-        eye = target + outward / np.linalg.norm(outward) * rng.uniform(near, far)
-        scene = Scene(boards, camera, cam_from_world_look_at(eye, target, -boards[1].normal()))
-        if sum(map(len, scene.truth())) == 144:
-            return scene
+def images(scenes: Sequence[BenchScene], blur: float, noises: Iterable[int]) -> Iterator[tuple[int, list[np.ndarray]]]:
+    """Yield (noise, an image of each scene)."""
+    light = [scene.radiance(Optics(blur)) for scene in scenes]
+    for noise in noises:
+        rng = np.random.default_rng(1000 + noise)
+        photometry = replace(BENCH_PHOTOMETRY, noise_levels=float(noise))
+        yield noise, [np.asarray(develop(picture, photometry, rng)) for picture in light]
 
 
-def room(rng: np.random.Generator, size_px: tuple[int, int]) -> Scene:
-    """Nine boards of different sizes, some foreshortened, in a fisheye view."""
-    camera = fisheye(size_px)
-    placed = []
-    for number in range(9):
-        board = Board(f"r{number}", 7 + number % 2, 5 + number // 5, 55.0, 55.0)
-        yaw, pitch = np.radians(-56.0 + 56.0 * (number % 3)), np.radians(-34.0 + 34.0 * (number // 3))
-        ray = np.array([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)])
-        turn = cam_from_world_look_at(np.zeros(3), ray).rotation.T @ exp_so3(
-            np.array([*rng.uniform(-0.6, 0.6, 2), rng.uniform(-0.4, 0.4)])
-        )
-        middle = np.array([27.5 * (board.columns - 1), 27.5 * (board.rows - 1), 0.0])
-        placed.append(PlacedBoard(board, Rigid3(turn, ray * rng.uniform(1000, 1500) - turn @ middle)))
-    return Scene(tuple(placed), camera, Rigid3.identity())
+def measure(scenes: Sequence[BenchScene], pictures: Sequence[np.ndarray]) -> Score:
+    pairs = zip(scenes, pictures, strict=True)
+    return Score.sum([score(scene, [FoundBoard.of(d) for d in detect_boards(picture)]) for scene, picture in pairs])
 
 
-SCENES: dict[str, Callable[[np.random.Generator], Scene]] = {
-    "single": lambda rng: single(rng, (640, 480)),
-    "trihedral": lambda rng: corner(rng, regular((640, 480)), 1150.0, 1400.0),
-    "trihedral-1600": lambda rng: corner(rng, regular((1600, 1200)), 1150.0, 1400.0),
-    "fisheye": lambda rng: corner(rng, fisheye((640, 480)), 420.0, 540.0),
-    "fisheye-1600": lambda rng: corner(rng, fisheye((1600, 1200)), 420.0, 560.0),
-    "room": lambda rng: room(rng, (1600, 1200)),
-}
+def counts(total: Score) -> dict[str, str | float]:
+    """Return the cells that say what was found."""
+    return {
+        "recall": total.recall,
+        "whole_boards": f"{total.complete}/{total.boards}",
+        "split": total.split,
+        "false": total.false_boards,
+        "wrong_index": total.wrong_indices,
+    }
 
 
-def ours(image: np.ndarray, sizes: list[tuple[int, int]]) -> Found:
-    del sizes
-    found = detect_boards(image)
-    return Found([item.pixels for item in found], [item.sigma_px for item in found])
-
-
-def opencv(image: np.ndarray, sizes: list[tuple[int, int]], *, sector: bool) -> Found:
-    """OpenCV's detectors, given the sizes; each board found is painted over before the next try."""
-    image = image.copy()
+def accuracy(tables: Tables, poses: int) -> list[Asked]:
+    """Errors beside the Cramer-Rao bound, over blur and noise."""
+    kinds = {"one board": one_board, "three boards": three_boards}
+    totals: dict[tuple[str, str, float, int], tuple[Score, float]] = {}
+    for lens in LENSES:
+        for kind, make in kinds.items():
+            scenes = [make(np.random.default_rng(seed), lens=lens) for seed in range(poses)]
+            for blur, noises in NOISES.items():
+                information = np.concatenate([x for scene in scenes for x in corner_information(scene, blur)])
+                for noise, pictures in images(scenes, blur, noises):
+                    total = measure(scenes, pictures)
+                    trace = np.trace(position_bound(information, noise), axis1=1, axis2=2)
+                    bound = float(np.sqrt(trace.mean()))
+                    totals[kind, lens, blur, noise] = total, bound
+                    tables.row(
+                        f"## Accuracy, 640x480, {poses} poses",
+                        scene=f"{kind}, {lens}",
+                        blur=blur,
+                        noise=noise,
+                        **counts(total),
+                        rms_px=total.rms_px,
+                        bound_px=bound,
+                        rms_over_bound=total.rms_px / bound,
+                        worst_px=total.worst_px,
+                        actual_over_predicted=total.actual_over_predicted if noise else float("nan"),
+                    )
     out = []
-    for size in sizes:
-        if sector:
-            ok, corners = cv2.findChessboardCornersSB(image, size)
-        else:
-            ok, corners = cv2.findChessboardCorners(image, size)
-        if not ok:
-            continue
-        corners = corners.reshape(-1, 1, 2).astype(np.float32)
-        if not sector:
-            grid = corners.reshape(size[1], size[0], 2)
-            gaps = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1)]
-            half = int(np.clip(0.4 * min(gaps), 2, 11))
-            corners = cv2.cornerSubPix(image, corners, (half, half), (-1, -1), (3, 40, 1e-4))
-        out.append(corners.reshape(-1, 2).astype(np.float64))
-        cv2.fillConvexPoly(image, cv2.convexHull(corners).astype(np.int32), int(np.median(image)))
-    return Found(out)
-
-
-def libcbdetect(image: np.ndarray, sizes: list[tuple[int, int]]) -> Found:
-    """libcbdetect as PyPI has it (pip install libcbdetect): it returns one board."""
-    from libCBDetect import Checkerboard
-
-    del sizes
-    board = Checkerboard()
-    board.show_processing = False
-    board.array_norm_to_image(image / 255.0, *image.shape)
-    board.find_corners()
-    board.find_board_from_corners()
-    u, v = np.zeros(board.rows * board.cols), np.zeros(board.rows * board.cols)
-    if not len(u):
-        return Found([])
-    board.get_board_corners(u, v)
-    return Found([np.stack([u, v], axis=1)])
-
-
-def detectors(peers: bool) -> dict[str, Callable[[np.ndarray, list[tuple[int, int]]], Found]]:
-    out: dict[str, Callable[[np.ndarray, list[tuple[int, int]]], Found]] = {"rigkit": ours}
-    if peers:
-        out["opencv classic + cornerSubPix"] = lambda image, sizes: opencv(image, sizes, sector=False)
-        out["opencv SB"] = lambda image, sizes: opencv(image, sizes, sector=True)
-        if importlib.util.find_spec("libCBDetect"):
-            out["libcbdetect"] = libcbdetect
-        else:
-            print("libCBDetect is not importable (pip install libcbdetect): left out", file=sys.stderr)
+    for (blur, noise), limit in ASKED_RMS_PX.items():
+        what = f"blur {blur} noise {noise}, 640x480, px rms"
+        out += [at_most(f"{k}, regular, {what}", limit, totals[k, "regular", blur, noise][0].rms_px) for k in kinds]
+    for name, (total, bound) in totals.items():
+        what = "{}, {}, blur {} noise {}, px rms, 1.1 bounds + 0.002".format(*name)
+        limit = BOUND_FACTOR * bound + BOUND_PX
+        if name[2:] in ASKED_RMS_PX or total.rms_px > limit:
+            out.append(at_most(what, limit, total.rms_px))
+    fisheye = totals["three boards", "fisheye", *PLAIN][0]
+    out.append(at_most("three boards, fisheye, blur 0.7 noise 2, px rms", 0.012, fisheye.rms_px))
+    out.append(at_most("the same, worst corner, px", 0.06, fisheye.worst_px))
+    noisy = {name: total.actual_over_predicted for name, (total, _) in totals.items() if name[3] > 0}
+    name, worst = max(noisy.items(), key=lambda item: abs(np.log(item[1])))
+    what = "predicted sigma, actual / predicted, furthest from 1 ({}, {}, blur {} noise {})".format(*name)
+    out.append(Asked(what, "0.8 to 1.2", f"{worst:.3f}", abs(worst - 1.0) <= SIGMA_BAND))
+    for lens in LENSES:
+        three = Score.sum([total for name, (total, _) in totals.items() if name[:2] == ("three boards", lens)])
+        out.append(at_least(f"three boards, {lens}, all blurs and noises, recall", 1.0, three.recall))
+        bad = three.false_boards + three.wrong_indices
+        out.append(at_most(f"three boards, {lens}, false boards and wrong indices", 0, bad))
     return out
 
 
-@dataclass
-class Score:
-    errors: list[np.ndarray]
-    ratios: list[np.ndarray]
-    corners: int = 0
-    found: int = 0
-    boards: int = 0
-    complete: int = 0
-    false: int = 0
-    images: int = 0
-    seconds: float = 0.0
+def conditions(tables: Tables, poses: int) -> list[Asked]:
+    """Everything that is not plain."""
+    out = []
+    table = f"## Conditions, 640x480 (rooms 1600x1200), {poses} poses"
 
-    def row(self) -> dict[str, float]:
-        errors = np.concatenate(self.errors) if self.errors else np.full((1, 2), np.nan)
-        ratios = np.concatenate(self.ratios) if self.ratios else np.full(1, np.nan)
-        return {
-            "rms_px": float(np.sqrt((errors**2).mean())),
-            "worst_px": float(np.linalg.norm(errors, axis=1).max()),
-            "recall": self.found / max(self.corners, 1),
-            "complete": self.complete / max(self.boards, 1),
-            "false_per_image": self.false / max(self.images, 1),
-            "actual_over_predicted": float(np.sqrt((ratios**2).mean())),
-            "cpu_ms": 1e3 * self.seconds / max(self.images, 1),
-        }
+    def add(name: str, lens: str, total: Score) -> Score:
+        sigma = total.actual_over_predicted
+        tables.row(
+            table,
+            scene=f"{name}, {lens}",
+            **counts(total),
+            rms_px=total.rms_px,
+            worst_px=total.worst_px,
+            actual_over_predicted=sigma,
+        )
+        return total
 
+    def drawn(make: object, lens: str, **settings: object) -> list[BenchScene]:
+        return [make(np.random.default_rng(seed), lens=lens, **settings) for seed in range(poses)]  # type: ignore[operator]
 
-def judge(score: Score, truth: list[np.ndarray], result: Found) -> None:
-    every = np.concatenate(truth)
-    tree = cKDTree(every)
-    owner = np.repeat(np.arange(len(truth)), [len(t) for t in truth])
-    hit = np.zeros(len(every), bool)
-    for number, corners in enumerate(result.corners):
-        distance, index = tree.query(corners)
-        good = distance < FOUND_PX
-        if good.mean() < 0.5:
-            score.false += 1
-            continue
-        hit[index[good]] = True
-        score.errors.append((corners - every[index])[good])
-        if result.sigma_px is not None:
-            score.ratios.append(((corners - every[index]) / result.sigma_px[number][:, None])[good].ravel())
-    score.corners += len(every)
-    score.found += int(hit.sum())
-    score.boards += len(truth)
-    score.complete += sum(bool(hit[owner == number].all()) for number in range(len(truth)))
-    score.images += 1
+    for lens in LENSES:
+        scenes = drawn(three_boards, lens)
+        for name, (optics, photometry) in CONDITIONS.items():
+            light = [scene.radiance(optics) for scene in scenes]
+            pictures = [develop(x, photometry, np.random.default_rng(seed)) for seed, x in enumerate(light)]
+            total = add(f"three boards, {name}", lens, measure(scenes, pictures))
+            out.append(at_least(f"three boards, {name}, {lens}, recall", 1.0, total.recall))
+        for kind in ("partial", "covered"):
+            scenes = drawn(SCENES[kind], lens)
+            add(kind, lens, measure(scenes, next(images(scenes, PLAIN[0], PLAIN[1:]))[1]))
+        for square_px in (5.0, 6.0):
+            scenes = drawn(small_board, lens, square_px=square_px)
+            total = add(f"squares of {square_px:g} px", lens, measure(scenes, next(images(scenes, 0.5, (2,)))[1]))
+            out.append(at_least(f"squares of {square_px:g} px (blur 0.5 noise 2), {lens}, recall", 1.0, total.recall))
+        scenes = [
+            room(np.random.default_rng(seed), lens=lens, size_px=SIZES["1600x1200"], count=7 + seed % 6)
+            for seed in range(poses)
+        ]
+        total = add("rooms of 7 to 12 boards", lens, measure(scenes, next(images(scenes, PLAIN[0], PLAIN[1:]))[1]))
+        share = total.complete / total.boards
+        out.append(at_least(f"rooms of 7 to 12 boards, {lens}, share of complete boards", 0.9, share))
+        out.append(at_most("the same, false boards and wrong indices", 0, total.false_boards + total.wrong_indices))
+    return out
 
 
-def conditions(poses: list[Scene], only: list[int] | None) -> Iterator[tuple[str, list[np.ndarray]]]:
-    """Yield (name, images) for every blur and noise."""
-    for blur, noises in NOISES.items():
-        light = [radiance(s.boards, s.camera, s.cam_from_world, optics=Optics(blur_px=blur)) for s in poses]
-        for noise in noises if only is None else [n for n in noises if n in only]:
-            photometry = Photometry(exposure=0.95, vignetting=0.25, gradient=(0.1, -0.05), noise_levels=float(noise))
-            rng = np.random.default_rng(1000 + noise)
-            yield f"blur {blur} noise {noise}", [np.asarray(develop(x, photometry, rng)) for x in light]
+def workers(names: Sequence[str], python: str) -> dict[str, Worker]:
+    """Return the workers that can be had; says which cannot."""
+    ours = ("rigkit", "OpenCV classic", "OpenCV SB")
+    all_of_them = {name: Worker(name, sys.executable if name in ours else python) for name in names}
+    for name, worker in all_of_them.items():
+        if worker.missing:
+            print(f"{name} left out: {worker.missing} (pip install {DETECTORS[name].install})", file=sys.stderr)
+    return {name: worker for name, worker in all_of_them.items() if not worker.missing}
+
+
+def peers(tables: Tables, poses: int, python: str) -> list[Asked]:
+    """The same images through all detectors."""
+    chosen = workers(("rigkit", *PEERS), python)
+    scenes = {
+        "one board, regular, 640x480": [one_board(np.random.default_rng(k)) for k in range(poses)],
+        "three boards, regular, 640x480": [three_boards(np.random.default_rng(k)) for k in range(poses)],
+        "three boards, fisheye, 640x480": [
+            three_boards(np.random.default_rng(k), lens="fisheye") for k in range(poses)
+        ],
+        "three boards, regular, 1600x1200": [
+            three_boards(np.random.default_rng(k), size_px=SIZES["1600x1200"]) for k in range(poses)
+        ],
+        "room of 9, fisheye, 1600x1200": [
+            room(np.random.default_rng(k), lens="fisheye", size_px=SIZES["1600x1200"], count=9) for k in range(2)
+        ],
+        "three boards, regular, 12 MP": [three_boards(np.random.default_rng(0), size_px=SIZES["12 MP"])],
+    }
+    times: dict[tuple[str, str], float] = {}
+    for name, group in scenes.items():
+        pictures = next(images(group, PLAIN[0], PLAIN[1:]))[1]
+        answers: dict[str, list[Answer]] = {detector: [] for detector in chosen}
+        for scene, picture in zip(group, pictures, strict=True):
+            for detector, worker in chosen.items():
+                answers[detector].append(worker.run(picture, [b.board.size for b in scene.boards]))
+        for detector, given in answers.items():
+            total = Score.sum([score(s, [FoundBoard(*b) for b in a.boards]) for s, a in zip(group, given, strict=True)])
+            times[name, detector] = 1e3 * float(np.median([a.cpu_s for a in given]))
+            failed = sorted({a.failed for a in given} - {""})
+            whole = f"{total.complete}/{total.boards}" if DETECTORS[detector].boards else "no boards"
+            tables.row(
+                f"## Beside other detectors, blur {PLAIN[0]} noise {PLAIN[1]}, {poses} poses",
+                scene=name,
+                detector=detector + "".join(f" ({reason})" for reason in failed),
+                recall=total.recall,
+                whole_boards=whole,
+                false=total.false_boards,
+                rms_px=total.rms_px,
+                cpu_ms=times[name, detector],
+                ratio_to_ours=times[name, detector] / times[name, "rigkit"],
+            )
+    for worker in chosen.values():
+        worker.close()
+    out = []
+    for name in scenes:
+        for peer, factor in (("libcbdetect", 10.0), ("calib-targets", 1.0)):
+            if (name, peer) in times:
+                ratio = times[name, peer] / times[name, "rigkit"]
+                out.append(at_least(f"{name}: time of {peer} in ours", factor, ratio))
+    return out
+
+
+def speed(tables: Tables, poses: int) -> list[Asked]:
+    """Image sizes, pictures without a board, memory."""
+    out = []
+    for size, size_px in SIZES.items():
+        # A worker a size: its peak memory is that of the size.
+        ours = Worker("rigkit")
+        scenes = [three_boards(np.random.default_rng(k), size_px=size_px) for k in range(1 if "MP" in size else poses)]
+        answers = [ours.run(p, [], budget_s=1.5) for p in next(images(scenes, PLAIN[0], PLAIN[1:]))[1]]
+        with_boards = 1e3 * float(np.median([a.cpu_s for a in answers]))
+        peak = answers[-1].peak_mb
+        tables.row("## Speed and memory", picture=f"three boards, {size}", cpu_ms=with_boards, peak_mb=peak)
+        if size in MOST_MS:
+            out.append(at_most(f"three boards, {size}, time", MOST_MS[size], with_boards, " ms"))
+        if size == "20 MP":
+            out.append(at_most("20 MP, memory of the whole process", 1024.0, peak, " MB"))
+        for name in BLANKS if size != "20 MP" else ():
+            answer = ours.run(blank(name, np.random.default_rng(1), size_px), [], budget_s=0.7)
+            without = 1e3 * answer.cpu_s
+            tables.row("## Speed and memory", picture=f"{name}, {size}", cpu_ms=without, peak_mb=answer.peak_mb)
+            what = f"no board ({name}), {size}"
+            out.append(at_most(f"{what}: time over that with three boards", 1.0, without / with_boards))
+            out.append(at_most(f"{what}: boards found", 0, len(answer.boards)))
+        ours.close()
+    return out
+
+
+def pairs(tables: Tables, count: int) -> list[Asked]:
+    """Three equal boards in two views."""
+    verdicts: dict[str, dict[str, int]] = {}
+    for seed in range(count):
+        what, scene = equal_boards_pair(seed)
+        views = scene.images(
+            optics=Optics(PLAIN[0], field_deg=bench_field_deg(what.split(", ")[0])),
+            photometry=replace(BENCH_PHOTOMETRY, noise_levels=float(PLAIN[1])),
+            rng=np.random.default_rng(seed),
+        )
+        try:
+            found = identify_pair(*(detect_boards(v) for v in views), EQUAL_BOARDS, scene.camera1, scene.camera2)
+            verdict = judge_pair(scene, found.pairs(), found.ambiguous)
+        except RigkitError:
+            verdict = PairVerdict.INCOMPLETE
+        if verdict != PairVerdict.RIGHT:
+            print(f"pair of seed {seed} ({what}): {verdict}", file=sys.stderr)
+        group = verdicts.setdefault(what, dict.fromkeys(map(str, PairVerdict), 0))
+        group[str(verdict)] += 1
+    for what, group in verdicts.items():
+        tables.row(f"## {count} pairs of three boards that look alike", views=what, **group)
+    sums = {v: sum(group[v] for group in verdicts.values()) for v in map(str, PairVerdict)}
+    tables.row(f"## {count} pairs of three boards that look alike", views="all", **sums)
+    return [
+        at_most(f"{count} pairs of three equal boards, wrong answers", 0, sums["wrong"]),
+        at_least("the same, right or a stated tie", count, sums["right"] + sums["ambiguous"]),
+    ]
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--scenes", nargs="+", default=["single", "trihedral", "fisheye"], choices=list(SCENES))
-    parser.add_argument("--poses", type=int, default=6)
-    parser.add_argument("--noise", nargs="+", type=int, help="only these noise levels")
-    parser.add_argument("--peers", action="store_true", help="also run OpenCV's detectors and libcbdetect")
+    parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=PARTS)
+    parser.add_argument("--poses", type=int, default=6, help="scenes a row")
+    parser.add_argument("--pairs", type=int, default=200, help="pairs of three equal boards")
+    parser.add_argument("--peers-python", default=sys.executable, help="interpreter that has the peers")
     parser.add_argument("--json", metavar="FILE", help="write the figures for programs")
     args = parser.parse_args()
     cv2.setNumThreads(1)
-    chosen = detectors(args.peers)
-    table: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
-    for name in args.scenes:
-        rng = np.random.default_rng(7)
-        poses = [SCENES[name](rng) for _ in range(args.poses)]
-        print(f"\n## {name}, {args.poses} poses\n")
-        head = None
-        for condition, images in conditions(poses, args.noise):
-            for detector, run in chosen.items():
-                score = Score([], [])
-                for scene, image in zip(poses, images, strict=True):
-                    truth = scene.truth()
-                    sizes = [placed.board.size for placed in scene.boards]
-                    started = time.thread_time()
-                    result = run(image, sizes)
-                    score.seconds += time.thread_time() - started
-                    judge(score, truth, result)
-                row = score.row()
-                if head is None:
-                    head = ["condition", "detector", *row]
-                    print("| " + " | ".join(head) + " |\n|" + "---|" * len(head))
-                print(f"| {condition} | {detector} | " + " | ".join(f"{value:.4g}" for value in row.values()) + " |")
-                table.setdefault(name, {}).setdefault(condition, {})[detector] = row
+    tables = Tables()
+    asked: list[Asked] = []
+    for part in args.parts:
+        if part == "accuracy":
+            asked += accuracy(tables, args.poses)
+        elif part == "conditions":
+            asked += conditions(tables, args.poses)
+        elif part == "peers":
+            asked += peers(tables, args.poses, args.peers_python)
+        elif part == "speed":
+            asked += speed(tables, args.poses)
+        else:
+            asked += pairs(tables, args.pairs)
+    print("\n## Asked\n")
+    print("\n".join(item.line() for item in asked))
+    missed = sum(not item.met for item in asked)
+    print(f"\n{len(asked) - missed} of {len(asked)} met")
     if args.json:
         with open(args.json, "w", encoding="utf-8") as stream:
-            json.dump(table, stream, indent=1)
+            json.dump({"tables": tables.rows, "asked": [vars(item) for item in asked]}, stream, indent=1)
     return 0
 
 
