@@ -32,7 +32,7 @@ FIRST_SIGMA_PX = 0.1
 """How well corners are known before the first pass: saddles of a smoothed image."""
 
 FIRST_PASS = (9.0, 4, 0.02)
-LAST_PASS = (18.0, 8, 1e-3)
+LAST_PASS = (18.0, 8, 2e-3)
 """Radius in px, Gauss-Newton steps at most, and the step in px that ends them: the first pass only has to bring the
 lattice to a few hundredths of a pixel."""
 
@@ -61,6 +61,7 @@ COVERED_FACTOR = 3.5
 off by this times the typical deviation, is covered in part, by the edge of a ruler or of a hand."""
 
 DIFFERENCES = (5, 6)
+FEWEST_DIFFERENCES = 16
 UNEXPLAINED = 1.25
 """A scatter about the lattice less than this times the expected one is what chance makes of fifty corners."""
 
@@ -135,7 +136,7 @@ def _typical_blur(item: RefinedLattice, parts: Sequence[Part]) -> FloatArray:
         mine = item.blur_px[part]
         known = np.isfinite(mine)
         if known.any():
-            typical = float(np.median(mine[known]))
+            typical = _typical(mine[known])
             blur[part] = np.where(known, np.clip(mine, 0.7 * typical, 1.4 * typical), typical)
     return blur.clip(*BLUR_RANGE)
 
@@ -247,8 +248,8 @@ def _checked(item: RefinedLattice, parts: Sequence[Part]) -> RefinedLattice:
         here, sure = known[part], judged[part]
         if here.sum() < FEWEST_CHECKED or sure.sum() < FEWEST_JUDGED:
             continue
-        typical = float(np.median(cells[part][sure]))
-        usual = float(np.median(relative[part][here]))
+        typical = _typical(cells[part][sure])
+        usual = _typical(relative[part][here])
         astray = (cells[part] > max(ASTRAY_CELLS, ASTRAY_FACTOR * typical)) & (excess[part] > ASTRAY_FACTOR)
         covered = relative[part] > max(COVERED, COVERED_FACTOR * usual)
         drop[part] = sure & (astray | (covered & (cells[part] > COVERED_FACTOR * typical)))
@@ -284,13 +285,19 @@ def _best_plane(lattice: Lattice) -> FloatArray:
 
 def _roughness(values: FloatArray, sigma: FloatArray, order: int) -> float:
     """Return the typical difference of `order` of `values` (R, C, 2) over the expected one; NaN if there are few."""
-    factors = np.array([float(comb(order, k)) for k in range(order + 1)])
+    factors = [float(comb(order, k)) ** 2 for k in range(order + 1)]
     ratios = [np.zeros(0)]
-    for axis in (0, 1):
-        if sigma.shape[axis] > order:
-            windows = np.lib.stride_tricks.sliding_window_view(sigma, order + 1, axis=axis)
-            expected = np.sqrt(((windows * factors) ** 2).sum(axis=-1))
-            ratio = np.abs(np.diff(values, order, axis=axis)) / expected[..., None]
+    for mine, spread in ((values, sigma**2), (np.swapaxes(values, 0, 1), sigma.T**2)):
+        count = len(spread) - order
+        if count > 0:
+            variance = sum(factor * spread[k : k + count] for k, factor in enumerate(factors))
+            ratio = np.abs(np.diff(mine, order, axis=0)) / np.sqrt(variance)[..., None]
             ratios.append(ratio[np.isfinite(ratio)])
     every = np.concatenate(ratios)
-    return float(np.median(every)) / MEDIAN_OF_NORMAL if len(every) >= 16 else np.nan
+    return float(np.median(every)) / MEDIAN_OF_NORMAL if len(every) >= FEWEST_DIFFERENCES else np.nan
+
+
+def _typical(values: FloatArray) -> float:
+    """Return the median of some `values`, the upper one of two."""
+    half = len(values) // 2
+    return float(np.partition(values, half)[half])

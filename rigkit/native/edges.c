@@ -92,7 +92,8 @@ static void collect(
     window->size = radius > 2.0 ? radius : 2.0;
     const double near = (rules->near_sigmas * blur + rules->near_px) / fabs(area);
     const double far1 = near * hypot(b[0], b[1]), far2 = near * hypot(a[0], a[1]);
-    const int64_t most = (int64_t)floor(rules->radius_px);
+    const double tallest = rules->reach * across_v + 1.0;
+    const int64_t most = (int64_t)floor(tallest < rules->radius_px ? tallest : rules->radius_px);
     const range_t columns = {-window->centre_u, (double)image.width - 1.0 - window->centre_u};
     window->count = 0;
     for (int64_t v = -most; v <= most; v++) {
@@ -300,18 +301,27 @@ static void brightness(double *values, const window_t *window, const geometry_t 
     double n = (double)window->count, sum_p = 0.0, sum_i = 0.0, sum_pp = 0.0, sum_pi = 0.0;
     for (int64_t start = 0; start < window->count; start += BLOCK) {
         edge_t one, two;
-        float pattern[BLOCK];
+        float pattern[BLOCK], value[BLOCK];
+        lanes_t p = {0.0f}, i = {0.0f}, pp = {0.0f}, pi = {0.0f};
         along_line(line1, window->u + start, window->v + start, x, y, blur, &one);
         along_line(line2, window->u + start, window->v + start, x, y, blur, &two);
-        for (int i = 0; i < BLOCK; i++)
-            pattern[i] = mixed(&one, &two, rho, i);
-        const int64_t used = window->count - start < BLOCK ? window->count - start : BLOCK;
-        for (int64_t i = 0; i < used; i++) {
-            const double p = sign * (double)pattern[i], value = (double)window->value[start + i];
-            sum_p += p;
-            sum_i += value;
-            sum_pp += p * p;
-            sum_pi += p * value;
+        for (int k = 0; k < BLOCK; k++) {
+            const int used = start + k < window->count;
+            pattern[k] = used ? (float)sign * mixed(&one, &two, rho, k) : 0.0f;
+            value[k] = used ? window->value[start + k] : 0.0f;
+        }
+        for (int k = 0; k < BLOCK; k += LANES) {
+            const lanes_t here = *(const lanes_t *)(pattern + k), grey = *(const lanes_t *)(value + k);
+            p += here;
+            i += grey;
+            pp += here * here;
+            pi += here * grey;
+        }
+        for (int lane = 0; lane < LANES; lane++) {
+            sum_p += (double)p[lane];
+            sum_i += (double)i[lane];
+            sum_pp += (double)pp[lane];
+            sum_pi += (double)pi[lane];
         }
     }
     n = n > 1.0 ? n : 1.0;
@@ -321,7 +331,8 @@ static void brightness(double *values, const window_t *window, const geometry_t 
     values[A] = (sum_i - slope * sum_p) / n;
 }
 
-/* Factor the lower half of `matrix` (rows of ROWS) in place, Cholesky; return whether it is positive definite. */
+/* Factor the lower half of `matrix` (rows of ROWS) in place, Cholesky, with one over the diagonal on the diagonal;
+ * return whether it is positive definite. */
 static int factor(double *matrix)
 {
     for (int j = 0; j < PARAMETERS; j++) {
@@ -330,13 +341,12 @@ static int factor(double *matrix)
             rest -= row[k] * row[k];
         if (!(rest > 0.0))
             return 0;
-        row[j] = sqrt(rest);
-        const double scale = 1.0 / row[j];
+        row[j] = 1.0 / sqrt(rest);
         for (int i = j + 1; i < PARAMETERS; i++) {
             double *below = matrix + i * ROWS, sum = below[j];
             for (int k = 0; k < j; k++)
                 sum -= below[k] * row[k];
-            below[j] = sum * scale;
+            below[j] = sum * row[j];
         }
     }
     return 1;
@@ -348,7 +358,7 @@ static void forward(const double *lower, double *right)
         double sum = right[i];
         for (int k = 0; k < i; k++)
             sum -= lower[i * ROWS + k] * right[k];
-        right[i] = sum / lower[i * ROWS + i];
+        right[i] = sum * lower[i * ROWS + i];
     }
 }
 
@@ -358,7 +368,7 @@ static void backward(const double *lower, double *right)
         double sum = right[i];
         for (int k = i + 1; k < PARAMETERS; k++)
             sum -= lower[k * ROWS + i] * right[k];
-        right[i] = sum / lower[i * ROWS + i];
+        right[i] = sum * lower[i * ROWS + i];
     }
 }
 
