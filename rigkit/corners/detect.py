@@ -11,8 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.boards import Board
+from rigkit.cameras.base import Camera
+from rigkit.corners.border import place_part
 from rigkit.corners.fold import join_parts, split_folds
 from rigkit.corners.grow import SaddleIndex, grow_all
+from rigkit.corners.guided import complete_boards
 from rigkit.corners.lattice import Lattice, build_lattices
 from rigkit.corners.links import find_links
 from rigkit.corners.origin import quarter_turns
@@ -26,6 +29,9 @@ __all__ = ["detect_boards"]
 
 FEWEST_OF_PART = 6
 """Corners of the smallest part of a board that something lies across."""
+
+SAME_PX = 2.0
+"""Corners of two detections nearer than this are one corner."""
 
 
 def find_lattices(image: NDArray[np.generic], min_corners: int) -> list[RefinedLattice]:
@@ -55,7 +61,11 @@ def _promising(grey: FloatImage, lattice: Lattice) -> bool:
 
 
 def detect_boards(
-    image: NDArray[np.generic], boards: Sequence[Board] | None = None, *, min_corners: int = 12
+    image: NDArray[np.generic],
+    boards: Sequence[Board] | None = None,
+    *,
+    min_corners: int = 12,
+    camera: Camera | None = None,
 ) -> tuple[BoardDetection, ...]:
     """Find every chessboard of `image`.
 
@@ -63,8 +73,12 @@ def detect_boards(
     ----------
     image : (H, W) or (H, W, 3 or 4), uint8 or uint16 (or float 0..255), grey or RGB.
     boards : what may be in the image, if known. A grid of a board's size, either way round, is turned to its columns x
-        rows. A board is named only where one single given board has that size and one single detection fits it.
+        rows; a part of a board whose borders show where it lies gets its place in the board's grid, any other part
+        stays a grid of its own. A board is named only where one single given board has that size and one single
+        detection fits it.
     min_corners : boards with fewer corners are not reported.
+    camera : the calibrated camera, if known: it shows where corners of known boards were missed, and fits all of them
+        with windows and lines as it sees them (`rigkit.corners.guided`).
 
     Returns
     -------
@@ -76,11 +90,29 @@ def detect_boards(
     InputError
         `image` is not an image of a supported type.
     """
-    sizes = tuple(dict.fromkeys(board.size for board in boards or ()))
-    lattices = [known_part(item, sizes) for item in find_lattices(image, min_corners)]
-    found = [_detection(item, sizes) for item in lattices]
-    found.sort(key=lambda item: (-len(item.grid), *np.round(item.pixels.mean(axis=0)[::-1], 3)))
-    return tuple(_named(found, boards or ()))
+    known = boards or ()
+    sizes = tuple(dict.fromkeys(board.size for board in known))
+    grey = grey_image(image)
+    lattices = [known_part(item, sizes) for item in find_lattices(grey, min_corners)]
+    placed = [place_part(grey, item, sizes) or item for item in lattices]
+    found = complete_boards(grey, [_detection(item, sizes) for item in placed], known, camera)
+    ordered = sorted(found, key=lambda item: (-len(item.grid), *np.round(item.pixels.mean(axis=0)[::-1], 3)))
+    return tuple(_named(_apart(ordered), known))
+
+
+def _apart(found: Sequence[BoardDetection]) -> list[BoardDetection]:
+    """Return those of `found`, the largest first, that are not for the most part corners of one before them.
+
+    A board that something lies across is found in parts; the largest, completed, has the corners of the others.
+    """
+    kept: list[BoardDetection] = []
+    for item in found:
+        shared = (
+            (np.abs(item.pixels[:, None] - other.pixels).max(axis=2) < SAME_PX).any(axis=1).mean() for other in kept
+        )
+        if not any(share > 0.5 for share in shared):
+            kept.append(item)
+    return kept
 
 
 def _detection(refined: RefinedLattice, sizes: Sequence[tuple[int, int]]) -> BoardDetection:

@@ -1,0 +1,224 @@
+"""Where a part of a board of known size lies in the board: which of its sides are the board's own border.
+
+Beyond the last corners of a board there is one more square, and then white paper. So one and a quarter squares beyond
+the last row seen, either the squares go on alternating (the board goes on: what follows was missed, or is out of the
+image), or it is white all along and the dark squares end on the line where they should (a border), or it is something
+else, and nothing is known. Borders and the known size together may leave one place for the part, or several: then it
+remains a part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from rigkit.arrays import BoolArray, FloatArray
+from rigkit.corners.lattice import Lattice
+from rigkit.corners.local_fit import LocalFit, fit_cells
+from rigkit.corners.response import FloatImage, sample
+from rigkit.corners.subpixel import RefinedLattice
+
+__all__ = ["Side", "place_part", "sides"]
+
+LEAST_CELL_PX = 6.0
+"""In smaller squares a quarter of one is not told from its edges."""
+
+FEWEST, STEADY_GAIN = 6, 12.0
+"""Corners behind a prediction, and its standard deviation for corners of standard deviation 1: of a few hundredths of a
+pixel, that is less than a tenth of a square."""
+
+WITHIN = np.array([-0.2, 0.0, 0.2])
+"""Where the brightness of a square is read, from its middle along the row, in squares."""
+
+SQUARE = np.array([0.35, 0.5, 0.65])
+BEYOND = np.array([1.14, 1.2, 1.26])
+"""Where the last square and the paper beyond it are read, in squares from the last corners outwards: near enough for
+narrow margins, far enough for blur."""
+
+PROFILE = np.arange(0.5, 1.3001, 0.02)
+"""Where the end of the dark squares is looked for."""
+
+ENDS_WITHIN, ENDS_WITHIN_PX = 0.07, 0.7
+"""The dark squares of a border end this near to the line, in squares or (the larger) in px: a ruler lies so by
+chance only."""
+
+EDGE_WIDTH = 0.12
+"""Half the width of the edge at their end, in squares: noise may cross its middle more than once."""
+
+WHITE = (0.8, 1.25)
+"""Brightness of the margin, 0 for the dark and 1 for the white squares beside it: it is the same paper."""
+
+DARK = 0.35
+"""The next dark square is darker than this, on the same scale."""
+
+LEAST_CONTRAST = 0.5
+"""Contrast of the outer squares relative to that of the corners: squares that something covers say nothing."""
+
+LEAST_OF_KIND = 2
+"""Dark and white squares that must have been seen to end, or to go on, each."""
+
+AGREEING = 0.9
+"""Part of the squares seen that must say the same."""
+
+
+class Side(Enum):
+    """What lies beyond one side of a lattice."""
+
+    BORDER = "border"
+    GOES_ON = "goes on"
+    UNKNOWN = "unknown"
+
+
+def place_part(image: FloatImage, refined: RefinedLattice, sizes: Sequence[tuple[int, int]]) -> RefinedLattice | None:
+    """Return `refined` on the grid of the whole board, empty where nothing was found; None where its place is open.
+
+    Parameters
+    ----------
+    image : grey, as for `rigkit.corners.subpixel.refine`.
+    refined : a part of a board; lattices of a known size come back as they are.
+    sizes : (columns, rows) of the boards that it may be, either way round.
+    """
+    columns, rows = refined.lattice.size
+    known = {size for c, r in sizes for size in ((c, r), (r, c))}
+    if (columns, rows) in known:
+        return refined
+    larger = [(c - columns, r - rows) for c, r in known if c >= columns and r >= rows]
+    if not larger:
+        return None
+    top, left, bottom, right = sides(image, refined.lattice)
+    fits = {
+        (across, down, before, above)
+        for across, down in larger
+        for before in range(across + 1)
+        for above in range(down + 1)
+        if _agrees(left, before) and _agrees(right, across - before)
+        if _agrees(top, above) and _agrees(bottom, down - above)
+    }
+    # A row too many (a shadow, what lies beside the board) makes a part as wide as the board: a size alone is no proof.
+    seen = Side.BORDER in (left, right) and Side.BORDER in (top, bottom)
+    if len(fits) != 1 or not seen:
+        return None
+    across, down, before, above = fits.pop()
+    return _padded(refined, (above, down - above), (before, across - before))
+
+
+def _agrees(side: Side, missing: int) -> bool:
+    """Return whether `missing` rows beyond a side can be what is seen there."""
+    return {Side.BORDER: missing == 0, Side.GOES_ON: missing > 0, Side.UNKNOWN: True}[side]
+
+
+def _padded(refined: RefinedLattice, rows: tuple[int, int], columns: tuple[int, int]) -> RefinedLattice:
+    def pad(values: FloatArray) -> FloatArray:
+        return np.pad(values, (rows, columns, *[(0, 0)] * (values.ndim - 2)), constant_values=np.nan)
+
+    old = refined.lattice
+    rising = old.rising != ((rows[0] + columns[0]) % 2 == 1)
+    lattice = Lattice(pad(old.pixels), pad(old.contrast), rising)
+    return RefinedLattice(lattice, pad(refined.sigma_px), pad(refined.blur_px), pad(refined.residual))
+
+
+def sides(image: FloatImage, lattice: Lattice) -> tuple[Side, Side, Side, Side]:
+    """Return what lies beyond the first row, the first column, the last row and the last column."""
+    first, second, third, fourth = (_above(image, lattice.turned(turns)) for turns in range(4))
+    return first, second, third, fourth
+
+
+def _above(image: FloatImage, lattice: Lattice) -> Side:
+    """Return what lies beyond the first row of `lattice`."""
+    squares = _Squares.above(lattice)
+    usable = squares.usable(image)
+    if usable.sum() < 2 * LEAST_OF_KIND:
+        return Side.UNKNOWN
+    inner, outer, beyond = (squares.brightness(image, places) for places in (-SQUARE, SQUARE, BEYOND))
+    contrast = np.where(squares.bright, outer - inner, inner - outer)
+    usable &= contrast > LEAST_CONTRAST * float(np.nanmedian(lattice.contrast))
+    if any((usable & kind).sum() < LEAST_OF_KIND for kind in (squares.bright, ~squares.bright)):
+        return Side.UNKNOWN
+    dark = np.minimum(inner, outer)
+    relative = (beyond - dark) / np.maximum(contrast, 1e-3)
+    ends = squares.bright | squares.end_on_the_line(image, dark + 0.5 * contrast)
+    border = ends & (relative > WHITE[0]) & (relative < WHITE[1])
+    if border[usable].mean() >= AGREEING:
+        return Side.BORDER
+    goes_on = np.where(squares.bright, relative < DARK, relative > 1.0 - DARK)
+    return Side.GOES_ON if goes_on[usable].mean() >= AGREEING else Side.UNKNOWN
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Squares:
+    """The M squares above the first row of a lattice, from the one before its first corner to the one after its last.
+
+    Attributes
+    ----------
+    bright : (M,) whether they are white.
+    near : (M,) whether a corner at their foot is known.
+    shape : of the cells (row -1, columns -1 .. C) and then of (row 0, columns -1 .. C), 2 (M + 1) in all.
+    """
+
+    bright: BoolArray
+    near: BoolArray
+    shape: LocalFit
+
+    @classmethod
+    def above(cls, lattice: Lattice) -> _Squares:
+        wide = lattice.padded(2)
+        cells = np.zeros(wide.known.shape, bool)
+        cells[1:3, 1:-1] = True
+        # The square between two columns is bright where brightness falls with the angle (downwards) across its foot.
+        bright = wide.signs()[2, 1:-2] < 0.0
+        known = wide.known[2, 1:-1]
+        shape = fit_cells(wide.pixels, cells, degree=3, ridge=(1e-3, 1e-2))
+        return cls(bright, known[:-1] | known[1:], shape)
+
+    def at(self, up: FloatArray, aside: FloatArray) -> FloatArray:
+        """Return (M, K, 2) pixels `up` (K,) squares beyond the row and `aside` (K,) from the squares' middles."""
+        count = len(self.bright)
+        far = up >= 0.5
+        out = np.zeros((count, len(up), 2))
+        for first, rows, which in ((0, 1.0 - up, far), (count + 1, -up, ~far)):
+            for shift, share in ((0, 0.5 - aside), (1, 0.5 + aside)):
+                part = slice(first + shift, first + shift + count)
+                along = (0.5 + aside - shift)[:, None]
+                down = rows[:, None]
+                place = self.shape.pixels[part, None] + along * self.shape.along_column[part, None]
+                place = place + down * self.shape.along_row[part, None]
+                place = place + 0.5 * along**2 * self.shape.bend_column[part, None]
+                place = place + 0.5 * down**2 * self.shape.bend_row[part, None]
+                out += np.where(which, share, 0.0)[:, None] * place
+        return out
+
+    def usable(self, image: FloatImage) -> BoolArray:
+        """Return which squares (M,) and the paper beyond them lie in the image, large enough, and well predicted."""
+        count = len(self.bright)
+        height, width = image.shape
+        corners = self.at(np.array([1.0, 1.0, BEYOND[-1], BEYOND[-1]]), np.array([-0.5, 0.5, -0.5, 0.5]))
+        inside = ((corners >= 0.0) & (corners <= np.array([width, height]) - 1.0)).all(axis=(1, 2))
+        shape = self.shape
+        sound = (shape.support >= FEWEST) & (shape.gain < STEADY_GAIN)
+        side = np.minimum(np.linalg.norm(shape.along_column, axis=1), np.linalg.norm(shape.along_row, axis=1))
+        sound &= side > LEAST_CELL_PX
+        both = sound.reshape(2, count + 1)
+        sound = both[0] & both[1]
+        return np.asarray(inside & self.near & sound[:-1] & sound[1:])
+
+    def brightness(self, image: FloatImage, up: FloatArray) -> FloatArray:
+        """Return the median brightness (M,) at `up` squares beyond the row, over the middle part of the squares."""
+        places = self.at(np.repeat(up, len(WITHIN)), np.tile(WITHIN, len(up)))
+        return np.asarray(np.median(sample(image, places), axis=1), dtype=np.float64)
+
+    def end_on_the_line(self, image: FloatImage, middle: FloatArray) -> BoolArray:
+        """Return which squares (M,) rise above the brightness `middle` a square beyond the row, and only there."""
+        places = self.at(np.repeat(PROFILE, len(WITHIN)), np.tile(WITHIN, len(PROFILE)))
+        values = sample(image, places).reshape(len(middle), len(PROFILE), len(WITHIN)).mean(axis=2)
+        above = values > middle[:, None]
+        step = PROFILE[1] - PROFILE[0]
+        end = PROFILE[0] + step * ((~above).sum(axis=1) - 0.5)
+        before, after = end[:, None] - EDGE_WIDTH > PROFILE, end[:, None] + EDGE_WIDTH < PROFILE
+        clean = ~(before & above).any(axis=1) & ~(after & ~above).any(axis=1)
+        count = len(self.bright) + 1
+        height = np.linalg.norm(self.shape.along_row[:count], axis=1)
+        within = np.maximum(ENDS_WITHIN, ENDS_WITHIN_PX / np.maximum(np.minimum(height[:-1], height[1:]), 1.0))
+        return np.asarray(clean & (np.abs(end - 1.0) < within))
