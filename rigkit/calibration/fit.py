@@ -12,7 +12,7 @@ from rigkit.calibration.normal import Normal, Residuals
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.poses import find_poses, refine_poses
 from rigkit.calibration.result import Convergence
-from rigkit.calibration.solver import State, evaluate, solve
+from rigkit.calibration.solver import State, evaluate, one_step, solve
 from rigkit.cameras.base import Camera, image_center
 from rigkit.errors import DegenerateError
 
@@ -114,10 +114,10 @@ def fit_model(observations: Observations, size_px: tuple[int, int], model: type[
     best: tuple[float, State, FloatArray] | None = None
     for start in initialise(observations, size_px, model, order):
         norm = evaluate(start, observations).weighted(observations)
-        if not np.isfinite(sigma_of(norm, observations.present)):
-            continue
-        state, norm = _robust(observations, start, norm)
         sigma = sigma_of(norm, observations.present)
+        if not np.isfinite(sigma):
+            continue
+        state, norm, sigma = _robust(observations, start, sigma)
         if best is None or sigma < best[0]:
             best = (sigma, state, norm)
         if sigma < GOOD_ENOUGH * size_px[0]:
@@ -131,16 +131,22 @@ def fit_model(observations: Observations, size_px: tuple[int, int], model: type[
     return _settled(observations, state, norm, inliers(norm, observations, sigma, size_px), SETTLE_ROUNDS)
 
 
-def _robust(observations: Observations, state: State, norm: FloatArray) -> tuple[State, FloatArray]:
-    """Return the state after a coarse and a fine robust solve, and its weighted residuals; views that fit badly get
-    their pose found anew. `norm` are the residuals of `state`."""
+def _robust(observations: Observations, state: State, start_sigma: float) -> tuple[State, FloatArray, float]:
+    """Return the state after a coarse and a fine robust solve, its weighted residuals and their robust standard
+    deviation; views that fit badly get their pose found anew. `start_sigma` is that of `state`."""
     present = observations.present
-    loss = CAUCHY_SIGMAS * sigma_of(norm, present)
+    loss = CAUCHY_SIGMAS * start_sigma
+    # One step from a good start is enough to see that there are no outliers, if there are none.
+    trial = one_step(observations, state, loss)
+    norm = evaluate(trial, observations).weighted(observations)
+    sigma = sigma_of(norm, present)
+    if sigma <= start_sigma and norm.max() <= OUTLIER_SIGMAS * sigma:
+        return trial, norm, sigma
     coarse = solve(observations, state, loss_px=loss, max_iterations=15, cost_tolerance=COARSE)
     state, norm = coarse.state, coarse.data.residuals[0].weighted(observations)
     sigma = sigma_of(norm, present)
     if not norm.max() > OUTLIER_SIGMAS * sigma:
-        return state, norm  # nothing for a robust loss to do
+        return state, norm, sigma  # nothing for a robust loss to do
     # Padding is left out of the medians by standing beyond all corners.
     ordered = np.sort(np.where(present, norm, np.inf), axis=1)
     of_view = ordered[np.arange(len(norm)), np.maximum(present.sum(axis=1) - 1, 0) // 2] / RAYLEIGH_MEDIAN
@@ -152,7 +158,8 @@ def _robust(observations: Observations, state: State, norm: FloatArray) -> tuple
         rotation[bad], translation[bad] = found.rotation, found.translation_mm
         state = replace(state, rotation=rotation, translation_mm=translation)
     fine = solve(observations, state, loss_px=CAUCHY_SIGMAS * sigma, max_iterations=30, cost_tolerance=FINE)
-    return fine.state, fine.data.residuals[0].weighted(observations)
+    norm = fine.data.residuals[0].weighted(observations)
+    return fine.state, norm, sigma_of(norm, present)
 
 
 def fit_kept(observations: Observations, state: State, kept: BoolArray, *, settle: bool = False) -> Fit:

@@ -29,7 +29,7 @@ __all__ = ["initialise", "start_error"]
 
 EXPONENTS = ((0, 2, 3, 4), (0, 2, 4), (0, 2), (0,))
 """Polynomials tried from rich to poor, until the angle increases with the radius."""
-ROUNDS = 3
+ROUNDS = 2
 ENUMERATE = 6
 """Up to this many views all patterns of signs are tried."""
 NARROW = 1.45

@@ -127,12 +127,13 @@ class Normal:
         return Step(step_g, step_p, predicted)
 
     def _eliminate_poses(self, damping_g: FloatArray, damping_p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        inverse = np.linalg.inv(_damped(self.pp, damping_p))
-        back = inverse @ np.swapaxes(self.gp, -1, -2)
-        reduced = self.gg + np.diag(damping_g) - _gemm(self.gp, back)
-        free = (inverse @ self.p[..., None])[..., 0]
-        step_g = _solve_positive(reduced, self.g - np.einsum("vgi,vi->g", self.gp, free))
-        return step_g, free - back @ step_g
+        count = len(self.g)
+        coupled = np.concatenate([self.gp, self.p[:, None]], axis=1)
+        back = np.linalg.inv(_damped(self.pp, damping_p)) @ np.swapaxes(coupled, -1, -2)
+        through = _gemm(self.gp, back)
+        reduced = _damped(self.gg, damping_g) - through[:, :count]
+        step_g = _solve_positive(reduced, self.g - through[:, count])
+        return step_g, -(back @ np.append(step_g, -1.0))
 
     def _eliminate_points(self, damping_g: FloatArray, damping_p: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Eliminate the released points by their 3x3 blocks: with many points and few views the system of the other
@@ -181,10 +182,10 @@ def _diagonal(matrix: FloatArray) -> FloatArray:
 
 
 def _damped(matrices: FloatArray, damping: FloatArray) -> FloatArray:
-    """Return matrices (N, K, K) with `damping` (N, K) added to their diagonals."""
+    """Return matrices (..., K, K) with `damping` (..., K) added to their diagonals."""
     out = np.array(matrices, order="C")
     count = damping.shape[-1]
-    out.reshape(-1, count * count)[:, :: count + 1] += damping
+    out.reshape(*damping.shape[:-1], count * count)[..., :: count + 1] += damping
     return out
 
 
@@ -207,8 +208,7 @@ def _inverse(pp: FloatArray) -> FloatArray:
 
 def _gemm(gp: FloatArray, back: FloatArray) -> FloatArray:
     """Return sum over views of gp_v @ back_v as one matrix product."""
-    count = gp.shape[1]
-    return np.asarray(gp.transpose(1, 0, 2).reshape(count, -1) @ back.reshape(-1, count))
+    return np.asarray(gp.transpose(1, 0, 2).reshape(gp.shape[1], -1) @ back.reshape(-1, back.shape[-1]))
 
 
 def _solve_positive(matrix: FloatArray, rhs: FloatArray) -> FloatArray:

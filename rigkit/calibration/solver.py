@@ -25,7 +25,7 @@ from rigkit.cameras.base import Camera
 from rigkit.errors import RigkitError
 from rigkit.geometry.rotation import exp_so3
 
-__all__ = ["Linearised", "Residuals", "Solution", "State", "evaluate", "minimise", "solve"]
+__all__ = ["Linearised", "Residuals", "Solution", "State", "evaluate", "minimise", "one_step", "solve"]
 
 S = TypeVar("S")
 
@@ -94,6 +94,14 @@ def evaluate(state: State, observations: Observations) -> Residuals:
     pixels, valid = state.camera.project(points)
     residuals = observations.pixels - pixels
     return Residuals(residuals if valid.all() else np.where(valid[..., None], residuals, lost_px(state.camera)), valid)
+
+
+def one_step(observations: Observations, start: State, loss_px: float) -> State:
+    """Return the state after one Gauss-Newton step of the robust problem, whether its cost is smaller or not; `start`
+    itself where there is no such step."""
+    step = _Solver(observations, observations.weight, loss_px, 0.2).linearise(start).normal.step(DAMPING_START)
+    moved = None if step is None else _moved(start, step)
+    return start if moved is None else moved
 
 
 def solve(

@@ -40,8 +40,8 @@ def usable_views(
             "have that size"
         )
     used, dropped = [], []
-    for view in views:
-        reason = _reason(view)
+    for view, flat in zip(views, _on_a_line(views), strict=True):
+        reason = _reason(view, flat)
         if reason is None:
             used.append(view)
         else:
@@ -55,13 +55,22 @@ def _inside(pixels: Pixels, size_px: tuple[int, int]) -> bool:
     return bool(((pixels >= -0.5) & (pixels <= np.array(size_px) - 0.5)).all())
 
 
-def _reason(view: BoardView) -> str | None:
+def _on_a_line(views: Sequence[BoardView]) -> list[bool]:
+    """Say for each view whether its corners lie on one line of the board."""
+    count = np.array([len(view.grid) for view in views])
+    owner = np.repeat(np.arange(len(views)), count)
+    grid = np.concatenate([view.grid for view in views]).astype(np.float64).T
+    mean = [np.bincount(owner, axis, len(views)) / np.maximum(count, 1) for axis in grid]
+    x, y = grid[0] - mean[0][owner], grid[1] - mean[1][owner]
+    xx, xy, yy = (np.bincount(owner, product, len(views)) for product in (x * x, x * y, y * y))
+    line: list[bool] = (xx * yy - xy * xy < MIN_SPREAD * (xx + yy) ** 2).tolist()
+    return line
+
+
+def _reason(view: BoardView, on_a_line: bool) -> str | None:
     if len(view.grid) < MIN_CORNERS:
         return f"{len(view.grid)} corners of board '{view.board.board_id}', at least {MIN_CORNERS} are needed"
-    grid = view.grid.astype(np.float64)
-    grid -= grid.sum(axis=0) / len(grid)
-    (xx, xy), (_, yy) = (grid.T @ grid).tolist()
-    if xx * yy - xy * xy < MIN_SPREAD * (xx + yy) ** 2:
+    if on_a_line:
         return f"the corners of board '{view.board.board_id}' lie on one line"
     return None
 

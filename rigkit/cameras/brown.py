@@ -25,7 +25,7 @@ KNOTS = 129
 """Samples of the radial curve from which its inverse starts."""
 STEPS = 30
 SETTLED = 1e-13
-"""Newton in the plane stops at this step, in units of the focal length."""
+"""Newton in the plane stops where the next step would be this small, in units of the focal length."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -101,10 +101,10 @@ class Brown(Camera):
         bound = 6.0 * np.hypot(self.parameters[6], self.parameters[7])
         # d(L r)/dr = L + 2 t L' = [(N + 2 t N') D - 2 t N D'] / D^2, in powers of t; both are to exceed bound * r.
         k, j = np.arange(top.size), np.arange(bottom.size)
-        radial = np.convolve(top * (1.0 + 2.0 * k), bottom) - 2.0 * np.convolve(top, bottom * j)
+        radial = _product(top * (1.0 + 2.0 * k), bottom) - 2.0 * _product(top, bottom * j)
         by_r = np.zeros((2, 2 * max(radial.size, 2 * bottom.size) - 1))
-        by_r[0, : 2 * radial.size : 2], by_r[1, : 2 * radial.size : 2] = radial, np.convolve(top, bottom)
-        by_r[:, 1 : 4 * bottom.size - 2 : 2] = -bound * np.convolve(bottom, bottom)
+        by_r[0, : 2 * radial.size : 2], by_r[1, : 2 * radial.size : 2] = radial, _product(top, bottom)
+        by_r[:, 1 : 4 * bottom.size - 2 : 2] = -bound * _product(bottom, bottom)
         limit = first_root(by_r, FARTHEST)
         if bottom.size > 1:
             limit = min(limit, float(np.sqrt(first_root(bottom, FARTHEST**2))))
@@ -167,7 +167,7 @@ class Brown(Camera):
         valid = np.isfinite(m[0] + m[1])
         m = np.where(valid, m, 0.0)
         plane = here = self._radial_start(m)
-        moving = np.arange(valid.size)
+        moving, before = np.arange(valid.size), np.full(valid.size, 1e-300)
         for _ in range(STEPS):
             squares = _squares(here)
             t = squares[0] + squares[2]
@@ -179,10 +179,13 @@ class Brown(Camera):
             here = here - step
             length = np.sqrt(here[0] ** 2 + here[1] ** 2 + 1e-300)
             here *= np.minimum(1.0, self._max_r / length)
-            unsettled = ~(np.abs(step[0]) + np.abs(step[1]) <= SETTLED * (1.0 + length))
+            # The next step is (size / before)^2 of this one, for as long as the convergence is quadratic.
+            size = np.abs(step[0]) + np.abs(step[1])
+            unsettled = ~(size * np.minimum(size / before, 1.0) ** 2 <= SETTLED * (1.0 + length))
+            before = np.maximum(size, 1e-300)
             plane[:, moving] = here
             if not unsettled.all():
-                moving, here, m = moving[unsettled], here[:, unsettled], m[:, unsettled]
+                moving, here, m, before = moving[unsettled], here[:, unsettled], m[:, unsettled], before[unsettled]
             if not moving.size:
                 break
         valid[moving] = False
@@ -236,6 +239,11 @@ def _fill_radial(
     np.multiply(ray, t, out=out[4])
     np.multiply(out[4], t, out=out[5])
     np.multiply(out[5], t, out=out[8])
+
+
+def _product(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the product of two polynomials."""
+    return a * b if b.size == 1 else np.convolve(a, b)
 
 
 def _squares(plane: FloatArray) -> FloatArray:
