@@ -35,6 +35,9 @@ CONTINUES_CELLS = 0.1
 GAP = 2
 """Parts of one board are at most so many steps apart: separate boards have their outer squares and margins between."""
 
+DIAGONAL = 1.5
+"""A diagonal step is so many times as long as a side, and a little more."""
+
 NEAREST_IN, NEAREST_OUT = 16, 6
 """Corners of the one part that carry its rows over, and of the other that must meet them."""
 
@@ -154,10 +157,10 @@ def _joined(one: _Part, two: _Part) -> Lattice | None:
     grid1, grid2, pixels1, pixels2 = one.grid, two.grid, one.pixels, two.pixels
     gap = pixels1[:, None] - pixels2
     apart = np.hypot(gap[..., 0], gap[..., 1])
-    if not apart.min() < 2.0 * GAP * one.side_px:
-        return None
     nearest = divmod(int(apart.argmin()), len(pixels2))
-    if not _alike(*(_cell(part, at) for part, at in zip((one, two), nearest, strict=True))):
+    cell = _cell(one, nearest[0])
+    longest = float(np.hypot(cell[:, 0], cell[:, 1]).max())
+    if not apart[nearest] < DIAGONAL * GAP * longest or not _alike(cell, _cell(two, nearest[1])):
         return None
     near2 = np.argsort(apart.min(axis=0), kind="stable")[:NEAREST_OUT]
     near1 = np.argsort(apart[:, near2].min(axis=1), kind="stable")[:NEAREST_IN]

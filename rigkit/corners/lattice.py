@@ -87,7 +87,7 @@ class Lattice:
     def trimmed(self) -> Lattice:
         """Return the lattice without empty outer rows and columns."""
         known = self.known
-        rows, columns = known.any(axis=1), known.any(axis=0)
+        rows, columns = (np.asarray(known.any(axis=axis)) for axis in (1, 0))
         if not rows.any():
             return self.cut(slice(0, 0), slice(0, 0))
         top, bottom = int(rows.argmax()), len(rows) - int(rows[::-1].argmax())

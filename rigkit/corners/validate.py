@@ -147,12 +147,17 @@ def trustworthy(refined: RefinedLattice, before: int, least: int) -> bool:
     known = lattice.known
     relative = refined.residual[known] / lattice.contrast[known]
     unexplained = relative**2 - (NOISE_LEVELS / lattice.contrast[known]) ** 2
-    if float(np.median(relative)) > MAX_RESIDUAL or float(np.median(unexplained)) > MAX_UNEXPLAINED**2:
+    if _middle(relative) > MAX_RESIDUAL or _middle(unexplained) > MAX_UNEXPLAINED**2:
         return False
     shape = fit_cells(lattice.pixels, known, degree=1)
     area = shape.along_column[:, 0] * shape.along_row[:, 1] - shape.along_column[:, 1] * shape.along_row[:, 0]
     in_cells = refined.sigma_px[known] / np.sqrt(np.maximum(area, 1e-6))
-    return float(np.median(in_cells)) < MAX_RELATIVE_SIGMA
+    return _middle(in_cells) < MAX_RELATIVE_SIGMA
+
+
+def _middle(values: FloatArray) -> float:
+    """Return the (upper) median; for some fifty values, np.median costs ten times as much."""
+    return float(np.sort(values)[len(values) // 2])
 
 
 def known_part(refined: RefinedLattice, sizes: Sequence[tuple[int, int]]) -> RefinedLattice:
