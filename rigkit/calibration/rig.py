@@ -21,6 +21,7 @@ from rigkit.calibration.rig_joint import solve_jointly
 from rigkit.calibration.rig_result import RigCalibration, RigCamera
 from rigkit.calibration.rig_seen import Places, Sights, seen_by
 from rigkit.calibration.rig_spread import frame_spread
+from rigkit.calibration.rig_verdicts import judge_rig
 from rigkit.detections import BoardView
 from rigkit.errors import DegenerateError, InputError
 from rigkit.progress import Progress, silent
@@ -84,7 +85,7 @@ def calibrate_rig(
     spread = frame_spread(joint.observations, solution.state, solution.normal, joint.frames, residual_sigma(joint))
     heldout = heldout_rms(joint, folds)
     rig = assemble_rig(list(views), single, joint, places, heldout, max(1.0, spread))
-    return replace(rig, verdicts=(*notes, *joint.notes))
+    return replace(rig, verdicts=judge_rig(rig, (*notes, *joint.notes)))
 
 
 class _Options:

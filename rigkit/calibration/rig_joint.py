@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, IntArray, Points
+from rigkit.arrays import FloatArray, IntArray
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig_frames import apart, first_frames, mounts_of, turned_alike
 from rigkit.calibration.rig_seen import Places, Sights
+from rigkit.calibration.rig_shape import common_shape
 from rigkit.calibration.rig_solver import RigSolution, solve_rig
-from rigkit.calibration.rig_state import Key, RigObservations, RigState, shape_unknowns
-from rigkit.calibration.shape import SHAPES, shape_model
+from rigkit.calibration.rig_state import Key, RigObservations, RigState
 from rigkit.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.progress import Progress
@@ -91,14 +91,14 @@ def solve_jointly(
     for i in range(MAX_ROUNDS):
         progress("rig", i, MAX_ROUNDS)
         _require_agreement(names, seen, places, len(left_out), shared)
-        observations = _observations(seen, single, places, sigma)
+        observations, unknowns = _observations(seen, single, places, sigma)
         start = RigState(
             tuple(result.camera for result in single),
             np.array([m.rotation for m in mounts]),
             np.array([m.translation_mm for m in mounts]),
             *first_frames(observations.keys, seen, mounts, places),
             *_board_poses(observations.cameras[0], places),
-            _first_unknowns(observations, single),
+            unknowns,
         )
         solution = solve_rig(observations, start, sigma)
         cost, count = _cost_of_sharing(observations, solution, seen)
@@ -127,8 +127,9 @@ def _sigma(single: Sequence[Calibration]) -> float:
 
 def _observations(
     seen: Sequence[Sights], single: Sequence[Calibration], places: Places, sigma: float
-) -> RigObservations:
-    """Pad the views of all cameras to one table of boards, weighted by how well each camera alone saw its corners."""
+) -> tuple[RigObservations, FloatArray]:
+    """Pad the views of all cameras to one table of boards, weighted by how well each camera alone saw its corners, and
+    return the first unknowns of the boards' shape."""
     entries = [list(own.values()) for own in seen]
     keys = {key: i for i, key in enumerate(dict.fromkeys(e.key for own in entries for e in own))}
     everything = Observations.from_views([e.view for own in entries for e in own])
@@ -148,11 +149,10 @@ def _observations(
         cameras.append(observations)
         weights.append(np.where(kept, better * observations.weight, 0.0))
         frame.append(np.array([keys[e.key] for e in own], dtype=np.int64))
-    kind = max((b.kind for alone in single for b in alone.boards), key=SHAPES.index)
     first_of = {target for target, _ in places.values()}
     free = tuple(b.board_id in places and b.board_id not in first_of for b in everything.boards)
-    shape = shape_model(kind, everything)
-    return RigObservations(tuple(cameras), tuple(weights), shape, tuple(frame), tuple(keys), free)
+    shape, unknowns = common_shape(everything, single)
+    return RigObservations(tuple(cameras), tuple(weights), shape, tuple(frame), tuple(keys), free), unknowns
 
 
 def _board_poses(observations: Observations, places: Places) -> tuple[FloatArray, FloatArray]:
@@ -160,20 +160,6 @@ def _board_poses(observations: Observations, places: Places) -> tuple[FloatArray
     alone = ("", Rigid3.identity())
     poses = [places.get(b.board_id, alone)[1] for b in observations.boards]
     return np.array([p.rotation for p in poses]), np.array([p.translation_mm for p in poses])
-
-
-def _first_unknowns(observations: RigObservations, single: Sequence[Calibration]) -> FloatArray:
-    """Return the shape's unknowns that come nearest to the boards as the cameras found them alone, on average."""
-    if not observations.shape.count:
-        return np.zeros(0)
-    table = observations.cameras[0]
-    rows = {b.board_id: int(row) for b, row in zip(table.boards, table.first_row, strict=False)}
-    points: dict[int, list[Points]] = {}
-    for result in single:
-        for board in result.boards:
-            if board.board_id in rows:
-                points.setdefault(rows[board.board_id], []).append(board.points_mm)
-    return shape_unknowns(observations.shape, {row: np.mean(found, axis=0) for row, found in points.items()})
 
 
 def _shared(seen: Sequence[Sights]) -> dict[Key, int]:

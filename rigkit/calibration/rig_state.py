@@ -8,7 +8,7 @@ other, whose frame is that of the first of them. The camera c sees board b of th
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +22,7 @@ from rigkit.cameras.base import Camera
 from rigkit.errors import RigkitError
 from rigkit.geometry.rotation import exp_so3
 
-__all__ = ["Key", "Layout", "RigObservations", "RigState", "shape_unknowns"]
+__all__ = ["Key", "Layout", "RigObservations", "RigState"]
 
 Key = tuple[str, str]
 """(frame, target): views that have a key in common see the same target in the same place."""
@@ -154,18 +154,3 @@ class RigState:
 
 def _steps(step: FloatArray, runs: Sequence[slice | None]) -> FloatArray:
     return np.array([np.zeros(6) if run is None else step[run] for run in runs]).reshape(-1, 6)
-
-
-def shape_unknowns(shape: ShapeModel, points: Mapping[int, Points]) -> FloatArray:
-    """Return the unknowns whose points come nearest to `points`, by first row in the shape's table: the warp first,
-    then what it leaves to released corners."""
-    off = np.zeros_like(shape.flat)
-    for row, own in points.items():
-        off[row : row + len(own)] = own - shape.flat[row : row + len(own)]
-    count = shape.basis.shape[-1]
-    warp: FloatArray = np.zeros(0)
-    if count:
-        warp = np.asarray(np.linalg.lstsq(shape.basis.reshape(-1, count), off.reshape(-1), rcond=None)[0], float)
-    if shape.kind != "released":
-        return warp
-    return np.concatenate([warp, (off - shape.basis @ warp).reshape(-1)])

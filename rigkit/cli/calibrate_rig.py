@@ -1,4 +1,4 @@
-"""The part of `rigkit calibrate` for several cameras on one mount: from their images to rig.json."""
+"""The part of `rigkit calibrate` for several cameras or boards on one mount: from their images to rig.json."""
 
 from __future__ import annotations
 
@@ -15,36 +15,47 @@ if TYPE_CHECKING:
     from rigkit.io.rig_session import RigSession
     from rigkit.validation.checks import Check
 
-__all__ = ["calibrate_rig_session", "run_rig"]
+__all__ = ["calibrate_rig_session", "measured_checks", "run_rig"]
 
 EXIT_CHECK_FAILED = 1
 
 
 def run_rig(args: argparse.Namespace) -> int:
-    """Calibrate the rig of `args.session`; return 1 if a measured baseline disagrees."""
+    """Calibrate the rig of `args.session`; return 1 if something measured disagrees."""
+    from rigkit.calibration.verdicts import judge
     from rigkit.cli.calibrate import page_path
     from rigkit.cli.console import note, print_json, progress_on_stderr
-    from rigkit.io.calibration_file import save_camera
+    from rigkit.io.calibration_file import save_calibration
     from rigkit.io.files import ensure_writable
-    from rigkit.io.rig_file import save_rig
+    from rigkit.io.rig_file import save_board_rigs, save_rig
     from rigkit.io.rig_session import load_rig_session
 
     session = load_rig_session(args.session)
     target: Path = args.output or session.rig_path
-    cameras = {name: target.with_name(f"{target.stem}-{name}.json") for name in session.cameras}
+    several = len(session.cameras) > 1
+    beside = {name: target.with_name(f"{target.stem}-{name}.json") if several else target for name in session.cameras}
+    boards = [target.with_name(f"{target.stem}-boards.json")] if session.rigid_boards else []
     page = page_path(args.report, target)
-    ensure_writable([target, *cameras.values(), *page], force=args.force)
+    rig_file = [target] if several else []
+    ensure_writable([*rig_file, *beside.values(), *boards, *page], force=args.force)
     started = time.monotonic()
     rig = calibrate_rig_session(session, progress_on_stderr())
-    checks = baseline_checks(session, rig)
-    save_rig(target, rig, force=args.force)
+    checks = measured_checks(session, rig)
+    for path in rig_file:
+        save_rig(path, rig, force=args.force)
     for camera in rig.cameras:
-        save_camera(cameras[camera.name], camera.camera, force=args.force)
+        from dataclasses import replace
+
+        # In the rig a camera has another held-out error than alone, and is surer.
+        own = replace(camera.calibration, verdicts=judge(camera.calibration))
+        save_calibration(beside[camera.name], own, force=args.force)
+    for path in boards:
+        save_board_rigs(path, rig.board_rigs, force=args.force)
     for path in page:
         from rigkit.cli.calibration_report import write_rig_report
 
         write_rig_report(path, session, rig, checks, target, force=args.force)
-    written = (target, *cameras.values(), *page)
+    written = (*rig_file, *beside.values(), *boards, *page)
     note(f"{', '.join(str(p) for p in written)} written, {time.monotonic() - started:.1f} s")
     if args.json:
         print_json(summary(rig, checks))
@@ -56,17 +67,21 @@ def run_rig(args: argparse.Namespace) -> int:
 def calibrate_rig_session(session: RigSession, progress: Progress = silent) -> RigCalibration:
     """Return the calibration of a rig's session: images -> corners (kept beside the session) -> rig.
 
-    Raises InputError where a camera's images show no board or nothing says which were taken together, DegenerateError
-    where the views do not determine a camera.
+    Raises InputError where a camera's images show no board, nothing says which were taken together, or boards cannot be
+    told apart; DegenerateError where the views do not determine a camera.
     """
     from dataclasses import replace
 
     from rigkit.calibration.rig import calibrate_rig
     from rigkit.cli.calibrate import session_corners, session_views
+    from rigkit.cli.rigid_boards import named_as_listed, named_by_rule, require_distinct
     from rigkit.io.rig_session import frames_of_images
 
-    found = {name: session_corners(own, progress) for name, own in session.cameras.items()}
-    frames = frames_of_images({name: list(own) for name, own in found.items()}, session.frames)
+    require_distinct(session)
+    found = {name: named_as_listed(session, session_corners(own, progress)) for name, own in session.cameras.items()}
+    frames = {name: {image: image for image in own} for name, own in found.items()}
+    if len(found) > 1:
+        frames = frames_of_images({name: list(own) for name, own in found.items()}, session.frames)
     views, sizes, dropped = {}, {}, {}
     for name, own in session.cameras.items():
         seen, sizes[name], dropped[name] = session_views(own, found[name])
@@ -77,14 +92,20 @@ def calibrate_rig_session(session: RigSession, progress: Progress = silent) -> R
         model={name: own.model for name, own in session.cameras.items()},
         degree={name: own.degree for name, own in session.cameras.items()},
         board=next(iter(session.cameras.values())).board_shape,
+        rigid_boards=[group.boards for group in session.rigid_boards],
         progress=progress,
     )
+    rig = named_by_rule(session, rig)
     single = [replace(c, dropped=(*dropped[n], *c.dropped)) for n, c in zip(session.cameras, rig.single, strict=True)]
-    return replace(rig, single=tuple(single))
+    cameras = [
+        replace(c, calibration=replace(c.calibration, dropped=alone.dropped))
+        for c, alone in zip(rig.cameras, single, strict=True)
+    ]
+    return replace(rig, single=tuple(single), cameras=tuple(cameras))
 
 
-def baseline_checks(session: RigSession, rig: RigCalibration) -> list[Check]:
-    """Return what a person measured beside what came out."""
+def measured_checks(session: RigSession, rig: RigCalibration) -> list[Check]:
+    """Return what a person measured beside what came out: baselines, angles and distances of boards on one mount."""
     from rigkit.validation.checks import COVERAGE, judge
 
     out = []
@@ -92,6 +113,17 @@ def baseline_checks(session: RigSession, rig: RigCalibration) -> list[Check]:
         known = (b.length.value_mm, b.length.sigma_mm, b.length.how)
         ours = rig.baseline_mm(b.a, b.b)
         out.append(judge(f"baseline {b.a}-{b.b}", "baseline", "mm", known, ours, COVERAGE, rig.corner_count))
+    for group, solved in zip(session.rigid_boards, rig.board_rigs, strict=True):
+        count = sum(b.board.corner_count for b in solved.boards)
+        for angle in group.truth.angles:
+            known = (angle.value_deg, angle.sigma_deg, angle.how)
+            ours = solved.angle_deg(angle.a, angle.b)
+            out.append(judge(f"angle {angle.a}-{angle.b}", "angle", "deg", known, ours, COVERAGE, count))
+        for distance in group.truth.distances:
+            known = (distance.value_mm, distance.sigma_mm, distance.how)
+            ours = solved.distance_mm(distance.a, distance.b)
+            name = f"distance {distance.a} to {distance.b}"
+            out.append(judge(name, "distance", "mm", known, ours, COVERAGE, count))
     return out
 
 
@@ -102,15 +134,22 @@ def summary(rig: RigCalibration, checks: list[Check]) -> dict[str, Any]:
     from rigkit.cli.calibrate import summary as summary_of_one
 
     return {
+        "heldout_rms_px": rig.heldout_rms_px,
         "rms_px": rig.rms_px,
         "sigma_px": rig.sigma_px,
+        "spread": rig.spread,
+        "verdicts": list(rig.verdicts),
         "cameras": [
             {
                 "name": camera.name,
+                "heldout_rms_px": camera.calibration.heldout_rms_px,
                 "rms_px": camera.rms_px,
                 "cam_from_rig": camera.cam_from_rig.matrix()[:3].tolist(),
                 "parameters": dict(
                     zip(camera.camera.parameter_names(), camera.camera.parameters.tolist(), strict=True)
+                ),
+                "sigmas": dict(
+                    zip(camera.camera.parameter_names(), camera.calibration.parameter_sigmas.tolist(), strict=True)
                 ),
                 "alone": summary_of_one(alone),
             }
@@ -119,6 +158,8 @@ def summary(rig: RigCalibration, checks: list[Check]) -> dict[str, Any]:
         "baselines": [
             {"from": a, "to": b, "value_mm": value, "sigma_mm": sigma} for a, b, value, sigma in baselines(rig)
         ],
+        "transfers": [{"from": a, "to": b, "median_px": m, "worst_px": w} for a, b, m, w in transfers(rig)],
+        "angles": [{"a": a, "b": b, "value_deg": value, "sigma_deg": sigma} for a, b, value, sigma in angles(rig)],
         "left_out": [{"frame": frame, "board": board, "reason": reason} for frame, board, reason in rig.left_out],
         "checks": [asdict(c) for c in checks],
     }
@@ -130,13 +171,31 @@ def baselines(rig: RigCalibration) -> list[tuple[str, str, float, float]]:
     return [(a, b, *rig.baseline_mm(a, b)) for a, b in combinations(names, 2)]
 
 
+def angles(rig: RigCalibration) -> list[tuple[str, str, float, float]]:
+    """Return (board, board, deg, sigma deg) of every two boards on one mount."""
+    return [(a, b, *t.angle_deg(a, b)) for t in rig.board_rigs for a, b in combinations(t.names, 2)]
+
+
+def transfers(rig: RigCalibration) -> list[tuple[str, str, float, float]]:
+    """Return (from, to, px at the middle corner, px at the worst) of every two cameras that see the same places."""
+    from rigkit.calibration.rig_uncertainty import transfer_uncertainty
+
+    found = [transfer_uncertainty(rig, a, b) for a, b in combinations([c.name for c in rig.cameras], 2)]
+    return [(t.a, t.b, t.median_px, t.worst_px) for t in found if t is not None]
+
+
 def describe(rig: RigCalibration, checks: list[Check]) -> str:
-    """Return the result for a person."""
+    """Return the result for a person: the headline first."""
     import numpy as np
 
     from rigkit.geometry.rotation import log_so3
 
-    lines = [f"{len(rig.cameras)} cameras, {rig.shared_count} boards seen by several of them: RMS {rig.rms_px:.4f} px"]
+    held = "held-out RMS not available" if rig.heldout_rms_px is None else f"held-out RMS {rig.heldout_rms_px:.4f} px"
+    count = len(rig.cameras)
+    lines = [
+        f"{count} camera{'s' if count > 1 else ''}, {rig.shared_count} poses shared by several views: {held}, training "
+        f"RMS {rig.rms_px:.4f} px; frames spread {rig.spread:.2f} times as independent corners would"
+    ]
     for camera, alone in zip(rig.cameras, rig.single, strict=True):
         held = "not available" if alone.heldout_rms_px is None else f"{alone.heldout_rms_px:.4f} px"
         x, y, z = camera.cam_from_rig.inverse().translation_mm
@@ -146,14 +205,19 @@ def describe(rig: RigCalibration, checks: list[Check]) -> str:
             f"rig {camera.rms_px:.4f} px; at ({x:.2f}, {y:.2f}, {z:.2f}) mm, turned by {turned:.3f} deg"
         )
     lines += [f"baseline {a} to {b}: {value:.3f} +- {sigma:.3f} mm" for a, b, value, sigma in baselines(rig)]
+    lines += [
+        f"a point seen by {a} appears in {b} within {middle:.3f} px (one standard deviation; {worst:.3f} at worst)"
+        for a, b, middle, worst in transfers(rig)
+    ]
+    lines += [f"angle {a} to {b}: {value:.3f} +- {sigma:.3f} deg" for a, b, value, sigma in angles(rig)]
     for c in checks:
         verdict = "as measured" if c.passed else "NOT as measured"
         lines.append(
-            f"{c.name} {verdict}: {c.ours:.3f} mm, measured {c.measured:g} +- {c.measured_sigma:g} mm ({c.how}), off "
-            f"by {c.k:.1f} combined sigmas"
+            f"{c.name} {verdict}: {c.ours:.3f} {c.unit}, measured {c.measured:g} +- {c.measured_sigma:g} {c.unit} "
+            f"({c.how}), off by {c.k:.1f} combined sigmas"
         )
     lines += [f"frame {frame}, board '{board}' left out: {reason}" for frame, board, reason in rig.left_out]
     for camera, alone in zip(rig.cameras, rig.single, strict=True):
         lines += [f"{camera.name}: dropped {image}: {reason}" for image, reason in alone.dropped]
-        lines += [f"{camera.name}: {verdict}" for verdict in alone.verdicts]
-    return "\n".join(lines)
+        lines += [f"{camera.name} alone: {verdict}" for verdict in alone.verdicts]
+    return "\n".join([*lines, *rig.verdicts])

@@ -1,33 +1,68 @@
-"""Rig files (JSON, schema "rigkit.rig/1"): cameras, where they sit, and how sure that is."""
+"""Rig files (JSON): cameras, where they sit, and how sure that is ("rigkit.rig/1"); boards on one mount, likewise
+("rigkit.board_rig/1"). Lengths in mm; covariances are of left perturbations (rad) and translations (mm)."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from rigkit.calibration.rig import RigCalibration
+import numpy as np
+
+from rigkit.arrays import FloatArray, as_array
+from rigkit.boards import Board
+from rigkit.calibration.board_rig import BoardRig, PlacedBoard
+from rigkit.calibration.rig_result import RigCalibration
 from rigkit.cameras.base import Camera
 from rigkit.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibration_file import camera_from_json, camera_to_json
 from rigkit.io.files import write_atomic
 
-__all__ = ["SCHEMA", "load_rig", "save_rig"]
+__all__ = ["BOARDS_SCHEMA", "SCHEMA", "SavedRig", "is_rig_file", "load_board_rigs", "load_rig", "load_saved_rig"]
+__all__ += ["save_board_rigs", "save_rig"]
 
 SCHEMA = "rigkit.rig/1"
-KEYS = {"schema", "cameras", "rms_px", "sigma_px", "covariance", "baselines"}
+BOARDS_SCHEMA = "rigkit.board_rig/1"
+KEYS = {
+    "schema", "cameras", "rms_px", "heldout_rms_px", "sigma_px", "spread", "scale_sigma", "covariance", "baselines",
+    "verdicts",
+}  # fmt: skip
 CAMERA_KEYS = {"name", "camera", "cam_from_rig", "rms_px"}
+BOARD_KEYS = {"board_id", "size", "square_mm", "square_sigma_mm", "points_mm", "target_from_board"}
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SavedRig:
+    """What a rig file says: cameras and cam_from_rig by name, and the covariance of all intrinsics and of the mounts of
+    all cameras but the first; None in a file that does not say (another tool's rig)."""
+
+    cameras: dict[str, tuple[Camera, Rigid3]]
+    covariance: FloatArray | None
+
+    @property
+    def mount_covariance(self) -> FloatArray | None:
+        """Of the mounts alone, (6 (n - 1), 6 (n - 1))."""
+        if self.covariance is None:
+            return None
+        first = len(self.covariance) - 6 * (len(self.cameras) - 1)
+        return np.asarray(self.covariance[first:, first:])
 
 
 def save_rig(path: str | Path, rig: RigCalibration, *, force: bool = False) -> None:
     """Write the rig; raises InputError where the file exists and `force` is not set."""
-    names = [c.name for c in rig.cameras]
-    pairs = [(a, b, *rig.baseline_mm(a, b)) for i, a in enumerate(names) for b in names[i + 1 :]]
+    pairs = [(a, b, *rig.baseline_mm(a, b)) for a, b in combinations([c.name for c in rig.cameras], 2)]
     data = {
         "schema": SCHEMA,
+        "heldout_rms_px": rig.heldout_rms_px,
         "rms_px": rig.rms_px,
         "sigma_px": rig.sigma_px,
+        "spread": rig.spread,
+        "scale_sigma": rig.scale_sigma,
+        "verdicts": list(rig.verdicts),
         "baselines": [{"from": a, "to": b, "value_mm": v, "sigma_mm": s} for a, b, v, s in pairs],
         "cameras": [
             {
@@ -44,28 +79,109 @@ def save_rig(path: str | Path, rig: RigCalibration, *, force: bool = False) -> N
 
 
 def load_rig(path: str | Path) -> dict[str, tuple[Camera, Rigid3]]:
-    """Return camera and cam_from_rig of every camera by name.
+    """Return camera and cam_from_rig of every camera by name; raises InputError like `load_saved_rig`."""
+    return load_saved_rig(path).cameras
+
+
+def load_saved_rig(path: str | Path) -> SavedRig:
+    """Return what a rig file says.
 
     Raises InputError for a missing or damaged file, another schema or an unknown key.
     """
+    data = _read(path, SCHEMA, KEYS)
+    cameras: dict[str, tuple[Camera, Rigid3]] = {}
+    try:
+        for entry in data["cameras"]:
+            if set(entry) != CAMERA_KEYS:
+                raise InputError(f"'{path}': a camera must have the keys {', '.join(sorted(CAMERA_KEYS))}, no others")
+            camera = camera_from_json(entry["camera"], path)
+            cameras[str(entry["name"])] = (camera, Rigid3.from_matrix(entry["cam_from_rig"]))
+        size = sum(camera.parameters.size for camera, _ in cameras.values()) + 6 * (len(cameras) - 1)
+        covariance = None
+        if "covariance" in data:
+            covariance = as_array(data["covariance"], (size, size), "covariance")
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"'{path}': damaged ({error}); calibrate again") from error
+    return SavedRig(cameras, covariance)
+
+
+def is_rig_file(path: str | Path) -> bool:
+    """Say whether the file is a rig's; False for anything that cannot be read."""
+    try:
+        data = json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(data, dict) and data.get("schema") == SCHEMA
+
+
+def save_board_rigs(path: str | Path, rigs: Sequence[BoardRig], *, force: bool = False) -> None:
+    """Write boards on one mount, with their angles; raises InputError where the file exists and `force` is not set."""
+    data = {
+        "schema": BOARDS_SCHEMA,
+        "rigs": [
+            {
+                "image_count": rig.image_count,
+                "scale_sigma": rig.scale_sigma,
+                "angles": [
+                    {"a": a, "b": b, "value_deg": value, "sigma_deg": sigma}
+                    for a, b in combinations(rig.names, 2)
+                    for value, sigma in (rig.angle_deg(a, b),)
+                ],
+                "boards": [
+                    {
+                        "board_id": placed.board.board_id,
+                        "size": list(placed.board.size),
+                        "square_mm": [placed.board.square_x_mm, placed.board.square_y_mm],
+                        "square_sigma_mm": placed.board.square_sigma_mm,
+                        "target_from_board": placed.target_from_board.matrix()[:3].tolist(),
+                        "points_mm": placed.points_mm.tolist(),
+                    }
+                    for placed in rig.boards
+                ],
+                "covariance": rig.covariance.tolist(),
+            }
+            for rig in rigs
+        ],
+    }
+    write_atomic(path, json.dumps(data, indent=1, allow_nan=False) + "\n", force=force)
+
+
+def load_board_rigs(path: str | Path) -> tuple[BoardRig, ...]:
+    """Return the boards on one mount; raises InputError like `load_saved_rig`."""
+    data = _read(path, BOARDS_SCHEMA, {"schema", "rigs"})
+    try:
+        return tuple(
+            BoardRig(
+                tuple(_placed(entry, path) for entry in rig["boards"]),
+                np.array(rig["covariance"], dtype=np.float64).reshape(-1, 6 * (len(rig["boards"]) - 1)),
+                int(rig["image_count"]),
+                float(rig["scale_sigma"]),
+            )
+            for rig in data["rigs"]
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"'{path}': damaged ({error}); calibrate again") from error
+
+
+def _placed(entry: dict[str, Any], path: str | Path) -> PlacedBoard:
+    if set(entry) != BOARD_KEYS:
+        raise InputError(f"'{path}': a board must have the keys {', '.join(sorted(BOARD_KEYS))}, and no others")
+    (columns, rows), (along_x, along_y), sigma = entry["size"], entry["square_mm"], entry["square_sigma_mm"]
+    known = None if sigma is None else float(sigma)
+    board = Board(str(entry["board_id"]), int(columns), int(rows), float(along_x), float(along_y), known)
+    return PlacedBoard(board, np.array(entry["points_mm"]), Rigid3.from_matrix(entry["target_from_board"]))
+
+
+def _read(path: str | Path, schema: str, keys: set[str]) -> dict[str, Any]:
     try:
         data: Any = json.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise InputError(f"rig file '{path}' does not exist; check the path") from error
     except (OSError, ValueError) as error:
         raise InputError(f"'{path}': not a rig file ({error}); calibrate again") from error
-    if not isinstance(data, dict) or data.get("schema") != SCHEMA:
-        raise InputError(f"'{path}': a file with schema '{SCHEMA}' is needed here")
-    unknown = sorted(set(data) - KEYS)
+    if not isinstance(data, dict) or data.get("schema") != schema:
+        raise InputError(f"'{path}': a file with schema '{schema}' is needed here")
+    unknown = sorted(set(data) - keys)
     if unknown:
-        raise InputError(f"'{path}': unknown key '{unknown[0]}'; known: {', '.join(sorted(KEYS))}")
-    out: dict[str, tuple[Camera, Rigid3]] = {}
-    try:
-        for entry in data["cameras"]:
-            if set(entry) != CAMERA_KEYS:
-                raise InputError(f"'{path}': a camera must have the keys {', '.join(sorted(CAMERA_KEYS))}, no others")
-            camera = camera_from_json(entry["camera"], path)
-            out[str(entry["name"])] = (camera, Rigid3.from_matrix(entry["cam_from_rig"]))
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"'{path}': damaged ({error}); calibrate again") from error
-    return out
+        raise InputError(f"'{path}': unknown key '{unknown[0]}'; known: {', '.join(sorted(keys))}")
+    return dict(data)

@@ -1,4 +1,4 @@
-"""Session files of several cameras on one mount (schema "rigkit.session/1" with [[cameras]] instead of `images`).
+"""Session files of rigs: several cameras on one mount ([[cameras]] instead of `images`), boards on one mount, or both.
 
 ::
 
@@ -22,6 +22,14 @@
     sigma_mm = 1.0
     how = "steel rule"
 
+    [[rigid_boards]]                 # optional: boards that are mounted to each other
+    boards = ["left", "floor", "right"]
+    layout = { left = "left", floor = "floor", right = "right" }  # optional: which is which, of boards that look alike
+    angles = [ { a = "left", b = "floor", value_deg = 90.0, sigma_deg = 0.3, how = "set square" } ]      # optional
+    distances = [ { a = "left.centre", b = "floor", value_mm = 150.0, sigma_mm = 1.0, how = "rule" } ]   # optional
+
+A session of one camera with [[rigid_boards]] has `images` as ever.
+
 Images of one moment have the same file name without its ending in every camera's folder (frames = "name"), the same
 number at the end of that name ("number": left07 and right07), or the same place in the sorted list ("order"). Where
 `frames` is not given, it is the first of name and number that any two cameras share.
@@ -35,15 +43,30 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path, PurePath
 
+from rigkit.boards import Board
+from rigkit.corners.naming import SIDES
 from rigkit.errors import InputError
 from rigkit.io.session import SCHEMA, Session, boards_of, images_of, options_of
 from rigkit.io.toml_reader import TomlTable, read_toml
-from rigkit.truth import MeasuredLength
+from rigkit.io.truth_file import truth_from_table
+from rigkit.truth import MeasuredLength, PairTruth
 
-__all__ = ["FRAMES", "MeasuredBaseline", "RigSession", "frames_of_images", "is_rig_session", "load_rig_session"]
+__all__ = [
+    "FRAMES",
+    "ONE",
+    "MeasuredBaseline",
+    "RigSession",
+    "RigidBoards",
+    "frames_of_images",
+    "is_rig_session",
+    "load_rig_session",
+]
 
 FRAMES = ("name", "number", "order")
 HINT_ID = 'id = "left"'
+HINT_RIGID = 'boards = ["left", "floor", "right"]'
+ONE = "camera"
+"""What the only camera of a session without [[cameras]] is called."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +79,15 @@ class MeasuredBaseline:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class RigidBoards:
+    """Boards mounted to each other: their ids, on which side those are that look alike, and what was measured."""
+
+    boards: tuple[str, ...]
+    layout: Mapping[str, str]
+    truth: PairTruth
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class RigSession:
     """What to calibrate together.
 
@@ -64,37 +96,45 @@ class RigSession:
     path : the session file.
     cameras : one session a camera, by its name, in the order of the file; the first is the rig's frame.
     frames : "name", "number" or "order"; None to choose.
-    baselines : what was measured.
+    baselines : what was measured between cameras.
+    rigid_boards : what is mounted to each other.
     """
 
     path: Path
     cameras: Mapping[str, Session]
     frames: str | None
     baselines: tuple[MeasuredBaseline, ...]
+    rigid_boards: tuple[RigidBoards, ...] = ()
 
     @property
     def rig_path(self) -> Path:
-        """Where the rig goes: beside the session."""
-        return self.path.parent / "rig.json"
+        """Where the result goes, beside the session: that of one camera is a calibration like any other."""
+        return self.path.parent / ("rig.json" if len(self.cameras) > 1 else "calibration.json")
 
 
 def is_rig_session(path: str | Path) -> bool:
-    """Say whether the session file has several cameras; raises InputError like `load_session`."""
-    return read_toml(path, SCHEMA).has("cameras")
+    """Say whether the session has several cameras or boards on one mount; raises InputError like `load_session`."""
+    table = read_toml(path, SCHEMA)
+    return table.has("cameras") or table.has("rigid_boards")
 
 
 def load_rig_session(path: str | Path) -> RigSession:
     """Return the session of a rig.
 
-    Raises InputError for a missing file or board, an unknown key, one camera only or two of one name, and a baseline
-    between cameras that are not there.
+    Raises InputError for a missing file or board, an unknown key, one camera only or two of one name, a baseline
+    between cameras that are not there, and boards on a mount that are not listed or are on two.
     """
     source = Path(path)
     table = read_toml(source, SCHEMA)
-    if table.has("images"):
-        raise table.error("'images' together with [[cameras]]; give every camera its own images")
     boards = boards_of(table)
     model, degree, shape = options_of(table)
+    rigid = _rigid_boards(table, boards)
+    if rigid and not table.has("cameras"):
+        one = Session(source, images_of(table), boards, model, degree, shape)
+        table.done()
+        return RigSession(source, {ONE: one}, None, (), rigid)
+    if table.has("images"):
+        raise table.error("'images' together with [[cameras]]; give every camera its own images")
     frames = None
     if table.has("frames"):
         frames = table.text("frames", hint='frames = "number"', choices=FRAMES)
@@ -113,7 +153,34 @@ def load_rig_session(path: str | Path) -> RigSession:
         raise table.error("a rig has at least two [[cameras]]; for one, write its `images` without [[cameras]]")
     baselines = _baselines(table, tuple(cameras))
     table.done()
-    return RigSession(source, cameras, frames, baselines)
+    return RigSession(source, cameras, frames, baselines, rigid)
+
+
+def _rigid_boards(table: TomlTable, boards: Sequence[Board]) -> tuple[RigidBoards, ...]:
+    if not table.has("rigid_boards"):
+        return ()
+    known = {b.board_id: b for b in boards}
+    out: list[RigidBoards] = []
+    for entry in table.tables("rigid_boards", hint=f"[[rigid_boards]] with {HINT_RIGID}"):
+        names = entry.texts("boards", hint=HINT_RIGID)
+        for name in names:
+            if name not in known:
+                raise entry.error(f"no board is called '{name}'; known: {', '.join(known)}")
+            if any(name in other.boards for other in out):
+                raise entry.error(f"board '{name}' is on two mounts; remove it from one")
+        if len(names) < 2:
+            raise entry.error(f"one board has no mount to share; write {HINT_RIGID}")
+        layout: dict[str, str] = {}
+        if entry.has("layout"):
+            sides = entry.table("layout", hint='layout = { left = "left", floor = "floor" }')
+            layout = {name: sides.text(name, hint=f'{name} = "left"', choices=tuple(SIDES)) for name in sides.names()}
+            for name in layout:
+                if name not in names:
+                    raise entry.error(f"layout: '{name}' is none of its boards, {', '.join(names)}")
+        if entry.has("baseline"):
+            raise entry.error("'baseline' is between cameras: write [[baselines]]")
+        out.append(RigidBoards(names, layout, truth_from_table(entry, [known[name] for name in names])))
+    return tuple(out)
 
 
 def _baselines(table: TomlTable, names: Sequence[str]) -> tuple[MeasuredBaseline, ...]:

@@ -7,8 +7,11 @@ from itertools import combinations
 
 import numpy as np
 
+from rigkit.calibration.board_rig import BoardRig
 from rigkit.calibration.rig import RigCalibration
+from rigkit.calibration.rig_uncertainty import transfer_uncertainty
 from rigkit.geometry.rotation import log_so3
+from rigkit.truth import Feature
 from rigkit.validation.checks import Check
 from rigkit.validation.tables import Cell, Column, Table
 
@@ -17,7 +20,12 @@ __all__ = ["rig_tables"]
 
 def rig_tables(rig: RigCalibration, checks: Sequence[Check]) -> tuple[Table, ...]:
     """Return the tables that stand first on the page of a rig."""
-    tables = [_cameras(rig), _baselines(rig, checks)]
+    tables = [_cameras(rig)]
+    if len(rig.cameras) > 1:
+        tables.append(_baselines(rig, checks))
+    tables += [_angles(rig, target, checks) for target in rig.board_rigs]
+    words = tuple((Cell(v),) for v in rig.verdicts)
+    tables.append(Table("verdicts", "The rig in words", (Column("remark"),), words))
     if rig.left_out:
         columns = (Column("frame"), Column("board"), Column("why"))
         rows = tuple((Cell(frame), Cell(board), Cell(reason)) for frame, board, reason in rig.left_out)
@@ -32,7 +40,8 @@ def _cameras(rig: RigCalibration) -> Table:
         Column("model"),
         Column("held-out RMS alone", "px"),
         Column("training RMS alone", "px"),
-        Column("RMS in the rig", "px"),
+        Column("held-out RMS in the rig", "px"),
+        Column("training RMS in the rig", "px"),
         *(Column(f"centre {axis}", "mm", 2) for axis in "xyz"),
         Column("turned by", "deg"),
     )
@@ -46,33 +55,91 @@ def _cameras(rig: RigCalibration) -> Table:
                 Cell(camera.camera.model),
                 Cell(alone.heldout_rms_px),
                 Cell(alone.rms_px),
+                Cell(camera.calibration.heldout_rms_px),
                 Cell(camera.rms_px),
                 *(Cell(float(c)) for c in centre),
                 Cell(turned),
             )
         )
+    held = "not available (too few frames)" if rig.heldout_rms_px is None else f"{rig.heldout_rms_px:.3f} px"
     note = (
-        f"All intrinsics and mounts solved together: RMS {rig.rms_px:.3f} px over {rig.corner_count} corners, "
-        f"{rig.shared_count} boards seen by several cameras at once. The frame is that of the first camera."
+        f"All intrinsics and mounts solved together. Held-out RMS, over frames that took no part and with one pose for "
+        f"all cameras: {held}; training RMS {rig.rms_px:.3f} px over {rig.corner_count} corners, {rig.shared_count} "
+        f"poses shared by several views. Frames disagree {rig.spread:.2f} times as much as independent corners would; "
+        "all sigmas count that in. The frame is that of the first camera."
     )
     return Table("rig", "Cameras of the rig", columns, tuple(rows), note)
 
 
 def _baselines(rig: RigCalibration, checks: Sequence[Check]) -> Table:
-    columns = (Column("baseline"), Column("solved", "mm"), Column("measured", "mm"), Column("how"), Column("verdict"))
+    columns = (
+        Column("baseline"),
+        Column("solved", "mm"),
+        Column("measured", "mm"),
+        Column("how"),
+        Column("verdict"),
+        Column("transfer", "px"),
+        Column("transfer at worst", "px"),
+    )
     rows = []
     for a, b in combinations([c.name for c in rig.cameras], 2):
         value, sigma = rig.baseline_mm(a, b)
-        known = next((c for c in checks if c.name in (f"baseline {a}-{b}", f"baseline {b}-{a}")), None)
-        measured = Cell(None) if known is None else Cell(known.measured, sigma=known.measured_sigma)
-        verdict = "" if known is None else "pass" if known.passed else f"FAIL, off by {known.k:.1f} combined sigmas"
+        transfer = transfer_uncertainty(rig, a, b)
+        sure = (None, None) if transfer is None else (transfer.median_px, transfer.worst_px)
         rows.append(
             (
                 Cell(f"{a} to {b}"),
                 Cell(value, sigma=sigma),
-                measured,
-                Cell("" if known is None else known.how),
-                Cell(verdict, failed=known is not None and not known.passed),
+                *_measured(checks, f"baseline {a}-{b}", f"baseline {b}-{a}"),
+                *(Cell(v) for v in sure),
             )
         )
-    return Table("baselines", "Distances between the cameras", columns, tuple(rows))
+    note = (
+        "Transfer: one standard deviation of where a point that the one camera sees must appear in the other, at the "
+        "middle and the worst of the boards' corners."
+    )
+    return Table("baselines", "Distances between the cameras", columns, tuple(rows), note)
+
+
+def _angles(rig: RigCalibration, target: BoardRig, checks: Sequence[Check]) -> Table:
+    columns = (
+        Column("boards"),
+        Column("angle", "deg"),
+        Column("measured", "deg"),
+        Column("how"),
+        Column("verdict"),
+        Column("between first corners", "mm"),
+        Column("between centres", "mm"),
+    )
+    rows = []
+    for a, b in combinations(target.names, 2):
+        value, sigma = target.angle_deg(a, b)
+        corners = target.distance_mm(Feature(a, grid=(0, 0)), Feature(b, grid=(0, 0)))
+        centres = target.distance_mm(Feature(a, centre=True), Feature(b, centre=True))
+        rows.append(
+            (
+                Cell(f"{a} and {b}"),
+                Cell(value, sigma=sigma),
+                *_measured(checks, f"angle {a}-{b}", f"angle {b}-{a}"),
+                Cell(corners[0], sigma=corners[1]),
+                Cell(centres[0], sigma=centres[1]),
+            )
+        )
+    distances = [c for c in checks if c.kind == "distance"]
+    note = f"Solved from {target.image_count} images that show at least two of these boards."
+    note += "".join(
+        f" {c.name}: {c.ours:.3f} +- {c.our_sigma:.3f} mm, measured {c.measured:g} +- {c.measured_sigma:g} ({c.how}): "
+        + ("pass." if c.passed else f"FAIL, off by {c.k:.1f} combined sigmas.")
+        for c in distances
+    )
+    key = f"boards-{target.names[0]}"
+    return Table(key, "Boards mounted to each other", columns, tuple(rows), note)
+
+
+def _measured(checks: Sequence[Check], *names: str) -> tuple[Cell, Cell, Cell]:
+    """Return what was measured, how, and the verdict; empty where nothing was."""
+    known = next((c for c in checks if c.name in names), None)
+    if known is None:
+        return Cell(None), Cell(""), Cell("")
+    verdict = "pass" if known.passed else f"FAIL, off by {known.k:.1f} combined sigmas"
+    return Cell(known.measured, sigma=known.measured_sigma), Cell(known.how), Cell(verdict, failed=not known.passed)

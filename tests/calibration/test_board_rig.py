@@ -93,7 +93,7 @@ def test_boards_that_look_alike_are_told_by_their_arrangement(board: str, rng: n
     room = corner_of_a_room(rng, ALIKE)
     views = target_views(rng, REG, ALIKE, room, 8, noise_px=NOISE_PX, distance_mm=1000.0, shuffled=True)
     rig = solve(views, ALIKE, board)
-    assert rig.left_out == () and rig.verdicts == ()
+    assert rig.left_out == () and len(rig.verdicts) == 1 and rig.verdicts[0].startswith("good")
     assert rig.sigma_px == pytest.approx(NOISE_PX, rel=0.1)
     found = rig.board_rigs[0]
     assert found.image_count == 8

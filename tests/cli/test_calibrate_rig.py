@@ -7,12 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration.test_rig import mounts, rig_views, sizes
+from calibration.test_rig import Views, mounts, rig_views
+from helpers.board_rig_scenes import ALIKE, corner_of_a_room, target_views
+from helpers.calibration_scenes import lens
 
+from rigkit.boards import Board
 from rigkit.cli.main import main
 from rigkit.detections import BoardDetection
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.io.calibration_file import load_calibration
 from rigkit.io.corner_cache import CornerCache, FoundCorners
-from rigkit.io.rig_file import load_rig
+from rigkit.io.rig_file import load_board_rigs, load_rig
 from rigkit.io.rig_session import load_rig_session
 
 NAMES = ("reg", "wide")
@@ -32,15 +37,24 @@ def session(tmp_path: Path, rng: np.random.Generator) -> Path:
         'schema = "rigkit.session/1"\nboard = "9x6.toml"\nmodel = "kannala_brandt"\nboard_shape = "flat"\n'
         f'{cameras}[[baselines]]\na = "wide"\nb = "reg"\nvalue_mm = {true}\nsigma_mm = 0.5\nhow = "drawing"\n'
     )
-    views = rig_views(rng, 16)
+    keep_corners(path, rig_views(rng, 16))
+    return path
+
+
+def keep_corners(path: Path, views: Views, *, named: bool = True) -> None:
+    """Keep the corners beside the session; the images themselves are gone."""
     for name, own in load_rig_session(path).cameras.items():
         cache = CornerCache(own.corners_path, own.boards)
+        images: dict[str, list[BoardDetection]] = {}
         for frame, view in views[name]:
-            found = BoardDetection("9x6", 9, 6, view.grid, view.pixels, view.sigma_px)
-            image = f"{name}{int(frame):0{2 if name == 'reg' else 3}d}.png"
-            cache.put(image, "0" * 64, FoundCorners(sizes()[name], (found,)))
+            board: Board = view.board
+            found = BoardDetection(
+                board.board_id if named else None, *board.size, view.grid, view.pixels, view.sigma_px
+            )
+            images.setdefault(f"{name}{int(frame):0{2 if name == 'reg' else 3}d}.png", []).append(found)
+        for image, detections in images.items():
+            cache.put(image, "0" * 64, FoundCorners(lens("reg").size_px, tuple(detections)))
         cache.save()
-    return path
 
 
 def test_rig_from_kept_corners(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -62,3 +76,82 @@ def test_rig_from_kept_corners(session: Path, capsys: pytest.CaptureFixture[str]
     session.write_text(session.read_text().replace("value_mm = 1", "value_mm = 2"))
     assert main(["calibrate", str(session), "--force"]) == 1
     assert "NOT as measured" in capsys.readouterr().out
+
+
+def test_diff_has_a_verdict_on_rigs_and_their_cameras(
+    session: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same rig again is the same; one with a camera moved by a millimetre is not, its lenses are."""
+    folder = session.parent
+    assert main(["calibrate", str(session)]) == 0
+    keep_corners(session, rig_views(rng, 16))
+    assert main(["calibrate", str(session), "-o", str(folder / "again.json")]) == 0
+    capsys.readouterr()
+    assert main(["diff", str(folder / "rig-wide.json"), str(folder / "again-wide.json"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["same"] is True
+    assert main(["diff", str(folder / "rig.json"), str(folder / "again.json"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["chance"] > 0.01 and set(told["cameras"]) == set(NAMES)
+
+    saved = json.loads((folder / "again.json").read_text())
+    for k in range(3):
+        saved["cameras"][1]["cam_from_rig"][k][3] += 1.0
+    (folder / "again.json").write_text(json.dumps(saved))
+    assert main(["diff", str(folder / "rig.json"), str(folder / "again.json")]) == 1
+    said = capsys.readouterr().out
+    assert "NOT the same rig" in said and said.count("the same camera") == len(NAMES)
+    assert main(["diff", str(folder / "rig.json"), str(folder / "rig-reg.json")]) == 2
+
+
+def test_a_camera_of_a_rig_is_surer_than_alone(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its file is a whole calibration: what `validate` needs to count its share."""
+    assert main(["calibrate", str(session), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    for camera in told["cameras"]:
+        saved = load_calibration(session.parent / f"rig-{camera['name']}.json")
+        assert saved.parameter_sigmas.tolist() == list(camera["sigmas"].values())
+        assert saved.heldout_rms_px == camera["heldout_rms_px"]
+        assert saved.verdicts[0].startswith("good")
+    assert told["heldout_rms_px"] == pytest.approx(np.sqrt(2.0) * 0.2, rel=0.05)
+    assert 0.0 < told["transfers"][0]["median_px"] < 0.5
+
+
+def test_boards_on_one_mount(tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]) -> None:
+    """One camera, three boards that look alike: a calibration like any other, and the boards' own geometry."""
+    for board in ALIKE:
+        (tmp_path / f"{board.board_id}.toml").write_text(
+            f'schema = "rigkit.board/1"\nid = "{board.board_id}"\ncolumns = 8\nrows = 6\nsquare_mm = 30.0\n'
+        )
+    names = json.dumps([b.board_id for b in ALIKE])
+    files = json.dumps([f"{b.board_id}.toml" for b in ALIKE])
+    path = tmp_path / "session.toml"
+    head = f'schema = "rigkit.session/1"\nboards = {files}\nmodel = "brown"\nboard_shape = "flat"\nimages = "*.png"\n'
+    angle = '{ a = "plane1", b = "plane2", value_deg = 90.0, sigma_deg = 3.0, how = "set square" }'
+    path.write_text(f"{head}[[rigid_boards]]\nboards = {names}\nangles = [ {angle} ]\n")
+    room = corner_of_a_room(rng, ALIKE)
+    one = {"camera": (lens("reg"), Rigid3.identity())}
+    views = target_views(rng, one, ALIKE, room, 6, noise_px=0.1, distance_mm=1000.0, shuffled=True)
+    keep_corners(path, views, named=False)
+    assert main(["calibrate", str(path), "--json", "--report"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["checks"][0]["passed"] and told["checks"][0]["our_sigma"] < 0.05
+    assert load_calibration(tmp_path / "calibration.json").heldout_rms_px == told["cameras"][0]["heldout_rms_px"]
+    (target,) = load_board_rigs(tmp_path / "calibration-boards.json")
+    assert sorted(target.names) == [b.board_id for b in ALIKE] and target.image_count == 6
+    assert target.angle_deg("plane1", "plane2")[0] == pytest.approx(told["checks"][0]["ours"])
+    assert "Boards mounted to each other" in (tmp_path / "calibration.html").read_text()
+
+    # Without the mount, two cameras cannot know which board is which.
+    path.write_text(
+        head.replace('images = "*.png"\n', "")
+        + "".join(f'[[cameras]]\nid = "{name}"\nimages = "{name}*.png"\n' for name in "ab")
+    )
+    assert main(["calibrate", str(path), "--force"]) == 2
+    assert "look alike" in capsys.readouterr().err
+
+
+def test_a_camera_without_views_is_named(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (session.parent / "corners-wide.json").unlink()
+    assert main(["calibrate", str(session)]) == 2
+    said = capsys.readouterr().err
+    assert "no image matches 'images' of camera 'wide'" in said and "Traceback" not in said

@@ -1,0 +1,69 @@
+"""The boards' shape in a rig: one for all cameras, begun where the cameras alone have it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from rigkit.arrays import FloatArray, Points
+from rigkit.calibration.observations import Observations
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.shape import BOWS, SHAPES, STRETCHES, WARP_UNKNOWNS, ShapeModel, often_seen, shape_model
+
+__all__ = ["common_shape"]
+
+LEAST = 1e-4
+"""A prior falls to no less than this part of the usual one: on exact data it would fall to nothing."""
+
+
+def common_shape(observations: Observations, single: Sequence[Calibration]) -> tuple[ShapeModel, FloatArray]:
+    """Return the shape model of all cameras' boards, and its unknowns as the cameras have them, on average.
+
+    It is the richest that a camera alone has chosen: a board that is bent for one camera is bent. How far corners stray
+    the cameras alone have asked of their views; the priors are as wide as what they found.
+    """
+    kind = max((b.kind for alone in single for b in alone.boards), key=SHAPES.index)
+    shape = shape_model(kind, observations)
+    if not shape.count:
+        return shape, np.zeros(0)
+    unknowns = _nearest(shape, _average(observations, single))
+    return replace(shape, sigma=_found(observations, shape, unknowns)), unknowns
+
+
+def _average(observations: Observations, single: Sequence[Calibration]) -> Points:
+    """Return the corners of all boards, on average over the cameras that saw them."""
+    found: dict[str, list[Points]] = {}
+    for shape in (shape for alone in single for shape in alone.boards):
+        found.setdefault(shape.board_id, []).append(shape.points_mm)
+    points = observations.table()
+    for board, first in zip(observations.boards, observations.first_row, strict=False):
+        if board.board_id in found:
+            points[first : first + board.corner_count] = np.mean(found[board.board_id], axis=0)
+    return points
+
+
+def _nearest(shape: ShapeModel, points: Points) -> FloatArray:
+    """Return the unknowns whose points are nearest to `points`: the warp's first, then what it leaves to released."""
+    off = points - shape.flat
+    count = shape.basis.shape[-1]
+    warp: FloatArray = np.zeros(0)
+    if count:
+        warp = np.asarray(np.linalg.lstsq(shape.basis.reshape(-1, count), off.reshape(-1), rcond=None)[0], float)
+    return warp if shape.kind != "released" else np.concatenate([warp, (off - shape.basis @ warp).ravel()])
+
+
+def _found(observations: Observations, shape: ShapeModel, unknowns: FloatArray) -> FloatArray:
+    """Return the prior standard deviation of each unknown: the size of those of one kind on one board."""
+    sizes = shape.sigma.copy()
+    first = shape.basis.shape[-1]
+    for i, board in enumerate(np.flatnonzero(often_seen(observations)).tolist()):
+        groups = [WARP_UNKNOWNS * i + part for part in (BOWS, STRETCHES)]
+        if shape.kind == "released":
+            rows = np.arange(observations.first_row[board], observations.first_row[board + 1])
+            groups += [first + (3 * rows[:, None] + np.array(axes)).ravel() for axes in ((0, 1), (2,))]
+        for group in groups:
+            found = float(np.sqrt((unknowns[group] ** 2).mean()))
+            sizes[group] = max(found, LEAST * float(sizes[group].max()))
+    return sizes

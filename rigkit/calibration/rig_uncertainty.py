@@ -1,0 +1,84 @@
+"""How far a rig may be off in pixels: where a point that one camera sees must appear in another.
+
+A point x at a known distance on the ray of a pixel of camera 1 moves with the intrinsics k1, as the pixel stays, and
+with the mounts; in camera 2
+
+    dq2 = dq2/dk2 dk2 + dq2/dx2 (dM2 + R21 (dx1 - dM1)),      dx1 = -(dq1/dx1)+ dq1/dk1 dk1,
+
+where dM = w x (x - t) + dt is how a mount's perturbation moves a point of its camera, seen from the rig, and + inverts
+across the ray only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.arrays import BoolArray, FloatArray, Points
+from rigkit.calibration.rig_result import RigCalibration
+from rigkit.geometry.rotation import skew
+
+__all__ = ["Transfer", "transfer_covariance", "transfer_uncertainty"]
+
+POINTS = 40
+"""So many corners, spread over all views, are enough to see how sure the transfer is where the boards were."""
+
+
+@dataclass(frozen=True, slots=True)
+class Transfer:
+    """From camera `a` to camera `b`: standard deviation in the worst direction, px, at the middle one and at the worst
+    of the corners that `a` saw and `b` has in its image."""
+
+    a: str
+    b: str
+    median_px: float
+    worst_px: float
+
+
+def transfer_uncertainty(rig: RigCalibration, a: str, b: str) -> Transfer | None:
+    """Return how sure it is where the boards' corners in camera `a` must appear in camera `b`; None where `b` has none
+    of their places in its image."""
+    calibration = rig.cameras[rig.index(a)].calibration
+    boards = {shape.board_id: shape.points_mm for shape in calibration.boards}
+    shown = [
+        view.cam_from_board.apply(boards[view.board_id])[:: max(1, len(boards[view.board_id]) // 8)]
+        for view in calibration.views
+    ]
+    points = np.concatenate(shown)
+    points = points[np.linspace(0, len(points) - 1, min(POINTS, len(points))).astype(np.int64)]
+    covariance, seen = transfer_covariance(rig, a, b, points)
+    if not seen.any():
+        return None
+    xx, xy, yy = covariance[seen, 0, 0], covariance[seen, 0, 1], covariance[seen, 1, 1]
+    worst = np.sqrt(np.maximum(0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy), 0.0))
+    return Transfer(a, b, float(np.median(worst)), float(worst.max()))
+
+
+def transfer_covariance(rig: RigCalibration, a: str, b: str, points: Points) -> tuple[FloatArray, BoolArray]:
+    """Return the covariance (N, 2, 2), px^2, of where `points` (N, 3) mm in camera `a` appear in camera `b`, their
+    pixels in `a` and their distances given, and whether they do (N,)."""
+    i, j = rig.index(a), rig.index(b)
+    first, second = rig.cameras[i], rig.cameras[j]
+    motion = rig.cam2_from_cam1(a, b)
+    there = motion.apply(points)
+    _, seen1, by_point1, by_camera1 = first.camera.project_with_jacobians(points)
+    pixels, seen2, by_point2, by_camera2 = second.camera.project_with_jacobians(there)
+    rays = points / np.linalg.norm(points, axis=-1, keepdims=True)
+    # Across the ray: the distance is given, so the third row keeps it.
+    system = np.concatenate([by_point1, rays[:, None, :]], axis=1)
+    held = np.concatenate([-by_camera1, np.zeros((len(points), 1, by_camera1.shape[-1]))], axis=1)
+    by_own = np.linalg.solve(system, held)
+    ends = np.cumsum([0, *(c.camera.parameters.size for c in rig.cameras)])
+    design = np.zeros((len(points), 2, len(rig.covariance)))
+    turned = by_point2 @ motion.rotation
+    design[:, :, ends[i] : ends[i + 1]] += turned @ by_own
+    design[:, :, ends[j] : ends[j + 1]] += by_camera2
+    for k, x, by_x, sign in ((i, points, turned, -1.0), (j, there, by_point2, 1.0)):
+        if k > 0:
+            lever = skew(x - rig.cameras[k].cam_from_rig.translation_mm)
+            run = rig.mount(k)
+            design[:, :, run.start : run.start + 3] += sign * by_x @ -lever
+            design[:, :, run.start + 3 : run.stop] += sign * by_x
+    covariance = design @ rig.covariance @ np.swapaxes(design, -1, -2)
+    return covariance, seen1 & seen2 & second.camera.on_image(pixels)

@@ -1,0 +1,100 @@
+"""What a person should know about a rig, in sentences, as `rigkit.calibration.verdicts` has it for a camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+
+from rigkit.calibration.rig_result import RigCalibration
+from rigkit.calibration.rig_uncertainty import transfer_uncertainty
+from rigkit.calibration.uncertainty import uncertainty_at_corners
+
+__all__ = ["judge_rig"]
+
+FEW_SHARED = 5
+"""A mount has six numbers: fewer shared boards leave hardly anything to check it by."""
+UNSURE_PX = 1.0
+"""Standard deviation, in the worst direction, of a projection or of where another camera's point must appear."""
+SPREAD = 2.0
+"""Frames that disagree by this many times what the corners' scatter explains have an error in common."""
+WORSE = 1.5
+"""Held-out error in the rig over that of the cameras alone."""
+MANY_LEFT_OUT = 0.2
+
+
+def judge_rig(rig: RigCalibration, notes: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return the verdicts, the headline first; `notes` are verdicts found elsewhere."""
+    found = [*notes, *_shared(rig), *_unsure(rig), *_spread(rig), *_worse(rig)]
+    if not rig.convergence.converged:
+        found.insert(0, f"bad: the joint solution did not converge ({rig.convergence.reason})")
+    held = rig.heldout_rms_px
+    error = f"training RMS {rig.rms_px:.3f} px" if held is None else f"held-out RMS {held:.3f} px"
+    bad = sum(v.startswith("bad") for v in found)
+    if bad:
+        return (f"bad: {error}, but {bad} of the remarks below must be dealt with first", *found)
+    return (f"good: {error}" + (f"; {len(found)} remarks below" if found else ""), *found)
+
+
+def _shared(rig: RigCalibration) -> list[str]:
+    out = []
+    if len(rig.cameras) > 1 and rig.shared_count < FEW_SHARED:
+        out.append(
+            f"look: {rig.shared_count} boards are seen by several cameras at once; take at least {FEW_SHARED} frames "
+            "in which they are"
+        )
+    total = rig.shared_count + len(rig.left_out)
+    if len(rig.left_out) > MANY_LEFT_OUT * total:
+        out.append(
+            f"look: {len(rig.left_out)} of {total} boards that several views share were left out because the views "
+            "disagree on them; fix rig and boards while the images are taken, and trigger the cameras together"
+        )
+    return out
+
+
+def _unsure(rig: RigCalibration) -> list[str]:
+    out = []
+    for camera in rig.cameras:
+        worst = float(np.nanmax(uncertainty_at_corners(camera.calibration)))
+        if worst > UNSURE_PX:
+            out.append(
+                f"bad: the projection of camera '{camera.name}' is uncertain by up to {worst:.1f} px where the boards "
+                "were; take more frames, the boards tilted"
+            )
+    for a, b in combinations([c.name for c in rig.cameras], 2):
+        transfer = transfer_uncertainty(rig, a, b)
+        if transfer is not None and transfer.median_px > UNSURE_PX:
+            out.append(
+                f"bad: where points of camera '{a}' must appear in camera '{b}' is uncertain by "
+                f"{transfer.median_px:.1f} px; take more frames that both see, or that link them"
+            )
+    return out
+
+
+def _spread(rig: RigCalibration) -> list[str]:
+    if rig.spread <= SPREAD:
+        return []
+    return [
+        f"look: the frames disagree by {rig.spread:.1f} times what the corners' scatter explains; all sigmas count it "
+        'in. The boards or the lenses are not quite as the models say: try board_shape = "auto", model = "auto"'
+    ]
+
+
+def _worse(rig: RigCalibration) -> list[str]:
+    alone = [c.heldout_rms_px for c in rig.single]
+    together = rig.heldout_rms_px
+    known = [a for a in alone if a is not None]
+    if together is None or len(known) < len(alone):
+        return []
+    usual = float(np.sqrt(np.mean(np.square(known))))
+    if together <= WORSE * usual:
+        return []
+    return [
+        f"look: frames that took no part are off by {together / usual:.1f} times as much as for the cameras alone: "
+        + (
+            "the cameras were not quite of one moment, or a mount gives way"
+            if len(rig.cameras) > 1
+            else "the boards give way against each other"
+        )
+    ]

@@ -1,0 +1,95 @@
+"""Boards that look alike in a rig's session: named in any way before the solution, and by the rule after it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rigkit.boards import Board
+    from rigkit.calibration.rig import RigCalibration
+    from rigkit.detections import BoardDetection
+    from rigkit.io.corner_cache import FoundCorners
+    from rigkit.io.rig_session import RigSession
+
+__all__ = ["named_as_listed", "named_by_rule", "require_distinct"]
+
+
+def require_distinct(session: RigSession) -> None:
+    """Raise InputError where a rig of cameras has boards that nothing tells apart: alike, and not on one mount."""
+    from rigkit.corners.candidates import board_kinds
+    from rigkit.errors import InputError
+
+    if len(session.cameras) < 2:
+        return
+    for kind in board_kinds(next(iter(session.cameras.values())).boards):
+        if len(kind.ids) > 1 and not any(set(kind.ids) <= set(group.boards) for group in session.rigid_boards):
+            raise InputError(
+                f"{session.path}: boards {', '.join(kind.ids)} look alike, so two cameras cannot know which is which; "
+                "use boards of different sizes, or mount them to each other and list them as [[rigid_boards]]"
+            )
+
+
+def named_as_listed(session: RigSession, found: Mapping[str, FoundCorners]) -> dict[str, FoundCorners]:
+    """Return the corners with a name for every whole board of a group that has none: which of those that look alike is
+    which, the solution finds out from how they stand to each other."""
+    from dataclasses import replace
+
+    boards = {b.board_id: b for own in session.cameras.values() for b in own.boards}
+    groups = [[boards[name] for name in group.boards] for group in session.rigid_boards]
+    if not groups:
+        return dict(found)
+    out = {}
+    for image, item in found.items():
+        taken = {d.board_id for d in item.detections}
+        detections = []
+        for detection in item.detections:
+            named = None
+            if detection.board_id is None:
+                named = next((n for group in groups if (n := _vacant(detection, group, taken)) is not None), None)
+            if named is not None:
+                taken.add(named.board_id)
+            detections.append(named or detection)
+        out[image] = replace(item, detections=tuple(detections))
+    return out
+
+
+def _vacant(detection: BoardDetection, group: list[Board], taken: set[str | None]) -> BoardDetection | None:
+    """Return the detection as the first board of its size in the group that has none yet."""
+    for turns in (0, 1):
+        turned = detection.turned(turns)
+        for board in group:
+            if board.board_id not in taken and board.size == (turned.columns, turned.rows):
+                if turns and board.square_x_mm != board.square_y_mm:
+                    continue
+                return turned.named(board.board_id)
+    return None
+
+
+def named_by_rule(session: RigSession, rig: RigCalibration) -> RigCalibration:
+    """Return the rig with boards that look alike called as `rigkit.corners.naming` has it, in the first image that
+    shows the most of them: by the session's layout, or in the order listed."""
+    from rigkit.calibration.board_names import renamed
+    from rigkit.corners.candidates import board_kinds
+    from rigkit.corners.naming import Located, name_boards
+
+    boards = {b.board_id: b for own in session.cameras.values() for b in own.boards}
+    names: dict[str, str] = {}
+    for group in session.rigid_boards:
+        kinds = board_kinds([boards[name] for name in group.boards])
+        views = [v for v in rig.cameras[0].calibration.views if v.board_id in group.boards]
+        images = list(dict.fromkeys(v.image for v in views))
+        if not images:
+            continue
+        most = max(images, key=lambda image: sum(v.image == image for v in views))
+        shown = {v.board_id: v.cam_from_board.matrix() for v in views if v.image == most}
+        owner = {i: k for k, kind in enumerate(kinds) for i in kind.ids}
+        # Of one kind, boards listed across have another frame: their names stay as they are.
+        loose = [i for i in shown if boards[i].size == kinds[owner[i]].board.size and len(kinds[owner[i]].ids) > 1]
+        located = [Located(owner[i], pose, None if i in loose else i) for i, pose in shown.items()]
+        found, _ = name_boards(located, kinds, group.layout or None)
+        names |= {old: new for old, new in zip(shown, found, strict=True) if old != new}
+    # Names that nobody has taken over go round, so that every board keeps exactly one.
+    free = [n for n in names if n not in names.values()]
+    names |= dict(zip([n for n in names.values() if n not in names], free, strict=True))
+    return renamed(rig, names) if names else rig
