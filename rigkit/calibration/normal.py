@@ -25,9 +25,6 @@ BLOCK = 8192
 MAX_CONDITION = 1e12
 """A pose whose scaled block is worse has directions that its corners leave open: fewer than three of them."""
 
-FLOOR = 1e-24
-"""Diagonal entries below this part of the largest are lifted to it: a polynomial's entries span many powers of ten."""
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Step:
@@ -175,10 +172,10 @@ class Normal:
 
 
 def _diagonal(matrix: FloatArray) -> FloatArray:
-    """Return the diagonal (..., K) for Marquardt's scaling, lifted where it vanishes."""
+    """Return the diagonal (..., K) for Marquardt's scaling, one where it vanishes. Its entries are not compared: they
+    have units of their own, and those of a polynomial's coefficients lie 40 powers of ten apart."""
     diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
-    top = diagonal.max(axis=-1, keepdims=True) if diagonal.size else diagonal
-    return np.maximum(diagonal, np.where(top > 0.0, FLOOR * top, 1.0))
+    return np.where(diagonal > 0.0, diagonal, 1.0)
 
 
 def _damped(matrices: FloatArray, damping: FloatArray) -> FloatArray:
