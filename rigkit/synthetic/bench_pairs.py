@@ -6,7 +6,7 @@ geometry of both views tells which is which, and which way round.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 
 import numpy as np
@@ -20,7 +20,7 @@ from rigkit.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.posetype import PoseType
-from rigkit.synthetic.bench_scenes import bench_camera
+from rigkit.synthetic.bench_scenes import LENSES, bench_camera
 from rigkit.synthetic.pairs import StereoScene, random_pair, trihedral_pair
 from rigkit.synthetic.scene import PlacedBoard, room_walls, wall_axes
 
@@ -33,8 +33,9 @@ SAME_PX = 1.0
 POSE_TYPES = (PoseType.GENERAL, PoseType.PLANAR, PoseType.STANDARD, PoseType.FORWARD)
 TRIES = 50
 RIGHT_ANGLES = (90.0, 90.0, 90.0)
-AWAY_MM = 160.0
-"""Boards that do not stand in the corner of the room are moved away from it by up to this along both walls."""
+CLEAR_MM, AWAY_MM = 8.0, 160.0
+"""Boards that do not stand in the corner of the room are away from it by this much along both walls."""
+OFF_SYMMETRY_MM = (0.0, 0.5, 1.0, 3.0, 6.0)
 PARALLAX_DEG = (8.0, 45.0)
 
 
@@ -52,24 +53,36 @@ class PairVerdict(StrEnum):
 
 
 def equal_boards_pair(seed: int, *, size_px: tuple[int, int] = (800, 600)) -> tuple[str, StereoScene]:
-    """Return what a pair is, in words, and the pair: regular and fisheye lenses in turn, two boards' arrangements in
-    turn (in the corner of the room, all pose types; anywhere on the walls, turned by any angle, free views)."""
+    """Return what a pair is, in words that begin with its lens, and the pair.
+
+    By turns: regular and fisheye; boards in the corner of the room as in a laboratory (all pose types), and anywhere on
+    the walls, turned by any angle (free views). Every tenth pair is a trap: a third of a turn maps the three boards
+    onto each other, exactly or but for a few millimetres, so that an honest answer may be that it cannot be told.
+    """
     rng = np.random.default_rng(seed)
-    lens = ("regular", "fisheye")[seed % 2]
+    lens = LENSES[(seed + seed // 10) % len(LENSES)]
     camera = bench_camera(lens, size_px)
+    if seed % 10 == 9:
+        off_mm = OFF_SYMMETRY_MM[seed // 20 % len(OFF_SYMMETRY_MM)]
+        pair = _random_pair(lambda: _cyclic_boards(off_mm, rng), camera, rng)
+        return f"{lens}, {off_mm:g} mm from symmetric", pair
     if seed // 2 % 2 == 0:
         pose_type = POSE_TYPES[seed // 4 % 4]
         pair = trihedral_pair(EQUAL_BOARDS, camera, pose_type, rng, baseline_mm=200.0)
         return f"{lens}, in the corner, {pose_type}", pair
-    return f"{lens}, anywhere on the walls", _anywhere_pair(camera, rng)
+    walls = wall_axes(RIGHT_ANGLES)
+
+    def boards() -> list[PlacedBoard]:
+        return [_on_wall(board, axes, rng) for board, axes in zip(EQUAL_BOARDS, walls, strict=True)]
+
+    return f"{lens}, anywhere on the walls", _random_pair(boards, camera, rng)
 
 
-def _anywhere_pair(camera: Camera, rng: np.random.Generator) -> StereoScene:
+def _random_pair(boards: Callable[[], Sequence[PlacedBoard]], camera: Camera, rng: np.random.Generator) -> StereoScene:
     for _ in range(TRIES):
-        placed = [_on_wall(board, axes, rng) for board, axes in zip(EQUAL_BOARDS, wall_axes(RIGHT_ANGLES), strict=True)]
         try:
             return random_pair(
-                placed,
+                boards(),
                 camera,
                 PoseType.GENERAL,
                 rng,
@@ -81,13 +94,25 @@ def _anywhere_pair(camera: Camera, rng: np.random.Generator) -> StereoScene:
     raise DegenerateError(f"equal boards: no two views of {TRIES} arrangements saw all boards")
 
 
+def _cyclic_boards(off_mm: float, rng: np.random.Generator) -> list[PlacedBoard]:
+    """Return three boards that a third of a turn about the corner's diagonal maps onto each other, but for `off_mm`."""
+    third = Rigid3(np.roll(np.eye(3), 1, axis=0), np.zeros(3))
+    pose = _on_wall(EQUAL_BOARDS[0], wall_axes(RIGHT_ANGLES)[0], rng).world_from_board
+    placed = []
+    for board in EQUAL_BOARDS:
+        in_plane = np.array([*rng.uniform(-1.0, 1.0, 2) * off_mm, 0.0])
+        placed.append(PlacedBoard(board, pose @ Rigid3(np.eye(3), in_plane)))
+        pose = third @ pose
+    return placed
+
+
 def _on_wall(board: Board, axes: FloatArray, rng: np.random.Generator) -> PlacedBoard:
     """Return the board on a wall, turned at random, all of its paper on the room's side of the other walls."""
     turn = exp_so3(np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]))
     turned = PlacedBoard(board, Rigid3(axes @ turn, np.zeros(3)))
     # The room is x, y, z < 0: the paper's highest coordinates along the wall go to a random place below zero.
     along = np.abs(axes[:, 2]) < 0.5
-    shift = np.where(along, -turned.outline().max(axis=0) - rng.uniform(3.0, AWAY_MM, 3), 0.0)
+    shift = np.where(along, -turned.outline().max(axis=0) - rng.uniform(CLEAR_MM, AWAY_MM, 3), 0.0)
     return PlacedBoard(board, Rigid3(axes @ turn, shift))
 
 

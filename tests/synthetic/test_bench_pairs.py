@@ -8,10 +8,10 @@ import pytest
 from rigkit.synthetic.bench_pairs import EQUAL_BOARDS, PairVerdict, equal_boards_pair, judge_pair
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+@pytest.mark.parametrize("seed", [0, 1, 2, 3, 9, 19])
 def test_pairs_see_three_equal_boards_whole(seed: int) -> None:
     what, scene = equal_boards_pair(seed)
-    assert what.startswith(("regular", "fisheye")[seed % 2])
+    assert what.split(",")[0] == ("regular", "fisheye")[(seed + seed // 10) % 2]
     assert {(b.board.size, b.board.square_x_mm) for b in scene.boards} == {((8, 6), 40.0)}
     assert all(d.complete for view in scene.detections() for d in view)
     # The walls are perpendicular, and no paper runs through another wall.
@@ -21,6 +21,17 @@ def test_pairs_see_three_equal_boards_whole(seed: int) -> None:
         assert (board.outline() < 1e-6).all()
     again = equal_boards_pair(seed)[1]
     assert again.cam2_from_cam1.allclose(scene.cam2_from_cam1)
+
+
+def test_every_tenth_pair_is_symmetric() -> None:
+    """A third of a turn takes every corner of an exactly symmetric pair to one of another board."""
+    what, scene = equal_boards_pair(9)
+    assert "0 mm" in what
+    points = [b.points() for b in scene.boards]
+    turned = [p[:, [2, 0, 1]] for p in points]
+    for k in range(3):
+        nearest = np.linalg.norm(turned[k][:, None] - points[(k + 1) % 3], axis=2).min(axis=1)
+        np.testing.assert_allclose(nearest, 0.0, atol=1e-9)
 
 
 def test_verdicts() -> None:
