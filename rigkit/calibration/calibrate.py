@@ -18,7 +18,7 @@ from rigkit.calibration.fit import Fit, fit_kept, fit_model, heldout_rms, robust
 from rigkit.calibration.moved import moved_lens
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration, Candidate
-from rigkit.calibration.shape import SHAPES
+from rigkit.calibration.shape import SHAPES, often_seen
 from rigkit.calibration.uncertainty import uncertainty_at_corners
 from rigkit.calibration.usable import usable_views
 from rigkit.calibration.verdicts import judge
@@ -101,7 +101,7 @@ def calibrate(
     options = _compared(observations, options, folds, progress)
     chosen = _choose(observations, options, MARGIN)
     candidates = [*_described(options, chosen, MARGIN), *failed]
-    if board != "flat":
+    if board != "flat" and often_seen(observations).any():
         shapes = _shapes(observations, chosen, SHAPES[1:] if board == "auto" else (board,), folds, progress)
         if board == "auto":
             shapes = [chosen, *shapes]
@@ -154,7 +154,7 @@ def _agreeing(observations: Observations, options: list[_Option]) -> tuple[BoolA
     total = observations.present.sum(axis=1)
     keep = kept >= np.maximum(MIN_KEPT_SHARE * total, 4)
     reasons = tuple(
-        (view.image, f"only {k} of {n} corners of board '{view.board.board_id}' agree with the other views")
+        (view.image, f"only {k} of {n} corners of board '{view.board.board_id}' agree with the other views; retake it")
         for view, k, n, ok in zip(observations.views, kept, total, keep, strict=True)
         if not ok
     )

@@ -6,15 +6,17 @@ result that it judges.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
+from rigkit.arrays import BoolArray, FloatArray, IntArray
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.uncertainty import uncertainty_at_corners, uncertainty_map
+from rigkit.calibration.uncertainty import uncertainty_at_corners
+from rigkit.cameras.base import image_center
 
-__all__ = ["judge"]
+__all__ = ["judge", "judge_session"]
 
 FEW_IMAGES = 8
 TILTED_DEG = 15.0
@@ -24,7 +26,13 @@ CELLS = (4, 3)
 CELL_CORNERS = 5
 """A cell with fewer corners than this is empty."""
 BAD_VIEW = 2.5
-"""A view whose median residual is this many times the usual one."""
+"""A view whose median residual is this many times the usual one, there in the image."""
+RINGS = 4
+"""What is usual is asked of so many rings around the middle of the image: towards the rim all corners scatter more."""
+OUTLYING = 0.2
+"""A view with this part of its corners outliers."""
+NAMED = 3
+"""So many images are named one by one."""
 PATTERN = 0.35
 """Correlation of residuals of neighbouring corners: noise has 0 (a fitted pose makes it slightly negative)."""
 OVERFIT = 1.25
@@ -45,6 +53,7 @@ def judge(
     `uncertainty_at_corners` returns, where it is known already."""
     found = [
         *also,
+        *_left_out(calibration.dropped),
         *_tilts(calibration),
         *_images(calibration),
         *_coverage(calibration),
@@ -56,7 +65,17 @@ def judge(
         *_outliers(calibration),
     ]
     if not calibration.convergence.converged:
-        found.insert(0, f"bad: the solver did not converge ({calibration.convergence.reason}); add tilted views")
+        found.insert(
+            0,
+            f"bad: the solver did not converge ({calibration.convergence.reason}): the model may not fit this lens; "
+            'try model = "auto", or add views with the board tilted',
+        )
+    return (_headline(calibration, found), *found)
+
+
+def judge_session(calibration: Calibration, dropped: Sequence[tuple[str, str]]) -> tuple[str, ...]:
+    """Return the verdicts of the calibration together with those on images that gave no view at all."""
+    found = [*_left_out(dropped), *calibration.verdicts[1:]]
     return (_headline(calibration, found), *found)
 
 
@@ -66,20 +85,34 @@ def _headline(c: Calibration, found: list[str]) -> str:
     bad = sum(v.startswith("bad") for v in found)
     if bad:
         return f"bad: {error}, but {bad} of the remarks below must be dealt with first"
-    return f"good: {error}" + (f"; {len(found)} remarks below" if found else "")
+    remarks = {0: "", 1: "; 1 remark below"}.get(len(found), f"; {len(found)} remarks below")
+    return f"good: {error}{remarks}"
+
+
+def _left_out(dropped: Sequence[tuple[str, str]]) -> list[str]:
+    """Name the images left out, or how many for each reason."""
+    if len(dropped) <= NAMED:
+        return [f"look: image '{image}' is left out: {reason}" for image, reason in dropped]
+    reasons = Counter(reason for _, reason in dropped)
+    first = {reason: image for image, reason in reversed(dropped)}
+    return [
+        f"look: {count} images are left out, '{first[reason]}' the first: {reason}"
+        if count > 1
+        else f"look: image '{first[reason]}' is left out: {reason}"
+        for reason, count in reasons.most_common(NAMED)
+    ]
 
 
 def _tilts(c: Calibration) -> list[str]:
-    """A board that faces the camera says nothing about the focal length."""
-    axes = np.array([v.cam_from_board.rotation[:, 2] for v in c.views])
-    places = np.array([v.cam_from_board.translation_mm for v in c.views])
-    facing = np.abs((axes * places).sum(axis=1)) / np.linalg.norm(places, axis=1)
-    tilted = int((facing < np.cos(np.radians(TILTED_DEG))).sum())
+    """Boards parallel to the image plane say nothing about the focal length."""
+    axes = np.array([v.cam_from_board.rotation[2, 2] for v in c.views])
+    tilted = int((np.abs(axes) < np.cos(np.radians(TILTED_DEG))).sum())
     if tilted >= min(TILTED_VIEWS, len(c.views)):
         return []
     return [
-        f"bad: the board is tilted by more than {TILTED_DEG:.0f} degrees in {tilted} of {len(c.views)} views only; "
-        f"take at least {TILTED_VIEWS} with the board tilted by 20 to 50 degrees, about different axes"
+        f"bad: the board is tilted by more than {TILTED_DEG:.0f} degrees against the image in {tilted} of "
+        f"{len(c.views)} views only; take at least {TILTED_VIEWS} with the board tilted by 20 to 50 degrees, about "
+        "different axes"
     ]
 
 
@@ -87,7 +120,10 @@ def _images(c: Calibration) -> list[str]:
     count = len({v.image for v in c.views})
     if count >= FEW_IMAGES:
         return []
-    return [f"look: {count} images; take at least {FEW_IMAGES}, better 15, so that errors can be told from lens"]
+    images = f"{count} images" if count > 1 else "1 image"
+    return [
+        f"look: {images} only; take at least {FEW_IMAGES}, better 15, to know how good the calibration is elsewhere"
+    ]
 
 
 def _coverage(c: Calibration) -> list[str]:
@@ -104,29 +140,59 @@ def _coverage(c: Calibration) -> list[str]:
     empty = (count < CELL_CORNERS) & valid & (np.where(valid, rays[..., 2], -1.0) > np.cos(np.radians(95.0)))
     if not empty.any():
         return []
-    names = [f"{NAMES_V[j]} {NAMES_U[i]}" for i, j in np.argwhere(empty)]
-    return [f"look: no corners in the {', '.join(names)} of the image; hold the board there, tilted"]
+    return [f"look: no corners in the {_in_words(empty)} of the image; hold the board there, tilted"]
+
+
+def _in_words(cells: BoolArray) -> str:
+    """Return cells (columns, rows) of the image in words, whole rows and columns together."""
+    columns, rows = np.asarray(cells.all(axis=1)), np.asarray(cells.all(axis=0))
+    names = [f"whole {NAMES_U[i]}" for i in np.flatnonzero(columns)]
+    names += [f"whole {NAMES_V[j]}" for j in np.flatnonzero(rows)]
+    single = np.asarray(cells & ~columns[:, None] & ~rows[None, :])
+    names += [f"{NAMES_V[j]} {NAMES_U[i]}" for i, j in np.argwhere(single)]
+    return ", ".join(names)
+
+
+def _cell(c: Calibration, pixel: FloatArray) -> str:
+    """Return in words where a pixel is."""
+    i, j = np.clip((pixel / c.camera.size_px * CELLS).astype(np.int64), 0, np.array(CELLS) - 1)
+    return f"{NAMES_V[j]} {NAMES_U[i]}"
 
 
 def _views(c: Calibration) -> list[str]:
-    # Medians over all corners: a view that is bad throughout has its worst corners among the outliers.
     if len(c.views) < 3:
         return []
-    count = np.array([len(v.grid) for v in c.views])
-    squared = np.full((len(count), int(count.max())), np.inf)
-    squared[np.arange(squared.shape[1]) < count[:, None]] = np.nan_to_num(
-        (np.concatenate([v.residuals_px for v in c.views]) ** 2).sum(axis=1)
-    )
-    squared.sort(axis=1)
-    view = np.arange(len(count))
-    middle = np.sqrt(0.5 * (squared[view, (count - 1) // 2] + squared[view, count // 2]))
+    lengths = np.array([len(v.grid) for v in c.views])
+    out = lengths - [int(v.kept.sum()) for v in c.views]
+    # Of all corners: a view that is bad throughout has its worst corners among the outliers.
+    residual = np.linalg.norm(np.nan_to_num(np.concatenate([v.residuals_px for v in c.views])), axis=1)
+    middle = _medians(residual, lengths)
     usual = max(float(np.median(middle)), np.finfo(float).tiny)
-    return [
-        f"look: image '{view.image}' has a median residual of {value:.3f} px, {value / usual:.1f} times the usual one; "
-        "look whether the board or the camera moved, and retake it"
-        for view, value in zip(c.views, middle, strict=True)
-        if value > BAD_VIEW * usual
-    ]
+    times = middle / usual
+    if times.max() > BAD_VIEW:
+        away = np.concatenate([v.pixels for v in c.views]) - image_center(c.camera.size_px)
+        there = np.full(len(away), usual)
+        for ring in np.array_split(np.argsort((away**2).sum(axis=1)), RINGS):
+            there[ring] = max(float(np.median(residual[ring])), usual)
+        times = _medians(residual / there, lengths)
+    found = []
+    for i in np.flatnonzero((times > BAD_VIEW) | (out > OUTLYING * lengths)).tolist():
+        what = f"has a median residual of {middle[i]:.3f} px, {times[i]:.1f} times the usual one there"
+        if times[i] <= BAD_VIEW:
+            what = f"has {out[i]} outliers among its {lengths[i]} corners"
+        found.append(
+            f"look: image '{c.views[i].image}' {what}; look whether the board or the camera moved, and retake it"
+        )
+    return found
+
+
+def _medians(values: FloatArray, count: IntArray) -> FloatArray:
+    """Return the median of each run of `count` values."""
+    padded = np.full((len(count), int(count.max())), np.inf)
+    padded[np.arange(padded.shape[1]) < count[:, None]] = values
+    padded.sort(axis=1)
+    row = np.arange(len(count))
+    return np.asarray(0.5 * (padded[row, (count - 1) // 2] + padded[row, count // 2]))
 
 
 def _pattern(c: Calibration) -> list[str]:
@@ -143,10 +209,13 @@ def _pattern(c: Calibration) -> list[str]:
         power += 0.5 * float(np.nansum(a**2 + b**2))
     if not power > 0.0 or products / power < PATTERN:
         return []
-    return [
-        f"look: residuals of neighbouring corners agree (correlation {products / power:.2f}): the lens model or the "
-        'board\'s shape does not fit; try model = "auto", board_shape = "auto", and check that the board is flat'
-    ]
+    what = f"look: residuals of neighbouring corners agree (correlation {products / power:.2f}): "
+    lenses = {candidate.name.split()[0] for candidate in c.candidates} - {"board"}
+    if all(board.kind == "flat" for board in c.boards) and not any(t.name == "board released" for t in c.candidates):
+        return [what + 'the board\'s shape or the lens model does not fit; try board_shape = "auto" or a flatter board']
+    if len(lenses) < 2:
+        return [what + 'the lens model, or the board\'s shape, does not quite fit; try model = "auto"']
+    return [what + "neither the lens models nor the boards' shapes follow all of it; take a board that does not bend"]
 
 
 def _overfit(c: Calibration) -> list[str]:
@@ -162,12 +231,12 @@ def _unsure(c: Calibration, inside: FloatArray) -> list[str]:
     worst = float(np.nanmax(inside)) if np.isfinite(inside).any() else np.inf
     if worst <= UNSURE_PX:
         return []
-    grid = uncertainty_map(c, grid=(12, 9))
-    place = grid.pixels.reshape(-1, 2)[np.nanargmax(np.where(grid.valid, grid.worst_px, -1.0))]
-    return [
-        f"bad: the projection is uncertain by up to {worst:.1f} px (one standard deviation) where the boards were, "
-        f"most in the image towards ({place[0]:.0f}, {place[1]:.0f}); take more views there, tilted"
-    ]
+    what = f"bad: the projection is uncertain by up to {worst:.1f} px (one standard deviation) where the boards were"
+    if not np.isfinite(worst):
+        return [what + "; take more views, with the board tilted"]
+    pixels = np.concatenate([view.pixels[view.kept] for view in c.views])
+    place = pixels[np.linspace(0, len(pixels) - 1, len(inside)).astype(np.int64)[np.nanargmax(inside)]]
+    return [f"{what}, most in the {_cell(c, place)} of the image; take more views there, with the board tilted"]
 
 
 def _boards(c: Calibration) -> list[str]:
@@ -180,13 +249,13 @@ def _boards(c: Calibration) -> list[str]:
         if board.bow_mm > 2e-3 * extent:
             out.append(
                 f"look: board '{board.board_id}' departs from a plane by {board.bow_mm:.2f} mm; its shape is part of "
-                "the solution, but a flat board is better"
+                "the solution, but glue it to something flat: it may bend otherwise next time"
             )
         if abs(board.aspect) > ASPECT:
-            longer = "columns" if board.aspect > 0 else "rows"
+            longer, other = ("x", "y") if board.aspect > 0 else ("y", "x")
             out.append(
-                f"look: board '{board.board_id}' has squares {100 * abs(board.aspect):.2f} % longer along its {longer} "
-                "than stated, against the other side; measure square_x_mm and square_y_mm again"
+                f"look: board '{board.board_id}' has squares {100 * abs(board.aspect):.2f} % longer in {longer} than "
+                f"stated, compared with {other}; measure square_x_mm and square_y_mm again"
             )
     return out
 
@@ -195,4 +264,8 @@ def _outliers(c: Calibration) -> list[str]:
     share = len(c.outliers) / max(len(c.outliers) + c.corner_count, 1)
     if share <= OUTLIER_SHARE:
         return []
-    return [f"look: {100 * share:.1f} % of the corners are outliers; check exposure, focus and motion blur"]
+    image, count = Counter(outlier.image for outlier in c.outliers).most_common(1)[0]
+    return [
+        f"look: {100 * share:.1f} % of the corners are outliers, most of them ({count}) in '{image}'; check exposure, "
+        "focus and motion blur there"
+    ]

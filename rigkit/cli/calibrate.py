@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 __all__ = ["HELP", "add_arguments", "calibrate_session", "page_path", "run", "session_corners", "session_views"]
 
+ODD_SIZES = 3
+"""A few images of another size are left out; where they are this part of all, which of the sizes is meant?"""
 HELP = "calibrate a camera, or several on one mount, from images of chessboards"
 
 
@@ -84,6 +86,7 @@ def calibrate_session(session: Session, progress: Progress = silent) -> Calibrat
     from dataclasses import replace
 
     from rigkit.calibration.calibrate import calibrate
+    from rigkit.calibration.verdicts import judge_session
 
     views, size_px, dropped = session_views(session, session_corners(session, progress))
     result = calibrate(
@@ -94,7 +97,7 @@ def calibrate_session(session: Session, progress: Progress = silent) -> Calibrat
         board=session.board_shape,
         progress=progress,
     )
-    return replace(result, dropped=(*dropped, *result.dropped))
+    return replace(result, dropped=(*dropped, *result.dropped), verdicts=judge_session(result, dropped))
 
 
 def session_views(
@@ -107,7 +110,7 @@ def session_views(
     from rigkit.calibration.usable import other_size, views_of_image
     from rigkit.errors import InputError
 
-    size_px = Counter(f.size_px for f in found.values()).most_common(1)[0][0]
+    size_px = _common_size(session, found)
     views, dropped = [], []
     for name, item in found.items():
         if item.size_px != size_px:
@@ -129,6 +132,21 @@ def session_views(
     if wrong is not None:
         raise InputError(f"{session.path}: {wrong}; correct columns and rows in the board file")
     return views, size_px, dropped
+
+
+def _common_size(session: Session, found: Mapping[str, FoundCorners]) -> tuple[int, int]:
+    """Return the size that most images have; raises InputError where as many as a third have another."""
+    from rigkit.errors import InputError
+
+    counts = Counter(item.size_px for item in found.values()).most_common()
+    if len(counts) > 1 and ODD_SIZES * counts[1][1] >= len(found):
+        first = {item.size_px: name for name, item in reversed(list(found.items()))}
+        sizes = " and ".join(f"{w}x{h} px ({n}, such as '{first[w, h]}')" for (w, h), n in counts[:2])
+        raise InputError(
+            f"{session.path}: images of {sizes}; a camera at one setting has one size: list only the images of one "
+            "size in 'images'"
+        )
+    return counts[0][0]
 
 
 def session_corners(session: Session, progress: Progress) -> dict[str, FoundCorners]:

@@ -10,6 +10,7 @@ from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 from rigkit.boards import Board
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration
+from rigkit.calibration.verdicts import judge_session
 
 
 def said(result: Calibration, words: str) -> bool:
@@ -25,10 +26,16 @@ def test_sound_views_are_called_good(rng: np.random.Generator) -> None:
 
 
 def test_too_few_tilts_and_empty_corners(rng: np.random.Generator) -> None:
-    views, _, _ = random_views(lens("reg"), 12, rng, reach_deg=15.0, tilt_deg=(0.0, 8.0))
+    views, _, _ = random_views(lens("reg"), 12, rng, reach_deg=12.0, tilt_deg=(0.0, 3.0))
     result = calibrate(views, SIZE, model="brown", board="flat")
     assert said(result, "tilted by more than") and result.verdicts[0].startswith("bad")
-    assert said(result, "no corners in the top left")
+    assert said(result, "where the boards were, most in the")
+    assert said(result, "no corners in the whole left, whole right")
+
+
+def test_boards_that_face_a_fisheye_from_all_sides_are_tilted_enough(rng: np.random.Generator) -> None:
+    views, _, _ = random_views(lens("fish"), 20, rng, reach_deg=92.5, tilt_deg=(0.0, 5.0))
+    assert calibrate(views, SIZE, model="kannala_brandt", board="flat").verdicts[0].startswith("good")
 
 
 def test_moved_lens(rng: np.random.Generator) -> None:
@@ -40,9 +47,19 @@ def test_moved_lens(rng: np.random.Generator) -> None:
     assert said(calibrate(views, SIZE, model="brown", board="flat"), "from 'later000.png' on")
 
 
+def test_a_bent_board_shown_in_order_is_no_moved_lens(rng: np.random.Generator) -> None:
+    bent = BOARD.points()
+    bent[:, 2] = 1.0 - ((bent[:, 0] - 120.0) / 120.0) ** 2
+    views, rotation, _ = random_views(lens("reg"), 40, rng, reach_deg=33.0, points_mm=bent)
+    for order in (rotation[:, 0, 2], np.array([view.pixels[:, 0].mean() for view in views])):
+        shown = [replace(views[i], image=f"{k:02d}.png") for k, i in enumerate(np.argsort(order))]
+        result = calibrate(shown, SIZE, model="brown", board="flat")
+        assert said(result, "neighbouring corners agree") and not said(result, "focus, zoom or mount moved")
+
+
 def test_wrong_aspect_and_bent_board(rng: np.random.Generator) -> None:
     views, _, _ = random_views(lens("reg"), 20, rng, reach_deg=33.0, points_mm=Board("b", 9, 6, 30.2, 30.0).points())
-    assert said(calibrate(views, SIZE, model="brown", board="warp"), "longer along its columns")
+    assert said(calibrate(views, SIZE, model="brown", board="warp"), "longer in x than stated")
     bent = BOARD.points()
     bent[:, 2] = 2.0 * (1.0 - ((bent[:, 0] - 120.0) / 120.0) ** 2)
     views, _, _ = random_views(lens("reg"), 20, rng, reach_deg=33.0, points_mm=bent)
@@ -58,3 +75,41 @@ def test_few_images_and_one_bad_view(rng: np.random.Generator) -> None:
     shaken = replace(views[2], pixels=views[2].pixels + 0.8 * rng.normal(size=(54, 2)))
     result = calibrate([*views[:2], shaken, *views[3:]], SIZE, model="brown", board="flat")
     assert said(result, "6 images") and said(result, "'002.png' has a median residual")
+
+
+def test_a_board_that_moved_during_the_exposure(rng: np.random.Generator) -> None:
+    views, _, _ = random_views(lens("reg"), 20, rng, reach_deg=33.0)
+    jump = np.where(np.arange(54) > 26, 2.0, 0.0)[:, None]
+    views[7] = replace(views[7], pixels=np.clip(views[7].pixels + jump, 0.0, np.array(SIZE) - 1.0))
+    result = calibrate(views, SIZE, model="brown", board="flat")
+    assert said(result, "image '007.png' has") and said(result, "retake it")
+    assert sum(v.startswith("look: image") for v in result.verdicts) == 1
+
+
+def test_more_scatter_at_the_rim_is_not_a_bad_view(rng: np.random.Generator) -> None:
+    camera = lens("fish")
+    views, _, _ = random_views(camera, 40, rng, reach_deg=92.5, noise_px=0.1)
+    middle = camera.project(np.array([0.0, 0.0, 1.0]))[0]
+    rough = []
+    for view in views:
+        share = np.clip((np.linalg.norm(view.pixels - middle, axis=1) - 250.0) / 350.0, 0.0, 1.0)
+        noise = 0.3 * share[:, None] * rng.normal(size=view.pixels.shape)
+        rough.append(replace(view, pixels=np.clip(view.pixels + noise, 0.0, np.array(SIZE) - 1.0)))
+    result = calibrate(rough, SIZE, model="kannala_brandt", board="flat")
+    assert not said(result, "retake it")
+
+
+def test_a_lens_that_no_model_tried_fits(rng: np.random.Generator) -> None:
+    views, _, _ = random_views(lens("fish"), 20, rng, reach_deg=92.5)
+    assert said(calibrate(views, SIZE, model="brown"), 'try model = "auto"')
+
+
+def test_images_left_out_are_named(rng: np.random.Generator) -> None:
+    views, _, _ = random_views(lens("reg"), 12, rng, reach_deg=33.0)
+    wrong = replace(views[3], pixels=np.clip(views[3].pixels + 30.0 * rng.normal(size=(54, 2)), 0.0, [1623.0, 1239.0]))
+    result = calibrate([*views[:3], wrong, *views[4:]], SIZE, model="brown", board="flat")
+    assert said(result, "image '003.png' is left out: only")
+    session = judge_session(result, [("a.png", "800x600 px, most images have 1624x1240")])
+    assert f"{len(result.verdicts)} remarks below" in session[0] and "'a.png' is left out: 800x600 px" in session[1]
+    many = judge_session(result, [(f"{i}.png", "no board found") for i in range(5)])
+    assert "5 images are left out, '0.png' the first: no board found" in many[1]
