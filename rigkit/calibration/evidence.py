@@ -85,7 +85,7 @@ def _variance(fit: Fit) -> FloatArray:
     normal, sigma = solution_normal(fit), fit.sigma_px if np.isfinite(fit.sigma_px) else 1.0
     count = fit.state.shape.count
     if fit.state.shape.kind == "warp":
-        return np.diag(normal.covariance()[0])[-count:] * sigma**2
+        return np.diag(normal.covariance()[0])[len(normal.g) - count :] * sigma**2
     first = fit.state.shape.basis.shape[-1]
     points, start = (count - first) // 3, len(normal.g) - (count - first)
     each = np.arange(points)

@@ -114,6 +114,15 @@ def test_one_image_is_as_good_as_three_boards_alone(rng: np.random.Generator) ->
     assert max(abs(e) for e in errors_in_sigmas(rig, room, DIFFERENT)) < SIGMAS
 
 
+@pytest.mark.parametrize("frames", [1, 2])
+def test_too_few_images_for_a_shape_leave_the_boards_flat(frames: int, rng: np.random.Generator) -> None:
+    room = corner_of_a_room(rng, DIFFERENT)
+    views = target_views(rng, REG, DIFFERENT, room, frames, noise_px=NOISE_PX, distance_mm=1000.0)
+    rig = solve(views, DIFFERENT, "auto")
+    assert all(shape.bow_mm < 1e-3 for shape in rig.cameras[0].calibration.boards)
+    assert max(abs(e) for e in errors_in_sigmas(rig, room, DIFFERENT)) < SIGMAS
+
+
 def test_ties_make_a_camera_surer() -> None:
     """Three images: 30 unknown numbers of poses and places instead of 54."""
     tied, alone = [], []
