@@ -30,6 +30,7 @@ __all__ = [
     "PARAMETERS",
     "PIXEL_KURTOSIS",
     "REACH",
+    "SHARP_BLUR_PX",
     "TAIL_SIGMAS",
     "Geometry",
     "Window",
@@ -48,6 +49,9 @@ TAIL_SIGMAS = 3.0
 
 PIXEL_KURTOSIS = -1.0 / 120.0
 """Fourth cumulant of a uniform distribution of width 1: of a pixel's square along its sides, px^4."""
+
+SHARP_BLUR_PX = 0.6
+"""Below this s the pixel's square shows: a series in its cumulants would be wrong by half a grey level at s = 0.4."""
 
 REACH = 0.5
 """Pixels are used up to this from the corner along the sides of its cell: the windows of neighbouring corners meet and
@@ -133,19 +137,35 @@ def collect(image: FloatImage, pixels: FloatArray, geometry: Geometry, blur: Flo
     )
 
 
-def _step(distance: Float32, blur: Float32, kurtosis: Float32, gaps: Float32) -> tuple[Float32, ...]:
+def _step(distance: Float32, blur: Float32, flat: Float32, gaps: Float32) -> tuple[Float32, ...]:
     """Return the blurred step S over the line, S' and S'' (with respect to x = distance / s), and -s dS/ds.
 
     Where squares are small against the blur, the edges of the parallel lines at `gaps` (N, 2) before and after reach
     into the window: their steps are taken away. Far from both they add up to nothing: one is -1, the other +1.
     """
-    total = _blurred_edge(distance / blur, kurtosis)
+    total = _edge(distance, blur, flat)
     tight = (gaps * (1.0 - REACH) < TAIL_SIGMAS * blur).any(axis=1)
     if tight.any():
-        near, sigma, beside, shape = distance[tight], blur[tight], gaps[tight], kurtosis[tight]
+        near, beside = distance[tight], gaps[tight]
         for place in (-beside[:, :1], beside[:, 1:]):
-            for mine, other in zip(total, _blurred_edge((near - place) / sigma, shape), strict=True):
+            for mine, other in zip(total, _edge(near - place, blur[tight], flat[tight]), strict=True):
                 mine[tight] -= other
+    return total
+
+
+def _edge(distance: Float32, blur: Float32, flat: Float32) -> tuple[Float32, ...]:
+    """Return, as `_step`, a single edge from -1 to 1; `flat` (N, 1) is the pixel's fourth cumulant across it, px^4.
+
+    Sharp edges are the mean of two Gaussian ones at +-r, which have the pixel's second and fourth cumulant: -2 r^4.
+    """
+    total = _blurred_edge(distance / blur, flat / blur**4)
+    sharp = blur[:, 0] < SHARP_BLUR_PX
+    if sharp.any():
+        half, apart = np.float32(0.5), np.sqrt(np.sqrt(np.float32(-0.5) * flat[sharp]))
+        width = np.sqrt(blur[sharp] ** 2 - apart**2)
+        before, after = (_blurred_edge((distance[sharp] + r) / width, np.zeros_like(width)) for r in (-apart, apart))
+        for order, mine, one, other in zip((0, 1, 2, 2), total, before, after, strict=True):
+            mine[sharp] = half * (blur[sharp] / width) ** order * (one + other)
     return total
 
 
@@ -181,8 +201,8 @@ def _parts(values: FloatArray, window: Window, geometry: Geometry) -> tuple[tupl
         along, aside = cosine * qu + sine * qv, cosine * qv - sine * qu
         kappa = geometry.curvature[:, line, None].astype(np.float32)
         distance = aside - (np.float32(0.5) * kappa) * (along * along + blur * blur)
-        kurtosis = np.float32(PIXEL_KURTOSIS) * (cosine**4 + sine**4) / blur**4
-        step = _step(distance, blur, kurtosis, geometry.gaps[:, line].astype(np.float32))
+        flat = np.float32(PIXEL_KURTOSIS) * (cosine**4 + sine**4)
+        step = _step(distance, blur, flat, geometry.gaps[:, line].astype(np.float32))
         step[3][...] += kappa * blur * step[1]
         out.append((*step, along, aside, cosine, sine, kappa))
     return tuple(out)

@@ -15,7 +15,7 @@ typedef float lanes_t __attribute__((vector_size(4 * LANES), aligned(4)));
 
 /* The constants of corners.edge_model and corners.edge_fit, under their names there (rigkit.native.edges.Rules). */
 typedef struct {
-    double reach, near_sigmas, near_px, tail_sigmas, pixel_kurtosis;
+    double reach, near_sigmas, near_px, tail_sigmas, pixel_kurtosis, sharp_blur;
     double least_blur, most_blur, angle_sigma, log_blur_sigma, light_sigma;
     double most_move_px, most_turn, most_blur_change, most_light_change;
     double least_variance, ridge, converged_px, blur_lag, valid_move_px, valid_move_cells, radius_px;
@@ -34,10 +34,12 @@ typedef struct {
     double centre_u, centre_v, size;
 } window_t;
 
-/* A line through the corner as float32 arithmetic wants it. */
+/* A line through the corner as float32 arithmetic wants it. A sharp edge is two of less `width`, `apart` to either side;
+ * `stretch` is s / width (edge_model._edge). */
 typedef struct {
-    float cosine, sine, curvature, kurtosis, before, after;
-    int tight;
+    float cosine, sine, curvature, before, after;
+    float blur, width, stretch, apart, kurtosis;
+    int tight, sharp;
 } line_t;
 
 /* The model along one line over a block of pixels: the step, its slopes, -s dS/ds, and the pixel's place. */
@@ -161,64 +163,68 @@ INLINE void blurred_edge(float x, float kurtosis, float out[4])
 INLINE line_t line_of(double angle, double curvature, const double gaps[2], double blur, const rules_t *rules)
 {
     const double cosine = cos(angle), sine = sin(angle), c2 = cosine * cosine, s2 = sine * sine, b2 = blur * blur;
+    const double flat = rules->pixel_kurtosis * (c2 * c2 + s2 * s2);
+    const int sharp = blur < rules->sharp_blur;
+    const double apart = sharp ? sqrt(sqrt(-0.5 * flat)) : 0.0, width = sqrt(b2 - apart * apart);
     const double nearest = gaps[0] < gaps[1] ? gaps[0] : gaps[1];
-    const int tight = nearest * (1.0 - rules->reach) < rules->tail_sigmas * blur;
-    const double kurtosis = rules->pixel_kurtosis * (c2 * c2 + s2 * s2) / (b2 * b2);
-    return (line_t){(float)cosine, (float)sine, (float)curvature, (float)kurtosis, (float)gaps[0], (float)gaps[1], tight};
+    return (line_t){
+        .cosine = (float)cosine, .sine = (float)sine, .curvature = (float)curvature,
+        .before = (float)gaps[0], .after = (float)gaps[1],
+        .blur = (float)blur, .width = (float)width, .stretch = (float)(blur / width), .apart = (float)apart,
+        .kurtosis = sharp ? 0.0f : (float)(flat / (b2 * b2)),
+        .tight = nearest * (1.0 - rules->reach) < rules->tail_sigmas * blur, .sharp = sharp};
 }
 
-/* Set `x` to the distances, plus `shift`, from a line in s. In a loop of its own: mixed with what follows, the limits
- * become branches that keep the compiler from vectorising. */
-INLINE void distances(const line_t line, const edge_t *edge, float shift, float blur, float x[BLOCK])
+/* Add a Gaussian edge, `shift` back from the line, with weight `part`. The distances have a loop of their own: mixed
+ * with what follows, their limits become branches that keep the compiler from vectorising. */
+INLINE void add_gaussian(const line_t line, float shift, float part, edge_t *out)
 {
-    const float per_blur = 1.0f / blur;
+    float x[BLOCK];
+    const float per_width = 1.0f / line.width;
     for (int i = 0; i < BLOCK; i++) {
-        const float along = edge->along[i];
-        const float bend = 0.5f * line.curvature * (along * along + blur * blur);
-        const float at = (edge->aside[i] - bend + shift) * per_blur;
+        const float along = out->along[i];
+        const float bend = 0.5f * line.curvature * (along * along + line.blur * line.blur);
+        const float at = (out->aside[i] - bend + shift) * per_width;
         const float most = at < FLAT_SIGMAS ? at : FLAT_SIGMAS;
         x[i] = most > -FLAT_SIGMAS ? most : -FLAT_SIGMAS;
     }
-}
-
-/* Take away what a neighbouring line, `shift` back from this one, adds (edge_model._step). */
-INLINE void without_neighbour(const line_t line, float shift, float blur, edge_t *out)
-{
-    float x[BLOCK];
-    distances(line, out, shift, blur, x);
+    const float once = part * line.stretch, twice = once * line.stretch;
     for (int i = 0; i < BLOCK; i++) {
-        float other[4];
-        blurred_edge(x[i], line.kurtosis, other);
-        out->value[i] -= other[0];
-        out->slope[i] -= other[1];
-        out->bow[i] -= other[2];
-        out->grown[i] -= other[3];
+        float edge[4];
+        blurred_edge(x[i], line.kurtosis, edge);
+        out->value[i] += part * edge[0];
+        out->slope[i] += once * edge[1];
+        out->bow[i] += twice * edge[2];
+        out->grown[i] += twice * edge[3];
     }
 }
 
-/* Evaluate one line over a block of pixels at (u, v) from the window's centre. */
-INLINE void along_line(const line_t line, const float *u, const float *v, float x, float y, float blur, edge_t *out)
+/* edge_model._edge, `shift` back from the line. */
+INLINE void add_edge(const line_t line, float shift, float part, edge_t *out)
+{
+    if (line.sharp) {
+        add_gaussian(line, shift - line.apart, 0.5f * part, out);
+        add_gaussian(line, shift + line.apart, 0.5f * part, out);
+    } else {
+        add_gaussian(line, shift, part, out);
+    }
+}
+
+/* Evaluate one line over a block of pixels at (u, v) from the window's centre (edge_model._step). */
+INLINE void along_line(const line_t line, const float *u, const float *v, float x, float y, edge_t *out)
 {
     for (int i = 0; i < BLOCK; i++) {
         out->along[i] = line.cosine * (u[i] - x) + line.sine * (v[i] - y);
         out->aside[i] = line.cosine * (v[i] - y) - line.sine * (u[i] - x);
+        out->value[i] = out->slope[i] = out->bow[i] = out->grown[i] = 0.0f;
     }
-    float at[BLOCK];
-    distances(line, out, 0.0f, blur, at);
-    for (int i = 0; i < BLOCK; i++) {
-        float own[4];
-        blurred_edge(at[i], line.kurtosis, own);
-        out->value[i] = own[0];
-        out->slope[i] = own[1];
-        out->bow[i] = own[2];
-        out->grown[i] = own[3];
-    }
+    add_edge(line, 0.0f, 1.0f, out);
     if (line.tight) {
-        without_neighbour(line, line.before, blur, out);
-        without_neighbour(line, -line.after, blur, out);
+        add_edge(line, line.before, -1.0f, out);
+        add_edge(line, -line.after, -1.0f, out);
     }
     for (int i = 0; i < BLOCK; i++)
-        out->grown[i] += line.curvature * blur * out->slope[i];
+        out->grown[i] += line.curvature * line.blur * out->slope[i];
 }
 
 /* edge_model._mixed. */
@@ -245,8 +251,8 @@ static void normal_equations(
         const float *u = window->u + start, *v = window->v + start, *value = window->value + start;
         edge_t one, two;
         float rows[ROWS][BLOCK];
-        along_line(line1, u, v, x, y, blur, &one);
-        along_line(line2, u, v, x, y, blur, &two);
+        along_line(line1, u, v, x, y, &one);
+        along_line(line2, u, v, x, y, &two);
         for (int i = 0; i < BLOCK; i++) {
             const float pattern = mixed(&one, &two, rho, i);
             const float plain = base + half * pattern;
@@ -294,7 +300,7 @@ static void normal_equations(
 FOR_EACH_PROCESSOR
 static void brightness(double *values, const window_t *window, const geometry_t at, const rules_t *rules, double sign)
 {
-    const float x = (float)values[X], y = (float)values[Y], blur = (float)values[S];
+    const float x = (float)values[X], y = (float)values[Y];
     const float rho = (float)cos(values[T1] - values[T2]);
     const line_t line1 = line_of(values[T1], at.curvature[0], at.gaps, values[S], rules);
     const line_t line2 = line_of(values[T2], at.curvature[1], at.gaps + 2, values[S], rules);
@@ -303,8 +309,8 @@ static void brightness(double *values, const window_t *window, const geometry_t 
         edge_t one, two;
         float pattern[BLOCK], value[BLOCK];
         lanes_t p = {0.0f}, i = {0.0f}, pp = {0.0f}, pi = {0.0f};
-        along_line(line1, window->u + start, window->v + start, x, y, blur, &one);
-        along_line(line2, window->u + start, window->v + start, x, y, blur, &two);
+        along_line(line1, window->u + start, window->v + start, x, y, &one);
+        along_line(line2, window->u + start, window->v + start, x, y, &two);
         for (int k = 0; k < BLOCK; k++) {
             const int used = start + k < window->count;
             pattern[k] = used ? (float)sign * mixed(&one, &two, rho, k) : 0.0f;

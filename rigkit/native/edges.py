@@ -30,6 +30,7 @@ class Rules(ctypes.Structure):
                 "near_px",
                 "tail_sigmas",
                 "pixel_kurtosis",
+                "sharp_blur",
                 "least_blur",
                 "most_blur",
                 "angle_sigma",

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from rigkit.corners.edge_fit import fit_edges
-from rigkit.corners.edge_model import PARAMETERS, Geometry, collect, linearise, pattern_of
+from rigkit.corners.edge_model import PARAMETERS, PIXEL_KURTOSIS, Geometry, _edge, collect, linearise, pattern_of
 
 DERIVATIVE_REL = 0.01
 """Differences of a float32 model with steps of 1e-3 are good to 1e-4 / 1e-3 grey levels of 60."""
@@ -145,3 +145,20 @@ def test_corner_at_the_frame_is_not_trusted() -> None:
     image, _ = image_of(np.array([[32.0, 32.0]]), shape, 0.8)
     fit = fit_edges(image[:, 32:], np.array([[0.2, 32.0]]), shape, np.ones(1), np.ones(1), radius_px=18.0, iterations=4)
     assert not fit.valid.any()
+
+
+def test_sharp_edges_have_the_pixel_s_shape() -> None:
+    """An edge of a hundred grey levels under the exact integral over the pixel's square, from sharp to blurred."""
+    nodes, weights = np.polynomial.legendre.leggauss(24)
+    for blur, most in ((0.3, 0.1), (0.45, 0.03), (0.55, 0.03), (0.8, 0.01)):
+        for angle in (0.0, 0.3, 0.25 * np.pi):
+            x = np.linspace(-2.0, 2.0, 81)
+            true = np.zeros_like(x)
+            for a, wa in zip(nodes, weights, strict=True):
+                for b, wb in zip(nodes, weights, strict=True):
+                    at = x - 0.5 * (a * np.cos(angle) + b * np.sin(angle))
+                    true += 0.25 * wa * wb * np.array([math.erf(v / (math.sqrt(2.0) * blur)) for v in at])
+            width = math.hypot(blur, math.sqrt(1.0 / 12.0))
+            flat = PIXEL_KURTOSIS * (np.cos(angle) ** 4 + np.sin(angle) ** 4)
+            ours = _edge(x[None].astype(np.float32), np.float32([[width]]), np.float32([[flat]]))[0][0]
+            assert 100.0 * np.abs(ours - true).max() / 2.0 < most, (blur, angle)
