@@ -1,18 +1,22 @@
-"""`rigkit board`: a chessboard to print, true to scale, and the measured print back into its file."""
+"""`rigkit board`: a chessboard or ChArUco board to print, true to scale, and the measured print back into its file."""
 
 from __future__ import annotations
 
 import argparse
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rigkit.errors import InputError
 
 if TYPE_CHECKING:
-    from rigkit.boards import Board
+    from rigkit.boards import Board, Markers
 
 HELP = "a board to print, true to scale (PDF and SVG), and its measured size back into the board file"
+
+MARKER_SHARE = 0.75
+"""Side of a marker in squares: large enough to be read, with white left around it for the corners."""
 
 BOARD_SIZE = re.compile(r"^(\d+)[xX](\d+)$")
 
@@ -23,6 +27,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--paper", default="a4", help="a4 (default), a3, a2, a1, a0, letter or tabloid")
     parser.add_argument("-o", "--output", metavar="NAME", help="write NAME.pdf, NAME.svg and NAME.toml")
     parser.add_argument("--force", action="store_true", help="replace existing files")
+    charuco = parser.add_argument_group("ChArUco", "markers in the white squares (with COLUMNSxROWS)")
+    charuco.add_argument("--charuco", metavar="DICTIONARY", help="OpenCV's name, such as DICT_5X5_100")
+    charuco.add_argument("--marker-mm", type=float, metavar="MM", help="side of a marker (three quarters of a square)")
+    charuco.add_argument("--first-marker", type=int, default=0, metavar="N", help="number of the first marker (0)")
+    charuco.add_argument("--legacy", action="store_true", help="pattern of OpenCV before 4.6")
     measured = parser.add_argument_group(
         "measured print", "what a rule shows on the print's two rulers; the board file gets the true square size"
     )
@@ -43,7 +52,9 @@ def run(args: argparse.Namespace) -> int:
             raise InputError("board: --square-mm is missing; give the side of a square, such as --square-mm 30")
         if args.output is None:
             raise InputError("board: -o is missing; give a name for the files, such as -o boards/a9x6_30")
-        board = Board("board", int(size[1]), int(size[2]), args.square_mm, args.square_mm)
+        board = Board("board", int(size[1]), int(size[2]), args.square_mm, args.square_mm, None, _markers(args))
+    elif args.charuco or args.marker_mm is not None or args.first_marker or args.legacy:
+        raise InputError("board: a board file says itself what markers it has; give a size such as 9x6 with --charuco")
     else:
         board = load_board(Path(args.size))
     sheet = board_sheet(board, args.paper)
@@ -64,6 +75,17 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _markers(args: argparse.Namespace) -> Markers | None:
+    from rigkit.boards import Markers
+
+    if args.charuco is None:
+        if args.marker_mm is not None or args.first_marker or args.legacy:
+            raise InputError("board: markers need a dictionary; give it, such as --charuco DICT_5X5_100")
+        return None
+    side = args.marker_mm if args.marker_mm is not None else MARKER_SHARE * args.square_mm
+    return Markers(args.charuco, side, args.first_marker, args.legacy)
+
+
 def _store_measured(args: argparse.Namespace, board: Board, ruler_x_mm: float, ruler_y_mm: float) -> int:
     from rigkit.boards import Board
     from rigkit.io.files import write_atomic
@@ -81,7 +103,10 @@ def _store_measured(args: argparse.Namespace, board: Board, ruler_x_mm: float, r
     sigma = None
     if args.sigma_mm is not None:
         sigma = args.sigma_mm * max(board.square_x_mm / ruler_x_mm, board.square_y_mm / ruler_y_mm)
-    measured_board = Board(board.board_id, board.columns, board.rows, x, y, sigma)
+    markers = board.markers
+    if markers is not None:
+        markers = replace(markers, side_mm=markers.side_mm * (x / board.square_x_mm + y / board.square_y_mm) / 2.0)
+    measured_board = Board(board.board_id, board.columns, board.rows, x, y, sigma, markers)
     words = f"measured: rulers of {ruler_x_mm:g} and {ruler_y_mm:g} mm read {args.ruler_x_mm:g} and {args.ruler_y_mm:g}"
     write_atomic(path, _board_toml(measured_board, words), force=True)
     print(f"{path}: squares {x:.4f} x {y:.4f} mm")
@@ -93,4 +118,8 @@ def _board_toml(board: Board, comment: str) -> str:
     lines += [f"square_x_mm = {board.square_x_mm:.6g}", f"square_y_mm = {board.square_y_mm:.6g}"]
     if board.square_sigma_mm is not None:
         lines.append(f"square_sigma_mm = {board.square_sigma_mm:.4g}")
+    if board.markers is not None:
+        lines += [f'dictionary = "{board.markers.dictionary}"', f"marker_mm = {board.markers.side_mm:.6g}"]
+        lines.append(f"first_marker = {board.markers.first_id}")
+        lines.append(f"legacy_pattern = {str(board.markers.legacy_pattern).lower()}")
     return "\n".join(lines) + "\n"

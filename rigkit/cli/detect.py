@@ -13,7 +13,11 @@ from rigkit.errors import CheckFailed, InputError
 
 if TYPE_CHECKING:
     from rigkit.boards import Board
+    from rigkit.cameras.base import Camera
     from rigkit.detections import BoardDetection
+
+    How = tuple[list[Board], Camera | None, int]
+    """Boards, camera and the smallest number of corners: the same for all images."""
 
 HELP = "corners of every chessboard in the images, to a corners file and overlay pictures"
 
@@ -24,6 +28,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("images", nargs="+", metavar="IMAGE|FOLDER", help="images, or folders of images")
     parser.add_argument(
         "--board", action="append", default=[], metavar="BOARD.toml", help="a board that may be there; repeat for more"
+    )
+    parser.add_argument(
+        "--camera",
+        metavar="CALIBRATION.json",
+        help="the camera of all images: finds corners that were missed on the boards given, and places all more finely",
     )
     parser.add_argument("-o", "--output", metavar="CORNERS.csv", help="write the corners file")
     parser.add_argument("--overlay", metavar="DIR", help="write a picture of each image with its corners")
@@ -47,9 +56,10 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--jobs {args.jobs}: at least one process is needed")
     images = list(_images(args.images))
     boards = [load_board(path) for path in args.board]
+    camera = _camera(args.camera, boards)
     overlays = _overlay_paths(images, args.overlay)
     ensure_writable([*([args.output] if args.output else []), *filter(None, overlays)], force=args.force)
-    found = _detect_all(images, overlays, boards, args)
+    found = _detect_all(images, overlays, (boards, camera, args.min_corners), args)
     if not any(found.values()):
         raise CheckFailed(f"no chessboard found in {len(images)} images; check focus and exposure, or --min-corners")
     if args.output:
@@ -62,6 +72,16 @@ def run(args: argparse.Namespace) -> int:
     missing = sum(not items for items in found.values())
     print(f"{sum(map(len, found.values()))} boards in {len(images) - missing} of {len(images)} images")
     return 0
+
+
+def _camera(path: str | None, boards: list[Board]) -> Camera | None:
+    from rigkit.io.calibration_file import load_camera
+
+    if path is None:
+        return None
+    if not boards:
+        raise InputError("--camera helps to find boards of known size only; give them, such as --board a9x6.toml")
+    return load_camera(path)
 
 
 def _images(paths: list[str]) -> Iterator[Path]:
@@ -93,7 +113,7 @@ def _overlay_paths(images: list[Path], folder: str | None) -> list[Path | None]:
 
 
 def _detect_all(
-    images: list[Path], overlays: list[Path | None], boards: list[Board], args: argparse.Namespace
+    images: list[Path], overlays: list[Path | None], how: How, args: argparse.Namespace
 ) -> dict[str, tuple[BoardDetection, ...]]:
     """Return the detections per image in the order of `images`, whatever the number of processes."""
     from concurrent.futures import ProcessPoolExecutor
@@ -102,9 +122,7 @@ def _detect_all(
     from rigkit.cli.console import progress_on_stderr
 
     progress = progress_on_stderr()
-    tasks = [
-        (image, overlay, boards, args.min_corners, args.force) for image, overlay in zip(images, overlays, strict=True)
-    ]
+    tasks = [(image, overlay, how, args.force) for image, overlay in zip(images, overlays, strict=True)]
     jobs = min(args.jobs or os.cpu_count() or 1, len(images))
     found: dict[str, tuple[BoardDetection, ...]] = {}
 
@@ -122,7 +140,7 @@ def _detect_all(
     return found
 
 
-def detect_one(task: tuple[Path, Path | None, list[Board], int, bool]) -> tuple[BoardDetection, ...]:
+def detect_one(task: tuple[Path, Path | None, How, bool]) -> tuple[BoardDetection, ...]:
     """Detect the boards of one image and write its overlay; at module level for other processes to find."""
     import cv2
 
@@ -131,11 +149,17 @@ def detect_one(task: tuple[Path, Path | None, list[Board], int, bool]) -> tuple[
     from rigkit.io.images import read_image
     from rigkit.report.overlay import draw_boards
 
-    path, overlay, boards, min_corners, force = task
+    path, overlay, (boards, camera, min_corners), force = task
     cv2.setNumThreads(1)
     image = read_image(path)
+    size = (image.shape[1], image.shape[0])
+    if camera is not None and size != camera.size_px:
+        raise InputError(
+            f"image '{path}' is {size[0]}x{size[1]} px but the calibration is for {camera.size_px[0]}x"
+            f"{camera.size_px[1]}; use that camera's images, or leave --camera out"
+        )
     try:
-        found = detect_boards(image, boards, min_corners=min_corners)
+        found = detect_boards(image, boards, min_corners=min_corners, camera=camera)
     except InputError as error:
         raise InputError(f"'{path}': {error}") from error
     if overlay is not None:

@@ -100,6 +100,9 @@ def board_kinds(boards: Sequence[Board]) -> tuple[BoardKind, ...]:
 
 
 def _alike(a: Board, b: Board) -> bool:
+    if a.markers is not None or b.markers is not None:
+        return False
+
     def close(x: float, y: float) -> bool:
         return abs(x - y) <= SAME_SQUARE_REL * max(x, y)
 
@@ -121,9 +124,11 @@ def possible_kinds(detections: Sequence[BoardDetection], kinds: Sequence[BoardKi
         if d.board_id in named:
             out.append([named[d.board_id]])
             continue
-        whole = [k for k, kind in enumerate(kinds) if tuple(sorted(kind.board.size)) == size]
+        # A ChArUco board is known by its markers, that is by name, or not at all.
+        plain = [k for k, kind in enumerate(kinds) if kind.board.markers is None]
+        whole = [k for k in plain if tuple(sorted(kinds[k].board.size)) == size]
         crowded = sizes.count(size) > sum(len(kinds[k].boards) for k in whole)
-        larger = [k for k, kind in enumerate(kinds) if k not in whole and placements(d, kind)]
+        larger = [k for k in plain if k not in whole and placements(d, kinds[k])]
         out.append(whole + larger if crowded or not whole else whole)
     return out
 
@@ -135,6 +140,8 @@ def placements(detection: BoardDetection, kind: BoardKind) -> list[Placement]:
     to place a whole grid; a square grid may have been turned by 90 degrees against the convention, which comes last.
     """
     columns, rows = kind.board.size
+    if kind.board.markers is not None:
+        return [Placement(0)]
     whole = sorted((detection.columns, detection.rows)) == sorted((columns, rows))
     if whole and (columns + rows) % 2 == 1:
         return [Placement(0 if detection.columns == columns else 1)]

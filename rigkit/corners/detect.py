@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rigkit.boards import Board
 from rigkit.cameras.base import Camera
 from rigkit.corners.border import place_part
-from rigkit.corners.fold import join_parts, split_folds
+from rigkit.corners.fold import join_parts, split_folds, split_necks
 from rigkit.corners.grow import SaddleIndex, grow_all
 from rigkit.corners.guided import complete_boards
 from rigkit.corners.lattice import Lattice, build_lattices
@@ -43,8 +43,8 @@ def find_lattices(image: NDArray[np.generic], min_corners: int) -> list[RefinedL
     lattices = build_lattices(corners, find_links(corners, levels[0]))
     index = SaddleIndex(saddles)
     grown = [item for item in grow_all(lattices, index, levels[0]) if item.count >= FEWEST_OF_PART]
-    folded = [part for item in grown for part in split_folds(item)]
-    parts = separate([tidy(part, size_px) for part in folded], FEWEST_OF_PART)
+    boards = [board for item in grown for part in split_folds(item) for board in split_necks(part)]
+    parts = separate([tidy(board, size_px) for board in boards], FEWEST_OF_PART)
     boards = [board for board in join_parts(parts) if large(board, min_corners)]
     boards = [board for board in boards if _promising(grey, board)]
     refined = zip(boards, refine(grey, boards), strict=True)
@@ -75,7 +75,7 @@ def detect_boards(
     boards : what may be in the image, if known. A grid of a board's size, either way round, is turned to its columns x
         rows; a part of a board whose borders show where it lies gets its place in the board's grid, any other part
         stays a grid of its own. A board is named only where one single given board has that size and one single
-        detection fits it.
+        detection fits it, or, a ChArUco board, by its markers.
     min_corners : boards with fewer corners are not reported.
     camera : the calibrated camera, if known: it shows where corners of known boards were missed, and fits all of them
         with windows and lines as it sees them (`rigkit.corners.guided`).
@@ -91,13 +91,20 @@ def detect_boards(
         `image` is not an image of a supported type.
     """
     known = boards or ()
-    sizes = tuple(dict.fromkeys(board.size for board in known))
+    plain = [board for board in known if board.markers is None]
+    sizes = tuple(dict.fromkeys(board.size for board in plain))
     grey = grey_image(image)
-    lattices = [known_part(item, sizes) for item in find_lattices(grey, min_corners)]
+    lattices = find_lattices(grey, min_corners)
+    marked: list[BoardDetection] = []
+    if len(plain) < len(known):
+        from rigkit.corners.charuco import charuco_boards
+
+        marked, lattices = charuco_boards(grey, lattices, known, min_corners)
+    lattices = [known_part(item, sizes) for item in lattices]
     placed = [place_part(grey, item, sizes) or item for item in lattices]
-    found = complete_boards(grey, [_detection(item, sizes) for item in placed], known, camera)
+    found = complete_boards(grey, [*marked, *(_detection(item, sizes) for item in placed)], known, camera)
     ordered = sorted(found, key=lambda item: (-len(item.grid), *np.round(item.pixels.mean(axis=0)[::-1], 3)))
-    return tuple(_named(_apart(ordered), known))
+    return tuple(_named(_apart(ordered), plain))
 
 
 def _apart(found: Sequence[BoardDetection]) -> list[BoardDetection]:

@@ -110,7 +110,7 @@ def _board_of(found: BoardDetection, boards: Sequence[Board]) -> Board | None:
     """Return a board of the detection's grid, the one it names if it names one."""
     fitting = [b for b in boards if b.size == (found.columns, found.rows)]
     named = [b for b in fitting if b.board_id == found.board_id]
-    return next(iter(named or fitting), None)
+    return next(iter(named or [b for b in fitting if b.markers is None]), None)
 
 
 def _fit(

@@ -8,13 +8,20 @@
     square_mm = 30.0         # or square_x_mm and square_y_mm
     square_sigma_mm = 0.05   # optional: how well it was measured
     id = "a9x6_30"           # optional: by default the file's name
+
+A ChArUco board has four keys more; without them it is read as a chessboard::
+
+    dictionary = "DICT_5X5_100"  # of its markers, by the name in OpenCV
+    marker_mm = 22.0             # side of a marker with its black border
+    first_marker = 0             # optional: number of the first marker
+    legacy_pattern = false       # optional: true for boards drawn by OpenCV before 4.6
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from rigkit.boards import Board
+from rigkit.boards import Board, Markers, marker_rectangles
 from rigkit.io.toml_reader import TomlTable, read_toml
 
 __all__ = ["SCHEMA", "board_from_table", "load_board"]
@@ -48,4 +55,19 @@ def board_from_table(table: TomlTable, default_id: str) -> Board:
     sigma = None
     if table.has("square_sigma_mm"):
         sigma = table.number("square_sigma_mm", hint="square_sigma_mm = 0.05")
-    return Board(board_id, columns, rows, x, y, sigma)
+    board = Board(board_id, columns, rows, x, y, sigma, _markers(table))
+    marker_rectangles(board)
+    return board
+
+
+def _markers(table: TomlTable) -> Markers | None:
+    if not table.has("dictionary"):
+        for key in ("marker_mm", "first_marker", "legacy_pattern"):
+            if table.has(key):
+                raise table.error(f"'{key}' without 'dictionary'; add dictionary = \"DICT_5X5_100\", or remove it")
+        return None
+    dictionary = table.text("dictionary", hint='dictionary = "DICT_5X5_100"')
+    side = table.number("marker_mm", hint="marker_mm = 22.0 (with the black border)")
+    first = table.integer("first_marker", hint="first_marker = 0", at_least=0) if table.has("first_marker") else 0
+    legacy = table.boolean("legacy_pattern", hint="legacy_pattern = false") if table.has("legacy_pattern") else False
+    return Markers(dictionary, side, first, legacy)

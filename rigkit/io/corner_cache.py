@@ -39,7 +39,7 @@ class CornerCache:
 
     def __init__(self, path: Path, boards: Sequence[Board]) -> None:
         self.path = path
-        self.detector = _detector_version() + " " + " ".join(f"{b.columns}x{b.rows}" for b in boards)
+        self.detector = _detector_version() + " " + " ".join(_target(b) for b in boards)
         self._entries: dict[str, dict[str, Any]] = {}
         self._changed = False
         try:
@@ -76,6 +76,13 @@ class CornerCache:
         if self._changed:
             data = {"schema": SCHEMA, "detector": self.detector, "images": self._entries}
             write_atomic(self.path, json.dumps(data, allow_nan=False) + "\n", force=True)
+
+
+def _target(board: Board) -> str:
+    """Return what the detector looks for of a board."""
+    size = f"{board.columns}x{board.rows}"
+    m = board.markers
+    return size if m is None else f"{board.board_id}:{size}:{m.dictionary}:{m.first_id}:{m.legacy_pattern}"
 
 
 def image_hash(path: Path) -> str:

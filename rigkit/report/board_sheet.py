@@ -1,4 +1,4 @@
-"""A chessboard to print, true to scale, with rulers that show what the printer made of it: SVG and PDF.
+"""A chessboard or ChArUco board to print, true to scale, with rulers that show what the printer made of it: SVG, PDF.
 
 The sheet is a list of shapes in mm with the origin at the top left; two small writers turn it into either format.
 """
@@ -11,7 +11,7 @@ from html import escape
 
 import numpy as np
 
-from rigkit.boards import Board
+from rigkit.boards import Board, marker_rectangles
 from rigkit.errors import InputError
 
 __all__ = ["PAPERS", "Sheet", "board_sheet", "pdf_bytes", "svg_text"]
@@ -55,8 +55,8 @@ class Sheet:
 def board_sheet(board: Board, paper: str) -> Sheet:
     """Lay out the board's (columns + 1) x (rows + 1) squares and two rulers on a sheet of `paper`.
 
-    The top-left square is black. Around the squares one margin of at least half a square stays white, which
-    detectors need.
+    The top-left square is black (on a ChArUco board as its pattern says). Around the squares one margin of at least
+    half a square stays white, which detectors need.
 
     Raises InputError where the paper is unknown or too small; the message names the paper that would do.
     """
@@ -65,12 +65,18 @@ def board_sheet(board: Board, paper: str) -> Sheet:
     w, h = across * board.square_x_mm, down * board.square_y_mm
     x0 = (size[0] - RULER_STRIP_MM - w) / 2.0
     y0 = (size[1] - RULER_STRIP_MM - h) / 2.0
-    rectangles = tuple(
+    rectangles = [
         (x0 + i * board.square_x_mm, y0 + j * board.square_y_mm, board.square_x_mm, board.square_y_mm)
         for j in range(down)
         for i in range(across)
-        if (i + j) % 2 == 0
-    )
+        if (i + j) % 2 == int(not board.first_black)
+    ]
+    # The rows and the columns of each marker's modules, one over the other: no hairline shows where two only touch.
+    squares_mm = np.array([board.square_x_mm, board.square_y_mm])
+    for upright in (False, True):
+        marks = marker_rectangles(board, upright=upright) * np.tile(squares_mm, 2)
+        marks[:, :2] += np.array([x0, y0]) + squares_mm
+        rectangles += [(x, y, width, height) for x, y, width, height in marks.tolist()]
     ruler_x = RULER_STEP_MM * np.floor(w / RULER_STEP_MM)
     ruler_y = RULER_STEP_MM * np.floor(h / RULER_STEP_MM)
     bottom = size[1] - UNPRINTABLE_MM - 7.0
@@ -80,11 +86,13 @@ def board_sheet(board: Board, paper: str) -> Sheet:
     lines += [(right, y0 + t, right - _tick(t), y0 + t) for t in np.arange(0.0, ruler_y + 1.0, RULER_STEP_MM)]
     squares = f"{board.square_x_mm:g} x {board.square_y_mm:g} mm"
     name = f"{board.columns} x {board.rows} inner corners, squares {squares}"
+    if board.markers is not None:
+        name += f", {board.markers.dictionary} from {board.markers.first_id}, markers {board.markers.side_mm:g} mm"
     texts = (
         (x0, bottom + 4.5, 0.0, f"rigkit: {name}. Print at 100 %. This ruler should be {ruler_x:g} mm; measure it."),
         (right + 2.0, y0, 90.0, f"This ruler should be {ruler_y:g} mm."),
     )
-    return Sheet(*size, name, rectangles, tuple(lines), texts, float(ruler_x), float(ruler_y))
+    return Sheet(*size, name, tuple(rectangles), tuple(lines), texts, float(ruler_x), float(ruler_y))
 
 
 def svg_text(sheet: Sheet) -> str:

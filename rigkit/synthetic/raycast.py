@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.arrays import BoolArray, FloatArray
+from rigkit.boards import marker_rectangles
 from rigkit.cameras.base import Camera
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.synthetic.scene import Panel, PlacedBoard
@@ -41,6 +42,8 @@ class Surface:
     black: float
     first_black: bool = True
     distance_mm: float = field(default=0.0)
+    marks: FloatArray | None = None
+    """(M, 4) black rectangles on white squares: x, y, width, height in squares."""
 
 
 def board_surface(placed: PlacedBoard, cam_from_world: Rigid3) -> Surface:
@@ -58,8 +61,9 @@ def board_surface(placed: PlacedBoard, cam_from_world: Rigid3) -> Surface:
         board.size if front else None,
         placed.white,
         placed.black,
-        placed.first_black,
+        placed.first_black if board.markers is None else board.first_black,
         float(np.linalg.norm(centre)),
+        marker_rectangles(board) if front and board.markers is not None else None,
     )
 
 
@@ -198,6 +202,26 @@ def paint(fine: Float32, surface: Surface, chart: Chart, per_pixel: int) -> None
     wave_x += in_x * in_y
     wave_x *= np.float32(0.5 * (surface.black - surface.white))
     target += wave_x
+    if surface.marks is not None:
+        _paint_marks(target, axes, widths, surface)
+
+
+def _paint_marks(target: Float32, axes: Float32, widths: list[Float32], surface: Surface) -> None:
+    """Blacken the rectangles of a surface in `target`; they touch, but do not overlap."""
+    marks = np.zeros((0, 4)) if surface.marks is None else surface.marks
+    reach = [float(w.max()) for w in widths]
+    low, high = marks[:, :2] - reach, marks[:, :2] + marks[:, 2:] + reach
+    seen = (high > axes.min(axis=(1, 2))).all(axis=1) & (low < axes.max(axis=(1, 2))).all(axis=1)
+    for n in np.flatnonzero(seen):
+        near = (axes[0] > low[n, 0]) & (axes[0] < high[n, 0]) & (axes[1] > low[n, 1]) & (axes[1] < high[n, 1])
+        rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
+        if not len(rows):
+            continue
+        box = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+        across, down = (
+            _inside(axes[k][box], widths[k][box], marks[n, k], marks[n, k] + marks[n, k + 2]) for k in (0, 1)
+        )
+        target[box] += np.float32(surface.black - surface.white) * across * down
 
 
 def _bounding_box(cx: FloatArray, cy: FloatArray, surface: Surface, per_pixel: int) -> tuple[slice, slice] | None:
