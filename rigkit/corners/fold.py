@@ -12,11 +12,11 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from rigkit.arrays import FloatArray, IntArray
+from rigkit.arrays import BoolArray, FloatArray, IntArray
 from rigkit.corners.lattice import Lattice
 from rigkit.corners.local_fit import fit_cells
 
-__all__ = ["join_parts", "split_folds"]
+__all__ = ["join_parts", "split_folds", "split_necks"]
 
 FOLD = 0.16
 FOLD_FACTOR = 3.5
@@ -45,6 +45,10 @@ ALIKE = 0.5
 """Sides of neighbouring cells across the gap differ less than this, relative to the longer side."""
 
 MEETS_CELLS = 0.15
+
+LOOSE_CELLS, MAX_GAIN = 0.08, 8.0
+"""A corner that hangs on to a lattice is this near to where the others say, in cells for a prediction as good as a
+corner itself, and by a prediction whose standard deviation is at most so many times that of a corner."""
 
 
 def split_folds(lattice: Lattice) -> list[Lattice]:
@@ -83,6 +87,70 @@ def _continues(lattice: Lattice, part: slice, at: int) -> bool:
     side = np.minimum(np.linalg.norm(shape.along_column, axis=1), np.linalg.norm(shape.along_row, axis=1))
     off = np.linalg.norm(shape.pixels - lattice.pixels[cells], axis=1)
     return bool(np.median(off / np.maximum(side, 1e-9)) < CONTINUES_CELLS)
+
+
+def split_necks(lattice: Lattice) -> list[Lattice]:
+    """Return the boards in `lattice`, without corners that are not where the others say.
+
+    Boards that touch at an odd angle hang together by a few corners that are none. So the broad parts of a lattice, of
+    nine corners in a square, belong together if they continue each other; the corners between them go to the part that
+    foretells them.
+    """
+    known = lattice.known
+    if known.all() and min(known.shape) >= 2:
+        return [lattice]
+    groups: list[BoolArray] = []
+    for broad in _broad_parts(known):
+        part = _Part.of(lattice.without(~broad))
+        for number, group in enumerate(groups):
+            if _same_board(_Part.of(lattice.without(~group)), part):
+                groups[number] = group | broad
+                break
+        else:
+            groups.append(broad)
+    _absorb(lattice, groups)
+    return [lattice.without(~group).trimmed() for group in groups]
+
+
+def _broad_parts(known: BoolArray) -> list[BoolArray]:
+    """Return the parts of `known` (R, C) that squares of nine corners (or else of four) make up, the largest first."""
+    for side in (3, 2):
+        square = np.ones((side, side), np.uint8)
+        fits = cv2.erode(known.astype(np.uint8), square, anchor=(0, 0), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+        squares = cv2.dilate(fits, square, anchor=(side - 1, side - 1))
+        count, label, stats, _ = cv2.connectedComponentsWithStats(squares, connectivity=4)
+        if count > 1:
+            order = 1 + np.argsort(-stats[1:, cv2.CC_STAT_AREA], kind="stable")
+            return [label == number for number in order]
+    return []
+
+
+def _same_board(one: _Part, two: _Part) -> bool:
+    """Return whether two parts of one lattice continue each other."""
+    gap = one.pixels[:, None] - two.pixels
+    near, place = _carried_over(one, two, np.hypot(gap[..., 0], gap[..., 1]))
+    return bool(np.abs(place - two.grid[near]).max() < MEETS_CELLS)
+
+
+def _absorb(lattice: Lattice, groups: list[BoolArray]) -> None:
+    """Add the other corners of `lattice`, ring by ring, to those of the `groups` (IN PLACE) that foretell them."""
+    loose = lattice.known & ~np.any(groups, axis=0) if groups else np.zeros_like(lattice.known)
+    while loose.any():
+        off = np.full((len(groups), *loose.shape), np.inf)
+        for number, group in enumerate(groups):
+            fit = fit_cells(lattice.without(~group).pixels, loose, degree=2, width=1.3, ridge=(0.02, 1.0))
+            side = np.minimum(np.hypot(*fit.along_column.T), np.hypot(*fit.along_row.T))
+            distance = np.hypot(*(fit.pixels - lattice.pixels[loose]).T)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                cells = distance / (side * np.hypot(1.0, fit.gain))
+            off[number][loose] = np.where((fit.support >= 3) & (fit.gain < MAX_GAIN), cells, np.inf)
+        best = off.argmin(axis=0)
+        added = loose & (off.min(axis=0) < LOOSE_CELLS)
+        if not added.any():
+            break
+        for number, group in enumerate(groups):
+            groups[number] = group | (added & (best == number))
+        loose &= ~added
 
 
 def _fold(pixels: FloatArray) -> int | None:
@@ -154,30 +222,37 @@ def _near(parts: Sequence[_Part]) -> list[tuple[int, int]]:
 
 def _joined(one: _Part, two: _Part) -> Lattice | None:
     """Return both lattices in one, None if `two` does not continue `one`."""
-    grid1, grid2, pixels1, pixels2 = one.grid, two.grid, one.pixels, two.pixels
-    gap = pixels1[:, None] - pixels2
+    gap = one.pixels[:, None] - two.pixels
     apart = np.hypot(gap[..., 0], gap[..., 1])
-    nearest = divmod(int(apart.argmin()), len(pixels2))
+    nearest = divmod(int(apart.argmin()), len(two.pixels))
     cell = _cell(one, nearest[0])
     longest = float(np.hypot(cell[:, 0], cell[:, 1]).max())
     if not apart[nearest] < DIAGONAL * GAP * longest or not _alike(cell, _cell(two, nearest[1])):
         return None
-    near2 = np.argsort(apart.min(axis=0), kind="stable")[:NEAREST_OUT]
-    near1 = np.argsort(apart[:, near2].min(axis=1), kind="stable")[:NEAREST_IN]
-    if (grid1[near1, 0] == grid1[near1[0], 0]).all():
-        return None
-    grid_from_pixel, _ = cv2.findHomography(pixels1[near1], grid1[near1].astype(np.float64), 0)
-    if grid_from_pixel is None:
-        return None
-    place = cv2.perspectiveTransform(pixels2[near2][None], grid_from_pixel)[0]
+    near, place = _carried_over(one, two, apart)
     whole = np.rint(place)
     if not np.abs(place - whole).max() < MEETS_CELLS:
         return None
     for quarter in range(4):
-        shift = whole.astype(np.int64) - _turned_grid(grid2[near2], two.lattice.size, quarter)
+        shift = whole.astype(np.int64) - _turned_grid(two.grid[near], two.lattice.size, quarter)
         if (shift == shift[0]).all():
             return _united(one.lattice, two.lattice.turned(quarter), shift[0])
     return None
+
+
+def _carried_over(one: _Part, two: _Part, apart: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Return the NEAREST_OUT corners of `two` and their (column, row) as the NEAREST_IN of `one` say, infinite if none.
+
+    `apart` (N, M) are the distances between the corners.
+    """
+    near2 = np.argsort(apart.min(axis=0), kind="stable")[:NEAREST_OUT]
+    near1 = np.argsort(apart[:, near2].min(axis=1), kind="stable")[:NEAREST_IN]
+    grid_from_pixel = None
+    if not (one.grid[near1] == one.grid[near1[0]]).all(axis=0).any():
+        grid_from_pixel, _ = cv2.findHomography(one.pixels[near1], one.grid[near1].astype(np.float64), 0)
+    if grid_from_pixel is None:
+        return near2, np.full((len(near2), 2), np.inf)
+    return near2, cv2.perspectiveTransform(two.pixels[near2][None], grid_from_pixel)[0]
 
 
 def _cell(part: _Part, corner: int) -> FloatArray:

@@ -11,7 +11,7 @@ from rigkit.corners.lattice import Lattice
 from rigkit.corners.local_fit import fit_cells
 from rigkit.corners.subpixel import RefinedLattice
 
-__all__ = ["known_part", "large", "largest_part", "sample_of", "separate", "tidy", "trustworthy"]
+__all__ = ["known_part", "large", "sample_of", "separate", "tidy", "trustworthy"]
 
 STRAY_ROW = 2
 """An outer row of so many corners or fewer, most of whose other corners should be in view too, is not of the board."""
@@ -44,36 +44,16 @@ WORSE = 1.5
 """Corners of rows that do not belong to the board fit so many times worse."""
 
 
-def largest_part(known: BoolArray) -> BoolArray:
-    """Return the largest part of `known` (R, C) that hangs together by closed squares of four corners."""
-    if known.all() and min(known.shape) >= 2:
-        return known
-    import cv2
-
-    square = known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:] & known[1:, 1:]
-    count, label, stats, _ = cv2.connectedComponentsWithStats(square.astype(np.uint8), connectivity=4)
-    out = np.zeros_like(known)
-    if count < 2:
-        return out
-    best = label == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
-    for rows in (slice(None, -1), slice(1, None)):
-        for columns in (slice(None, -1), slice(1, None)):
-            out[rows, columns] |= best
-    return out
-
-
 def tidy(lattice: Lattice, size_px: tuple[int, int]) -> Lattice:
-    """Return `lattice` without corners outside closed squares and without stray outer rows, trimmed.
+    """Return `lattice` without stray outer rows, trimmed.
 
     `size_px` is the (width, height) of the full-resolution image.
     """
-    while min(lattice.pixels.shape[:2]) >= 2:
-        lattice = lattice.without(~largest_part(lattice.known)).trimmed()
-        stray = _stray_row(lattice, size_px)
-        if stray is None:
-            return lattice
+    stray = _stray_row(lattice, size_px)
+    while stray is not None:
         lattice = lattice.without(stray).trimmed()
-    return lattice.without(np.ones_like(lattice.known)).trimmed()
+        stray = _stray_row(lattice, size_px)
+    return lattice
 
 
 def _stray_row(lattice: Lattice, size_px: tuple[int, int]) -> BoolArray | None:

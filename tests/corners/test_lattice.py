@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rigkit.corners.fold import join_parts, split_folds
+from rigkit.corners.fold import join_parts, split_folds, split_necks
 from rigkit.corners.lattice import Lattice
 from rigkit.corners.local_fit import fit_cells
 from rigkit.detections import BoardDetection
@@ -99,3 +99,42 @@ def test_parts_of_the_wrong_colours_do_not_join() -> None:
     lower = whole.cut(slice(4, 6), slice(0, 7))
     wrong = Lattice(lower.pixels, lower.contrast, not lower.rising)
     assert len(join_parts([whole.cut(slice(0, 3), slice(0, 7)), wrong])) == 2
+
+
+def test_boards_that_touch_at_an_odd_angle_are_parted_at_the_neck() -> None:
+    """Two boards, the second turned by 12 degrees, with a pair of corners between them that belongs to neither."""
+    row, column = np.mgrid[:6, :5].astype(float)
+    first = np.stack([20.0 * column, 20.0 * row], axis=-1)
+    turn = np.radians(12.0)
+    second = first @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]) + [122.0, -24.0]
+    pixels = np.full((6, 11, 2), np.nan)
+    pixels[:, :5], pixels[:, 6:] = first, second
+    pixels[2:4, 5] = 0.5 * (first[2:4, 4] + second[2:4, 0])
+    whole = Lattice(pixels, np.ones((6, 11)), True)
+    parts = split_necks(whole)
+    assert len(parts) == 2
+    for part, board in zip(parts, (first, second), strict=True):
+        inside = (np.abs(board[:, :, None, None] - part.pixels).max(axis=-1) == 0.0).any(axis=(2, 3))
+        assert inside.all()
+    assert sum(part.count for part in parts) <= 62
+
+
+def test_holes_do_not_part_a_board() -> None:
+    """Covered in places so that its closed squares fall apart: one board with all corners that are left."""
+    board = lattice(7, 5)
+    covered = np.zeros((5, 7), bool)
+    covered[[0, 1, 3, 4, 1, 3], [3, 3, 3, 3, 1, 5]] = True
+    (part,) = split_necks(board.without(covered))
+    assert part.count == 29
+    assert part.size == (7, 5)
+
+
+def test_a_corner_astray_is_left_out() -> None:
+    board = lattice(7, 5)
+    corner = np.zeros((5, 7), bool)
+    corner[0, 1:] = True
+    loose = board.without(corner)
+    loose.pixels[0, 0] += [4.0, -4.0]
+    (part,) = split_necks(loose)
+    assert part.size == (7, 4)
+    assert part.count == 28
