@@ -17,7 +17,7 @@ from rigkit.corners.lattice import STEPS, Lattice
 from rigkit.corners.links import ALONG, CONTRAST_RATIO, MOST, edge_contrast
 from rigkit.corners.local_fit import LocalFit, fit_cells
 from rigkit.corners.response import Level
-from rigkit.corners.ring import CIRCLE, MAX_CENTRE, MAX_ODD, read_rings
+from rigkit.corners.ring import read_rings, ring_rules
 from rigkit.corners.saddle import Saddles
 from rigkit.native import kernels
 from rigkit.native.growth import Buckets, FitRules, GrowthRules, grown
@@ -179,7 +179,7 @@ def _rules() -> GrowthRules:
         "least_area": LEAST_AREA,
     }
     predictions = [FitRules(degree, RADIUS, False, WIDTH, ridge) for degree, ridge in (STIFF, PLIANT)]
-    return GrowthRules.make(predictions, CIRCLE, MAX_ODD, MAX_CENTRE, ALONG, **numbers)
+    return GrowthRules.make(predictions, ring_rules(), ALONG, **numbers)
 
 
 def _widened(cells: BoolArray) -> BoolArray:

@@ -4,19 +4,29 @@ Around a corner the brightness is the same on opposite sides and changes exactly
 itself is as bright as the ring on average, whatever the angles, the blur and the slope of the light. Where it rises
 (angle counted from u to v) lies line A, where it falls line B; so the ring gives the two line directions and the
 polarity: which quadrants are bright.
+
+Blur bends the borders of the quadrants near the corner, up to right angles in its middle, so the places where the ring
+changes from dark to bright are not on the lines. What blur does to the harmonics of the angle is known, though: that of
+order m of a corner blurred by a Gaussian of sigma s shrinks by R_m(r / s) on the ring of radius r (Hankel transform),
+
+    y = r^2 / (2 s^2),  R_2 = 1 - (1 - e^-y) / y,  R_4 = 1 - (4 + 2 e^-y) / y + 6 (1 - e^-y) / y^2.
+
+Two bright quadrants of angle b have harmonics 2 and 4 of ratio cos b. Harmonic 2 on a ring of half the radius tells y,
+harmonics 2 and 4 of the ring the angle, and the phase of harmonic 2 where the middle of the bright quadrants is.
 """
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rigkit.arrays import BoolArray, FloatArray
 from rigkit.corners.response import FloatImage, sample
+from rigkit.native.front import RingRules
 
-__all__ = ["Rings", "arm_vectors", "read_rings"]
+__all__ = ["Rings", "arm_vectors", "read_rings", "ring_rules"]
 
 HALF = 16
 """Samples in half a turn."""
@@ -30,6 +40,17 @@ MAX_ODD = 0.35
 MAX_CENTRE = 0.16
 """Largest difference of the centre from the mean of the ring, relative to the contrast. Rings inside the four squares
 show less than 0.06; more where they reach beyond, which spoils the directions as well, and between dots or letters."""
+
+LARGEST_GAIN = 8.0
+"""Largest R_2 / R_4 that is made up for: beyond it, in the middle of a strong blur, harmonic 4 is only noise."""
+
+MAX_COSINE = 0.99
+"""Bound of cos b: flatter quadrants than 8 degrees are noise."""
+
+GAINS = 64
+"""Entries of the table of R_2(r / s) / R_4(r / s) over R_2(r / 2 s) / R_2(r / s), which goes from 1/4 to 1."""
+
+HARMONICS = [np.exp(-1j * m * np.arange(HALF) * (np.pi / HALF)).astype(np.complex64) for m in (2, 4)]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -62,23 +83,40 @@ def read_rings(image: FloatImage, pixels: FloatArray, radius_px: FloatArray | fl
     symmetric = (odd**2).sum(axis=1) < MAX_ODD * (spread**2).sum(axis=1)
     balanced = np.abs(sample(image, pixels) - mean) < MAX_CENTRE * (high - low)
     above = even > middle[:, None]
-    following = np.roll(above, -1, axis=1)
-    rising, falling = ~above & following, above & ~following
-    valid = symmetric & balanced & (rising.sum(axis=1) == 1) & (contrast > 0.0)
-    angle_a, angle_b = (_crossing(even, middle, where) for where in (rising, falling))
-    angle_a %= np.pi
-    angle_b = angle_a + (angle_b - angle_a) % np.pi
-    return Rings(np.stack([angle_a, angle_b], axis=-1), contrast, valid)
+    valid = symmetric & balanced & (np.count_nonzero(~above & np.roll(above, -1, axis=1), axis=1) == 1)
+    angles = np.zeros((len(pixels), 2))
+    angles[valid] = _angles(image, pixels[valid], radius[valid], even[valid])
+    return Rings(angles, contrast, valid)
 
 
-def _crossing(even: NDArray[np.floating], middle: NDArray[np.floating], where: BoolArray) -> FloatArray:
-    """Return the angle at which each row of `even` passes `middle` in the interval marked by `where` (the first)."""
-    row = np.arange(len(even))
-    start = where.argmax(axis=1)
-    here, there = even[row, start], even[row, (start + 1) % HALF]
-    step = np.where(there == here, 1.0, there - here)
-    angle: FloatArray = (start + np.clip((middle - here) / step, 0.0, 1.0)) * (np.pi / HALF)
-    return angle
+def _angles(image: FloatImage, pixels: FloatArray, radius: FloatImage, even: FloatImage) -> FloatArray:
+    """Return the angles of lines A and B (N, 2) from the `even` parts (N, HALF) of rings of `radius` (N,)."""
+    second, fourth = (even @ wave for wave in HARMONICS)
+    inner = sample(image, pixels[:, None, :].astype(np.float32) + 0.5 * radius[:, None, None] * CIRCLE[::2])
+    size = np.maximum(np.abs(second), 1e-20)
+    phase = second / size
+    nearer = (0.5 * (inner[:, : HALF // 2] + inner[:, HALF // 2 :])) @ HARMONICS[0][::2]
+    gain = np.interp(2.0 * (nearer * phase.conj()).real / size, np.linspace(0.25, 1.0, GAINS), _gains())
+    cosine = gain * (fourth * phase.conj() ** 2).real / size
+    half = 0.5 * np.arccos(np.clip(cosine, -MAX_COSINE, MAX_COSINE))
+    first = (-0.5 * np.angle(phase) - half) % np.pi
+    return np.stack([first, first + 2.0 * half], axis=-1)
+
+
+@functools.cache
+def _gains() -> FloatArray:
+    """Return R_2 / R_4 where harmonic 2 on the inner ring, relative to that on the ring, is 1/4 to 1 in GAINS steps."""
+    y = np.geomspace(1e-2, 1e4, 2000)
+    fall = np.exp(-y)
+    second, quarter = 1.0 - (1.0 - fall) / y, 1.0 - (1.0 - np.exp(-0.25 * y)) / (0.25 * y)
+    fourth = 1.0 - (4.0 + 2.0 * fall) / y + 6.0 * (1.0 - fall) / y**2
+    return np.minimum(np.interp(np.linspace(0.25, 1.0, GAINS), quarter / second, second / fourth), LARGEST_GAIN)
+
+
+@functools.cache
+def ring_rules() -> RingRules:
+    """Return the constants of this module for the kernels."""
+    return RingRules.make(CIRCLE, MAX_ODD, MAX_CENTRE, _gains(), MAX_COSINE)
 
 
 def arm_vectors(angles: FloatArray) -> FloatArray:

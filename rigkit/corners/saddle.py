@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray
 from rigkit.corners.response import FloatImage, Level, peaks
-from rigkit.corners.ring import CIRCLE, MAX_CENTRE, MAX_ODD, read_rings
+from rigkit.corners.ring import read_rings, ring_rules
 from rigkit.native import front
 
 __all__ = ["Corners", "Saddles", "find_corners", "saddle_step"]
@@ -93,7 +92,7 @@ def _corners_of(level: Level) -> tuple[FloatArray, IntArray, FloatArray, FloatAr
     at, response = peaks(level)
     library = front.loaded()
     if library is not None:
-        return front.corners(library, level.smooth, at, response, RADII, MAX_STEP, MAX_SHARPNESS, _ring_rules())
+        return front.corners(library, level.smooth, at, response, RADII, MAX_STEP, MAX_SHARPNESS, ring_rules())
     found, near = saddle_step(level.smooth, at)
     found = found[near]
     rings = read_rings(level.smooth, found, RADII[0])
@@ -105,11 +104,6 @@ def _corners_of(level: Level) -> tuple[FloatArray, IntArray, FloatArray, FloatAr
         todo = todo[rings.valid]
         angles[todo], contrast[todo] = rings.angles[rings.valid], rings.contrast[rings.valid]
     return found, which, angles, contrast
-
-
-@functools.cache
-def _ring_rules() -> front.RingRules:
-    return front.RingRules.make(CIRCLE, MAX_ODD, MAX_CENTRE)
 
 
 def _without_known(fresh: Corners, known: list[Corners]) -> Corners:

@@ -22,19 +22,22 @@ Image = NDArray[np.float32]
 
 
 class RingRules(Structure):
-    """ring_rules_t; `make` also keeps the array that it points to."""
+    """ring_rules_t; `make` also keeps the arrays that it points to."""
 
     _fields_: ClassVar = [
-        ("circle", c_void_p),
-        ("half", c_int64),
-        *((name, c_double) for name in ("most_odd", "most_centre")),
+        *((name, c_void_p) for name in ("circle", "gains")),
+        *((name, c_int64) for name in ("half", "gain_count")),
+        *((name, c_double) for name in ("most_odd", "most_centre", "most_cosine")),
     ]
 
     @classmethod
-    def make(cls, circle: Image, most_odd: float, most_centre: float) -> RingRules:
+    def make(
+        cls, circle: Image, most_odd: float, most_centre: float, gains: FloatArray, most_cosine: float
+    ) -> RingRules:
         """Return the rules; `circle` (2 * half, 2) are the samples of a ring of radius 1."""
-        kept = np.ascontiguousarray(circle, np.float32)
-        rules = cls(kept.ctypes.data, len(kept) // 2, most_odd, most_centre)
+        kept = np.ascontiguousarray(circle, np.float32), np.ascontiguousarray(gains, np.float64)
+        arrays = (kept[0].ctypes.data, kept[1].ctypes.data, len(kept[0]) // 2, len(kept[1]))
+        rules = cls(*arrays, most_odd, most_centre, most_cosine)
         rules.kept = kept
         return rules
 

@@ -10,6 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray
+from rigkit.native.front import RingRules
 
 __all__ = ["Buckets", "FitRules", "GrowthRules", "components_of", "fit", "grown"]
 
@@ -30,20 +31,12 @@ class FitRules(Structure):
     ]
 
 
-class _RingRules(Structure):
-    _fields_: ClassVar = [
-        ("circle", c_void_p),
-        ("half", c_int64),
-        *((name, c_double) for name in ("most_odd", "most_centre")),
-    ]
-
-
 class GrowthRules(Structure):
     """growth_rules_t; `make` also keeps the arrays that it points to."""
 
     _fields_: ClassVar = [
         ("predictions", FitRules * 2),
-        ("ring", POINTER(_RingRules)),
+        ("ring", POINTER(RingRules)),
         ("along", c_void_p),
         *((name, c_int64) for name in ("places", "most", "tried", "fewest")),
         *(
@@ -59,18 +52,16 @@ class GrowthRules(Structure):
     def make(
         cls,
         predictions: Sequence[FitRules],
-        circle: np.ndarray,
-        most_odd: float,
-        most_centre: float,
+        ring: RingRules,
         along: np.ndarray,
         **numbers: float,
     ) -> GrowthRules:
-        """Return the rules; `circle` (2 * half, 2) are the samples of a ring of radius 1."""
-        kept = np.ascontiguousarray(circle, np.float32), np.ascontiguousarray(along, np.float64)
+        """Return the rules; `along` are the places of an edge that are looked at."""
+        kept = np.ascontiguousarray(along, np.float64)
         rules = cls(**numbers)
         rules.predictions = (FitRules * 2)(*predictions)
-        rules.ring = pointer(_RingRules(kept[0].ctypes.data, len(kept[0]) // 2, most_odd, most_centre))
-        rules.along, rules.places = kept[1].ctypes.data, len(kept[1])
+        rules.ring = pointer(ring)
+        rules.along, rules.places = kept.ctypes.data, len(kept)
         rules.kept = kept
         return rules
 

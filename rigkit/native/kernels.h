@@ -52,22 +52,54 @@ INLINE float brightness_at(const image_t image, float u, float v)
 #define PI 3.14159265358979323846
 #define MOST_HALF 32
 
-/* How rings are read (corners.ring): `circle` holds the (u, v) of `half` samples in half a turn and of their opposites. */
+/* How rings are read (corners.ring): `circle` holds the (u, v) of `half` samples in half a turn and of their opposites;
+ * `gains` R_2 / R_4 over the ratio of harmonic 2 at half the radius to that on the ring, from 1/4 to 1. */
 typedef struct {
     const float *circle;
-    int64_t half;
-    double most_odd, most_centre;
+    const double *gains;
+    int64_t half, gain_count;
+    double most_odd, most_centre, most_cosine;
 } ring_rules_t;
 
-/* Return the angle at which `even` passes `middle` between the samples `start` and the next. */
-INLINE double ring_crossing(const float *even, int64_t half, float middle, int64_t start)
+/* Return the two angles of a corner from the `even` part of its ring (corners.ring._angles). */
+INLINE void ring_angles(
+    const image_t image, const ring_rules_t *rules, float u, float v, float radius, const float *even, double angles[2])
 {
-    const float here = even[start], there = even[(start + 1) % half];
-    const float step = there == here ? 1.0f : there - here;
-    float part = (middle - here) / step;
-    part = part > 0.0f ? part : 0.0f;
-    part = part < 1.0f ? part : 1.0f;
-    return ((double)start + (double)part) * (PI / (double)half);
+    const int64_t half = rules->half, turn = 2 * half;
+    const float *circle = rules->circle;
+    float second_u = 0.0f, second_v = 0.0f, fourth_u = 0.0f, fourth_v = 0.0f, inner_u = 0.0f, inner_v = 0.0f;
+    for (int64_t k = 0; k < half; k++) {
+        const float *two = circle + 2 * (2 * k % turn), *four = circle + 2 * (4 * k % turn);
+        second_u += even[k] * two[0];
+        second_v -= even[k] * two[1];
+        fourth_u += even[k] * four[0];
+        fourth_v -= even[k] * four[1];
+    }
+    for (int64_t k = 0; k < turn; k += 2) {
+        const float *two = circle + 2 * (2 * k % turn);
+        const float part_u = 0.5f * radius * circle[2 * k], part_v = 0.5f * radius * circle[2 * k + 1];
+        const float here = brightness_at(image, u + part_u, v + part_v);
+        inner_u += here * two[0];
+        inner_v -= here * two[1];
+    }
+    double size = sqrt((double)second_u * second_u + (double)second_v * second_v);
+    size = size > 1e-20 ? size : 1e-20;
+    const double phase_u = second_u / size, phase_v = second_v / size;
+    /* Twice half of all samples of a whole turn, of which every second is taken. */
+    const double ratio = (inner_u * phase_u + inner_v * phase_v) / size;
+    double place = (ratio - 0.25) / 0.75 * (double)(rules->gain_count - 1);
+    place = place > 0.0 ? place : 0.0;
+    place = place < (double)(rules->gain_count - 1) ? place : (double)(rules->gain_count - 1);
+    int64_t at = (int64_t)place;
+    at = at < rules->gain_count - 2 ? at : rules->gain_count - 2;
+    const double gain = rules->gains[at] + (place - (double)at) * (rules->gains[at + 1] - rules->gains[at]);
+    const double twice_u = phase_u * phase_u - phase_v * phase_v, twice_v = 2.0 * phase_u * phase_v;
+    double cosine = gain * (fourth_u * twice_u + fourth_v * twice_v) / size;
+    cosine = cosine < rules->most_cosine ? cosine : rules->most_cosine;
+    cosine = cosine > -rules->most_cosine ? cosine : -rules->most_cosine;
+    const double quadrant = acos(cosine), first = -0.5 * (atan2(phase_v, phase_u) + quadrant);
+    angles[0] = first < 0.0 ? first + PI : first;
+    angles[1] = angles[0] + quadrant;
 }
 
 /* Return whether the ring around (u, v) is that of a chessboard corner; if so, its two angles and its contrast
@@ -118,23 +150,12 @@ INLINE int read_ring(
     if (!(fabsf(brightness_at(image, u, v) - mean) < (float)rules.most_centre * (high - low)))
         return 0;
     const float middle = 0.5f * (low + high);
-    int64_t rises = 0, rise = 0, fall = 0;
-    for (int64_t k = 0; k < half; k++) {
-        const int here = even[k] > middle, there = even[k + 1 < half ? k + 1 : 0] > middle;
-        if (there && !here) {
-            rise = k;
-            rises++;
-        }
-        if (here && !there)
-            fall = k;
-    }
+    int64_t rises = 0;
+    for (int64_t k = 0; k < half; k++)
+        rises += even[k + 1 < half ? k + 1 : 0] > middle && !(even[k] > middle);
     if (rises != 1)
         return 0;
-    const double a = fmod(ring_crossing(even, half, middle, rise), PI);
-    double to_b = fmod(ring_crossing(even, half, middle, fall) - a, PI);
-    to_b += to_b < 0.0 ? PI : 0.0;
-    angles[0] = a;
-    angles[1] = a + to_b;
+    ring_angles(image, &rules, u, v, radius, even, angles);
     *contrast = (double)high - (double)low;
     return 1;
 }
