@@ -29,7 +29,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import cv2
 import numpy as np
-from benchmark_peers import DETECTORS, PEERS, Answer, Worker
+from benchmark_peers import DETECTORS, INSTALL, PEERS, Answer, Worker
 
 from rigkit.corners.detect import detect_boards
 from rigkit.corners.identify import identify_pair
@@ -225,11 +225,12 @@ def conditions(tables: Tables, poses: int) -> list[Asked]:
 def workers(names: Sequence[str], python: str) -> dict[str, Worker]:
     """Return the workers that can be had; says which cannot."""
     ours = ("rigkit", "OpenCV classic", "OpenCV SB")
-    all_of_them = {name: Worker(name, sys.executable if name in ours else python) for name in names}
-    for name, worker in all_of_them.items():
-        if worker.missing:
-            print(f"{name} left out: {worker.missing} (pip install {DETECTORS[name].install})", file=sys.stderr)
-    return {name: worker for name, worker in all_of_them.items() if not worker.missing}
+    every = {name: Worker(name, sys.executable if name in ours else python) for name in names}
+    missing = [name for name, worker in every.items() if worker.missing]
+    if missing:
+        reasons = "; ".join(f"{name}: {every[name].missing}" for name in missing)
+        print(f"left out: {reasons} (to have them: {INSTALL})", file=sys.stderr)
+    return {name: worker for name, worker in every.items() if name not in missing}
 
 
 def peers(tables: Tables, poses: int, python: str) -> list[Asked]:

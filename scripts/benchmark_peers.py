@@ -38,12 +38,10 @@ class Detector:
 
     Attributes
     ----------
-    install : arguments of `pip install`.
-    load : returns the function that detects; raises ImportError. The function is given the sizes of the boards.
+    load : returns the function that detects, given an image and the sizes of the boards; raises ImportError.
     boards : whether it returns boards; if not, corners without order.
     """
 
-    install: str
     load: Callable[[], Detect]
     boards: bool = True
 
@@ -138,16 +136,21 @@ def load_calib_targets() -> Detect:
 
 
 DETECTORS: dict[str, Detector] = {
-    "rigkit": Detector("-e .", load_rigkit),
-    "libcbdetect": Detector("libcbdetect", load_libcbdetect),
-    # Its dependencies (torch) are for steps that are off by default.
-    "PyCBD": Detector("libcbdetect && pip install --no-deps PyCBD", load_pycbd),
-    "chess-corners": Detector("chess-corners", load_chess_corners, boards=False),
-    "calib-targets": Detector("calib-targets", load_calib_targets),
-    "OpenCV classic": Detector("opencv-python-headless", lambda: load_opencv(sector=False)),
-    "OpenCV SB": Detector("opencv-python-headless", lambda: load_opencv(sector=True)),
+    "rigkit": Detector(load_rigkit),
+    "libcbdetect": Detector(load_libcbdetect),
+    "PyCBD": Detector(load_pycbd),
+    "chess-corners": Detector(load_chess_corners, boards=False),
+    "calib-targets": Detector(load_calib_targets),
+    "OpenCV classic": Detector(lambda: load_opencv(sector=False)),
+    "OpenCV SB": Detector(lambda: load_opencv(sector=True)),
 }
 PEERS = tuple(name for name in DETECTORS if name != "rigkit")
+INSTALL = (
+    "python -m venv PEERS && PEERS/bin/pip install libcbdetect chess-corners calib-targets && "
+    "PEERS/bin/pip install --no-deps PyCBD, then --peers-python PEERS/bin/python"
+)
+"""libcbdetect wants another build of OpenCV than ours, hence the environment; what PyCBD wants besides (torch) serves
+steps that are off by default."""
 
 
 @dataclass(frozen=True)

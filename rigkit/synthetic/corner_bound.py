@@ -7,7 +7,7 @@ that blur and noise are the same over the cell, the noise's level. Corners are b
 plane and one lens is not used, nor do detectors.
 
 The derivatives are differences of rendered images, noise-free and before rounding: the scene moved by a part of a
-pixel along u and v, and blurred a little more or less. Moving one line only is a motion of the picture that shears
+pixel along u and v (second differences give the blur's). Moving one line only is a motion of the picture that shears
 along the other line.
 """
 
@@ -21,14 +21,15 @@ from rigkit.arrays import FloatArray
 from rigkit.detections import BoardDetection
 from rigkit.errors import InputError
 from rigkit.synthetic.bench_scenes import BENCH_PHOTOMETRY, BenchScene
+from rigkit.synthetic.photometry import develop
+from rigkit.synthetic.render import Optics
 
 __all__ = ["ROUNDING_VARIANCE", "corner_information", "position_bound"]
 
 ROUNDING_VARIANCE = 1.0 / 12.0
 """Of rounding to whole grey levels, which is noise wherever brightness varies: it bounds noise-free images, too."""
-SHIFT_PX = 0.05
-"""Half width of the differences: the third derivative of an edge of blur 0.3 adds less than one per cent."""
-BLUR_STEP_PX = 0.02
+SHIFT_PX = 0.07
+"""Half width of the differences: the next derivatives of an edge of blur 0.3 add less than one per cent."""
 HALF_CELL = 0.5
 """Pixels of a cell: up to this from the corner along both sides."""
 PARAMETERS = 9
@@ -40,12 +41,14 @@ def corner_information(scene: BenchScene, blur_px: float) -> tuple[FloatArray, .
 
     Divide by the noise's variance, ROUNDING_VARIANCE included. NaN where a cell holds too few pixels.
     """
-    moved = {axis: [_levels(_shifted(scene, axis, sign * SHIFT_PX), blur_px) for sign in (-1, 1)] for axis in (0, 1)}
-    along_u, along_v = ((high - low) / (2.0 * SHIFT_PX) for low, high in (moved[0], moved[1]))
-    low, high = (_levels(scene, blur_px + sign * BLUR_STEP_PX) for sign in (-1, 1))
-    wider = (high - low) / (2.0 * BLUR_STEP_PX)
     plain = _levels(scene, blur_px)
-    pictures = np.stack([along_u, along_v, wider, plain])
+    slopes, bows = [], []
+    for axis in (0, 1):
+        before, after = (_levels(_shifted(scene, axis, sign * SHIFT_PX), blur_px) for sign in (-1, 1))
+        slopes.append((after - before) / (2.0 * SHIFT_PX))
+        bows.append((after + before - 2.0 * plain) / SHIFT_PX**2)
+    # A Gaussian blur spreads as heat does: d I / d blur = blur (d2 I / du2 + d2 I / dv2).
+    pictures = np.stack([*slopes, blur_px * (bows[0] + bows[1]), plain])
     return tuple(_of_board(detection, pictures) for detection in scene.truth())
 
 
@@ -59,9 +62,11 @@ def position_bound(information: FloatArray, noise_levels: float) -> FloatArray:
 
 
 def _levels(scene: BenchScene, blur_px: float) -> FloatArray:
-    """Return the noise-free picture in grey levels, not rounded (to 1/257 of a level)."""
-    fine = scene.render(blur_px=blur_px, photometry=replace(BENCH_PHOTOMETRY, bits=16))
-    return fine / 257.0
+    """Return the noise-free picture in grey levels, not rounded."""
+    picture = scene.radiance(Optics(blur_px))
+    # The light is the same whatever is in the picture: that of a white one, in steps of 1/257 of a level.
+    light = develop(np.ones_like(picture), replace(BENCH_PHOTOMETRY, bits=16)) / 257.0
+    return picture * light
 
 
 def _shifted(scene: BenchScene, axis: int, by_px: float) -> BenchScene:
