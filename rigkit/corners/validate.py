@@ -22,7 +22,7 @@ FRAME_CELLS = 0.5
 SHARED_PX = 2.0
 """Corners of two lattices nearer than this are the same."""
 
-MAX_RELATIVE_SIGMA = 0.01
+MAX_RELATIVE_SIGMA = 0.011
 """Corners more uncertain than this, in cells, make no board: keys, letters, weave."""
 
 MAX_RESIDUAL = 0.25
