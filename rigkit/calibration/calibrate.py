@@ -23,7 +23,7 @@ from rigkit.calibration.uncertainty import uncertainty_at_corners
 from rigkit.calibration.usable import usable_views
 from rigkit.calibration.verdicts import judge
 from rigkit.cameras.base import Camera
-from rigkit.cameras.registry import MODELS, camera_model
+from rigkit.cameras.registry import MODELS, camera_model, check_order
 from rigkit.detections import BoardView
 from rigkit.errors import DegenerateError, InputError
 from rigkit.progress import Progress, silent
@@ -115,6 +115,8 @@ def calibrate(
 
 
 def _wanted(model: str, degree: int | None) -> list[tuple[str, type[Camera], int | None]]:
+    if degree is not None:
+        check_order(model, degree)
     names = list(MODELS) if model == "auto" else [model]
     out: list[tuple[str, type[Camera], int | None]] = []
     for name in names:

@@ -43,6 +43,8 @@ class Camera(ABC):
 
     model: ClassVar[str]
     """Name in the registry and in files."""
+    orders: ClassVar[tuple[int, ...]] = ()
+    """The sizes that a model of several sizes can have: Brown's numbers of distortion terms, Scaramuzza's degrees."""
 
     def __post_init__(self) -> None:
         width, height = (int(v) for v in self.size_px)

@@ -45,6 +45,7 @@ class Brown(Camera):
     """
 
     model: ClassVar[str] = "brown"
+    orders: ClassVar[tuple[int, ...]] = (4, 5, 8)
 
     _max_r: float = field(init=False, repr=False)
 
@@ -59,7 +60,7 @@ class Brown(Camera):
         order: int | None = None,
     ) -> Self:
         count = 5 if order is None else order
-        if count not in (4, 5, 8):
+        if count not in cls.orders:
             raise InputError(f"brown camera: {count} distortion terms; choose 4 (k3 stays 0), 5 or 8")
         centre, theta, radius = checked_curve(centre_px, theta_rad, radius_px, cls.model, below_rad=np.pi / 2)
         r = np.tan(theta)

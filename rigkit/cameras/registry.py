@@ -12,7 +12,7 @@ from rigkit.cameras.scaramuzza import Scaramuzza
 from rigkit.cameras.ucm import UCM
 from rigkit.errors import InputError
 
-__all__ = ["MODELS", "camera_model"]
+__all__ = ["MODELS", "camera_model", "check_order"]
 
 MODELS: dict[str, type[Camera]] = {
     cls.model: cls for cls in (Pinhole, Brown, KannalaBrandt, Scaramuzza, UCM, EUCM, DoubleSphere)
@@ -24,3 +24,19 @@ def camera_model(name: str) -> type[Camera]:
     if name not in MODELS:
         raise InputError(f"camera model '{name}' is unknown; known: {', '.join(sorted(MODELS))}")
     return MODELS[name]
+
+
+def check_order(name: str, order: int) -> None:
+    """Raise InputError where the model called `name` (or "auto") has no size `order`."""
+    sizes = {n: cls.orders for n, cls in MODELS.items() if cls.orders}
+    known = ", ".join(f"{n} ({', '.join(map(str, orders))})" for n, orders in sizes.items())
+    if name == "auto":
+        raise InputError(
+            f'degree {order} with model = "auto", which chooses by itself; name a model that has one: {known}'
+        )
+    if not camera_model(name).orders:
+        raise InputError(
+            f"degree {order} for {name}, which comes in one size; remove it. Models that have one: {known}"
+        )
+    if order not in sizes[name]:
+        raise InputError(f"{name} has no degree {order}; choose {', '.join(map(str, sizes[name]))}, or leave it out")

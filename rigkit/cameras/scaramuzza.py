@@ -44,6 +44,7 @@ class Scaramuzza(RadialCamera):
     """
 
     model: ClassVar[str] = "scaramuzza"
+    orders: ClassVar[tuple[int, ...]] = tuple(DEGREES)
 
     _max_rho: float = field(init=False, repr=False)
     _polynomial: FloatArray = field(init=False, repr=False)

@@ -27,6 +27,10 @@ from rigkit.io.toml_reader import TomlTable, read_toml
 __all__ = ["SCHEMA", "board_from_table", "load_board"]
 
 SCHEMA = "rigkit.board/1"
+MOST_CORNERS = 1000
+"""Along one side: no image resolves more."""
+SQUARES_MM = (0.1, 5000.0)
+"""Sizes outside are slips of the unit, 0.03 for 0.03 m."""
 
 
 def load_board(path: str | Path) -> Board:
@@ -45,6 +49,9 @@ def board_from_table(table: TomlTable, default_id: str) -> Board:
     board_id = table.text("id", hint='id = "plane1"') if table.has("id") else default_id
     columns = table.integer("columns", hint="columns = 9 (inner corners along x)", at_least=2)
     rows = table.integer("rows", hint="rows = 6 (inner corners along y)", at_least=2)
+    for key, count in (("columns", columns), ("rows", rows)):
+        if count > MOST_CORNERS:
+            raise table.error(f"'{key}' is {count}, more than {MOST_CORNERS}; count the inner corners along one side")
     both = "square_x_mm = 30.0 and square_y_mm = 30.0"
     if table.has("square_x_mm") or table.has("square_y_mm"):
         if table.has("square_mm"):
@@ -52,6 +59,9 @@ def board_from_table(table: TomlTable, default_id: str) -> Board:
         x, y = table.number("square_x_mm", hint=both), table.number("square_y_mm", hint=both)
     else:
         x = y = table.number("square_mm", hint="square_mm = 30.0 (measured with a ruler over many squares)")
+    for side in (x, y):
+        if not SQUARES_MM[0] <= side <= SQUARES_MM[1]:
+            raise table.error(f"squares of {side:g} mm are outside {SQUARES_MM[0]:g} to {SQUARES_MM[1]:g} mm; write mm")
     sigma = None
     if table.has("square_sigma_mm"):
         sigma = table.number("square_sigma_mm", hint="square_sigma_mm = 0.05")

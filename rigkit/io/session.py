@@ -20,7 +20,7 @@ from pathlib import Path
 
 from rigkit.boards import Board
 from rigkit.calibration.shape import SHAPES
-from rigkit.cameras.registry import MODELS
+from rigkit.cameras.registry import MODELS, check_order
 from rigkit.errors import InputError
 from rigkit.io.board_file import load_board
 from rigkit.io.toml_reader import TomlTable, read_toml
@@ -82,6 +82,11 @@ def options_of(table: TomlTable) -> tuple[str, int | None, str]:
     """Return model, degree and board shape that a table asks for."""
     model = table.text("model", hint='model = "scaramuzza"', choices=("auto", *MODELS))
     degree = table.integer("degree", hint="degree = 6", at_least=1) if table.has("degree") else None
+    if degree is not None:
+        try:
+            check_order(model, degree)
+        except InputError as error:
+            raise table.error(f"'degree': {error}") from error
     shape = "auto"
     if table.has("board_shape"):
         shape = table.text("board_shape", hint='board_shape = "auto"', choices=("auto", *SHAPES))

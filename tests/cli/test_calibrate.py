@@ -7,6 +7,7 @@ import os
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from helpers.data import REPOSITORY
@@ -161,3 +162,53 @@ def test_image_of_another_size_is_dropped_with_the_reason(session: Path) -> None
     result = load_calibration(session.parent / "calibration.json")
     assert [image for image, _ in result.dropped] == ["01.jpg"]
     assert "812x620" in result.dropped[0][1]
+
+
+@pytest.mark.parametrize(
+    ("model", "degree", "said"),
+    [
+        ("scaramuzza", 99, "scaramuzza has no degree 99; choose 3, 4, 5, 6, 7, 8, 9, 10"),
+        ("brown", 6, "brown has no degree 6; choose 4, 5, 8"),
+        ("kannala_brandt", 4, "comes in one size; remove it"),
+        ("auto", 6, "chooses by itself"),
+        ("scaramuzza", 0, "must be at least 1"),
+    ],
+)
+def test_degrees_that_no_model_has(
+    session: Path, capsys: pytest.CaptureFixture[str], model: str, degree: int, said: str
+) -> None:
+    session.write_text(SESSION.replace("kannala_brandt", model) + f"degree = {degree}\n")
+    assert main(["calibrate", str(session)]) == 2
+    error = capsys.readouterr().err
+    assert said in error and "'degree'" in error and str(session) in error
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("columns = 9000", "'columns' is 9000, more than 1000"),
+        ("square_mm = 0.03", "write mm"),
+        ("square_mm = inf", "must be a number"),
+        ("rows = 1", "must be at least 2"),
+    ],
+)
+def test_boards_that_nobody_has(session: Path, capsys: pytest.CaptureFixture[str], line: str, said: str) -> None:
+    board = session.parent / "board.toml"
+    key = line.split()[0]
+    board.write_text("\n".join(line if row.startswith(key) else row for row in board.read_text().splitlines()))
+    assert main(["calibrate", str(session)]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_images_of_two_sizes(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def halve(name: str) -> None:
+        image = cv2.imread(str(session.parent / name))
+        cv2.imwrite(str(session.parent / name), cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+
+    halve("04.jpg")
+    assert main(["calibrate", str(session)]) == 0
+    assert "look: image '04.jpg' is left out: 812x620 px, most images have 1624x1240" in capsys.readouterr().out
+    halve("03.jpg")
+    assert main(["calibrate", str(session), "--force"]) == 2
+    error = capsys.readouterr().err
+    assert "1624x1240 px (3, such as '00.jpg') and 812x620 px (2, such as '03.jpg')" in error and "list only" in error

@@ -48,8 +48,8 @@ for _lens in LENSES:
 
 
 REFUSED = {"reg-brown-1-view": 1}
-"""One view of a long lens with five terms of distortion: focal length and distortion trade off, and one seed of twenty
-ends with the message that the focal length is open."""
+"""Refused, and rightly: the only view is tilted by 9 degrees against the image, and with five terms of distortion its
+focal length comes out as 1064 +- 969 px where 1364 is true."""
 
 
 def failure(case: Case, seed: int) -> str | None:
