@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from rigkit.arrays import FloatArray, IntArray
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration
+from rigkit.calibration.rig_disagree import (
+    DISAGREES,
+    LEAST_PX,
+    bad_ones,
+    cost_of_sharing,
+    masked,
+    part,
+    part_far,
+    shared_keys,
+    usual_cost,
+    why,
+)
 from rigkit.calibration.rig_frames import apart, first_frames, mounts_of, turned_alike
 from rigkit.calibration.rig_seen import Places, Sights
 from rigkit.calibration.rig_shape import common_shape
@@ -22,19 +33,13 @@ from rigkit.progress import Progress
 
 __all__ = ["JointRig", "solve_jointly"]
 
-FAR_APART = 12.0
-"""Before the joint solve a board's pose in one image may be off by some pixels in the other: only more than this many
-times the usual distance is a board that moved."""
-DISAGREES = 3.5
-"""After it, sharing a pose costs a target six numbers for every view but one: on average sigma each. More than this
-many times sigma (or the usual, where lens and board are not quite what the models say) is no chance."""
-LEAST_PX = 0.02
-"""No corner is better than this: without noise the usual residual is rounding, and many times that is rounding too."""
 NOTHING_IN_COMMON = 30.0
 """Where sharing poses usually costs this many sigmas, the cameras do not see the same."""
 MIN_SHARE = 0.5
 """More of the shared targets must agree than disagree."""
 MAX_ROUNDS = 8
+TRIED = 6
+"""Of few targets that all look bad, the worst ones are left out for trial, one by one."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -69,7 +74,7 @@ class JointRig:
     @property
     def shared_count(self) -> int:
         """Targets, counted in every frame, of which several views are tied."""
-        return len(_shared(self.seen))
+        return len(shared_keys(self.seen))
 
 
 def solve_jointly(
@@ -85,28 +90,24 @@ def solve_jointly(
     """
     mounts, notes = mounts_of(names, seen, places)
     seen = turned_alike(seen, mounts, places)
-    shared = len(_shared(seen))
-    left_out = _part_far(seen, apart(seen, mounts, [result.camera for result in single], places))
+    shared = len(shared_keys(seen))
+    left_out = part_far(seen, apart(seen, mounts, [result.camera for result in single], places))
     sigma = _sigma(single)
     for i in range(MAX_ROUNDS):
         progress("rig", i, MAX_ROUNDS)
         _require_agreement(names, seen, places, len(left_out), shared)
-        observations, unknowns = _observations(seen, single, places, sigma)
-        start = RigState(
-            tuple(result.camera for result in single),
-            np.array([m.rotation for m in mounts]),
-            np.array([m.translation_mm for m in mounts]),
-            *first_frames(observations.keys, seen, mounts, places),
-            *_board_poses(observations.cameras[0], places),
-            unknowns,
-        )
-        solution = solve_rig(observations, start, sigma)
-        cost, count = _cost_of_sharing(observations, solution, seen)
-        usual = _usual(cost, sigma)
-        worse = _part_bad(seen, cost, count, usual) if i < MAX_ROUNDS - 1 else []
-        left_out += worse
-        if not worse:
+        observations, solution = _solved(seen, mounts, single, places, sigma)
+        cost = cost_of_sharing(observations, solution, seen)
+        usual = usual_cost(cost, sigma)
+        worse = bad_ones(cost, usual)
+        if not worse and masked(cost, sigma):
+            worse = _one_bad(names, seen, mounts, single, places, sigma, cost)
+        if not worse or i == MAX_ROUNDS - 1:
             break
+        for key in worse:
+            how = f"{np.sqrt(cost[key] / max(sigma, LEAST_PX) ** 2):.1f} times the corners' noise"
+            left_out.append((*key, why(seen, key, how)))
+            part(seen, key)
         state = solution.state
         mounts = [Rigid3(r, t) for r, t in zip(state.mount_rotation, state.mount_mm, strict=True)]
     progress("rig", MAX_ROUNDS, MAX_ROUNDS)
@@ -117,6 +118,48 @@ def solve_jointly(
             f"disagree on where the boards are; {_advice(seen)}"
         )
     return JointRig(observations, solution, tuple(seen), sigma, usual_sigmas, tuple(left_out), notes)
+
+
+def _solved(
+    seen: Sequence[Sights], mounts: Sequence[Rigid3], single: Sequence[Calibration], places: Places, sigma: float
+) -> tuple[RigObservations, RigSolution]:
+    observations, unknowns = _observations(seen, single, places, sigma)
+    start = RigState(
+        tuple(result.camera for result in single),
+        np.array([m.rotation for m in mounts]),
+        np.array([m.translation_mm for m in mounts]),
+        *first_frames(observations.keys, seen, mounts, places),
+        *_board_poses(observations.cameras[0], places),
+        unknowns,
+    )
+    return observations, solve_rig(observations, start, sigma)
+
+
+def _one_bad(
+    names: Sequence[str],
+    seen: Sequence[Sights],
+    mounts: Sequence[Rigid3],
+    single: Sequence[Calibration],
+    places: Places,
+    sigma: float,
+    cost: Mapping[Key, float],
+) -> list[Key]:
+    """Return the one target, if any, without which the others agree: among few, a bad one pulls the mounts so far that
+    all of them look bad."""
+    found: list[tuple[float, float, Key]] = []
+    for key in sorted(cost, key=lambda k: -cost[k])[:TRIED]:
+        trial = [dict(own) for own in seen]
+        part(trial, key)
+        try:
+            mounts_of(names, trial, places)
+        except InputError:
+            continue
+        without = cost_of_sharing(*_solved(trial, mounts, single, places, sigma), trial)
+        found.append((sum(without.values()), usual_cost(without, sigma, mean=True), key))
+    if not found:
+        return []
+    rest, usual, key = min(found)
+    return [key] if sum(cost.values()) - rest > DISAGREES**2 * usual else []
 
 
 def _sigma(single: Sequence[Calibration]) -> float:
@@ -162,12 +205,6 @@ def _board_poses(observations: Observations, places: Places) -> tuple[FloatArray
     return np.array([p.rotation for p in poses]), np.array([p.translation_mm for p in poses])
 
 
-def _shared(seen: Sequence[Sights]) -> dict[Key, int]:
-    """Return the targets of which several views share a pose, and how many."""
-    count = Counter(entry.key for own in seen for entry in own.values())
-    return {key: n for key, n in count.items() if n > 1}
-
-
 def _require_agreement(names: Sequence[str], seen: Sequence[Sights], places: Places, left: int, shared: int) -> None:
     """Raise DegenerateError where so much was left out that the rest means nothing."""
     if not left:
@@ -190,75 +227,3 @@ def _advice(seen: Sequence[Sights]) -> str:
     if len(seen) > 1:
         return "check that the images of a frame were taken at one moment"
     return "check that the boards do not move against each other"
-
-
-def _cost_of_sharing(
-    observations: RigObservations, solution: RigSolution, seen: Sequence[Sights]
-) -> tuple[dict[Key, float], IntArray]:
-    """Return what it costs every shared target that its views have one pose, px^2 for each of the six numbers that
-    every view but one gives up, and the number of corners. A view that is bad in itself is no reason to distrust the
-    moment."""
-    poses = len(observations.keys)
-    alone, count, views = np.zeros(poses), np.zeros(poses, dtype=np.int64), np.zeros(poses)
-    for own, weight, frame, camera in zip(
-        seen, observations.weights, observations.frame, observations.cameras, strict=True
-    ):
-        squared = np.zeros(weight.shape)
-        squared[camera.present] = np.concatenate([e.squared_px for e in own.values()])
-        np.add.at(alone, frame, (weight**2 * squared).sum(axis=1))
-        np.add.at(count, frame, (weight > 0.0).sum(axis=1))
-        np.add.at(views, frame, 1.0)
-    excess = np.maximum(solution.normal.costs - alone, 0.0) / np.maximum(6.0 * (views - 1.0), 1.0)
-    shared = views > 1.0
-    return {key: float(e) for key, e, s in zip(observations.keys, excess, shared, strict=True) if s}, count
-
-
-def _usual(cost: Mapping[Key, float], sigma: float) -> float:
-    """Return the usual cost, px^2: the lower of two in the middle, so that of two targets the worse is the bad one."""
-    ordered = sorted(cost.values())
-    middle = ordered[(len(ordered) - 1) // 2] if ordered else 0.0
-    return max(middle, max(sigma, LEAST_PX) ** 2)
-
-
-def _part_bad(
-    seen: list[Sights], cost: Mapping[Key, float], count: IntArray, usual: float
-) -> list[tuple[str, str, str]]:
-    worst = max(cost.values(), default=0.0)
-    out = []
-    for key in sorted(cost):
-        # The worst ones first: they may be why the others look bad.
-        if cost[key] > max(DISAGREES**2 * usual, 0.25 * worst):
-            out.append((*key, _why(seen, key, f"{np.sqrt(cost[key] / usual):.1f} times the usual")))
-            _part(seen, key)
-    return out
-
-
-def _part_far(seen: list[Sights], off_px: Mapping[Key, float]) -> list[tuple[str, str, str]]:
-    shared = _shared(seen)
-    usual = max(float(np.median([off_px[key] for key in shared])) if shared else 0.0, LEAST_PX)
-    worst = max((off_px[key] for key in shared), default=0.0)
-    out = []
-    for key in sorted(shared):
-        if off_px[key] > max(FAR_APART * usual, 0.5 * worst):
-            words = f"by {off_px[key]:.2g} px, {off_px[key] / usual:.0f} times the usual"
-            out.append((*key, _why(seen, key, words)))
-            _part(seen, key)
-    return out
-
-
-def _why(seen: Sequence[Sights], key: Key, how: str) -> str:
-    cameras = [k for k, own in enumerate(seen) if any(e.key == key for e in own.values())]
-    if len(cameras) > 1:
-        return (
-            f"the cameras disagree on where it is ({how}); the board or the rig moved between the exposures, or they "
-            "are not of one moment"
-        )
-    return f"its boards disagree on where it is ({how}); one of them was moved against the others"
-
-
-def _part(seen: list[Sights], key: Key) -> None:
-    """Give every view of the target a pose of its own: they still support their camera's intrinsics."""
-    for k, own in enumerate(seen):
-        for place, entry in own.items():
-            if entry.key == key:
-                own[place] = replace(entry, key=(f"{entry.frame}, camera {k + 1} alone", entry.board_id))

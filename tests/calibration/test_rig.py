@@ -12,6 +12,7 @@ from rigkit.calibration.observations import Observations
 from rigkit.calibration.rig import calibrate_rig
 from rigkit.calibration.rig_solver import rig_normal
 from rigkit.calibration.rig_state import RigObservations, RigState
+from rigkit.calibration.rig_uncertainty import transfer_covariance, transfer_uncertainty
 from rigkit.calibration.shape import shape_model
 from rigkit.calibration.solver import evaluate
 from rigkit.cameras.base import Camera
@@ -37,8 +38,13 @@ def mounts() -> dict[str, tuple[Camera, Rigid3]]:
     }
 
 
-def rig_views(rng: np.random.Generator, frames: int, *, chain: bool = False) -> Views:
-    """Return frames seen by all cameras that have the board in view; with `chain` never by first and last at once."""
+def rig_views(
+    rng: np.random.Generator, frames: int, *, chain: bool = False, bumps_mm: np.ndarray | float = 0.0
+) -> Views:
+    """Return frames seen by all cameras that have the board in view; with `chain` never by first and last at once.
+
+    `bumps_mm` (54, 3) is how far the corners are from where the board is said to have them.
+    """
     views: Views = {name: [] for name in mounts()}
     k = 0
     for _ in range(2000):
@@ -51,7 +57,7 @@ def rig_views(rng: np.random.Generator, frames: int, *, chain: bool = False) -> 
         )
         seen = {}
         for name, (camera, cam_from_rig) in mounts().items():
-            pixels, valid = camera.project((cam_from_rig @ rig_from_board).apply(BOARD.points()))
+            pixels, valid = camera.project((cam_from_rig @ rig_from_board).apply(BOARD.points() + bumps_mm))
             if valid.all() and camera.on_image(pixels).all():
                 noisy = np.clip(pixels + NOISE_PX * rng.normal(size=pixels.shape), 0.0, np.array(camera.size_px) - 1.0)
                 seen[name] = BoardView(f"{name}{k}.png", BOARD, BOARD.grid(), noisy, np.full(54, NOISE_PX))
@@ -186,3 +192,46 @@ def test_cameras_that_share_nothing_are_named(rng: np.random.Generator) -> None:
         calibrate_rig(views, sizes(), model=MODELS)
     with pytest.raises(InputError, match="at least two"):
         calibrate_rig({"reg": views["reg"]}, sizes())
+
+
+def test_transfer_is_as_sure_as_it_says() -> None:
+    """Where points of one camera appear in another: errors over predicted deviations, 20 rigs."""
+    z = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        rig = calibrate_rig(rig_views(rng, 10), sizes(), model=MODELS, folds=0)
+        pixels = rng.uniform([500.0, 350.0], [1100.0, 850.0], size=(8, 2))
+        for a, b in (("reg", "wide"), ("wide", "fish")):
+            (camera_a, a_from_rig), (camera_b, b_from_rig) = mounts()[a], mounts()[b]
+            distance = rng.uniform(400.0, 700.0, size=(8, 1))
+            true = camera_b.project(
+                (b_from_rig @ a_from_rig.inverse()).apply(distance * camera_a.unproject(pixels)[0])
+            )[0]
+            points = distance * rig.cameras[rig.index(a)].camera.unproject(pixels)[0]
+            found = rig.cameras[rig.index(b)].camera.project(rig.cam2_from_cam1(a, b).apply(points))[0]
+            covariance, seen = transfer_covariance(rig, a, b, points)
+            assert seen.all()
+            z.append((found - true) / np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1)))
+    # 40 rigs and pairs, about three independent numbers each.
+    assert 0.85 < np.sqrt(np.mean(np.square(z))) < 1.15
+    transfer = transfer_uncertainty(rig, "reg", "wide")
+    assert transfer is not None and 0.0 < transfer.median_px < transfer.worst_px
+
+
+def test_spread_is_one_for_noise_and_more_for_errors_in_common() -> None:
+    """Boards that are not what they are said to be: sigmas grow, and with them the truth stays within reach."""
+    clean, bumpy, z = [], [], []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        views = {n: own for n, own in rig_views(rng, 12).items() if n != "fish"}
+        clean.append(calibrate_rig(views, sizes(), model=MODELS, folds=0).spread)
+        column = np.zeros((54, 3))
+        column[:, 0] = 0.12 * rng.normal(size=9)[BOARD.grid()[:, 0]]
+        column[:, 2] = 0.3 * (np.linspace(-1.0, 1.0, 9)[BOARD.grid()[:, 0]] ** 2)
+        views = {n: own for n, own in rig_views(rng, 12, bumps_mm=column).items() if n != "fish"}
+        rig = calibrate_rig(views, sizes(), model=MODELS, folds=0)
+        bumpy.append(rig.spread)
+        length, sigma = rig.baseline_mm("reg", "wide")
+        z.append((length - np.linalg.norm(mounts()["wide"][1].translation_mm)) / sigma)
+    assert np.mean(clean) < 1.1 and np.mean(bumpy) > 1.15
+    assert np.sqrt(np.mean(np.square(z))) < 1.6

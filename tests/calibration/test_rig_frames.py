@@ -14,7 +14,7 @@ from rigkit.calibration.rig_seen import Seen
 from rigkit.detections import BoardView
 from rigkit.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3
+from rigkit.geometry.rotation import exp_so3, rotation_angle
 
 MODELS = {"reg": "brown", "wide": "kannala_brandt", "fish": "kannala_brandt"}
 
@@ -64,18 +64,72 @@ def test_frames_not_taken_at_one_moment(shift_px: float, rng: np.random.Generato
     assert_true_mounts(rig)
 
 
-def test_nothing_in_common_is_said(rng: np.random.Generator) -> None:
-    """Two cameras of which every frame was taken at another moment."""
-    views = {name: own for name, own in rig_views(rng, 16).items() if name != "fish"}
-    frames = [frame for frame, _ in views["wide"]]
-    shuffled = dict(zip(frames, np.roll(frames, 3).tolist(), strict=True))
+@pytest.mark.parametrize("frames", [4, 16])
+def test_nothing_in_common_is_said(frames: int, rng: np.random.Generator) -> None:
+    """Two cameras of which every frame was taken at another moment: no rig comes out of it (100 of 100 seeds)."""
+    views = {name: own for name, own in rig_views(rng, frames).items() if name != "fish"}
+    seen = [frame for frame, _ in views["wide"]]
+    shuffled = dict(zip(seen, np.roll(seen, max(1, frames // 5)).tolist(), strict=True))
     views["wide"] = [(shuffled[frame], view) for frame, view in views["wide"]]
-    try:
-        rig = calibrate_rig(views, sizes(), model=MODELS)
-    except DegenerateError as error:
-        assert "disagree" in str(error)
-    else:
-        assert rig.sigma_px > 10.0 * NOISE_PX or len(rig.left_out) > len(frames) / 2
+    with pytest.raises(DegenerateError, match="check that the images of a frame were taken at one moment"):
+        calibrate_rig(views, sizes(), model=MODELS, folds=0)
+
+
+def moved_once(views: Views, by_mm: float, rng: np.random.Generator) -> tuple[Views, str]:
+    """Return the views with the board moved before the wide camera took one of its images, and the frame."""
+    frame, view = views["wide"][1]
+    camera = mounts()["wide"][0]
+    alone = calibrate_rig(views, sizes(), model=MODELS, folds=0).single[list(views).index("wide")]
+    pose = next(v.cam_from_board for v in alone.views if v.image == view.image)
+    shift = rng.normal(size=3)
+    there = Rigid3(np.eye(3), by_mm * shift / np.linalg.norm(shift)) @ pose
+    pixels = view.pixels + camera.project(there.apply(view.points()))[0] - camera.project(pose.apply(view.points()))[0]
+    moved = replace(view, pixels=np.clip(pixels, 0.0, np.array(camera.size_px) - 1.0))
+    return {**views, "wide": [(f, moved if f == frame else v) for f, v in views["wide"]]}, frame
+
+
+@pytest.mark.parametrize("frames", [4, 10])
+def test_one_frame_in_which_the_board_was_moved(frames: int, rng: np.random.Generator) -> None:
+    """Among four, one moved by 3 mm pulls the mount so far that all look bad; it is found all the same, and alone."""
+    views = {name: own for name, own in rig_views(rng, frames).items() if name != "fish"}
+    moved, frame = moved_once(views, 3.0, rng)
+    rig = calibrate_rig(moved, sizes(), model=MODELS, folds=0)
+    assert [left[0] for left in rig.left_out] == [frame]
+    length, sigma = rig.baseline_mm("reg", "wide")
+    assert abs(length - np.linalg.norm(mounts()["wide"][1].translation_mm)) < SIGMAS * sigma
+
+
+@pytest.mark.slow
+def test_false_alarms_and_detections() -> None:
+    """No clean frame is left out, flat boards or bumpy ones; boards moved by 1 mm are found 9 times of 10."""
+    found = 0
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        bumps = 0.1 * rng.normal(size=(54, 3)) * np.array([0.3, 0.3, 1.0]) if seed % 2 else np.zeros((54, 3))
+        views = {n: own for n, own in rig_views(rng, 8, bumps_mm=bumps).items() if n != "fish"}
+        assert calibrate_rig(views, sizes(), model=MODELS, folds=0).left_out == ()
+        moved, frame = moved_once(views, 1.0, rng)
+        left_out = calibrate_rig(moved, sizes(), model=MODELS, folds=0).left_out
+        assert {left[0] for left in left_out} <= {frame}
+        found += len(left_out)
+    assert found >= 27
+
+
+def test_one_pose_of_a_board_that_looks_the_same_turned_is_said(rng: np.random.Generator) -> None:
+    """One frame cannot tell which of two mounts it is: the smaller turn is taken, and said to be."""
+    board = Board("8x6", 8, 6, 30.0, 30.0)
+    views: Views = {"reg": [], "wide": []}
+    every = {name: own for name, own in rig_views(rng, 12).items() if name != "fish"}
+    for name, own in every.items():
+        # Intrinsics from frames of their own, the mount from one frame.
+        for k, (frame, view) in enumerate(own):
+            views[name].append(
+                (frame if k == 0 else f"{name}{frame}", only_part(view, board, bool(rng.random() < 0.5)))
+            )
+    rig = calibrate_rig(views, sizes(), model=MODELS)
+    assert any("look the same turned" in verdict for verdict in rig.verdicts)
+    true = mounts()["wide"][1]
+    assert np.degrees(rotation_angle(rig.cameras[1].cam_from_rig.rotation @ true.rotation.T)) < 2.0
 
 
 @pytest.mark.parametrize("board", [Board("a", 8, 6, 30.0, 20.0), Board("b", 4, 4, 25.0, 25.0)])
