@@ -16,7 +16,7 @@ from rigkit.calibration.solver import State, evaluate, one_step, solve
 from rigkit.cameras.base import Camera, image_center
 from rigkit.errors import DegenerateError
 
-__all__ = ["OUTLIER_SIGMAS", "Fit", "fit_kept", "fit_model", "heldout_rms", "inliers", "robust_sigma"]
+__all__ = ["OUTLIER_SIGMAS", "Fit", "fit_kept", "fit_model", "heldout_squares", "inliers", "robust_sigma"]
 
 OUTLIER_SIGMAS = 5.0
 """A corner is an outlier when its weighted 2-D residual exceeds this many robust standard deviations per coordinate,
@@ -195,14 +195,16 @@ def _sigma(state: State, norm: FloatArray, kept: BoolArray) -> float:
     return float(np.sqrt((total + prior * sigma**2) / freedom)) if prior else float(sigma)
 
 
-def heldout_rms(observations: Observations, fit: Fit, folds: int) -> float | None:
-    """Return the 2-D RMS over images that took no part: camera and shape from the other images, only the poses of the
-    held-out boards refitted; kept corners only. None with fewer images than folds."""
+def heldout_squares(observations: Observations, fit: Fit, folds: int) -> FloatArray | None:
+    """Return the sum of squared residuals, px^2, of the kept corners of each image while it took no part: camera and
+    shape from the other images, only the poses of its boards refitted. None with fewer images than folds."""
     images = list(dict.fromkeys(observations.images))
     if folds < 2 or len(images) < folds:
         return None
-    fold = np.array([images.index(name) % folds for name in observations.images])
-    squared, count = 0.0, 0
+    place = {name: i for i, name in enumerate(images)}
+    image = np.array([place[name] for name in observations.images])
+    fold = image % folds
+    squared = np.zeros(len(images))
     weight = fit.weight(observations)
     for k in range(folds):
         train, test = np.flatnonzero(fold != k), np.flatnonzero(fold == k)
@@ -217,7 +219,6 @@ def heldout_rms(observations: Observations, fit: Fit, folds: int) -> float | Non
         start = fit.state.subset(test)
         moved = replace(solved, rotation=start.rotation, translation_mm=start.translation_mm)
         found, _ = refine_poses(part, moved, weight[test])
-        kept = fit.kept[test]
-        squared += float((evaluate(found, part).px[kept] ** 2).sum())
-        count += int(kept.sum())
-    return float(np.sqrt(squared / count)) if count else None
+        own = np.where(fit.kept[test], (evaluate(found, part).px ** 2).sum(axis=-1), 0.0)
+        np.add.at(squared, image[test], own.sum(axis=-1))
+    return squared if fit.kept.any() else None

@@ -164,3 +164,21 @@ def test_boards_parallel_to_the_image_leave_the_focal_length_open(rng: np.random
         views.append(BoardView(f"{k}.png", BOARD, BOARD.grid(), pixels, np.full(54, 0.1)))
     with pytest.raises(DegenerateError, match="tilted"):
         calibrate(views, SIZE, model="pinhole", board="flat")
+
+
+@pytest.mark.parametrize("reach_deg", [30.0, 50.0, 70.0, 92.5])
+def test_auto_is_as_good_as_the_best_model(rng: np.random.Generator, reach_deg: float) -> None:
+    camera = lens("wide" if reach_deg < 60.0 else "fish")
+    views, _, _ = random_views(camera, 20, rng, reach_deg=reach_deg)
+    result = calibrate(views, SIZE, model="auto", board="flat")
+    held = [c.heldout_rms_px for c in result.candidates if c.heldout_rms_px is not None]
+    assert len(held) >= 10 and result.heldout_rms_px < 1.02 * min(held)
+    known = calibrate(views, SIZE, model="kannala_brandt", board="flat")
+    covered = np.concatenate([v.pixels for v in views])
+    off, least = (
+        float(np.sqrt(np.mean(projection_difference(c.camera, camera, 0.95 * reach_deg, covered=covered) ** 2)))
+        for c in (result, known)
+    )
+    # The true model is one of those tried: what another costs in the lens is chance.
+    assert off < 1.5 * least + 0.05
+    assert all(c.reason for c in result.candidates)
