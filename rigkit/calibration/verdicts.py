@@ -73,9 +73,11 @@ def judge(
     return (_headline(calibration, found), *found)
 
 
-def judge_session(calibration: Calibration, dropped: Sequence[tuple[str, str]]) -> tuple[str, ...]:
-    """Return the verdicts of the calibration together with those on images that gave no view at all."""
-    found = [*_left_out(dropped), *calibration.verdicts[1:]]
+def judge_session(
+    calibration: Calibration, dropped: Sequence[tuple[str, str]], also: Sequence[str] = ()
+) -> tuple[str, ...]:
+    """Return the verdicts of the calibration together with those on images that gave no view at all, and others."""
+    found = [*_left_out(dropped), *calibration.verdicts[1:], *also]
     return (_headline(calibration, found), *found)
 
 

@@ -85,6 +85,7 @@ def calibrate_session(session: Session, progress: Progress = silent) -> Calibrat
     """
     from dataclasses import replace
 
+    from rigkit.calibration.board_ties import suggest_ties
     from rigkit.calibration.calibrate import calibrate
     from rigkit.calibration.verdicts import judge_session
 
@@ -97,7 +98,8 @@ def calibrate_session(session: Session, progress: Progress = silent) -> Calibrat
         board=session.board_shape,
         progress=progress,
     )
-    return replace(result, dropped=(*dropped, *result.dropped), verdicts=judge_session(result, dropped))
+    verdicts = judge_session(result, dropped, suggest_ties(views, result))
+    return replace(result, dropped=(*dropped, *result.dropped), verdicts=verdicts)
 
 
 def session_views(

@@ -10,6 +10,8 @@ from helpers.board_rig_scenes import ALIKE, DIFFERENT, corner_of_a_room, target_
 from helpers.calibration_scenes import lens
 
 from rigkit.boards import Board
+from rigkit.calibration.board_ties import suggest_ties
+from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.rig import RigCalibration, calibrate_rig
 from rigkit.cameras.base import Camera
 from rigkit.detections import BoardView
@@ -201,3 +203,32 @@ def test_held_out_error_of_a_tied_camera(rng: np.random.Generator) -> None:
     rig = solve(views, DIFFERENT, folds=5)
     assert rig.heldout_rms_px == pytest.approx(np.sqrt(2.0) * NOISE_PX, rel=0.05)
     assert all(c.calibration.heldout_rms_px is not None for c in rig.cameras)
+
+
+@pytest.mark.parametrize("alike", [False, True])
+def test_boards_that_keep_their_places_are_noticed(alike: bool, rng: np.random.Generator) -> None:
+    boards = ALIKE if alike else DIFFERENT
+    room = corner_of_a_room(rng, boards)
+    views = [
+        v
+        for _, v in target_views(rng, REG, boards, room, 5, noise_px=NOISE_PX, distance_mm=1000.0, shuffled=alike)[
+            "reg"
+        ]
+    ]
+    if alike:
+        # As the program has them where no name can be told: every view shows a board of its own.
+        views = [replace(v, board=replace(v.board, board_id=f"part {k}")) for k, v in enumerate(views)]
+    result = calibrate(views, REG["reg"][0].size_px, model="brown", board="flat")
+    (said,) = suggest_ties(views, result)
+    assert "kept their places to each other in 5 images" in said
+    assert ("3 boards of 8x6 corners" in said) if alike else ('boards = ["floor", "left", "right"]' in said)
+
+
+def test_boards_that_move_are_not_taken_for_mounted(rng: np.random.Generator) -> None:
+    views = []
+    for k in range(5):
+        room = corner_of_a_room(rng, DIFFERENT)
+        own = target_views(rng, REG, DIFFERENT, room, 1, noise_px=NOISE_PX, distance_mm=1000.0)["reg"]
+        views += [replace(view, image=f"{k}.png") for _, view in own]
+    result = calibrate(views, REG["reg"][0].size_px, model="brown", board="flat")
+    assert suggest_ties(views, result) == ()

@@ -1,0 +1,77 @@
+"""Whether boards that were taken for free are mounted to each other: then a calibration gains from saying so."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+from rigkit.boards import Board
+from rigkit.calibration.board_places import board_places
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.rig_joint import solve_jointly
+from rigkit.calibration.rig_seen import Sights, seen_by
+from rigkit.detections import BoardView
+from rigkit.errors import RigkitError
+from rigkit.progress import silent
+
+__all__ = ["suggest_ties"]
+
+MIN_IMAGES = 3
+"""Two images can agree by chance; boards that keep their places in three are mounted."""
+TIED_SIGMAS = 10.0
+"""Sharing one pose costs boards on one mount a few sigmas (paper that is not flat: up to 3.5), and boards that moved by
+a millimetre against each other some tens."""
+NAMES = "{0} boards of {1}x{2} corners"
+
+
+def suggest_ties(views: Sequence[BoardView], calibration: Calibration) -> tuple[str, ...]:
+    """Return a verdict if boards kept their places to each other in all images that show several, else nothing.
+
+    `views` are those of the calibration, with their boards.
+    """
+    images = Counter(view.image for view in calibration.views)
+    if sum(n > 1 for n in images.values()) < MIN_IMAGES:
+        return ()
+    seen = _by_size([(view.image, view) for view in views], calibration)
+    boards = {entry.board_id: entry.view.board for entry in seen.values()}
+    often = Counter(board for image, board in seen if images[image] > 1)
+    group = [name for name, count in often.items() if count >= MIN_IMAGES]
+    if len(group) < 2:
+        return ()
+    # Sharing a shape is for the solution itself to find: here flat boards will do.
+    flat = replace(calibration, boards=tuple(replace(b, kind="flat") for b in calibration.boards))
+    try:
+        named, places, notes = board_places([group], [seen], boards)
+        joint = solve_jointly(["camera"], named, [flat], places, silent)
+    except RigkitError:
+        return ()
+    if notes or joint.left_out or joint.shared_count < MIN_IMAGES or joint.cost_sigmas > TIED_SIGMAS:
+        return ()
+    alike = not {b.board_id for b in calibration.boards}.issuperset(group)
+    size = boards[group[0]]
+    words = NAMES.format(len(group), size.columns, size.rows) if alike else f"boards {', '.join(group)}"
+    how = "give each a board file with an id of its own, and write" if alike else "write"
+    listed = ", ".join(f'"{name}"' for name in group) if not alike else "..."
+    return (
+        f"look: the {words} kept their places to each other in {joint.shared_count} images; {how} [[rigid_boards]] "
+        f"with boards = [{listed}] in the session: the camera gets surer, and the boards' angles come out",
+    )
+
+
+def _by_size(views: Sequence[tuple[str, BoardView]], calibration: Calibration) -> Sights:
+    """Return what the camera saw, boards without a name of their own called by their size and number in the image."""
+    out: Sights = {}
+    count: Counter[tuple[str, str]] = Counter()
+    often = Counter(view.board.board_id for _, view in views)
+    for entry in seen_by(views, calibration).values():
+        board = entry.view.board
+        name = board.board_id
+        if often[name] == 1:
+            kind = f"{board.columns}x{board.rows}"
+            count[entry.frame, kind] += 1
+            name = f"{kind} number {count[entry.frame, kind]}"
+            board = Board(name, *board.size, board.square_x_mm, board.square_y_mm, board.square_sigma_mm)
+        key = (entry.frame, name)
+        out[key] = replace(entry, view=replace(entry.view, board=board), key=key)
+    return out
