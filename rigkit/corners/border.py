@@ -117,7 +117,8 @@ def _padded(refined: RefinedLattice, rows: tuple[int, int], columns: tuple[int, 
     old = refined.lattice
     rising = old.rising != ((rows[0] + columns[0]) % 2 == 1)
     lattice = Lattice(pad(old.pixels), pad(old.contrast), rising)
-    return RefinedLattice(lattice, pad(refined.sigma_px), pad(refined.blur_px), pad(refined.residual))
+    rest = (refined.sigma_px, refined.blur_px, refined.residual, refined.noise)
+    return RefinedLattice(lattice, *(pad(values) for values in rest))
 
 
 def sides(image: FloatImage, lattice: Lattice) -> tuple[Side, Side, Side, Side]:

@@ -1,7 +1,9 @@
 """Chessboard corners by maximum likelihood: Gauss-Newton on the edge model, all corners of an image at once.
 
 For noise that is independent and equal in all pixels, least squares is maximum likelihood and reaches the Cramer-Rao
-bound; the same normal equations predict the standard deviation.
+bound; the same normal equations predict the standard deviation. How large the noise is, is read from what the model
+leaves and mirroring at the corner changes: blur of another shape, a tone curve or sharpening leave much, but the same
+on both sides, and so do not move the corner.
 """
 
 from __future__ import annotations
@@ -56,6 +58,9 @@ BLUR_LAG = 10.0
 """The last step may change s by so many times what it may move the corner: a wrong s hardly moves the corner, but adds
 to the residuals and so to the predicted sigma."""
 
+FEWEST_MIRRORED = 12
+"""Noise is read from so many pixels with a mirror image at least."""
+
 LEAST_VARIANCE = 1e-6
 RIDGE = 1e-9
 """Of grey levels, and on the normal equations' diagonal: keep an image without noise or without contrast solvable."""
@@ -71,10 +76,11 @@ class EdgeFit:
     Attributes
     ----------
     pixels : (N, 2)
-    sigma_px : (N,) predicted standard deviation per axis, from the residuals and the curvature of the likelihood.
+    sigma_px : (N,) predicted standard deviation per axis, from the noise and the curvature of the likelihood.
     blur : (N,) s, px.
     contrast : (N,) 2 b, negative if bright and dark are the other way round than expected.
     residual : (N,) root mean square, grey levels.
+    noise : (N,) the same of the part that mirroring changes, as that of independent noise.
     valid : (N,) the fit converged near its start, with pixels on all sides.
     """
 
@@ -83,6 +89,7 @@ class EdgeFit:
     blur: FloatArray
     contrast: FloatArray
     residual: FloatArray
+    noise: FloatArray
     valid: BoolArray
 
 
@@ -96,6 +103,7 @@ def fit_edges(
     radius_px: float,
     iterations: int,
     converged_px: float = 1e-3,
+    mirrored: bool = True,
 ) -> EdgeFit:
     """Fit the edge model to `image` (grey float32) around the corners that are near `pixels` (N, 2).
 
@@ -105,6 +113,7 @@ def fit_edges(
     blur : (N,) expected s.
     radius_px : pixels further from the corner are not used.
     iterations : Gauss-Newton steps at most.
+    mirrored : tell noise from other residuals; otherwise all counts as noise.
     converged_px : the last step moves the corner by less than this; the next one would by a hundredth of it.
     """
     fitted = fit_corners(
@@ -115,11 +124,11 @@ def fit_edges(
         geometry.gaps,
         sign,
         blur,
-        _rules(radius_px, iterations, converged_px),
+        _rules(radius_px, iterations, converged_px, mirrored),
     )
     if fitted is not None:
-        _, _, sigma_px, width, contrast, residual, valid = fitted.T
-        return EdgeFit(fitted[:, :2], sigma_px, width, contrast, residual, valid > 0.5)
+        _, _, sigma_px, width, contrast, residual, noise, valid = fitted.T
+        return EdgeFit(fitted[:, :2], sigma_px, width, contrast, residual, noise, valid > 0.5)
     window = collect(image, pixels, geometry, blur, radius_px)
     prior_mean, prior = _prior(geometry, blur, window.size)
     values = prior_mean.copy()
@@ -149,10 +158,11 @@ def fit_edges(
         active[np.flatnonzero(active)[change.max(axis=1) <= converged_px]] = False
         if not active.any():
             break
-    return _result(values, variance, normal, window, pixels, geometry, sign)
+    noise = _noise(values, variance, window, geometry) if mirrored else variance
+    return _result(values, variance, noise, normal, window, pixels, geometry, sign)
 
 
-def _rules(radius_px: float, iterations: int, converged_px: float) -> Rules:
+def _rules(radius_px: float, iterations: int, converged_px: float, mirrored: bool) -> Rules:
     return Rules(
         reach=REACH,
         near_sigmas=NEAR_SIGMAS,
@@ -177,6 +187,8 @@ def _rules(radius_px: float, iterations: int, converged_px: float) -> Rules:
         valid_move_cells=VALID_MOVE_CELLS,
         radius_px=radius_px,
         iterations=iterations,
+        mirrored=mirrored,
+        fewest_mirrored=FEWEST_MIRRORED,
     )
 
 
@@ -216,6 +228,45 @@ def _limited(step: FloatArray, values: FloatArray) -> FloatArray:
     return out
 
 
+def _noise(values: FloatArray, variance: FloatArray, window: Window, geometry: Geometry) -> FloatArray:
+    """Return the variance (N,) of the noise: of what the model leaves, less what is left at the mirrored pixel, too.
+
+    Mirrored at the corner, a pixel falls between four, which are interpolated; where one of them is not in the window
+    it has no mirror image. Few such pixels: `variance`, that of all residuals.
+    """
+    rest = linearise(values, window, geometry)[:, -1].astype(np.float64)
+    used = window.weight > 0.0
+    middle = int(max(np.abs(window.u).max(initial=0.0), np.abs(window.v).max(initial=0.0))) + 1
+    across = 2 * middle + 1
+    u, v = window.u.astype(np.int64), window.v.astype(np.int64)
+    owner = np.broadcast_to(np.arange(len(rest))[:, None], rest.shape)
+    # Two more rows and columns of nothing, for mirror images that fall outside.
+    square = np.full((len(rest), across + 2, across + 2), np.nan)
+    square[owner[used], v[used] + middle, u[used] + middle] = rest[used]
+    twice = 2.0 * values[:, [X, Y]]
+    whole = np.floor(twice)
+    right, below = (twice - whole).T[:, :, None]
+    from_u, from_v = (whole.astype(np.int64) + middle).T[:, :, None]
+    row, column = from_v - v, from_u - u
+    outside = (row < 0) | (column < 0) | (row >= across) | (column >= across)
+    row, column = np.where(outside, across, row), np.where(outside, across, column)
+    places = (
+        ((1.0 - right) * (1.0 - below), 0, 0),
+        (right * (1.0 - below), 0, 1),
+        ((1.0 - right) * below, 1, 0),
+        (right * below, 1, 1),
+    )
+    mirror = sum(weight * square[owner, row + down, column + over] for weight, down, over in places)
+    spread = 1.0 + sum(weight[:, 0] ** 2 for weight, _, _ in places)
+    change = np.where(used, rest - mirror, np.nan)
+    paired = np.isfinite(change)
+    pairs, count = paired.sum(axis=1), used.sum(axis=1)
+    mean = np.where(paired, change, 0.0) ** 2
+    apart = mean.sum(axis=1) / np.maximum(pairs, 1) / spread * count / np.maximum(count - PARAMETERS, 1)
+    enough = (pairs >= FEWEST_MIRRORED) & (count > PARAMETERS)
+    return np.where(enough, np.maximum(apart, LEAST_VARIANCE), variance)
+
+
 def _surrounded(pixels: FloatArray, window: Window) -> BoolArray:
     """Return whether there are pixels on all sides of the corner: it is not cut off by the frame."""
     off = (window.centre - pixels).astype(np.float32)
@@ -227,13 +278,14 @@ def _surrounded(pixels: FloatArray, window: Window) -> BoolArray:
 def _result(
     values: FloatArray,
     variance: FloatArray,
+    noise: FloatArray,
     normal: FloatArray,
     window: Window,
     start: FloatArray,
     geometry: Geometry,
     sign: FloatArray,
 ) -> EdgeFit:
-    covariance = np.linalg.inv(normal) * variance[:, None, None]
+    covariance = np.linalg.inv(normal) * noise[:, None, None]
     pixels = window.centre + values[:, [X, Y]]
     spread = 0.5 * (covariance[:, X, X] + covariance[:, Y, Y])
     moved = np.linalg.norm(pixels - start, axis=1)
@@ -246,5 +298,6 @@ def _result(
         values[:, S],
         2.0 * values[:, B] * sign,
         np.sqrt(variance),
+        np.sqrt(noise),
         valid,
     )

@@ -31,10 +31,10 @@ FIRST_BLUR = 1.0
 FIRST_SIGMA_PX = 0.1
 """How well corners are known before the first pass: saddles of a smoothed image."""
 
-FIRST_PASS = (9.0, 4, 0.02)
-LAST_PASS = (18.0, 8, 2e-3)
-"""Radius in px, Gauss-Newton steps at most, and the step in px that ends them: the first pass only has to bring the
-lattice to a few hundredths of a pixel."""
+FIRST_PASS = (9.0, 4, 0.02, False)
+LAST_PASS = (18.0, 8, 2e-3, True)
+"""Radius in px, Gauss-Newton steps at most, the step in px that ends them, and whether noise is told from other
+residuals: the first pass only has to bring the lattice to a few hundredths of a pixel."""
 
 FEWEST_NEIGHBOURS = 3
 """An empty cell is tried if so many of its eight neighbours are known."""
@@ -76,23 +76,33 @@ class RefinedLattice:
     Attributes
     ----------
     lattice : the corners.
-    sigma_px, blur_px, residual : predicted standard deviation, width of the edges, RMS of the fit in grey levels.
+    sigma_px, blur_px : predicted standard deviation, width of the edges.
+    residual, noise : RMS of what the fit leaves and of the part of it that is noise, grey levels.
     """
 
     lattice: Lattice
     sigma_px: FloatArray
     blur_px: FloatArray
     residual: FloatArray
+    noise: FloatArray
+
+    @property
+    def worst_sigma_px(self) -> FloatArray:
+        """(R, C) standard deviation if all that the fit leaves were noise: large for what is no chessboard."""
+        return self.sigma_px * self.residual / self.noise
 
     def without(self, drop: BoolArray) -> RefinedLattice:
         """Return this with the corners `drop` (R, C) forgotten."""
-        rest = (np.where(drop, np.nan, values) for values in (self.sigma_px, self.blur_px, self.residual))
+        rest = (np.where(drop, np.nan, values) for values in self._values())
         return RefinedLattice(self.lattice.without(drop), *rest)
 
     def cut(self, rows: slice, columns: slice) -> RefinedLattice:
         """Return the part of `rows` and `columns`."""
-        rest = (values[rows, columns] for values in (self.sigma_px, self.blur_px, self.residual))
+        rest = (values[rows, columns] for values in self._values())
         return RefinedLattice(self.lattice.cut(rows, columns), *rest)
+
+    def _values(self) -> tuple[FloatArray, ...]:
+        return (self.sigma_px, self.blur_px, self.residual, self.noise)
 
 
 def refine(image: FloatImage, lattices: Sequence[Lattice]) -> list[RefinedLattice]:
@@ -126,7 +136,7 @@ def _part_of(sheet: RefinedLattice, part: Part, rising: bool) -> RefinedLattice:
     sigma_px = sheet.sigma_px[part]
     if lattice.count >= FEWEST_CHECKED:
         sigma_px = sigma_px * _scatter(lattice, sigma_px)
-    return RefinedLattice(lattice, sigma_px, sheet.blur_px[part], sheet.residual[part])
+    return RefinedLattice(lattice, sigma_px, sheet.blur_px[part], sheet.residual[part], sheet.noise[part])
 
 
 def _typical_blur(item: RefinedLattice, parts: Sequence[Part]) -> FloatArray:
@@ -150,6 +160,7 @@ def _pass(
     radius_px: float,
     iterations: int,
     converged_px: float,
+    mirrored: bool,
 ) -> RefinedLattice:
     """Fit all corners of the sheet `start`, known to `sigma_px` (R, C); those that fail are left out."""
     known = start.known
@@ -165,6 +176,7 @@ def _pass(
         radius_px=radius_px,
         iterations=iterations,
         converged_px=converged_px,
+        mirrored=mirrored,
     )
     found = known.copy()
     good = fit.valid & (fit.contrast > 0.0)
@@ -176,7 +188,7 @@ def _pass(
         return out
 
     lattice = Lattice(spread(fit.pixels), spread(fit.contrast), start.rising)
-    return RefinedLattice(lattice, spread(fit.sigma_px), spread(fit.blur), spread(fit.residual))
+    return RefinedLattice(lattice, spread(fit.sigma_px), spread(fit.blur), spread(fit.residual), spread(fit.noise))
 
 
 def _with_holes(lattice: Lattice, inside: BoolArray) -> tuple[Lattice, BoolArray]:

@@ -131,7 +131,7 @@ def trustworthy(refined: RefinedLattice, before: int, least: int) -> bool:
         return False
     shape = fit_cells(lattice.pixels, known, degree=1)
     area = shape.along_column[:, 0] * shape.along_row[:, 1] - shape.along_column[:, 1] * shape.along_row[:, 0]
-    in_cells = refined.sigma_px[known] / np.sqrt(np.maximum(area, 1e-6))
+    in_cells = refined.worst_sigma_px[known] / np.sqrt(np.maximum(area, 1e-6))
     return _middle(in_cells) < MAX_RELATIVE_SIGMA
 
 

@@ -8,7 +8,7 @@
 
 enum { X, Y, T1, T2, S, A, B, GX, GY, PARAMETERS };
 enum { ROWS = PARAMETERS + 1, LANES = 8, GROUPS = 8, BLOCK = LANES * GROUPS };
-enum { OUTCOMES = 7 };
+enum { OUTCOMES = 8 };
 
 /* Eight numbers at once, wherever they lie. */
 typedef float lanes_t __attribute__((vector_size(4 * LANES), aligned(4)));
@@ -19,7 +19,7 @@ typedef struct {
     double least_blur, most_blur, angle_sigma, log_blur_sigma, light_sigma;
     double most_move_px, most_turn, most_blur_change, most_light_change;
     double least_variance, ridge, converged_px, blur_lag, valid_move_px, valid_move_cells, radius_px;
-    int64_t iterations;
+    int64_t iterations, mirrored, fewest_mirrored;
 } rules_t;
 
 /* What the lattice says of a corner: its cell's sides, the curvature of its lines, and where their neighbours are. */
@@ -27,10 +27,11 @@ typedef struct {
     const double *sides, *curvature, *gaps;
 } geometry_t;
 
-/* The pixels of a corner, relative to (centre_u, centre_v). */
+/* The pixels of a corner, relative to (centre_u, centre_v). `rest` has room for what the model leaves of them, `square`
+ * for `across` x `across` pixels around the centre. */
 typedef struct {
-    float *u, *v, *value;
-    int64_t count;
+    float *u, *v, *value, *rest, *square;
+    int64_t count, across;
     double centre_u, centre_v, size;
 } window_t;
 
@@ -405,6 +406,57 @@ static void move(double *values, const double *step, const rules_t *rules)
     values[S] = clipped(values[S], rules->least_blur, rules->most_blur);
 }
 
+/* Set `rest` of the window to what the model leaves. */
+FOR_EACH_PROCESSOR
+static void leave(const double *values, window_t *window, const geometry_t at, const rules_t *rules)
+{
+    const float x = (float)values[X], y = (float)values[Y], base = (float)values[A], half = (float)values[B];
+    const float light_u = (float)(values[GX] / window->size), light_v = (float)(values[GY] / window->size);
+    const float rho = (float)cos(values[T1] - values[T2]);
+    const line_t line1 = line_of(values[T1], at.curvature[0], at.gaps, values[S], rules);
+    const line_t line2 = line_of(values[T2], at.curvature[1], at.gaps + 2, values[S], rules);
+    for (int64_t start = 0; start < window->count; start += BLOCK) {
+        const float *u = window->u + start, *v = window->v + start;
+        edge_t one, two;
+        along_line(line1, u, v, x, y, &one);
+        along_line(line2, u, v, x, y, &two);
+        for (int i = 0; i < BLOCK; i++)
+            window->rest[start + i] = window->value[start + i]
+                - (1.0f + light_u * u[i] + light_v * v[i]) * (base + half * mixed(&one, &two, rho, i));
+    }
+}
+
+/* Return the mean square of what the model leaves and mirroring at the corner changes, as that of independent noise, or
+ * -1 where few pixels have a mirror image (edge_fit._noise). */
+static double unmirrored(const double *values, window_t *window, int64_t fewest)
+{
+    const int64_t across = window->across, middle = across / 2;
+    memset(window->square, 0xff, (size_t)(across * across) * sizeof(float)); /* NaN */
+    for (int64_t i = 0; i < window->count; i++)
+        window->square[((int64_t)window->v[i] + middle) * across + (int64_t)window->u[i] + middle] = window->rest[i];
+    const double left = floor(2.0 * values[X]), top = floor(2.0 * values[Y]);
+    const float right = (float)(2.0 * values[X] - left), below = (float)(2.0 * values[Y] - top);
+    const float w00 = (1.0f - right) * (1.0f - below), w10 = right * (1.0f - below);
+    const float w01 = (1.0f - right) * below, w11 = right * below;
+    const int64_t from_u = (int64_t)left + middle, from_v = (int64_t)top + middle;
+    double sum = 0.0;
+    int64_t pairs = 0;
+    for (int64_t i = 0; i < window->count; i++) {
+        const int64_t u = from_u - (int64_t)window->u[i], v = from_v - (int64_t)window->v[i];
+        if (u < 0 || v < 0 || u > across - 2 || v > across - 2)
+            continue;
+        const float *there = window->square + v * across + u;
+        const float mirror = w00 * there[0] + w10 * there[1] + w01 * there[across] + w11 * there[across + 1];
+        const float change = window->rest[i] - mirror;
+        if (change == change) {
+            sum += (double)(change * change);
+            pairs++;
+        }
+    }
+    const double spread = 1.0 + (double)(w00 * w00 + w10 * w10 + w01 * w01 + w11 * w11);
+    return pairs >= fewest ? sum / (double)pairs / spread : -1.0;
+}
+
 /* Return whether there are pixels on all sides of (x, y) (edge_fit._surrounded). */
 static int surrounded(const window_t *window, float x, float y)
 {
@@ -418,7 +470,7 @@ static int surrounded(const window_t *window, float x, float y)
     return right >= 2 && left >= 2 && below >= 2 && above >= 2;
 }
 
-/* Fit one corner; `out` is u, v, sigma, s, 2 b, RMS residual, valid. */
+/* Fit one corner; `out` is u, v, sigma, s, 2 b, RMS residual, RMS noise, valid. */
 static void fit_corner(
     window_t *window, const double pixel[2], const geometry_t at, double sign, double blur, const rules_t *rules, double *out)
 {
@@ -454,7 +506,14 @@ static void fit_corner(
             && fabs(step[S]) <= rules->blur_lag * rules->converged_px)
             break;
     }
-    const double spread = solved ? 0.5 * variance * (inverse_at(products, X) + inverse_at(products, Y)) : NAN;
+    double noise = variance;
+    if (rules->mirrored && more > 0) {
+        leave(values, window, at, rules);
+        const double mean = unmirrored(values, window, rules->fewest_mirrored);
+        noise = mean < 0.0 ? variance : mean * (double)window->count / (double)more;
+        noise = noise > rules->least_variance ? noise : rules->least_variance;
+    }
+    const double spread = solved ? 0.5 * noise * (inverse_at(products, X) + inverse_at(products, Y)) : NAN;
     const double u = window->centre_u + values[X], v = window->centre_v + values[Y];
     const double side1 = hypot(at.sides[0], at.sides[1]), side2 = hypot(at.sides[2], at.sides[3]);
     double most = rules->valid_move_cells * (side1 > side2 ? side1 : side2);
@@ -467,14 +526,25 @@ static void fit_corner(
     out[3] = values[S];
     out[4] = 2.0 * values[B] * sign;
     out[5] = sqrt(variance);
-    out[6] = (double)valid;
+    out[6] = sqrt(noise);
+    out[7] = (double)valid;
+}
+
+/* Pixels further than this from the centre have no place in the square: none within the radius, nor their mirrors
+ * but for those that lie outside of the window anyway. */
+static int64_t across_square(double radius_px) { return 2 * ((int64_t)floor(radius_px) + 1) + 1; }
+
+static int64_t room_of_window(double radius_px)
+{
+    const int64_t side = 2 * (int64_t)floor(radius_px) + 1;
+    return side * side + BLOCK;
 }
 
 /* Return how many floats of scratch fit_edges needs. */
 int64_t edges_scratch(double radius_px)
 {
-    const int64_t side = 2 * (int64_t)floor(radius_px) + 1;
-    return 3 * (side * side + BLOCK);
+    const int64_t across = across_square(radius_px);
+    return 4 * room_of_window(radius_px) + across * across;
 }
 
 /* Fit the edge model around `count` corners (edge_fit.fit_edges). pixels (N, 2), sides (N, 2, 2), curvature (N, 2), gaps
@@ -485,8 +555,10 @@ void fit_edges(
     float *scratch, double *out)
 {
     const image_t image = {grey, width, height};
-    const int64_t room = edges_scratch(rules->radius_px) / 3;
-    window_t window = {scratch, scratch + room, scratch + 2 * room, 0, 0.0, 0.0, 0.0};
+    const int64_t room = room_of_window(rules->radius_px);
+    window_t window = {
+        .u = scratch, .v = scratch + room, .value = scratch + 2 * room, .rest = scratch + 3 * room,
+        .square = scratch + 4 * room, .across = across_square(rules->radius_px)};
     for (int64_t n = 0; n < count; n++) {
         const geometry_t at = {sides + 4 * n, curvature + 2 * n, gaps + 4 * n};
         collect(&window, image, pixels + 2 * n, at, blur[n], rules);

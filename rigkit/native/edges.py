@@ -14,8 +14,8 @@ from rigkit.native import kernels
 
 __all__ = ["OUTCOMES", "BendRules", "Rules", "fit_corners", "line_bends"]
 
-OUTCOMES = 7
-"""Numbers that come out of a corner: u, v, sigma, s, 2 b, RMS residual, whether it is valid."""
+OUTCOMES = 8
+"""Numbers that come out of a corner: u, v, sigma, s, 2 b, RMS residual, RMS noise, whether it is valid."""
 
 
 class Rules(ctypes.Structure):
@@ -49,7 +49,7 @@ class Rules(ctypes.Structure):
                 "radius_px",
             )
         ),
-        ("iterations", ctypes.c_int64),
+        *((name, ctypes.c_int64) for name in ("iterations", "mirrored", "fewest_mirrored")),
     ]
 
 
@@ -88,7 +88,7 @@ def fit_corners(
     blur: FloatArray,
     rules: Rules,
 ) -> FloatArray | None:
-    """Return the `OUTCOMES` of N corners, (N, 7), or None without the compiled kernel. Arguments as `fit_edges`."""
+    """Return the `OUTCOMES` of N corners, (N, 8), or None without the compiled kernel. Arguments as `fit_edges`."""
     library = _library()
     if library is None:
         return None

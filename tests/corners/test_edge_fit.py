@@ -18,6 +18,9 @@ ASLANT_CORRELATION = 0.99
 EXACT_PX = 2e-4
 """float32 pixels of a model that the fit has exactly."""
 
+SHAPED_REL = 0.2
+"""As much as is asked of predicted sigmas: what a tone curve leaves is not quite the same on both sides."""
+
 MONTE_CARLO_REL = 0.12
 """Scatter of a standard deviation estimated from 2 x 200 errors is 3.5 %; three times that."""
 
@@ -138,6 +141,26 @@ def test_predicted_sigma_is_the_scatter(rng: np.random.Generator) -> None:
     actual = np.sqrt(((fit.pixels - pixels) ** 2).mean())
     predicted = np.sqrt((fit.sigma_px**2).mean())
     assert abs(actual / predicted - 1.0) < MONTE_CARLO_REL
+
+
+def test_what_is_the_same_on_both_sides_is_no_noise(rng: np.random.Generator) -> None:
+    """A tone curve leaves residuals three times the noise; the corners scatter by what the noise explains."""
+    count = 200
+    shape = geometry(count, oblique=1.2)
+    pixels = corners(count, rng)
+    image, _ = image_of(pixels, shape, 0.8)
+    curved = 230.0 * (np.clip(image - 40.0, 0.0, 170.0) / 170.0) ** 0.45
+    noisy = (curved + rng.normal(0.0, 2.0, image.shape)).astype(np.float32)
+    fit = fit_edges(noisy, pixels, shape, np.ones(count), np.full(count, 0.8), radius_px=18.0, iterations=8)
+    assert fit.valid.all()
+    assert np.median(fit.residual) > 5.0
+    actual = np.sqrt(((fit.pixels - pixels) ** 2).mean())
+    predicted = np.sqrt((fit.sigma_px**2).mean())
+    assert abs(actual / predicted - 1.0) < SHAPED_REL
+    blind = fit_edges(
+        noisy, pixels, shape, np.ones(count), np.full(count, 0.8), radius_px=18.0, iterations=8, mirrored=False
+    )
+    assert np.sqrt((blind.sigma_px**2).mean()) > 2.0 * actual
 
 
 def test_corner_at_the_frame_is_not_trusted() -> None:

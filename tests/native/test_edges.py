@@ -65,7 +65,7 @@ def test_compiled_fit_is_the_numpy_fit(
     good = plain.valid & (np.abs(plain.contrast) > 20.0)
     assert good.sum() > 40
     assert np.abs(compiled.pixels - plain.pixels)[good].max() < ROUNDING_PX
-    for name in ("sigma_px", "blur", "contrast", "residual"):
+    for name in ("sigma_px", "blur", "contrast", "residual", "noise"):
         ours, theirs = getattr(compiled, name)[good], getattr(plain, name)[good]
         assert np.abs(ours / theirs - 1.0).max() < ROUNDING_REL, name
 
