@@ -12,7 +12,7 @@ import json
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -64,7 +64,15 @@ def corner_figures(matched: MatchedPair, truth: Mapping[str, Any]) -> dict[str, 
     }
 
 
-def measure_pair(job: tuple[Pair, Camera, Camera, Path, str]) -> dict[str, Any]:
+class PairJob(NamedTuple):
+    pair: Pair
+    camera1: Camera
+    camera2: Camera
+    folder: Path
+    chain: str
+
+
+def measure_pair(job: PairJob) -> dict[str, Any]:
     """All figures of one pair."""
     pair, camera1, camera2, folder, chain = job
     truth = json.loads((folder / "truth.json").read_text())
@@ -126,10 +134,12 @@ def measure(folder: Path, *, pairs: Sequence[str] = (), chain: str = "raw", jobs
     dataset = load_dataset(ROOT / "datasets" / "lab-a").select(pairs)
     cameras = {k: v.camera for k, v in load_cameras(dataset, recalibrate=False, progress=progress).items()}
     work = [
-        (p, cameras[p.camera1.camera_id], cameras[p.camera2.camera_id], folder / "captures" / p.pair_id, chain)
+        PairJob(p, cameras[p.camera1.camera_id], cameras[p.camera2.camera_id], folder / "captures" / p.pair_id, chain)
         for p in dataset.pairs
     ]
-    results = list(over_pairs(measure_pair, work, jobs, "pairs against truth", progress))
+    results, failures = over_pairs(measure_pair, work, jobs, "pairs against truth", progress)
+    if failures:
+        raise failures[0].error
     lenses = {}
     for name, camera in cameras.items():
         truth = json.loads((folder / "calibration" / name / "truth.json").read_text())

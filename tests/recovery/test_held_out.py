@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -87,13 +88,22 @@ def test_a_level_that_held_badly_does_not_mislead_a_long_lens(seed: int) -> None
     assert_pose_is_true(reconstructed(scene, MIXED, rng), scene)
 
 
-def test_a_wrongly_declared_pose_type_is_named_where_nothing_comes_out() -> None:
+def test_a_wrongly_declared_pose_type_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether a pose comes out or not: which, is chance."""
     rng = np.random.default_rng(5)
     boards = tuple(Board(f"plane{k}", *size, 25.0, 25.0) for k, size in enumerate(((11, 8), (9, 6), (10, 7)), start=1))
     scene = trihedral_pair(boards, regular_lens(30.0), PoseType.GENERAL, rng, parallax_deg=(10.0, 20.0))
     first, second = (noisy(d, rng) for d in scene.detections())
     pair = match_pair("held out", scene.camera1, scene.camera2, first, second, boards)
-    with pytest.raises(DegenerateError, match=r"no scale.*declared 'standard'.* speak for 'general'"):
+    words = r"declared 'standard'.* speak for 'general'"
+
+    def no_scale(*_: object) -> None:
+        raise DegenerateError("no scale")
+
+    (note,) = reconstruct_pair(pair, pose_type="forward").notes[:1]
+    assert re.search(words.replace("standard", "forward"), note)
+    monkeypatch.setattr("rigkit.reconstruct.metric_pose", no_scale)
+    with pytest.raises(DegenerateError, match=f"no scale.*{words}"):
         reconstruct_pair(pair, pose_type="standard", level_sigma_rad=np.radians(0.2))
 
 
