@@ -105,6 +105,17 @@ def test_boards_that_look_alike_are_told_by_their_arrangement(board: str, rng: n
         assert abs(angle - expected) < SIGMAS * sigma
 
 
+def test_two_cameras_and_boards_that_look_alike(rng: np.random.Generator) -> None:
+    """Each camera names and counts them at random; the arrangement makes both mean the same."""
+    room = corner_of_a_room(rng, ALIKE)
+    views = target_views(rng, PAIR, ALIKE, room, 8, noise_px=NOISE_PX, distance_mm=1000.0, shuffled=True)
+    rig = solve(views, ALIKE)
+    assert rig.left_out == () and rig.shared_count == 8
+    assert rig.sigma_px == pytest.approx(NOISE_PX, rel=0.1)
+    length, sigma = rig.baseline_mm("reg", "wide")
+    assert abs(length - np.linalg.norm(PAIR["wide"][1].translation_mm)) < SIGMAS * sigma < 1.0
+
+
 def test_one_image_is_as_good_as_three_boards_alone(rng: np.random.Generator) -> None:
     """With one image there is nothing to tie: as many unknowns, the same camera; and the boards' geometry."""
     room = corner_of_a_room(rng, DIFFERENT)
