@@ -44,7 +44,12 @@ NEAREST_IN, NEAREST_OUT = 16, 6
 ALIKE = 0.5
 """Sides of neighbouring cells across the gap differ less than this, relative to the longer side."""
 
-MEETS_CELLS = 0.15
+MEETS_CELLS, MEETS_AT_ALL = 0.15, 0.42
+"""Corners of the other part lie this near to where a homography of the one says, in cells; within the larger of the
+two, a lens may have bent the rows, and the parts are asked what lies between them."""
+
+AGREES_CELLS, BETWEEN = 0.12, 8
+"""So far apart is what the two parts say of the cells between them, in cells, for the cells that both know best."""
 
 LOOSE_CELLS, MAX_GAIN = 0.08, 8.0
 """A corner that hangs on to a lattice is this near to where the others say, in cells for a prediction as good as a
@@ -129,7 +134,11 @@ def _same_board(one: _Part, two: _Part) -> bool:
     """Return whether two parts of one lattice continue each other."""
     gap = one.pixels[:, None] - two.pixels
     near, place = _carried_over(one, two, np.hypot(gap[..., 0], gap[..., 1]))
-    return bool(np.abs(place - two.grid[near]).max() < MEETS_CELLS)
+    off = float(np.abs(place - two.grid[near]).max())
+    if not MEETS_CELLS <= off < MEETS_AT_ALL:
+        return off < MEETS_CELLS
+    pixels = np.where(one.lattice.known[..., None], one.lattice.pixels, two.lattice.pixels)
+    return _agree(pixels, one.lattice.known, two.lattice.known)
 
 
 def _absorb(lattice: Lattice, groups: list[BoolArray]) -> None:
@@ -231,13 +240,42 @@ def _joined(one: _Part, two: _Part) -> Lattice | None:
         return None
     near, place = _carried_over(one, two, apart)
     whole = np.rint(place)
-    if not np.abs(place - whole).max() < MEETS_CELLS:
+    off = float(np.abs(place - whole).max())
+    if not off < MEETS_AT_ALL:
         return None
     for quarter in range(4):
         shift = whole.astype(np.int64) - _turned_grid(two.grid[near], two.lattice.size, quarter)
         if (shift == shift[0]).all():
-            return _united(one.lattice, two.lattice.turned(quarter), shift[0])
+            united = _united(one.lattice, two.lattice.turned(quarter), shift[0])
+            if united is None or off < MEETS_CELLS:
+                return united
+            left, top = np.maximum(0, -shift[0])
+            mine = np.zeros(united.known.shape, bool)
+            mine[top : top + one.lattice.size[1], left : left + one.lattice.size[0]] = one.lattice.known
+            return united if _agree(united.pixels, mine, united.known & ~mine) else None
     return None
+
+
+def _agree(pixels: FloatArray, one: BoolArray, two: BoolArray) -> bool:
+    """Return whether two parts of the corners `pixels` (R, C, 2) say the same of the cells between them.
+
+    Each goes on as a smooth surface to half way, whatever the lens: the stiffer one bears corners that the ruler covers
+    in part, the more pliant one rows that bend strongly.
+    """
+    reach = np.ones((2 * GAP + 1, 2 * GAP + 1), np.uint8)
+    between = (cv2.dilate(one.astype(np.uint8), reach) > 0) & (cv2.dilate(two.astype(np.uint8), reach) > 0)
+    for degree, ridge in ((2, (0.02, 1.0)), (3, (1e-3, 1e-2))):
+        mine, theirs = (
+            fit_cells(np.where(part[..., None], pixels, np.nan), between, degree=degree, width=1.3, ridge=ridge)
+            for part in (one, two)
+        )
+        gain = np.where((mine.support > 3) & (theirs.support > 3), np.maximum(mine.gain, theirs.gain), np.inf)
+        best = np.argsort(gain)[: min(BETWEEN, int(np.isfinite(gain).sum()))]
+        side = np.minimum(np.hypot(*mine.along_column[best].T), np.hypot(*mine.along_row[best].T))
+        apart = np.hypot(*(mine.pixels - theirs.pixels)[best].T) / np.maximum(side, 1e-9)
+        if len(best) and np.median(apart) < AGREES_CELLS:
+            return True
+    return False
 
 
 def _carried_over(one: _Part, two: _Part, apart: FloatArray) -> tuple[IntArray, FloatArray]:

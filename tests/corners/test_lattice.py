@@ -138,3 +138,18 @@ def test_a_corner_astray_is_left_out() -> None:
     (part,) = split_necks(loose)
     assert part.size == (7, 4)
     assert part.count == 28
+
+
+def test_parts_join_across_a_ruler_in_a_fisheye() -> None:
+    """Rows that bend strongly: no homography carries the one part over to the other, but smooth rows do."""
+    row, column = np.mgrid[:8, :9].astype(float)
+    plane = np.stack([0.12 * (column - 1.0), 0.12 * (row - 2.0)], axis=-1)
+    radius = np.maximum(np.linalg.norm(plane, axis=-1, keepdims=True), 1e-9)
+    pixels = 320.0 + 250.0 * np.arctan(radius) * plane / radius
+    whole = Lattice(pixels, np.full((8, 9), 100.0), True)
+    left, right = whole.cut(slice(0, 8), slice(0, 4)), whole.cut(slice(0, 8), slice(5, 9))
+    (joined,) = join_parts([left, right])
+    assert joined.count == 64
+    assert joined.size == (9, 8)
+    moved = Lattice(right.pixels + np.array([0.0, 6.0]), right.contrast, right.rising)
+    assert len(join_parts([left, moved])) == 2
