@@ -114,7 +114,8 @@ def calibrate(
         chosen = _choose(observations, shapes)
         candidates += [c for c in _described(shapes, chosen) if "board" in c.name]
     result = assemble(observations, chosen.fit, chosen.heldout_px, dropped, tuple(candidates))
-    at_corners = uncertainty_at_corners(result)
+    points, _ = chosen.fit.state.points_in_cam(observations)
+    at_corners = uncertainty_at_corners(result, points[chosen.fit.kept])
     require_determined(result, at_corners)
     moved = moved_lens(observations, chosen.fit) if folds else ()
     return replace(result, verdicts=judge(result, moved, at_corners_px=at_corners))

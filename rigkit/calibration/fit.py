@@ -9,10 +9,10 @@ import numpy as np
 from rigkit.arrays import BoolArray, FloatArray, IntArray
 from rigkit.calibration.initialise import initialise
 from rigkit.calibration.normal import Normal, Residuals
-from rigkit.calibration.observations import Observations
+from rigkit.calibration.observations import Observations, median_of
 from rigkit.calibration.poses import find_poses, refine_poses
 from rigkit.calibration.result import Convergence
-from rigkit.calibration.solver import State, evaluate, one_step, solve
+from rigkit.calibration.solver import State, equations, evaluate, solve
 from rigkit.cameras.base import Camera, image_center
 from rigkit.errors import DegenerateError
 
@@ -76,12 +76,7 @@ class Fit:
 def sigma_of(norm: FloatArray, used: BoolArray | IntArray) -> float:
     """Return the robust standard deviation per coordinate, median |r| / 1.177, of the corners `used`."""
     chosen = norm[used]
-    if not chosen.size:
-        return SIGMA_FLOOR_PX
-    # np.median takes four times as long, mostly to look for NaN, which `norm` has none of.
-    low, high = (chosen.size - 1) // 2, chosen.size // 2
-    chosen.partition((low, high))
-    return max(0.5 * float(chosen[low] + chosen[high]) / RAYLEIGH_MEDIAN, SIGMA_FLOOR_PX)
+    return max(median_of(chosen) / RAYLEIGH_MEDIAN, SIGMA_FLOOR_PX) if chosen.size else SIGMA_FLOOR_PX
 
 
 def robust_sigma(fit: Fit, observations: Observations) -> float:
@@ -111,42 +106,62 @@ def fit_model(observations: Observations, size_px: tuple[int, int], model: type[
 
     Raises DegenerateError where no start explains the views.
     """
-    best: tuple[float, State, FloatArray] | None = None
+    best: _Found | None = None
     for start in initialise(observations, size_px, model, order):
-        norm = evaluate(start, observations).weighted(observations)
-        sigma = sigma_of(norm, observations.present)
-        if not np.isfinite(sigma):
+        here = _Found.at(start, equations(observations, start), observations)
+        if not np.isfinite(here.sigma_px):
             continue
-        state, norm, sigma = _robust(observations, start, sigma)
-        if best is None or sigma < best[0]:
-            best = (sigma, state, norm)
-        if sigma < GOOD_ENOUGH * size_px[0]:
+        found = _clean(observations, here) or _robust(observations, start, here.sigma_px)
+        if best is None or found.sigma_px < best.sigma_px:
+            best = found
+        if found.sigma_px < GOOD_ENOUGH * size_px[0]:
             break
     if best is None:
         raise DegenerateError(
             f"calibration: no {model.model} camera explains the views even roughly; take views in which the board is "
             "tilted, and check the board's size"
         )
-    sigma, state, norm = best
-    return _settled(observations, state, norm, inliers(norm, observations, sigma, size_px), SETTLE_ROUNDS)
+    kept = inliers(best.norm, observations, best.sigma_px, size_px)
+    clean = bool((kept == observations.present).all())
+    return _settled(observations, best.state, best.norm, kept, SETTLE_ROUNDS, best.data if clean else None)
 
 
-def _robust(observations: Observations, state: State, start_sigma: float) -> tuple[State, FloatArray, float]:
-    """Return the state after a coarse and a fine robust solve, its weighted residuals and their robust standard
-    deviation; views that fit badly get their pose found anew. `start_sigma` is that of `state`."""
+@dataclass(frozen=True, eq=False, slots=True)
+class _Found:
+    """A state found robustly, its weighted residuals and their robust standard deviation; the normal equations of all
+    corners there, where they are known."""
+
+    state: State
+    norm: FloatArray
+    sigma_px: float
+    data: Normal | None = None
+
+    @classmethod
+    def at(cls, state: State, data: Normal, observations: Observations) -> _Found:
+        """Return the state with what follows from the normal equations there."""
+        norm = data.residuals[0].weighted(observations)
+        return cls(state, norm, sigma_of(norm, observations.present), data)
+
+
+def _clean(observations: Observations, start: _Found) -> _Found | None:
+    """Return the state after one step of least squares if no corner is an outlier there, None otherwise. From a good
+    start to clean corners there is nothing for a robust loss to do."""
+    sigma = start.sigma_px
+    one = solve(observations, start.state, prior_sigma_px=sigma, max_iterations=1, at_start=start.data)
+    found = _Found.at(one.state, one.data, observations)
+    return found if found.sigma_px <= sigma and found.norm.max() <= OUTLIER_SIGMAS * found.sigma_px else None
+
+
+def _robust(observations: Observations, state: State, start_sigma: float) -> _Found:
+    """Return what a coarse and a fine robust solve find; views that fit badly get their pose found anew. `start_sigma`
+    is that of `state`."""
     present = observations.present
     loss = CAUCHY_SIGMAS * start_sigma
-    # One step from a good start is enough to see that there are no outliers, if there are none.
-    trial = one_step(observations, state, loss)
-    norm = evaluate(trial, observations).weighted(observations)
-    sigma = sigma_of(norm, present)
-    if sigma <= start_sigma and norm.max() <= OUTLIER_SIGMAS * sigma:
-        return trial, norm, sigma
     coarse = solve(observations, state, loss_px=loss, max_iterations=15, cost_tolerance=COARSE)
     state, norm = coarse.state, coarse.data.residuals[0].weighted(observations)
     sigma = sigma_of(norm, present)
     if not norm.max() > OUTLIER_SIGMAS * sigma:
-        return state, norm, sigma  # nothing for a robust loss to do
+        return _Found(state, norm, sigma)  # nothing for a robust loss to do
     # Padding is left out of the medians by standing beyond all corners.
     ordered = np.sort(np.where(present, norm, np.inf), axis=1)
     of_view = ordered[np.arange(len(norm)), np.maximum(present.sum(axis=1) - 1, 0) // 2] / RAYLEIGH_MEDIAN
@@ -159,7 +174,7 @@ def _robust(observations: Observations, state: State, start_sigma: float) -> tup
         state = replace(state, rotation=rotation, translation_mm=translation)
     fine = solve(observations, state, loss_px=CAUCHY_SIGMAS * sigma, max_iterations=30, cost_tolerance=FINE)
     norm = fine.data.residuals[0].weighted(observations)
-    return fine.state, norm, sigma_of(norm, present)
+    return _Found(fine.state, norm, sigma_of(norm, present))
 
 
 def fit_kept(observations: Observations, state: State, kept: BoolArray, *, settle: bool = False) -> Fit:
@@ -169,11 +184,20 @@ def fit_kept(observations: Observations, state: State, kept: BoolArray, *, settl
     return _settled(observations, state, norm, kept, SETTLE_ROUNDS if settle else 1)
 
 
-def _settled(observations: Observations, state: State, norm: FloatArray, kept: BoolArray, rounds: int) -> Fit:
-    """As `fit_kept`, with the weighted residuals `norm` of the state."""
+def _settled(
+    observations: Observations,
+    state: State,
+    norm: FloatArray,
+    kept: BoolArray,
+    rounds: int,
+    data: Normal | None = None,
+) -> Fit:
+    """As `fit_kept`, with the weighted residuals `norm` of the state, and the normal equations of the kept corners
+    there, where they are known."""
     for again in range(1, rounds + 1):
         weight = np.where(kept, observations.weight, 0.0)
-        solution = solve(observations, state, weight=weight, prior_sigma_px=sigma_of(norm, kept))
+        solution = solve(observations, state, weight=weight, prior_sigma_px=sigma_of(norm, kept), at_start=data)
+        data = None
         state, norm = solution.state, solution.data.residuals[0].weighted(observations)
         agree = inliers(norm, observations, sigma_of(norm, kept), state.camera.size_px)
         if again == rounds or (agree == kept).all():

@@ -18,7 +18,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rigkit.arrays import FloatArray, Mat3, Points
-from rigkit.calibration.observations import Observations
+from rigkit.calibration.observations import Observations, median_of
 from rigkit.calibration.radial_alignment import Alignment, align, distortion_centre
 from rigkit.calibration.solver import State, evaluate
 from rigkit.cameras.base import Camera, image_center
@@ -157,7 +157,7 @@ class _Depths:
             z = (a @ self._rows[:, which[:-1]]) + (self._middle[:, which[:-1]] @ a)[:, None]
             slope = s / np.maximum(s * s + z * z, 1e-300)
             residual = np.abs(z - t3[:, None] - sign[:, None] * depth) * slope
-            scale = 2.5 * 1.4826 * float(np.median(residual[self._used])) + 1e-9
+            scale = 2.5 * 1.4826 * median_of(residual[self._used]) + 1e-9
             weight = np.where(self._used, self._weight * slope / (1.0 + (residual / scale) ** 2), 0.0)
             a, sign, t3 = self._joint(which, weight, sign)
         radius = np.linspace(0.0, 1.0, SAMPLES)

@@ -13,7 +13,7 @@ from rigkit.boards import Board
 from rigkit.detections import BoardView
 from rigkit.errors import InputError
 
-__all__ = ["Observations"]
+__all__ = ["Observations", "median_of"]
 
 SIGMA_RANGE = 8.0
 """Corner sigmas are believed within this factor of their median: a predicted 0.001 px must not rule the solution."""
@@ -88,14 +88,17 @@ class Observations:
         sigma = np.ones(present.shape)
         corner += first_row[board][:, None]
         if views:
-            pixels[present] = np.concatenate([view.pixels for view in views])
-            sigma[present] = np.concatenate([view.sigma_px for view in views])
-            size = np.array([view.board.size for view in views])
+            flat = np.flatnonzero(present)
+            view_of = np.repeat(np.arange(len(views)), length)
+            pixels.reshape(-1, 2)[flat] = np.concatenate([view.pixels for view in views])
+            own_sigma = np.concatenate([view.sigma_px for view in views])
+            sigma.reshape(-1)[flat] = own_sigma
+            size = np.array([one.size for one in boards.values()])[board[view_of]]
             grid = np.concatenate([view.grid for view in views])
-            view_of = np.nonzero(present)[0]
-            _check(views, view_of, grid, size[view_of], sigma[present])
-            corner[present] += grid[:, 1] * size[view_of, 0] + grid[:, 0]
-            _check_once(views, view_of, corner[present], int(first_row[-1]))
+            _check(views, view_of, grid, size, own_sigma)
+            row = first_row[board[view_of]] + grid[:, 1] * size[:, 0] + grid[:, 0]
+            _check_once(views, view_of, row, int(first_row[-1]))
+            corner.reshape(-1)[flat] = row
         weight = _weights(sigma, present)
         table = tuple(boards.values())
         return cls(tuple(views), pixels, corner, sigma, weight, present, table, first_row, board)
@@ -152,7 +155,14 @@ def _check_once(views: Sequence[BoardView], view_of: IntArray, corner: IntArray,
         raise InputError(f"image '{view.image}': a corner of board '{view.board.board_id}' comes twice")
 
 
+def median_of(values: FloatArray) -> float:
+    """Return the median of N > 0 numbers, which are reordered. np.median takes four times as long, to look for NaN."""
+    low, high = (values.size - 1) // 2, values.size // 2
+    values.partition((low, high))
+    return 0.5 * float(values[low] + values[high])
+
+
 def _weights(sigma: FloatArray, present: BoolArray) -> FloatArray:
-    median = float(np.median(sigma[present])) if present.any() else 1.0
-    sigma = np.clip(sigma, median / SIGMA_RANGE, median * SIGMA_RANGE)
+    median = median_of(sigma[present]) if present.any() else 1.0
+    sigma = np.minimum(np.maximum(sigma, median / SIGMA_RANGE), median * SIGMA_RANGE)
     return np.where(present, median / sigma, 0.0)

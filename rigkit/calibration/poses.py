@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.arrays import FloatArray
-from rigkit.calibration.normal import Normal, normal_equations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.radial_alignment import align
-from rigkit.calibration.solver import State
+from rigkit.calibration.solver import State, equations
 from rigkit.geometry.rotation import exp_so3, nearest_rotation
 
 __all__ = ["find_poses", "refine_poses"]
@@ -28,19 +27,7 @@ def refine_poses(
     Levenberg-Marquardt with a damping of its own for each view. `loss_px` is the scale of the Cauchy loss.
     """
 
-    def linearise(s: State) -> Normal:
-        return normal_equations(
-            s.camera,
-            s.rotation,
-            s.translation_mm,
-            s.shape,
-            s.unknowns,
-            observations,
-            weight,
-            loss_px,
-        )
-
-    normal = linearise(state)
+    normal = equations(observations, state, weight, loss_px)
     pp, p, cost = normal.pp, normal.p, normal.costs
     damping = np.full(len(cost), DAMPING_START)
     active = np.ones(len(cost), dtype=bool)
@@ -55,7 +42,7 @@ def refine_poses(
             rotation=exp_so3(step[:, :3]) @ state.rotation,
             translation_mm=state.translation_mm + step[:, 3:],
         )
-        normal = linearise(trial)
+        normal = equations(observations, trial, weight, loss_px)
         better = active & (normal.costs < cost)
         state = replace(
             state,

@@ -25,6 +25,10 @@ SUBSET_SIZE = 7
 """With 5 % bad corners 70 % of such subsets are clean; 16 miss once in 10^8 views."""
 SUSPICIOUS = 8.0
 """A largest residual of more than this many robust sigmas sends the view through random subsets."""
+SHIFT = 1e-13
+"""Of the trace, keeps the normal matrix of exact corners invertible."""
+INVERSE_STEPS = 3
+"""Each brings the vector nearer by the ratio of the two smallest eigenvalues, the noise against the view's tilt."""
 SQUARE_ROW, SQUARE_COLUMN = np.triu_indices(3)
 """The six different products of two of three numbers."""
 NORMAL = 3 * np.tile([[0, 1, 2], [1, 3, 4], [2, 4, 5]], (2, 2)) + np.kron([[0, 1], [1, 2]], np.ones((3, 3), dtype=int))
@@ -76,7 +80,7 @@ def align(offset: FloatArray, board: FloatArray, weight: FloatArray) -> Alignmen
     for _ in range(ROUNDS):
         sigma = _sigma(residual, used)
         robust = np.where(used, weight / (1.0 + (residual / (2.5 * sigma[:, None])) ** 2), 0.0)
-        h = views.fit(robust / radius)
+        h = views.fit(robust / radius, h)
         residual, radius = views.residual(h)
         if not bad.any():
             break
@@ -110,11 +114,20 @@ class _Views:
         self._squares = local[..., SQUARE_ROW, :] * local[..., SQUARE_COLUMN, :]
         self._direction = np.stack([self._v * self._v, -self._u * self._v, self._u * self._u], axis=-2)
 
-    def fit(self, weight: FloatArray) -> FloatArray:
-        """Return the unit h (..., 6) that minimises sum weight^2 (u Y - v X)^2."""
+    def fit(self, weight: FloatArray, start: FloatArray | None = None) -> FloatArray:
+        """Return the unit h (..., 6) that minimises sum weight^2 (u Y - v X)^2, from a `start` near it if there is one:
+        inverse iteration then costs half of all eigenvectors."""
         moments = self._squares @ np.swapaxes(self._direction * (weight * weight)[..., None, :], -1, -2)
         normal = moments.reshape(*weight.shape[:-1], -1)[..., NORMAL]
-        return np.asarray(np.linalg.eigh(normal)[1][..., 0])
+        if start is None:
+            return np.asarray(np.linalg.eigh(normal)[1][..., 0])
+        trace = np.trace(normal, axis1=-2, axis2=-1)[..., None]
+        inverse = np.linalg.inv(normal + (SHIFT * trace + np.finfo(float).tiny)[..., None] * np.eye(6))
+        h = start[..., None]
+        for _ in range(INVERSE_STEPS):
+            h = inverse @ h
+            h /= np.sqrt((h * h).sum(axis=-2, keepdims=True))
+        return np.asarray(h[..., 0])
 
     def camera_xy(self, h: FloatArray) -> FloatArray:
         """Return (X, Y) (..., 2, C)."""

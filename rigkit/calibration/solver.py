@@ -25,7 +25,7 @@ from rigkit.cameras.base import Camera
 from rigkit.errors import RigkitError
 from rigkit.geometry.rotation import exp_so3
 
-__all__ = ["Linearised", "Residuals", "Solution", "State", "evaluate", "minimise", "one_step", "solve"]
+__all__ = ["Linearised", "Residuals", "Solution", "State", "equations", "evaluate", "minimise", "solve"]
 
 S = TypeVar("S")
 
@@ -96,12 +96,20 @@ def evaluate(state: State, observations: Observations) -> Residuals:
     return Residuals(residuals if valid.all() else np.where(valid[..., None], residuals, lost_px(state.camera)), valid)
 
 
-def one_step(observations: Observations, start: State, loss_px: float) -> State:
-    """Return the state after one Gauss-Newton step of the robust problem, whether its cost is smaller or not; `start`
-    itself where there is no such step."""
-    step = _Solver(observations, observations.weight, loss_px, 0.2).linearise(start).normal.step(DAMPING_START)
-    moved = None if step is None else _moved(start, step)
-    return start if moved is None else moved
+def equations(
+    observations: Observations, state: State, weight: FloatArray | None = None, loss_px: float | None = None
+) -> Normal:
+    """Return the normal equations at `state`, without priors; `weight` and `loss_px` as for `solve`."""
+    return normal_equations(
+        state.camera,
+        state.rotation,
+        state.translation_mm,
+        state.shape,
+        state.unknowns,
+        observations,
+        observations.weight if weight is None else weight,
+        loss_px,
+    )
 
 
 def solve(
@@ -113,6 +121,7 @@ def solve(
     prior_sigma_px: float = 0.2,
     max_iterations: int = MAX_ITERATIONS,
     cost_tolerance: float = COST_TOLERANCE,
+    at_start: Normal | None = None,
 ) -> Solution:
     """Return the state that minimises the weighted residuals from `start`, and how the solver ended. Never raises for
     lack of data: what is not determined stays where it started.
@@ -124,10 +133,12 @@ def solve(
     loss_px : scale of the Cauchy loss; None for least squares.
     prior_sigma_px : standard deviation of a corner, which sets residuals against the priors of shape and camera; zero
         for none.
+    at_start : the normal equations at `start`, without priors, where they are known.
     """
     weight = observations.weight if weight is None else weight
     solver = _Solver(observations, weight, loss_px, prior_sigma_px)
-    state, last, convergence = minimise(start, solver.linearise, _moved, max_iterations, cost_tolerance)
+    here = None if at_start is None else solver.with_priors(start, at_start)
+    state, last, convergence = minimise(start, solver.linearise, _moved, max_iterations, cost_tolerance, here)
     return Solution(state, last.data, convergence)
 
 
@@ -139,18 +150,11 @@ class _Solver:
     prior_sigma_px: float
 
     def linearise(self, state: State) -> Linearised:
-        normal = normal_equations(
-            state.camera,
-            state.rotation,
-            state.translation_mm,
-            state.shape,
-            state.unknowns,
-            self.observations,
-            self.weight,
-            self.loss_px,
-        )
+        return self.with_priors(state, equations(self.observations, state, self.weight, self.loss_px))
+
+    def with_priors(self, state: State, data: Normal) -> Linearised:
         priors = state.camera, self.prior_sigma_px, state.shape.sigma, state.unknowns
-        return Linearised(normal, normal.with_priors(*priors))
+        return Linearised(data, data.with_priors(*priors))
 
 
 def minimise(
@@ -159,13 +163,15 @@ def minimise(
     moved: Callable[[S, Step], S | None],
     max_iterations: int = MAX_ITERATIONS,
     tolerance: float = COST_TOLERANCE,
+    here: Linearised | None = None,
 ) -> tuple[S, Linearised, Convergence]:
     """Return the state of least cost near `state`, the problem around it, and how it ended: Levenberg-Marquardt.
 
     `linearise` gives cost and normal equations together: nearly every step is taken, so hardly any are in vain.
-    `moved` returns the state after a step, None where there is no such state.
+    `moved` returns the state after a step, None where there is no such state. `here` is the problem around the start,
+    where it is known.
     """
-    here = linearise(state)
+    here = linearise(state) if here is None else here
     damping, growth = DAMPING_START, DAMPING_GROWTH
     for iteration in range(1, max_iterations + 1):
         step = here.normal.step(damping)

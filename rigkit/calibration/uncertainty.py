@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, Pixels
+from rigkit.arrays import BoolArray, FloatArray, IntArray, Pixels, Points
 from rigkit.calibration.result import Calibration
 
 __all__ = ["Uncertainty", "projection_uncertainty", "uncertainty_at_corners", "uncertainty_map"]
@@ -44,42 +44,60 @@ class Uncertainty:
     @property
     def worst_px(self) -> FloatArray:
         """Standard deviation in the worst direction, (...,) px, NaN where invalid."""
-        a, b, c = self.covariance[..., 0, 0], self.covariance[..., 0, 1], self.covariance[..., 1, 1]
-        return np.sqrt(0.5 * (a + c) + np.hypot(0.5 * (a - c), b))
+        return _worst(self.covariance)
 
 
 def projection_uncertainty(calibration: Calibration, pixels: Pixels, *, range_mm: float = np.inf) -> Uncertainty:
     """Return the uncertainty of the projection at `pixels` (..., 2) of points `range_mm` away (infinity by default)."""
-    camera = calibration.camera
     pixels = np.asarray(pixels, dtype=np.float64)
-    rays, valid = camera.unproject(pixels)
+    rays, valid = calibration.camera.unproject(pixels)
     flat = np.where(valid[..., None], rays, [0.0, 0.0, 1.0]).reshape(-1, 3)
-    _, _, by_point, by_camera = camera.project_with_jacobians(flat)
+    covariance = _covariance(calibration, flat, range_mm).reshape(*valid.shape, 2, 2)
+    return Uncertainty(pixels, np.where(valid[..., None, None], covariance, np.nan), valid)
+
+
+def _worst(covariance: FloatArray) -> FloatArray:
+    """Return the standard deviation in the worst direction (...,) of covariances (..., 2, 2)."""
+    a, b, c = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
+    return np.sqrt(0.5 * (a + c) + np.hypot(0.5 * (a - c), b))
+
+
+def _covariance(calibration: Calibration, rays: FloatArray, range_mm: float) -> FloatArray:
+    """Return the covariance (M, 2, 2) of the projection along rays (M, 3); unit rays, unless the range is infinite."""
+    camera = calibration.camera
     # Unknowns first, pixels last: one matrix product for each coordinate. At infinity the world's shift shows nothing.
-    p = by_camera.shape[-1]
+    p = camera.parameters.size
     count = p + 3 if np.isinf(range_mm) else p + 6
-    design = np.empty((2, count, len(flat)))
-    design[:, :p] = np.moveaxis(by_camera, 0, -1)
-    ray, by_x = flat.T, np.moveaxis(by_point, 0, -1)
+    design, by_x = np.zeros((2, count, len(rays))), np.empty((2, 3, len(rays)))
+    ray = np.ascontiguousarray(rays.T)
+    camera.derivatives(ray[0], ray[1], ray[2], by_x, design[:, :p])
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
         design[:, p + k] = ray[i] * by_x[:, j] - ray[j] * by_x[:, i]
     if count > p + 3:
         design[:, p + 3 :] = by_x / range_mm
     moved = calibration.frame_covariance[:count, :count] @ design
-    covariance = np.empty((len(flat), 2, 2))
+    covariance = np.empty((len(rays), 2, 2))
     for i, j in ((0, 0), (0, 1), (1, 1)):
         covariance[:, i, j] = covariance[:, j, i] = np.einsum("kn,kn->n", design[i], moved[j])
-    covariance = covariance.reshape(*valid.shape, 2, 2)
-    return Uncertainty(pixels, np.where(valid[..., None, None], covariance, np.nan), valid)
+    return covariance
 
 
-def uncertainty_at_corners(calibration: Calibration) -> FloatArray:
-    """Return the standard deviation in the worst direction, (M,) px, at up to 400 of the corners used."""
-    kept = np.concatenate([view.kept for view in calibration.views])
-    pixels = np.concatenate([view.pixels for view in calibration.views])[kept]
-    chosen = np.linspace(0, len(pixels) - 1, min(CORNERS, len(pixels))).astype(np.int64)
-    return projection_uncertainty(calibration, pixels[chosen]).worst_px
+def uncertainty_at_corners(calibration: Calibration, points_in_cam: Points | None = None) -> FloatArray:
+    """Return the standard deviation in the worst direction, (M,) px, at up to 400 of the corners used.
+
+    `points_in_cam` (N, 3) are the board's corners in the camera frame, of the corners used, where they are known: it
+    saves the way back from the pixels.
+    """
+    if points_in_cam is None:
+        kept = np.concatenate([view.kept for view in calibration.views])
+        pixels = np.concatenate([view.pixels for view in calibration.views])[kept]
+        return projection_uncertainty(calibration, pixels[_spread(len(pixels))]).worst_px
+    return _worst(_covariance(calibration, points_in_cam[_spread(len(points_in_cam))], np.inf))
+
+
+def _spread(count: int) -> IntArray:
+    return np.linspace(0, count - 1, min(CORNERS, count)).astype(np.int64)
 
 
 def uncertainty_map(

@@ -131,7 +131,8 @@ def _images(c: Calibration) -> list[str]:
 def _coverage(c: Calibration) -> list[str]:
     """Name the cells of the image that no board reached, where the lens has an image at all."""
     width, height = c.camera.size_px
-    pixels = np.concatenate([v.pixels[v.kept] for v in c.views])
+    kept = np.concatenate([v.kept for v in c.views])
+    pixels = np.concatenate([v.pixels for v in c.views])[kept]
     size = np.array([width / CELLS[0], height / CELLS[1]])
     cell = np.clip((pixels / size).astype(np.int64), 0, np.array(CELLS) - 1)
     count = np.bincount(cell[:, 0] * CELLS[1] + cell[:, 1], minlength=CELLS[0] * CELLS[1]).reshape(CELLS)
@@ -165,9 +166,9 @@ def _views(c: Calibration) -> list[str]:
     if len(c.views) < 3:
         return []
     lengths = np.array([len(v.grid) for v in c.views])
-    out = lengths - [int(v.kept.sum()) for v in c.views]
+    out = lengths - [np.count_nonzero(v.kept) for v in c.views]
     # Of all corners: a view that is bad throughout has its worst corners among the outliers.
-    residual = np.linalg.norm(np.nan_to_num(np.concatenate([v.residuals_px for v in c.views])), axis=1)
+    residual = np.hypot(*np.nan_to_num(np.concatenate([v.residuals_px for v in c.views])).T)
     middle = _medians(residual, lengths)
     usual = max(float(np.median(middle)), np.finfo(float).tiny)
     times = middle / usual
@@ -203,12 +204,15 @@ def _pattern(c: Calibration) -> list[str]:
     kept = np.concatenate([v.kept for v in c.views])
     view = np.repeat(np.arange(len(c.views)), [len(v.grid) for v in c.views])
     columns, rows = (grid.max(axis=0) + 1).tolist()
-    lattice = np.full((len(c.views), rows, columns, 2), np.nan)
-    lattice[view[kept], grid[kept, 1], grid[kept, 0]] = np.concatenate([v.residuals_px for v in c.views])[kept]
+    lattice, there = np.zeros((len(c.views) * rows * columns, 2)), np.zeros(len(c.views) * rows * columns)
+    place = ((view * rows + grid[:, 1]) * columns + grid[:, 0])[kept]
+    lattice[place], there[place] = np.concatenate([v.residuals_px for v in c.views])[kept], 1.0
+    lattice, there = lattice.reshape(-1, rows, columns, 2), there.reshape(-1, rows, columns)
+    squared = lattice[..., 0] ** 2 + lattice[..., 1] ** 2
     products, power = 0.0, 0.0
-    for a, b in ((lattice[:, :, 1:], lattice[:, :, :-1]), (lattice[:, 1:], lattice[:, :-1])):
-        products += float(np.nansum(a * b))
-        power += 0.5 * float(np.nansum(a**2 + b**2))
+    for one, other in ((np.s_[:, :, 1:], np.s_[:, :, :-1]), (np.s_[:, 1:], np.s_[:, :-1])):
+        products += float((lattice[one] * lattice[other]).sum())
+        power += 0.5 * float((squared[one] * there[other] + squared[other] * there[one]).sum())
     if not power > 0.0 or products / power < PATTERN:
         return []
     what = f"look: residuals of neighbouring corners agree (correlation {products / power:.2f}): "
