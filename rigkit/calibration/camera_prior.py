@@ -6,9 +6,11 @@ millionth of that). One or two views do not determine a lens by themselves: thes
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
-from rigkit.arrays import FloatArray
+from rigkit.arrays import FloatArray, IntArray
 from rigkit.cameras.base import Camera, image_center
 
 __all__ = ["camera_prior"]
@@ -25,25 +27,39 @@ DENOMINATOR_SIGMA = 1.0
 
 def camera_prior(camera: Camera) -> tuple[FloatArray, FloatArray]:
     """Return d r / d parameters (m, P) and r (m,): departures from what is expected, in standard deviations."""
-    place = {name: i for i, name in enumerate(camera.parameter_names())}
-    values = camera.parameters.tolist()
-    middle = image_center(camera.size_px).tolist()
-    reach = CENTRE_SIGMA * max(camera.size_px)
+    fixed, index, mean, sigma, focal = _layout(camera.parameter_names(), camera.size_px)
+    values = camera.parameters
+    rows, residuals = fixed.copy(), np.empty(len(fixed))
+    residuals[: len(index)] = (values[index] - mean) / sigma
+    if focal is not None:
+        x, y = focal
+        fx, fy = float(values[x]), float(values[y])
+        size = SQUARE_SIGMA * 0.5 * (abs(fx) + abs(fy))
+        rows[-1, x], rows[-1, y], residuals[-1] = 1.0 / size, -1.0 / size, (fx - fy) / size
+    return rows, residuals
+
+
+@lru_cache(maxsize=32)
+def _layout(
+    names: tuple[str, ...], size_px: tuple[int, int]
+) -> tuple[FloatArray, IntArray, FloatArray, FloatArray, tuple[int, int] | None]:
+    """Return the rows of the prior that are the same for every camera with these parameters (and a row of zeros for the
+    ratio of the focal lengths where there are two), the parameters that they are about, with means and standard
+    deviations, and the places of the focal lengths."""
+    middle = image_center(size_px).tolist()
+    reach = CENTRE_SIGMA * max(size_px)
     expected = {
         "cx": (middle[0], reach),
         "cy": (middle[1], reach),
         "c": (1.0, SQUARE_SIGMA),
         "d": (0.0, SQUARE_SIGMA),
     }
-    if "k6" in place:
+    if "k6" in names:
         expected |= dict.fromkeys(("k4", "k5", "k6"), (0.0, DENOMINATOR_SIGMA))
-    known = [(place[name], *prior) for name, prior in expected.items() if name in place]
-    square = "fx" in place and "fy" in place
-    rows, residuals = np.zeros((len(known) + square, len(values))), np.zeros(len(known) + square)
-    for row, (k, mean, sigma) in enumerate(known):
-        rows[row, k], residuals[row] = 1.0 / sigma, (values[k] - mean) / sigma
-    if square:
-        x, y = place["fx"], place["fy"]
-        sigma = SQUARE_SIGMA * 0.5 * (abs(values[x]) + abs(values[y]))
-        rows[-1, x], rows[-1, y], residuals[-1] = 1.0 / sigma, -1.0 / sigma, (values[x] - values[y]) / sigma
-    return rows, residuals
+    known = [name for name in expected if name in names]
+    index = np.array([names.index(name) for name in known], dtype=np.int64)
+    mean, sigma = np.array([expected[name] for name in known]).reshape(-1, 2).T
+    focal = (names.index("fx"), names.index("fy")) if "fx" in names and "fy" in names else None
+    rows = np.zeros((len(known) + (focal is not None), len(names)))
+    rows[np.arange(len(known)), index] = 1.0 / sigma
+    return rows, index, mean, sigma, focal
