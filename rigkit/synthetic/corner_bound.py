@@ -7,7 +7,7 @@ that blur and noise are the same over the cell, the noise's level. Corners are b
 plane and one lens is not used, nor do detectors.
 
 The derivatives are differences of rendered images, noise-free and before rounding: the scene moved by a part of a
-pixel along u and v (second differences give the blur's). Moving one line only is a motion of the picture that shears
+pixel along u and v, and blurred a little more or less. Moving one line only is a motion of the picture that shears
 along the other line.
 """
 
@@ -29,7 +29,8 @@ __all__ = ["ROUNDING_VARIANCE", "corner_information", "position_bound"]
 ROUNDING_VARIANCE = 1.0 / 12.0
 """Of rounding to whole grey levels, which is noise wherever brightness varies: it bounds noise-free images, too."""
 SHIFT_PX = 0.07
-"""Half width of the differences: the next derivatives of an edge of blur 0.3 add less than one per cent."""
+"""Half width of the differences: the third derivative of an edge of blur 0.3 adds less than one per cent."""
+BLUR_STEP_PX = 0.02
 HALF_CELL = 0.5
 """Pixels of a cell: up to this from the corner along both sides."""
 PARAMETERS = 9
@@ -41,14 +42,12 @@ def corner_information(scene: BenchScene, blur_px: float) -> tuple[FloatArray, .
 
     Divide by the noise's variance, ROUNDING_VARIANCE included. NaN where a cell holds too few pixels.
     """
-    plain = _levels(scene, blur_px)
-    slopes, bows = [], []
+    slopes = []
     for axis in (0, 1):
         before, after = (_levels(_shifted(scene, axis, sign * SHIFT_PX), blur_px) for sign in (-1, 1))
         slopes.append((after - before) / (2.0 * SHIFT_PX))
-        bows.append((after + before - 2.0 * plain) / SHIFT_PX**2)
-    # A Gaussian blur spreads as heat does: d I / d blur = blur (d2 I / du2 + d2 I / dv2).
-    pictures = np.stack([*slopes, blur_px * (bows[0] + bows[1]), plain])
+    sharper, wider = (_levels(scene, blur_px + sign * BLUR_STEP_PX) for sign in (-1, 1))
+    pictures = np.stack([*slopes, (wider - sharper) / (2.0 * BLUR_STEP_PX), 0.5 * (wider + sharper)])
     return tuple(_of_board(detection, pictures) for detection in scene.truth())
 
 

@@ -77,7 +77,12 @@ def test_bound_of_another_model_of_the_same_corner() -> None:
     fit = least_squares(lambda p: model(p) - levels, start, jac="3-point", x_scale="jac")
     assert np.abs(fit.fun).max() < 1.5
     assert np.abs(fit.x[:2]).max() < 1e-3
-    covariance = np.linalg.inv(fit.jac.T @ fit.jac)[:2, :2] * (noise**2 + ROUNDING_VARIANCE)
+    normal = fit.jac.T @ fit.jac
+    # Lines turn by px at the next corner here, by slope there; s^2 is the variance of blur and pixel together.
+    scale = np.array([1.0, 1.0, 1.0 / square_px, 1.0 / square_px, blur_px / fit.x[4]])
+    same = np.diag(normal)[[0, 1, 3, 2, 4]] * scale**2
+    np.testing.assert_allclose(np.diag(information[middle])[:5], same, rtol=OTHER_MODEL_REL)
+    covariance = np.linalg.inv(normal)[:2, :2] * (noise**2 + ROUNDING_VARIANCE)
     bound = position_bound(information, noise)[middle]
     np.testing.assert_allclose(np.trace(bound), np.trace(covariance), rtol=OTHER_MODEL_REL)
 
