@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from helpers.board_rig_scenes import ALIKE, DIFFERENT, corner_of_a_room, target_
 from helpers.calibration_scenes import lens
 
 from rigkit.boards import Board
+from rigkit.calibration.board_rig import BoardRig, PlacedBoard
 from rigkit.calibration.board_ties import suggest_ties
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.rig import RigCalibration, calibrate_rig
@@ -114,6 +116,45 @@ def test_two_cameras_and_boards_that_look_alike(rng: np.random.Generator) -> Non
     assert rig.sigma_px == pytest.approx(NOISE_PX, rel=0.1)
     length, sigma = rig.baseline_mm("reg", "wide")
     assert abs(length - np.linalg.norm(PAIR["wide"][1].translation_mm)) < SIGMAS * sigma < 1.0
+
+
+def test_boards_that_only_neighbours_link(rng: np.random.Generator) -> None:
+    """No image shows all three: floor and left, or left and right."""
+    room = corner_of_a_room(rng, DIFFERENT)
+    views = target_views(rng, REG, DIFFERENT, room, 10, noise_px=NOISE_PX, distance_mm=1000.0)
+    hidden = ("right", "floor")
+    views["reg"] = [(f, v) for f, v in views["reg"] if v.board.board_id != hidden[int(f) % 2]]
+    rig = solve(views, DIFFERENT)
+    assert sorted(rig.board_rigs[0].names) == ["floor", "left", "right"] and rig.shared_count == 10
+    assert max(abs(e) for e in errors_in_sigmas(rig, room, DIFFERENT)) < SIGMAS
+
+
+def test_sigmas_of_angles_and_distances_follow_the_covariance(rng: np.random.Generator) -> None:
+    """Against central differences by every number of the places."""
+    room = corner_of_a_room(rng, DIFFERENT)
+    root = 1e-2 * rng.normal(size=(12, 12)) * np.tile([1e-2, 1e-2, 1e-2, 1.0, 1.0, 1.0], 2)[:, None]
+    first = room["floor"].inverse()
+    poses = [first @ room[b.board_id] for b in DIFFERENT]
+
+    def rig(x: np.ndarray) -> BoardRig:
+        moved = [poses[0]] + [
+            Rigid3(exp_so3(d[:3]) @ pose.rotation, pose.translation_mm + d[3:])
+            for pose, d in zip(poses[1:], x.reshape(2, 6), strict=True)
+        ]
+        placed = [PlacedBoard(b, b.points(), pose) for b, pose in zip(DIFFERENT, moved, strict=True)]
+        return BoardRig(tuple(placed), root @ root.T, 1)
+
+    quantities: list[Callable[[BoardRig], tuple[float, float]]] = []
+    for a, b in [("floor", "left"), ("left", "right"), ("right", "floor")]:
+        quantities += [
+            lambda r, a=a, b=b: r.angle_deg(a, b),
+            lambda r, a=a, b=b: r.distance_mm(Feature(a, centre=True), Feature(b, grid=(2, 3))),
+            lambda r, a=a, b=b: r.distance_mm(Feature(a), Feature(b, grid=(5, 1))),
+        ]
+    for quantity in quantities:
+        steps = 1e-6 * np.eye(12)
+        slope = np.array([(quantity(rig(d))[0] - quantity(rig(-d))[0]) / 2e-6 for d in steps])
+        assert quantity(rig(np.zeros(12)))[1] == pytest.approx(np.linalg.norm(slope @ root), rel=1e-5)
 
 
 def test_one_image_is_as_good_as_three_boards_alone(rng: np.random.Generator) -> None:

@@ -8,18 +8,22 @@ import pytest
 
 from rigkit.cli.main import main
 from rigkit.errors import InputError
-from rigkit.io.rig_session import frames_of_images, is_rig_session, load_rig_session
+from rigkit.io.rig_session import ONE, frames_of_images, is_rig_session, load_rig_session
 from rigkit.io.session import load_session
 
 BOARD = 'schema = "rigkit.board/1"\ncolumns = 9\nrows = 6\nsquare_mm = 30.0\n'
 HEAD = 'schema = "rigkit.session/1"\nboard = "board.toml"\nmodel = "brown"\n'
 LEFT = '[[cameras]]\nid = "left"\nimages = "left*.jpg"\n'
 RIGHT = '[[cameras]]\nid = "right"\nimages = "right*.jpg"\nmodel = "scaramuzza"\ndegree = 5\n'
+TWO = HEAD.replace('board = "board.toml"', 'boards = ["board.toml", "other.toml"]')
+IMAGES = 'images = "*.jpg"\n'
+RIGID = '[[rigid_boards]]\nboards = ["board", "other"]\n'
 BASELINE = '[[baselines]]\na = "left"\nb = "right"\nvalue_mm = 100.0\nsigma_mm = 1.0\nhow = "steel rule"\n'
 
 
 def session(tmp_path: Path, text: str) -> Path:
     (tmp_path / "board.toml").write_text(BOARD)
+    (tmp_path / "other.toml").write_text(BOARD.replace("9", "8"))
     path = tmp_path / "session.toml"
     path.write_text(text)
     return path
@@ -43,6 +47,21 @@ def test_reads_what_is_written(tmp_path: Path) -> None:
         load_session(path)
 
 
+def test_reads_boards_on_one_mount(tmp_path: Path) -> None:
+    angle = '{ a = "board", b = "other", value_deg = 90.0, sigma_deg = 0.3, how = "set square" }'
+    length = '{ a = "board[0,0]", b = "other", value_mm = 150.0, sigma_mm = 1.0, how = "rule" }'
+    text = TWO + IMAGES + RIGID + f'layout = {{ board = "floor" }}\nangles = [ {angle} ]\ndistances = [ {length} ]\n'
+    path = session(tmp_path, text)
+    assert is_rig_session(path)
+    rig = load_rig_session(path)
+    assert list(rig.cameras) == [ONE] and rig.cameras[ONE].camera is None
+    assert rig.rig_path.name == "calibration.json"
+    (group,) = rig.rigid_boards
+    assert group.boards == ("board", "other") and group.layout == {"board": "floor"}
+    assert group.truth.angles[0].value_deg == 90.0 and str(group.truth.distances[0].a) == "board[0,0]"
+    assert load_rig_session(session(tmp_path, TWO + LEFT + RIGHT + RIGID)).rigid_boards[0].boards == group.boards
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -55,6 +74,14 @@ def test_reads_what_is_written(tmp_path: Path) -> None:
         (HEAD + LEFT + RIGHT + BASELINE.replace("sigma_mm = 1.0\n", ""), "sigma_mm"),
         (HEAD + LEFT + RIGHT.replace("images", "image"), "images"),
         (HEAD + LEFT.replace('"left"', '"a/b"') + RIGHT, "slashes"),
+        (HEAD + IMAGES + '[[rigid_boards]]\nboards = ["board"]\n', "one board has no mount"),
+        (HEAD + IMAGES + '[[rigid_boards]]\nboards = ["board", "roof"]\n', "no board is called 'roof'"),
+        (TWO + IMAGES + RIGID + RIGID, "on two mounts"),
+        (TWO + IMAGES + RIGID + 'layout = { roof = "left" }\n', "'roof' is none of its boards"),
+        (TWO + IMAGES + RIGID + 'layout = { board = "sky" }\n', "'sky', which is unknown"),
+        (TWO + IMAGES + RIGID + "angles = [ { a = 'board', b = 'other', value_deg = 90.0 } ]\n", "sigma_deg"),
+        (TWO + IMAGES + RIGID + 'baseline = { value_mm = 3.0, sigma_mm = 1.0, how = "rule" }\n', "[[baselines]]"),
+        (TWO + IMAGES + RIGID + "images = 'x.png'\n", "unknown key 'images'"),
     ],
 )
 def test_bad_files_are_explained(text: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
