@@ -58,8 +58,9 @@ BLUR_LAG = 10.0
 """The last step may change s by so many times what it may move the corner: a wrong s hardly moves the corner, but adds
 to the residuals and so to the predicted sigma."""
 
-FEWEST_MIRRORED = 12
-"""Noise is read from so many pixels with a mirror image at least."""
+FEWEST_MIRRORED, MOST_MIRRORED_PX = 12, 2.0
+"""Noise is read from so many pixels with a mirror image at least, and not where a corner has ended so far from the
+middle of its window: little of the window has a mirror image then."""
 
 LEAST_VARIANCE = 1e-6
 RIDGE = 1e-9
@@ -185,6 +186,7 @@ def _rules(radius_px: float, iterations: int, converged_px: float, mirrored: boo
         blur_lag=BLUR_LAG,
         valid_move_px=VALID_MOVE_PX,
         valid_move_cells=VALID_MOVE_CELLS,
+        most_mirrored=MOST_MIRRORED_PX,
         radius_px=radius_px,
         iterations=iterations,
         mirrored=mirrored,
@@ -264,6 +266,7 @@ def _noise(values: FloatArray, variance: FloatArray, window: Window, geometry: G
     mean = np.where(paired, change, 0.0) ** 2
     apart = mean.sum(axis=1) / np.maximum(pairs, 1) / spread * count / np.maximum(count - PARAMETERS, 1)
     enough = (pairs >= FEWEST_MIRRORED) & (count > PARAMETERS)
+    enough &= np.abs(values[:, [X, Y]]).max(axis=1) <= MOST_MIRRORED_PX
     return np.where(enough, np.maximum(apart, LEAST_VARIANCE), variance)
 
 

@@ -18,7 +18,7 @@ typedef struct {
     double reach, near_sigmas, near_px, tail_sigmas, pixel_kurtosis, sharp_blur;
     double least_blur, most_blur, angle_sigma, log_blur_sigma, light_sigma;
     double most_move_px, most_turn, most_blur_change, most_light_change;
-    double least_variance, ridge, converged_px, blur_lag, valid_move_px, valid_move_cells, radius_px;
+    double least_variance, ridge, converged_px, blur_lag, valid_move_px, valid_move_cells, most_mirrored, radius_px;
     int64_t iterations, mirrored, fewest_mirrored;
 } rules_t;
 
@@ -69,13 +69,19 @@ INLINE range_t both(range_t a, range_t b)
 
 INLINE void take(window_t *window, const image_t image, int64_t v, range_t range)
 {
-    const int64_t first = (int64_t)ceil(range.lo), last = (int64_t)floor(range.hi);
-    const float *row = image.brightness + ((int64_t)window->centre_v + v) * image.width + (int64_t)window->centre_u;
-    for (int64_t u = first; u <= last; u++) {
-        window->u[window->count] = (float)u;
-        window->v[window->count] = (float)v;
-        window->value[window->count++] = row[u];
+    const int64_t first = (int64_t)ceil(range.lo), count = (int64_t)floor(range.hi) - first + 1;
+    if (count <= 0)
+        return;
+    const float *restrict row =
+        image.brightness + ((int64_t)window->centre_v + v) * image.width + (int64_t)window->centre_u + first;
+    float *restrict us = window->u + window->count, *restrict vs = window->v + window->count;
+    float *restrict values = window->value + window->count;
+    for (int32_t k = 0; k < (int32_t)count; k++) {
+        us[k] = (float)((int32_t)first + k);
+        vs[k] = (float)v;
+        values[k] = row[k];
     }
+    window->count += count;
 }
 
 /* Gather the pixels near the two lines, inside the cell, the radius and the image (edge_model.collect): of every row
@@ -428,33 +434,32 @@ static void leave(const double *values, window_t *window, const geometry_t at, c
 
 /* Return the mean square of what the model leaves and mirroring at the corner changes, as that of independent noise, or
  * -1 where few pixels have a mirror image (edge_fit._noise). */
-static double unmirrored(const double *values, window_t *window, int64_t fewest)
+static double unmirrored(const double *values, window_t *window, const rules_t *rules)
 {
-    const int64_t across = window->across, middle = across / 2;
+    if (fabs(values[X]) > rules->most_mirrored || fabs(values[Y]) > rules->most_mirrored)
+        return -1.0;
+    const int32_t across = (int32_t)window->across, middle = across / 2;
+    float *square = window->square + middle * across + middle;
     memset(window->square, 0xff, (size_t)(across * across) * sizeof(float)); /* NaN */
     for (int64_t i = 0; i < window->count; i++)
-        window->square[((int64_t)window->v[i] + middle) * across + (int64_t)window->u[i] + middle] = window->rest[i];
+        square[(int32_t)window->v[i] * across + (int32_t)window->u[i]] = window->rest[i];
     const double left = floor(2.0 * values[X]), top = floor(2.0 * values[Y]);
     const float right = (float)(2.0 * values[X] - left), below = (float)(2.0 * values[Y] - top);
     const float w00 = (1.0f - right) * (1.0f - below), w10 = right * (1.0f - below);
     const float w01 = (1.0f - right) * below, w11 = right * below;
-    const int64_t from_u = (int64_t)left + middle, from_v = (int64_t)top + middle;
+    const float *mirrored = square + (int32_t)top * across + (int32_t)left;
     double sum = 0.0;
     int64_t pairs = 0;
     for (int64_t i = 0; i < window->count; i++) {
-        const int64_t u = from_u - (int64_t)window->u[i], v = from_v - (int64_t)window->v[i];
-        if (u < 0 || v < 0 || u > across - 2 || v > across - 2)
-            continue;
-        const float *there = window->square + v * across + u;
-        const float mirror = w00 * there[0] + w10 * there[1] + w01 * there[across] + w11 * there[across + 1];
-        const float change = window->rest[i] - mirror;
-        if (change == change) {
-            sum += (double)(change * change);
-            pairs++;
-        }
+        const float *there = mirrored - ((int32_t)window->v[i] * across + (int32_t)window->u[i]);
+        const float change =
+            window->rest[i] - (w00 * there[0] + w10 * there[1] + w01 * there[across] + w11 * there[across + 1]);
+        const int paired = change == change;
+        sum += paired ? (double)(change * change) : 0.0;
+        pairs += paired;
     }
     const double spread = 1.0 + (double)(w00 * w00 + w10 * w10 + w01 * w01 + w11 * w11);
-    return pairs >= fewest ? sum / (double)pairs / spread : -1.0;
+    return pairs >= rules->fewest_mirrored ? sum / (double)pairs / spread : -1.0;
 }
 
 /* Return whether there are pixels on all sides of (x, y) (edge_fit._surrounded). */
@@ -509,7 +514,7 @@ static void fit_corner(
     double noise = variance;
     if (rules->mirrored && more > 0) {
         leave(values, window, at, rules);
-        const double mean = unmirrored(values, window, rules->fewest_mirrored);
+        const double mean = unmirrored(values, window, rules);
         noise = mean < 0.0 ? variance : mean * (double)window->count / (double)more;
         noise = noise > rules->least_variance ? noise : rules->least_variance;
     }
@@ -530,9 +535,11 @@ static void fit_corner(
     out[7] = (double)valid;
 }
 
-/* Pixels further than this from the centre have no place in the square: none within the radius, nor their mirrors
- * but for those that lie outside of the window anyway. */
-static int64_t across_square(double radius_px) { return 2 * ((int64_t)floor(radius_px) + 1) + 1; }
+/* Side of the square that holds the window and, around it, nothing where mirror images may fall. */
+static int64_t across_square(const rules_t *rules)
+{
+    return 2 * ((int64_t)floor(rules->radius_px) + (int64_t)ceil(2.0 * rules->most_mirrored) + 1) + 1;
+}
 
 static int64_t room_of_window(double radius_px)
 {
@@ -541,10 +548,10 @@ static int64_t room_of_window(double radius_px)
 }
 
 /* Return how many floats of scratch fit_edges needs. */
-int64_t edges_scratch(double radius_px)
+int64_t edges_scratch(const rules_t *rules)
 {
-    const int64_t across = across_square(radius_px);
-    return 4 * room_of_window(radius_px) + across * across;
+    const int64_t across = across_square(rules);
+    return 4 * room_of_window(rules->radius_px) + across * across;
 }
 
 /* Fit the edge model around `count` corners (edge_fit.fit_edges). pixels (N, 2), sides (N, 2, 2), curvature (N, 2), gaps
@@ -558,7 +565,7 @@ void fit_edges(
     const int64_t room = room_of_window(rules->radius_px);
     window_t window = {
         .u = scratch, .v = scratch + room, .value = scratch + 2 * room, .rest = scratch + 3 * room,
-        .square = scratch + 4 * room, .across = across_square(rules->radius_px)};
+        .square = scratch + 4 * room, .across = across_square(rules)};
     for (int64_t n = 0; n < count; n++) {
         const geometry_t at = {sides + 4 * n, curvature + 2 * n, gaps + 4 * n};
         collect(&window, image, pixels + 2 * n, at, blur[n], rules);

@@ -46,6 +46,7 @@ class Rules(ctypes.Structure):
                 "blur_lag",
                 "valid_move_px",
                 "valid_move_cells",
+                "most_mirrored",
                 "radius_px",
             )
         ),
@@ -70,7 +71,7 @@ def _library() -> ctypes.CDLL | None:
     if library is not None:
         count, array = ctypes.c_int64, ctypes.c_void_p
         library.edges_scratch.restype = count
-        library.edges_scratch.argtypes = [ctypes.c_double]
+        library.edges_scratch.argtypes = [array]
         library.fit_edges.restype = None
         library.fit_edges.argtypes = [array, count, count, count, *[array] * 9]
         library.line_bends.restype = None
@@ -95,7 +96,7 @@ def fit_corners(
     grey = np.ascontiguousarray(image, np.float32)
     known = [np.ascontiguousarray(part, np.float64) for part in (pixels, sides, curvature, gaps, sign, blur)]
     out = np.empty((len(pixels), OUTCOMES))
-    scratch = np.zeros(library.edges_scratch(rules.radius_px), np.float32)
+    scratch = np.zeros(library.edges_scratch(ctypes.addressof(rules)), np.float32)
     height, width = grey.shape
     library.fit_edges(
         grey.ctypes.data,
