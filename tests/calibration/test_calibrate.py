@@ -20,6 +20,7 @@ from rigkit.boards import Board
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.initialise import initialise, start_error
 from rigkit.calibration.observations import Observations
+from rigkit.calibration.uncertainty import uncertainty_at_corners
 from rigkit.cameras.registry import MODELS
 from rigkit.detections import BoardView
 from rigkit.errors import DegenerateError, InputError
@@ -128,6 +129,32 @@ def test_input_is_not_modified(rng: np.random.Generator) -> None:
     before = [v.pixels.copy() for v in views]
     calibrate(views, SIZE, model="kannala_brandt", board="warp")
     assert all((v.pixels == b).all() for v, b in zip(views, before, strict=True))
+
+
+def test_views_of_any_length(rng: np.random.Generator) -> None:
+    """Each view of the result has its own corners, residuals against its own pose, and cannot be written to."""
+    views, _, _ = random_views(lens("wide"), 8, rng, reach_deg=55.0)
+    seen = [np.sort(rng.choice(54, 20 + 4 * k, replace=False)) for k in range(len(views))]
+    parts = [
+        BoardView(v.image, v.board, v.grid[s], v.pixels[s], v.sigma_px[s]) for v, s in zip(views, seen, strict=True)
+    ]
+    result = calibrate(parts, SIZE, model="kannala_brandt", board="flat")
+    for part, view in zip(parts, result.views, strict=True):
+        projected, _ = result.camera.project(view.cam_from_board.apply(part.points()))
+        assert np.abs(view.residuals_px - (part.pixels - projected)).max() < 1e-9
+        assert (view.grid == part.grid).all() and view.kept.all() and view.rms_px < 2.0 * NOISE_PX
+        for array in (view.grid, view.pixels, view.residuals_px, view.kept):
+            assert not array.flags.writeable
+    assert result.corner_count == sum(len(s) for s in seen)
+
+
+def test_uncertainty_at_corners_from_pixels_or_points(rng: np.random.Generator) -> None:
+    """The way back from the pixels gives what the solved points give, but for the residuals."""
+    views, _, _ = random_views(lens("reg"), 8, rng, reach_deg=33.0)
+    result = calibrate(views, SIZE, model="brown", board="flat", folds=0)
+    points = np.concatenate([v.cam_from_board.apply(BOARD.points()) for v in result.views])
+    there = uncertainty_at_corners(result, points)
+    assert there == pytest.approx(uncertainty_at_corners(result), rel=0.01)
 
 
 def test_too_few_images_for_folds(rng: np.random.Generator) -> None:

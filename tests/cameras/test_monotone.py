@@ -43,6 +43,13 @@ def test_first_root() -> None:
     assert first_root(np.array([4.0, -4.0, 1.0]), 10.0) == pytest.approx(2.0, abs=1e-6)
 
 
+def test_first_root_of_several() -> None:
+    """The smallest root of all that are given together, whatever their degree."""
+    cubic, line = np.array([6.0, 1.0, -4.0, 1.0]), np.array([3.0, -2.0, 0.0, 0.0])
+    assert first_root(np.stack([cubic, line]), 10.0) == pytest.approx(1.5, abs=1e-12)
+    assert first_root(np.stack([cubic, -line]), 1.0) == 1.0
+
+
 def test_first_root_of_coefficients_in_pixels() -> None:
     """As in a lens polynomial: 1 - (x / 900)^8 has coefficients over 24 orders of magnitude."""
     coefficients = np.zeros(9)
