@@ -13,7 +13,7 @@ import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray
 from rigkit.calibration.assemble import assemble, require_determined
-from rigkit.calibration.evidence import fit_shape
+from rigkit.calibration.evidence import fit_shapes
 from rigkit.calibration.fit import Fit, fit_kept, fit_model, heldout_squares, robust_sigma
 from rigkit.calibration.moved import moved_lens
 from rigkit.calibration.observations import Observations
@@ -108,11 +108,11 @@ def calibrate(
     chosen = _choose(observations, options, SURELY)
     candidates = [*_described(options, chosen), *failed]
     if board != "flat" and often_seen(observations).any():
-        shapes = _shapes(observations, chosen, SHAPES[1:] if board == "auto" else (board,), folds, progress)
+        shapes, spared = _shapes(observations, chosen, board, folds, progress)
         if board == "auto":
             shapes = [chosen, *shapes]
         chosen = _choose(observations, shapes)
-        candidates += [c for c in _described(shapes, chosen) if "board" in c.name]
+        candidates += [*(c for c in _described(shapes, chosen) if "board" in c.name), *spared]
     result = assemble(observations, chosen.fit, chosen.heldout_px, dropped, tuple(candidates))
     points, _ = chosen.fit.state.points_in_cam(observations)
     at_corners = uncertainty_at_corners(result, points[chosen.fit.kept])
@@ -205,10 +205,16 @@ def _compared(observations: Observations, options: list[_Option], folds: int, pr
 
 
 def _shapes(
-    observations: Observations, flat: _Option, kinds: Sequence[str], folds: int, progress: Progress
-) -> list[_Option]:
-    options = [_Option(f"board {kind}", fit_shape(observations, flat.fit, kind)) for kind in kinds]
-    return _compared(observations, options, folds, progress)
+    observations: Observations, flat: _Option, board: str, folds: int, progress: Progress
+) -> tuple[list[_Option], list[Candidate]]:
+    """Return the shapes in the running, and what was not tried."""
+    fits = fit_shapes(observations, flat.fit, board)
+    options = [_Option(f"board {kind}", fit) for kind, fit in fits.items()]
+    spared = []
+    if board == "auto" and "released" not in fits:
+        reason = "not tried: corners stray from the warp by no more than chance"
+        spared.append(Candidate("board released", 0, float("nan"), None, False, reason))
+    return _compared(observations, options, folds, progress), spared
 
 
 def _choose(observations: Observations, options: list[_Option], surely: float | None = None) -> _Option:

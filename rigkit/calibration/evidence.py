@@ -15,61 +15,106 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, IntArray
-from rigkit.calibration.assemble import solution_normal
-from rigkit.calibration.fit import Fit, fit_kept
+from rigkit.arrays import BoolArray, FloatArray, IntArray
+from rigkit.calibration.fit import Fit, fit_kept, inliers, sigma_of
+from rigkit.calibration.normal import Normal, normal_equations
 from rigkit.calibration.observations import Observations
-from rigkit.calibration.shape import BOWS, STRETCHES, WARP_UNKNOWNS, often_seen, shape_model
+from rigkit.calibration.shape import BOWS, STRETCHES, WARP_UNKNOWNS, ShapeModel, often_seen, shape_model
+from rigkit.calibration.solver import State, evaluate, solve
 
-__all__ = ["fit_shape"]
+__all__ = ["fit_shapes"]
 
 ROUNDS = 2
 """More rounds change the sizes by a few per cent and the lens not at all."""
+STRAY_SIGMAS = 3.0
+"""Corners stray where they take this many standard deviations more off the cost than chance does."""
+COARSE = 1e-4
+"""The rounds stop where a step promises less than this part of the cost: sizes are known to a tenth at best."""
 LEAST = 1e-4
 """A size falls to no less than this part of the first one in a round: on exact data it would fall to nothing."""
 
 
-def fit_shape(observations: Observations, fit: Fit, kind: str) -> Fit:
-    """Return the fit with boards of the shape `kind`, from that with flat ones."""
-    if kind == "flat":
-        return fit
+def fit_shapes(observations: Observations, fit: Fit, board: str) -> dict[str, Fit]:
+    """Return the fits with boards of the shape `board` ("warp", "released", or "auto": both), from that with flat ones.
+    With "auto" corners are only released where they stray at all."""
     shape = shape_model("warp", observations)
     start = replace(fit.state, shape=shape, unknowns=np.zeros(shape.count))
-    fit = _evident(observations, fit_kept(observations, start, fit.kept, settle=True))
-    if kind == "warp":
-        return fit
-    first = fit.state.shape.count
-    shape = shape_model(kind, observations)
-    shape = replace(shape, sigma=np.concatenate([fit.state.shape.sigma, shape.sigma[first:]]))
-    unknowns = np.concatenate([fit.state.unknowns, np.zeros(shape.count - first)])
-    start = replace(fit.state, shape=shape, unknowns=unknowns)
-    return _evident(observations, fit_kept(observations, start, fit.kept, settle=True))
+    state, kept = _evident(observations, start, fit.kept)
+    found: dict[str, Fit] = {}
+    if board != "released":
+        found["warp"] = warp = fit_kept(observations, state, kept, settle=True)
+        state, kept = warp.state, warp.kept
+    if board == "released" or (board == "auto" and _stray(observations, state, kept)):
+        first, shape = state.shape.count, shape_model("released", observations)
+        shape = replace(shape, sigma=np.concatenate([state.shape.sigma, shape.sigma[first:]]))
+        unknowns = np.concatenate([state.unknowns, np.zeros(shape.count - first)])
+        state, kept = _evident(observations, replace(state, shape=shape, unknowns=unknowns), kept)
+        found["released"] = fit_kept(observations, state, kept, settle=True)
+    return found
 
 
-def _evident(observations: Observations, fit: Fit) -> Fit:
+def _stray(observations: Observations, state: State, kept: BoolArray) -> bool:
+    """Say whether corners lie elsewhere than the warp has them, by more than chance: what releasing each alone would
+    take off the cost, g^T H^-1 g, is chi-squared with three degrees of freedom for each."""
+    shape = replace(shape_model("released", observations), basis=state.shape.basis)
+    unknowns = np.concatenate([state.unknowns, np.zeros(shape.count - state.shape.count)])
+    weight = np.where(kept, observations.weight, 0.0)
+    place = state.camera, state.rotation, state.translation_mm, shape, unknowns
+    normal = normal_equations(*place, observations, weight, None)
+    points = len(shape.flat)
+    # In one view two coordinates are all that is seen of a corner.
+    seen = np.bincount(observations.corner[kept], minlength=points) > 1
+    gradient = normal.g[-3 * points :].reshape(points, 3, 1)[seen]
+    less = np.swapaxes(gradient, -1, -2) @ np.linalg.solve(_own_blocks(normal, points)[seen], gradient)
+    count = 3 * int(seen.sum())
+    views = int(kept.any(axis=1).sum())
+    freedom = max(2 * int(kept.sum()) - state.camera.parameters.size - 6 * views, 1)
+    variance = float((normal.residuals[0].weighted(observations)[kept] ** 2).sum()) / freedom
+    return bool(less.sum() > variance * (count + STRAY_SIGMAS * np.sqrt(2.0 * count)))
+
+
+def _own_blocks(normal: Normal, points: int) -> FloatArray:
+    """Return the 3x3 blocks (M, 3, 3) of the released corners."""
+    each, start = np.arange(points), len(normal.g) - 3 * points
+    return np.asarray(normal.gg[start:, start:].reshape(points, 3, points, 3)[each, :, each, :])
+
+
+def _evident(observations: Observations, state: State, kept: BoolArray) -> tuple[State, BoolArray]:
+    """Return the state, roughly solved, with its priors as wide as the views say, and the corners to keep."""
+    norm = evaluate(state, observations).weighted(observations)
     for _ in range(ROUNDS):
-        shape = replace(fit.state.shape, sigma=_sizes(observations, fit))
-        fit = fit_kept(observations, replace(fit.state, shape=shape), fit.kept, settle=True)
-    return fit
+        solution = solve(
+            observations,
+            state,
+            weight=np.where(kept, observations.weight, 0.0),
+            prior_sigma_px=sigma_of(norm, kept),
+            cost_tolerance=COARSE,
+        )
+        state, norm = solution.state, solution.data.residuals[0].weighted(observations)
+        sigma = sigma_of(norm, kept)
+        normal = solution.data.with_priors(state.camera, sigma, state.shape.sigma, state.unknowns)
+        state = replace(state, shape=replace(state.shape, sigma=_sizes(observations, state, normal, sigma)))
+        kept = inliers(norm, observations, sigma, state.camera.size_px)
+    return state, kept
 
 
-def _sizes(observations: Observations, fit: Fit) -> FloatArray:
+def _sizes(observations: Observations, state: State, normal: Normal, sigma_px: float) -> FloatArray:
     """Return the prior standard deviation of each unknown of the shape."""
-    sizes = fit.state.shape.sigma.copy()
-    known = 1.0 - (_variance(fit) / sizes**2)
-    for group in _groups(observations, fit):
+    sizes = state.shape.sigma.copy()
+    known = 1.0 - _variance(state, normal) * sigma_px**2 / sizes**2
+    for group in _groups(observations, state.shape):
         if (gamma := float(known[group].sum())) > 0.0:
-            found = np.sqrt((fit.state.unknowns[group] ** 2).sum() / gamma)
+            found = np.sqrt((state.unknowns[group] ** 2).sum() / gamma)
             sizes[group] = max(float(found), LEAST * float(sizes[group].max()))
     return sizes
 
 
-def _groups(observations: Observations, fit: Fit) -> Iterator[IntArray]:
+def _groups(observations: Observations, shape: ShapeModel) -> Iterator[IntArray]:
     """Yield the unknowns that have one size together: of the warp, or of the released corners that move against it.
     Those at the board's border are apart: paper ends or curls there, and a detector sees one neighbour less."""
-    first = fit.state.shape.basis.shape[-1]
+    first = shape.basis.shape[-1]
     for i, board in enumerate(np.flatnonzero(often_seen(observations)).tolist()):
-        if fit.state.shape.kind == "warp":
+        if shape.kind == "warp":
             yield from (WARP_UNKNOWNS * i + part for part in (BOWS, STRETCHES))
         else:
             grid = observations.boards[board].grid()
@@ -79,16 +124,12 @@ def _groups(observations: Observations, fit: Fit) -> Iterator[IntArray]:
                 yield from (first + (3 * rows[:, None] + np.array(axes)).ravel() for axes in ((0, 1), (2,)))
 
 
-def _variance(fit: Fit) -> FloatArray:
-    """Return the variance of each unknown of the shape. That of a released corner is taken with the others held:
-    against the exact one its sizes come out the same within a tenth, without the inverse of a matrix of thousands."""
-    normal, sigma = solution_normal(fit), fit.sigma_px if np.isfinite(fit.sigma_px) else 1.0
-    count = fit.state.shape.count
-    if fit.state.shape.kind == "warp":
-        return np.diag(normal.covariance()[0])[len(normal.g) - count :] * sigma**2
-    first = fit.state.shape.basis.shape[-1]
-    points, start = (count - first) // 3, len(normal.g) - (count - first)
-    each = np.arange(points)
-    blocks = normal.gg[start:, start:].reshape(points, 3, points, 3)[each, :, each, :]
-    own = np.diagonal(np.linalg.inv(blocks), axis1=-2, axis2=-1) * sigma**2
+def _variance(state: State, normal: Normal) -> FloatArray:
+    """Return the variance of each unknown of the shape for corners of unit variance. That of a released corner is taken
+    with the others held: against the exact one its sizes come out the same within a tenth, without the inverse of a
+    matrix of thousands."""
+    count, first = state.shape.count, state.shape.basis.shape[-1]
+    if state.shape.kind == "warp":
+        return np.diag(normal.covariance()[0])[-count:]
+    own = np.diagonal(np.linalg.inv(_own_blocks(normal, (count - first) // 3)), axis1=-2, axis2=-1)
     return np.concatenate([np.zeros(first), own.ravel()])

@@ -16,7 +16,7 @@ from rigkit.calibration.solver import State, equations, evaluate, solve
 from rigkit.cameras.base import Camera, image_center
 from rigkit.errors import DegenerateError
 
-__all__ = ["OUTLIER_SIGMAS", "Fit", "fit_kept", "fit_model", "heldout_squares", "inliers", "robust_sigma"]
+__all__ = ["OUTLIER_SIGMAS", "Fit", "fit_kept", "fit_model", "heldout_squares", "inliers", "robust_sigma", "sigma_of"]
 
 OUTLIER_SIGMAS = 5.0
 """A corner is an outlier when its weighted 2-D residual exceeds this many robust standard deviations per coordinate,

@@ -9,7 +9,7 @@ import pytest
 from helpers.calibration_scenes import BOARD, REACH_DEG, SIZE, lens, projection_difference, random_views, with_outliers
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.evidence import fit_shape
+from rigkit.calibration.evidence import fit_shapes
 from rigkit.calibration.fit import fit_model
 from rigkit.calibration.observations import Observations
 from rigkit.cameras.brown import Brown
@@ -80,6 +80,7 @@ def test_a_flat_board_stays_flat_and_releasing_it_does_no_harm(rng: np.random.Ge
     views, _, _ = random_views(lens("fish"), 30, rng, reach_deg=92.5)
     chosen = calibrate(views, SIZE, model="kannala_brandt")
     assert chosen.boards[0].kind == "flat"
+    assert any("not tried: corners stray" in c.reason for c in chosen.candidates)
     released = calibrate(views, SIZE, model="kannala_brandt", board="released")
     assert difference(released.camera, "fish") < FLAT_FACTOR * difference(chosen.camera, "fish")
 
@@ -90,14 +91,14 @@ def test_prior_of_released_corners_is_as_wide_as_they_stray(rng: np.random.Gener
     observations = Observations.from_views(views)
     flat = fit_model(observations, SIZE, Brown, 5)
     inner = np.flatnonzero(((BOARD.grid() > 0) & (BOARD.grid() < [8, 5])).all(axis=1))
-    shape = fit_shape(observations, flat, "released").state.shape
+    shape = fit_shapes(observations, flat, "released")["released"].state.shape
     sizes = shape.sigma[shape.basis.shape[-1] :].reshape(-1, 3)[inner]
     # 56 coordinates know their scatter to 10 %.
     assert sizes[:, :2] == pytest.approx(STRAY_MM, rel=0.3)
     assert sizes[:, 2].max() < STRAY_MM
     exact, _, _ = random_views(lens("reg"), 40, rng, reach_deg=REACH_DEG["reg"])
     observations = Observations.from_views(exact)
-    held = fit_shape(observations, fit_model(observations, SIZE, Brown, 5), "released")
+    held = fit_shapes(observations, fit_model(observations, SIZE, Brown, 5), "released")["released"]
     assert np.abs(held.state.shape.points(held.state.unknowns) - BOARD.points()).max() < STRAY_MM
 
 
