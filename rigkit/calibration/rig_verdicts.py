@@ -34,7 +34,8 @@ def judge_rig(rig: RigCalibration, notes: Sequence[str] = ()) -> tuple[str, ...]
     bad = sum(v.startswith("bad") for v in found)
     if bad:
         return (f"bad: {error}, but {bad} of the remarks below must be dealt with first", *found)
-    return (f"good: {error}" + (f"; {len(found)} remarks below" if found else ""), *found)
+    remarks = {0: "", 1: "; 1 remark below"}.get(len(found), f"; {len(found)} remarks below")
+    return (f"good: {error}{remarks}", *found)
 
 
 def _shared(rig: RigCalibration) -> list[str]:
@@ -77,7 +78,8 @@ def _spread(rig: RigCalibration) -> list[str]:
         return []
     return [
         f"look: the frames disagree by {rig.spread:.1f} times what the corners' scatter explains; all sigmas count it "
-        'in. The boards or the lenses are not quite as the models say: try board_shape = "auto", model = "auto"'
+        "in. Boards or lenses are not quite as the models say, or cameras not quite of one moment: board_shape and "
+        'model "auto" may help, a flatter board does'
     ]
 
 
