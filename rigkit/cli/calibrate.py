@@ -226,11 +226,11 @@ def describe(calibration: Calibration) -> str:
     for name, value, sigma in zip(camera.parameter_names(), camera.parameters, sigmas, strict=True):
         lines.append(f"  {name:>4} = {value:.9g} +- {sigma:.2g}")
     lines += [f"dropped {image}: {reason}" for image, reason in calibration.dropped]
-    lines += [f"{c.name}: {c.reason}" for c in calibration.candidates if not math.isfinite(c.rms_px)]
     lines += [
         f"tried {c.name}: held-out {'-' if c.heldout_rms_px is None else format(c.heldout_rms_px, '.4f')} px, "
-        f"training {c.rms_px:.4f} px{' (chosen)' if c.chosen else ''}"
+        f"training {c.rms_px:.4f} px{f' (chosen: {c.reason})' if c.chosen else ''}"
         for c in calibration.candidates
         if math.isfinite(c.rms_px)
     ]
+    lines += [f"{c.name}: {c.reason}" for c in calibration.candidates if not math.isfinite(c.rms_px)]
     return "\n".join([*lines, *calibration.verdicts])
