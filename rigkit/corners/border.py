@@ -1,16 +1,16 @@
 """Where a part of a board of known size lies in the board: which of its sides are the board's own border.
 
-Beyond the last corners of a board there is one more square, and then white paper. So one and a quarter squares beyond
-the last row seen, either the squares go on alternating (the board goes on: what follows was missed, or is out of the
-image), or it is white all along and the dark squares end on the line where they should (a border), or it is something
-else, and nothing is known. Borders and the known size together may leave one place for the part, or several: then it
-remains a part.
+Beyond the last corners of a board there is one more square, and then white paper, or what the board is glued to. So one
+and a quarter squares beyond the last row seen, either the squares go on alternating (the board goes on: what follows
+was missed, or is out of the image), or it is equally bright all along and the squares end on one line, where they
+should (a border), or it is something else, and nothing is known. Borders and the known size together may leave one
+place for the part, or several: then it remains a part.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -41,15 +41,27 @@ narrow margins, far enough for blur."""
 PROFILE = np.arange(0.5, 1.3001, 0.02)
 """Where the end of the dark squares is looked for."""
 
-ENDS_WITHIN, ENDS_WITHIN_PX = 0.07, 0.7
-"""The dark squares of a border end this near to the line, in squares or (the larger) in px: a ruler lies so by
-chance only."""
+ENDS_WITHIN = 0.13
+"""The squares end this near to where the next corners would be, in squares: some boards are cut a little short."""
+
+STRAIGHT, STRAIGHT_PX = 0.07, 0.7
+"""They end this near to one line, in squares or (the larger) in px."""
 
 EDGE_WIDTH = 0.12
 """Half the width of the edge at their end, in squares: noise may cross its middle more than once."""
 
 WHITE = (0.8, 1.25)
-"""Brightness of the margin, 0 for the dark and 1 for the white squares beside it: it is the same paper."""
+"""Brightness of a white margin, 0 for the dark and 1 for the white squares beside it: it is the same paper."""
+
+EVEN = 0.2
+"""What lies beyond a border is so even in brightness, on the same scale."""
+
+SAME_LEVEL = 0.15
+"""Two borders of one board with this difference in brightness beyond, on the same scale, bear each other out: where
+there is no white margin, a sheet that lies along the squares looks like a border, but not like another one."""
+
+LEAST_STEP = 0.3
+"""Steps of brightness from which the end of a square is looked for, on the same scale."""
 
 DARK = 0.35
 """The next dark square is darker than this, on the same scale."""
@@ -60,7 +72,7 @@ LEAST_CONTRAST = 0.5
 LEAST_OF_KIND = 2
 """Dark and white squares that must have been seen to end, or to go on, each."""
 
-AGREEING = 0.9
+AGREEING = 0.8
 """Part of the squares seen that must say the same."""
 
 
@@ -70,6 +82,25 @@ class Side(Enum):
     BORDER = "border"
     GOES_ON = "goes on"
     UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True, slots=True)
+class Beyond:
+    """What lies beyond one side of a lattice, and how bright it is: 0 as the dark squares, 1 as the white ones."""
+
+    side: Side
+    level: float = np.nan
+
+    def agrees(self, missing: int) -> bool:
+        """Return whether `missing` rows beyond the side can be what is seen there."""
+        return {Side.BORDER: missing == 0, Side.GOES_ON: missing > 0, Side.UNKNOWN: True}[self.side]
+
+    def proven(self, every: Sequence[Beyond]) -> bool:
+        """Return whether the side is a border beyond doubt, the others seen as well: `every`, itself included."""
+        if self.side is not Side.BORDER:
+            return False
+        alike = sum(other.side is Side.BORDER and abs(other.level - self.level) < SAME_LEVEL for other in every)
+        return alike > 1 or WHITE[0] < self.level < WHITE[1]
 
 
 def place_part(image: FloatImage, refined: RefinedLattice, sizes: Sequence[tuple[int, int]]) -> RefinedLattice | None:
@@ -88,26 +119,22 @@ def place_part(image: FloatImage, refined: RefinedLattice, sizes: Sequence[tuple
     larger = [(c - columns, r - rows) for c, r in known if c >= columns and r >= rows]
     if not larger:
         return None
-    top, left, bottom, right = sides(image, refined.lattice)
+    every = sides(image, refined.lattice)
+    top, left, bottom, right = every
     fits = {
         (across, down, before, above)
         for across, down in larger
         for before in range(across + 1)
         for above in range(down + 1)
-        if _agrees(left, before) and _agrees(right, across - before)
-        if _agrees(top, above) and _agrees(bottom, down - above)
+        if left.agrees(before) and right.agrees(across - before)
+        if top.agrees(above) and bottom.agrees(down - above)
     }
     # A row too many (a shadow, what lies beside the board) makes a part as wide as the board: a size alone is no proof.
-    seen = Side.BORDER in (left, right) and Side.BORDER in (top, bottom)
+    seen = all(any(side.proven(every) for side in axis) for axis in ((left, right), (top, bottom)))
     if len(fits) != 1 or not seen:
         return None
     across, down, before, above = fits.pop()
     return _padded(refined, (above, down - above), (before, across - before))
-
-
-def _agrees(side: Side, missing: int) -> bool:
-    """Return whether `missing` rows beyond a side can be what is seen there."""
-    return {Side.BORDER: missing == 0, Side.GOES_ON: missing > 0, Side.UNKNOWN: True}[side]
 
 
 def _padded(refined: RefinedLattice, rows: tuple[int, int], columns: tuple[int, int]) -> RefinedLattice:
@@ -117,35 +144,37 @@ def _padded(refined: RefinedLattice, rows: tuple[int, int], columns: tuple[int, 
     old = refined.lattice
     rising = old.rising != ((rows[0] + columns[0]) % 2 == 1)
     lattice = Lattice(pad(old.pixels), pad(old.contrast), rising)
-    rest = (refined.sigma_px, refined.blur_px, refined.residual, refined.noise)
-    return RefinedLattice(lattice, *(pad(values) for values in rest))
+    rest = {name: pad(getattr(refined, name)) for name in RefinedLattice.__slots__ if name != "lattice"}
+    return replace(refined, lattice=lattice, **rest)
 
 
-def sides(image: FloatImage, lattice: Lattice) -> tuple[Side, Side, Side, Side]:
+def sides(image: FloatImage, lattice: Lattice) -> tuple[Beyond, Beyond, Beyond, Beyond]:
     """Return what lies beyond the first row, the first column, the last row and the last column."""
     first, second, third, fourth = (_above(image, lattice.turned(turns)) for turns in range(4))
     return first, second, third, fourth
 
 
-def _above(image: FloatImage, lattice: Lattice) -> Side:
+def _above(image: FloatImage, lattice: Lattice) -> Beyond:
     """Return what lies beyond the first row of `lattice`."""
     squares = _Squares.above(lattice)
     usable = squares.usable(image)
     if usable.sum() < 2 * LEAST_OF_KIND:
-        return Side.UNKNOWN
+        return Beyond(Side.UNKNOWN)
     inner, outer, beyond = (squares.brightness(image, places) for places in (-SQUARE, SQUARE, BEYOND))
     contrast = np.where(squares.bright, outer - inner, inner - outer)
     usable &= contrast > LEAST_CONTRAST * float(np.nanmedian(lattice.contrast))
     if any((usable & kind).sum() < LEAST_OF_KIND for kind in (squares.bright, ~squares.bright)):
-        return Side.UNKNOWN
+        return Beyond(Side.UNKNOWN)
     dark = np.minimum(inner, outer)
     relative = (beyond - dark) / np.maximum(contrast, 1e-3)
-    ends = squares.bright | squares.end_on_the_line(image, dark + 0.5 * contrast)
-    border = ends & (relative > WHITE[0]) & (relative < WHITE[1])
-    if border[usable].mean() >= AGREEING:
-        return Side.BORDER
+    level = float(np.median(relative[usable]))
+    steps = np.abs(beyond - outer) > LEAST_STEP * contrast
+    border = squares.end_on_one_line(image, outer, beyond, usable & steps) | ~steps
+    border &= np.abs(relative - level) < EVEN
+    if (usable & steps).sum() >= LEAST_OF_KIND and border[usable].mean() >= AGREEING:
+        return Beyond(Side.BORDER, level)
     goes_on = np.where(squares.bright, relative < DARK, relative > 1.0 - DARK)
-    return Side.GOES_ON if goes_on[usable].mean() >= AGREEING else Side.UNKNOWN
+    return Beyond(Side.GOES_ON if goes_on[usable].mean() >= AGREEING else Side.UNKNOWN)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -210,16 +239,18 @@ class _Squares:
         places = self.at(np.repeat(up, len(WITHIN)), np.tile(WITHIN, len(up)))
         return np.asarray(np.median(sample(image, places), axis=1), dtype=np.float64)
 
-    def end_on_the_line(self, image: FloatImage, middle: FloatArray) -> BoolArray:
-        """Return which squares (M,) rise above the brightness `middle` a square beyond the row, and only there."""
+    def end_on_one_line(self, image: FloatImage, outer: FloatArray, beyond: FloatArray, judged: BoolArray) -> BoolArray:
+        """Return which squares (M,) change from brightness `outer` to `beyond` once, where those `judged` do."""
         places = self.at(np.repeat(PROFILE, len(WITHIN)), np.tile(WITHIN, len(PROFILE)))
-        values = sample(image, places).reshape(len(middle), len(PROFILE), len(WITHIN)).mean(axis=2)
-        above = values > middle[:, None]
-        step = PROFILE[1] - PROFILE[0]
-        end = PROFILE[0] + step * ((~above).sum(axis=1) - 0.5)
-        before, after = end[:, None] - EDGE_WIDTH > PROFILE, end[:, None] + EDGE_WIDTH < PROFILE
-        clean = ~(before & above).any(axis=1) & ~(after & ~above).any(axis=1)
+        values = sample(image, places).reshape(len(outer), len(PROFILE), len(WITHIN)).mean(axis=2)
+        step = beyond - outer
+        step = np.where(np.abs(step) < 1e-3, 1e-3, step)
+        past = (values - outer[:, None]) / step[:, None] > 0.5
+        end = PROFILE[0] + (PROFILE[1] - PROFILE[0]) * ((~past).sum(axis=1) - 0.5)
+        from_end = PROFILE - end[:, None]
+        clean = ~((from_end < -EDGE_WIDTH) & past).any(axis=1) & ~((from_end > EDGE_WIDTH) & ~past).any(axis=1)
         count = len(self.bright) + 1
         height = np.linalg.norm(self.shape.along_row[:count], axis=1)
-        within = np.maximum(ENDS_WITHIN, ENDS_WITHIN_PX / np.maximum(np.minimum(height[:-1], height[1:]), 1.0))
-        return np.asarray(clean & (np.abs(end - 1.0) < within))
+        within = np.maximum(STRAIGHT, STRAIGHT_PX / np.maximum(np.minimum(height[:-1], height[1:]), 1.0))
+        line = float(np.median(end[judged])) if judged.any() else 1.0
+        return np.asarray(clean & (np.abs(end - line) < within) & (abs(line - 1.0) < ENDS_WITHIN))

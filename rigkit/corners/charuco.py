@@ -8,13 +8,16 @@ where none was found. Where the corners are exactly, the edge model says, as for
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray
 from rigkit.boards import Board, Markers
+from rigkit.corners.guided import fit_corners
 from rigkit.corners.lattice import Lattice
+from rigkit.corners.local_fit import fit_cells
 from rigkit.corners.response import FloatImage
 from rigkit.corners.subpixel import RefinedLattice, refine
 from rigkit.detections import BoardDetection
@@ -62,6 +65,7 @@ def charuco_boards(
                 whole = _united(whole, placed)
         whole = _united(whole, _of(board, grid, pixels))
         (refined,) = refine(image, [whole])
+        refined = _beside_markers(image, refined, board)
         if refined.lattice.count >= min_corners:
             out.append(_detection(refined, board))
             rest = left
@@ -145,6 +149,32 @@ def _onto(lattice: Lattice, shift: IntArray, board: Board) -> Lattice:
     out.pixels[place[:, 1], place[:, 0]] = lattice.pixels[row, column]
     out.contrast[place[:, 1], place[:, 0]] = lattice.contrast[row, column]
     return out
+
+
+def _beside_markers(image: FloatImage, refined: RefinedLattice, board: Board) -> RefinedLattice:
+    """Return the corners fitted anew with windows that leave the markers out; those that then fail are dropped."""
+    lattice = refined.lattice
+    known = lattice.known
+    if not known.any():
+        return refined
+    shape, blur = fit_cells(lattice.pixels, known), float(np.median(refined.blur_px[known]))
+    fit = fit_corners(image, board, shape, lattice.pixels[known], lattice.signs()[known], blur)
+
+    def spread(values: FloatArray) -> FloatArray:
+        out = np.full((*known.shape, *values.shape[1:]), np.nan)
+        out[known] = values
+        return out
+
+    narrow = replace(
+        refined,
+        lattice=Lattice(spread(fit.pixels), spread(fit.contrast), lattice.rising),
+        sigma_px=spread(fit.sigma_px),
+        blur_px=spread(fit.blur),
+        residual=spread(fit.residual),
+    )
+    drop = known.copy()
+    drop[known] = ~fit.valid | (fit.contrast <= 0.0)
+    return narrow.without(drop)
 
 
 def _detection(refined: RefinedLattice, board: Board) -> BoardDetection:

@@ -20,12 +20,12 @@ from rigkit.boards import Board
 from rigkit.cameras.base import Camera
 from rigkit.corners.board_guide import FEWEST, UNSOUND, BoardState, Guide, cell_areas
 from rigkit.corners.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
-from rigkit.corners.edge_model import Geometry
+from rigkit.corners.edge_model import NEAR_PX, NEAR_SIGMAS, Geometry
 from rigkit.corners.local_fit import LocalFit, fit_cells
 from rigkit.corners.response import FloatImage, grey_image
 from rigkit.detections import BoardDetection
 
-__all__ = ["complete_boards"]
+__all__ = ["complete_boards", "fit_corners"]
 
 RADIUS_PX, STEPS = 18.0, 8
 """Radius of the window and Gauss-Newton steps, as in the last pass of `rigkit.corners.subpixel`."""
@@ -35,6 +35,9 @@ FIRST_BLUR = 1.0
 
 WIDE_BLUR_CELLS = 0.05
 """A missing corner is first sought with edges so wide, in sides of the cell: they reach as far as predictions err."""
+
+MARKER_BLURS = 2.0
+"""The edges of a ChArUco board's markers reach so many s towards the corners."""
 
 ROUNDS = 40
 """Rounds of adding at most, without a camera one ring of corners each: more than any board has rows or columns."""
@@ -71,6 +74,9 @@ MOST_RESIDUAL, MOST_RESIDUAL_ALONE = 1.6, 1.3
 """Residual in grey levels relative to that of the found corners, with and without a camera that says where the corner
 is: pixels of another thing raise it."""
 
+MOST_RESIDUAL_MARKED = 3.0
+"""The same on ChArUco boards, where what the windows see of the markers differs from corner to corner."""
+
 MOST_SIGMA_CELLS = 0.03
 """Largest predicted standard deviation, in sides of the cell."""
 
@@ -101,7 +107,8 @@ def complete_boards(
     out = []
     for found in detections:
         board = _board_of(found, boards)
-        worth = board is not None and len(found.grid) >= FEWEST and not (camera is None and found.complete)
+        worth = board is not None and len(found.grid) >= FEWEST
+        worth &= camera is not None or not found.complete
         out.append(_completed(grey, found, board, camera) if worth and board is not None else found)
     return tuple(out)
 
@@ -113,18 +120,37 @@ def _board_of(found: BoardDetection, boards: Sequence[Board]) -> Board | None:
     return next(iter(named or [b for b in fitting if b.markers is None]), None)
 
 
-def _fit(
-    image: FloatImage, state: BoardState, shape: LocalFit, start: FloatArray, cells: BoolArray, blur: FloatArray | float
+def fit_corners(
+    image: FloatImage,
+    board: Board,
+    shape: LocalFit,
+    start: FloatArray,
+    signs: FloatArray,
+    blur: FloatArray | float,
 ) -> EdgeFit:
-    """Fit the corners of `cells` from `start` (M, 2)."""
+    """Fit the edge model to corners of `board` from `start` (M, 2); `shape` is that of their cells.
+
+    `signs` (M,) as `Lattice.signs`; `blur` is the s expected. Windows end before the markers of a ChArUco board.
+    """
     sides = np.stack([shape.along_column, shape.along_row], axis=1)
     geometry = Geometry(sides, shape.curvature(), shape.gaps())
-    width = np.broadcast_to(np.asarray(blur, dtype=np.float64), (len(start),)).clip(*BLUR_RANGE)
-    return fit_edges(image, start, geometry, state.signs[cells], width, radius_px=RADIUS_PX, iterations=STEPS)
+    width = _short_of_markers(board, sides, np.broadcast_to(np.asarray(blur, dtype=np.float64), (len(start),)))
+    # What markers leave in the windows is no noise, but makes the corners uncertain all the same.
+    plain = board.markers is None
+    return fit_edges(image, start, geometry, signs, width, radius_px=RADIUS_PX, iterations=STEPS, mirrored=plain)
+
+
+def _short_of_markers(board: Board, sides: FloatArray, blur: FloatArray) -> FloatArray:
+    """Return the s (M,) to start from, so small that the windows, a few s to either side of a line, are narrow."""
+    if board.markers is not None:
+        squares = np.array([board.square_x_mm, board.square_y_mm])
+        gap = (0.5 * (1.0 - board.markers.side_mm / squares) * np.linalg.norm(sides, axis=2)).min(axis=1)
+        blur = np.minimum(blur, (gap - MARKER_BLURS * blur - NEAR_PX) / NEAR_SIGMAS)
+    return np.clip(blur, *BLUR_RANGE)
 
 
 def _completed(image: FloatImage, found: BoardDetection, board: Board, camera: Camera | None) -> BoardDetection:
-    opened = _opened(image, found)
+    opened = _opened(image, found, board)
     if opened is None:
         return found
     state = opened
@@ -178,7 +204,7 @@ def _scatter(guide: Guide, state: BoardState) -> float:
     return ratio if ratio > UNEXPLAINED else 1.0
 
 
-def _opened(image: FloatImage, found: BoardDetection) -> BoardState | None:
+def _opened(image: FloatImage, found: BoardDetection, board: Board) -> BoardState | None:
     """Return what the fit says of the corners found; None where they do not alternate like a chessboard's."""
     shape = (found.rows, found.columns)
     empty = np.full(shape, np.nan)
@@ -188,11 +214,11 @@ def _opened(image: FloatImage, found: BoardDetection) -> BoardState | None:
     if not (cells.any(axis=0).sum() >= 3 and cells.any(axis=1).sum() >= 3):
         return None
     local = fit_cells(state.pixels, cells)
-    fit = _fit(image, state, local, state.pixels[cells], cells, FIRST_BLUR)
+    fit = fit_corners(image, board, local, state.pixels[cells], signs[cells], FIRST_BLUR)
     if np.median(fit.contrast) < 0.0:
         state = replace(state, signs=-signs)
     # Once more: the fit ends when the corner stands still, and its residual means something only with the right blur.
-    fit = _fit(image, state, local, state.pixels[cells], cells, float(np.median(fit.blur)))
+    fit = fit_corners(image, board, local, state.pixels[cells], state.signs[cells], float(np.median(fit.blur)))
     good = fit.valid & (fit.contrast > 0.0)
     if good.sum() < FEWEST:
         return None
@@ -220,9 +246,10 @@ def _added(image: FloatImage, guide: Guide, state: BoardState) -> BoardState | N
     shape = _of(shape, usable)
     side = side[usable]
     blur = float(np.nanmedian(state.blur))
-    rough = _fit(image, state, shape, shape.pixels, cells, np.maximum(blur, WIDE_BLUR_CELLS * side))
+    signs = state.signs[cells]
+    rough = fit_corners(image, guide.board, shape, shape.pixels, signs, np.maximum(blur, WIDE_BLUR_CELLS * side))
     start = np.where(rough.valid[:, None], rough.pixels, shape.pixels)
-    fit = _fit(image, state, shape, start, cells, blur)
+    fit = fit_corners(image, guide.board, shape, start, signs, blur)
     good = _confirmed(guide, state, shape, side, fit)
     return state.with_fit(cells, fit, good) if good.any() else None
 
@@ -243,6 +270,7 @@ def _confirmed(guide: Guide, state: BoardState, shape: LocalFit, side: FloatArra
     good = fit.valid & (moved < limit) & (fit.contrast > LEAST_CONTRAST * contrast)
     # Noise is the same at any contrast; what the model gets wrong grows with it.
     most = MOST_RESIDUAL if guide.camera is not None else MOST_RESIDUAL_ALONE
+    most = most if guide.board.markers is None else MOST_RESIDUAL_MARKED
     good &= fit.residual < most * residual * np.maximum(1.0, fit.contrast / contrast)
     good &= fit.sigma_px < MOST_SIGMA_CELLS * side
     return np.asarray(good)
@@ -253,7 +281,9 @@ def _again(image: FloatImage, guide: Guide, state: BoardState) -> BoardState:
     cells = state.known
     shape, seen = guide.at(state, cells)
     shape = replace(shape, pixels=np.where(seen[:, None], shape.pixels, state.pixels[cells]))
-    fit = _fit(image, state, shape, state.pixels[cells], cells, float(np.nanmedian(state.blur)))
+    fit = fit_corners(
+        image, guide.board, shape, state.pixels[cells], state.signs[cells], float(np.nanmedian(state.blur))
+    )
     good = fit.valid & seen & (fit.contrast > 0.0)
     return state.with_fit(cells, fit, good)
 

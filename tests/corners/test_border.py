@@ -110,12 +110,12 @@ def test_what_lies_beyond_each_side_is_read_from_the_image(rng: np.random.Genera
     image = straight(Board("b", 9, 6, 30.0, 30.0), (-210.0, 0.0)).render(noise_levels=2.0, rng=rng)
     (item,) = find_lattices(grey_image(image), 12)
     assert item.lattice.size[0] < 9
-    top, left, bottom, right = sides(grey_image(image), item.lattice)
+    top, left, bottom, right = (beyond.side for beyond in sides(grey_image(image), item.lattice))
     assert {top, bottom} == {Side.BORDER}
     assert {left, right} == {Side.BORDER, Side.UNKNOWN}
     # Without its last two columns the board goes on beyond what is left.
     inner = item.lattice.cut(slice(0, 6), slice(0, item.lattice.size[0] - 2))
-    assert sides(grey_image(image), inner)[3] is Side.GOES_ON
+    assert sides(grey_image(image), inner)[3].side is Side.GOES_ON
 
 
 def test_a_board_cut_on_one_side_has_its_place_and_its_name(rng: np.random.Generator) -> None:
