@@ -11,18 +11,18 @@ from typing import TYPE_CHECKING, Any
 from rigkit.progress import Progress, silent
 
 if TYPE_CHECKING:
+    from rigkit.calibration.result import Calibration
     from rigkit.calibration.rig import RigCalibration
     from rigkit.io.rig_session import RigSession
     from rigkit.validation.checks import Check
 
-__all__ = ["calibrate_rig_session", "measured_checks", "run_rig"]
+__all__ = ["calibrate_camera", "calibrate_rig_session", "measured_checks", "run_rig"]
 
 EXIT_CHECK_FAILED = 1
 
 
 def run_rig(args: argparse.Namespace) -> int:
     """Calibrate the rig of `args.session`; return 1 if something measured disagrees."""
-    from rigkit.calibration.verdicts import judge
     from rigkit.cli.calibrate import page_path
     from rigkit.cli.console import note, print_json, progress_on_stderr
     from rigkit.io.calibration_file import save_calibration
@@ -44,11 +44,7 @@ def run_rig(args: argparse.Namespace) -> int:
     for path in rig_file:
         save_rig(path, rig, force=args.force)
     for camera in rig.cameras:
-        from dataclasses import replace
-
-        # In the rig a camera has another held-out error than alone, and is surer.
-        own = replace(camera.calibration, verdicts=judge(camera.calibration))
-        save_calibration(beside[camera.name], own, force=args.force)
+        save_calibration(beside[camera.name], judged(camera.calibration), force=args.force)
     for path in boards:
         save_board_rigs(path, rig.board_rigs, force=args.force)
     for path in page:
@@ -64,6 +60,31 @@ def run_rig(args: argparse.Namespace) -> int:
     return 0 if all(c.passed for c in checks) else EXIT_CHECK_FAILED
 
 
+def calibrate_camera(path: Path, progress: Progress = silent) -> Calibration:
+    """Return the calibration of one camera from its session, with boards on one mount or without.
+
+    Raises InputError for a session of several cameras, and as `calibrate_rig_session`.
+    """
+    from rigkit.cli.calibrate import calibrate_session
+    from rigkit.io.rig_session import is_rig_session, load_rig_session
+    from rigkit.io.session import load_session
+
+    session = load_rig_session(path) if is_rig_session(path) else None
+    if session is None or len(session.cameras) > 1:
+        return calibrate_session(load_session(path), progress)
+    return judged(calibrate_rig_session(session, progress).cameras[0].calibration)
+
+
+def judged(calibration: Calibration) -> Calibration:
+    """Return a camera's calibration with the verdicts on it as it is in the rig: there it has another held-out error
+    than alone, and is surer."""
+    from dataclasses import replace
+
+    from rigkit.calibration.verdicts import judge
+
+    return replace(calibration, verdicts=judge(calibration))
+
+
 def calibrate_rig_session(session: RigSession, progress: Progress = silent) -> RigCalibration:
     """Return the calibration of a rig's session: images -> corners (kept beside the session) -> rig.
 
@@ -72,6 +93,7 @@ def calibrate_rig_session(session: RigSession, progress: Progress = silent) -> R
     """
     from dataclasses import replace
 
+    from rigkit.calibration.board_ties import suggest_ties
     from rigkit.calibration.rig import calibrate_rig
     from rigkit.cli.calibrate import session_corners, session_views
     from rigkit.cli.rigid_boards import named_as_listed, named_by_rule, require_distinct
@@ -96,6 +118,13 @@ def calibrate_rig_session(session: RigSession, progress: Progress = silent) -> R
         progress=progress,
     )
     rig = named_by_rule(session, rig)
+    if not session.rigid_boards:
+        said = [
+            s
+            for (_, own), c in zip(views.items(), rig.single, strict=True)
+            for s in suggest_ties([v for _, v in own], c)
+        ]
+        rig = replace(rig, verdicts=(*rig.verdicts, *dict.fromkeys(said)))
     single = [replace(c, dropped=(*dropped[n], *c.dropped)) for n, c in zip(session.cameras, rig.single, strict=True)]
     cameras = [
         replace(c, calibration=replace(c.calibration, dropped=alone.dropped))

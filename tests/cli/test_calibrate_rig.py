@@ -12,6 +12,7 @@ from helpers.board_rig_scenes import ALIKE, corner_of_a_room, target_views
 from helpers.calibration_scenes import lens
 
 from rigkit.boards import Board
+from rigkit.cli.calibrate_rig import calibrate_camera
 from rigkit.cli.main import main
 from rigkit.detections import BoardDetection
 from rigkit.geometry.rigid3 import Rigid3
@@ -140,6 +141,9 @@ def test_boards_on_one_mount(tmp_path: Path, rng: np.random.Generator, capsys: p
     assert sorted(target.names) == [b.board_id for b in ALIKE] and target.image_count == 6
     assert target.angle_deg("plane1", "plane2")[0] == pytest.approx(told["checks"][0]["ours"])
     assert "Boards mounted to each other" in (tmp_path / "calibration.html").read_text()
+
+    again = calibrate_camera(path)
+    assert again.heldout_rms_px == told["cameras"][0]["heldout_rms_px"]
 
     # Without the mount, two cameras cannot know which board is which.
     path.write_text(
