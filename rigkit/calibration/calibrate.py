@@ -257,6 +257,7 @@ def _described(options: list[_Option], chosen: _Option) -> list[Candidate]:
         else:
             reason = f"held-out error {100.0 * (o.heldout_px / chosen.heldout_px - 1.0):+.1f} % against the chosen one"
             if o.heldout_px < chosen.heldout_px:
-                reason += f", too little for {o.count - chosen.count} numbers more"
+                more = o.count - chosen.count
+                reason += f", too little for {'one number' if more == 1 else f'{more} numbers'} more"
         out.append(Candidate(o.name, o.count, o.fit.rms_px, o.heldout_px, o is chosen, reason))
     return out

@@ -50,8 +50,8 @@ def write_rig_report(
 
 
 def _boards_in_words(boards: Sequence[Board]) -> str:
-    return "board " + ", ".join(
-        f"{b.board_id} ({b.columns} x {b.rows} corners, {b.square_x_mm:g} x {b.square_y_mm:g} mm)" for b in boards
+    return ("board " if len(boards) == 1 else "boards ") + ", ".join(
+        f"'{b.board_id}' ({b.columns} x {b.rows} corners, {b.square_x_mm:g} x {b.square_y_mm:g} mm)" for b in boards
     )
 
 

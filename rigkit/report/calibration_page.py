@@ -132,7 +132,7 @@ def _candidates(c: Calibration) -> Table:
     rows = tuple(
         (
             Cell(option.name),
-            Cell(float(option.parameter_count)),
+            Cell(float(option.parameter_count) if option.parameter_count else None),
             Cell(option.heldout_rms_px, best=option.chosen),
             Cell(option.rms_px),
             Cell("taken" if option.chosen else ""),
@@ -166,7 +166,7 @@ def _views(section: CalibrationSection) -> str:
             next(b.points_mm for b in c.boards if b.board_id == view.board_id).mean(axis=0)
         )
         distance = float(np.linalg.norm(middle))
-        tilt = np.degrees(np.arccos(np.clip(view.cam_from_board.rotation[:, 2] @ middle / distance, -1.0, 1.0)))
+        tilt = np.degrees(np.arccos(np.clip(abs(view.cam_from_board.rotation[2, 2]), 0.0, 1.0)))
         cells = [
             _picture(section, view.image) if view.image not in shown else "<td></td>",
             f'<td class="text">{escape(view.image)}</td><td class="text">{escape(view.board_id)}</td>',
@@ -176,7 +176,7 @@ def _views(section: CalibrationSection) -> str:
         ]
         shown.add(view.image)
         rows.append(f"<tr>{''.join(cells)}</tr>")
-    note = '<p class="soft">Tilt: between the board and a plane across the line of sight.</p>'
+    note = '<p class="soft">Tilt: between the board and the image plane.</p>'
     return _picture_table("Images", head, "".join(rows)) + note
 
 
