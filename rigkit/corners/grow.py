@@ -57,6 +57,10 @@ RING = 0.3
 
 MIN_RING_PX, MAX_RING_PX = 2.2, 9.0
 
+CENTRE = 0.35
+"""As `ring.MAX_CENTRE`, for a saddle whose place and directions the lattice foretells: the ring may reach beyond the
+squares of flat or small cells."""
+
 LINE_SINE = float(np.sin(np.radians(25.0)))
 """How well the ring's lines must follow the lattice."""
 
@@ -179,7 +183,7 @@ def _rules() -> GrowthRules:
         "least_area": LEAST_AREA,
     }
     predictions = [FitRules(degree, RADIUS, False, WIDTH, ridge) for degree, ridge in (STIFF, PLIANT)]
-    return GrowthRules.make(predictions, ring_rules(), ALONG, **numbers)
+    return GrowthRules.make(predictions, ring_rules(CENTRE), ALONG, **numbers)
 
 
 def _widened(cells: BoolArray) -> BoolArray:
@@ -253,7 +257,7 @@ def _fits(
     """Return the contrast at `pixels` and whether they can be the corners of the cells `owner`."""
     local = level.to_level(pixels)
     height = _area(fit)[owner] / np.maximum(_longest(fit)[owner], 1e-9) / level.scale
-    rings = read_rings(level.smooth, local, np.clip(RING * height, MIN_RING_PX, MAX_RING_PX))
+    rings = read_rings(level.smooth, local, np.clip(RING * height, MIN_RING_PX, MAX_RING_PX), CENTRE)
     sign = lattice.signs()[cell[owner, 0], cell[owner, 1]]
     a, b = fit.along_column[owner], fit.along_row[owner]
     first = np.where((sign > 0)[:, None], a, b)
@@ -261,8 +265,10 @@ def _fits(
     good = rings.valid & _parallel(rings.angles[:, 0], first) & _parallel(rings.angles[:, 1], second)
     for direction in range(4):
         beside = cell[owner] + STEPS[direction][::-1]
+        inside = ((beside >= 0) & (beside < lattice.known.shape)).all(axis=1)
+        beside = np.where(inside[:, None], beside, 0)
         neighbour = lattice.pixels[beside[:, 0], beside[:, 1]]
-        there = np.isfinite(neighbour[:, 0])
+        there = inside & np.isfinite(neighbour[:, 0])
         end = level.to_level(np.where(there[:, None], neighbour, pixels))
         length = np.linalg.norm(end - local, axis=1)
         side = sign if direction % 2 == 0 else -sign

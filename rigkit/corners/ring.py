@@ -69,7 +69,9 @@ class Rings:
     valid: BoolArray
 
 
-def read_rings(image: FloatImage, pixels: FloatArray, radius_px: FloatArray | float) -> Rings:
+def read_rings(
+    image: FloatImage, pixels: FloatArray, radius_px: FloatArray | float, max_centre: float = MAX_CENTRE
+) -> Rings:
     """Return what rings of `radius_px` (scalar or (N,)) around `pixels` (N, 2) of `image` look like."""
     radius = np.broadcast_to(np.asarray(radius_px, np.float32), pixels.shape[:1])
     values = sample(image, pixels[:, None, :].astype(np.float32) + radius[:, None, None] * CIRCLE)
@@ -81,7 +83,7 @@ def read_rings(image: FloatImage, pixels: FloatArray, radius_px: FloatArray | fl
     mean = even.mean(axis=1)
     spread = even - mean[:, None]
     symmetric = (odd**2).sum(axis=1) < MAX_ODD * (spread**2).sum(axis=1)
-    balanced = np.abs(sample(image, pixels) - mean) < MAX_CENTRE * (high - low)
+    balanced = np.abs(sample(image, pixels) - mean) < max_centre * (high - low)
     above = even > middle[:, None]
     valid = symmetric & balanced & (np.count_nonzero(~above & np.roll(above, -1, axis=1), axis=1) == 1)
     angles = np.zeros((len(pixels), 2))
@@ -114,9 +116,9 @@ def _gains() -> FloatArray:
 
 
 @functools.cache
-def ring_rules() -> RingRules:
+def ring_rules(max_centre: float = MAX_CENTRE) -> RingRules:
     """Return the constants of this module for the kernels."""
-    return RingRules.make(CIRCLE, MAX_ODD, MAX_CENTRE, _gains(), MAX_COSINE)
+    return RingRules.make(CIRCLE, MAX_ODD, max_centre, _gains(), MAX_COSINE)
 
 
 def arm_vectors(angles: FloatArray) -> FloatArray:

@@ -13,13 +13,12 @@ from rigkit.native import front
 
 __all__ = ["Corners", "Saddles", "find_corners", "saddle_step"]
 
-RADII = (2.6, 4.6)
-"""Ring radii in pixels of the level: the smaller decides, since it fits squares of 6 px; the larger, where it fits too,
-gives the better directions."""
+RADIUS = 2.6
+"""Of the ring, in pixels of the level: fits squares of 6 px, and 5 where they are seen straight on."""
 
 MAX_SHARPNESS = 0.11
-"""Largest response of a corner, relative to the square of its contrast on the first ring. Edges without blur, smoothed
-as the level is, make 0.08, sharpened ones 0.09, whatever the angles and down to squares of 4 px; noise makes 0.12."""
+"""Largest response of a corner, relative to the square of its contrast on the ring. Edges without blur, smoothed as
+the level is, make 0.08, sharpened ones 0.09, whatever the angles and down to squares of 4 px; noise makes 0.12."""
 
 KNOWN = 2.0
 """A corner this near to one of a finer level is the same, in pixels of its own level."""
@@ -92,18 +91,12 @@ def _corners_of(level: Level) -> tuple[FloatArray, IntArray, FloatArray, FloatAr
     at, response = peaks(level)
     library = front.loaded()
     if library is not None:
-        return front.corners(library, level.smooth, at, response, RADII, MAX_STEP, MAX_SHARPNESS, ring_rules())
+        return front.corners(library, level.smooth, at, response, RADIUS, MAX_STEP, MAX_SHARPNESS, ring_rules())
     found, near = saddle_step(level.smooth, at)
     found = found[near]
-    rings = read_rings(level.smooth, found, RADII[0])
+    rings = read_rings(level.smooth, found, RADIUS)
     which = np.flatnonzero(rings.valid & (response[near] <= MAX_SHARPNESS * rings.contrast**2))
-    angles, contrast = rings.angles[which], rings.contrast[which]
-    todo = np.arange(len(which))
-    for radius in RADII[1:]:
-        rings = read_rings(level.smooth, found[which[todo]], radius)
-        todo = todo[rings.valid]
-        angles[todo], contrast[todo] = rings.angles[rings.valid], rings.contrast[rings.valid]
-    return found, which, angles, contrast
+    return found, which, rings.angles[which], rings.contrast[which]
 
 
 def _without_known(fresh: Corners, known: list[Corners]) -> Corners:

@@ -53,7 +53,8 @@ FOR_EACH_PROCESSOR void smooth(
         middle[width] = middle[width + 1] = middle[width - 1];
         float *restrict to = out + v * width;
         for (int64_t u = 0; u < width; u++)
-            to[u] = outer * (column[u] + column[u + 4]) + inner * (column[u + 1] + column[u + 3]) + centre * column[u + 2];
+            to[u] = outer * (column[u] + column[u + 4]) + inner * (column[u + 1] + column[u + 3]) +
+                    centre * column[u + 2];
         if (v % 2 == 0)
             for (int64_t u = 0; u < half_width; u++)
                 half[v / 2 * half_width + u] = to[2 * u];
@@ -83,9 +84,9 @@ void typical_values(
         }
 }
 
-/* Mark the peaks among the pixels u to u + STRIP - 1 of a row: not lower than the neighbours that follow within two pixels,
- * higher than those before (a corner between pixels makes two equal ones), and above the threshold. Returns whether there
- * are any. */
+/* Mark the peaks among the pixels u to u + STRIP - 1 of a row: not lower than the neighbours that follow within two
+ * pixels, higher than those before (a corner between pixels makes two equal ones), and above the threshold. Returns
+ * whether there are any. */
 INLINE int32_t mark_peaks(float *const rows[5], int64_t u, float threshold, int32_t *restrict peak)
 {
     float before[STRIP + 4], after[STRIP + 4];
@@ -189,16 +190,16 @@ INLINE int saddle_near(const float *smooth, int64_t width, int64_t u, int64_t v,
     return fabs(step_u) <= most_step && fabs(step_v) <= most_step;
 }
 
-/* The corners of one level among `count` peaks of `response`: `saddles` (count, 2) gets those with a saddle nearby, `which`,
- * `angles` (count, 2) and `contrast` those of them that are corners: valid at the first radius and there no sharper than
- * `most_sharp`, read at the last valid radius. Returns the number of saddles and, in `found`, of corners. */
+/* The corners of one level among `count` peaks of `response`: `saddles` (count, 2) gets those with a saddle nearby,
+ * `which`, `angles` (count, 2) and `contrast` those of them that are corners: their ring is valid and they are no sharper
+ * than `most_sharp`. Returns the number of saddles and, in `found`, of corners. */
 int64_t find_corners(
-    image_t image, const ring_rules_t *rules, const double *radii, int64_t radius_count, double most_step,
-    double most_sharp, const int32_t *peaks, const float *response, int64_t count, double *saddles, int64_t *which, double *angles, double *contrast,
+    image_t image, const ring_rules_t *rules, double radius, double most_step, double most_sharp, const int32_t *peaks,
+    const float *response, int64_t count, double *saddles, int64_t *which, double *angles, double *contrast,
     int64_t *found);
 FOR_EACH_PROCESSOR int64_t find_corners(
-    image_t image, const ring_rules_t *rules, const double *radii, int64_t radius_count, double most_step,
-    double most_sharp, const int32_t *peaks, const float *response, int64_t count, double *saddles, int64_t *which, double *angles, double *contrast,
+    image_t image, const ring_rules_t *rules, double radius, double most_step, double most_sharp, const int32_t *peaks,
+    const float *response, int64_t count, double *saddles, int64_t *which, double *angles, double *contrast,
     int64_t *found)
 {
     int64_t near = 0, corners = 0;
@@ -207,16 +208,10 @@ FOR_EACH_PROCESSOR int64_t find_corners(
         if (!saddle_near(image.brightness, image.width, peaks[2 * k], peaks[2 * k + 1], most_step, pixel))
             continue;
         near++;
-        const float u = (float)pixel[0], v = (float)pixel[1];
-        double *turn = angles + 2 * corners, *height = contrast + corners;
-        if (!read_ring(image, *rules, u, v, (float)radii[0], turn, height))
-            continue;
-        if (response[k] > most_sharp * *height * *height)
-            continue;
-        for (int64_t wider = 1; wider < radius_count; wider++)
-            if (!read_ring(image, *rules, u, v, (float)radii[wider], turn, height))
-                break;
-        which[corners++] = near - 1;
+        if (read_ring(image, *rules, (float)pixel[0], (float)pixel[1], (float)radius, angles + 2 * corners,
+                      contrast + corners) &&
+            response[k] <= most_sharp * contrast[corners] * contrast[corners])
+            which[corners++] = near - 1;
     }
     *found = corners;
     return near;
@@ -239,7 +234,7 @@ INLINE int64_t square_at(double position, double least, double side, int64_t cou
     return place > 0.0 ? (place < (double)count ? (int64_t)place : count - 1) : 0;
 }
 
-/* Sort `count` > 0 points into squares of at least `side`, at least as many points as squares. Returns 0 without memory. */
+/* Sort `count` > 0 points into squares of at least `side`. Returns 0 without memory. */
 static int fill_squares(const double *points, int64_t count, double side, squares_t *out)
 {
     double left = points[0], right = left, top = points[1], bottom = top;
@@ -250,7 +245,8 @@ static int fill_squares(const double *points, int64_t count, double side, square
         top = v < top ? v : top;
         bottom = v > bottom ? v : bottom;
     }
-    while ((right - left) / side * ((bottom - top) / side) + (right - left + bottom - top) / side > SQUARES_A_POINT * (double)count + 8.0)
+    const double most = SQUARES_A_POINT * (double)count + 8.0;
+    while (((right - left) / side + 1.0) * ((bottom - top) / side + 1.0) > most)
         side *= 1.4;
     const squares_t squares = {points, NULL, NULL, (int64_t)((right - left) / side) + 1,
                                (int64_t)((bottom - top) / side) + 1, left, top, side};
@@ -276,7 +272,7 @@ static int fill_squares(const double *points, int64_t count, double side, square
     return 1;
 }
 
-/* corners.saddle: mark those of `fresh` (count, 2) that lie within `reach` of one of `known`. Returns 0 without memory. */
+/* Mark those of `fresh` (count, 2) that lie within `reach` of one of `known`. Returns 0 without memory. */
 int64_t mark_known(
     const double *fresh, int64_t count, const double *known, int64_t known_count, double reach, uint8_t *mark);
 int64_t mark_known(
@@ -389,12 +385,13 @@ INLINE int64_t gather(
     }
 }
 
-/* Mark which of the corners around `home` are like it in contrast and point arms of the other kind at it, as it at them. */
+/* Mark which of the corners around `home` are like it in contrast and point an arm of the other kind at it, as it does. */
 INLINE void mark_facing(const place_t *home, const link_rules_t *rules, const near_t *near, int64_t count)
 {
     const float ratio = (float)rules->contrast_ratio, contrast = home->contrast;
     const float cosine = (float)(rules->arm_cosine * rules->arm_cosine);
-    const float mine_a_u = home->lines[0], mine_a_v = home->lines[1], mine_b_u = home->lines[2], mine_b_v = home->lines[3];
+    const float mine_a_u = home->lines[0], mine_a_v = home->lines[1];
+    const float mine_b_u = home->lines[2], mine_b_v = home->lines[3];
     const float *restrict square = near->columns[SQUARE], *restrict theirs = near->columns[CONTRAST];
     const float *restrict u = near->columns[CHORD_U], *restrict v = near->columns[CHORD_V];
     const float *restrict a_u = near->columns[A_U], *restrict a_v = near->columns[A_V];
@@ -424,7 +421,8 @@ INLINE int link_seen(
 {
     const int64_t j = link->end;
     const double u = (corners->pixels[2 * i] - offset) / scale, v = (corners->pixels[2 * i + 1] - offset) / scale;
-    const double end_u = (corners->pixels[2 * j] - offset) / scale, end_v = (corners->pixels[2 * j + 1] - offset) / scale;
+    const double end_u = (corners->pixels[2 * j] - offset) / scale;
+    const double end_v = (corners->pixels[2 * j + 1] - offset) / scale;
     double aside = rules->aside * sqrt((end_u - u) * (end_u - u) + (end_v - v) * (end_v - v));
     const double most = corners->reach[i];
     aside = aside > rules->least_aside ? aside : rules->least_aside;
@@ -479,8 +477,8 @@ static double link_length(const double *pixels, int64_t i, int64_t to)
     return sqrt(du * du + dv * dv);
 }
 
-/* corners.links.find_links: both[4 * i + arm] = 4 * neighbour + its arm, -1 for none. Of the corners, `lines` (count, 4) are
- * the unit vectors of A and B, `least` and `most` bound the contrast of those looked at, `reach` is the most `aside`.
+/* corners.links.find_links: both[4 * i + arm] = 4 * neighbour + its arm, -1 for none. Of the corners, `lines` (count, 4)
+ * are the unit vectors of A and B, `least` and `most` bound the contrast of those looked at, `reach` is the most `aside`.
  * `nearest` (count, 4) is scratch. Returns 0 without memory. */
 int64_t find_links(
     const corners_t *corners, image_t image, double scale, double offset, const link_rules_t *rules, int64_t *nearest,

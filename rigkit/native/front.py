@@ -88,7 +88,7 @@ def loaded() -> ctypes.CDLL | None:
     for name in ("shrink", "smooth", "typical_values"):
         getattr(library, name).restype = None
     library.find_peaks.argtypes = [address, size, size, c_float, *[address] * 3]
-    rings = (_Image, POINTER(RingRules), address, size, c_double, c_double)
+    rings = (_Image, POINTER(RingRules), c_double, c_double, c_double)
     library.find_corners.argtypes = [*rings, address, address, size, *[address] * 5]
     library.mark_known.argtypes = [address, size, address, size, c_double, address]
     library.find_links.argtypes = [
@@ -142,19 +142,19 @@ def corners(
     smooth: Image,
     at: NDArray[np.signedinteger],
     response: Image,
-    radii: tuple[float, ...],
+    radius: float,
     most_step: float,
     most_sharp: float,
     rules: RingRules,
 ) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
     """Return the saddles next to the peaks `at` (N, 2); of the corners among them: which, angles (M, 2), contrast."""
     at, response = np.ascontiguousarray(at, np.int32), np.ascontiguousarray(response, np.float32)
-    count, found, radius = len(at), c_int64(), np.array(radii)
+    count, found = len(at), c_int64()
     pixels, which = np.empty((count, 2)), np.empty(count, np.int64)
     # A ring is read before it is known whether it is kept.
     angles, contrast = np.empty((count + 1, 2)), np.empty(count + 1)
     near = library.find_corners(
-        *(_Image.of(smooth), byref(rules), radius.ctypes.data, len(radius), most_step, most_sharp),
+        *(_Image.of(smooth), byref(rules), radius, most_step, most_sharp),
         *(at.ctypes.data, response.ctypes.data, count),
         *(array.ctypes.data for array in (pixels, which, angles, contrast)),
         byref(found),

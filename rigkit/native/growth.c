@@ -270,6 +270,8 @@ typedef struct {
 
 INLINE int is_known(const sheet_t *sheet, int64_t row, int64_t column)
 {
+    if (row < 0 || column < 0 || row >= sheet->rows || column >= sheet->columns)
+        return 0;
     const double u = sheet->pixels[2 * (row * sheet->columns + column)];
     return u == u;
 }
@@ -363,9 +365,8 @@ INLINE int try_cell(
 
 INLINE int has_neighbour(const sheet_t *sheet, int64_t row, int64_t column)
 {
-    return (row > 0 && is_known(sheet, row - 1, column)) || (column > 0 && is_known(sheet, row, column - 1)) ||
-           (row + 1 < sheet->rows && is_known(sheet, row + 1, column)) ||
-           (column + 1 < sheet->columns && is_known(sheet, row, column + 1));
+    return is_known(sheet, row - 1, column) || is_known(sheet, row, column - 1) || is_known(sheet, row + 1, column) ||
+           is_known(sheet, row, column + 1);
 }
 
 static int touches_border(const sheet_t *sheet)
