@@ -1,6 +1,6 @@
 """Calibration beside its peers on the same corners: time, error, difference to the true lens, failures.
 
-    python scripts/benchmark_calibration.py [--views 40] [--repeats 7] [--failures 20 [--omnidir 3]]
+    python scripts/benchmark_calibration.py [--views 40] [--repeats 15] [--failures 20 [--omnidir 3]]
 
 Times are medians of CPU seconds of one process with one thread, initialisation included, nothing given but the corners;
 all peers of a table take turns, so that what else the machine does falls on each alike. RMS is 2-D per corner.
@@ -198,7 +198,8 @@ def speed(name: str, count: int, board: Board, repeats: int, mrcal: bool) -> Non
         try:
             found[solver] = solve_once()
         except (cv2.error, RigkitError, AssertionError) as failed:
-            rows.append([solver, "-", "-", "-", (str(failed) or "no sensible camera").splitlines()[0][:60]])
+            why = str(failed).split("error: ")[-1].splitlines() or ["no sensible camera"]
+            rows.append([solver, "-", "-", "-", f"failed: {why[0][:60]}"])
     runs = {solver: clocked(solvers[solver]) for solver in found}
     if name == "reg" and mrcal:
         with Mrcal({(k, 0): view for k, view in enumerate(views)}) as peer:
