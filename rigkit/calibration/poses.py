@@ -17,6 +17,8 @@ __all__ = ["find_poses", "refine_poses"]
 MAX_ITERATIONS = 40
 TOLERANCE = 1e-10
 DAMPING_START = 1e-6
+DAMPING_LEAST = 1e-12
+"""A view of which hardly a corner projects does not determine its pose: less than this would leave it singular."""
 
 
 def refine_poses(
@@ -52,7 +54,7 @@ def refine_poses(
         active &= (predicted > TOLERANCE * cost) & (damping < 1e10)
         pp, p = np.where(better[:, None, None], normal.pp, pp), np.where(better[:, None], normal.p, p)
         cost = np.where(better, normal.costs, cost)
-        damping = np.where(better, damping * 0.1, damping * 10.0)
+        damping = np.where(better, np.maximum(0.1 * damping, DAMPING_LEAST), 10.0 * damping)
         if not active.any():
             break
     return state, cost

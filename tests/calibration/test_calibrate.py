@@ -20,6 +20,8 @@ from rigkit.boards import Board
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.initialise import initialise, start_error
 from rigkit.calibration.observations import Observations
+from rigkit.calibration.poses import find_poses
+from rigkit.calibration.solver import State, evaluate
 from rigkit.calibration.uncertainty import uncertainty_at_corners
 from rigkit.cameras.registry import MODELS
 from rigkit.detections import BoardView
@@ -209,3 +211,12 @@ def test_auto_is_as_good_as_the_best_model(rng: np.random.Generator, reach_deg: 
     # The true model is one of those tried: what another costs in the lens is chance.
     assert off < 1.5 * least + 0.05
     assert all(c.reason for c in result.candidates)
+
+
+def test_poses_of_views_that_hardly_project_raise_nothing(rng: np.random.Generator) -> None:
+    views, rotation, translation = random_views(lens("fish"), 12, rng, reach_deg=92.5)
+    observations = Observations.from_views(views)
+    # Behind the camera and facing away: at most a corner or two project, if any.
+    away = State.start(lens("fish"), rotation @ np.diag([1.0, -1.0, -1.0]), -translation, observations)
+    found = find_poses(observations, away, observations.weight, 0.5)
+    assert np.median(evaluate(found, observations).norm(observations)) < 1.0
