@@ -33,17 +33,21 @@ def write_rig_report(
     path: Path, session: RigSession, rig: RigCalibration, checks: Sequence[Check], target: Path, *, force: bool
 ) -> None:
     """Write the page of a rig, which was saved as `target`: what the cameras share, then each camera alone."""
+    from rigkit.cli.calibrate_rig import judged
     from rigkit.io.files import write_atomic
     from rigkit.report.calibration_page import CalibrationSection, build_calibration_page
     from rigkit.report.rig_tables import rig_tables
 
     name = session.path.resolve().parent.name
+    # One camera is shown as its boards on one mount have it: that is what its file says.
+    several = rig.single if len(rig.cameras) > 1 else ()
     sections = [
-        CalibrationSection(own, alone, _thumbnails(session.cameras[own].images, alone))
-        for own, alone in zip(session.cameras, rig.single, strict=True)
+        CalibrationSection(own, shown, _thumbnails(session.cameras[own].images, shown))
+        for own, shown in zip(session.cameras, several or [judged(rig.cameras[0].calibration)], strict=True)
     ]
     boards = _boards_in_words(next(iter(session.cameras.values())).boards)
-    lead = f"{session.path.name} with {boards}: the rig first, then every camera as calibrated alone"
+    then = "then every camera as calibrated alone" if several else "then the camera"
+    lead = f"{session.path.name} with {boards}: the rig first, {then}"
     facts = _provenance([session.path, target], {f"images of {own}": s.images for own, s in session.cameras.items()})
     page = build_calibration_page(f"rigkit rig calibration: {name}", lead, sections, facts, rig_tables(rig, checks))
     write_atomic(path, page, force=force)

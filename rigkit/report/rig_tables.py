@@ -24,8 +24,6 @@ def rig_tables(rig: RigCalibration, checks: Sequence[Check]) -> tuple[Table, ...
     if len(rig.cameras) > 1:
         tables.append(_baselines(rig, checks))
     tables += [_angles(rig, target, checks) for target in rig.board_rigs]
-    words = tuple((Cell(v),) for v in rig.verdicts)
-    tables.append(Table("verdicts", "The rig in words", (Column("remark"),), words))
     if rig.left_out:
         columns = (Column("frame"), Column("board"), Column("why"))
         rows = tuple((Cell(frame), Cell(board), Cell(reason)) for frame, board, reason in rig.left_out)
@@ -62,8 +60,8 @@ def _cameras(rig: RigCalibration) -> Table:
             )
         )
     held = "not available (too few frames)" if rig.heldout_rms_px is None else f"{rig.heldout_rms_px:.3f} px"
-    note = (
-        f"All intrinsics and mounts solved together. Held-out RMS, over frames that took no part and with one pose for "
+    note = " ".join(f"{verdict[:1].upper()}{verdict[1:]}." for verdict in rig.verdicts) + (
+        " All intrinsics and mounts solved together. Held-out RMS, over frames that took no part and with one pose for "
         f"all cameras: {held}; training RMS {rig.rms_px:.3f} px over {rig.corner_count} corners, {rig.shared_count} "
         f"poses shared by several views. Frames disagree {rig.spread:.2f} times as much as independent corners would; "
         "all sigmas count that in. The frame is that of the first camera."
@@ -114,7 +112,11 @@ def _angles(rig: RigCalibration, target: BoardRig, checks: Sequence[Check]) -> T
     rows = []
     for a, b in combinations(target.names, 2):
         value, sigma = target.angle_deg(a, b)
-        corners = target.distance_mm(Feature(a, grid=(0, 0)), Feature(b, grid=(0, 0)))
+        both = (target.boards[target.index(name)].board for name in (a, b))
+        # A board that looks the same turned has no first corner that a person could measure from.
+        corners: tuple[float | None, float | None] = (None, None)
+        if not any(board.looks_same_turned for board in both):
+            corners = target.distance_mm(Feature(a, grid=(0, 0)), Feature(b, grid=(0, 0)))
         centres = target.distance_mm(Feature(a, centre=True), Feature(b, centre=True))
         rows.append(
             (
