@@ -55,10 +55,11 @@ ASTRAY_FACTOR = 8.0
 """A corner further than this from where its neighbours say (in cells; and times the board's typical deviation; and
 times the standard deviation expected of it) is something else: a finger, a glint, the end of a ruler."""
 
-COVERED = 0.15
-COVERED_FACTOR = 3.5
-"""A corner whose residual, relative to its contrast, exceeds this and this times the board's typical one, and that lies
-off by this times the typical deviation, is covered in part, by the edge of a ruler or of a hand."""
+COVERED, COVERED_FACTOR = 0.03, 6.0
+COVERED_OFF = 3.5
+"""A corner whose noise, relative to its contrast, exceeds this and this times the board's typical one, and that lies
+off by this times the typical deviation, is covered in part, by the edge of a ruler or of a hand: its sides are not
+alike. On rendered boards under a ruler the factor is 12 and more, on boards with marks in their squares seldom 6."""
 
 DIFFERENCES = (5, 6)
 FEWEST_DIFFERENCES = 16
@@ -239,7 +240,7 @@ def _around(values: FloatArray, known: BoolArray) -> FloatArray:
 
 
 def _checked(item: RefinedLattice, parts: Sequence[Part]) -> RefinedLattice:
-    """Return `item` without corners that lie where their neighbours say they cannot."""
+    """Return `item` without corners that are covered in part or lie where their neighbours say they cannot."""
     known = item.lattice.known
     shape = fit_cells(item.lattice.pixels, known, leave_out=True)
 
@@ -254,7 +255,7 @@ def _checked(item: RefinedLattice, parts: Sequence[Part]) -> RefinedLattice:
     judged[known] = (shape.support >= FEWEST_CHECKED) & (shape.gain < 1.5)
     cells = spread(distance / _cell_px(shape))
     excess = spread(distance / (item.sigma_px[known] * np.hypot(1.0, shape.gain)))
-    relative = item.residual / item.lattice.contrast
+    relative = item.noise / item.lattice.contrast
     drop = np.zeros_like(known)
     for part in parts:
         here, sure = known[part], judged[part]
@@ -264,7 +265,7 @@ def _checked(item: RefinedLattice, parts: Sequence[Part]) -> RefinedLattice:
         usual = _typical(relative[part][here])
         astray = (cells[part] > max(ASTRAY_CELLS, ASTRAY_FACTOR * typical)) & (excess[part] > ASTRAY_FACTOR)
         covered = relative[part] > max(COVERED, COVERED_FACTOR * usual)
-        drop[part] = sure & (astray | (covered & (cells[part] > COVERED_FACTOR * typical)))
+        drop[part] = sure & (astray | (covered & (cells[part] > COVERED_OFF * typical)))
     return item.without(drop) if drop.any() else item
 
 

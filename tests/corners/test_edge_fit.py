@@ -185,3 +185,16 @@ def test_sharp_edges_have_the_pixel_s_shape() -> None:
             flat = PIXEL_KURTOSIS * (np.cos(angle) ** 4 + np.sin(angle) ** 4)
             ours = _edge(x[None].astype(np.float32), np.float32([[width]]), np.float32([[flat]]))[0][0]
             assert 100.0 * np.abs(ours - true).max() / 2.0 < most, (blur, angle)
+
+
+def test_a_covered_corner_shows_as_noise(rng: np.random.Generator) -> None:
+    """A ruler over a third of a corner's window: residuals that mirroring changes, a dozen times those elsewhere."""
+    shape = geometry(5)
+    pixels = corners(5, rng)
+    image, _ = image_of(pixels, shape, 0.8)
+    image += rng.normal(0.0, 1.0, image.shape).astype(np.float32)
+    image[:, 128 + 36 : 192] = 200.0
+    fit = fit_edges(image, pixels, shape, np.ones(5), np.full(5, 0.8), radius_px=18.0, iterations=8)
+    others = np.array([0, 1, 3, 4])
+    assert np.abs(fit.noise[others] - 1.0).max() < 0.3
+    assert fit.noise[2] > 12.0
