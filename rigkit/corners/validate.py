@@ -31,8 +31,8 @@ MAX_UNEXPLAINED, NOISE_LEVELS = 0.17, 10.0
 levels) does not explain. Dots in rows have saddles between them, too, and show 0.2; boards 0.03 to 0.07 with motion,
 saturation or compression, 0.13 where a camera sharpens strongly."""
 
-MAX_LOST = 0.25
-"""Largest part of a lattice's corners that the sub-pixel fit may refuse."""
+MAX_LOST = 0.4
+"""Largest part of a lattice's corners that the sub-pixel fit may refuse: beside what covers a board there are many."""
 
 MANY, SAMPLE = 200, 7
 """Lattices of so many corners are judged by so many rows and columns before all of them are fitted."""
