@@ -50,6 +50,7 @@ _PUBLIC = {
     "calibrate": "rigkit.calibration.calibrate",
     "camera_model": "rigkit.cameras.registry",
     "compare_cameras": "rigkit.cameras.compare",
+    "complete_boards": "rigkit.corners.guided",
     "crosscheck": "rigkit.validation.crosscheck",
     "detect_boards": "rigkit.corners.detect",
     "fundamental_for": "rigkit.fundamental.registry",

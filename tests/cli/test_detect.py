@@ -48,6 +48,35 @@ def test_folder_to_corners_and_overlays_whatever_the_number_of_processes(images:
     assert all(items[0].complete and items[0].board_id for items in found.values())
 
 
+def camera_file(path: Path, size_px: tuple[int, int] = (640, 480)) -> Path:
+    parameters = dict(zip(("fx", "fy", "cx", "cy"), (545.0, 545.0, 318.0, 242.0), strict=True))
+    camera = {"model": "pinhole", "size_px": size_px, "parameters": parameters}
+    path.write_text(json.dumps({"schema": "rigkit.calibration/1", "camera": camera}))
+    return path
+
+
+def test_a_known_camera_adds_corners_whatever_the_number_of_processes(images: Path, tmp_path: Path) -> None:
+    for path in sorted(images.iterdir()):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        cv2.line(image, (150, 0), (420, 479), 128, 40)
+        cv2.imwrite(str(path), image)
+    camera = camera_file(tmp_path / "camera.json")
+    counts = {}
+    for name, more in (
+        ("plain", ["1"]),
+        ("one", ["1", "--camera", str(camera)]),
+        ("two", ["2", "--camera", str(camera)]),
+    ):
+        corners = tmp_path / f"{name}.csv"
+        arguments = [str(images), "--board", str(tmp_path / "a9x6.toml"), "-o", str(corners), "--jobs", *more]
+        assert main(["detect", *arguments]) == 0
+        found = read_corners(corners, [Board("a9x6", 9, 6, 30.0, 30.0)])
+        counts[name] = sum(len(d.grid) for items in found.values() for d in items if d.board_id)
+    assert (tmp_path / "one.csv").read_text() == (tmp_path / "two.csv").read_text()
+    assert counts["one"] >= counts["plain"]
+    assert counts["one"] > 90
+
+
 def test_json_is_the_result_on_stdout(images: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["detect", str(images / "0.png"), "--json", "--jobs", "1"]) == 0
     (items,) = json.loads(capsys.readouterr().out).values()
@@ -62,16 +91,23 @@ def test_existing_output_stays(images: Path, tmp_path: Path, capsys: pytest.Capt
     assert "--force" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("what", ["missing", "empty folder", "truncated", "jobs"])
+@pytest.mark.parametrize(
+    "what",
+    ["missing", "empty folder", "truncated", "jobs", "camera without board", "camera of another size", "no camera"],
+)
 def test_bad_input_is_one_line(what: str, images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "empty").mkdir()
     cut = tmp_path / "cut.png"
     cut.write_bytes((images / "0.png").read_bytes()[:5000])
+    board = ["--jobs", "1", "--board", str(tmp_path / "a9x6.toml")]
     arguments = {
         "missing": ["no/such.png"],
         "empty folder": [str(tmp_path / "empty")],
         "truncated": [str(cut), "--jobs", "1"],
         "jobs": [str(images), "--jobs", "0"],
+        "camera without board": [str(images), "--camera", str(camera_file(tmp_path / "a.json"))],
+        "camera of another size": [str(images), *board, "--camera", str(camera_file(tmp_path / "b.json", (800, 600)))],
+        "no camera": [str(images), *board, "--camera", str(tmp_path / "none.json")],
     }[what]
     assert main(["detect", *arguments]) == 2
     error = [line for line in capsys.readouterr().err.splitlines() if line.startswith("rigkit:")]
