@@ -126,3 +126,23 @@ def test_boards_of_other_sizes_come_back_as_they_are(rng: np.random.Generator) -
     assert complete_boards(image, found, [Board("other", 7, 5, 30.0, 30.0)], scene.camera) == found
     with pytest.raises(InputError, match="image:"):
         complete_boards(np.zeros((4, 4)), found, [BOARD])
+
+
+@pytest.mark.parametrize("camera_known", [True, False])
+def test_what_is_covered_stays_missing(camera_known: bool, rng: np.random.Generator) -> None:
+    """Two blots with edges of their own over corners of the last columns; the third corner forgotten is in sight."""
+    scene = one_board(rng, board=BOARD, square_px=34.0, max_tilt_deg=20.0)
+    image = scene.render(noise_levels=2.0, rng=rng)
+    found = whole(detect_boards(image, [BOARD]))
+    assert found is not None
+    assert found.complete
+    blots = {(7, 1): (12, 9), (8, 4): (4, 3)}
+    for (column, row), (across, down) in blots.items():
+        u, v = np.round(found.lattice()[row, column] + np.array([across // 3, down // 3])).astype(int)
+        image[v - down : v + down, u - across : u + across] = 120
+    dropped = np.array([tuple(cell) in {*blots, (3, 3)} for cell in found.grid.tolist()])
+    part = missing(found, dropped)
+    (again,) = complete_boards(image, [part], [BOARD], scene.camera if camera_known else None)
+    cells = {tuple(cell) for cell in again.grid.tolist()}
+    assert (3, 3) in cells
+    assert not cells & set(blots)
