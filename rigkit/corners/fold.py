@@ -33,10 +33,16 @@ CONTINUES_CELLS = 0.1
 """A column that goes on smoothly lies this near to where the others say, in cells."""
 
 GAP = 2
-"""Parts of one board are at most so many steps apart: separate boards have their outer squares and margins between."""
+"""Parts of one board are at most so many steps apart along a row or column: separate boards have their outer squares
+and margins between, or touch at a corner."""
 
-DIAGONAL = 1.5
-"""A diagonal step is so many times as long as a side, and a little more."""
+FAR_GAP, FAR_MEETS_CELLS, FAR_OUT, FAR_FACING = 3, 0.1, 24, 2
+"""A step more if so many corners of the other part, and not only the nearest, are where they should be, and if two see
+one of the first along their row or column."""
+
+DIAGONAL, REACH = 1.5, 3.3
+"""A diagonal step is so many times as long as a side, and a little more; the nearest corners of parts a step further
+apart are so many sides apart, at most."""
 
 NEAREST_IN, NEAREST_OUT = 16, 6
 """Corners of the one part that carry its rows over, and of the other that must meet them."""
@@ -134,7 +140,7 @@ def _same_board(one: _Part, two: _Part) -> bool:
     """Return whether two parts of one lattice continue each other."""
     gap = one.pixels[:, None] - two.pixels
     near, place = _carried_over(one, two, np.hypot(gap[..., 0], gap[..., 1]))
-    off = float(np.abs(place - two.grid[near]).max())
+    off = float(np.abs(place - two.grid[near])[:NEAREST_OUT].max())
     if not MEETS_CELLS <= off < MEETS_AT_ALL:
         return off < MEETS_CELLS
     pixels = np.where(one.lattice.known[..., None], one.lattice.pixels, two.lattice.pixels)
@@ -220,12 +226,12 @@ class _Part(NamedTuple):
 
 
 def _near(parts: Sequence[_Part]) -> list[tuple[int, int]]:
-    """Return the pairs whose bounding boxes come within GAP sides of a cell of the first, at its largest."""
+    """Return the pairs whose bounding boxes come within FAR_GAP sides of a cell of the first, at its largest."""
     if len(parts) < 2:
         return []
     low, high = np.array([item.low for item in parts]), np.array([item.high for item in parts])
     gap = (np.maximum(low[:, None], low) - np.minimum(high[:, None], high)).max(axis=2)
-    near = np.triu(gap < GAP * np.array([[item.side_px] for item in parts]), 1)
+    near = np.triu(gap < FAR_GAP * np.array([[item.side_px] for item in parts]), 1)
     return [(int(i), int(j)) for i, j in np.argwhere(near)]
 
 
@@ -236,17 +242,21 @@ def _joined(one: _Part, two: _Part) -> Lattice | None:
     nearest = divmod(int(apart.argmin()), len(two.pixels))
     cell = _cell(one, nearest[0])
     longest = float(np.hypot(cell[:, 0], cell[:, 1]).max())
-    if not apart[nearest] < DIAGONAL * GAP * longest or not _alike(cell, _cell(two, nearest[1])):
+    if not apart[nearest] < REACH * longest or not _alike(cell, _cell(two, nearest[1])):
         return None
     near, place = _carried_over(one, two, apart)
     whole = np.rint(place)
+    far_off = float(np.abs(place - whole).max())
+    near, place, whole = near[:NEAREST_OUT], place[:NEAREST_OUT], whole[:NEAREST_OUT]
     off = float(np.abs(place - whole).max())
     if not off < MEETS_AT_ALL:
         return None
     for quarter in range(4):
         shift = whole.astype(np.int64) - _turned_grid(two.grid[near], two.lattice.size, quarter)
         if (shift == shift[0]).all():
-            united = _united(one.lattice, two.lattice.turned(quarter), shift[0])
+            close = bool(apart[nearest] < DIAGONAL * GAP * longest)
+            far = far_off < FAR_MEETS_CELLS
+            united = _united(one.lattice, two.lattice.turned(quarter), shift[0], close, far)
             if united is None or off < MEETS_CELLS:
                 return united
             left, top = np.maximum(0, -shift[0])
@@ -279,12 +289,12 @@ def _agree(pixels: FloatArray, one: BoolArray, two: BoolArray) -> bool:
 
 
 def _carried_over(one: _Part, two: _Part, apart: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Return the NEAREST_OUT corners of `two` and their (column, row) as the NEAREST_IN of `one` say, infinite if none.
+    """Return the FAR_OUT nearest corners of `two` and their (column, row) as the NEAREST_IN of `one` say, or infinity.
 
     `apart` (N, M) are the distances between the corners.
     """
-    near2 = np.argsort(apart.min(axis=0), kind="stable")[:NEAREST_OUT]
-    near1 = np.argsort(apart[:, near2].min(axis=1), kind="stable")[:NEAREST_IN]
+    near2 = np.argsort(apart.min(axis=0), kind="stable")[:FAR_OUT]
+    near1 = np.argsort(apart[:, near2[:NEAREST_OUT]].min(axis=1), kind="stable")[:NEAREST_IN]
     grid_from_pixel = None
     if not (one.grid[near1] == one.grid[near1[0]]).all(axis=0).any():
         grid_from_pixel, _ = cv2.findHomography(one.pixels[near1], one.grid[near1].astype(np.float64), 0)
@@ -317,7 +327,13 @@ def _turned_grid(grid: IntArray, size: tuple[int, int], quarter_turns: int) -> I
     return grid
 
 
-def _united(one: Lattice, two: Lattice, shift: IntArray) -> Lattice | None:
+def _facing(one: Lattice, two: Lattice, steps: int) -> int:
+    """Return how many corners of `two` have one of `one` at most so many steps along their row or column."""
+    reach = cv2.getStructuringElement(cv2.MORPH_CROSS, (2 * steps + 1, 2 * steps + 1))
+    return int(np.count_nonzero((cv2.dilate(one.known.astype(np.uint8), reach) > 0) & two.known))
+
+
+def _united(one: Lattice, two: Lattice, shift: IntArray, near: bool, far: bool) -> Lattice | None:
     """Return `two`, moved by `shift` (columns, rows), put into `one`; None if they overlap, differ or are far apart."""
     low = np.minimum(0, shift)
     high = np.maximum(one.size, shift + np.array(two.size))
@@ -335,8 +351,7 @@ def _united(one: Lattice, two: Lattice, shift: IntArray) -> Lattice | None:
     first, second = parts
     if first.rising != second.rising or (first.known & second.known).any():
         return None
-    reach = cv2.dilate(first.known.astype(np.uint8), np.ones((2 * GAP + 1, 2 * GAP + 1), np.uint8)) > 0
-    if not (reach & second.known).any():
+    if not (near and _facing(first, second, GAP)) and not (far and _facing(first, second, FAR_GAP) >= FAR_FACING):
         return None
     known = first.known
     return Lattice(
