@@ -31,6 +31,8 @@ RINGS = 4
 """What is usual is asked of so many rings around the middle of the image: towards the rim all corners scatter more."""
 OUTLYING = 0.2
 """A view with this part of its corners outliers."""
+SMALL_PX = 0.1
+"""Corners this near to where they should be are no reason to retake an image, however sure they were said to be."""
 NAMED = 3
 """So many images are named one by one."""
 PATTERN = 0.35
@@ -180,12 +182,15 @@ def _views(c: Calibration) -> list[str]:
         times = _medians(residual / there, lengths)
     found = []
     for i in np.flatnonzero((times > BAD_VIEW) | (out > OUTLYING * lengths)).tolist():
-        what = f"has a median residual of {middle[i]:.3f} px, {times[i]:.1f} times the usual one there"
-        if times[i] <= BAD_VIEW:
-            what = f"has {out[i]} outliers among its {lengths[i]} corners"
-        found.append(
-            f"look: image '{c.views[i].image}' {what}; look whether the board or the camera moved, and retake it"
-        )
+        view = c.views[i]
+        far = int((~view.kept & ~(np.linalg.norm(view.residuals_px, axis=1) <= SMALL_PX)).sum())
+        if times[i] > BAD_VIEW and middle[i] > SMALL_PX:
+            what = f"has a median residual of {middle[i]:.3f} px, {times[i]:.1f} times the usual one there"
+        elif far > OUTLYING * lengths[i]:
+            what = f"has {far} outliers among its {lengths[i]} corners"
+        else:
+            continue
+        found.append(f"look: image '{view.image}' {what}; look whether the board or the camera moved, and retake it")
     return found
 
 
@@ -267,10 +272,11 @@ def _boards(c: Calibration) -> list[str]:
 
 
 def _outliers(c: Calibration) -> list[str]:
-    share = len(c.outliers) / max(len(c.outliers) + c.corner_count, 1)
+    far = [outlier for outlier in c.outliers if not outlier.residual_px <= SMALL_PX]
+    share = len(far) / max(len(c.outliers) + c.corner_count, 1)
     if share <= OUTLIER_SHARE:
         return []
-    image, count = Counter(outlier.image for outlier in c.outliers).most_common(1)[0]
+    image, count = Counter(outlier.image for outlier in far).most_common(1)[0]
     return [
         f"look: {100 * share:.1f} % of the corners are outliers, most of them ({count}) in '{image}'; check exposure, "
         "focus and motion blur there"

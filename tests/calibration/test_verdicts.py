@@ -113,3 +113,12 @@ def test_images_left_out_are_named(rng: np.random.Generator) -> None:
     assert f"{len(result.verdicts)} remarks below" in session[0] and "'a.png' is left out: 800x600 px" in session[1]
     many = judge_session(result, [(f"{i}.png", "no board found") for i in range(5)])
     assert "5 images are left out, '0.png' the first: no board found" in many[1]
+
+
+def test_hundredths_of_a_pixel_are_no_reason_to_retake(rng: np.random.Generator) -> None:
+    views, _, _ = random_views(lens("reg"), 20, rng, reach_deg=33.0, noise_px=0.01)
+    for i, some in ((3, np.full(54, 0.025)), (4, np.where(np.arange(54) % 3 == 0, 0.06, 0.0))):
+        rough = views[i].pixels + some[:, None] * rng.choice([-1.0, 1.0], size=(54, 2))
+        views[i] = replace(views[i], pixels=np.clip(rough, 0.0, np.array(SIZE) - 1.0))
+    result = calibrate(views, SIZE, model="brown", board="flat")
+    assert len(result.outliers) > 10 and not said(result, "retake") and not said(result, "outliers")
