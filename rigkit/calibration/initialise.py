@@ -21,7 +21,7 @@ from rigkit.arrays import FloatArray, Mat3, Points
 from rigkit.calibration.observations import Observations, median_of
 from rigkit.calibration.radial_alignment import Alignment, align, distortion_centre
 from rigkit.calibration.solver import State, evaluate
-from rigkit.cameras.base import Camera, image_center
+from rigkit.cameras.base import Camera, RadialCurve, image_center
 from rigkit.errors import InputError
 from rigkit.geometry.rotation import nearest_rotation
 
@@ -100,7 +100,8 @@ def _fitted(
     for limit in (np.inf, NARROW):
         inside = theta < limit
         try:
-            return model.from_radial_curve(size_px, centre, theta[inside], radius[inside], order=order)
+            curve = RadialCurve(centre, theta[inside], radius[inside])
+            return model.from_radial_curve(size_px, curve, order=order)
         except InputError:
             continue
     return None

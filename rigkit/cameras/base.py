@@ -16,12 +16,54 @@ from numpy.typing import ArrayLike
 from rigkit.arrays import BoolArray, FloatArray, Pixels, Points, RayJacobians, Rays, as_array
 from rigkit.errors import InputError
 
-__all__ = ["Camera", "image_center"]
+__all__ = ["Camera", "RadialCurve", "image_center"]
 
 
 def image_center(size_px: tuple[int, int]) -> FloatArray:
     """Return the centre of the image, px: (width - 1) / 2, (height - 1) / 2, because (0, 0) is a pixel's centre."""
     return np.array([(size_px[0] - 1) / 2.0, (size_px[1] - 1) / 2.0])
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RadialCurve:
+    """How far from its centre a lens images what lies off its axis, in samples.
+
+    Attributes
+    ----------
+    centre_px : (2,) where the optical axis meets the image.
+    theta_rad, radius_px : (N,) angles from the axis and distances from the centre, both increasing; samples on the
+        axis are left out.
+
+    Raises
+    ------
+    InputError
+        Fewer than four samples off the axis, or angles or radii that do not increase.
+    """
+
+    centre_px: FloatArray
+    theta_rad: FloatArray
+    radius_px: FloatArray
+
+    def __post_init__(self) -> None:
+        theta = as_array(self.theta_rad, (None,), "theta_rad")
+        radius = as_array(self.radius_px, theta.shape, "radius_px")
+        theta, radius = theta[theta > 0.0], radius[theta > 0.0]
+        if theta.size < 4:
+            raise InputError(f"radial curve: {theta.size} samples off the axis; at least 4 are needed")
+        if (np.diff(theta) <= 0.0).any() or (np.diff(radius, prepend=0.0) <= 0.0).any():
+            raise InputError("radial curve: angles and radii must both increase from the axis outwards")
+        object.__setattr__(self, "centre_px", as_array(self.centre_px, (2,), "centre_px"))
+        object.__setattr__(self, "theta_rad", theta)
+        object.__setattr__(self, "radius_px", radius)
+
+    def below(self, limit_rad: float, model: str) -> tuple[FloatArray, FloatArray]:
+        """Return angles and radii; raises InputError where they reach `limit_rad`, beyond which `model` is blind."""
+        if self.theta_rad[-1] >= limit_rad:
+            raise InputError(
+                f"radial curve: it reaches {np.degrees(self.theta_rad[-1]):.1f} degrees, a {model} camera sees less "
+                f"than {np.degrees(limit_rad):.0f}; cut the curve or take a fisheye model"
+            )
+        return self.theta_rad, self.radius_px
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -67,27 +109,18 @@ class Camera(ABC):
 
     @classmethod
     @abstractmethod
-    def from_radial_curve(
-        cls,
-        size_px: tuple[int, int],
-        centre_px: ArrayLike,
-        theta_rad: ArrayLike,
-        radius_px: ArrayLike,
-        *,
-        order: int | None = None,
-    ) -> Self:
+    def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
         """Return the camera of this model nearest to a sampled radial curve: where every calibration starts.
 
         Parameters
         ----------
-        centre_px : (2,) where the optical axis meets the image.
-        theta_rad, radius_px : (N,) angles from the axis and their distances from the centre, increasing.
+        curve : where the optical axis meets the image, and radii over angles.
         order : for models of several sizes: Brown's number of distortion terms, Scaramuzza's degree.
 
         Raises
         ------
         InputError
-            The curve has too few samples, or a model of this kind cannot follow it (a pinhole beyond 90 degrees).
+            A model of this kind cannot follow the curve (a pinhole beyond 90 degrees).
         """
 
     @abstractmethod

@@ -9,12 +9,10 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from rigkit.arrays import BoolArray, FloatArray
-from rigkit.cameras.base import Camera
+from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.cameras.monotone import first_root, horner
-from rigkit.cameras.radial import checked_curve
 from rigkit.errors import InputError
 
 __all__ = ["Brown"]
@@ -50,19 +48,11 @@ class Brown(Camera):
     _max_r: float = field(init=False, repr=False)
 
     @classmethod
-    def from_radial_curve(
-        cls,
-        size_px: tuple[int, int],
-        centre_px: ArrayLike,
-        theta_rad: ArrayLike,
-        radius_px: ArrayLike,
-        *,
-        order: int | None = None,
-    ) -> Self:
+    def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
         count = 5 if order is None else order
         if count not in cls.orders:
             raise InputError(f"brown camera: {count} distortion terms; choose 4 (k3 stays 0), 5 or 8")
-        centre, theta, radius = checked_curve(centre_px, theta_rad, radius_px, cls.model, below_rad=np.pi / 2)
+        theta, radius = curve.below(np.pi / 2, cls.model)
         r = np.tan(theta)
         # A curve with noise may be fitted best by a polynomial that turns down just outside it: then fewer terms.
         for top, bottom in ((3, 3), (3, 0), (2, 0), (1, 0), (0, 0))[{8: 0, 5: 1, 4: 2}[count] :]:
@@ -79,7 +69,7 @@ class Brown(Camera):
             k = np.zeros(6)
             k[:top], k[3 : 3 + bottom] = a[1 : top + 1] / a[0], a[top + 1 :]
             shape = np.array([k[0], k[1], 0.0, 0.0, *k[2:]])[: max(count, 5)]
-            camera = cls(size_px, np.array([a[0], a[0], *centre, *shape]))
+            camera = cls(size_px, np.array([a[0], a[0], *curve.centre_px, *shape]))
             if a[0] > 0.0 and camera.max_angle_rad > theta[-1]:
                 return camera
         return camera

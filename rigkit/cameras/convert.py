@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.arrays import FloatArray, Pixels, Rays
-from rigkit.cameras.base import Camera
+from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.cameras.registry import camera_model
 from rigkit.errors import InputError
 
@@ -154,7 +154,8 @@ def _start(
     mean = [np.bincount(ring, v, CURVE_SAMPLES)[kept] / count[kept] for v in (theta, radius)]
     rising = np.append(True, np.diff(np.maximum.accumulate(mean[1])) > 0.0)
     try:
-        return model.from_radial_curve(size_px, centre, mean[0][rising], mean[1][rising], order=order)
+        curve = RadialCurve(centre, mean[0][rising], mean[1][rising])
+        return model.from_radial_curve(size_px, curve, order=order)
     except InputError as error:
         raise _NoStart(f"camera conversion: a {model.model} camera cannot follow this lens ({error})") from error
 

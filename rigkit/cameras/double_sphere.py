@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from rigkit.arrays import BoolArray, FloatArray
-from rigkit.cameras.radial import FocalCamera, ScaleDerivatives, checked_curve, fit_shape
+from rigkit.cameras.base import RadialCurve
+from rigkit.cameras.radial import FocalCamera, ScaleDerivatives, fit_shape
 from rigkit.errors import InputError
 
 __all__ = ["DoubleSphere"]
@@ -31,17 +31,8 @@ class DoubleSphere(FocalCamera):
     model: ClassVar[str] = "double_sphere"
 
     @classmethod
-    def from_radial_curve(
-        cls,
-        size_px: tuple[int, int],
-        centre_px: ArrayLike,
-        theta_rad: ArrayLike,
-        radius_px: ArrayLike,
-        *,
-        order: int | None = None,
-    ) -> Self:
-        centre, theta, radius = checked_curve(centre_px, theta_rad, radius_px, cls.model)
-        return fit_shape(cls, size_px, centre, theta, radius, STARTS)
+    def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
+        return fit_shape(cls, size_px, curve, STARTS)
 
     def parameter_names(self) -> tuple[str, ...]:
         return ("fx", "fy", "cx", "cy", "xi", "alpha")

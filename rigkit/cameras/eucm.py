@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from rigkit.arrays import BoolArray, FloatArray
-from rigkit.cameras.radial import FocalCamera, ScaleDerivatives, checked_curve, fit_shape
+from rigkit.cameras.base import RadialCurve
+from rigkit.cameras.radial import FocalCamera, ScaleDerivatives, fit_shape
 from rigkit.errors import InputError
 
 __all__ = ["EUCM"]
@@ -33,18 +33,9 @@ class EUCM(FocalCamera):
     model: ClassVar[str] = "eucm"
 
     @classmethod
-    def from_radial_curve(
-        cls,
-        size_px: tuple[int, int],
-        centre_px: ArrayLike,
-        theta_rad: ArrayLike,
-        radius_px: ArrayLike,
-        *,
-        order: int | None = None,
-    ) -> Self:
-        centre, theta, radius = checked_curve(centre_px, theta_rad, radius_px, cls.model)
+    def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
         count = len(cls.shape_names())
-        return fit_shape(cls, size_px, centre, theta, radius, [start[:count] for start in STARTS])
+        return fit_shape(cls, size_px, curve, [start[:count] for start in STARTS])
 
     @classmethod
     def shape_names(cls) -> tuple[str, ...]:

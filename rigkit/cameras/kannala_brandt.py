@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray
+from rigkit.cameras.base import RadialCurve
 from rigkit.cameras.monotone import first_root, horner, invert_increasing
-from rigkit.cameras.radial import FocalCamera, ScaleDerivatives, checked_curve
+from rigkit.cameras.radial import FocalCamera, ScaleDerivatives
 
 __all__ = ["KannalaBrandt"]
 
@@ -35,16 +35,8 @@ class KannalaBrandt(FocalCamera):
     _max_angle: float = field(init=False, repr=False)
 
     @classmethod
-    def from_radial_curve(
-        cls,
-        size_px: tuple[int, int],
-        centre_px: ArrayLike,
-        theta_rad: ArrayLike,
-        radius_px: ArrayLike,
-        *,
-        order: int | None = None,
-    ) -> Self:
-        centre, theta, radius = checked_curve(centre_px, theta_rad, radius_px, cls.model)
+    def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
+        theta, radius = curve.theta_rad, curve.radius_px
         # A curve with noise may be fitted best by a polynomial that turns down just outside it: then fewer terms.
         for terms in (5, 4, 3, 2, 1):
             powers = theta[:, None] ** np.arange(1, 2 * terms, 2)
@@ -52,7 +44,7 @@ class KannalaBrandt(FocalCamera):
             a = np.linalg.lstsq(powers / size, radius, rcond=None)[0] / size
             shape = np.zeros(4)
             shape[: terms - 1] = a[1:] / a[0]
-            camera = cls(size_px, np.array([a[0], a[0], *centre, *shape]))
+            camera = cls(size_px, np.array([a[0], a[0], *curve.centre_px, *shape]))
             if a[0] > 0.0 and camera.max_angle_rad > theta[-1]:
                 return camera
         return camera

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from rigkit.arrays import BoolArray, FloatArray
-from rigkit.cameras.base import Camera
+from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.errors import InputError
 
 __all__ = ["Cylindrical", "EpipolarCylindrical", "EpipolarEquirectangular", "Equirectangular", "Panorama"]
@@ -32,15 +31,7 @@ class Panorama(Camera):
     horizontal_axis: ClassVar[bool] = False
 
     @classmethod
-    def from_radial_curve(
-        cls,
-        size_px: tuple[int, int],
-        centre_px: ArrayLike,
-        theta_rad: ArrayLike,
-        radius_px: ArrayLike,
-        *,
-        order: int | None = None,
-    ) -> Self:
+    def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
         raise InputError(f"a {cls.model} image has no radial curve: it is a target of rectification, not a lens")
 
     @property

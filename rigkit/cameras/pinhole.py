@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from rigkit.arrays import BoolArray, FloatArray, Mat3
-from rigkit.cameras.radial import FocalCamera, ScaleDerivatives, checked_curve
+from rigkit.cameras.base import RadialCurve
+from rigkit.cameras.radial import FocalCamera, ScaleDerivatives
 
 __all__ = ["Pinhole"]
 
@@ -29,19 +29,11 @@ class Pinhole(FocalCamera):
         return cls(size_px, np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]))
 
     @classmethod
-    def from_radial_curve(
-        cls,
-        size_px: tuple[int, int],
-        centre_px: ArrayLike,
-        theta_rad: ArrayLike,
-        radius_px: ArrayLike,
-        *,
-        order: int | None = None,
-    ) -> Self:
-        centre, theta, radius = checked_curve(centre_px, theta_rad, radius_px, cls.model, below_rad=np.pi / 2)
+    def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
+        theta, radius = curve.below(np.pi / 2, cls.model)
         tangent = np.tan(theta)
         focal = float(tangent @ radius / (tangent @ tangent))
-        return cls(size_px, np.array([focal, focal, *centre]))
+        return cls(size_px, np.array([focal, focal, *curve.centre_px]))
 
     @property
     def K(self) -> Mat3:

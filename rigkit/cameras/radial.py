@@ -12,13 +12,12 @@ from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from rigkit.arrays import BoolArray, FloatArray, as_array
-from rigkit.cameras.base import Camera
+from rigkit.arrays import BoolArray, FloatArray
+from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.errors import InputError
 
-__all__ = ["FocalCamera", "RadialCamera", "ScaleDerivatives", "checked_curve", "fit_shape"]
+__all__ = ["FocalCamera", "RadialCamera", "ScaleDerivatives", "fit_shape"]
 
 FIT_STEPS = 40
 FIT_MAX_DAMPING = 1e3
@@ -119,49 +118,24 @@ class FocalCamera(RadialCamera):
             out[0, k], out[1, k] = du, dv
 
 
-def checked_curve(
-    centre_px: ArrayLike, theta_rad: ArrayLike, radius_px: ArrayLike, model: str, *, below_rad: float = np.pi
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return centre, angles and radii of a radial curve, checked; samples on the axis are left out.
-
-    Raises InputError where fewer than 4 samples remain, where either does not increase, or where the curve reaches
-    `below_rad`, beyond which the model does not see.
-    """
-    centre = as_array(centre_px, (2,), "centre_px")
-    theta = as_array(theta_rad, (None,), "theta_rad")
-    radius = as_array(radius_px, theta.shape, "radius_px")
-    theta, radius = theta[theta > 0.0], radius[theta > 0.0]
-    if theta.size < 4:
-        raise InputError(f"radial curve: {theta.size} samples off the axis; a {model} camera needs at least 4")
-    if (np.diff(theta) <= 0.0).any() or (np.diff(radius, prepend=0.0) <= 0.0).any():
-        raise InputError("radial curve: angles and radii must both increase from the axis outwards")
-    if theta[-1] >= below_rad:
-        raise InputError(
-            f"radial curve: it reaches {np.degrees(theta[-1]):.1f} degrees, a {model} camera sees less than "
-            f"{np.degrees(below_rad):.0f}; cut the curve or take a fisheye model"
-        )
-    return centre, theta, radius
-
-
 _Focal = TypeVar("_Focal", bound=FocalCamera)
 
 
 def fit_shape(
     model: type[_Focal],
     size_px: tuple[int, int],
-    centre: FloatArray,
-    theta: FloatArray,
-    radius: FloatArray,
+    curve: RadialCurve,
     starts: Sequence[Sequence[float]],
 ) -> _Focal:
     """Return the camera of `model` nearest to the curve: one focal length and its shape, damped Gauss-Newton.
 
     Each of `starts` is a shape; the best end is returned. Raises InputError where no start sees the whole curve.
     """
+    theta = curve.theta_rad
     points = np.stack([np.sin(theta), np.zeros_like(theta), np.cos(theta)], axis=-1)
     best: tuple[float, _Focal] | None = None
     for start in starts:
-        found = _descend(model(size_px, np.array([1.0, 1.0, *centre, *start])), points, radius)
+        found = _descend(model(size_px, np.array([1.0, 1.0, *curve.centre_px, *start])), points, curve.radius_px)
         if found is not None and (best is None or found[0] < best[0]):
             best = found
     if best is None:

@@ -11,12 +11,11 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray
-from rigkit.cameras.base import image_center
+from rigkit.cameras.base import RadialCurve, image_center
 from rigkit.cameras.monotone import first_root, horner, invert_increasing
-from rigkit.cameras.radial import RadialCamera, ScaleDerivatives, checked_curve
+from rigkit.cameras.radial import RadialCamera, ScaleDerivatives
 from rigkit.errors import InputError
 
 __all__ = ["DEFAULT_DEGREE", "DEGREES", "Scaramuzza"]
@@ -51,19 +50,11 @@ class Scaramuzza(RadialCamera):
     _slope: FloatArray = field(init=False, repr=False)
 
     @classmethod
-    def from_radial_curve(
-        cls,
-        size_px: tuple[int, int],
-        centre_px: ArrayLike,
-        theta_rad: ArrayLike,
-        radius_px: ArrayLike,
-        *,
-        order: int | None = None,
-    ) -> Self:
+    def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
         degree = DEFAULT_DEGREE if order is None else order
         if degree not in DEGREES:
             raise InputError(f"scaramuzza camera: degree {degree}; choose {DEGREES[0]} to {DEGREES[-1]}")
-        centre, theta, rho = checked_curve(centre_px, theta_rad, radius_px, cls.model)
+        theta, rho = curve.theta_rad, curve.radius_px
         sine, cosine = np.sin(theta), np.cos(theta)
         unit_px = rho[-1]
         # A curve with noise may be fitted best by a polynomial that folds just outside it: then a lower degree.
@@ -79,7 +70,7 @@ class Scaramuzza(RadialCamera):
             shape = np.zeros(degree)
             shape[:used] = a * unit_px ** (1.0 - exponents)
             if shape[0] > 0.0:
-                camera = cls(size_px, np.array([*shape, *centre, 1.0, 0.0]))
+                camera = cls(size_px, np.array([*shape, *curve.centre_px, 1.0, 0.0]))
                 if camera.max_angle_rad > theta[-1]:
                     return camera
         raise InputError("radial curve: no scaramuzza polynomial with a0 > 0 follows it; check that radii are in px")

@@ -14,6 +14,7 @@ from rigkit.calibration.normal import Normal, normal_equations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.shape import shape_model
 from rigkit.calibration.solver import State, evaluate, solve
+from rigkit.cameras.base import RadialCurve
 from rigkit.cameras.scaramuzza import Scaramuzza
 from rigkit.geometry.rotation import exp_so3
 
@@ -159,7 +160,9 @@ def test_scaramuzza_converges_quickly(rng: np.random.Generator) -> None:
     observations, truth = scene("fish", rng, count=10)
     theta = np.linspace(0.02, 1.62, 80)
     radius = truth.camera.project(np.stack([np.sin(theta), 0 * theta, np.cos(theta)], -1))[0][:, 0] - 808.0
-    camera = Scaramuzza.from_radial_curve(truth.camera.size_px, [808.0, 615.0], theta, 1.05 * radius, order=6)
+    camera = Scaramuzza.from_radial_curve(
+        truth.camera.size_px, RadialCurve([808.0, 615.0], theta, 1.05 * radius), order=6
+    )
     solution = solve(observations, replace(truth, camera=camera))
     assert solution.convergence.converged
     assert solution.convergence.iterations <= 12

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from rigkit.cameras.base import RadialCurve
 from rigkit.cameras.brown import Brown
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
@@ -46,15 +47,15 @@ def test_start_is_near(model: str, fov_deg: int, rng: np.random.Generator) -> No
     theta, radius = _curve(fov_deg)
     if model == "brown" and fov_deg >= 180:
         with pytest.raises(InputError, match="less than 90"):
-            MODELS[model].from_radial_curve(SIZE_PX, CENTRE_PX, theta, radius)
+            MODELS[model].from_radial_curve(SIZE_PX, RadialCurve(CENTRE_PX, theta, radius))
         return
-    camera = MODELS[model].from_radial_curve(SIZE_PX, CENTRE_PX, theta, radius)
+    camera = MODELS[model].from_radial_curve(SIZE_PX, RadialCurve(CENTRE_PX, theta, radius))
     assert camera.size_px == SIZE_PX
     assert np.abs(_radius(camera, theta) - radius).max() < START_PX
     assert camera.max_angle_rad > theta[-1]
     noisy = np.maximum.accumulate(radius + 0.5 * rng.normal(size=60) + 1e-6 * np.arange(60))
     keep = np.append(True, np.diff(noisy) > 0.0) & (noisy > 0.0)
-    noisy_camera = MODELS[model].from_radial_curve(SIZE_PX, CENTRE_PX, theta[keep], noisy[keep])
+    noisy_camera = MODELS[model].from_radial_curve(SIZE_PX, RadialCurve(CENTRE_PX, theta[keep], noisy[keep]))
     error = _radius(noisy_camera, theta[keep]) - _radius(camera, theta[keep])
     assert np.sqrt(np.mean(error**2)) < NOISY_RMS_PX
 
@@ -63,7 +64,7 @@ def test_higher_degrees_follow_better() -> None:
     theta, radius = _curve(185)
     worst = []
     for degree in DEGREES:
-        camera = Scaramuzza.from_radial_curve(SIZE_PX, CENTRE_PX, theta, radius, order=degree)
+        camera = Scaramuzza.from_radial_curve(SIZE_PX, RadialCurve(CENTRE_PX, theta, radius), order=degree)
         assert camera.degree == degree
         assert camera.parameters.size == degree + 4
         worst.append(np.abs(_radius(camera, theta) - radius).max())
@@ -75,14 +76,17 @@ def test_higher_degrees_follow_better() -> None:
 
 def test_terms_of_brown() -> None:
     theta, radius = _curve(60)
-    sizes = {order: Brown.from_radial_curve(SIZE_PX, CENTRE_PX, theta, radius, order=order) for order in (4, 5, 8)}
+    sizes = {
+        order: Brown.from_radial_curve(SIZE_PX, RadialCurve(CENTRE_PX, theta, radius), order=order)
+        for order in (4, 5, 8)
+    }
     assert [c.parameters.size for c in sizes.values()] == [9, 9, 12]
     assert sizes[4].parameters[8] == 0.0
     assert np.abs(_radius(sizes[8], theta) - radius).max() < np.abs(_radius(sizes[4], theta) - radius).max()
     with pytest.raises(InputError, match="choose 4"):
-        Brown.from_radial_curve(SIZE_PX, CENTRE_PX, theta, radius, order=6)
+        Brown.from_radial_curve(SIZE_PX, RadialCurve(CENTRE_PX, theta, radius), order=6)
     with pytest.raises(InputError, match="degree 12"):
-        Scaramuzza.from_radial_curve(SIZE_PX, CENTRE_PX, theta, radius, order=12)
+        Scaramuzza.from_radial_curve(SIZE_PX, RadialCurve(CENTRE_PX, theta, radius), order=12)
 
 
 @pytest.mark.parametrize(("model", "squeeze"), [("kannala_brandt", 1.0), ("scaramuzza", 1.0), ("brown", 0.7)])
@@ -91,7 +95,7 @@ def test_a_curve_that_flattens_at_its_end_does_not_fold_the_camera(model: str, s
     theta = squeeze * np.linspace(0.0, 1.4, 60)
     radius = np.linspace(0.0, 560.0, 60)
     radius[-8:] = radius[-9] + np.linspace(0.01, 0.5, 8)
-    camera = MODELS[model].from_radial_curve(SIZE_PX, CENTRE_PX, theta, radius)
+    camera = MODELS[model].from_radial_curve(SIZE_PX, RadialCurve(CENTRE_PX, theta, radius))
     assert camera.max_angle_rad > theta[-1]
 
 
@@ -104,6 +108,6 @@ def test_curves_that_make_no_camera() -> None:
         (theta, radius[:-1], "shape"),
     ):
         with pytest.raises(InputError, match=words):
-            KannalaBrandt.from_radial_curve(SIZE_PX, CENTRE_PX, bad_theta, bad_radius)
+            KannalaBrandt.from_radial_curve(SIZE_PX, RadialCurve(CENTRE_PX, bad_theta, bad_radius))
     with pytest.raises(InputError, match="90"):
-        Pinhole.from_radial_curve(SIZE_PX, CENTRE_PX, *_curve(185))
+        Pinhole.from_radial_curve(SIZE_PX, RadialCurve(CENTRE_PX, *_curve(185)))

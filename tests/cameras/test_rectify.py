@@ -8,7 +8,7 @@ from helpers.cameras import image_pixels, rays_within, sample_cameras
 from helpers.differences import central_difference
 from tolerances import JACOBIAN_REL, ROUND_TRIP_PX
 
-from rigkit.cameras.base import Camera
+from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.cameras.panorama import (
     Cylindrical,
     EpipolarCylindrical,
@@ -81,7 +81,7 @@ def test_panoramas_refuse_what_they_do_not_show(name: str) -> None:
     pixel[axis] += 118.0 * 3.3
     assert not camera.unproject(pixel)[1]
     with pytest.raises(InputError, match="target of rectification"):
-        type(camera).from_radial_curve((10, 10), (5.0, 5.0), [0.1, 0.2], [1.0, 2.0])
+        type(camera).from_radial_curve((10, 10), RadialCurve((5.0, 5.0), [0.1, 0.2, 0.3, 0.4], [1.0, 2.0, 3.0, 4.0]))
 
 
 @pytest.mark.parametrize("name", sorted(TARGETS))

@@ -8,7 +8,7 @@ from helpers.cameras import image_pixels, rays_within, sample_cameras
 from helpers.differences import central_difference
 from tolerances import JACOBIAN_REL, ROUND_TRIP_PX
 
-from rigkit.cameras.base import Camera
+from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.cameras.registry import MODELS
 from rigkit.errors import InputError
 
@@ -273,12 +273,12 @@ def test_radial_curve_gives_the_camera_back(camera: Camera) -> None:
     centre = plain[[names.index("cx"), names.index("cy")]]
     radius = truth.project(points)[0][:, 0] - centre[0]
     order = {"brown": plain.size - 4, "scaramuzza": plain.size - 4}.get(camera.model)
-    fitted = type(camera).from_radial_curve(camera.size_px, centre, theta, radius, order=order)
+    fitted = type(camera).from_radial_curve(camera.size_px, RadialCurve(centre, theta, radius), order=order)
     assert fitted.parameters.size == camera.parameters.size
     error = fitted.project(points)[0][:, 0] - centre[0] - radius
     assert np.abs(error).max() < CURVE_PX
     with pytest.raises(InputError, match="increase"):
-        type(camera).from_radial_curve(camera.size_px, centre, theta[::-1], radius, order=order)
+        type(camera).from_radial_curve(camera.size_px, RadialCurve(centre, theta[::-1], radius), order=order)
 
 
 def test_parameters_of_no_lens_are_refused_or_harmless(camera: Camera, rng: np.random.Generator) -> None:

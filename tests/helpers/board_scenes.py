@@ -9,7 +9,7 @@ import numpy as np
 
 from helpers.data import shared_data
 from rigkit.boards import Board
-from rigkit.cameras.base import Camera
+from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.detections import BoardDetection
@@ -122,7 +122,7 @@ def lab_camera(truth: dict) -> KannalaBrandt:
     lens = truth["lens_truth"]
     radius_mm = np.linspace(0.0, 4.7, 400)
     theta = sum(k * radius_mm ** (i + 1) for i, k in enumerate(lens["k"]))
-    return KannalaBrandt.from_radial_curve(SIZE_PX, lens["centre_px"], theta, radius_mm / lens["pixel_mm"])
+    return KannalaBrandt.from_radial_curve(SIZE_PX, RadialCurve(lens["centre_px"], theta, radius_mm / lens["pixel_mm"]))
 
 
 def lab_scene(name: str) -> Scene:
