@@ -26,10 +26,10 @@ MAX_RELATIVE_SIGMA = 0.011
 """Corners more uncertain than this, in cells, make no board: keys, letters, weave."""
 
 MAX_RESIDUAL = 0.25
-MAX_UNEXPLAINED, NOISE_LEVELS = 0.17, 10.0
+MAX_UNEXPLAINED, NOISE_LEVELS = 0.185, 10.0
 """Largest typical residual of the edge model, relative to the contrast, and the part of it that noise (of so many grey
 levels) does not explain. Dots in rows have saddles between them, too, and show 0.2; boards 0.03 to 0.07 with motion,
-saturation or compression, 0.13 where a camera sharpens strongly."""
+saturation or compression, 0.13 where a camera sharpens strongly, 0.175 in black and white without any grey."""
 
 MAX_LOST = 0.4
 """Largest part of a lattice's corners that the sub-pixel fit may refuse: beside what covers a board there are many."""

@@ -20,6 +20,9 @@ WORST_FISHEYE_PX = 0.06
 SIGMA_RATIO = (0.75, 1.25)
 """Actual over predicted error of 144 corners: 20 % asked, and 288 errors scatter by 4 %."""
 
+STAIRCASE_PX = 0.1
+"""Steps of a pixel, averaged over the few that each edge of a window has."""
+
 SAME_PX = 0.02
 """One scene with other bits or colours: only quantisation and noise differ."""
 
@@ -148,6 +151,15 @@ def test_light_and_compression(change: dict[str, object], rng: np.random.Generat
     (found,) = detect_boards(scene.image(rng, **change))
     assert found.complete
     assert np.sqrt((errors_by_position(found, scene.truth()[0][1]) ** 2).mean()) < 0.06
+
+
+def test_black_and_white_without_any_grey(rng: np.random.Generator) -> None:
+    """A thresholded scan: every edge is a staircase, which no blur explains."""
+    scene = single(Board("a", 9, 6, 30.0, 30.0), [0.1, 0.05, 0.06], 600.0)
+    image = np.where(scene.image(rng, noise_levels=0.0) > 110, 255, 0).astype(np.uint8)
+    (found,) = detect_boards(image)
+    assert found.complete
+    assert np.sqrt((errors_by_position(found, scene.truth()[0][1]) ** 2).mean()) < STAIRCASE_PX
 
 
 def test_bits_and_colours_do_not_matter() -> None:

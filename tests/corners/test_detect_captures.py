@@ -42,6 +42,20 @@ def test_rooms_with_many_boards(name: str, count: int) -> None:
     assert sum(d.complete for d in found) >= count - (name == "e3")
 
 
+@pytest.mark.parametrize("number, size", enumerate([*[(7, 5)] * 7, (6, 4), (21, 19)], start=1))
+def test_public_single_boards(number: int, size: tuple[int, int]) -> None:
+    image = cv2.imread(str(shared_data("real/opencv-detector") / f"chess{number}.png"), cv2.IMREAD_GRAYSCALE)
+    (found,) = detect_boards(image)
+    assert found.complete
+    assert sorted((found.columns, found.rows)) == sorted(size)
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_boards_with_a_corner_missing_are_not_whole(number: int) -> None:
+    image = cv2.imread(str(shared_data("real/opencv-detector") / f"negative_{number}.png"), cv2.IMREAD_GRAYSCALE)
+    assert not any(found.complete for found in detect_boards(image))
+
+
 @pytest.mark.parametrize(
     "folder, pattern, size, count",
     [
