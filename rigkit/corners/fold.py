@@ -32,9 +32,9 @@ LEAST_ROWS = 4
 CONTINUES_CELLS = 0.1
 """A column that goes on smoothly lies this near to where the others say, in cells."""
 
-GAP = 2
-"""Parts of one board are at most so many steps apart along a row or column: separate boards have their outer squares
-and margins between, or touch at a corner."""
+GAP, SLANTED = 2, 3
+"""Parts of one board are at most so many steps apart along a row or column, or along both where so many corners see one
+of the other part: separate boards have their outer squares and margins between, or touch at a corner."""
 
 FAR_GAP, FAR_MEETS_CELLS, FAR_OUT, FAR_FACING = 3, 0.1, 24, 2
 """A step more if so many corners of the other part, and not only the nearest, are where they should be, and if two see
@@ -327,9 +327,9 @@ def _turned_grid(grid: IntArray, size: tuple[int, int], quarter_turns: int) -> I
     return grid
 
 
-def _facing(one: Lattice, two: Lattice, steps: int) -> int:
-    """Return how many corners of `two` have one of `one` at most so many steps along their row or column."""
-    reach = cv2.getStructuringElement(cv2.MORPH_CROSS, (2 * steps + 1, 2 * steps + 1))
+def _facing(one: Lattice, two: Lattice, steps: int, shape: int = cv2.MORPH_CROSS) -> int:
+    """Return how many corners of `two` have one of `one` at most so many steps along row or column (or both)."""
+    reach = cv2.getStructuringElement(shape, (2 * steps + 1, 2 * steps + 1))
     return int(np.count_nonzero((cv2.dilate(one.known.astype(np.uint8), reach) > 0) & two.known))
 
 
@@ -351,7 +351,9 @@ def _united(one: Lattice, two: Lattice, shift: IntArray, near: bool, far: bool) 
     first, second = parts
     if first.rising != second.rising or (first.known & second.known).any():
         return None
-    if not (near and _facing(first, second, GAP)) and not (far and _facing(first, second, FAR_GAP) >= FAR_FACING):
+    beside = near and (_facing(first, second, GAP) or _facing(first, second, GAP, cv2.MORPH_RECT) >= SLANTED)
+    beyond = far and _facing(first, second, FAR_GAP) >= FAR_FACING
+    if not (beside or beyond):
         return None
     known = first.known
     return Lattice(
