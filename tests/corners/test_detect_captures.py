@@ -81,3 +81,18 @@ def test_boards_cut_by_the_frame_are_not_whole() -> None:
         path = shared_data("real/opencv-detector") / f"negative_{number}.png"
         for found in detect_boards(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), [Board("b", 7, 6, 30.0, 30.0)]):
             assert not found.complete
+
+
+def test_a_board_with_markers_in_its_squares() -> None:
+    """Published corners of a 22x22 board, much of it at the rim of a fisheye."""
+    found, published = 0, 0
+    for path in sorted(shared_data("real/ov-plane/corners").glob("*/*.orpc")):
+        lines = path.read_text().splitlines()
+        start = next(i for i, line in enumerate(lines) if line.startswith("encoding")) + 1
+        corners = np.array([[float(x) for x in line.split(",")[3:5]] for line in lines[start:] if line.strip()])
+        boards = detect_boards(cv2.imread(str(path.with_suffix(".png")), cv2.IMREAD_GRAYSCALE))
+        pixels = np.concatenate([board.pixels for board in boards])
+        found += int((np.linalg.norm(corners[:, None] - pixels, axis=2).min(axis=1) < 3.0).sum())
+        published += len(corners)
+    assert published == 9587
+    assert found >= 0.993 * published
