@@ -37,7 +37,7 @@ from rigkit.boards import Board
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.initialise import initialise
 from rigkit.calibration.observations import Observations
-from rigkit.calibration.rig import calibrate_rig
+from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.solver import State, solve
 from rigkit.cameras.base import Camera
 from rigkit.cameras.brown import Brown

@@ -72,6 +72,13 @@ def test_a_module_imports_only_rows_below(path: Path) -> None:
         assert lower or same, f"{path.relative_to(PACKAGE)} imports {name}, which is not below it"
 
 
+def test_one_camera_knows_nothing_of_rigs() -> None:
+    """The package inside `calibration` builds on what lies beside it, not the other way round."""
+    for path in (PACKAGE / "calibration").glob("*.py"):
+        above = [name for name in imports_of(ast.parse(path.read_text())) if name.startswith("rigkit.calibration.rig")]
+        assert not above, f"{path.relative_to(PACKAGE)} imports {above}"
+
+
 @pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
 def test_module_size(path: Path) -> None:
     lines = len(path.read_text().splitlines())

@@ -86,8 +86,8 @@ def calibrate_session(session: Session, progress: Progress = silent) -> Calibrat
     """
     from dataclasses import replace
 
-    from rigkit.calibration.board_ties import suggest_ties
     from rigkit.calibration.calibrate import calibrate
+    from rigkit.calibration.rig.board_ties import suggest_ties
     from rigkit.calibration.verdicts import judge_session
 
     views, size_px, dropped = session_views(session, session_corners(session, progress))

@@ -12,7 +12,7 @@ from rigkit.progress import Progress, silent
 
 if TYPE_CHECKING:
     from rigkit.calibration.result import Calibration
-    from rigkit.calibration.rig import RigCalibration
+    from rigkit.calibration.rig.result import RigCalibration
     from rigkit.io.rig_session import RigSession
     from rigkit.validation.checks import Check
 
@@ -93,8 +93,8 @@ def calibrate_rig_session(session: RigSession, progress: Progress = silent) -> R
     """
     from dataclasses import replace
 
-    from rigkit.calibration.board_ties import suggest_ties
-    from rigkit.calibration.rig import calibrate_rig
+    from rigkit.calibration.rig.board_ties import suggest_ties
+    from rigkit.calibration.rig.calibrate import calibrate_rig
     from rigkit.cli.calibrate import session_corners, session_views
     from rigkit.cli.rigid_boards import named_as_listed, named_by_rule, require_distinct
     from rigkit.io.rig_session import frames_of_images
@@ -207,7 +207,7 @@ def angles(rig: RigCalibration) -> list[tuple[str, str, float, float]]:
 
 def transfers(rig: RigCalibration) -> list[tuple[str, str, float, float]]:
     """Return (from, to, px at the middle corner, px at the worst) of every two cameras that see the same places."""
-    from rigkit.calibration.rig_uncertainty import transfer_uncertainty
+    from rigkit.calibration.rig.uncertainty import transfer_uncertainty
 
     found = [transfer_uncertainty(rig, a, b) for a, b in combinations([c.name for c in rig.cameras], 2)]
     return [(t.a, t.b, t.median_px, t.worst_px) for t in found if t is not None]

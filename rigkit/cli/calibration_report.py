@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rigkit.boards import Board
     from rigkit.calibration.result import Calibration, ViewResult
-    from rigkit.calibration.rig import RigCalibration
+    from rigkit.calibration.rig.result import RigCalibration
     from rigkit.io.rig_session import RigSession
     from rigkit.io.session import Session
     from rigkit.validation.checks import Check

@@ -87,7 +87,7 @@ def _rigs(a: Path, b: Path) -> dict[str, Any]:
     """Return the differences of the mounts, and of the cameras where their calibrations lie beside the rigs."""
     from dataclasses import asdict
 
-    from rigkit.calibration.rig_compare import compare_mounts
+    from rigkit.calibration.rig.compare import compare_mounts
     from rigkit.errors import InputError
     from rigkit.io.rig_file import load_saved_rig
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rigkit.boards import Board
-    from rigkit.calibration.rig import RigCalibration
+    from rigkit.calibration.rig.result import RigCalibration
     from rigkit.detections import BoardDetection
     from rigkit.io.corner_cache import FoundCorners
     from rigkit.io.rig_session import RigSession
@@ -69,7 +69,7 @@ def _vacant(detection: BoardDetection, group: list[Board], taken: set[str | None
 def named_by_rule(session: RigSession, rig: RigCalibration) -> RigCalibration:
     """Return the rig with boards that look alike called as `rigkit.corners.naming` has it, in the first image that
     shows the most of them: by the session's layout, or in the order listed."""
-    from rigkit.calibration.board_names import renamed
+    from rigkit.calibration.rig.board_names import renamed
     from rigkit.corners.candidates import board_kinds
     from rigkit.corners.naming import Located, name_boards
 

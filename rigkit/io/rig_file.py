@@ -14,8 +14,8 @@ import numpy as np
 
 from rigkit.arrays import FloatArray, as_array
 from rigkit.boards import Board
-from rigkit.calibration.board_rig import BoardRig, PlacedBoard
-from rigkit.calibration.rig_result import RigCalibration
+from rigkit.calibration.rig.board_rig import BoardRig, PlacedBoard
+from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.base import Camera
 from rigkit.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3

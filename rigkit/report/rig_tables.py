@@ -7,9 +7,9 @@ from itertools import combinations
 
 import numpy as np
 
-from rigkit.calibration.board_rig import BoardRig
-from rigkit.calibration.rig import RigCalibration
-from rigkit.calibration.rig_uncertainty import transfer_uncertainty
+from rigkit.calibration.rig.board_rig import BoardRig
+from rigkit.calibration.rig.result import RigCalibration
+from rigkit.calibration.rig.uncertainty import transfer_uncertainty
 from rigkit.geometry.rotation import log_so3
 from rigkit.truth import Feature
 from rigkit.validation.checks import Check

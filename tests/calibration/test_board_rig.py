@@ -11,10 +11,11 @@ from helpers.board_rig_scenes import ALIKE, DIFFERENT, corner_of_a_room, target_
 from helpers.calibration_scenes import lens
 
 from rigkit.boards import Board
-from rigkit.calibration.board_rig import BoardRig, PlacedBoard
-from rigkit.calibration.board_ties import suggest_ties
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.rig import RigCalibration, calibrate_rig
+from rigkit.calibration.rig.board_rig import BoardRig, PlacedBoard
+from rigkit.calibration.rig.board_ties import suggest_ties
+from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.base import Camera
 from rigkit.detections import BoardView
 from rigkit.errors import DegenerateError, InputError

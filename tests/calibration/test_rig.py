@@ -13,11 +13,11 @@ from rigkit.boards import Board
 from rigkit.calibration.camera_prior import camera_prior
 from rigkit.calibration.normal import Step
 from rigkit.calibration.observations import Observations
-from rigkit.calibration.rig import calibrate_rig
-from rigkit.calibration.rig_solver import rig_normal
-from rigkit.calibration.rig_spread import frame_spread
-from rigkit.calibration.rig_state import RigObservations, RigState
-from rigkit.calibration.rig_uncertainty import transfer_covariance, transfer_uncertainty
+from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.solver import rig_normal
+from rigkit.calibration.rig.spread import frame_spread
+from rigkit.calibration.rig.state import RigObservations, RigState
+from rigkit.calibration.rig.uncertainty import transfer_covariance, transfer_uncertainty
 from rigkit.calibration.shape import shape_model
 from rigkit.calibration.solver import evaluate
 from rigkit.cameras.base import Camera
@@ -278,7 +278,7 @@ def test_spread_has_no_bias_with_few_frames(monkeypatch: pytest.MonkeyPatch) -> 
         squared.append(frame_spread(*args) ** 2)
         return 1.0
 
-    monkeypatch.setattr("rigkit.calibration.rig.frame_spread", recorded)
+    monkeypatch.setattr("rigkit.calibration.rig.calibrate.frame_spread", recorded)
     for seed in range(16):
         views = {n: own for n, own in rig_views(np.random.default_rng(seed), 6).items() if n != "fish"}
         calibrate_rig(views, sizes(), model=MODELS, folds=0)

@@ -9,8 +9,9 @@ import pytest
 from calibration.test_rig import NOISE_PX, SIGMAS, Views, mounts, rig_views, sizes
 
 from rigkit.boards import Board
-from rigkit.calibration.rig import RigCalibration, calibrate_rig
-from rigkit.calibration.rig_seen import Seen
+from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.result import RigCalibration
+from rigkit.calibration.rig.seen import Seen
 from rigkit.detections import BoardView
 from rigkit.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3

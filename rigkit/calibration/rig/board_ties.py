@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from rigkit.boards import Board
-from rigkit.calibration.board_places import board_places
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.rig_joint import solve_jointly
-from rigkit.calibration.rig_seen import Sights, seen_by
+from rigkit.calibration.rig.board_places import board_places
+from rigkit.calibration.rig.joint import solve_jointly
+from rigkit.calibration.rig.seen import Sights, seen_by
 from rigkit.detections import BoardView
 from rigkit.errors import RigkitError
 from rigkit.progress import silent

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, Points
-from rigkit.calibration.rig_result import RigCalibration
+from rigkit.calibration.rig.result import RigCalibration
 from rigkit.geometry.rotation import skew
 
 __all__ = ["Transfer", "transfer_covariance", "transfer_uncertainty"]

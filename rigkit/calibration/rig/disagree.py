@@ -15,9 +15,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.rig_seen import Sights
-from rigkit.calibration.rig_solver import RigSolution
-from rigkit.calibration.rig_state import Key, RigObservations
+from rigkit.calibration.rig.seen import Sights
+from rigkit.calibration.rig.solver import RigSolution
+from rigkit.calibration.rig.state import Key, RigObservations
 
 __all__ = ["DISAGREES", "FAR_APART", "LEAST_PX", "bad_ones", "cost_of_sharing", "masked", "part", "part_far"]
 __all__ += ["shared_keys", "usual_cost", "why"]

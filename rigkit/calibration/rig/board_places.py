@@ -15,7 +15,7 @@ import numpy as np
 
 from rigkit.arrays import FloatArray
 from rigkit.boards import Board
-from rigkit.calibration.rig_seen import Places, Seen, Sights, same_looks
+from rigkit.calibration.rig.seen import Places, Seen, Sights, same_looks
 from rigkit.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import nearest_rotation

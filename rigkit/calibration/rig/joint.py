@@ -10,7 +10,7 @@ import numpy as np
 from rigkit.arrays import FloatArray, IntArray
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.rig_disagree import (
+from rigkit.calibration.rig.disagree import (
     DISAGREES,
     LEAST_PX,
     bad_ones,
@@ -22,11 +22,11 @@ from rigkit.calibration.rig_disagree import (
     usual_cost,
     why,
 )
-from rigkit.calibration.rig_frames import apart, first_frames, mounts_of, turned_alike
-from rigkit.calibration.rig_seen import Places, Sights
-from rigkit.calibration.rig_shape import common_shape
-from rigkit.calibration.rig_solver import RigSolution, solve_rig
-from rigkit.calibration.rig_state import Key, RigObservations, RigState
+from rigkit.calibration.rig.frames import apart, first_frames, mounts_of, turned_alike
+from rigkit.calibration.rig.seen import Places, Sights
+from rigkit.calibration.rig.shape import common_shape
+from rigkit.calibration.rig.solver import RigSolution, solve_rig
+from rigkit.calibration.rig.state import Key, RigObservations, RigState
 from rigkit.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.progress import Progress

@@ -12,21 +12,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from rigkit.boards import Board
-from rigkit.calibration.board_places import board_places
 from rigkit.calibration.calibrate import FOLDS, calibrate
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.rig_assemble import assemble_rig, residual_sigma
-from rigkit.calibration.rig_heldout import heldout_rms
-from rigkit.calibration.rig_joint import solve_jointly
-from rigkit.calibration.rig_result import RigCalibration, RigCamera
-from rigkit.calibration.rig_seen import Places, Sights, seen_by
-from rigkit.calibration.rig_spread import frame_spread
-from rigkit.calibration.rig_verdicts import judge_rig
+from rigkit.calibration.rig.assemble import assemble_rig, residual_sigma
+from rigkit.calibration.rig.board_places import board_places
+from rigkit.calibration.rig.heldout import heldout_rms
+from rigkit.calibration.rig.joint import solve_jointly
+from rigkit.calibration.rig.result import RigCalibration
+from rigkit.calibration.rig.seen import Places, Sights, seen_by
+from rigkit.calibration.rig.spread import frame_spread
+from rigkit.calibration.rig.verdicts import judge_rig
 from rigkit.detections import BoardView
 from rigkit.errors import DegenerateError, InputError
 from rigkit.progress import Progress, silent
 
-__all__ = ["RigCalibration", "RigCamera", "calibrate_rig"]
+__all__ = ["calibrate_rig"]
 
 Views = Mapping[str, Sequence[tuple[str, BoardView]]]
 

@@ -19,7 +19,7 @@ from rigkit.arrays import FloatArray, IntArray
 from rigkit.calibration.camera_prior import camera_prior
 from rigkit.calibration.normal import Normal, Residuals, normal_equations
 from rigkit.calibration.result import Convergence
-from rigkit.calibration.rig_state import RigObservations, RigState
+from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.calibration.solver import COST_TOLERANCE, Linearised, minimise
 from rigkit.geometry.rotation import exp_so3, skew
 

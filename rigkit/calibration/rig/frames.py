@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points
-from rigkit.calibration.rig_seen import Places, Seen, Sights, same_looks, turns_of
-from rigkit.calibration.rig_state import Key
+from rigkit.calibration.rig.seen import Places, Seen, Sights, same_looks, turns_of
+from rigkit.calibration.rig.state import Key
 from rigkit.cameras.base import Camera
 from rigkit.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3

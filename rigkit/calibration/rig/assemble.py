@@ -9,13 +9,13 @@ import numpy as np
 
 from rigkit.arrays import FloatArray
 from rigkit.boards import Board
-from rigkit.calibration.board_rig import BoardRig, PlacedBoard
 from rigkit.calibration.result import BoardShape, Calibration, ViewResult
-from rigkit.calibration.rig_joint import JointRig
-from rigkit.calibration.rig_result import RigCalibration, RigCamera
-from rigkit.calibration.rig_seen import Places
-from rigkit.calibration.rig_solver import carried
-from rigkit.calibration.rig_state import Layout, RigObservations
+from rigkit.calibration.rig.board_rig import BoardRig, PlacedBoard
+from rigkit.calibration.rig.joint import JointRig
+from rigkit.calibration.rig.result import RigCalibration, RigCamera
+from rigkit.calibration.rig.seen import Places
+from rigkit.calibration.rig.solver import carried
+from rigkit.calibration.rig.state import Layout, RigObservations
 from rigkit.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew

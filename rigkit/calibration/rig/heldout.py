@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.calibration.rig_joint import JointRig
-from rigkit.calibration.rig_solver import refine_frames, solve_rig
+from rigkit.calibration.rig.joint import JointRig
+from rigkit.calibration.rig.solver import refine_frames, solve_rig
 
 __all__ = ["heldout_rms"]
 

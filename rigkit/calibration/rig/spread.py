@@ -21,8 +21,8 @@ import numpy as np
 
 from rigkit.arrays import FloatArray, IntArray
 from rigkit.calibration.normal import Normal
-from rigkit.calibration.rig_solver import carried
-from rigkit.calibration.rig_state import RigObservations, RigState
+from rigkit.calibration.rig.solver import carried
+from rigkit.calibration.rig.state import RigObservations, RigState
 
 __all__ = ["MIN_FRAMES", "frame_spread"]
 

@@ -11,7 +11,7 @@ import numpy as np
 from rigkit.arrays import BoolArray, FloatArray
 from rigkit.boards import Board
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.rig_state import Key
+from rigkit.calibration.rig.state import Key
 from rigkit.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from rigkit.calibration.board_rig import BoardRig
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.rig_result import RigCalibration, RigCamera
+from rigkit.calibration.rig.board_rig import BoardRig
+from rigkit.calibration.rig.result import RigCalibration, RigCamera
 
 __all__ = ["renamed"]
 

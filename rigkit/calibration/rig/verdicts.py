@@ -7,8 +7,8 @@ from itertools import combinations
 
 import numpy as np
 
-from rigkit.calibration.rig_result import RigCalibration
-from rigkit.calibration.rig_uncertainty import transfer_uncertainty
+from rigkit.calibration.rig.result import RigCalibration
+from rigkit.calibration.rig.uncertainty import transfer_uncertainty
 from rigkit.calibration.uncertainty import uncertainty_at_corners
 
 __all__ = ["judge_rig"]

@@ -1,0 +1,1 @@
+"""Several cameras, or boards, on one mount: calibrated together."""
