@@ -18,7 +18,7 @@ import numpy as np
 from rigkit.arrays import BoolArray, FloatArray
 from rigkit.corners.lattice import Lattice
 from rigkit.corners.local_fit import LocalFit, fit_cells
-from rigkit.corners.response import FloatImage, sample
+from rigkit.corners.response import GreyImage, sample
 from rigkit.corners.subpixel import RefinedLattice
 
 __all__ = ["Side", "place_part", "sides"]
@@ -103,7 +103,7 @@ class Beyond:
         return alike > 1 or WHITE[0] < self.level < WHITE[1]
 
 
-def place_part(image: FloatImage, refined: RefinedLattice, sizes: Sequence[tuple[int, int]]) -> RefinedLattice | None:
+def place_part(image: GreyImage, refined: RefinedLattice, sizes: Sequence[tuple[int, int]]) -> RefinedLattice | None:
     """Return `refined` on the grid of the whole board, empty where nothing was found; None where its place is open.
 
     Parameters
@@ -148,13 +148,13 @@ def _padded(refined: RefinedLattice, rows: tuple[int, int], columns: tuple[int, 
     return replace(refined, lattice=lattice, **rest)
 
 
-def sides(image: FloatImage, lattice: Lattice) -> tuple[Beyond, Beyond, Beyond, Beyond]:
+def sides(image: GreyImage, lattice: Lattice) -> tuple[Beyond, Beyond, Beyond, Beyond]:
     """Return what lies beyond the first row, the first column, the last row and the last column."""
     first, second, third, fourth = (_above(image, lattice.turned(turns)) for turns in range(4))
     return first, second, third, fourth
 
 
-def _above(image: FloatImage, lattice: Lattice) -> Beyond:
+def _above(image: GreyImage, lattice: Lattice) -> Beyond:
     """Return what lies beyond the first row of `lattice`."""
     squares = _Squares.above(lattice)
     usable = squares.usable(image)
@@ -220,7 +220,7 @@ class _Squares:
                 out += np.where(which, share, 0.0)[:, None] * place
         return out
 
-    def usable(self, image: FloatImage) -> BoolArray:
+    def usable(self, image: GreyImage) -> BoolArray:
         """Return which squares (M,) and the paper beyond them lie in the image, large enough, and well predicted."""
         count = len(self.bright)
         height, width = image.shape
@@ -234,12 +234,12 @@ class _Squares:
         sound = both[0] & both[1]
         return np.asarray(inside & self.near & sound[:-1] & sound[1:])
 
-    def brightness(self, image: FloatImage, up: FloatArray) -> FloatArray:
+    def brightness(self, image: GreyImage, up: FloatArray) -> FloatArray:
         """Return the median brightness (M,) at `up` squares beyond the row, over the middle part of the squares."""
         places = self.at(np.repeat(up, len(WITHIN)), np.tile(WITHIN, len(up)))
         return np.asarray(np.median(sample(image, places), axis=1), dtype=np.float64)
 
-    def end_on_one_line(self, image: FloatImage, outer: FloatArray, beyond: FloatArray, judged: BoolArray) -> BoolArray:
+    def end_on_one_line(self, image: GreyImage, outer: FloatArray, beyond: FloatArray, judged: BoolArray) -> BoolArray:
         """Return which squares (M,) change from brightness `outer` to `beyond` once, where those `judged` do."""
         places = self.at(np.repeat(PROFILE, len(WITHIN)), np.tile(WITHIN, len(PROFILE)))
         values = sample(image, places).reshape(len(outer), len(PROFILE), len(WITHIN)).mean(axis=2)

@@ -18,7 +18,7 @@ from rigkit.boards import Board, Markers
 from rigkit.corners.guided import fit_corners
 from rigkit.corners.lattice import Lattice
 from rigkit.corners.local_fit import fit_cells
-from rigkit.corners.response import FloatImage
+from rigkit.corners.response import GreyImage
 from rigkit.corners.subpixel import RefinedLattice, refine
 from rigkit.detections import BoardDetection
 
@@ -35,7 +35,7 @@ SEED_CONTRAST = 100.0
 
 
 def charuco_boards(
-    image: FloatImage, found: Sequence[RefinedLattice], boards: Sequence[Board], min_corners: int
+    image: GreyImage, found: Sequence[RefinedLattice], boards: Sequence[Board], min_corners: int
 ) -> tuple[list[BoardDetection], list[RefinedLattice]]:
     """Return the ChArUco boards in an image, named and on their own grids, and the lattices that are none.
 
@@ -151,7 +151,7 @@ def _onto(lattice: Lattice, shift: IntArray, board: Board) -> Lattice:
     return out
 
 
-def _beside_markers(image: FloatImage, refined: RefinedLattice, board: Board) -> RefinedLattice:
+def _beside_markers(image: GreyImage, refined: RefinedLattice, board: Board) -> RefinedLattice:
     """Return the corners fitted anew with windows that leave the markers out; those that then fail are dropped."""
     lattice = refined.lattice
     known = lattice.known

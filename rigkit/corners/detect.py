@@ -19,7 +19,7 @@ from rigkit.corners.guided import complete_boards
 from rigkit.corners.lattice import Lattice, build_lattices
 from rigkit.corners.links import find_links
 from rigkit.corners.origin import quarter_turns
-from rigkit.corners.response import FloatImage, grey_image, pyramid
+from rigkit.corners.response import GreyImage, grey_image, pyramid
 from rigkit.corners.saddle import find_corners
 from rigkit.corners.subpixel import RefinedLattice, refine
 from rigkit.corners.validate import known_part, large, sample_of, separate, tidy, trustworthy
@@ -51,7 +51,7 @@ def find_lattices(image: NDArray[np.generic], min_corners: int) -> list[RefinedL
     return [after for before, after in refined if trustworthy(after, before.count, min_corners)]
 
 
-def _promising(grey: FloatImage, lattice: Lattice) -> bool:
+def _promising(grey: GreyImage, lattice: Lattice) -> bool:
     """Return whether `lattice` is worth to be refined: small, or a board as far as a sample of it tells."""
     sample = sample_of(lattice)
     if sample is None:

@@ -36,7 +36,7 @@ from rigkit.corners.edge_model import (
     linearise,
     pattern_of,
 )
-from rigkit.corners.response import FloatImage
+from rigkit.corners.response import GreyImage
 from rigkit.native.edges import Rules, fit_corners
 
 __all__ = ["BLUR_RANGE", "EdgeFit", "fit_edges"]
@@ -95,7 +95,7 @@ class EdgeFit:
 
 
 def fit_edges(
-    image: FloatImage,
+    image: GreyImage,
     pixels: FloatArray,
     geometry: Geometry,
     sign: FloatArray,
@@ -106,7 +106,7 @@ def fit_edges(
     converged_px: float = 1e-3,
     mirrored: bool = True,
 ) -> EdgeFit:
-    """Fit the edge model to `image` (grey float32) around the corners that are near `pixels` (N, 2).
+    """Fit the edge model to `image` (as `grey_image` returns it) around the corners that are near `pixels` (N, 2).
 
     Parameters
     ----------

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.arrays import BoolArray, FloatArray
-from rigkit.corners.response import FloatImage
+from rigkit.corners.response import GreyImage
 
 __all__ = [
     "NEAR_PX",
@@ -97,7 +97,7 @@ class Window:
         )
 
 
-def collect(image: FloatImage, pixels: FloatArray, geometry: Geometry, blur: FloatArray, radius_px: float) -> Window:
+def collect(image: GreyImage, pixels: FloatArray, geometry: Geometry, blur: FloatArray, radius_px: float) -> Window:
     """Return the pixels of `image` near the two lines of each corner, inside its cell and `radius_px`."""
     height, width = image.shape
     a, b = geometry.sides[:, 0], geometry.sides[:, 1]
@@ -132,9 +132,8 @@ def collect(image: FloatImage, pixels: FloatArray, geometry: Geometry, blur: Flo
     u, v = du[index], dv[index]
     column = np.clip(u + centre[:, :1].astype(np.int64), 0, width - 1)
     row = np.clip(v + centre[:, 1:].astype(np.int64), 0, height - 1)
-    return Window(
-        centre, u.astype(np.float32), v.astype(np.float32), image[row, column], weight, np.maximum(radius, 2.0)
-    )
+    value = image[row, column].astype(np.float32)
+    return Window(centre, u.astype(np.float32), v.astype(np.float32), value, weight, np.maximum(radius, 2.0))
 
 
 def _step(distance: Float32, blur: Float32, flat: Float32, gaps: Float32) -> tuple[Float32, ...]:

@@ -22,7 +22,7 @@ from rigkit.corners.board_guide import FEWEST, UNSOUND, BoardState, Guide, cell_
 from rigkit.corners.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
 from rigkit.corners.edge_model import NEAR_PX, NEAR_SIGMAS, Geometry
 from rigkit.corners.local_fit import LocalFit, fit_cells
-from rigkit.corners.response import FloatImage, grey_image
+from rigkit.corners.response import GreyImage, grey_image
 from rigkit.detections import BoardDetection
 
 __all__ = ["complete_boards", "fit_corners"]
@@ -121,7 +121,7 @@ def _board_of(found: BoardDetection, boards: Sequence[Board]) -> Board | None:
 
 
 def fit_corners(
-    image: FloatImage,
+    image: GreyImage,
     board: Board,
     shape: LocalFit,
     start: FloatArray,
@@ -149,7 +149,7 @@ def _short_of_markers(board: Board, sides: FloatArray, blur: FloatArray) -> Floa
     return np.clip(blur, *BLUR_RANGE)
 
 
-def _completed(image: FloatImage, found: BoardDetection, board: Board, camera: Camera | None) -> BoardDetection:
+def _completed(image: GreyImage, found: BoardDetection, board: Board, camera: Camera | None) -> BoardDetection:
     opened = _opened(image, found, board)
     if opened is None:
         return found
@@ -204,7 +204,7 @@ def _scatter(guide: Guide, state: BoardState) -> float:
     return ratio if ratio > UNEXPLAINED else 1.0
 
 
-def _opened(image: FloatImage, found: BoardDetection, board: Board) -> BoardState | None:
+def _opened(image: GreyImage, found: BoardDetection, board: Board) -> BoardState | None:
     """Return what the fit says of the corners found; None where they do not alternate like a chessboard's."""
     shape = (found.rows, found.columns)
     empty = np.full(shape, np.nan)
@@ -227,7 +227,7 @@ def _opened(image: FloatImage, found: BoardDetection, board: Board) -> BoardStat
     return replace(opened, pixels=state.pixels)
 
 
-def _added(image: FloatImage, guide: Guide, state: BoardState) -> BoardState | None:
+def _added(image: GreyImage, guide: Guide, state: BoardState) -> BoardState | None:
     """Return the state with those missing corners that can be added now, None where there are none."""
     missing = ~state.known
     if not missing.any():
@@ -276,7 +276,7 @@ def _confirmed(guide: Guide, state: BoardState, shape: LocalFit, side: FloatArra
     return np.asarray(good)
 
 
-def _again(image: FloatImage, guide: Guide, state: BoardState) -> BoardState:
+def _again(image: GreyImage, guide: Guide, state: BoardState) -> BoardState:
     """Return the state with every corner fitted anew as the camera sees it."""
     cells = state.known
     shape, seen = guide.at(state, cells)

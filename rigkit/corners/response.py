@@ -18,9 +18,12 @@ from rigkit.arrays import FloatArray, IntArray
 from rigkit.errors import InputError
 from rigkit.native import front
 
-__all__ = ["FloatImage", "Level", "grey_image", "peaks", "pyramid", "sample"]
+__all__ = ["FloatImage", "GreyImage", "Level", "grey_image", "peaks", "pyramid", "sample"]
 
 FloatImage = NDArray[np.float32]
+
+GreyImage = NDArray[np.uint8] | NDArray[np.float32]
+"""Grey levels 0..255. Those of an 8-bit camera stay bytes: four times the memory costs as much time as the search."""
 
 BASE_PIXELS = 2.6e6
 """The finest level of the search has at most this many pixels; only the sub-pixel fit looks at larger images."""
@@ -77,8 +80,8 @@ class Level:
         return pixels * self.scale + self.offset
 
 
-def grey_image(image: NDArray[np.generic]) -> FloatImage:
-    """Return an 8- or 16-bit, grey or RGB(A) image as grey float32, 0..255.
+def grey_image(image: NDArray[np.generic]) -> GreyImage:
+    """Return an 8- or 16-bit, grey or RGB(A) image in grey levels 0..255: uint8 as such, all others as float32.
 
     16-bit images are scaled by their own brightest value (the 99.9 % quantile), because 10- and 12-bit sensors do not
     fill the range. Floating-point images are taken as 0..255 as they are.
@@ -101,7 +104,9 @@ def grey_image(image: NDArray[np.generic]) -> FloatImage:
         array = array.astype(np.float32)
     if array.ndim == 3:
         array = cv2.cvtColor(array, cv2.COLOR_RGB2GRAY if array.shape[2] == 3 else cv2.COLOR_RGBA2GRAY)
-    grey = np.ascontiguousarray(array, dtype=np.float32)
+    if array.dtype == np.uint8:
+        return np.ascontiguousarray(array, np.uint8)
+    grey = np.ascontiguousarray(array, np.float32)
     if array.dtype == np.uint16:
         step = max(1, int(np.sqrt(grey.size / 1e5)))
         brightest = float(np.quantile(grey[::step, ::step], 0.999))
@@ -109,7 +114,7 @@ def grey_image(image: NDArray[np.generic]) -> FloatImage:
     return grey
 
 
-def pyramid(grey: FloatImage) -> list[Level]:
+def pyramid(grey: GreyImage) -> list[Level]:
     """Return the levels of the search, the finest first."""
     scale = 1
     while grey.size > scale**2 * BASE_PIXELS:
@@ -123,7 +128,7 @@ def pyramid(grey: FloatImage) -> list[Level]:
     return levels
 
 
-def _shrunk(grey: FloatImage, factor: int) -> FloatImage:
+def _shrunk(grey: GreyImage, factor: int) -> GreyImage:
     """Return the means of `factor` x `factor` pixels."""
     if factor == 1:
         return grey
@@ -132,10 +137,11 @@ def _shrunk(grey: FloatImage, factor: int) -> FloatImage:
         return front.shrunk(library, grey, factor)
     height, width = grey.shape[0] // factor, grey.shape[1] // factor
     whole = grey[: factor * height, : factor * width]
-    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+    mean = cv2.resize(whole.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(mean, np.float32)
 
 
-def _smoothed(image: FloatImage) -> tuple[FloatImage, FloatImage]:
+def _smoothed(image: GreyImage) -> tuple[FloatImage, FloatImage]:
     """Return `image` smoothed, and every second pixel of every second row of that."""
     library = front.loaded()
     if library is not None:
@@ -204,9 +210,18 @@ def _repeated(response: FloatImage, flat: IntArray, width: int) -> NDArray[np.bo
     return repeated
 
 
-def sample(image: FloatImage, pixels: NDArray[np.floating]) -> FloatImage:
+def sample(image: GreyImage, pixels: NDArray[np.floating]) -> FloatImage:
     """Return `image` at `pixels` (..., 2), bilinear, the border repeated; (...) float32."""
     flat = np.asarray(pixels, np.float32).reshape(-1, 2)
+    if image.dtype == np.uint8:
+        # OpenCV would round to whole grey levels. Only the part that is looked at is converted.
+        seen = flat[np.isfinite(flat).all(axis=1)]
+        if len(seen):
+            last = np.array(image.shape[::-1]) - 1
+            low, high = (f(seen, axis=0).clip(0, last).astype(int) for f in (np.min, np.max))
+            image = image[low[1] : high[1] + 2, low[0] : high[0] + 2]
+            flat = flat - low.astype(np.float32)
+        image = image.astype(np.float32)
     width = 1024
     padded = np.zeros((-(-max(len(flat), 1) // width) * width, 2), np.float32)
     padded[: len(flat)] = flat

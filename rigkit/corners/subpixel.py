@@ -19,7 +19,7 @@ from rigkit.corners.edge_fit import BLUR_RANGE, fit_edges
 from rigkit.corners.edge_model import Geometry
 from rigkit.corners.lattice import Lattice, Sheet
 from rigkit.corners.local_fit import LocalFit, fit_cells
-from rigkit.corners.response import FloatImage
+from rigkit.corners.response import GreyImage
 
 __all__ = ["RefinedLattice", "refine"]
 
@@ -106,7 +106,7 @@ class RefinedLattice:
         return (self.sigma_px, self.blur_px, self.residual, self.noise)
 
 
-def refine(image: FloatImage, lattices: Sequence[Lattice]) -> list[RefinedLattice]:
+def refine(image: GreyImage, lattices: Sequence[Lattice]) -> list[RefinedLattice]:
     """Return `lattices` with their corners placed by the edge model on the full-resolution grey `image`.
 
     Corners whose fit fails or that contradict their neighbours are dropped; corners in empty cells that the fit
@@ -153,7 +153,7 @@ def _typical_blur(item: RefinedLattice, parts: Sequence[Part]) -> FloatArray:
 
 
 def _pass(
-    image: FloatImage,
+    image: GreyImage,
     start: Lattice,
     signs: FloatArray,
     blur: FloatArray,

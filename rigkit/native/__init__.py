@@ -13,8 +13,11 @@ import hashlib
 import importlib.util
 import os
 from pathlib import Path
+from typing import Any
 
-__all__ = ["kernels"]
+from numpy.typing import NDArray
+
+__all__ = ["address", "kernels"]
 
 SWITCH = "RIGKIT_NATIVE"
 """Environment variable: 0 leaves the kernels unused."""
@@ -37,3 +40,15 @@ def kernels(name: str) -> ctypes.CDLL | None:
     folder = Path(__file__).parent
     source = (folder / f"{name}.c").read_bytes() + (folder / "kernels.h").read_bytes()
     return library if built_from == hashlib.sha256(source).hexdigest()[:16] else None
+
+
+def address(array: NDArray[Any]) -> int:
+    """Return the address of the first value of a contiguous `array`, which must outlive its use.
+
+    `array.ctypes.data` takes four times as long, and a detection needs two hundred addresses.
+    """
+    try:
+        return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        # Read-only, or empty.
+        return int(array.ctypes.data)

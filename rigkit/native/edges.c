@@ -67,27 +67,38 @@ INLINE range_t both(range_t a, range_t b)
     return (range_t){a.lo > b.lo ? a.lo : b.lo, a.hi < b.hi ? a.hi : b.hi};
 }
 
-INLINE void take(window_t *window, const image_t image, int64_t v, range_t range)
+/* An image as the camera gave it, a byte a pixel, or of floats: windows are copied anyway. */
+typedef struct {
+    const void *brightness;
+    int64_t width, height, bytes;
+} picture_t;
+
+INLINE void take(window_t *window, const picture_t image, int64_t v, range_t range)
 {
     const int64_t first = (int64_t)ceil(range.lo), count = (int64_t)floor(range.hi) - first + 1;
     if (count <= 0)
         return;
-    const float *restrict row =
-        image.brightness + ((int64_t)window->centre_v + v) * image.width + (int64_t)window->centre_u + first;
+    const int64_t start = ((int64_t)window->centre_v + v) * image.width + (int64_t)window->centre_u + first;
+    const uint8_t *restrict bytes = (const uint8_t *)image.brightness + start;
+    const float *restrict floats = (const float *)image.brightness + start;
     float *restrict us = window->u + window->count, *restrict vs = window->v + window->count;
     float *restrict values = window->value + window->count;
     for (int32_t k = 0; k < (int32_t)count; k++) {
         us[k] = (float)((int32_t)first + k);
         vs[k] = (float)v;
-        values[k] = row[k];
     }
+    if (image.bytes)
+        for (int32_t k = 0; k < (int32_t)count; k++)
+            values[k] = (float)bytes[k];
+    else
+        memcpy(values, floats, (size_t)count * sizeof(float));
     window->count += count;
 }
 
 /* Gather the pixels near the two lines, inside the cell, the radius and the image (edge_model.collect): of every row
  * one or two stretches. */
 static void collect(
-    window_t *window, const image_t image, const double pixel[2], const geometry_t at, double blur, const rules_t *rules)
+    window_t *window, const picture_t image, const double pixel[2], const geometry_t at, double blur, const rules_t *rules)
 {
     const double *a = at.sides, *b = at.sides + 2;
     double area = a[0] * b[1] - a[1] * b[0];
@@ -555,13 +566,14 @@ int64_t edges_scratch(const rules_t *rules)
 }
 
 /* Fit the edge model around `count` corners (edge_fit.fit_edges). pixels (N, 2), sides (N, 2, 2), curvature (N, 2), gaps
- * (N, 2, 2), sign (N), blur (N), out (N, OUTCOMES); scratch as `edges_scratch` says, zeroed. */
+ * (N, 2, 2), sign (N), blur (N), out (N, OUTCOMES); scratch as `edges_scratch` says, zeroed; `grey` is of uint8_t if
+ * `bytes`, else of float. */
 void fit_edges(
-    const float *grey, int64_t width, int64_t height, int64_t count, const double *pixels, const double *sides,
+    const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *sides,
     const double *curvature, const double *gaps, const double *sign, const double *blur, const rules_t *rules,
     float *scratch, double *out)
 {
-    const image_t image = {grey, width, height};
+    const picture_t image = {grey, width, height, bytes};
     const int64_t room = room_of_window(rules->radius_px);
     window_t window = {
         .u = scratch, .v = scratch + room, .value = scratch + 2 * room, .rest = scratch + 3 * room,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.arrays import BoolArray, FloatArray
-from rigkit.native import kernels
+from rigkit.native import address, kernels
 
 __all__ = ["OUTCOMES", "BendRules", "Rules", "fit_corners", "line_bends"]
 
@@ -73,14 +73,14 @@ def _library() -> ctypes.CDLL | None:
         library.edges_scratch.restype = count
         library.edges_scratch.argtypes = [array]
         library.fit_edges.restype = None
-        library.fit_edges.argtypes = [array, count, count, count, *[array] * 9]
+        library.fit_edges.argtypes = [array, count, count, count, count, *[array] * 9]
         library.line_bends.restype = None
         library.line_bends.argtypes = [array, array, array, count, count, array, array, array]
     return library
 
 
 def fit_corners(
-    image: NDArray[np.float32],
+    image: NDArray[np.uint8] | NDArray[np.float32],
     pixels: FloatArray,
     sides: FloatArray,
     curvature: FloatArray,
@@ -93,20 +93,21 @@ def fit_corners(
     library = _library()
     if library is None:
         return None
-    grey = np.ascontiguousarray(image, np.float32)
+    grey = np.ascontiguousarray(image)
     known = [np.ascontiguousarray(part, np.float64) for part in (pixels, sides, curvature, gaps, sign, blur)]
     out = np.empty((len(pixels), OUTCOMES))
     scratch = np.zeros(library.edges_scratch(ctypes.addressof(rules)), np.float32)
     height, width = grey.shape
     library.fit_edges(
-        grey.ctypes.data,
+        address(grey),
+        grey.dtype == np.uint8,
         width,
         height,
         len(pixels),
-        *(part.ctypes.data for part in known),
+        *(address(part) for part in known),
         ctypes.addressof(rules),
-        scratch.ctypes.data,
-        out.ctypes.data,
+        address(scratch),
+        address(out),
     )
     return out
 
@@ -123,13 +124,13 @@ def line_bends(
     rows, columns = wanted.shape
     out = np.empty((len(sides), 2))
     library.line_bends(
-        places.ctypes.data,
-        sigmas.ctypes.data,
-        wanted.ctypes.data,
+        address(places),
+        address(sigmas),
+        address(wanted),
         rows,
         columns,
-        sides.ctypes.data,
+        address(sides),
         ctypes.addressof(rules),
-        out.ctypes.data,
+        address(out),
     )
     return out

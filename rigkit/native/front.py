@@ -11,14 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray
-from rigkit.native import kernels
+from rigkit.native import address, kernels
 
 __all__ = ["LinkRules", "RingRules", "corners", "links", "loaded", "near_any", "peaks", "shrunk", "smoothed", "typical"]
 
 STRIP = 64
 """As in front.c: rows of scratch memory are longer than the image by this and a peak's neighbourhood."""
 
+WHOLE = 16.0
+"""A kernel of multiples of 1/16 smooths bytes exactly in integers of 16 bits."""
+
+MOST_SUMMED = 256
+"""Bytes whose sum fits 16 bits."""
+
 Image = NDArray[np.float32]
+Picture = NDArray[np.uint8] | NDArray[np.float32]
 
 
 class RingRules(Structure):
@@ -36,7 +43,7 @@ class RingRules(Structure):
     ) -> RingRules:
         """Return the rules; `circle` (2 * half, 2) are the samples of a ring of radius 1."""
         kept = np.ascontiguousarray(circle, np.float32), np.ascontiguousarray(gains, np.float64)
-        arrays = (kept[0].ctypes.data, kept[1].ctypes.data, len(kept[0]) // 2, len(kept[1]))
+        arrays = (address(kept[0]), address(kept[1]), len(kept[0]) // 2, len(kept[1]))
         rules = cls(*arrays, most_odd, most_centre, most_cosine)
         rules.kept = kept
         return rules
@@ -55,7 +62,7 @@ class LinkRules(Structure):
     def make(cls, neighbours: int, along: FloatArray, most: int, **numbers: float) -> LinkRules:
         """Return the rules; `along` are the places of an edge that are looked at."""
         kept = np.ascontiguousarray(along, np.float64)
-        rules = cls(neighbours, len(kept), most, kept.ctypes.data, **numbers)
+        rules = cls(neighbours, len(kept), most, address(kept), **numbers)
         rules.kept = kept
         return rules
 
@@ -65,7 +72,7 @@ class _Image(Structure):
 
     @classmethod
     def of(cls, image: Image) -> _Image:
-        return cls(image.ctypes.data, image.shape[1], image.shape[0])
+        return cls(address(image), image.shape[1], image.shape[0])
 
 
 class _Corners(Structure):
@@ -82,10 +89,12 @@ def loaded() -> ctypes.CDLL | None:
     if library is None:
         return None
     address, size = c_void_p, c_int64
-    library.shrink.argtypes = [address, size, size, size, address, address]
-    library.smooth.argtypes = [address, size, size, *[address] * 4]
+    library.shrink_floats.argtypes = [address, size, size, size, address, address]
+    library.shrink_bytes.argtypes = library.shrink_floats.argtypes
+    library.smooth_floats.argtypes = [address, size, size, *[address] * 4]
+    library.smooth_bytes.argtypes = [address, size, size, address, c_float, *[address] * 3]
     library.typical_values.argtypes = [address, size, size, size, address, address]
-    for name in ("shrink", "smooth", "typical_values"):
+    for name in ("shrink_floats", "shrink_bytes", "smooth_floats", "smooth_bytes", "typical_values"):
         getattr(library, name).restype = None
     library.find_peaks.argtypes = [address, size, size, c_float, *[address] * 3]
     rings = (_Image, POINTER(RingRules), c_double, c_double, c_double)
@@ -100,21 +109,34 @@ def loaded() -> ctypes.CDLL | None:
     return library
 
 
-def shrunk(library: ctypes.CDLL, image: Image, factor: int) -> Image:
+def shrunk(library: ctypes.CDLL, image: Picture, factor: int) -> Image:
     """Return the means of `factor` x `factor` pixels."""
     height, width = image.shape
-    sums, out = np.empty(width, np.float32), np.empty((height // factor, width // factor), np.float32)
-    library.shrink(image.ctypes.data, height, width, factor, sums.ctypes.data, out.ctypes.data)
+    bytewise = image.dtype == np.uint8 and factor <= MOST_SUMMED
+    image = image if bytewise else image.astype(np.float32, copy=False)
+    sums = np.empty(width, np.uint16 if bytewise else np.float32)
+    out = np.empty((height // factor, width // factor), np.float32)
+    shrink = library.shrink_bytes if bytewise else library.shrink_floats
+    shrink(address(image), height, width, factor, address(sums), address(out))
     return out
 
 
-def smoothed(library: ctypes.CDLL, image: Image, kernel: Image) -> tuple[Image, Image]:
-    """Return `image` smoothed with the symmetric `kernel` (5,) both ways, and every second of its pixels both ways."""
+def smoothed(library: ctypes.CDLL, image: Picture, kernel: Image) -> tuple[Image, Image]:
+    """Return `image` smoothed with the symmetric `kernel` (5,), of multiples of 1/WHOLE, both ways, and every second of
+    its pixels both ways."""
     height, width = image.shape
-    smooth, half = np.empty_like(image), np.empty(((height + 1) // 2, (width + 1) // 2), np.float32)
-    column = np.empty(width + 4, np.float32)
-    arrays = (kernel, column, smooth, half)
-    library.smooth(image.ctypes.data, height, width, *(array.ctypes.data for array in arrays))
+    half_height, half_width = (height + 1) // 2, (width + 1) // 2
+    # One block of memory: the allocator keeps it for the next image, as it would not two.
+    block = np.empty(height * width + half_height * half_width, np.float32)
+    smooth, half = block[: height * width].reshape(height, width), block[height * width :].reshape(-1, half_width)
+    if image.dtype == np.uint8:
+        column = np.empty(width + 4, np.uint16)
+        arrays = (address(column), address(smooth), address(half))
+        library.smooth_bytes(address(image), height, width, address(kernel), WHOLE, *arrays)
+    else:
+        column = np.empty(width + 4, np.float32)
+        arrays = (address(column), address(smooth), address(half))
+        library.smooth_floats(address(image), height, width, address(kernel), *arrays)
     return smooth, half
 
 
@@ -122,7 +144,7 @@ def typical(library: ctypes.CDLL, smooth: Image, step: int) -> tuple[Image, Imag
     """Return |response| and brightness at every `step`-th inner pixel of every `step`-th inner row."""
     height, width = smooth.shape
     out = np.empty((2, -(-(height - 2) // step) * -(-(width - 2) // step)), np.float32)
-    library.typical_values(smooth.ctypes.data, height, width, step, out[0].ctypes.data, out[1].ctypes.data)
+    library.typical_values(address(smooth), height, width, step, address(out[0]), address(out[1]))
     return out[0], out[1]
 
 
@@ -133,7 +155,7 @@ def peaks(library: ctypes.CDLL, smooth: Image, threshold: float) -> tuple[NDArra
     at, response = np.empty((most, 2), np.int32), np.empty(most, np.float32)
     scratch = np.empty(5 * (width + STRIP + 4), np.float32)
     arrays = (scratch, at, response)
-    found = library.find_peaks(smooth.ctypes.data, height, width, threshold, *(array.ctypes.data for array in arrays))
+    found = library.find_peaks(address(smooth), height, width, threshold, *(address(array) for array in arrays))
     return at[:found], response[:found]
 
 
@@ -155,8 +177,8 @@ def corners(
     angles, contrast = np.empty((count + 1, 2)), np.empty(count + 1)
     near = library.find_corners(
         *(_Image.of(smooth), byref(rules), radius, most_step, most_sharp),
-        *(at.ctypes.data, response.ctypes.data, count),
-        *(array.ctypes.data for array in (pixels, which, angles, contrast)),
+        *(address(at), address(response), count),
+        *(address(array) for array in (pixels, which, angles, contrast)),
         byref(found),
     )
     size = found.value
@@ -167,7 +189,7 @@ def near_any(library: ctypes.CDLL, fresh: FloatArray, known: FloatArray, reach: 
     """Return which of `fresh` (N, 2) lie within `reach` of any of `known` (M, 2), M > 0."""
     fresh, known = np.ascontiguousarray(fresh, np.float64), np.ascontiguousarray(known, np.float64)
     mark = np.empty(len(fresh), np.bool_)
-    if not library.mark_known(fresh.ctypes.data, len(fresh), known.ctypes.data, len(known), reach, mark.ctypes.data):
+    if not library.mark_known(address(fresh), len(fresh), address(known), len(known), reach, address(mark)):
         raise MemoryError
     return mark
 
@@ -190,9 +212,9 @@ def links(
     largest distance of the places that are looked at from the edge.
     """
     arrays = [np.ascontiguousarray(a, np.float64) for a in (pixels, lines, contrast, *bounds, reach)]
-    given = _Corners(*(array.ctypes.data for array in arrays), len(pixels))
+    given = _Corners(*(address(array) for array in arrays), len(pixels))
     out = np.empty((2, len(pixels), 4), np.int64)
-    place = (out[0].ctypes.data, out[1].ctypes.data)
+    place = (address(out[0]), address(out[1]))
     if not library.find_links(byref(given), _Image.of(image), scale, offset, byref(rules), *place):
         raise MemoryError
     return np.asarray(out[1])

@@ -10,6 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray
+from rigkit.native import address
 from rigkit.native.front import RingRules
 
 __all__ = ["Buckets", "FitRules", "GrowthRules", "components_of", "fit", "grown"]
@@ -61,7 +62,7 @@ class GrowthRules(Structure):
         rules = cls(**numbers)
         rules.predictions = (FitRules * 2)(*predictions)
         rules.ring = pointer(ring)
-        rules.along, rules.places = kept.ctypes.data, len(kept)
+        rules.along, rules.places = address(kept), len(kept)
         rules.kept = kept
         return rules
 
@@ -99,7 +100,7 @@ class Buckets(Structure):
         side = float(np.sqrt(POINTS_A_BUCKET * span[0] * span[1] / len(points))) + 1e-9
         columns, rows = int(span[0] / side) + 1, int(span[1] / side) + 1
         first, order = np.empty(columns * rows + 1, np.int64), np.empty(len(points), np.int64)
-        where = (points.ctypes.data, first.ctypes.data, order.ctypes.data)
+        where = (address(points), address(first), address(order))
         buckets = cls(*where, len(points), columns, rows, float(low[0]), float(low[1]), side)
         buckets.kept = (points, first, order)
         library.fill_buckets(byref(buckets))
@@ -127,7 +128,7 @@ def fit(library: ctypes.CDLL, lattice: FloatArray, cells: BoolArray, rules: FitR
     cells = np.ascontiguousarray(cells, np.bool_)
     out = np.empty((int(np.count_nonzero(cells)), FIT_COLUMNS))
     rows, columns = cells.shape
-    _declared(library).fit_cells(lattice.ctypes.data, rows, columns, cells.ctypes.data, byref(rules), out.ctypes.data)
+    _declared(library).fit_cells(address(lattice), rows, columns, address(cells), byref(rules), address(out))
     return out
 
 
@@ -151,13 +152,11 @@ def grown(
     image = np.ascontiguousarray(image, np.float32)
     due = np.ones((2, rows, columns), np.uint8)
     fresh, where = np.empty((rows * columns, 3)), np.empty(rows * columns, np.int64)
-    start = due.ctypes.data
-    sheet = _Sheet(pixels.ctypes.data, contrast.ctypes.data, start, start + rows * columns, rows, columns, sign)
-    level = _Level(image.ctypes.data, image.shape[1], image.shape[0], scale, offset)
+    start = address(due)
+    sheet = _Sheet(address(pixels), address(contrast), start, start + rows * columns, rows, columns, sign)
+    level = _Level(address(image), image.shape[1], image.shape[0], scale, offset)
     call = _declared(library).grow_lattice
-    return int(
-        call(byref(sheet), byref(level), byref(saddles), byref(rules), rings, fresh.ctypes.data, where.ctypes.data)
-    )
+    return int(call(byref(sheet), byref(level), byref(saddles), byref(rules), rings, address(fresh), address(where)))
 
 
 def components_of(
@@ -172,5 +171,5 @@ def components_of(
     label, grid, turn = np.empty(count, np.int64), np.empty((count, 2), np.int64), np.empty(count, np.int64)
     members, queue, marks = np.empty(count, np.int64), np.empty(2 * count, np.int64), np.empty(4 * count, np.uint8)
     arrays = (label, grid, turn, members, queue, marks)
-    found = _declared(library).find_components(count, links.ctypes.data, tries, *(a.ctypes.data for a in arrays))
+    found = _declared(library).find_components(count, address(links), tries, *(address(a) for a in arrays))
     return int(found), label, grid, turn, members

@@ -52,9 +52,11 @@ def in_numpy(monkeypatch: pytest.MonkeyPatch) -> Callable[..., object]:
     return run
 
 
+@pytest.mark.parametrize("depth", [np.uint8, np.float32])
 @pytest.mark.parametrize("name", list(_images()))
-def test_levels(name: str, in_numpy: Callable[..., list[Level]]) -> None:
-    grey = grey_image(_images()[name])
+def test_levels(name: str, depth: type, in_numpy: Callable[..., list[Level]]) -> None:
+    grey = grey_image(_images()[name].astype(depth))
+    assert grey.dtype == depth
     for ours, theirs in zip(pyramid(grey), in_numpy(pyramid, grey), strict=True):
         assert ours.smooth.shape == theirs.smooth.shape
         assert np.abs(ours.smooth - theirs.smooth).max() < SMOOTH_LEVELS
@@ -62,12 +64,20 @@ def test_levels(name: str, in_numpy: Callable[..., list[Level]]) -> None:
         assert (ours.scale, ours.offset) == (theirs.scale, theirs.offset)
 
 
+@pytest.mark.parametrize("depth", [np.uint8, np.float32])
 @pytest.mark.parametrize("factor", [2, 4, 8])
-def test_shrinking(factor: int, rng: np.random.Generator, in_numpy: Callable[..., np.ndarray]) -> None:
-    image = (rng.random((67, 85)) * 255).astype(np.float32)
+def test_shrinking(factor: int, depth: type, rng: np.random.Generator, in_numpy: Callable[..., np.ndarray]) -> None:
+    image = (rng.random((67, 85)) * 256).astype(depth)
     ours, theirs = response._shrunk(image, factor), in_numpy(response._shrunk, image, factor)
     assert ours.shape == theirs.shape == (67 // factor, 85 // factor)
     assert np.abs(ours - theirs).max() < SMOOTH_LEVELS
+
+
+def test_the_brightest_bytes_overflow_nothing() -> None:
+    white = np.full((600, 530), 255, np.uint8)
+    assert (pyramid(white)[0].smooth == 255.0).all()
+    for factor in (2, 256, 260):
+        assert np.abs(response._shrunk(white, factor) - 255.0).max() < SMOOTH_LEVELS
 
 
 @pytest.mark.parametrize("name", list(_images()))
