@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
+from rigkit.arrays import FloatArray, Points
 from rigkit.calibration.fit import Fit
 from rigkit.calibration.normal import Normal
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import BoardShape, Calibration, Candidate, Outlier, ViewResult
-from rigkit.calibration.solver import State
+from rigkit.calibration.solver import State, with_priors
 from rigkit.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
 
-__all__ = ["assemble", "require_determined", "solution_normal"]
+__all__ = ["assemble", "motion_of_world", "require_determined", "solution_normal"]
 
 UNKNOWN_SHARE = 0.05
 """A projection that is uncertain by this part of the image's width, where the boards were, is not determined."""
@@ -66,22 +66,31 @@ def _outliers(observations: Observations, fit: Fit) -> tuple[Outlier, ...]:
 def solution_normal(fit: Fit) -> Normal:
     """Return the normal equations at the solution, in px^-2, priors of the shape included."""
     sigma = fit.sigma_px if np.isfinite(fit.sigma_px) else 1.0
-    return fit.data.with_priors(fit.state.camera, sigma, fit.state.shape.sigma, fit.state.unknowns)
+    return with_priors(fit.data, fit.state, sigma)
+
+
+def motion_of_world(translation_mm: Points) -> FloatArray:
+    """Return how the motions (dw, dt) of boards at `translation_mm` (V, 3) become motions (W, T) of the world,
+    (V, 6, 6).
+
+    A point x in the camera frame that sticks to the board moves by dw x (x - t) + dt = W x x + T, with W = dw and
+    T = dt + t x dw.
+    """
+    lever = np.zeros((len(translation_mm), 6, 6))
+    lever[:] = np.eye(6)
+    lever[:, 3:, :3] = skew(translation_mm)
+    return lever
 
 
 def frame_covariance(normal: Normal, state: State) -> FloatArray:
     """Return the covariance, for unit residuals, of the P parameters and of the mean motion of the boards (w, t).
 
-    With p_v = (dw_v, dt_v) a point x in the camera frame moves by dw_v x (x - t_v) + dt_v if it sticks to board v; on
-    average over the boards by W x x + T, W = mean dw_v and T = mean (dt_v + t_v x dw_v).
+    The boards on average move a point x in the camera frame by W x x + T, W and T the means of `motion_of_world`.
     """
     p = state.camera.parameters.size
     globals_, back, own = normal.covariance()
     used = normal.pp.trace(axis1=-2, axis2=-1) > 0.0
-    lever = np.zeros((len(used), 6, 6))
-    lever[:, :3, :3] = lever[:, 3:, 3:] = np.eye(3)
-    lever[:, 3:, :3] = skew(state.translation_mm)
-    lever = lever[used] / max(int(used.sum()), 1)
+    lever = motion_of_world(state.translation_mm[used]) / max(int(used.sum()), 1)
     through = lever.transpose(1, 0, 2).reshape(6, -1) @ back[used].reshape(-1, len(globals_))
     spread = (lever @ own[used] @ np.swapaxes(lever, -1, -2)).sum(axis=0)
     chosen = globals_[:p]

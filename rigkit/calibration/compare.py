@@ -8,7 +8,7 @@ import numpy as np
 
 from rigkit.arrays import FloatArray, Pixels
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.uncertainty import projection_uncertainty
+from rigkit.calibration.uncertainty import projection_design, projection_uncertainty
 from rigkit.cameras.compare import CameraDifference, compare_cameras
 
 __all__ = ["CalibrationComparison", "compare_calibrations"]
@@ -65,9 +65,10 @@ def compare_calibrations(
     found = float(np.mean((difference.difference_px[covered] ** 2).sum(axis=-1) / variance))
     # The rotation that the comparison fits, at first order. In two calibrations of one camera both are the same.
     root = np.repeat(1.0 / np.sqrt(variance), 2)[:, None]
-    turn = root * np.concatenate([_turn(a, pixels), _turn(b, seen)], axis=1)
+    designs = _design(a, pixels), _design(b, seen)
+    turn = root * np.concatenate([design[:, -3:] for design in designs], axis=1)
     rng = np.random.default_rng(seed)
-    drawn = root * (_draw(a, pixels, rng) - _draw(b, seen, rng))
+    drawn = root * (_draw(a, designs[0], rng) - _draw(b, designs[1], rng))
     drawn = drawn - turn @ np.linalg.lstsq(turn, drawn, rcond=None)[0]
     null = (drawn.reshape(len(pixels), 2, SAMPLES) ** 2).sum(axis=1).mean(axis=0)
     predicted = np.full(covered.shape, np.nan)
@@ -88,22 +89,19 @@ def _rays(calibration: Calibration, pixels: Pixels) -> FloatArray:
     return calibration.camera.unproject(pixels)[0]
 
 
-def _turn(calibration: Calibration, pixels: Pixels) -> FloatArray:
-    """Return d pixel / d turn of the ray (2 N, 3)."""
-    rays = _rays(calibration, pixels)
-    _, _, by_point, _ = calibration.camera.project_with_jacobians(rays)
-    return np.cross(rays[:, None, :], by_point).reshape(-1, 3)
+def _design(calibration: Calibration, pixels: Pixels) -> FloatArray:
+    """Return d pixel / d (parameters, turn of the rays), (2 N, P + 3)."""
+    design = projection_design(calibration.camera, _rays(calibration, pixels))
+    return design.transpose(2, 0, 1).reshape(2 * len(pixels), -1)
 
 
-def _draw(calibration: Calibration, pixels: Pixels, rng: np.random.Generator) -> FloatArray:
-    """Return errors of the projection at `pixels` (2 N, SAMPLES), drawn from the calibration's covariance."""
-    _, _, _, by_camera = calibration.camera.project_with_jacobians(_rays(calibration, pixels))
-    p = calibration.camera.parameters.size
-    covariance = calibration.frame_covariance[: p + 3, : p + 3]
+def _draw(calibration: Calibration, design: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return errors of the projection (2 N, SAMPLES), drawn from the calibration's covariance."""
+    count = design.shape[1]
+    covariance = calibration.frame_covariance[:count, :count]
     # Scaled to correlations first: parameters differ by twenty orders of magnitude.
     sigma = np.sqrt(np.diag(covariance))
     safe = np.where(sigma > 0.0, sigma, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
     root = safe[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-    design = np.concatenate([by_camera.reshape(-1, p), _turn(calibration, pixels)], axis=1)
-    return np.asarray(design @ root @ rng.normal(size=(p + 3, SAMPLES)))
+    return np.asarray(design @ root @ rng.normal(size=(count, SAMPLES)))

@@ -10,17 +10,17 @@ Reference: D. MacKay, "Bayesian interpolation", Neural Computation 4 (1992), sec
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, IntArray
+from rigkit.arrays import BoolArray, FloatArray
 from rigkit.calibration.fit import Fit, fit_kept, inliers, sigma_of
-from rigkit.calibration.normal import Normal, normal_equations
+from rigkit.calibration.linearise import normal_equations
+from rigkit.calibration.normal import Normal
 from rigkit.calibration.observations import Observations
-from rigkit.calibration.shape import BOWS, STRETCHES, WARP_UNKNOWNS, ShapeModel, often_seen, shape_model
-from rigkit.calibration.solver import State, evaluate, solve
+from rigkit.calibration.shape import released_groups, shape_model, warp_groups
+from rigkit.calibration.solver import State, evaluate, solve, with_priors
 
 __all__ = ["fit_shapes"]
 
@@ -92,7 +92,7 @@ def _evident(observations: Observations, state: State, kept: BoolArray) -> tuple
         )
         state, norm = solution.state, solution.data.residuals[0].weighted(observations)
         sigma = sigma_of(norm, kept)
-        normal = solution.data.with_priors(state.camera, sigma, state.shape.sigma, state.unknowns)
+        normal = with_priors(solution.data, state, sigma)
         state = replace(state, shape=replace(state.shape, sigma=_sizes(observations, state, normal, sigma)))
         kept = inliers(norm, observations, sigma, state.camera.size_px)
     return state, kept
@@ -102,26 +102,13 @@ def _sizes(observations: Observations, state: State, normal: Normal, sigma_px: f
     """Return the prior standard deviation of each unknown of the shape."""
     sizes = state.shape.sigma.copy()
     known = 1.0 - _variance(state, normal) * sigma_px**2 / sizes**2
-    for group in _groups(observations, state.shape):
+    released = state.shape.kind == "released"
+    groups = released_groups(observations, state.shape.basis.shape[-1]) if released else warp_groups(observations)
+    for group in groups:
         if (gamma := float(known[group].sum())) > 0.0:
             found = np.sqrt((state.unknowns[group] ** 2).sum() / gamma)
             sizes[group] = max(float(found), LEAST * float(sizes[group].max()))
     return sizes
-
-
-def _groups(observations: Observations, shape: ShapeModel) -> Iterator[IntArray]:
-    """Yield the unknowns that have one size together: of the warp, or of the released corners that move against it.
-    Those at the board's border are apart: paper ends or curls there, and a detector sees one neighbour less."""
-    first = shape.basis.shape[-1]
-    for i, board in enumerate(np.flatnonzero(often_seen(observations)).tolist()):
-        if shape.kind == "warp":
-            yield from (WARP_UNKNOWNS * i + part for part in (BOWS, STRETCHES))
-        else:
-            grid = observations.boards[board].grid()
-            border = ((grid == 0) | (grid == np.array(observations.boards[board].size) - 1)).any(axis=1)
-            for chosen in (border, ~border):
-                rows = observations.first_row[board] + np.flatnonzero(chosen)
-                yield from (first + (3 * rows[:, None] + np.array(axes)).ravel() for axes in ((0, 1), (2,)))
 
 
 def _variance(state: State, normal: Normal) -> FloatArray:

@@ -14,7 +14,6 @@ import numpy as np
 from rigkit.arrays import BoolArray, FloatArray
 from rigkit.calibration.fit import Fit
 from rigkit.calibration.observations import Observations
-from rigkit.calibration.shape import ShapeModel
 from rigkit.calibration.solver import State, evaluate, solve
 
 __all__ = ["moved_lens"]
@@ -37,9 +36,7 @@ def moved_lens(observations: Observations, fit: Fit) -> tuple[str, ...]:
     place = {name: i for i, name in enumerate(images)}
     number = np.array([place[name] for name in observations.images])
     # The shape of the boards stays as it was found: two shapes are not two lenses.
-    points = fit.state.shape.points(fit.state.unknowns)
-    shape = ShapeModel("flat", points, np.zeros((len(points), 3, 0)), np.zeros(0))
-    state = replace(fit.state, shape=shape, unknowns=np.zeros(0))
+    state = replace(fit.state, shape=fit.state.shape.held(fit.state.unknowns), unknowns=np.zeros(0))
     distance = _apart(observations, fit, state, number >= len(images) // 2)
     if not distance > SIGMAS:
         return ()

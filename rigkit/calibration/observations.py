@@ -18,12 +18,6 @@ __all__ = ["Observations", "median_of"]
 SIGMA_RANGE = 8.0
 """Corner sigmas are believed within this factor of their median: a predicted 0.001 px must not rule the solution."""
 
-KEPT_BYTES = 24 << 20
-np.empty(KEPT_BYTES, dtype=np.uint8)
-"""glibc returns freed memory to the system and takes it back page by page, which costs small problems a tenth of their
-time. Once a block of this size has been freed it keeps as much (mallopt(3), M_MMAP_THRESHOLD). Elsewhere this does
-nothing; the pages are never touched."""
-
 
 class Workspace:
     """Memory for the derivatives of a block of views, kept from one linearisation to the next: pages fresh from the

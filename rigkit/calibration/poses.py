@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
+from rigkit.arrays import FloatArray, Mat3, Points
+from rigkit.calibration.normal import Normal
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.radial_alignment import align
 from rigkit.calibration.solver import State, equations
 from rigkit.geometry.rotation import exp_so3, nearest_rotation
 
-__all__ = ["find_poses", "refine_poses"]
+__all__ = ["find_poses", "refine_each", "refine_poses"]
 
 MAX_ITERATIONS = 40
 TOLERANCE = 1e-10
 DAMPING_START = 1e-6
+DAMPING_MAX = 1e10
 DAMPING_LEAST = 1e-12
 """A view of which hardly a corner projects does not determine its pose: less than this would leave it singular."""
 
@@ -24,40 +27,45 @@ DAMPING_LEAST = 1e-12
 def refine_poses(
     observations: Observations, state: State, weight: FloatArray, loss_px: float | None = None
 ) -> tuple[State, FloatArray]:
-    """Return the state with each view's pose at its own minimum, and each view's cost (V,) in px^2.
+    """Return the state with each view's pose at its own minimum, and each view's cost (V,) in px^2. `loss_px` is the
+    scale of the Cauchy loss."""
 
-    Levenberg-Marquardt with a damping of its own for each view. `loss_px` is the scale of the Cauchy loss.
-    """
+    def at(rotation: Mat3, translation_mm: Points) -> State:
+        return replace(state, rotation=rotation, translation_mm=translation_mm)
 
-    normal = equations(observations, state, weight, loss_px)
+    rotation, translation_mm, cost = refine_each(
+        state.rotation, state.translation_mm, lambda *poses: equations(observations, at(*poses), weight, loss_px)
+    )
+    return at(rotation, translation_mm), cost
+
+
+def refine_each(
+    rotation: Mat3, translation_mm: Points, linearise: Callable[[Mat3, Points], Normal]
+) -> tuple[Mat3, Points, FloatArray]:
+    """Return poses (N, 3, 3), (N, 3) each at its own minimum and their costs (N,): Levenberg-Marquardt with a damping
+    of its own for each. `linearise` returns the normal equations at given poses."""
+    normal = linearise(rotation, translation_mm)
     pp, p, cost = normal.pp, normal.p, normal.costs
     damping = np.full(len(cost), DAMPING_START)
-    active = np.ones(len(cost), dtype=bool)
+    active = cost > 0.0
     for _ in range(MAX_ITERATIONS):
+        if not active.any():
+            break
         diagonal = np.diagonal(pp, axis1=-2, axis2=-1)
         diagonal = np.where(diagonal > 0.0, diagonal, 1.0)
         damped = pp + (damping[:, None] * diagonal)[..., None] * np.eye(6)
         step: FloatArray = np.asarray(np.linalg.solve(damped, p[..., None])[..., 0] * active[:, None], float)
         predicted = (step * (damping[:, None] * diagonal * step + p)).sum(axis=-1)
-        trial = replace(
-            state,
-            rotation=exp_so3(step[:, :3]) @ state.rotation,
-            translation_mm=state.translation_mm + step[:, 3:],
-        )
-        normal = equations(observations, trial, weight, loss_px)
-        better = active & (normal.costs < cost)
-        state = replace(
-            state,
-            rotation=np.where(better[:, None, None], trial.rotation, state.rotation),
-            translation_mm=np.where(better[:, None], trial.translation_mm, state.translation_mm),
-        )
-        active &= (predicted > TOLERANCE * cost) & (damping < 1e10)
-        pp, p = np.where(better[:, None, None], normal.pp, pp), np.where(better[:, None], normal.p, p)
-        cost = np.where(better, normal.costs, cost)
+        turned, shifted = exp_so3(step[:, :3]) @ rotation, translation_mm + step[:, 3:]
+        there = linearise(turned, shifted)
+        better = active & (there.costs < cost)
+        rotation = np.where(better[:, None, None], turned, rotation)
+        translation_mm = np.where(better[:, None], shifted, translation_mm)
+        active &= (predicted > TOLERANCE * cost) & (damping < DAMPING_MAX)
+        pp, p = np.where(better[:, None, None], there.pp, pp), np.where(better[:, None], there.p, p)
+        cost = np.where(better, there.costs, cost)
         damping = np.where(better, np.maximum(0.1 * damping, DAMPING_LEAST), 10.0 * damping)
-        if not active.any():
-            break
-    return state, cost
+    return rotation, translation_mm, cost
 
 
 def find_poses(observations: Observations, state: State, weight: FloatArray, loss_px: float | None) -> State:

@@ -7,14 +7,15 @@ the views say themselves: see `rigkit.calibration.evidence`.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, Points
+from rigkit.arrays import BoolArray, FloatArray, IntArray, Points
 from rigkit.calibration.observations import Observations
 
-__all__ = ["BOWS", "SHAPES", "STRETCHES", "WARP_UNKNOWNS", "ShapeModel", "often_seen", "shape_model"]
+__all__ = ["SHAPES", "ShapeModel", "often_seen", "released_groups", "shape_model", "warp_groups"]
 
 SHAPES = ("flat", "warp", "released")
 
@@ -71,12 +72,20 @@ class ShapeModel:
         points = self.flat + self.basis @ unknowns[:count]
         return points + unknowns[count:].reshape(-1, 3) if self.kind == "released" else points
 
+    def held(self, unknowns: FloatArray) -> ShapeModel:
+        """Return the shape with nothing left to solve for: boards as the unknowns have them."""
+        return _rigid(self.points(unknowns))
+
+
+def _rigid(points: Points) -> ShapeModel:
+    return ShapeModel("flat", points, np.zeros((len(points), 3, 0)), np.zeros(0))
+
 
 def shape_model(kind: str, observations: Observations) -> ShapeModel:
     """Return the shape model `kind` for the boards of the observations."""
     flat = observations.table()
     if kind == "flat":
-        return ShapeModel("flat", flat, np.zeros((len(flat), 3, 0)), np.zeros(0))
+        return _rigid(flat)
     warp = _warp(observations, flat)
     if kind == "warp":
         return warp
@@ -93,6 +102,24 @@ def shape_model(kind: str, observations: Observations) -> ShapeModel:
 def often_seen(observations: Observations) -> BoolArray:
     """Say of which boards, (boards,), the shape can be told: those in several views (in one view a bow is a pose)."""
     return np.bincount(observations.board, minlength=len(observations.boards)) >= MIN_VIEWS
+
+
+def warp_groups(observations: Observations) -> Iterator[IntArray]:
+    """Yield the unknowns of the warp that have one size together, board by board: bows, stretches."""
+    for i in range(int(often_seen(observations).sum())):
+        yield from (WARP_UNKNOWNS * i + part for part in (BOWS, STRETCHES))
+
+
+def released_groups(observations: Observations, first: int) -> Iterator[IntArray]:
+    """Yield the unknowns of the released corners, `first` the first of them, that have one size together: in the plane
+    and out of it. Those at a board's border are apart: paper ends or curls there, and a detector sees one neighbour
+    less."""
+    for board in np.flatnonzero(often_seen(observations)).tolist():
+        grid = observations.boards[board].grid()
+        border = ((grid == 0) | (grid == np.array(observations.boards[board].size) - 1)).any(axis=1)
+        for chosen in (border, ~border):
+            rows = observations.first_row[board] + np.flatnonzero(chosen)
+            yield from (first + (3 * rows[:, None] + np.array(axes)).ravel() for axes in ((0, 1), (2,)))
 
 
 def _per_board(observations: Observations, table: Points) -> list[Points]:

@@ -17,7 +17,8 @@ from typing import TypeVar
 import numpy as np
 
 from rigkit.arrays import FloatArray, IntArray, Mat3, Points
-from rigkit.calibration.normal import Normal, Residuals, Step, lost_px, normal_equations
+from rigkit.calibration.linearise import lost_px, normal_equations
+from rigkit.calibration.normal import Normal, Residuals, Step
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.shape import ShapeModel, shape_model
@@ -26,6 +27,7 @@ from rigkit.errors import RigkitError
 from rigkit.geometry.rotation import exp_so3
 
 __all__ = ["Linearised", "Residuals", "Solution", "State", "equations", "evaluate", "minimise", "solve"]
+__all__ += ["with_priors"]
 
 S = TypeVar("S")
 
@@ -112,6 +114,14 @@ def equations(
     )
 
 
+def with_priors(data: Normal, state: State, sigma_px: float) -> Normal:
+    """Return the normal equations with the priors of camera and shape added; `sigma_px` is the standard deviation of a
+    corner."""
+    p = state.camera.parameters.size
+    shape = slice(p, p + state.unknowns.size)
+    return data.with_priors([(slice(0, p), state.camera)], shape, state.shape.sigma, state.unknowns, sigma_px)
+
+
 def solve(
     observations: Observations,
     start: State,
@@ -153,8 +163,7 @@ class _Solver:
         return self.with_priors(state, equations(self.observations, state, self.weight, self.loss_px))
 
     def with_priors(self, state: State, data: Normal) -> Linearised:
-        priors = state.camera, self.prior_sigma_px, state.shape.sigma, state.unknowns
-        return Linearised(data, data.with_priors(*priors))
+        return Linearised(data, with_priors(data, state, self.prior_sigma_px))
 
 
 def minimise(

@@ -19,8 +19,10 @@ import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray, Pixels, Points
 from rigkit.calibration.result import Calibration
+from rigkit.cameras.base import Camera
 
-__all__ = ["Uncertainty", "projection_uncertainty", "uncertainty_at_corners", "uncertainty_map"]
+__all__ = ["Uncertainty", "projection_design", "projection_uncertainty", "uncertainty_at_corners", "uncertainty_map"]
+__all__ += ["worst_direction"]
 
 CORNERS = 400
 """So many corners, spread over all views, are enough to see how sure the projection is where the boards were."""
@@ -44,7 +46,7 @@ class Uncertainty:
     @property
     def worst_px(self) -> FloatArray:
         """Standard deviation in the worst direction, (...,) px, NaN where invalid."""
-        return _worst(self.covariance)
+        return worst_direction(self.covariance)
 
 
 def projection_uncertainty(calibration: Calibration, pixels: Pixels, *, range_mm: float = np.inf) -> Uncertainty:
@@ -56,16 +58,27 @@ def projection_uncertainty(calibration: Calibration, pixels: Pixels, *, range_mm
     return Uncertainty(pixels, np.where(valid[..., None, None], covariance, np.nan), valid)
 
 
-def _worst(covariance: FloatArray) -> FloatArray:
+def worst_direction(covariance: FloatArray) -> FloatArray:
     """Return the standard deviation in the worst direction (...,) of covariances (..., 2, 2)."""
     a, b, c = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
-    return np.sqrt(0.5 * (a + c) + np.hypot(0.5 * (a - c), b))
+    return np.asarray(np.sqrt(0.5 * (a + c) + np.hypot(0.5 * (a - c), b)))
 
 
 def _covariance(calibration: Calibration, rays: FloatArray, range_mm: float) -> FloatArray:
     """Return the covariance (M, 2, 2) of the projection along rays (M, 3); unit rays, unless the range is infinite."""
-    camera = calibration.camera
-    # Unknowns first, pixels last: one matrix product for each coordinate. At infinity the world's shift shows nothing.
+    design = projection_design(calibration.camera, rays, range_mm)
+    count = design.shape[1]
+    moved = calibration.frame_covariance[:count, :count] @ design
+    covariance = np.empty((len(rays), 2, 2))
+    for i, j in ((0, 0), (0, 1), (1, 1)):
+        covariance[:, i, j] = covariance[:, j, i] = np.einsum("kn,kn->n", design[i], moved[j])
+    return covariance
+
+
+def projection_design(camera: Camera, rays: FloatArray, range_mm: float = np.inf) -> FloatArray:
+    """Return d pixel / d (k, W, T), (2, P + 6, M), along rays (M, 3); at infinity the world's shift shows nothing, and
+    it is (2, P + 3, M)."""
+    # Unknowns first, pixels last: one matrix product for each coordinate.
     p = camera.parameters.size
     count = p + 3 if np.isinf(range_mm) else p + 6
     design, by_x = np.zeros((2, count, len(rays))), np.empty((2, 3, len(rays)))
@@ -76,11 +89,7 @@ def _covariance(calibration: Calibration, rays: FloatArray, range_mm: float) -> 
         design[:, p + k] = ray[i] * by_x[:, j] - ray[j] * by_x[:, i]
     if count > p + 3:
         design[:, p + 3 :] = by_x / range_mm
-    moved = calibration.frame_covariance[:count, :count] @ design
-    covariance = np.empty((len(rays), 2, 2))
-    for i, j in ((0, 0), (0, 1), (1, 1)):
-        covariance[:, i, j] = covariance[:, j, i] = np.einsum("kn,kn->n", design[i], moved[j])
-    return covariance
+    return design
 
 
 def uncertainty_at_corners(calibration: Calibration, points_in_cam: Points | None = None) -> FloatArray:
@@ -93,7 +102,7 @@ def uncertainty_at_corners(calibration: Calibration, points_in_cam: Points | Non
         kept = np.concatenate([view.kept for view in calibration.views])
         pixels = np.concatenate([view.pixels for view in calibration.views])[kept]
         return projection_uncertainty(calibration, pixels[_spread(len(pixels))]).worst_px
-    return _worst(_covariance(calibration, points_in_cam[_spread(len(points_in_cam))], np.inf))
+    return worst_direction(_covariance(calibration, points_in_cam[_spread(len(points_in_cam))], np.inf))
 
 
 def _spread(count: int) -> IntArray:

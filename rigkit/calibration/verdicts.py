@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import uncertainty_at_corners
 from rigkit.cameras.base import image_center
 
-__all__ = ["judge", "judge_session"]
+__all__ = ["headline", "judge", "judge_session"]
 
 FEW_IMAGES = 8
 TILTED_DEG = 15.0
@@ -48,6 +49,16 @@ NAMES_U = ("left", "centre left", "centre right", "right")
 NAMES_V = ("top", "middle", "bottom")
 
 
+class Judged(Protocol):
+    """What has a training error and, perhaps, one on images that took no part."""
+
+    @property
+    def rms_px(self) -> float: ...
+
+    @property
+    def heldout_rms_px(self) -> float | None: ...
+
+
 def judge(
     calibration: Calibration, also: Sequence[str] = (), *, at_corners_px: FloatArray | None = None
 ) -> tuple[str, ...]:
@@ -72,7 +83,7 @@ def judge(
             f"bad: the solver did not converge ({calibration.convergence.reason}): the model may not fit this lens; "
             'try model = "auto", or add views with the board tilted',
         )
-    return (_headline(calibration, found), *found)
+    return (headline(calibration, found), *found)
 
 
 def judge_session(
@@ -80,12 +91,13 @@ def judge_session(
 ) -> tuple[str, ...]:
     """Return the verdicts of the calibration together with those on images that gave no view at all, and others."""
     found = [*_left_out(dropped), *calibration.verdicts[1:], *also]
-    return (_headline(calibration, found), *found)
+    return (headline(calibration, found), *found)
 
 
-def _headline(c: Calibration, found: list[str]) -> str:
-    held = c.heldout_rms_px
-    error = f"training RMS {c.rms_px:.3f} px" if held is None else f"held-out RMS {held:.3f} px"
+def headline(result: Judged, found: Sequence[str]) -> str:
+    """Return the first verdict, from all others."""
+    held = result.heldout_rms_px
+    error = f"training RMS {result.rms_px:.3f} px" if held is None else f"held-out RMS {held:.3f} px"
     bad = sum(v.startswith("bad") for v in found)
     if bad:
         return f"bad: {error}, but {bad} of the remarks below must be dealt with first"

@@ -10,10 +10,11 @@ from helpers.calibration_scenes import REACH_DEG, SIZE, lens, random_views
 from scipy.optimize import least_squares
 
 from rigkit.calibration.initialise import initialise
-from rigkit.calibration.normal import Normal, normal_equations
+from rigkit.calibration.linearise import normal_equations
+from rigkit.calibration.normal import Normal
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.shape import shape_model
-from rigkit.calibration.solver import State, evaluate, solve
+from rigkit.calibration.solver import State, evaluate, solve, with_priors
 from rigkit.cameras.base import RadialCurve
 from rigkit.cameras.scaramuzza import Scaramuzza
 from rigkit.geometry.rotation import exp_so3
@@ -98,7 +99,7 @@ def test_second_derivative_blocks(rng: np.random.Generator) -> None:
     shape = shape_model("released", observations)
     state = replace(disturbed(state, rng, 1e-3), shape=shape, unknowns=np.zeros(shape.count))
     normal = normals(state, observations, observations.weight)
-    normal = normal.with_priors(state.camera, 0.2, shape.sigma, state.unknowns)
+    normal = with_priors(normal, state, 0.2)
     first, second = normal.step(1e-6), replace(normal, points_from=None).step(1e-6)
     assert first is not None and second is not None
     assert np.abs(first.poses - second.poses).max() < 1e-7 * np.abs(second.poses).max()

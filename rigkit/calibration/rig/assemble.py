@@ -9,6 +9,7 @@ import numpy as np
 
 from rigkit.arrays import FloatArray
 from rigkit.boards import Board
+from rigkit.calibration.assemble import motion_of_world
 from rigkit.calibration.result import BoardShape, Calibration, ViewResult
 from rigkit.calibration.rig.board_rig import BoardRig, PlacedBoard
 from rigkit.calibration.rig.joint import JointRig
@@ -18,7 +19,6 @@ from rigkit.calibration.rig.solver import carried
 from rigkit.calibration.rig.state import Layout, RigObservations
 from rigkit.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import skew
 
 __all__ = ["assemble_rig", "residual_sigma"]
 
@@ -52,12 +52,8 @@ def assemble_rig(
         kept = observations.weights[c] > 0.0
         squared.append((residuals.px**2).sum(axis=-1)[kept])
         px = np.where(residuals.valid[..., None], residuals.px, np.nan)
-        views = tuple(
-            ViewResult(v.image, v.board.board_id, pose, v.grid, v.pixels, r[: len(v.grid)], k[: len(v.grid)])
-            for v, pose, r, k in zip(
-                observations.cameras[c].views, Rigid3.stack(alone.rotation, alone.translation_mm), px, kept, strict=True
-            )
-        )
+        poses = Rigid3.stack(alone.rotation, alone.translation_mm)
+        views = ViewResult.of_views(observations.cameras[c].views, poses, px, kept)
         frame = _frame_covariance(observations, joint, layout, c, unit, back, own) * (sigma * spread) ** 2
         p = alone.camera.parameters.size
         of_camera = replace(
@@ -127,10 +123,7 @@ def _frame_covariance(
     state = joint.solution.state
     translation = state.of_camera(c, observations).translation_mm
     f = observations.frame[c]
-    lever = np.zeros((len(f), 6, 6))
-    lever[:, :3, :3] = lever[:, 3:, 3:] = np.eye(3)
-    lever[:, 3:, :3] = skew(translation)
-    lever /= max(len(f), 1)
+    lever = motion_of_world(translation) / max(len(f), 1)
     by = carried(observations, state, c, translation)
     through_target = lever @ by.target
     # The targets' poses follow the globals, pose = -W globals + what is their own.

@@ -15,7 +15,7 @@ import numpy as np
 
 from rigkit.arrays import FloatArray
 from rigkit.boards import Board
-from rigkit.calibration.rig.seen import Places, Seen, Sights, same_looks
+from rigkit.calibration.rig.seen import Places, Seen, Sights, outer_corners, same_looks
 from rigkit.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import nearest_rotation
@@ -152,13 +152,8 @@ def _ways(entry: Seen, members: Sequence[Board]) -> list[_Way]:
         turns = [*(same_looks(own) if straight else ()), *((1, 3) if across and own.columns != own.rows else ())]
         for count in turns:
             seen = entry.counted(count, board)
-            far = (board.columns - 1) * board.square_x_mm, (board.rows - 1) * board.square_y_mm
-            found.append(_Way(seen, seen.cam_from_board.apply(_corners(far))))
+            found.append(_Way(seen, seen.cam_from_board.apply(outer_corners(board))))
     return found
-
-
-def _corners(far: tuple[float, float]) -> FloatArray:
-    return np.array([[0.0, 0.0, 0.0], [far[0], 0.0, 0.0], [0.0, far[1], 0.0], [far[0], far[1], 0.0]])
 
 
 Reading = dict[int, Seen]
@@ -183,7 +178,7 @@ def _read(
     reference: list[_Entry], scenes: Sequence[list[_Entry]], members: Sequence[Board]
 ) -> tuple[dict[str, Rigid3], list[Reading | None], float]:
     """Read all scenes by one of them; the last number is the median misfit, as a part of the distance."""
-    far = {b.board_id: _corners(((b.columns - 1) * b.square_x_mm, (b.rows - 1) * b.square_y_mm)) for b in members}
+    far = {b.board_id: outer_corners(b) for b in members}
     known: dict[str, Rigid3] = {}
     for entry in reference:
         way = next((w.seen for w in entry.ways if w.seen.board_id not in known), None)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points
-from rigkit.calibration.rig.seen import Places, Seen, Sights, same_looks, turns_of
+from rigkit.calibration.rig.seen import Places, Seen, Sights, outer_corners, same_looks, turns_of
 from rigkit.calibration.rig.state import Key
 from rigkit.cameras.base import Camera
 from rigkit.errors import InputError
@@ -78,18 +78,16 @@ def _targets(own: Sights, places: Places) -> dict[Key, _Target]:
         return {}
     out = {}
     for (key, entry), rotation, shift in zip(best.items(), *target_poses(list(best.values()), places), strict=True):
-        board = entry.view.board
-        far = [(board.columns - 1) * board.square_x_mm, (board.rows - 1) * board.square_y_mm]
+        corners = outer_corners(entry.view.board)
         if entry.board_id in places:
             # Two cameras may know the target by different boards: its own frame has the same points for both.
-            out[key] = _Target(rotation, shift, max(far) * _FRAME, ALONE)
+            out[key] = _Target(rotation, shift, corners.max() * _FRAME, ALONE)
         else:
-            out[key] = _Target(rotation, shift, np.array([*far, 0.0]) * _CORNERS, turns_of(board))
+            out[key] = _Target(rotation, shift, corners, turns_of(entry.view.board))
     return out
 
 
 _FRAME = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-_CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 0.0]])
 ALONE = (Rigid3.identity(),)
 
 

@@ -8,14 +8,14 @@ from functools import lru_cache
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray
+from rigkit.arrays import BoolArray, FloatArray, Points
 from rigkit.boards import Board
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.state import Key
 from rigkit.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
 
-__all__ = ["Places", "Seen", "Sights", "board_turn", "same_looks", "seen_by", "turns_of"]
+__all__ = ["Places", "Seen", "Sights", "board_turn", "outer_corners", "same_looks", "seen_by", "turns_of"]
 
 Places = Mapping[str, tuple[str, Rigid3]]
 """Board -> its target and target_from_board, of the boards that are mounted to others."""
@@ -77,6 +77,12 @@ def board_turn(size: tuple[int, int], squares_mm: tuple[float, float], quarter_t
     corners = np.array([[0.0, 0.0, 0.0], [far[0], far[1], 0.0]])
     # After the turn the grid must again begin at zero.
     return Rigid3(turn, -(corners @ turn.T).min(axis=0))
+
+
+def outer_corners(board: Board) -> Points:
+    """Return the four outer corners in the board's frame, (4, 3) mm."""
+    far = [(board.columns - 1) * board.square_x_mm, (board.rows - 1) * board.square_y_mm, 0.0]
+    return np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 0.0]]) * far
 
 
 def same_looks(board: Board) -> tuple[int, ...]:

@@ -10,7 +10,7 @@ import numpy as np
 from rigkit.arrays import FloatArray, Points
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.shape import BOWS, SHAPES, STRETCHES, WARP_UNKNOWNS, ShapeModel, often_seen, shape_model
+from rigkit.calibration.shape import SHAPES, ShapeModel, released_groups, shape_model, warp_groups
 
 __all__ = ["common_shape"]
 
@@ -57,13 +57,10 @@ def _nearest(shape: ShapeModel, points: Points) -> FloatArray:
 def _found(observations: Observations, shape: ShapeModel, unknowns: FloatArray) -> FloatArray:
     """Return the prior standard deviation of each unknown: the size of those of one kind on one board."""
     sizes = shape.sigma.copy()
-    first = shape.basis.shape[-1]
-    for i, board in enumerate(np.flatnonzero(often_seen(observations)).tolist()):
-        groups = [WARP_UNKNOWNS * i + part for part in (BOWS, STRETCHES)]
-        if shape.kind == "released":
-            rows = np.arange(observations.first_row[board], observations.first_row[board + 1])
-            groups += [first + (3 * rows[:, None] + np.array(axes)).ravel() for axes in ((0, 1), (2,))]
-        for group in groups:
-            found = float(np.sqrt((unknowns[group] ** 2).mean()))
-            sizes[group] = max(found, LEAST * float(sizes[group].max()))
+    groups = [*warp_groups(observations)]
+    if shape.kind == "released":
+        groups += released_groups(observations, shape.basis.shape[-1])
+    for group in groups:
+        found = float(np.sqrt((unknowns[group] ** 2).mean()))
+        sizes[group] = max(found, LEAST * float(sizes[group].max()))
     return sizes

@@ -15,19 +15,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, IntArray
-from rigkit.calibration.camera_prior import camera_prior
-from rigkit.calibration.normal import Normal, Residuals, normal_equations
+from rigkit.arrays import FloatArray, IntArray, Mat3, Points
+from rigkit.calibration.linearise import normal_equations
+from rigkit.calibration.normal import Normal, Residuals
+from rigkit.calibration.poses import refine_each
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.calibration.solver import COST_TOLERANCE, Linearised, minimise
-from rigkit.geometry.rotation import exp_so3, skew
+from rigkit.geometry.rotation import skew
 
 __all__ = ["Carried", "RigSolution", "carried", "refine_frames", "rig_normal", "solve_rig"]
-
-FRAME_ITERATIONS = 30
-FRAME_TOLERANCE = 1e-8
-FRAME_DAMPING = 1e-6
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -79,7 +76,6 @@ def rig_normal(observations: RigObservations, state: RigState, sigma_px: float =
     gp, pp, p = np.zeros((poses, count, 6)), np.zeros((poses, 6, 6)), np.zeros((poses, 6))
     costs = np.zeros(poses)
     residuals: tuple[Residuals, ...] = ()
-    prior = 0.0
     for c, own in enumerate(observations.cameras):
         alone = state.of_camera(c, observations)
         n = normal_equations(
@@ -131,21 +127,12 @@ def rig_normal(observations: RigObservations, state: RigState, sigma_px: float =
             for run, how, views in free[1:]:
                 gg[m, run] += (np.swapaxes(by.mount[views], -1, -2) @ n.pp[views] @ how[views]).sum(axis=0)
                 gg[run, m] = gg[m, run].T
-        if sigma_px > 0.0:
-            rows, residual = camera_prior(alone.camera)
-            gg[k, k] += sigma_px**2 * rows.T @ rows
-            g[k] -= sigma_px**2 * rows.T @ residual
-            prior += sigma_px**2 * float(residual @ residual)
-    if sigma_px > 0.0 and state.unknowns.size:
-        weight = (sigma_px / observations.shape.sigma) ** 2
-        at = np.arange(layout.shape.start, layout.shape.stop)
-        gg[at, at] += weight
-        g[at] -= weight * state.unknowns
-        prior += float((weight * state.unknowns**2).sum())
     released = None
     if observations.shape.kind == "released":
         released = layout.shape.start + observations.shape.basis.shape[-1]
-    return Normal(gg, gp, pp, g, p, costs, residuals, prior, released)
+    normal = Normal(gg, gp, pp, g, p, costs, residuals, points_from=released)
+    cameras = list(zip(layout.cameras, state.cameras, strict=True))
+    return normal.with_priors(cameras, layout.shape, observations.shape.sigma, state.unknowns, sigma_px)
 
 
 def _add(total: FloatArray, row: IntArray, values: FloatArray) -> None:
@@ -177,36 +164,13 @@ def solve_rig(
 
 def refine_frames(observations: RigObservations, state: RigState) -> tuple[RigState, Normal]:
     """Return the state with the pose of every target at its own minimum, all else as it is, and the normal equations
-    there: Levenberg-Marquardt with a damping of its own for each pose."""
-    normal = rig_normal(observations, state)
-    damping = np.full(len(normal.pp), FRAME_DAMPING)
-    active = normal.costs > 0.0
-    for _ in range(FRAME_ITERATIONS):
-        if not active.any():
-            break
-        diagonal = np.diagonal(normal.pp, axis1=-2, axis2=-1)
-        diagonal = np.where(diagonal > 0.0, diagonal, 1.0)
-        system = normal.pp + (damping[:, None] * diagonal)[..., None] * np.eye(6)
-        step: FloatArray = np.asarray(np.linalg.solve(system, normal.p[..., None])[..., 0] * active[:, None], float)
-        predicted = (step * (damping[:, None] * diagonal * step + normal.p)).sum(axis=-1)
-        trial = replace(
-            state,
-            frame_rotation=exp_so3(step[:, :3]) @ state.frame_rotation,
-            frame_mm=state.frame_mm + step[:, 3:],
-        )
-        there = rig_normal(observations, trial)
-        better = active & (there.costs < normal.costs)
-        active &= (predicted > FRAME_TOLERANCE * normal.costs) & (damping < 1e10)
-        state = replace(
-            state,
-            frame_rotation=np.where(better[:, None, None], trial.frame_rotation, state.frame_rotation),
-            frame_mm=np.where(better[:, None], trial.frame_mm, state.frame_mm),
-        )
-        normal = replace(
-            normal,
-            pp=np.where(better[:, None, None], there.pp, normal.pp),
-            p=np.where(better[:, None], there.p, normal.p),
-            costs=np.where(better, there.costs, normal.costs),
-        )
-        damping = np.where(better, 0.1 * damping, 10.0 * damping)
-    return state, rig_normal(observations, state)
+    there."""
+
+    def at(rotation: Mat3, translation_mm: Points) -> RigState:
+        return replace(state, frame_rotation=rotation, frame_mm=translation_mm)
+
+    rotation, translation_mm, _ = refine_each(
+        state.frame_rotation, state.frame_mm, lambda *poses: rig_normal(observations, at(*poses))
+    )
+    found = at(rotation, translation_mm)
+    return found, rig_normal(observations, found)

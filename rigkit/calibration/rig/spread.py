@@ -20,6 +20,7 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.arrays import FloatArray, IntArray
+from rigkit.calibration.linearise import view_products
 from rigkit.calibration.normal import Normal
 from rigkit.calibration.rig.solver import carried
 from rigkit.calibration.rig.state import RigObservations, RigState
@@ -72,24 +73,9 @@ def _by_frame(observations: RigObservations, state: RigState, frame: IntArray) -
     information, score = np.zeros((int(frame.max()) + 1, n, n)), np.zeros((int(frame.max()) + 1, n))
     for c, own in enumerate(observations.cameras):
         alone = state.of_camera(c, observations)
-        lever = alone.shape.points(alone.unknowns)[own.corner] @ np.swapaxes(alone.rotation, -1, -2)
-        with np.errstate(all="ignore"):
-            pixels, valid, by_point, by_camera = alone.camera.project_with_jacobians(
-                lever + alone.translation_mm[:, None, :]
-            )
-        weight = np.where(valid, observations.weights[c], 0.0)
+        place = alone.rotation, alone.translation_mm, alone.shape, alone.unknowns
+        product = view_products(alone.camera, *place, own, observations.weights[c])
         p = alone.camera.parameters.size
-        # Unknowns first, corners last: long contiguous runs.
-        rows = np.empty((p + 7, 2, *weight.shape))
-        rows[:p] = np.moveaxis(by_camera, (-1, -2), (0, 1))
-        rows[p + 3 : p + 6] = np.moveaxis(by_point, (-1, -2), (0, 1))
-        for k in range(3):
-            i, j = (k + 1) % 3, (k + 2) % 3
-            rows[p + k] = lever[..., i] * rows[p + 3 + j] - lever[..., j] * rows[p + 3 + i]
-        rows[-1] = np.moveaxis(own.pixels - pixels, -1, 0)
-        rows = np.where(weight > 0.0, weight * rows, 0.0)
-        flat = np.moveaxis(rows, 2, 0).reshape(len(weight), p + 7, -1)
-        product = flat @ np.swapaxes(flat, -1, -2)
         by = carried(observations, state, c, alone.translation_mm)
         at = frame[observations.frame[c]]
         for b in np.unique(own.board).tolist():

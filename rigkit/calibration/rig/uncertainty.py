@@ -17,6 +17,7 @@ import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, Points
 from rigkit.calibration.rig.result import RigCalibration
+from rigkit.calibration.uncertainty import worst_direction
 from rigkit.geometry.rotation import skew
 
 __all__ = ["Transfer", "transfer_covariance", "transfer_uncertainty"]
@@ -50,8 +51,7 @@ def transfer_uncertainty(rig: RigCalibration, a: str, b: str) -> Transfer | None
     covariance, seen = transfer_covariance(rig, a, b, points)
     if not seen.any():
         return None
-    xx, xy, yy = covariance[seen, 0, 0], covariance[seen, 0, 1], covariance[seen, 1, 1]
-    worst = np.sqrt(np.maximum(0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy), 0.0))
+    worst = worst_direction(covariance[seen])
     return Transfer(a, b, float(np.median(worst)), float(worst.max()))
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.uncertainty import transfer_uncertainty
 from rigkit.calibration.uncertainty import uncertainty_at_corners
+from rigkit.calibration.verdicts import headline
 
 __all__ = ["judge_rig"]
 
@@ -29,13 +30,7 @@ def judge_rig(rig: RigCalibration, notes: Sequence[str] = ()) -> tuple[str, ...]
     found = [*notes, *_shared(rig), *_unsure(rig), *_spread(rig), *_worse(rig)]
     if not rig.convergence.converged:
         found.insert(0, f"bad: the joint solution did not converge ({rig.convergence.reason})")
-    held = rig.heldout_rms_px
-    error = f"training RMS {rig.rms_px:.3f} px" if held is None else f"held-out RMS {held:.3f} px"
-    bad = sum(v.startswith("bad") for v in found)
-    if bad:
-        return (f"bad: {error}, but {bad} of the remarks below must be dealt with first", *found)
-    remarks = {0: "", 1: "; 1 remark below"}.get(len(found), f"; {len(found)} remarks below")
-    return (f"good: {error}{remarks}", *found)
+    return (headline(rig, found), *found)
 
 
 def _shared(rig: RigCalibration) -> list[str]:
