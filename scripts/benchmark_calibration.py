@@ -6,22 +6,18 @@ Times are medians of CPU seconds of one process with one thread, initialisation 
 all peers of a table take turns, so that what else the machine does falls on each alike. RMS is 2-D per corner.
 "Difference" is the projection against the true lens over its whole field after the best rotation, RMS in px.
 
-mrcal is Debian's (apt-get install mrcal python3-mrcal) and runs in Debian's Python, timed in its own process.
+mrcal is Debian's (apt-get install mrcal python3-mrcal).
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import statistics
-import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -31,6 +27,16 @@ import cv2
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+from benchmark_calibration_peers import (
+    Mrcal,
+    colmap_adjuster,
+    colmap_model,
+    colmap_poses,
+    opencv_fisheye,
+    opencv_multiview,
+    opencv_omnidir,
+    opencv_regular,
+)
 from helpers.calibration_scenes import BOARD, REACH_DEG, SIZE, lens, projection_difference, random_views
 
 from rigkit.boards import Board
@@ -38,9 +44,8 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.initialise import initialise
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.rig.calibrate import calibrate_rig
-from rigkit.calibration.solver import State, solve
+from rigkit.calibration.solver import solve
 from rigkit.cameras.base import Camera
-from rigkit.cameras.brown import Brown
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.detections import BoardView
 from rigkit.errors import RigkitError
@@ -49,8 +54,6 @@ from rigkit.geometry.rotation import exp_so3
 
 NOISE_PX = 0.2
 LARGE = Board("14x10", 14, 10, 30.0, 30.0)
-DEBIAN_PYTHON = "/usr/bin/python3"
-MRCAL_WORKER = Path(__file__).with_name("mrcal_worker.py")
 
 Run = Callable[[], float]
 """One run of a peer, returning its CPU seconds."""
@@ -78,93 +81,6 @@ def timed(runs: Mapping[str, Run], repeats: int) -> dict[str, float]:
     return {name: statistics.median(seconds) for name, seconds in spent.items()}
 
 
-class Mrcal:
-    """mrcal on views by (frame, camera), started once; a context manager."""
-
-    def __init__(self, views: Mapping[tuple[int, int], BoardView]) -> None:
-        self._views = views
-        self.last: dict[str, Any] = {}
-
-    @staticmethod
-    def available() -> bool:
-        """Say whether Debian's mrcal is installed."""
-        try:
-            found = subprocess.run([DEBIAN_PYTHON, "-c", "import mrcal"], capture_output=True, check=False)
-        except FileNotFoundError:
-            return False
-        return found.returncode == 0
-
-    def __enter__(self) -> Mrcal:
-        self._folder = tempfile.TemporaryDirectory()
-        path = Path(self._folder.name) / "corners.npz"
-        keys = sorted(self._views)
-        board = self._views[keys[0]].board
-        frames = {frame: i for i, frame in enumerate(dict.fromkeys(frame for frame, _ in keys))}
-        observations = np.full((len(keys), board.rows, board.columns, 3), -1.0)
-        for k, key in enumerate(keys):
-            view = self._views[key]
-            observations[k, view.grid[:, 1], view.grid[:, 0], :2] = view.pixels
-            observations[k, view.grid[:, 1], view.grid[:, 0], 2] = 1.0
-        frame_camera = np.array([(frames[frame], camera) for frame, camera in keys], dtype=np.int32)
-        np.savez(path, observations=observations, frame_camera=frame_camera, spacing=board.square_x_mm, size=SIZE)
-        environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
-        self._process = subprocess.Popen(
-            [DEBIAN_PYTHON, str(MRCAL_WORKER), str(path)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env=environment,
-        )
-        return self
-
-    def run(self) -> float:
-        """Calibrate once; the answer is in `last`."""
-        assert self._process.stdin is not None and self._process.stdout is not None
-        self._process.stdin.write("run\n")
-        self._process.stdin.flush()
-        self.last = json.loads(self._process.stdout.readline())
-        return float(self.last["seconds"])
-
-    def cameras(self) -> list[Camera]:
-        """Return the cameras of the last run."""
-        return [Brown(SIZE, np.array(one)) for one in self.last["intrinsics"]]
-
-    def __exit__(self, *_: object) -> None:
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        self._process.wait()
-        self._folder.cleanup()
-
-
-def opencv_points(views: list[BoardView], dtype: type = np.float32) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    return [v.points().astype(dtype)[None] for v in views], [v.pixels.astype(dtype)[None] for v in views]
-
-
-def opencv_regular(views: list[BoardView]) -> tuple[float, Camera]:
-    objects, images = opencv_points(views)
-    rms, K, d, _, _ = cv2.calibrateCamera([o[0] for o in objects], [i[0] for i in images], SIZE, None, None)
-    return rms, Brown(SIZE, np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *d.ravel()[:5]]))
-
-
-def opencv_fisheye(views: list[BoardView], guess: np.ndarray | None = None) -> tuple[float, Camera]:
-    """As in its documentation: extrinsics recomputed in each iteration, no skew. Without the former it ends anywhere.
-
-    `guess` is K where there is one.
-    """
-    objects, images = opencv_points(views, np.float64)
-    flags = fisheye_flag("RECOMPUTE_EXTRINSIC") | fisheye_flag("FIX_SKEW")
-    if guess is not None:
-        flags |= fisheye_flag("USE_INTRINSIC_GUESS")
-    K0 = np.eye(3) if guess is None else guess.copy()
-    rms, K, d, _, _ = cv2.fisheye.calibrate(objects, images, SIZE, K0, np.zeros((4, 1)), flags=flags)
-    return rms, KannalaBrandt(SIZE, np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *d.ravel()[:4]]))
-
-
-def fisheye_flag(name: str) -> int:
-    """Return a flag of cv2.fisheye: OpenCV 5 has moved them out of that module."""
-    return int(getattr(cv2.fisheye, f"CALIB_{name}", None) or getattr(cv2, f"CALIB_{name}"))
-
-
 def ours(views: list[BoardView], model: str, degree: int | None) -> tuple[float, Camera]:
     result = calibrate(views, SIZE, model=model, degree=degree, board="flat", folds=0)
     return result.rms_px, result.camera
@@ -183,13 +99,13 @@ def speed(name: str, count: int, board: Board, repeats: int, mrcal: bool) -> Non
     if name == "reg":
         solvers = {
             "rigkit brown 5": lambda: ours(views, "brown", 5),
-            "cv2.calibrateCamera": lambda: opencv_regular(views),
+            "cv2.calibrateCamera": lambda: opencv_regular(views, SIZE),
         }
     else:
         solvers = {
             "rigkit kannala_brandt": lambda: ours(views, "kannala_brandt", None),
             "rigkit scaramuzza 6": lambda: ours(views, "scaramuzza", 6),
-            "cv2.fisheye": lambda: opencv_fisheye(views),
+            "cv2.fisheye": lambda: opencv_fisheye(views, SIZE),
         }
     first = next(iter(solvers))
     found: dict[str, tuple[float, Camera]] = {}
@@ -202,7 +118,7 @@ def speed(name: str, count: int, board: Board, repeats: int, mrcal: bool) -> Non
             rows.append([solver, "-", "-", "-", f"failed: {why[0][:60]}"])
     runs = {solver: clocked(solvers[solver]) for solver in found}
     if name == "reg" and mrcal:
-        with Mrcal({(k, 0): view for k, view in enumerate(views)}) as peer:
+        with Mrcal({(k, 0): view for k, view in enumerate(views)}, SIZE) as peer:
             spent = timed({**runs, "mrcal OPENCV5": peer.run}, repeats)
             found["mrcal OPENCV5"] = np.sqrt(2.0) * peer.last["rms"], peer.cameras()[0]
     else:
@@ -236,17 +152,7 @@ def ceres(count: int, repeats: int) -> None:
     def run() -> float:
         model = colmap_model(pycolmap, views, start)
         models[:] = [model]
-        options = pycolmap.BundleAdjustmentOptions()
-        options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = True
-        options.print_summary = False
-        options.ceres.solver_options.num_threads = 1
-        config = pycolmap.BundleAdjustmentConfig()
-        for image_id in model.images:
-            config.add_image(image_id)
-        for point_id in model.points3D:
-            config.add_constant_point(point_id)
-        adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
-        return clocked(adjuster.solve)()
+        return clocked(colmap_adjuster(pycolmap, model).solve)()
 
     own = clocked(lambda: solve(observations, start, prior_sigma_px=0.0))
     spent = timed({"rigkit": own, "Ceres": run}, repeats)
@@ -255,7 +161,7 @@ def ceres(count: int, repeats: int) -> None:
     fitted = camera.params - np.array([0.0, 0.0, 0.5, 0.5, 0.0, 0.0, 0.0, 0.0])
     squared = sum(
         float(((camera.img_from_cam(v.points() @ R.T + t) - 0.5 - v.pixels) ** 2).sum())
-        for v, (R, t) in zip(views, _colmap_poses(model), strict=True)
+        for v, (R, t) in zip(views, colmap_poses(model), strict=True)
     )
     cost = float(found.data.costs.sum())
     apart = np.abs(found.state.camera.parameters - fitted)[:2].max()
@@ -265,47 +171,6 @@ def ceres(count: int, repeats: int) -> None:
         f"({spent['Ceres'] / spent['rigkit']:.1f} times); cost {cost:.8f} and {squared:.8f}, relative difference "
         f"{(cost - squared) / squared:.1e}; focal lengths apart by {apart:.1e} px"
     )
-
-
-def colmap_model(pycolmap: ModuleType, views: list[BoardView], start: State) -> Any:
-    """Return a pycolmap reconstruction of the views at the start: one camera, the board's corners as fixed points."""
-    model = pycolmap.Reconstruction()
-    parameters = start.camera.parameters.copy()
-    parameters[2:4] += 0.5
-    model.add_camera_with_trivial_rig(
-        pycolmap.Camera(camera_id=1, model="OPENCV_FISHEYE", width=SIZE[0], height=SIZE[1], params=parameters.tolist())
-    )
-    for k, view in enumerate(views):
-        image = pycolmap.Image(name=f"{k}", keypoints=view.pixels + 0.5, camera_id=1, image_id=k + 1)
-        pose = np.column_stack([start.rotation[k], start.translation_mm[k]])
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
-    for j, point in enumerate(views[0].points()):
-        track = pycolmap.Track()
-        for k in range(len(views)):
-            track.add_element(k + 1, j)
-        model.add_point3D(point, track)
-    return model
-
-
-def _colmap_poses(model: Any) -> list[tuple[np.ndarray, np.ndarray]]:
-    matrices = [model.images[k].cam_from_world().matrix() for k in sorted(model.images)]
-    return [(m[:, :3], m[:, 3]) for m in matrices]
-
-
-def multiview(views: dict[str, list[tuple[str, BoardView]]], frames: int) -> list[np.ndarray]:
-    """Return the mounts' translations by cv2.calibrateMultiview, mm."""
-    seen = {name: dict(own) for name, own in views.items()}
-    used = [str(f) for f in range(frames) if any(str(f) in own for own in seen.values())]
-    board = next(iter(views.values()))[0][1].board
-    blank = np.full((board.corner_count, 2), -1.0, np.float32)
-    pixels = [[own[f].pixels.astype(np.float32) if f in own else blank for f in used] for own in seen.values()]
-    mask = np.array([[255 * (f in own) for f in used] for own in seen.values()], dtype=np.uint8)
-    # In squares: it takes a board in mm for a line.
-    objects3 = [(board.points() / board.square_x_mm).astype(np.float32)] * len(used)
-    sizes = [SIZE] * len(seen)
-    pinhole = np.zeros(len(seen), np.uint8)
-    *_, T = cv2.calibrateMultiview(objects3, pixels, sizes, mask, pinhole, None, None, None, None)
-    return [np.ravel(t) * board.square_x_mm for t in T]
 
 
 def failures(seeds: int, omnidir: int) -> None:
@@ -322,10 +187,10 @@ def failures(seeds: int, omnidir: int) -> None:
             views, _, _ = random_views(lens(name), count, np.random.default_rng(1000 + seed), reach_deg=reach)
             failed += [
                 _fails(lambda views=views: ours(views, "kannala_brandt", None)[0]),
-                _fails(lambda views=views: opencv_fisheye(views)[0]),
-                _fails(lambda views=views, K=K: opencv_fisheye(views, K)[0]),
+                _fails(lambda views=views: opencv_fisheye(views, SIZE)[0]),
+                _fails(lambda views=views, K=K: opencv_fisheye(views, SIZE, K)[0]),
             ]
-            slow += seed < omnidir and _fails(lambda views=views: _omnidir(views))
+            slow += seed < omnidir and _fails(lambda views=views: opencv_omnidir(views, SIZE))
         tried = min(seeds, omnidir)
         rows.append([name, f"{reach:g}", str(count), *(f"{n} of {seeds}" for n in failed), f"{slow} of {tried}"])
     columns = ["lens", "boards out to deg", "views", "rigkit", "cv2.fisheye", "with K 5 % off", "cv2.omnidir"]
@@ -337,13 +202,6 @@ def _fails(run: Callable[[], float]) -> bool:
         return not run() < 1.1 * NOISE_PX * np.sqrt(2.0)
     except (cv2.error, RigkitError):
         return True
-
-
-def _omnidir(views: list[BoardView]) -> float:
-    objects, images = opencv_points(views, np.float64)
-    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-8)
-    rms, *_, used = cv2.omnidir.calibrate(objects, images, SIZE, None, None, None, 0, criteria)
-    return float(rms) if np.size(used) == len(views) else np.inf
 
 
 def scale(repeats: int) -> None:
@@ -370,12 +228,12 @@ def rig(frames: int, repeats: int, mrcal: bool) -> None:
         result[0] = calibrate_rig(views, sizes, model="brown", degree=5, folds=0)
 
     def opencv() -> None:
-        result[1] = multiview(views, frames)
+        result[1] = opencv_multiview(views, SIZE, frames)
 
     runs = {"rigkit brown 5": clocked(own), "cv2.calibrateMultiview": clocked(opencv)}
     if mrcal:
         by_key = {(int(f), k): view for k, name in enumerate(views) for f, view in views[name]}
-        with Mrcal(by_key) as peer:
+        with Mrcal(by_key, SIZE) as peer:
             spent = timed({**runs, "mrcal OPENCV5": peer.run}, repeats)
         theirs = [np.zeros(6), *np.array(peer.last["mounts"])]
     else:

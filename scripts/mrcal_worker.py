@@ -1,4 +1,4 @@
-"""mrcal on corners from an .npz, in Debian's own Python: benchmark_calibration.py starts it and asks for runs.
+"""mrcal on corners from an .npz, in Debian's own Python: benchmark_calibration_peers.py starts it and asks for runs.
 
     /usr/bin/python3 scripts/mrcal_worker.py corners.npz
 
