@@ -8,6 +8,7 @@ settled by the image: the choice whose columns and rows run most nearly to the r
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -36,13 +37,15 @@ def quarter_turns(lattice: Lattice, sizes: Sequence[tuple[int, int]] = ()) -> in
 
 def _downwards(lattice: Lattice) -> list[float]:
     """Return how far columns and rows together run to the right and down after 0 to 3 quarter turns, in cells."""
-    column, row = (_mean_step(np.diff(lattice.pixels, axis=axis)) for axis in (1, 0))
-    longest = max(float(np.linalg.norm(column)), float(np.linalg.norm(row)), 1e-9)
-    along, down = float(column.sum()) / longest, float(row.sum()) / longest
+    pixels = lattice.pixels
+    (x1, y1), (x2, y2) = _mean(pixels[:, 1:] - pixels[:, :-1]), _mean(pixels[1:] - pixels[:-1])
+    longest = max(math.hypot(x1, y1), math.hypot(x2, y2), 1e-9)
+    along, down = (x1 + y1) / longest, (x2 + y2) / longest
     return [round(value, 9) for value in (along + down, along - down, -along - down, down - along)]
 
 
-def _mean_step(steps: FloatArray) -> FloatArray:
-    known = np.isfinite(steps[..., 0])
-    mean: FloatArray = steps[known].mean(axis=0) if known.any() else np.zeros(2)
-    return mean
+def _mean(steps: FloatArray) -> tuple[float, float]:
+    seen = np.isfinite(steps[..., 0])
+    count = max(int(np.count_nonzero(seen)), 1)
+    u, v = np.add.reduce(steps[seen], axis=0)
+    return float(u) / count, float(v) / count
