@@ -153,12 +153,13 @@ void typical_values(
         }
 }
 
-/* Mark the peaks among the pixels u to u + STRIP - 1 of a row: not lower than the neighbours that follow within two
- * pixels, higher than those before (a corner between pixels makes two equal ones), and above the threshold. Returns
- * whether there are any. */
-INLINE int32_t mark_peaks(float *const rows[5], int64_t u, float threshold, int32_t *restrict peak)
+/* Return as bits, the lowest first, which of the pixels u to u + STRIP - 1 of a row are peaks: not lower than the
+ * neighbours that follow within two pixels, higher than those before (a corner between pixels makes two equal ones), and
+ * above the threshold. */
+INLINE uint64_t peaks_among(float *const rows[5], int64_t u, float threshold)
 {
     float before[STRIP + 4], after[STRIP + 4];
+    uint8_t peak[STRIP];
     const float *above2 = rows[0] + u - 2, *above = rows[1] + u - 2, *here = rows[2] + u;
     const float *below = rows[3] + u - 2, *below2 = rows[4] + u - 2;
     for (int k = 0; k < STRIP + 4; k++) {
@@ -181,61 +182,71 @@ INLINE int32_t mark_peaks(float *const rows[5], int64_t u, float threshold, int3
         least = after[k + 4] > least ? after[k + 4] : least;
         least = here[k + 1] > least ? here[k + 1] : least;
         least = here[k + 2] > least ? here[k + 2] : least;
-        peak[k] = (here[k] > most) & (here[k] >= least);
+        peak[k] = (uint8_t)((here[k] > most) & (here[k] >= least));
     }
-    int32_t any = 0;
-    for (int k = 0; k < STRIP; k++)
-        any |= peak[k];
-    return any;
+    uint64_t bits = 0;
+    for (int k = 0; k < STRIP; k += 8) {
+        uint64_t eight;
+        memcpy(&eight, peak + k, 8);
+        /* The product gathers the lowest bits of eight bytes (the first one the lowest) in the highest byte. */
+        bits |= (eight * UINT64_C(0x0102040810204080)) >> 56 << k;
+    }
+    return bits;
+}
+
+/* The saddle response at the `count` pixels from u on of a row, into `to`; whether any is above the threshold. */
+INLINE int32_t fill_response(const float *restrict from, int64_t width, int64_t count, float threshold, float *restrict to)
+{
+    int32_t high = 0;
+    for (int64_t k = 0; k < count; k++) {
+        const float response = saddle_response(from + k, width);
+        to[k] = response;
+        high |= response > threshold;
+    }
+    return high;
 }
 
 /* corners.response.peaks: (u, v) and response of the peaks, row by row; returns how many. There is at most one peak in
- * 3x3 pixels. `scratch` holds 5 * (width + STRIP + 4) floats. */
+ * 3x3 pixels. `scratch` holds 5 * (width + STRIP + 4) floats, `high` 5 * (width / STRIP + 1) bytes. */
 int64_t find_peaks(
-    const float *smooth, int64_t height, int64_t width, float threshold, float *scratch, int32_t *at, float *response);
+    const float *smooth, int64_t height, int64_t width, float threshold, float *scratch, uint8_t *high, int32_t *at,
+    float *response);
 FOR_EACH_PROCESSOR int64_t find_peaks(
-    const float *smooth, int64_t height, int64_t width, float threshold, float *scratch, int32_t *at, float *response)
+    const float *smooth, int64_t height, int64_t width, float threshold, float *scratch, uint8_t *high, int32_t *at,
+    float *response)
 {
-    const int64_t stride = width + STRIP + 4;
-    float *rows[5];
-    for (int k = 0; k < 5; k++) {
-        rows[k] = scratch + k * stride;
-        for (int64_t u = 0; u < stride; u++)
-            rows[k][u] = -1e30f;
-    }
+    enum { FIRST = 3 };
+    const int64_t stride = width + STRIP + 4, strips = width / STRIP + 1;
+    for (int64_t k = 0; k < 5 * stride; k++)
+        scratch[k] = -1e30f;
     int64_t count = 0;
     for (int64_t v = 1; v < height - 1; v++) {
-        float *restrict last = rows[0];
-        for (int k = 0; k < 4; k++)
-            rows[k] = rows[k + 1];
-        rows[4] = last;
-        const float *restrict from = smooth + v * width;
-        for (int64_t u = 1; u < width - 1; u++)
-            last[u] = saddle_response(from + u, width);
+        const float *from = smooth + v * width;
+        float *last = scratch + v % 5 * stride;
+        uint8_t *mark = high + v % 5 * strips;
+        last[1] = saddle_response(from + 1, width);
+        last[2] = saddle_response(from + 2, width);
+        for (int64_t u = FIRST; u < width - 1; u += STRIP, mark++)
+            /* Twice, so that the compiler knows how many there are. */
+            *mark = (uint8_t)(u + STRIP < width ? fill_response(from + u, width, STRIP, threshold, last + u)
+                                                : fill_response(from + u, width, width - 1 - u, threshold, last + u));
         /* The middle one of the five rows is v - 2. */
         if (v < 5)
             continue;
-        for (int64_t u = 3; u < width - 3; u += STRIP) {
-            int32_t high = 0;
-            for (int64_t k = 0; k < STRIP; k++)
-                high += rows[2][u + k] > threshold;
-            if (!high)
+        float *rows[5];
+        for (int k = 0; k < 5; k++)
+            rows[k] = scratch + (v + 1 + k) % 5 * stride;
+        mark = high + (v - 2) % 5 * strips;
+        for (int64_t u = FIRST; u < width - 3; u += STRIP, mark++) {
+            if (!*mark)
                 continue;
-            int32_t peak[STRIP];
-            if (!mark_peaks(rows, u, threshold, peak))
-                continue;
-            for (int64_t k = 0; k < STRIP && u + k < width - 3; k++) {
-                /* Peaks are rare: eight pixels at a time. */
-                if (k % 8 == 0 && !((peak[k] | peak[k + 1] | peak[k + 2] | peak[k + 3]) |
-                                    (peak[k + 4] | peak[k + 5] | peak[k + 6] | peak[k + 7]))) {
-                    k += 7;
-                    continue;
-                }
-                if (!peak[k])
-                    continue;
-                at[2 * count] = (int32_t)(u + k);
+            for (uint64_t left = peaks_among(rows, u, threshold); left; left &= left - 1) {
+                const int64_t at_u = u + __builtin_ctzll(left);
+                if (at_u >= width - 3)
+                    break;
+                at[2 * count] = (int32_t)at_u;
                 at[2 * count + 1] = (int32_t)(v - 2);
-                response[count++] = rows[2][u + k];
+                response[count++] = rows[2][at_u];
             }
         }
     }

@@ -88,21 +88,21 @@ def loaded() -> ctypes.CDLL | None:
     library = kernels("front")
     if library is None:
         return None
-    address, size = c_void_p, c_int64
-    library.shrink_floats.argtypes = [address, size, size, size, address, address]
+    array, size = c_void_p, c_int64
+    library.shrink_floats.argtypes = [array, size, size, size, array, array]
     library.shrink_bytes.argtypes = library.shrink_floats.argtypes
-    library.smooth_floats.argtypes = [address, size, size, *[address] * 4]
-    library.smooth_bytes.argtypes = [address, size, size, address, c_float, *[address] * 3]
-    library.typical_values.argtypes = [address, size, size, size, address, address]
+    library.smooth_floats.argtypes = [array, size, size, *[array] * 4]
+    library.smooth_bytes.argtypes = [array, size, size, array, c_float, *[array] * 3]
+    library.typical_values.argtypes = [array, size, size, size, array, array]
     for name in ("shrink_floats", "shrink_bytes", "smooth_floats", "smooth_bytes", "typical_values"):
         getattr(library, name).restype = None
-    library.find_peaks.argtypes = [address, size, size, c_float, *[address] * 3]
+    library.find_peaks.argtypes = [array, size, size, c_float, *[array] * 4]
     rings = (_Image, POINTER(RingRules), c_double, c_double, c_double)
-    library.find_corners.argtypes = [*rings, address, address, size, *[address] * 5]
-    library.mark_known.argtypes = [address, size, address, size, c_double, address]
+    library.find_corners.argtypes = [*rings, array, array, size, *[array] * 5]
+    library.mark_known.argtypes = [array, size, array, size, c_double, array]
     library.find_links.argtypes = [
         *(POINTER(_Corners), _Image, c_double, c_double, POINTER(LinkRules)),
-        *(address, address),
+        *(array, array),
     ]
     for name in ("find_peaks", "find_corners", "mark_known", "find_links"):
         getattr(library, name).restype = size
@@ -153,8 +153,8 @@ def peaks(library: ctypes.CDLL, smooth: Image, threshold: float) -> tuple[NDArra
     height, width = smooth.shape
     most = (height // 3 + 1) * (width // 3 + 1)
     at, response = np.empty((most, 2), np.int32), np.empty(most, np.float32)
-    scratch = np.empty(5 * (width + STRIP + 4), np.float32)
-    arrays = (scratch, at, response)
+    scratch, high = np.empty(5 * (width + STRIP + 4), np.float32), np.empty(5 * (width // STRIP + 1), np.uint8)
+    arrays = (scratch, high, at, response)
     found = library.find_peaks(address(smooth), height, width, threshold, *(address(array) for array in arrays))
     return at[:found], response[:found]
 
