@@ -9,7 +9,7 @@ Layers, each importing only rows below it (tests/test_architecture.py reads the 
     4  pairing | reconstruct | scene   the pipeline from detections, or correspondences, to a Reconstruction
     3  corners | affine | fundamental | calibration | synthetic | interop
     2  cameras       protocol, models, rectification, registry
-    1  geometry | boards | detections | matches | cloud | posetype | progress
+    1  geometry | boards | detections | matches | cloud | posetype | processes | progress
     0  errors | arrays | native (compiled kernels, optional)
 
 Conventions: `b_from_a` maps a to b, `x_in_a` lives in a, touching names match; camera x right, y down, z forward; pixel

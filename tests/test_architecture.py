@@ -14,7 +14,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("errors", "arrays", "native"),
-    ("geometry", "boards", "detections", "matches", "cloud", "posetype", "progress", "truth"),
+    ("geometry", "boards", "detections", "matches", "cloud", "posetype", "processes", "progress", "truth"),
     ("cameras",),
     ("corners", "affine", "fundamental", "calibration", "synthetic", "interop"),
     ("reconstruct", "pairing", "scene"),

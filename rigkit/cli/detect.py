@@ -116,10 +116,8 @@ def _detect_all(
     images: list[Path], overlays: list[Path | None], how: How, args: argparse.Namespace
 ) -> dict[str, tuple[BoardDetection, ...]]:
     """Return the detections per image in the order of `images`, whatever the number of processes."""
-    from concurrent.futures import ProcessPoolExecutor
-    from multiprocessing import get_context
-
     from rigkit.cli.console import progress_on_stderr
+    from rigkit.processes import worker_pool
 
     progress = progress_on_stderr()
     tasks = [(image, overlay, how, args.force) for image, overlay in zip(images, overlays, strict=True)]
@@ -134,8 +132,7 @@ def _detect_all(
     if jobs == 1:
         collect(map(detect_one, tasks))
     else:
-        # "spawn": a fork after OpenCV has started its threads can hang.
-        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        with worker_pool(jobs) as pool:
             collect(pool.map(detect_one, tasks, chunksize=max(1, min(8, len(tasks) // (4 * jobs)))))
     return found
 

@@ -7,11 +7,16 @@ A verb is a module in this package with `HELP: str`, `add_arguments(parser)` and
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib
 import os
+import signal
 import sys
+import threading
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
 
 from rigkit.errors import RigkitError
 
@@ -33,8 +38,23 @@ VERBS: dict[str, tuple[str, str]] = {
 }
 """Verb -> (module, one-line help)."""
 
-EXIT_INTERRUPTED = 130
+EXIT_BAD_INPUT = 2
 EXIT_BUG = 70
+SIGNAL_EXIT = 128
+"""A program that a signal ends exits with this plus the signal's number."""
+
+SURROUNDINGS = {
+    getattr(errno, name) for name in ("ENOSPC", "EDQUOT", "EROFS", "EACCES", "EPERM", "EIO", "EMFILE", "ENFILE")
+}
+"""Errors of the system that are nobody's bug: a full disk, a folder that may not be written, too many open files."""
+
+
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM or SIGHUP, taken as Ctrl-C is: what is half done is cleared away on the way out."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
 
 
 def build_parser(verb: str | None) -> argparse.ArgumentParser:
@@ -64,21 +84,46 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     verb = next((a for a in arguments if not a.startswith("-")), None)
     try:
-        args = build_parser(verb).parse_args(arguments)
-        return int(args.run(args))
+        with _signals_interrupt():
+            args = build_parser(verb).parse_args(arguments)
+            return int(args.run(args))
     except RigkitError as error:
         print(f"rigkit: {error}", file=sys.stderr)
         return error.exit_code
     except BrokenPipeError:
         sys.stderr.close()
         return 0
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
+        number = stop.number if isinstance(stop, _Terminated) else signal.SIGINT
         print("rigkit: interrupted", file=sys.stderr)
-        return EXIT_INTERRUPTED
-    except Exception:
+        return SIGNAL_EXIT + number
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno in SURROUNDINGS:
+            where = f"'{error.filename}': " if error.filename else ""
+            print(f"rigkit: {where}{error.strerror}; make room or choose another folder", file=sys.stderr)
+            return EXIT_BAD_INPUT
         traceback.print_exc()
         print("rigkit: this is a bug in rigkit; please report the lines above", file=sys.stderr)
         return EXIT_BUG
+
+
+@contextmanager
+def _signals_interrupt() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP interrupt the block as Ctrl-C does; a signal that is ignored (nohup) stays ignored."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise _Terminated(number)
+
+    taken = []
+    if threading.current_thread() is threading.main_thread():
+        taken = [n for n in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) is signal.SIG_DFL]
+    for number in taken:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number in taken:
+            signal.signal(number, signal.SIG_DFL)
 
 
 if __name__ == "__main__":

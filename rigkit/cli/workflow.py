@@ -10,16 +10,15 @@ import contextlib
 import functools
 import itertools
 import json
-import multiprocessing
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from rigkit.cli.console import note
 from rigkit.errors import DegenerateError, InputError, RigkitError
+from rigkit.processes import worker_pool
 
 if TYPE_CHECKING:
     from rigkit.arrays import FloatArray
@@ -88,8 +87,17 @@ def select_dataset(args: argparse.Namespace) -> Dataset:
 def output_folder(args: argparse.Namespace, name: str) -> Path:
     """Return the folder for results: the one asked for, or the first of out/NAME, out/NAME-2, ... that is free.
 
-    Raises InputError, before the work, where the folder asked for holds results and `--force` is not given.
+    Raises InputError, before the work, where the folder asked for holds results and `--force` is not given, or files
+    could not be written there.
     """
+    from rigkit.io.files import ensure_folder_writable
+
+    folder = _chosen_folder(args, name)
+    ensure_folder_writable(folder)
+    return folder
+
+
+def _chosen_folder(args: argparse.Namespace, name: str) -> Path:
     if args.output:
         folder = Path(args.output)
         if folder.is_dir() and any(folder.iterdir()) and not args.force:
@@ -105,12 +113,10 @@ def output_folder(args: argparse.Namespace, name: str) -> Path:
 
 
 def write_results(folder: Path, files: Mapping[str, str | bytes], *, force: bool) -> None:
-    """Write all files (relative path -> content) into `folder`, after making sure that each may be written."""
-    from rigkit.io.files import ensure_writable, write_atomic
+    """Write all files (relative path -> content) into `folder`, or none."""
+    from rigkit.io.files import write_together
 
-    ensure_writable([folder / name for name in files], force=force)
-    for name, data in files.items():
-        write_atomic(folder / name, data, force=force)
+    write_together({folder / name: data for name, data in files.items()}, force=force)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -289,13 +295,8 @@ def over_pairs(
     outcomes: list[Result | RigkitError] = []
     with contextlib.ExitStack() as stack:
         attempt = functools.partial(_attempt, work)
-        results: Iterable[Result | RigkitError]
-        if count <= 1:
-            results = map(attempt, jobs)
-        else:
-            # Fresh processes: threads of OpenCV do not survive a fork.
-            context = multiprocessing.get_context("spawn")
-            results = stack.enter_context(ProcessPoolExecutor(count, mp_context=context)).map(attempt, jobs)
+        each = map if count <= 1 else stack.enter_context(worker_pool(count)).map
+        results: Iterable[Result | RigkitError] = each(attempt, jobs)
         for done, outcome in enumerate(results, start=1):
             progress(what, done, len(jobs))
             outcomes.append(outcome)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
 from rigkit.errors import InputError
 
-__all__ = ["ensure_writable", "write_atomic"]
+__all__ = ["ensure_folder_writable", "ensure_writable", "write_atomic", "write_together"]
 
 
 def ensure_writable(paths: str | Path | Iterable[str | Path], *, force: bool = False) -> None:
@@ -24,11 +24,21 @@ def ensure_writable(paths: str | Path | Iterable[str | Path], *, force: bool = F
             raise InputError(f"cannot write '{target}': a folder of that name exists; give another name")
         if target.exists() and not force:
             raise InputError(f"'{target}' exists and is left as it is; use --force to replace it, or another name")
-        parent = next(p for p in target.absolute().parents if p.exists())
-        if not parent.is_dir():
-            raise InputError(f"cannot write '{target}': '{parent}' is a file, not a folder; give another name")
-        if not os.access(parent, os.W_OK | os.X_OK):
-            raise InputError(f"cannot write '{target}': no permission in '{parent}'; choose another folder")
+        _ensure_place(target, target.absolute().parent)
+
+
+def ensure_folder_writable(folder: str | Path) -> None:
+    """Raise InputError if files could not be written into `folder`, which need not exist yet."""
+    _ensure_place(Path(folder), Path(folder).absolute())
+
+
+def _ensure_place(target: Path, folder: Path) -> None:
+    """Raise InputError where `target` could not be written because of `folder`, or of the folder to make that in."""
+    place = next(p for p in (folder, *folder.parents) if p.exists())
+    if not place.is_dir():
+        raise InputError(f"cannot write '{target}': '{place}' is a file, not a folder; give another name")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise InputError(f"cannot write '{target}': no permission in '{place}'; choose another folder")
 
 
 def write_atomic(path: str | Path, data: str | bytes, *, force: bool = False) -> None:
@@ -42,32 +52,57 @@ def write_atomic(path: str | Path, data: str | bytes, *, force: bool = False) ->
         The file exists and `force` is not set, or it cannot be written (permission, full disk); what was there before
         is still there.
     """
-    target = Path(path)
-    ensure_writable(target, force=force)
-    payload = data.encode("utf-8") if isinstance(data, str) else data
+    write_together({Path(path): data}, force=force)
+
+
+def write_together(files: Mapping[Path, str | bytes], *, force: bool = False) -> None:
+    """Write all `files` (path -> content) or none: none takes its name before all are on the disk.
+
+    Raises InputError as `write_atomic` does; what was there before is still there then, and no new folder is left.
+    """
+    ensure_writable(files, force=force)
+    made: list[Path] = []
+    staged: dict[Path, Path] = {}
+    target = Path()
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
-    except OSError as error:
-        raise InputError(f"cannot write '{target}': {error.strerror}; choose another folder") from error
-    temporary = Path(name)
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(payload)
-            stream.flush()
-            os.fsync(stream.fileno())
-        # mkstemp makes files that only the owner may read; a result should have the permissions of any new file.
-        temporary.chmod(0o666 & ~_umask())
-        if force:
-            temporary.replace(target)
-        else:
-            # A hard link fails if somebody made the file meanwhile, where a rename would silently replace it.
-            _link_new(temporary, target)
+        for target, data in files.items():
+            made += _make_folder(target.parent)
+            handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
+            staged[target] = Path(name)
+            _fill(handle, data.encode("utf-8") if isinstance(data, str) else data)
+            # mkstemp makes files that only the owner may read; a result should have the permissions of any new file.
+            staged[target].chmod(0o666 & ~_umask())
+        for target, temporary in staged.items():
+            if force:
+                temporary.replace(target)
+            else:
+                # A hard link fails if somebody made the file meanwhile, where a rename would silently replace it.
+                _link_new(temporary, target)
     except OSError as error:
         raise InputError(f"cannot write '{target}': {error.strerror}; nothing was changed") from error
     finally:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
+        for temporary in staged.values():
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
+        # Those with files in them stay.
+        for folder in reversed(made):
+            with suppress(OSError):
+                folder.rmdir()
+
+
+def _make_folder(folder: Path) -> list[Path]:
+    """Make `folder` and what is missing above it; return what was made, the outermost first."""
+    missing = [p for p in (folder, *folder.parents) if not p.exists()][::-1]
+    for path in missing:
+        path.mkdir(exist_ok=True)
+    return missing
+
+
+def _fill(handle: int, data: bytes) -> None:
+    with os.fdopen(handle, "wb") as stream:
+        stream.write(data)
+        stream.flush()
+        os.fsync(stream.fileno())
 
 
 def _link_new(temporary: Path, target: Path) -> None:

@@ -8,7 +8,7 @@ import io
 import json
 import os
 from collections.abc import Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from rigkit.errors import InputError
 from rigkit.io.files import write_atomic
+from rigkit.processes import worker_pool
 from rigkit.progress import Progress, silent
 from rigkit.validation.study import Study, chunk_count, run_chunk
 
@@ -105,7 +106,7 @@ def _compute(study: Study, indices: list[int], jobs: int, dask: str | None) -> I
         for index in indices:
             yield index, run_chunk(study, index)
     else:
-        with ProcessPoolExecutor(min(jobs, len(indices), os.cpu_count() or 1)) as pool:
+        with worker_pool(min(jobs, len(indices), os.cpu_count() or 1)) as pool:
             waiting = {pool.submit(run_chunk, study, index): index for index in indices}
             for future in as_completed(waiting):
                 yield waiting[future], future.result()

@@ -7,6 +7,8 @@ goes to `truth.json`, which nothing in the pipeline reads.
 from __future__ import annotations
 
 import json
+import tempfile
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -51,16 +53,34 @@ def demo_camera() -> Camera:
 
 
 def build_demo(directory: str | Path, rng: np.random.Generator, progress: Progress = silent) -> Path:
-    """Write the demo capture into a new or empty folder and return its manifest.
+    """Write the demo capture into a new or empty folder, whole or not at all, and return its manifest.
 
     Raises
     ------
     InputError
-        The folder has something in it.
+        The folder has something in it, or cannot be written (permission, full disk).
     """
     root = Path(directory)
     if root.exists() and (not root.is_dir() or any(root.iterdir())):
         raise InputError(f"demo: '{root}' is not empty; give a new folder")
+    new = not root.exists()
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".", dir=root, ignore_cleanup_errors=True) as work:
+            _build(Path(work), rng, progress)
+            for part in Path(work).iterdir():
+                part.replace(root / part.name)
+    except BaseException as error:
+        if new:
+            with suppress(OSError):
+                root.rmdir()
+        if isinstance(error, OSError):
+            raise InputError(f"demo: cannot write '{root}': {error.strerror}; choose another folder") from error
+        raise
+    return root / "dataset.toml"
+
+
+def _build(root: Path, rng: np.random.Generator, progress: Progress) -> None:
     camera = demo_camera()
     total = VIEWS + 2 * len(PAIRS)
     targets = [_calibration_view(camera, k, rng) for k in range(VIEWS)]
@@ -81,9 +101,7 @@ def build_demo(directory: str | Path, rng: np.random.Generator, progress: Progre
         _write_text(root / f"boards/{board.board_id}.toml", _board_toml(board))
     _write_text(root / "cameras/fisheye/session.toml", _session_toml())
     _write_text(root / "truth.json", json.dumps(_truth(camera, targets, scenes), indent=1))
-    manifest = root / "dataset.toml"
-    _write_text(manifest, _manifest_toml(scenes))
-    return manifest
+    _write_text(root / "dataset.toml", _manifest_toml(scenes))
 
 
 def _calibration_view(camera: Camera, index: int, rng: np.random.Generator) -> PlacedBoard:

@@ -14,7 +14,7 @@ from helpers.reconstructions import make_reconstruction
 from rigkit.cloud import OrientedCloud
 from rigkit.errors import InputError
 from rigkit.io import files
-from rigkit.io.files import ensure_writable, write_atomic
+from rigkit.io.files import ensure_folder_writable, ensure_writable, write_atomic, write_together
 from rigkit.io.ply import read_ply, write_ply
 
 ANGLE_REL = 1e-15
@@ -92,6 +92,29 @@ def test_a_write_that_fails_half_way_leaves_the_old_file_and_no_rubbish(
     assert os.listdir(tmp_path) == ["out"]
 
 
+@pytest.mark.parametrize("fault", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_of_several_files_none_changes_where_one_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: BaseException
+) -> None:
+    (tmp_path / "first").write_text("old")
+    count = 0
+
+    def full(handle: int) -> None:
+        nonlocal count
+        count += 1
+        if count == 3:
+            raise fault
+
+    monkeypatch.setattr(files.os, "fsync", full)
+    together = {tmp_path / name: "new" for name in ("first", "made/deep/second", "made/third")}
+    with pytest.raises(InputError if isinstance(fault, OSError) else KeyboardInterrupt):
+        write_together(together, force=True)
+    assert (tmp_path / "first").read_text() == "old"
+    assert os.listdir(tmp_path) == ["first"]
+    write_together(together, force=True)
+    assert [path.read_text() for path in together] == ["new"] * 3
+
+
 def test_a_file_that_appears_meanwhile_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     target = tmp_path / "out"
     monkeypatch.setattr(files.os, "fsync", lambda handle: target.write_text("somebody else's"))
@@ -111,4 +134,7 @@ def test_what_cannot_be_written_is_known_before_the_work(tmp_path: Path) -> None
         ensure_writable(tmp_path / "file" / "below")
     with pytest.raises(InputError, match="a folder of that name"):
         ensure_writable(tmp_path, force=True)
+    ensure_folder_writable(tmp_path / "new" / "folder")
+    with pytest.raises(InputError, match="is a file, not a folder"):
+        ensure_folder_writable(tmp_path / "file")
     assert sorted(os.listdir(tmp_path)) == ["file"]

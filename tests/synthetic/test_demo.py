@@ -73,3 +73,26 @@ def test_a_folder_with_something_in_it_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not empty"):
         build_demo(tmp_path, np.random.default_rng(1))
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.parametrize("fault", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+@pytest.mark.parametrize("there", [True, False])
+def test_a_demo_that_cannot_be_written_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: BaseException, there: bool
+) -> None:
+    root = tmp_path / "demo"
+    if there:
+        root.mkdir()
+
+    def full(path: Path, image: object) -> None:
+        if path.name == "02.png":
+            raise fault
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"image")
+
+    monkeypatch.setattr("rigkit.synthetic.demo._write_png", full)
+    monkeypatch.setattr("rigkit.synthetic.demo.render", lambda *args, **options: None)
+    with pytest.raises(InputError if isinstance(fault, OSError) else KeyboardInterrupt):
+        build_demo(root, np.random.default_rng(1))
+    assert root.exists() == there
+    assert not there or not any(root.iterdir())

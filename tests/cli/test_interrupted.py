@@ -1,0 +1,83 @@
+"""A program that is interrupted or killed: one line, the signal's exit code, no process and no half file left."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from rigkit.cli.main import main
+
+WORK = """
+import os, sys, time
+from pathlib import Path
+from rigkit.cli.main import main
+from rigkit.io.files import write_together
+from rigkit.processes import worker_pool
+
+def work(path):
+    Path(path).write_text(str(os.getpid()))
+    time.sleep(600)
+
+def run(args):
+    folder = Path(args.output)
+    with worker_pool(2) as pool:
+        list(pool.map(work, [folder / "0", folder / "1"]))
+
+if __name__ == "__main__":
+    import rigkit.cli.diff as verb
+    verb.run = run
+    sys.exit(main(["diff", "a", "b", "-o", sys.argv[1]]))
+"""
+"""The program with a verb that works for ten minutes in two processes."""
+
+PATIENCE_S = 60.0
+
+
+def alive(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+    except OSError:
+        return False
+    return state != "Z"
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL], ids=lambda s: s.name)
+@pytest.mark.parametrize("to_all", [True, False], ids=["group", "process"])
+def test_workers_end_with_the_program(tmp_path: Path, how: signal.Signals, to_all: bool) -> None:
+    (tmp_path / "work.py").write_text(WORK)
+    program = subprocess.Popen(
+        [sys.executable, str(tmp_path / "work.py"), str(tmp_path)],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    notes = [tmp_path / "0", tmp_path / "1"]
+    end = time.monotonic() + PATIENCE_S
+    while not all(note.exists() and note.read_text() for note in notes):
+        assert time.monotonic() < end and program.poll() is None
+        time.sleep(0.02)
+    (os.killpg if to_all else os.kill)(program.pid, how)
+    _, words = program.communicate(timeout=PATIENCE_S)
+    if how is signal.SIGKILL:
+        assert program.returncode == -how
+    else:
+        assert program.returncode == 128 + how
+        assert words.splitlines() == ["rigkit: interrupted"]
+    while any(alive(int(note.read_text())) for note in notes):
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def test_a_full_disk_is_no_bug_of_ours(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def full(args: object) -> int:
+        raise OSError(28, "No space left on device", "results/cloud.ply")
+
+    monkeypatch.setattr("rigkit.cli.diff.run", full)
+    assert main(["diff", "a", "b"]) == 2
+    assert "'results/cloud.ply': No space left on device" in capsys.readouterr().err
