@@ -8,7 +8,7 @@ the viewer: plane 1 is the wall in front (normal z), plane 2 the floor (normal y
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,6 +24,8 @@ __all__ = ["Panel", "PlacedBoard", "exact_detection", "exact_view", "room_walls"
 
 BOARD_CLEARANCE_MM = 3.0
 """Gap between the paper's edge and the seam of two walls: boards that touch would hide each other's edge."""
+SEAM_ROUNDING_MM = 1e-6
+"""In a room of right angles a board's edge lies at the clearance to rounding, and stays there."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -150,6 +152,9 @@ def trihedral(
 ) -> tuple[PlacedBoard, PlacedBoard, PlacedBoard]:
     """Return three boards pushed into the corner of a room: front wall, floor, right wall.
 
+    Each lies against one seam; where the seams meet at less than a right angle it is moved along it until no part of it
+    sticks through the third plane.
+
     Parameters
     ----------
     boards : three boards of any sizes.
@@ -160,15 +165,24 @@ def trihedral(
         raise InputError(f"trihedral: three boards expected, got {len(boards)}")
     # Which corner of the paper points into the corner of the room, in board axes (+1: the far end, -1: the near end).
     corner_side = ((1, 1), (1, -1), (-1, 1))
+    walls = wall_axes(angles_deg)
+    # The board axis along the seam that it lies against, and the plane at the seam's end.
+    along_seam = ((0, 2), (0, 2), (1, 1))
     out = []
-    for board, axes, side in zip(boards, wall_axes(angles_deg), corner_side, strict=True):
+    for board, axes, side, (axis, end) in zip(boards, walls, corner_side, along_seam, strict=True):
         square = np.array([board.square_x_mm, board.square_y_mm])
         count = np.array([board.columns, board.rows])
         m = 1.0 + margin_squares
         far, near = (count - 1 + m) * square + clearance_mm, m * square + clearance_mm
         origin = np.where(np.array(side) > 0, -far, near)
-        rigid = Rigid3(axes, axes[:, :2] @ origin)
-        out.append(PlacedBoard(board, rigid, margin_squares, first_black=first_black))
+        placed = PlacedBoard(board, Rigid3(axes, axes[:, :2] @ origin), margin_squares, first_black=first_black)
+        facing = walls[end][:, 2]
+        beyond = float((placed.outline() @ facing).max()) + clearance_mm
+        if beyond > SEAM_ROUNDING_MM:
+            step = beyond / float(facing @ axes[:, axis]) * axes[:, axis]
+            moved = Rigid3(axes, placed.world_from_board.translation_mm - step)
+            placed = replace(placed, world_from_board=moved)
+        out.append(placed)
     return (out[0], out[1], out[2])
 
 

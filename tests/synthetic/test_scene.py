@@ -21,7 +21,7 @@ CAMERA = Pinhole((1624, 1240), np.array([1350.0, 1352.0, 805.0, 622.0]))
 FISHEYE = KannalaBrandt((960, 720), np.array([352.0, 351.0, 484.0, 356.0, -0.02, 0.001, 0.0, 0.0]))
 
 
-@pytest.mark.parametrize("angles", [(90.0, 90.0, 90.0), (91.6, 88.0, 93.5), (60.0, 80.0, 100.0)])
+@pytest.mark.parametrize("angles", [(90.0, 90.0, 90.0), (91.6, 88.0, 93.5), (60.0, 80.0, 100.0), (75.0, 90.0, 100.0)])
 def test_planes_stand_at_the_angles_asked_for(angles: tuple[float, float, float]) -> None:
     placed = trihedral(BOARDS, angles_deg=angles)
     normals = [p.normal() for p in placed]
@@ -30,6 +30,7 @@ def test_planes_stand_at_the_angles_asked_for(angles: tuple[float, float, float]
     for p in placed:
         # Every plane passes through the corner of the room, and its board lies in the room, clear of the seams.
         assert np.abs(p.outline() @ p.normal()).max() < EXACT_REL * 1e3
+        assert max((p.outline() @ -q.normal()).max() for q in placed if q is not p) < -2.5
     if angles == (90.0, 90.0, 90.0):
         assert max(p.outline().max() for p in placed) < ROUNDING * 1e3
         for k, p in enumerate(placed):
