@@ -12,6 +12,7 @@ enum { OUTCOMES = 8 };
 
 /* Eight numbers at once, wherever they lie. */
 typedef float lanes_t __attribute__((vector_size(4 * LANES), aligned(4)));
+typedef int32_t mask_t __attribute__((vector_size(4 * LANES)));
 
 /* The constants of corners.edge_model and corners.edge_fit, under their names there (rigkit.native.edges.Rules). */
 typedef struct {
@@ -27,11 +28,11 @@ typedef struct {
     const double *sides, *curvature, *gaps;
 } geometry_t;
 
-/* The pixels of a corner, relative to (centre_u, centre_v). `rest` has room for what the model leaves of them, `square`
- * for `across` x `across` pixels around the centre. */
+/* The pixels of a corner, relative to (centre_u, centre_v), at most `radius` from it both ways. `rest` has room for what
+ * the model leaves of them, `square` and `turned` for `across` x `across` pixels around the centre. */
 typedef struct {
-    float *u, *v, *value, *rest, *square;
-    int64_t count, across;
+    float *u, *v, *value, *rest, *square, *turned;
+    int64_t count, across, radius;
     double centre_u, centre_v, size;
 } window_t;
 
@@ -97,6 +98,7 @@ INLINE void take(window_t *window, const picture_t image, int64_t v, range_t ran
 
 /* Gather the pixels near the two lines, inside the cell, the radius and the image (edge_model.collect): of every row
  * one or two stretches. */
+FOR_EACH_PROCESSOR
 static void collect(
     window_t *window, const picture_t image, const double pixel[2], const geometry_t at, double blur, const rules_t *rules)
 {
@@ -445,35 +447,52 @@ static void leave(const double *values, window_t *window, const geometry_t at, c
 
 /* Return the mean square of what the model leaves and mirroring at the corner changes, as that of independent noise, or
  * -1 where few pixels have a mirror image (edge_fit._noise). */
+FOR_EACH_PROCESSOR
 static double unmirrored(const double *values, window_t *window, const rules_t *rules)
 {
     if (fabs(values[X]) > rules->most_mirrored || fabs(values[Y]) > rules->most_mirrored)
         return -1.0;
-    const int32_t across = (int32_t)window->across, middle = across / 2;
-    float *square = window->square + middle * across + middle;
+    /* What is left as a picture, and turned by half a turn: then mirror images are read in the order of the pixels. */
+    const int32_t across = (int32_t)window->across, middle = across / 2, radius = (int32_t)window->radius;
+    float *square = window->square + middle * across + middle, *turned = window->turned + middle * across + middle;
     memset(window->square, 0xff, (size_t)(across * across) * sizeof(float)); /* NaN */
-    for (int64_t i = 0; i < window->count; i++)
-        square[(int32_t)window->v[i] * across + (int32_t)window->u[i]] = window->rest[i];
+    memset(window->turned, 0xff, (size_t)(across * across) * sizeof(float));
+    for (int64_t i = 0; i < window->count; i++) {
+        const int32_t at = (int32_t)window->v[i] * across + (int32_t)window->u[i];
+        square[at] = turned[-at] = window->rest[i];
+    }
     const double left = floor(2.0 * values[X]), top = floor(2.0 * values[Y]);
     const float right = (float)(2.0 * values[X] - left), below = (float)(2.0 * values[Y] - top);
     const float w00 = (1.0f - right) * (1.0f - below), w10 = right * (1.0f - below);
     const float w01 = (1.0f - right) * below, w11 = right * below;
-    const float *mirrored = square + (int32_t)top * across + (int32_t)left;
+    lanes_t sums = {0.0f};
+    mask_t pairs = {0};
+    for (int32_t v = -radius; v <= radius; v++) {
+        const float *restrict here = square + v * across - radius;
+        const float *restrict there = turned + (v - (int32_t)top) * across - (int32_t)left - radius;
+        const float *restrict above = there - across;
+        /* Beyond the radius there is nothing. */
+        for (int32_t u = 0; u <= 2 * radius; u += LANES) {
+            const lanes_t near = w00 * *(const lanes_t *)(there + u) + w10 * *(const lanes_t *)(there + u - 1);
+            const lanes_t far = w01 * *(const lanes_t *)(above + u) + w11 * *(const lanes_t *)(above + u - 1);
+            const lanes_t change = *(const lanes_t *)(here + u) - (near + far);
+            const mask_t paired = change == change;
+            sums += (lanes_t)((mask_t)(change * change) & paired);
+            pairs -= paired;
+        }
+    }
     double sum = 0.0;
-    int64_t pairs = 0;
-    for (int64_t i = 0; i < window->count; i++) {
-        const float *there = mirrored - ((int32_t)window->v[i] * across + (int32_t)window->u[i]);
-        const float change =
-            window->rest[i] - (w00 * there[0] + w10 * there[1] + w01 * there[across] + w11 * there[across + 1]);
-        const int paired = change == change;
-        sum += paired ? (double)(change * change) : 0.0;
-        pairs += paired;
+    int64_t count = 0;
+    for (int lane = 0; lane < LANES; lane++) {
+        sum += (double)sums[lane];
+        count += pairs[lane];
     }
     const double spread = 1.0 + (double)(w00 * w00 + w10 * w10 + w01 * w01 + w11 * w11);
-    return pairs >= rules->fewest_mirrored ? sum / (double)pairs / spread : -1.0;
+    return count >= rules->fewest_mirrored ? sum / (double)count / spread : -1.0;
 }
 
 /* Return whether there are pixels on all sides of (x, y) (edge_fit._surrounded). */
+FOR_EACH_PROCESSOR
 static int surrounded(const window_t *window, float x, float y)
 {
     int32_t right = 0, left = 0, below = 0, above = 0;
@@ -549,7 +568,7 @@ static void fit_corner(
 /* Side of the square that holds the window and, around it, nothing where mirror images may fall. */
 static int64_t across_square(const rules_t *rules)
 {
-    return 2 * ((int64_t)floor(rules->radius_px) + (int64_t)ceil(2.0 * rules->most_mirrored) + 1) + 1;
+    return 2 * ((int64_t)floor(rules->radius_px) + (int64_t)ceil(2.0 * rules->most_mirrored) + LANES) + 1;
 }
 
 static int64_t room_of_window(double radius_px)
@@ -562,7 +581,7 @@ static int64_t room_of_window(double radius_px)
 int64_t edges_scratch(const rules_t *rules)
 {
     const int64_t across = across_square(rules);
-    return 4 * room_of_window(rules->radius_px) + across * across;
+    return 4 * room_of_window(rules->radius_px) + 2 * across * across;
 }
 
 /* Fit the edge model around `count` corners (edge_fit.fit_edges). pixels (N, 2), sides (N, 2, 2), curvature (N, 2), gaps
@@ -574,10 +593,11 @@ void fit_edges(
     float *scratch, double *out)
 {
     const picture_t image = {grey, width, height, bytes};
-    const int64_t room = room_of_window(rules->radius_px);
+    const int64_t room = room_of_window(rules->radius_px), across = across_square(rules);
     window_t window = {
         .u = scratch, .v = scratch + room, .value = scratch + 2 * room, .rest = scratch + 3 * room,
-        .square = scratch + 4 * room, .across = across_square(rules)};
+        .square = scratch + 4 * room, .turned = scratch + 4 * room + across * across, .across = across,
+        .radius = (int64_t)floor(rules->radius_px)};
     for (int64_t n = 0; n < count; n++) {
         const geometry_t at = {sides + 4 * n, curvature + 2 * n, gaps + 4 * n};
         collect(&window, image, pixels + 2 * n, at, blur[n], rules);
