@@ -5,6 +5,7 @@ No size need be known, no number of boards, no lens.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -19,10 +20,10 @@ from rigkit.corners.guided import complete_boards
 from rigkit.corners.lattice import Lattice, build_lattices
 from rigkit.corners.links import find_links
 from rigkit.corners.origin import quarter_turns
-from rigkit.corners.response import GreyImage, grey_image, pyramid
+from rigkit.corners.response import GreyImage, Level, grey_image, pyramid
 from rigkit.corners.saddle import find_corners
 from rigkit.corners.subpixel import RefinedLattice, refine
-from rigkit.corners.validate import known_part, large, sample_of, separate, tidy, trustworthy
+from rigkit.corners.validate import compact, known_part, large, leans, sample_of, separate, tidy, trustworthy
 from rigkit.detections import BoardDetection
 
 __all__ = ["detect_boards"]
@@ -42,17 +43,22 @@ def find_lattices(image: NDArray[np.generic], min_corners: int) -> list[RefinedL
     corners, saddles = find_corners(levels)
     lattices = build_lattices(corners, find_links(corners, levels[0]))
     index = SaddleIndex(saddles)
-    grown = [item for item in grow_all(lattices, index, levels[0]) if item.count >= FEWEST_OF_PART]
+    grown = grow_all(lattices, index, levels[0], functools.partial(_promising, grey, levels[0]))
+    grown = [item for item in grown if item.count >= FEWEST_OF_PART]
+    if not any(item.solid or min_corners < 9 for item in grown):
+        return []
     boards = [board for item in grown for part in split_folds(item) for board in split_necks(part)]
     parts = separate([tidy(board, size_px) for board in boards], FEWEST_OF_PART)
     boards = [board for board in join_parts(parts) if large(board, min_corners)]
-    boards = [board for board in boards if _promising(grey, board)]
     refined = zip(boards, refine(grey, boards), strict=True)
-    return [after for before, after in refined if trustworthy(after, before.count, min_corners)]
+    found = [after for before, after in refined if trustworthy(after, before.count, min_corners)]
+    return [item for item in found if min_corners < 9 or compact(item.lattice, size_px)]
 
 
-def _promising(grey: GreyImage, lattice: Lattice) -> bool:
-    """Return whether `lattice` is worth to be refined: small, or a board as far as a sample of it tells."""
+def _promising(grey: GreyImage, finest: Level, lattice: Lattice) -> bool:
+    """Return whether `lattice` may be a board, as far as a quick look at its edges and a sample of it tell."""
+    if lattice.solid and leans(lattice, finest):
+        return False
     sample = sample_of(lattice)
     if sample is None:
         return True

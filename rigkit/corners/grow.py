@@ -6,16 +6,17 @@ is a corner with the polarity and the directions that the lattice demands and if
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import cache, cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray
-from rigkit.corners.lattice import STEPS, Lattice
+from rigkit.corners.lattice import MANY, STEPS, Lattice
 from rigkit.corners.links import ALONG, CONTRAST_RATIO, MOST, edge_contrast
 from rigkit.corners.local_fit import LocalFit, fit_cells
+from rigkit.corners.nearby import near_any
 from rigkit.corners.response import Level
 from rigkit.corners.ring import read_rings, ring_rules
 from rigkit.corners.saddle import Saddles
@@ -43,8 +44,9 @@ WIDTH, RADIUS = 1.3, 3
 FEWEST = 3
 """Known corners that foretell another."""
 
-MAX_SEEDS = 96
-"""So many lattices are grown: clutter can make hundreds, of one square each, after those of the boards."""
+MAX_FRUITLESS = 16
+"""After so many lattices in a row without a board no more are grown: those of boards come first, being larger, and
+clutter can make hundreds, of one square each."""
 
 REACH = 0.25
 """A corner lies within this of its prediction, in cells."""
@@ -70,8 +72,8 @@ ASIDE, MIN_ASIDE_PX, MAX_ASIDE_PX = 0.12, 1.0, 4.0
 LEAST_AREA = 1.0
 """Cells of fewer px^2 are none."""
 
-SAME_PX = 1.0
-"""Corners nearer than this in both directions are one: found again on a coarser level."""
+SAME_PX = 1.4
+"""Corners nearer than this are one: found again on a coarser level."""
 
 
 class SaddleIndex:
@@ -102,38 +104,54 @@ class SaddleIndex:
         return np.where(found, index, 0), found
 
 
-def grow_all(lattices: Iterable[Lattice], saddles: SaddleIndex, level: Level) -> list[Lattice]:
-    """Return the lattices grown from `lattices` one by one; those that others have grown over are left out."""
+def grow_all(
+    lattices: Iterable[Lattice], saddles: SaddleIndex, level: Level, promising: Callable[[Lattice], bool]
+) -> list[Lattice]:
+    """Return the lattices grown from `lattices` one by one, without what others have grown over.
+
+    Those that are not `promising`, as soon as there is enough of them to tell, are left out.
+    """
     out: list[Lattice] = []
     taken = np.zeros((0, 2))
+    fruitless = 0
     for lattice in lattices:
-        if len(out) == MAX_SEEDS:
+        if fruitless == MAX_FRUITLESS:
             break
-        if not _covered(lattice, taken):
-            out.append(grow(lattice, saddles, level))
-            taken = np.concatenate([taken, out[-1].pixels[out[-1].known]])
+        if _covered(lattice, taken):
+            continue
+        lattice, good = _grown(lattice, saddles, level, promising)
+        taken = np.concatenate([taken, lattice.pixels[lattice.known]])
+        fruitless = 0 if good and lattice.solid else fruitless + 1
+        if good:
+            out.append(lattice)
     return out
 
 
 def _covered(lattice: Lattice, corners: FloatArray) -> bool:
     """Return whether most of the corners of `lattice` are among `corners` (M, 2)."""
-    mine = lattice.pixels[lattice.known]
-    inside = ((corners > mine.min(axis=0) - SAME_PX) & (corners < mine.max(axis=0) + SAME_PX)).all(axis=1)
-    if not inside.any():
-        return False
-    gaps = np.abs(mine[:, None] - corners[inside]).max(axis=2)
-    return bool((gaps.min(axis=1) < SAME_PX).mean() > 0.5)
+    return bool(near_any(lattice.pixels[lattice.known], corners, SAME_PX).mean() > 0.5)
 
 
 def grow(lattice: Lattice, saddles: SaddleIndex, level: Level) -> Lattice:
     """Return `lattice` with all corners that can be added one after the other; brightness is read from `level`."""
-    rings = MAX_RINGS
+    return _grown(lattice, saddles, level, lambda _: True)[0]
+
+
+def _grown(
+    lattice: Lattice, saddles: SaddleIndex, level: Level, promising: Callable[[Lattice], bool]
+) -> tuple[Lattice, bool]:
+    """Return `lattice` as `grow` does, and whether it is `promising`; if it is not, maybe not fully grown."""
+    rings, judged = MAX_RINGS, False
     while rings > 0:
+        if not judged and lattice.count >= MANY:
+            if not promising(lattice):
+                return lattice, False
+            judged = True
         wide = lattice.padded(ROOM)
         rings = _grow(wide, saddles, level, rings)
         if wide.count > lattice.count:
             lattice = wide.trimmed()
-    return lattice
+    return lattice, judged or promising(lattice)
 
 
 def _grow(lattice: Lattice, saddles: SaddleIndex, level: Level, rings: int) -> int:

@@ -18,13 +18,21 @@ from rigkit.corners.saddle import Corners
 from rigkit.native import kernels
 from rigkit.native.growth import components_of
 
-__all__ = ["STEPS", "Lattice", "Sheet", "build_lattices"]
+__all__ = ["MANY", "STEPS", "Lattice", "Sheet", "build_lattices"]
 
 STEPS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
 """(column, row) of the four grid directions."""
 
 MAX_WALKS = 3
 """Links that contradict each other are cut, and the rest numbered again, so many times."""
+
+
+MANY = 200
+"""Lattices of so many corners are judged by a part of them before anything else is done with them."""
+
+BLOCKS = ((3, 3, 1), (2, 4, 0), (4, 2, 0))
+"""Rows, columns and missing corners of the least that shows a board: squares of random brightness that happen to
+alternate hang together in crooked chains."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -50,6 +58,15 @@ class Lattice:
     @property
     def count(self) -> int:
         return int(np.count_nonzero(self.known))
+
+    @property
+    def solid(self) -> bool:
+        """Whether it has all corners of BLOCKS rows and columns somewhere, or of a larger block all but one."""
+        known = self.known
+        return any(
+            bool((_block_sums(known, rows, columns) >= rows * columns - missing).any())
+            for rows, columns, missing in BLOCKS
+        )
 
     @property
     def size(self) -> tuple[int, int]:
@@ -108,6 +125,15 @@ class Lattice:
                 bool(signs.size and signs[0, 0] > 0),
             )
         return out
+
+
+def _block_sums(known: BoolArray, rows: int, columns: int) -> IntArray:
+    """Return how many of `known` (R, C) lie in the blocks of so many rows and columns."""
+    down, right = (max(n - size + 1, 0) for n, size in zip(known.shape, (rows, columns), strict=True))
+    total = np.zeros((down, right), np.int64)
+    for top, left in np.ndindex(rows, columns):
+        total += known[top : top + down, left : left + right]
+    return total
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray
+from rigkit.corners.nearby import near_any
 from rigkit.corners.response import FloatImage, Level, peaks
 from rigkit.corners.ring import read_rings, ring_rules
 from rigkit.native import front
@@ -103,14 +104,8 @@ def _without_known(fresh: Corners, known: list[Corners]) -> Corners:
     """Return those of `fresh` that no finer level has found already."""
     if not len(fresh) or not any(len(k) for k in known):
         return fresh
-    before, reach = np.concatenate([k.pixels for k in known]), KNOWN * float(fresh.scale[0])
-    library = front.loaded()
-    if library is not None:
-        new = ~front.near_any(library, fresh.pixels, before, reach)
-    else:
-        from scipy.spatial import cKDTree
-
-        new = cKDTree(before).query(fresh.pixels)[0] > reach
+    before = np.concatenate([k.pixels for k in known])
+    new = ~near_any(fresh.pixels, before, KNOWN * float(fresh.scale[0]))
     return Corners(fresh.pixels[new], fresh.angles[new], fresh.contrast[new], fresh.scale[new])
 
 

@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from rigkit.arrays import BoolArray, FloatArray
-from rigkit.corners.lattice import Lattice
+from rigkit.corners.lattice import MANY, Lattice
 from rigkit.corners.local_fit import fit_cells
+from rigkit.corners.nearby import near_any
+from rigkit.corners.response import Level, sample
 from rigkit.corners.subpixel import RefinedLattice
 
-__all__ = ["known_part", "large", "sample_of", "separate", "tidy", "trustworthy"]
+__all__ = ["compact", "known_part", "large", "leans", "sample_of", "separate", "tidy", "trustworthy"]
 
 STRAY_ROW = 2
 """An outer row of so many corners or fewer, most of whose other corners should be in view too, is not of the board."""
@@ -34,8 +37,26 @@ saturation or compression, 0.13 where a camera sharpens strongly, 0.175 in black
 MAX_LOST = 0.4
 """Largest part of a lattice's corners that the sub-pixel fit may refuse: beside what covers a board there are many."""
 
-MANY, SAMPLE = 200, 7
-"""Lattices of so many corners are judged by so many rows and columns before all of them are fitted."""
+LARGE_SAMPLE, SAMPLE, RAGGED = 7, 5, 0.75
+"""Rows and columns by which a lattice of many corners is judged, or a smaller one that fills less than this part of its
+rows and columns."""
+
+FEWEST_ROWS = 3
+"""Rows and columns of the smallest board."""
+
+MAX_UNEVEN = 0.5
+"""Typical difference of neighbouring steps, relative to the shorter: boards show at most 0.35, near the rim of a strong
+fisheye; the crossings of a cloth's stripes 0.7."""
+
+ASIDE = 0.12
+MAX_LEAN_DARK, MAX_LEAN_BRIGHT = 0.2, 0.3
+"""Halfway between two corners the edge lies between them, so its brightness is the mean of that ASIDE, in chords, to
+both sides; differences relative to the contrast. Lenses bend edges to the dark side as often as to the bright one;
+light that saturates moves them by 0.15 to 0.25 into the dark. Dots, threads and lines lean by 0.25 to 0.5."""
+
+NEARLY_FULL, BY_CHANCE = 0.9, 24
+"""A board of few corners has most of those between them, or somewhere a full block in so many squares: codes and
+mosaics have such blocks, too, but hardly one in 2^23 places."""
 
 MAX_EXTRA = 2
 """Rows and columns that may be too many, when a grid is larger than the board it may be."""
@@ -80,7 +101,7 @@ def _stray_row(lattice: Lattice, size_px: tuple[int, int]) -> BoolArray | None:
 
 def large(lattice: Lattice, least: int) -> bool:
     """Return whether `lattice` has `least` corners and, if that is to be a board (9), three rows and three columns."""
-    return lattice.count >= least and min(lattice.size) >= (3 if least >= 9 else 2)
+    return lattice.count >= least and min(lattice.size) >= (FEWEST_ROWS if least >= FEWEST_ROWS**2 else 2)
 
 
 def separate(lattices: Sequence[Lattice], least: int) -> list[Lattice]:
@@ -99,40 +120,90 @@ def separate(lattices: Sequence[Lattice], least: int) -> list[Lattice]:
 
 def _overlap(mine: FloatArray, theirs: FloatArray) -> bool:
     """Return whether more than one of the corners `mine` (N, 2) is among `theirs` (M, 2)."""
-    low, high = mine.min(axis=0) - SHARED_PX, mine.max(axis=0) + SHARED_PX
-    near = theirs[((theirs > low) & (theirs < high)).all(axis=1)]
-    if not len(near):
-        return False
-    gap = mine[:, None] - near
-    return bool(np.count_nonzero(((gap * gap).sum(axis=2) < SHARED_PX**2).any(axis=1)) > 1)
+    return bool(np.count_nonzero(near_any(mine, theirs, SHARED_PX)) > 1)
 
 
 def sample_of(lattice: Lattice) -> Lattice | None:
-    """Return the fullest block of SAMPLE rows and columns of a lattice that is much larger; None for smaller ones.
+    """Return the fullest block of some rows and columns of a lattice that is large or ragged; None for others.
 
-    A page of dots makes thousands of corners: a look at a few tells that they are none.
+    A page of dots makes thousands of corners, with many gaps: a look at a few tells that they are none.
     """
-    if lattice.count < MANY or min(lattice.size) < SAMPLE:
+    known = lattice.known
+    many = lattice.count >= MANY
+    side = LARGE_SAMPLE if many else SAMPLE
+    if min(known.shape) < side or (not many and (lattice.count < side**2 or known.mean() >= RAGGED)):
         return None
-    full = np.lib.stride_tricks.sliding_window_view(lattice.known, (SAMPLE, SAMPLE)).sum(axis=(2, 3))
+    full = sliding_window_view(known, (side, side)).sum(axis=(2, 3))
     row, column = (int(at) for at in np.unravel_index(full.argmax(), full.shape))
-    return lattice.cut(slice(row, row + SAMPLE), slice(column, column + SAMPLE))
+    return lattice.cut(slice(row, row + side), slice(column, column + side))
+
+
+def leans(lattice: Lattice, level: Level) -> bool:
+    """Return whether the edges of `lattice`, as `level` shows them, lie to one side of the corners that they join."""
+    pixels, signs = level.to_level(lattice.pixels), lattice.signs()
+    edges = [
+        (pixels[:, :-1], pixels[:, 1:], signs[:, :-1]),
+        (pixels[:-1], pixels[1:], -signs[:-1]),
+    ]
+    start, end, sign = (np.concatenate([e[k].reshape(-1, *e[k].shape[2:]) for e in edges]) for k in range(3))
+    there = np.isfinite(start[:, 0]) & np.isfinite(end[:, 0])
+    start, chord, sign = start[there], (end - start)[there], sign[there]
+    aside = (ASIDE * sign)[:, None] * np.stack([-chord[:, 1], chord[:, 0]], axis=-1)
+    middle = start + 0.5 * chord
+    dark, between, bright = sample(level.smooth, np.stack([middle - aside, middle, middle + aside]))
+    lean = float((between - 0.5 * (dark + bright)).sum()) / max(float((bright - dark).sum()), 1e-9)
+    return not -MAX_LEAN_DARK < lean < MAX_LEAN_BRIGHT
+
+
+def compact(lattice: Lattice, size_px: tuple[int, int]) -> bool:
+    """Return whether `lattice` is nearly full or has a full block as large as chance does not make.
+
+    Squares of random brightness that happen to alternate make crooked chains of corners; what covers a board, or the
+    frame of the image (`size_px` is its width and height), leaves blocks.
+    """
+    known = lattice.known
+    if known.mean() >= NEARLY_FULL:
+        return True
+    missing = fit_cells(lattice.pixels, ~known, degree=1)
+    full = known.copy()
+    full[~known] = ((missing.pixels < 0.0) | (missing.pixels > np.array(size_px) - 1.0)).any(axis=1)
+    rows, columns = full.shape
+    for high in range(2, rows + 1):
+        wide = max(2, -(-BY_CHANCE // (high + 1)) - 1)
+        if wide <= columns and sliding_window_view(full, (high, wide)).all(axis=(2, 3)).any():
+            return True
+    return False
 
 
 def trustworthy(refined: RefinedLattice, before: int, least: int) -> bool:
     """Return whether what the fit left of a lattice of `before` corners is a board."""
     lattice = refined.lattice
-    if lattice.count < max(least, (1.0 - MAX_LOST) * before) or min(lattice.size) < 3:
+    if lattice.count < max(least, (1.0 - MAX_LOST) * before) or min(lattice.size) < FEWEST_ROWS:
         return False
     known = lattice.known
     relative = refined.residual[known] / lattice.contrast[known]
     unexplained = relative**2 - (NOISE_LEVELS / lattice.contrast[known]) ** 2
     if _middle(relative) > MAX_RESIDUAL or _middle(unexplained) > MAX_UNEXPLAINED**2:
         return False
+    if _uneven(lattice):
+        return False
     shape = fit_cells(lattice.pixels, known, degree=1)
     area = shape.along_column[:, 0] * shape.along_row[:, 1] - shape.along_column[:, 1] * shape.along_row[:, 0]
     in_cells = refined.worst_sigma_px[known] / np.sqrt(np.maximum(area, 1e-6))
     return _middle(in_cells) < MAX_RELATIVE_SIGMA
+
+
+def _uneven(lattice: Lattice) -> bool:
+    """Return whether rows and columns follow each other at steps as different as no lens and no view makes them."""
+    for pixels in (lattice.pixels, lattice.pixels.swapaxes(0, 1)):
+        step = np.diff(pixels, axis=0)
+        length = np.hypot(step[..., 0], step[..., 1])
+        bend = np.diff(step, axis=0)
+        relative = np.hypot(bend[..., 0], bend[..., 1]) / np.minimum(length[1:], length[:-1])
+        relative = relative[np.isfinite(relative)]
+        if len(relative) and _middle(relative) > MAX_UNEVEN:
+            return True
+    return False
 
 
 def _middle(values: FloatArray) -> float:

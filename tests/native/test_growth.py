@@ -72,7 +72,7 @@ def test_growth_of_rendered_boards(lens: str, rng: np.random.Generator, monkeypa
     def grown_from_squares() -> tuple[list[lattice.Lattice], list[lattice.Lattice]]:
         found = list(lattice.build_lattices(corners, links))
         seeds = [item.cut(*one_square) for item in found if min(item.size) > 4]
-        return found, grow.grow_all(seeds, grow.SaddleIndex(saddles), levels[0])
+        return found, grow.grow_all(seeds, grow.SaddleIndex(saddles), levels[0], lambda _: True)
 
     compiled = grown_from_squares()
     without_kernels(monkeypatch)
