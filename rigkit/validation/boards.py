@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, IntArray, Mat3, Normals, Points
+from rigkit.arrays import FloatArray, IntArray, Mat3, Normals, Points
 from rigkit.boards import Board
 from rigkit.errors import DegenerateError
 from rigkit.truth import Feature
-from rigkit.validation.planes import NormalErrors, Plane, fit_plane, normal_errors
+from rigkit.validation.planes import NormalErrors, Plane, fit_moved, fit_plane, normal_errors
 
 __all__ = ["BoardResult", "Lattice", "fit_lattice", "measure_board"]
 
@@ -90,17 +90,18 @@ def measure_board(
     normals: Normals,
     grid: IntArray,
     covariance_mm2: FloatArray | None = None,
-    used: BoolArray | None = None,
+    common_mm: FloatArray | None = None,
+    like: Plane | None = None,
 ) -> BoardResult:
     """Return plane, lattice and normal errors of one board's points (N, 3), normals (N, 3) and grid (N, 2).
 
-    Gross outliers (see `fit_plane`) take no part in plane and lattice; all normals are judged. `used` (N,) says which
-    points are none, where that was decided before.
+    `covariance_mm2` and `common_mm` as in `fit_plane`; with `like`, the points are those of that plane, moved a little.
+    Points that the plane leaves out take no part in the lattice either; all normals are judged.
 
     Raises DegenerateError where too few corners are left; the message names the board.
     """
     try:
-        plane = fit_plane(points_mm, covariance_mm2, used)
+        plane = fit_plane(points_mm, covariance_mm2, common_mm) if like is None else fit_moved(points_mm, like)
         lattice = fit_lattice(points_mm[plane.used], grid[plane.used])
     except DegenerateError as error:
         raise DegenerateError(f"board '{board.board_id}': {error}") from error

@@ -224,7 +224,7 @@ def validate(
 
 
 def _outlier_notes(boards: Iterable[BoardResult]) -> list[str]:
-    lost = {b.board.board_id: int((~b.plane.used).sum()) for b in boards}
+    lost = {b.board.board_id: b.plane.gross for b in boards}
     return [
         f"board '{name}': {count} corners lie far off its plane and were left out of it; is something in front of it?"
         for name, count in lost.items()

@@ -47,7 +47,9 @@ def colmap_reconstruction(reconstruction: Reconstruction, pair: ColmapPair, resu
         return metric
     # t = s u: its direction moves with the pose, its length with the scale that this pose gives to the squares.
     across = np.diag([1.0] * 3 + [scale] * 3) @ result.adjusted_covariance @ np.diag([1.0] * 3 + [scale] * 3)
-    slope = np.array([np.sum(by_point * motion) / (scale * step) for motion, step in points_by_pose(metric)])
+    # A point without a triangulation takes no part.
+    moves = [(np.nan_to_num(motion), step) for motion, step in points_by_pose(metric)]
+    slope = np.array([np.sum(by_point * motion) / (scale * step) for motion, step in moves])
     along = np.eye(6)
     along[3:] += np.outer(result.adjusted.translation_mm, slope)
     covariance = along @ across @ along.T * variance

@@ -30,10 +30,22 @@ NEGLIGIBLE = 1e-12
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CalibrationShifts:
-    """A reconstruction estimated again with the calibrations as they are, and moved along each principal axis."""
+    """A reconstruction estimated again with the calibrations as they are, and moved along each principal axis.
+
+    `known` (N,) are the points that could be triangulated with all of these cameras. The others stay where they were,
+    and how well they are known is not known: corners at the rim of the field, and beside the epipoles.
+    """
 
     base: Reconstruction
     moved: tuple[Reconstruction, ...]
+    known: BoolArray
+
+    def points(self) -> FloatArray:
+        """Return how the points move along each axis (K, N, 3), mm; NaN where that is not known."""
+        moves = np.array([moved.cloud.points_mm - self.base.cloud.points_mm for moved in self.moved])
+        moves = moves.reshape(-1, len(self.known), 3)
+        moves[:, ~self.known] = np.nan
+        return moves
 
     def variance(self, quantity: Callable[[Reconstruction], float]) -> float:
         """Return the variance of a quantity from the calibrations' uncertainty."""
@@ -73,8 +85,9 @@ def calibration_shifts(
             for camera, pixels in zip(both, (reconstruction.pixels1, reconstruction.pixels2), strict=True)
         ]
     )
-    base, *moved = (_again(reconstruction, *both, level_sigma_rad, seen) for both in cameras)
-    return CalibrationShifts(base, tuple(moved))
+    again = [_again(reconstruction, *both, level_sigma_rad, seen) for both in cameras]
+    base, *moved = (estimated for estimated, _ in again)
+    return CalibrationShifts(base, tuple(moved), np.logical_and.reduce([found for _, found in again]))
 
 
 def principal_axes(covariance: FloatArray) -> FloatArray:
@@ -88,8 +101,11 @@ def principal_axes(covariance: FloatArray) -> FloatArray:
 
 def _again(
     reconstruction: Reconstruction, camera1: Camera, camera2: Camera, level_sigma_rad: float | None, seen: BoolArray
-) -> Reconstruction:
-    """Estimate pose, scale and points again from the corners `seen`; the others, and all normals, stay."""
+) -> tuple[Reconstruction, BoolArray]:
+    """Estimate pose, scale and points again from the corners `seen`, and say which points (N,) could be.
+
+    The other points, and all normals, stay.
+    """
     known = reconstruction.matches.select(seen)
     matches = Matches.from_cameras(
         camera1,
@@ -107,10 +123,11 @@ def _again(
     points, covariance, valid = triangulate_matches(matches, refined.cam2_from_cam1)
     scale, _ = metric_scale(points, matches.board_index, matches.grid, reconstruction.boards, covariance)
     cloud = reconstruction.cloud
-    found = np.flatnonzero(seen)[valid]
+    found = np.zeros(len(seen), dtype=bool)
+    found[np.flatnonzero(seen)[valid]] = True
     again = np.array(cloud.points_mm)
     again[found] = scale * points[valid]
-    return replace(
+    estimated = replace(
         reconstruction,
         camera1=camera1,
         camera2=camera2,
@@ -119,3 +136,4 @@ def _again(
         cloud=replace(cloud, points_mm=again),
         baseline_mm=scale,
     )
+    return estimated, found

@@ -1,14 +1,15 @@
 """Angles and distances of a reconstruction, with their standard deviations.
 
-The corners' own scatter about plane and lattice is observed. The relative pose moves all points together, which no
-scatter shows: its covariance is carried through triangulation by central differences. Both parts are independent,
-because the residuals that fix the pose are orthogonal to those that fix the points. The calibrations' uncertainty is
-the third part, where they come with their covariances; else intrinsics are taken as exact.
+The corners' own scatter about plane and lattice is observed. The relative pose moves all points together: its
+covariance is carried through triangulation by central differences. Both parts are independent, because the residuals
+that fix the pose are orthogonal to those that fix the points. The calibrations' uncertainty is the third part, where
+they come with their covariances; else intrinsics are taken as exact. What pose and calibrations bend of a plane is
+counted with them, not with the scatter.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +21,7 @@ from rigkit.geometry.triangulation import point_covariances, triangulate_rays
 from rigkit.reconstruct import Reconstruction
 from rigkit.truth import MeasuredDistance
 from rigkit.validation.boards import BoardResult, measure_board
-from rigkit.validation.intrinsics import CalibrationShifts
+from rigkit.validation.intrinsics import CalibrationShifts, principal_axes
 from rigkit.validation.planes import angle_jacobian, face_angle
 
 __all__ = ["Measured", "measure", "points_by_pose"]
@@ -95,7 +96,7 @@ def measure(reconstruction: Reconstruction, shifts: CalibrationShifts | None = N
     rays1, _ = reconstruction.camera1.unproject(reconstruction.pixels1)
     rays2, _ = reconstruction.camera2.unproject(reconstruction.pixels2)
     # Only the ratios of these covariances count, as weights across the plane: one pixel is as good a sigma as any.
-    covariances = point_covariances(
+    covariance = point_covariances(
         cloud.points_mm,
         reconstruction.cam2_from_cam1,
         rays1,
@@ -103,7 +104,9 @@ def measure(reconstruction: Reconstruction, shifts: CalibrationShifts | None = N
         reconstruction.camera1.ray_jacobian(reconstruction.pixels1),
         reconstruction.camera2.ray_jacobian(reconstruction.pixels2),
     )
-    usable = bool(np.isfinite(covariances).all())
+    usable = bool(np.isfinite(covariance).all())
+    by_pose = () if reconstruction.pose_covariance is None else points_by_pose(reconstruction)
+    common = _common_moves(reconstruction, by_pose, shifts)
 
     def boards_of(points: Points, as_in: Boards | None = None) -> Boards:
         out: Boards = {}
@@ -115,19 +118,17 @@ def measure(reconstruction: Reconstruction, shifts: CalibrationShifts | None = N
                     points[on],
                     cloud.normals[on],
                     cloud.grid[on],
-                    covariances[on] if usable else None,
-                    None if as_in is None else as_in[board.board_id].plane.used,
+                    covariance[on] if usable else None,
+                    common[:, on],
+                    None if as_in is None else as_in[board.board_id].plane,
                 )
         return out
 
     found = boards_of(cloud.points_mm)
-
-    shaken: list[tuple[Boards, Boards, float]] = []
-    if reconstruction.pose_covariance is not None:
-        for motion, step in points_by_pose(reconstruction):
-            shaken.append(
-                (boards_of(cloud.points_mm + motion, found), boards_of(cloud.points_mm - motion, found), step)
-            )
+    shaken = [
+        (boards_of(cloud.points_mm + motion, found), boards_of(cloud.points_mm - motion, found), step)
+        for motion, step in by_pose
+    ]
     shifted = () if shifts is None else (shifts.base, *shifts.moved)
     return Measured(
         found,
@@ -141,7 +142,7 @@ def points_by_pose(reconstruction: Reconstruction) -> tuple[tuple[FloatArray, fl
     """Return for each of the six pose parameters how the points move (N, 3) mm for a small step, and the step.
 
     Parameters are those of `Reconstruction.pose_covariance`: left rotation perturbation (rad), translation (mm). The
-    points are triangulated again from the same corners. A point that has no triangulation does not move.
+    points are triangulated again from the same corners. A point that has no triangulation moves by NaN.
     """
     camera1, camera2 = reconstruction.camera1, reconstruction.camera2
     rays1, _ = camera1.unproject(reconstruction.pixels1)
@@ -159,8 +160,21 @@ def points_by_pose(reconstruction: Reconstruction) -> tuple[tuple[FloatArray, fl
             found, _ = triangulate_rays(rays1, rays2, shifted, jacobians1=jacobians[0], jacobians2=jacobians[1])
             return found
 
-        out.append((np.nan_to_num(0.5 * (points(1.0) - points(-1.0))), step))
+        out.append((0.5 * (points(1.0) - points(-1.0)), step))
     return tuple(out)
+
+
+def _common_moves(
+    reconstruction: Reconstruction, by_pose: Sequence[tuple[FloatArray, float]], shifts: CalibrationShifts | None
+) -> FloatArray:
+    """Return how the points move (K, N, 3), mm, for one sigma of each independent error that they share."""
+    moves = [np.zeros((0, len(reconstruction.cloud), 3))]
+    if reconstruction.pose_covariance is not None:
+        slopes = np.array([motion / step for motion, step in by_pose])
+        moves.append(np.einsum("kp,pni->kni", principal_axes(reconstruction.pose_covariance), slopes))
+    if shifts is not None:
+        moves.append(shifts.points())
+    return np.concatenate(moves)
 
 
 def _distance(boards: Boards, distance: MeasuredDistance) -> float:
@@ -182,9 +196,7 @@ def _distance_scatter(boards: Boards, distance: MeasuredDistance) -> float:
     point, covariance = boards[a.board_id].feature(a)
     if b.is_plane:
         plane = boards[b.board_id].plane
-        across = float(plane.normal @ covariance @ plane.normal)
-        arm = point - plane.centroid_mm
-        return across + float(arm @ plane.normal_covariance @ arm) + plane.rms_mm**2 / plane.count
+        return float(plane.normal @ covariance @ plane.normal) + plane.variance_at(point)
     other, covariance_other = boards[b.board_id].feature(b)
     if a.board_id == b.board_id:
         lattice, result = boards[a.board_id].lattice, boards[a.board_id]

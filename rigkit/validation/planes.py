@@ -4,11 +4,14 @@ A plane is n . x = offset with a unit normal that faces the camera at the origin
 uncertainty across the plane is known, the fit is repeated with those weights, and points that lie far off in spite of
 it (the edge of something in front of a board, taken for a corner) are left out: Open3D's RANSAC finds the plane of the
 others.
+
+A point is uncertain by its own noise, and by errors that it shares with all others: those of the pose and of the
+calibrations. What these do to the whole plane is no reason to trust a point less, but what they bend it by is.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,14 +20,18 @@ from rigkit.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import angle_between
 from rigkit.interop.open3d import mean_and_covariance, plane_inliers
 
-__all__ = ["NormalErrors", "Plane", "angle_jacobian", "face_angle", "fit_plane", "normal_errors"]
+__all__ = ["NormalErrors", "Plane", "angle_jacobian", "face_angle", "fit_moved", "fit_plane", "normal_errors"]
 
 MIN_POINTS = 4
 """Three points always lie in a plane and say nothing about how flat it is."""
 MIN_WIDTH = 1e-3
 """Points whose second principal extent is below this part of the first lie on a line: the plane could turn about it."""
 GROSS = 8.0
-"""A point this many robust standard deviations off is no corner of the board: chance never does that."""
+"""A point this many standard deviations off, noise and bending together, is no corner of the board: chance never does
+that."""
+VAGUE = 8.0
+"""A point this many times as uncertain as the middle one of its board has a sixty-fourth of its say. Nothing is lost
+without it, and beside an epipole errors are so large that they are no longer linear: nobody knows its true variance."""
 TO_SIGMA = 1.4826
 """From the median of absolute values to the standard deviation of a Gaussian."""
 ROUNDING = 1e-9
@@ -33,6 +40,10 @@ RANSAC_ROUNDS = 2
 """The first takes its distance from the scatter about the tilted plane, the second from that about the common one."""
 RANSAC_ITERATIONS = 60
 """With a third of the points bad, no good sample of three is found once in a billion."""
+WEIGHT_ROUNDS = 3
+"""Weights follow from the plane and the plane from the weights: a third round changes nothing that shows."""
+NEWTON_STEPS, NEWTON_TOLERANCE = 100, 1e-10
+"""Until it is near, a step doubles the noise's variance at least; then convergence is quadratic."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -46,8 +57,13 @@ class Plane:
     centroid_mm : (3,) weighted mean of the points.
     rms_mm, peak_mm : root mean square and largest distance of the points from the plane: flatness.
     count : how many points it goes through.
-    normal_covariance : (3, 3) rad^2, of the normal's tilt from the points' independent scatter; rank 2.
-    used : (N,) which of the points given; the others are gross outliers, and part of no figure here.
+    tangents : (3, 2) unit vectors along the plane.
+    scatter : (3, 3) covariance of the plane's height at the centroid (mm) and of its slopes along the tangents (rad),
+        from the points' independent noise alone.
+    weights : (count,) of the points, summing to one.
+    noise_mm2 : (count,) variance of each point across the plane, from its own noise as observed.
+    used : (N,) which of the points given; the others are part of no figure here.
+    gross : how many of those are gross outliers; of the rest it is not known where they are.
     """
 
     normal: FloatArray
@@ -56,12 +72,26 @@ class Plane:
     rms_mm: float
     peak_mm: float
     count: int
-    normal_covariance: Mat3
+    tangents: FloatArray
+    scatter: Mat3
+    weights: FloatArray
+    noise_mm2: FloatArray
     used: BoolArray
+    gross: int = 0
 
     def distances(self, points: Points) -> FloatArray:
         """Return the signed distances (...) of points (..., 3) in mm, positive on the camera's side."""
         return np.asarray(np.asarray(points) @ self.normal - self.offset_mm)
+
+    def variance_at(self, point: FloatArray) -> float:
+        """Return the variance (mm^2) of where the plane passes a point (3,), from the noise alone."""
+        row = np.array([1.0, *((point - self.centroid_mm) @ self.tangents)])
+        return float(row @ self.scatter @ row)
+
+    @property
+    def normal_covariance(self) -> Mat3:
+        """(3, 3) rad^2, of the normal's tilt from the points' independent noise; rank 2."""
+        return np.asarray(self.tangents @ self.scatter[1:, 1:] @ self.tangents.T)
 
     @property
     def sigma_rad(self) -> float:
@@ -81,16 +111,18 @@ class NormalErrors:
     count: int
 
 
-def fit_plane(points_mm: Points, covariance_mm2: FloatArray | None = None, used: BoolArray | None = None) -> Plane:
+def fit_plane(
+    points_mm: Points, covariance_mm2: FloatArray | None = None, common_mm: FloatArray | None = None
+) -> Plane:
     """Return the plane through points (N, 3) in the frame of camera 1.
 
     Parameters
     ----------
     points_mm : (N, 3)
-    covariance_mm2 : (N, 3, 3) of each point, or None. Only what lies across the plane matters: weights are
-        1 / (n^T C n), with n from the unweighted fit. They are used as weights only: the normal's covariance is built
-        on the scatter that is observed. Without them all points count, as far off as they may be.
-    used : (N,) the points to fit, where that was decided before; None: all but gross outliers.
+    covariance_mm2 : (N, 3, 3) of each point's own noise, or None. Only what lies across the plane matters, and only the
+        ratios: how large the noise is, the observed scatter tells. Without it all points count, as far off as they are.
+    common_mm : (K, N, 3) how the points move for one standard deviation of each of K independent errors that they share
+        (pose, calibrations), or None: there are none. A point with NaN is left out: how far off it is, nobody knows.
 
     Raises
     ------
@@ -99,37 +131,125 @@ def fit_plane(points_mm: Points, covariance_mm2: FloatArray | None = None, used:
 
     Notes
     -----
-    With eigenvalues l1 >= l2 >= l3 and eigenvectors t1, t2, n of the weighted covariance, a residual e_k across the
-    plane tilts the normal by -sum_k w_k e_k (t_i . (x_k - c)) / l_i about the other axis: the tilt's covariance is
-    s^2 (t1 t1^T / l1 + t2 t2^T / l2) / N_w with s^2 = sum w e^2 N / (N - 3), weights summing to one.
+    Weights are 1 / (s^2 n^T C_k n + sum b^2): s^2 scales the noise to what is observed, and b is what the weighted fit
+    does not follow of each common move. A plane's heights and slopes are T e, with e the residuals across it,
+    T = (A^T W A)^-1 A^T W and rows (1, t1 . (x_k - c), t2 . (x_k - c)) of A. Their covariance from the noise is
+    T diag(s^2 n^T C_k n) T^T; their error from what is common is T times the moves: see `fit_moved`.
     """
     points = as_array(points_mm, (None, 3), "points_mm")
-    covariance = None if covariance_mm2 is None else np.asarray(covariance_mm2, dtype=np.float64)
-    if used is None:
-        used = np.ones(len(points), dtype=bool)
-        if covariance is not None and len(points) > 2 * MIN_POINTS:
-            used = _not_gross(points, covariance)
-    centroid, values, vectors, weights = _principal(points[used], None if covariance is None else covariance[used])
-    return _plane(points[used], centroid, values, vectors, weights, used)
+    common = np.zeros((0, *points.shape)) if common_mm is None else np.asarray(common_mm, dtype=np.float64)
+    used = np.array(np.isfinite(common).all(axis=(0, 2)), dtype=bool)
+    if covariance_mm2 is None:
+        return _plane(points[used], np.full(int(used.sum()), 1.0 / max(used.sum(), 1)), None, used)
+    covariance = np.asarray(covariance_mm2, dtype=np.float64)
+    gross = 0
+    if used.sum() > 2 * MIN_POINTS:
+        near, telling = _judged(points[used], covariance[used], common[:, used])
+        gross = int((~near).sum())
+        used[used] = near & telling
+    weights, noise = _weights(points[used], covariance[used], common[:, used])
+    return replace(_plane(points[used], weights, noise, used), gross=gross)
 
 
-def _principal(points: Points, covariance: FloatArray | None) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return centroid, eigenvalues (rising) and eigenvectors of the (weighted) scatter, and the weights (N,)."""
+def fit_moved(points_mm: Points, like: Plane) -> Plane:
+    """Return the plane of points (N, 3) that moved a little since `like` was fitted to them, with its weights."""
+    moved = _plane(np.asarray(points_mm)[like.used], like.weights, like.noise_mm2, like.used)
+    return replace(moved, gross=like.gross)
+
+
+def _principal(points: Points, weights: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+    """Return centroid and principal axes (columns, the normal first) of points that have `weights` summing to one."""
     n = len(points)
     if n < MIN_POINTS:
         raise DegenerateError(f"plane: {n} points; at least {MIN_POINTS} are needed to fit one and judge it")
-    centroid, scatter = mean_and_covariance(points)
-    values, vectors = np.linalg.eigh(scatter)
-    weights = np.full(n, 1.0 / n)
-    if covariance is not None:
-        weights = 1.0 / _variance_across(vectors[:, 0], covariance)
-        weights /= weights.sum()
+    if weights is None:
+        centroid, scatter = mean_and_covariance(points)
+    else:
         centroid = weights @ points
         offsets = points - centroid
-        values, vectors = np.linalg.eigh(np.einsum("n,ni,nj->ij", weights, offsets, offsets))
+        scatter = np.einsum("n,ni,nj->ij", weights, offsets, offsets)
+    values, axes = np.linalg.eigh(scatter)
     if values[1] < MIN_WIDTH**2 * values[2]:
         raise DegenerateError(f"plane: its {n} points lie on a line; more of the board must be seen")
-    return centroid, values, vectors, weights
+    return centroid, axes
+
+
+def _weights(points: Points, covariance: FloatArray, common: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the points' weights, summing to one, and the variance of each across the plane from its noise, mm^2."""
+    centroid, axes = _principal(points)
+    # A point that the common errors move far would pull the first plane to itself, and look unmoved from there: so the
+    # whole move counts in the first round.
+    weights = np.zeros(len(points))
+    for _ in range(WEIGHT_ROUNDS):
+        seen = _Across.of(points, covariance, common, centroid, axes)
+        noise = seen.noise_variance() * seen.variance
+        weights = 1.0 / (noise + np.sum(seen.bending(weights) ** 2, axis=1))
+        weights /= weights.sum()
+        centroid, axes = _principal(points, weights)
+    return weights, noise
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Across:
+    """What is seen of points across a plane near theirs.
+
+    Attributes
+    ----------
+    residuals : (N,) mm.
+    variance : (N,) mm^2, of their noise as it was given.
+    design : (N, 3) rows (1, t1 . (x - c), t2 . (x - c)).
+    common : (N, K) mm, the common moves.
+    floor_mm : rounding.
+    """
+
+    residuals: FloatArray
+    variance: FloatArray
+    design: FloatArray
+    common: FloatArray
+    floor_mm: float
+
+    @classmethod
+    def of(
+        cls, points: Points, covariance: FloatArray, common: FloatArray, centroid: FloatArray, axes: FloatArray
+    ) -> _Across:
+        offsets = points - centroid
+        return cls(
+            offsets @ axes[:, 0],
+            _variance_across(axes[:, 0], covariance),
+            np.concatenate([np.ones((len(points), 1)), offsets @ axes[:, 1:]], axis=1),
+            (common @ axes[:, 0]).T,
+            ROUNDING * float(np.linalg.norm(centroid)),
+        )
+
+    def bending(self, weights: FloatArray) -> FloatArray:
+        """Return what a fit with these weights (N,) leaves of the common moves, (N, K) mm; all if they are zero."""
+        root = np.sqrt(weights)[:, None]
+        follows, *_ = np.linalg.lstsq(root * self.design, root * self.common, rcond=None)
+        return np.asarray(self.common - self.design @ follows)
+
+    def noise_variance(self) -> float:
+        """Return s^2: of the noise alone, in units of `variance`; what is common bends the points, but is no noise.
+
+        Divided by the root of `variance`, the residuals have the covariance V = s^2 1 + H H^T. s^2 is that at which
+        e^T V^-1 e, in the space that no plane follows, has its expectation.
+        """
+        sigma = np.sqrt(self.variance)
+        basis, _ = np.linalg.qr(self.design / sigma[:, None])
+        both = np.concatenate([self.residuals[:, None], self.common], axis=1) / sigma[:, None]
+        both -= basis @ (basis.T @ both)
+        modes, sizes, _ = np.linalg.svd(both[:, 1:], full_matrices=False)
+        along, free = (modes.T @ both[:, 0]) ** 2, len(both) - 3
+        rest = max(float(both[:, 0] @ both[:, 0] - along.sum()), 0.0)
+        # rest / s^2 + sum along / (s^2 + sizes^2) = free. The left side falls and is convex: Newton's steps from below
+        # the root stay below. Where the common errors can explain everything, there is no rest.
+        variance = max(rest / free, float(np.mean(self.floor_mm / sigma)) ** 2)
+        for _ in range(NEWTON_STEPS):
+            spread = variance + sizes**2
+            excess = rest / variance + float(np.sum(along / spread)) - free
+            if excess <= NEWTON_TOLERANCE * free:
+                break
+            variance += excess / (rest / variance**2 + float(np.sum(along / spread**2)))
+        return variance
 
 
 def _variance_across(normal: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -139,47 +259,49 @@ def _variance_across(normal: FloatArray, covariance: FloatArray) -> FloatArray:
     return np.asarray(variance)
 
 
-def _not_gross(points: Points, covariance: FloatArray) -> BoolArray:
-    """Return which points are no gross outliers, (N,).
+def _judged(points: Points, covariance: FloatArray, common: FloatArray) -> tuple[BoolArray, BoolArray]:
+    """Return which points are no gross outliers (N,), and which are certain enough to tell something (N,).
 
-    Outliers tilt the plane that they would be judged by: they are judged by one that most points share.
+    Outliers tilt the plane that they would be judged by: they are judged by one that most points share. How far what is
+    common bends the points away from that plane is no evidence against them.
     """
-    centroid, _, vectors, _ = _principal(points, covariance)
-    sigma = np.sqrt(_variance_across(vectors[:, 0], covariance))
+    centroid, axes = _principal(points)
     floor = ROUNDING * float(np.linalg.norm(centroid))
     for _ in range(RANSAC_ROUNDS):
-        off = np.abs((points - centroid) @ vectors[:, 0])
+        off = np.abs((points - centroid) @ axes[:, 0])
         near = 2.0 * TO_SIGMA * float(np.median(off)) + floor
-        common = plane_inliers(points, near, iterations=RANSAC_ITERATIONS)
-        centroid, _, vectors, _ = _principal(points[common], covariance[common])
-    off = np.abs((points - centroid) @ vectors[:, 0])
-    scatter = TO_SIGMA * float(np.median(off / sigma))
-    return np.asarray(off <= GROSS * scatter * sigma + floor)
+        shared = plane_inliers(points, near, iterations=RANSAC_ITERATIONS)
+        weights = np.zeros(len(points))
+        weights[shared], _ = _weights(points[shared], covariance[shared], common[:, shared])
+        centroid, axes = _principal(points, weights)
+    seen = _Across.of(points, covariance, common, centroid, axes)
+    off = np.abs(seen.residuals)
+    scatter = TO_SIGMA * float(np.median(off / np.sqrt(seen.variance)))
+    expected = np.sqrt(scatter**2 * seen.variance + np.sum(seen.bending(weights) ** 2, axis=1))
+    return np.asarray(off <= GROSS * expected + floor), np.asarray(expected <= VAGUE * np.median(expected))
 
 
-def _plane(
-    points: Points,
-    centroid: FloatArray,
-    values: FloatArray,
-    vectors: FloatArray,
-    weights: FloatArray,
-    used: BoolArray,
-) -> Plane:
-    n = len(points)
-    normal = vectors[:, 0] if vectors[:, 0] @ centroid < 0.0 else -vectors[:, 0]
+def _plane(points: Points, weights: FloatArray, noise_mm2: FloatArray | None, used: BoolArray) -> Plane:
+    """Return the plane of points with weights; their noise is estimated, equal for all, where it is not given."""
+    equal = noise_mm2 is None
+    centroid, axes = _principal(points, None if equal else weights)
+    normal = axes[:, 0] if axes[:, 0] @ centroid < 0.0 else -axes[:, 0]
     residuals = (points - centroid) @ normal
-    tilts = (points - centroid) @ vectors[:, 1:] / values[1:] * weights[:, None]
-    # Residual variance of a point is taken as inverse to its weight, scaled to what was observed.
-    unit_variance = float(np.sum(weights * residuals**2) * n / (n - 3))
-    spread = unit_variance * np.einsum("ni,n,nj->ij", tilts, 1.0 / (weights * n), tilts)
+    if noise_mm2 is None:
+        noise_mm2 = np.full(len(points), residuals @ residuals / (len(points) - 3))
+    design = np.concatenate([np.ones((len(points), 1)), (points - centroid) @ axes[:, 1:]], axis=1)
+    operator = np.linalg.solve((design.T * weights) @ design, design.T * weights)
     return Plane(
         normal,
         float(normal @ centroid),
         centroid,
         float(np.sqrt(np.mean(residuals**2))),
         float(np.abs(residuals).max()),
-        n,
-        vectors[:, 1:] @ spread @ vectors[:, 1:].T,
+        len(points),
+        axes[:, 1:],
+        operator * noise_mm2 @ operator.T,
+        weights,
+        noise_mm2,
         used,
     )
 

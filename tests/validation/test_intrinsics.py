@@ -69,6 +69,7 @@ def test_the_share_is_in_every_sigma_of_the_report(rng: np.random.Generator) -> 
     shifts = calibration_shifts(made, covariance_of(made.camera1, rng))
     plain, honest = validate(made, truth), validate(made, truth, shifts=shifts)
     for a, b in zip(plain.checks, honest.checks, strict=True):
-        assert a.ours == b.ours
+        # Weights differ, exact points do not.
+        assert a.ours == pytest.approx(b.ours, abs=1e-9)
         assert b.our_sigma > a.our_sigma + 1e-6
     assert honest.baseline_sigma_mm == honest.check("baseline").our_sigma

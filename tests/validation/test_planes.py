@@ -11,7 +11,7 @@ from rigkit.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import angle_between, exp_so3
 from rigkit.interop.open3d import mean_and_covariance, plane_inliers, to_open3d
 from rigkit.validation.boards import fit_lattice, measure_board
-from rigkit.validation.planes import face_angle, fit_plane, normal_errors
+from rigkit.validation.planes import face_angle, fit_moved, fit_plane, normal_errors
 
 EXACT_RAD = 1e-9
 """PCA of exact points at 1.5 m: rounding only."""
@@ -185,3 +185,86 @@ def test_ordinary_scatter_loses_no_corner(rng: np.random.Generator) -> None:
         for _ in range(200):
             noisy = points + (scatter * rng.normal(size=48) * sigma)[:, None] * normal
             assert fit_plane(noisy, covariance).used.all()
+
+
+def bend(count: int, strength: float) -> np.ndarray:
+    """How shared errors move the board's points across it (count, 48), mm: a twist, and one that grows to a side."""
+    x, y = (BOARDS[0].grid() / np.array([7.0, 5.0]) * 2.0 - 1.0).T
+    return strength * np.stack([x * y, np.exp(4.0 * (x - 1.0)) * 10.0])[:count]
+
+
+def test_what_shared_errors_bend_is_neither_noise_nor_gross(rng: np.random.Generator) -> None:
+    """Errors of pose and calibration fifty times the noise: no corner is lost, and the noise is told from them."""
+    points, normal = board_points()
+    moves = bend(2, 1.0)
+    common = moves[:, :, None] * normal
+    covariance = np.tile(np.eye(3), (48, 1, 1))
+    noise = []
+    for _ in range(300):
+        shared = rng.normal(size=2) @ moves
+        plane = fit_plane(points + (shared + 0.2 * rng.normal(size=48))[:, None] * normal, covariance, common)
+        assert plane.gross == 0
+        noise.append(plane.noise_mm2.mean())
+    # 43 degrees of freedom in 300 draws: 1.2 %.
+    assert np.mean(noise) == pytest.approx(0.2**2, rel=0.04)
+
+
+def test_a_gross_outlier_is_one_beside_shared_errors(rng: np.random.Generator) -> None:
+    points, normal = board_points()
+    moves = bend(1, 0.5)
+    spoiled = points + (rng.normal(size=1) @ moves + 0.1 * rng.normal(size=48))[:, None] * normal
+    spoiled[[16, 17]] += 25.0 * normal
+    plane = fit_plane(spoiled, np.tile(np.eye(3), (48, 1, 1)), moves[:, :, None] * normal)
+    assert plane.gross == 2
+    assert (np.flatnonzero(~plane.used) == [16, 17]).all()
+
+
+def test_points_that_shared_errors_move_far_pull_less(rng: np.random.Generator) -> None:
+    """Beside an epipole some corners are off by millimetres, all of a board in the same way."""
+    points, normal = board_points()
+    moves = bend(2, 0.5)
+    common, covariance = moves[:, :, None] * normal, np.tile(np.eye(3), (48, 1, 1))
+    tilts = {"told": [], "untold": []}
+    for _ in range(200):
+        off = points + (rng.normal(size=2) @ moves + 0.05 * rng.normal(size=48))[:, None] * normal
+        tilts["told"].append(angle_between(fit_plane(off, covariance, common).normal, normal))
+        tilts["untold"].append(angle_between(fit_plane(off, covariance).normal, normal))
+    told, untold = (np.sqrt(np.mean(np.square(tilts[name]))) for name in ("told", "untold"))
+    assert told < 0.4 * untold
+
+
+def test_points_that_nobody_can_place_are_left_out_without_a_word(rng: np.random.Generator) -> None:
+    points, normal = board_points()
+    noisy = points + 0.1 * rng.normal(size=48)[:, None] * normal
+    common = np.zeros((2, 48, 3))
+    common[0, 47] = np.nan
+    common[1, 40] = 30.0 * normal
+    plane = fit_plane(noisy, np.tile(np.eye(3), (48, 1, 1)), common)
+    assert (np.flatnonzero(~plane.used) == [40, 47]).all()
+    assert plane.gross == 0
+
+
+def test_moved_points_are_fitted_with_the_same_weights(rng: np.random.Generator) -> None:
+    """Moving the points by a plane tilts the plane by it, and gross outliers stay out."""
+    points, normal = board_points()
+    sigma = np.linspace(0.1, 0.4, 48)
+    noisy = points + (rng.normal(size=48) * sigma)[:, None] * normal
+    noisy[5] += 40.0 * normal
+    plane = fit_plane(noisy, sigma[:, None, None] ** 2 * np.eye(3))
+    slope = np.array([2e-5, -1e-5])
+    heights = 0.3 + (noisy - plane.centroid_mm) @ plane.tangents @ slope
+    moved = fit_moved(noisy + heights[:, None] * plane.normal, plane)
+    assert not moved.used[5]
+    np.testing.assert_allclose(moved.normal - plane.normal, -plane.tangents @ slope, atol=1e-9)
+    assert moved.offset_mm == pytest.approx(plane.offset_mm + 0.3, abs=0.02)
+
+
+def test_where_the_plane_passes_a_point_is_as_uncertain_as_observed(rng: np.random.Generator) -> None:
+    points, normal = board_points()
+    sigma = np.linspace(0.1, 0.5, 48)
+    covariance = sigma[:, None, None] ** 2 * np.eye(3)
+    place = points[40] + 30.0 * (points[47] - points[46]) / 50.0
+    planes = [fit_plane(points + (rng.normal(size=48) * sigma)[:, None] * normal, covariance) for _ in range(1000)]
+    observed = np.sqrt(np.mean([p.distances(place) ** 2 for p in planes]))
+    predicted = np.sqrt(np.mean([p.variance_at(place) for p in planes]))
+    assert SIGMA_RATIO[0] < observed / predicted < SIGMA_RATIO[1]
