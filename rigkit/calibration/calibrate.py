@@ -13,12 +13,14 @@ import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray
 from rigkit.calibration.assemble import assemble, require_determined
+from rigkit.calibration.counting import miscounted, recounted
 from rigkit.calibration.evidence import fit_shapes
 from rigkit.calibration.fit import Fit, fit_kept, fit_model, heldout_squares, robust_sigma
 from rigkit.calibration.moved import moved_lens
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.shape import SHAPES, often_seen
+from rigkit.calibration.solver import equations
 from rigkit.calibration.uncertainty import uncertainty_at_corners
 from rigkit.calibration.usable import usable_views
 from rigkit.calibration.verdicts import judge
@@ -108,7 +110,8 @@ def calibrate(
     chosen = _choose(observations, options, SURELY)
     candidates = [*_described(options, chosen), *failed]
     if board != "flat" and often_seen(observations).any():
-        shapes, spared = _shapes(observations, chosen, board, folds, progress)
+        observations, chosen, fits = _fit_shapes(observations, chosen, board)
+        shapes, spared = _shapes(observations, fits, board, folds, progress)
         if board == "auto":
             shapes = [chosen, *shapes]
         chosen = _choose(observations, shapes)
@@ -204,11 +207,25 @@ def _compared(observations: Observations, options: list[_Option], folds: int, pr
     return out
 
 
+def _fit_shapes(observations: Observations, flat: _Option, board: str) -> tuple[Observations, _Option, dict[str, Fit]]:
+    """Return the shapes fitted, and views and flat boards with every board that looks the same turned counted from the
+    same end, where the shapes tell."""
+    fits = fit_shapes(observations, flat.fit, board)
+    for quarter_turns in (1, 2):
+        *_, richest = fits.values()
+        views = miscounted(observations, richest, quarter_turns)
+        if views.any():
+            observations, state = recounted(observations, flat.fit.state, views, quarter_turns)
+            data = equations(observations, state, flat.fit.weight(observations))
+            flat = replace(flat, fit=replace(flat.fit, state=state, data=data))
+            fits = fit_shapes(observations, flat.fit, board)
+    return observations, flat, fits
+
+
 def _shapes(
-    observations: Observations, flat: _Option, board: str, folds: int, progress: Progress
+    observations: Observations, fits: dict[str, Fit], board: str, folds: int, progress: Progress
 ) -> tuple[list[_Option], list[Candidate]]:
     """Return the shapes in the running, and what was not tried."""
-    fits = fit_shapes(observations, flat.fit, board)
     options = [_Option(f"board {kind}", fit) for kind, fit in fits.items()]
     spared = []
     if board == "auto" and "released" not in fits:

@@ -15,7 +15,7 @@ import numpy as np
 from rigkit.arrays import BoolArray, FloatArray, IntArray, Points
 from rigkit.calibration.observations import Observations
 
-__all__ = ["SHAPES", "ShapeModel", "often_seen", "released_groups", "shape_model", "warp_groups"]
+__all__ = ["SHAPES", "ShapeModel", "often_seen", "released_groups", "released_sigma", "shape_model", "warp_groups"]
 
 SHAPES = ("flat", "warp", "released")
 
@@ -40,8 +40,8 @@ BOWS, STRETCHES = np.arange(2, 5), np.arange(5, 11)
 """Which of them are lengths of one kind."""
 MIN_VIEWS = 3
 """A board in fewer views stays flat."""
-HELD = 1e-6
-"""Size in mm that stands for the half diagonal of a board whose corners are not released: their prior holds them."""
+HELD = 1e-9
+"""Prior in mm of the corners of a board that are not released: it holds them."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -90,12 +90,12 @@ def shape_model(kind: str, observations: Observations) -> ShapeModel:
     if kind == "warp":
         return warp
     # Released corners move against a warp: a bow costs a few numbers, not the prior of every corner.
-    unit = np.array([RELEASED_SIGMA_XY, RELEASED_SIGMA_XY, RELEASED_SIGMA_Z])
-    size = [
-        np.full(len(points), _half_diagonal(points) if often else HELD)
-        for points, often in zip(_per_board(observations, flat), often_seen(observations), strict=True)
-    ]
-    released = (np.concatenate(size)[:, None] * unit).reshape(-1)
+    released = np.concatenate(
+        [
+            np.tile(released_sigma(points) if often else np.full(3, HELD), len(points))
+            for points, often in zip(_per_board(observations, flat), often_seen(observations), strict=True)
+        ]
+    )
     return ShapeModel("released", flat, warp.basis, np.concatenate([warp.sigma, released]))
 
 
@@ -125,6 +125,12 @@ def released_groups(observations: Observations, first: int) -> Iterator[IntArray
 def _per_board(observations: Observations, table: Points) -> list[Points]:
     rows = observations.first_row
     return [table[rows[i] : rows[i + 1]] for i in range(len(observations.boards))]
+
+
+def released_sigma(points: Points) -> FloatArray:
+    """Return the prior standard deviation of a released corner before the views have been asked, (3,) mm, from the flat
+    corners of its board."""
+    return _half_diagonal(points) * np.array([RELEASED_SIGMA_XY, RELEASED_SIGMA_XY, RELEASED_SIGMA_Z])
 
 
 def _half_diagonal(points: Points) -> float:

@@ -120,6 +120,10 @@ def test_fisheye1_from_images() -> None:
     result = calibrate(views, size, model="kannala_brandt")
     assert result.heldout_rms_px is not None and result.heldout_rms_px < FISHEYE1_PX
     assert np.abs(_centre(result.camera) - [543.99, 377.65]).max() < 2.0
+    # The sheet's white margin is 0.80 squares wide on one side and 0.95 on the other: these three show it turned.
+    other = {r.image for r, v in zip(result.views, views, strict=True) if (r.grid != v.grid).any()}
+    turned = {"Fisheye1_1.jpg", "Fisheye1_2.jpg", "Fisheye1_7.jpg"}
+    assert other in (turned, {v.image for v in views} - turned)
 
 
 def test_camodocal_fisheye_uses_every_image() -> None:

@@ -15,7 +15,8 @@ import numpy as np
 
 from rigkit.arrays import FloatArray
 from rigkit.boards import Board
-from rigkit.calibration.rig.seen import Places, Seen, Sights, outer_corners, same_looks
+from rigkit.calibration.counting import same_looks
+from rigkit.calibration.rig.seen import Places, Seen, Sights, outer_corners
 from rigkit.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import nearest_rotation

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points
-from rigkit.calibration.rig.seen import Places, Seen, Sights, outer_corners, same_looks, turns_of
+from rigkit.calibration.counting import same_looks
+from rigkit.calibration.rig.seen import Places, Seen, Sights, outer_corners, turns_of
 from rigkit.calibration.rig.state import Key
 from rigkit.cameras.base import Camera
 from rigkit.errors import InputError
