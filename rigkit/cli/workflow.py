@@ -171,7 +171,11 @@ def _load(path: Path) -> LoadedCamera:
 
 
 def find_boards(pair: Pair, camera1: Camera, camera2: Camera) -> tuple[Detections, Detections, Any, Any]:
-    """Return the boards found in either image of a pair, and the images; raises InputError where there are none."""
+    """Return the boards found in either image of a pair, and the images; raises InputError where there are none.
+
+    The cameras show where corners were missed, which parts are of one board, what is covered, and how lines bend; a
+    camera that no pose of a board fits is left aside.
+    """
     from rigkit.corners.detect import detect_boards
     from rigkit.io.images import to_grey
 
@@ -179,7 +183,7 @@ def find_boards(pair: Pair, camera1: Camera, camera2: Camera) -> tuple[Detection
     found: list[Detections] = []
     for path, camera, entry in ((pair.image1, camera1, pair.camera1), (pair.image2, camera2, pair.camera2)):
         image = read_for(camera, path, f"pair '{pair.pair_id}', camera '{entry.camera_id}'")
-        detections = detect_boards(to_grey(image), pair.boards)
+        detections = detect_boards(to_grey(image), pair.boards, camera=camera)
         if not detections:
             sizes = ", ".join(sorted({f"{b.columns}x{b.rows}" for b in pair.boards}))
             raise InputError(
