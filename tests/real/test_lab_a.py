@@ -21,7 +21,7 @@ PAPER_OVER_OURS = {"orthogonality_deg": 12.0, "mean_normal_deg": 4.0, "baseline_
 """What the averages over the cells of the paper's tables should gain by at least."""
 
 FEWEST_CORNERS = 143
-"""Of 144. One corner of fisheye-forward was placed 0.13 px off, five times what is usual there, and the camera knows."""
+"""Of 144: one corner of fisheye-forward is placed 0.13 px off, five times what is usual there, and the camera knows."""
 
 PAIRS = [f"{lens}-{pose}" for lens in ("regular", "fisheye") for pose in ORTHOGONALITY_DEG]
 
