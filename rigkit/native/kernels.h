@@ -12,7 +12,7 @@
 /* On a hot function: also compiled for newer processors, chosen when the library is loaded. By what they can do:
  * "arch=haswell" would be chosen on a Haswell alone. */
 #if defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 12 && defined(__x86_64__) && defined(__gnu_linux__)
-#define FOR_EACH_PROCESSOR __attribute__((target_clones("arch=x86-64-v3", "default")))
+#define FOR_EACH_PROCESSOR __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
 #else
 #define FOR_EACH_PROCESSOR
 #endif
@@ -160,24 +160,78 @@ INLINE int read_ring(
     return 1;
 }
 
-/* Return at how many of the `places` `along` the edge from (u, v) to (end_u, end_v) the side that should be brighter
- * (sign +1: where angles grow from u to v, seen from the start) is so by more than `weakest` (corners.links.edge_contrast). */
-INLINE int64_t edge_seen(
-    const image_t image, const double *along, int64_t places, double u, double v, double end_u, double end_v,
-    double sign, double offset, double weakest)
+/* Return whether at `most` or more of the `places` `along` the edge from (u, v) to (end_u, end_v) the side that should be
+ * brighter (sign +1: where angles grow from u to v, seen from the start) is so by more than `weakest`
+ * (corners.links.edge_contrast). */
+INLINE int edge_seen(
+    const image_t image, const double *along, int64_t places, int64_t most, double u, double v, double end_u,
+    double end_v, double sign, double offset, double weakest)
 {
     const double chord_u = end_u - u, chord_v = end_v - v;
     double length = sqrt(chord_u * chord_u + chord_v * chord_v);
     length = length > 1e-9 ? length : 1e-9;
     const double aside_u = -sign * offset * chord_v / length, aside_v = sign * offset * chord_u / length;
-    int64_t seen = 0;
-    for (int64_t k = 0; k < places; k++) {
+    /* Clutter is told from an edge by the first places. */
+    int64_t unseen = 0;
+    for (int64_t k = 0; k < places && unseen <= places - most; k++) {
         const double at_u = u + along[k] * chord_u, at_v = v + along[k] * chord_v;
         const float bright = brightness_at(image, (float)(at_u + aside_u), (float)(at_v + aside_v));
         const float dark = brightness_at(image, (float)(at_u - aside_u), (float)(at_v - aside_v));
-        seen += (double)(bright - dark) > weakest;
+        unseen += !((double)(bright - dark) > weakest);
     }
-    return seen;
+    return unseen <= places - most;
+}
+
+/* Points in squares: those of square b are order[first[b]] to order[first[b + 1] - 1]. */
+typedef struct {
+    const double *points;
+    int32_t *first, *order;
+    int64_t columns, rows;
+    double left, top, side;
+} squares_t;
+
+/* At most so many squares for so many points: smaller ones leave more of them to look into, larger ones more points that
+ * are too far. */
+#define MOST_SQUARES(count) ((count) / 2 + 8)
+
+/* int32_t that `fill_squares` needs. */
+#define SQUARES_MEMORY(count) (MOST_SQUARES(count) + 1 + 2 * (count))
+
+INLINE int64_t square_at(double position, double least, double side, int64_t count)
+{
+    const double place = (position - least) / side;
+    return place > 0.0 ? (place < (double)count ? (int64_t)place : count - 1) : 0;
+}
+
+/* Sort `count` > 0 points into squares of at least `side`, in `memory` (SQUARES_MEMORY), which must outlive `out`. */
+INLINE void fill_squares(const double *points, int64_t count, double side, int32_t *memory, squares_t *out)
+{
+    double left = points[0], right = left, top = points[1], bottom = top;
+    for (int64_t i = 1; i < count; i++) {
+        const double u = points[2 * i], v = points[2 * i + 1];
+        left = u < left ? u : left;
+        right = u > right ? u : right;
+        top = v < top ? v : top;
+        bottom = v > bottom ? v : bottom;
+    }
+    while (((right - left) / side + 1.0) * ((bottom - top) / side + 1.0) > (double)MOST_SQUARES(count))
+        side *= 1.4;
+    const int64_t columns = (int64_t)((right - left) / side) + 1, rows = (int64_t)((bottom - top) / side) + 1;
+    const int64_t size = columns * rows;
+    const squares_t squares = {points, memory, memory + size + 1, columns, rows, left, top, side};
+    *out = squares;
+    int32_t *first = squares.first, *order = squares.order, *square = order + count;
+    memset(first, 0, (size_t)(size + 1) * sizeof(int32_t));
+    for (int64_t i = 0; i < count; i++) {
+        square[i] = (int32_t)(square_at(points[2 * i + 1], top, side, rows) * columns +
+                              square_at(points[2 * i], left, side, columns));
+        first[square[i]]++;
+    }
+    /* The end of each square; filling it from there moves that to its start. */
+    for (int64_t b = 1; b <= size; b++)
+        first[b] += first[b - 1];
+    for (int64_t i = count - 1; i >= 0; i--)
+        order[--first[square[i]]] = (int32_t)i;
 }
 
 /* The source that this library was built from (setup.py). */
