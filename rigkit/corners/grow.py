@@ -21,7 +21,7 @@ from rigkit.corners.response import Level
 from rigkit.corners.ring import read_rings, ring_rules
 from rigkit.corners.saddle import Saddles
 from rigkit.native import kernels
-from rigkit.native.growth import Buckets, FitRules, GrowthRules, grown
+from rigkit.native.growth import FitRules, GrowthRules, Squares, grown
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -89,11 +89,11 @@ class SaddleIndex:
         return cKDTree(self.pixels)
 
     @cached_property
-    def buckets(self) -> Buckets:
+    def squares(self) -> Squares:
         """The saddles as the kernels want them."""
         library = kernels("growth")
         assert library is not None
-        return Buckets.of(library, self.pixels)
+        return Squares.of(library, self.pixels)
 
     def nearest(self, pixels: FloatArray, reach_px: FloatArray) -> tuple[IntArray, BoolArray]:
         """Return the TRIED nearest saddles of each of `pixels` (M, 2) and which of them lie within `reach_px` (M,)."""
@@ -163,7 +163,7 @@ def _grow(lattice: Lattice, saddles: SaddleIndex, level: Level, rings: int) -> i
     if library is not None:
         sheet = (lattice.pixels, lattice.contrast, 1.0 if lattice.rising else -1.0)
         brightness = (level.smooth, level.scale, level.offset)
-        return grown(library, *sheet, *brightness, saddles.buckets, _rules(), rings)
+        return grown(library, *sheet, *brightness, saddles.squares, _rules(), rings)
     due = np.ones((2, *lattice.known.shape), bool)
     for left in range(rings, 0, -1):
         known = lattice.known

@@ -297,61 +297,6 @@ FOR_EACH_PROCESSOR int64_t find_corners(
     return near;
 }
 
-/* Points in square buckets: those of bucket b are order[first[b]] to order[first[b + 1] - 1]. */
-typedef struct {
-    const double *points;
-    int32_t *first, *order;
-    int64_t columns, rows;
-    double left, top, side;
-} squares_t;
-
-/* Smaller squares leave more of them to look into, larger ones more points that are too far. */
-static const double SQUARES_A_POINT = 0.5;
-
-INLINE int64_t square_at(double position, double least, double side, int64_t count)
-{
-    const double place = (position - least) / side;
-    return place > 0.0 ? (place < (double)count ? (int64_t)place : count - 1) : 0;
-}
-
-/* Sort `count` > 0 points into squares of at least `side`. Returns 0 without memory. */
-static int fill_squares(const double *points, int64_t count, double side, squares_t *out)
-{
-    double left = points[0], right = left, top = points[1], bottom = top;
-    for (int64_t i = 1; i < count; i++) {
-        const double u = points[2 * i], v = points[2 * i + 1];
-        left = u < left ? u : left;
-        right = u > right ? u : right;
-        top = v < top ? v : top;
-        bottom = v > bottom ? v : bottom;
-    }
-    const double most = SQUARES_A_POINT * (double)count + 8.0;
-    while (((right - left) / side + 1.0) * ((bottom - top) / side + 1.0) > most)
-        side *= 1.4;
-    const squares_t squares = {points, NULL, NULL, (int64_t)((right - left) / side) + 1,
-                               (int64_t)((bottom - top) / side) + 1, left, top, side};
-    const int64_t size = squares.columns * squares.rows;
-    *out = squares;
-    out->first = calloc((size_t)(size + 1 + count), sizeof(int32_t));
-    if (!out->first)
-        return 0;
-    out->order = out->first + size + 1;
-    for (int pass = 0; pass < 2; pass++) {
-        for (int64_t i = count - 1; i >= 0; i--) {
-            const int64_t at = square_at(points[2 * i + 1], top, side, squares.rows) * squares.columns +
-                               square_at(points[2 * i], left, side, squares.columns);
-            if (pass == 0)
-                out->first[at]++;
-            else
-                out->order[--out->first[at]] = (int32_t)i;
-        }
-        /* After the first pass the end of each square; the second moves it to its start. */
-        for (int64_t b = 1; pass == 0 && b <= size; b++)
-            out->first[b] += out->first[b - 1];
-    }
-    return 1;
-}
-
 /* Mark those of `fresh` (count, 2) that lie within `reach` of one of `known`. Returns 0 without memory. */
 int64_t mark_known(
     const double *fresh, int64_t count, const double *known, int64_t known_count, double reach, uint8_t *mark);
@@ -359,8 +304,10 @@ int64_t mark_known(
     const double *fresh, int64_t count, const double *known, int64_t known_count, double reach, uint8_t *mark)
 {
     squares_t squares;
-    if (!fill_squares(known, known_count, reach, &squares))
+    int32_t *scratch = malloc((size_t)SQUARES_MEMORY(known_count) * sizeof(int32_t));
+    if (!scratch)
         return 0;
+    fill_squares(known, known_count, reach, scratch, &squares);
     for (int64_t i = 0; i < count; i++) {
         const double u = fresh[2 * i], v = fresh[2 * i + 1];
         const int64_t left = square_at(u - reach, squares.left, squares.side, squares.columns);
@@ -375,7 +322,7 @@ int64_t mark_known(
             }
         }
     }
-    free(squares.first);
+    free(scratch);
     return 1;
 }
 
@@ -398,26 +345,78 @@ typedef struct {
     int64_t arm, end, back;
 } candidate_t;
 
-/* A corner in the order of the squares: what the search reads lies side by side. */
-typedef struct {
-    double u, v;
-    float lines[4], contrast;
-    int32_t corner;
-} place_t;
+/* Corners that are looked at together; memory behind all lists is long enough for so many more. */
+enum { TOGETHER = 8 };
 
-/* The corners around one: square of the distance, chord, both lines' unit vectors, contrast, index; and the test. */
-enum { SQUARE, CHORD_U, CHORD_V, A_U, A_V, B_U, B_V, CONTRAST, COLUMNS };
+/* The corners in the order of the squares, so that those of a row of squares lie side by side: position, the unit
+ * vectors of both lines, contrast. */
+enum { A_U, A_V, B_U, B_V, CONTRAST, COLUMNS };
 typedef struct {
+    double *u, *v;
     float *columns[COLUMNS];
-    int32_t *corner, *meets;
+} places_t;
+
+/* What is found around a corner: square of the distance, infinite where the contrast is not like its own; the place;
+ * whether they point an arm of the other kind at each other. */
+typedef struct {
+    float *square;
+    int32_t *place, *meets;
 } near_t;
 
-/* Collect the corners around `home` whose contrast lies within the bounds: at least the `wanted` nearest. Returns how
- * many. */
-INLINE int64_t gather(
-    const squares_t *squares, const place_t *places, const place_t *home, float least, float most, int64_t wanted,
-    const near_t *near)
+/* The corner whose neighbours are looked for, and the bounds of their contrast. */
+typedef struct {
+    double u, v;
+    float lines[4], contrast, least, most, ratio, square_of_cosine;
+} home_t;
+
+/* Look at the places `from` to `to` - 1 and append them to the `count` near ones; return how many there are then. */
+INLINE int64_t look_at(
+    const places_t *places, int64_t from, int64_t to, const home_t *home, const near_t *near, int64_t count)
 {
+    const float mine_a_u = home->lines[0], mine_a_v = home->lines[1];
+    const float mine_b_u = home->lines[2], mine_b_v = home->lines[3];
+    const float contrast = home->contrast, ratio = home->ratio, cosine = home->square_of_cosine;
+    for (int64_t first = from; first < to; first += TOGETHER) {
+        const double *us = places->u + first, *vs = places->v + first;
+        const float *a_u = places->columns[A_U] + first, *a_v = places->columns[A_V] + first;
+        const float *b_u = places->columns[B_U] + first, *b_v = places->columns[B_V] + first;
+        const float *theirs = places->columns[CONTRAST] + first;
+        float *restrict square = near->square + count + first - from;
+        int32_t *restrict place = near->place + count + first - from;
+        int32_t *restrict meets = near->meets + count + first - from;
+        for (int32_t k = 0; k < TOGETHER; k++) {
+            const float u = (float)(us[k] - home->u), v = (float)(vs[k] - home->v), here = u * u + v * v;
+            const float a = u * mine_a_u + v * mine_a_v, b = u * mine_b_u + v * mine_b_v;
+            const float home_a = u * a_u[k] + v * a_v[k], home_b = u * b_u[k] + v * b_v[k];
+            const float along = a * a > b * b ? a * a : b * b;
+            const float back = home_a * home_a > home_b * home_b ? home_a * home_a : home_b * home_b;
+            const int32_t alike = (theirs[k] > home->least) & (theirs[k] < home->most);
+            square[k] = alike ? here : INFINITY;
+            place[k] = (int32_t)first + k;
+            meets[k] = alike & (along > cosine * here) & (back > cosine * here) &
+                       ((b * b > a * a) != (home_b * home_b > home_a * home_a)) & (contrast > ratio * theirs[k]) &
+                       (theirs[k] > ratio * contrast);
+        }
+    }
+    return count + to - from;
+}
+
+/* How many of the `count` near corners are alike and nearer than the square root of `most`. */
+INLINE int32_t count_nearer(const near_t *near, int64_t count, float most)
+{
+    const float *restrict square = near->square;
+    int32_t nearer = 0;
+    for (int64_t k = 0; k < count; k++)
+        nearer += square[k] < most;
+    return nearer;
+}
+
+/* Look at the corners around `home`, square by square: at least the `wanted` nearest alike. Returns how many. */
+INLINE int64_t gather(
+    const squares_t *squares, const places_t *places, const home_t *home, int64_t wanted, const near_t *near)
+{
+    /* Squares to each side that mostly have enough. */
+    enum { AT_ONCE = 3 };
     const double u = home->u, v = home->v, side = squares->side;
     const int64_t column = square_at(u, squares->left, side, squares->columns);
     const int64_t row = square_at(v, squares->top, side, squares->rows);
@@ -426,65 +425,27 @@ INLINE int64_t gather(
     inner = side - in_u < inner ? side - in_u : inner;
     inner = side - in_v < inner ? side - in_v : inner;
     int64_t count = 0;
-    for (int64_t ring = 0;; ring++) {
+    for (int64_t ring = AT_ONCE;; ring++) {
         const int64_t left = column - ring, right = column + ring, top = row - ring, bottom = row + ring;
         for (int64_t r = top > 0 ? top : 0; r <= bottom && r < squares->rows; r++) {
             const int32_t *first = squares->first + r * squares->columns;
             /* Whole rows above and below, the two ends of the others. */
-            const int whole = r == top || r == bottom;
-            for (int part = 0; part < (whole || ring == 0 ? 1 : 2); part++) {
+            const int whole = ring == AT_ONCE || r == top || r == bottom;
+            for (int part = 0; part < (whole ? 1 : 2); part++) {
                 int64_t from = part == 0 ? left : right, to = whole ? right : from;
                 if (to < 0 || from >= squares->columns)
                     continue;
                 from = from > 0 ? from : 0;
                 to = to < squares->columns ? to : squares->columns - 1;
-                for (const place_t *place = places + first[from]; place < places + first[to + 1]; place++) {
-                    const float du = (float)(place->u - u), dv = (float)(place->v - v);
-                    near->columns[SQUARE][count] = du * du + dv * dv;
-                    near->columns[CHORD_U][count] = du;
-                    near->columns[CHORD_V][count] = dv;
-                    for (int k = 0; k < 4; k++)
-                        near->columns[A_U + k][count] = place->lines[k];
-                    near->columns[CONTRAST][count] = place->contrast;
-                    near->corner[count] = place->corner;
-                    count += (place->contrast > least) & (place->contrast < most);
-                }
+                count = look_at(places, first[from], first[to + 1], home, near, count);
             }
         }
         if (left <= 0 && top <= 0 && right >= squares->columns - 1 && bottom >= squares->rows - 1)
             return count;
-        if (count < wanted)
-            continue;
-        /* All corners within `safe` are among them by now. */
+        /* All corners within the root of `safe` are among them by now. */
         const float safe = (float)((inner + (double)ring * side) * (inner + (double)ring * side));
-        int32_t within = 0;
-        for (int64_t k = 0; k < count; k++)
-            within += near->columns[SQUARE][k] <= safe;
-        if (within >= wanted)
+        if (count >= wanted && count_nearer(near, count, safe) >= wanted)
             return count;
-    }
-}
-
-/* Mark which of the corners around `home` are like it in contrast and point an arm of the other kind at it, as it does. */
-INLINE void mark_facing(const place_t *home, const link_rules_t *rules, const near_t *near, int64_t count)
-{
-    const float ratio = (float)rules->contrast_ratio, contrast = home->contrast;
-    const float cosine = (float)(rules->arm_cosine * rules->arm_cosine);
-    const float mine_a_u = home->lines[0], mine_a_v = home->lines[1];
-    const float mine_b_u = home->lines[2], mine_b_v = home->lines[3];
-    const float *restrict square = near->columns[SQUARE], *restrict theirs = near->columns[CONTRAST];
-    const float *restrict u = near->columns[CHORD_U], *restrict v = near->columns[CHORD_V];
-    const float *restrict a_u = near->columns[A_U], *restrict a_v = near->columns[A_V];
-    const float *restrict b_u = near->columns[B_U], *restrict b_v = near->columns[B_V];
-    int32_t *restrict meets = near->meets;
-    for (int64_t k = 0; k < count; k++) {
-        const float a = u[k] * mine_a_u + v[k] * mine_a_v, b = u[k] * mine_b_u + v[k] * mine_b_v;
-        const float home_a = u[k] * a_u[k] + v[k] * a_v[k], home_b = u[k] * b_u[k] + v[k] * b_v[k];
-        const float along = a * a > b * b ? a * a : b * b;
-        const float back = home_a * home_a > home_b * home_b ? home_a * home_a : home_b * home_b;
-        meets[k] = (along > cosine * square[k]) & (back > cosine * square[k]) &
-                   ((b * b > a * a) != (home_b * home_b > home_a * home_a)) & (contrast > ratio * theirs[k]) &
-                   (theirs[k] > ratio * contrast);
     }
 }
 
@@ -509,40 +470,49 @@ INLINE int link_seen(
     aside = aside < most ? aside : most;
     const double there = corners->contrast[j], here = corners->contrast[i];
     const double weakest = rules->contrast_ratio * (there < here ? there : here);
-    return edge_seen(image, rules->along, rules->places, u, v, end_u, end_v, link->arm % 2 ? -1.0 : 1.0, aside,
-                     weakest) >= rules->most;
+    return edge_seen(image, rules->along, rules->places, rules->most, u, v, end_u, end_v, link->arm % 2 ? -1.0 : 1.0,
+                     aside, weakest);
 }
 
-/* The nearest corner along each of the four arms of `home` whose edge is seen: to[arm] = 4 * corner + arm, or -1. */
+/* The nearest corner along each of the four arms of the corner at `place` whose edge is seen: to[arm] = 4 * corner +
+ * arm, or -1. */
 INLINE void link_arms(
-    const corners_t *corners, const squares_t *squares, const place_t *places, const place_t *home, const image_t image,
+    const corners_t *corners, const squares_t *squares, const places_t *places, int64_t place, const image_t image,
     double scale, double offset, const link_rules_t *rules, const near_t *near, int64_t *to)
 {
     enum { MOST_CANDIDATES = 512 };
     candidate_t candidates[MOST_CANDIDATES];
-    const int64_t i = home->corner, wanted = rules->neighbours + 1;
-    const int64_t count =
-        gather(squares, places, home, (float)corners->least[i], (float)corners->most[i], wanted, near);
-    mark_facing(home, rules, near, count);
+    const int64_t i = squares->order[place], wanted = rules->neighbours + 1;
+    const home_t home = {places->u[place], places->v[place],
+                         {places->columns[A_U][place], places->columns[A_V][place], places->columns[B_U][place],
+                          places->columns[B_V][place]},
+                         places->columns[CONTRAST][place], (float)corners->least[i], (float)corners->most[i],
+                         (float)rules->contrast_ratio, (float)(rules->arm_cosine * rules->arm_cosine)};
+    const int64_t count = gather(squares, places, &home, wanted, near);
     int64_t listed = 0;
-    for (int64_t k = 0; k < count && listed < MOST_CANDIDATES; k++) {
-        if (!near->meets[k])
+    for (int64_t first = 0; first < count; first += TOGETHER) {
+        int32_t any = 0;
+        for (int64_t k = first; k < first + TOGETHER; k++)
+            any |= near->meets[k];
+        if (!any)
             continue;
-        const float square = near->columns[SQUARE][k], u = near->columns[CHORD_U][k], v = near->columns[CHORD_V][k];
-        int32_t nearer = 0;
-        for (int64_t n = 0; n < count; n++)
-            nearer += near->columns[SQUARE][n] < square;
-        if (nearer >= wanted)
-            continue;
-        const candidate_t fresh = {
-            square, arm_along(u * home->lines[0] + v * home->lines[1], u * home->lines[2] + v * home->lines[3]),
-            near->corner[k],
-            arm_along(-(u * near->columns[A_U][k] + v * near->columns[A_V][k]),
-                      -(u * near->columns[B_U][k] + v * near->columns[B_V][k]))};
-        int64_t at = listed++;
-        for (; at > 0 && candidates[at - 1].square > square; at--)
-            candidates[at] = candidates[at - 1];
-        candidates[at] = fresh;
+        const int64_t end = first + TOGETHER < count ? first + TOGETHER : count;
+        for (int64_t k = first; k < end && listed < MOST_CANDIDATES; k++) {
+            const float square = near->square[k];
+            if (!near->meets[k] || count_nearer(near, count, square) >= wanted)
+                continue;
+            const int32_t at = near->place[k];
+            const float u = (float)(places->u[at] - home.u), v = (float)(places->v[at] - home.v);
+            const candidate_t fresh = {
+                square, arm_along(u * home.lines[0] + v * home.lines[1], u * home.lines[2] + v * home.lines[3]),
+                squares->order[at],
+                arm_along(-(u * places->columns[A_U][at] + v * places->columns[A_V][at]),
+                          -(u * places->columns[B_U][at] + v * places->columns[B_V][at]))};
+            int64_t rank = listed++;
+            for (; rank > 0 && candidates[rank - 1].square > square; rank--)
+                candidates[rank] = candidates[rank - 1];
+            candidates[rank] = fresh;
+        }
     }
     for (int64_t k = 0; k < listed; k++) {
         const candidate_t *link = candidates + k;
@@ -567,36 +537,37 @@ FOR_EACH_PROCESSOR int64_t find_links(
     const corners_t *corners, image_t image, double scale, double offset, const link_rules_t *rules, int64_t *nearest,
     int64_t *both)
 {
-    const int64_t count = corners->count;
+    const int64_t count = corners->count, room = count + TOGETHER;
     squares_t squares;
-    if (!fill_squares(corners->pixels, count, 1.0, &squares))
-        return 0;
-    place_t *places = malloc((size_t)count * (sizeof(place_t) + COLUMNS * sizeof(float) + 2 * sizeof(int32_t)));
-    if (!places) {
-        free(squares.first);
+    double *memory = calloc((size_t)room, 2 * sizeof(double) + (COLUMNS + 1) * sizeof(float) + 2 * sizeof(int32_t));
+    int32_t *scratch = malloc((size_t)SQUARES_MEMORY(count) * sizeof(int32_t));
+    if (!memory || !scratch) {
+        free(memory);
+        free(scratch);
         return 0;
     }
-    near_t near;
+    fill_squares(corners->pixels, count, 1.0, scratch, &squares);
+    places_t places = {memory, memory + room, {NULL}};
     for (int k = 0; k < COLUMNS; k++)
-        near.columns[k] = (float *)(places + count) + k * count;
-    near.corner = (int32_t *)(near.columns[COLUMNS - 1] + count);
-    near.meets = near.corner + count;
+        places.columns[k] = (float *)(memory + 2 * room) + k * room;
+    const near_t near = {places.columns[COLUMNS - 1] + room, (int32_t *)(places.columns[COLUMNS - 1] + 2 * room),
+                         (int32_t *)(places.columns[COLUMNS - 1] + 3 * room)};
     for (int64_t k = 0; k < count; k++) {
         const int32_t i = squares.order[k];
-        const double *line = corners->lines + 4 * i;
-        const place_t place = {corners->pixels[2 * i], corners->pixels[2 * i + 1],
-                               {(float)line[0], (float)line[1], (float)line[2], (float)line[3]},
-                               (float)corners->contrast[i], i};
-        places[k] = place;
+        places.u[k] = corners->pixels[2 * i];
+        places.v[k] = corners->pixels[2 * i + 1];
+        for (int part = 0; part < 4; part++)
+            places.columns[A_U + part][k] = (float)corners->lines[4 * i + part];
+        places.columns[CONTRAST][k] = (float)corners->contrast[i];
     }
     for (int64_t k = 0; k < 4 * count; k++)
         nearest[k] = both[k] = -1;
     /* In the order of the squares: neighbours look at the same corners and pixels. */
     for (int64_t k = 0; k < count; k++)
-        link_arms(corners, &squares, places, places + k, image, scale, offset, rules, &near,
-                  nearest + 4 * (int64_t)places[k].corner);
-    free(places);
-    free(squares.first);
+        link_arms(corners, &squares, &places, k, image, scale, offset, rules, &near,
+                  nearest + 4 * (int64_t)squares.order[k]);
+    free(memory);
+    free(scratch);
     for (int64_t k = 0; k < 4 * count; k++)
         if (nearest[k] >= 0 && nearest[nearest[k]] == k)
             both[k] = nearest[k];

@@ -176,59 +176,30 @@ FOR_EACH_PROCESSOR void fit_cells(
                 fit_cell(lattice, rows, columns, row, column, rules, bell, out++);
 }
 
-/* Points in square buckets: those of bucket b are order[first[b]] to order[first[b + 1] - 1]. */
-typedef struct {
-    const double *points;
-    int64_t *first, *order;
-    int64_t count, columns, rows;
-    double left, top, side;
-} buckets_t;
-
-static int64_t bucket_at(double position, double least, double side, int64_t count)
+/* Sort the `count` > 0 points into squares, in `memory` (squares_memory). */
+void sort_points(const double *points, int64_t count, int32_t *memory, squares_t *out);
+FOR_EACH_PROCESSOR void sort_points(const double *points, int64_t count, int32_t *memory, squares_t *out)
 {
-    const double place = (position - least) / side;
-    if (!(place > 0.0))
-        return 0;
-    return place < (double)count ? (int64_t)place : count - 1;
+    fill_squares(points, count, 1.0, memory, out);
 }
 
-static int64_t bucket_of(const buckets_t *buckets, const double *point)
-{
-    const int64_t column = bucket_at(point[0], buckets->left, buckets->side, buckets->columns);
-    return bucket_at(point[1], buckets->top, buckets->side, buckets->rows) * buckets->columns + column;
-}
-
-/* Fill `first` (columns * rows + 1) and `order` (count). */
-void fill_buckets(const buckets_t *buckets);
-void fill_buckets(const buckets_t *buckets)
-{
-    const int64_t size = buckets->columns * buckets->rows;
-    memset(buckets->first, 0, (size_t)(size + 1) * sizeof(int64_t));
-    for (int64_t i = 0; i < buckets->count; i++)
-        buckets->first[bucket_of(buckets, buckets->points + 2 * i) + 1]++;
-    for (int64_t b = 0; b < size; b++)
-        buckets->first[b + 1] += buckets->first[b];
-    for (int64_t i = buckets->count - 1; i >= 0; i--)
-        buckets->order[--buckets->first[bucket_of(buckets, buckets->points + 2 * i) + 1]] = i;
-    /* The start of bucket b is at b + 1 now. */
-    memmove(buckets->first, buckets->first + 1, (size_t)size * sizeof(int64_t));
-    buckets->first[size] = buckets->count;
-}
+int64_t squares_memory(int64_t count);
+int64_t squares_memory(int64_t count) { return SQUARES_MEMORY(count); }
 
 /* Find the (at most `most`) nearest points within `reach` of (u, v), the nearest first; return how many. */
-static int64_t nearest_points(const buckets_t *buckets, double u, double v, double reach, int64_t most, int64_t *found)
+static int64_t nearest_points(const squares_t *squares, double u, double v, double reach, int64_t most, int64_t *found)
 {
     double distance[MOST_TRIED];
     int64_t count = 0;
-    const int64_t low_c = bucket_at(u - reach, buckets->left, buckets->side, buckets->columns);
-    const int64_t high_c = bucket_at(u + reach, buckets->left, buckets->side, buckets->columns);
-    const int64_t low_r = bucket_at(v - reach, buckets->top, buckets->side, buckets->rows);
-    const int64_t high_r = bucket_at(v + reach, buckets->top, buckets->side, buckets->rows);
+    const int64_t low_c = square_at(u - reach, squares->left, squares->side, squares->columns);
+    const int64_t high_c = square_at(u + reach, squares->left, squares->side, squares->columns);
+    const int64_t low_r = square_at(v - reach, squares->top, squares->side, squares->rows);
+    const int64_t high_r = square_at(v + reach, squares->top, squares->side, squares->rows);
     for (int64_t row = low_r; row <= high_r; row++) {
-        const int64_t *first = buckets->first + row * buckets->columns;
-        for (int64_t k = first[low_c]; k < first[high_c + 1]; k++) {
-            const double du = buckets->points[2 * buckets->order[k]] - u;
-            const double dv = buckets->points[2 * buckets->order[k] + 1] - v;
+        const int32_t *first = squares->first + row * squares->columns;
+        for (int32_t k = first[low_c]; k < first[high_c + 1]; k++) {
+            const double du = squares->points[2 * squares->order[k]] - u;
+            const double dv = squares->points[2 * squares->order[k] + 1] - v;
             const double here = du * du + dv * dv;
             if (!(here <= reach * reach) || (count == most && here >= distance[count - 1]))
                 continue;
@@ -238,7 +209,7 @@ static int64_t nearest_points(const buckets_t *buckets, double u, double v, doub
                 found[at] = found[at - 1];
             }
             distance[at] = here;
-            found[at] = buckets->order[k];
+            found[at] = squares->order[k];
         }
     }
     return count;
@@ -310,7 +281,7 @@ INLINE int fits(
         double aside = rules->aside * sqrt((end_u - u) * (end_u - u) + (end_v - v) * (end_v - v));
         aside = aside > rules->min_aside ? aside : rules->min_aside;
         aside = aside < rules->max_aside ? aside : rules->max_aside;
-        if (edge_seen(level->image, rules->along, rules->places, u, v, end_u, end_v, side, aside, weakest) < rules->most)
+        if (!edge_seen(level->image, rules->along, rules->places, rules->most, u, v, end_u, end_v, side, aside, weakest))
             return 0;
     }
     return 1;
@@ -318,7 +289,7 @@ INLINE int fits(
 
 /* Try the saddles near the prediction of one empty cell; return whether one fits, its pixel and contrast in `out`. */
 INLINE int try_cell(
-    const sheet_t *sheet, const level_t *level, const buckets_t *saddles, const growth_rules_t *rules,
+    const sheet_t *sheet, const level_t *level, const squares_t *saddles, const growth_rules_t *rules,
     const fit_rules_t *prediction, const double *bell, int64_t row, int64_t column, double out[3])
 {
     fit_t fit;
@@ -384,10 +355,10 @@ static int touches_border(const sheet_t *sheet)
  * (rows * columns) are scratch. Returns the rings that are left, 0 or more, if it needs a wider sheet to grow on; -1 if
  * it has grown all it can. */
 int64_t grow_lattice(
-    sheet_t *sheet, const level_t *level, const buckets_t *saddles, const growth_rules_t *rules, int64_t rings,
+    sheet_t *sheet, const level_t *level, const squares_t *saddles, const growth_rules_t *rules, int64_t rings,
     double *fresh, int64_t *where);
 FOR_EACH_PROCESSOR int64_t grow_lattice(
-    sheet_t *sheet, const level_t *level, const buckets_t *saddles, const growth_rules_t *rules, int64_t rings,
+    sheet_t *sheet, const level_t *level, const squares_t *saddles, const growth_rules_t *rules, int64_t rings,
     double *fresh, int64_t *where)
 {
     const int64_t rows = sheet->rows, columns = sheet->columns;

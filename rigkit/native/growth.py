@@ -13,11 +13,9 @@ from rigkit.arrays import BoolArray, FloatArray, IntArray
 from rigkit.native import address
 from rigkit.native.front import RingRules
 
-__all__ = ["Buckets", "FitRules", "GrowthRules", "components_of", "fit", "grown"]
+__all__ = ["FitRules", "GrowthRules", "Squares", "components_of", "fit", "grown"]
 
 FIT_COLUMNS = 12
-POINTS_A_BUCKET = 2.0
-"""Buckets of so many points on average cost the least to fill and to search."""
 
 
 class FitRules(Structure):
@@ -83,28 +81,23 @@ class _Sheet(Structure):
     ]
 
 
-class Buckets(Structure):
-    """buckets_t: points (N, 2), N > 0, sorted into squares, to find those near a place."""
+class Squares(Structure):
+    """squares_t: points (N, 2), N > 0, sorted into squares, to find those near a place."""
 
     _fields_: ClassVar = [
         *((name, c_void_p) for name in ("points", "first", "order")),
-        *((name, c_int64) for name in ("count", "columns", "rows")),
+        *((name, c_int64) for name in ("columns", "rows")),
         *((name, c_double) for name in ("left", "top", "side")),
     ]
 
     @classmethod
-    def of(cls, library: ctypes.CDLL, points: FloatArray) -> Buckets:
+    def of(cls, library: ctypes.CDLL, points: FloatArray) -> Squares:
         points = np.ascontiguousarray(points, np.float64)
-        low, high = points.min(axis=0), points.max(axis=0)
-        span = np.maximum(high - low, 1.0)
-        side = float(np.sqrt(POINTS_A_BUCKET * span[0] * span[1] / len(points))) + 1e-9
-        columns, rows = int(span[0] / side) + 1, int(span[1] / side) + 1
-        first, order = np.empty(columns * rows + 1, np.int64), np.empty(len(points), np.int64)
-        where = (address(points), address(first), address(order))
-        buckets = cls(*where, len(points), columns, rows, float(low[0]), float(low[1]), side)
-        buckets.kept = (points, first, order)
-        library.fill_buckets(byref(buckets))
-        return buckets
+        memory = np.empty(_declared(library).squares_memory(len(points)), np.int32)
+        squares = cls()
+        squares.kept = (points, memory)
+        library.sort_points(address(points), len(points), address(memory), byref(squares))
+        return squares
 
 
 def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
@@ -113,10 +106,13 @@ def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
         library.fit_cells.argtypes = [c_void_p, c_int64, c_int64, c_void_p, POINTER(FitRules), c_void_p]
         library.fit_cells.restype = None
         library.grow_lattice.argtypes = [
-            *(POINTER(kind) for kind in (_Sheet, _Level, Buckets, GrowthRules)),
+            *(POINTER(kind) for kind in (_Sheet, _Level, Squares, GrowthRules)),
             *(c_int64, c_void_p, c_void_p),
         ]
         library.grow_lattice.restype = c_int64
+        library.squares_memory.argtypes, library.squares_memory.restype = [c_int64], c_int64
+        library.sort_points.argtypes = [c_void_p, c_int64, c_void_p, POINTER(Squares)]
+        library.sort_points.restype = None
         library.find_components.argtypes = [c_int64, c_void_p, c_int64, *[c_void_p] * 6]
         library.find_components.restype = c_int64
     return library
@@ -140,7 +136,7 @@ def grown(
     image: np.ndarray,
     scale: float,
     offset: float,
-    saddles: Buckets,
+    saddles: Squares,
     rules: GrowthRules,
     rings: int,
 ) -> int:
