@@ -23,9 +23,6 @@ __all__ = ["MANY", "STEPS", "Lattice", "Sheet", "build_lattices"]
 STEPS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
 """(column, row) of the four grid directions."""
 
-MAX_WALKS = 3
-"""Links that contradict each other are cut, and the rest numbered again, so many times."""
-
 
 MANY = 200
 """Lattices of so many corners are judged by a part of them before anything else is done with them."""
@@ -183,7 +180,7 @@ def build_lattices(corners: Corners, links: Links) -> Iterator[Lattice]:
     library = kernels("growth")
     if library is not None:
         states = np.where(links.corner >= 0, 4 * links.corner + links.arm, -1)
-        count, label, grid, turn, members = components_of(library, states, MAX_WALKS)
+        count, label, grid, turn, members = components_of(library, states)
     else:
         label, grid, turn = _components(links)
         count = int(label.max(initial=-1)) + 1
@@ -221,13 +218,7 @@ def _components(links: Links) -> tuple[IntArray, IntArray, IntArray]:
     """Return per corner its lattice (-1 alone), its (column, row), and the arm that points to +column."""
     bound = quads(links)
     links = Links(np.where(bound, links.corner, -1), links.arm)
-    for _ in range(MAX_WALKS):
-        component, grid, turn = _walk(links)
-        wrong = _contradictions(links, grid, turn)
-        if not wrong.any():
-            break
-        links = Links(np.where(wrong, -1, links.corner), links.arm)
-    return component, grid, turn
+    return _walk(links)
 
 
 def _walk(links: Links) -> tuple[IntArray, IntArray, IntArray]:
@@ -265,13 +256,3 @@ def _walk(links: Links) -> tuple[IntArray, IntArray, IntArray]:
         done[end] = True
         frontier = end
     return component, grid, turn
-
-
-def _contradictions(links: Links, grid: IntArray, turn: IntArray) -> BoolArray:
-    """Return the links (N, 4) that do not agree with the rows and columns given to their ends."""
-    there = links.corner >= 0
-    end = np.where(there, links.corner, 0)
-    direction = (np.arange(4) - turn[:, None]) % 4
-    moved = (grid[end] == grid[:, None] + STEPS[direction]).all(axis=2)
-    facing = (turn[end] - (links.arm - direction - 2)) % 4 == 0
-    return np.asarray(there & ~(moved & facing), dtype=np.bool_)

@@ -492,42 +492,15 @@ static int64_t walk(
     return lattices;
 }
 
-/* Cut the links that do not agree with the columns and rows of their ends; return how many there were. */
-static int64_t cut_contradictions(int64_t count, int64_t *to, const int64_t *grid, const int64_t *turn, uint8_t *wrong)
-{
-    static const int64_t step_c[4] = {1, 0, -1, 0}, step_r[4] = {0, 1, 0, -1};
-    int64_t cut = 0;
-    for (int64_t state = 0; state < 4 * count; state++) {
-        wrong[state] = 0;
-        if (to[state] < 0)
-            continue;
-        const int64_t start = state / 4, end = to[state] / 4, direction = (state % 4 - turn[start] + 4) % 4;
-        const int moved = grid[2 * end] == grid[2 * start] + step_c[direction] &&
-                          grid[2 * end + 1] == grid[2 * start + 1] + step_r[direction];
-        wrong[state] = !moved || turn[end] != (to[state] % 4 - direction + 6) % 4;
-        cut += wrong[state];
-    }
-    for (int64_t state = 0; state < 4 * count; state++)
-        if (wrong[state])
-            to[state] = -1;
-    return cut;
-}
-
 /* corners.lattice: the lattices of the links `to` (count, 4), which are changed. Returns how many; label, grid (count, 2),
- * turn and members as in `walk`. `queue` (2 * count) and `marks` (4 * count) are scratch. */
+ * turn and members as in `walk`. `queue` (2 * count) and `bound` (4 * count) are scratch. */
 int64_t find_components(
-    int64_t count, int64_t *to, int64_t tries, int64_t *label, int64_t *grid, int64_t *turn, int64_t *members,
-    int64_t *queue, uint8_t *marks);
+    int64_t count, int64_t *to, int64_t *label, int64_t *grid, int64_t *turn, int64_t *members, int64_t *queue,
+    uint8_t *bound);
 int64_t find_components(
-    int64_t count, int64_t *to, int64_t tries, int64_t *label, int64_t *grid, int64_t *turn, int64_t *members,
-    int64_t *queue, uint8_t *marks)
+    int64_t count, int64_t *to, int64_t *label, int64_t *grid, int64_t *turn, int64_t *members, int64_t *queue,
+    uint8_t *bound)
 {
-    int64_t lattices = 0;
-    keep_quads(count, to, marks);
-    for (int64_t k = 0; k < tries; k++) {
-        lattices = walk(count, to, label, grid, turn, members, queue);
-        if (!cut_contradictions(count, to, grid, turn, marks))
-            break;
-    }
-    return lattices;
+    keep_quads(count, to, bound);
+    return walk(count, to, label, grid, turn, members, queue);
 }

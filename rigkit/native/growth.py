@@ -113,7 +113,7 @@ def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
         library.squares_memory.argtypes, library.squares_memory.restype = [c_int64], c_int64
         library.sort_points.argtypes = [c_void_p, c_int64, c_void_p, POINTER(Squares)]
         library.sort_points.restype = None
-        library.find_components.argtypes = [c_int64, c_void_p, c_int64, *[c_void_p] * 6]
+        library.find_components.argtypes = [c_int64, *[c_void_p] * 7]
         library.find_components.restype = c_int64
     return library
 
@@ -155,9 +155,7 @@ def grown(
     return int(call(byref(sheet), byref(level), byref(saddles), byref(rules), rings, address(fresh), address(where)))
 
 
-def components_of(
-    library: ctypes.CDLL, links: IntArray, tries: int
-) -> tuple[int, IntArray, IntArray, IntArray, IntArray]:
+def components_of(library: ctypes.CDLL, links: IntArray) -> tuple[int, IntArray, IntArray, IntArray, IntArray]:
     """Return the number of lattices that mutual `links` make up, and label, grid (N, 2), turn, members of the corners.
 
     `links` (N, 4) are 4 * the neighbour + its arm, -1 for none.
@@ -165,7 +163,7 @@ def components_of(
     count = len(links)
     links = np.array(links, np.int64, order="C")
     label, grid, turn = np.empty(count, np.int64), np.empty((count, 2), np.int64), np.empty(count, np.int64)
-    members, queue, marks = np.empty(count, np.int64), np.empty(2 * count, np.int64), np.empty(4 * count, np.uint8)
-    arrays = (label, grid, turn, members, queue, marks)
-    found = _declared(library).find_components(count, address(links), tries, *(address(a) for a in arrays))
+    members, queue, bound = np.empty(count, np.int64), np.empty(2 * count, np.int64), np.empty(4 * count, np.uint8)
+    arrays = (label, grid, turn, members, queue, bound)
+    found = _declared(library).find_components(count, address(links), *(address(a) for a in arrays))
     return int(found), label, grid, turn, members
