@@ -278,14 +278,15 @@ def _confirmed(guide: Guide, state: BoardState, shape: LocalFit, side: FloatArra
 
 def _again(image: GreyImage, guide: Guide, state: BoardState) -> BoardState:
     """Return the state with every corner fitted anew as the camera sees it."""
-    cells = state.known
+    cells = state.known.copy()
     shape, seen = guide.at(state, cells)
-    shape = replace(shape, pixels=np.where(seen[:, None], shape.pixels, state.pixels[cells]))
-    fit = fit_corners(
-        image, guide.board, shape, state.pixels[cells], state.signs[cells], float(np.nanmedian(state.blur))
-    )
-    good = fit.valid & seen & (fit.contrast > 0.0)
-    return state.with_fit(cells, fit, good)
+    # At the end of a lens model's field a corner may be seen but not the half squares around it: it stays as it is.
+    cells[cells] = seen
+    if not seen.any():
+        return state
+    blur = float(np.nanmedian(state.blur))
+    fit = fit_corners(image, guide.board, _of(shape, seen), state.pixels[cells], state.signs[cells], blur)
+    return state.with_fit(cells, fit, fit.valid & (fit.contrast > 0.0))
 
 
 def _unanimous(guide: Guide, state: BoardState) -> BoardState:
@@ -309,7 +310,8 @@ def _contradiction(guide: Guide, state: BoardState, judges: BoardState) -> Float
     cells, own = state.known, judges.known
     off = np.zeros(cells.shape)
     shape, _ = guide.at(judges, cells)
-    off[cells] = np.linalg.norm(state.pixels[cells] - shape.pixels, axis=1) / np.maximum(shape.gain, 1.0)
+    # Where the lens model ends nothing is said.
+    off[cells] = np.nan_to_num(np.linalg.norm(state.pixels[cells] - shape.pixels, axis=1) / np.maximum(shape.gain, 1.0))
     usual = max(float(np.median(off[own])), FLOOR_PX) if own.any() else FLOOR_PX
     sigma = np.minimum(np.where(cells, state.sigma_px, 1.0), UNSOUND * state.usual_sigma)
     allowed = ASTRAY_FACTOR * np.hypot(usual, sigma)

@@ -76,6 +76,9 @@ typedef struct {
 
 INLINE void take(window_t *window, const picture_t image, int64_t v, range_t range)
 {
+    /* Nothing, or NaN: no place in the image. */
+    if (!(range.lo <= range.hi))
+        return;
     const int64_t first = (int64_t)ceil(range.lo), count = (int64_t)floor(range.hi) - first + 1;
     if (count <= 0)
         return;
@@ -120,7 +123,7 @@ static void collect(
     window->count = 0;
     for (int64_t v = -most; v <= most; v++) {
         const double row = window->centre_v + (double)v;
-        if (row < 0.0 || row > (double)(image.height - 1))
+        if (!(row >= 0.0 && row <= (double)(image.height - 1)))
             continue;
         const double half = sqrt(rules->radius_px * rules->radius_px - (double)(v * v));
         /* Position in cells along side a and along side b, as functions of the column. */

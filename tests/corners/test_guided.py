@@ -146,3 +146,28 @@ def test_what_is_covered_stays_missing(camera_known: bool, rng: np.random.Genera
     cells = {tuple(cell) for cell in again.grid.tolist()}
     assert (3, 3) in cells
     assert not cells & set(blots)
+
+
+class Cut:
+    """A camera whose model ends at a column of the image: what lies beyond is not projected."""
+
+    def __init__(self, camera: Camera, limit_px: float) -> None:
+        self.camera, self.limit_px = camera, limit_px
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self.camera, name)
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        pixels, valid = self.camera.project(points)
+        valid = valid & (pixels[..., 0] < self.limit_px)
+        return np.where(valid[..., None], pixels, np.nan), valid
+
+
+def test_corners_at_the_end_of_the_lens_model_stay_as_they_are(rng: np.random.Generator) -> None:
+    scene = one_board(rng, lens="fisheye", board=BOARD)
+    image = scene.render(noise_levels=2.0, rng=rng)
+    (found,) = detect_boards(image, [BOARD])
+    camera = Cut(scene.camera, np.quantile(found.pixels[:, 0], 0.8))
+    (again,) = complete_boards(image, [found], [BOARD], camera)  # type: ignore[arg-type]
+    assert again.complete
+    assert judged(again, scene)[:2] == (54, 0)

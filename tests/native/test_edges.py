@@ -109,3 +109,14 @@ def test_compiled_bends_are_the_numpy_ones(rng: np.random.Generator, monkeypatch
     assert np.isfinite(plain).all()
     assert np.abs(plain).max() > 1e-4
     assert np.abs(compiled - plain).max() < 1e-9
+
+
+def test_a_corner_of_no_known_place_or_shape_is_not_fitted(rng: np.random.Generator) -> None:
+    image, truth = scene(0.7, 2.0, rng)
+    shape = fit_cells(truth, np.ones(truth.shape[:2], bool))
+    sides = np.stack([shape.along_column, shape.along_row], axis=1)
+    start = truth.reshape(-1, 2).copy()
+    start[0], start[1], sides[2], sides[3] = np.nan, np.inf, np.nan, -np.inf
+    geometry = Geometry(sides, shape.curvature(), shape.gaps())
+    fit = fit_edges(image, start, geometry, np.ones(len(start)), np.full(len(start), 0.7), radius_px=18.0, iterations=8)
+    assert not fit.valid[:4].any()
