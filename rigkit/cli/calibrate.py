@@ -15,6 +15,7 @@ from rigkit.progress import Progress, silent
 
 if TYPE_CHECKING:
     from rigkit.calibration.result import Calibration
+    from rigkit.cameras.base import Camera
     from rigkit.detections import BoardView
     from rigkit.io.corner_cache import FoundCorners
     from rigkit.io.session import Session
@@ -153,36 +154,75 @@ def _common_size(session: Session, found: Mapping[str, FoundCorners]) -> tuple[i
 
 
 def session_corners(session: Session, progress: Progress) -> dict[str, FoundCorners]:
-    """Return the corners of every image by name, from the images or from the cache."""
-    from rigkit.cli.console import note
-    from rigkit.corners.detect import detect_boards
-    from rigkit.errors import InputError
-    from rigkit.io.corner_cache import CornerCache, FoundCorners, image_hash
-    from rigkit.io.images import read_image
+    """Return the corners of every image by name, from the images or from the cache.
 
-    what = "corners" if session.camera is None else f"corners of {session.camera}"
+    They are found twice: a first calibration, from the corners of the first time, says how lines bend at every corner,
+    which few large squares through a wide lens do not, and what is covered.
+    """
+    from rigkit.cli.console import note
+    from rigkit.errors import InputError
+    from rigkit.io.corner_cache import CornerCache, image_hash
+
     cache = CornerCache(session.corners_path, session.boards)
     found: dict[str, FoundCorners] = {}
     if not session.images:
         found = {name: item for name in cache.images if (item := cache.get(name, None)) is not None}
         if not found:
-            camera = "" if session.camera is None else f" of camera '{session.camera}'"
-            raise InputError(f"{session.path}: no image matches 'images'{camera}, and no corners are kept beside it")
-    for i, (path, name) in enumerate(zip(session.images, _image_names(session), strict=True)):
-        progress(what, i, len(session.images))
-        digest = image_hash(path)
+            whose = "" if session.camera is None else f" of camera '{session.camera}'"
+            raise InputError(f"{session.path}: no image matches 'images'{whose}, and no corners are kept beside it")
+    hashes = {name: image_hash(path) for path, name in zip(session.images, _image_names(session), strict=True)}
+    paths = dict(zip(hashes, session.images, strict=True))
+    for name, digest in hashes.items():
         item = cache.get(name, digest)
-        if item is None:
-            image = read_image(path)
-            item = FoundCorners((image.shape[1], image.shape[0]), detect_boards(image, session.boards))
-            cache.put(name, digest, item)
-        found[name] = item
-    progress(what, len(session.images), len(session.images))
+        if item is not None:
+            found[name] = item
+
+    def look(names: list[str], camera: Camera | None) -> None:
+        """Find the corners in the images of these names and remember them."""
+        words = ("corners", "through the lens")[: 1 if camera is None else 2]
+        what = " ".join(words if session.camera is None else (*words, "of", session.camera))
+        for i, name in enumerate(names):
+            progress(what, i, len(names))
+            found[name] = _found_in(paths[name], session, camera)
+            cache.put(name, hashes[name], found[name])
+        progress(what, len(names), len(names))
+
+    look([name for name in paths if name not in found], None)
+    # All of them, or the corners would depend on which images were added when.
+    new = not all(found[name].through_camera for name in paths)
+    camera = _first_camera(session, found) if new else None
+    if camera is not None:
+        look([name for name in paths if found[name].size_px == camera.size_px], camera)
+    found = {name: found[name] for name in paths or found}
     try:
         cache.save()
     except InputError as error:
         note(f"{error}; the corners are used, but not kept")
     return found
+
+
+def _found_in(path: Path, session: Session, camera: Camera | None) -> FoundCorners:
+    from rigkit.corners.detect import detect_boards
+    from rigkit.io.corner_cache import FoundCorners
+    from rigkit.io.images import read_image
+
+    image = read_image(path)
+    detections = detect_boards(image, session.boards, camera=camera)
+    return FoundCorners((image.shape[1], image.shape[0]), detections, camera is not None)
+
+
+def _first_camera(session: Session, found: Mapping[str, FoundCorners]) -> Camera | None:
+    """Return a camera calibrated quickly from `found`; None where it cannot be: the calibration proper says why."""
+    from rigkit.calibration.calibrate import calibrate
+    from rigkit.errors import RigkitError
+
+    try:
+        views, size_px, _ = session_views(session, found)
+        # Scaramuzza's model takes any lens.
+        model = "scaramuzza" if session.model == "auto" else session.model
+        return calibrate(views, size_px, model=model, degree=session.degree, board="flat").camera
+    except RigkitError:
+        return None
 
 
 def _image_names(session: Session) -> list[str]:

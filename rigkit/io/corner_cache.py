@@ -28,10 +28,18 @@ SCHEMA = "rigkit.corners/1"
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FoundCorners:
-    """What was found in one image: its size, (width, height), and the boards."""
+    """What was found in one image.
+
+    Attributes
+    ----------
+    size_px : (width, height).
+    detections : the boards.
+    through_camera : whether they were placed with the help of a first calibration of the camera.
+    """
 
     size_px: tuple[int, int]
     detections: tuple[BoardDetection, ...]
+    through_camera: bool = False
 
 
 class CornerCache:
@@ -68,7 +76,8 @@ class CornerCache:
     def put(self, name: str, digest: str, found: FoundCorners) -> None:
         """Remember the corners of an image."""
         boards = [_detection_out(d) for d in found.detections]
-        self._entries[name] = {"sha256": digest, "size_px": list(found.size_px), "boards": boards}
+        entry = {"sha256": digest, "size_px": list(found.size_px), "through_camera": found.through_camera}
+        self._entries[name] = entry | {"boards": boards}
         self._changed = True
 
     def save(self) -> None:
@@ -110,7 +119,8 @@ def _detection_out(d: BoardDetection) -> dict[str, Any]:
 
 def _found_in(entry: dict[str, Any]) -> FoundCorners:
     width, height = entry["size_px"]
-    return FoundCorners((int(width), int(height)), tuple(_detection_in(v) for v in entry["boards"]))
+    through_camera = entry.get("through_camera", False) is True
+    return FoundCorners((int(width), int(height)), tuple(_detection_in(v) for v in entry["boards"]), through_camera)
 
 
 def _detection_in(data: dict[str, Any]) -> BoardDetection:
