@@ -15,6 +15,7 @@ import numpy as np
 from rigkit.arrays import FloatArray
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruct import Reconstruction
+from rigkit.report.tables import measured_words
 from rigkit.validation.tables import Cell, Column, Table
 
 __all__ = ["PairSection", "build_page", "facts_html", "page_html", "scene_of", "table_html"]
@@ -46,9 +47,7 @@ def _cell(cell: Cell, column: Column) -> str:
         kind = "fail" if cell.failed else "pass" if cell.value == "pass" else "text"
         return f'<td class="{kind}">{html.escape(cell.value)}</td>'
     known = cell.value is not None and np.isfinite(cell.value)
-    words = f"{cell.value:.{column.decimals}f}" if known else "–"
-    if known and cell.sigma is not None and np.isfinite(cell.sigma):
-        words += f" ± {cell.sigma:.{column.decimals}f}"
+    words = measured_words(cell.value, cell.sigma, column.decimals) if cell.value is not None and known else "–"
     if cell.best:
         words = f"<b>{words}</b>"
     if cell.paper is not None:

@@ -12,7 +12,17 @@ import numpy as np
 
 from rigkit.validation.tables import Cell, Column, Table
 
-__all__ = ["tables_to_csv", "tables_to_json", "tables_to_latex", "tables_to_markdown", "tables_to_text"]
+__all__ = [
+    "measured_words",
+    "tables_to_csv",
+    "tables_to_json",
+    "tables_to_latex",
+    "tables_to_markdown",
+    "tables_to_text",
+]
+
+MOST_DECIMALS = 6
+"""Of a value with its sigma: nanometres."""
 
 LATEX = {
     "\\": r"\textbackslash{}",
@@ -156,10 +166,21 @@ def _text(cell: Cell, column: Column) -> str:
     elif isinstance(cell.value, str):
         text = cell.value
     else:
-        text = f"{cell.value:.{column.decimals}f}"
-        if cell.sigma is not None and np.isfinite(cell.sigma):
-            text += f" ± {cell.sigma:.{column.decimals}f}"
+        text = measured_words(cell.value, cell.sigma, column.decimals)
     return text if cell.paper is None else f"{text} ({cell.paper})"
+
+
+def measured_words(value: float, sigma: float | None, decimals: int) -> str:
+    """Return "value ± sigma", with more than `decimals` where the sigma would else be shown as nothing.
+
+    >>> measured_words(120.0031, 0.0042, 2), measured_words(301.0, 0.5, 2), measured_words(301.0, None, 2)
+    ('120.003 ± 0.004', '301.00 ± 0.50', '301.00')
+    """
+    if sigma is None or not np.isfinite(sigma):
+        return f"{value:.{decimals}f}"
+    while decimals < MOST_DECIMALS and 0.0 < sigma < 0.5 * 10.0**-decimals:
+        decimals += 1
+    return f"{value:.{decimals}f} ± {sigma:.{decimals}f}"
 
 
 def _left(table: Table) -> list[bool]:

@@ -10,6 +10,7 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import uncertainty_at_corners
 from rigkit.reconstruct import Reconstruction
 from rigkit.report.page import PairSection, scene_of
+from rigkit.report.tables import measured_words
 from rigkit.validation.checks import ValidationReport
 from rigkit.validation.crosscheck import CrossCheckReport
 from rigkit.validation.tables import Cell, Column, Table, check_table
@@ -110,7 +111,8 @@ def pair_section(
     shown = next(r for r in reports if r.affine_method == reconstruction.affine_method)
     lead = (
         f"{shown.pose_type} motion, {shown.count} points, {len(shown.boards)} boards; "
-        f"shown: {shown.affine_method}; baseline {shown.baseline_mm:.2f} ± {shown.baseline_sigma_mm:.2f} mm; "
+        f"shown: {shown.affine_method}; baseline "
+        f"{measured_words(shown.baseline_mm, shown.baseline_sigma_mm, 2)} mm; "
         f"Sampson rms {shown.sampson_rms_px:.3f} px"
     )
     tables = (check_table([shown]), _by_estimator(reports), *extra)

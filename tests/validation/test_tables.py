@@ -16,7 +16,7 @@ from helpers.reconstructions import make_reconstruction
 
 from rigkit.errors import InputError
 from rigkit.io.paper_tables import load_paper_tables
-from rigkit.report.tables import tables_to_csv, tables_to_json, tables_to_latex, tables_to_markdown
+from rigkit.report.tables import measured_words, tables_to_csv, tables_to_json, tables_to_latex, tables_to_markdown
 from rigkit.truth import MeasuredAngle, MeasuredLength, PairTruth
 from rigkit.validation.checks import ValidationReport, validate
 from rigkit.validation.tables import Cell, Column, PaperTables, Table, best_method, build_tables
@@ -189,3 +189,10 @@ def test_a_spoiled_paper_table_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         load_paper_tables(tmp_path / "none")
     assert isinstance(load_paper_tables(PAPER), PaperTables)
+
+
+def test_a_small_sigma_is_not_shown_as_nothing() -> None:
+    assert measured_words(120.0031, 0.0042, 2) == "120.003 ± 0.004"
+    assert measured_words(301.0, 0.5, 2) == "301.00 ± 0.50"
+    assert measured_words(301.0, 0.0, 2) == "301.00 ± 0.00"
+    assert measured_words(301.0, None, 2) == measured_words(301.0, float("nan"), 2) == "301.00"
