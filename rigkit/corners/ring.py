@@ -26,7 +26,7 @@ from rigkit.arrays import BoolArray, FloatArray
 from rigkit.corners.response import FloatImage, sample
 from rigkit.native.front import RingRules
 
-__all__ = ["Rings", "arm_vectors", "read_rings", "ring_rules"]
+__all__ = ["Rings", "arm_vectors", "may_be_corners", "read_rings", "ring_rules"]
 
 HALF = 16
 """Samples in half a turn."""
@@ -40,6 +40,12 @@ MAX_ODD = 0.35
 MAX_CENTRE = 0.16
 """Largest difference of the centre from the mean of the ring, relative to the contrast. Rings inside the four squares
 show less than 0.06; more where they reach beyond, which spoils the directions as well, and between dots or letters."""
+
+QUICK, QUICK_ODD, QUICK_CENTRE, QUICK_SHARP = 4, 0.5, 0.6, 1.3
+"""Every so many samples tell most of what is no corner, at a quarter of the cost: the energy of the odd part relative to
+that of the even part, the centre off the mean relative to its deviation, the response relative to its variance.
+Of 29157 rings that pass the other tests, in rendered and real images, two are lost; of those of noise and texture two in
+three need not be read."""
 
 LARGEST_GAIN = 8.0
 """Largest R_2 / R_4 that is made up for: beyond it, in the middle of a strong blur, harmonic 4 is only noise."""
@@ -67,6 +73,20 @@ class Rings:
     angles: FloatArray
     contrast: FloatArray
     valid: BoolArray
+
+
+def may_be_corners(image: FloatImage, pixels: FloatArray, radius_px: float, response: FloatImage) -> BoolArray:
+    """Return which of `pixels` (N, 2), where the saddle response is `response` (N,), are worth to be read a ring of."""
+    places = pixels.astype(np.float32)
+    values = sample(image, places[:, None, :] + np.float32(radius_px) * CIRCLE[::QUICK])
+    one, other = np.split(values, 2, axis=1)
+    even = 0.5 * (one + other)
+    mean = even.mean(axis=1)
+    variance = even.var(axis=1)
+    odd = 0.25 * ((one - other) ** 2).mean(axis=1)
+    off = np.abs(sample(image, places) - mean)
+    possible: BoolArray = odd < QUICK_ODD * variance
+    return possible & (off**2 < QUICK_CENTRE**2 * variance) & (response < QUICK_SHARP * variance)
 
 
 def read_rings(
@@ -118,7 +138,16 @@ def _gains() -> FloatArray:
 @functools.cache
 def ring_rules(max_centre: float = MAX_CENTRE) -> RingRules:
     """Return the constants of this module for the kernels."""
-    return RingRules.make(CIRCLE, MAX_ODD, max_centre, _gains(), MAX_COSINE)
+    return RingRules.make(
+        CIRCLE,
+        _gains(),
+        most_odd=MAX_ODD,
+        most_centre=max_centre,
+        most_cosine=MAX_COSINE,
+        quick_odd=QUICK_ODD,
+        quick_centre=QUICK_CENTRE,
+        quick_sharp=QUICK_SHARP,
+    )
 
 
 def arm_vectors(angles: FloatArray) -> FloatArray:

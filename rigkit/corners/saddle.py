@@ -9,7 +9,7 @@ import numpy as np
 from rigkit.arrays import BoolArray, FloatArray, IntArray
 from rigkit.corners.nearby import near_any
 from rigkit.corners.response import FloatImage, Level, peaks
-from rigkit.corners.ring import read_rings, ring_rules
+from rigkit.corners.ring import may_be_corners, read_rings, ring_rules
 from rigkit.native import front
 
 __all__ = ["Corners", "Saddles", "find_corners", "saddle_step"]
@@ -94,10 +94,11 @@ def _corners_of(level: Level) -> tuple[FloatArray, IntArray, FloatArray, FloatAr
     if library is not None:
         return front.corners(library, level.smooth, at, response, RADIUS, MAX_STEP, MAX_SHARPNESS, ring_rules())
     found, near = saddle_step(level.smooth, at)
-    found = found[near]
-    rings = read_rings(level.smooth, found, RADIUS)
-    which = np.flatnonzero(rings.valid & (response[near] <= MAX_SHARPNESS * rings.contrast**2))
-    return found, which, rings.angles[which], rings.contrast[which]
+    found, response = found[near], response[near]
+    which = np.flatnonzero(may_be_corners(level.smooth, found, RADIUS, response))
+    rings = read_rings(level.smooth, found[which], RADIUS)
+    good = rings.valid & (response[which] <= MAX_SHARPNESS * rings.contrast**2)
+    return found, which[good], rings.angles[good], rings.contrast[good]
 
 
 def _without_known(fresh: Corners, known: list[Corners]) -> Corners:

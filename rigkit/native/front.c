@@ -270,6 +270,31 @@ INLINE int saddle_near(const float *smooth, int64_t width, int64_t u, int64_t v,
     return fabs(step_u) <= most_step && fabs(step_v) <= most_step;
 }
 
+/* Return whether every fourth sample of the ring around (u, v) leaves it possible that there is a corner
+ * (corners.ring.may_be_corners). */
+INLINE int may_be_corner(
+    const image_t image, const ring_rules_t *rules, float u, float v, float radius, float response)
+{
+    enum { PAIRS = MOST_HALF / 4 };
+    float even[PAIRS], mean = 0.0f, energy = 0.0f, odd_energy = 0.0f;
+    const int64_t pairs = rules->half / 4;
+    for (int64_t k = 0; k < pairs; k++) {
+        const float *one = rules->circle + 8 * k, *other = one + 2 * rules->half;
+        const float here = brightness_at(image, u + radius * one[0], v + radius * one[1]);
+        const float there = brightness_at(image, u + radius * other[0], v + radius * other[1]);
+        even[k] = 0.5f * (here + there);
+        mean += even[k];
+        odd_energy += 0.25f * (here - there) * (here - there);
+    }
+    mean /= (float)pairs;
+    for (int64_t k = 0; k < pairs; k++)
+        energy += (even[k] - mean) * (even[k] - mean);
+    const float centre = brightness_at(image, u, v) - mean, variance = energy / (float)pairs;
+    return odd_energy < (float)rules->quick_odd * energy &&
+           centre * centre < (float)(rules->quick_centre * rules->quick_centre) * variance &&
+           response < (float)rules->quick_sharp * variance;
+}
+
 /* The corners of one level among `count` peaks of `response`: `saddles` (count, 2) gets those with a saddle nearby,
  * `which`, `angles` (count, 2) and `contrast` those of them that are corners: their ring is valid and they are no sharper
  * than `most_sharp`. Returns the number of saddles and, in `found`, of corners. */
@@ -288,7 +313,8 @@ FOR_EACH_PROCESSOR int64_t find_corners(
         if (!saddle_near(image.brightness, image.width, peaks[2 * k], peaks[2 * k + 1], most_step, pixel))
             continue;
         near++;
-        if (read_ring(image, *rules, (float)pixel[0], (float)pixel[1], (float)radius, angles + 2 * corners,
+        if (may_be_corner(image, rules, (float)pixel[0], (float)pixel[1], (float)radius, response[k]) &&
+            read_ring(image, *rules, (float)pixel[0], (float)pixel[1], (float)radius, angles + 2 * corners,
                       contrast + corners) &&
             response[k] <= most_sharp * contrast[corners] * contrast[corners])
             which[corners++] = near - 1;

@@ -34,17 +34,17 @@ class RingRules(Structure):
     _fields_: ClassVar = [
         *((name, c_void_p) for name in ("circle", "gains")),
         *((name, c_int64) for name in ("half", "gain_count")),
-        *((name, c_double) for name in ("most_odd", "most_centre", "most_cosine")),
+        *(
+            (name, c_double)
+            for name in ("most_odd", "most_centre", "most_cosine", "quick_odd", "quick_centre", "quick_sharp")
+        ),
     ]
 
     @classmethod
-    def make(
-        cls, circle: Image, most_odd: float, most_centre: float, gains: FloatArray, most_cosine: float
-    ) -> RingRules:
+    def make(cls, circle: Image, gains: FloatArray, **numbers: float) -> RingRules:
         """Return the rules; `circle` (2 * half, 2) are the samples of a ring of radius 1."""
         kept = np.ascontiguousarray(circle, np.float32), np.ascontiguousarray(gains, np.float64)
-        arrays = (address(kept[0]), address(kept[1]), len(kept[0]) // 2, len(kept[1]))
-        rules = cls(*arrays, most_odd, most_centre, most_cosine)
+        rules = cls(address(kept[0]), address(kept[1]), len(kept[0]) // 2, len(kept[1]), **numbers)
         rules.kept = kept
         return rules
 

@@ -58,7 +58,7 @@ typedef struct {
     const float *circle;
     const double *gains;
     int64_t half, gain_count;
-    double most_odd, most_centre, most_cosine;
+    double most_odd, most_centre, most_cosine, quick_odd, quick_centre, quick_sharp;
 } ring_rules_t;
 
 /* Return the two angles of a corner from the `even` part of its ring (corners.ring._angles). */
