@@ -42,9 +42,9 @@ MAX_CENTRE = 0.16
 show less than 0.06; more where they reach beyond, which spoils the directions as well, and between dots or letters."""
 
 QUICK, QUICK_ODD, QUICK_CENTRE, QUICK_SHARP = 4, 0.5, 0.6, 1.3
-"""Every so many samples tell most of what is no corner, at a quarter of the cost: the energy of the odd part relative to
-that of the even part, the centre off the mean relative to its deviation, the response relative to its variance.
-Of 29157 rings that pass the other tests, in rendered and real images, two are lost; of those of noise and texture two in
+"""Every so many samples tell most of what is no corner, at a quarter of the cost: the energy of the odd part relative
+to that of the even part, the centre off the mean relative to its deviation, the response relative to its variance. Of
+29157 rings that pass the other tests, in rendered and real images, two are lost; of those of noise and texture two in
 three need not be read."""
 
 LARGEST_GAIN = 8.0
@@ -85,8 +85,8 @@ def may_be_corners(image: FloatImage, pixels: FloatArray, radius_px: float, resp
     variance = even.var(axis=1)
     odd = 0.25 * ((one - other) ** 2).mean(axis=1)
     off = np.abs(sample(image, places) - mean)
-    possible: BoolArray = odd < QUICK_ODD * variance
-    return possible & (off**2 < QUICK_CENTRE**2 * variance) & (response < QUICK_SHARP * variance)
+    possible = (odd < QUICK_ODD * variance) & (off**2 < QUICK_CENTRE**2 * variance) & (response < QUICK_SHARP * variance)
+    return np.asarray(possible, dtype=np.bool_)
 
 
 def read_rings(
