@@ -12,6 +12,7 @@ from rigkit.boards import Board
 from rigkit.calibration.assemble import motion_of_world
 from rigkit.calibration.result import BoardShape, Calibration, ViewResult
 from rigkit.calibration.rig.board_rig import BoardRig, PlacedBoard
+from rigkit.calibration.rig.flatness import shape_error
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.result import RigCalibration, RigCamera
 from rigkit.calibration.rig.seen import Places
@@ -40,6 +41,9 @@ def assemble_rig(
     layout = state.layout(observations)
     sigma = residual_sigma(joint)
     unit, back, own = normal.covariance()
+    off = shape_error(observations, state, sigma * spread)
+    if off.any():
+        unit[: len(off), : len(off)] += np.outer(off, off) / (sigma * spread) ** 2
     covariance = unit * (sigma * spread) ** 2
     boards = observations.cameras[0].boards
     points = observations.shape.points(state.unknowns)

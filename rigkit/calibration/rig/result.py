@@ -49,7 +49,8 @@ class RigCalibration:
         (rad) and translation (mm), six each.
     sigma_px : standard deviation of a corner per coordinate, of median quality.
     spread : by how much more the frames disagree than the corners' scatter alone explains, as a ratio of standard
-        deviations: 1 where the errors of a frame's corners are independent. All covariances count it in.
+        deviations: 1 where the errors of a frame's corners are independent. All covariances count it in, and by how
+        much cameras and mounts would move if the boards' corners were free.
     single : each camera calibrated alone, with its own verdicts.
     convergence : of the joint solve.
     corner_count : corners used.
