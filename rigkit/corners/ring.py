@@ -85,7 +85,9 @@ def may_be_corners(image: FloatImage, pixels: FloatArray, radius_px: float, resp
     variance = even.var(axis=1)
     odd = 0.25 * ((one - other) ** 2).mean(axis=1)
     off = np.abs(sample(image, places) - mean)
-    possible = (odd < QUICK_ODD * variance) & (off**2 < QUICK_CENTRE**2 * variance) & (response < QUICK_SHARP * variance)
+    possible = (
+        (odd < QUICK_ODD * variance) & (off**2 < QUICK_CENTRE**2 * variance) & (response < QUICK_SHARP * variance)
+    )
     return np.asarray(possible, dtype=np.bool_)
 
 
