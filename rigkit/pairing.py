@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations, product
 from typing import Literal
 
 import numpy as np
@@ -19,7 +20,9 @@ from rigkit.corners.identify import identify_pair
 from rigkit.corners.pair_identity import PairIdentity, common_corners
 from rigkit.detections import BoardDetection
 from rigkit.errors import DegenerateError, InputError
+from rigkit.geometry.rotation import angle_between
 from rigkit.matches import DirectionPairs, Matches
+from rigkit.truth import MeasuredAngle
 
 __all__ = ["Chain", "MatchedPair", "match_pair"]
 
@@ -28,6 +31,16 @@ Chain = Literal["raw", "rectified"]
 MAX_RECTIFIED_RAD = np.deg2rad(75.0)
 """A perspective view along the camera's axis stretches a pixel there by 1 / cos^2 = 15; beyond it the raw chain is the
 only sensible one."""
+
+POSED_SIGMA_DEG = 0.3
+"""How well the boards' poses in a pair show the angle between two of them, at the worst."""
+NAMING_ODDS = 2.0 * np.log(1000.0)
+"""Angles tell boards that look alike apart where chi2 speaks so clearly for other names, and for those names: as the
+odds in `rigkit.corners.identify`."""
+NAMING_COVERAGE = 4.0
+"""Largest deviation of an angle, in sigmas, under the names it speaks for."""
+MOST_ALIKE = 6
+"""More boards of one kind are not told apart by angles: their orders are too many to try."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -78,6 +91,7 @@ def match_pair(
     boards: Sequence[Board],
     *,
     layout: Mapping[str, str] | None = None,
+    angles: Sequence[MeasuredAngle] = (),
     chain: Chain = "raw",
     support: Support = "patch",
     window: int | None = 2,
@@ -90,7 +104,8 @@ def match_pair(
     camera1, camera2 : the cameras; one object twice where one camera was moved.
     detections1, detections2 : all boards found in either image.
     boards : the boards that stand there.
-    layout : board id -> "left", "right" or "floor" where a person said so.
+    layout : board id -> "left", "right", "floor", "ceiling" or "back" where a person said so.
+    angles : between boards, as measured: they tell boards that look alike apart where no layout does.
     chain : coordinates to work in.
     support, window : what a direction is estimated from, see `direction_field`.
 
@@ -103,6 +118,17 @@ def match_pair(
     """
     _check_sizes(pair_id, (*detections1, *detections2), boards)
     identity = identify_pair(detections1, detections2, boards, camera1, camera2, layout=layout)
+    given = {d.board_id for d in (*detections1, *detections2)} | set(layout or ())
+    names = _names_by_angles(identity, [b for b in boards if b.board_id not in given], angles)
+    if names:
+        before = identity
+        first, second = (
+            [replace(d, board_id=names.get(str(d.board_id), d.board_id)) for d in found]
+            for found in (identity.detections1, identity.detections2)
+        )
+        identity = identify_pair(first, second, boards, camera1, camera2, layout=layout)
+        said = f"boards {', '.join(sorted(names))} look alike and were told apart by the measured angles"
+        identity = replace(identity, notes=(*before.notes, f"{said}; a layout would say for certain which is which"))
     pairs, unseen = _with_rays(identity.pairs(), camera1, camera2)
     if not pairs:
         reasons = "; ".join(f"{name}: {why}" for name, why in identity.missing.items())
@@ -133,6 +159,47 @@ def match_pair(
         noise,
         (*notes, *identity.notes),
     )
+
+
+def _names_by_angles(
+    identity: PairIdentity, boards: Sequence[Board], angles: Sequence[MeasuredAngle]
+) -> dict[str, str]:
+    """Return other names for those of `boards` that look alike, if the angles speak for them clearly; else nothing."""
+    faces = {}
+    for board_id, pose in identity.cam1_from_board.items():
+        normal = pose.rotation[:, 2]
+        faces[board_id] = -np.sign(normal @ pose.translation_mm) * normal
+    known = [a for a in angles if a.a in faces and a.b in faces]
+    choices = list(_other_names([b for b in boards if b.board_id in faces])) if known else []
+    if not choices:
+        return {}
+
+    def deviations(names: Mapping[str, str]) -> FloatArray:
+        """Return how far each angle is off if the board called k is truly `names[k]`, in sigmas."""
+        face_of = {names.get(k, k): face for k, face in faces.items()}
+        ours = [180.0 - np.rad2deg(angle_between(face_of[a.a], face_of[a.b])) for a in known]
+        sigma = np.hypot([a.sigma_deg for a in known], POSED_SIGMA_DEG)
+        return np.asarray((np.array(ours) - [a.value_deg for a in known]) / sigma)
+
+    best = min(choices, key=lambda names: float((deviations(names) ** 2).sum()))
+    gain = float((deviations({}) ** 2).sum() - (deviations(best) ** 2).sum())
+    if gain < NAMING_ODDS or np.abs(deviations(best)).max() > NAMING_COVERAGE:
+        return {}
+    return {name: other for name, other in best.items() if name != other}
+
+
+def _other_names(boards: Sequence[Board]) -> Iterator[dict[str, str]]:
+    """Yield every way to exchange the names of boards that look alike."""
+    kinds: dict[tuple[tuple[int, float], ...], list[str]] = {}
+    for board in boards:
+        if board.markers is None:
+            sides = sorted([(board.columns, board.square_x_mm), (board.rows, board.square_y_mm)])
+            kinds.setdefault(tuple(sides), []).append(board.board_id)
+    alike = [ids for ids in kinds.values() if 1 < len(ids) <= MOST_ALIKE]
+    for orders in product(*(permutations(ids) for ids in alike)):
+        names = {a: b for ids, order in zip(alike, orders, strict=True) for a, b in zip(ids, order, strict=True)}
+        if any(a != b for a, b in names.items()):
+            yield names
 
 
 def _check_sizes(pair_id: str, detections: Sequence[BoardDetection], boards: Sequence[Board]) -> None:

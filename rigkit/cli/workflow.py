@@ -233,6 +233,7 @@ def match_found(
         detections2,
         pair.boards,
         layout=pair.layout or None,
+        angles=pair.truth.angles,
         chain="rectified" if chain == "rectified" else "raw",
     )
 

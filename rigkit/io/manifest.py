@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from rigkit.boards import Board
+from rigkit.corners.naming import SIDES
 from rigkit.errors import InputError
 from rigkit.io.board_file import board_from_table, load_board
 from rigkit.io.toml_reader import TomlTable, read_toml
@@ -21,7 +22,6 @@ __all__ = ["SCHEMA", "CameraEntry", "Dataset", "Pair", "load_dataset"]
 SCHEMA = "rigkit.dataset/1"
 MANIFEST = "dataset.toml"
 SESSION = "session.toml"
-PLACES = ("left", "right", "floor")
 
 Entry = TypeVar("Entry")
 
@@ -55,7 +55,7 @@ class Pair:
     level_sigma_deg : how well the spirit level held, or None: a soft prior.
     boards : the boards that stand there.
     truth : what a person measured.
-    layout : board id -> "left", "right" or "floor", as seen from camera 1; empty where not stated.
+    layout : board id -> "left", "right", "floor", "ceiling" or "back", as seen from camera 1; empty where not stated.
     """
 
     pair_id: str
@@ -200,7 +200,7 @@ def _layout(table: TomlTable, names: Sequence[str]) -> dict[str, str]:
     out = {}
     for board_id in inner.names():
         _named(board_id, dict.fromkeys(names, 0), f"{inner.path}: {inner.where}: board")
-        out[board_id] = inner.text(board_id, hint=f'{board_id} = "left"', choices=PLACES)
+        out[board_id] = inner.text(board_id, hint=f'{board_id} = "left"', choices=tuple(SIDES))
     return out
 
 
