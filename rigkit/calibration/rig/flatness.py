@@ -25,25 +25,27 @@ DAMPING = 1e-12
 
 
 def shape_error(observations: RigObservations, state: RigState, sigma_px: float) -> FloatArray:
-    """Return by how much the globals but for the shape, (G,), would move if the boards had a richer shape: the richest
-    by which they depart from the one they have by more than chance. Zero where there is none.
+    """Return by how much the globals but for the shape, (G,), would move if the boards had a richer shape: richer ones
+    are tried as long as the boards depart from the one they have by more than chance. Zero where they do not.
 
     `sigma_px` is the standard deviation of a corner, the disagreement of the frames counted in.
     """
     count = state.layout(observations).shape.start
+    found = np.zeros(count)
     if not sigma_px > 0.0:
-        return np.zeros(count)
+        return found
     # Which boards are seen often enough, all cameras together.
     boards = np.concatenate([own.board for own in observations.cameras])
     everything = replace(observations.cameras[0], board=boards)
     known = observations.shape.count
-    for kind in SHAPES[: SHAPES.index(observations.shape.kind) : -1]:
+    for kind in SHAPES[SHAPES.index(observations.shape.kind) + 1 :]:
         shape = shape_model(kind, everything)
         shape = replace(shape, sigma=np.concatenate([observations.shape.sigma, shape.sigma[known:]]))
         unknowns = np.concatenate([state.unknowns, np.zeros(shape.count - known)])
         normal = rig_normal(replace(observations, shape=shape), replace(state, unknowns=unknowns), sigma_px)
         step = normal.step(DAMPING)
         more = shape.count - known
-        if step is not None and step.predicted > sigma_px**2 * (more + CHANCE_SIGMAS * np.sqrt(2.0 * more)):
-            return step.globals[:count]
-    return np.zeros(count)
+        if step is None or step.predicted < sigma_px**2 * (more + CHANCE_SIGMAS * np.sqrt(2.0 * more)):
+            break
+        found = step.globals[:count]
+    return found
