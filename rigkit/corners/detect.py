@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from rigkit.arrays import IntArray
 from rigkit.boards import Board
 from rigkit.cameras.base import Camera
 from rigkit.corners.border import place_part
@@ -19,6 +20,7 @@ from rigkit.corners.grow import SaddleIndex, grow_all
 from rigkit.corners.guided import complete_boards
 from rigkit.corners.lattice import Lattice, build_lattices
 from rigkit.corners.links import find_links
+from rigkit.corners.nearby import near_any
 from rigkit.corners.origin import quarter_turns
 from rigkit.corners.response import GreyImage, Level, grey_image, pyramid
 from rigkit.corners.saddle import find_corners
@@ -109,8 +111,13 @@ def detect_boards(
     lattices = [known_part(item, sizes) for item in lattices]
     placed = [place_part(grey, item, sizes) or item for item in lattices]
     found = complete_boards(grey, [*marked, *(_detection(item, sizes) for item in placed)], known, camera)
-    ordered = sorted(found, key=lambda item: (-len(item.grid), *np.round(item.pixels.mean(axis=0)[::-1], 3)))
+    ordered = sorted(found, key=_rank)
     return tuple(_named(_apart(ordered), plain))
+
+
+def _rank(item: BoardDetection) -> tuple[int, float, float]:
+    u, v = item.pixels.mean(axis=0)
+    return -len(item.grid), round(float(v), 3), round(float(u), 3)
 
 
 def _apart(found: Sequence[BoardDetection]) -> list[BoardDetection]:
@@ -118,24 +125,33 @@ def _apart(found: Sequence[BoardDetection]) -> list[BoardDetection]:
 
     A board that something lies across is found in parts; the largest, completed, has the corners of the others.
     """
-    kept: list[BoardDetection] = []
-    for item in found:
-        shared = (
-            (np.abs(item.pixels[:, None] - other.pixels).max(axis=2) < SAME_PX).any(axis=1).mean() for other in kept
-        )
-        if not any(share > 0.5 for share in shared):
-            kept.append(item)
-    return kept
+    low, high = (np.array([f(item.pixels, axis=0) for item in found]).reshape(-1, 2) for f in (np.min, np.max))
+    touching = np.asarray(((low[:, None] < high + SAME_PX) & (low < high[:, None] + SAME_PX)).all(axis=2))
+    kept: list[int] = []
+    for k, item in enumerate(found):
+        others = (found[j] for j in kept if touching[j, k])
+        if not any(near_any(item.pixels, other.pixels, SAME_PX).mean() > 0.5 for other in others):
+            kept.append(k)
+    return [found[k] for k in kept]
 
 
 def _detection(refined: RefinedLattice, sizes: Sequence[tuple[int, int]]) -> BoardDetection:
-    row, column = np.nonzero(refined.lattice.known)
-    columns, rows = refined.lattice.size
-    grid = np.stack([column, row], axis=-1)
-    found = BoardDetection(
-        None, columns, rows, grid, refined.lattice.pixels[row, column], refined.sigma_px[row, column]
+    lattice, turns = refined.lattice, quarter_turns(refined.lattice, sizes)
+    # The corners row by row as they will be counted.
+    columns, rows = lattice.size
+    cells: IntArray = np.rot90(np.arange(rows * columns).reshape(rows, columns), -turns)
+    row, column = np.nonzero(lattice.known.ravel()[cells])
+    order = cells[row, column]
+    if turns % 2 == 1:
+        columns, rows = rows, columns
+    return BoardDetection(
+        None,
+        columns,
+        rows,
+        np.stack([column, row], axis=-1),
+        lattice.pixels.reshape(-1, 2)[order],
+        refined.sigma_px.ravel()[order],
     )
-    return found.turned(quarter_turns(refined.lattice, sizes))
 
 
 def _named(found: list[BoardDetection], boards: Sequence[Board]) -> list[BoardDetection]:
