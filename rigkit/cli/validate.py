@@ -281,6 +281,8 @@ def _say_failures(reports: list[ValidationReport], compared: list[CrossCheckRepo
                     f"DISAGREES {other.pair_id} {c.name}: {c.ours:.4f} {c.unit}, {c.how} {c.measured:.4f}, "
                     f"{c.k:.1f} combined sigmas apart"
                 )
+        for words in other.skipped:
+            note(f"{other.pair_id}: not cross-checked by {words}")
     for words in dict.fromkeys(f"{report.pair_id}: {n}" for report in reports for n in report.notes):
         note(words)
 

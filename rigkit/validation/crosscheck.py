@@ -193,6 +193,11 @@ def compare_chains(reconstruction: Reconstruction, other: Reconstruction, name: 
 
 
 def _colmap_ways(reconstruction: Reconstruction, seed: int) -> list[OtherWay]:
+    if len(np.unique(reconstruction.cloud.board_index)) == 1:
+        raise DegenerateError(
+            "all corners lie on one board, and two poses show one plane alike: pycolmap knows no squares "
+            "and may find the other one"
+        )
     pixels = (reconstruction.pixels1, reconstruction.pixels2)
     pair = colmap_pair(reconstruction.camera1, reconstruction.camera2, *pixels)
     excluded = int((~pair.used).sum())

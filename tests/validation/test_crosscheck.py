@@ -203,3 +203,10 @@ def test_relative_covariance_is_the_sampled_one(rng: np.random.Generator) -> Non
     predicted = relative_pose_covariance(one, two, half @ half.T)
     # 4000 draws: 1.1 % per standard deviation.
     assert np.std(samples, axis=0) == pytest.approx(np.sqrt(np.diag(predicted)), rel=0.05)
+
+
+def test_one_board_is_no_case_for_pycolmap() -> None:
+    report = crosscheck(made(CAMERAS["brown"], keep=(2,)))
+    assert report.passed
+    assert [way.name for way in report.ways] == [PNP]
+    assert "one board" in report.skipped[0]
