@@ -281,21 +281,28 @@ def _fits(
     first = np.where((sign > 0)[:, None], a, b)
     second = np.where((sign > 0)[:, None], b, a)
     good = rings.valid & _parallel(rings.angles[:, 0], first) & _parallel(rings.angles[:, 1], second)
-    for direction in range(4):
-        beside = cell[owner] + STEPS[direction][::-1]
-        inside = ((beside >= 0) & (beside < lattice.known.shape)).all(axis=1)
-        beside = np.where(inside[:, None], beside, 0)
-        neighbour = lattice.pixels[beside[:, 0], beside[:, 1]]
-        there = inside & np.isfinite(neighbour[:, 0])
-        end = level.to_level(np.where(there[:, None], neighbour, pixels))
-        length = np.linalg.norm(end - local, axis=1)
-        side = sign if direction % 2 == 0 else -sign
-        difference = edge_contrast(level.smooth, local, end, side, np.clip(ASIDE * length, MIN_ASIDE_PX, MAX_ASIDE_PX))
-        known = np.nan_to_num(lattice.contrast[beside[:, 0], beside[:, 1]], nan=0.0)
-        weakest = CONTRAST_RATIO * np.minimum(known, rings.contrast)
-        edge = (difference > weakest[:, None]).sum(axis=1) >= MOST
-        good &= edge | ~there
+    # Few pass, so only theirs are the edges that are read.
+    good[good] = _edges_seen(lattice, level, cell[owner[good]], local[good], sign[good], rings.contrast[good])
     return rings.contrast, good
+
+
+def _edges_seen(
+    lattice: Lattice, level: Level, cell: IntArray, local: FloatArray, sign: FloatArray, contrast: FloatArray
+) -> BoolArray:
+    """Return whether the edges from `local` (M, 2), in the cells `cell` (M, 2), to all known neighbours are there."""
+    beside = cell[:, None] + STEPS[:, ::-1]
+    inside = ((beside >= 0) & (beside < lattice.known.shape)).all(axis=2)
+    row, column = np.moveaxis(np.where(inside[..., None], beside, 0), 2, 0)
+    which, direction = np.nonzero(inside & lattice.known[row, column])
+    end = level.to_level(lattice.pixels[row, column][which, direction])
+    length = np.linalg.norm(end - local[which], axis=1)
+    side = np.where(direction % 2 == 0, sign[which], -sign[which])
+    aside = np.clip(ASIDE * length, MIN_ASIDE_PX, MAX_ASIDE_PX)
+    difference = edge_contrast(level.smooth, local[which], end, side, aside)
+    weakest = CONTRAST_RATIO * np.minimum(lattice.contrast[row, column][which, direction], contrast[which])
+    seen = np.ones(len(cell), np.bool_)
+    seen[which[(difference > weakest[:, None]).sum(axis=1) < MOST]] = False
+    return seen
 
 
 def _parallel(angle: FloatArray, vector: FloatArray) -> BoolArray:
