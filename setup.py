@@ -19,7 +19,7 @@ def library(source: Path) -> Extension:
         sources=[str(source)],
         depends=[str(HEADER)],
         define_macros=[("RIGKIT_SOURCE", f'"{digest}"')],
-        extra_compile_args=["-O3", "-std=gnu11", "-Wall", "-fno-math-errno", "-fno-trapping-math"],
+        extra_compile_args=["-O3", "-std=gnu11", "-Wall", "-fno-math-errno", "-fno-trapping-math", "-fopenmp-simd"],
         optional=True,
     )
 

@@ -16,7 +16,9 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, Mat3
+from rigkit.fundamental.eight_point import essential_nearest
 from rigkit.fundamental.rows import essential_from_planar
+from rigkit.native import minimal as native
 
 __all__ = [
     "essential_from_five_rows",
@@ -35,6 +37,12 @@ _DEGREES3 = np.array([list(map(int, term)) for term in _CUBIC + _LOWER])
 
 _DEGREES2 = np.array([[3, 0], [2, 1], [1, 2], [0, 3], [2, 0], [1, 1], [0, 2], [1, 0], [0, 1], [0, 0]])
 
+_OFTEN = np.array([1.0, 3.0, 3.0, 1.0, 3.0, 6.0, 3.0, 3.0, 3.0, 1.0])
+"""How many of the 27 products of three of (x, y, 1) are each of the ten monomials."""
+
+_PRODUCTS = np.array([[0, 1, 4, 1, 2, 5, 4, 5, 7], [1, 2, 5, 2, 3, 6, 5, 6, 8], [4, 5, 7, 5, 6, 8, 7, 8, 9]])
+"""Which monomial is the product of one of (x, y, 1), by row, and each pair of them."""
+
 
 def fundamental_from_seven_rows(rows: FloatArray) -> Mat3:
     """Return up to three F (B, 3, 3, 3) of rows (B, 7, 9): det(x F1 + y F2) = 0 in the null space."""
@@ -51,6 +59,8 @@ def fundamental_from_seven_rows(rows: FloatArray) -> Mat3:
 
 def essential_from_five_rows(rows: FloatArray) -> Mat3:
     """Return up to ten E (B, 10, 3, 3) of rows (B, 5, 9)."""
+    if (library := native.loaded()) is not None:
+        return native.five_rows(library, rows)
     basis = _null_space(rows, 4)
     coefficients = _constraint_coefficients(basis, _DEGREES3)
     ok = np.linalg.cond(coefficients[:, :, :10]) < 1e13
@@ -70,16 +80,20 @@ def essential_from_five_rows(rows: FloatArray) -> Mat3:
 
 
 def essential_from_six_rows(rows: FloatArray) -> Mat3:
-    """Return the E (B, 1, 3, 3) of rows (B, 6, 9), two affine correspondences: the best common root of ten cubics."""
+    """Return the E (B, 1, 3, 3) of rows (B, 6, 9), two affine correspondences: the essential matrix nearest to the one
+    whose monomials violate the ten cubics least.
+
+    The monomials are scaled so that the answer does not depend on the choice of the basis: all 27 products of three of
+    the unknowns, of which ten differ, have the length one together.
+    """
+    if (library := native.loaded()) is not None:
+        return native.six_rows(library, rows)
     basis = _null_space(rows, 3)
-    coefficients = _constraint_coefficients(basis, _DEGREES2)
-    monomials = np.linalg.svd(coefficients)[2][:, -1]
-    # x3, y3 and 1 = z3 with their neighbours: divide by the largest, which no bad choice of the basis can make small.
-    cubes = monomials[:, [[0, 1, 4], [2, 3, 6], [7, 8, 9]]]
-    pick = np.argmax(np.abs(monomials[:, [0, 3, 9]]), axis=1)
-    weights = cubes[np.arange(len(rows)), pick]
-    real = np.ones((len(rows), 1), dtype=bool)
-    return _unit(np.einsum("bk,bkij->bij", weights, basis)[:, None], real)
+    coefficients = _constraint_coefficients(basis, _DEGREES2) / np.sqrt(_OFTEN)
+    monomials = np.linalg.svd(coefficients)[2][:, -1] / np.sqrt(_OFTEN)
+    # With noise they are no products: the weights whose products come nearest.
+    weights = np.linalg.svd(monomials[:, _PRODUCTS])[0][:, :, 0]
+    return essential_nearest(np.einsum("bk,bkij->bij", weights, basis))[:, None]
 
 
 def planar_from_two_rows(rows: FloatArray) -> Mat3:

@@ -4,14 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, Mat3, Rays
+from rigkit.arrays import FloatArray, IntArray, Mat3, Rays
 from rigkit.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import cross, log_so3, skew
 from rigkit.geometry.triangulation import ray_ranges
 from rigkit.posetype import PoseType
 
-__all__ = ["choose_pose", "decompose_essential", "essential_from_pose", "hypothesis_poses", "translation_basis"]
+__all__ = [
+    "choose_pose",
+    "decompose_essential",
+    "essential_from_pose",
+    "free_directions",
+    "hypothesis_poses",
+    "rotations_and_direction",
+    "translation_basis",
+]
 
 
 def essential_from_pose(cam2_from_cam1: Rigid3) -> Mat3:
@@ -23,13 +31,21 @@ def essential_from_pose(cam2_from_cam1: Rigid3) -> Mat3:
     return np.asarray(E21 / size)
 
 
-def decompose_essential(E21: Mat3) -> tuple[Rigid3, Rigid3, Rigid3, Rigid3]:
-    """Return the four poses cam2_from_cam1 (unit baseline) whose essential matrix is `E21` up to sign."""
+def rotations_and_direction(E21: Mat3) -> tuple[Mat3, Mat3, FloatArray]:
+    """Return two rotations (..., 3, 3) and a unit direction (..., 3) with E = [t]x R up to sign and size (..., 3, 3).
+
+    The rotations differ by half a turn about the baseline.
+    """
     u, _, vt = np.linalg.svd(E21)
-    u, vt = u * np.linalg.det(u), vt * np.linalg.det(vt)
-    W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    first, second, t = u @ W @ vt, u @ W.T @ vt, u[:, 2]
-    return Rigid3(first, t), Rigid3(first, -t), Rigid3(second, t), Rigid3(second, -t)
+    u, vt = u * np.linalg.det(u)[..., None, None], vt * np.linalg.det(vt)[..., None, None]
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    return u @ quarter @ vt, u @ quarter.T @ vt, np.array(u[..., 2])
+
+
+def decompose_essential(E21: Mat3) -> tuple[Rigid3, ...]:
+    """Return the four poses cam2_from_cam1 (unit baseline) whose essential matrix is `E21` up to sign."""
+    first, second, t = rotations_and_direction(E21)
+    return Rigid3.stack(np.stack([first, first, second, second]), np.stack([t, -t, t, -t]))
 
 
 def hypothesis_poses(E21: Mat3, pose_type: PoseType | str = PoseType.GENERAL) -> tuple[Rigid3, ...]:
@@ -56,7 +72,8 @@ def choose_pose(E21: Mat3, rays1: Rays, rays2: Rays, pose_type: PoseType | str =
     infinity, no baseline).
     """
     poses = hypothesis_poses(E21, pose_type)
-    counts = [_in_front(pose, rays1, rays2) for pose in poses]
+    # The poses come in pairs of opposite translations, which turn the signs of all ranges.
+    counts = [count for pose in poses[::2] for count in _in_front(pose, rays1, rays2)]
     order = sorted(range(len(poses)), key=counts.__getitem__, reverse=True)
     best, second = counts[order[0]], counts[order[1]]
     if best <= 0.5 * len(rays1) or best == second:
@@ -67,15 +84,22 @@ def choose_pose(E21: Mat3, rays1: Rays, rays2: Rays, pose_type: PoseType | str =
     return poses[order[0]]
 
 
-def _in_front(pose: Rigid3, rays1: Rays, rays2: Rays) -> int:
+def _in_front(pose: Rigid3, rays1: Rays, rays2: Rays) -> tuple[int, int]:
+    """Return how many points lie in front of both cameras, and how many with the opposite translation."""
     range1, range2, defined = ray_ranges(rays1, rays2, pose)
-    return int((defined & (np.nan_to_num(range1) > 0.0) & (np.nan_to_num(range2) > 0.0)).sum())
+    ahead = [np.sum(defined & (sign * range1 > 0.0) & (sign * range2 > 0.0)) for sign in (1.0, -1.0)]
+    return int(ahead[0]), int(ahead[1])
 
 
 def translation_basis(direction: FloatArray) -> FloatArray:
-    """Return two unit vectors (2, 3) perpendicular to `direction` and to each other; the first is horizontal."""
+    """Return two unit vectors (..., 2, 3) across `direction` (..., 3), at right angles, the first horizontal."""
     t = np.asarray(direction, dtype=np.float64)
-    first = np.array([t[2], 0.0, -t[0]])
-    size = np.linalg.norm(first)
-    first = first / size if size > 1e-9 else np.array([1.0, 0.0, 0.0])
-    return np.stack([first, cross(t, first)])
+    size = np.hypot(t[..., 0], t[..., 2])[..., None]
+    across = np.stack([t[..., 2], np.zeros(t.shape[:-1]), -t[..., 0]], axis=-1)
+    first = np.where(size > 1e-9, across / np.maximum(size, 1e-9), [1.0, 0.0, 0.0])
+    return np.stack([first, cross(t, first)], axis=-2)
+
+
+def free_directions(pose_type: PoseType | str) -> IntArray:
+    """Return which of (w, b) a pose type leaves free: w the rotation, b the direction along `translation_basis`."""
+    return np.array({"general": [0, 1, 2, 3, 4], "planar": [1, 3]}.get(str(pose_type), []), dtype=np.int64)

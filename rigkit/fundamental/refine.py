@@ -7,17 +7,16 @@ spirit level that holds to 0.2 degrees is neither ignored nor believed exactly.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, IntArray
+from rigkit.arrays import FloatArray
 from rigkit.errors import DegenerateError, InputError
 from rigkit.fundamental.one_plane import one_plane_poses
 from rigkit.fundamental.pose import choose_pose, essential_from_pose, translation_basis
+from rigkit.fundamental.pose_problem import Minimum, PoseProblem, RobustWeights, cauchy_weights
 from rigkit.fundamental.registry import fundamental_for
-from rigkit.fundamental.residuals import affinity_terms, level_terms, point_terms
 from rigkit.fundamental.weights import RowWeights, WeightRule, estimate_sigma_A, usable_affinities
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, rotation_angle, unit
@@ -27,14 +26,10 @@ from rigkit.posetype import PoseType
 
 __all__ = ["RefinedPose", "cauchy_weights", "estimate_pose", "project_to_type", "refine_pose"]
 
-MAX_ITERATIONS = 60
-STEP_TOLERANCE = 1e-10
 SAME_POSE = 5e-3
 """Two minima nearer than this (rad, and share of the baseline) mislead nobody."""
 SIGNIFICANT_COST = 9.0
 """A cost (chi square) higher by this rules a pose out: three standard deviations."""
-CAUCHY_SCALE = 2.385
-"""In standard deviations: 95 % efficient for Gaussian noise."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -61,15 +56,6 @@ class RefinedPose:
     weights: FloatArray
     iterations: int
     converged: bool
-
-
-RobustWeights = Callable[[FloatArray], FloatArray]
-"""From residuals in sigmas (N,) to factors of their squares (N,)."""
-
-
-def cauchy_weights(residuals: FloatArray) -> FloatArray:
-    """Return the weights 1 / (1 + (r / c)^2) of the Cauchy loss."""
-    return np.asarray(1.0 / (1.0 + (residuals / CAUCHY_SCALE) ** 2))
 
 
 def refine_pose(
@@ -109,9 +95,9 @@ def refine_pose(
     if level_sigma_rad is not None and not level_sigma_rad > 0.0:
         raise InputError(f"level sigma must be positive, got {level_sigma_rad} rad; leave it out for an exact level")
     exact = level_sigma_rad is None
-    problem = _Problem(matches, str(pose_type), level_sigma_rad, covariance_A, robust, point_weights)
+    problem = PoseProblem(matches, str(pose_type), level_sigma_rad, covariance_A, robust, point_weights)
     R, t = project_to_type(start, pose_type) if exact else _split(start)
-    return _minimise(problem, R, t)
+    return _result(problem, problem.minimum(R, t))
 
 
 def estimate_pose(
@@ -199,96 +185,9 @@ def _with_sigma(matches: Matches, E21: FloatArray, weights: WeightRule | RowWeig
     return matches
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Problem:
-    """Residuals, Jacobian and free directions at a pose."""
-
-    matches: Matches
-    kind: str
-    level_sigma_rad: float | None
-    covariance_A: FloatArray | None
-    robust: RobustWeights | None
-    point_weights: FloatArray | None
-
-    def free(self) -> FloatArray:
-        """Return the directions (5, K) in which the pose may move: by (w, b), the first of b horizontal."""
-        if self.level_sigma_rad is not None or self.kind == PoseType.GENERAL:
-            return np.eye(5)
-        return np.eye(5)[:, [1, 3]] if self.kind == PoseType.PLANAR else np.zeros((5, 0))
-
-    def residuals(self, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
-        """Return residuals (M,), Jacobian (M, 5) and the match of each (M,), -1 for the prior; no weights yet."""
-        basis = translation_basis(t)
-        r, jacobian = point_terms(self.matches, R, t, basis)
-        ra, ja, which = affinity_terms(self.matches, R, t, basis, self.covariance_A)
-        rows, by, of = [r, ra.reshape(-1)], [jacobian, ja.reshape(-1, 5)], [np.arange(len(r)), np.repeat(which, 2)]
-        if self.level_sigma_rad is not None:
-            deviation, by_pose = level_terms(self.kind, R, t, basis)
-            rows.append(deviation / self.level_sigma_rad)
-            by.append(by_pose / self.level_sigma_rad)
-            of.append(np.full(len(deviation), -1))
-        return np.concatenate(rows), np.concatenate(by), np.concatenate(of)
-
-    def weights(self, r: FloatArray, of: IntArray) -> FloatArray:
-        """Return the factors (M,) of the squared residuals."""
-        n = len(self.matches)
-        w = np.ones(n) if self.point_weights is None else np.asarray(self.point_weights, dtype=np.float64)
-        data = of >= 0
-        out = np.where(data, w[np.maximum(of, 0)], 1.0)
-        if self.robust is not None:
-            # A match is doubted by its point and by its affinity, each per degree of freedom.
-            doubt = self.robust(r[:n])
-            pair = r[n : n + 2 * int((data.sum() - n) // 2)].reshape(-1, 2)
-            of_pair = self.robust(np.sqrt(0.5 * np.sum(pair**2, axis=1)))
-            out[:n] *= doubt
-            out[n : n + pair.size] *= np.repeat(of_pair, 2) * doubt[of[n : n + pair.size]]
-        return out
-
-
-def _minimise(problem: _Problem, R: FloatArray, t: FloatArray) -> RefinedPose:
-    free = problem.free()
-    freedom = free.shape[1]
-    r, jacobian, of = problem.residuals(R, t)
-    if len(r) < freedom:
-        raise InputError(f"pose refinement: {len(r)} residuals for {freedom} degrees of freedom; add matches")
-    w = problem.weights(r, of)
-    damping, converged, iterations = 1e-6, freedom == 0, 0
-    while not converged and iterations < MAX_ITERATIONS:
-        iterations += 1
-        J = jacobian @ free
-        gram, gradient = (J.T * w) @ J, (J.T * w) @ r
-        scale = np.diag(gram) + 1e-12 * np.trace(gram) + 1e-300
-        step = np.linalg.solve(gram + damping * np.diag(scale), -gradient)
-        new_R, new_t = _moved(R, t, free @ step)
-        new_r, new_jacobian, _ = problem.residuals(new_R, new_t)
-        converged = bool(np.abs(step).max() < STEP_TOLERANCE)
-        # Both poses under the old weights: a step that lowers this sum lowers the robust loss as well.
-        if np.sum(w * new_r**2) <= np.sum(w * r**2) * (1.0 + 1e-14):
-            R, t, r, jacobian = new_R, new_t, new_r, new_jacobian
-            w = problem.weights(r, of)
-            damping = max(damping * 0.1, 1e-12)
-        else:
-            converged = converged or damping > 1e8
-            damping *= 10.0
-    root = np.sqrt(w)
-    return _result(problem, R, t, r * root, (jacobian @ free) * root[:, None], w[of >= 0], iterations, converged)
-
-
-def _moved(R: FloatArray, t: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
-    return exp_so3(step[:3]) @ R, unit(t + step[3:] @ translation_basis(t))
-
-
-def _result(
-    problem: _Problem,
-    R: FloatArray,
-    t: FloatArray,
-    r: FloatArray,
-    J: FloatArray,
-    w: FloatArray,
-    iterations: int,
-    converged: bool,
-) -> RefinedPose:
-    matches, freedom = problem.matches, J.shape[1]
+def _result(problem: PoseProblem, end: Minimum) -> RefinedPose:
+    matches, root, freedom = problem.matches, np.sqrt(end.weights), len(problem.free())
+    r, J = end.residuals * root, end.jacobian[:, problem.free()] * root[:, None]
     gram = J.T @ J
     if freedom and np.linalg.eigvalsh(gram)[0] <= 1e-14 * np.trace(gram):
         raise DegenerateError(
@@ -297,14 +196,11 @@ def _result(
         )
     to_six = np.zeros((6, 5))
     to_six[:3, :3] = np.eye(3)
-    to_six[3:, 3:] = translation_basis(t).T
-    spread = to_six @ problem.free()
+    to_six[3:, 3:] = translation_basis(end.t).T
+    spread = to_six[:, problem.free()]
     covariance = spread @ np.linalg.inv(gram) @ spread.T if freedom else np.zeros((6, 6))
-    prior = 0
-    if problem.level_sigma_rad is not None:
-        prior = len(level_terms(problem.kind, R, t, translation_basis(t))[0])
-    data, n = r[: len(r) - prior], len(matches)
-    pose = Rigid3(R, t)
+    data, n = r[: len(r) - end.priors], len(matches)
+    pose = Rigid3(end.R, end.t)
     E21 = essential_from_pose(pose)
     px = sampson_distances(E21, matches.rays1, matches.rays2, matches.jacobians1, matches.jacobians2)
     return RefinedPose(
@@ -312,8 +208,8 @@ def _result(
         covariance,
         float(np.sqrt(np.mean(px**2))),
         float(r @ r),
-        float(data @ data) / max(len(data) + prior - freedom, 1),
-        w[:n],
-        iterations,
-        converged,
+        float(data @ data) / max(len(r) - freedom, 1),
+        end.weights[:n],
+        end.iterations,
+        end.converged,
     )

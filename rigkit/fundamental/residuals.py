@@ -21,7 +21,7 @@ from rigkit.geometry.triangulation import correct_rays_px
 from rigkit.matches import Matches
 from rigkit.posetype import PoseType
 
-__all__ = ["affinity_terms", "level_terms", "point_terms"]
+__all__ = ["affinity_terms", "level_terms", "point_terms", "whitened_affinities"]
 
 
 def point_terms(matches: Matches, R: FloatArray, t: FloatArray, basis: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -51,17 +51,10 @@ def affinity_terms(
     `covariance_A` (N, 4, 4) of the row-major entries of A21; None takes sigma_A of the matches. Without either there
     are no affinity residuals.
     """
-    nothing = np.zeros((0, 2)), np.zeros((0, 2, 5)), np.zeros(0, dtype=np.int64)
-    if matches.A21 is None or (matches.sigma_A is None and covariance_A is None):
-        return nothing
-    usable = usable_affinities(matches)
-    if covariance_A is not None:
-        usable &= np.isfinite(covariance_A).all(axis=(-2, -1))
-    elif matches.sigma_A is not None:
-        usable &= np.isfinite(matches.sigma_A) & (matches.sigma_A > 0.0)
-    which: IntArray = np.flatnonzero(usable).astype(np.int64)
-    if which.size == 0:
-        return nothing
+    which = _chosen(matches, covariance_A)
+    if not len(which):
+        return np.zeros((0, 2)), np.zeros((0, 2, 5)), which
+    assert matches.A21 is not None
     f1, f2 = matches.rays1[which], matches.rays2[which]
     b1, b2, A = matches.jacobians1[which], matches.jacobians2[which], matches.A21[which]
     turned = f1 @ R.T
@@ -90,6 +83,33 @@ def affinity_terms(
     floor = 1e-12 * np.trace(of_g, axis1=1, axis2=2)[:, None, None] + 1e-300
     whiten = np.linalg.inv(np.linalg.cholesky(of_g + floor * np.eye(2)))
     return (whiten @ g[..., None])[..., 0], whiten @ dg, which
+
+
+def whitened_affinities(matches: Matches) -> tuple[FloatArray, IntArray]:
+    """Return what `affinity_terms` takes from the matches, for its kernel: 23 rows (23, K), and which matches (K,).
+
+    Rays of both images, columns of their ray Jacobians by pixel coordinate, the entries of A21, 1 / sigma_A.
+    """
+    which = _chosen(matches, None)
+    if not len(which):
+        return np.zeros((23, 0)), which
+    assert matches.A21 is not None and matches.sigma_A is not None
+    columns = [b[which].T.reshape(6, -1) for b in (matches.jacobians1, matches.jacobians2)]
+    entries = matches.A21[which].reshape(-1, 4).T
+    rays = matches.rays1[which].T, matches.rays2[which].T
+    return np.concatenate([*rays, *columns, entries, 1.0 / matches.sigma_A[None, which]]), which
+
+
+def _chosen(matches: Matches, covariance_A: FloatArray | None) -> IntArray:
+    """Return which matches (K,) have an affinity of known uncertainty."""
+    usable = usable_affinities(matches)
+    if covariance_A is not None:
+        usable &= np.isfinite(covariance_A).all(axis=(-2, -1))
+    elif matches.sigma_A is not None:
+        usable &= np.isfinite(matches.sigma_A) & (matches.sigma_A > 0.0)
+    else:
+        usable[:] = False
+    return np.flatnonzero(usable).astype(np.int64)
 
 
 def level_terms(

@@ -16,15 +16,18 @@ import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray, Mat3
 from rigkit.errors import DegenerateError, InputError, RigkitError
-from rigkit.fundamental.eight_point import essential_nearest
 from rigkit.fundamental.local import SampsonRows
+from rigkit.fundamental.marginal import QUANTILE, MarginalLoss, marginal_quality, marginal_weights
 from rigkit.fundamental.minimal import essential_from_five_rows, essential_from_six_rows, planar_from_two_rows
 from rigkit.fundamental.planar import solve_planar_batch
 from rigkit.fundamental.pose import choose_pose, essential_from_pose
 from rigkit.fundamental.refine import RefinedPose, refine_pose
 from rigkit.fundamental.registry import fundamental_for
 from rigkit.fundamental.rows import PLANAR_ENTRIES, affinity_rows, essential_from_planar, point_rows
-from rigkit.fundamental.weights import usable_affinities
+from rigkit.fundamental.weights import affinity_residuals, usable_affinities
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import cross
+from rigkit.geometry.triangulation import ray_ranges
 from rigkit.matches import Matches
 from rigkit.posetype import PoseType
 
@@ -33,14 +36,17 @@ __all__ = ["RobustPose", "Sample", "marginal_quality", "marginal_weights", "robu
 Sample = Literal["points", "affine", "mixed"]
 """What minimal samples consist of: points only; affine correspondences only; one affine correspondence and points."""
 
-QUANTILE = 2.576
 MEDIAN_OF_NORMAL = 0.6745
 BATCH = 64
 WIDE = 4.0
-LOCAL_TRIES = 2
+LOCAL_TRIES = 6
 PROMISING = 0.6
-FINALISTS = 6
+FINALISTS = 4
+SAME_QUALITY = 1e-3
+"""In matches: optima that differ by less are one, to the precision of the local optimisation."""
 LEAST_NOISE = 1.5
+"""Noise level over the noise that the matches show: the loss still sees the tails, and few wrong matches."""
+NOISE_ROUNDS = 3
 GOOD_AFFINE = 0.1
 """Share of clean samples with an affinity that lead to the optimum (measured: a third at 0.05 noise of A)."""
 
@@ -63,20 +69,6 @@ class RobustPose:
     weights: FloatArray
     quality: float
     trials: int
-
-
-def marginal_quality(r: FloatArray, max_noise: FloatArray | float) -> FloatArray:
-    """Return q (0 to 1) of residuals in sigmas; `max_noise` may be an array that broadcasts with `r`."""
-    rho = np.abs(r) / QUANTILE
-    low = np.clip(rho, 1.0, max_noise)
-    value = (max_noise - low - rho**2 * (1.0 / low - 1.0 / max_noise)) / (max_noise - 1.0)
-    return np.asarray(np.where(rho < max_noise, value, 0.0))
-
-
-def marginal_weights(r: FloatArray, max_noise: FloatArray | float) -> FloatArray:
-    """Return the weights -q'(r) / r, 1 for small residuals and 0 beyond the highest noise level."""
-    low = np.clip(np.abs(r) / QUANTILE, 1.0, max_noise)
-    return np.asarray((1.0 / low - 1.0 / max_noise) / (1.0 - 1.0 / max_noise))
 
 
 def robust_pose(
@@ -119,21 +111,70 @@ def robust_pose(
         raise DegenerateError(f"no pose in {trials} samples of {len(matches)} matches; check how they were matched")
     # The search allowed for much noise; what the matches that fit show is the noise there is. At that level the local
     # optima, nearly equal before, part company.
-    fitting = np.abs(rows.residuals(finalists[:1])[0])
-    fitting = fitting[fitting < QUANTILE * max_noise]
-    shown = float(np.median(fitting)) / MEDIAN_OF_NORMAL if fitting.size else max_noise
-    final = min(max_noise, max(2.0 * shown, LEAST_NOISE))
-    finalists = rows.improved(finalists, kind, np.full(len(finalists), final), _loss)
-    order = np.argsort(-marginal_quality(rows.residuals(finalists), final).sum(axis=1), kind="stable")
-    for E21 in finalists[order]:
+    noise = max_noise
+    for _ in range(NOISE_ROUNDS):
+        fitting = np.abs(rows.residuals(finalists[:1])[0])
+        fitting = fitting[fitting < QUANTILE * noise]
+        shown = float(np.median(fitting)) / MEDIAN_OF_NORMAL if fitting.size else max_noise
+        noise = min(max_noise, max(LEAST_NOISE * shown, LEAST_NOISE))
+    finalists = rows.improved(finalists, kind, noise)[0]
+    loss = MarginalLoss(noise)
+    for start, plausible in _poses(matches, rows, finalists, kind, noise, max_noise):
+        own = plausible.astype(np.float64)
         try:
-            end = _refined(matches, rows, E21, kind, level_sigma_rad, final)
+            end = refine_pose(matches, start, kind, level_sigma_rad, robust=loss, point_weights=own)
         except RigkitError:
             continue
         r = rows.residuals(essential_from_pose(end.cam2_from_cam1)[None])[0]
-        q, weights = _loss(r, final)
-        return RobustPose(end, np.asarray(np.abs(r) < QUANTILE * final), weights, float(q.sum()), trials)
-    raise DegenerateError(f"no pose that puts the matches in front of both cameras among {len(finalists)} found")
+        plausible = _plausible(matches, end.cam2_from_cam1, max_noise)
+        quality = float(np.sum(marginal_quality(r, noise), where=plausible))
+        return RobustPose(end, plausible & (np.abs(r) < QUANTILE * noise), loss(r) * plausible, quality, trials)
+    raise DegenerateError(f"no pose that enough matches agree with, from in front of both cameras, in {trials} samples")
+
+
+def _poses(
+    matches: Matches, rows: SampsonRows, E21: Mat3, kind: str, noise: float, max_noise: float
+) -> list[tuple[Rigid3, BoolArray]]:
+    """Return the best poses of `E21` (H, 3, 3), best first, and which matches each may be true for (N,).
+
+    Epipolar lines alone do not tell a plane's two poses apart, and have twice the wrong matches on them by chance.
+    """
+    found: list[tuple[float, Rigid3, BoolArray]] = []
+    total, best = rows.quality(E21, noise), 0.0
+    for k in np.argsort(-total, kind="stable"):
+        # What is plausible is a part of all.
+        if total[k] <= best:
+            break
+        r = np.abs(rows.residuals(E21[k : k + 1])[0])
+        # Cheirality by the matches that fit best: those that only might fit are half in front by chance.
+        near = r <= max(QUANTILE, float(np.sort(r)[min(10, len(r)) - 1]))
+        try:
+            pose = choose_pose(E21[k], matches.rays1[near], matches.rays2[near], kind)
+        except DegenerateError:
+            continue
+        plausible = _plausible(matches, pose, max_noise)
+        quality = float(np.sum(marginal_quality(r, noise), where=plausible))
+        found.append((quality, pose, plausible))
+        best = max(best, quality)
+    return [(pose, plausible) for _, pose, plausible in sorted(found, key=lambda entry: -entry[0])]
+
+
+def _plausible(matches: Matches, pose: Rigid3, max_noise: float) -> BoolArray:
+    """Return which matches (N,) are not certainly wrong, wherever they lie on their epipolar lines.
+
+    Certainly wrong: behind a camera by a parallax that is no noise, or with an affinity that is off by more than the
+    highest noise level.
+    """
+    m, sigmas = matches, QUANTILE * max_noise
+    range1, range2, defined = ray_ranges(m.rays1, m.rays2, pose)
+    behind = defined & ((range1 < 0.0) | (range2 < 0.0))
+    parallax = np.linalg.norm(cross(m.rays2, m.rays1 @ pose.rotation.T), axis=1)
+    size1, size2 = (np.sqrt(0.5 * np.sum(b * b, axis=(1, 2))) for b in (m.jacobians1, m.jacobians2))
+    behind &= parallax > sigmas * np.hypot(m.sigma1_px * size1, m.sigma2_px * size2)
+    if m.sigma_A is None:
+        return np.asarray(~behind)
+    off = np.linalg.norm(affinity_residuals(m, essential_from_pose(pose)), axis=1) * np.sqrt(0.5)
+    return np.asarray(~behind & ~(off > sigmas * m.sigma_A))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -149,7 +190,7 @@ class _Search:
 
     def run(self, rng: np.random.Generator, confidence: float, max_trials: int) -> tuple[Mat3, int]:
         """Return the best essential matrices (H, 3, 3), locally optimised, best first, and the number of samples."""
-        best, quality = np.zeros((0, 3, 3)), np.zeros(0)
+        best = np.zeros((0, 3, 3))
         trials, needed, best_rank = 0, float(max_trials), 0.0
         affine = np.flatnonzero(usable_affinities(self.matches))
         while trials < needed:
@@ -159,53 +200,37 @@ class _Search:
             if not len(candidates):
                 continue
             # A sample's own noise can hide a good hypothesis at the final noise level: rank at a wider one.
-            rank = self.quality(candidates, WIDE * self.max_noise)
+            rank = self.rows.quality(candidates, WIDE * self.max_noise)
             tried = np.argsort(-rank, kind="stable")[:LOCAL_TRIES]
             tried = tried[rank[tried] >= PROMISING * best_rank]
             if len(tried):
-                better = self.improved(candidates[tried])
-                best, quality = np.concatenate([best, better]), np.append(quality, self.quality(better, self.max_noise))
-                order = np.argsort(-quality, kind="stable")[:FINALISTS]
-                best, quality = best[order], quality[order]
-                best_rank = float(self.quality(best[:1], WIDE * self.max_noise)[0])
+                best = self.best(np.concatenate([best, self.improved(candidates[tried])]))
+                best_rank = float(self.rows.quality(best[:1], WIDE * self.max_noise)[0])
             share = float(np.mean(np.abs(self.rows.residuals(best[:1])[0]) < QUANTILE * self.max_noise))
             # Affinities are noisy: of the samples without outliers only some are good enough to start from.
             hit = share**self.size * (1.0 if self.sample == "points" else GOOD_AFFINE)
             needed = min(float(max_trials), float(np.log(1.0 - confidence) / np.log1p(-np.clip(hit, 1e-12, 1 - 1e-12))))
         return best, trials
 
-    def quality(self, E21: Mat3, noise: float) -> FloatArray:
-        """Return the sum of q over the matches of hypotheses (H, 3, 3)."""
-        return np.asarray(marginal_quality(self.rows.residuals(E21), noise).sum(axis=1))
-
     def improved(self, E21: Mat3) -> Mat3:
-        """Return what `E21` (H, 3, 3) lead to, each twice, (2 H, 3, 3).
+        """Return what `E21` (H, 3, 3) lead to, (4 H, 3, 3), at the highest noise level and on to the least.
 
         Widely first, which forgives a poor start; and at once, which an outlier with leverage cannot lure.
         """
-        out, count = np.concatenate([E21, E21]), len(E21)
-        for wide, narrow in ((WIDE * self.max_noise, self.max_noise), (self.max_noise, LEAST_NOISE)):
-            out = self.rows.improved(out, self.kind, np.repeat([wide, narrow], count), _loss)
-        return out
+        widely = self.rows.improved(E21, self.kind, WIDE * self.max_noise, self.max_noise, LEAST_NOISE)[1:]
+        at_once = self.rows.improved(E21, self.kind, self.max_noise, LEAST_NOISE)
+        return np.concatenate([*widely, *at_once])
 
-
-def _loss(r: FloatArray, max_noise: FloatArray | float) -> tuple[FloatArray, FloatArray]:
-    return marginal_quality(r, max_noise), marginal_weights(r, max_noise)
-
-
-def _refined(
-    matches: Matches, rows: SampsonRows, E21: Mat3, kind: str, level_sigma_rad: float | None, max_noise: float
-) -> RefinedPose:
-    """Return the maximum likelihood pose under the marginalised loss, from the essential matrix `E21`."""
-    r = np.abs(rows.residuals(E21[None])[0])
-    # Cheirality by the matches that fit best: those that only might fit are half in front by chance.
-    near = r <= max(QUANTILE, float(np.sort(r)[min(10, len(r)) - 1]))
-    start = choose_pose(E21, matches.rays1[near], matches.rays2[near], kind)
-
-    def weights(r: FloatArray) -> FloatArray:
-        return marginal_weights(r, max_noise)
-
-    return refine_pose(matches, start, kind, level_sigma_rad, robust=weights)
+    def best(self, E21: Mat3) -> Mat3:
+        """Return the best few of `E21` (H, 3, 3) at the highest noise level, the best first, and then at the least."""
+        kept = []
+        for noise in (self.max_noise, LEAST_NOISE):
+            quality = self.rows.quality_ahead(E21, noise, QUANTILE * self.max_noise)
+            order = np.argsort(-quality, kind="stable")
+            # Many starts lead to the same optimum.
+            fresh = np.append(True, -np.diff(quality[order]) > SAME_QUALITY)
+            kept.append(order[fresh][:FINALISTS])
+        return np.asarray(E21[np.concatenate(kept)])
 
 
 def _sample_size(matches: Matches, kind: str, sample: Sample) -> int:
@@ -229,11 +254,20 @@ def _sample_size(matches: Matches, kind: str, sample: Sample) -> int:
 def _draw(rng: np.random.Generator, count: int, affine: IntArray, sample: Sample, size: int) -> IntArray:
     """Return indices (BATCH, size) without repetition in a row; "mixed" begins with an affine correspondence."""
     if sample == "affine":
-        return np.asarray(affine[np.argsort(rng.random((BATCH, len(affine))), axis=1)[:, :size]])
-    order = rng.random((BATCH, count))
-    if sample == "mixed":
-        order[np.arange(BATCH), rng.choice(affine, BATCH)] = -1.0
-    return np.asarray(np.argsort(order, axis=1)[:, :size])
+        return np.asarray(affine[_distinct(rng, len(affine), np.zeros((BATCH, 0), dtype=np.int64), size)])
+    first = rng.choice(affine, (BATCH, 1)) if sample == "mixed" else np.zeros((BATCH, 0), dtype=np.int64)
+    return _distinct(rng, count, first, size)
+
+
+def _distinct(rng: np.random.Generator, count: int, taken: IntArray, size: int) -> IntArray:
+    """Return `taken` (B, k) and numbers below `count` after it, (B, size), all different within a row."""
+    while taken.shape[1] < size:
+        fresh = rng.integers(0, count - taken.shape[1], len(taken))
+        # The fresh-th of the numbers not taken yet.
+        for passed in np.sort(taken, axis=1).T:
+            fresh += fresh >= passed
+        taken = np.concatenate([taken, fresh[:, None]], axis=1)
+    return taken
 
 
 def _hypotheses(matches: Matches, index: IntArray, kind: str, sample: Sample) -> Mat3:
@@ -263,5 +297,4 @@ def _hypotheses(matches: Matches, index: IntArray, kind: str, sample: Sample) ->
     else:
         found = essential_from_six_rows(rows)
     flat = found.reshape(-1, 3, 3)
-    flat = flat[np.isfinite(flat).all(axis=(1, 2))]
-    return essential_nearest(flat) if kind == PoseType.GENERAL else flat
+    return np.asarray(flat[np.isfinite(flat[:, 0, 0])])

@@ -80,7 +80,7 @@ def test_robust_pose_is_no_worse_than_colmaps(rng):
     options.compute_relative_pose = True
     options.ransac.random_seed = 0
     ours, theirs = [], []
-    for _ in range(12):
+    for _ in range(40):
         m, pose, _ = pair(rng, 150, noise_px=0.5)
         q2 = np.array(m.pixels2)
         q2[:50] = rng.uniform([0, 0], [1624, 1240], (50, 2))

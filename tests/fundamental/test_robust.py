@@ -10,9 +10,10 @@ from helpers.epipolar_scenes import REGULAR, pair, pose_errors_deg
 
 from rigkit.errors import DegenerateError, InputError
 from rigkit.fundamental.local import SampsonRows
+from rigkit.fundamental.marginal import marginal_quality, marginal_weights
 from rigkit.fundamental.pose import essential_from_pose
 from rigkit.fundamental.refine import refine_pose
-from rigkit.fundamental.robust import marginal_quality, marginal_weights, robust_pose
+from rigkit.fundamental.robust import robust_pose
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.sampson import sampson_distances
@@ -101,7 +102,9 @@ def test_the_batch_ends_near_the_maximum_likelihood_pose(rng, kind):
     turns = np.zeros((8, 3))
     turns[:, 1] = rng.normal(0.0, np.radians(1.0), 8)
     starts = np.stack([essential_from_pose(Rigid3(exp_so3(w) @ pose.rotation, pose.translation_mm)) for w in turns])
-    found = SampsonRows.of(clean).improved(starts, kind, np.full(8, 6.0), lambda r, m: (-(r**2), np.ones_like(r)))
+    # With sigmas a few times too large all residuals lie where the loss is a parabola.
+    wide = replace(clean, sigma1_px=3.0 * clean.sigma1_px, sigma2_px=3.0 * clean.sigma2_px)
+    found = SampsonRows.of(wide).improved(starts, kind, 600.0, 60.0, 6.0)[-1]
     truth = essential_from_pose(best.cam2_from_cam1)
     sign = np.sign(np.sum(found * truth, axis=(1, 2), keepdims=True))
     # How the distances' own sigmas change with the pose is left out: that is second order in the noise.
