@@ -55,23 +55,23 @@ class SampsonRows:
             return native.qualities(library, self.packed, E21, noise)
         return np.asarray(marginal_quality(self._split(E21)[0], noise).sum(axis=1))
 
-    def quality_ahead(self, E21: Mat3, noise: float, sigmas: float) -> FloatArray:
-        """Return the sums (H,) over the matches ahead of both cameras, under the best of the four poses of each E.
+    def quality_ahead(self, E21: Mat3, sigmas: float, *noise: float) -> FloatArray:
+        """Return the sums (L, H) at L noise levels over the matches ahead of both cameras, E's best of four poses.
 
         A match whose parallax is at most so many `sigmas` may be anywhere and is counted always.
         """
         first, second, t = rotations_and_direction(E21)
         R = np.stack([first, second], axis=1)
         if (library := native.loaded()) is not None:
-            return native.qualities_ahead(library, self.packed, R, t, noise, sigmas)
-        quality = marginal_quality(self._split(skew(t) @ first)[0], noise)[:, None]
+            return np.stack([native.qualities_ahead(library, self.packed, R, t, level, sigmas) for level in noise])
         f1, f2 = self.packed[:3].T, self.packed[3:6].T
-        a, t = f1 @ np.swapaxes(R, 2, 3), t[:, None, None]
+        r, a, t = self._split(skew(t) @ first)[0], f1 @ np.swapaxes(R, 2, 3), t[:, None, None]
         across = cross(f2, a)
         range1, range2 = (np.sum(cross(t, f) * across, axis=-1) for f in (f2, a))
         far = np.sum(across**2, axis=-1) <= sigmas**2 * 0.5 * np.sum(self.packed[6:] ** 2, axis=0)
-        ahead = [far | ((sign * range1 >= 0.0) & (sign * range2 >= 0.0)) for sign in (1.0, -1.0)]
-        return np.asarray(np.max([np.sum(quality * mask, axis=2) for mask in ahead], axis=(0, 2)))
+        ahead = np.stack([far | ((sign * range1 >= 0.0) & (sign * range2 >= 0.0)) for sign in (1.0, -1.0)])
+        sums = [np.sum(marginal_quality(r, level)[:, None] * ahead, axis=3) for level in noise]
+        return np.asarray(np.max(sums, axis=(1, 3)))
 
     def _split(self, E21: Mat3) -> tuple[FloatArray, FloatArray]:
         """Return the distances in sigmas and 1 / s, (H, N); both zero at the epipoles, where any partner fits."""

@@ -2,7 +2,7 @@
 
 * F from seven equations (two affine correspondences and a point, or seven points): a cubic in the null space.
 * E from five equations (five points, or one affine correspondence and two points): ten cubics in three unknowns, solved
-  by the eigenvectors of the multiplication by x (Stewenius, Engels, Nister 2006).
+  by the eigenvectors of the multiplication by x (Stewenius, Engels, Nister 2006); compiled, by a polynomial in one.
 * E from six equations (two affine correspondences): ten cubics in two unknowns, linear in their ten monomials
   (Eichhardt and Barath; Raposo and Barreto).
 * Planar E from two equations (two points): a quadratic; from three (one affine correspondence): solve_planar_batch.

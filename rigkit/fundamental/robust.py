@@ -1,10 +1,10 @@
 """Robust relative pose from contaminated matches: minimal samples, a marginalised threshold, local optimisation.
 
-The quality of a hypothesis is that of its points' Sampson distances r in sigmas, marginalised over the unknown noise
-level s in [1, max_noise]: q(r) = mean over s of max(0, 1 - (r / (k s))^2), k the 99 % quantile. No threshold between
-inlier and outlier is set; the same q gives the weights of the local optimisation, which is the maximum likelihood
-refinement itself. Deterministic under a seeded generator. References: Fischler and Bolles; Chum, Matas, Kittler
-("Locally optimized RANSAC"); Barath, Noskova, Matas ("MAGSAC++").
+No threshold between inlier and outlier is set: hypotheses are ranked, improved and refined under the marginalised loss
+(marginal.py), whose weights the maximum likelihood refinement takes as well. Several local optima are kept until the
+noise of the matches is known, counting only what lies in front of both cameras. Deterministic under a seeded
+generator. References: Fischler and Bolles; Chum, Matas, Kittler ("Locally optimized RANSAC"); Barath, Noskova, Matas
+("MAGSAC++").
 """
 
 from __future__ import annotations
@@ -37,16 +37,21 @@ Sample = Literal["points", "affine", "mixed"]
 """What minimal samples consist of: points only; affine correspondences only; one affine correspondence and points."""
 
 MEDIAN_OF_NORMAL = 0.6745
-BATCH = 64
+BATCH = 96
+"""Samples at a time: a little more than 40 % of wrong matches ask for."""
 WIDE = 4.0
-LOCAL_TRIES = 6
+"""Factor of the highest noise level at which minimal samples, noisy themselves, are ranked and improved first."""
+LOCAL_TRIES = 8
 PROMISING = 0.6
+"""Of a batch the best few are improved, if they rank as high as this share of the best so far."""
 FINALISTS = 4
+"""Local optima kept at each of the two noise levels."""
 SAME_QUALITY = 1e-3
 """In matches: optima that differ by less are one, to the precision of the local optimisation."""
 LEAST_NOISE = 1.5
 """Noise level over the noise that the matches show: the loss still sees the tails, and few wrong matches."""
 NOISE_ROUNDS = 3
+"""Each leaves out what the noise of the round before does not explain."""
 GOOD_AFFINE = 0.1
 """Share of clean samples with an affinity that lead to the optimum (measured: a third at 0.05 noise of A)."""
 
@@ -58,9 +63,10 @@ class RobustPose:
     Attributes
     ----------
     refined : the pose, refined on the weighted matches.
-    inliers : (N,) bool, matches that fit at twice the noise that the fitting ones show.
-    weights : (N,) of the last local optimisation.
-    quality : sum of q over the matches at that noise.
+    inliers : (N,) bool, matches that fit at one and a half times the noise that the fitting ones show, lie in front of
+        both cameras (by more than noise) and, where there are affinities with sigmas, agree by them.
+    weights : (N,) of the marginalised loss at that noise, 0 for those not in front or with a wrong affinity.
+    quality : sum of the marginal quality at that noise over the same matches.
     trials : samples drawn.
     """
 
@@ -126,7 +132,6 @@ def robust_pose(
         except RigkitError:
             continue
         r = rows.residuals(essential_from_pose(end.cam2_from_cam1)[None])[0]
-        plausible = _plausible(matches, end.cam2_from_cam1, max_noise)
         quality = float(np.sum(marginal_quality(r, noise), where=plausible))
         return RobustPose(end, plausible & (np.abs(r) < QUANTILE * noise), loss(r) * plausible, quality, trials)
     raise DegenerateError(f"no pose that enough matches agree with, from in front of both cameras, in {trials} samples")
@@ -224,8 +229,7 @@ class _Search:
     def best(self, E21: Mat3) -> Mat3:
         """Return the best few of `E21` (H, 3, 3) at the highest noise level, the best first, and then at the least."""
         kept = []
-        for noise in (self.max_noise, LEAST_NOISE):
-            quality = self.rows.quality_ahead(E21, noise, QUANTILE * self.max_noise)
+        for quality in self.rows.quality_ahead(E21, QUANTILE * self.max_noise, self.max_noise, LEAST_NOISE):
             order = np.argsort(-quality, kind="stable")
             # Many starts lead to the same optimum.
             fresh = np.append(True, -np.diff(quality[order]) > SAME_QUALITY)

@@ -160,33 +160,35 @@ FOR_EACH_PROCESSOR void qualities_ahead(
         double E[9], most = 0.0;
         essential(R + 18 * h, t + 3 * h, E);
         const v3_t axis = v3(t + 3 * h);
-        for (int second = 0; second < 2; second++) {
-            const double *turn = R + 18 * h + 9 * second;
-            double along = 0.0, against = 0.0;
-            for (int64_t first = 0; first < count; first += BLOCK) {
-                const int64_t size = block_size(count, first);
-                distances(packed, count, first, size, E, &block);
-                double one = 0.0, other = 0.0;
-#pragma omp simd reduction(+ : one, other)
-                for (int64_t k = 0; k < size; k++) {
-                    const int64_t i = first + k;
-                    const v3_t a = apply(turn, column(packed, count, i)), b = column(packed + 3 * count, count, i);
-                    const v3_t across = cross(b, a);
-                    const double range1 = dot(cross(axis, b), across), range2 = dot(cross(axis, a), across);
-                    double square = 0.0;
-                    for (int row = 6; row < 18; row++)
-                        square += 0.5 * packed[row * count + i] * packed[row * count + i];
-                    const int far = dot(across, across) <= sigmas * sigmas * square;
-                    const double value = quality_of(block.r[k], level);
-                    one += far | ((range1 >= 0.0) & (range2 >= 0.0)) ? value : 0.0;
-                    other += far | ((range1 <= 0.0) & (range2 <= 0.0)) ? value : 0.0;
-                }
-                along += one;
-                against += other;
+        const double *turn = R + 18 * h;
+        double sums[4] = {0.0};
+        for (int64_t first = 0; first < count; first += BLOCK) {
+            const int64_t size = block_size(count, first);
+            double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0;
+            distances(packed, count, first, size, E, &block);
+#pragma omp simd reduction(+ : s0, s1, s2, s3)
+            for (int64_t k = 0; k < size; k++) {
+                const int64_t i = first + k;
+                const v3_t f1 = column(packed, count, i), b = column(packed + 3 * count, count, i);
+                const v3_t a = apply(turn, f1), c = apply(turn + 9, f1), of_a = cross(b, a), of_c = cross(b, c);
+                const v3_t side = cross(axis, b);
+                const double a1 = dot(side, of_a), a2 = dot(cross(axis, a), of_a);
+                const double c1 = dot(side, of_c), c2 = dot(cross(axis, c), of_c);
+                double square = 0.0;
+                for (int row = 6; row < 18; row++)
+                    square += packed[row * count + i] * packed[row * count + i];
+                square *= 0.5 * sigmas * sigmas;
+                const int far_a = dot(of_a, of_a) <= square, far_c = dot(of_c, of_c) <= square;
+                const double value = quality_of(block.r[k], level);
+                s0 += far_a | ((a1 >= 0.0) & (a2 >= 0.0)) ? value : 0.0;
+                s1 += far_a | ((a1 <= 0.0) & (a2 <= 0.0)) ? value : 0.0;
+                s2 += far_c | ((c1 >= 0.0) & (c2 >= 0.0)) ? value : 0.0;
+                s3 += far_c | ((c1 <= 0.0) & (c2 <= 0.0)) ? value : 0.0;
             }
-            most = along > most ? along : most;
-            most = against > most ? against : most;
+            sums[0] += s0, sums[1] += s1, sums[2] += s2, sums[3] += s3;
         }
+        for (int k = 0; k < 4; k++)
+            most = sums[k] > most ? sums[k] : most;
         out[h] = most;
     }
 }

@@ -118,9 +118,9 @@ def test_residuals_and_qualities(rng, camera, in_numpy):
     rows, E21 = SampsonRows.of(wild), np.concatenate([_starts(rng, pose), rng.normal(size=(5, 3, 3))])
     assert rows.residuals(E21) == pytest.approx(in_numpy(rows.residuals, E21), rel=1e-9, abs=1e-9)
     for noise in (1.5, 6.0, 24.0):
-        ahead = rows.quality_ahead(E21, noise, 5.0)
-        assert ahead == pytest.approx(in_numpy(rows.quality_ahead, E21, noise, 5.0), rel=1e-9)
-        assert (ahead < rows.quality(E21, noise)).any()
+        ahead = rows.quality_ahead(E21, 5.0, noise)
+        assert ahead == pytest.approx(in_numpy(rows.quality_ahead, E21, 5.0, noise), rel=1e-9)
+        assert (ahead[0] < rows.quality(E21, noise)).any()
         assert rows.quality(E21, noise) == pytest.approx(in_numpy(rows.quality, E21, noise), rel=1e-9)
 
 
