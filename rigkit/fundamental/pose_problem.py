@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, IntArray
+from rigkit.arrays import FloatArray, IntArray, as_array
 from rigkit.errors import InputError
 from rigkit.fundamental.local import SampsonRows
 from rigkit.fundamental.marginal import MarginalLoss
@@ -139,7 +139,8 @@ class PoseProblem:
 
     def _own_weights(self) -> FloatArray:
         """Return the fixed factors (N,) of the matches."""
-        return np.ones(len(self.matches)) if self.point_weights is None else np.asarray(self.point_weights, np.float64)
+        n = len(self.matches)
+        return np.ones(n) if self.point_weights is None else as_array(self.point_weights, (n,), "point weights")
 
     def _weights(self, r: FloatArray, of: IntArray) -> FloatArray:
         """Return the factors (M,) of the squared residuals."""
