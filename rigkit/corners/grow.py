@@ -44,9 +44,9 @@ WIDTH, RADIUS = 1.3, 3
 FEWEST = 3
 """Known corners that foretell another."""
 
-MAX_FRUITLESS = 16
-"""After so many lattices in a row without a board no more are grown: those of boards come first, being larger, and
-clutter can make hundreds, of one square each."""
+MAX_GROWN, MAX_FRUITLESS = 96, 16
+"""So many lattices are grown, or so many in a row without a board: those of boards come first, being larger, and clutter
+can make hundreds, of one square each."""
 
 REACH = 0.25
 """A corner lies within this of its prediction, in cells."""
@@ -113,13 +113,14 @@ def grow_all(
     """
     out: list[Lattice] = []
     taken = np.zeros((0, 2))
-    fruitless = 0
+    grown = fruitless = 0
     for lattice in lattices:
-        if fruitless == MAX_FRUITLESS:
+        if grown == MAX_GROWN or fruitless == MAX_FRUITLESS:
             break
         if _covered(lattice, taken):
             continue
         lattice, good = _grown(lattice, saddles, level, promising)
+        grown += 1
         taken = np.concatenate([taken, lattice.pixels[lattice.known]])
         fruitless = 0 if good and lattice.solid else fruitless + 1
         if good:

@@ -54,9 +54,9 @@ MAX_LEAN_DARK, MAX_LEAN_BRIGHT = 0.2, 0.3
 both sides; differences relative to the contrast. Lenses bend edges to the dark side as often as to the bright one;
 light that saturates moves them by 0.15 to 0.25 into the dark. Dots, threads and lines lean by 0.25 to 0.5."""
 
-NEARLY_FULL, BY_CHANCE = 0.9, 24
-"""A board of few corners has most of those between them, or somewhere a full block in so many squares: codes and
-mosaics have such blocks, too, but hardly one in 2^23 places."""
+RARELY_BY_CHANCE, NEARLY_FULL, BY_CHANCE = 24, 0.9, 24
+"""A board of fewer corners than the first has most of those between them, or somewhere a full block in so many squares:
+codes and mosaics have such blocks, too, but hardly one in 2^23 places, and one crooked chain of 24 in 126 pages."""
 
 MAX_EXTRA = 2
 """Rows and columns that may be too many, when a grid is larger than the board it may be."""
@@ -156,13 +156,13 @@ def leans(lattice: Lattice, level: Level) -> bool:
 
 
 def compact(lattice: Lattice, size_px: tuple[int, int]) -> bool:
-    """Return whether `lattice` is nearly full or has a full block as large as chance does not make.
+    """Return whether `lattice` is large, nearly full, or has a full block as large as chance does not make.
 
     Squares of random brightness that happen to alternate make crooked chains of corners; what covers a board, or the
     frame of the image (`size_px` is its width and height), leaves blocks.
     """
     known = lattice.known
-    if known.mean() >= NEARLY_FULL:
+    if lattice.count >= RARELY_BY_CHANCE or known.mean() >= NEARLY_FULL:
         return True
     missing = fit_cells(lattice.pixels, ~known, degree=1)
     full = known.copy()

@@ -15,9 +15,6 @@ from rigkit.corners.validate import compact, leans
 from rigkit.synthetic.bench_blanks import BLANKS, blank
 from rigkit.synthetic.bench_scenes import one_board
 
-MOST_LATTICES = 80
-"""Lattices that are grown in a picture without a board."""
-
 MOST_FITTED = 1200
 """Corners that are fitted there in vain: about as many as twelve boards have."""
 
@@ -45,7 +42,7 @@ def test_nothing_is_found_and_work_is_bounded(name: str, monkeypatch: pytest.Mon
         fitted.clear()
         grown.clear()
         assert detect_boards(blank(name, np.random.default_rng(seed), SIZE_PX)) == (), f"seed {seed}"
-        assert len(grown) <= MOST_LATTICES
+        assert len(grown) <= grow.MAX_GROWN
         assert sum(fitted) <= MOST_FITTED
 
 
