@@ -263,6 +263,7 @@ def _directions(
 ) -> tuple[DirectionPairs, DirectionNoise]:
     vectors: tuple[list[FloatArray], list[FloatArray]] = ([], [])
     covariances: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+    shared: tuple[list[FloatArray], list[FloatArray]] = ([], [])
     valid = []
     for first, second in pairs:
         _, i, j = common_corners(first, second)
@@ -271,6 +272,7 @@ def _directions(
         for k, (field, index) in enumerate(((field1, i), (field2, j))):
             vectors[k].append(field.vectors[index])
             covariances[k].append(field.covariance[index])
+            shared[k].append(field.shared[index])
         valid.append(field1.valid[i] & field2.valid[j])
     directions = DirectionPairs(
         np.concatenate(vectors[0]),
@@ -279,7 +281,7 @@ def _directions(
         pixels1=matches.pixels1,
         pixels2=matches.pixels2,
     )
-    noise = DirectionNoise.of_board(np.concatenate(covariances[0]), np.concatenate(covariances[1]))
+    noise = DirectionNoise.of_board(*(np.concatenate(parts) for parts in (*covariances, *shared)))
     return directions, noise
 
 

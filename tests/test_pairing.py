@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from rigkit.boards import Board
+from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.pairing import MatchedPair, match_pair
 from rigkit.posetype import PoseType
@@ -15,6 +16,7 @@ from rigkit.synthetic.pairs import StereoScene, trihedral_pair
 from rigkit.truth import MeasuredAngle
 
 CAMERA = Pinhole((1624, 1240), np.array([1350.0, 1352.0, 805.0, 622.0]))
+FISHEYE = KannalaBrandt((960, 720), np.array([352.0, 351.0, 484.0, 356.0, -0.02, 0.001, 0.0, 0.0]))
 BOARDS = tuple(Board(name, 8, 6, 50.0, 50.0) for name in ("front", "floor", "right"))
 
 
@@ -66,3 +68,17 @@ def test_a_layout_stands_above_the_angles(rng: np.random.Generator) -> None:
     made = scene(rng, angles)
     layout = {"front": "right", "floor": "floor", "right": "left"}
     assert not names_are_right(matched(made, angles=measured(angles), layout=layout), made)
+
+
+def test_the_joint_covariance_of_directions_is_one() -> None:
+    made = trihedral_pair(BOARDS, FISHEYE, PoseType.GENERAL, np.random.default_rng(5))
+    rng = np.random.default_rng(6)
+    # Corners of unequal accuracy, as near the end of a board in perspective, make what directions share lopsided.
+    first, second = (
+        [replace(d, board_id=None, sigma_px=rng.uniform(0.005, 0.1, len(d.grid))) for d in found]
+        for found in made.detections()
+    )
+    pair = match_pair("pair", FISHEYE, FISHEYE, first, second, BOARDS)
+    for covariance in (pair.noise.covariance1, pair.noise.covariance2):
+        eigenvalues = np.linalg.eigvalsh(covariance)
+        assert (eigenvalues[:, 0] > -1e-12 * eigenvalues[:, -1]).all()

@@ -108,20 +108,29 @@ class DirectionNoise:
         return cls.independent(round_blob(directions.image1, sigma1_px), round_blob(directions.image2, sigma2_px))
 
     @classmethod
-    def of_board(cls, covariance1: FloatArray, covariance2: FloatArray) -> DirectionNoise:
+    def of_board(
+        cls,
+        covariance1: FloatArray,
+        covariance2: FloatArray,
+        shared1: FloatArray | None = None,
+        shared2: FloatArray | None = None,
+    ) -> DirectionNoise:
         """Build for a chessboard's horizontal, vertical and diagonal, the diagonal being the sum of the two.
 
         Parameters
         ----------
         covariance1, covariance2 : (N, 3, 2, 2) px^2, of the three directions of either image. That of the diagonal
             says what the edges share: cov(d) = cov(h) + cov(v) + cov(h, v) + cov(v, h).
+        shared1, shared2 : (N, 2, 2) px^2, cov(h, v); None: its symmetric part, which is all that cov(d) tells.
         """
         joint = []
-        for c in (np.asarray(v, dtype=np.float64) for v in (covariance1, covariance2)):
+        for covariance, shared in ((covariance1, shared1), (covariance2, shared2)):
+            c = np.asarray(covariance, dtype=np.float64)
             if c.ndim != 4 or c.shape[1:] != (3, 2, 2):
                 raise InputError(f"direction noise of a board: expected Nx3x2x2, got {c.shape}")
             edges = _block_diagonal(c[:, :2])
-            edges[:, :2, 2:] = edges[:, 2:, :2] = 0.5 * (c[:, 2] - c[:, 0] - c[:, 1])
+            edges[:, :2, 2:] = 0.5 * (c[:, 2] - c[:, 0] - c[:, 1]) if shared is None else shared
+            edges[:, 2:, :2] = np.swapaxes(edges[:, :2, 2:], 1, 2)
             joint.append(edges)
         return cls(*joint).with_sum(0, 1)
 

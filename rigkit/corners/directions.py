@@ -43,11 +43,13 @@ class DirectionField:
         where unknown.
     valid : (N, 3) bool
     covariance : (N, 3, 2, 2) px^2, from the corners' `sigma_px`.
+    shared : (N, 2, 2) px^2, covariance of the horizontal (rows) with the vertical (columns).
     """
 
     vectors: FloatArray
     valid: BoolArray
     covariance: FloatArray
+    shared: FloatArray
 
     def sigma_rad(self) -> FloatArray:
         """Return the predicted standard deviation of each direction's angle, (N, 3) radians."""
@@ -194,7 +196,7 @@ def _along_both(horizontal: tuple[FloatArray, FloatArray], vertical: tuple[Float
     """Join two directions and their sum. The sum's covariance leaves out what the two share by the corner itself."""
     vectors = np.stack([horizontal[0], vertical[0], horizontal[0] + vertical[0]], axis=1)
     covariance = np.stack([horizontal[1], vertical[1], horizontal[1] + vertical[1]], axis=1)
-    return DirectionField(vectors, _finite(vectors), covariance)
+    return DirectionField(vectors, _finite(vectors), covariance, np.zeros((len(vectors), 2, 2)))
 
 
 def _chords(tangent: _Tangent, detection: BoardDetection, axis: int) -> tuple[FloatArray, FloatArray]:
@@ -270,7 +272,7 @@ def _patch_fit(tangent: _Tangent, detection: BoardDetection, window: int | None)
     joint = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
     all_vectors = joint @ vectors
     all_covariance = np.einsum("ka,naibj,kb->nkij", joint, covariance, joint)
-    return DirectionField(all_vectors, _finite(all_vectors), all_covariance)
+    return DirectionField(all_vectors, _finite(all_vectors), all_covariance, covariance[:, 0, :, 1])
 
 
 def _projective_fit(tangent: _Tangent, index: IntArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
