@@ -158,7 +158,7 @@ def _beside_markers(image: GreyImage, refined: RefinedLattice, board: Board) -> 
     if not known.any():
         return refined
     shape, blur = fit_cells(lattice.pixels, known), float(np.median(refined.blur_px[known]))
-    fit = fit_corners(image, board, shape, lattice.pixels[known], lattice.signs()[known], blur)
+    fit = fit_corners(image, board, known, shape, lattice.pixels[known], lattice.signs()[known], blur)
 
     def spread(values: FloatArray) -> FloatArray:
         out = np.full((*known.shape, *values.shape[1:]), np.nan)

@@ -14,8 +14,10 @@ import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray
 from rigkit.corners.edge_model import (
+    END_SIGMAS,
     GX,
     GY,
+    LEAST_REACH,
     NEAR_PX,
     NEAR_SIGMAS,
     PARAMETERS,
@@ -61,6 +63,9 @@ to the residuals and so to the predicted sigma."""
 FEWEST_MIRRORED, MOST_MIRRORED_PX = 12, 2.0
 """Noise is read from so many pixels with a mirror image at least, and not where a corner has ended so far from the
 middle of its window: little of the window has a mirror image then."""
+
+START_BLOCK = 64
+"""Brightness and contrast to start from are those of every second block of so many pixels, the compiled fit's."""
 
 LEAST_VARIANCE = 1e-6
 RIDGE = 1e-9
@@ -123,6 +128,7 @@ def fit_edges(
         geometry.sides,
         geometry.curvature,
         geometry.gaps,
+        geometry.ends,
         sign,
         blur,
         _rules(radius_px, iterations, converged_px, mirrored),
@@ -166,6 +172,8 @@ def fit_edges(
 def _rules(radius_px: float, iterations: int, converged_px: float, mirrored: bool) -> Rules:
     return Rules(
         reach=REACH,
+        end_sigmas=END_SIGMAS,
+        least_reach=LEAST_REACH,
         near_sigmas=NEAR_SIGMAS,
         near_px=NEAR_PX,
         tail_sigmas=TAIL_SIGMAS,
@@ -207,12 +215,14 @@ def _prior(geometry: Geometry, blur: FloatArray, size: FloatArray) -> tuple[Floa
 
 
 def _brightness(values: FloatArray, window: Window, geometry: Geometry, sign: FloatArray) -> None:
-    """Set a and b of `values` by linear least squares with everything else as it stands."""
+    """Set a and b of `values` by linear least squares with everything else as it stands, from half of the pixels."""
+    every = np.arange(window.weight.shape[1]) // START_BLOCK % 2 == 0
+    weight = window.weight * every
     pattern = pattern_of(values, window, geometry) * sign[:, None].astype(np.float32)
-    total = np.maximum(window.weight.sum(axis=1, dtype=np.float64), 1.0)
-    mean_p = (window.weight * pattern).sum(axis=1, dtype=np.float64) / total
-    mean_i = (window.weight * window.value).sum(axis=1, dtype=np.float64) / total
-    spread = (pattern - mean_p[:, None].astype(np.float32)) * window.weight
+    total = np.maximum(weight.sum(axis=1, dtype=np.float64), 1.0)
+    mean_p = (weight * pattern).sum(axis=1, dtype=np.float64) / total
+    mean_i = (weight * window.value).sum(axis=1, dtype=np.float64) / total
+    spread = (pattern - mean_p[:, None].astype(np.float32)) * weight
     slope = (spread * window.value).sum(axis=1) / np.maximum((spread**2).sum(axis=1), 1e-9)
     values[:, B] = slope * sign
     values[:, A] = mean_i - slope * mean_p

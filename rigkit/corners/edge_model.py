@@ -25,6 +25,8 @@ from rigkit.arrays import BoolArray, FloatArray
 from rigkit.corners.response import GreyImage
 
 __all__ = [
+    "END_SIGMAS",
+    "LEAST_REACH",
     "NEAR_PX",
     "NEAR_SIGMAS",
     "PARAMETERS",
@@ -35,6 +37,7 @@ __all__ = [
     "Geometry",
     "Window",
     "collect",
+    "ends_of",
     "linearise",
     "pattern_of",
 ]
@@ -60,6 +63,11 @@ do not overlap, so that every pixel is used and the errors of neighbours are ind
 NEAR_SIGMAS, NEAR_PX = 3.0, 1.5
 """Pixels are used so near to one of the lines (s and px added up): those beyond only repeat how bright squares are."""
 
+END_SIGMAS = 2.5
+LEAST_REACH = 0.25
+"""Where the lattice ends, what lies behind the next line is not known: paper, a narrow margin, another square. Pixels
+nearer to that line, s, are left out, but never those so near to the corner, in cells."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Geometry:
@@ -70,14 +78,33 @@ class Geometry:
     sides : (N, 2, 2) the cell's sides along column and row, px: directions of line 1 and 2, and the window.
     curvature : (N, 2) of the two lines, 1/px, positive towards +90 degrees.
     gaps : (N, 2, 2) distance of the neighbouring lines before and after line 1 and line 2 (along +90 degrees), px.
+    ends : (N, 2, 2) whether the lattice has no corner on that line beside this one.
     """
 
     sides: FloatArray
     curvature: FloatArray
     gaps: FloatArray
+    ends: BoolArray
 
     def of(self, keep: BoolArray) -> Geometry:
-        return Geometry(self.sides[keep], self.curvature[keep], self.gaps[keep])
+        return Geometry(self.sides[keep], self.curvature[keep], self.gaps[keep], self.ends[keep])
+
+    def reach(self, blur: FloatArray) -> FloatArray:
+        """Return (N, 2, 2) how far the window reaches, in cells: along both sides, backwards and forwards."""
+        left = 1.0 - END_SIGMAS * blur[:, None, None] / np.maximum(self.gaps, 1e-9)
+        out = np.where(self.ends, np.clip(left, LEAST_REACH, REACH), REACH)
+        # +90 degrees from line 1, which runs along the first side, is forwards along the second; from line 2 backwards.
+        return np.stack([out[:, 1, ::-1], out[:, 0]], axis=1)
+
+
+def ends_of(known: BoolArray, cells: BoolArray) -> BoolArray:
+    """Return the `ends` (M, 2, 2) of the `cells` of a lattice whose corners (R, C) are `known`."""
+    around = np.zeros((known.shape[0] + 2, known.shape[1] + 2), np.bool_)
+    around[1:-1, 1:-1] = known
+    row, column = np.nonzero(cells)
+    above, below = around[row, column + 1], around[row + 2, column + 1]
+    left, right = around[row + 1, column], around[row + 1, column + 2]
+    return ~np.stack([above, below, right, left], axis=-1).reshape(-1, 2, 2)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -92,9 +119,7 @@ class Window:
     size: FloatArray
 
     def of(self, keep: BoolArray) -> Window:
-        return Window(
-            self.centre[keep], self.u[keep], self.v[keep], self.value[keep], self.weight[keep], self.size[keep]
-        )
+        return Window(*(getattr(self, name)[keep] for name in Window.__slots__))
 
 
 def collect(image: GreyImage, pixels: FloatArray, geometry: Geometry, blur: FloatArray, radius_px: float) -> Window:
@@ -114,11 +139,12 @@ def collect(image: GreyImage, pixels: FloatArray, geometry: Geometry, blur: Floa
     # Position of each pixel in cells along both sides, as one product with (du, dv, 1).
     rows = np.stack([b[:, 1], -b[:, 0], -a[:, 1], a[:, 0]], axis=1).reshape(-1, 2, 2) / area[:, None, None]
     rows = np.concatenate([rows, -rows @ off[:, :, None]], axis=2).astype(np.float32)
-    cells = np.abs(rows @ np.stack([du, dv, np.ones_like(du)]).astype(np.float32))
+    cells = rows @ np.stack([du, dv, np.ones_like(du)]).astype(np.float32)
+    limits = geometry.reach(blur).astype(np.float32)
+    inside: BoolArray = np.all((cells >= -limits[:, :, :1]) & (cells <= limits[:, :, 1:]), axis=1)
     near = NEAR_SIGMAS * blur + NEAR_PX
     far = np.stack([np.linalg.norm(b, axis=1), np.linalg.norm(a, axis=1)], axis=1) * (near / np.abs(area))[:, None]
-    beside = cells <= far[:, :, None].astype(np.float32)
-    inside = (np.maximum(cells[:, 0], cells[:, 1]) <= REACH) & (beside[:, 0] | beside[:, 1])
+    inside &= (np.abs(cells) <= far[:, :, None].astype(np.float32)).any(axis=1)
     at_frame = ((centre < reach) | (centre > np.array([width, height]) - 1 - reach)).any(axis=1)
     if at_frame.any():
         column, row = du + centre[at_frame, :1], dv + centre[at_frame, 1:]
@@ -137,7 +163,7 @@ def collect(image: GreyImage, pixels: FloatArray, geometry: Geometry, blur: Floa
 
 
 def _step(distance: Float32, blur: Float32, flat: Float32, gaps: Float32) -> tuple[Float32, ...]:
-    """Return the blurred step S over the line, S' and S'' (with respect to x = distance / s), and -s dS/ds.
+    """Return the blurred step S over the line, S', S'', S''' (with respect to x = distance / s), and -s dS/ds.
 
     Where squares are small against the blur, the edges of the parallel lines at `gaps` (N, 2) before and after reach
     into the window: their steps are taken away. Far from both they add up to nothing: one is -1, the other +1.
@@ -163,7 +189,7 @@ def _edge(distance: Float32, blur: Float32, flat: Float32) -> tuple[Float32, ...
         half, apart = np.float32(0.5), np.sqrt(np.sqrt(np.float32(-0.5) * flat[sharp]))
         width = np.sqrt(blur[sharp] ** 2 - apart**2)
         before, after = (_blurred_edge((distance[sharp] + r) / width, np.zeros_like(width)) for r in (-apart, apart))
-        for order, mine, one, other in zip((0, 1, 2, 2), total, before, after, strict=True):
+        for order, mine, one, other in zip((0, 1, 2, 3, 2), total, before, after, strict=True):
             mine[sharp] = half * (blur[sharp] / width) ** order * (one + other)
     return total
 
@@ -172,7 +198,8 @@ def _blurred_edge(x: Float32, kurtosis: Float32) -> tuple[Float32, ...]:
     """Return, as `_step`, an edge from -1 to 1 at x = 0, blurred to standard deviation 1 and excess `kurtosis`.
 
     The first terms of Edgeworth's series: S = erf(x / sqrt 2) - k / 24 He3 p, with p twice the normal density. k goes
-    with s^-4, so -s dS/ds = x S' - k / 6 He3 p.
+    with s^-4, so -s dS/ds = x S' - k / 6 He3 p. S''' is that of the Gaussian alone: it only matters where lines cross
+    aslant.
     """
     from scipy.special import erf
 
@@ -183,11 +210,12 @@ def _blurred_edge(x: Float32, kurtosis: Float32) -> tuple[Float32, ...]:
     third = part * x * (square - three) * density
     slope = density * (one + part * (square * (square - six) + three))
     bow = -density * x * (one + part * (square * (square - ten) + fifteen))
-    return erf(x * np.float32(np.sqrt(0.5))) - third, slope, bow, x * slope - np.float32(4.0) * third
+    curl = density * (square - one)
+    return erf(x * np.float32(np.sqrt(0.5))) - third, slope, bow, curl, x * slope - np.float32(4.0) * third
 
 
 def _parts(values: FloatArray, window: Window, geometry: Geometry) -> tuple[tuple[Float32, ...], ...]:
-    """Return for line 1 and line 2: S, S', S'', -s dS/ds, along, aside, cosine, sine, curvature; (N, P) or (N, 1).
+    """Return for line 1 and line 2: S, S', S'', S''', -s dS/ds, along, aside, cosine, sine, curvature; (N, P), (N, 1).
 
     Blur pulls a bent edge towards the inside of the bend: the mean of curvature / 2 t^2 along it is curvature / 2 s^2.
     """
@@ -202,7 +230,7 @@ def _parts(values: FloatArray, window: Window, geometry: Geometry) -> tuple[tupl
         distance = aside - (np.float32(0.5) * kappa) * (along * along + blur * blur)
         flat = np.float32(PIXEL_KURTOSIS) * (cosine**4 + sine**4)
         step = _step(distance, blur, flat, geometry.gaps[:, line].astype(np.float32))
-        step[3][...] += kappa * blur * step[1]
+        step[4][...] += kappa * blur * step[1]
         out.append((*step, along, aside, cosine, sine, kappa))
     return tuple(out)
 
@@ -222,24 +250,26 @@ def _mixed(one: tuple[Float32, ...], two: tuple[Float32, ...], rho: Float32) -> 
     """Return the blurred product of the two steps.
 
     The blur mixes them where the lines cross aslant: for a Gaussian, E[sign d1 sign d2] is the sum over k of
-    rho^k / k! S1^(k) S2^(k) (Mehler), rho the cosine between the lines; two terms are kept. Brightness grows with the
+    rho^k / k! S1^(k) S2^(k) (Mehler), rho the cosine between the lines; three terms are kept. Brightness grows with the
     angle across line 1: that is d1 > 0, d2 < 0 bright.
     """
     mixed = one[0] * two[0]
     mixed += rho * one[1] * two[1]
     mixed += (np.float32(0.5) * rho * rho) * one[2] * two[2]
+    mixed += (np.float32(1.0 / 6.0) * rho * rho * rho) * one[3] * two[3]
     return np.asarray(np.negative(mixed, out=mixed), np.float32)
 
 
 def linearise(values: FloatArray, window: Window, geometry: Geometry) -> Float32:
     """Return the derivatives (N, 9, P) of the brightness and, as a tenth row, the residuals; zero in the padding.
 
-    How the blur mixes lines that cross aslant is differentiated to first order in their cosine.
+    How the blur mixes lines that cross aslant is differentiated to second order in their cosine.
     """
     one, two = _parts(values, window, geometry)
     rho = _oblique(values)
-    f1, slope1, bow1, grown1, along1, aside1, cos1, sin1, kappa1 = one
-    f2, slope2, bow2, grown2, along2, aside2, cos2, sin2, kappa2 = two
+    f1, slope1, bow1, curl1, grown1, along1, aside1, cos1, sin1, kappa1 = one
+    f2, slope2, bow2, curl2, grown2, along2, aside2, cos2, sin2, kappa2 = two
+    half_square = np.float32(0.5) * rho * rho
     known = values.astype(np.float32)
     weight = window.weight
     pattern = _mixed(one, two, rho)
@@ -256,8 +286,8 @@ def linearise(values: FloatArray, window: Window, geometry: Geometry) -> Float32
     rows[:, GX] = plain * window.u
     rows[:, GY] = plain * window.v
     light *= -(known[:, B] / known[:, S])[:, None]
-    by_d1 = light * (slope1 * f2 + rho * bow1 * slope2)
-    by_d2 = light * (slope2 * f1 + rho * bow2 * slope1)
+    by_d1 = light * (slope1 * f2 + rho * bow1 * slope2 + half_square * curl1 * bow2)
+    by_d2 = light * (slope2 * f1 + rho * bow2 * slope1 + half_square * curl2 * bow1)
     bend1, bend2 = kappa1 * along1, kappa2 * along2
     rows[:, X] = by_d1 * (sin1 + bend1 * cos1) + by_d2 * (sin2 + bend2 * cos2)
     rows[:, Y] = by_d1 * (bend1 * sin1 - cos1) + by_d2 * (bend2 * sin2 - cos2)

@@ -20,7 +20,7 @@ from rigkit.boards import Board
 from rigkit.cameras.base import Camera
 from rigkit.corners.board_guide import FEWEST, UNSOUND, BoardState, Guide, cell_areas
 from rigkit.corners.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
-from rigkit.corners.edge_model import NEAR_PX, NEAR_SIGMAS, Geometry
+from rigkit.corners.edge_model import NEAR_PX, NEAR_SIGMAS, Geometry, ends_of
 from rigkit.corners.local_fit import LocalFit, fit_cells
 from rigkit.corners.response import GreyImage, grey_image
 from rigkit.detections import BoardDetection
@@ -123,17 +123,18 @@ def _board_of(found: BoardDetection, boards: Sequence[Board]) -> Board | None:
 def fit_corners(
     image: GreyImage,
     board: Board,
+    cells: BoolArray,
     shape: LocalFit,
     start: FloatArray,
     signs: FloatArray,
     blur: FloatArray | float,
 ) -> EdgeFit:
-    """Fit the edge model to corners of `board` from `start` (M, 2); `shape` is that of their cells.
+    """Fit the edge model to the M `cells` (R, C) of `board` from `start` (M, 2); `shape` is theirs.
 
     `signs` (M,) as `Lattice.signs`; `blur` is the s expected. Windows end before the markers of a ChArUco board.
     """
     sides = np.stack([shape.along_column, shape.along_row], axis=1)
-    geometry = Geometry(sides, shape.curvature(), shape.gaps())
+    geometry = Geometry(sides, shape.curvature(), shape.gaps(), ends_of(np.ones_like(cells), cells))
     width = _short_of_markers(board, sides, np.broadcast_to(np.asarray(blur, dtype=np.float64), (len(start),)))
     # What markers leave in the windows is no noise, but makes the corners uncertain all the same.
     plain = board.markers is None
@@ -214,11 +215,12 @@ def _opened(image: GreyImage, found: BoardDetection, board: Board) -> BoardState
     if not (cells.any(axis=0).sum() >= 3 and cells.any(axis=1).sum() >= 3):
         return None
     local = fit_cells(state.pixels, cells)
-    fit = fit_corners(image, board, local, state.pixels[cells], signs[cells], FIRST_BLUR)
+    fit = fit_corners(image, board, cells, local, state.pixels[cells], signs[cells], FIRST_BLUR)
     if np.median(fit.contrast) < 0.0:
         state = replace(state, signs=-signs)
     # Once more: the fit ends when the corner stands still, and its residual means something only with the right blur.
-    fit = fit_corners(image, board, local, state.pixels[cells], state.signs[cells], float(np.median(fit.blur)))
+    blur = float(np.median(fit.blur))
+    fit = fit_corners(image, board, cells, local, state.pixels[cells], state.signs[cells], blur)
     good = fit.valid & (fit.contrast > 0.0)
     if good.sum() < FEWEST:
         return None
@@ -247,9 +249,10 @@ def _added(image: GreyImage, guide: Guide, state: BoardState) -> BoardState | No
     side = side[usable]
     blur = float(np.nanmedian(state.blur))
     signs = state.signs[cells]
-    rough = fit_corners(image, guide.board, shape, shape.pixels, signs, np.maximum(blur, WIDE_BLUR_CELLS * side))
+    wide = np.maximum(blur, WIDE_BLUR_CELLS * side)
+    rough = fit_corners(image, guide.board, cells, shape, shape.pixels, signs, wide)
     start = np.where(rough.valid[:, None], rough.pixels, shape.pixels)
-    fit = fit_corners(image, guide.board, shape, start, signs, blur)
+    fit = fit_corners(image, guide.board, cells, shape, start, signs, blur)
     good = _confirmed(guide, state, shape, side, fit)
     return state.with_fit(cells, fit, good) if good.any() else None
 
@@ -285,7 +288,7 @@ def _again(image: GreyImage, guide: Guide, state: BoardState) -> BoardState:
     if not seen.any():
         return state
     blur = float(np.nanmedian(state.blur))
-    fit = fit_corners(image, guide.board, _of(shape, seen), state.pixels[cells], state.signs[cells], blur)
+    fit = fit_corners(image, guide.board, cells, _of(shape, seen), state.pixels[cells], state.signs[cells], blur)
     return state.with_fit(cells, fit, fit.valid & (fit.contrast > 0.0))
 
 

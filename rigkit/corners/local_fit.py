@@ -52,15 +52,12 @@ class LocalFit:
         First index: the column line, the row line; second: before and after, in the direction of +90 degrees.
         """
         a, b = self.along_column, self.along_row
-        rows = [np.abs(_cross(a, b + sign * self.bend_row)) for sign in (-0.5, 0.5)]
-        columns = [np.abs(_cross(b, a + sign * self.bend_column)) for sign in (0.5, -0.5)]
-        return np.stack(
-            [
-                np.stack(rows, axis=-1) / np.linalg.norm(a, axis=1)[:, None],
-                np.stack(columns, axis=-1) / np.linalg.norm(b, axis=1)[:, None],
-            ],
-            axis=1,
-        )
+        area, row, column = _cross(a, b), 0.5 * _cross(a, self.bend_row), 0.5 * _cross(self.bend_column, b)
+        gaps = np.stack([area - row, area + row, area + column, area - column], axis=-1).reshape(-1, 2, 2)
+        np.abs(gaps, out=gaps)
+        gaps[:, 0] /= np.sqrt((a * a).sum(axis=1))[:, None]
+        gaps[:, 1] /= np.sqrt((b * b).sum(axis=1))[:, None]
+        return gaps
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -16,7 +16,7 @@ import numpy as np
 from rigkit.arrays import BoolArray, FloatArray
 from rigkit.corners.bends import line_curvature
 from rigkit.corners.edge_fit import BLUR_RANGE, fit_edges
-from rigkit.corners.edge_model import Geometry
+from rigkit.corners.edge_model import Geometry, ends_of
 from rigkit.corners.lattice import Lattice, Sheet
 from rigkit.corners.local_fit import LocalFit, fit_cells
 from rigkit.corners.response import GreyImage
@@ -90,7 +90,9 @@ class RefinedLattice:
     @property
     def worst_sigma_px(self) -> FloatArray:
         """(R, C) standard deviation if all that the fit leaves were noise: large for what is no chessboard."""
-        return self.sigma_px * self.residual / self.noise
+        # Of few pixels, those with mirror images may have more noise than all of them have residuals.
+        worst: FloatArray = self.sigma_px * np.maximum(self.residual / self.noise, 1.0)
+        return worst
 
     def without(self, drop: BoolArray) -> RefinedLattice:
         """Return this with the corners `drop` (R, C) forgotten."""
@@ -128,7 +130,7 @@ def refine(image: GreyImage, lattices: Sequence[Lattice]) -> list[RefinedLattice
     # paper), the sigmas of the board are raised to what is seen.
     scatter = _scatter(checked, sheet.parts)
     return [
-        _part_of(checked, part, item.rising, raised)
+        _part_of(checked, part, item.rising, float(raised))
         for part, item, raised in zip(sheet.parts, lattices, scatter, strict=True)
     ]
 
@@ -136,9 +138,8 @@ def refine(image: GreyImage, lattices: Sequence[Lattice]) -> list[RefinedLattice
 def _part_of(sheet: RefinedLattice, part: Part, rising: bool, raised: float) -> RefinedLattice:
     """Return the lattice at `part` of the sheet, its sigmas `raised` by a factor."""
     lattice = Lattice(sheet.lattice.pixels[part], sheet.lattice.contrast[part], rising)
-    return RefinedLattice(
-        lattice, sheet.sigma_px[part] * raised, sheet.blur_px[part], sheet.residual[part], sheet.noise[part]
-    )
+    sigma_px = sheet.sigma_px[part] * raised
+    return RefinedLattice(lattice, sigma_px, sheet.blur_px[part], sheet.residual[part], sheet.noise[part])
 
 
 def _typical_blur(item: RefinedLattice, parts: Sequence[Part]) -> FloatArray:
@@ -169,10 +170,11 @@ def _pass(
     shape = fit_cells(start.pixels, known)
     sides = np.stack([shape.along_column, shape.along_row], axis=1)
     lengths = np.maximum(np.sqrt((sides**2).sum(axis=2)), 1.0)
+    curvature = line_curvature(start.pixels, sigma_px, known, lengths)
     fit = fit_edges(
         image,
         start.pixels[known],
-        Geometry(sides, line_curvature(start.pixels, sigma_px, known, lengths), shape.gaps()),
+        Geometry(sides, curvature, shape.gaps(), ends_of(known, known)),
         signs[known],
         blur[known],
         radius_px=radius_px,

@@ -16,16 +16,18 @@ typedef int32_t mask_t __attribute__((vector_size(4 * LANES)));
 
 /* The constants of corners.edge_model and corners.edge_fit, under their names there (rigkit.native.edges.Rules). */
 typedef struct {
-    double reach, near_sigmas, near_px, tail_sigmas, pixel_kurtosis, sharp_blur;
+    double reach, end_sigmas, least_reach, near_sigmas, near_px, tail_sigmas, pixel_kurtosis, sharp_blur;
     double least_blur, most_blur, angle_sigma, log_blur_sigma, light_sigma;
     double most_move_px, most_turn, most_blur_change, most_light_change;
     double least_variance, ridge, converged_px, blur_lag, valid_move_px, valid_move_cells, most_mirrored, radius_px;
     int64_t iterations, mirrored, fewest_mirrored;
 } rules_t;
 
-/* What the lattice says of a corner: its cell's sides, the curvature of its lines, and where their neighbours are. */
+/* What the lattice says of a corner: its cell's sides, the curvature of its lines, where their neighbours are, and which
+ * of these have no corner of the lattice. */
 typedef struct {
     const double *sides, *curvature, *gaps;
+    const uint8_t *ends;
 } geometry_t;
 
 /* The pixels of a corner, relative to (centre_u, centre_v), at most `radius` from it both ways. `rest` has room for what
@@ -44,23 +46,28 @@ typedef struct {
     int tight, sharp;
 } line_t;
 
-/* The model along one line over a block of pixels: the step, its slopes, -s dS/ds, and the pixel's place. */
+/* The model along one line over a block of pixels: the step, its derivatives, -s dS/ds, and the pixel's place. */
 typedef struct {
-    float value[BLOCK], slope[BLOCK], bow[BLOCK], grown[BLOCK], along[BLOCK], aside[BLOCK];
+    float value[BLOCK], slope[BLOCK], bow[BLOCK], curl[BLOCK], grown[BLOCK], along[BLOCK], aside[BLOCK];
 } edge_t;
 
 typedef struct {
     double lo, hi;
 } range_t;
 
-/* Return where |slope x + offset| <= limit. */
-INLINE range_t band(double slope, double offset, double limit)
+/* Return where low <= slope x + offset <= high. */
+INLINE range_t between(double slope, double offset, double low, double high)
 {
-    const double lo = (-limit - offset) / slope, hi = (limit - offset) / slope;
+    const double lo = (low - offset) / slope, hi = (high - offset) / slope;
     /* A line along the row: dividing by zero has given infinities of both signs, or NaN at the very limit. */
     if (slope == 0.0)
-        return fabs(offset) <= limit ? (range_t){-1e9, 1e9} : (range_t){1e9, -1e9};
+        return low <= offset && offset <= high ? (range_t){-1e9, 1e9} : (range_t){1e9, -1e9};
     return lo < hi ? (range_t){lo, hi} : (range_t){hi, lo};
+}
+
+INLINE range_t band(double slope, double offset, double limit)
+{
+    return between(slope, offset, -limit, limit);
 }
 
 INLINE range_t both(range_t a, range_t b)
@@ -99,8 +106,17 @@ INLINE void take(window_t *window, const picture_t image, int64_t v, range_t ran
     window->count += count;
 }
 
-/* Gather the pixels near the two lines, inside the cell, the radius and the image (edge_model.collect): of every row
- * one or two stretches. */
+/* Return how far the window reaches towards neighbouring line `k` (edge_model.Geometry.reach). */
+INLINE double reach_to(const geometry_t at, int k, double blur, const rules_t *rules)
+{
+    if (!at.ends[k])
+        return rules->reach;
+    const double left = 1.0 - rules->end_sigmas * blur / (at.gaps[k] > 1e-9 ? at.gaps[k] : 1e-9);
+    return left < rules->least_reach ? rules->least_reach : left < rules->reach ? left : rules->reach;
+}
+
+/* Gather the pixels inside the cell, the radius and the image (edge_model.collect): of every row one or two stretches
+ * near the two lines. */
 FOR_EACH_PROCESSOR
 static void collect(
     window_t *window, const picture_t image, const double pixel[2], const geometry_t at, double blur, const rules_t *rules)
@@ -108,6 +124,10 @@ static void collect(
     const double *a = at.sides, *b = at.sides + 2;
     double area = a[0] * b[1] - a[1] * b[0];
     area = fabs(area) > 1.0 ? area : 1.0;
+    window->count = 0;
+    window->size = 2.0;
+    if (!isfinite(a[0] + a[1] + b[0] + b[1] + pixel[0] + pixel[1]))
+        return;
     window->centre_u = rint(pixel[0]);
     window->centre_v = rint(pixel[1]);
     const double off_u = pixel[0] - window->centre_u, off_v = pixel[1] - window->centre_v;
@@ -120,33 +140,36 @@ static void collect(
     const double tallest = rules->reach * across_v + 1.0;
     const int64_t most = (int64_t)floor(tallest < rules->radius_px ? tallest : rules->radius_px);
     const range_t columns = {-window->centre_u, (double)image.width - 1.0 - window->centre_u};
-    window->count = 0;
+    const double left = reach_to(at, 3, blur, rules), right = reach_to(at, 2, blur, rules);
+    const double above = reach_to(at, 0, blur, rules), below = reach_to(at, 1, blur, rules);
     for (int64_t v = -most; v <= most; v++) {
         const double row = window->centre_v + (double)v;
         if (!(row >= 0.0 && row <= (double)(image.height - 1)))
             continue;
         const double half = sqrt(rules->radius_px * rules->radius_px - (double)(v * v));
         /* Position in cells along side a and along side b, as functions of the column. */
-        const double at1 = (-b[0] * ((double)v - off_v) - b[1] * off_u) / area;
-        const double at2 = (a[0] * ((double)v - off_v) + a[1] * off_u) / area;
-        range_t whole = both(band(b[1] / area, at1, rules->reach), band(-a[1] / area, at2, rules->reach));
+        const double cells[4] = {
+            b[1] / area, (-b[0] * ((double)v - off_v) - b[1] * off_u) / area,
+            -a[1] / area, (a[0] * ((double)v - off_v) + a[1] * off_u) / area};
+        range_t whole = both(between(cells[0], cells[1], -left, right), between(cells[2], cells[3], -above, below));
         whole = both(both(whole, columns), (range_t){-half, half});
-        range_t one = both(whole, band(b[1] / area, at1, far1)), two = both(whole, band(-a[1] / area, at2, far2));
+        if (!(whole.lo <= whole.hi))
+            continue;
+        range_t one = both(whole, band(cells[0], cells[1], far1)), two = both(whole, band(cells[2], cells[3], far2));
         if (two.lo < one.lo) {
             const range_t swap = one;
             one = two;
             two = swap;
         }
         if (one.lo > one.hi) {
-            take(window, image, v, two);
-        } else if (two.lo > two.hi || two.hi <= one.hi) {
-            take(window, image, v, one);
-        } else if (floor(one.hi) >= ceil(two.lo)) {
-            take(window, image, v, (range_t){one.lo, two.hi});
-        } else {
-            take(window, image, v, one);
-            take(window, image, v, two);
+            one = two;
+            two.lo = INFINITY;
+        } else if (two.lo <= two.hi && floor(one.hi) + 1.0 >= ceil(two.lo)) {
+            one.hi = one.hi > two.hi ? one.hi : two.hi;
+            two.lo = INFINITY;
         }
+        take(window, image, v, one);
+        take(window, image, v, two);
     }
 }
 
@@ -167,7 +190,7 @@ INLINE float decay(float y)
 }
 
 /* edge_model._blurred_edge, with the error function of Abramowitz and Stegun 7.1.26, right to 1.5e-7. */
-INLINE void blurred_edge(float x, float kurtosis, float out[4])
+INLINE void blurred_edge(float x, float kurtosis, float out[5])
 {
     const float square = x * x, gauss = decay(-0.5f * square);
     const float t = 1.0f / (1.0f + (0.3275911f * 0.70710678f) * fabsf(x));
@@ -180,7 +203,8 @@ INLINE void blurred_edge(float x, float kurtosis, float out[4])
     out[0] = error - third;
     out[1] = slope;
     out[2] = -density * x * (1.0f + part * (square * (square - 10.0f) + 15.0f));
-    out[3] = x * slope - 4.0f * third;
+    out[3] = density * (square - 1.0f);
+    out[4] = x * slope - 4.0f * third;
 }
 
 INLINE line_t line_of(double angle, double curvature, const double gaps[2], double blur, const rules_t *rules)
@@ -211,14 +235,15 @@ INLINE void add_gaussian(const line_t line, float shift, float part, edge_t *out
         const float most = at < FLAT_SIGMAS ? at : FLAT_SIGMAS;
         x[i] = most > -FLAT_SIGMAS ? most : -FLAT_SIGMAS;
     }
-    const float once = part * line.stretch, twice = once * line.stretch;
+    const float once = part * line.stretch, twice = once * line.stretch, thrice = twice * line.stretch;
     for (int i = 0; i < BLOCK; i++) {
-        float edge[4];
+        float edge[5];
         blurred_edge(x[i], line.kurtosis, edge);
         out->value[i] += part * edge[0];
         out->slope[i] += once * edge[1];
         out->bow[i] += twice * edge[2];
-        out->grown[i] += twice * edge[3];
+        out->curl[i] += thrice * edge[3];
+        out->grown[i] += twice * edge[4];
     }
 }
 
@@ -239,7 +264,7 @@ INLINE void along_line(const line_t line, const float *u, const float *v, float 
     for (int i = 0; i < BLOCK; i++) {
         out->along[i] = line.cosine * (u[i] - x) + line.sine * (v[i] - y);
         out->aside[i] = line.cosine * (v[i] - y) - line.sine * (u[i] - x);
-        out->value[i] = out->slope[i] = out->bow[i] = out->grown[i] = 0.0f;
+        out->value[i] = out->slope[i] = out->bow[i] = out->curl[i] = out->grown[i] = 0.0f;
     }
     add_edge(line, 0.0f, 1.0f, out);
     if (line.tight) {
@@ -253,8 +278,9 @@ INLINE void along_line(const line_t line, const float *u, const float *v, float 
 /* edge_model._mixed. */
 INLINE float mixed(const edge_t *one, const edge_t *two, float rho, int i)
 {
-    return -(one->value[i] * two->value[i] + rho * one->slope[i] * two->slope[i]
-             + 0.5f * rho * rho * one->bow[i] * two->bow[i]);
+    return -(one->value[i] * two->value[i]
+             + rho * (one->slope[i] * two->slope[i]
+                      + rho * (0.5f * one->bow[i] * two->bow[i] + (1.0f / 6.0f) * rho * one->curl[i] * two->curl[i])));
 }
 
 /* Add the products of the rows (edge_model.linearise) of all pixels to `products` (ROWS x ROWS, lower half). */
@@ -268,6 +294,7 @@ static void normal_equations(
     const float rho = (float)cos(values[T1] - values[T2]);
     const line_t line1 = line_of(values[T1], at.curvature[0], at.gaps, values[S], rules);
     const line_t line2 = line_of(values[T2], at.curvature[1], at.gaps + 2, values[S], rules);
+    const float half_rho = 0.5f * rho;
     lanes_t sums[ROWS * (ROWS + 1) / 2];
     memset(sums, 0, sizeof sums);
     for (int64_t start = 0; start < window->count; start += BLOCK) {
@@ -281,8 +308,10 @@ static void normal_equations(
             const float plain = base + half * pattern;
             const float light = 1.0f + light_u * u[i] + light_v * v[i];
             const float scale = -light * half / blur;
-            const float by_d1 = scale * (one.slope[i] * two.value[i] + rho * one.bow[i] * two.slope[i]);
-            const float by_d2 = scale * (two.slope[i] * one.value[i] + rho * two.bow[i] * one.slope[i]);
+            const float by_d1 = scale * (one.slope[i] * two.value[i]
+                                         + rho * (one.bow[i] * two.slope[i] + half_rho * one.curl[i] * two.bow[i]));
+            const float by_d2 = scale * (two.slope[i] * one.value[i]
+                                         + rho * (two.bow[i] * one.slope[i] + half_rho * two.curl[i] * one.bow[i]));
             const float bend1 = line1.curvature * one.along[i], bend2 = line2.curvature * two.along[i];
             rows[X][i] = by_d1 * (line1.sine + bend1 * line1.cosine) + by_d2 * (line2.sine + bend2 * line2.cosine);
             rows[Y][i] = by_d1 * (bend1 * line1.sine - line1.cosine) + by_d2 * (bend2 * line2.sine - line2.cosine);
@@ -319,7 +348,8 @@ static void normal_equations(
         }
 }
 
-/* Set a and b by linear least squares with everything else as it stands (edge_fit._brightness). */
+/* Set a and b by linear least squares with everything else as it stands (edge_fit._brightness); every second block says
+ * enough. */
 FOR_EACH_PROCESSOR
 static void brightness(double *values, const window_t *window, const geometry_t at, const rules_t *rules, double sign)
 {
@@ -327,11 +357,12 @@ static void brightness(double *values, const window_t *window, const geometry_t 
     const float rho = (float)cos(values[T1] - values[T2]);
     const line_t line1 = line_of(values[T1], at.curvature[0], at.gaps, values[S], rules);
     const line_t line2 = line_of(values[T2], at.curvature[1], at.gaps + 2, values[S], rules);
-    double n = (double)window->count, sum_p = 0.0, sum_i = 0.0, sum_pp = 0.0, sum_pi = 0.0;
-    for (int64_t start = 0; start < window->count; start += BLOCK) {
+    double n = 0.0, sum_p = 0.0, sum_i = 0.0, sum_pp = 0.0, sum_pi = 0.0;
+    for (int64_t start = 0; start < window->count; start += 2 * BLOCK) {
         edge_t one, two;
         float pattern[BLOCK], value[BLOCK];
         lanes_t p = {0.0f}, i = {0.0f}, pp = {0.0f}, pi = {0.0f};
+        n += (double)(window->count - start < BLOCK ? window->count - start : BLOCK);
         along_line(line1, window->u + start, window->v + start, x, y, &one);
         along_line(line2, window->u + start, window->v + start, x, y, &two);
         for (int k = 0; k < BLOCK; k++) {
@@ -588,12 +619,12 @@ int64_t edges_scratch(const rules_t *rules)
 }
 
 /* Fit the edge model around `count` corners (edge_fit.fit_edges). pixels (N, 2), sides (N, 2, 2), curvature (N, 2), gaps
- * (N, 2, 2), sign (N), blur (N), out (N, OUTCOMES); scratch as `edges_scratch` says, zeroed; `grey` is of uint8_t if
+ * (N, 2, 2), ends (N, 2, 2), sign (N), blur (N), out (N, OUTCOMES); scratch as `edges_scratch` says, zeroed; `grey` is of uint8_t if
  * `bytes`, else of float. */
 void fit_edges(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *sides,
-    const double *curvature, const double *gaps, const double *sign, const double *blur, const rules_t *rules,
-    float *scratch, double *out)
+    const double *curvature, const double *gaps, const double *sign, const double *blur, const uint8_t *ends,
+    const rules_t *rules, float *scratch, double *out)
 {
     const picture_t image = {grey, width, height, bytes};
     const int64_t room = room_of_window(rules->radius_px), across = across_square(rules);
@@ -602,7 +633,7 @@ void fit_edges(
         .square = scratch + 4 * room, .turned = scratch + 4 * room + across * across, .across = across,
         .radius = (int64_t)floor(rules->radius_px)};
     for (int64_t n = 0; n < count; n++) {
-        const geometry_t at = {sides + 4 * n, curvature + 2 * n, gaps + 4 * n};
+        const geometry_t at = {sides + 4 * n, curvature + 2 * n, gaps + 4 * n, ends + 4 * n};
         collect(&window, image, pixels + 2 * n, at, blur[n], rules);
         fit_corner(&window, pixels + 2 * n, at, sign[n], blur[n], rules, out + OUTCOMES * n);
     }

@@ -26,6 +26,8 @@ class Rules(ctypes.Structure):
             (name, ctypes.c_double)
             for name in (
                 "reach",
+                "end_sigmas",
+                "least_reach",
                 "near_sigmas",
                 "near_px",
                 "tail_sigmas",
@@ -73,7 +75,7 @@ def _library() -> ctypes.CDLL | None:
         library.edges_scratch.restype = count
         library.edges_scratch.argtypes = [array]
         library.fit_edges.restype = None
-        library.fit_edges.argtypes = [array, count, count, count, count, *[array] * 9]
+        library.fit_edges.argtypes = [array, count, count, count, count, *[array] * 10]
         library.line_bends.restype = None
         library.line_bends.argtypes = [array, array, array, count, count, array, array, array]
     return library
@@ -85,6 +87,7 @@ def fit_corners(
     sides: FloatArray,
     curvature: FloatArray,
     gaps: FloatArray,
+    ends: BoolArray,
     sign: FloatArray,
     blur: FloatArray,
     rules: Rules,
@@ -95,6 +98,7 @@ def fit_corners(
         return None
     grey = np.ascontiguousarray(image)
     known = [np.ascontiguousarray(part, np.float64) for part in (pixels, sides, curvature, gaps, sign, blur)]
+    edges = np.ascontiguousarray(ends, np.bool_)
     out = np.empty((len(pixels), OUTCOMES))
     scratch = np.zeros(library.edges_scratch(ctypes.addressof(rules)), np.float32)
     height, width = grey.shape
@@ -105,6 +109,7 @@ def fit_corners(
         height,
         len(pixels),
         *(address(part) for part in known),
+        address(edges),
         ctypes.addressof(rules),
         address(scratch),
         address(out),

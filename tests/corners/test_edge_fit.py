@@ -32,6 +32,7 @@ def geometry(count: int, *, bend: float = 0.0, side_px: float = 30.0, oblique: f
         np.broadcast_to(sides, (count, 2, 2)).copy(),
         np.full((count, 2), bend),
         np.full((count, 2, 2), gap),
+        np.zeros((count, 2, 2), bool),
     )
 
 
@@ -39,9 +40,9 @@ def image_of(pixels: np.ndarray, shape: Geometry, blur: float) -> tuple[np.ndarr
     """Return an image with the model's own corners at `pixels` (N, 2), and the parameters (N, 9)."""
     image = np.full((64, 64 * len(pixels)), 120.0, np.float32)
     values = np.zeros((len(pixels), PARAMETERS))
-    # Wider than any window of the fit, which need not be centred on the true corner.
-    wide = Geometry(2.0 * shape.sides, shape.curvature, shape.gaps)
-    window = collect(image, pixels, wide, np.full(len(pixels), 3.0 * blur), 26.0)
+    # Wider than any window of the fit, which need not be centred on the true corner, squares and all.
+    wide = Geometry(2.0 * shape.sides, shape.curvature, shape.gaps, shape.ends)
+    window = collect(image, pixels, wide, np.full(len(pixels), 20.0), 26.0)
     values[:, :2] = pixels - window.centre
     values[:, 2:4] = np.arctan2(shape.sides[..., 1], shape.sides[..., 0])
     values[:, 4:7] = blur, 120.0, 70.0
@@ -92,7 +93,7 @@ def test_finds_its_own_corners(rng: np.random.Generator) -> None:
         assert np.abs(fit.pixels - pixels).max() < EXACT_PX
         assert np.abs(fit.blur - 0.8).max() < 0.01
         assert np.abs(fit.contrast - 140.0).max() < 0.5
-        straight = Geometry(shape.sides, np.zeros_like(shape.curvature), shape.gaps)
+        straight = Geometry(shape.sides, np.zeros_like(shape.curvature), shape.gaps, shape.ends)
         blind = fit_edges(image, start, straight, np.ones(6), np.full(6, 1.2), radius_px=18.0, iterations=12)
         moved = np.abs(blind.pixels - pixels).max()
         assert (moved > 0.1) == (bend > 0.0), "curvature is what keeps a bent row from pulling the corner aside"
@@ -113,13 +114,60 @@ def test_neighbouring_edges_in_the_blur_do_not_pull() -> None:
     gaps = np.array([[[before, after], [after, before]]])
     off = []
     for known in (gaps, gaps + 1e3):
-        shape = Geometry(sides, np.zeros((1, 2)), known)
+        shape = Geometry(sides, np.zeros((1, 2)), known, np.zeros((1, 2, 2), bool))
         start = np.array([[32.0, 32.0]])
         fit = fit_edges(image, start, shape, np.ones(1), np.full(1, 1.9), radius_px=18.0, iterations=12)
         assert fit.contrast[0] > 100.0
         off.append(float(np.abs(fit.pixels - [32.3, 31.8]).max()))
     assert off[0] < 0.01
     assert off[1] > 0.03
+
+
+def test_what_lies_behind_the_last_squares_does_not_pull() -> None:
+    """A board's last corner: squares 7.5 px wide to the right and 8.5 px high below, then paper; s = 2."""
+    blur, right, below = 2.0, 7.5, 8.5
+
+    def edge(x: np.ndarray) -> np.ndarray:
+        return np.vectorize(math.erf)(x / (math.sqrt(2.0) * blur))
+
+    u, v = np.arange(64.0) - 32.3, np.arange(64.0) - 31.8
+    board = 0.25 * (1.0 - edge(u - right))[None] * (1.0 - edge(v - below))[:, None]
+    squares = (edge(u) - edge(u + 16.0) + 1.0)[None] * (edge(v) - edge(v + 16.0) + 1.0)[:, None]
+    image = (120.0 + 70.0 * (1.0 - board + board * squares)).astype(np.float32)
+    off = []
+    for known in (True, False):
+        ends = np.array([[[False, known], [known, False]]])
+        gaps = np.array([[[16.0, below], [right, 16.0]]])
+        shape = Geometry(np.array([[[right, 0.0], [0.0, below]]]), np.zeros((1, 2)), gaps, ends)
+        fit = fit_edges(
+            image, np.array([[32.0, 32.0]]), shape, np.ones(1), np.full(1, blur), radius_px=18.0, iterations=12
+        )
+        assert fit.contrast[0] > 100.0
+        off.append(float(np.abs(fit.pixels - [32.3, 31.8]).max()))
+    assert off[1] > 0.05
+    assert off[0] < 0.5 * off[1]
+
+
+def test_lines_aslant_mix_as_in_a_gaussian_blur() -> None:
+    """E[sign d1 sign d2] of two normal variables correlated by the lines' cosine, from their joint distribution."""
+    from scipy.stats import multivariate_normal, norm
+
+    for oblique, most in ((0.5 * np.pi, 1e-3), (1.0, 6e-3), (0.75, 0.025)):
+        shape = geometry(1, oblique=oblique)
+        window = collect(
+            np.zeros((64, 64), np.float32), np.array([[32.0, 32.0]]), shape, np.full(1, 5.0), radius_px=6.0
+        )
+        values = np.zeros((1, PARAMETERS))
+        values[:, 2:4] = 0.2, 0.2 + oblique
+        # So blurred that the pixel's square does not show.
+        values[:, 4:7] = 5.0, 0.0, 1.0
+        far = Geometry(shape.sides, shape.curvature, shape.gaps + 1e3, shape.ends)
+        ours = pattern_of(values, window, far)[0]
+        x = [(np.cos(a) * window.v[0] - np.sin(a) * window.u[0]) / 5.0 for a in values[0, 2:4]]
+        rho = np.cos(oblique)
+        joint = multivariate_normal(cov=[[1.0, rho], [rho, 1.0]]).cdf(np.stack(x, axis=-1))
+        true = -(4.0 * joint - 2.0 * norm.cdf(x[0]) - 2.0 * norm.cdf(x[1]) + 1.0)
+        assert np.abs(ours - true)[window.weight[0] > 0].max() < most, oblique
 
 
 def test_wrong_polarity_shows_as_negative_contrast(rng: np.random.Generator) -> None:
