@@ -22,10 +22,11 @@ from rigkit.cloud import OrientedCloud
 from rigkit.errors import DegenerateError, InputError, RigkitError
 from rigkit.fundamental.chance import log_false_alarms
 from rigkit.fundamental.estimate import check_baseline
+from rigkit.fundamental.marginal import marginal_quality
 from rigkit.fundamental.pose import essential_from_pose
 from rigkit.fundamental.refine import RefinedPose, cauchy_weights, refine_pose
 from rigkit.fundamental.registry import fundamental_for
-from rigkit.fundamental.robust import RobustPose, Sample, marginal_quality, robust_pose
+from rigkit.fundamental.robust import RobustPose, Sample, robust_pose
 from rigkit.fundamental.weights import affinity_residuals, usable_affinities
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.sampson import sampson_distances

@@ -17,7 +17,7 @@ import numpy as np
 from rigkit.arrays import BoolArray, FloatArray, IntArray, Mat3
 from rigkit.errors import DegenerateError, InputError, RigkitError
 from rigkit.fundamental.local import SampsonRows
-from rigkit.fundamental.marginal import QUANTILE, MarginalLoss, marginal_quality, marginal_weights
+from rigkit.fundamental.marginal import QUANTILE, MarginalLoss, marginal_quality
 from rigkit.fundamental.minimal import essential_from_five_rows, essential_from_six_rows, planar_from_two_rows
 from rigkit.fundamental.planar import solve_planar_batch
 from rigkit.fundamental.pose import choose_pose, essential_from_pose
@@ -31,7 +31,7 @@ from rigkit.geometry.triangulation import ray_ranges
 from rigkit.matches import Matches
 from rigkit.posetype import PoseType
 
-__all__ = ["RobustPose", "Sample", "marginal_quality", "marginal_weights", "robust_pose"]
+__all__ = ["RobustPose", "Sample", "robust_pose"]
 
 Sample = Literal["points", "affine", "mixed"]
 """What minimal samples consist of: points only; affine correspondences only; one affine correspondence and points."""

@@ -45,10 +45,6 @@ class RowWeights:
     affinities: FloatArray
     sigma_A: FloatArray
 
-    def scaled(self, factors: FloatArray) -> RowWeights:
-        """Return the weights times a factor for each match (N,)."""
-        return RowWeights(self.points * factors, self.affinities * factors, self.sigma_A)
-
 
 def usable_affinities(matches: Matches) -> BoolArray:
     """Return which matches have a finite affinity (N,)."""
