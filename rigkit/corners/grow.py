@@ -45,8 +45,8 @@ FEWEST = 3
 """Known corners that foretell another."""
 
 MAX_GROWN, MAX_FRUITLESS = 96, 16
-"""So many lattices are grown, or so many in a row without a board: those of boards come first, being larger, and clutter
-can make hundreds, of one square each."""
+"""So many lattices are grown, or so many in a row without a board: those of boards come first, being larger, and
+clutter can make hundreds, of one square each."""
 
 REACH = 0.25
 """A corner lies within this of its prediction, in cells."""
