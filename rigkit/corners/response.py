@@ -51,8 +51,10 @@ TYPICAL = 4e3
 EXTREME = 0.005
 """The span of brightness leaves out this part at either end: glints, dead pixels."""
 
-MAX_PEAKS = 20000
-"""Keep the strongest peaks of a level: texture may have more, a board never."""
+PIXELS_A_PEAK, MAX_PEAKS = 250, 5000
+"""Keep the strongest peaks of a level, one for so many of its pixels, or the second number if that is more: texture and
+noise have more. Corners of a board are among the strongest even where it lies in the shade, out of focus, or in the
+noise of a gain that is far too high; with four times as many peaks no more boards are found."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -195,8 +197,9 @@ def peaks(level: Level) -> tuple[IntArray, FloatImage]:
         flat = flat[~_repeated(response.ravel(), flat, response.shape[1])]
         v, u = np.divmod(flat, response.shape[1])
         at, height = np.stack([u, v], axis=-1) + 1, response.ravel()[flat]
-    if len(at) > MAX_PEAKS:
-        least = np.partition(height, len(at) - MAX_PEAKS)[len(at) - MAX_PEAKS]
+    most = max(MAX_PEAKS, level.smooth.size // PIXELS_A_PEAK)
+    if len(at) > most:
+        least = np.partition(height, len(at) - most)[len(at) - most]
         at, height = at[height >= least], height[height >= least]
     return np.asarray(at, np.int64), np.asarray(height, np.float32)
 
