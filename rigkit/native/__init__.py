@@ -25,7 +25,7 @@ SWITCH = "RIGKIT_NATIVE"
 
 @functools.cache
 def kernels(name: str) -> ctypes.CDLL | None:
-    """Return the library built from NAME.c: None where there is none, where it is out of date, or if `SWITCH` is 0."""
+    """Return the library built from NAME.c: None where there is none, NAME.c has changed or gone, or `SWITCH` is 0."""
     if os.environ.get(SWITCH) == "0":
         return None
     found = importlib.util.find_spec(f"rigkit.native._{name}")
@@ -35,10 +35,10 @@ def kernels(name: str) -> ctypes.CDLL | None:
         library = ctypes.CDLL(found.origin)
         library.rigkit_source.restype = ctypes.c_char_p
         built_from = library.rigkit_source().decode()
+        folder = Path(__file__).parent
+        source = (folder / f"{name}.c").read_bytes() + (folder / "kernels.h").read_bytes()
     except (OSError, AttributeError):
         return None
-    folder = Path(__file__).parent
-    source = (folder / f"{name}.c").read_bytes() + (folder / "kernels.h").read_bytes()
     return library if built_from == hashlib.sha256(source).hexdigest()[:16] else None
 
 
