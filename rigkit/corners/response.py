@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.arrays import FloatArray, IntArray
+from rigkit.arrays import BoolArray, FloatArray, IntArray
 from rigkit.errors import InputError
 from rigkit.native import front
 
@@ -51,10 +51,13 @@ TYPICAL = 4e3
 EXTREME = 0.005
 """The span of brightness leaves out this part at either end: glints, dead pixels."""
 
-PIXELS_A_PEAK, MAX_PEAKS = 250, 5000
+PIXELS_A_PEAK, MAX_PEAKS = 400, 4000
 """Keep the strongest peaks of a level, one for so many of its pixels, or the second number if that is more: texture and
-noise have more. Corners of a board are among the strongest even where it lies in the shade, out of focus, or in the
-noise of a gain that is far too high; with four times as many peaks no more boards are found."""
+noise have more, a board never."""
+
+AROUND, SHARES = 32, 1024
+"""How strong a peak is, is seen beside the strongest one in its square of so many pixels, to one part in so many: a
+board in the shade has weaker corners than a page of text in the sun."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -184,24 +187,36 @@ def _threshold(smooth: FloatImage) -> float:
 
 def peaks(level: Level) -> tuple[IntArray, FloatImage]:
     """Return the local maxima of the response above the threshold, (N, 2) as (u, v) of the level, row by row, and D."""
+    most = max(MAX_PEAKS, level.smooth.size // PIXELS_A_PEAK)
     library = front.loaded()
     if library is not None:
-        at, height = front.peaks(library, level.smooth, level.threshold)
-    else:
-        response = _response(level.smooth)
-        highest = cv2.dilate(response, np.ones((5, 5), np.uint8))
-        mask = (response >= highest) & (response > level.threshold)
-        mask[:2] = mask[-2:] = False
-        mask[:, :2] = mask[:, -2:] = False
-        flat = np.flatnonzero(mask)
-        flat = flat[~_repeated(response.ravel(), flat, response.shape[1])]
-        v, u = np.divmod(flat, response.shape[1])
-        at, height = np.stack([u, v], axis=-1) + 1, response.ravel()[flat]
-    most = max(MAX_PEAKS, level.smooth.size // PIXELS_A_PEAK)
-    if len(at) > most:
-        least = np.partition(height, len(at) - most)[len(at) - most]
-        at, height = at[height >= least], height[height >= least]
-    return np.asarray(at, np.int64), np.asarray(height, np.float32)
+        at, height = front.peaks(library, level.smooth, level.threshold, most, AROUND, SHARES)
+        return np.asarray(at, np.int64), height
+    response = _response(level.smooth)
+    highest = cv2.dilate(response, np.ones((5, 5), np.uint8))
+    mask = (response >= highest) & (response > level.threshold)
+    mask[:2] = mask[-2:] = False
+    mask[:, :2] = mask[:, -2:] = False
+    flat = np.flatnonzero(mask)
+    flat = flat[~_repeated(response.ravel(), flat, response.shape[1])]
+    v, u = np.divmod(flat, response.shape[1])
+    places, heights = np.stack([u, v], axis=-1) + 1, response.ravel()[flat]
+    kept = _strongest(places, heights, most) if len(places) > most else slice(None)
+    return places[kept], heights[kept]
+
+
+def _strongest(at: IntArray, height: FloatImage, most: int) -> BoolArray:
+    """Return which of the peaks `at` (N, 2) of `height` (N,) are the `most` strongest in their surroundings.
+
+    More where the last ones are equally strong.
+    """
+    column, row = (at // AROUND).T
+    square = row * (int(column.max()) + 1) + column
+    strongest = np.zeros(int(square.max()) + 1, np.float32)
+    np.maximum.at(strongest, square, height)
+    share = (np.float32(SHARES) * (height / strongest[square])).astype(np.int64)
+    at_least = np.cumsum(np.bincount(share, minlength=SHARES + 1)[::-1])[::-1]
+    return np.asarray(share >= np.flatnonzero(at_least >= most)[-1], np.bool_)
 
 
 def _repeated(response: FloatImage, flat: IntArray, width: int) -> NDArray[np.bool_]:

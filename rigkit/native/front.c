@@ -253,6 +253,40 @@ FOR_EACH_PROCESSOR int64_t find_peaks(
     return count;
 }
 
+/* Keep of `count` peaks, in place and in their order, about the `most` strongest beside the strongest one in their square
+ * of `side` pixels (corners.response._strongest): as many bins of this share as are needed, the highest first. `squares`
+ * ((height / side + 1) * (width / side + 1)), `bins` (`finest` + 1), both zeroed, and `share` (count) are scratch. Returns
+ * how many are left. */
+int64_t keep_strongest(
+    int32_t *at, float *response, int64_t count, int64_t width, int64_t side, int64_t most, int64_t finest,
+    float *squares, int32_t *bins, int32_t *share);
+int64_t keep_strongest(
+    int32_t *at, float *response, int64_t count, int64_t width, int64_t side, int64_t most, int64_t finest,
+    float *squares, int32_t *bins, int32_t *share)
+{
+    const int32_t across = (int32_t)(width / side) + 1, step = (int32_t)side;
+    for (int64_t k = 0; k < count; k++) {
+        share[k] = at[2 * k + 1] / step * across + at[2 * k] / step;
+        float *strongest = squares + share[k];
+        *strongest = response[k] > *strongest ? response[k] : *strongest;
+    }
+    for (int64_t k = 0; k < count; k++) {
+        share[k] = (int32_t)((float)finest * (response[k] / squares[share[k]]));
+        bins[share[k]]++;
+    }
+    int64_t least = finest, kept = bins[finest];
+    while (least > 0 && kept < most)
+        kept += bins[--least];
+    kept = 0;
+    for (int64_t k = 0; k < count; k++) {
+        at[2 * kept] = at[2 * k];
+        at[2 * kept + 1] = at[2 * k + 1];
+        response[kept] = response[k];
+        kept += share[k] >= least;
+    }
+    return kept;
+}
+
 /* corners.saddle.saddle_step for one pixel; whether it is a saddle and near. */
 INLINE int saddle_near(const float *smooth, int64_t width, int64_t u, int64_t v, double most_step, double pixel[2])
 {

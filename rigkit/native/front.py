@@ -97,6 +97,7 @@ def loaded() -> ctypes.CDLL | None:
     for name in ("shrink_floats", "shrink_bytes", "smooth_floats", "smooth_bytes", "typical_values"):
         getattr(library, name).restype = None
     library.find_peaks.argtypes = [array, size, size, c_float, *[array] * 4]
+    library.keep_strongest.argtypes = [array, array, *[size] * 5, *[array] * 3]
     rings = (_Image, POINTER(RingRules), c_double, c_double, c_double)
     library.find_corners.argtypes = [*rings, array, array, size, *[array] * 5]
     library.mark_known.argtypes = [array, size, array, size, c_double, array]
@@ -104,7 +105,7 @@ def loaded() -> ctypes.CDLL | None:
         *(POINTER(_Corners), _Image, c_double, c_double, POINTER(LinkRules)),
         *(array, array),
     ]
-    for name in ("find_peaks", "find_corners", "mark_known", "find_links"):
+    for name in ("find_peaks", "keep_strongest", "find_corners", "mark_known", "find_links"):
         getattr(library, name).restype = size
     return library
 
@@ -148,14 +149,27 @@ def typical(library: ctypes.CDLL, smooth: Image, step: int) -> tuple[Image, Imag
     return out[0], out[1]
 
 
-def peaks(library: ctypes.CDLL, smooth: Image, threshold: float) -> tuple[NDArray[np.int32], Image]:
-    """Return (u, v) and response of the peaks above `threshold`, row by row."""
+def peaks(
+    library: ctypes.CDLL, smooth: Image, threshold: float, limit: int, side: int, finest: int
+) -> tuple[NDArray[np.int32], Image]:
+    """Return (u, v) and response of the peaks above `threshold`, row by row.
+
+    Of more than `limit` peaks, about so many are kept: those strongest beside the strongest in their square of `side`
+    pixels, to one part in `finest`.
+    """
     height, width = smooth.shape
     most = (height // 3 + 1) * (width // 3 + 1)
     at, response = np.empty((most, 2), np.int32), np.empty(most, np.float32)
     scratch, high = np.empty(5 * (width + STRIP + 4), np.float32), np.empty(5 * (width // STRIP + 1), np.uint8)
     arrays = (scratch, high, at, response)
     found = library.find_peaks(address(smooth), height, width, threshold, *(address(array) for array in arrays))
+    if found > limit:
+        squares = np.zeros((height // side + 1) * (width // side + 1), np.float32)
+        bins, share = np.zeros(finest + 1, np.int32), np.empty(found, np.int32)
+        scratch_of_it = (address(squares), address(bins), address(share))
+        found = library.keep_strongest(
+            address(at), address(response), found, width, side, limit, finest, *scratch_of_it
+        )
     return at[:found], response[:found]
 
 
