@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
+import cv2
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray
@@ -22,7 +23,6 @@ __all__ = ["MANY", "STEPS", "Lattice", "Sheet", "build_lattices"]
 
 STEPS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
 """(column, row) of the four grid directions."""
-
 
 MANY = 200
 """Lattices of so many corners are judged by a part of them before anything else is done with them."""
@@ -59,9 +59,10 @@ class Lattice:
     @property
     def solid(self) -> bool:
         """Whether it has all corners of BLOCKS rows and columns somewhere, or of a larger block all but one."""
-        known = self.known
+        known = self.known.astype(np.uint8)
         return any(
-            bool((_block_sums(known, rows, columns) >= rows * columns - missing).any())
+            cv2.boxFilter(known, -1, (columns, rows), normalize=False, borderType=cv2.BORDER_CONSTANT).max(initial=0)
+            >= rows * columns - missing
             for rows, columns, missing in BLOCKS
         )
 
@@ -122,15 +123,6 @@ class Lattice:
                 bool(signs.size and signs[0, 0] > 0),
             )
         return out
-
-
-def _block_sums(known: BoolArray, rows: int, columns: int) -> IntArray:
-    """Return how many of `known` (R, C) lie in the blocks of so many rows and columns."""
-    down, right = (max(n - size + 1, 0) for n, size in zip(known.shape, (rows, columns), strict=True))
-    total = np.zeros((down, right), np.int64)
-    for top, left in np.ndindex(rows, columns):
-        total += known[top : top + down, left : left + right]
-    return total
 
 
 @dataclass(frozen=True, eq=False, slots=True)
