@@ -43,7 +43,9 @@ COMPARABLE = 1.5
 MIN_KEPT_SHARE = 0.5
 """A view in which fewer of the corners agree with the other views is dropped."""
 DEGREES_TRIED: dict[str, tuple[int | None, ...]] = {"scaramuzza": (4, 5, 6, 7, 8), "brown": (5,)}
-"""Sizes tried of models that come in several, where none is asked for."""
+"""Sizes tried of models that come in several, where none is asked for,"""
+DEGREES_BEYOND: dict[str, tuple[int, ...]] = {"scaramuzza": (9, 10)}
+"""and those tried where the largest of them is the best: precise corners, or lenses of more than 200 degrees."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -108,6 +110,11 @@ def calibrate(
     observations = _reweighted(observations, options)
     options = _compared(observations, options, folds, progress)
     chosen = _choose(observations, options, SURELY)
+    beyond = [] if degree is not None else _beyond(chosen)
+    if beyond:
+        more, unfit = _fit_all(observations, size_px, [*wanted, *beyond], progress)
+        options = _compared(observations, more, folds, progress)
+        chosen, failed = _choose(observations, options, SURELY), unfit
     candidates = [*_described(options, chosen), *failed]
     if board != "flat" and often_seen(observations).any():
         observations, chosen, fits = _fit_shapes(observations, chosen, board)
@@ -120,8 +127,11 @@ def calibrate(
     points, _ = chosen.fit.state.points_in_cam(observations)
     at_corners = uncertainty_at_corners(result, points[chosen.fit.kept])
     require_determined(result, at_corners)
-    moved = moved_lens(observations, chosen.fit) if folds else ()
-    return replace(result, verdicts=judge(result, moved, at_corners_px=at_corners))
+    also = [
+        *(moved_lens(observations, chosen.fit) if folds else ()),
+        *(_at_the_end(beyond, result) if model != "auto" else ()),
+    ]
+    return replace(result, verdicts=judge(result, also, at_corners_px=at_corners))
 
 
 def _wanted(model: str, degree: int | None) -> list[tuple[str, type[Camera], int | None]]:
@@ -134,6 +144,25 @@ def _wanted(model: str, degree: int | None) -> list[tuple[str, type[Camera], int
         orders = (degree,) if degree is not None else DEGREES_TRIED.get(name, (None,))
         out += [(name if order is None else f"{name} {order}", cls, order) for order in orders]
     return out
+
+
+def _beyond(chosen: _Option) -> list[tuple[str, type[Camera], int | None]]:
+    """Return the larger sizes to try of the model chosen, if it is of the largest size tried so far."""
+    camera = chosen.fit.state.camera
+    tried, more = DEGREES_TRIED.get(camera.model, (None,)), DEGREES_BEYOND.get(camera.model, ())
+    if chosen.name != f"{camera.model} {tried[-1]}":
+        return []
+    return [(f"{camera.model} {order}", type(camera), order) for order in more]
+
+
+def _at_the_end(beyond: Sequence[tuple[str, type[Camera], int | None]], result: Calibration) -> list[str]:
+    """Say that the lens may ask for more than the model has, where the largest size of all is the best."""
+    if not beyond or not any(c.name == beyond[-1][0] and c.chosen for c in result.candidates):
+        return []
+    return [
+        f"look: {beyond[-1][0]} is the largest there is of its kind, and the best: the lens may ask for more, most "
+        'towards its rim; try model = "auto"'
+    ]
 
 
 def _fit_all(

@@ -9,6 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from rigkit.progress import Progress, silent
@@ -20,10 +21,21 @@ if TYPE_CHECKING:
     from rigkit.io.corner_cache import FoundCorners
     from rigkit.io.session import Session
 
-__all__ = ["HELP", "add_arguments", "calibrate_session", "page_path", "run", "session_corners", "session_views"]
+__all__ = [
+    "HELP",
+    "add_arguments",
+    "calibrate_session",
+    "first_camera",
+    "page_path",
+    "run",
+    "session_corners",
+    "session_views",
+]
 
 ODD_SIZES = 3
 """A few images of another size are left out; where they are this part of all, which of the sizes is meant?"""
+LOOSE = 1.5
+"""A first calibration with a scatter of more than this many times the corners' own sigmas is not the lens."""
 HELP = "calibrate a camera, or several on one mount, from images of chessboards"
 
 
@@ -190,7 +202,7 @@ def session_corners(session: Session, progress: Progress) -> dict[str, FoundCorn
     look([name for name in paths if name not in found], None)
     # All of them, or the corners would depend on which images were added when.
     new = not all(found[name].through_camera for name in paths)
-    camera = _first_camera(session, found) if new else None
+    camera = first_camera(session, found) if new else None
     if camera is not None:
         look([name for name in paths if found[name].size_px == camera.size_px], camera)
     found = {name: found[name] for name in paths or found}
@@ -211,16 +223,19 @@ def _found_in(path: Path, session: Session, camera: Camera | None) -> FoundCorne
     return FoundCorners((image.shape[1], image.shape[0]), detections, camera is not None)
 
 
-def _first_camera(session: Session, found: Mapping[str, FoundCorners]) -> Camera | None:
+def first_camera(session: Session, found: Mapping[str, FoundCorners]) -> Camera | None:
     """Return a camera calibrated quickly from `found`; None where it cannot be: the calibration proper says why."""
     from rigkit.calibration.calibrate import calibrate
     from rigkit.errors import RigkitError
 
     try:
         views, size_px, _ = session_views(session, found)
-        # Scaramuzza's model takes any lens.
+        # Scaramuzza's model takes any lens; what it does not follow closely, another may.
         model = "scaramuzza" if session.model == "auto" else session.model
-        return calibrate(views, size_px, model=model, degree=session.degree, board="flat").camera
+        first = calibrate(views, size_px, model=model, degree=session.degree, board="flat")
+        if session.model == "auto" and first.sigma_px > LOOSE * median(s for v in views for s in v.sigma_px.tolist()):
+            first = calibrate(views, size_px, model="auto", board="flat")
+        return first.camera
     except RigkitError:
         return None
 

@@ -23,6 +23,7 @@ from rigkit.calibration.observations import Observations
 from rigkit.calibration.poses import find_poses
 from rigkit.calibration.solver import State, evaluate
 from rigkit.calibration.uncertainty import uncertainty_at_corners
+from rigkit.cameras.double_sphere import DoubleSphere
 from rigkit.cameras.registry import MODELS
 from rigkit.detections import BoardView
 from rigkit.errors import DegenerateError, InputError
@@ -68,6 +69,20 @@ def test_scaramuzza_degree_by_heldout_error(rng: np.random.Generator) -> None:
     assert result.camera.model == "scaramuzza"
     assert sum(c.chosen for c in result.candidates) == 1
     assert np.sqrt((projection_difference(result.camera, lens("fish"), 90.0) ** 2).mean()) < 0.2
+
+
+def test_a_lens_of_220_degrees_takes_the_largest_degree_and_is_told_so(rng: np.random.Generator) -> None:
+    """f = rho cot(theta) has a pole at 180 degrees: no polynomial follows the rim of such a lens."""
+    camera = DoubleSphere(SIZE, np.array([330.0, 330.0, 808.0, 615.0, -0.2, 0.6]))
+    views, _, _ = random_views(camera, 20, rng, reach_deg=108.0, noise_px=0.01)
+    result = calibrate(views, SIZE, board="flat")
+    eight = calibrate(views, SIZE, degree=8, board="flat")
+    off, before = (
+        float(np.sqrt((projection_difference(c.camera, camera, 105.0) ** 2).mean())) for c in (result, eight)
+    )
+    assert off < 0.5 * before
+    assert any("scaramuzza 10 is the largest there is" in verdict for verdict in result.verdicts)
+    assert not any("largest there is" in verdict for verdict in eight.verdicts)
 
 
 def test_rational_brown_converges(rng: np.random.Generator) -> None:
