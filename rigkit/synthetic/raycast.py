@@ -23,8 +23,9 @@ FAR_SQUARES = 1e4
 """Board coordinate given to rays that miss a board's plane."""
 RIM_MARGIN = 0.1
 """Cosine by which the nodes must clear the lens's rim for a whole tile to be lit: they stop short of its edge."""
-MAX_CELL = 2.0
-"""Widest cell, in squares or panel sides: beyond, the plane is seen edge on and differences mean nothing."""
+LEAST_CELL, MAX_CELL = 1e-6, 2.0
+"""A cell's side, in squares or panel sides: shorter is none; longer, the plane is seen edge on and differences mean
+nothing."""
 SMOOTH_DEPTH_RATIO = 0.5
 """Depth ratio over a tile above which x and y are fitted themselves: the fit's error is below 6 ** -NODES = 1e-7."""
 
@@ -185,15 +186,15 @@ def paint(fine: Float32, surface: Surface, chart: Chart, per_pixel: int) -> None
     if box is None:
         return
     axes = chart.locate(surface.plane_from_ray, *box).astype(np.float32)
-    widths = [_cell_width(axis, per_pixel) for axis in axes]
+    cells = [_cells(axis, per_pixel) for axis in axes]
     target = fine[box]
-    sheet = [_inside(a, w, surface.low[k], surface.high[k]) for k, (a, w) in enumerate(zip(axes, widths, strict=True))]
+    sheet = [_inside(a, c, surface.low[k], surface.high[k]) for k, (a, c) in enumerate(zip(axes, cells, strict=True))]
     share = sheet[0] * sheet[1]
     target += share * (np.float32(surface.white) - target)
     if surface.cells is None:
         return
     (in_x, wave_x), (in_y, wave_y) = (
-        _squares(a, w, count) for a, w, count in zip(axes, widths, surface.cells, strict=True)
+        _squares(a, c, count) for a, c, count in zip(axes, cells, surface.cells, strict=True)
     )
     # Both waves are -1 on the square before the first inner corner.
     wave_x *= wave_y
@@ -203,13 +204,13 @@ def paint(fine: Float32, surface: Surface, chart: Chart, per_pixel: int) -> None
     wave_x *= np.float32(0.5 * (surface.black - surface.white))
     target += wave_x
     if surface.marks is not None:
-        _paint_marks(target, axes, widths, surface)
+        _paint_marks(target, axes, cells, surface)
 
 
-def _paint_marks(target: Float32, axes: Float32, widths: list[Float32], surface: Surface) -> None:
+def _paint_marks(target: Float32, axes: Float32, cells: list[_Cells], surface: Surface) -> None:
     """Blacken the rectangles of a surface in `target`; they touch, but do not overlap."""
     marks = np.zeros((0, 4)) if surface.marks is None else surface.marks
-    reach = [float(w.max()) for w in widths]
+    reach = [c.reach for c in cells]
     low, high = marks[:, :2] - reach, marks[:, :2] + marks[:, 2:] + reach
     seen = (high > axes.min(axis=(1, 2))).all(axis=1) & (low < axes.max(axis=(1, 2))).all(axis=1)
     for n in np.flatnonzero(seen):
@@ -217,9 +218,13 @@ def _paint_marks(target: Float32, axes: Float32, widths: list[Float32], surface:
         rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
         if not len(rows):
             continue
-        box = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+        per_pixel = cells[0].per_pixel
+        # In whole pixels, as the cells' sides are.
+        first, end = [rows[0] // per_pixel, columns[0] // per_pixel], [rows[-1] // per_pixel, columns[-1] // per_pixel]
+        pixels = tuple(slice(a, b + 1) for a, b in zip(first, end, strict=True))
+        box = tuple(slice(a * per_pixel, (b + 1) * per_pixel) for a, b in zip(first, end, strict=True))
         across, down = (
-            _inside(axes[k][box], widths[k][box], marks[n, k], marks[n, k] + marks[n, k + 2]) for k in (0, 1)
+            _inside(axes[k][box], cells[k].of(pixels), marks[n, k], marks[n, k] + marks[n, k + 2]) for k in (0, 1)
         )
         target[box] += np.float32(surface.black - surface.white) * across * down
 
@@ -243,44 +248,78 @@ def _bounding_box(cx: FloatArray, cy: FloatArray, surface: Surface, per_pixel: i
     rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
     if not len(rows):
         return None
-    # _cell_width needs two pixels along each axis.
+    # _cells needs two pixels along each axis.
     v, u = (slice(max(int(k[0]) - 1, 0) * per_pixel, (int(k[-1]) + 2) * per_pixel) for k in (rows, columns))
     return (v, u)
 
 
-def _cell_width(axis: Float32, per_pixel: int) -> Float32:
-    """Return how far `axis` moves across one sub-sample's cell along its gradient, constant within a pixel."""
+@dataclass(frozen=True, eq=False, slots=True)
+class _Cells:
+    """How far a coordinate of the plane moves across the sub-samples' cells of each pixel, constant within a pixel.
+
+    A cell is a parallelogram to the coordinate: the sum of two boxes, one from its side along u and one from that
+    along v. Only so do the cells' shares of an edge's two sides add up, whatever the edge's direction.
+    """
+
+    wide: Float32
+    """(rows, columns) of pixels: the longer of the two boxes."""
+    narrow: Float32
+    per_pixel: int
+    reach: float
+    """No cell extends further from its middle."""
+
+    def of(self, pixels: tuple[slice, ...]) -> _Cells:
+        return _Cells(self.wide[pixels], self.narrow[pixels], self.per_pixel, self.reach)
+
+    def beyond(self, distance: Float32) -> Float32:
+        """Return the share of each cell beyond an edge less 1/2, from the middles' distances (rows, columns) from it.
+
+        The integral of a trapezoid: it rises over the narrow box, is flat, and falls over the narrow box.
+        """
+        out = np.copysign(np.float32(0.5), distance)
+        far = np.abs(distance)
+        row, column = np.divmod(np.flatnonzero(far < self.reach), distance.shape[1])
+        pixel = row // self.per_pixel * self.wide.shape[1] + column // self.per_pixel
+        wide, narrow = self.wide.ravel()[pixel], self.narrow.ravel()[pixel]
+        far = far[row, column]
+        slope = np.clip(far - np.float32(0.5) * (wide - narrow), np.float32(0.0), narrow)
+        share = np.minimum(far, np.float32(0.5) * (wide + narrow)) - slope * slope / (np.float32(2.0) * narrow)
+        out[row, column] = np.copysign(share / wide, out[row, column])
+        return np.asarray(out)
+
+
+def _cells(axis: Float32, per_pixel: int) -> _Cells:
     down, right = np.gradient(axis[::per_pixel, ::per_pixel])
-    width = np.clip(np.hypot(down, right) / per_pixel, 1e-6, MAX_CELL).astype(np.float32)
-    return np.asarray(np.repeat(np.repeat(width, per_pixel, axis=0), per_pixel, axis=1))
+    sides = np.abs(np.stack([down, right])) / np.float32(per_pixel)
+    sides = np.clip(sides, LEAST_CELL, MAX_CELL).astype(np.float32)
+    wide, narrow = sides.max(axis=0), sides.min(axis=0)
+    return _Cells(wide, narrow, per_pixel, 0.5 * float((wide + narrow).max()))
 
 
-def _inside(axis: Float32, width: Float32, low: float, high: float) -> Float32:
+def _inside(axis: Float32, cells: _Cells, low: float, high: float) -> Float32:
     """Return the share of each cell with low <= axis <= high."""
-    if axis.min() - width.max() > low and axis.max() + width.max() < high:
+    if axis.min() - cells.reach > low and axis.max() + cells.reach < high:
         return np.ones((1, 1), dtype=np.float32)
-    share = np.minimum(np.float32(high) - axis, axis - np.float32(low))
-    share /= width
+    share = cells.beyond(np.minimum(np.float32(high) - axis, axis - np.float32(low)))
     share += np.float32(0.5)
-    return np.asarray(np.clip(share, 0.0, 1.0, out=share))
+    return share
 
 
-def _squares(axis: Float32, width: Float32, count: int) -> tuple[Float32, Float32]:
+def _squares(axis: Float32, cells: _Cells, count: int) -> tuple[Float32, Float32]:
     """Return, averaged over each cell, the indicator of -1 <= axis <= count and the wave within it.
 
     The wave is +1 on [0, 1), changes sign at every inner corner 0 .. count - 1, and is 0 outside [-1, count].
     A cell is narrower than a square, so it meets one edge at most.
     """
-    inside = _inside(axis, width, -1.0, float(count))
+    inside = _inside(axis, cells, -1.0, float(count))
     # Triangle wave: 0 at every corner, slope +-1 there, positive on [0, 1).
     wave = (axis - np.float32(0.5)) * np.float32(0.5)
     wave -= np.rint(wave)
     np.abs(wave, out=wave)
     wave *= np.float32(-2.0)
     wave += np.float32(0.5)
+    wave = cells.beyond(wave)
     wave *= np.float32(2.0)
-    wave /= width
-    np.clip(wave, -1.0, 1.0, out=wave)
     if inside.size > 1:
         last = np.float32(1.0 if count % 2 else -1.0)
         wave = np.where(axis < -0.5, -inside, np.where(axis > count - 0.5, last * inside, wave))

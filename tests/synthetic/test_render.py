@@ -1,4 +1,4 @@
-"""The renderer against point sampling, against symmetry, and against OpenCV's corner refinement."""
+"""The renderer against integrals, point sampling, finer sampling, symmetry, and OpenCV's corner refinement."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from itertools import product
 import cv2
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from rigkit.boards import Board
 from rigkit.cameras.base import Camera
@@ -20,6 +21,12 @@ from rigkit.synthetic.photometry import Photometry, Shadow, develop
 from rigkit.synthetic.render import Optics, radiance, render
 from rigkit.synthetic.scene import Panel, PlacedBoard, room_walls, trihedral
 
+EDGE_LEVELS = 4e-3
+"""Without blur a straight edge is exact but for the rounding of single-precision coordinates: of 255 levels."""
+EDGE_PX = 4e-4
+"""Shift of a straight, blurred edge: a blur of 0.3 px is sampled in steps of 0.25 px."""
+FINER_PX, FINEST_PX = 1e-3, 3e-4
+"""Shift of corners against an image with twice the sub-samples along each axis, rms: from 4, and from 8."""
 SAMPLING_LEVELS = 0.6
 """Point sampling with 2048 symmetric samples a pixel is right to about 0.15 grey levels of 255 (rms 0.03 to 0.1)."""
 SAMPLING_MAX_LEVELS = 4.0
@@ -61,6 +68,17 @@ def sampled(placed: PlacedBoard, camera: Camera, blur_px: float, background: flo
     return out / len(offsets)
 
 
+def shifts(image: np.ndarray, reference: np.ndarray, pixels: np.ndarray) -> float:
+    """Return by how much the surroundings of `pixels` (N, 2) are shifted against the reference, rms per axis, px."""
+    down, right = np.gradient(reference)
+    found = []
+    for u, v in np.rint(pixels).astype(int):
+        window = (slice(v - 3, v + 4), slice(u - 3, u + 4))
+        slopes = np.stack([right[window].ravel(), down[window].ravel()], axis=1)
+        found.append(np.linalg.lstsq(slopes, (image - reference)[window].ravel(), rcond=None)[0])
+    return float(np.sqrt(np.mean(np.square(found))))
+
+
 @pytest.mark.parametrize(("camera", "blur_px"), list(product((PINHOLE, FISHEYE), (0.0, 0.7))))
 def test_equals_point_sampling(camera: Camera, blur_px: float) -> None:
     image = radiance([BOARD], camera, Rigid3.identity(), optics=Optics(blur_px), background=0.35)
@@ -70,14 +88,67 @@ def test_equals_point_sampling(camera: Camera, blur_px: float) -> None:
     assert np.abs(difference).max() < SAMPLING_MAX_LEVELS
     pixels, valid = BOARD.see(camera, Rigid3.identity())
     assert valid.all()
-    down, right = np.gradient(reference)
-    shifts = []
-    for u, v in np.rint(pixels).astype(int):
-        window = (slice(v - 3, v + 4), slice(u - 3, u + 4))
-        slopes = np.stack([right[window].ravel(), down[window].ravel()], axis=1)
-        shifts.append(np.linalg.lstsq(slopes, (image - reference)[window].ravel(), rcond=None)[0])
-    assert len(shifts) == 30
-    assert np.sqrt(np.mean(np.square(shifts))) < SHIFT_PX
+    assert len(pixels) == 30
+    assert shifts(image, reference, pixels) < SHIFT_PX
+
+
+def edge_response(distance: np.ndarray, angle: float, blur_px: float) -> np.ndarray:
+    """Return the share beyond a straight edge whose normal has `angle`: step, pixel's square and Gaussian convolved.
+
+    The square is two boxes to the edge: twice the difference of the step's double integral, a Gaussian's for blur.
+    """
+    across, along = abs(np.cos(angle)), abs(np.sin(angle))
+
+    def twice(d: np.ndarray) -> np.ndarray:
+        if blur_px == 0.0:
+            return np.asarray(0.5 * np.maximum(d, 0.0) ** 2)
+        density = np.exp(-0.5 * (d / blur_px) ** 2) / np.sqrt(2.0 * np.pi)
+        return np.asarray(0.5 * ((d**2 + blur_px**2) * ndtr(d / blur_px) + d * blur_px * density))
+
+    far, near = 0.5 * (across + along), 0.5 * (across - along)
+    total = twice(distance + far) - twice(distance + near) - twice(distance - near) + twice(distance - far)
+    return np.asarray(total / (across * along))
+
+
+@pytest.mark.parametrize("degrees", [3.0, 20.0, 40.0, 44.5, 45.0, 135.0])
+@pytest.mark.parametrize("blur_px", [0.0, 0.3, 0.7])
+def test_straight_edge_is_its_integral(degrees: float, blur_px: float) -> None:
+    angle, size, f = np.radians(degrees), 96, 100.0
+    camera = Pinhole((size, size), np.array([f, f, 47.37, 48.12]))
+    rotation = exp_so3(np.array([0.0, 0.0, angle]))
+    # Its edge at x = 0 of its own frame, everything else out of sight.
+    half_plane = Panel(Rigid3(rotation, rotation @ [100.0, 0.0, f]), 200.0, 200.0, 0.9)
+    image = radiance([], camera, Rigid3.identity(), panels=[half_plane], optics=Optics(blur_px), background=0.1)
+    v, u = np.indices(image.shape)
+    distance = (u - 47.37) * np.cos(angle) + (v - 48.12) * np.sin(angle)
+    expected = 0.1 + 0.8 * edge_response(distance, angle, blur_px)
+    if blur_px == 0.0:
+        assert 255.0 * np.abs(image - expected).max() < EDGE_LEVELS
+    step = 1e-4
+    slope = 0.8 * (edge_response(distance + step, angle, blur_px) - edge_response(distance - step, angle, blur_px))
+    slope /= 2.0 * step
+    assert abs((slope * (image - expected)).sum() / (slope**2).sum()) < EDGE_PX
+
+
+@pytest.mark.parametrize("degrees", [1.0, 20.0, 44.5, 45.0])
+@pytest.mark.parametrize("lens", ["pinhole", "fisheye"])
+def test_more_sub_samples_change_little(lens: str, degrees: float) -> None:
+    """At 45 degrees, too, where the corners of cells, not their sides, meet the edge."""
+    centre = [79.6, 80.1]
+    camera: Camera = Pinhole((160, 160), np.array([160.0, 160.0, *centre]))
+    rotation = exp_so3(np.array([0.0, 0.0, np.radians(degrees)]))
+    if lens == "fisheye":
+        camera = KannalaBrandt((160, 160), np.array([160.0, 160.0, *centre, -0.03, 0.004, 0.0, 0.0]))
+        rotation = exp_so3(np.array([0.4, 0.0, 0.0])) @ rotation
+    pose = Rigid3(rotation, np.array([0.7, 0.3, 600.0]) - rotation @ [125.0, 125.0, 0.0])
+    placed = PlacedBoard(Board("a", 6, 6, 50.0, 50.0), pose, 0.5)
+    pixels, valid = placed.see(camera, Rigid3.identity())
+    assert valid.all()
+    coarse, finer, finest = (
+        radiance([placed], camera, Rigid3.identity(), optics=Optics(0.5, supersample=n)) for n in (4, 8, 16)
+    )
+    assert shifts(coarse, finer, pixels) < FINER_PX
+    assert shifts(finer, finest, pixels) < FINEST_PX
 
 
 def test_half_turn_of_the_camera_turns_the_image() -> None:
