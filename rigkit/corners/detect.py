@@ -22,6 +22,7 @@ from rigkit.corners.lattice import Lattice, build_lattices
 from rigkit.corners.links import find_links
 from rigkit.corners.nearby import near_any
 from rigkit.corners.origin import quarter_turns
+from rigkit.corners.rejoin import rejoined
 from rigkit.corners.response import GreyImage, Level, grey_image, pyramid
 from rigkit.corners.saddle import find_corners
 from rigkit.corners.subpixel import RefinedLattice, refine
@@ -85,8 +86,9 @@ def detect_boards(
         stays a grid of its own. A board is named only where one single given board has that size and one single
         detection fits it, or, a ChArUco board, by its markers.
     min_corners : boards with fewer corners are not reported.
-    camera : the calibrated camera, if known: it shows where corners of known boards were missed, and fits all of them
-        with windows and lines as it sees them (`rigkit.corners.guided`).
+    camera : the calibrated camera, if known: it shows which parts are of one board (`rigkit.corners.rejoin`) and where
+        corners of known boards were missed, and fits all of them with windows and lines as it sees them
+        (`rigkit.corners.guided`).
 
     Returns
     -------
@@ -109,10 +111,23 @@ def detect_boards(
 
         marked, lattices = charuco_boards(grey, lattices, known, min_corners)
     lattices = [known_part(item, sizes) for item in lattices]
-    placed = [place_part(grey, item, sizes) or item for item in lattices]
+    placed = _placed(grey, lattices, plain, camera)
     found = complete_boards(grey, [*marked, *(_detection(item, sizes) for item in placed)], known, camera)
     ordered = sorted(found, key=_rank)
     return tuple(_named(_apart(ordered), plain))
+
+
+def _placed(
+    grey: GreyImage, lattices: Sequence[RefinedLattice], boards: Sequence[Board], camera: Camera | None
+) -> list[RefinedLattice]:
+    """Return the grids with those that are parts of a board in their place, where that is known."""
+    sizes = tuple(dict.fromkeys(board.size for board in boards))
+    tried = [(item, place_part(grey, item, sizes)) for item in lattices]
+    placed = [item for _, item in tried if item is not None]
+    parts = [item for item, known in tried if known is None]
+    if camera is None or len(parts) < 2:
+        return [*placed, *parts]
+    return [*placed, *(place_part(grey, item, sizes) or item for item in rejoined(parts, boards, camera))]
 
 
 def _rank(item: BoardDetection) -> tuple[int, float, float]:
