@@ -116,7 +116,7 @@ WRONG = [
     ('boards = ["left", "floor"]', "boards = []", ["'boards' is empty"]),
     ('boards = ["left", "floor"]', 'boards = ["left", "left"]', ["twice"]),
     ('boards = ["left", "floor"]', "boards = 2", ["list of strings"]),
-    ('layout = { left = "left"', 'layout = { left = "ceiling"', ["left, right, floor"]),
+    ('layout = { left = "left"', 'layout = { left = "attic"', ["left, right, floor"]),
     ('id = "floor"', 'id = "left"', ["'left' is declared twice"]),
     ('id = "first"', 'id = "../first"', ["letters, digits"]),
     ("columns = 7", "", ["'floor'", "'columns' is missing"]),
