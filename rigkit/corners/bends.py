@@ -2,9 +2,10 @@
 
 The edge model is told the curvature of its two lines: an error of 1e-4 / px moves a corner by some thousandths of a
 pixel. A row is a smooth curve of the column number; its Taylor coefficients at a corner are the most probable ones
-given the corners on the row, with their standard deviations, and that the k-th is about DECAY^k sides of the cell. Few
+given the corners on the row, with their standard deviations, and that the k-th is about DECAY^k sides of the cell, or
+phi^(k - 1) / 2 where a line is seen to turn, or its cells to grow, by phi a cell, as large squares do in a fisheye. Few
 or noisy corners leave the high ones near zero; many exact ones are followed to the end of the row, where a polynomial
-of low degree would miss.
+of low degree would miss. Where few corners leave the curvature open, its standard deviation says so.
 """
 
 from __future__ import annotations
@@ -20,6 +21,9 @@ __all__ = ["line_curvature"]
 DECAY = 0.1
 """Boards under strong perspective and in fisheyes have coefficients up to this^k, in sides of the cell."""
 
+BENT_RAD = 0.06
+"""Where this phi is seen, DECAY would be too strict: the third coefficient, phi^2 / 2, then exceeds DECAY^3."""
+
 LINE_REACH = Sheet.GAP
 """Corners so many cells away are used: on a sheet, further ones may be another board's."""
 
@@ -33,8 +37,12 @@ FREE = 1e-6
 """Weight of the prior on position and direction: none to speak of, but enough for a corner that is alone."""
 
 
-def line_curvature(pixels: FloatArray, sigma_px: FloatArray, cells: BoolArray, sides_px: FloatArray) -> FloatArray:
-    """Return the curvature of row and column at the M `cells`, (M, 2) 1/px, positive towards +90 degrees.
+def line_curvature(
+    pixels: FloatArray, sigma_px: FloatArray, cells: BoolArray, sides_px: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the curvature of row and column at the M `cells` and its standard deviation, (M, 2) each, 1/px.
+
+    Positive towards +90 degrees.
 
     Parameters
     ----------
@@ -43,18 +51,18 @@ def line_curvature(pixels: FloatArray, sigma_px: FloatArray, cells: BoolArray, s
     cells : (R, C) bool, row by row.
     sides_px : (M, 2) lengths of the cell's sides along row and column.
     """
-    rules = BendRules(DECAY, LEAST_SIGMA_PX, FREE, LINE_REACH)
+    rules = BendRules(DECAY, LEAST_SIGMA_PX, FREE, BENT_RAD, LINE_REACH)
     compiled = line_bends(pixels, sigma_px, cells, sides_px, rules)
     if compiled is not None:
         return compiled
     steps = np.arange(-LINE_REACH, LINE_REACH + 1)
-    design = (DECAY * steps[:, None]) ** np.arange(TERMS)
+    design = steps[:, None].astype(np.float64) ** np.arange(TERMS)
     products = (design[:, :, None] * design[:, None, :]).reshape(len(steps), -1)
-    prior = np.diag([FREE, FREE, *[1.0] * (TERMS - 2)])
+    decay = DECAY ** np.arange(TERMS)
     known = np.isfinite(sigma_px) & np.isfinite(pixels[..., 0])
     weight = np.where(known, np.maximum(sigma_px, LEAST_SIGMA_PX) ** -2.0, 0.0)
     row, column = np.nonzero(cells)
-    out = np.empty((len(row), 2))
+    out, out_sigma = np.empty((2, len(row), 2))
     for line, (along_row, along_column) in enumerate(((0, 1), (1, 0))):
         r, c = row[:, None] + along_row * steps, column[:, None] + along_column * steps
         inside = (r >= 0) & (r < pixels.shape[0]) & (c >= 0) & (c < pixels.shape[1])
@@ -62,10 +70,27 @@ def line_curvature(pixels: FloatArray, sigma_px: FloatArray, cells: BoolArray, s
         side = sides_px[:, line, None]
         weights = np.where(inside, weight[r, c], 0.0) * side**2
         off = np.where((weights > 0.0)[..., None], pixels[r, c] - pixels[row, column][:, None], 0.0) / side[..., None]
-        normal = (weights @ products).reshape(-1, TERMS, TERMS) + prior
-        right = np.swapaxes(design.T @ (weights[..., None] * off), 1, 2)
-        solved = np.linalg.solve(normal, np.swapaxes(right, 1, 2))
-        first, second = DECAY * solved[:, 1], 2.0 * DECAY**2 * solved[:, 2]
+        normal = (weights @ products).reshape(-1, TERMS, TERMS)
+        right = design.T @ (weights[..., None] * off)
+        found, sigma = _most_probable(normal, right, np.broadcast_to(decay, (len(row), TERMS)))
+        size = np.linalg.norm(found, axis=2)
+        turn = np.maximum(2.0 * size[:, 2], np.sqrt(2.0 * size[:, 3]))
+        bent = turn > BENT_RAD
+        if bent.any():
+            expected: FloatArray = np.repeat(decay[None], np.count_nonzero(bent), axis=0)
+            expected[:, 2:] = np.maximum(decay[2:], 0.5 * turn[bent, None] ** np.arange(1, TERMS - 1))
+            found[bent], sigma[bent] = _most_probable(normal[bent], right[bent], expected)
+        first, second = found[:, 1], 2.0 * found[:, 2]
         cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
-        out[:, line] = cross / (np.maximum((first**2).sum(axis=1), 1e-12) ** 1.5 * sides_px[:, line])
-    return out
+        square = np.maximum((first**2).sum(axis=1), 1e-12)
+        out[:, line] = cross / (square**1.5 * sides_px[:, line])
+        out_sigma[:, line] = 2.0 * sigma / (square * sides_px[:, line])
+    return out, out_sigma
+
+
+def _most_probable(normal: FloatArray, right: FloatArray, expected: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the coefficients (M, TERMS, 2) that are `expected` (M, TERMS) in size, and the second's sigma (M,)."""
+    prior = np.diag([FREE, FREE, *[1.0] * (TERMS - 2)])
+    inverse = np.linalg.inv(normal * expected[:, :, None] * expected[:, None, :] + prior)
+    found = expected[..., None] * (inverse @ (expected[..., None] * right))
+    return found, expected[:, 2] * np.sqrt(inverse[:, 2, 2])

@@ -17,6 +17,8 @@ from rigkit.corners.edge_model import (
     END_SIGMAS,
     GX,
     GY,
+    K1,
+    K2,
     LEAST_REACH,
     NEAR_PX,
     NEAR_SIGMAS,
@@ -42,6 +44,9 @@ from rigkit.corners.response import GreyImage
 from rigkit.native.edges import Rules, fit_corners
 
 __all__ = ["BLUR_RANGE", "EdgeFit", "fit_edges"]
+
+DETERMINED = K1
+"""So many parameters only the pixels determine; the curvatures of the lines are mostly the lattice's."""
 
 BLUR_RANGE = (0.28, 5.0)
 """s of a perfectly sharp image is the pixel's own 0.29; above 5 px there is no edge to speak of."""
@@ -110,6 +115,7 @@ def fit_edges(
     iterations: int,
     converged_px: float = 1e-3,
     mirrored: bool = True,
+    curvature_sigma: FloatArray | None = None,
 ) -> EdgeFit:
     """Fit the edge model to `image` (as `grey_image` returns it) around the corners that are near `pixels` (N, 2).
 
@@ -121,12 +127,15 @@ def fit_edges(
     iterations : Gauss-Newton steps at most.
     mirrored : tell noise from other residuals; otherwise all counts as noise.
     converged_px : the last step moves the corner by less than this; the next one would by a hundredth of it.
+    curvature_sigma : (N, 2) how well the geometry's curvatures are known, 1/px; where 0, and without, both are kept.
     """
+    loose = np.zeros((len(pixels), 2)) if curvature_sigma is None else curvature_sigma
     fitted = fit_corners(
         image,
         pixels,
         geometry.sides,
         geometry.curvature,
+        loose,
         geometry.gaps,
         geometry.ends,
         sign,
@@ -137,12 +146,13 @@ def fit_edges(
         _, _, sigma_px, width, contrast, residual, noise, valid = fitted.T
         return EdgeFit(fitted[:, :2], sigma_px, width, contrast, residual, noise, valid > 0.5)
     window = collect(image, pixels, geometry, blur, radius_px)
-    prior_mean, prior = _prior(geometry, blur, window.size)
+    prior_mean, prior = _prior(geometry, loose, blur, window.size)
+    kept = np.count_nonzero(loose > 0.0, axis=1) < 2
     values = prior_mean.copy()
     values[:, [X, Y]] = pixels - window.centre
     _brightness(values, window, geometry, sign)
     used = window.weight.sum(axis=1, dtype=np.float64)
-    free = np.maximum(used - PARAMETERS, 1.0)
+    free = np.maximum(used - DETERMINED, 1.0)
     variance = np.full(len(pixels), np.inf)
     normal = np.zeros((len(pixels), PARAMETERS, PARAMETERS))
     active = np.ones(len(pixels), bool)
@@ -152,6 +162,7 @@ def fit_edges(
         rows = linearise(
             values[active], window if every else window.of(active), geometry if every else geometry.of(active)
         )
+        rows[kept[active], K1 : K2 + 1] = 0.0
         products = (rows @ np.swapaxes(rows, 1, 2)).astype(np.float64)
         variance[active] = np.maximum(products[:, -1, -1] / free[active], LEAST_VARIANCE)
         pull = prior[active] * variance[active, None]
@@ -202,14 +213,16 @@ def _rules(radius_px: float, iterations: int, converged_px: float, mirrored: boo
     )
 
 
-def _prior(geometry: Geometry, blur: FloatArray, size: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the parameters as known beforehand (N, 9) and one over their variances, 0 for unknown."""
+def _prior(geometry: Geometry, loose: FloatArray, blur: FloatArray, size: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the parameters as known beforehand (N, 11) and one over their variances, 0 for unknown."""
     mean = np.zeros((len(blur), PARAMETERS))
     mean[:, [T1, T2]] = np.arctan2(geometry.sides[..., 1], geometry.sides[..., 0])
     mean[:, S] = blur
+    mean[:, [K1, K2]] = geometry.curvature
     weight = np.zeros_like(mean)
     weight[:, [T1, T2]] = ANGLE_SIGMA_RAD**-2
     weight[:, S] = (LOG_BLUR_SIGMA * blur) ** -2
+    weight[:, [K1, K2]] = np.where(loose > 0.0, loose, 1.0) ** -2.0
     weight[:, [GX, GY]] = ((LIGHT_SIGMA_PER_PX * size) ** -2)[:, None]
     return mean, weight
 
@@ -274,8 +287,8 @@ def _noise(values: FloatArray, variance: FloatArray, window: Window, geometry: G
     paired = np.isfinite(change)
     pairs, count = paired.sum(axis=1), used.sum(axis=1)
     mean = np.where(paired, change, 0.0) ** 2
-    apart = mean.sum(axis=1) / np.maximum(pairs, 1) / spread * count / np.maximum(count - PARAMETERS, 1)
-    enough = (pairs >= FEWEST_MIRRORED) & (count > PARAMETERS)
+    apart = mean.sum(axis=1) / np.maximum(pairs, 1) / spread * count / np.maximum(count - DETERMINED, 1)
+    enough = (pairs >= FEWEST_MIRRORED) & (count > DETERMINED)
     enough &= np.abs(values[:, [X, Y]]).max(axis=1) <= MOST_MIRRORED_PX
     return np.where(enough, np.maximum(apart, LEAST_VARIANCE), variance)
 
@@ -304,7 +317,7 @@ def _result(
     moved = np.linalg.norm(pixels - start, axis=1)
     longest = np.linalg.norm(geometry.sides, axis=2).max(axis=1)
     valid = (moved < np.maximum(VALID_MOVE_PX, VALID_MOVE_CELLS * longest)) & (spread > 0.0) & np.isfinite(spread)
-    valid &= (window.weight.sum(axis=1) > PARAMETERS) & _surrounded(pixels, window)
+    valid &= (window.weight.sum(axis=1) > DETERMINED) & _surrounded(pixels, window)
     return EdgeFit(
         pixels,
         np.sqrt(np.where(valid, spread, 0.0)),

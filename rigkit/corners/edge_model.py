@@ -1,16 +1,16 @@
-"""The brightness around a chessboard corner as a model of nine parameters.
+"""The brightness around a chessboard corner as a model of eleven parameters.
 
     I(p) = (1 + g . (p - c)) (a + b S(d1 / s) S(d2 / s))
 
-with d1, d2 the distances of pixel p from the two lines through the corner (given curvatures, so that a fisheye's bent
+with d1, d2 the distances of pixel p from the two lines through the corner (with curvatures, so that a fisheye's bent
 rows do not pull the corner aside), S the step of an edge as a Gaussian lens and the square of a pixel blur it, of
 standard deviation s together, a and b brightness and half contrast, g the gradient of the light. Parameters: corner
-(2), angles of the lines (2), s, a, b, g (2).
+(2), angles of the lines (2), s, a, b, g (2), curvatures (2).
 
 The model is symmetric about the corner but for curvature and light, so what it gets wrong otherwise (the shape of the
 blur, sharpening) does not move the corner; but it adds to the residuals, and so to the predicted sigma.
 
-Arrays are float32 here, the one place besides image filters: N corners x P pixels x 9 derivatives, of values 0..255,
+Arrays are float32 here, the one place besides image filters: N corners x P pixels x 11 derivatives, of values 0..255,
 summed in products of P terms; the corner is good to 1e-5 px.
 """
 
@@ -44,8 +44,8 @@ __all__ = [
 
 Float32 = NDArray[np.float32]
 
-PARAMETERS = 9
-X, Y, T1, T2, S, A, B, GX, GY = range(PARAMETERS)
+PARAMETERS = 11
+X, Y, T1, T2, S, A, B, GX, GY, K1, K2 = range(PARAMETERS)
 
 TAIL_SIGMAS = 3.0
 """An edge is felt so far away, s: the edges of the neighbouring lines are reckoned with where they are nearer."""
@@ -223,10 +223,10 @@ def _parts(values: FloatArray, window: Window, geometry: Geometry) -> tuple[tupl
     blur = known[:, S, None]
     qu, qv = window.u - known[:, X, None], window.v - known[:, Y, None]
     out = []
-    for angle, line in ((T1, 0), (T2, 1)):
+    for angle, bend, line in ((T1, K1, 0), (T2, K2, 1)):
         cosine, sine = np.cos(known[:, angle, None]), np.sin(known[:, angle, None])
         along, aside = cosine * qu + sine * qv, cosine * qv - sine * qu
-        kappa = geometry.curvature[:, line, None].astype(np.float32)
+        kappa = known[:, bend, None]
         distance = aside - (np.float32(0.5) * kappa) * (along * along + blur * blur)
         flat = np.float32(PIXEL_KURTOSIS) * (cosine**4 + sine**4)
         step = _step(distance, blur, flat, geometry.gaps[:, line].astype(np.float32))
@@ -261,7 +261,7 @@ def _mixed(one: tuple[Float32, ...], two: tuple[Float32, ...], rho: Float32) -> 
 
 
 def linearise(values: FloatArray, window: Window, geometry: Geometry) -> Float32:
-    """Return the derivatives (N, 9, P) of the brightness and, as a tenth row, the residuals; zero in the padding.
+    """Return the derivatives (N, 11, P) of the brightness and, as a twelfth row, the residuals; zero in the padding.
 
     How the blur mixes lines that cross aslant is differentiated to second order in their cosine.
     """
@@ -294,4 +294,6 @@ def linearise(values: FloatArray, window: Window, geometry: Geometry) -> Float32
     rows[:, T1] = -by_d1 * (along1 + bend1 * aside1)
     rows[:, T2] = -by_d2 * (along2 + bend2 * aside2)
     rows[:, S] = -light * (grown1 * f2 + grown2 * f1)
+    rows[:, K1] = np.float32(-0.5) * by_d1 * (along1 * along1 + known[:, S, None] ** 2)
+    rows[:, K2] = np.float32(-0.5) * by_d2 * (along2 * along2 + known[:, S, None] ** 2)
     return rows

@@ -2,12 +2,12 @@
  * at the end, how the lines of a lattice bend: corners.bends.
  *
  * The pixels of a corner are gathered once. Every Gauss-Newton step evaluates the model and its derivatives in float32,
- * a block of pixels at a time, which the compiler vectorises; products are summed in float32 lanes, and the nine normal
- * equations are solved in double. */
+ * a block of pixels at a time, which the compiler vectorises; products are summed in float32 lanes, and the normal
+ * equations are solved in double: eleven, or the FEWER of a corner whose lines bend as given. */
 #include "kernels.h"
 
-enum { X, Y, T1, T2, S, A, B, GX, GY, PARAMETERS };
-enum { ROWS = PARAMETERS + 1, LANES = 8, GROUPS = 8, BLOCK = LANES * GROUPS };
+enum { X, Y, T1, T2, S, A, B, GX, GY, K1, K2, PARAMETERS };
+enum { FEWER = K1, ROWS = PARAMETERS + 1, LANES = 8, GROUPS = 8, BLOCK = LANES * GROUPS };
 enum { OUTCOMES = 8 };
 
 /* Eight numbers at once, wherever they lie. */
@@ -23,10 +23,10 @@ typedef struct {
     int64_t iterations, mirrored, fewest_mirrored;
 } rules_t;
 
-/* What the lattice says of a corner: its cell's sides, the curvature of its lines, where their neighbours are, and which
- * of these have no corner of the lattice. */
+/* What the lattice says of a corner: its cell's sides, the curvature of its lines and how uncertain it is, where their
+ * neighbours are, and which of these have no corner of the lattice. */
 typedef struct {
-    const double *sides, *curvature, *gaps;
+    const double *sides, *curvature, *curvature_sigma, *gaps;
     const uint8_t *ends;
 } geometry_t;
 
@@ -283,17 +283,18 @@ INLINE float mixed(const edge_t *one, const edge_t *two, float rho, int i)
                       + rho * (0.5f * one->bow[i] * two->bow[i] + (1.0f / 6.0f) * rho * one->curl[i] * two->curl[i])));
 }
 
-/* Add the products of the rows (edge_model.linearise) of all pixels to `products` (ROWS x ROWS, lower half). */
-FOR_EACH_PROCESSOR
-static void normal_equations(
-    const double *values, const window_t *window, const geometry_t at, const rules_t *rules, double *products)
+/* Set `products` (rows of ROWS, lower half) to those of the first `parameters` rows of edge_model.linearise and the last,
+ * the residuals, over all pixels. */
+INLINE void multiply_rows(
+    const int parameters, const double *values, const window_t *window, const geometry_t at, const rules_t *rules,
+    double *products)
 {
     const float x = (float)values[X], y = (float)values[Y], blur = (float)values[S];
     const float base = (float)values[A], half = (float)values[B], per_size = (float)(1.0 / window->size);
     const float light_u = (float)values[GX] * per_size, light_v = (float)values[GY] * per_size;
     const float rho = (float)cos(values[T1] - values[T2]);
-    const line_t line1 = line_of(values[T1], at.curvature[0], at.gaps, values[S], rules);
-    const line_t line2 = line_of(values[T2], at.curvature[1], at.gaps + 2, values[S], rules);
+    const line_t line1 = line_of(values[T1], values[K1], at.gaps, values[S], rules);
+    const line_t line2 = line_of(values[T2], values[K2], at.gaps + 2, values[S], rules);
     const float half_rho = 0.5f * rho;
     lanes_t sums[ROWS * (ROWS + 1) / 2];
     memset(sums, 0, sizeof sums);
@@ -322,13 +323,17 @@ static void normal_equations(
             rows[B][i] = light * pattern;
             rows[GX][i] = plain * per_size * u[i];
             rows[GY][i] = plain * per_size * v[i];
-            rows[PARAMETERS][i] = value[i] - light * plain;
+            rows[parameters][i] = value[i] - light * plain;
+            if (parameters == PARAMETERS) {
+                rows[K1][i] = -0.5f * by_d1 * (one.along[i] * one.along[i] + blur * blur);
+                rows[K2][i] = -0.5f * by_d2 * (two.along[i] * two.along[i] + blur * blur);
+            }
         }
         const int64_t used = window->count - start;
-        for (int row = 0; row < ROWS && used < BLOCK; row++)
+        for (int row = 0; row <= parameters && used < BLOCK; row++)
             memset(rows[row] + used, 0, (size_t)(BLOCK - used) * sizeof(float));
         lanes_t *sum = sums;
-        for (int i = 0; i < ROWS; i++) {
+        for (int i = 0; i <= parameters; i++) {
             const lanes_t *left = (const lanes_t *)rows[i];
             const lanes_t l0 = left[0], l1 = left[1], l2 = left[2], l3 = left[3];
             const lanes_t l4 = left[4], l5 = left[5], l6 = left[6], l7 = left[7];
@@ -339,13 +344,27 @@ static void normal_equations(
             }
         }
     }
-    for (int i = 0, k = 0; i < ROWS; i++)
+    for (int i = 0, k = 0; i <= parameters; i++)
         for (int j = 0; j <= i; j++, k++) {
             double total = 0.0;
             for (int lane = 0; lane < LANES; lane++)
                 total += (double)sums[k][lane];
             products[i * ROWS + j] = total;
         }
+}
+
+FOR_EACH_PROCESSOR
+static void normal_equations(
+    const double *values, const window_t *window, const geometry_t at, const rules_t *rules, double *products)
+{
+    multiply_rows(FEWER, values, window, at, rules, products);
+}
+
+FOR_EACH_PROCESSOR
+static void all_normal_equations(
+    const double *values, const window_t *window, const geometry_t at, const rules_t *rules, double *products)
+{
+    multiply_rows(PARAMETERS, values, window, at, rules, products);
 }
 
 /* Set a and b by linear least squares with everything else as it stands (edge_fit._brightness); every second block says
@@ -355,8 +374,8 @@ static void brightness(double *values, const window_t *window, const geometry_t 
 {
     const float x = (float)values[X], y = (float)values[Y];
     const float rho = (float)cos(values[T1] - values[T2]);
-    const line_t line1 = line_of(values[T1], at.curvature[0], at.gaps, values[S], rules);
-    const line_t line2 = line_of(values[T2], at.curvature[1], at.gaps + 2, values[S], rules);
+    const line_t line1 = line_of(values[T1], values[K1], at.gaps, values[S], rules);
+    const line_t line2 = line_of(values[T2], values[K2], at.gaps + 2, values[S], rules);
     double n = 0.0, sum_p = 0.0, sum_i = 0.0, sum_pp = 0.0, sum_pi = 0.0;
     for (int64_t start = 0; start < window->count; start += 2 * BLOCK) {
         edge_t one, two;
@@ -391,18 +410,18 @@ static void brightness(double *values, const window_t *window, const geometry_t 
     values[A] = (sum_i - slope * sum_p) / n;
 }
 
-/* Factor the lower half of `matrix` (rows of ROWS) in place, Cholesky, with one over the diagonal on the diagonal;
+/* Factor the lower half of `matrix` (n rows of ROWS) in place, Cholesky, with one over the diagonal on the diagonal;
  * return whether it is positive definite. */
-static int factor(double *matrix)
+static int factor(double *matrix, int n)
 {
-    for (int j = 0; j < PARAMETERS; j++) {
+    for (int j = 0; j < n; j++) {
         double *row = matrix + j * ROWS, rest = row[j];
         for (int k = 0; k < j; k++)
             rest -= row[k] * row[k];
         if (!(rest > 0.0))
             return 0;
         row[j] = 1.0 / sqrt(rest);
-        for (int i = j + 1; i < PARAMETERS; i++) {
+        for (int i = j + 1; i < n; i++) {
             double *below = matrix + i * ROWS, sum = below[j];
             for (int k = 0; k < j; k++)
                 sum -= below[k] * row[k];
@@ -412,9 +431,9 @@ static int factor(double *matrix)
     return 1;
 }
 
-static void forward(const double *lower, double *right)
+static void forward(const double *lower, double *right, int n)
 {
-    for (int i = 0; i < PARAMETERS; i++) {
+    for (int i = 0; i < n; i++) {
         double sum = right[i];
         for (int k = 0; k < i; k++)
             sum -= lower[i * ROWS + k] * right[k];
@@ -422,23 +441,23 @@ static void forward(const double *lower, double *right)
     }
 }
 
-static void backward(const double *lower, double *right)
+static void backward(const double *lower, double *right, int n)
 {
-    for (int i = PARAMETERS - 1; i >= 0; i--) {
+    for (int i = n - 1; i >= 0; i--) {
         double sum = right[i];
-        for (int k = i + 1; k < PARAMETERS; k++)
+        for (int k = i + 1; k < n; k++)
             sum -= lower[k * ROWS + i] * right[k];
         right[i] = sum * lower[i * ROWS + i];
     }
 }
 
 /* Return element (k, k) of the inverse of what `lower` is the factor of. */
-static double inverse_at(const double *lower, int k)
+static double inverse_at(const double *lower, int k, int n)
 {
     double unit[PARAMETERS] = {0.0}, total = 0.0;
     unit[k] = 1.0;
-    forward(lower, unit);
-    for (int i = k; i < PARAMETERS; i++)
+    forward(lower, unit, n);
+    for (int i = k; i < n; i++)
         total += unit[i] * unit[i];
     return total;
 }
@@ -449,12 +468,12 @@ static double clipped(double value, double low, double high)
 }
 
 /* Move `values` by `step`, cut where it would leave the region in which the model is nearly linear (edge_fit._limited). */
-static void move(double *values, const double *step, const rules_t *rules)
+static void move(double *values, const double *step, int n, const rules_t *rules)
 {
     const double limits[PARAMETERS] = {
         rules->most_move_px, rules->most_move_px, rules->most_turn, rules->most_turn, rules->most_blur_change * values[S],
-        INFINITY, INFINITY, rules->most_light_change, rules->most_light_change};
-    for (int k = 0; k < PARAMETERS; k++)
+        INFINITY, INFINITY, rules->most_light_change, rules->most_light_change, INFINITY, INFINITY};
+    for (int k = 0; k < n; k++)
         values[k] += clipped(step[k], -limits[k], limits[k]);
     values[S] = clipped(values[S], rules->least_blur, rules->most_blur);
 }
@@ -466,8 +485,8 @@ static void leave(const double *values, window_t *window, const geometry_t at, c
     const float x = (float)values[X], y = (float)values[Y], base = (float)values[A], half = (float)values[B];
     const float light_u = (float)(values[GX] / window->size), light_v = (float)(values[GY] / window->size);
     const float rho = (float)cos(values[T1] - values[T2]);
-    const line_t line1 = line_of(values[T1], at.curvature[0], at.gaps, values[S], rules);
-    const line_t line2 = line_of(values[T2], at.curvature[1], at.gaps + 2, values[S], rules);
+    const line_t line1 = line_of(values[T1], values[K1], at.gaps, values[S], rules);
+    const line_t line2 = line_of(values[T2], values[K2], at.gaps + 2, values[S], rules);
     for (int64_t start = 0; start < window->count; start += BLOCK) {
         const float *u = window->u + start, *v = window->v + start;
         edge_t one, two;
@@ -546,31 +565,35 @@ static void fit_corner(
     const double turn = 1.0 / (rules->angle_sigma * rules->angle_sigma);
     const double width = 1.0 / (rules->log_blur_sigma * rules->log_blur_sigma * blur * blur);
     const double light = 1.0 / (rules->light_sigma * rules->light_sigma * window->size * window->size);
-    const double prior[PARAMETERS] = {0.0, 0.0, turn, turn, width, 0.0, 0.0, light, light};
+    const double bend1 = at.curvature_sigma[0], bend2 = at.curvature_sigma[1];
+    const int n = bend1 > 0.0 && bend2 > 0.0 ? PARAMETERS : FEWER;
+    const double prior[PARAMETERS] = {
+        0.0, 0.0, turn, turn, width, 0.0, 0.0, light, light, 1.0 / (bend1 * bend1), 1.0 / (bend2 * bend2)};
     const double mean[PARAMETERS] = {
-        0.0, 0.0, atan2(at.sides[1], at.sides[0]), atan2(at.sides[3], at.sides[2]), blur, 0.0, 0.0, 0.0, 0.0};
+        0.0, 0.0, atan2(at.sides[1], at.sides[0]), atan2(at.sides[3], at.sides[2]), blur, 0.0, 0.0, 0.0, 0.0,
+        at.curvature[0], at.curvature[1]};
     double values[PARAMETERS], products[ROWS * ROWS], variance = INFINITY;
     memcpy(values, mean, sizeof values);
     values[X] = pixel[0] - window->centre_u;
     values[Y] = pixel[1] - window->centre_v;
     brightness(values, window, at, rules, sign);
-    const int64_t more = window->count - PARAMETERS;
+    const int64_t more = window->count - FEWER;
     int solved = 0;
     for (int64_t turns = 0; turns < rules->iterations; turns++) {
-        normal_equations(values, window, at, rules, products);
-        variance = products[ROWS * ROWS - 1] / (double)(more > 1 ? more : 1);
+        (n == FEWER ? normal_equations : all_normal_equations)(values, window, at, rules, products);
+        variance = products[n * ROWS + n] / (double)(more > 1 ? more : 1);
         variance = variance > rules->least_variance ? variance : rules->least_variance;
         double step[PARAMETERS];
-        for (int k = 0; k < PARAMETERS; k++) {
+        for (int k = 0; k < n; k++) {
             products[k * ROWS + k] += prior[k] * variance + rules->ridge;
-            step[k] = products[PARAMETERS * ROWS + k] + prior[k] * variance * (mean[k] - values[k]);
+            step[k] = products[n * ROWS + k] + prior[k] * variance * (mean[k] - values[k]);
         }
-        solved = factor(products);
+        solved = factor(products, n);
         if (!solved)
             break;
-        forward(products, step);
-        backward(products, step);
-        move(values, step, rules);
+        forward(products, step, n);
+        backward(products, step, n);
+        move(values, step, n, rules);
         if (fabs(step[X]) <= rules->converged_px && fabs(step[Y]) <= rules->converged_px
             && fabs(step[S]) <= rules->blur_lag * rules->converged_px)
             break;
@@ -582,7 +605,7 @@ static void fit_corner(
         noise = mean < 0.0 ? variance : mean * (double)window->count / (double)more;
         noise = noise > rules->least_variance ? noise : rules->least_variance;
     }
-    const double spread = solved ? 0.5 * noise * (inverse_at(products, X) + inverse_at(products, Y)) : NAN;
+    const double spread = solved ? 0.5 * noise * (inverse_at(products, X, n) + inverse_at(products, Y, n)) : NAN;
     const double u = window->centre_u + values[X], v = window->centre_v + values[Y];
     const double side1 = hypot(at.sides[0], at.sides[1]), side2 = hypot(at.sides[2], at.sides[3]);
     double most = rules->valid_move_cells * (side1 > side2 ? side1 : side2);
@@ -618,13 +641,13 @@ int64_t edges_scratch(const rules_t *rules)
     return 4 * room_of_window(rules->radius_px) + 2 * across * across;
 }
 
-/* Fit the edge model around `count` corners (edge_fit.fit_edges). pixels (N, 2), sides (N, 2, 2), curvature (N, 2), gaps
- * (N, 2, 2), ends (N, 2, 2), sign (N), blur (N), out (N, OUTCOMES); scratch as `edges_scratch` says, zeroed; `grey` is of uint8_t if
- * `bytes`, else of float. */
+/* Fit the edge model around `count` corners (edge_fit.fit_edges). pixels (N, 2), sides (N, 2, 2), curvature and its sigma
+ * (N, 2), gaps (N, 2, 2), ends (N, 2, 2), sign (N), blur (N), out (N, OUTCOMES); scratch as `edges_scratch` says, zeroed;
+ * `grey` is of uint8_t if `bytes`, else of float. */
 void fit_edges(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *sides,
-    const double *curvature, const double *gaps, const double *sign, const double *blur, const uint8_t *ends,
-    const rules_t *rules, float *scratch, double *out)
+    const double *curvature, const double *curvature_sigma, const double *gaps, const double *sign, const double *blur,
+    const uint8_t *ends, const rules_t *rules, float *scratch, double *out)
 {
     const picture_t image = {grey, width, height, bytes};
     const int64_t room = room_of_window(rules->radius_px), across = across_square(rules);
@@ -633,7 +656,8 @@ void fit_edges(
         .square = scratch + 4 * room, .turned = scratch + 4 * room + across * across, .across = across,
         .radius = (int64_t)floor(rules->radius_px)};
     for (int64_t n = 0; n < count; n++) {
-        const geometry_t at = {sides + 4 * n, curvature + 2 * n, gaps + 4 * n, ends + 4 * n};
+        const geometry_t at = {
+            sides + 4 * n, curvature + 2 * n, curvature_sigma + 2 * n, gaps + 4 * n, ends + 4 * n};
         collect(&window, image, pixels + 2 * n, at, blur[n], rules);
         fit_corner(&window, pixels + 2 * n, at, sign[n], blur[n], rules, out + OUTCOMES * n);
     }
@@ -643,42 +667,55 @@ enum { TERMS = 6 };
 
 /* The constants of corners.bends (rigkit.native.edges.BendRules). */
 typedef struct {
-    double decay, least_sigma, free;
+    double decay, least_sigma, free, bent;
     int64_t reach;
 } bend_rules_t;
 
-/* Solve `normal` (lower half) for two right-hand sides in place, Cholesky; the prior keeps it positive definite. */
-static void solve_line(double normal[TERMS][TERMS], double right[TERMS][2])
+/* The normal equations of a line's Taylor coefficients, in sides of the cell, without their prior. */
+typedef struct {
+    double normal[TERMS][TERMS], right[TERMS][2];
+} taylor_t;
+
+/* Set `out` to the most probable coefficients along both axes, if they are known beforehand to be of size `sigma`, and
+ * return the standard deviation of the second. */
+static double most_probable(const taylor_t *line, const double sigma[TERMS], double free, double out[TERMS][2])
 {
+    /* Beside the two axes, a column of the inverse. */
+    double lower[TERMS][TERMS], right[TERMS][3] = {{0.0}};
+    right[2][2] = 1.0;
     for (int j = 0; j < TERMS; j++) {
+        right[j][0] = line->right[j][0] * sigma[j];
+        right[j][1] = line->right[j][1] * sigma[j];
         for (int i = j; i < TERMS; i++) {
-            double sum = normal[i][j];
+            double sum = line->normal[i][j] * sigma[i] * sigma[j] + (i > j ? 0.0 : j < 2 ? free : 1.0);
             for (int k = 0; k < j; k++)
-                sum -= normal[i][k] * normal[j][k];
-            normal[i][j] = i == j ? sqrt(sum) : sum / normal[j][j];
+                sum -= lower[i][k] * lower[j][k];
+            lower[i][j] = i == j ? sqrt(sum) : sum / lower[j][j];
         }
-        for (int axis = 0; axis < 2; axis++) {
+        for (int axis = 0; axis < 3; axis++) {
             for (int k = 0; k < j; k++)
-                right[j][axis] -= normal[j][k] * right[k][axis];
-            right[j][axis] /= normal[j][j];
+                right[j][axis] -= lower[j][k] * right[k][axis];
+            right[j][axis] /= lower[j][j];
         }
     }
     for (int j = TERMS - 1; j >= 0; j--)
-        for (int axis = 0; axis < 2; axis++) {
+        for (int axis = 0; axis < 3; axis++) {
             for (int k = j + 1; k < TERMS; k++)
-                right[j][axis] -= normal[k][j] * right[k][axis];
-            right[j][axis] /= normal[j][j];
+                right[j][axis] -= lower[k][j] * right[k][axis];
+            right[j][axis] /= lower[j][j];
         }
+    for (int j = 0; j < TERMS; j++)
+        for (int axis = 0; axis < 2; axis++)
+            out[j][axis] = right[j][axis] * sigma[j];
+    return sqrt(right[2][2]) * sigma[2];
 }
 
-/* Return the curvature at place `at` of a line of `count` corners, `stride` cells apart. */
-static double line_bend(
+/* Set `out` to the curvature at place `at` of a line of `count` corners, `stride` cells apart, and its sigma. */
+static void line_bend(
     const double *pixels, const double *sigma, int64_t stride, int64_t at, int64_t count, double side,
-    const bend_rules_t *rules)
+    const bend_rules_t *rules, double *out, double *out_sigma)
 {
-    double normal[TERMS][TERMS] = {{0.0}}, right[TERMS][2] = {{0.0}};
-    for (int k = 0; k < TERMS; k++)
-        normal[k][k] = k < 2 ? rules->free : 1.0;
+    taylor_t line = {0};
     for (int64_t step = -rules->reach; step <= rules->reach; step++) {
         if (at + step < 0 || at + step >= count)
             continue;
@@ -691,33 +728,47 @@ static double line_bend(
         const double off[2] = {(other[0] - pixels[0]) / side, (other[1] - pixels[1]) / side};
         double power[TERMS] = {1.0};
         for (int k = 1; k < TERMS; k++)
-            power[k] = power[k - 1] * rules->decay * (double)step;
+            power[k] = power[k - 1] * (double)step;
         for (int i = 0; i < TERMS; i++) {
             for (int j = 0; j <= i; j++)
-                normal[i][j] += weight * power[i] * power[j];
-            right[i][0] += weight * power[i] * off[0];
-            right[i][1] += weight * power[i] * off[1];
+                line.normal[i][j] += weight * power[i] * power[j];
+            line.right[i][0] += weight * power[i] * off[0];
+            line.right[i][1] += weight * power[i] * off[1];
         }
     }
-    solve_line(normal, right);
-    const double decay = rules->decay;
-    const double cross = 2.0 * decay * decay * decay * (right[1][0] * right[2][1] - right[1][1] * right[2][0]);
-    double square = decay * decay * (right[1][0] * right[1][0] + right[1][1] * right[1][1]);
+    double expected[TERMS] = {1.0}, found[TERMS][2];
+    for (int k = 1; k < TERMS; k++)
+        expected[k] = expected[k - 1] * rules->decay;
+    double wide = most_probable(&line, expected, rules->free, found);
+    const double second = 2.0 * hypot(found[2][0], found[2][1]), third = sqrt(2.0 * hypot(found[3][0], found[3][1]));
+    const double turn = second > third ? second : third;
+    if (turn > rules->bent) {
+        double size = 0.5;
+        for (int k = 2; k < TERMS; k++) {
+            size *= turn;
+            expected[k] = expected[k] > size ? expected[k] : size;
+        }
+        wide = most_probable(&line, expected, rules->free, found);
+    }
+    const double cross = 2.0 * (found[1][0] * found[2][1] - found[1][1] * found[2][0]);
+    double square = found[1][0] * found[1][0] + found[1][1] * found[1][1];
     square = square > 1e-12 ? square : 1e-12;
-    return cross / (square * sqrt(square) * side);
+    *out = cross / (square * sqrt(square) * side);
+    *out_sigma = 2.0 * wide / (square * side);
 }
 
-/* Set `out` (M, 2) to the curvature of row and column at the M wanted cells (corners.bends.line_curvature). */
+/* Set `out` (M, 2) to the curvature of row and column at the M wanted cells and `out_sigma` to its standard deviation
+ * (corners.bends.line_curvature). */
 void line_bends(
     const double *pixels, const double *sigma, const uint8_t *wanted, int64_t rows, int64_t columns, const double *sides,
-    const bend_rules_t *rules, double *out)
+    const bend_rules_t *rules, double *out, double *out_sigma)
 {
     for (int64_t row = 0; row < rows; row++)
         for (int64_t column = 0; column < columns; column++) {
             const int64_t cell = row * columns + column;
             if (!wanted[cell])
                 continue;
-            *out++ = line_bend(pixels + 2 * cell, sigma + cell, 1, column, columns, *sides++, rules);
-            *out++ = line_bend(pixels + 2 * cell, sigma + cell, columns, row, rows, *sides++, rules);
+            line_bend(pixels + 2 * cell, sigma + cell, 1, column, columns, *sides++, rules, out++, out_sigma++);
+            line_bend(pixels + 2 * cell, sigma + cell, columns, row, rows, *sides++, rules, out++, out_sigma++);
         }
 }

@@ -63,6 +63,7 @@ class BendRules(ctypes.Structure):
         ("decay", ctypes.c_double),
         ("least_sigma", ctypes.c_double),
         ("free", ctypes.c_double),
+        ("bent", ctypes.c_double),
         ("reach", ctypes.c_int64),
     ]
 
@@ -75,9 +76,9 @@ def _library() -> ctypes.CDLL | None:
         library.edges_scratch.restype = count
         library.edges_scratch.argtypes = [array]
         library.fit_edges.restype = None
-        library.fit_edges.argtypes = [array, count, count, count, count, *[array] * 10]
+        library.fit_edges.argtypes = [array, count, count, count, count, *[array] * 11]
         library.line_bends.restype = None
-        library.line_bends.argtypes = [array, array, array, count, count, array, array, array]
+        library.line_bends.argtypes = [array, array, array, count, count, array, array, array, array]
     return library
 
 
@@ -86,6 +87,7 @@ def fit_corners(
     pixels: FloatArray,
     sides: FloatArray,
     curvature: FloatArray,
+    curvature_sigma: FloatArray,
     gaps: FloatArray,
     ends: BoolArray,
     sign: FloatArray,
@@ -97,7 +99,8 @@ def fit_corners(
     if library is None:
         return None
     grey = np.ascontiguousarray(image)
-    known = [np.ascontiguousarray(part, np.float64) for part in (pixels, sides, curvature, gaps, sign, blur)]
+    parts = (pixels, sides, curvature, curvature_sigma, gaps, sign, blur)
+    known = [np.ascontiguousarray(part, np.float64) for part in parts]
     edges = np.ascontiguousarray(ends, np.bool_)
     out = np.empty((len(pixels), OUTCOMES))
     scratch = np.zeros(library.edges_scratch(ctypes.addressof(rules)), np.float32)
@@ -119,7 +122,7 @@ def fit_corners(
 
 def line_bends(
     pixels: FloatArray, sigma_px: FloatArray, cells: BoolArray, sides_px: FloatArray, rules: BendRules
-) -> FloatArray | None:
+) -> tuple[FloatArray, FloatArray] | None:
     """Return what `corners.bends.line_curvature` does, or None without the compiled kernel."""
     library = _library()
     if library is None:
@@ -127,7 +130,7 @@ def line_bends(
     places, sigmas = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(sigma_px, np.float64)
     wanted, sides = np.ascontiguousarray(cells, np.bool_), np.ascontiguousarray(sides_px, np.float64)
     rows, columns = wanted.shape
-    out = np.empty((len(sides), 2))
+    out, out_sigma = np.empty((2, len(sides), 2))
     library.line_bends(
         address(places),
         address(sigmas),
@@ -137,5 +140,6 @@ def line_bends(
         address(sides),
         ctypes.addressof(rules),
         address(out),
+        address(out_sigma),
     )
-    return out
+    return out, out_sigma

@@ -12,6 +12,10 @@ TRUE_REL = 0.05
 """At the ends of rows of eight corners that bend by a fifth of a cell."""
 
 
+HONEST = 1.2
+"""Errors in sigmas: what coefficients are expected to be is a rule of thumb, on the safe side."""
+
+
 def circles(side_px: float, radius_px: float) -> np.ndarray:
     """Return (6, 8, 2): rows on circles about one centre, which the columns point to."""
     row, column = np.mgrid[:6, :8].astype(float)
@@ -23,7 +27,7 @@ def curvature(pixels: np.ndarray, sigma_px: float) -> np.ndarray:
     cells = np.ones(pixels.shape[:2], bool)
     shape = fit_cells(pixels, cells)
     sides = np.linalg.norm(np.stack([shape.along_column, shape.along_row], axis=1), axis=2)
-    return line_curvature(pixels, np.full(cells.shape, sigma_px), cells, sides).reshape(*cells.shape, 2)
+    return line_curvature(pixels, np.full(cells.shape, sigma_px), cells, sides)[0].reshape(*cells.shape, 2)
 
 
 def test_circles_and_straight_lines() -> None:
@@ -32,6 +36,31 @@ def test_circles_and_straight_lines() -> None:
     # Rows run to the right and bend towards the centre, which is above: +90 degrees is below.
     assert np.abs(found[..., 0] / -true[:, None] - 1.0).max() < TRUE_REL
     assert np.abs(found[..., 1]).max() < 1e-6
+
+
+def test_sigmas_are_honest_where_squares_turn_far(rng: np.random.Generator) -> None:
+    """The view of a plane 0.5 rad aside through an equidistant fisheye: lines turn by up to a quarter of a radian."""
+    row, column = np.mgrid[:4, :5].astype(float)
+
+    def see(column: np.ndarray, row: np.ndarray) -> np.ndarray:
+        x, y = 0.24 * column - 0.2, 0.24 * row + 0.4
+        radius = np.hypot(x, y)
+        return 190.0 * (np.arctan(radius) / radius)[..., None] * np.stack([x, y], axis=-1)
+
+    pixels = see(column, row)
+    before, after = see(column - 0.01, row), see(column + 0.01, row)
+    first, second = (after - before) / 0.02, (after - 2.0 * pixels + before) / 1e-4
+    true = (first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]) / np.linalg.norm(first, axis=-1) ** 3
+    cells = np.ones(pixels.shape[:2], bool)
+    shape = fit_cells(pixels, cells)
+    sides = np.linalg.norm(np.stack([shape.along_column, shape.along_row], axis=1), axis=2)
+    for noise in (1e-3, 1e-2, 5e-2):
+        z = []
+        for _ in range(20):
+            noisy = pixels + rng.normal(0.0, noise, pixels.shape)
+            found, sigma = line_curvature(noisy, np.full(cells.shape, noise), cells, sides)
+            z.append((found[:, 0] - true.ravel()) / sigma[:, 0])
+        assert np.sqrt(np.mean(np.square(z))) < HONEST
 
 
 def test_noise_does_not_bend_much(rng: np.random.Generator) -> None:

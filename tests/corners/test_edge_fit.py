@@ -37,7 +37,7 @@ def geometry(count: int, *, bend: float = 0.0, side_px: float = 30.0, oblique: f
 
 
 def image_of(pixels: np.ndarray, shape: Geometry, blur: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return an image with the model's own corners at `pixels` (N, 2), and the parameters (N, 9)."""
+    """Return an image with the model's own corners at `pixels` (N, 2), and the parameters (N, 11)."""
     image = np.full((64, 64 * len(pixels)), 120.0, np.float32)
     values = np.zeros((len(pixels), PARAMETERS))
     # Wider than any window of the fit, which need not be centred on the true corner, squares and all.
@@ -47,6 +47,7 @@ def image_of(pixels: np.ndarray, shape: Geometry, blur: float) -> tuple[np.ndarr
     values[:, 2:4] = np.arctan2(shape.sides[..., 1], shape.sides[..., 0])
     values[:, 4:7] = blur, 120.0, 70.0
     values[:, 7:9] = 0.05, -0.04
+    values[:, 9:11] = shape.curvature
     light = 1.0 + (values[:, 7:8] * window.u + values[:, 8:9] * window.v) / window.size[:, None]
     brightness = light * (values[:, 5:6] + values[:, 6:7] * pattern_of(values, window, shape))
     row, column = window.v + window.centre[:, 1:], window.u + window.centre[:, :1]
@@ -71,7 +72,7 @@ def test_derivatives(rng: np.random.Generator) -> None:
         up, down = values.copy(), values.copy()
         up[:, k] += step
         down[:, k] -= step
-        # The tenth row is what the image has more than the model: its change is that of the model, reversed.
+        # The last row is what the image has more than the model: its change is that of the model, reversed.
         numeric = (linearise(down, window, shape)[:, -1] - linearise(up, window, shape)[:, -1]) / (2.0 * step)
         scale = np.abs(numeric).max()
         assert scale > 0.0
@@ -97,6 +98,9 @@ def test_finds_its_own_corners(rng: np.random.Generator) -> None:
         blind = fit_edges(image, start, straight, np.ones(6), np.full(6, 1.2), radius_px=18.0, iterations=12)
         moved = np.abs(blind.pixels - pixels).max()
         assert (moved > 0.1) == (bend > 0.0), "curvature is what keeps a bent row from pulling the corner aside"
+        loose = {"curvature_sigma": np.full((6, 2), 0.02)}
+        free = fit_edges(image, start, straight, np.ones(6), np.full(6, 1.2), radius_px=18.0, iterations=12, **loose)
+        assert np.abs(free.pixels - pixels).max() < EXACT_PX, "a curvature known to be uncertain is fitted"
 
 
 def test_neighbouring_edges_in_the_blur_do_not_pull() -> None:
