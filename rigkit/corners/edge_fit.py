@@ -72,6 +72,10 @@ middle of its window: little of the window has a mirror image then."""
 START_BLOCK = 64
 """Brightness and contrast to start from are those of every second block of so many pixels, the compiled fit's."""
 
+ROUNDING_VARIANCE = 1.0 / 12.0
+"""Of grey levels, the least in 8-bit images: in flat squares rounding is the same everywhere and leaves nothing, but at
+the edges, where the corner comes from, its error varies evenly over a level."""
+
 LEAST_VARIANCE = 1e-6
 RIDGE = 1e-9
 """Of grey levels, and on the normal equations' diagonal: keep an image without noise or without contrast solvable."""
@@ -130,6 +134,7 @@ def fit_edges(
     curvature_sigma : (N, 2) how well the geometry's curvatures are known, 1/px; where 0, and without, both are kept.
     """
     loose = np.zeros((len(pixels), 2)) if curvature_sigma is None else curvature_sigma
+    least = ROUNDING_VARIANCE if image.dtype == np.uint8 else LEAST_VARIANCE
     fitted = fit_corners(
         image,
         pixels,
@@ -140,7 +145,7 @@ def fit_edges(
         geometry.ends,
         sign,
         blur,
-        _rules(radius_px, iterations, converged_px, mirrored),
+        _rules(radius_px, iterations, converged_px, mirrored, least),
     )
     if fitted is not None:
         _, _, sigma_px, width, contrast, residual, noise, valid = fitted.T
@@ -164,7 +169,7 @@ def fit_edges(
         )
         rows[kept[active], K1 : K2 + 1] = 0.0
         products = (rows @ np.swapaxes(rows, 1, 2)).astype(np.float64)
-        variance[active] = np.maximum(products[:, -1, -1] / free[active], LEAST_VARIANCE)
+        variance[active] = np.maximum(products[:, -1, -1] / free[active], least)
         pull = prior[active] * variance[active, None]
         hessian = products[:, :-1, :-1]
         hessian[:, diagonal, diagonal] += pull + RIDGE
@@ -176,11 +181,11 @@ def fit_edges(
         active[np.flatnonzero(active)[change.max(axis=1) <= converged_px]] = False
         if not active.any():
             break
-    noise = _noise(values, variance, window, geometry) if mirrored else variance
+    noise = np.maximum(_noise(values, variance, window, geometry), least) if mirrored else variance
     return _result(values, variance, noise, normal, window, pixels, geometry, sign)
 
 
-def _rules(radius_px: float, iterations: int, converged_px: float, mirrored: bool) -> Rules:
+def _rules(radius_px: float, iterations: int, converged_px: float, mirrored: bool, least: float) -> Rules:
     return Rules(
         reach=REACH,
         end_sigmas=END_SIGMAS,
@@ -199,7 +204,7 @@ def _rules(radius_px: float, iterations: int, converged_px: float, mirrored: boo
         most_turn=MOST_TURN_RAD,
         most_blur_change=MOST_BLUR_CHANGE,
         most_light_change=MOST_LIGHT_CHANGE,
-        least_variance=LEAST_VARIANCE,
+        least_variance=least,
         ridge=RIDGE,
         converged_px=converged_px,
         blur_lag=BLUR_LAG,
@@ -290,7 +295,7 @@ def _noise(values: FloatArray, variance: FloatArray, window: Window, geometry: G
     apart = mean.sum(axis=1) / np.maximum(pairs, 1) / spread * count / np.maximum(count - DETERMINED, 1)
     enough = (pairs >= FEWEST_MIRRORED) & (count > DETERMINED)
     enough &= np.abs(values[:, [X, Y]]).max(axis=1) <= MOST_MIRRORED_PX
-    return np.where(enough, np.maximum(apart, LEAST_VARIANCE), variance)
+    return np.where(enough, apart, variance)
 
 
 def _surrounded(pixels: FloatArray, window: Window) -> BoolArray:
