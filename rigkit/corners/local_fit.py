@@ -55,8 +55,10 @@ class LocalFit:
         area, row, column = _cross(a, b), 0.5 * _cross(a, self.bend_row), 0.5 * _cross(self.bend_column, b)
         gaps = np.stack([area - row, area + row, area + column, area - column], axis=-1).reshape(-1, 2, 2)
         np.abs(gaps, out=gaps)
-        gaps[:, 0] /= np.sqrt((a * a).sum(axis=1))[:, None]
-        gaps[:, 1] /= np.sqrt((b * b).sum(axis=1))[:, None]
+        # A cell without sides has no neighbours: NaN.
+        with np.errstate(invalid="ignore"):
+            gaps[:, 0] /= np.sqrt((a * a).sum(axis=1))[:, None]
+            gaps[:, 1] /= np.sqrt((b * b).sum(axis=1))[:, None]
         return gaps
 
 
