@@ -47,6 +47,12 @@ def alive(pid: int) -> bool:
     return state != "Z"
 
 
+def _heeds_signals() -> None:
+    """Undo what a test run in the background or under nohup passes on: signals that are ignored."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL], ids=lambda s: s.name)
 @pytest.mark.parametrize("to_all", [True, False], ids=["group", "process"])
 def test_workers_end_with_the_program(tmp_path: Path, how: signal.Signals, to_all: bool) -> None:
@@ -56,6 +62,7 @@ def test_workers_end_with_the_program(tmp_path: Path, how: signal.Signals, to_al
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
+        preexec_fn=_heeds_signals,
     )
     notes = [tmp_path / "0", tmp_path / "1"]
     end = time.monotonic() + PATIENCE_S
