@@ -24,7 +24,6 @@ from rigkit.calibration.fit import Fit
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.shape import often_seen, released_sigma
 from rigkit.calibration.solver import State
-from rigkit.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
 
 __all__ = ["board_turn", "grid_turned", "miscounted", "recounted", "same_looks"]
@@ -69,17 +68,17 @@ def recounted(
 ) -> tuple[Observations, State]:
     """Return the same with the boards of the chosen `views` (V,) counted from another end. Residuals of flat boards do
     not change."""
-    rotation, translation = state.rotation.copy(), state.translation_mm.copy()
-    turned: list[BoardView] = []
-    for i, (view, chosen) in enumerate(zip(observations.views, views.tolist(), strict=True)):
-        turned.append(view)
-        if chosen:
-            turned[i] = replace(view, grid=grid_turned(view.grid, view.board.size, quarter_turns))
-            back = board_turn(view.board, quarter_turns).inverse()
-            translation[i] += rotation[i] @ back.translation_mm
-            rotation[i] = rotation[i] @ back.rotation
-    again = Observations.from_views(turned)
-    observations = replace(observations, views=again.views, corner=again.corner)
+    rotation, translation, corner = state.rotation.copy(), state.translation_mm.copy(), observations.corner.copy()
+    turned = list(observations.views)
+    for i in np.flatnonzero(views).tolist():
+        view = turned[i]
+        grid = grid_turned(view.grid, view.board.size, quarter_turns)
+        turned[i] = replace(view, grid=grid)
+        corner[i, : len(grid)] = observations.first_row[observations.board[i]] + grid @ [1, view.board.columns]
+        back = board_turn(view.board, quarter_turns).inverse()
+        translation[i] += rotation[i] @ back.translation_mm
+        rotation[i] = rotation[i] @ back.rotation
+    observations = replace(observations, views=tuple(turned), corner=corner)
     return observations, replace(state, rotation=rotation, translation_mm=translation)
 
 

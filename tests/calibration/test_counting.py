@@ -122,3 +122,17 @@ def test_recounting_moves_no_flat_corner(board: Board, quarter_turns: int, rng: 
     back = board_turn(board, quarter_turns).apply(board.points())
     place = grid_turned(board.grid(), board.size, quarter_turns)
     assert np.allclose(back[:, :2], place * [board.square_x_mm, board.square_y_mm])
+
+
+def test_recounting_keeps_the_table_of_boards(rng: np.random.Generator) -> None:
+    """Views that were left out may have been the first of their board: the table stays in its old order."""
+    views, rotation, translation = zip(
+        *(random_views(lens("reg"), 2, rng, reach_deg=30.0, board=board) for board in (OBLONG, SQUARE)), strict=True
+    )
+    order = [0, 2, 1, 3]
+    both = Observations.from_views([(*views[0], *views[1])[i] for i in order]).subset(np.arange(1, 4))
+    poses = np.concatenate(rotation)[order[1:]], np.concatenate(translation)[order[1:]]
+    state = State.start(lens("reg"), *poses, both)
+    again, moved = recounted(both, state, np.array([True, True, False]), 2)
+    off = evaluate(moved, again).px - evaluate(state, both).px
+    assert np.abs(off[both.present]).max() < 1e-8
