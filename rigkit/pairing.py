@@ -15,6 +15,7 @@ from rigkit.arrays import FloatArray, Pixels
 from rigkit.boards import Board
 from rigkit.cameras.base import Camera
 from rigkit.cameras.pinhole import Pinhole
+from rigkit.corners.candidates import board_kinds
 from rigkit.corners.directions import Support, direction_field
 from rigkit.corners.identify import identify_pair
 from rigkit.corners.pair_identity import PairIdentity, common_corners
@@ -35,8 +36,8 @@ only sensible one."""
 POSED_SIGMA_DEG = 0.3
 """How well the boards' poses in a pair show the angle between two of them, at the worst."""
 NAMING_ODDS = 2.0 * np.log(1000.0)
-"""Angles tell boards that look alike apart where chi2 speaks so clearly for other names, and for those names: as the
-odds in `rigkit.corners.identify`."""
+"""Angles speak for other names of boards that look alike where chi2 is smaller by so much, and alike for all names
+within so much of the smallest: as the odds in `rigkit.corners.identify`."""
 NAMING_COVERAGE = 4.0
 """Largest deviation of an angle, in sigmas, under the names it speaks for."""
 MOST_ALIKE = 6
@@ -119,15 +120,17 @@ def match_pair(
     _check_sizes(pair_id, (*detections1, *detections2), boards)
     identity = identify_pair(detections1, detections2, boards, camera1, camera2, layout=layout)
     given = {d.board_id for d in (*detections1, *detections2)} | set(layout or ())
-    names = _names_by_angles(identity, [b for b in boards if b.board_id not in given], angles)
-    if names:
-        before = identity
+    fitting = _names_by_angles(identity, [b for b in boards if b.board_id not in given], angles)
+    if fitting:
+        before, names = identity, fitting[0]
         first, second = (
             [replace(d, board_id=names.get(str(d.board_id), d.board_id)) for d in found]
             for found in (identity.detections1, identity.detections2)
         )
         identity = identify_pair(first, second, boards, camera1, camera2, layout=layout)
         said = f"boards {', '.join(sorted(names))} look alike and were told apart by the measured angles"
+        if len(fitting) > 1:
+            said += f", which {len(fitting)} ways to name the boards fit: the one with the fewest changes was taken"
         identity = replace(identity, notes=(*before.notes, f"{said}; a layout would say for certain which is which"))
     pairs, unseen = _with_rays(identity.pairs(), camera1, camera2)
     if not pairs:
@@ -163,8 +166,11 @@ def match_pair(
 
 def _names_by_angles(
     identity: PairIdentity, boards: Sequence[Board], angles: Sequence[MeasuredAngle]
-) -> dict[str, str]:
-    """Return other names for those of `boards` that look alike, if the angles speak for them clearly; else nothing."""
+) -> list[dict[str, str]]:
+    """Return other names for those of `boards` that look alike, if the angles speak for them clearly; else nothing.
+
+    Where they speak for several ways to name the boards, those are all returned, the fewest changes first.
+    """
     faces = {}
     for board_id, pose in identity.cam1_from_board.items():
         normal = pose.rotation[:, 2]
@@ -172,7 +178,7 @@ def _names_by_angles(
     known = [a for a in angles if a.a in faces and a.b in faces]
     choices = list(_other_names([b for b in boards if b.board_id in faces])) if known else []
     if not choices:
-        return {}
+        return []
 
     def deviations(names: Mapping[str, str]) -> FloatArray:
         """Return how far each angle is off if the board called k is truly `names[k]`, in sigmas."""
@@ -181,21 +187,18 @@ def _names_by_angles(
         sigma = np.hypot([a.sigma_deg for a in known], POSED_SIGMA_DEG)
         return np.asarray((np.array(ours) - [a.value_deg for a in known]) / sigma)
 
-    best = min(choices, key=lambda names: float((deviations(names) ** 2).sum()))
-    gain = float((deviations({}) ** 2).sum() - (deviations(best) ** 2).sum())
-    if gain < NAMING_ODDS or np.abs(deviations(best)).max() > NAMING_COVERAGE:
-        return {}
-    return {name: other for name, other in best.items() if name != other}
+    own, *others = (deviations(names) for names in ({}, *choices))
+    chi2 = np.sum(np.square(others), axis=1)
+    enough = min(float(chi2.min()) + NAMING_ODDS, float(own @ own) - NAMING_ODDS)
+    fitting = [n for n, off in enumerate(others) if chi2[n] <= enough and np.abs(off).max() <= NAMING_COVERAGE]
+    # Right angles say the same of several names: then as few as possible are changed.
+    renamed = [{k: other for k, other in choices[n].items() if k != other} for n in fitting]
+    return sorted(renamed, key=len)
 
 
 def _other_names(boards: Sequence[Board]) -> Iterator[dict[str, str]]:
     """Yield every way to exchange the names of boards that look alike."""
-    kinds: dict[tuple[tuple[int, float], ...], list[str]] = {}
-    for board in boards:
-        if board.markers is None:
-            sides = sorted([(board.columns, board.square_x_mm), (board.rows, board.square_y_mm)])
-            kinds.setdefault(tuple(sides), []).append(board.board_id)
-    alike = [ids for ids in kinds.values() if 1 < len(ids) <= MOST_ALIKE]
+    alike = [kind.ids for kind in board_kinds(boards) if 1 < len(kind.ids) <= MOST_ALIKE]
     for orders in product(*(permutations(ids) for ids in alike)):
         names = {a: b for ids, order in zip(alike, orders, strict=True) for a, b in zip(ids, order, strict=True)}
         if any(a != b for a, b in names.items()):

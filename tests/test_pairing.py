@@ -50,6 +50,28 @@ def test_other_walls_than_right_angles_tell_equal_boards_apart(seed: int) -> Non
     assert any("look alike and were told apart by the measured angles" in words for words in pair.notes)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_where_angles_fit_several_names_the_fewest_change_and_it_is_said(seed: int) -> None:
+    """Front and floor may be either way round to an angle between them; the floor keeps the name that it has."""
+    angles = (75.0, 90.0, 90.0)
+    made = scene(np.random.default_rng(seed), angles)
+    for said in (measured(angles), measured(angles)[:1]):
+        pair = matched(made, angles=said)
+        assert names_are_right(pair, made)
+        (words,) = [words for words in pair.notes if "measured angles" in words]
+        assert "2 ways to name the boards fit" in words
+
+
+def test_boards_of_almost_the_same_squares_look_alike_too() -> None:
+    """Each measured on its own: they are one kind to `rigkit.corners.identify`, and so to the angles."""
+    angles = (75.0, 90.0, 100.0)
+    boards = tuple(replace(b, square_x_mm=s, square_y_mm=s) for b, s in zip(BOARDS, (50.0, 50.1, 49.9), strict=True))
+    made = trihedral_pair(boards, CAMERA, PoseType.GENERAL, np.random.default_rng(0), angles_deg=angles)
+    first, second = ([replace(d, board_id=None) for d in found] for found in made.detections())
+    pair = match_pair("pair", CAMERA, CAMERA, first, second, boards, angles=measured(angles))
+    assert names_are_right(pair, made)
+
+
 @pytest.mark.parametrize("angles", [(90.0, 90.0, 90.0), (88.0, 90.0, 90.0)])
 def test_angles_that_say_nothing_or_that_fit_no_names_change_nothing(
     rng: np.random.Generator, angles: tuple[float, float, float]
