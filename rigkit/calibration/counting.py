@@ -197,8 +197,7 @@ class _Patterns:
         total = self.information.sum(axis=0) + prior
         told = np.linalg.solve(total, self.pull[..., None])[..., 0].reshape(views, -1)
         alike = told @ self.pull.reshape(views, -1).T
-        signs = _agreeing(alike)
-        others = np.array([_agreeing_without(alike, signs, v) for v in range(views)])
+        others = _agreeing_without_each(alike - np.diag(np.diag(alike)))
         rest = total - self.information
         departure = np.linalg.solve(rest, np.tensordot(others, self.pull, axes=1)[..., None])[..., 0]
         here = np.repeat(np.take_along_axis(departure, self.corner[..., None], axis=1), 2, axis=1)
@@ -216,29 +215,27 @@ def _within(basis: FloatArray, values: FloatArray) -> FloatArray:
     return np.asarray((basis @ (np.swapaxes(basis, -1, -2) @ values[..., None]))[..., 0])
 
 
-def _agreeing(alike: FloatArray) -> FloatArray:
-    """Return the signs (V,) that make s^T `alike` s large, most of them plus: from the first eigenvector, then one by
-    one."""
-    off = alike - np.diag(np.diag(alike))
-    signs = _improved(off, np.where(np.linalg.eigh(off)[1][:, -1] < 0.0, -1.0, 1.0))
-    return signs if signs.sum() >= 0.0 else -signs
+def _agreeing_without_each(alike: FloatArray) -> FloatArray:
+    """Return for each view (V, V) the signs on which the others agree without what it says, zero for itself: those that
+    make s^T `alike` s large, most of them plus. The diagonal of `alike` is zero."""
+    signs = _improved(alike, np.where(np.linalg.eigh(alike)[1][:, -1:].T < 0.0, -1.0, 1.0))
+    own = np.where(np.eye(len(alike)) > 0.0, 0.0, signs if signs.sum() >= 0.0 else -signs)
+    found = _improved(alike, own)
+    return np.where((found * own).sum(axis=1, keepdims=True) >= 0.0, found, -found)
 
 
-def _agreeing_without(alike: FloatArray, signs: FloatArray, view: int) -> FloatArray:
-    """Return the signs of the other views without what this one says, zero for it."""
-    off = alike - np.diag(np.diag(alike))
-    off[view] = off[:, view] = 0.0
-    own = np.where(np.arange(len(signs)) == view, 0.0, signs)
-    found = _improved(off, own)
-    return found if found @ own >= 0.0 else -found
-
-
-def _improved(off: FloatArray, signs: FloatArray) -> FloatArray:
+def _improved(alike: FloatArray, signs: FloatArray) -> FloatArray:
+    """Return sets of signs (N, V), each with the worst one turned as long as its s^T `alike` s gains by it; what is
+    zero stays zero and says nothing."""
     signs = signs.copy()
-    for _ in range(len(signs) ** 2):
-        gain = signs * (off @ signs)
-        worst = int(np.argmin(gain))
-        if gain[worst] >= 0.0:
+    left = np.arange(len(signs))
+    # Every turn gains; the end is for gains that are rounding.
+    for _ in range(signs.shape[1] ** 2):
+        gain = signs[left] * (signs[left] @ alike)
+        worst = np.argmin(gain, axis=1)
+        gains = gain[np.arange(len(left)), worst] < 0.0
+        left, worst = left[gains], worst[gains]
+        if not left.size:
             break
-        signs[worst] = -signs[worst]
+        signs[left, worst] *= -1.0
     return signs
