@@ -200,11 +200,14 @@ def session_corners(session: Session, progress: Progress) -> dict[str, FoundCorn
         progress(what, len(names), len(names))
 
     look([name for name in paths if name not in found], None)
+    # An image of another size is of no use: it must not count as new time and again.
+    size_px = Counter(item.size_px for item in found.values()).most_common(1)[0][0]
+    usable = [name for name in paths if found[name].size_px == size_px]
     # All of them, or the corners would depend on which images were added when.
-    new = not all(found[name].through_camera for name in paths)
+    new = not all(found[name].through_camera for name in usable)
     camera = first_camera(session, found) if new else None
     if camera is not None:
-        look([name for name in paths if found[name].size_px == camera.size_px], camera)
+        look(usable, camera)
     found = {name: found[name] for name in paths or found}
     try:
         cache.save()

@@ -173,6 +173,10 @@ def test_image_of_another_size_is_dropped_with_the_reason(session: Path) -> None
     result = load_calibration(session.parent / "calibration.json")
     assert [image for image, _ in result.dropped] == ["01.jpg"]
     assert "812x620" in result.dropped[0][1]
+    # Nor does it have the corners of the others found again every time.
+    corners = (session.parent / "corners.json").read_bytes()
+    assert main(["calibrate", str(session), "--force"]) == 0
+    assert (session.parent / "corners.json").read_bytes() == corners
 
 
 @pytest.mark.parametrize(
