@@ -37,7 +37,7 @@ class RadialCurve:
     Raises
     ------
     InputError
-        Fewer than four samples off the axis, or angles or radii that do not increase.
+        Fewer than four samples off the axis, angles or radii that do not increase, or angles of 180 degrees and more.
     """
 
     centre_px: FloatArray
@@ -52,6 +52,11 @@ class RadialCurve:
             raise InputError(f"radial curve: {theta.size} samples off the axis; at least 4 are needed")
         if (np.diff(theta) <= 0.0).any() or (np.diff(radius, prepend=0.0) <= 0.0).any():
             raise InputError("radial curve: angles and radii must both increase from the axis outwards")
+        if theta[-1] >= np.pi:
+            raise InputError(
+                f"radial curve: it reaches {np.degrees(theta[-1]):.1f} degrees, not less than 180; check that angles "
+                "are in radians"
+            )
         object.__setattr__(self, "centre_px", as_array(self.centre_px, (2,), "centre_px"))
         object.__setattr__(self, "theta_rad", theta)
         object.__setattr__(self, "radius_px", radius)

@@ -106,6 +106,7 @@ def test_curves_that_make_no_camera() -> None:
         (theta, radius[::-1], "increase"),
         (theta, np.where(radius == radius[30], np.nan, radius), "NaN"),
         (theta, radius[:-1], "shape"),
+        (np.degrees(theta), radius, "radians"),
     ):
         with pytest.raises(InputError, match=words):
             KannalaBrandt.from_radial_curve(SIZE_PX, RadialCurve(CENTRE_PX, bad_theta, bad_radius))
