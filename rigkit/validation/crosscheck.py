@@ -25,6 +25,7 @@ from rigkit.validation.checks import Check, judge, without_nan
 from rigkit.validation.colmap_way import colmap_reconstruction
 from rigkit.validation.intrinsics import CalibrationShifts
 from rigkit.validation.measure import Measured, measure
+from rigkit.validation.planes import face_angle, fit_moved
 from rigkit.validation.pnp import planar_pnp
 
 __all__ = ["CrossCheckReport", "OtherWay", "compare_chains", "crosscheck"]
@@ -172,8 +173,8 @@ def crosscheck(
     if other_chain is not None:
         ways.append(compare_chains(reconstruction, other_chain, OTHER_CHAIN))
     own = _with_observed_corners(reconstruction, ways)
-    ours = _angles(measure(own))
-    checks = [check for way in ways for check in _checks(own, ours, way, coverage, shifts)]
+    measured = measure(own)
+    checks = [check for way in ways for check in _checks(own, measured, way, coverage, shifts)]
     return CrossCheckReport(
         reconstruction.pair_id,
         reconstruction.affine_method,
@@ -268,14 +269,19 @@ def _angles(measured: Measured) -> Angles:
 
 
 def _checks(
-    reconstruction: Reconstruction, ours: Angles, way: OtherWay, coverage: float, shifts: CalibrationShifts | None
+    reconstruction: Reconstruction,
+    measured: Measured,
+    way: OtherWay,
+    coverage: float,
+    shifts: CalibrationShifts | None,
 ) -> list[Check]:
     """Return the checks of one way; none for what that way gives without uncertainty.
 
     Epipolar ways take the same calibration in the same manner; only the boards' own poses move apart from ours.
     """
     checks = []
-    apart = _apart(shifts) if shifts is not None and way.name == PNP else {}
+    ours = _angles(measured)
+    apart = _apart(measured, shifts) if shifts is not None and way.name == PNP else {}
     sigma = _pose_sigmas(way.cam2_from_cam1, way.covariance)
     if all(np.isfinite(value) for value in sigma):
         unknown = np.full((6, 6), np.nan)
@@ -299,7 +305,7 @@ def _checks(
     return checks
 
 
-def _apart(shifts: CalibrationShifts) -> dict[str, float]:
+def _apart(measured: Measured, shifts: CalibrationShifts) -> dict[str, float]:
     """Return how far the calibrations' uncertainty moves our quantities and those of planar PnP apart, one sigma."""
 
     def differences(moved: Reconstruction) -> dict[str, FloatArray]:
@@ -309,8 +315,9 @@ def _apart(shifts: CalibrationShifts) -> dict[str, float]:
             "rotation": log_so3(pnp.cam2_from_cam1.rotation @ ours.rotation.T),
             "translation direction": unit(pnp.cam2_from_cam1.translation_mm) - unit(ours.translation_mm),
         }
-        angles = _angles(measure(moved))
-        out |= {f"angle {a}-{b}": np.deg2rad([angles[a, b][0] - v]) for (a, b), (v, _) in pnp.angles_deg.items()}
+        normals = _moved_normals(measured, moved)
+        for (a, b), (value, _) in pnp.angles_deg.items():
+            out[f"angle {a}-{b}"] = np.array([face_angle(normals[a], normals[b]) - np.deg2rad(value)])
         out = {name: np.rad2deg(value) for name, value in out.items()}
         baseline = float(np.linalg.norm(pnp.cam2_from_cam1.translation_mm))
         return out | {"baseline": np.array([moved.baseline_mm - baseline])}
@@ -321,6 +328,13 @@ def _apart(shifts: CalibrationShifts) -> dict[str, float]:
         for name, value in differences(moved).items():
             squares[name] += float(np.sum((value - base[name]) ** 2))
     return {name: float(np.sqrt(square)) for name, square in squares.items()}
+
+
+def _moved_normals(measured: Measured, moved: Reconstruction) -> dict[str, FloatArray]:
+    """Return the boards' normals in a reconstruction that moved a little, its planes weighted as those `measured`."""
+    cloud, boards = moved.cloud, moved.boards
+    points = {board.board_id: cloud.points_mm[cloud.board_index == index] for index, board in enumerate(boards)}
+    return {name: fit_moved(points[name], found.plane).normal for name, found in measured.boards.items()}
 
 
 def _pose_sigmas(pose: Rigid3, covariance: FloatArray) -> tuple[float, float, float]:

@@ -20,6 +20,8 @@ from rigkit.geometry.rotation import exp_so3, log_so3
 from rigkit.interop.colmap import colmap_pair, solve_pair
 from rigkit.reconstruct import Reconstruction
 from rigkit.validation.crosscheck import ADJUSTED, PNP, crosscheck
+from rigkit.validation.intrinsics import calibration_shifts
+from rigkit.validation.measure import measure
 from rigkit.validation.pnp import planar_pnp
 
 EXACT_RAD = 1e-6
@@ -203,6 +205,29 @@ def test_relative_covariance_is_the_sampled_one(rng: np.random.Generator) -> Non
     predicted = relative_pose_covariance(one, two, half @ half.T)
     # 4000 draws: 1.1 % per standard deviation.
     assert np.std(samples, axis=0) == pytest.approx(np.sqrt(np.diag(predicted)), rel=0.05)
+
+
+def test_calibrations_move_only_the_boards_own_poses_apart(rng: np.random.Generator) -> None:
+    """The share in the sigmas of the angles is what calibrations drawn from their covariance show."""
+    exact = made(CAMERAS["kannala_brandt"])
+    axes = np.diag(np.where(np.abs(exact.camera1.parameters) > 1.0, 0.3, 3e-4))
+    plain, honest = (crosscheck(exact, shifts=s) for s in (None, calibration_shifts(exact, axes**2)))
+    share: dict[str, float] = {}
+    for before, after in zip(plain.checks, honest.checks, strict=True):
+        added = after.our_sigma**2 - before.our_sigma**2
+        assert added > 0.0 if before.how == PNP else added == 0.0
+        if before.how == PNP and before.kind == "angle":
+            share[before.name] = np.sqrt(added)
+    apart = []
+    for _ in range(20):
+        drawn = rng.normal(size=len(axes)) @ axes
+        (moved,) = calibration_shifts(exact, np.outer(drawn, drawn)).moved
+        ours = measure(moved)
+        apart.append([ours.angle_deg(*two)[0] - value for two, (value, _) in planar_pnp(moved).angles_deg.items()])
+    ratio = np.sqrt(np.mean(np.square(apart), axis=0)) / list(share.values())
+    # The spread of 20 draws is itself uncertain by 16 %.
+    assert (ratio > 0.55).all(), ratio
+    assert (ratio < 1.5).all(), ratio
 
 
 def test_one_board_is_no_case_for_pycolmap() -> None:
