@@ -58,15 +58,19 @@ def write_atomic(path: str | Path, data: str | bytes, *, force: bool = False) ->
 def write_together(files: Mapping[Path, str | bytes], *, force: bool = False) -> None:
     """Write all `files` (path -> content) or none: none takes its name before all are on the disk.
 
-    Raises InputError as `write_atomic` does; what was there before is still there then, and no new folder is left.
+    Raises InputError as `write_atomic` does; what was there before is still there then, and no new folder is left. Only
+    where files are replaced and the system refuses a later one its name are those before it new; the message says so.
     """
     ensure_writable(files, force=force)
     made: list[Path] = []
     staged: dict[Path, Path] = {}
+    renamed: list[Path] = []
     target = Path()
     try:
         for target, data in files.items():
-            made += _make_folder(target.parent)
+            for folder in [p for p in (target.parent, *target.parent.parents) if not p.exists()][::-1]:
+                folder.mkdir(exist_ok=True)
+                made.append(folder)
             handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
             staged[target] = Path(name)
             _fill(handle, data.encode("utf-8") if isinstance(data, str) else data)
@@ -78,8 +82,16 @@ def write_together(files: Mapping[Path, str | bytes], *, force: bool = False) ->
             else:
                 # A hard link fails if somebody made the file meanwhile, where a rename would silently replace it.
                 _link_new(temporary, target)
-    except OSError as error:
-        raise InputError(f"cannot write '{target}': {error.strerror}; nothing was changed") from error
+            renamed.append(target)
+    except BaseException as error:
+        if not force:
+            for path in renamed:
+                with suppress(OSError):
+                    path.unlink()
+        if not isinstance(error, OSError):
+            raise
+        changed = f"{len(renamed)} of {len(files)} files were replaced" if force and renamed else "nothing was changed"
+        raise InputError(f"cannot write '{target}': {error.strerror}; {changed}") from error
     finally:
         for temporary in staged.values():
             with suppress(OSError):
@@ -88,14 +100,6 @@ def write_together(files: Mapping[Path, str | bytes], *, force: bool = False) ->
         for folder in reversed(made):
             with suppress(OSError):
                 folder.rmdir()
-
-
-def _make_folder(folder: Path) -> list[Path]:
-    """Make `folder` and what is missing above it; return what was made, the outermost first."""
-    missing = [p for p in (folder, *folder.parents) if not p.exists()][::-1]
-    for path in missing:
-        path.mkdir(exist_ok=True)
-    return missing
 
 
 def _fill(handle: int, data: bytes) -> None:

@@ -124,6 +124,48 @@ def test_a_file_that_appears_meanwhile_is_not_replaced(tmp_path: Path, monkeypat
     assert os.listdir(tmp_path) == ["out"]
 
 
+def test_of_several_new_files_none_stays_where_one_appears_meanwhile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(files.os, "fsync", lambda handle: (tmp_path / "second").write_text("somebody else's"))
+    with pytest.raises(InputError, match="appeared"):
+        write_together({tmp_path / name: "ours" for name in ("made/first", "second", "third")})
+    assert (tmp_path / "second").read_text() == "somebody else's"
+    assert os.listdir(tmp_path) == ["second"]
+
+
+def test_what_was_replaced_before_the_system_refused_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    together = {tmp_path / name: "new" for name in ("first", "second")}
+    for path in together:
+        path.write_text("old")
+    replace = Path.replace
+
+    def refused(path: Path, target: Path) -> Path:
+        if target.name == "second":
+            raise PermissionError(1, "Operation not permitted")
+        return replace(path, target)
+
+    monkeypatch.setattr(Path, "replace", refused)
+    with pytest.raises(InputError, match="1 of 2 files were replaced"):
+        write_together(together, force=True)
+    assert [path.read_text() for path in together] == ["new", "old"]
+    assert sorted(os.listdir(tmp_path)) == ["first", "second"]
+
+
+def test_no_folder_stays_where_one_below_it_cannot_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make = Path.mkdir
+
+    def full(path: Path, **options: bool) -> None:
+        if path.name == "deep":
+            raise OSError(28, "No space left on device")
+        make(path, **options)
+
+    monkeypatch.setattr(Path, "mkdir", full)
+    with pytest.raises(InputError, match="No space left"):
+        write_atomic(tmp_path / "made" / "deep" / "file", "new")
+    assert os.listdir(tmp_path) == []
+
+
 def test_what_cannot_be_written_is_known_before_the_work(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     ensure_writable([tmp_path / "a", tmp_path / "deep" / "b"])
