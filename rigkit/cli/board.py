@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from rigkit.boards import Board
     from rigkit.io.board_file import load_board
-    from rigkit.io.files import ensure_writable, write_atomic
+    from rigkit.io.files import write_together
     from rigkit.report.board_sheet import board_sheet, pdf_bytes, svg_text
 
     size = BOARD_SIZE.match(args.size)
@@ -68,9 +68,8 @@ def run(args: argparse.Namespace) -> int:
     }
     if size is not None:
         files[f"{args.output}.toml"] = _board_toml(board, "nominal: print, measure both rulers, run rigkit board again")
-    ensure_writable(files, force=args.force)
-    for path, data in files.items():
-        write_atomic(path, data, force=args.force)
+    write_together({Path(path): data for path, data in files.items()}, force=args.force)
+    for path in files:
         print(path)
     return 0
 

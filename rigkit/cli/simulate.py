@@ -24,7 +24,7 @@ def run(args: argparse.Namespace) -> int:
 
     from rigkit.cli.console import note, print_json, progress_on_stderr
     from rigkit.errors import InputError
-    from rigkit.io.files import ensure_writable, write_atomic
+    from rigkit.io.files import ensure_writable, write_together
     from rigkit.io.study_file import load_study
     from rigkit.io.study_run import run_study
     from rigkit.report.study_figure import study_figure
@@ -55,8 +55,7 @@ def run(args: argparse.Namespace) -> int:
             "md": table.to_markdown(),
             args.format: study_figure(table, args.format),
         }
-        for suffix, data in files.items():
-            write_atomic(out / f"{study.name}.{suffix}", data, force=args.force)
+        write_together({out / f"{study.name}.{suffix}": data for suffix, data in files.items()}, force=args.force)
         if not args.json:
             print(table.to_markdown())
         note(f"{study.name}: {', '.join(str(out / f'{study.name}.{suffix}') for suffix in suffixes)}")
