@@ -31,7 +31,8 @@ class SampsonRows:
 
     Attributes
     ----------
-    packed : (18, N): the rays f1 and f2, then by pixel coordinate the columns of sigma1 B1 and of sigma2 B2.
+    packed : (18, N), C-contiguous: the rays f1 and f2, then by pixel coordinate the columns of sigma1 B1 and of
+        sigma2 B2.
     """
 
     packed: FloatArray
@@ -41,7 +42,8 @@ class SampsonRows:
         f1, f2, b1, b2 = matches.rays1, matches.rays2, matches.jacobians1, matches.jacobians2
         s1, s2 = (np.broadcast_to(s, len(matches)) for s in (matches.sigma1_px, matches.sigma2_px))
         columns = [(s * b.T).reshape(6, -1) for s, b in ((s1, b1), (s2, b2))]
-        return cls(np.concatenate([f1.T, f2.T, *columns]))
+        # Of transposed arrays alone numpy makes a transposed one.
+        return cls(np.ascontiguousarray(np.concatenate([f1.T, f2.T, *columns])))
 
     def residuals(self, E21: Mat3) -> FloatArray:
         """Return the signed Sampson distances (H, N) in sigmas of hypotheses (H, 3, 3)."""

@@ -124,6 +124,14 @@ def test_residuals_and_qualities(rng, camera, in_numpy):
         assert rows.quality(E21, noise) == pytest.approx(in_numpy(rows.quality, E21, noise), rel=1e-9)
 
 
+def test_how_arrays_lie_in_memory_does_not_matter(rng):
+    wild, pose = _matches(rng)
+    turned = [np.swapaxes(np.ascontiguousarray(np.swapaxes(b, 1, 2)), 1, 2) for b in (wild.jacobians1, wild.jacobians2)]
+    E21 = _starts(rng, pose)
+    same = replace(wild, jacobians1=turned[0], jacobians2=turned[1])
+    assert np.array_equal(SampsonRows.of(same).residuals(E21), SampsonRows.of(wild).residuals(E21))
+
+
 @pytest.mark.parametrize("kind", ["general", "planar", "standard"])
 def test_local_optima(rng, kind, in_numpy):
     wild, pose = _matches(rng, kind)
