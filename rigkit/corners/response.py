@@ -214,7 +214,8 @@ def _strongest(at: IntArray, height: FloatImage, most: int) -> BoolArray:
     square = row * (int(column.max()) + 1) + column
     strongest = np.zeros(int(square.max()) + 1, np.float32)
     np.maximum.at(strongest, square, height)
-    share = (np.float32(SHARES) * (height / strongest[square])).astype(np.int64)
+    # Beyond what float32 holds one is as strong as the other.
+    share = (np.float32(SHARES) * np.nan_to_num(height / strongest[square], nan=1.0)).astype(np.int64)
     at_least = np.cumsum(np.bincount(share, minlength=SHARES + 1)[::-1])[::-1]
     return np.asarray(share >= np.flatnonzero(at_least >= most)[-1], np.bool_)
 

@@ -271,7 +271,9 @@ int64_t keep_strongest(
         *strongest = response[k] > *strongest ? response[k] : *strongest;
     }
     for (int64_t k = 0; k < count; k++) {
-        share[k] = (int32_t)((float)finest * (response[k] / squares[share[k]]));
+        const float part = response[k] / squares[share[k]];
+        /* Beyond what float32 holds one is as strong as the other. */
+        share[k] = part < 1.0f ? (int32_t)((float)finest * part) : (int32_t)finest;
         bins[share[k]]++;
     }
     int64_t least = finest, kept = bins[finest];

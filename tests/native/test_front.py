@@ -107,6 +107,25 @@ def test_no_more_peaks_than_asked(monkeypatch: pytest.MonkeyPatch, in_numpy: Cal
     assert np.array_equal(ours, theirs)
 
 
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_peaks_beyond_float32_are_the_strongest(
+    monkeypatch: pytest.MonkeyPatch, in_numpy: Callable[..., np.ndarray]
+) -> None:
+    image = _images()["noise"].astype(np.float32)
+    image[20::97, 20::97] = 1e30
+    level = pyramid(grey_image(image))[0]
+    for found in (peaks, lambda level: in_numpy(peaks, level)):
+        everything = found(level)
+        with monkeypatch.context() as patch:
+            patch.setattr(response, "MAX_PEAKS", 100)
+            patch.setattr(response, "PIXELS_A_PEAK", 10**4)
+            fewer = found(level)
+        assert len(fewer[0]) < len(everything[0])
+        infinite = [at[np.isinf(height)] for at, height in (everything, fewer)]
+        assert len(infinite[0]) > 0
+        assert np.array_equal(*infinite)
+
+
 @pytest.mark.parametrize("name", list(_images()))
 def test_corners(name: str, in_numpy: Callable[..., tuple[Corners, saddle.Saddles]]) -> None:
     levels = pyramid(grey_image(_images()[name]))
