@@ -10,7 +10,7 @@ place for the part, or several: then it remains a part.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -134,18 +134,7 @@ def place_part(image: GreyImage, refined: RefinedLattice, sizes: Sequence[tuple[
     if len(fits) != 1 or not seen:
         return None
     across, down, before, above = fits.pop()
-    return _padded(refined, (above, down - above), (before, across - before))
-
-
-def _padded(refined: RefinedLattice, rows: tuple[int, int], columns: tuple[int, int]) -> RefinedLattice:
-    def pad(values: FloatArray) -> FloatArray:
-        return np.pad(values, (rows, columns, *[(0, 0)] * (values.ndim - 2)), constant_values=np.nan)
-
-    old = refined.lattice
-    rising = old.rising != ((rows[0] + columns[0]) % 2 == 1)
-    lattice = Lattice(pad(old.pixels), pad(old.contrast), rising)
-    rest = {name: pad(getattr(refined, name)) for name in RefinedLattice.__slots__ if name != "lattice"}
-    return replace(refined, lattice=lattice, **rest)
+    return refined.padded((above, down - above), (before, across - before))
 
 
 def sides(image: GreyImage, lattice: Lattice) -> tuple[Beyond, Beyond, Beyond, Beyond]:
@@ -194,7 +183,7 @@ class _Squares:
 
     @classmethod
     def above(cls, lattice: Lattice) -> _Squares:
-        wide = lattice.padded(2)
+        wide = lattice.padded((2, 2), (2, 2))
         cells = np.zeros(wide.known.shape, bool)
         cells[1:3, 1:-1] = True
         # The square between two columns is bright where brightness falls with the angle (downwards) across its foot.

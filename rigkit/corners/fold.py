@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray
-from rigkit.corners.lattice import Lattice
+from rigkit.corners.lattice import Lattice, margins
 from rigkit.corners.local_fit import fit_cells
 
 __all__ = ["join_parts", "split_folds", "split_necks"]
@@ -335,29 +335,9 @@ def _facing(one: Lattice, two: Lattice, steps: int, shape: int = cv2.MORPH_CROSS
 
 def _united(one: Lattice, two: Lattice, shift: IntArray, near: bool, far: bool) -> Lattice | None:
     """Return `two`, moved by `shift` (columns, rows), put into `one`; None if they overlap, differ or are far apart."""
-    low = np.minimum(0, shift)
-    high = np.maximum(one.size, shift + np.array(two.size))
-    columns, rows = high - low
-    parts = []
-    for item, at in ((one, -low), (two, shift - low)):
-        pixels = np.full((rows, columns, 2), np.nan)
-        contrast = np.full((rows, columns), np.nan)
-        signs = np.zeros((rows, columns))
-        place = (slice(at[1], at[1] + item.size[1]), slice(at[0], at[0] + item.size[0]))
-        pixels[place], contrast[place], signs[place] = item.pixels, item.contrast, item.signs()
-        odd = (np.arange(rows)[:, None] + np.arange(columns)) % 2
-        rising = bool((signs * np.where(odd == 1, -1.0, 1.0))[place].flat[0] > 0.0)
-        parts.append(Lattice(pixels, contrast, rising))
-    first, second = parts
+    first, second = (item.padded(*m) for item, m in zip((one, two), margins(one.size, two.size, shift), strict=True))
     if first.rising != second.rising or (first.known & second.known).any():
         return None
     beside = near and (_facing(first, second, GAP) or _facing(first, second, GAP, cv2.MORPH_RECT) >= SLANTED)
     beyond = far and _facing(first, second, FAR_GAP) >= FAR_FACING
-    if not (beside or beyond):
-        return None
-    known = first.known
-    return Lattice(
-        np.where(known[..., None], first.pixels, second.pixels),
-        np.where(known, first.contrast, second.contrast),
-        first.rising,
-    )
+    return first.filled(second) if beside or beyond else None

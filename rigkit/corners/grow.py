@@ -26,7 +26,7 @@ from rigkit.native.growth import FitRules, GrowthRules, Squares, grown
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-__all__ = ["SaddleIndex", "grow", "grow_all"]
+__all__ = ["SaddleIndex", "grow_all"]
 
 MAX_RINGS = 60
 """More rings than any board has rows or columns."""
@@ -133,22 +133,20 @@ def _covered(lattice: Lattice, corners: FloatArray) -> bool:
     return bool(near_any(lattice.pixels[lattice.known], corners, SAME_PX).mean() > 0.5)
 
 
-def grow(lattice: Lattice, saddles: SaddleIndex, level: Level) -> Lattice:
-    """Return `lattice` with all corners that can be added one after the other; brightness is read from `level`."""
-    return _grown(lattice, saddles, level, lambda _: True)[0]
-
-
 def _grown(
     lattice: Lattice, saddles: SaddleIndex, level: Level, promising: Callable[[Lattice], bool]
 ) -> tuple[Lattice, bool]:
-    """Return `lattice` as `grow` does, and whether it is `promising`; if it is not, maybe not fully grown."""
+    """Return `lattice` with all corners that can be added one after the other, and whether it is `promising`.
+
+    Brightness is read from `level`. A lattice that is not promising may not be fully grown.
+    """
     rings, judged = MAX_RINGS, False
     while rings > 0:
         if not judged and lattice.count >= MANY:
             if not promising(lattice):
                 return lattice, False
             judged = True
-        wide = lattice.padded(ROOM)
+        wide = lattice.padded((ROOM, ROOM), (ROOM, ROOM))
         rings = _grow(wide, saddles, level, rings)
         if wide.count > lattice.count:
             lattice = wide.trimmed()

@@ -19,7 +19,7 @@ from rigkit.corners.saddle import Corners
 from rigkit.native import kernels
 from rigkit.native.growth import components_of
 
-__all__ = ["MANY", "STEPS", "Lattice", "Sheet", "build_lattices"]
+__all__ = ["MANY", "STEPS", "Lattice", "Sheet", "build_lattices", "margins", "padded"]
 
 STEPS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
 """(column, row) of the four grid directions."""
@@ -77,14 +77,19 @@ class Lattice:
         odd = (np.arange(rows)[:, None] + np.arange(columns) + int(not self.rising)) % 2
         return np.where(odd == 1, -1.0, 1.0)
 
-    def padded(self, by: int = 1) -> Lattice:
-        """Return the lattice with `by` empty rows and columns on every side."""
-        rows, columns = self.pixels.shape[:2]
-        pixels = np.full((rows + 2 * by, columns + 2 * by, 2), np.nan)
-        contrast = np.full(pixels.shape[:2], np.nan)
-        pixels[by : by + rows, by : by + columns] = self.pixels
-        contrast[by : by + rows, by : by + columns] = self.contrast
-        return Lattice(pixels, contrast, self.rising)
+    def padded(self, rows: tuple[int, int], columns: tuple[int, int]) -> Lattice:
+        """Return the lattice with so many empty rows and columns before and after it."""
+        odd = (rows[0] + columns[0]) % 2 == 1
+        return Lattice(padded(self.pixels, rows, columns), padded(self.contrast, rows, columns), self.rising != odd)
+
+    def filled(self, other: Lattice) -> Lattice:
+        """Return the lattice with the corners of `other`, of the same size, where it has none."""
+        known = self.known
+        return Lattice(
+            np.where(known[..., None], self.pixels, other.pixels),
+            np.where(known, self.contrast, other.contrast),
+            self.rising,
+        )
 
     def cut(self, rows: slice, columns: slice) -> Lattice:
         """Return the part of `rows` and `columns` (slices with a start and without a step)."""
@@ -123,6 +128,30 @@ class Lattice:
                 bool(signs.size and signs[0, 0] > 0),
             )
         return out
+
+
+def padded(values: FloatArray, rows: tuple[int, int], columns: tuple[int, int]) -> FloatArray:
+    """Return `values` (R, C, ...) with so many rows and columns of NaN before and after."""
+    height, width = values.shape[:2]
+    out = np.full((rows[0] + height + rows[1], columns[0] + width + columns[1], *values.shape[2:]), np.nan)
+    out[rows[0] : rows[0] + height, columns[0] : columns[0] + width] = values
+    return out
+
+
+Margins = tuple[tuple[int, int], tuple[int, int]]
+
+
+def margins(one: tuple[int, int], two: tuple[int, int], shift: IntArray) -> tuple[Margins, Margins]:
+    """Return the rows and columns to pad two lattices with that lie `shift` (columns, rows) off each other.
+
+    `one` and `two` are their (columns, rows).
+    """
+    low = np.minimum(0, shift)
+    size = np.maximum(one, shift + np.array(two)) - low
+    first, second = (
+        np.stack([at, size - at - mine], axis=-1)[::-1].tolist() for at, mine in ((-low, one), (shift - low, two))
+    )
+    return (tuple(first[0]), tuple(first[1])), (tuple(second[0]), tuple(second[1]))
 
 
 @dataclass(frozen=True, eq=False, slots=True)

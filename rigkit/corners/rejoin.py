@@ -7,14 +7,13 @@ plane the corners of the other lie: they are parts of one board where that is on
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from rigkit.arrays import FloatArray, IntArray
 from rigkit.boards import Board
 from rigkit.cameras.base import Camera
-from rigkit.corners.lattice import Lattice
+from rigkit.corners.lattice import Lattice, margins
 from rigkit.corners.subpixel import RefinedLattice
 from rigkit.errors import DegenerateError
 from rigkit.geometry.board_pose import board_poses
@@ -72,7 +71,7 @@ def _both(one: RefinedLattice, two: RefinedLattice, boards: Sequence[Board], cam
         for cam_from_grid in _poses(one.lattice, side_mm, camera):
             on_grid = _on_plane(two.lattice, cam_from_grid, camera) / side_mm
             for turns in range(4):
-                turned = _turned(two, turns)
+                turned = two.turned(turns)
                 shift = _shift(turned.lattice, np.rot90(on_grid, -turns))
                 both = None if shift is None else _united(one, turned, shift, sizes)
                 if both is not None and shift is not None and _flat(both, turned, shift, side_mm, camera):
@@ -118,25 +117,18 @@ def _shift(lattice: Lattice, on_grid: FloatArray) -> IntArray | None:
     return shift.astype(np.int64) if apart < OFF_GRID else None
 
 
-def _turned(item: RefinedLattice, quarter_turns: int) -> RefinedLattice:
-    rest = {name: np.rot90(getattr(item, name), -quarter_turns) for name in _rest()}
-    return replace(item, lattice=item.lattice.turned(quarter_turns), **rest)
-
-
-def _rest() -> list[str]:
-    return [name for name in RefinedLattice.__slots__ if name != "lattice"]
-
-
 def _united(
     one: RefinedLattice, two: RefinedLattice, shift: IntArray, sizes: set[tuple[int, int]]
 ) -> RefinedLattice | None:
     """Return `two`, moved by `shift`, put into `one`; None if that is larger than any of the `sizes` (columns, rows),
     its colours do not go on, or two corners want one place."""
-    low = np.minimum(0, shift)
-    columns, rows = (np.maximum(one.lattice.size, shift + np.array(two.lattice.size)) - low).tolist()
+    around = margins(one.lattice.size, two.lattice.size, shift)
+    # Before anything of that size is made: two planes that nearly miss each other put it anywhere.
+    (above, below), (left, right) = around[0]
+    columns, rows = one.lattice.size[0] + left + right, one.lattice.size[1] + above + below
     if not any(columns <= c and rows <= r for c, r in sizes):
         return None
-    first, second = (_placed(item, at, columns, rows) for item, at in ((one, -low), (two, shift - low)))
+    first, second = (item.padded(*m) for item, m in zip((one, two), around, strict=True))
     if first.lattice.rising != second.lattice.rising:
         return None
     known = first.lattice.known
@@ -144,26 +136,7 @@ def _united(
     apart = np.linalg.norm(first.lattice.pixels - second.lattice.pixels, axis=-1)[twice]
     if (apart > SAME_PX).any():
         return None
-    lattice = Lattice(
-        np.where(known[..., None], first.lattice.pixels, second.lattice.pixels),
-        np.where(known, first.lattice.contrast, second.lattice.contrast),
-        first.lattice.rising,
-    )
-    rest = {name: np.where(known, getattr(first, name), getattr(second, name)) for name in _rest()}
-    return replace(one, lattice=lattice, **rest)
-
-
-def _placed(item: RefinedLattice, at: IntArray, columns: int, rows: int) -> RefinedLattice:
-    """Return the part with its first corner at `at` (column, row) of a larger grid."""
-    right, below = columns - at[0] - item.lattice.size[0], rows - at[1] - item.lattice.size[1]
-    margins = ((int(at[1]), int(below)), (int(at[0]), int(right)))
-
-    def pad(values: FloatArray) -> FloatArray:
-        return np.pad(values, (*margins, *[(0, 0)] * (values.ndim - 2)), constant_values=np.nan)
-
-    rising = item.lattice.rising != (int(at.sum()) % 2 == 1)
-    lattice = Lattice(pad(item.lattice.pixels), pad(item.lattice.contrast), rising)
-    return replace(item, lattice=lattice, **{name: pad(getattr(item, name)) for name in _rest()})
+    return first.filled(second)
 
 
 def _flat(both: RefinedLattice, two: RefinedLattice, shift: IntArray, side_mm: float, camera: Camera) -> bool:

@@ -17,7 +17,7 @@ from rigkit.arrays import BoolArray, FloatArray
 from rigkit.corners.bends import line_curvature
 from rigkit.corners.edge_fit import BLUR_RANGE, fit_edges
 from rigkit.corners.edge_model import REACH, Geometry, ends_of
-from rigkit.corners.lattice import Lattice, Sheet
+from rigkit.corners.lattice import Lattice, Sheet, padded
 from rigkit.corners.local_fit import LocalFit, fit_cells
 from rigkit.corners.response import GreyImage
 
@@ -108,6 +108,22 @@ class RefinedLattice:
         """Return the part of `rows` and `columns`."""
         rest = (values[rows, columns] for values in self._values())
         return RefinedLattice(self.lattice.cut(rows, columns), *rest)
+
+    def padded(self, rows: tuple[int, int], columns: tuple[int, int]) -> RefinedLattice:
+        """Return this with so many empty rows and columns before and after."""
+        rest = (padded(values, rows, columns) for values in self._values())
+        return RefinedLattice(self.lattice.padded(rows, columns), *rest)
+
+    def turned(self, quarter_turns: int) -> RefinedLattice:
+        """Return this counted from another corner, as `Lattice.turned`."""
+        rest = (np.rot90(values, -quarter_turns) for values in self._values())
+        return RefinedLattice(self.lattice.turned(quarter_turns), *rest)
+
+    def filled(self, other: RefinedLattice) -> RefinedLattice:
+        """Return this with the corners of `other`, of the same size, where it has none."""
+        known = self.lattice.known
+        pairs = zip(self._values(), other._values(), strict=True)
+        return RefinedLattice(self.lattice.filled(other.lattice), *(np.where(known, *pair) for pair in pairs))
 
     def _values(self) -> tuple[FloatArray, ...]:
         return (self.sigma_px, self.blur_px, self.residual, self.noise)
