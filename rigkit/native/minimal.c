@@ -12,6 +12,8 @@
 #define MOST_ROOTS 10
 /* Roots of the polynomial lose digits on the way to it: solutions worse than this are polished. */
 #define EXACT 1e-11
+/* What is worse than this afterwards, far above the rounding even of double roots, was none. */
+#define NONE 1e-6
 
 /* Places in products of polynomials in x, y, z: of degree one (x y z 1), two (x2 xy xz y2 yz z2 x y z 1) and three:
  * x3 y3 x2y xy2 x2z x2 y2z y2 xyz xy | xz2 xz x yz2 yz y z3 z2 z 1, the first ten of which are eliminated. */
@@ -53,7 +55,8 @@ INLINE void null_space(const double *rows, int count, double *basis)
             square += work[k][i] * work[k][i];
         const double size = sqrt(square);
         memset(v[k], 0, sizeof v[k]);
-        if (!(size > 0.0))
+        /* A row that says nothing; one that is not finite makes everything NaN. */
+        if (size == 0.0)
             continue;
         memcpy(v[k] + k, work[k] + k, sizeof(double) * (size_t)(9 - k));
         v[k][k] += v[k][k] < 0.0 ? -size : size;
@@ -451,8 +454,11 @@ INLINE void solve_five(const double *rows, double *out)
             polish(given, place);
             combine(basis, place, E);
         }
-        written++;
+        if (violation(E) < NONE)
+            written++;
     }
+    for (int i = 9 * written; i < 9 * MOST_ROOTS; i++)
+        out[i] = NAN;
 }
 
 /* Rotate the `size` columns of `m`, `length` numbers each and one after the other, until they are perpendicular; `v`

@@ -102,6 +102,27 @@ def test_samples_that_determine_nothing_are_survived(rng):
     assert essential_from_six_rows(np.zeros((2, 6, 9))).shape == (2, 1, 3, 3)
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("solve, count", [(essential_from_five_rows, 5), (essential_from_six_rows, 6)])
+def test_a_number_that_is_none_spoils_its_own_sample_alone(rng, solve, count, bad):
+    rows = rng.normal(size=(20, count, 9))
+    found = solve(rows)
+    rows[::2, rng.integers(count), rng.integers(9)] = bad
+    again = solve(rows)
+    assert np.isnan(again[::2]).all()
+    assert np.array_equal(again[1::2], found[1::2], equal_nan=True)
+
+
+def test_what_five_equations_find_is_essential(rng):
+    # Points seen in pure translation: a sheaf of solutions, where rounding turns signs that no root does.
+    m, _, _ = pair(rng, 5000, "standard")
+    found = essential_from_five_rows(point_rows(m.rays1, m.rays2).reshape(-1, 5, 9)).reshape(-1, 3, 3)
+    found = found[np.isfinite(found).all(axis=(1, 2))]
+    assert len(found) > 1000
+    s = np.linalg.svd(found, compute_uv=False)
+    assert np.abs(s - [np.sqrt(0.5), np.sqrt(0.5), 0.0]).max() < 10.0 * SOLUTION
+
+
 def test_six_equations(rng, in_numpy):
     m, _, _ = pair(rng, 200, noise_px=0.5, sigma_A=0.05)
     more = affinity_rows(m.rays1, m.rays2, m.jacobians1, m.jacobians2, m.A21)
