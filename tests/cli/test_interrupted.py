@@ -27,14 +27,14 @@ def work(path):
 def run(args):
     folder = Path(args.output)
     with worker_pool(2) as pool:
-        list(pool.map(work, [folder / "0", folder / "1"]))
+        list(pool.map(work, [folder / str(k) for k in range(8)]))
 
 if __name__ == "__main__":
     import rigkit.cli.diff as verb
     verb.run = run
     sys.exit(main(["diff", "a", "b", "-o", sys.argv[1]]))
 """
-"""The program with a verb that works for ten minutes in two processes."""
+"""The program with a verb that works for ten minutes in two processes, and has more to do."""
 
 PATIENCE_S = 60.0
 
