@@ -11,6 +11,7 @@ import numpy as np
 from rigkit.arrays import FloatArray, Mat3
 from rigkit.errors import DegenerateError, InputError
 from rigkit.fundamental.weights import (
+    LEAST_SIGMA_A,
     RowWeights,
     WeightRule,
     assumed_sigma_A,
@@ -20,14 +21,16 @@ from rigkit.fundamental.weights import (
     noise_weights,
     usable_affinities,
 )
-from rigkit.geometry.rotation import nearest_rotation
+from rigkit.geometry.rotation import nearest_rotation, unit
 from rigkit.geometry.sampson import sampson_distances
 from rigkit.matches import Matches
 
-__all__ = ["EpipolarEstimate", "FundamentalSolver", "check_baseline", "finish", "reweighted"]
+__all__ = ["EpipolarEstimate", "FundamentalSolver", "check_baseline", "finish", "reweighted", "transfer_error"]
 
 REWEIGHTINGS = 3
 """The weights depend on the geometry only weakly: the third repetition changes E by less than 1e-3 of its error."""
+ROTATION_SIGMAS = 4.0
+"""A rotation whose chi square is no more than this many standard deviations too large explains the matches."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -83,7 +86,7 @@ def reweighted(
     E21 = solve(row_weights)
     for _ in range(REWEIGHTINGS):
         if rule == "auto":
-            sigma_A = np.where(usable_affinities(matches), max(estimate_sigma_A(matches, E21), 1e-6), np.nan)
+            sigma_A = np.where(usable_affinities(matches), max(estimate_sigma_A(matches, E21), LEAST_SIGMA_A), np.nan)
         row_weights = noise_weights(matches, E21, sigma_A)
         E21 = solve(row_weights)
     return E21, row_weights
@@ -118,18 +121,20 @@ def check_baseline(matches: Matches) -> None:
     n = len(matches)
     if n < 2:
         return
-    R = nearest_rotation(matches.rays2.T @ matches.rays1)
-    turned = matches.rays1 @ R.T
-    difference = matches.rays2 - turned
-    # Tangential difference in px of image 2: least squares of B2 dq = difference.
-    jacobians2 = matches.jacobians2
-    gram = np.swapaxes(jacobians2, -1, -2) @ jacobians2
-    dq = np.linalg.solve(gram, np.swapaxes(jacobians2, -1, -2) @ difference[..., None])[..., 0]
-    square = np.sum(dq * dq, axis=-1) / (matches.sigma1_px**2 + matches.sigma2_px**2)
+    square = np.sum(transfer_error(matches, nearest_rotation(matches.rays2.T @ matches.rays1)) ** 2, axis=1)
     freedom = 2 * n - 3
-    if square.sum() < freedom + 4.0 * np.sqrt(2.0 * freedom):
-        rms = float(np.sqrt(np.mean(np.sum(dq * dq, axis=-1))))
+    chi2 = float(np.sum(square / (matches.sigma1_px**2 + matches.sigma2_px**2)))
+    if chi2 < freedom + ROTATION_SIGMAS * np.sqrt(2.0 * freedom):
+        rms = float(np.sqrt(np.mean(square)))
         raise DegenerateError(
             f"no baseline: a rotation alone explains the {n} matches (rms {rms:.3g} px, within their noise); "
             "use two images taken from different places"
         )
+
+
+def transfer_error(matches: Matches, H21: Mat3) -> FloatArray:
+    """Return by how many px of image 2 (N, 2) the second ray is off the first one mapped by `H21` (f2 ~ H f1)."""
+    difference = matches.rays2 - unit(matches.rays1 @ H21.T)
+    B = matches.jacobians2
+    gram = np.swapaxes(B, -1, -2) @ B
+    return np.asarray(np.linalg.solve(gram, np.swapaxes(B, -1, -2) @ difference[..., None])[..., 0])

@@ -10,12 +10,13 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.arrays import FloatArray, Mat3
+from rigkit.fundamental.estimate import check_baseline, transfer_error
 from rigkit.fundamental.rows import right_singular
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import nearest_rotation, skew, unit
 from rigkit.matches import Matches
 
-__all__ = ["decompose_homography", "homography_of_rays", "one_plane_poses", "transfer_error"]
+__all__ = ["decompose_homography", "homography_of_rays", "one_plane_poses"]
 
 ONE_PLANE_SIGMAS = 3.0
 """Points whose homography transfers them within so many sigmas (rms) may lie on one plane."""
@@ -29,14 +30,6 @@ def homography_of_rays(matches: Matches) -> Mat3:
     H = H if np.median(side) >= 0.0 else -H
     middle = np.linalg.svd(H, compute_uv=False)[1]
     return np.asarray(H / (middle if middle > 0.0 else 1.0))
-
-
-def transfer_error(matches: Matches, H21: Mat3) -> FloatArray:
-    """Return by how many px of image 2 (N, 2) the second ray is off the first one mapped by `H21`."""
-    difference = matches.rays2 - unit(matches.rays1 @ H21.T)
-    B = matches.jacobians2
-    gram = np.swapaxes(B, -1, -2) @ B
-    return np.asarray(np.linalg.solve(gram, np.swapaxes(B, -1, -2) @ difference[..., None])[..., 0])
 
 
 def decompose_homography(H21: Mat3) -> tuple[tuple[Rigid3, FloatArray], ...]:
@@ -65,7 +58,8 @@ def decompose_homography(H21: Mat3) -> tuple[tuple[Rigid3, FloatArray], ...]:
 def one_plane_poses(matches: Matches) -> tuple[Rigid3, ...]:
     """Return the poses (unit baseline) of the plane that all points may lie on; nothing if they do not lie on one.
 
-    Only poses with all points on the visible side of the plane's half-space, d > 0, are returned: at most two.
+    Only poses with all points on the visible side of the plane's half-space, d > 0, are returned: at most two. Raises
+    DegenerateError where that plane is at infinity: a rotation explains the matches.
     """
     if len(matches) < 4:
         return ()
@@ -73,6 +67,7 @@ def one_plane_poses(matches: Matches) -> tuple[Rigid3, ...]:
     square = np.sum(transfer_error(matches, H21) ** 2, axis=1) / (matches.sigma1_px**2 + matches.sigma2_px**2)
     if np.mean(square) > 2.0 * ONE_PLANE_SIGMAS**2:
         return ()
+    check_baseline(matches)
     poses = []
     for pose, normal in decompose_homography(H21):
         if np.mean(matches.rays1 @ normal > 0.0) > 0.9 and np.linalg.norm(pose.translation_mm) > 0.0:

@@ -9,9 +9,11 @@ from rigkit.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import cross, log_so3, skew
 from rigkit.geometry.triangulation import ray_ranges
+from rigkit.matches import Matches
 from rigkit.posetype import PoseType
 
 __all__ = [
+    "behind_sigmas",
     "choose_pose",
     "decompose_essential",
     "essential_from_pose",
@@ -82,6 +84,20 @@ def choose_pose(E21: Mat3, rays1: Rays, rays2: Rays, pose_type: PoseType | str =
             "points in front of both cameras; check that the two images are matched rightly and have a baseline"
         )
     return poses[order[0]]
+
+
+def behind_sigmas(matches: Matches, cam2_from_cam1: Rigid3) -> FloatArray:
+    """Return by how many sigmas of parallax each match (N,) is behind a camera; 0 in front of both.
+
+    The nearest point that both cameras can see is then at infinity: that far the pixels would have to move.
+    """
+    m = matches
+    range1, range2, defined = ray_ranges(m.rays1, m.rays2, cam2_from_cam1)
+    behind = defined & ((range1 < 0.0) | (range2 < 0.0))
+    parallax = np.linalg.norm(cross(m.rays2, m.rays1 @ cam2_from_cam1.rotation.T), axis=1)
+    size1, size2 = (np.sqrt(0.5 * np.sum(b * b, axis=(1, 2))) for b in (m.jacobians1, m.jacobians2))
+    noise = np.hypot(m.sigma1_px * size1, m.sigma2_px * size2)
+    return np.asarray(np.divide(parallax, noise, out=np.zeros(len(m)), where=behind))
 
 
 def _in_front(pose: Rigid3, rays1: Rays, rays2: Rays) -> tuple[int, int]:

@@ -7,6 +7,7 @@ spirit level that holds to 0.2 degrees is neither ignored nor believed exactly.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,13 +15,14 @@ import numpy as np
 from rigkit.arrays import FloatArray
 from rigkit.errors import DegenerateError, InputError
 from rigkit.fundamental.one_plane import one_plane_poses
-from rigkit.fundamental.pose import choose_pose, essential_from_pose, translation_basis
+from rigkit.fundamental.pose import behind_sigmas, choose_pose, essential_from_pose, translation_basis
 from rigkit.fundamental.pose_problem import Minimum, PoseProblem, RobustWeights, cauchy_weights
 from rigkit.fundamental.registry import fundamental_for
-from rigkit.fundamental.weights import RowWeights, WeightRule, estimate_sigma_A, usable_affinities
+from rigkit.fundamental.residuals import whitened_affinities
+from rigkit.fundamental.weights import LEAST_SIGMA_A, RowWeights, WeightRule, estimate_sigma_A, usable_affinities
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, rotation_angle, unit
-from rigkit.geometry.sampson import sampson_distances
+from rigkit.geometry.sampson import epipolar_normals, sampson_distances
 from rigkit.matches import Matches
 from rigkit.posetype import PoseType
 
@@ -28,8 +30,8 @@ __all__ = ["RefinedPose", "cauchy_weights", "estimate_pose", "project_to_type", 
 
 SAME_POSE = 5e-3
 """Two minima nearer than this (rad, and share of the baseline) mislead nobody."""
-SIGNIFICANT_COST = 9.0
-"""A cost (chi square) higher by this rules a pose out: three standard deviations."""
+SIGNIFICANT = 3.0
+"""Standard deviations that the cost (chi square) of a pose must be higher by to rule it out."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -116,43 +118,66 @@ def estimate_pose(
     if str(pose_type) == PoseType.GENERAL:
         level_sigma_rad = None
     kinds = [str(pose_type)] if level_sigma_rad is None else [str(pose_type), "general"]
-    starts: list[tuple[Rigid3, Matches]] = []
+    starts: list[Rigid3] = []
     failure: DegenerateError | InputError | None = None
     for kind in kinds:
         try:
             estimate = fundamental_for(kind).solve(matches, weights)
-            start = choose_pose(estimate.E21, matches.rays1, matches.rays2, kind)
-            starts.append((start, _with_sigma(matches, estimate.E21, weights)))
+            starts.append(choose_pose(estimate.E21, matches.rays1, matches.rays2, kind))
         except (DegenerateError, InputError) as error:
             failure = failure or error
     flat = one_plane_poses(matches) if "general" in kinds else ()
-    starts += [(pose, _with_sigma(matches, essential_from_pose(pose), weights)) for pose in flat]
+    starts += flat
+    matches = _with_sigma(matches, starts, weights)
     ends: list[RefinedPose] = []
-    for start, usable in starts:
+    for start in starts:
         try:
-            ends.append(refine_pose(usable, start, pose_type, level_sigma_rad, robust=robust))
+            ends.append(refine_pose(matches, start, pose_type, level_sigma_rad, robust=robust))
         except DegenerateError as error:
             failure = failure or error
     if not ends:
         raise failure or DegenerateError("no pose found")
-    best = min(ends, key=lambda end: end.cost)
+    best = min(ends, key=lambda end: _visible_cost(matches, end))
     if flat:
-        _refuse_ambiguity(best, ends)
+        _refuse_ambiguity(matches, best, ends)
     return best
 
 
-def _refuse_ambiguity(best: RefinedPose, ends: list[RefinedPose]) -> None:
+def _visible_cost(matches: Matches, end: RefinedPose) -> float:
+    """Return the cost with what it takes to bring the points that are behind a camera to infinity."""
+    return end.cost + float(np.sum(end.weights * behind_sigmas(matches, end.cam2_from_cam1) ** 2))
+
+
+def _refuse_ambiguity(matches: Matches, best: RefinedPose, ends: list[RefinedPose]) -> None:
     """Raise DegenerateError if another pose explains the points of one plane as well as the best one."""
-    scale = max(best.variance_factor, 1.0)
     for end in ends:
         difference = best.cam2_from_cam1 @ end.cam2_from_cam1.inverse()
         turn, shift = float(rotation_angle(difference.rotation)), float(np.linalg.norm(difference.translation_mm))
-        same = max(turn, shift) < SAME_POSE
-        if not same and end.cost - best.cost < SIGNIFICANT_COST * scale:
+        if max(turn, shift) < SAME_POSE:
+            continue
+        scale = max(best.variance_factor, 1.0)
+        chance = scale * _chance_difference(matches, best.cam2_from_cam1, end.cam2_from_cam1)
+        if _visible_cost(matches, end) - _visible_cost(matches, best) < SIGNIFICANT * chance:
             raise DegenerateError(
-                f"all {len(best.weights)} points lie on one plane and two poses {np.degrees(turn):.1f} deg apart "
+                f"all {len(matches)} points lie on one plane and two poses {np.degrees(turn):.1f} deg apart "
                 "explain them equally well; add a board that is not parallel to it, or declare the pose type"
             )
+
+
+def _chance_difference(matches: Matches, first: Rigid3, second: Rigid3) -> float:
+    """Return the standard deviation of the difference of two poses' costs where both are true, for all the matches say.
+
+    A residual is the noise across an epipolar line, and another pose has other lines: of two normal residuals with the
+    correlation c the squares differ by 4 (1 - c^2) in the mean square. Along with SIGNIFICANT itself, for the pose.
+    """
+    m, which = matches, whitened_affinities(matches)[1]
+    lines1, lines2 = [], []
+    for pose in (first, second):
+        _, n1, n2 = epipolar_normals(essential_from_pose(pose), m.rays1, m.rays2, m.jacobians1, m.jacobians2)
+        lines1.append(unit(np.concatenate([m.sigma1_px[:, None] * n1, m.sigma2_px[:, None] * n2], axis=1)))
+        lines2.append(unit(n2[which]))
+    independent = [1.0 - np.nan_to_num(np.sum(a * b, axis=1)) ** 2 for a, b in (lines1, lines2)]
+    return float(np.sqrt(SIGNIFICANT**2 + 4.0 * independent[0].sum() + 8.0 * independent[1].sum()))
 
 
 def project_to_type(pose: Rigid3, pose_type: PoseType | str) -> tuple[FloatArray, FloatArray]:
@@ -176,12 +201,13 @@ def _split(pose: Rigid3) -> tuple[FloatArray, FloatArray]:
     return np.array(pose.rotation), unit(pose.translation_mm)
 
 
-def _with_sigma(matches: Matches, E21: FloatArray, weights: WeightRule | RowWeights | None) -> Matches:
-    """Return the matches with the sigma_A that the weight rule stands for."""
+def _with_sigma(matches: Matches, starts: Sequence[Rigid3], weights: WeightRule | RowWeights | None) -> Matches:
+    """Return the matches with the sigma_A that the weight rule stands for: one for all starts, of the best of them."""
     if weights == "points" or (weights == "auto" and not usable_affinities(matches).any()):
         return replace(matches, A21=None, sigma_A=None)
-    if weights == "auto":
-        return replace(matches, sigma_A=np.full(len(matches), max(estimate_sigma_A(matches, E21), 1e-6)))
+    if weights == "auto" and starts:
+        least = min(estimate_sigma_A(matches, essential_from_pose(start)) for start in starts)
+        return replace(matches, sigma_A=np.full(len(matches), max(least, LEAST_SIGMA_A)))
     return matches
 
 

@@ -20,14 +20,12 @@ from rigkit.fundamental.local import SampsonRows
 from rigkit.fundamental.marginal import QUANTILE, MarginalLoss, marginal_quality
 from rigkit.fundamental.minimal import essential_from_five_rows, essential_from_six_rows, planar_from_two_rows
 from rigkit.fundamental.planar import solve_planar_batch
-from rigkit.fundamental.pose import choose_pose, essential_from_pose
+from rigkit.fundamental.pose import behind_sigmas, choose_pose, essential_from_pose
 from rigkit.fundamental.refine import RefinedPose, refine_pose
 from rigkit.fundamental.registry import fundamental_for
 from rigkit.fundamental.rows import PLANAR_ENTRIES, affinity_rows, essential_from_planar, point_rows
 from rigkit.fundamental.weights import affinity_residuals, usable_affinities
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import cross
-from rigkit.geometry.triangulation import ray_ranges
 from rigkit.matches import Matches
 from rigkit.posetype import PoseType
 
@@ -170,16 +168,12 @@ def _plausible(matches: Matches, pose: Rigid3, max_noise: float) -> BoolArray:
     Certainly wrong: behind a camera by a parallax that is no noise, or with an affinity that is off by more than the
     highest noise level.
     """
-    m, sigmas = matches, QUANTILE * max_noise
-    range1, range2, defined = ray_ranges(m.rays1, m.rays2, pose)
-    behind = defined & ((range1 < 0.0) | (range2 < 0.0))
-    parallax = np.linalg.norm(cross(m.rays2, m.rays1 @ pose.rotation.T), axis=1)
-    size1, size2 = (np.sqrt(0.5 * np.sum(b * b, axis=(1, 2))) for b in (m.jacobians1, m.jacobians2))
-    behind &= parallax > sigmas * np.hypot(m.sigma1_px * size1, m.sigma2_px * size2)
-    if m.sigma_A is None:
-        return np.asarray(~behind)
-    off = np.linalg.norm(affinity_residuals(m, essential_from_pose(pose)), axis=1) * np.sqrt(0.5)
-    return np.asarray(~behind & ~(off > sigmas * m.sigma_A))
+    sigmas = QUANTILE * max_noise
+    seen = behind_sigmas(matches, pose) <= sigmas
+    if matches.sigma_A is None:
+        return np.asarray(seen)
+    off = np.linalg.norm(affinity_residuals(matches, essential_from_pose(pose)), axis=1) * np.sqrt(0.5)
+    return np.asarray(seen & ~(off > sigmas * matches.sigma_A))
 
 
 @dataclass(frozen=True, eq=False, slots=True)

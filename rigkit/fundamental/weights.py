@@ -19,7 +19,15 @@ from rigkit.errors import InputError
 from rigkit.geometry.sampson import epipolar_normals
 from rigkit.matches import Matches
 
-__all__ = ["RowWeights", "WeightRule", "estimate_sigma_A", "initial_weights", "noise_weights", "usable_affinities"]
+__all__ = [
+    "LEAST_SIGMA_A",
+    "RowWeights",
+    "WeightRule",
+    "estimate_sigma_A",
+    "initial_weights",
+    "noise_weights",
+    "usable_affinities",
+]
 
 WeightRule = Literal["noise", "auto", "equal", "points"]
 """noise: from the sigmas of the matches (affinities without a sigma_A are ignored); auto: sigma_A estimated from the
@@ -28,6 +36,8 @@ data; equal: every row counts the same in normalised coordinates; points: affini
 MAD_TO_SIGMA = 1.4826
 START_SIGMA_A = 0.05
 """Where nothing is known of the affinities, the estimate starts from here; it is replaced by what the data say."""
+LEAST_SIGMA_A = 1e-6
+"""Exact affinities show none at all, and weights are one over it."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -6,7 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.epipolar_scenes import FISHEYE, REGULAR, board_pair, pair, pose_errors_deg, pose_of
+from helpers.epipolar_scenes import (
+    FISHEYE,
+    REGULAR,
+    board_pair,
+    pair,
+    pictures,
+    plane_in_sight,
+    pose_errors_deg,
+    pose_of,
+)
 
 from rigkit.errors import DegenerateError, InputError
 from rigkit.fundamental.pose import translation_basis
@@ -18,6 +27,10 @@ from rigkit.matches import Matches
 
 JACOBIAN_ABS = 1e-4
 """Of the largest entry: the derivative of the reprojection distance neglects second-order terms of the noise."""
+MATCH_FIELDS = (
+    *("pixels1", "pixels2", "rays1", "rays2", "jacobians1", "jacobians2", "sigma1_px", "sigma2_px"),
+    *("board_index", "grid"),
+)
 COVARIANCE_REL = 0.15
 """Standard deviations, predicted against Monte Carlo: 160 runs know one to 5.6 %."""
 
@@ -210,3 +223,46 @@ def test_one_plane_gives_both_poses_or_says_so(rng):
     assert solved > 0
     three, _ = board_pair(rng, Rigid3(exp_so3([0.05, 0.2, 0.03]), [-290.0, 30.0, 70.0]), 0.1)
     assert one_plane_poses(three) == ()
+
+
+@pytest.mark.parametrize("noise_px", [0.05, 0.3])
+def test_noise_does_not_choose_between_the_poses_of_a_plane(rng, noise_px):
+    # Each pose sees another part of the noise: their costs differ by 20 and more, which says nothing.
+    solved = 0
+    for _ in range(40):
+        m, pose = plane_in_sight(rng, noise_px)
+        try:
+            found = estimate_pose(m).cam2_from_cam1
+        except DegenerateError as error:
+            assert "one plane" in str(error)
+            continue
+        # The direction is known to about noise over parallax, 0.3 px of 250.
+        assert max(pose_errors_deg(found, pose)) < 2.0
+        solved += 1
+    # Often only one of the two poses has all of the plane in front of both cameras.
+    assert solved > 10
+
+
+def test_points_off_the_plane_choose_between_its_poses(rng):
+    for _ in range(20):
+        m, pose = plane_in_sight(rng)
+        other, _, _ = pair(rng, 30, pose=pose, noise_px=0.3)
+        both = Matches(*(np.concatenate([getattr(m, name), getattr(other, name)]) for name in MATCH_FIELDS))
+        assert max(pose_errors_deg(estimate_pose(both).cam2_from_cam1, pose)) < 1.0
+
+
+def test_a_short_baseline_is_no_reason_to_find_two_poses(rng):
+    # Nearly a plane at infinity: one of its poses can be refined into the true one mirrored, all points behind.
+    for _ in range(25):
+        X = rng.uniform([-500.0, -400.0, 800.0], [500.0, 400.0, 2000.0], (200, 3))
+        pose = Rigid3(exp_so3([0.02, 0.1, 0.03]), unit(rng.normal(size=3) * [1.0, 1.0, 0.5]) * 6.0)
+        # A parallax of 6 px, known to 0.03: the direction to a few degrees.
+        assert max(pose_errors_deg(estimate_pose(pictures(rng, X, pose)).cam2_from_cam1, pose)) < 20.0
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.1])
+@pytest.mark.parametrize("kind", ["general", "planar", "standard", "forward"])
+def test_a_pose_without_a_baseline_is_refused(rng, turn, kind):
+    X = rng.uniform([-500.0, -400.0, 800.0], [500.0, 400.0, 2000.0], (150, 3))
+    with pytest.raises(DegenerateError, match="no baseline"):
+        estimate_pose(pictures(rng, X, Rigid3(exp_so3([0.02, turn, 0.03]), np.zeros(3))), kind)

@@ -75,6 +75,26 @@ def pair(
     )
 
 
+def pictures(rng: np.random.Generator, points: np.ndarray, pose: Rigid3, noise_px: float = 0.3) -> Matches:
+    """Matches of those of the points that lie in both pictures of the regular camera."""
+    q1, q2 = (REGULAR.project(x)[0] + noise_px * rng.normal(size=(len(x), 2)) for x in (points, pose.apply(points)))
+    seen = ((q1 > 0.0) & (q2 > 0.0) & (q1 < REGULAR.size_px) & (q2 < REGULAR.size_px)).all(axis=1)
+    sigma = np.full(int(seen.sum()), max(noise_px, 1e-6))
+    return Matches.from_cameras(REGULAR, REGULAR, q1[seen], q2[seen], sigma1_px=sigma, sigma2_px=sigma)
+
+
+def plane_in_sight(rng: np.random.Generator, noise_px: float = 0.3) -> tuple[Matches, Rigid3]:
+    """Matches of one slanted plane seen from general positions, 50 to 150 of them, and the true pose."""
+    while True:
+        pose = Rigid3(exp_so3(0.1 * rng.normal(size=3)), unit(rng.normal(size=3) * [1.0, 1.0, 0.5]) * 250.0)
+        normal = unit(np.append(0.5 * rng.normal(size=2), 1.0))
+        across = rng.uniform([-500.0, -400.0], [500.0, 400.0], (150, 2))
+        depth = (1200.0 * normal[2] - across @ normal[:2]) / normal[2]
+        m = pictures(rng, np.column_stack([across, depth]), pose, noise_px)
+        if len(m) >= 50:
+            return m, pose
+
+
 BOARDS = (Board("a", 8, 6, 40.0, 40.0), Board("b", 7, 6, 40.0, 41.0), Board("c", 8, 5, 40.0, 40.0))
 
 
