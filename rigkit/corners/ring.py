@@ -24,12 +24,9 @@ import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray
 from rigkit.corners.response import FloatImage, sample
-from rigkit.native.front import RingRules
+from rigkit.native.front import HALF, RingRules
 
 __all__ = ["Rings", "arm_vectors", "may_be_corners", "read_rings", "ring_rules"]
-
-HALF = 16
-"""Samples in half a turn."""
 
 CIRCLE = np.stack([f(np.arange(2 * HALF) * (np.pi / HALF)) for f in (np.cos, np.sin)], axis=-1).astype(np.float32)
 """Where they lie on a ring of radius 1, (2 HALF, 2)."""

@@ -265,8 +265,12 @@ int64_t keep_strongest(
     float *squares, int32_t *bins, int32_t *share)
 {
     const int32_t across = (int32_t)(width / side) + 1, step = (int32_t)side;
-    for (int64_t k = 0; k < count; k++) {
-        share[k] = at[2 * k + 1] / step * across + at[2 * k] / step;
+    for (int32_t k = 0, row = -1, first = 0; k < (int32_t)count; k++) {
+        if (at[2 * k + 1] != row) {
+            row = at[2 * k + 1];
+            first = row / step * across;
+        }
+        share[k] = first + at[2 * k] / step;
         float *strongest = squares + share[k];
         *strongest = response[k] > *strongest ? response[k] : *strongest;
     }
@@ -311,21 +315,20 @@ INLINE int saddle_near(const float *smooth, int64_t width, int64_t u, int64_t v,
 INLINE int may_be_corner(
     const image_t image, const ring_rules_t *rules, float u, float v, float radius, float response)
 {
-    enum { PAIRS = MOST_HALF / 4 };
+    enum { PAIRS = HALF / 4 };
     float even[PAIRS], mean = 0.0f, energy = 0.0f, odd_energy = 0.0f;
-    const int64_t pairs = rules->half / 4;
-    for (int64_t k = 0; k < pairs; k++) {
-        const float *one = rules->circle + 8 * k, *other = one + 2 * rules->half;
+    for (int64_t k = 0; k < PAIRS; k++) {
+        const float *one = rules->circle + 8 * k, *other = one + 2 * HALF;
         const float here = brightness_at(image, u + radius * one[0], v + radius * one[1]);
         const float there = brightness_at(image, u + radius * other[0], v + radius * other[1]);
         even[k] = 0.5f * (here + there);
         mean += even[k];
         odd_energy += 0.25f * (here - there) * (here - there);
     }
-    mean /= (float)pairs;
-    for (int64_t k = 0; k < pairs; k++)
+    mean /= (float)PAIRS;
+    for (int64_t k = 0; k < PAIRS; k++)
         energy += (even[k] - mean) * (even[k] - mean);
-    const float centre = brightness_at(image, u, v) - mean, variance = energy / (float)pairs;
+    const float centre = brightness_at(image, u, v) - mean, variance = energy / (float)PAIRS;
     return odd_energy < (float)rules->quick_odd * energy &&
            centre * centre < (float)(rules->quick_centre * rules->quick_centre) * variance &&
            response < (float)rules->quick_sharp * variance;

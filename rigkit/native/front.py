@@ -18,6 +18,9 @@ __all__ = ["LinkRules", "RingRules", "corners", "links", "loaded", "near_any", "
 STRIP = 64
 """As in front.c: rows of scratch memory are longer than the image by this and a peak's neighbourhood."""
 
+HALF = 16
+"""Samples of a ring in half a turn, as in kernels.h."""
+
 WHOLE = 16.0
 """A kernel of multiples of 1/16 smooths bytes exactly in integers of 16 bits."""
 
@@ -33,7 +36,7 @@ class RingRules(Structure):
 
     _fields_: ClassVar = [
         *((name, c_void_p) for name in ("circle", "gains")),
-        *((name, c_int64) for name in ("half", "gain_count")),
+        ("gain_count", c_int64),
         *(
             (name, c_double)
             for name in ("most_odd", "most_centre", "most_cosine", "quick_odd", "quick_centre", "quick_sharp")
@@ -42,9 +45,11 @@ class RingRules(Structure):
 
     @classmethod
     def make(cls, circle: Image, gains: FloatArray, **numbers: float) -> RingRules:
-        """Return the rules; `circle` (2 * half, 2) are the samples of a ring of radius 1."""
+        """Return the rules; `circle` (2 * HALF, 2) are the samples of a ring of radius 1."""
+        if circle.shape != (2 * HALF, 2):
+            raise ValueError(f"ring of {len(circle)} samples: the kernels read {2 * HALF}, HALF in kernels.h")
         kept = np.ascontiguousarray(circle, np.float32), np.ascontiguousarray(gains, np.float64)
-        rules = cls(address(kept[0]), address(kept[1]), len(kept[0]) // 2, len(kept[1]), **numbers)
+        rules = cls(address(kept[0]), address(kept[1]), len(kept[1]), **numbers)
         rules.kept = kept
         return rules
 

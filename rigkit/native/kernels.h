@@ -50,14 +50,15 @@ INLINE float brightness_at(const image_t image, float u, float v)
 }
 
 #define PI 3.14159265358979323846
-#define MOST_HALF 32
+/* Samples of a ring in half a turn (corners.ring): known here, the loops over them need no counting. */
+enum { HALF = 16, TURN = 2 * HALF };
 
-/* How rings are read (corners.ring): `circle` holds the (u, v) of `half` samples in half a turn and of their opposites;
+/* How rings are read (corners.ring): `circle` holds the (u, v) of HALF samples in half a turn and of their opposites;
  * `gains` R_2 / R_4 over the ratio of harmonic 2 at half the radius to that on the ring, from 1/4 to 1. */
 typedef struct {
     const float *circle;
     const double *gains;
-    int64_t half, gain_count;
+    int64_t gain_count;
     double most_odd, most_centre, most_cosine, quick_odd, quick_centre, quick_sharp;
 } ring_rules_t;
 
@@ -65,18 +66,17 @@ typedef struct {
 INLINE void ring_angles(
     const image_t image, const ring_rules_t *rules, float u, float v, float radius, const float *even, double angles[2])
 {
-    const int64_t half = rules->half, turn = 2 * half;
     const float *circle = rules->circle;
     float second_u = 0.0f, second_v = 0.0f, fourth_u = 0.0f, fourth_v = 0.0f, inner_u = 0.0f, inner_v = 0.0f;
-    for (int64_t k = 0; k < half; k++) {
-        const float *two = circle + 2 * (2 * k % turn), *four = circle + 2 * (4 * k % turn);
+    for (int64_t k = 0; k < HALF; k++) {
+        const float *two = circle + 2 * (2 * k % TURN), *four = circle + 2 * (4 * k % TURN);
         second_u += even[k] * two[0];
         second_v -= even[k] * two[1];
         fourth_u += even[k] * four[0];
         fourth_v -= even[k] * four[1];
     }
-    for (int64_t k = 0; k < turn; k += 2) {
-        const float *two = circle + 2 * (2 * k % turn);
+    for (int64_t k = 0; k < TURN; k += 2) {
+        const float *two = circle + 2 * (2 * k % TURN);
         const float part_u = 0.5f * radius * circle[2 * k], part_v = 0.5f * radius * circle[2 * k + 1];
         const float here = brightness_at(image, u + part_u, v + part_v);
         inner_u += here * two[0];
@@ -103,17 +103,16 @@ INLINE void ring_angles(
 }
 
 /* Return whether the ring around (u, v) is that of a chessboard corner; if so, its two angles and its contrast
- * (corners.ring.read_rings). At most MOST_HALF samples in half a turn. */
+ * (corners.ring.read_rings). */
 INLINE int read_ring(
     const image_t image, const ring_rules_t rules, float u, float v, float radius, double angles[2], double *contrast)
 {
-    float ring[2 * MOST_HALF], even[MOST_HALF], right[2 * MOST_HALF], below[2 * MOST_HALF];
-    int32_t at[2 * MOST_HALF];
-    const int64_t half = rules.half;
+    float ring[TURN], even[HALF], right[TURN], below[TURN];
+    int32_t at[TURN];
     const int32_t width = (int32_t)image.width, height = (int32_t)image.height;
     const float most_u = (float)(width - 1), most_v = (float)(height - 1);
     /* As brightness_at, but first all places, which vectorises, then all reads. */
-    for (int64_t k = 0; k < 2 * half; k++) {
+    for (int64_t k = 0; k < TURN; k++) {
         float sample_u = u + radius * rules.circle[2 * k], sample_v = v + radius * rules.circle[2 * k + 1];
         sample_u = sample_u > 0.0f ? sample_u : 0.0f;
         sample_v = sample_v > 0.0f ? sample_v : 0.0f;
@@ -126,22 +125,22 @@ INLINE int read_ring(
         below[k] = sample_v - (float)top;
         at[k] = top * width + left;
     }
-    for (int64_t k = 0; k < 2 * half; k++) {
+    for (int64_t k = 0; k < TURN; k++) {
         const float *upper = image.brightness + at[k], *lower = upper + width;
         const float above = upper[0] + right[k] * (upper[1] - upper[0]);
         ring[k] = above + below[k] * (lower[0] + right[k] * (lower[1] - lower[0]) - above);
     }
     float low = 1e30f, high = -1e30f, mean = 0.0f, odd_energy = 0.0f, energy = 0.0f;
-    for (int64_t k = 0; k < half; k++)
-        even[k] = 0.5f * (ring[k] + ring[half + k]);
-    for (int64_t k = 0; k < half; k++) {
+    for (int64_t k = 0; k < HALF; k++)
+        even[k] = 0.5f * (ring[k] + ring[HALF + k]);
+    for (int64_t k = 0; k < HALF; k++) {
         low = even[k] < low ? even[k] : low;
         high = even[k] > high ? even[k] : high;
         mean += even[k];
     }
-    mean /= (float)half;
-    for (int64_t k = 0; k < half; k++) {
-        const float odd = 0.5f * (ring[k] - ring[half + k]);
+    mean /= (float)HALF;
+    for (int64_t k = 0; k < HALF; k++) {
+        const float odd = 0.5f * (ring[k] - ring[HALF + k]);
         odd_energy += odd * odd;
         energy += (even[k] - mean) * (even[k] - mean);
     }
@@ -151,8 +150,8 @@ INLINE int read_ring(
         return 0;
     const float middle = 0.5f * (low + high);
     int64_t rises = 0;
-    for (int64_t k = 0; k < half; k++)
-        rises += even[k + 1 < half ? k + 1 : 0] > middle && !(even[k] > middle);
+    for (int64_t k = 0; k < HALF; k++)
+        rises += even[k + 1 < HALF ? k + 1 : 0] > middle && !(even[k] > middle);
     if (rises != 1)
         return 0;
     ring_angles(image, &rules, u, v, radius, even, angles);
