@@ -82,6 +82,11 @@ class MatchedPair:
         noise = DirectionNoise(self.noise.covariance1 * factor**2, self.noise.covariance2 * factor**2)
         return replace(self, captured=scaled(self.captured), matches=scaled(self.matches), noise=noise)
 
+    def in_chain(self, chain: Chain, *, support: Support = "patch", window: int | None = 2) -> MatchedPair:
+        """Return the same corners, told apart as they are, in the coordinates of another chain; see `match_pair`."""
+        both = (self.camera1, self.camera2)
+        return _matched(self.pair_id, *both, self.boards, self.identity, chain, support, window)
+
 
 def match_pair(
     pair_id: str,
@@ -132,6 +137,20 @@ def match_pair(
         if len(fitting) > 1:
             said += f", which {len(fitting)} ways to name the boards fit: the one with the fewest changes was taken"
         identity = replace(identity, notes=(*before.notes, f"{said}; a layout would say for certain which is which"))
+    return _matched(pair_id, camera1, camera2, boards, identity, chain, support, window)
+
+
+def _matched(
+    pair_id: str,
+    camera1: Camera,
+    camera2: Camera,
+    boards: Sequence[Board],
+    identity: PairIdentity,
+    chain: Chain,
+    support: Support,
+    window: int | None,
+) -> MatchedPair:
+    """Match the corners of boards told apart, and take directions; else as `match_pair`."""
     pairs, unseen = _with_rays(identity.pairs(), camera1, camera2)
     if not pairs:
         reasons = "; ".join(f"{name}: {why}" for name, why in identity.missing.items())

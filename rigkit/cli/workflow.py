@@ -266,11 +266,8 @@ def shifts_of(reconstruction: Reconstruction, camera1: LoadedCamera, camera2: Lo
 
 def reconstruct_other_chain(matched: MatchedPair, pair: Pair) -> Reconstruction | None:
     """Reconstruct the same corners in the other pixels (raw or rectified); None where they do not fit."""
-    identity = matched.identity
-    other = "rectified" if matched.chain == "raw" else "raw"
     try:
-        again = match_found(pair, matched.camera1, matched.camera2, identity.detections1, identity.detections2, other)
-        return reconstruct_with(again, pair, "3SDIR")
+        return reconstruct_with(matched.in_chain("rectified" if matched.chain == "raw" else "raw"), pair, "3SDIR")
     except DegenerateError:
         return None
 
