@@ -7,7 +7,7 @@ likelihood refines the pose; rays are intersected optimally, affinities give nor
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -24,7 +24,7 @@ from rigkit.boards import Board
 from rigkit.cameras.base import Camera
 from rigkit.cloud import OrientedCloud
 from rigkit.errors import DegenerateError
-from rigkit.fundamental.metric import metric_pose, triangulate_matches
+from rigkit.fundamental.metric import MetricPose, metric_pose, triangulate_matches
 from rigkit.fundamental.pose import choose_pose, essential_from_pose
 from rigkit.fundamental.refine import RefinedPose, refine_pose
 from rigkit.fundamental.registry import fundamental_for
@@ -45,6 +45,9 @@ MAX_BASELINE_SIGMA = 0.2
 
 NOTABLE_SCATTER = 2.0
 """Corners that scatter this many times more than predicted are worth a word: blur, JPEG, a bad calibration."""
+
+SAME_COST = 1e-9
+"""Costs that differ by less than this part are one minimum, reached from two sides."""
 
 GREY = 160
 
@@ -141,34 +144,17 @@ def _reconstruct(
     scale: str,
     image1: NDArray[np.generic] | None,
 ) -> Reconstruction:
-    notes = list(pair.notes)
-    by_points = fundamental_for(PoseType.GENERAL).solve(pair.matches)
-    pose_type, level_sigma_rad, remark = decide_pose_type(pair.captured, pose_type, level_sigma_rad)
-    notes += remark
-    affinities = _affinities(pair, affine_method, by_points.E21, scale)
+    known = _known_by_points(pair, pose_type, level_sigma_rad)
+    pose_type, level_sigma_rad = known.pose_type, known.level_sigma_rad
+    affinities = _affinities(pair, affine_method, known.E21, scale)
     matches = pair.matches.with_affinities(affinities.A21, affinities.sigma_A)
     # Affinities computed from an epipolar geometry satisfy it exactly: estimating it from them again is circular.
     rule: WeightRule = "points" if needs_epipolar(affine_method) else "noise"
-    refined = _likeliest_pose(pair, matches, rule, by_points.E21, pose_type, level_sigma_rad)
-    scatter = float(np.sqrt(refined.variance_factor))
-    if scatter > 1.0:
-        # The corners miss the epipolar geometry by more than their sigmas promise: believe what is seen.
-        pair = pair.noisier(scatter)
-        affinities = _affinities(pair, affine_method, by_points.E21, scale)
-        matches = pair.matches.with_affinities(affinities.A21, affinities.sigma_A)
-        refined = refine_pose(pair.captured, refined.cam2_from_cam1, pose_type, level_sigma_rad)
-    if scatter > NOTABLE_SCATTER:
-        notes.append(f"corners scatter {scatter:.1f} times as much as predicted; all sigmas were enlarged to match")
-    metric = metric_pose(pair.captured, refined.cam2_from_cam1, refined.covariance, pair.boards)
-    if metric.baseline_sigma_mm > MAX_BASELINE_SIGMA * metric.baseline_mm:
-        raise DegenerateError(
-            f"the baseline is {metric.baseline_mm:.2f} mm, known to no better than {metric.baseline_sigma_mm:.2f} mm: "
-            "too short for these boards; move the camera further between the images"
-        )
+    pair, refined, metric, remarks = _metric(pair, _likeliest_pose(pair, matches, rule, known), known)
+    notes = [*pair.notes, *known.remarks, *remarks]
     E21 = essential_from_pose(metric.cam2_from_cam1)
-    if needs_epipolar(affine_method):
-        affinities = _affinities(pair, affine_method, E21, scale)
-        matches = pair.matches.with_affinities(affinities.A21, affinities.sigma_A)
+    affinities = _affinities(pair, affine_method, E21, scale)
+    matches = pair.matches.with_affinities(affinities.A21, affinities.sigma_A)
     affines: Callable[[EpipolarNormals], Affines] | None = None
     if needs_epipolar(affine_method):
 
@@ -242,14 +228,51 @@ def decide_pose_type(
     return declared, level or None, () if contradiction is None else (contradiction,)
 
 
-def _likeliest_pose(
-    pair: MatchedPair,
-    matches: Matches,
-    rule: WeightRule,
-    by_points: Mat3,
-    pose_type: PoseType,
-    level_sigma_rad: float | None,
-) -> RefinedPose:
+@dataclass(frozen=True, eq=False, slots=True)
+class _Known:
+    """What the points of a pair say without any affinity.
+
+    Attributes
+    ----------
+    E21 : (3, 3) linear solution.
+    pose_type, level_sigma_rad, remarks : see `decide_pose_type`.
+    ends : of the refinement, from the linear solution and from the pose by which the boards were told apart.
+    failure : why a start led nowhere.
+    """
+
+    E21: Mat3
+    pose_type: PoseType
+    level_sigma_rad: float | None
+    remarks: tuple[str, ...]
+    ends: tuple[RefinedPose, ...]
+    failure: DegenerateError | None
+
+
+@lru_cache(maxsize=4)
+def _known_by_points(pair: MatchedPair, pose_type: PoseType, level_sigma_rad: float | None) -> _Known:
+    """Remembered, as in `decide_pose_type`: the answer is the same for every affine estimator."""
+    m = pair.matches
+    E21 = fundamental_for(PoseType.GENERAL).solve(m).E21
+    pose_type, level_sigma_rad, remarks = decide_pose_type(pair.captured, pose_type, level_sigma_rad)
+    starts = (lambda: choose_pose(E21, m.rays1, m.rays2), lambda: pair.identity.cam2_from_cam1)
+    return _Known(E21, pose_type, level_sigma_rad, remarks, *_ends(pair, starts, pose_type, level_sigma_rad))
+
+
+def _ends(
+    pair: MatchedPair, starts: Iterable[Callable[[], Rigid3]], pose_type: PoseType, level_sigma_rad: float | None
+) -> tuple[tuple[RefinedPose, ...], DegenerateError | None]:
+    """Return the ends of the refinement from every start that can be refined, and the first reason why one cannot."""
+    ends: list[RefinedPose] = []
+    failure: DegenerateError | None = None
+    for start in starts:
+        try:
+            ends.append(refine_pose(pair.captured, start(), pose_type, level_sigma_rad))
+        except DegenerateError as error:
+            failure = failure or error
+    return tuple(ends), failure
+
+
+def _likeliest_pose(pair: MatchedPair, matches: Matches, rule: WeightRule, known: _Known) -> RefinedPose:
     """Return the pose of maximum likelihood among the ends of the refinement from every start there is.
 
     The linear solution of a pose type holds it exactly: where a level is off by half a degree and the corners are good,
@@ -257,22 +280,37 @@ def _likeliest_pose(
     """
 
     def of_type() -> Rigid3:
-        estimate = fundamental_for(pose_type).solve(matches, rule)
-        return choose_pose(estimate.E21, matches.rays1, matches.rays2, pose_type)
+        estimate = fundamental_for(known.pose_type).solve(matches, rule)
+        return choose_pose(estimate.E21, matches.rays1, matches.rays2, known.pose_type)
 
-    def general() -> Rigid3:
-        return choose_pose(by_points, matches.rays1, matches.rays2)
+    ends, failure = _ends(pair, [of_type], known.pose_type, known.level_sigma_rad)
+    if not (*known.ends, *ends):
+        raise failure or known.failure or DegenerateError("no pose found")
+    best = min((*known.ends, *ends), key=lambda end: end.cost)
+    # In one valley all starts end alike, and estimators that do share what follows.
+    return next(end for end in (*known.ends, *ends) if end.cost <= best.cost * (1.0 + SAME_COST))
 
-    ends: list[RefinedPose] = []
-    failure: DegenerateError | None = None
-    for start in (of_type, general, lambda: pair.identity.cam2_from_cam1):
-        try:
-            ends.append(refine_pose(pair.captured, start(), pose_type, level_sigma_rad))
-        except DegenerateError as error:
-            failure = failure or error
-    if not ends:
-        raise failure or DegenerateError("no pose found")
-    return min(ends, key=lambda end: end.cost)
+
+@lru_cache(maxsize=4)
+def _metric(
+    pair: MatchedPair, refined: RefinedPose, known: _Known
+) -> tuple[MatchedPair, RefinedPose, MetricPose, tuple[str, ...]]:
+    """Return the pair with sigmas that fit what is seen, its pose, the pose in mm, and what there is to say of it."""
+    notes: tuple[str, ...] = ()
+    scatter = float(np.sqrt(refined.variance_factor))
+    if scatter > 1.0:
+        # The corners miss the epipolar geometry by more than their sigmas promise: believe what is seen.
+        pair = pair.noisier(scatter)
+        refined = refine_pose(pair.captured, refined.cam2_from_cam1, known.pose_type, known.level_sigma_rad)
+    if scatter > NOTABLE_SCATTER:
+        notes = (f"corners scatter {scatter:.1f} times as much as predicted; all sigmas were enlarged to match",)
+    metric = metric_pose(pair.captured, refined.cam2_from_cam1, refined.covariance, pair.boards)
+    if metric.baseline_sigma_mm > MAX_BASELINE_SIGMA * metric.baseline_mm:
+        raise DegenerateError(
+            f"the baseline is {metric.baseline_mm:.2f} mm, known to no better than {metric.baseline_sigma_mm:.2f} mm: "
+            "too short for these boards; move the camera further between the images"
+        )
+    return pair, refined, metric, notes
 
 
 def _affinities(pair: MatchedPair, method: str, E21: Mat3, scale: str) -> Affinities:
