@@ -8,7 +8,7 @@ import pytest
 
 from rigkit.boards import Board
 from rigkit.errors import DegenerateError, InputError
-from rigkit.geometry.board_pose import board_pose, board_poses, ray_residuals, tangent_bases
+from rigkit.geometry.board_pose import board_pose, board_poses, moved_board_poses, ray_residuals, tangent_bases
 from rigkit.geometry.rotation import exp_so3, log_so3, rotation_angle, unit
 
 EXACT_ROTATION_RAD = 1e-9
@@ -45,6 +45,25 @@ def test_exact_everywhere_round_the_camera(rng: np.random.Generator) -> None:
         assert error < EXACT_TRANSLATION_REL * np.linalg.norm(translation)
         behind += bool((rays[:, 2] < 0.0).all())
     assert behind > 20
+
+
+def test_rays_that_moved_give_the_poses_that_each_gives_alone(rng: np.random.Generator) -> None:
+    checked = 0
+    for _ in range(10):
+        rotation, translation = random_pose(rng)
+        noise = 1e-3 * rng.normal(size=(5, 48, 3))
+        rays = unit(unit(BOARD.points() @ rotation.T + translation) + noise)
+        alone = [board_pose(f, BOARD.points()) for f in rays]
+        together = moved_board_poses(rays, BOARD.points(), alone[0].cam_from_board)
+        for one, other in zip(together, alone, strict=True):
+            if other.rms_rad < one.rms_rad * (1.0 - 1e-9):
+                # From afar both tilts fit: alone, the better one is taken, together the one to start from.
+                continue
+            assert one.cam_from_board.allclose(other.cam_from_board, rotation_tol=1e-7, translation_tol_mm=1e-3)
+            np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-4, atol=1e-12)
+            assert one.rms_rad == pytest.approx(other.rms_rad, rel=1e-9)
+            checked += 1
+    assert checked >= 45
 
 
 def test_rays_wider_apart_than_a_right_angle() -> None:
