@@ -12,7 +12,7 @@ from rigkit.errors import DegenerateError
 from rigkit.truth import Feature
 from rigkit.validation.planes import NormalErrors, Plane, fit_moved, fit_plane, normal_errors
 
-__all__ = ["BoardResult", "Lattice", "fit_lattice", "measure_board"]
+__all__ = ["BoardResult", "Lattice", "Placed", "fit_lattice", "measure_board", "place_moved"]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -34,6 +34,29 @@ class Lattice:
         """Return the point (3,) at (column, row), mm, and its covariance (3, 3)."""
         row = np.array([1.0, *np.asarray(place, dtype=np.float64)])
         return row @ self.steps_mm, self.scatter_mm2 * float(row @ self.cofactor @ row)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Placed:
+    """Where a board is: once, or for each of several (...) ways in which its points moved.
+
+    Attributes
+    ----------
+    normal, offset_mm : (..., 3) and (...), of its plane.
+    steps_mm : (..., 3, 3), of its lattice.
+    """
+
+    normal: Normals
+    offset_mm: FloatArray
+    steps_mm: Mat3
+
+    def at(self, place: FloatArray) -> Points:
+        """Return the points (..., 3) at (column, row), mm."""
+        return np.asarray(np.array([1.0, *place]) @ self.steps_mm)
+
+    def distances(self, points: Points) -> FloatArray:
+        """Return the signed distances (...) of points (..., 3) from the plane, mm."""
+        return np.asarray(np.sum(points * self.normal, axis=-1) - self.offset_mm)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -60,6 +83,11 @@ class BoardResult:
     skew_deg: float
     right_handed: bool
 
+    @property
+    def placed(self) -> Placed:
+        """Where the board is."""
+        return Placed(self.plane.normal, np.asarray(self.plane.offset_mm), self.lattice.steps_mm)
+
     def feature(self, feature: Feature) -> tuple[FloatArray, Mat3]:
         """Return where a corner or the centre lies (3,), mm, and its covariance (3, 3) from the corners' scatter."""
         return self.lattice.at(self.place(feature))
@@ -76,12 +104,25 @@ def fit_lattice(points_mm: Points, grid: IntArray) -> Lattice:
 
     Raises DegenerateError where the corners lie in one row or column, or are fewer than four.
     """
-    design = np.concatenate([np.ones((len(grid), 1)), grid], axis=1)
+    design = _design(grid)
     if len(grid) < 4 or np.linalg.matrix_rank(design) < 3:
         raise DegenerateError(f"board: {len(grid)} corners in one line do not fix its frame; more of it must be seen")
     steps, *_ = np.linalg.lstsq(design, points_mm, rcond=None)
     residuals = points_mm - design @ steps
-    return Lattice(steps, residuals.T @ residuals / (len(grid) - 3), np.linalg.inv(design.T @ design))
+    scatter = np.asarray(residuals.T @ residuals / (len(grid) - 3))
+    return Lattice(np.asarray(steps), scatter, np.asarray(np.linalg.inv(design.T @ design)))
+
+
+def _design(grid: IntArray) -> FloatArray:
+    return np.concatenate([np.ones((len(grid), 1)), grid], axis=1)
+
+
+def place_moved(points_mm: Points, grid: IntArray, like: Plane) -> Placed:
+    """Return where a board is for points (M, N, 3): M times those that `like` was fitted to, moved a little."""
+    used = points_mm[:, like.used]
+    many = np.swapaxes(used, 0, 1).reshape(used.shape[1], -1)
+    steps, *_ = np.linalg.lstsq(_design(grid[like.used]), many, rcond=None)
+    return Placed(*fit_moved(points_mm, like), np.swapaxes(steps.reshape(3, len(used), 3), 0, 1))
 
 
 def measure_board(
@@ -91,17 +132,16 @@ def measure_board(
     grid: IntArray,
     covariance_mm2: FloatArray | None = None,
     common_mm: FloatArray | None = None,
-    like: Plane | None = None,
 ) -> BoardResult:
     """Return plane, lattice and normal errors of one board's points (N, 3), normals (N, 3) and grid (N, 2).
 
-    `covariance_mm2` and `common_mm` as in `fit_plane`; with `like`, the points are those of that plane, moved a little.
-    Points that the plane leaves out take no part in the lattice either; all normals are judged.
+    `covariance_mm2` and `common_mm` as in `fit_plane`. Points that the plane leaves out take no part in the lattice
+    either; all normals are judged.
 
     Raises DegenerateError where too few corners are left; the message names the board.
     """
     try:
-        plane = fit_plane(points_mm, covariance_mm2, common_mm) if like is None else fit_moved(points_mm, like)
+        plane = fit_plane(points_mm, covariance_mm2, common_mm)
         lattice = fit_lattice(points_mm[plane.used], grid[plane.used])
     except DegenerateError as error:
         raise DegenerateError(f"board '{board.board_id}': {error}") from error

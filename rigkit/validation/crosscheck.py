@@ -26,7 +26,7 @@ from rigkit.validation.colmap_way import colmap_reconstruction
 from rigkit.validation.intrinsics import CalibrationShifts
 from rigkit.validation.measure import Measured, measure
 from rigkit.validation.planes import face_angle, fit_moved
-from rigkit.validation.pnp import planar_pnp
+from rigkit.validation.pnp import AnglesDeg, moved_pnp, planar_pnp
 
 __all__ = ["CrossCheckReport", "OtherWay", "compare_chains", "crosscheck"]
 
@@ -36,8 +36,6 @@ OTHER_CHAIN = "other chain"
 CROSS_COVERAGE = 4.0
 """A data set of eight pairs makes a hundred and fifty comparisons: at four sigmas one such data set in a hundred has a
 false alarm, at three every third, at two each."""
-
-Angles = dict[tuple[str, str], tuple[float, float]]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -63,7 +61,7 @@ class OtherWay:
     rotation_difference_deg: float
     direction_difference_deg: float
     baseline_mm: float
-    angles_deg: Angles
+    angles_deg: AnglesDeg
     rms_px: float
     used: int
     excluded: int
@@ -252,7 +250,7 @@ def _way(
     reconstruction: Reconstruction,
     pose: Rigid3,
     covariance: FloatArray,
-    angles: Angles,
+    angles: AnglesDeg,
     rms_px: float,
     used: int,
     excluded: int,
@@ -264,7 +262,7 @@ def _way(
     return OtherWay(name, pose, covariance, turn, direction, baseline, angles, rms_px, used, excluded)
 
 
-def _angles(measured: Measured) -> Angles:
+def _angles(measured: Measured) -> AnglesDeg:
     return {two: measured.angle_deg(*two) for two in combinations(measured.boards, 2)}
 
 
@@ -308,33 +306,27 @@ def _checks(
 def _apart(measured: Measured, shifts: CalibrationShifts) -> dict[str, float]:
     """Return how far the calibrations' uncertainty moves our quantities and those of planar PnP apart, one sigma."""
 
-    def differences(moved: Reconstruction) -> dict[str, FloatArray]:
-        pnp = planar_pnp(moved)
+    every = (shifts.base, *shifts.moved)
+    cloud, boards = shifts.base.cloud, shifts.base.boards
+    points = np.array([moved.cloud.points_mm for moved in every])
+    normals = {}
+    for index, board in enumerate(boards):
+        if board.board_id in measured.boards:
+            like = measured.boards[board.board_id].plane
+            normals[board.board_id], _ = fit_moved(points[:, cloud.board_index == index], like)
+    rows: list[dict[str, FloatArray]] = []
+    for m, (moved, (pose, angles_deg)) in enumerate(zip(every, moved_pnp(every), strict=True)):
         ours = moved.cam2_from_cam1
-        out = {
-            "rotation": log_so3(pnp.cam2_from_cam1.rotation @ ours.rotation.T),
-            "translation direction": unit(pnp.cam2_from_cam1.translation_mm) - unit(ours.translation_mm),
+        row = {
+            "rotation": log_so3(pose.rotation @ ours.rotation.T),
+            "translation direction": unit(pose.translation_mm) - unit(ours.translation_mm),
         }
-        normals = _moved_normals(measured, moved)
-        for (a, b), (value, _) in pnp.angles_deg.items():
-            out[f"angle {a}-{b}"] = np.array([face_angle(normals[a], normals[b]) - np.deg2rad(value)])
-        out = {name: np.rad2deg(value) for name, value in out.items()}
-        baseline = float(np.linalg.norm(pnp.cam2_from_cam1.translation_mm))
-        return out | {"baseline": np.array([moved.baseline_mm - baseline])}
-
-    base = differences(shifts.base)
-    squares = dict.fromkeys(base, 0.0)
-    for moved in shifts.moved:
-        for name, value in differences(moved).items():
-            squares[name] += float(np.sum((value - base[name]) ** 2))
-    return {name: float(np.sqrt(square)) for name, square in squares.items()}
-
-
-def _moved_normals(measured: Measured, moved: Reconstruction) -> dict[str, FloatArray]:
-    """Return the boards' normals in a reconstruction that moved a little, its planes weighted as those `measured`."""
-    cloud, boards = moved.cloud, moved.boards
-    points = {board.board_id: cloud.points_mm[cloud.board_index == index] for index, board in enumerate(boards)}
-    return {name: fit_moved(points[name], found.plane).normal for name, found in measured.boards.items()}
+        for (a, b), (value, _) in angles_deg.items():
+            row[f"angle {a}-{b}"] = face_angle(normals[a][m], normals[b][m]) - np.deg2rad(value)
+        row = {name: np.rad2deg(value) for name, value in row.items()}
+        rows.append(row | {"baseline": np.asarray(moved.baseline_mm - np.linalg.norm(pose.translation_mm))})
+    base, *others = rows
+    return {name: float(np.sqrt(sum(np.sum((row[name] - base[name]) ** 2) for row in others))) for name in base}
 
 
 def _pose_sigmas(pose: Rigid3, covariance: FloatArray) -> tuple[float, float, float]:

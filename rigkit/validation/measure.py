@@ -9,7 +9,7 @@ counted with them, not with the scatter.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +20,7 @@ from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.triangulation import point_covariances, triangulate_rays
 from rigkit.reconstruct import Reconstruction
 from rigkit.truth import MeasuredDistance
-from rigkit.validation.boards import BoardResult, measure_board
+from rigkit.validation.boards import BoardResult, Placed, measure_board, place_moved
 from rigkit.validation.intrinsics import CalibrationShifts, principal_axes
 from rigkit.validation.planes import angle_jacobian, face_angle
 
@@ -40,17 +40,17 @@ class Measured:
     Attributes
     ----------
     boards : by id, in the order of the reconstruction.
-    shaken : for each of the six pose parameters (rotation rad, translation mm) the boards after a small step forward
-        and backward, and the step.
+    moved : the same boards after a small step forward in each pose parameter (rotation rad, translation mm), after a
+        step backward in each, and estimated again: first with the calibrations as they are, then moved along each
+        principal axis of their covariance. Without these covariances the steps or the new estimates are left out.
+    steps : (6,) of the pose parameters, or empty.
     pose_covariance : (6, 6), or None: then only the scatter counts.
-    shifted : the boards estimated again, first with the calibrations as they are, then moved along each principal axis
-        of their covariance; empty where that is not known.
     """
 
     boards: Boards
-    shaken: tuple[tuple[Boards, Boards, float], ...]
+    moved: Mapping[str, Placed]
+    steps: FloatArray
     pose_covariance: FloatArray | None
-    shifted: tuple[Boards, ...] = ()
 
     def absent(self, *board_ids: str) -> str:
         """Return in words which of the boards were not reconstructed; empty if all were."""
@@ -66,25 +66,25 @@ class Measured:
         one, two = self.boards[a].plane, self.boards[b].plane
         by_a, by_b = angle_jacobian(one.normal, two.normal)
         scatter = by_a @ one.normal_covariance @ by_a + by_b @ two.normal_covariance @ by_b
-        common = self._common_variance(lambda boards: face_angle(boards[a].plane.normal, boards[b].plane.normal))
+        common = self._common_variance(face_angle(self.moved[a].normal, self.moved[b].normal))
         return float(np.rad2deg(face_angle(one.normal, two.normal))), float(np.rad2deg(np.sqrt(scatter + common)))
 
     def distance_mm(self, distance: MeasuredDistance) -> tuple[float, float]:
         """Return a distance between features and its sigma, mm."""
         scatter = _distance_scatter(self.boards, distance)
-        common = self._common_variance(lambda boards: _distance(boards, distance))
-        return _distance(self.boards, distance), float(np.sqrt(scatter + common))
+        common = self._common_variance(_distance(self.boards, self.moved, distance))
+        found = _distance(self.boards, {name: board.placed for name, board in self.boards.items()}, distance)
+        return float(found), float(np.sqrt(scatter + common))
 
-    def _common_variance(self, quantity: Callable[[Boards], float]) -> float:
-        """Return the variance from what moves all points together: the pose, and the calibrations."""
+    def _common_variance(self, moved: FloatArray) -> float:
+        """Return the variance from what moves all points together, pose and calibrations, from values as `moved`."""
+        count = len(self.steps)
+        ahead, back, shifted = np.split(moved, [count, 2 * count])
         variance = 0.0
         if self.pose_covariance is not None:
-            slope = np.array([(quantity(ahead) - quantity(back)) / (2.0 * step) for ahead, back, step in self.shaken])
+            slope = (ahead - back) / (2.0 * self.steps)
             variance += float(slope @ self.pose_covariance @ slope)
-        if self.shifted:
-            base, *moved = (quantity(boards) for boards in self.shifted)
-            variance += float(sum((value - base) ** 2 for value in moved))
-        return variance
+        return variance + float(np.sum((shifted[1:] - shifted[:1]) ** 2))
 
 
 def measure(reconstruction: Reconstruction, shifts: CalibrationShifts | None = None) -> Measured:
@@ -108,34 +108,19 @@ def measure(reconstruction: Reconstruction, shifts: CalibrationShifts | None = N
     by_pose = () if reconstruction.pose_covariance is None else points_by_pose(reconstruction)
     common = _common_moves(reconstruction, by_pose, shifts)
 
-    def boards_of(points: Points, as_in: Boards | None = None) -> Boards:
-        out: Boards = {}
-        for index, board in enumerate(reconstruction.boards):
-            on = cloud.board_index == index
-            if on.any():
-                out[board.board_id] = measure_board(
-                    board,
-                    points[on],
-                    cloud.normals[on],
-                    cloud.grid[on],
-                    covariance[on] if usable else None,
-                    common[:, on],
-                    None if as_in is None else as_in[board.board_id].plane,
-                )
-        return out
-
-    found = boards_of(cloud.points_mm)
-    shaken = [
-        (boards_of(cloud.points_mm + motion, found), boards_of(cloud.points_mm - motion, found), step)
-        for motion, step in by_pose
-    ]
-    shifted = () if shifts is None else (shifts.base, *shifts.moved)
-    return Measured(
-        found,
-        tuple(shaken),
-        reconstruction.pose_covariance,
-        tuple(boards_of(moved.cloud.points_mm, found) for moved in shifted),
-    )
+    ahead, back = ([cloud.points_mm + sign * motion for motion, _ in by_pose] for sign in (1.0, -1.0))
+    again = [] if shifts is None else [moved.cloud.points_mm for moved in (shifts.base, *shifts.moved)]
+    points = np.array([*ahead, *back, *again]).reshape(-1, len(cloud), 3)
+    boards: Boards = {}
+    moved: dict[str, Placed] = {}
+    for index, board in enumerate(reconstruction.boards):
+        on = cloud.board_index == index
+        if on.any():
+            seen = (cloud.points_mm[on], cloud.normals[on], cloud.grid[on])
+            found = measure_board(board, *seen, covariance[on] if usable else None, common[:, on])
+            boards[board.board_id] = found
+            moved[board.board_id] = place_moved(points[:, on], cloud.grid[on], found.plane)
+    return Measured(boards, moved, np.array([step for _, step in by_pose]), reconstruction.pose_covariance)
 
 
 def points_by_pose(reconstruction: Reconstruction) -> tuple[tuple[FloatArray, float], ...]:
@@ -177,15 +162,15 @@ def _common_moves(
     return np.concatenate(moves)
 
 
-def _distance(boards: Boards, distance: MeasuredDistance) -> float:
+def _distance(boards: Boards, placed: Mapping[str, Placed], distance: MeasuredDistance) -> FloatArray:
+    """Return a distance (...), mm, between features of `boards` that are where `placed` says."""
     a, b = distance.a, distance.b
     if a.is_plane:
         a, b = b, a
-    point, _ = boards[a.board_id].feature(a)
+    point = placed[a.board_id].at(boards[a.board_id].place(a))
     if b.is_plane:
-        return abs(float(boards[b.board_id].plane.distances(point)))
-    other, _ = boards[b.board_id].feature(b)
-    return float(np.linalg.norm(point - other))
+        return np.abs(placed[b.board_id].distances(point))
+    return np.asarray(np.linalg.norm(point - placed[b.board_id].at(boards[b.board_id].place(b)), axis=-1))
 
 
 def _distance_scatter(boards: Boards, distance: MeasuredDistance) -> float:

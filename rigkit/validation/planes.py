@@ -151,25 +151,32 @@ def fit_plane(
     return replace(_plane(points[used], weights, noise, used), gross=gross)
 
 
-def fit_moved(points_mm: Points, like: Plane) -> Plane:
-    """Return the plane of points (N, 3) that moved a little since `like` was fitted to them, with its weights."""
-    moved = _plane(np.asarray(points_mm)[like.used], like.weights, like.noise_mm2, like.used)
-    return replace(moved, gross=like.gross)
+def fit_moved(points_mm: Points, like: Plane) -> tuple[Normals, FloatArray]:
+    """Return the normal (..., 3) and the offset (...), mm, of the plane of points (..., N, 3).
+
+    They are those that `like` was fitted to, moved a little, and keep their weights.
+    """
+    centroid, axes = _principal(np.asarray(points_mm)[..., like.used, :], like.weights)
+    normal = _facing(axes[..., 0], centroid)
+    return normal, np.asarray(np.sum(normal * centroid, axis=-1))
 
 
 def _principal(points: Points, weights: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
-    """Return centroid and principal axes (columns, the normal first) of points that have `weights` summing to one."""
-    n = len(points)
+    """Return centroid and principal axes (columns, the normal first) of points (..., N, 3).
+
+    Their `weights` (N,) sum to one; without, all points are alike, and there is one set (N, 3) of them.
+    """
+    n = points.shape[-2]
     if n < MIN_POINTS:
         raise DegenerateError(f"plane: {n} points; at least {MIN_POINTS} are needed to fit one and judge it")
     if weights is None:
         centroid, scatter = mean_and_covariance(points)
     else:
         centroid = weights @ points
-        offsets = points - centroid
-        scatter = np.einsum("n,ni,nj->ij", weights, offsets, offsets)
+        offsets = points - centroid[..., None, :]
+        scatter = np.swapaxes(offsets, -1, -2) @ (weights[:, None] * offsets)
     values, axes = np.linalg.eigh(scatter)
-    if values[1] < MIN_WIDTH**2 * values[2]:
+    if (values[..., 1] < MIN_WIDTH**2 * values[..., 2]).any():
         raise DegenerateError(f"plane: its {n} points lie on a line; more of the board must be seen")
     return centroid, axes
 
@@ -285,7 +292,7 @@ def _plane(points: Points, weights: FloatArray, noise_mm2: FloatArray | None, us
     """Return the plane of points with weights; their noise is estimated, equal for all, where it is not given."""
     equal = noise_mm2 is None
     centroid, axes = _principal(points, None if equal else weights)
-    normal = axes[:, 0] if axes[:, 0] @ centroid < 0.0 else -axes[:, 0]
+    normal = _facing(axes[:, 0], centroid)
     residuals = (points - centroid) @ normal
     if noise_mm2 is None:
         noise_mm2 = np.full(len(points), residuals @ residuals / (len(points) - 3))
@@ -306,12 +313,17 @@ def _plane(points: Points, weights: FloatArray, noise_mm2: FloatArray | None, us
     )
 
 
-def face_angle(normal_a: FloatArray, normal_b: FloatArray) -> float:
-    """Return the angle between two faces, radians, as a protractor laid across them shows it.
+def _facing(normal: Normals, point: Points) -> Normals:
+    """Return normals (..., 3) that face the origin from points (..., 3)."""
+    return np.asarray(np.where(np.sum(normal * point, axis=-1, keepdims=True) < 0.0, normal, -normal))
+
+
+def face_angle(normal_a: Normals, normal_b: Normals) -> FloatArray:
+    """Return the angle (...) between two faces with normals (..., 3), radians, as a protractor across them shows it.
 
     It is pi minus the angle between the normals that face the camera.
     """
-    return float(np.pi - angle_between(normal_a, normal_b))
+    return np.asarray(np.pi - angle_between(normal_a, normal_b))
 
 
 def angle_jacobian(normal_a: FloatArray, normal_b: FloatArray) -> tuple[FloatArray, FloatArray]:

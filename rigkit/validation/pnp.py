@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
+from rigkit.arrays import FloatArray, Points, Rays
 from rigkit.errors import DegenerateError
-from rigkit.geometry.board_pose import BoardPose, board_pose
+from rigkit.geometry.board_pose import BoardPose, board_pose, moved_board_poses
 from rigkit.geometry.relative_pose import relative_pose, relative_pose_covariance
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3, skew
 from rigkit.reconstruct import Reconstruction
 from rigkit.validation.planes import angle_jacobian, face_angle
 
-__all__ = ["PnpResult", "planar_pnp"]
+__all__ = ["AnglesDeg", "PnpResult", "moved_pnp", "planar_pnp"]
 
 MIN_CORNERS = 8
+
+AnglesDeg = dict[tuple[str, str], tuple[float, float]]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -38,7 +41,7 @@ class PnpResult:
 
     cam2_from_cam1: Rigid3
     covariance: FloatArray
-    angles_deg: dict[tuple[str, str], tuple[float, float]]
+    angles_deg: AnglesDeg
     rms_rad: float
     variance_factor: float
     count: int
@@ -50,18 +53,11 @@ def planar_pnp(reconstruction: Reconstruction) -> PnpResult:
 
     Raises DegenerateError where no board has eight corners.
     """
-    rays1, seen1 = reconstruction.camera1.unproject(reconstruction.pixels1)
-    rays2, seen2 = reconstruction.camera2.unproject(reconstruction.pixels2)
-    poses: dict[str, tuple[BoardPose, BoardPose]] = {}
-    counts: dict[str, int] = {}
-    for index, board in enumerate(reconstruction.boards):
-        on = (reconstruction.cloud.board_index == index) & seen1 & seen2
-        if int(on.sum()) >= MIN_CORNERS:
-            points = board.points(reconstruction.cloud.grid[on])
-            poses[board.board_id] = (board_pose(rays1[on], points), board_pose(rays2[on], points))
-            counts[board.board_id] = int(on.sum())
-    if not poses:
+    sights = _sights([reconstruction])
+    if not sights:
         raise DegenerateError(f"pair '{reconstruction.pair_id}': no board has {MIN_CORNERS} corners for its own pose")
+    poses = {b: (board_pose(s.rays1[0], s.points), board_pose(s.rays2[0], s.points)) for b, s in sights.items()}
+    counts = {b: len(s.points) for b, s in sights.items()}
     pose, covariance = _mean_pose([_relative(*both) for both in poses.values()], reconstruction.cam2_from_cam1)
     total = sum(counts.values())
     square = sum(counts[b] * (one.rms_rad**2 + two.rms_rad**2) / 2.0 for b, (one, two) in poses.items()) / total
@@ -69,6 +65,50 @@ def planar_pnp(reconstruction: Reconstruction) -> PnpResult:
     free = 1.0 - 3.0 * len(poses) / total
     factor = square / free / _predicted_square(reconstruction, list(poses))
     return PnpResult(pose, covariance, _angles(poses), float(np.sqrt(square)), factor, total, len(poses))
+
+
+def moved_pnp(moved: Sequence[Reconstruction]) -> tuple[tuple[Rigid3, AnglesDeg], ...]:
+    """Return relative pose and face angles as `planar_pnp` does, for one pair with cameras that differ a little.
+
+    Corners count that all the cameras see.
+    """
+    ones: dict[str, tuple[BoardPose, ...]] = {}
+    twos: dict[str, tuple[BoardPose, ...]] = {}
+    for name, seen in _sights(moved).items():
+        ones[name], twos[name] = (
+            moved_board_poses(rays, seen.points, board_pose(rays[0], seen.points).cam_from_board)
+            for rays in (seen.rays1, seen.rays2)
+        )
+    out = []
+    for m, reconstruction in enumerate(moved):
+        poses = {name: (ones[name][m], twos[name][m]) for name in ones}
+        pose, _ = _mean_pose([_relative(*both) for both in poses.values()], reconstruction.cam2_from_cam1)
+        out.append((pose, _angles(poses)))
+    return tuple(out)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Sight:
+    """A board's corners (N, 3), mm, and the rays to them in M cameras of either view, (M, N, 3)."""
+
+    points: Points
+    rays1: Rays
+    rays2: Rays
+
+
+def _sights(reconstructions: Sequence[Reconstruction]) -> dict[str, _Sight]:
+    """Return by id the boards with enough corners that every camera of these reconstructions of one pair sees."""
+    first = reconstructions[0]
+    rays1, seen1 = zip(*(r.camera1.unproject(r.pixels1) for r in reconstructions), strict=True)
+    rays2, seen2 = zip(*(r.camera2.unproject(r.pixels2) for r in reconstructions), strict=True)
+    seen = np.logical_and.reduce([*seen1, *seen2])
+    out = {}
+    for index, board in enumerate(first.boards):
+        on = (first.cloud.board_index == index) & seen
+        if int(on.sum()) >= MIN_CORNERS:
+            points = board.points(first.cloud.grid[on])
+            out[board.board_id] = _Sight(points, np.array(rays1)[:, on], np.array(rays2)[:, on])
+    return out
 
 
 def _predicted_square(reconstruction: Reconstruction, board_ids: list[str]) -> float:
@@ -101,7 +141,7 @@ def _mean_pose(found: list[tuple[Rigid3, FloatArray]], near: Rigid3) -> tuple[Ri
     return pose, np.asarray(np.linalg.inv(information), dtype=np.float64)
 
 
-def _angles(poses: dict[str, tuple[BoardPose, BoardPose]]) -> dict[tuple[str, str], tuple[float, float]]:
+def _angles(poses: Mapping[str, tuple[BoardPose, BoardPose]]) -> AnglesDeg:
     """Return face angles, the mean of both views weighted by variance."""
     out = {}
     ids = list(poses)

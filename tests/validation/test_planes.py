@@ -253,10 +253,12 @@ def test_moved_points_are_fitted_with_the_same_weights(rng: np.random.Generator)
     plane = fit_plane(noisy, sigma[:, None, None] ** 2 * np.eye(3))
     slope = np.array([2e-5, -1e-5])
     heights = 0.3 + (noisy - plane.centroid_mm) @ plane.tangents @ slope
-    moved = fit_moved(noisy + heights[:, None] * plane.normal, plane)
-    assert not moved.used[5]
-    np.testing.assert_allclose(moved.normal - plane.normal, -plane.tangents @ slope, atol=1e-9)
-    assert moved.offset_mm == pytest.approx(plane.offset_mm + 0.3, abs=0.02)
+    assert not plane.used[5]
+    ways = np.array([0.0, 1.0, -2.0])
+    normal, offset_mm = fit_moved(noisy + ways[:, None, None] * heights[:, None] * plane.normal, plane)
+    np.testing.assert_allclose(normal - plane.normal, -np.outer(ways, plane.tangents @ slope), atol=2e-9)
+    np.testing.assert_allclose(offset_mm, plane.offset_mm + 0.3 * ways, atol=0.04)
+    np.testing.assert_allclose(offset_mm[0], plane.offset_mm, rtol=1e-12)
 
 
 def test_where_the_plane_passes_a_point_is_as_uncertain_as_observed(rng: np.random.Generator) -> None:
