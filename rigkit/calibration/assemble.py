@@ -30,8 +30,7 @@ def assemble(
     candidates: tuple[Candidate, ...],
 ) -> Calibration:
     """Return the result, without verdicts."""
-    state = fit.state
-    sigma = fit.sigma_px if np.isfinite(fit.sigma_px) else 0.0
+    state, sigma = fit.state, fit.sigma_px
     covariance = frame_covariance(solution_normal(fit), state)
     px = np.where(fit.residuals.valid[..., None], fit.residuals.px, np.nan)
     poses = Rigid3.stack(state.rotation, state.translation_mm)
@@ -65,8 +64,7 @@ def _outliers(observations: Observations, fit: Fit) -> tuple[Outlier, ...]:
 
 def solution_normal(fit: Fit) -> Normal:
     """Return the normal equations at the solution, in px^-2, priors of the shape included."""
-    sigma = fit.sigma_px if np.isfinite(fit.sigma_px) else 1.0
-    return with_priors(fit.data, fit.state, sigma)
+    return with_priors(fit.data, fit.state, fit.sigma_px)
 
 
 def motion_of_world(translation_mm: Points) -> FloatArray:

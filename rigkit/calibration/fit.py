@@ -69,8 +69,7 @@ class Fit:
     @property
     def rms_px(self) -> float:
         """2-D RMS over the kept corners, px."""
-        squared = (self.residuals.px**2).sum(axis=-1)[self.kept]
-        return float(np.sqrt(squared.mean())) if squared.size else float("nan")
+        return float(np.sqrt((self.residuals.px**2).sum(axis=-1)[self.kept].mean()))
 
 
 def sigma_of(norm: FloatArray, used: BoolArray | IntArray) -> float:
@@ -104,7 +103,7 @@ def inliers(norm: FloatArray, observations: Observations, sigma_px: float, size_
 def fit_model(observations: Observations, size_px: tuple[int, int], model: type[Camera], order: int | None) -> Fit:
     """Return the model fitted to all views from no guess.
 
-    Raises DegenerateError where no start explains the views.
+    Raises DegenerateError where no start explains the views, or there are no more of them than unknowns.
     """
     best: _Found | None = None
     for start in initialise(observations, size_px, model, order):
@@ -116,14 +115,16 @@ def fit_model(observations: Observations, size_px: tuple[int, int], model: type[
             best = found
         if found.sigma_px < GOOD_ENOUGH * size_px[0]:
             break
-    if best is None:
-        raise DegenerateError(
-            f"calibration: no {model.model} camera explains the views even roughly; take views in which the board is "
-            "tilted, and check the board's size"
-        )
-    kept = inliers(best.norm, observations, best.sigma_px, size_px)
-    clean = bool((kept == observations.present).all())
-    return _settled(observations, best.state, best.norm, kept, SETTLE_ROUNDS, best.data if clean else None)
+    if best is not None:
+        kept = inliers(best.norm, observations, best.sigma_px, size_px)
+        clean = bool((kept == observations.present).all())
+        fit = _settled(observations, best.state, best.norm, kept, SETTLE_ROUNDS, best.data if clean else None)
+        if np.isfinite(robust_sigma(fit, observations)):
+            return fit
+    raise DegenerateError(
+        f"calibration: no {model.model} camera explains the views even roughly; take views in which the board is "
+        "tilted, and check the board's size"
+    )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -196,25 +197,34 @@ def _settled(
     there, where they are known."""
     for again in range(1, rounds + 1):
         weight = np.where(kept, observations.weight, 0.0)
-        solution = solve(observations, state, weight=weight, prior_sigma_px=sigma_of(norm, kept), at_start=data)
+        sigma = sigma_of(norm, kept)
+        # Where most corners do not even project there is nothing to weigh a prior by.
+        prior = sigma if np.isfinite(sigma) else 0.0
+        solution = solve(observations, state, weight=weight, prior_sigma_px=prior, at_start=data)
         data = None
         state, norm = solution.state, solution.data.residuals[0].weighted(observations)
         agree = inliers(norm, observations, sigma_of(norm, kept), state.camera.size_px)
         if again == rounds or (agree == kept).all():
             break
         kept = agree
-    return Fit(state, solution.data, kept, _sigma(state, norm, kept), solution.convergence)
+    return Fit(state, solution.data, kept, _sigma(state, float(solution.data.costs.sum()), kept), solution.convergence)
 
 
-def _sigma(state: State, norm: FloatArray, kept: BoolArray) -> float:
-    """Return the standard deviation per coordinate of a corner of median quality, degrees of freedom counted."""
+def _sigma(state: State, total: float, kept: BoolArray) -> float:
+    """Return the standard deviation per coordinate of a corner of median quality, degrees of freedom counted, from the
+    sum of squares of the weighted residuals.
+
+    Raises DegenerateError where there are none: the residuals are then next to nothing, whatever the camera.
+    """
     prior = float(((state.unknowns / state.shape.sigma) ** 2).sum()) if state.shape.count else 0.0
     views = int(kept.any(axis=1).sum())
     # Each prior is a measurement too: it pays for the unknown that it holds.
     freedom = 2 * int(kept.sum()) - state.camera.parameters.size - 6 * views
-    total = float((norm[kept] ** 2).sum())
     if freedom <= 0:
-        return float("nan")
+        raise DegenerateError(
+            f"calibration: a {state.camera.model} camera of {state.camera.parameters.size} numbers and the poses of "
+            f"{views} views are as many unknowns as their corners can tell, or more; take more views"
+        )
     sigma = np.sqrt(total / freedom)
     return float(np.sqrt((total + prior * sigma**2) / freedom)) if prior else float(sigma)
 
@@ -236,7 +246,7 @@ def heldout_squares(observations: Observations, fit: Fit, folds: int) -> FloatAr
             observations.subset(train),
             fit.state.subset(train),
             weight=weight[train],
-            prior_sigma_px=fit.sigma_px if np.isfinite(fit.sigma_px) else 1.0,
+            prior_sigma_px=fit.sigma_px,
             cost_tolerance=1e-6,
         ).state
         part = observations.subset(test)
@@ -245,4 +255,4 @@ def heldout_squares(observations: Observations, fit: Fit, folds: int) -> FloatAr
         found, _ = refine_poses(part, moved, weight[test])
         own = np.where(fit.kept[test], (evaluate(found, part).px ** 2).sum(axis=-1), 0.0)
         np.add.at(squared, image[test], own.sum(axis=-1))
-    return squared if fit.kept.any() else None
+    return squared

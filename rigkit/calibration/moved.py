@@ -70,8 +70,7 @@ def _apart(observations: Observations, fit: Fit, state: State, second: BoolArray
     for chosen in (np.flatnonzero(~second), np.flatnonzero(second)):
         part, start = observations.subset(chosen), state.subset(chosen)
         weight = np.where(fit.kept[chosen], part.weight, 0.0)
-        sigma = fit.sigma_px if np.isfinite(fit.sigma_px) else 1.0
-        own = solve(part, start, weight=weight, prior_sigma_px=sigma, cost_tolerance=TOLERANCE).state
+        own = solve(part, start, weight=weight, prior_sigma_px=fit.sigma_px, cost_tolerance=TOLERANCE).state
         whole += _cost(part, start, weight)
         split += _cost(part, own, weight)
         count += 2 * int(fit.kept[chosen].sum()) - 6 * len(chosen)

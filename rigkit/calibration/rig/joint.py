@@ -164,8 +164,7 @@ def _one_bad(
 
 def _sigma(single: Sequence[Calibration]) -> float:
     """Return the standard deviation of a corner of median quality in the median camera."""
-    known = [c.sigma_px for c in single if np.isfinite(c.sigma_px) and c.sigma_px > 0.0]
-    return float(np.median(known)) if known else LEAST_PX
+    return float(np.median([c.sigma_px for c in single]))
 
 
 def _observations(
@@ -187,8 +186,7 @@ def _observations(
         if float(np.ptp(observations.sigma_px[observations.present])) > 0.0:
             observations = observations.with_common_error(squared, kept)
         # Cameras differ in how sharp they are: a residual counts in its own camera's standard deviations.
-        better = sigma / max(alone.sigma_px, LEAST_PX) if np.isfinite(alone.sigma_px) else 1.0
-        better = 1.0 if sigma <= LEAST_PX else better
+        better = sigma / max(alone.sigma_px, LEAST_PX) if sigma > LEAST_PX else 1.0
         cameras.append(observations)
         weights.append(np.where(kept, better * observations.weight, 0.0))
         frame.append(np.array([keys[e.key] for e in own], dtype=np.int64))
