@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigkit.arrays import Pixels
+from rigkit.arrays import FloatArray, IntArray, Pixels
 from rigkit.boards import Board
 from rigkit.detections import BoardDetection, BoardView
 from rigkit.errors import InputError
@@ -19,7 +19,8 @@ MIN_CORNERS = 6
 OFTEN = 3
 """Whole grids of one size: parts of a larger board, as the frame cuts them, come in many sizes."""
 MIN_SPREAD = 1e-6
-"""Corners of a row only: the determinant of their scatter, as a part of its squared trace, is rounding."""
+"""Corners on a line: the determinant of their scatter, as a part of its squared trace, is rounding (of a row of the
+board), or noise (of a board seen edge-on: it is then a thousandth as high as it is wide)."""
 
 
 def usable_views(
@@ -40,8 +41,10 @@ def usable_views(
             "have that size"
         )
     used, dropped = [], []
-    for view, flat in zip(views, _on_a_line(views), strict=True):
-        reason = _reason(view, flat)
+    count = np.array([len(view.grid) for view in views])
+    of_board = _on_a_line(np.concatenate([view.grid for view in views]).astype(np.float64), count)
+    for view, on_board, in_image in zip(views, of_board, _on_a_line(corners, count), strict=True):
+        reason = _reason(view, "board" if on_board else "image" if in_image else None)
         if reason is None:
             used.append(view)
         else:
@@ -55,23 +58,21 @@ def _inside(pixels: Pixels, size_px: tuple[int, int]) -> bool:
     return bool(((pixels >= -0.5) & (pixels <= np.array(size_px) - 0.5)).all())
 
 
-def _on_a_line(views: Sequence[BoardView]) -> list[bool]:
-    """Say for each view whether its corners lie on one line of the board."""
-    count = np.array([len(view.grid) for view in views])
-    owner = np.repeat(np.arange(len(views)), count)
-    grid = np.concatenate([view.grid for view in views]).astype(np.float64).T
-    mean = [np.bincount(owner, axis, len(views)) / np.maximum(count, 1) for axis in grid]
-    x, y = grid[0] - mean[0][owner], grid[1] - mean[1][owner]
-    xx, xy, yy = (np.bincount(owner, product, len(views)) for product in (x * x, x * y, y * y))
-    line: list[bool] = (xx * yy - xy * xy < MIN_SPREAD * (xx + yy) ** 2).tolist()
+def _on_a_line(points: FloatArray, count: IntArray) -> list[bool]:
+    """Say for each view, of `count` (V,) of the points (N, 2), whether they lie on one line or spot."""
+    owner = np.repeat(np.arange(len(count)), count)
+    mean = [np.bincount(owner, axis, len(count)) / np.maximum(count, 1) for axis in points.T]
+    x, y = points[:, 0] - mean[0][owner], points[:, 1] - mean[1][owner]
+    xx, xy, yy = (np.bincount(owner, product, len(count)) for product in (x * x, x * y, y * y))
+    line: list[bool] = (xx * yy - xy * xy <= MIN_SPREAD * (xx + yy) ** 2).tolist()
     return line
 
 
-def _reason(view: BoardView, on_a_line: bool) -> str | None:
+def _reason(view: BoardView, line_of: str | None) -> str | None:
     if len(view.grid) < MIN_CORNERS:
         return f"{len(view.grid)} corners of board '{view.board.board_id}', at least {MIN_CORNERS} are needed"
-    if on_a_line:
-        return f"the corners of board '{view.board.board_id}' lie on one line"
+    if line_of is not None:
+        return f"the corners of board '{view.board.board_id}' lie on one line of the {line_of}"
     return None
 
 
