@@ -70,12 +70,12 @@ class Observations:
         boards: dict[str, Board] = {}
         for view in views:
             known = boards.setdefault(view.board.board_id, view.board)
-            if known.size != view.board.size or known.square_x_mm != view.board.square_x_mm:
+            if _measures(known) != _measures(view.board):
                 raise InputError(f"image '{view.image}': board '{known.board_id}' has another size in another view")
-        place = {name: i for i, name in enumerate(boards)}
+        index = {name: i for i, name in enumerate(boards)}
         counts = [b.corner_count for b in boards.values()]
         first_row = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        board = np.array([place[view.board.board_id] for view in views], dtype=np.int64)
+        board = np.array([index[view.board.board_id] for view in views], dtype=np.int64)
         length = np.array([len(view.grid) for view in views], dtype=np.int64)
         present = np.arange(length.max(initial=0)) < length[:, None]
         pixels, corner = np.zeros((*present.shape, 2)), np.zeros(present.shape, dtype=np.int64)
@@ -90,9 +90,9 @@ class Observations:
             size = np.array([one.size for one in boards.values()])[board[view_of]]
             grid = np.concatenate([view.grid for view in views])
             _check(views, view_of, grid, size, own_sigma)
-            row = first_row[board[view_of]] + grid[:, 1] * size[:, 0] + grid[:, 0]
-            _check_once(views, view_of, row, int(first_row[-1]))
-            corner.reshape(-1)[flat] = row
+            place = grid[:, 1] * size[:, 0] + grid[:, 0]
+            _check_once(views, view_of, place, max(counts))
+            corner.reshape(-1)[flat] += place
         weight = _weights(sigma, present)
         table = tuple(boards.values())
         return cls(tuple(views), pixels, corner, sigma, weight, present, table, first_row, board)
@@ -142,10 +142,15 @@ def _check(views: Sequence[BoardView], view_of: IntArray, grid: IntArray, size: 
         raise InputError(f"image '{views[view_of[(sigma <= 0.0).argmax()]].image}': corner sigmas must be positive")
 
 
-def _check_once(views: Sequence[BoardView], view_of: IntArray, corner: IntArray, total: int) -> None:
-    count = np.bincount(view_of * total + corner)
+def _measures(board: Board) -> tuple[int, int, float, float]:
+    return (*board.size, board.square_x_mm, board.square_y_mm)
+
+
+def _check_once(views: Sequence[BoardView], view_of: IntArray, place: IntArray, largest: int) -> None:
+    """`place` (N,) is the number of each corner on its board, of `largest` corners at most."""
+    count = np.bincount(view_of * largest + place)
     if count.max(initial=0) > 1:
-        view = views[int(count.argmax()) // total]
+        view = views[int(count.argmax()) // largest]
         raise InputError(f"image '{view.image}': a corner of board '{view.board.board_id}' comes twice")
 
 
