@@ -28,6 +28,8 @@ ROUNDS = 2
 """More rounds change the sizes by a few per cent and the lens not at all."""
 STRAY_SIGMAS = 3.0
 """Corners stray where they take this many standard deviations more off the cost than chance does."""
+OPEN = 1e-9
+"""A direction of which the views know this part of what they know of the best is open: it is rounding."""
 COARSE = 1e-4
 """The rounds stop where a step promises less than this part of the cost: sizes are known to a tenth at best."""
 LEAST = 1e-4
@@ -55,18 +57,20 @@ def fit_shapes(observations: Observations, fit: Fit, board: str) -> dict[str, Fi
 
 def _stray(observations: Observations, state: State, kept: BoolArray) -> bool:
     """Say whether corners lie elsewhere than the warp has them, by more than chance: what releasing each alone would
-    take off the cost, g^T H^-1 g, is chi-squared with three degrees of freedom for each."""
+    take off the cost, g^T H^-1 g, is chi-squared with as many degrees of freedom as the views know directions of it."""
     shape = replace(shape_model("released", observations), basis=state.shape.basis)
     unknowns = np.concatenate([state.unknowns, np.zeros(shape.count - state.shape.count)])
     weight = np.where(kept, observations.weight, 0.0)
     place = state.camera, state.rotation, state.translation_mm, shape, unknowns
     normal = normal_equations(*place, observations, weight, None)
-    points = len(shape.flat)
-    # In one view two coordinates are all that is seen of a corner.
-    seen = np.bincount(observations.corner[kept], minlength=points) > 1
-    gradient = normal.g[-3 * points :].reshape(points, 3, 1)[seen]
-    less = np.swapaxes(gradient, -1, -2) @ np.linalg.solve(_own_blocks(normal, points)[seen], gradient)
-    count = 3 * int(seen.sum())
+    points = len(shape.released)
+    # In one view a residual is all that is seen of a corner; from one side nothing tells how far off it is.
+    seen = np.bincount(observations.corner[kept], minlength=len(shape.flat))[shape.released] > 1
+    size, axes = np.linalg.eigh(_own_blocks(normal, points))
+    along = np.swapaxes(axes, -1, -2) @ normal.g[-3 * points :].reshape(points, 3, 1)
+    known = seen[:, None] & (size > OPEN * size[:, -1:])
+    less = along[known, 0] ** 2 / size[known]
+    count = int(known.sum())
     views = int(kept.any(axis=1).sum())
     freedom = max(2 * int(kept.sum()) - state.camera.parameters.size - 6 * views, 1)
     variance = float((normal.residuals[0].weighted(observations)[kept] ** 2).sum()) / freedom

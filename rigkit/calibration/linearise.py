@@ -51,7 +51,7 @@ def normal_equations(
     # Coordinates first in memory: every later step takes u and v apart.
     px = np.moveaxis(np.empty((2, views, corners)), 0, -1)
     residuals = Residuals(px, np.empty((views, corners), dtype=bool))
-    released = _Released(len(shape.flat), views, count) if shape.kind == "released" else None
+    released = _Released(shape, views, count) if shape.kind == "released" else None
     poses = rotation, translation_mm
     for block, rows in _blocks(camera, poses, shape, unknowns, observations, weight, loss_px, residuals, costs):
         # Per view only what involves its pose; the globals among themselves in one product over all corners.
@@ -192,18 +192,24 @@ def _by_board(rows: FloatArray, rotation: Mat3) -> FloatArray:
 
 
 class _Released:
-    """Three unknowns for every board point; a corner touches only those of its own point."""
+    """Three unknowns for every released board point; a corner touches only those of its own point."""
 
-    def __init__(self, points: int, views: int, count: int) -> None:
+    def __init__(self, shape: ShapeModel, views: int, count: int) -> None:
+        points = len(shape.released)
+        # Where each point of the table stands among those released; beyond them where it is not.
+        self._place = np.full(len(shape.flat), points)
+        self._place[shape.released] = np.arange(points)
         self._pose = np.zeros((views, points, 3, 6))
         self._own = np.zeros((points, 3, count + 4))
 
     def add(self, rows: FloatArray, by_board: FloatArray, corner: IntArray, present: BoolArray, first: int) -> None:
         """Add a block of views, the first of them number `first`."""
         count = len(rows) - 7
-        cross = np.einsum("jivc,kivc->vcjk", by_board, rows, optimize=True)[present]
-        own = np.einsum("jivc,kivc->vcjk", by_board, by_board, optimize=True)[present]
-        index, view = corner[present], first + np.nonzero(present)[0]
+        place = self._place[corner]
+        mine = present & (place < len(self._own))
+        cross = np.einsum("jivc,kivc->vcjk", by_board, rows, optimize=True)[mine]
+        own = np.einsum("jivc,kivc->vcjk", by_board, by_board, optimize=True)[mine]
+        index, view = place[mine], first + np.nonzero(mine)[0]
         self._pose[view, index] = cross[..., count : count + 6]
         np.add.at(self._own, index, np.concatenate([cross[..., :count], own, cross[..., -1:]], axis=-1))
 

@@ -40,8 +40,9 @@ BOWS, STRETCHES = np.arange(2, 5), np.arange(5, 11)
 """Which of them are lengths of one kind."""
 MIN_VIEWS = 3
 """A board in fewer views stays flat."""
-HELD = 1e-9
-"""Prior in mm of the corners of a board that are not released: it holds them."""
+
+
+NONE: IntArray = np.zeros(0, dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -53,13 +54,15 @@ class ShapeModel:
     kind : "flat", "warp" or "released".
     flat : (M, 3) mm, the boards as measured.
     basis : (M, 3, B) mm per unknown of the warp; B = 0 for flat.
-    sigma : prior standard deviation of each unknown: B of the warp, then, for released boards, 3 M in mm.
+    sigma : prior standard deviation of each unknown: B of the warp, then three of each released corner, in mm.
+    released : (K,) rows of the released corners, those of the boards often seen.
     """
 
     kind: str
     flat: Points
     basis: FloatArray
     sigma: FloatArray
+    released: IntArray
 
     @property
     def count(self) -> int:
@@ -69,8 +72,9 @@ class ShapeModel:
     def points(self, unknowns: FloatArray) -> Points:
         """Return the board points, (M, 3) mm."""
         count = self.basis.shape[-1]
-        points = self.flat + self.basis @ unknowns[:count]
-        return points + unknowns[count:].reshape(-1, 3) if self.kind == "released" else points
+        points: Points = self.flat + self.basis @ unknowns[:count]
+        points[self.released] += unknowns[count:].reshape(-1, 3)
+        return points
 
     def held(self, unknowns: FloatArray) -> ShapeModel:
         """Return the shape with nothing left to solve for: boards as the unknowns have them."""
@@ -78,7 +82,7 @@ class ShapeModel:
 
 
 def _rigid(points: Points) -> ShapeModel:
-    return ShapeModel("flat", points, np.zeros((len(points), 3, 0)), np.zeros(0))
+    return ShapeModel("flat", points, np.zeros((len(points), 3, 0)), np.zeros(0), NONE)
 
 
 def shape_model(kind: str, observations: Observations) -> ShapeModel:
@@ -90,13 +94,11 @@ def shape_model(kind: str, observations: Observations) -> ShapeModel:
     if kind == "warp":
         return warp
     # Released corners move against a warp: a bow costs a few numbers, not the prior of every corner.
-    released = np.concatenate(
-        [
-            np.tile(released_sigma(points) if often else np.full(3, HELD), len(points))
-            for points, often in zip(_per_board(observations, flat), often_seen(observations), strict=True)
-        ]
-    )
-    return ShapeModel("released", flat, warp.basis, np.concatenate([warp.sigma, released]))
+    often = often_seen(observations)
+    released = np.flatnonzero(np.repeat(often, np.diff(observations.first_row)))
+    each = [flat[_rows(observations, board)] for board in np.flatnonzero(often).tolist()]
+    sigma = np.concatenate([warp.sigma, *(np.tile(released_sigma(points), len(points)) for points in each)])
+    return ShapeModel("released", flat, warp.basis, sigma, released)
 
 
 def often_seen(observations: Observations) -> BoolArray:
@@ -114,17 +116,17 @@ def released_groups(observations: Observations, first: int) -> Iterator[IntArray
     """Yield the unknowns of the released corners, `first` the first of them, that have one size together: in the plane
     and out of it. Those at a board's border are apart: paper ends or curls there, and a detector sees one neighbour
     less."""
-    for board in np.flatnonzero(often_seen(observations)).tolist():
-        grid = observations.boards[board].grid()
-        border = ((grid == 0) | (grid == np.array(observations.boards[board].size) - 1)).any(axis=1)
+    for board in (b for b, often in zip(observations.boards, often_seen(observations), strict=True) if often):
+        grid = board.grid()
+        border = ((grid == 0) | (grid == np.array(board.size) - 1)).any(axis=1)
         for chosen in (border, ~border):
-            rows = observations.first_row[board] + np.flatnonzero(chosen)
-            yield from (first + (3 * rows[:, None] + np.array(axes)).ravel() for axes in ((0, 1), (2,)))
+            corners = 3 * np.flatnonzero(chosen)[:, None]
+            yield from (first + (corners + np.array(axes)).ravel() for axes in ((0, 1), (2,)))
+        first += 3 * len(grid)
 
 
-def _per_board(observations: Observations, table: Points) -> list[Points]:
-    rows = observations.first_row
-    return [table[rows[i] : rows[i + 1]] for i in range(len(observations.boards))]
+def _rows(observations: Observations, board: int) -> slice:
+    return slice(int(observations.first_row[board]), int(observations.first_row[board + 1]))
 
 
 def released_sigma(points: Points) -> FloatArray:
@@ -144,8 +146,8 @@ def _warp(observations: Observations, flat: Points) -> ShapeModel:
     often = np.flatnonzero(often_seen(observations))
     basis = np.zeros((len(flat), 3, WARP_UNKNOWNS * len(often)))
     sigma: list[float] = []
-    for i, board in enumerate(often):
-        rows = slice(observations.first_row[board], observations.first_row[board + 1])
+    for i, board in enumerate(often.tolist()):
+        rows = _rows(observations, board)
         points = flat[rows]
         centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
         half = 0.5 * np.ptp(points, axis=0)
@@ -160,4 +162,4 @@ def _warp(observations: Observations, flat: Points) -> ShapeModel:
         block[:, 0, 5:8] = block[:, 1, 8:11] = stretch
         size = _half_diagonal(points)
         sigma += [ASPECT_SIGMA, SHEAR_SIGMA, *[BOW_SIGMA * size] * 3, *[STRETCH_SIGMA * size] * 6]
-    return ShapeModel("warp", flat, basis, np.array(sigma))
+    return ShapeModel("warp", flat, basis, np.array(sigma), NONE)

@@ -48,10 +48,8 @@ def _nearest(shape: ShapeModel, points: Points) -> FloatArray:
     """Return the unknowns whose points are nearest to `points`: the warp's first, then what it leaves to released."""
     off = points - shape.flat
     count = shape.basis.shape[-1]
-    warp: FloatArray = np.zeros(0)
-    if count:
-        warp = np.asarray(np.linalg.lstsq(shape.basis.reshape(-1, count), off.reshape(-1), rcond=None)[0], float)
-    return warp if shape.kind != "released" else np.concatenate([warp, (off - shape.basis @ warp).ravel()])
+    warp = np.linalg.lstsq(shape.basis.reshape(-1, count), off.reshape(-1), rcond=None)[0]
+    return np.concatenate([warp, (off - shape.basis @ warp)[shape.released].ravel()])
 
 
 def _found(observations: Observations, shape: ShapeModel, unknowns: FloatArray) -> FloatArray:
