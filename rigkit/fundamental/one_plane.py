@@ -9,17 +9,25 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, Mat3
+from rigkit.arrays import FloatArray, Mat3, Rays
 from rigkit.fundamental.estimate import check_baseline, transfer_error
+from rigkit.fundamental.pose import parallax_noise
 from rigkit.fundamental.rows import right_singular
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import nearest_rotation, skew, unit
+from rigkit.geometry.rotation import cross, nearest_rotation, rotation_angle, skew, unit
 from rigkit.matches import Matches
 
-__all__ = ["decompose_homography", "homography_of_rays", "one_plane_poses"]
+__all__ = ["compare_poses", "decompose_homography", "homography_of_rays", "one_plane_poses", "twin_poses"]
 
+SAME_POSE = 5e-3
+"""Two poses nearer than this (rad, and share of the baseline) mislead nobody."""
 ONE_PLANE_SIGMAS = 3.0
 """Points whose homography transfers them within so many sigmas (rms) may lie on one plane."""
+AT_REST_SIGMAS = 3.3
+"""A parallax, or one off a plane's, is noise below: one good point in a thousand has more."""
+NEARLY_ALL = 0.9
+"""Of matches that fit some fit by chance, and of points some are seen on the wrong side of the horizon of a plane."""
+PLANE_ROUNDS = 10
 
 
 def homography_of_rays(matches: Matches) -> Mat3:
@@ -68,8 +76,56 @@ def one_plane_poses(matches: Matches) -> tuple[Rigid3, ...]:
     if np.mean(square) > 2.0 * ONE_PLANE_SIGMAS**2:
         return ()
     check_baseline(matches)
+    return _visible(matches.rays1, H21)
+
+
+def twin_poses(matches: Matches, pose: Rigid3) -> tuple[Rigid3, ...]:
+    """Return the other poses (unit baseline) of the plane on which most points lie under `pose`; nothing without one.
+
+    Parameters
+    ----------
+    matches : that agree with the epipolar geometry of the pose; a few of them may be wrong all the same.
+    pose : unit baseline.
+
+    Raises DegenerateError where a rotation alone explains nearly all of them.
+
+    Notes
+    -----
+    The parallax of a point on the plane n . x = 1 is |t x f2| (n . f1), linear in n: least squares with Cauchy weights.
+    """
+    f2, t = matches.rays2, pose.translation_mm
+    across = cross(t, f2)
+    noise, reach = parallax_noise(matches), np.linalg.norm(across, axis=1)
+    parallax = np.sum(cross(f2, matches.rays1 @ pose.rotation.T) * unit(across), axis=1) / noise
+    still = np.abs(parallax) < AT_REST_SIGMAS
+    if still.mean() > NEARLY_ALL:
+        check_baseline(matches.select(still))
+    rows = matches.rays1 * (reach / noise)[:, None]
+    weights = np.ones(len(matches))
+    for _ in range(PLANE_ROUNDS):
+        weighted = rows * weights[:, None]
+        normal = np.linalg.lstsq(weighted.T @ rows, weighted.T @ parallax, rcond=None)[0]
+        off = np.abs(parallax - rows @ normal)
+        weights = 1.0 / (1.0 + (off / max(1.0, float(np.median(off)))) ** 2)
+    on = off < AT_REST_SIGMAS
+    if on.mean() < 0.5:
+        return ()
+    H21 = pose.rotation + np.outer(t, normal)
+    twins = _visible(matches.rays1[on], H21 / np.linalg.svd(H21, compute_uv=False)[1])
+    return tuple(twin for twin in twins if not compare_poses(pose, twin)[1])
+
+
+def compare_poses(first: Rigid3, second: Rigid3) -> tuple[float, bool]:
+    """Return the angle in radians between two rotations, and whether the poses (unit baseline) are the same."""
+    difference = first @ second.inverse()
+    turn = float(rotation_angle(difference.rotation))
+    return turn, max(turn, float(np.linalg.norm(difference.translation_mm))) < SAME_POSE
+
+
+def _visible(rays1: Rays, H21: Mat3) -> tuple[Rigid3, ...]:
+    """Return the poses (unit baseline) of `H21` whose plane is in front of camera 1 where the points are."""
     poses = []
     for pose, normal in decompose_homography(H21):
-        if np.mean(matches.rays1 @ normal > 0.0) > 0.9 and np.linalg.norm(pose.translation_mm) > 0.0:
+        if np.mean(rays1 @ normal > 0.0) > NEARLY_ALL and np.linalg.norm(pose.translation_mm) > 0.0:
             poses.append(Rigid3(pose.rotation, unit(pose.translation_mm)))
     return tuple(poses)

@@ -19,6 +19,7 @@ __all__ = [
     "essential_from_pose",
     "free_directions",
     "hypothesis_poses",
+    "parallax_noise",
     "rotations_and_direction",
     "translation_basis",
 ]
@@ -91,13 +92,17 @@ def behind_sigmas(matches: Matches, cam2_from_cam1: Rigid3) -> FloatArray:
 
     The nearest point that both cameras can see is then at infinity: that far the pixels would have to move.
     """
-    m = matches
-    range1, range2, defined = ray_ranges(m.rays1, m.rays2, cam2_from_cam1)
+    range1, range2, defined = ray_ranges(matches.rays1, matches.rays2, cam2_from_cam1)
     behind = defined & ((range1 < 0.0) | (range2 < 0.0))
-    parallax = np.linalg.norm(cross(m.rays2, m.rays1 @ cam2_from_cam1.rotation.T), axis=1)
+    parallax = np.linalg.norm(cross(matches.rays2, matches.rays1 @ cam2_from_cam1.rotation.T), axis=1)
+    return np.asarray(np.divide(parallax, parallax_noise(matches), out=np.zeros(len(matches)), where=behind))
+
+
+def parallax_noise(matches: Matches) -> FloatArray:
+    """Return the standard deviation (N,) in radians of the angle between the rays of each match, along a line."""
+    m = matches
     size1, size2 = (np.sqrt(0.5 * np.sum(b * b, axis=(1, 2))) for b in (m.jacobians1, m.jacobians2))
-    noise = np.hypot(m.sigma1_px * size1, m.sigma2_px * size2)
-    return np.asarray(np.divide(parallax, noise, out=np.zeros(len(m)), where=behind))
+    return np.asarray(np.hypot(m.sigma1_px * size1, m.sigma2_px * size2))
 
 
 def _in_front(pose: Rigid3, rays1: Rays, rays2: Rays) -> tuple[int, int]:

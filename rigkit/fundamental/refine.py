@@ -14,22 +14,20 @@ import numpy as np
 
 from rigkit.arrays import FloatArray
 from rigkit.errors import DegenerateError, InputError
-from rigkit.fundamental.one_plane import one_plane_poses
+from rigkit.fundamental.one_plane import compare_poses, one_plane_poses
 from rigkit.fundamental.pose import behind_sigmas, choose_pose, essential_from_pose, translation_basis
 from rigkit.fundamental.pose_problem import Minimum, PoseProblem, RobustWeights, cauchy_weights
 from rigkit.fundamental.registry import fundamental_for
 from rigkit.fundamental.residuals import whitened_affinities
 from rigkit.fundamental.weights import LEAST_SIGMA_A, RowWeights, WeightRule, estimate_sigma_A, usable_affinities
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3, rotation_angle, unit
+from rigkit.geometry.rotation import exp_so3, unit
 from rigkit.geometry.sampson import epipolar_normals, sampson_distances
 from rigkit.matches import Matches
 from rigkit.posetype import PoseType
 
 __all__ = ["RefinedPose", "cauchy_weights", "estimate_pose", "project_to_type", "refine_pose"]
 
-SAME_POSE = 5e-3
-"""Two minima nearer than this (rad, and share of the baseline) mislead nobody."""
 SIGNIFICANT = 3.0
 """Standard deviations that the cost (chi square) of a pose must be higher by to rule it out."""
 
@@ -151,9 +149,8 @@ def _visible_cost(matches: Matches, end: RefinedPose) -> float:
 def _refuse_ambiguity(matches: Matches, best: RefinedPose, ends: list[RefinedPose]) -> None:
     """Raise DegenerateError if another pose explains the points of one plane as well as the best one."""
     for end in ends:
-        difference = best.cam2_from_cam1 @ end.cam2_from_cam1.inverse()
-        turn, shift = float(rotation_angle(difference.rotation)), float(np.linalg.norm(difference.translation_mm))
-        if max(turn, shift) < SAME_POSE:
+        turn, same = compare_poses(best.cam2_from_cam1, end.cam2_from_cam1)
+        if same:
             continue
         scale = max(best.variance_factor, 1.0)
         chance = scale * _chance_difference(matches, best.cam2_from_cam1, end.cam2_from_cam1)

@@ -9,7 +9,7 @@ generator. References: Fischler and Bolles; Chum, Matas, Kittler ("Locally optim
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -19,6 +19,7 @@ from rigkit.errors import DegenerateError, InputError, RigkitError
 from rigkit.fundamental.local import SampsonRows
 from rigkit.fundamental.marginal import QUANTILE, MarginalLoss, marginal_quality
 from rigkit.fundamental.minimal import essential_from_five_rows, essential_from_six_rows, planar_from_two_rows
+from rigkit.fundamental.one_plane import compare_poses, twin_poses
 from rigkit.fundamental.planar import solve_planar_batch
 from rigkit.fundamental.pose import behind_sigmas, choose_pose, essential_from_pose
 from rigkit.fundamental.refine import RefinedPose, refine_pose
@@ -50,6 +51,8 @@ LEAST_NOISE = 1.5
 """Noise level over the noise that the matches show: the loss still sees the tails, and few wrong matches."""
 NOISE_ROUNDS = 3
 """Each leaves out what the noise of the round before does not explain."""
+SIGNIFICANT = 3.0
+"""Standard deviations by which one of a plane's two poses must be better than the other."""
 GOOD_AFFINE = 0.1
 """Share of clean samples with an affinity that lead to the optimum (measured: a third at 0.05 noise of A)."""
 
@@ -99,10 +102,16 @@ def robust_pose(
     Raises
     ------
     InputError
-        Too few matches for a sample, or affinities asked for where there are none.
+        Too few matches for a sample, or affinities asked for where there are none; options without a meaning.
     DegenerateError
-        No sample gave a pose.
+        No sample gave a pose; the matches that fit leave another one open, all on one plane, or have no baseline.
     """
+    if not (np.isfinite(max_noise) and max_noise > 1.0):
+        raise InputError(f"robust estimation: max_noise is in sigmas of the matches and above 1, got {max_noise}")
+    if not 0.0 < confidence < 1.0:
+        raise InputError(f"robust estimation: confidence must be between 0 and 1, got {confidence}")
+    if max_trials < 1:
+        raise InputError(f"robust estimation: max_trials must be 1 at least, got {max_trials}")
     kind = str(pose_type)
     rows = SampsonRows.of(matches)
     if kind in (PoseType.STANDARD, PoseType.FORWARD):
@@ -123,16 +132,57 @@ def robust_pose(
         noise = min(max_noise, max(LEAST_NOISE * shown, LEAST_NOISE))
     finalists = rows.improved(finalists, kind, noise)[0]
     loss = MarginalLoss(noise)
-    for start, plausible in _poses(matches, rows, finalists, kind, noise, max_noise):
+
+    def finished(start: Rigid3, plausible: BoolArray) -> tuple[RobustPose, FloatArray]:
         own = plausible.astype(np.float64)
+        end = refine_pose(matches, start, kind, level_sigma_rad, robust=loss, point_weights=own)
+        r = rows.residuals(essential_from_pose(end.cam2_from_cam1)[None])[0]
+        qualities = marginal_quality(r, noise) * plausible
+        inliers = plausible & (np.abs(r) < QUANTILE * noise)
+        return RobustPose(end, inliers, loss(r) * plausible, float(qualities.sum()), trials), qualities
+
+    for start, plausible in _poses(matches, rows, finalists, kind, noise, max_noise):
         try:
-            end = refine_pose(matches, start, kind, level_sigma_rad, robust=loss, point_weights=own)
+            found, qualities = finished(start, plausible)
         except RigkitError:
             continue
-        r = rows.residuals(essential_from_pose(end.cam2_from_cam1)[None])[0]
-        quality = float(np.sum(marginal_quality(r, noise), where=plausible))
-        return RobustPose(end, plausible & (np.abs(r) < QUANTILE * noise), loss(r) * plausible, quality, trials)
+        for twin in twin_poses(_as_noisy(matches.select(found.inliers), noise / LEAST_NOISE), _pose(found)):
+            try:
+                other, others = finished(twin, _plausible(matches, twin, max_noise))
+            except RigkitError:
+                continue
+            if not compare_poses(_pose(found), _pose(other))[1]:
+                found, qualities = _preferred((found, qualities), (other, others))
+        return found
     raise DegenerateError(f"no pose that enough matches agree with, from in front of both cameras, in {trials} samples")
+
+
+def _pose(found: RobustPose) -> Rigid3:
+    return found.refined.cam2_from_cam1
+
+
+def _as_noisy(matches: Matches, factor: float) -> Matches:
+    """Return the points alone, with larger sigmas."""
+    sigma1, sigma2 = factor * matches.sigma1_px, factor * matches.sigma2_px
+    return replace(matches, sigma1_px=sigma1, sigma2_px=sigma2, A21=None, sigma_A=None)
+
+
+def _preferred(
+    first: tuple[RobustPose, FloatArray], second: tuple[RobustPose, FloatArray]
+) -> tuple[RobustPose, FloatArray]:
+    """Return the better one of two poses of a plane, each with the qualities of all matches.
+
+    Raises DegenerateError if neither is: noise, and wrong matches that fit one of them by chance, prefer either alike.
+    """
+    difference = first[1] - second[1]
+    total, chance = float(difference.sum()), float(np.linalg.norm(difference))
+    if abs(total) <= SIGNIFICANT * chance:
+        turn = np.degrees(compare_poses(_pose(first[0]), _pose(second[0]))[0])
+        raise DegenerateError(
+            f"nearly all of the {int(first[0].inliers.sum())} matches that fit lie on one plane and two poses "
+            f"{turn:.1f} deg apart explain them equally well; add points off that plane, or declare the pose type"
+        )
+    return first if total > 0.0 else second
 
 
 def _poses(
@@ -240,8 +290,9 @@ def _sample_size(matches: Matches, kind: str, sample: Sample) -> int:
     if kind not in sizes or sample not in sizes[kind]:
         raise InputError(f"robust estimation knows no samples of kind '{sample}' for pose type '{kind}'")
     size = sizes[kind][sample]
-    if len(matches) < size + 1:
-        raise InputError(f"robust estimation: {len(matches)} matches, at least {size + 1} are needed")
+    different = len(np.unique(np.concatenate([matches.pixels1, matches.pixels2], axis=1), axis=0))
+    if different < size + 1:
+        raise InputError(f"robust estimation: {different} different matches, at least {size + 1} are needed")
     have = int(usable_affinities(matches).sum())
     wanted = {"points": 0, "affine": size, "mixed": 1}[sample]
     if have < wanted:

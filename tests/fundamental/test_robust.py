@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.epipolar_scenes import REGULAR, pair, pose_errors_deg
+from helpers.epipolar_scenes import REGULAR, joined, pair, pictures, plane_in_sight, pose_errors_deg
 
 from rigkit.errors import DegenerateError, InputError
 from rigkit.fundamental.local import SampsonRows
@@ -73,6 +73,62 @@ def test_what_is_missing_is_said(rng):
         robust_pose(wild.select(np.arange(5)), rng)
     with pytest.raises(InputError, match="no samples"):
         robust_pose(wild, rng, sample="lines")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "options", [{"max_noise": 1.0}, {"max_noise": np.nan}, {"confidence": 1.0}, {"confidence": 0.0}, {"max_trials": 0}]
+)
+def test_options_without_a_meaning_are_refused(rng, options):
+    wild, _, _ = contaminated(rng, "general", count=20)
+    with pytest.raises(InputError, match=next(iter(options))):
+        robust_pose(wild, rng, **options)
+
+
+def test_the_same_match_again_says_nothing_more(rng):
+    m, _, _ = pair(rng, 5, noise_px=0.5)
+    with pytest.raises(InputError, match="5 different matches"):
+        robust_pose(m.select(np.repeat(np.arange(5), 20)), rng)
+
+
+def with_wrong(rng, m, share=0.3):
+    """The same matches with wrong partners for some of them."""
+    bad, q2 = rng.random(len(m)) < share, np.array(m.pixels2)
+    q2[bad] = rng.uniform([0, 0], REGULAR.size_px, (bad.sum(), 2))
+    return Matches.from_cameras(REGULAR, REGULAR, m.pixels1, q2, sigma1_px=m.sigma1_px, sigma2_px=m.sigma2_px)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3])
+@pytest.mark.parametrize("kind", ["general", "planar", "standard"])
+@pytest.mark.parametrize("understated", [1.0, 3.0])
+def test_a_pose_without_a_baseline_is_refused(rng, kind, share, understated):
+    X = rng.uniform([-500.0, -400.0, 800.0], [500.0, 400.0, 2000.0], (200, 3))
+    turn = [0.0, 0.0 if kind == "standard" else 0.1, 0.0]
+    m = pictures(rng, X, Rigid3(exp_so3(turn), np.zeros(3)))
+    m = replace(m, sigma1_px=m.sigma1_px / understated, sigma2_px=m.sigma2_px / understated)
+    with pytest.raises(DegenerateError, match="no baseline"):
+        robust_pose(with_wrong(rng, m, share), rng, pose_type=kind)
+
+
+def test_the_right_one_of_the_two_poses_of_a_plane_or_none(rng):
+    solved = 0
+    for _ in range(30):
+        m, pose = plane_in_sight(rng)
+        try:
+            found = robust_pose(with_wrong(rng, m, 0.2), rng).refined.cam2_from_cam1
+        except DegenerateError as error:
+            assert "one plane" in str(error)
+            continue
+        assert max(pose_errors_deg(found, pose)) < 2.0
+        solved += 1
+    assert solved > 10
+
+
+def test_points_off_the_plane_choose_between_its_poses(rng):
+    for _ in range(10):
+        m, pose = plane_in_sight(rng)
+        others, _, _ = pair(rng, 60, pose=pose, noise_px=0.3)
+        found = robust_pose(with_wrong(rng, joined(m, others)), rng).refined.cam2_from_cam1
+        assert max(pose_errors_deg(found, pose)) < 2.0
 
 
 def test_nothing_but_outliers_gives_few_inliers_or_an_error(rng):
