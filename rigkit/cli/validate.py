@@ -126,14 +126,14 @@ def validate_pair(job: PairJob) -> PairOutcome:
 def _judge(job: PairJob, matched: MatchedPair, image1: Any, image2: Any, causes: tuple[str, ...]) -> PairOutcome:
     from rigkit.affine.registry import AFFINE_METHODS
     from rigkit.io.ply import ply_bytes
-    from rigkit.report.validation_page import best_report
-    from rigkit.validation.checks import validate
+    from rigkit.validation.checks import validate_each
     from rigkit.validation.crosscheck import crosscheck
+    from rigkit.validation.tables import best_report
 
     pair = job.pair
     reconstructions = {method: reconstruct_with(matched, pair, method, image1) for method in AFFINE_METHODS}
     shifts = _shifts(reconstructions, job)
-    reports = tuple(validate(r, pair.truth, shifts=shifts[method]) for method, r in reconstructions.items())
+    reports = validate_each(list(reconstructions.values()), pair.truth, [shifts[m] for m in reconstructions])
     best = best_report(reports)
     files: dict[str, bytes] = {
         f"{pair.pair_id}/{method}.ply": ply_bytes(r.cloud) for method, r in reconstructions.items()

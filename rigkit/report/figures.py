@@ -285,7 +285,7 @@ def _fitted(image: NDArray[Any], width: float, height: float) -> NDArray[np.uint
 
     scale = min(width / image.shape[1], height / image.shape[0], 1.0)
     size = (max(round(scale * image.shape[1]), 1), max(round(scale * image.shape[0]), 1))
-    small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA)) if scale < 1.0 else image
+    small: NDArray[Any] = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if scale < 1.0 else image
     if image.ndim == 3:
         return (small >> 8).astype(np.uint8) if image.dtype == np.uint16 else small
     low, high = int(image.min()), int(image.max())

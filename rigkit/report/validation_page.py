@@ -13,14 +13,9 @@ from rigkit.report.page import PairSection, scene_of
 from rigkit.report.tables import measured_words
 from rigkit.validation.checks import ValidationReport
 from rigkit.validation.crosscheck import CrossCheckReport
-from rigkit.validation.tables import Cell, Column, Table, check_table
+from rigkit.validation.tables import Cell, Column, Table, check_table, mean_normal_error
 
-__all__ = ["best_report", "camera_table", "crosscheck_table", "pair_section", "summary_table"]
-
-
-def best_report(reports: Sequence[ValidationReport]) -> ValidationReport:
-    """Return the report of the estimator with the smallest mean normal error over the boards."""
-    return min(reports, key=_mean_normal_error)
+__all__ = ["camera_table", "crosscheck_table", "pair_section", "summary_table"]
 
 
 def summary_table(reports: Sequence[ValidationReport]) -> Table:
@@ -48,7 +43,7 @@ def summary_table(reports: Sequence[ValidationReport]) -> Table:
                 Cell(report.affine_method),
                 Cell(float(report.count)),
                 Cell(max(angles) if angles else None),
-                Cell(_mean_normal_error(report)),
+                Cell(mean_normal_error([report])),
                 Cell(None) if known is None else Cell(known.measured, sigma=known.measured_sigma),
                 Cell(report.baseline_mm, sigma=report.baseline_sigma_mm),
                 Cell(report.sampson_rms_px),
@@ -172,7 +167,3 @@ def _by_estimator(reports: Sequence[ValidationReport]) -> Table:
         rows.append((Cell(f"flatness of {board_id}, rms mm"), *(Cell(value) for value in flat)))
     rows.append((Cell("baseline, mm"), *(Cell(r.baseline_mm, sigma=r.baseline_sigma_mm) for r in reports)))
     return Table("by_estimator", "Affine estimators", columns, tuple(rows))
-
-
-def _mean_normal_error(report: ValidationReport) -> float:
-    return float(np.mean([board.normal_errors.mean_deg for board in report.boards]))

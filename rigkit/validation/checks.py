@@ -8,7 +8,7 @@ sigma is honest, and fewer where people state theirs generously.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import combinations
 from typing import Any
@@ -20,9 +20,18 @@ from rigkit.reconstruct import Reconstruction
 from rigkit.truth import PairTruth
 from rigkit.validation.boards import BoardResult
 from rigkit.validation.intrinsics import CalibrationShifts
-from rigkit.validation.measure import measure
+from rigkit.validation.measure import Measured, measure
 
-__all__ = ["COVERAGE", "AngleResult", "Check", "ValidationReport", "judge", "validate", "without_nan"]
+__all__ = [
+    "COVERAGE",
+    "AngleResult",
+    "Check",
+    "ValidationReport",
+    "judge",
+    "validate",
+    "validate_each",
+    "without_nan",
+]
 
 COVERAGE = 2.0
 
@@ -175,7 +184,36 @@ def validate(
     DegenerateError
         A board has too few points for a plane.
     """
-    measured = measure(reconstruction, shifts)
+    return _report(reconstruction, measure(reconstruction, shifts), truth, shifts, coverage)
+
+
+def validate_each(
+    reconstructions: Sequence[Reconstruction], truth: PairTruth, shifts: Sequence[CalibrationShifts | None]
+) -> tuple[ValidationReport, ...]:
+    """Return `validate` of reconstructions of one pair by several estimators, each with its shifts.
+
+    Estimators that kept the same corners have the same points, whose planes are fitted once.
+    """
+    known: dict[tuple[bytes | int, ...], Measured] = {}
+    reports = []
+    for reconstruction, moved in zip(reconstructions, shifts, strict=True):
+        r = reconstruction
+        arrays = (r.cloud.points_mm, r.pixels1, np.array([] if r.pose_covariance is None else r.pose_covariance))
+        key: tuple[bytes | int, ...] = (*(array.tobytes() for array in arrays), id(moved))
+        if key not in known:
+            known[key] = measure(r, moved)
+        measured = known[key].with_normals(r)
+        reports.append(_report(reconstruction, measured, truth, moved, COVERAGE))
+    return tuple(reports)
+
+
+def _report(
+    reconstruction: Reconstruction,
+    measured: Measured,
+    truth: PairTruth,
+    shifts: CalibrationShifts | None,
+    coverage: float,
+) -> ValidationReport:
     baseline_sigma_mm = reconstruction.baseline_sigma_mm
     if shifts is not None:
         baseline_sigma_mm = float(np.hypot(baseline_sigma_mm, np.sqrt(shifts.variance(lambda r: r.baseline_mm))))

@@ -73,8 +73,11 @@ def camera_suspects(
     """
     fits = []
     for found, own in zip(detections, declared, strict=True):
-        size_px = cameras[own].size_px
-        fits.append({n: camera_fit(c, found, boards) for n, c in cameras.items() if c.size_px == size_px})
+        fit = {own: camera_fit(cameras[own], found, boards)}
+        if fit[own] > MISFIT_PX:
+            others = {n: c for n, c in cameras.items() if n != own and c.size_px == cameras[own].size_px}
+            fit |= {name: camera_fit(camera, found, boards) for name, camera in others.items()}
+        fits.append(fit)
     better = [_clearly_better(fit, name) for fit, name in zip(fits, declared, strict=True)]
     one, two = declared
     if one != two and better == [two, one]:

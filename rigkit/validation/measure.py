@@ -10,7 +10,7 @@ counted with them, not with the scatter.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from rigkit.reconstruct import Reconstruction
 from rigkit.truth import MeasuredDistance
 from rigkit.validation.boards import BoardResult, Placed, measure_board, place_moved
 from rigkit.validation.intrinsics import CalibrationShifts, principal_axes
-from rigkit.validation.planes import angle_jacobian, face_angle
+from rigkit.validation.planes import angle_jacobian, face_angle, normal_errors
 
 __all__ = ["Measured", "measure", "points_by_pose"]
 
@@ -51,6 +51,16 @@ class Measured:
     moved: Mapping[str, Placed]
     steps: FloatArray
     pose_covariance: FloatArray | None
+
+    def with_normals(self, reconstruction: Reconstruction) -> Measured:
+        """Return the same for a reconstruction that differs in its normals only."""
+        cloud = reconstruction.cloud
+        of = {board.board_id: cloud.normals[cloud.board_index == n] for n, board in enumerate(reconstruction.boards)}
+        boards = {
+            name: replace(found, normal_errors=normal_errors(of[name], found.plane))
+            for name, found in self.boards.items()
+        }
+        return replace(self, boards=boards)
 
     def absent(self, *board_ids: str) -> str:
         """Return in words which of the boards were not reconstructed; empty if all were."""

@@ -23,14 +23,19 @@ __all__ = [
     "average_table",
     "baseline_table",
     "best_method",
+    "best_report",
     "build_tables",
     "check_table",
     "estimator_table",
+    "mean_normal_error",
     "plane_table",
 ]
 
 TIE_MM = 1e-3
 """Baselines closer than this are the same: less than the table shows."""
+
+TIE_DEG = 1e-6
+"""Estimators whose normal errors differ by less find the same normals: rounding must not choose between them."""
 
 Printed = Mapping[str, Mapping[str, str]]
 
@@ -127,19 +132,30 @@ def best_method(reports: Sequence[ValidationReport]) -> str:
     methods = list(dict.fromkeys(report.affine_method for report in reports))
     pairs = {m: {r.pair_id for r in reports if r.affine_method == m} for m in methods}
     common = set.intersection(*pairs.values()) or {r.pair_id for r in reports}
-    score = {
-        method: np.mean(
-            [
-                board.normal_errors.mean_deg
-                for report in reports
-                if report.affine_method == method and report.pair_id in common
-                for board in report.boards
-            ]
-            or [np.inf]
-        )
-        for method in methods
-    }
-    return min(methods, key=lambda method: float(score[method]))
+    return _least(
+        {
+            method: mean_normal_error([r for r in reports if r.affine_method == method and r.pair_id in common])
+            for method in methods
+        }
+    )
+
+
+def best_report(reports: Sequence[ValidationReport]) -> ValidationReport:
+    """Return the report with the smallest mean normal error, of the reports of one pair by several estimators."""
+    by_method = {report.affine_method: report for report in reports}
+    return by_method[_least({method: mean_normal_error([report]) for method, report in by_method.items()})]
+
+
+def mean_normal_error(reports: Sequence[ValidationReport]) -> float:
+    """Return the mean over the boards of their mean normal errors, degrees; infinite for no boards."""
+    errors = [board.normal_errors.mean_deg for report in reports for board in report.boards]
+    return float(np.mean(errors)) if errors else np.inf
+
+
+def _least(score: Mapping[str, float]) -> str:
+    """Return the name with the smallest score; of several within a tie the last, which is no worse and uses most."""
+    least = min(score.values())
+    return [method for method, value in score.items() if value <= least + TIE_DEG][-1]
 
 
 def plane_table(reports: Sequence[ValidationReport], method: str, paper: PaperTables) -> Table:

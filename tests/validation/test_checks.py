@@ -15,7 +15,7 @@ from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.triangulation import triangulate_rays
 from rigkit.reconstruct import Reconstruction
 from rigkit.truth import Feature, MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
-from rigkit.validation.checks import judge, validate
+from rigkit.validation.checks import judge, validate, validate_each
 from rigkit.validation.measure import Measured, measure
 
 BASELINE_MM = float(np.linalg.norm(CAM2_FROM_CAM1.translation_mm))
@@ -137,6 +137,18 @@ def test_report_is_json_without_nan() -> None:
     assert data["baseline_sigma_mm"] is None
     assert data["checks"][0]["name"] == "baseline"
     assert data["boards"][1]["normal_errors"]["count"] == 48
+
+
+def test_estimators_with_the_same_points_are_judged_as_each_alone() -> None:
+    made = make_reconstruction()
+    tilted = made.cloud.normals @ exp_so3(np.array([0.01, 0.0, 0.0])).T
+    other = replace(made, affine_method="2SDIR", cloud=replace(made.cloud, normals=tilted))
+    moved = replace(make_reconstruction(angles_deg=(90.0, 90.0, 91.0)), affine_method="F2UDIR")
+    looser = replace(made, affine_method="3SDIR", pose_covariance=1e-6 * np.eye(6))
+    every = [made, other, moved, looser]
+    together = validate_each(every, truth(), [None] * 4)
+    assert [r.to_json() for r in together] == [validate(r, truth()).to_json() for r in every]
+    assert len({r.to_json() for r in together}) == 4
 
 
 def triangulated(made: Reconstruction, pose: Rigid3, noise_px: np.ndarray) -> Reconstruction:

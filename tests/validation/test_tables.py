@@ -19,7 +19,7 @@ from rigkit.io.paper_tables import load_paper_tables
 from rigkit.report.tables import measured_words, tables_to_csv, tables_to_json, tables_to_latex, tables_to_markdown
 from rigkit.truth import MeasuredAngle, MeasuredLength, PairTruth
 from rigkit.validation.checks import ValidationReport, validate
-from rigkit.validation.tables import Cell, Column, PaperTables, Table, best_method, build_tables
+from rigkit.validation.tables import Cell, Column, PaperTables, Table, best_method, best_report, build_tables
 
 REPO = Path(__file__).parents[2]
 PAPER = REPO / "datasets" / "hajder2021"
@@ -77,6 +77,24 @@ def test_plane_table_is_ours_beside_the_papers(tables: tuple[Table, ...]) -> Non
 def test_the_estimator_with_the_best_normals_is_shown(reports: list[ValidationReport]) -> None:
     assert best_method(reports) == "3SDIR"
     assert best_method([r for r in reports if r.affine_method == "F2UDIR"]) == "F2UDIR"
+
+
+def test_rounding_does_not_choose_between_estimators_that_find_the_same_normals(
+    reports: list[ValidationReport],
+) -> None:
+    def with_error(report: ValidationReport, method: str, add: float) -> ValidationReport:
+        boards = tuple(replace(b, normal_errors=replace(b.normal_errors, mean_deg=0.5 + add)) for b in report.boards)
+        return replace(report, affine_method=method, boards=boards)
+
+    for rounding in (-1e-14, 1e-14):
+        tied = [
+            with_error(r, method, add)
+            for r in reports
+            if r.affine_method == "3SDIR"
+            for method, add in (("F3UDIR", 1e-4), ("DET3UDIR", 0.0), ("3SDIR", rounding))
+        ]
+        assert best_method(tied) == "3SDIR"
+        assert best_report(tied[:3]).affine_method == "3SDIR"
 
 
 def test_baselines_mark_the_nearest_and_the_failed(tables: tuple[Table, ...]) -> None:
