@@ -183,8 +183,7 @@ def _observations(
         squared = np.zeros(observations.present.shape)
         kept[observations.present] = np.concatenate([e.kept for e in own])
         squared[observations.present] = np.concatenate([e.squared_px for e in own])
-        if float(np.ptp(observations.sigma_px[observations.present])) > 0.0:
-            observations = observations.with_common_error(squared, kept)
+        observations = observations.with_common_error(squared, kept)
         # Cameras differ in how sharp they are: a residual counts in its own camera's standard deviations.
         better = sigma / max(alone.sigma_px, LEAST_PX) if sigma > LEAST_PX else 1.0
         cameras.append(observations)
