@@ -48,7 +48,7 @@ def compare_mounts(
     covariance_a: FloatArray | None,
     covariance_b: FloatArray | None,
 ) -> RigDifference:
-    """Compare cam_from_rig of n cameras, the first the identity in both.
+    """Compare cam_from_rig of n cameras, the first the identity in both; of one camera alone nothing can differ.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def compare_mounts(
         not among them.
     """
     both = None if covariance_a is None or covariance_b is None else covariance_a + covariance_b
-    off = np.concatenate([_off(first, second) for first, second in zip(a[1:], b[1:], strict=True)])
+    off = np.concatenate([np.zeros(0), *(_off(first, second) for first, second in zip(a[1:], b[1:], strict=True))])
     mounts = []
     for k, name in enumerate(names[1:]):
         own = slice(6 * k, 6 * k + 6)
