@@ -6,6 +6,7 @@ import numpy as np
 
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.solver import refine_frames, solve_rig
+from rigkit.calibration.rig.state import RigObservations
 
 __all__ = ["heldout_rms"]
 
@@ -16,21 +17,20 @@ TOLERANCE = 1e-6
 def heldout_rms(joint: JointRig, folds: int) -> tuple[float | None, tuple[float | None, ...]]:
     """Return the 2-D RMS over frames that took no part, of all cameras together and of each: cameras, mounts, places
     and shapes of boards from the other frames, only one pose a target refitted, by all cameras at once. None with fewer
-    frames than folds.
+    frames than folds, or where those of one fold alone tell where a camera sits.
 
     It counts what a held-out error of single cameras cannot see: cameras that disagree.
     """
     observations, state = joint.observations, joint.solution.state
     frame = joint.frames
     nothing = None, (None,) * len(observations.cameras)
-    # Poses that no two views share say nothing about the rig.
     if folds < 2 or int(frame.max()) + 1 < folds:
         return nothing
     squared, count = np.zeros(len(observations.cameras)), np.zeros(len(observations.cameras))
     for k in range(folds):
         test = frame % folds == k
         train = observations.subset(~test)
-        if any(not len(own.views) for own in train.cameras):
+        if not _hang_together(train):
             return nothing
         solved = solve_rig(train, state, joint.sigma_px, TOLERANCE).state
         part = observations.subset(test)
@@ -41,3 +41,15 @@ def heldout_rms(joint: JointRig, folds: int) -> tuple[float | None, tuple[float 
             count[c] += float(used.sum())
     each = tuple(float(np.sqrt(s / n)) if n else None for s, n in zip(squared, count, strict=True))
     return float(np.sqrt(squared.sum() / count.sum())), each
+
+
+def _hang_together(observations: RigObservations) -> bool:
+    """Say whether every camera shares a pose with the first, or with those that hang together with it."""
+    poses = [set(own.tolist()) for own in observations.frame]
+    linked, rest = poses[0], poses[1:]
+    while rest:
+        near = [own for own in rest if own & linked]
+        if not near:
+            return False
+        linked, rest = linked.union(*near), [own for own in rest if not own & linked]
+    return True
