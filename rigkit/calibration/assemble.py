@@ -9,12 +9,13 @@ from rigkit.calibration.fit import Fit
 from rigkit.calibration.normal import Normal
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import BoardShape, Calibration, Candidate, Outlier, ViewResult
+from rigkit.calibration.shape import ShapeModel
 from rigkit.calibration.solver import State, with_priors
 from rigkit.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
 
-__all__ = ["assemble", "motion_of_world", "require_determined", "solution_normal"]
+__all__ = ["assemble", "board_shapes", "motion_of_world", "require_determined", "solution_normal"]
 
 UNKNOWN_SHARE = 0.05
 """A projection that is uncertain by this part of the image's width, where the boards were, is not determined."""
@@ -47,7 +48,7 @@ def assemble(
         outliers=_outliers(observations, fit),
         candidates=candidates,
         convergence=fit.convergence,
-        boards=_boards(observations, state),
+        boards=board_shapes(observations, state.shape, state.unknowns),
     )
 
 
@@ -113,18 +114,10 @@ def require_determined(result: Calibration, at_corners_px: FloatArray) -> None:
         )
 
 
-def _boards(observations: Observations, state: State) -> tuple[BoardShape, ...]:
-    points = state.shape.points(state.unknowns)
-    out = []
-    for i, board in enumerate(observations.boards):
-        own = points[observations.first_row[i] : observations.first_row[i + 1]]
-        if state.shape.kind == "flat":
-            out.append(BoardShape(board.board_id, "flat", own))
-            continue
-        centred = own - own.mean(axis=0)
-        normal = np.linalg.svd(centred, full_matrices=False)[2][2]
-        flat = board.points() - board.points().mean(axis=0)
-        scale = (flat * centred).sum(axis=0)[:2] / (flat**2).sum(axis=0)[:2]
-        bow = float(np.abs(centred @ normal).max())
-        out.append(BoardShape(board.board_id, state.shape.kind, own, bow, float(scale[0] / scale[1] - 1.0)))
-    return tuple(out)
+def board_shapes(observations: Observations, shape: ShapeModel, unknowns: FloatArray) -> tuple[BoardShape, ...]:
+    """Return the boards that the views show, as the shape's unknowns have them."""
+    points, first_row = shape.points(unknowns), observations.first_row
+    return tuple(
+        BoardShape.of(observations.boards[b], shape.kind, points[first_row[b] : first_row[b + 1]])
+        for b in np.unique(observations.board).tolist()
+    )

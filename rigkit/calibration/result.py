@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray, Pixels, Points, as_array, as_indices
+from rigkit.boards import Board
 from rigkit.cameras.base import Camera
 from rigkit.detections import BoardView
 from rigkit.errors import InputError
@@ -132,6 +133,18 @@ class BoardShape:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points_mm", as_array(self.points_mm, (None, 3), "points_mm"))
+
+    @classmethod
+    def of(cls, board: Board, kind: str, points_mm: Points) -> BoardShape:
+        """Return the shape of `board` with its corners at `points_mm`, bow and aspect from them."""
+        if kind == "flat":
+            return cls(board.board_id, kind, points_mm)
+        centred = points_mm - points_mm.mean(axis=0)
+        normal = np.linalg.svd(centred, full_matrices=False)[2][2]
+        flat = board.points() - board.points().mean(axis=0)
+        scale = (flat * centred).sum(axis=0)[:2] / (flat**2).sum(axis=0)[:2]
+        bow = float(np.abs(centred @ normal).max())
+        return cls(board.board_id, kind, points_mm, bow, float(scale[0] / scale[1] - 1.0))
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -9,8 +9,8 @@ import numpy as np
 
 from rigkit.arrays import FloatArray
 from rigkit.boards import Board
-from rigkit.calibration.assemble import motion_of_world
-from rigkit.calibration.result import BoardShape, Calibration, ViewResult
+from rigkit.calibration.assemble import board_shapes, motion_of_world
+from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.rig.board_rig import BoardRig, PlacedBoard
 from rigkit.calibration.rig.flatness import shape_error
 from rigkit.calibration.rig.joint import JointRig
@@ -69,7 +69,7 @@ def assemble_rig(
             frame_covariance=frame,
             views=views,
             convergence=joint.solution.convergence,
-            boards=_shapes(single[c], observations, shapes),
+            boards=board_shapes(observations.cameras[c], observations.shape, state.unknowns),
         )
         mount = Rigid3(state.mount_rotation[c], state.mount_mm[c])
         cameras.append(RigCamera(name, mount, of_camera))
@@ -147,18 +147,6 @@ def _frame_covariance(
     out = design @ unit @ design.T
     out[-6:, -6:] += np.einsum("fij,fjk,flk->il", each, own, each)
     return np.asarray(0.5 * (out + out.T))
-
-
-def _shapes(alone: Calibration, observations: RigObservations, shapes: dict[str, FloatArray]) -> tuple[BoardShape, ...]:
-    """Return the shapes of the boards that the camera saw, as the rig has them."""
-    known = {b.board_id: b for b in alone.boards}
-    out = []
-    for name, points in shapes.items():
-        before = known.get(name)
-        if before is not None:
-            kind = observations.shape.kind
-            out.append(before if kind == "flat" else replace(before, kind=kind, points_mm=points))
-    return tuple(out)
 
 
 def _board_rigs(
