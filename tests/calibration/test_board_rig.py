@@ -203,7 +203,7 @@ def test_cameras_that_see_different_boards_of_a_target(rng: np.random.Generator)
     shared = {(f, v.board.board_id) for f, v in views["reg"]} & {(f, v.board.board_id) for f, v in views["wide"]}
     views["reg"] = [(f, v) for f, v in views["reg"] if (f, v.board.board_id) not in shared]
     views["reg"] += [
-        (f + "x", v)
+        (f + "x", replace(v, image=v.image + "x"))
         for f, v in target_views(rng, REG, DIFFERENT, room, 3, noise_px=NOISE_PX, distance_mm=1000.0)["reg"]
     ]
     rig = solve(views, DIFFERENT)

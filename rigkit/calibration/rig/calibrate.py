@@ -9,7 +9,7 @@ well. One camera before such a target is a rig too.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from rigkit.boards import Board
 from rigkit.calibration.calibrate import FOLDS, calibrate
@@ -59,12 +59,18 @@ def calibrate_rig(
     ------
     InputError
         Fewer than two cameras and no rigid boards, cameras that share no board in any frame, a camera without views, or
-        rigid boards that are never seen together.
+        rigid boards that are never seen together; two images of a frame by one camera; a camera without size or model.
     DegenerateError
         As for `calibrate`, with the name of the camera; or the cameras disagree on most of what they share.
     """
     if not views or (len(views) < 2 and not rigid_boards):
         raise InputError(f"rig: {len(views)} camera; a rig has at least two, or boards that are mounted to each other")
+    for what, given in (("sizes_px", sizes_px), ("model", model), ("degree", degree)):
+        missing = [name for name in views if isinstance(given, Mapping) and name not in given]
+        if missing:
+            raise InputError(f"rig: {what} has no entry for camera '{missing[0]}'")
+    for name, own in views.items():
+        _require_one_image(name, own)
     options = _Options(sizes_px, model, degree, board, folds)
     single = options.each_alone(views, progress)
     seen = [seen_by(own, result) for own, result in zip(views.values(), single, strict=True)]
@@ -88,18 +94,34 @@ def calibrate_rig(
     return replace(rig, verdicts=judge_rig(rig, (*notes, *joint.notes)))
 
 
+def _require_one_image(name: str, own: Sequence[tuple[str, BoardView]]) -> None:
+    """Raise InputError where the camera shows a board twice in a frame, or one image in two frames."""
+    shown: set[tuple[str, str]] = set()
+    frames: dict[str, str] = {}
+    for frame, view in own:
+        board = view.board.board_id
+        if (frame, board) in shown:
+            raise InputError(
+                f"rig: camera '{name}' shows board '{board}' twice in frame '{frame}'; a frame is one image of each "
+                "camera, and boards have names of their own"
+            )
+        shown.add((frame, board))
+        if frames.setdefault(view.image, frame) != frame:
+            raise InputError(
+                f"rig: camera '{name}': image '{view.image}' is of frame '{frame}' and of '{frames[view.image]}'; give "
+                "images names of their own"
+            )
+
+
+@dataclass(frozen=True, slots=True)
 class _Options:
     """How every camera is calibrated alone."""
 
-    def __init__(
-        self,
-        sizes_px: Mapping[str, tuple[int, int]],
-        model: str | Mapping[str, str],
-        degree: int | Mapping[str, int | None] | None,
-        board: str,
-        folds: int,
-    ) -> None:
-        self._sizes_px, self._model, self._degree, self._board, self._folds = sizes_px, model, degree, board, folds
+    sizes_px: Mapping[str, tuple[int, int]]
+    model: str | Mapping[str, str]
+    degree: int | Mapping[str, int | None] | None
+    board: str
+    folds: int
 
     def each_alone(self, views: Views, progress: Progress) -> tuple[Calibration, ...]:
         """Return the calibration of each camera alone; errors name the camera."""
@@ -110,11 +132,11 @@ class _Options:
                 single.append(
                     calibrate(
                         [view for _, view in own],
-                        self._sizes_px[name],
-                        model=self._model if isinstance(self._model, str) else self._model[name],
-                        degree=self._degree[name] if isinstance(self._degree, Mapping) else self._degree,
-                        board=self._board,
-                        folds=self._folds,
+                        self.sizes_px[name],
+                        model=self.model if isinstance(self.model, str) else self.model[name],
+                        degree=self.degree[name] if isinstance(self.degree, Mapping) else self.degree,
+                        board=self.board,
+                        folds=self.folds,
                     )
                 )
             except (InputError, DegenerateError) as error:
