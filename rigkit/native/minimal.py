@@ -9,7 +9,7 @@ from ctypes import c_int64, c_void_p
 import numpy as np
 
 from rigkit.arrays import FloatArray, Mat3
-from rigkit.native import kernels
+from rigkit.native import address, kernels
 
 __all__ = ["five_rows", "loaded", "six_rows"]
 
@@ -29,12 +29,12 @@ def loaded() -> ctypes.CDLL | None:
 def five_rows(library: ctypes.CDLL, rows: FloatArray) -> Mat3:
     """Return up to ten E (B, 10, 3, 3) of `rows` (B, 5, 9), NaN where there are fewer."""
     rows, out = np.ascontiguousarray(rows, np.float64), np.empty((len(rows), 10, 3, 3))
-    library.five_rows(rows.ctypes.data, len(rows), out.ctypes.data)
+    library.five_rows(address(rows), len(rows), address(out))
     return out
 
 
 def six_rows(library: ctypes.CDLL, rows: FloatArray) -> Mat3:
     """Return the E (B, 1, 3, 3) of `rows` (B, 6, 9)."""
     rows, out = np.ascontiguousarray(rows, np.float64), np.empty((len(rows), 1, 3, 3))
-    library.six_rows(rows.ctypes.data, len(rows), out.ctypes.data)
+    library.six_rows(address(rows), len(rows), address(out))
     return out

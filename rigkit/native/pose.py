@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from rigkit.arrays import FloatArray, IntArray, Mat3
-from rigkit.native import kernels
+from rigkit.native import address, kernels
 
 __all__ = ["improve", "loaded", "minimise", "qualities", "qualities_ahead", "residuals"]
 
@@ -34,14 +34,14 @@ def loaded() -> ctypes.CDLL | None:
     library = kernels("pose")
     if library is None:
         return None
-    address, size = c_void_p, c_int64
-    library.residuals.argtypes = [address, size, address, size, address]
-    library.qualities.argtypes = [address, size, address, size, c_double, address]
-    library.improve.argtypes = [address, size, address, address, c_double, size, address, size, size, c_double]
-    library.qualities_ahead.argtypes = [address, size, address, address, size, c_double, c_double, address]
+    pointer, size = c_void_p, c_int64
+    library.residuals.argtypes = [pointer, size, pointer, size, pointer]
+    library.qualities.argtypes = [pointer, size, pointer, size, c_double, pointer]
+    library.improve.argtypes = [pointer, size, pointer, pointer, c_double, size, pointer, size, size, c_double]
+    library.qualities_ahead.argtypes = [pointer, size, pointer, pointer, size, c_double, c_double, pointer]
     for name in ("residuals", "qualities", "qualities_ahead", "improve"):
         getattr(library, name).restype = None
-    library.minimise.argtypes, library.minimise.restype = [POINTER(_Problem), *[address] * 5], size
+    library.minimise.argtypes, library.minimise.restype = [POINTER(_Problem), *[pointer] * 5], size
     return library
 
 
@@ -49,7 +49,7 @@ def residuals(library: ctypes.CDLL, packed: FloatArray, E21: Mat3) -> FloatArray
     """Return the distances (H, N) in sigmas of the matches `packed` (18, N) from hypotheses (H, 3, 3)."""
     E21 = np.ascontiguousarray(E21, np.float64)
     out = np.empty((len(E21), packed.shape[1]))
-    library.residuals(packed.ctypes.data, packed.shape[1], E21.ctypes.data, len(E21), out.ctypes.data)
+    library.residuals(address(packed), packed.shape[1], address(E21), len(E21), address(out))
     return out
 
 
@@ -57,7 +57,7 @@ def qualities(library: ctypes.CDLL, packed: FloatArray, E21: Mat3, noise: float)
     """Return the sums (H,) of the marginal qualities of the matches `packed` (18, N) under hypotheses (H, 3, 3)."""
     E21 = np.ascontiguousarray(E21, np.float64)
     out = np.empty(len(E21))
-    library.qualities(packed.ctypes.data, packed.shape[1], E21.ctypes.data, len(E21), noise, out.ctypes.data)
+    library.qualities(address(packed), packed.shape[1], address(E21), len(E21), noise, address(out))
     return out
 
 
@@ -65,9 +65,10 @@ def qualities_ahead(
     library: ctypes.CDLL, packed: FloatArray, R: FloatArray, t: FloatArray, noise: float, sigmas: float
 ) -> FloatArray:
     """Return the sums (H,) over what lies ahead, of rotations (H, 2, 3, 3) and directions (H, 3); see pose.c."""
-    R, t, out = np.ascontiguousarray(R), np.ascontiguousarray(t), np.empty(len(t))
-    where = packed.ctypes.data, packed.shape[1], R.ctypes.data, t.ctypes.data
-    library.qualities_ahead(*where, len(t), noise, sigmas, out.ctypes.data)
+    R, t = np.ascontiguousarray(R, np.float64), np.ascontiguousarray(t, np.float64)
+    out = np.empty(len(t))
+    where = address(packed), packed.shape[1], address(R), address(t)
+    library.qualities_ahead(*where, len(t), noise, sigmas, address(out))
     return out
 
 
@@ -82,10 +83,11 @@ def improve(
     settled_rad: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the rotations (H, 3, 3) and directions (H, 3) of best quality at a noise level near those given."""
-    R, t, free = np.array(R, order="C"), np.array(t, order="C"), np.ascontiguousarray(free, np.int64)
+    R, t = np.array(R, np.float64, order="C"), np.array(t, np.float64, order="C")
+    free = np.ascontiguousarray(free, np.int64)
     library.improve(
-        *(packed.ctypes.data, packed.shape[1], R.ctypes.data, t.ctypes.data, noise, len(R)),
-        *(free.ctypes.data, len(free), most_steps, settled_rad),
+        *(address(packed), packed.shape[1], address(R), address(t), noise, len(R)),
+        *(address(free), len(free), most_steps, settled_rad),
     )
     return R, t
 
@@ -111,7 +113,7 @@ def minimise(
     kept = [np.ascontiguousarray(a, np.float64) for a in (packed, affine, point_weights)]
     indices = [np.ascontiguousarray(a, np.int64) for a in (which, free)]
     problem = _Problem(
-        *(array.ctypes.data for array in (*kept, *indices)),
+        *(address(array) for array in (*kept, *indices)),
         *(packed.shape[1], len(which), len(free), loss[0], most_iterations),
         *(loss[1], tolerance),
     )
@@ -119,7 +121,7 @@ def minimise(
     R, t = np.array(R, np.float64, order="C"), np.array(t, np.float64)
     r, jacobian, weights = np.empty(rows), np.empty((rows, 5)), np.empty(rows)
     out = (R, t, r, jacobian, weights)
-    iterations = library.minimise(byref(problem), *(array.ctypes.data for array in out))
+    iterations = library.minimise(byref(problem), *(address(array) for array in out))
     if iterations == NO_MEMORY:
         raise MemoryError
     return *out, abs(iterations), iterations > 0 or not len(free)

@@ -153,6 +153,15 @@ def test_how_arrays_lie_in_memory_does_not_matter(rng):
     assert np.array_equal(SampsonRows.of(same).residuals(E21), SampsonRows.of(wild).residuals(E21))
 
 
+def test_the_precision_of_the_hypotheses_does_not_matter(rng):
+    wild, pose = _matches(rng)
+    rows, E21 = SampsonRows.of(wild), _starts(rng, pose).astype(np.float32)
+    same = E21.astype(np.float64)
+    assert np.array_equal(rows.residuals(E21), rows.residuals(same))
+    assert rows.quality_ahead(E21, 5.0, 6.0) == pytest.approx(rows.quality_ahead(same, 5.0, 6.0), rel=1e-4)
+    assert _off(rows.improved(E21, "general", 6.0), rows.improved(same, "general", 6.0)).max() < 1e-5
+
+
 @pytest.mark.parametrize("kind", ["general", "planar", "standard"])
 def test_local_optima(rng, kind, in_numpy):
     wild, pose = _matches(rng, kind)
