@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from rigkit.errors import InputError
 from rigkit.fundamental.estimate import FundamentalSolver
-from rigkit.fundamental.forward import ForwardSolver
+from rigkit.fundamental.fixed import FixedSolver
 from rigkit.fundamental.general import GeneralSolver
 from rigkit.fundamental.planar import PlanarSolver
-from rigkit.fundamental.standard import StandardSolver
 from rigkit.fundamental.translation import TranslationSolver
 
 __all__ = ["SOLVERS", "fundamental_for"]
@@ -15,8 +14,8 @@ __all__ = ["SOLVERS", "fundamental_for"]
 SOLVERS: dict[str, FundamentalSolver] = {
     "general": GeneralSolver(),
     "planar": PlanarSolver(),
-    "standard": StandardSolver(),
-    "forward": ForwardSolver(),
+    "standard": FixedSolver((1.0, 0.0, 0.0)),
+    "forward": FixedSolver((0.0, 0.0, 1.0)),
     "translation": TranslationSolver(),
 }
 
