@@ -64,7 +64,7 @@ def homography_from_affines(pixels1: Pixels, pixels2: Pixels, A21: Affines, *, a
     Raises
     ------
     InputError
-        Fewer than two points, or shapes that do not fit.
+        Fewer than two points, shapes that do not fit, numbers that are not finite.
     DegenerateError
         The points and affinities do not determine a homography (all points equal, affinities singular).
 
@@ -76,6 +76,8 @@ def homography_from_affines(pixels1: Pixels, pixels2: Pixels, A21: Affines, *, a
     n = len(q1)
     if n < 2 or q1.shape != (n, 2) or q2.shape != (n, 2) or A.shape != (n, 2, 2):
         raise InputError(f"homography from affinities: two points or more with pixels and affinities, got {q1.shape}")
+    if not all(np.isfinite(v).all() for v in (q1, q2, A)):
+        raise InputError("homography from affinities: pixels or affinities are NaN or infinite; leave those points out")
     T1, T2 = _normalisation(q1), _normalisation(q2)
     x1, x2 = q1 * T1[0, 0] + T1[:2, 2], q2 * T2[0, 0] + T2[:2, 2]
     A = A * (T2[0, 0] / T1[0, 0])
@@ -90,7 +92,7 @@ def homography_from_affines(pixels1: Pixels, pixels2: Pixels, A21: Affines, *, a
             affine[:, r, c, 2, c] = -x2[:, r]
             affine[:, r, c, 2] -= A[:, r, c, None] * x1h
     system = np.concatenate([points.reshape(-1, 9), affine_weight * affine.reshape(-1, 9)])
-    _, singular, vt = np.linalg.svd(system)
+    _, singular, vt = np.linalg.svd(system, full_matrices=False)
     if singular[7] < DEGENERATE * singular[0]:
         raise DegenerateError("homography from affinities: points and affinities do not determine it")
     H21 = np.linalg.inv(T2) @ vt[-1].reshape(3, 3) @ T1
@@ -155,6 +157,8 @@ DEGENERATE = 1e-10
 
 def _normalisation(pixels: Pixels) -> Mat3:
     """Return the similarity that centres the points and makes their mean distance from the origin sqrt(2)."""
+    if not len(pixels):
+        return np.eye(3)
     centre = pixels.mean(axis=0)
     spread = np.linalg.norm(pixels - centre, axis=1).mean()
     s = np.sqrt(2.0) / spread if spread > 0.0 else 1.0

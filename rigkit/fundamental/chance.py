@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import lgamma
+from math import inf, lgamma
 
 import numpy as np
 
@@ -24,6 +24,8 @@ def log_false_alarms(
 ) -> float:
     """Return the log of how many poses would be expected to do as well if all matches were wrong.
 
+    Infinite for fewer matches than a pose can always be made to fit.
+
     Parameters
     ----------
     matches : all of them.
@@ -40,6 +42,8 @@ def log_false_alarms(
     seen from the points themselves, partnered wrongly on purpose, and from the affinities of those that do not fit.
     """
     n, k = len(matches), int(inliers.sum())
+    if k < freedom:
+        return inf
     fitting = total = 0
     for shift in range(1, min(n, SHIFTS + 1)):
         other = np.roll(np.arange(n), shift)

@@ -116,10 +116,13 @@ def check_count(matches: Matches, weights: RowWeights, minimum: int, what: str) 
 def check_baseline(matches: Matches) -> None:
     """Raise DegenerateError if a rotation alone explains the matches: no baseline, no epipolar geometry.
 
-    The test is on the sum of squared residuals, in the sigmas of the matches, of the best rotation f2 = R f1.
+    The test is on the sum of squared residuals, in the sigmas of the matches, of the best rotation f2 = R f1. No matches
+    at all raise InputError.
     """
     n = len(matches)
-    if n < 2:
+    if n == 0:
+        raise InputError("there are no matches: nothing to estimate an epipolar geometry from")
+    if n == 1:
         return
     square = np.sum(transfer_error(matches, nearest_rotation(matches.rays2.T @ matches.rays1)) ** 2, axis=1)
     freedom = 2 * n - 3

@@ -21,6 +21,7 @@ class GeneralSolver:
 
     def solve(self, matches: Matches, weights: WeightRule | RowWeights | None = None) -> EpipolarEstimate:
         """Return F21 (rank two) and the nearest E21; see FundamentalSolver."""
+        check_baseline(matches)
         rows = NormalisedRows(matches)
 
         def linear(row_weights: RowWeights) -> Mat3:
@@ -28,5 +29,4 @@ class GeneralSolver:
             return linear_epipolar(rows, row_weights)
 
         matrix, used = reweighted(matches, weights, linear)
-        check_baseline(matches)
         return finish(matches, essential_nearest(matrix), matrix, used)

@@ -135,6 +135,8 @@ def _similarity_scale(
     """Return mm per unit, its standard deviation and its gradient (N, 3) for one board; None without a scale."""
     centred = model - model.mean(axis=0)
     k, R, c = _robust_start(points, centred)
+    if not k > 0.0:
+        return None
     if covariances is None:
         whiten = np.broadcast_to(np.eye(3), (len(points), 3, 3))
     else:
@@ -169,7 +171,8 @@ def _robust_start(points: Points, centred: Points) -> tuple[float, FloatArray, F
     """Return unit per mm (median of all distance ratios), rotation and centre to begin with."""
     first, second = np.triu_indices(len(points), 1)
     between = np.linalg.norm(points[first] - points[second], axis=1)
-    k = float(np.median(between / np.linalg.norm(centred[first] - centred[second], axis=1)))
+    grid = np.linalg.norm(centred[first] - centred[second], axis=1)
+    k = float(np.median(between[grid > 0.0] / grid[grid > 0.0]))
     c = np.median(points, axis=0)
     R = nearest_rotation((points - c).T @ centred)
     for _ in range(5):

@@ -15,6 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, Mat3, Pixels, Points, RayJacobians, Rays
+from rigkit.errors import InputError
 from rigkit.geometry.projection_jacobian import projection_jacobian
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import cross, skew, unit
@@ -82,7 +83,7 @@ def correct_hartley_sturm(pixels1: Pixels, pixels2: Pixels, F21: Mat3) -> tuple[
     rotation2, f2, offset2 = _epipole_frame(u[:, 2], q2)
     # Coordinates with the point at the origin and the epipole at (1, 0, f).
     local = rotation2 @ np.swapaxes(offset2, -1, -2) @ F21 @ offset1 @ np.swapaxes(rotation1, -1, -2)
-    local = local / np.linalg.norm(local, axis=(-2, -1), keepdims=True)
+    local = _ratio(local, np.linalg.norm(local, axis=(-2, -1), keepdims=True))
     a, b, c, d = (local[:, i, j, None] for i, j in ((1, 1), (1, 2), (2, 1), (2, 2)))
     f1, f2 = f1[:, None], f2[:, None]
     # First-order size of t: the distance from the line of the other image through the epipole.
@@ -112,6 +113,9 @@ def correct_hartley_sturm(pixels1: Pixels, pixels2: Pixels, F21: Mat3) -> tuple[
     return np.where(keep, q1, out1), np.where(keep, q2, out2)
 
 
+CORRECTIONS = {"lindstrom": correct_lindstrom, "hartley_sturm": correct_hartley_sturm}
+
+
 def correct_rays(
     rays1: Rays,
     rays2: Rays,
@@ -126,7 +130,8 @@ def correct_rays(
     perpendicular to the baseline.
     """
     a, b = np.asarray(rays1) @ cam2_from_cam1.rotation.T, np.asarray(rays2, dtype=np.float64)
-    basis = np.linalg.svd(unit(cam2_from_cam1.translation_mm)[None, :])[2][1:]
+    # Without a baseline, any two directions: nothing is triangulated with those rays.
+    basis = np.linalg.svd(cam2_from_cam1.translation_mm[None, :])[2][1:]
     wa = (a @ basis.T) / np.asarray(sigma1_rad)[..., None]
     wb = (b @ basis.T) / np.asarray(sigma2_rad)[..., None]
     moment = wa[..., :, None] * wa[..., None, :] + wb[..., :, None] * wb[..., None, :]
@@ -222,13 +227,13 @@ def triangulate_pixels(
 ) -> tuple[Points, BoolArray]:
     """Return the points (N, 3) seen in two perspective views and where they are valid.
 
-    `method` is "lindstrom" or "hartley_sturm"; `K1`, `K2` are the camera matrices.
+    `method` is "lindstrom" or "hartley_sturm"; `K1`, `K2` are the camera matrices. Raises InputError for another one.
     """
+    if method not in CORRECTIONS:
+        raise InputError(f"triangulation method '{method}' is unknown; known: {', '.join(CORRECTIONS)}")
     inverse1, inverse2 = np.linalg.inv(K1), np.linalg.inv(K2)
     F21 = inverse2.T @ skew(cam2_from_cam1.translation_mm) @ cam2_from_cam1.rotation @ inverse1
-    F21 = F21 / np.linalg.norm(F21)
-    correct = {"lindstrom": correct_lindstrom, "hartley_sturm": correct_hartley_sturm}[method]
-    near1, near2 = correct(pixels1, pixels2, F21)
+    near1, near2 = CORRECTIONS[method](pixels1, pixels2, F21)
     rays1 = unit(near1 @ inverse1[:, :2].T + inverse1[:, 2])
     rays2 = unit(near2 @ inverse2[:, :2].T + inverse2[:, 2])
     return triangulate_midpoint(rays1, rays2, cam2_from_cam1)

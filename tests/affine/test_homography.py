@@ -96,3 +96,28 @@ def test_homography_from_one_affinity_and_F(corners: Corners, H21: np.ndarray) -
     assert valid.all()
     sign = np.sign(found[:, 2, 2] * H21[2, 2])[:, None, None]
     np.testing.assert_allclose(sign * found, np.broadcast_to(H21, found.shape), atol=1e-9 * np.abs(H21).max())
+
+
+@pytest.mark.parametrize("name", ["pixels1", "pixels2", "A21"])
+def test_a_homography_of_unknown_numbers_is_refused(name):
+    given = {"pixels1": np.eye(2), "pixels2": np.eye(2), "A21": np.tile(np.eye(2), (2, 1, 1))}
+    given[name][1] = np.nan
+    with pytest.raises(InputError, match="NaN"):
+        homography_from_affines(**given)
+
+
+def test_a_homography_of_many_points_needs_little_memory(rng):
+    # All left singular vectors of the six rows of each point would take 30 GB.
+    H = np.array([[1.1, 0.1, 20.0], [-0.1, 0.9, -30.0], [1e-4, -2e-4, 1.0]])
+    q1 = rng.uniform(0.0, 1000.0, (10_000, 2))
+    A21, _ = affines_from_homography(H, q1)
+    q2 = np.concatenate([q1, np.ones((10_000, 1))], axis=1) @ H.T
+    found = homography_from_affines(q1, q2[:, :2] / q2[:, 2:], A21)
+    assert found == pytest.approx(H / np.linalg.norm(H), abs=EXACT_REL)
+
+
+def test_no_points_have_no_homographies(corners):
+    none = np.zeros((0, 2))
+    H21, valid = homographies_from_affines_and_F(np.eye(3), none, none, np.zeros((0, 2, 2)))
+    assert H21.shape == (0, 3, 3)
+    assert valid.shape == (0,)

@@ -138,6 +138,21 @@ def test_too_few_matches_are_refused_with_the_number(rng, kind, count):
         fundamental_for(kind).solve(matches, "points")
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_matches_are_refused(rng, kind):
+    with pytest.raises(InputError, match="no matches"):
+        fundamental_for(kind).solve(pair(rng, 1)[0].select(np.zeros(0, dtype=np.int64)))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_rule_auto_finds_the_noise_of_the_affinities(rng, kind):
+    matches, _, _ = pair(rng, 200, kind, noise_px=0.2, sigma_A=0.01)
+    estimate = fundamental_for(kind).solve(matches, "auto")
+    # The median of 400 numbers is known to 6 %.
+    assert estimate.weights.sigma_A == pytest.approx(np.full(200, 0.01), rel=0.25)
+
+
 def test_affine_correspondences_need_fewer(rng):
     for kind, count in (("general", 3), ("planar", 1), ("translation", 1)):
         matches, pose, _ = pair(rng, count, kind, sigma_A=0.0)

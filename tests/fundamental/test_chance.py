@@ -33,6 +33,11 @@ def test_right_matches_are_no_chance_and_wrong_ones_are(rng):
     assert log_false_alarms(wrong, pose, inliers, ALL, 5, GATE) > 0.0
 
 
+def test_fewer_matches_than_a_pose_needs_say_nothing(rng):
+    m, pose, _ = pair(rng, 80, noise_px=0.5)
+    assert log_false_alarms(m, pose, np.arange(80) < 3, ALL, 5, GATE) == np.inf
+
+
 def test_it_is_the_binomial_bound(rng):
     """The chance of a fit, measured over all wrong partners, is the share of all pairs of points that fit."""
     m, pose, _ = pair(rng, 80, noise_px=0.5)

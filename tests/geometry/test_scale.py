@@ -114,3 +114,18 @@ def test_the_gradient_is_that_of_differences(rng, weighted):
         step = 1e-6
         ahead, back = (metric_scale(points + sign * step * motion, *known)[0] for sign in (1.0, -1.0))
         assert np.sum(gradient * motion) == pytest.approx((ahead - back) / (2.0 * step), rel=0.01, abs=1e-3 * scale)
+
+
+def test_a_corner_that_comes_twice_counts_twice(rng):
+    points, index, grid, covariance = reconstruction(rng, 1e-4)
+    again = np.r_[np.arange(len(points)), 7]
+    scale, sigma = metric_scale(points[again], index[again], grid[again], BOARDS, covariance[again])
+    assert abs(scale - TRUE) < 5.0 * sigma
+
+
+def test_points_that_coincide_have_no_scale(rng):
+    points, index, grid, covariance = reconstruction(rng)
+    with pytest.raises(DegenerateError, match="no scale"):
+        metric_scale(np.zeros_like(points), index, grid, BOARDS, covariance)
+    points[index == 0] = points[0]
+    assert metric_scale(points, index, grid, BOARDS, covariance)[0] == pytest.approx(TRUE)

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from rigkit.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, exp_so3, skew, unit
 from rigkit.geometry.sampson import sampson_distances
@@ -242,3 +243,19 @@ def test_point_covariance_agrees_with_monte_carlo(rng):
         assert np.allclose(measured[:, axis, axis] / predicted[:, axis, axis], 1.0, atol=0.11)
     ratio = np.trace(measured @ np.linalg.inv(predicted), axis1=1, axis2=2) / 3.0
     assert abs(ratio.mean() - 1.0) < 0.03
+
+
+@pytest.mark.filterwarnings("error")
+def test_cameras_in_one_place_triangulate_nothing(rng):
+    still = Rigid3(exp_so3(np.array([0.0, 0.1, 0.0])), np.zeros(3))
+    X = rng.uniform([-300, -200, 700], [300, 200, 1500], (20, 3))
+    rays1, rays2 = unit(X), unit(still.apply(X))
+    assert not triangulate_rays(rays1, rays2, still)[1].any()
+    q1, q2 = (((f / f[:, 2:]) @ K.T)[:, :2] for f in (rays1, rays2))
+    for method in ("lindstrom", "hartley_sturm"):
+        assert not triangulate_pixels(q1, q2, K, K, still, method=method)[1].any()
+
+
+def test_an_unknown_method_is_refused():
+    with pytest.raises(InputError, match="lindstrom"):
+        triangulate_pixels(np.zeros((1, 2)), np.zeros((1, 2)), K, K, POSES["standard"], method="midpoint")
