@@ -59,9 +59,9 @@ RING = 0.3
 
 MIN_RING_PX, MAX_RING_PX = 2.2, 9.0
 
-CENTRE = 0.35
-"""As `ring.MAX_CENTRE`, for a saddle whose place and directions the lattice foretells: the ring may reach beyond the
-squares of flat or small cells."""
+ODD, CENTRE = 0.35, 0.35
+"""As `ring.MAX_ODD` and `ring.MAX_CENTRE`, for a saddle whose place and directions the lattice foretells: the edge of a
+shadow may cross it, and the ring may reach beyond the squares of flat or small cells."""
 
 LINE_SINE = float(np.sin(np.radians(25.0)))
 """How well the ring's lines must follow the lattice."""
@@ -200,7 +200,7 @@ def _rules() -> GrowthRules:
         "least_area": LEAST_AREA,
     }
     predictions = [FitRules(degree, RADIUS, False, WIDTH, ridge) for degree, ridge in (STIFF, PLIANT)]
-    return GrowthRules.make(predictions, ring_rules(CENTRE), ALONG, **numbers)
+    return GrowthRules.make(predictions, ring_rules(ODD, CENTRE), ALONG, **numbers)
 
 
 def _widened(cells: BoolArray) -> BoolArray:
@@ -274,7 +274,7 @@ def _fits(
     """Return the contrast at `pixels` and whether they can be the corners of the cells `owner`."""
     local = level.to_level(pixels)
     height = _area(fit)[owner] / np.maximum(_longest(fit)[owner], 1e-9) / level.scale
-    rings = read_rings(level.smooth, local, np.clip(RING * height, MIN_RING_PX, MAX_RING_PX), CENTRE)
+    rings = read_rings(level.smooth, local, np.clip(RING * height, MIN_RING_PX, MAX_RING_PX), ODD, CENTRE)
     sign = lattice.signs()[cell[owner, 0], cell[owner, 1]]
     a, b = fit.along_column[owner], fit.along_row[owner]
     first = np.where((sign > 0)[:, None], a, b)
