@@ -8,8 +8,11 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import ParamSpec, TypeVar
+
+from rigkit.errors import InputError
 
 __all__ = ["worker_pool"]
 
@@ -45,7 +48,7 @@ def worker_pool(count: int) -> Iterator[ProcessPoolExecutor]:
     """Give a pool of `count` fresh processes for the length of a `with` block.
 
     An exception in the block, an interrupt among them, ends work under way instead of waiting for it. If this process
-    is killed, its workers notice and end.
+    is killed, its workers notice and end. If a worker is killed, InputError says so.
     """
     others = set(multiprocessing.active_children())
     # "spawn": a fork after OpenCV has started its threads can hang.
@@ -53,6 +56,11 @@ def worker_pool(count: int) -> Iterator[ProcessPoolExecutor]:
         pool = _Pool(count, mp_context=multiprocessing.get_context("spawn"), initializer=_end_with_parent)
     try:
         yield pool
+    except BrokenProcessPool as error:
+        raise InputError(
+            "a process ended before its work was done, perhaps for want of memory; use fewer (-j 1), which shows any "
+            "other reason too"
+        ) from error
     except BaseException:
         pool.shutdown(wait=False, cancel_futures=True)
         for process in set(multiprocessing.active_children()) - others:

@@ -54,7 +54,7 @@ def _cameras(a: Path, b: Path, output: Path | None = None, *, force: bool = Fals
 
     cameras = load_camera(a), load_camera(b)
     # A camera from another tool comes without covariance: then there is a difference but no verdict.
-    known = all("covariance" in json.loads(path.read_text(encoding="utf-8")) for path in (a, b))
+    known = all("covariance" in json.loads(path.read_text(encoding="utf-8-sig")) for path in (a, b))
     result = compare_calibrations(load_calibration(a), load_calibration(b)) if known else None
     difference = compare_cameras(*cameras) if result is None else result.difference
     if output is not None:

@@ -71,7 +71,7 @@ def _read_camera(path: Path, kind: str) -> Camera:
     if kind == "rigkit":
         return load_camera(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"camera file '{path}' cannot be read ({error}); check the path") from error
     name = str(path)

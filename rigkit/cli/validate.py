@@ -25,6 +25,7 @@ from rigkit.cli.workflow import (
     shifts_of,
     write_results,
 )
+from rigkit.errors import InputError
 
 if TYPE_CHECKING:
     from rigkit.cli.workflow import LoadedCamera, PairFailure
@@ -62,6 +63,11 @@ def run(args: argparse.Namespace) -> int:
 def validate_dataset(args: argparse.Namespace, dataset: Dataset, out: Path) -> int:
     """Validate every pair of a data set, write the results into `out` and return the exit code."""
     started = time.monotonic()
+    if not any(pair.truth.count for pair in dataset.pairs):
+        raise InputError(
+            f"{dataset.manifest}: nothing was measured of these pairs; add a baseline or angles under [pairs.truth]"
+        )
+    paper = _paper_tables(dataset)
     progress = progress_on_stderr()
     cameras = load_cameras(dataset, recalibrate=args.recalibrate, progress=progress)
     jobs = [
@@ -76,7 +82,7 @@ def validate_dataset(args: argparse.Namespace, dataset: Dataset, out: Path) -> i
         for pair in dataset.pairs
     ]
     outcomes, failures = over_pairs(validate_pair, jobs, args.jobs, "reconstructing and validating pairs", progress)
-    return finish(args, dataset, outcomes, failures, out, time.monotonic() - started)
+    return finish(args, dataset, outcomes, failures, paper, out, time.monotonic() - started)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -203,6 +209,7 @@ def finish(
     dataset: Dataset,
     outcomes: list[PairOutcome],
     failures: tuple[PairFailure, ...],
+    paper: PaperTables | None,
     out: Path,
     seconds: float,
 ) -> int:
@@ -220,7 +227,7 @@ def finish(
     causes += suspects([outcome.best for outcome in outcomes])
     causes += [f"pair '{report.pair_id}': {words}" for report in compared for words in report.suspects]
     summary = summary_table([outcome.best for outcome in outcomes])
-    tables = [summary, *build_tables(reports, _paper_tables(dataset))]
+    tables = [summary, *build_tables(reports, paper)]
     if compared:
         tables.insert(-2, crosscheck_table(compared))
     files: dict[str, str | bytes] = {
@@ -289,7 +296,6 @@ def _say_failures(reports: list[ValidationReport], compared: list[CrossCheckRepo
 
 def _calibrations(dataset: Dataset) -> list[Table]:
     """Return the table of the cameras in use; none where their files say no more than the camera."""
-    from rigkit.errors import InputError
     from rigkit.io.calibration_file import load_calibration
     from rigkit.report.validation_page import camera_table
 

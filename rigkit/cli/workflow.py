@@ -165,7 +165,7 @@ def _load(path: Path) -> LoadedCamera:
     from rigkit.io.calibration_file import load_calibration, load_camera
 
     camera = load_camera(path)
-    if "covariance" not in json.loads(path.read_text(encoding="utf-8")):
+    if "covariance" not in json.loads(path.read_text(encoding="utf-8-sig")):
         return LoadedCamera(camera, None)
     return LoadedCamera(camera, load_calibration(path).covariance)
 

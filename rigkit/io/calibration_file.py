@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -91,7 +93,7 @@ def load_calibration(path: str | Path) -> Calibration:
     missing = sorted(KEYS - set(data))
     if missing:
         raise InputError(f"'{path}': no {', '.join(missing)}: a camera without its calibration; calibrate again")
-    try:
+    with damage_named(path):
         return Calibration(
             camera=camera_from_json(data["camera"], path),
             rms_px=float(data["rms_px"]),
@@ -107,7 +109,14 @@ def load_calibration(path: str | Path) -> Calibration:
             boards=tuple(BoardShape(**v) for v in data["boards"]),
             verdicts=tuple(str(v) for v in data["verdicts"]),
         )
-    except (KeyError, TypeError, ValueError, InputError) as error:
+
+
+@contextmanager
+def damage_named(path: str | Path) -> Iterator[None]:
+    """Turn what a damaged file leads to in the block, whatever stands in it, into an InputError that names the file."""
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, InputError) as error:
         words = str(error)
         raise InputError(words if str(path) in words else f"'{path}': damaged ({words}); calibrate again") from error
 
@@ -115,7 +124,7 @@ def load_calibration(path: str | Path) -> Calibration:
 def _read(path: str | Path) -> dict[str, Any]:
     source = Path(path)
     try:
-        data = json.loads(source.read_text(encoding="utf-8"))
+        data = json.loads(source.read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
         raise InputError(f"calibration '{source}' does not exist; run `rigkit calibrate` first") from error
     except OSError as error:
@@ -150,7 +159,7 @@ def camera_from_json(data: Any, path: str | Path) -> Camera:
     try:
         width, height = (int(v) for v in data["size_px"])
         values = np.array([float(v) for v in data["parameters"].values()])
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"'{path}': camera: {error}; size_px is [width, height], parameters are numbers") from error
     try:
         camera = camera_model(str(data["model"]))((width, height), values)

@@ -56,7 +56,7 @@ def read_corners(path: str | Path, boards: Sequence[Board] = ()) -> dict[str, tu
     """
     source = Path(path)
     try:
-        text = source.read_text(encoding="utf-8")
+        text = source.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"corners file '{source}' cannot be read ({error}); check the path") from error
     lines = csv.reader(io.StringIO(text))

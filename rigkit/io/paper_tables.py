@@ -25,9 +25,9 @@ def load_paper_tables(folder: str | Path) -> PaperTables:
 
 def _read(path: Path) -> dict[str, dict[str, str]]:
     try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"the paper's table '{path}' cannot be read: {error.strerror}; check the folder") from error
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"the paper's table '{path}' cannot be read ({error}); restore the file") from error
     head, *rows = list(csv.reader(io.StringIO(text))) or [[]]
     names = [_without_unit(name) for name in head]
     out: dict[str, dict[str, str]] = {}
@@ -38,7 +38,7 @@ def _read(path: Path) -> dict[str, dict[str, str]]:
             try:
                 float(cell)
             except ValueError as error:
-                raise InputError(f"{path}: line {number}: '{cell}' is not a number; correct it") from error
+                raise InputError(f"{path}: line {number}: {cell!r} is not a number; correct it") from error
         out[_without_unit(row[0])] = dict(zip(names[1:], row[1:], strict=True))
     if not out:
         raise InputError(f"{path}: no rows; restore the file")

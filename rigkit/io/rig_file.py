@@ -19,7 +19,7 @@ from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.base import Camera
 from rigkit.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.io.calibration_file import camera_from_json, camera_to_json
+from rigkit.io.calibration_file import camera_from_json, camera_to_json, damage_named
 from rigkit.io.files import write_atomic
 
 __all__ = ["BOARDS_SCHEMA", "SCHEMA", "SavedRig", "is_rig_file", "load_board_rigs", "load_rig", "load_saved_rig"]
@@ -90,7 +90,7 @@ def load_saved_rig(path: str | Path) -> SavedRig:
     """
     data = _read(path, SCHEMA, KEYS)
     cameras: dict[str, tuple[Camera, Rigid3]] = {}
-    try:
+    with damage_named(path):
         for entry in data["cameras"]:
             if set(entry) != CAMERA_KEYS:
                 raise InputError(f"'{path}': a camera must have the keys {', '.join(sorted(CAMERA_KEYS))}, no others")
@@ -100,15 +100,13 @@ def load_saved_rig(path: str | Path) -> SavedRig:
         covariance = None
         if "covariance" in data:
             covariance = as_array(data["covariance"], (size, size), "covariance")
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"'{path}': damaged ({error}); calibrate again") from error
     return SavedRig(cameras, covariance)
 
 
 def is_rig_file(path: str | Path) -> bool:
     """Say whether the file is a rig's; False for anything that cannot be read."""
     try:
-        data = json.loads(Path(path).read_text(encoding="utf-8"))
+        data = json.loads(Path(path).read_text(encoding="utf-8-sig"))
     except (OSError, ValueError):
         return False
     return isinstance(data, dict) and data.get("schema") == SCHEMA
@@ -149,7 +147,7 @@ def save_board_rigs(path: str | Path, rigs: Sequence[BoardRig], *, force: bool =
 def load_board_rigs(path: str | Path) -> tuple[BoardRig, ...]:
     """Return the boards on one mount; raises InputError like `load_saved_rig`."""
     data = _read(path, BOARDS_SCHEMA, {"schema", "rigs"})
-    try:
+    with damage_named(path):
         return tuple(
             BoardRig(
                 tuple(_placed(entry, path) for entry in rig["boards"]),
@@ -159,8 +157,6 @@ def load_board_rigs(path: str | Path) -> tuple[BoardRig, ...]:
             )
             for rig in data["rigs"]
         )
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"'{path}': damaged ({error}); calibrate again") from error
 
 
 def _placed(entry: dict[str, Any], path: str | Path) -> PlacedBoard:
@@ -174,7 +170,7 @@ def _placed(entry: dict[str, Any], path: str | Path) -> PlacedBoard:
 
 def _read(path: str | Path, schema: str, keys: set[str]) -> dict[str, Any]:
     try:
-        data: Any = json.loads(Path(path).read_text(encoding="utf-8"))
+        data: Any = json.loads(Path(path).read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
         raise InputError(f"rig file '{path}' does not exist; check the path") from error
     except (OSError, ValueError) as error:

@@ -152,7 +152,7 @@ def read_toml(path: str | Path, schema: str) -> TomlTable:
     """
     source = Path(path)
     try:
-        text = source.read_text(encoding="utf-8")
+        text = source.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
         raise InputError(f"'{source}' does not exist; check the path") from error
     except OSError as error:

@@ -25,6 +25,11 @@ SAME_RATIO = 0.005
 """Baselines that are off by one factor, to half a percent, share a cause."""
 ODD_BOARD = 0.003
 """A board whose squares come out of this much another size than those of the other boards was measured wrongly."""
+NO_BOARD = 0.2
+"""Logarithm of width over height: nobody measures a square this wrongly, so it is no square of the board."""
+UNITS = {"m": 1000.0, "cm": 10.0, "inches": 25.4}
+UNIT_RATIO = 0.05
+"""A length that is off by the factor of a unit, to five percent, was written in that unit."""
 MIN_CORNERS = 12
 
 
@@ -149,7 +154,12 @@ def _board_suspects(report: ValidationReport) -> list[str]:
                 f"again ({board.square_x_mm * (1.0 + off):.2f} mm would fit, {board.square_x_mm:g} is declared)"
             )
         aspect = result.square_x_ratio / result.square_y_ratio - 1.0
-        if abs(aspect) > ODD_BOARD:
+        if abs(np.log1p(aspect)) > NO_BOARD:
+            out.append(
+                f"board '{name}' comes out with another shape than any board: corners of different boards were matched "
+                "(boards of this kind that stand there and are not listed?), or the pose is wrong"
+            )
+        elif abs(aspect) > ODD_BOARD:
             out.append(
                 f"board '{name}': its squares come out {100.0 * aspect:+.1f} % wider than high against what is "
                 "declared; measure square_x_mm and square_y_mm, or look at the calibration's aspect"
@@ -167,6 +177,10 @@ def _length_suspects(failed: Sequence[tuple[str, Check]], reports: Sequence[Vali
     board = reports[0].boards[0].board
     squares = f"{board.square_x_mm / common:.2f} mm instead of {board.square_x_mm:g}"
     percent = 100.0 * (common - 1.0)
+    unit = next((u for u, factor in UNITS.items() if (np.abs(ratios / factor - 1.0) < UNIT_RATIO).all()), None)
+    if unit is not None:
+        names = ", ".join(dict.fromkeys(f"pair '{pair}': {check.name}" for pair, check in failed))
+        return [f"{names}: written in {unit}? Lengths are in mm; or the squares are {squares}"]
     if len(lengths) > 1 and all(agree) and np.ptp(ratios) < SAME_RATIO + 4.0 * _ratio_sigma(failed):
         return [f"square size: all {len(lengths)} lengths come out {percent:+.1f} %; {squares} would explain them"]
     if len(lengths) == 1:

@@ -136,6 +136,40 @@ def test_not_toml(write: Write, tmp_path: Path, capsys: pytest.CaptureFixture[st
     check(*run(folder, capsys), 2, "dataset.toml")
 
 
+def test_a_byte_order_mark_and_windows_line_ends_do_not_matter(
+    write: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Editors on Windows put them there; both files must be read as without."""
+    (tmp_path / "camera.json").write_bytes(b"\xef\xbb\xbf" + CALIBRATION.read_bytes())
+    manifest = write(calibration="camera.json", columns=4, rows=4) / "dataset.toml"
+    manifest.write_bytes(b"\xef\xbb\xbf" + manifest.read_bytes().replace(b"\n", b"\r\n"))
+    code, line = run(tmp_path, capsys)
+    check(code, line, 2, "8x6")
+
+
+def test_without_anything_measured_no_work_is_done(
+    write: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    manifest = write() / "dataset.toml"
+    manifest.write_text(manifest.read_text().partition("[pairs.truth]")[0])
+    monkeypatch.setattr("rigkit.cli.validate.load_cameras", lambda *_, **__: pytest.fail("work was done"))
+    code, line = run(tmp_path, capsys)
+    check(code, line, 2, "dataset.toml", "nothing was measured", "[pairs.truth]")
+
+
+def test_a_spoiled_table_of_the_paper_is_known_before_the_work(
+    write: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    (write() / "dataset.toml").rename(folder / "dataset.toml")
+    (tmp_path / "hajder2021").mkdir()
+    (tmp_path / "hajder2021" / "planes.csv").write_bytes(b"\xff\xfe")
+    monkeypatch.setattr("rigkit.cli.validate.load_cameras", lambda *_, **__: pytest.fail("work was done"))
+    code, line = run(folder, capsys)
+    check(code, line, 2, "planes.csv", "restore the file")
+
+
 def test_identical_images_have_no_baseline(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
     check(*run(write(image2=IMAGES / "view1.jpg"), capsys), 3, "pair", "no baseline")
 

@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 
 from rigkit.cli.main import main
+from rigkit.errors import InputError
+from rigkit.processes import worker_pool
 
 WORK = """
 import os, sys, time
@@ -88,3 +90,12 @@ def test_a_full_disk_is_no_bug_of_ours(monkeypatch: pytest.MonkeyPatch, capsys: 
     monkeypatch.setattr("rigkit.cli.diff.run", full)
     assert main(["diff", "a", "b"]) == 2
     assert "'results/cloud.ply': No space left on device" in capsys.readouterr().err
+
+
+def _ends(_: int) -> None:
+    os._exit(1)
+
+
+def test_a_worker_that_is_killed_is_told_in_words() -> None:
+    with pytest.raises(InputError, match="-j 1"), worker_pool(1) as pool:
+        list(pool.map(_ends, [0]))

@@ -128,3 +128,37 @@ def test_session_file(tmp_path: Path) -> None:
         path.write_text(wrong)
         with pytest.raises(InputError, match=message):
             load_session(path)
+
+
+WEIRD = (None, True, -1, 10**400, 1e308, float("nan"), "x", "", [], {}, [1], [[]], [None], {"a": 1}, [[1, 2], [3]])
+
+
+def spoiled(data: object, rng: np.random.Generator) -> object:
+    """The same with something strange somewhere inside; what the strange thing is in does not matter."""
+    out = json.loads(json.dumps(data))
+    inner = out
+    for _ in range(int(rng.integers(1, 6))):
+        if not inner or not isinstance(inner, dict | list):
+            break
+        places = list(inner) if isinstance(inner, dict) else range(len(inner))
+        place = places[int(rng.integers(len(places)))]
+        around, inner = inner, inner[place]
+    around[place] = WEIRD[int(rng.integers(len(WEIRD)))]
+    return out
+
+
+def test_whatever_stands_in_a_file_is_read_or_the_file_is_named(
+    calibration: Calibration, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    path = tmp_path / "calibration.json"
+    save_calibration(path, calibration)
+    data = json.loads(path.read_text())
+    refused = 0
+    for _ in range(400):
+        path.write_text(json.dumps(spoiled(data, rng)))
+        try:
+            load_calibration(path)
+        except InputError as error:
+            assert str(path) in str(error) and "\n" not in str(error)
+            refused += 1
+    assert refused > 200

@@ -164,3 +164,21 @@ def test_no_board_of_known_size_says_nothing(rng: np.random.Generator) -> None:
     found = detected(rng, CAMERAS["regular"])[0]
     assert np.isnan(camera_fit(CAMERAS["regular"], found, [Board("other", 5, 4, 10.0, 10.0)]))
     assert camera_suspects("p", ("regular", "regular"), (found, []), [Board("x", 5, 4, 1.0, 1.0)], CAMERAS) == ()
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("m", 1000.0), ("cm", 10.0), ("inches", 25.4)])
+def test_a_length_in_another_unit_is_named(unit: str, factor: float) -> None:
+    one = suspects([reported(stated_mm=BASELINE_MM / factor, distances=False)])
+    assert len(one) == 1
+    assert f"written in {unit}?" in one[0]
+    beside = suspects([reported(stated_mm=BASELINE_MM / factor)])
+    assert f"written in {unit}?" in beside[0]
+    assert not any("written in" in words for words in suspects([reported(stated_mm=BASELINE_MM / 1.1)]))
+
+
+def test_corners_of_different_boards_are_not_called_wrong_squares() -> None:
+    report = reported()
+    odd = replace(report.boards[0], square_x_ratio=18.0, square_y_ratio=1.0)
+    failed = replace(report, boards=(odd, *report.boards[1:]), checks=(replace(report.checks[0], passed=False),))
+    assert any("matched" in words and "plane1" in words for words in suspects([failed]))
+    assert not any("measure square_x_mm" in words for words in suspects([failed]))

@@ -204,8 +204,10 @@ def test_a_spoiled_paper_table_is_refused(tmp_path: Path) -> None:
         (tmp_path / "planes.csv").write_text(text)
         with pytest.raises(InputError, match=words):
             load_paper_tables(tmp_path)
-    with pytest.raises(InputError, match="cannot be read"):
-        load_paper_tables(tmp_path / "none")
+    (tmp_path / "planes.csv").write_bytes(b"\xff\xfea")
+    for folder in ("none", "."):
+        with pytest.raises(InputError, match="cannot be read"):
+            load_paper_tables(tmp_path / folder)
     assert isinstance(load_paper_tables(PAPER), PaperTables)
 
 
