@@ -112,9 +112,9 @@ def calibrate(
     chosen = _choose(observations, options, SURELY)
     beyond = [] if degree is not None else _beyond(chosen)
     if beyond:
-        more, unfit = _fit_all(observations, size_px, [*wanted, *beyond], progress)
-        options = _compared(observations, more, folds, progress)
-        chosen, failed = _choose(observations, options, SURELY), unfit
+        options, unfit = _fit_all(observations, size_px, beyond, progress, options)
+        options = _compared(observations, options, folds, progress)
+        chosen, failed = _choose(observations, options, SURELY), [*failed, *unfit]
     candidates = [*_described(options, chosen), *failed]
     if board != "flat" and often_seen(observations).any():
         observations, chosen, fits = _fit_shapes(observations, chosen, board)
@@ -170,8 +170,10 @@ def _fit_all(
     size_px: tuple[int, int],
     wanted: Sequence[tuple[str, type[Camera], int | None]],
     progress: Progress,
+    known: Sequence[_Option] = (),
 ) -> tuple[list[_Option], list[Candidate]]:
-    options: list[_Option] = []
+    """Return the options `known` and those `wanted`, fitted, and which could not be; raises where there is none."""
+    options = list(known)
     failed: list[Candidate] = []
     error: Exception | None = None
     for i, (name, cls, order) in enumerate(wanted):
@@ -221,7 +223,7 @@ def _reweighted(observations: Observations, options: list[_Option]) -> Observati
 
 
 def _compared(observations: Observations, options: list[_Option], folds: int, progress: Progress) -> list[_Option]:
-    """Return the options refitted to the same corners, with their held-out errors."""
+    """Return the options refitted to the same corners, with their held-out errors, where they are not yet."""
     sigma = [robust_sigma(o.fit, observations) for o in options] if len(options) > 1 else [0.0]
     near = [o.fit.kept for o, s in zip(options, sigma, strict=True) if s <= COMPARABLE * min(sigma)]
     kept = np.any(near, axis=0)
@@ -229,6 +231,9 @@ def _compared(observations: Observations, options: list[_Option], folds: int, pr
     unequal = float(np.ptp(observations.weight[observations.present])) > 0.0
     for i, option in enumerate(options):
         progress("cross-validation", i, len(options))
+        if option.heldout is not None and (option.fit.kept == kept).all():
+            out.append(option)
+            continue
         same = (option.fit.kept == kept).all() and not unequal
         fit = option.fit if same else fit_kept(observations, option.fit.state, kept)
         out.append(replace(option, fit=fit, heldout=heldout_squares(observations, fit, folds)))
