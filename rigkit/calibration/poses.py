@@ -18,6 +18,9 @@ __all__ = ["find_poses", "refine_each", "refine_poses"]
 
 MAX_ITERATIONS = 40
 TOLERANCE = 1e-10
+"""Stop where a step promises less than this part of a view's cost,"""
+START_TOLERANCE = 1e-5
+"""or this, of a pose that is only where a solve begins: a robust loss takes dozens of steps for the last digits."""
 DAMPING_START = 1e-6
 DAMPING_MAX = 1e10
 DAMPING_LEAST = 1e-12
@@ -25,22 +28,30 @@ DAMPING_LEAST = 1e-12
 
 
 def refine_poses(
-    observations: Observations, state: State, weight: FloatArray, loss_px: float | None = None
+    observations: Observations,
+    state: State,
+    weight: FloatArray,
+    loss_px: float | None = None,
+    tolerance: float = TOLERANCE,
 ) -> tuple[State, FloatArray]:
     """Return the state with each view's pose at its own minimum, and each view's cost (V,) in px^2. `loss_px` is the
-    scale of the Cauchy loss."""
+    scale of the Cauchy loss, `tolerance` the part of the cost that a step must promise to be worth another."""
 
     def at(rotation: Mat3, translation_mm: Points) -> State:
         return replace(state, rotation=rotation, translation_mm=translation_mm)
 
-    rotation, translation_mm, cost = refine_each(
-        state.rotation, state.translation_mm, lambda *poses: equations(observations, at(*poses), weight, loss_px)
-    )
+    def linearise(rotation: Mat3, translation_mm: Points) -> Normal:
+        return equations(observations, at(rotation, translation_mm), weight, loss_px)
+
+    rotation, translation_mm, cost = refine_each(state.rotation, state.translation_mm, linearise, tolerance)
     return at(rotation, translation_mm), cost
 
 
 def refine_each(
-    rotation: Mat3, translation_mm: Points, linearise: Callable[[Mat3, Points], Normal]
+    rotation: Mat3,
+    translation_mm: Points,
+    linearise: Callable[[Mat3, Points], Normal],
+    tolerance: float = TOLERANCE,
 ) -> tuple[Mat3, Points, FloatArray]:
     """Return poses (N, 3, 3), (N, 3) each at its own minimum and their costs (N,): Levenberg-Marquardt with a damping
     of its own for each. `linearise` returns the normal equations at given poses."""
@@ -61,7 +72,7 @@ def refine_each(
         better = active & (there.costs < cost)
         rotation = np.where(better[:, None, None], turned, rotation)
         translation_mm = np.where(better[:, None], shifted, translation_mm)
-        active &= (predicted > TOLERANCE * cost) & (damping < DAMPING_MAX)
+        active &= (predicted > tolerance * cost) & (damping < DAMPING_MAX)
         pp, p = np.where(better[:, None, None], there.pp, pp), np.where(better[:, None], there.p, p)
         cost = np.where(better, there.costs, cost)
         damping = np.where(better, np.maximum(0.1 * damping, DAMPING_LEAST), 10.0 * damping)
@@ -80,7 +91,7 @@ def find_poses(observations: Observations, state: State, weight: FloatArray, los
     z = np.where(seen, s * rays[..., 2] / across, 0.0)
     share = np.where(seen, alignment.weight * across**2, 0.0)
     total = np.maximum(share.sum(axis=1), 1e-12)
-    best, cost = refine_poses(observations, state, weight, loss_px)
+    best, cost = refine_poses(observations, state, weight, loss_px, START_TOLERANCE)
     for sign in (1.0, -1.0):
         tilt = sign * alignment.tilt
         t3 = (share * (z - (tilt[:, None] @ board)[:, 0])).sum(axis=1) / total
@@ -91,7 +102,7 @@ def find_poses(observations: Observations, state: State, weight: FloatArray, los
             rotation=nearest_rotation(np.concatenate([columns, third[..., None]], axis=-1)),
             translation_mm=np.concatenate([alignment.rows[..., 2], t3[:, None]], axis=-1),
         )
-        found, found_cost = refine_poses(observations, start, weight, loss_px)
+        found, found_cost = refine_poses(observations, start, weight, loss_px, START_TOLERANCE)
         wins = found_cost < cost
         best = replace(
             best,
