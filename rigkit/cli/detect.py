@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", metavar="CORNERS.csv", help="write the corners file")
     parser.add_argument("--overlay", metavar="DIR", help="write a picture of each image with its corners")
     parser.add_argument("--min-corners", type=int, default=12, metavar="N", help="smallest board reported (12)")
-    parser.add_argument("--jobs", type=int, metavar="N", help="processes (default: one a processor)")
+    parser.add_argument("-j", "--jobs", type=int, metavar="N", help="processes (default: one a core)")
     parser.add_argument("--force", action="store_true", help="replace existing files")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 

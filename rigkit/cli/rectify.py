@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 HELP = "perspective, cylindrical or equirectangular image from any camera's image, or a stereo pair"
 
+EIGHT_BIT = (".jpg", ".jpeg", ".bmp", ".webp")
+
 IMAGE_SIZE = re.compile(r"^(\d+)[xX](\d+)$")
 
 
@@ -58,6 +60,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.camera is None:
         raise InputError("rectify: --camera is missing; give the camera's calibration.json")
+    _ensure_kind(args.output)
     ensure_writable(args.output, force=args.force)
     camera = load_camera(args.camera)
     target = target_camera(
@@ -77,6 +80,7 @@ def _run_stereo(args: argparse.Namespace) -> int:
 
     if args.image2 is None or args.rig is None:
         raise InputError("rectify: a stereo pair needs two images and --rig RIG.json")
+    _ensure_kind(args.output)
     if args.hfov_deg is not None or args.size is not None or args.yaw_deg or args.pitch_deg or args.roll_deg:
         raise InputError("rectify: the baseline decides the view of a stereo pair; leave out its angles and its size")
     rig = load_rig(args.rig)
@@ -148,12 +152,16 @@ def _encoded(image: object, path: str) -> bytes:
 
     suffix = Path(path).suffix.lower()
     pixels = np.asarray(image)
-    if suffix in (".jpg", ".jpeg") and pixels.dtype != np.uint8:
-        raise InputError(f"'{path}': JPEG has no 16-bit pixels; write a .png or .tif")
-    try:
-        done, data = cv2.imencode(suffix, pixels if pixels.ndim == 2 else np.ascontiguousarray(pixels[..., ::-1]))
-    except cv2.error:
-        done = False
-    if not done:
-        raise InputError(f"'{path}': images of the kind '{suffix}' cannot be written; take .png, .tif or .jpg")
+    if suffix in EIGHT_BIT and pixels.dtype != np.uint8:
+        raise InputError(f"'{path}': a {suffix} file has no 16-bit pixels; write a .png or .tif")
+    _, data = cv2.imencode(suffix, pixels if pixels.ndim == 2 else np.ascontiguousarray(pixels[..., ::-1]))
     return bytes(data)
+
+
+def _ensure_kind(path: str) -> None:
+    """Refuse a kind of image that cannot be written, before the work."""
+    import cv2
+
+    if not cv2.haveImageWriter(path):
+        kind = Path(path).suffix
+        raise InputError(f"'{path}': images of the kind '{kind}' cannot be written; take .png, .tif or .jpg")

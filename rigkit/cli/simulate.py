@@ -12,7 +12,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("studies", nargs="+", metavar="STUDY.toml", help="one or more study files")
     parser.add_argument("-o", "--output", default="out/studies", metavar="FOLDER", help="default: out/studies")
     parser.add_argument("--trials", type=int, metavar="N", help="instead of the number in the file")
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes; the numbers stay the same")
+    parser.add_argument("-j", "--jobs", type=int, default=1, metavar="N", help="processes; the numbers stay the same")
     parser.add_argument("--dask", metavar="ADDRESS", help="a Dask scheduler to use instead of processes")
     parser.add_argument("--format", choices=("png", "pdf", "svg"), default="png", help="of the figures")
     parser.add_argument("--json", action="store_true", help="print the tables as JSON instead of Markdown")

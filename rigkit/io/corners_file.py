@@ -68,15 +68,23 @@ def read_corners(path: str | Path, boards: Sequence[Board] = ()) -> dict[str, tu
             image, board, *numbers = line
             column, row = int(numbers[0]), int(numbers[1])
             u, v, sigma = (float(value) for value in numbers[2:])
+            if not np.isfinite([u, v, sigma]).all():
+                raise ValueError("a value is NaN or infinite")
+            if not sigma > 0.0:
+                raise ValueError(f"sigma_px is {sigma:g} and must be positive")
         except (ValueError, IndexError) as error:
             raise InputError(
                 f"corners file '{source}', line {number}: {error}; expected {','.join(COLUMNS)}"
             ) from error
         rows.setdefault(image, {}).setdefault(board, []).append((column, row, u, v, sigma))
     sizes = {board.board_id: board.size for board in boards}
-    return {
-        image: tuple(_detection(name, values, sizes) for name, values in found.items()) for image, found in rows.items()
-    }
+    try:
+        return {
+            image: tuple(_detection(name, values, sizes) for name, values in found.items())
+            for image, found in rows.items()
+        }
+    except (InputError, OverflowError) as error:
+        raise InputError(f"corners file '{source}': {error}") from error
 
 
 def _detection(name: str, values: list[tuple[float, ...]], sizes: Mapping[str, tuple[int, int]]) -> BoardDetection:

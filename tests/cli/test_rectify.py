@@ -119,3 +119,17 @@ def test_a_pair_gets_the_same_rows(tmp_path: Path, capsys: pytest.CaptureFixture
         assert words in capsys.readouterr().err
     assert main(["rectify", *images, "--camera", str(rig), "-o", str(tmp_path / "x.png")]) == 2
     assert "--rig" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["out", "out.xyz", "out.json"])
+def test_a_kind_of_image_that_nobody_writes_is_known_before_the_work(
+    name: str,
+    files: tuple[str, str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("rigkit.io.calibration_file.load_camera", lambda _: pytest.fail("work was done"))
+    assert main(["rectify", files[0], "--camera", files[1], "-o", str(tmp_path / name)]) == 2
+    assert ".png" in capsys.readouterr().err
+    assert not (tmp_path / name).exists()

@@ -60,3 +60,20 @@ def test_bad_files_are_refused(text: str, word: str, tmp_path: Path) -> None:
     path.write_text(text)
     with pytest.raises(InputError, match=word):
         read_corners(path)
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "1e400"])
+def test_a_value_that_is_no_place_is_refused_with_its_line(tmp_path: Path, value: str) -> None:
+    path = tmp_path / "corners.csv"
+    path.write_text(f"{','.join(COLUMNS)}\na.png,a,0,0,1.0,2.0,0.1\na.png,a,1,0,{value},2.0,0.1\n")
+    with pytest.raises(InputError, match=r"line 3.*NaN or infinite") as caught:
+        read_corners(path)
+    assert str(path) in str(caught.value)
+
+
+def test_corners_that_are_none_of_a_board_name_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "corners.csv"
+    for sigma, grid in (("-0.1", "1,0"), ("0.1", "-1,0"), ("0.1", "0,0"), ("0.1", f"{10**30},0")):
+        path.write_text(f"{','.join(COLUMNS)}\na.png,a,0,0,1.0,2.0,0.1\na.png,a,{grid},5.0,2.0,{sigma}\n")
+        with pytest.raises(InputError, match=r"corners\.csv"):
+            read_corners(path)
