@@ -90,6 +90,8 @@ def read_corners(path: str | Path, boards: Sequence[Board] = ()) -> dict[str, tu
 def _detection(name: str, values: list[tuple[float, ...]], sizes: Mapping[str, tuple[int, int]]) -> BoardDetection:
     table = np.array(values)
     grid = table[:, :2].astype(np.int64)
+    if len(np.unique(grid, axis=0)) < len(grid):
+        raise InputError(f"board '{name}': a corner is listed twice; leave one")
     unnamed = UNNAMED.match(name)
     if unnamed:
         columns, rows = int(unnamed[1]), int(unnamed[2])
