@@ -27,7 +27,7 @@ from rigkit.fundamental.pose import essential_from_pose
 from rigkit.fundamental.refine import RefinedPose, cauchy_weights, refine_pose
 from rigkit.fundamental.registry import fundamental_for
 from rigkit.fundamental.robust import RobustPose, Sample, robust_pose
-from rigkit.fundamental.weights import affinity_residuals, usable_affinities
+from rigkit.fundamental.weights import affinity_distances, affinity_residuals, usable_affinities
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.sampson import sampson_distances
 from rigkit.matches import Matches
@@ -266,10 +266,7 @@ def _agreeing(matches: Matches, pose: Rigid3) -> BoolArray:
 
 
 def _affinity_in_sigmas(matches: Matches, pose: Rigid3) -> FloatArray:
-    if matches.sigma_A is None:
-        return np.full(len(matches), np.nan)
-    residual = affinity_residuals(matches, essential_from_pose(pose))
-    return np.asarray(np.linalg.norm(residual, axis=1) / matches.sigma_A)
+    return affinity_distances(matches, essential_from_pose(pose))
 
 
 def _with_shown_noise(matches: Matches, pose: Rigid3, inliers: BoolArray) -> Matches:

@@ -116,8 +116,8 @@ def check_count(matches: Matches, weights: RowWeights, minimum: int, what: str) 
 def check_baseline(matches: Matches) -> None:
     """Raise DegenerateError if a rotation alone explains the matches: no baseline, no epipolar geometry.
 
-    The test is on the sum of squared residuals, in the sigmas of the matches, of the best rotation f2 = R f1. No matches
-    at all raise InputError.
+    The test is on the sum of squared residuals, in the sigmas of the matches, of the best rotation f2 = R f1. Without
+    any matches InputError.
     """
     n = len(matches)
     if n == 0:

@@ -5,8 +5,9 @@ The pose is (R, t), |t| = 1, perturbed by R <- exp(w) R and t <- t + b1 T1 + b2 
 Points: the reprojection error itself, not its first-order approximation. For each pair of pixels the nearest pair that
 satisfies the epipolar geometry is found (two linearisations); the residual is the signed length of that displacement
 in sigmas, and by the envelope theorem its derivative is that of the constraint at the corrected rays over its standard
-deviation. Affinities: (A^T n2 + n1) whitened by M C M^T, C the covariance of A and M = d(A^T n2)/dA; with C = sigma_A^2
-I that is (A^T n2 + n1) / (sigma_A |n2|).
+deviation. Affinities: (A^T n2 + n1) whitened by M C M^T, C the covariance of A and M = d(A^T n2)/dA, and what the
+pixels' noise adds to it (weights.pixel_share); with C = sigma_A^2 I that is division by the root of sigma_A^2 |n2|^2
+and that share.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.arrays import FloatArray, IntArray
-from rigkit.fundamental.weights import usable_affinities
+from rigkit.fundamental.weights import pixel_share, usable_affinities
 from rigkit.geometry.rotation import cross, log_so3, skew
 from rigkit.geometry.sampson import epipolar_normals
 from rigkit.geometry.triangulation import correct_rays_px
@@ -54,9 +55,9 @@ def affinity_terms(
     which = _chosen(matches, covariance_A)
     if not len(which):
         return np.zeros((0, 2)), np.zeros((0, 2, 5)), which
-    assert matches.A21 is not None
-    f1, f2 = matches.rays1[which], matches.rays2[which]
-    b1, b2, A = matches.jacobians1[which], matches.jacobians2[which], matches.A21[which]
+    m = matches.select(which)
+    assert m.A21 is not None
+    f1, f2, b1, b2, A = m.rays1, m.rays2, m.jacobians1, m.jacobians2, m.A21
     turned = f1 @ R.T
     # E f1 = t x (R f1) and E^T f2 = R^T (f2 x t), and their derivatives by (w, b).
     line2, line1 = cross(t, turned), cross(f2, t)
@@ -68,36 +69,52 @@ def affinity_terms(
     dn1 = np.swapaxes(b1, -1, -2) @ (R.T @ by1)
     g = (n2[:, None, :] @ A)[:, 0] + n1
     dg = np.swapaxes(A, -1, -2) @ dn2 + dn1
+    share = pixel_share(m, skew(t) @ R)
     if covariance_A is None:
-        assert matches.sigma_A is not None
-        size = np.linalg.norm(n2, axis=-1)
-        size = np.where(size > 0.0, size, np.inf)
-        scale = 1.0 / (matches.sigma_A[which] * size)
-        along = np.sum(n2[:, :, None] * dn2, axis=1) / size[:, None] ** 2
+        assert m.sigma_A is not None
+        variance = m.sigma_A**2 * np.sum(n2**2, axis=1) + share
+        variance = np.where(variance > 0.0, variance, np.inf)
+        along = m.sigma_A[:, None] ** 2 * np.sum(n2[:, :, None] * dn2, axis=1) + _half_slope(m, R, t, basis)
+        along /= variance[:, None]
+        scale = 1.0 / np.sqrt(variance)
         jacobian = (dg - g[:, :, None] * along[:, None, :]) * scale[:, None, None]
         return g * scale[:, None], jacobian, which
     M = np.zeros((which.size, 2, 4))
     M[:, 0, 0], M[:, 0, 2] = n2[:, 0], n2[:, 1]
     M[:, 1, 1], M[:, 1, 3] = n2[:, 0], n2[:, 1]
-    of_g = M @ covariance_A[which] @ np.swapaxes(M, -1, -2)
+    of_g = M @ covariance_A[which] @ np.swapaxes(M, -1, -2) + share[:, None, None] * np.eye(2)
     floor = 1e-12 * np.trace(of_g, axis1=1, axis2=2)[:, None, None] + 1e-300
     whiten = np.linalg.inv(np.linalg.cholesky(of_g + floor * np.eye(2)))
     return (whiten @ g[..., None])[..., 0], whiten @ dg, which
 
 
-def whitened_affinities(matches: Matches) -> tuple[FloatArray, IntArray]:
-    """Return what `affinity_terms` takes from the matches, for its kernel: 23 rows (23, K), and which matches (K,).
+def _half_slope(matches: Matches, R: FloatArray, t: FloatArray, basis: FloatArray) -> FloatArray:
+    """Return half the derivative (K, 5) of `pixel_share`: a sum of squares, of M = B2^T E B1."""
+    m = matches
+    assert m.A21 is not None
+    C = R @ m.jacobians1
+    M = np.swapaxes(m.jacobians2, -1, -2) @ (skew(t) @ C)
+    s1, s2 = (s[:, None, None] ** 2 for s in (m.sigma1_px, m.sigma2_px))
+    C, P = (np.swapaxes(v, -1, -2) for v in (C, m.jacobians2 @ (s1 * m.A21 @ np.swapaxes(m.A21, -1, -2) @ M + s2 * M)))
+    by_rotation, by_direction = cross(C, cross(P, t)).sum(axis=1), cross(C, P).sum(axis=1)
+    return 0.5 * np.concatenate([by_rotation, by_direction @ basis.T], axis=1)
 
-    Rays of both images, columns of their ray Jacobians by pixel coordinate, the entries of A21, 1 / sigma_A.
+
+def whitened_affinities(matches: Matches) -> tuple[FloatArray, IntArray]:
+    """Return what `affinity_terms` takes from the matches, for its kernel: 25 rows (25, K), and which matches (K,).
+
+    Rays of both images, columns of their ray Jacobians by pixel coordinate, the entries of A21, the variances of its
+    entries and of the pixels of both images.
     """
     which = _chosen(matches, None)
     if not len(which):
-        return np.zeros((23, 0)), which
+        return np.zeros((25, 0)), which
     assert matches.A21 is not None and matches.sigma_A is not None
     columns = [b[which].T.reshape(6, -1) for b in (matches.jacobians1, matches.jacobians2)]
     entries = matches.A21[which].reshape(-1, 4).T
     rays = matches.rays1[which].T, matches.rays2[which].T
-    return np.concatenate([*rays, *columns, entries, 1.0 / matches.sigma_A[None, which]]), which
+    sigmas = np.stack([matches.sigma_A[which], matches.sigma1_px[which], matches.sigma2_px[which]])
+    return np.concatenate([*rays, *columns, entries, sigmas**2]), which
 
 
 def _chosen(matches: Matches, covariance_A: FloatArray | None) -> IntArray:

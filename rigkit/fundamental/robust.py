@@ -25,7 +25,7 @@ from rigkit.fundamental.pose import behind_sigmas, choose_pose, essential_from_p
 from rigkit.fundamental.refine import RefinedPose, refine_pose
 from rigkit.fundamental.registry import fundamental_for
 from rigkit.fundamental.rows import PLANAR_ENTRIES, affinity_rows, essential_from_planar, point_rows
-from rigkit.fundamental.weights import affinity_residuals, usable_affinities
+from rigkit.fundamental.weights import affinity_distances, usable_affinities
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.matches import Matches
 from rigkit.posetype import PoseType
@@ -222,8 +222,8 @@ def _plausible(matches: Matches, pose: Rigid3, max_noise: float) -> BoolArray:
     seen = behind_sigmas(matches, pose) <= sigmas
     if matches.sigma_A is None:
         return np.asarray(seen)
-    off = np.linalg.norm(affinity_residuals(matches, essential_from_pose(pose)), axis=1) * np.sqrt(0.5)
-    return np.asarray(seen & ~(off > sigmas * matches.sigma_A))
+    off = affinity_distances(matches, essential_from_pose(pose)) * np.sqrt(0.5)
+    return np.asarray(seen & ~(off > sigmas))
 
 
 @dataclass(frozen=True, eq=False, slots=True)

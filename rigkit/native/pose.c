@@ -370,7 +370,7 @@ FOR_EACH_PROCESSOR void improve(
     }
 }
 
-/* What the maximum likelihood pose is sought from (pose_problem.PoseProblem). `affine` are 23 rows of `chosen` numbers
+/* What the maximum likelihood pose is sought from (pose_problem.PoseProblem). `affine` are 25 rows of `chosen` numbers
  * (residuals.whitened_affinities). */
 typedef struct {
     const double *packed, *affine, *point_weights;
@@ -420,7 +420,8 @@ INLINE void point_terms(const problem_t *p, const pose_t pose, int64_t rows, ter
 }
 
 /* residuals.affinity_terms with sigma_A. With a = R f1, C = R B1 and the columns B of B2 the gradients are n2 = B . (t x a)
- * and n1 = C . (f2 x t); by rotation a x (B x t) and C x (f2 x t), by direction a x B and C x f2. */
+ * and n1 = C . (f2 x t); by rotation a x (B x t) and C x (f2 x t), by direction a x B and C x f2. In the pixels' share of
+ * the variance (weights.pixel_share) M = B . (t x C). */
 INLINE void affinity_terms(const problem_t *p, const pose_t pose, int64_t rows, terms_t out)
 {
     const int64_t count = p->count, chosen = p->chosen;
@@ -436,18 +437,36 @@ INLINE void affinity_terms(const problem_t *p, const pose_t pose, int64_t rows, 
         const double n2u = dot(Bu, line2), n2v = dot(Bv, line2), square = n2u * n2u + n2v * n2v;
         const double a1 = at[18 * chosen + k], a2 = at[19 * chosen + k];
         const double a3 = at[20 * chosen + k], a4 = at[21 * chosen + k];
-        const double scale = square > 0.0 ? at[22 * chosen + k] / sqrt(square) : 0.0;
-        const double inverse = square > 0.0 ? 1.0 / square : 0.0;
+        const v3_t turned_u = cross(t, Cu), turned_v = cross(t, Cv);
+        const double muu = dot(Bu, turned_u), muv = dot(Bu, turned_v), mvu = dot(Bv, turned_u), mvv = dot(Bv, turned_v);
+        const double auu = a1 * muu + a3 * mvu, auv = a1 * muv + a3 * mvv;
+        const double avu = a2 * muu + a4 * mvu, avv = a2 * muv + a4 * mvv;
+        const double share1 = at[23 * chosen + k] * (auu * auu + auv * auv + avu * avu + avv * avv);
+        const double share2 = at[24 * chosen + k] * (muu * muu + muv * muv + mvu * mvu + mvv * mvv);
+        const double variance = at[22 * chosen + k] * square + 0.5 * (share1 + share2);
+        const double scale = variance > 0.0 ? 1.0 / sqrt(variance) : 0.0;
+        const double half = variance > 0.0 ? 0.5 / variance : 0.0, inverse = 2.0 * half * at[22 * chosen + k];
+        /* residuals._half_slope */
+        const double s1 = half * at[23 * chosen + k], s2 = half * at[24 * chosen + k];
+        const double puu = s1 * (a1 * auu + a2 * avu) + s2 * muu, pvu = s1 * (a3 * auu + a4 * avu) + s2 * mvu;
+        const double puv = s1 * (a1 * auv + a2 * avv) + s2 * muv, pvv = s1 * (a3 * auv + a4 * avv) + s2 * mvv;
+        const v3_t Pu = plus(times(puu, Bu), times(pvu, Bv)), Pv = plus(times(puv, Bu), times(pvv, Bv));
+        const v3_t slope_rotation = plus(cross(Cu, cross(Pu, t)), cross(Cv, cross(Pv, t)));
+        const v3_t slope_direction = plus(cross(Cu, Pu), cross(Cv, Pv));
         const double gu = a1 * n2u + a3 * n2v + dot(Cu, line1), gv = a2 * n2u + a4 * n2v + dot(Cv, line1);
         const v3_t by_u = cross(a, cross(Bu, t)), by_v = cross(a, cross(Bv, t));
         const v3_t to_u = cross(a, Bu), to_v = cross(a, Bv);
-        /* The second terms of the factors: how the length of n2 changes. */
+        /* The second terms of the factors: how the variance changes with n2. */
         const double uu = a1 - gu * n2u * inverse, uv = a3 - gu * n2v * inverse;
         const double vu = a2 - gv * n2u * inverse, vv = a4 - gv * n2v * inverse;
-        const v3_t rotation_u = plus(plus(times(uu, by_u), times(uv, by_v)), cross(Cu, line1));
-        const v3_t rotation_v = plus(plus(times(vu, by_u), times(vv, by_v)), cross(Cv, line1));
-        const v3_t direction_u = plus(plus(times(uu, to_u), times(uv, to_v)), cross(Cu, f2));
-        const v3_t direction_v = plus(plus(times(vu, to_u), times(vv, to_v)), cross(Cv, f2));
+        const v3_t by_line_u = plus(cross(Cu, line1), times(-gu, slope_rotation));
+        const v3_t by_line_v = plus(cross(Cv, line1), times(-gv, slope_rotation));
+        const v3_t to_line_u = plus(cross(Cu, f2), times(-gu, slope_direction));
+        const v3_t to_line_v = plus(cross(Cv, f2), times(-gv, slope_direction));
+        const v3_t rotation_u = plus(plus(times(uu, by_u), times(uv, by_v)), by_line_u);
+        const v3_t rotation_v = plus(plus(times(vu, by_u), times(vv, by_v)), by_line_v);
+        const v3_t direction_u = plus(plus(times(uu, to_u), times(uv, to_v)), to_line_u);
+        const v3_t direction_v = plus(plus(times(vu, to_u), times(vv, to_v)), to_line_v);
         const int64_t u = count + k, v = u + chosen;
         out.r[u] = gu * scale;
         out.r[v] = gv * scale;

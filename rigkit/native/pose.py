@@ -107,7 +107,7 @@ def minimise(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, int, bool]:
     """Return R, t, residuals (M,), Jacobian (M, 5), weights (M,), iterations, and whether the last step was small.
 
-    `affine` (23, K) are the affinities of the matches `which` (K,), see pose.c; `loss` is 0 for none, 1 for Cauchy's
+    `affine` (25, K) are the affinities of the matches `which` (K,), see pose.c; `loss` is 0 for none, 1 for Cauchy's
     or 2 for the marginal one, and its scale; `free` which of the five unknowns move.
     """
     kept = [np.ascontiguousarray(a, np.float64) for a in (packed, affine, point_weights)]

@@ -262,3 +262,33 @@ def test_a_pose_without_a_baseline_is_refused(rng, turn, kind):
     X = rng.uniform([-500.0, -400.0, 800.0], [500.0, 400.0, 2000.0], (150, 3))
     with pytest.raises(DegenerateError, match="no baseline"):
         estimate_pose(pictures(rng, X, Rigid3(exp_so3([0.02, turn, 0.03]), np.zeros(3))), kind)
+
+
+FORWARD = Rigid3(exp_so3([0.01, 0.02, -0.03]), [5.0, 3.0, -200.0])
+"""The epipole is near the middle of both images."""
+
+
+@pytest.mark.parametrize("sigma_A", [0.005, 0.05])
+@pytest.mark.parametrize("full", [False, True], ids=["sigma_A", "covariance_A"])
+@pytest.mark.parametrize("camera", [REGULAR, FISHEYE], ids=["pinhole", "fisheye"])
+def test_residuals_of_affinities_have_the_variance_one_near_the_epipole_too(rng, sigma_A, full, camera):
+    # There the epipolar lines of noisy pixels lie anyhow, and the affinity's own noise is the lesser part.
+    R, t = FORWARD.rotation, unit(FORWARD.translation_mm)
+    m, _, _ = pair(rng, 3000, pose=FORWARD, noise_px=0.5, sigma_A=sigma_A, camera=camera)
+    covariance = np.tile(sigma_A**2 * np.eye(4), (3000, 1, 1)) if full else None
+    r, _, _ = affinity_terms(m, R, t, translation_basis(t), covariance)
+    away = np.linalg.norm(m.pixels2 - camera.project(-t)[0], axis=1)
+    for near, far in ((0.0, 60.0), (60.0, 150.0), (150.0, 400.0), (400.0, 2000.0)):
+        within = (away >= near) & (away < far)
+        # The mean of 2 n squares is known to sqrt(1 / n).
+        assert np.mean(r[within] ** 2) == pytest.approx(1.0, abs=0.1 + 4.0 / np.sqrt(within.sum()))
+
+
+def test_accurate_affinities_help_where_the_epipole_is_in_the_image(rng):
+    errors = []
+    for _ in range(30):
+        m, _, _ = pair(rng, 100, pose=FORWARD, noise_px=0.5, sigma_A=0.005)
+        ways = (m, replace(m, A21=None, sigma_A=None))
+        errors.append([pose_errors_deg(refine_pose(way, FORWARD).cam2_from_cam1, FORWARD) for way in ways])
+    both, points = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert (both < 0.9 * points).all()
