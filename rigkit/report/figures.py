@@ -51,6 +51,9 @@ PYRAMID_DEPTH = 0.18
 FAR = 4.0
 """Points this many times farther than the median one do not set the limits of the picture."""
 
+FILL = 0.8
+"""Part of the picture that the box round the scene takes; the rest is for the numbers along its edges."""
+
 CURVE_SAMPLES = 240
 JPEG_QUALITY = 85
 
@@ -104,6 +107,7 @@ def epipolar_figure(
         axis.set_ylim(camera.size_px[1] - 0.5, -0.5)
     rms = reconstruction.sampson_rms_px
     axes[0].set_title(f"{reconstruction.pair_id}: epipolar curves, Sampson rms {rms:.3f} px", fontsize=9)
+    axes[1].set_title("view 2 (each curve passes through its corner)", fontsize=9)
     return figure
 
 
@@ -139,6 +143,7 @@ def cloud_figure(reconstruction: Reconstruction, *, unit: str = "mm") -> Figure:
 
     figure = Figure(figsize=(13, 6), dpi=DPI)
     FigureCanvasAgg(figure)
+    figure.subplots_adjust(left=0.0, right=0.97, bottom=0.02, top=0.94, wspace=0.0)
     cloud = reconstruction.cloud
     scene = cloud.points_mm
     reach = float(np.median(np.linalg.norm(scene, axis=1)))
@@ -158,15 +163,14 @@ def cloud_figure(reconstruction: Reconstruction, *, unit: str = "mm") -> Figure:
         cameras = ((Rigid3.identity(), "camera 1"), (reconstruction.cam2_from_cam1.inverse(), "camera 2"))
         for cam1_from_cam, name in cameras:
             _draw_pyramid(axis, cam1_from_cam, reach * PYRAMID_DEPTH, name)
-        axis.set_box_aspect(_equal_limits(axis, reconstruction), zoom=1.25)
         axis.view_init(elev=elevation, azim=azimuth)
+        _fit_equal(axis, reconstruction)
         axis.set_xlabel(f"x {unit}", fontsize=7)
         axis.set_ylabel(f"z {unit}", fontsize=7)
         if from_above := elevation > 45.0:
             axis.set_zticks([])
         axis.set_zlabel("" if from_above else f"-y {unit}", fontsize=7)
         axis.tick_params(labelsize=6)
-    figure.subplots_adjust(left=0.0, right=0.97, bottom=0.02, top=0.94, wspace=0.0)
     axis.legend(fontsize=7, loc="upper right")
     title = f"{reconstruction.pair_id}, {reconstruction.affine_method}: {len(cloud)} points, "
     figure.suptitle(f"{title}baseline {reconstruction.baseline_mm:.2f} {unit}", fontsize=10)
@@ -220,11 +224,13 @@ def _draw_pyramid(axis: Any, cam1_from_cam: Rigid3, depth: float, name: str) -> 
     for start, end in zip(base, np.roll(base, -1, axis=0), strict=True):
         axis.plot(*np.stack([start, end]).T, color="black", linewidth=0.8)
         axis.plot(*np.stack([tip, start]).T, color="black", linewidth=0.8)
-    axis.text(*tip, name, fontsize=7)
+    axis.text(*tip, f"   {name}", fontsize=7)
 
 
-def _equal_limits(axis: Any, reconstruction: Reconstruction) -> FloatArray:
-    """Set limits around cloud and cameras; return the box aspect that keeps millimetres equal on all axes."""
+def _fit_equal(axis: Any, reconstruction: Reconstruction) -> None:
+    """Set limits around cloud and cameras, millimetres equal on all axes, and fill the picture with that box."""
+    from mpl_toolkits.mplot3d import proj3d
+
     centres = np.stack([np.zeros(3), reconstruction.cam2_from_cam1.inverse().translation_mm])
     points = reconstruction.cloud.points_mm
     distance = np.linalg.norm(points, axis=1)
@@ -236,7 +242,12 @@ def _equal_limits(axis: Any, reconstruction: Reconstruction) -> FloatArray:
     axis.set_xlim(low[0], high[0])
     axis.set_ylim(low[1], high[1])
     axis.set_zlim(low[2], high[2])
-    return np.asarray(high - low)
+    axis.set_box_aspect(high - low)
+    ends = np.stack(np.meshgrid(*np.stack([low, high], axis=1)), axis=-1).reshape(-1, 3)
+    u, v, _ = proj3d.proj_transform(*ends.T, axis.get_proj())
+    seen = axis.transData.transform(np.stack([u, v], axis=1)) - axis.transData.transform((0.0, 0.0))
+    room = 0.5 * np.array([axis.bbox.width, axis.bbox.height])
+    axis.set_box_aspect(high - low, zoom=FILL * float((room / np.abs(seen).max(axis=0)).min()))
 
 
 def _draw_boards(axis: Any, reconstruction: Reconstruction, pixels: Pixels) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from helpers.reconstructions import make_reconstruction
 
+from rigkit.geometry.rigid3 import Rigid3
 from rigkit.report.figures import as_pdf, cloud_figure, corners_figure
 
 
@@ -19,3 +21,16 @@ def test_a_pdf_has_vectors_real_fonts_and_no_date() -> None:
     assert b"CreationDate" not in first
     # The cloud has no photograph in it: all of it is lines and text.
     assert b"/Subtype /Image" not in as_pdf(cloud_figure(reconstruction))
+
+
+@pytest.mark.parametrize("baseline_mm", [(300.0, 0.0, 0.0), (0.0, 0.0, 900.0), (0.0, 1500.0, 0.0)])
+def test_the_cloud_s_axes_and_their_numbers_are_all_in_the_picture(baseline_mm: tuple[float, float, float]) -> None:
+    figure = cloud_figure(make_reconstruction(cam2_from_cam1=Rigid3(np.eye(3), np.array(baseline_mm))))
+    figure.canvas.draw()
+    width, height = figure.bbox.width, figure.bbox.height
+    for axes in figure.axes:
+        drawn = axes.get_tightbbox()
+        assert drawn is not None
+        assert drawn.x0 >= 0.0 and drawn.y0 >= 0.0 and drawn.x1 <= width and drawn.y1 <= height
+        # And the scene fills it: no stamp in the middle.
+        assert max(drawn.width / (0.5 * width), drawn.height / height) > 0.8
