@@ -10,7 +10,8 @@ from rigkit.calibration.normal import Normal
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import BoardShape, Calibration, Candidate, Outlier, ViewResult
 from rigkit.calibration.shape import ShapeModel
-from rigkit.calibration.solver import State, with_priors
+from rigkit.calibration.solver import with_priors
+from rigkit.calibration.state import State
 from rigkit.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew

@@ -16,11 +16,11 @@ from rigkit.calibration.assemble import assemble, require_determined
 from rigkit.calibration.counting import miscounted, recounted
 from rigkit.calibration.evidence import fit_shapes
 from rigkit.calibration.fit import Fit, fit_kept, fit_model, heldout_squares, robust_sigma
+from rigkit.calibration.linearise import normal_equations
 from rigkit.calibration.moved import moved_lens
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.shape import SHAPES, often_seen
-from rigkit.calibration.solver import equations
 from rigkit.calibration.uncertainty import uncertainty_at_corners
 from rigkit.calibration.usable import usable_views
 from rigkit.calibration.verdicts import judge
@@ -250,7 +250,7 @@ def _fit_shapes(observations: Observations, flat: _Option, board: str) -> tuple[
         views = miscounted(observations, richest, quarter_turns)
         if views.any():
             observations, state = recounted(observations, flat.fit.state, views, quarter_turns)
-            data = equations(observations, state, flat.fit.weight(observations))
+            data = normal_equations(observations, state, flat.fit.weight(observations))
             flat = replace(flat, fit=replace(flat.fit, state=state, data=data))
             fits = fit_shapes(observations, flat.fit, board)
     return observations, flat, fits

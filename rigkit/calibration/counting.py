@@ -23,7 +23,7 @@ from rigkit.boards import Board
 from rigkit.calibration.fit import Fit
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.shape import often_seen, released_sigma
-from rigkit.calibration.solver import State
+from rigkit.calibration.state import State
 from rigkit.geometry.rigid3 import Rigid3
 
 __all__ = ["board_turn", "grid_turned", "miscounted", "recounted", "same_looks"]
@@ -154,9 +154,8 @@ class _Patterns:
         board, points = observations.boards[b], fit.state.shape.points(fit.state.unknowns)
         flat = board.points()
         points[rows] = flat + turn.summed(points[rows] - flat, 1.0) / turn.order
-        shape = replace(fit.state.shape.held(fit.state.unknowns), flat=points)
-        part = observations.subset(views)
-        state = replace(fit.state.subset(views), shape=shape, unknowns=np.zeros(0))
+        part, state = observations.subset(views), fit.state.subset(views).with_boards_held()
+        state = replace(state, shape=replace(state.shape, flat=points))
         in_cam, _ = state.points_in_cam(part)
         pixels, valid, by_point, _ = state.camera.project_with_jacobians(in_cam)
         weight = np.where(valid & fit.kept[views], part.weight, 0.0)

@@ -20,7 +20,8 @@ from rigkit.calibration.linearise import normal_equations
 from rigkit.calibration.normal import Normal
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.shape import released_groups, shape_model, warp_groups
-from rigkit.calibration.solver import State, evaluate, solve, with_priors
+from rigkit.calibration.solver import solve, with_priors
+from rigkit.calibration.state import State, evaluate
 
 __all__ = ["fit_shapes"]
 
@@ -61,8 +62,7 @@ def _stray(observations: Observations, state: State, kept: BoolArray) -> bool:
     shape = replace(shape_model("released", observations), basis=state.shape.basis)
     unknowns = np.concatenate([state.unknowns, np.zeros(shape.count - state.shape.count)])
     weight = np.where(kept, observations.weight, 0.0)
-    place = state.camera, state.rotation, state.translation_mm, shape, unknowns
-    normal = normal_equations(*place, observations, weight, None)
+    normal = normal_equations(observations, replace(state, shape=shape, unknowns=unknowns), weight)
     points = len(shape.released)
     # In one view a residual is all that is seen of a corner; from one side nothing tells how far off it is.
     seen = np.bincount(observations.corner[kept], minlength=len(shape.flat))[shape.released] > 1

@@ -8,11 +8,13 @@ import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray
 from rigkit.calibration.initialise import initialise
+from rigkit.calibration.linearise import normal_equations
 from rigkit.calibration.normal import Normal, Residuals
 from rigkit.calibration.observations import Observations, median_of
 from rigkit.calibration.poses import find_poses, refine_poses
 from rigkit.calibration.result import Convergence
-from rigkit.calibration.solver import State, equations, evaluate, solve
+from rigkit.calibration.solver import solve
+from rigkit.calibration.state import State, evaluate
 from rigkit.cameras.base import Camera, image_center
 from rigkit.errors import DegenerateError
 
@@ -107,7 +109,7 @@ def fit_model(observations: Observations, size_px: tuple[int, int], model: type[
     """
     best: _Found | None = None
     for start in initialise(observations, size_px, model, order):
-        here = _Found.at(start, equations(observations, start), observations)
+        here = _Found.at(start, normal_equations(observations, start), observations)
         if not np.isfinite(here.sigma_px):
             continue
         found = _clean(observations, here) or _robust(observations, start, here.sigma_px)

@@ -20,7 +20,7 @@ import numpy as np
 from rigkit.arrays import FloatArray, Mat3, Points
 from rigkit.calibration.observations import Observations, median_of
 from rigkit.calibration.radial_alignment import Alignment, align, distortion_centre
-from rigkit.calibration.solver import State, evaluate
+from rigkit.calibration.state import State, evaluate
 from rigkit.cameras.base import Camera, RadialCurve, image_center
 from rigkit.errors import InputError
 from rigkit.geometry.rotation import nearest_rotation

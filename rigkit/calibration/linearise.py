@@ -16,35 +16,27 @@ from rigkit.arrays import BoolArray, FloatArray, IntArray, Mat3, Points
 from rigkit.calibration.normal import Normal, Residuals
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.shape import ShapeModel
+from rigkit.calibration.state import State, lost_px
 from rigkit.cameras.base import Camera
 
-__all__ = ["lost_px", "normal_equations", "view_products"]
+__all__ = ["normal_equations", "view_products"]
 
 BLOCK = 8192
 """Corners linearised at a time: their derivatives then stay in the cache, and memory does not grow with the views."""
 
 
-def lost_px(camera: Camera) -> float:
-    """Return the residual per coordinate of a corner outside the model's field of view: the diagonal of the image."""
-    return float(np.hypot(*camera.size_px))
-
-
 def normal_equations(
-    camera: Camera,
-    rotation: Mat3,
-    translation_mm: Points,
-    shape: ShapeModel,
-    unknowns: FloatArray,
-    observations: Observations,
-    weight: FloatArray,
-    loss_px: float | None,
+    observations: Observations, state: State, weight: FloatArray | None = None, loss_px: float | None = None
 ) -> Normal:
-    """Return the normal equations and the cost for boards at the poses (V, 3, 3), (V, 3) with the shape's `unknowns`.
+    """Return the normal equations and the cost at `state`, without priors.
 
-    `weight` (V, C) multiplies the residuals; `loss_px` is the scale of the Cauchy loss, None for least squares.
+    `weight` (V, C) multiplies the residuals, by default the observations' own; `loss_px` is the scale of the Cauchy
+    loss, None for least squares.
     """
+    weight = observations.weight if weight is None else weight
     views, corners = weight.shape
-    count = camera.parameters.size + shape.basis.shape[-1]
+    shape = state.shape
+    count = state.camera.parameters.size + shape.basis.shape[-1]
     gg, g = np.zeros((count, count)), np.zeros(count)
     gp, pp = np.empty((views, count, 6)), np.empty((views, 6, 6))
     p, costs = np.empty((views, 6)), np.empty(views)
@@ -52,8 +44,7 @@ def normal_equations(
     px = np.moveaxis(np.empty((2, views, corners)), 0, -1)
     residuals = Residuals(px, np.empty((views, corners), dtype=bool))
     released = _Released(shape, views, count) if shape.kind == "released" else None
-    poses = rotation, translation_mm
-    for block, rows in _blocks(camera, poses, shape, unknowns, observations, weight, loss_px, residuals, costs):
+    for block, rows in _blocks(observations, state, weight, loss_px, residuals, costs):
         # Per view only what involves its pose; the globals among themselves in one product over all corners.
         each = np.moveaxis(rows, (1, 2), (0, 1))
         product = (each @ np.swapaxes(each[:, :, count:], -1, -2)).sum(axis=0)
@@ -62,40 +53,28 @@ def normal_equations(
         g += product[:, :count, 6].sum(axis=0)
         gp[block], pp[block], p[block] = product[:, :count, :6], product[:, count:-1, :6], product[:, count:-1, 6]
         if released is not None:
-            by_board = _by_board(rows, rotation[block])
+            by_board = _by_board(rows, state.rotation[block])
             released.add(rows, by_board, observations.corner[block], observations.present[block], block.start)
     normal = Normal(gg, gp, pp, g, p, costs, (residuals,))
     return normal if released is None else released.appended(normal)
 
 
-def view_products(
-    camera: Camera,
-    rotation: Mat3,
-    translation_mm: Points,
-    shape: ShapeModel,
-    unknowns: FloatArray,
-    observations: Observations,
-    weight: FloatArray,
-) -> FloatArray:
+def view_products(observations: Observations, state: State, weight: FloatArray) -> FloatArray:
     """Return of every view the sums of the products of its weighted rows, (V, P + 7, P + 7): derivatives by the P
     parameters of the camera and by the pose (w, t), and last the residual. The boards keep their shape."""
     views, corners = weight.shape
     residuals, costs = Residuals(np.empty((views, corners, 2)), np.empty((views, corners), dtype=bool)), np.empty(views)
-    count = camera.parameters.size + 7
+    count = state.camera.parameters.size + 7
     out = np.empty((views, count, count))
-    held, poses = shape.held(unknowns), (rotation, translation_mm)
-    for block, rows in _blocks(camera, poses, held, np.zeros(0), observations, weight, None, residuals, costs):
+    for block, rows in _blocks(observations, state.with_boards_held(), weight, None, residuals, costs):
         each = np.moveaxis(rows, (1, 2), (0, 1))
         out[block] = (each @ np.swapaxes(each, -1, -2)).sum(axis=0)
     return out
 
 
 def _blocks(
-    camera: Camera,
-    poses: tuple[Mat3, Points],
-    shape: ShapeModel,
-    unknowns: FloatArray,
     observations: Observations,
+    state: State,
     weight: FloatArray,
     loss_px: float | None,
     residuals: Residuals,
@@ -103,15 +82,16 @@ def _blocks(
 ) -> Iterator[tuple[slice, FloatArray]]:
     """Yield blocks of views and their weighted rows (K, 2, V, C), valid until the next: derivatives by the globals
     and the pose, and the residual. `residuals` and `costs` (V,) are filled."""
-    table = np.ascontiguousarray(shape.points(unknowns).T)
+    camera, shape = state.camera, state.shape
+    table = np.ascontiguousarray(shape.points(state.unknowns).T)
     views, corners = weight.shape
     count = camera.parameters.size + shape.basis.shape[-1] + 7
     step = max(1, BLOCK // max(corners, 1))
     for first in range(0, views, step):
         block = slice(first, min(first + step, views))
         part = _Part(
-            poses[0][block],
-            poses[1][block],
+            state.rotation[block],
+            state.translation_mm[block],
             observations.corner[block],
             observations.pixels[block],
             weight[block],

@@ -7,14 +7,13 @@ tells apart more clearly than any of those is a lens that moved.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray
 from rigkit.calibration.fit import Fit
 from rigkit.calibration.observations import Observations
-from rigkit.calibration.solver import State, evaluate, solve
+from rigkit.calibration.solver import solve
+from rigkit.calibration.state import State, evaluate
 
 __all__ = ["moved_lens"]
 
@@ -36,7 +35,7 @@ def moved_lens(observations: Observations, fit: Fit) -> tuple[str, ...]:
     place = {name: i for i, name in enumerate(images)}
     number = np.array([place[name] for name in observations.images])
     # The shape of the boards stays as it was found: two shapes are not two lenses.
-    state = replace(fit.state, shape=fit.state.shape.held(fit.state.unknowns), unknowns=np.zeros(0))
+    state = fit.state.with_boards_held()
     distance = _apart(observations, fit, state, number >= len(images) // 2)
     if not distance > SIGMAS:
         return ()

@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.arrays import FloatArray, Mat3, Points
+from rigkit.calibration.linearise import normal_equations
 from rigkit.calibration.normal import Normal
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.radial_alignment import align
-from rigkit.calibration.solver import State, equations
+from rigkit.calibration.state import State
 from rigkit.geometry.rotation import exp_so3, nearest_rotation
 
 __all__ = ["find_poses", "refine_each", "refine_poses"]
@@ -41,7 +42,7 @@ def refine_poses(
         return replace(state, rotation=rotation, translation_mm=translation_mm)
 
     def linearise(rotation: Mat3, translation_mm: Points) -> Normal:
-        return equations(observations, at(rotation, translation_mm), weight, loss_px)
+        return normal_equations(observations, at(rotation, translation_mm), weight, loss_px)
 
     rotation, translation_mm, cost = refine_each(state.rotation, state.translation_mm, linearise, tolerance)
     return at(rotation, translation_mm), cost

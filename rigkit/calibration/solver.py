@@ -16,18 +16,16 @@ from typing import TypeVar
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, IntArray, Mat3, Points
-from rigkit.calibration.linearise import lost_px, normal_equations
-from rigkit.calibration.normal import Normal, Residuals, Step
+from rigkit.arrays import FloatArray
+from rigkit.calibration.linearise import normal_equations
+from rigkit.calibration.normal import Normal, Step
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Convergence
-from rigkit.calibration.shape import ShapeModel, shape_model
-from rigkit.cameras.base import Camera
+from rigkit.calibration.state import State
 from rigkit.errors import RigkitError
 from rigkit.geometry.rotation import exp_so3
 
-__all__ = ["Linearised", "Residuals", "Solution", "State", "equations", "evaluate", "minimise", "solve"]
-__all__ += ["with_priors"]
+__all__ = ["Linearised", "Solution", "minimise", "solve", "with_priors"]
 
 S = TypeVar("S")
 
@@ -45,35 +43,6 @@ DAMPING_MAX = 1e12
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class State:
-    """Everything that is solved for: camera, poses (V, 3, 3) and (V, 3) mm, shape and its unknowns."""
-
-    camera: Camera
-    rotation: Mat3
-    translation_mm: Points
-    shape: ShapeModel
-    unknowns: FloatArray
-
-    @classmethod
-    def start(cls, camera: Camera, rotation: Mat3, translation_mm: Points, observations: Observations) -> State:
-        """Return the state with flat boards."""
-        return cls(camera, rotation, translation_mm, shape_model("flat", observations), np.zeros(0))
-
-    def subset(self, chosen: IntArray) -> State:
-        """Return the state of the views `chosen`."""
-        return replace(self, rotation=self.rotation[chosen], translation_mm=self.translation_mm[chosen])
-
-    def points_in_cam(self, observations: Observations) -> tuple[Points, Points]:
-        """Return the corners in the camera frame and their lever arms R X, both (V, C, 3) mm, coordinates first in
-        memory."""
-        board = np.take(self.shape.points(self.unknowns).T, observations.corner, axis=1)
-        lever = np.empty_like(board)
-        np.matmul(self.rotation, np.swapaxes(board, 0, 1), out=np.swapaxes(lever, 0, 1))
-        points = lever + self.translation_mm.T[:, :, None]
-        return np.moveaxis(points, 0, -1), np.moveaxis(lever, 0, -1)
-
-
-@dataclass(frozen=True, eq=False, slots=True)
 class Linearised:
     """The problem around a state: the normal equations of the corners, and those with all priors added."""
 
@@ -88,30 +57,6 @@ class Solution:
     state: State
     data: Normal
     convergence: Convergence
-
-
-def evaluate(state: State, observations: Observations) -> Residuals:
-    """Return the residuals of `state`; where a corner does not project, the diagonal of the image."""
-    points, _ = state.points_in_cam(observations)
-    pixels, valid = state.camera.project(points)
-    residuals = observations.pixels - pixels
-    return Residuals(residuals if valid.all() else np.where(valid[..., None], residuals, lost_px(state.camera)), valid)
-
-
-def equations(
-    observations: Observations, state: State, weight: FloatArray | None = None, loss_px: float | None = None
-) -> Normal:
-    """Return the normal equations at `state`, without priors; `weight` and `loss_px` as for `solve`."""
-    return normal_equations(
-        state.camera,
-        state.rotation,
-        state.translation_mm,
-        state.shape,
-        state.unknowns,
-        observations,
-        observations.weight if weight is None else weight,
-        loss_px,
-    )
 
 
 def with_priors(data: Normal, state: State, sigma_px: float) -> Normal:
@@ -160,7 +105,7 @@ class _Solver:
     prior_sigma_px: float
 
     def linearise(self, state: State) -> Linearised:
-        return self.with_priors(state, equations(self.observations, state, self.weight, self.loss_px))
+        return self.with_priors(state, normal_equations(self.observations, state, self.weight, self.loss_px))
 
     def with_priors(self, state: State, data: Normal) -> Linearised:
         return Linearised(data, with_priors(data, state, self.prior_sigma_px))

@@ -21,7 +21,7 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.initialise import initialise, start_error
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.poses import find_poses
-from rigkit.calibration.solver import State, evaluate
+from rigkit.calibration.state import State, evaluate
 from rigkit.calibration.uncertainty import uncertainty_at_corners
 from rigkit.cameras.double_sphere import DoubleSphere
 from rigkit.cameras.registry import MODELS

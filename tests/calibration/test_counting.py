@@ -14,7 +14,7 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.counting import board_turn, grid_turned, recounted, same_looks
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.solver import State, evaluate
+from rigkit.calibration.state import State, evaluate
 from rigkit.detections import BoardView
 
 OBLONG, SQUARE = Board("8x6", 8, 6, 30.0, 30.0), Board("6x6", 6, 6, 30.0, 30.0)

@@ -19,7 +19,7 @@ from rigkit.calibration.rig.spread import frame_spread
 from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.calibration.rig.uncertainty import transfer_covariance, transfer_uncertainty
 from rigkit.calibration.shape import shape_model
-from rigkit.calibration.solver import evaluate
+from rigkit.calibration.state import evaluate
 from rigkit.cameras.base import Camera
 from rigkit.detections import BoardView
 from rigkit.errors import InputError

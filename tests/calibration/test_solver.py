@@ -11,10 +11,10 @@ from scipy.optimize import least_squares
 
 from rigkit.calibration.initialise import initialise
 from rigkit.calibration.linearise import normal_equations
-from rigkit.calibration.normal import Normal
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.shape import shape_model
-from rigkit.calibration.solver import State, evaluate, solve, with_priors
+from rigkit.calibration.solver import solve, with_priors
+from rigkit.calibration.state import State, evaluate
 from rigkit.cameras.base import RadialCurve
 from rigkit.cameras.scaramuzza import Scaramuzza
 from rigkit.geometry.rotation import exp_so3
@@ -47,11 +47,6 @@ def disturbed(state: State, rng: np.random.Generator, size: float) -> State:
     )
 
 
-def normals(state: State, observations: Observations, weight: np.ndarray) -> Normal:
-    poses = state.rotation, state.translation_mm
-    return normal_equations(state.camera, *poses, state.shape, state.unknowns, observations, weight, None)
-
-
 @pytest.mark.parametrize("kind", ["flat", "warp", "released"])
 @pytest.mark.parametrize("name", ["reg", "fish"])
 def test_gradient_of_every_unknown(name: str, kind: str, rng: np.random.Generator) -> None:
@@ -60,7 +55,7 @@ def test_gradient_of_every_unknown(name: str, kind: str, rng: np.random.Generato
     shape = shape_model(kind, observations)
     state = replace(disturbed(state, rng, 1e-3), shape=shape, unknowns=0.1 * shape.sigma * rng.normal(size=shape.count))
     weight = observations.weight * rng.uniform(0.5, 1.5, observations.weight.shape)
-    normal = normals(state, observations, weight)
+    normal = normal_equations(observations, state, weight)
     p = state.camera.parameters.size
     analytic = -2.0 * np.concatenate([normal.g, normal.p.ravel()])
 
@@ -98,7 +93,7 @@ def test_second_derivative_blocks(rng: np.random.Generator) -> None:
     observations, state = scene("fish", rng)
     shape = shape_model("released", observations)
     state = replace(disturbed(state, rng, 1e-3), shape=shape, unknowns=np.zeros(shape.count))
-    normal = normals(state, observations, observations.weight)
+    normal = normal_equations(observations, state, observations.weight)
     normal = with_priors(normal, state, 0.2)
     first, second = normal.step(1e-6), replace(normal, points_from=None).step(1e-6)
     assert first is not None and second is not None

@@ -17,7 +17,7 @@ from rigkit.calibration.observations import Observations
 from rigkit.calibration.poses import find_poses, refine_poses
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
-from rigkit.calibration.solver import State, evaluate
+from rigkit.calibration.state import State, evaluate
 from rigkit.calibration.usable import views_of_image
 from rigkit.cameras.base import Camera
 from rigkit.corners.detect import detect_boards

@@ -13,7 +13,8 @@ from rigkit.calibration.fit import fit_kept
 from rigkit.calibration.initialise import initialise
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Convergence
-from rigkit.calibration.solver import State, solve
+from rigkit.calibration.solver import solve
+from rigkit.calibration.state import State
 from rigkit.calibration.uncertainty import projection_uncertainty, uncertainty_map
 from rigkit.cameras.registry import MODELS
 

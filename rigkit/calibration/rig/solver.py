@@ -16,11 +16,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.arrays import FloatArray, IntArray, Mat3, Points
+from rigkit.calibration.linearise import normal_equations
 from rigkit.calibration.normal import Normal, Residuals
 from rigkit.calibration.poses import refine_each
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.rig.state import RigObservations, RigState
-from rigkit.calibration.solver import COST_TOLERANCE, Linearised, equations, minimise
+from rigkit.calibration.solver import COST_TOLERANCE, Linearised, minimise
 from rigkit.geometry.rotation import skew
 
 __all__ = ["Carried", "RigSolution", "carried", "refine_frames", "rig_normal", "solve_rig"]
@@ -77,7 +78,7 @@ def rig_normal(observations: RigObservations, state: RigState, sigma_px: float =
     residuals: tuple[Residuals, ...] = ()
     for c, own in enumerate(observations.cameras):
         alone = state.of_camera(c, observations)
-        n = equations(own, alone, observations.weights[c])
+        n = normal_equations(own, alone, observations.weights[c])
         residuals += n.residuals
         f = observations.frame[c]
         by = carried(observations, state, c, alone.translation_mm)

@@ -73,8 +73,7 @@ def _by_frame(observations: RigObservations, state: RigState, frame: IntArray) -
     information, score = np.zeros((int(frame.max()) + 1, n, n)), np.zeros((int(frame.max()) + 1, n))
     for c, own in enumerate(observations.cameras):
         alone = state.of_camera(c, observations)
-        place = alone.rotation, alone.translation_mm, alone.shape, alone.unknowns
-        product = view_products(alone.camera, *place, own, observations.weights[c])
+        product = view_products(own, alone, observations.weights[c])
         p = alone.camera.parameters.size
         by = carried(observations, state, c, alone.translation_mm)
         at = frame[observations.frame[c]]

@@ -17,7 +17,7 @@ from rigkit.arrays import BoolArray, FloatArray, IntArray, Mat3, Points
 from rigkit.calibration.normal import Step
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.shape import ShapeModel
-from rigkit.calibration.solver import State
+from rigkit.calibration.state import State
 from rigkit.cameras.base import Camera
 from rigkit.errors import RigkitError
 from rigkit.geometry.rotation import exp_so3

@@ -1,0 +1,61 @@
+"""Everything that is solved for when one camera is calibrated, and the residuals that it leaves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rigkit.arrays import FloatArray, IntArray, Mat3, Points
+from rigkit.calibration.normal import Residuals
+from rigkit.calibration.observations import Observations
+from rigkit.calibration.shape import ShapeModel, shape_model
+from rigkit.cameras.base import Camera
+
+__all__ = ["State", "evaluate", "lost_px"]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class State:
+    """Camera, poses (V, 3, 3) and (V, 3) mm, shape and its unknowns."""
+
+    camera: Camera
+    rotation: Mat3
+    translation_mm: Points
+    shape: ShapeModel
+    unknowns: FloatArray
+
+    @classmethod
+    def start(cls, camera: Camera, rotation: Mat3, translation_mm: Points, observations: Observations) -> State:
+        """Return the state with flat boards."""
+        return cls(camera, rotation, translation_mm, shape_model("flat", observations), np.zeros(0))
+
+    def subset(self, chosen: IntArray) -> State:
+        """Return the state of the views `chosen`."""
+        return replace(self, rotation=self.rotation[chosen], translation_mm=self.translation_mm[chosen])
+
+    def with_boards_held(self) -> State:
+        """Return the state with nothing of the boards' shape left to solve for."""
+        return replace(self, shape=self.shape.held(self.unknowns), unknowns=np.zeros(0))
+
+    def points_in_cam(self, observations: Observations) -> tuple[Points, Points]:
+        """Return the corners in the camera frame and their lever arms R X, both (V, C, 3) mm, coordinates first in
+        memory."""
+        board = np.take(self.shape.points(self.unknowns).T, observations.corner, axis=1)
+        lever = np.empty_like(board)
+        np.matmul(self.rotation, np.swapaxes(board, 0, 1), out=np.swapaxes(lever, 0, 1))
+        points = lever + self.translation_mm.T[:, :, None]
+        return np.moveaxis(points, 0, -1), np.moveaxis(lever, 0, -1)
+
+
+def evaluate(state: State, observations: Observations) -> Residuals:
+    """Return the residuals of `state`; where a corner does not project, the diagonal of the image."""
+    points, _ = state.points_in_cam(observations)
+    pixels, valid = state.camera.project(points)
+    residuals = observations.pixels - pixels
+    return Residuals(residuals if valid.all() else np.where(valid[..., None], residuals, lost_px(state.camera)), valid)
+
+
+def lost_px(camera: Camera) -> float:
+    """Return the residual per coordinate of a corner outside the model's field of view: the diagonal of the image."""
+    return float(np.hypot(*camera.size_px))
