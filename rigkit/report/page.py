@@ -15,7 +15,7 @@ import numpy as np
 from rigkit.arrays import FloatArray
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruct import Reconstruction
-from rigkit.report.tables import measured_words
+from rigkit.report.tables import below, measured_words
 from rigkit.validation.tables import Cell, Column, Table
 
 __all__ = ["PairSection", "build_page", "facts_html", "page_html", "scene_of", "table_html"]
@@ -35,7 +35,7 @@ def table_html(table: Table) -> str:
         f"<tr>{''.join(_cell(c, column) for c, column in zip(row, table.columns, strict=True))}</tr>"
         for row in table.rows
     )
-    note = f'<p class="soft">{html.escape(table.note)}</p>' if table.note else ""
+    note = f'<p class="soft">{html.escape(below(table))}</p>' if below(table) else ""
     return (
         f'<h3>{html.escape(table.title)}</h3><div class="scroll"><table><thead><tr>{head}</tr></thead>'
         f"<tbody>{body}</tbody></table></div>{note}"

@@ -13,6 +13,7 @@ import numpy as np
 from rigkit.validation.tables import Cell, Column, Table
 
 __all__ = [
+    "below",
     "measured_words",
     "tables_to_csv",
     "tables_to_json",
@@ -54,7 +55,7 @@ def tables_to_markdown(tables: Sequence[Table]) -> str:
                 text = _escape_markdown(_text(cell, column))
                 cells.append(f"**{text}**" if text and (cell.best or cell.failed) else text)
             lines.append(_bar(cells))
-        lines += ["", *([table.note + _legend(table)] if table.note or _legend(table) else [])]
+        lines += ["", *filter(None, [below(table)])]
         parts.append("\n".join(lines).rstrip() + "\n")
     return "\n".join(parts)
 
@@ -96,7 +97,7 @@ def tables_to_latex(tables: Sequence[Table]) -> str:
         lines = [
             r"\begin{table}",
             r"\centering",
-            rf"\caption{{{_escape_latex((table.title + '. ' + table.note + _legend(table)).strip())}}}",
+            rf"\caption{{{_escape_latex((table.title + '. ' + below(table)).strip())}}}",
             rf"\label{{tab:{table.key}}}",
             r"\resizebox{\textwidth}{!}{%",
             rf"\begin{{tabular}}{{{''.join('l' if left else 'r' for left in _left(table))}}}",
@@ -142,7 +143,7 @@ def tables_to_text(tables: Sequence[Table]) -> str:
         widths = [max(len(line[j]) for line in grid) for j in range(len(table.columns))]
         pad = [str.ljust if left else str.rjust for left in _left(table)]
         lines = ["  ".join(p(t, w) for p, t, w in zip(pad, line, widths, strict=True)).rstrip() for line in grid]
-        parts.append("\n".join([table.title, *lines, *([table.note] if table.note else [])]))
+        parts.append("\n".join([table.title, *lines, *filter(None, [below(table)])]))
     return "\n\n".join(parts)
 
 
@@ -188,9 +189,10 @@ def _left(table: Table) -> list[bool]:
     return [any(isinstance(row[j].value, str) for row in table.rows) for j in range(len(table.columns))]
 
 
-def _legend(table: Table) -> str:
+def below(table: Table) -> str:
+    """Return what stands below a table as text: its note, and what brackets mean where there are any."""
     printed = any(cell.paper is not None for row in table.rows for cell in row)
-    return (" " if table.note else "") + "In brackets: the paper's." if printed else ""
+    return " ".join(filter(None, [table.note, "In brackets: the paper's." if printed else ""]))
 
 
 def _extra(table: Table, j: int) -> tuple[bool, bool]:

@@ -16,7 +16,15 @@ from helpers.reconstructions import make_reconstruction
 
 from rigkit.errors import InputError
 from rigkit.io.paper_tables import load_paper_tables
-from rigkit.report.tables import measured_words, tables_to_csv, tables_to_json, tables_to_latex, tables_to_markdown
+from rigkit.report.page import table_html
+from rigkit.report.tables import (
+    measured_words,
+    tables_to_csv,
+    tables_to_json,
+    tables_to_latex,
+    tables_to_markdown,
+    tables_to_text,
+)
 from rigkit.truth import MeasuredAngle, MeasuredLength, PairTruth
 from rigkit.validation.checks import ValidationReport, validate
 from rigkit.validation.tables import Cell, Column, PaperTables, Table, best_method, best_report, build_tables
@@ -104,6 +112,19 @@ def test_baselines_mark_the_nearest_and_the_failed(tables: tuple[Table, ...]) ->
     assert (worse.value, worse.paper, worse.best, worse.failed) == (310.0, "292.90", False, True)
     assert (better.value, better.paper, better.best, better.failed) == (301.0, "290.70", True, False)
     assert cell(baselines, "regular-standard", "measured").value == 300.0
+
+
+def test_nothing_is_marked_where_all_estimators_agree(reports: list[ValidationReport]) -> None:
+    same = [replace(r, baseline_mm=301.0) for r in reports]
+    baselines = by_key(build_tables(same), "baselines")
+    assert not any(c.best for row in baselines.rows for c in row)
+
+
+def test_what_brackets_mean_is_said_wherever_there_are_any(tables: tuple[Table, ...]) -> None:
+    for key, words in (("planes", True), ("checks", False)):
+        table = by_key(tables, key)
+        said = [tables_to_markdown([table]), tables_to_text([table]), tables_to_latex([table]), table_html(table)]
+        assert [("In brackets" in text) for text in said] == [words] * 4
 
 
 def test_averages_are_over_the_cells_that_the_paper_has(tables: tuple[Table, ...]) -> None:
