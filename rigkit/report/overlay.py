@@ -37,9 +37,14 @@ def draw_boards(image: NDArray[np.generic], detections: Sequence[BoardDetection]
         if len(found.pixels) > 1:
             cv2.arrowedLine(canvas, _fixed(first), _fixed(found.pixels[1]), colour, 2 * width, cv2.LINE_AA, SHIFT, 0.3)
         label = f"{found.board_id or number + 1}: {len(found.grid)} of {found.columns}x{found.rows}"
+        font = (cv2.FONT_HERSHEY_SIMPLEX, 0.5 * width)
+        (length, height), below = cv2.getTextSize(label, *font, width)
         corner = found.pixels.min(axis=0) - 8 * width
-        place = (max(2, int(corner[0])), max(14 * width, int(corner[1])))
-        cv2.putText(canvas, label, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5 * width, colour, width, cv2.LINE_AA)
+        # All of it inside the image, and readable on black squares.
+        place = (max(2, min(int(corner[0]), canvas.shape[1] - length - 2)), max(14 * width, int(corner[1])))
+        plate = ((place[0] - 2, place[1] - height - 2), (place[0] + length + 2, place[1] + below))
+        cv2.rectangle(canvas, *plate, (255, 255, 255), cv2.FILLED)
+        cv2.putText(canvas, label, place, *font, colour, width, cv2.LINE_AA)
     return canvas
 
 

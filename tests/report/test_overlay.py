@@ -20,4 +20,17 @@ def test_rows_are_drawn_through_the_corners() -> None:
         assert picture.shape == (150, 200, 3)
         middles = (0.5 * (pixels[:-1] + pixels[1:]))[[0, 1, 4, 5, 8, 9]].astype(int)
         assert all((picture[v, u] == COLOURS[0]).all() for u, v in middles)
-        assert (picture[140, 190] == picture[5, 190]).all()
+        assert (picture[145, 5] == picture[145, 195]).all()
+
+
+def test_the_label_stays_inside_the_image() -> None:
+    """As much of it is drawn at the right edge as at the left: ink of the board's colour, on white."""
+    board = Board("a", 4, 3, 30.0, 30.0)
+    ink = []
+    for column in (40.0, 260.0):
+        pixels = 10.0 * board.grid() + [column, 100.0]
+        found = BoardDetection("a", 4, 3, board.grid(), pixels, np.full(12, 0.01))
+        label = draw_boards(np.full((150, 300), 60, np.uint8), [found])[70:93]
+        ink.append(int((label == COLOURS[0]).all(axis=-1).sum()))
+    assert ink[0] > 20
+    assert ink[1] == ink[0]
