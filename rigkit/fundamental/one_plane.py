@@ -27,7 +27,7 @@ AT_REST_SIGMAS = 3.3
 """A parallax, or one off a plane's, is noise below: one good point in a thousand has more."""
 NEARLY_ALL = 0.9
 """Of matches that fit some fit by chance, and of points some are seen on the wrong side of the horizon of a plane."""
-PLANE_ROUNDS = 10
+PLANE_ROUNDS = 5
 
 
 def homography_of_rays(matches: Matches) -> Mat3:
@@ -103,8 +103,9 @@ def twin_poses(matches: Matches, pose: Rigid3) -> tuple[Rigid3, ...]:
     rows = matches.rays1 * (reach / noise)[:, None]
     weights = np.ones(len(matches))
     for _ in range(PLANE_ROUNDS):
-        weighted = rows * weights[:, None]
-        normal = np.linalg.lstsq(weighted.T @ rows, weighted.T @ parallax, rcond=None)[0]
+        weighted = (rows * weights[:, None]).T
+        gram = weighted @ rows
+        normal = np.linalg.solve(gram + 1e-12 * np.trace(gram) * np.eye(3), weighted @ parallax)
         off = np.abs(parallax - rows @ normal)
         weights = 1.0 / (1.0 + (off / max(1.0, float(np.median(off)))) ** 2)
     on = off < AT_REST_SIGMAS

@@ -6,6 +6,7 @@ import numpy as np
 
 from rigkit.arrays import FloatArray, IntArray, Mat3, Rays
 from rigkit.errors import DegenerateError
+from rigkit.fundamental.eight_point import essential_nearest
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import cross, log_so3, skew
 from rigkit.geometry.triangulation import ray_ranges
@@ -35,20 +36,28 @@ def essential_from_pose(cam2_from_cam1: Rigid3) -> Mat3:
 
 
 def rotations_and_direction(E21: Mat3) -> tuple[Mat3, Mat3, FloatArray]:
-    """Return two rotations (..., 3, 3) and a unit direction (..., 3) with E = [t]x R up to sign and size (..., 3, 3).
+    """Return two rotations (N, 3, 3) and a unit direction (N, 3) with E = [t]x R up to sign and size, E essential.
 
     The rotations differ by half a turn about the baseline.
+
+    Notes
+    -----
+    E E^T = I - t t^T with |E|_F^2 = 2, the cofactors of E are t t^T R, and [t]x E is t t^T R - R.
     """
-    u, _, vt = np.linalg.svd(E21)
-    u, vt = u * np.linalg.det(u)[..., None, None], vt * np.linalg.det(vt)[..., None, None]
-    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    return u @ quarter @ vt, u @ quarter.T @ vt, np.array(u[..., 2])
+    E = E21 * np.sqrt(2.0 / np.einsum("nij,nij->n", E21, E21))[:, None, None]
+    outer = np.eye(3) - E @ np.swapaxes(E, 1, 2)
+    every, largest = np.arange(len(E)), np.argmax(np.einsum("nii->ni", outer), axis=1)
+    t = outer[every, largest] / np.sqrt(outer[every, largest, largest])[:, None]
+    columns = np.swapaxes(E, 1, 2)
+    cofactors = np.swapaxes(cross(columns[:, [1, 2, 0]], columns[:, [2, 0, 1]]), 1, 2)
+    across = skew(t) @ E
+    return cofactors - across, cofactors + across, t
 
 
 def decompose_essential(E21: Mat3) -> tuple[Rigid3, ...]:
-    """Return the four poses cam2_from_cam1 (unit baseline) whose essential matrix is `E21` up to sign."""
-    first, second, t = rotations_and_direction(E21)
-    return Rigid3.stack(np.stack([first, first, second, second]), np.stack([t, -t, t, -t]))
+    """Return the four poses cam2_from_cam1 (unit baseline) of the essential matrix nearest to `E21` up to sign."""
+    first, second, t = rotations_and_direction(essential_nearest(E21)[None])
+    return Rigid3.stack(np.concatenate([first, first, second, second]), np.concatenate([t, -t, t, -t]))
 
 
 def hypothesis_poses(E21: Mat3, pose_type: PoseType | str = PoseType.GENERAL) -> tuple[Rigid3, ...]:

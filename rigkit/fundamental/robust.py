@@ -290,7 +290,7 @@ def _sample_size(matches: Matches, kind: str, sample: Sample) -> int:
     if kind not in sizes or sample not in sizes[kind]:
         raise InputError(f"robust estimation knows no samples of kind '{sample}' for pose type '{kind}'")
     size = sizes[kind][sample]
-    different = len(np.unique(np.concatenate([matches.pixels1, matches.pixels2], axis=1), axis=0))
+    different = len({pair.tobytes() for pair in np.concatenate([matches.pixels1, matches.pixels2], axis=1)})
     if different < size + 1:
         raise InputError(f"robust estimation: {different} different matches, at least {size + 1} are needed")
     have = int(usable_affinities(matches).sum())
