@@ -180,18 +180,23 @@ class _Released:
         self._place = np.full(len(shape.flat), points)
         self._place[shape.released] = np.arange(points)
         self._pose = np.zeros((views, points, 3, 6))
-        self._own = np.zeros((points, 3, count + 4))
+        # Products with all rows of its corners, and with their own three.
+        self._own = np.zeros((points, 3, count + 10))
 
     def add(self, rows: FloatArray, by_board: FloatArray, corner: IntArray, present: BoolArray, first: int) -> None:
         """Add a block of views, the first of them number `first`."""
         count = len(rows) - 7
-        place = self._place[corner]
-        mine = present & (place < len(self._own))
-        cross = np.einsum("jivc,kivc->vcjk", by_board, rows, optimize=True)[mine]
-        own = np.einsum("jivc,kivc->vcjk", by_board, by_board, optimize=True)[mine]
-        index, view = place[mine], first + np.nonzero(mine)[0]
+        place = self._place[corner].ravel()
+        mine = np.flatnonzero(present.ravel() & (place < len(self._own)))
+        # Corners of one point after each other, to be summed.
+        mine = mine[np.argsort(place[mine], kind="stable")]
+        index, view = place[mine], first + mine // corner.shape[1]
+        left = by_board.reshape(3, 2, -1)[..., mine]
+        right = np.concatenate([rows.reshape(len(rows), 2, -1)[..., mine], left])
+        cross = left.transpose(2, 0, 1) @ right.transpose(2, 1, 0)
         self._pose[view, index] = cross[..., count : count + 6]
-        np.add.at(self._own, index, np.concatenate([cross[..., :count], own, cross[..., -1:]], axis=-1))
+        starts = np.flatnonzero(np.diff(index, prepend=-1))
+        self._own[index[starts]] += np.add.reduceat(cross, starts, axis=0)
 
     def appended(self, normal: Normal) -> Normal:
         """Return the normal equations with these unknowns after the others."""
@@ -202,7 +207,7 @@ class _Released:
         gg[p:, :p] = self._own[..., :p].reshape(-1, p)
         gg[:p, p:] = gg[p:, :p].T
         blocks = gg[p:, p:].reshape(points, 3, points, 3)
-        blocks[np.arange(points), :, np.arange(points), :] = self._own[..., p : p + 3]
-        g[p:] = self._own[..., -1].reshape(-1)
+        blocks[np.arange(points), :, np.arange(points), :] = self._own[..., p + 7 :]
+        g[p:] = self._own[..., p + 6].reshape(-1)
         gp = np.concatenate([normal.gp, self._pose.reshape(len(normal.pp), -1, 6)], axis=1)
         return replace(normal, gg=gg, gp=gp, g=g, points_from=p)

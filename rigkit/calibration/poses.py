@@ -38,14 +38,14 @@ def refine_poses(
     """Return the state with each view's pose at its own minimum, and each view's cost (V,) in px^2. `loss_px` is the
     scale of the Cauchy loss, `tolerance` the part of the cost that a step must promise to be worth another."""
 
-    def at(rotation: Mat3, translation_mm: Points) -> State:
-        return replace(state, rotation=rotation, translation_mm=translation_mm)
+    held = state.with_boards_held()
 
     def linearise(rotation: Mat3, translation_mm: Points) -> Normal:
-        return normal_equations(observations, at(rotation, translation_mm), weight, loss_px)
+        moved = replace(held, rotation=rotation, translation_mm=translation_mm)
+        return normal_equations(observations, moved, weight, loss_px)
 
     rotation, translation_mm, cost = refine_each(state.rotation, state.translation_mm, linearise, tolerance)
-    return at(rotation, translation_mm), cost
+    return replace(state, rotation=rotation, translation_mm=translation_mm), cost
 
 
 def refine_each(

@@ -7,6 +7,7 @@ import numpy as np
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.solver import refine_frames, solve_rig
 from rigkit.calibration.rig.state import RigObservations
+from rigkit.calibration.state import evaluate
 
 __all__ = ["heldout_rms"]
 
@@ -34,10 +35,11 @@ def heldout_rms(joint: JointRig, folds: int) -> tuple[float | None, tuple[float 
             return nothing
         solved = solve_rig(train, state, joint.sigma_px, TOLERANCE).state
         part = observations.subset(test)
-        _, normal = refine_frames(part, solved.with_frames(state))
-        for c, (residuals, weight) in enumerate(zip(normal.residuals, part.weights, strict=True)):
+        found = refine_frames(part, solved.with_frames(state))
+        for c, (own, weight) in enumerate(zip(part.cameras, part.weights, strict=True)):
             used = weight > 0.0
-            squared[c] += float((residuals.px**2).sum(axis=-1)[used].sum())
+            px = evaluate(found.of_camera(c, part), own).px
+            squared[c] += float((px**2).sum(axis=-1)[used].sum())
             count[c] += float(used.sum())
     each = tuple(float(np.sqrt(s / n)) if n else None for s, n in zip(squared, count, strict=True))
     return float(np.sqrt(squared.sum() / count.sum())), each

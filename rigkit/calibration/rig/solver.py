@@ -153,15 +153,13 @@ def solve_rig(
     return RigSolution(state, last.normal, convergence)
 
 
-def refine_frames(observations: RigObservations, state: RigState) -> tuple[RigState, Normal]:
-    """Return the state with the pose of every target at its own minimum, all else as it is, and the normal equations
-    there."""
+def refine_frames(observations: RigObservations, state: RigState) -> RigState:
+    """Return the state with the pose of every target at its own minimum, all else as it is."""
+    seen = replace(observations, shape=observations.shape.held(state.unknowns))
+    held = replace(state, unknowns=np.zeros(0))
 
-    def at(rotation: Mat3, translation_mm: Points) -> RigState:
-        return replace(state, frame_rotation=rotation, frame_mm=translation_mm)
+    def linearise(rotation: Mat3, translation_mm: Points) -> Normal:
+        return rig_normal(seen, replace(held, frame_rotation=rotation, frame_mm=translation_mm))
 
-    rotation, translation_mm, _ = refine_each(
-        state.frame_rotation, state.frame_mm, lambda *poses: rig_normal(observations, at(*poses))
-    )
-    found = at(rotation, translation_mm)
-    return found, rig_normal(observations, found)
+    rotation, translation_mm, _ = refine_each(state.frame_rotation, state.frame_mm, linearise)
+    return replace(state, frame_rotation=rotation, frame_mm=translation_mm)
