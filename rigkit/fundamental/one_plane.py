@@ -7,9 +7,11 @@ front of both cameras: then one plane does not determine the pose and no algorit
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from rigkit.arrays import FloatArray, Mat3, Rays
+from rigkit.arrays import BoolArray, FloatArray, Mat3, Rays
 from rigkit.fundamental.estimate import check_baseline, transfer_error
 from rigkit.fundamental.pose import parallax_noise
 from rigkit.fundamental.rows import right_singular
@@ -28,6 +30,7 @@ AT_REST_SIGMAS = 3.3
 NEARLY_ALL = 0.9
 """Of matches that fit some fit by chance, and of points some are seen on the wrong side of the horizon of a plane."""
 PLANE_ROUNDS = 5
+"""Of weighting anew: where half of the points lie on a plane, each halves what they are off it until that is noise."""
 
 
 def homography_of_rays(matches: Matches) -> Mat3:
@@ -79,12 +82,13 @@ def one_plane_poses(matches: Matches) -> tuple[Rigid3, ...]:
     return _visible(matches.rays1, H21)
 
 
-def twin_poses(matches: Matches, pose: Rigid3) -> tuple[Rigid3, ...]:
+def twin_poses(matches: Matches, among: BoolArray, noise: float, pose: Rigid3) -> tuple[Rigid3, ...]:
     """Return the other poses (unit baseline) of the plane on which most points lie under `pose`; nothing without one.
 
     Parameters
     ----------
-    matches : that agree with the epipolar geometry of the pose; a few of them may be wrong all the same.
+    matches, among : those (N,) that agree with the epipolar geometry of the pose; a few may be wrong all the same.
+    noise : of the matches, in their sigmas.
     pose : unit baseline.
 
     Raises DegenerateError where a rotation alone explains nearly all of them.
@@ -93,26 +97,26 @@ def twin_poses(matches: Matches, pose: Rigid3) -> tuple[Rigid3, ...]:
     -----
     The parallax of a point on the plane n . x = 1 is |t x f2| (n . f1), linear in n: least squares with Cauchy weights.
     """
-    f2, t = matches.rays2, pose.translation_mm
-    across = cross(t, f2)
-    noise, reach = parallax_noise(matches), np.linalg.norm(across, axis=1)
-    parallax = np.sum(cross(f2, matches.rays1 @ pose.rotation.T) * unit(across), axis=1) / noise
+    rays1, f2, t = matches.rays1[among], matches.rays2[among], pose.translation_mm
+    across, sigma = cross(t, f2), noise * parallax_noise(matches)[among]
+    reach = np.sqrt(np.sum(across**2, axis=1))
+    parallax = np.sum(cross(f2, rays1 @ pose.rotation.T) * unit(across), axis=1) / sigma
     still = np.abs(parallax) < AT_REST_SIGMAS
     if still.mean() > NEARLY_ALL:
-        check_baseline(matches.select(still))
-    rows = matches.rays1 * (reach / noise)[:, None]
-    weights = np.ones(len(matches))
+        m = matches.select(np.flatnonzero(among)[still])
+        check_baseline(replace(m, sigma1_px=noise * m.sigma1_px, sigma2_px=noise * m.sigma2_px))
+    rows, weights, before = rays1 * (reach / sigma)[:, None], np.ones(len(f2)), np.inf
     for _ in range(PLANE_ROUNDS):
         weighted = (rows * weights[:, None]).T
         gram = weighted @ rows
         normal = np.linalg.solve(gram + 1e-12 * np.trace(gram) * np.eye(3), weighted @ parallax)
         off = np.abs(parallax - rows @ normal)
-        weights = 1.0 / (1.0 + (off / max(1.0, float(np.median(off)))) ** 2)
-    on = off < AT_REST_SIGMAS
-    if on.mean() < 0.5:
-        return ()
+        middle = float(np.median(off))
+        if middle > max(0.5 * before, AT_REST_SIGMAS):
+            return ()
+        weights, before = 1.0 / (1.0 + (off / max(1.0, middle)) ** 2), middle
     H21 = pose.rotation + np.outer(t, normal)
-    twins = _visible(matches.rays1[on], H21 / np.linalg.svd(H21, compute_uv=False)[1])
+    twins = _visible(rays1[off < AT_REST_SIGMAS], H21 / np.linalg.svd(H21, compute_uv=False)[1])
     return tuple(twin for twin in twins if not compare_poses(pose, twin)[1])
 
 

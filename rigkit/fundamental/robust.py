@@ -9,7 +9,7 @@ generator. References: Fischler and Bolles; Chum, Matas, Kittler ("Locally optim
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -146,7 +146,7 @@ def robust_pose(
             found, qualities = finished(start, plausible)
         except RigkitError:
             continue
-        for twin in twin_poses(_as_noisy(matches.select(found.inliers), noise / LEAST_NOISE), _pose(found)):
+        for twin in twin_poses(matches, found.inliers, noise / LEAST_NOISE, _pose(found)):
             try:
                 other, others = finished(twin, _plausible(matches, twin, max_noise))
             except RigkitError:
@@ -159,12 +159,6 @@ def robust_pose(
 
 def _pose(found: RobustPose) -> Rigid3:
     return found.refined.cam2_from_cam1
-
-
-def _as_noisy(matches: Matches, factor: float) -> Matches:
-    """Return the points alone, with larger sigmas."""
-    sigma1, sigma2 = factor * matches.sigma1_px, factor * matches.sigma2_px
-    return replace(matches, sigma1_px=sigma1, sigma2_px=sigma2, A21=None, sigma_A=None)
 
 
 def _preferred(
