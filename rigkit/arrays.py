@@ -5,6 +5,7 @@ All arrays are float64 with points in rows; a leading `...` broadcasts. Jacobian
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any
 
 import numpy as np
@@ -25,6 +26,7 @@ __all__ = [
     "Rays",
     "as_array",
     "as_indices",
+    "without_nan",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -91,3 +93,12 @@ def _check_shape(array: NDArray[Any], shape: tuple[int | None, ...], name: str) 
     if not fits:
         wanted = "x".join("N" if want is None else str(want) for want in shape) or "a scalar"
         raise InputError(f"{name}: expected shape {wanted}, got {'x'.join(map(str, array.shape)) or 'a scalar'}")
+
+
+def without_nan(value: Any) -> Any:
+    """Return nested dicts and lists with None for every number that is not finite: JSON has no NaN."""
+    if isinstance(value, dict):
+        return {key: without_nan(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_nan(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

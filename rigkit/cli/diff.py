@@ -44,17 +44,15 @@ def run(args: argparse.Namespace) -> int:
 
 def _cameras(a: Path, b: Path, output: Path | None = None, *, force: bool = False) -> dict[str, Any]:
     """Return the difference of two cameras; `same` is None where a file has no covariance."""
-    import json
-
     from rigkit.calibration.compare import compare_calibrations
     from rigkit.cameras.compare import compare_cameras
-    from rigkit.io.calibration_file import load_calibration, load_camera
+    from rigkit.io.calibration_file import is_calibration, load_calibration, load_camera
     from rigkit.io.files import write_atomic
     from rigkit.report.figures import difference_png
 
     cameras = load_camera(a), load_camera(b)
     # A camera from another tool comes without covariance: then there is a difference but no verdict.
-    known = all("covariance" in json.loads(path.read_text(encoding="utf-8-sig")) for path in (a, b))
+    known = all(is_calibration(path) for path in (a, b))
     result = compare_calibrations(load_calibration(a), load_calibration(b)) if known else None
     difference = compare_cameras(*cameras) if result is None else result.difference
     if output is not None:

@@ -67,14 +67,11 @@ def _read_camera(path: Path, kind: str) -> Camera:
     from rigkit.interop.opencv import read_opencv
     from rigkit.interop.ros import read_camera_info
     from rigkit.io.calibration_file import load_camera
+    from rigkit.io.text import read_text
 
     if kind == "rigkit":
         return load_camera(path)
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"camera file '{path}' cannot be read ({error}); check the path") from error
-    name = str(path)
+    text, name = read_text(path, "camera file"), str(path)
     if kind == "kalibr":
         cameras, _ = read_kalibr(text, name)
         return _only(cameras, name)

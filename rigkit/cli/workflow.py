@@ -9,7 +9,6 @@ import argparse
 import contextlib
 import functools
 import itertools
-import json
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -162,12 +161,12 @@ def load_cameras(dataset: Dataset, *, recalibrate: bool, progress: Progress) -> 
 
 
 def _load(path: Path) -> LoadedCamera:
-    from rigkit.io.calibration_file import load_calibration, load_camera
+    from rigkit.io.calibration_file import is_calibration, load_calibration, load_camera
 
-    camera = load_camera(path)
-    if "covariance" not in json.loads(path.read_text(encoding="utf-8-sig")):
-        return LoadedCamera(camera, None)
-    return LoadedCamera(camera, load_calibration(path).covariance)
+    if not is_calibration(path):
+        return LoadedCamera(load_camera(path), None)
+    calibration = load_calibration(path)
+    return LoadedCamera(calibration.camera, calibration.covariance)
 
 
 def find_boards(pair: Pair, camera1: Camera, camera2: Camera) -> tuple[Detections, Detections, Any, Any]:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
+from rigkit.arrays import FloatArray, without_nan
 from rigkit.calibration.result import BoardShape, Calibration, Candidate, Convergence, Outlier, ViewResult
 from rigkit.cameras.base import Camera
 from rigkit.cameras.registry import camera_model
@@ -28,6 +28,8 @@ __all__ = [
     "SCHEMA",
     "camera_from_json",
     "camera_to_json",
+    "damage_named",
+    "is_calibration",
     "load_calibration",
     "load_camera",
     "save_calibration",
@@ -85,6 +87,11 @@ def load_camera(path: str | Path) -> Camera:
     """
     data = _read(path)
     return camera_from_json(_field(data, "camera", path), path)
+
+
+def is_calibration(path: str | Path) -> bool:
+    """Say whether the file has more than a camera, as one that came from another tool."""
+    return "covariance" in _read(path)
 
 
 def load_calibration(path: str | Path) -> Calibration:
@@ -218,14 +225,4 @@ def _dumps(data: dict[str, Any]) -> str:
 
 
 def _line(value: Any) -> str:
-    return json.dumps(_without_nan(value), allow_nan=False)
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {k: _without_nan(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_nan(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    return json.dumps(without_nan(value), allow_nan=False)

@@ -18,6 +18,7 @@ from rigkit.boards import Board
 from rigkit.detections import BoardDetection
 from rigkit.errors import InputError
 from rigkit.io.files import write_atomic
+from rigkit.io.text import read_text
 
 __all__ = ["COLUMNS", "corners_text", "read_corners", "write_corners"]
 
@@ -55,11 +56,7 @@ def read_corners(path: str | Path, boards: Sequence[Board] = ()) -> dict[str, tu
         No such file, other columns, or a line that cannot be understood; names the line.
     """
     source = Path(path)
-    try:
-        text = source.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"corners file '{source}' cannot be read ({error}); check the path") from error
-    lines = csv.reader(io.StringIO(text))
+    lines = csv.reader(io.StringIO(read_text(source, "corners file")))
     if tuple(next(lines, ())) != COLUMNS:
         raise InputError(f"corners file '{source}': the first line must be {','.join(COLUMNS)}")
     rows: dict[str, dict[str, list[tuple[float, ...]]]] = {}

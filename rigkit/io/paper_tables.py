@@ -7,6 +7,7 @@ import io
 from pathlib import Path
 
 from rigkit.errors import InputError
+from rigkit.io.text import read_text
 from rigkit.validation.tables import PaperTables
 
 __all__ = ["load_paper_tables"]
@@ -24,11 +25,7 @@ def load_paper_tables(folder: str | Path) -> PaperTables:
 
 
 def _read(path: Path) -> dict[str, dict[str, str]]:
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"the paper's table '{path}' cannot be read ({error}); restore the file") from error
-    head, *rows = list(csv.reader(io.StringIO(text))) or [[]]
+    head, *rows = list(csv.reader(io.StringIO(read_text(path, "the paper's table")))) or [[]]
     names = [_without_unit(name) for name in head]
     out: dict[str, dict[str, str]] = {}
     for number, row in enumerate(rows, start=2):

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from rigkit.errors import InputError
+from rigkit.io.text import read_text
 
 __all__ = ["TomlTable", "read_toml"]
 
@@ -151,14 +152,7 @@ def read_toml(path: str | Path, schema: str) -> TomlTable:
         No such file, not TOML (with the line), no schema, another schema or another version.
     """
     source = Path(path)
-    try:
-        text = source.read_text(encoding="utf-8-sig")
-    except FileNotFoundError as error:
-        raise InputError(f"'{source}' does not exist; check the path") from error
-    except OSError as error:
-        raise InputError(f"'{source}' cannot be read: {error.strerror}; check the path and permissions") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{source}: not UTF-8 text; save it as UTF-8") from error
+    text = read_text(source)
     try:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

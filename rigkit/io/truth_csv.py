@@ -23,6 +23,7 @@ import numpy as np
 
 from rigkit.boards import Board
 from rigkit.errors import InputError
+from rigkit.io.text import read_text
 from rigkit.io.truth_file import make_angle, make_distance
 from rigkit.truth import MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
 
@@ -84,13 +85,7 @@ def load_truth_csv(path: str | Path, boards: Mapping[str, Sequence[Board]]) -> d
 
 def _read(source: Path) -> tuple[list[str], list[tuple[int, Row]]]:
     """Return the head and the rows that are not empty, each with its line."""
-    try:
-        # Spreadsheets put a byte order mark in front.
-        text = source.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputError(f"truth table '{source}' cannot be read: {error.strerror}; check the path") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{source}: not UTF-8 text; save it as CSV UTF-8") from error
+    text = read_text(source, "truth table")
     first = text.partition("\n")[0]
     reader = csv.reader(io.StringIO(text), delimiter=";" if first.count(";") > first.count(",") else ",")
     head: list[str] = []

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from rigkit.arrays import without_nan
 from rigkit.errors import InputError
 from rigkit.reconstruct import Reconstruction
 from rigkit.truth import PairTruth
@@ -30,7 +31,6 @@ __all__ = [
     "judge",
     "validate",
     "validate_each",
-    "without_nan",
 ]
 
 COVERAGE = 2.0
@@ -322,12 +322,3 @@ def _board_dict(result: BoardResult) -> dict[str, Any]:
         "skew_deg": result.skew_deg,
         "right_handed": result.right_handed,
     }
-
-
-def without_nan(value: Any) -> Any:
-    """Return nested dicts and lists with None for every number that is not finite: JSON has no NaN."""
-    if isinstance(value, dict):
-        return {key: without_nan(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [without_nan(inner) for inner in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -167,7 +167,7 @@ def test_a_spoiled_table_of_the_paper_is_known_before_the_work(
     (tmp_path / "hajder2021" / "planes.csv").write_bytes(b"\xff\xfe")
     monkeypatch.setattr("rigkit.cli.validate.load_cameras", lambda *_, **__: pytest.fail("work was done"))
     code, line = run(folder, capsys)
-    check(code, line, 2, "planes.csv", "restore the file")
+    check(code, line, 2, "planes.csv", "not UTF-8")
 
 
 def test_identical_images_have_no_baseline(write: Write, capsys: pytest.CaptureFixture[str]) -> None:

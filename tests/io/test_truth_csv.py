@@ -91,7 +91,7 @@ def test_a_missing_column_of_units_is_said(tmp_path: Path) -> None:
 def test_nothing_measured_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no measurements"):
         load(tmp_path, TEXT.splitlines()[0] + "\n")
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="does not exist"):
         load_truth_csv(tmp_path / "none.csv", BOARDS)
 
 
