@@ -188,7 +188,7 @@ def _poses(
     """
     found: list[tuple[float, Rigid3, BoolArray]] = []
     total, best = rows.quality(E21, noise), 0.0
-    for k in np.argsort(-total, kind="stable"):
+    for k in _different(total):
         # What is plausible is a part of all.
         if total[k] <= best:
             break
@@ -204,6 +204,12 @@ def _poses(
         found.append((quality, pose, plausible))
         best = max(best, quality)
     return [(pose, plausible) for _, pose, plausible in sorted(found, key=lambda entry: -entry[0])]
+
+
+def _different(quality: FloatArray) -> IntArray:
+    """Return the indices of different optima, best first: many starts lead to the same one."""
+    order = np.argsort(-quality, kind="stable")
+    return np.asarray(order[np.append(True, -np.diff(quality[order]) > SAME_QUALITY)])
 
 
 def _plausible(matches: Matches, pose: Rigid3, max_noise: float) -> BoolArray:
@@ -268,10 +274,7 @@ class _Search:
         """Return the best few of `E21` (H, 3, 3) at the highest noise level, the best first, and then at the least."""
         kept = []
         for quality in self.rows.quality_ahead(E21, QUANTILE * self.max_noise, self.max_noise, LEAST_NOISE):
-            order = np.argsort(-quality, kind="stable")
-            # Many starts lead to the same optimum.
-            fresh = np.append(True, -np.diff(quality[order]) > SAME_QUALITY)
-            kept.append(order[fresh][:FINALISTS])
+            kept.append(_different(quality)[:FINALISTS])
         return np.asarray(E21[np.concatenate(kept)])
 
 
