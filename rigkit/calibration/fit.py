@@ -39,6 +39,8 @@ SIGMA_FLOOR_PX = 1e-4
 """Exact corners have no scatter to judge outliers by: below this rounding would make them."""
 GOOD_ENOUGH = 1e-3
 """A scatter of this part of the image's width ends the search for a better start: 1.6 px of 1600."""
+FOLD = 1e-6
+"""A fold begins at the solution of all images: a step that promises less of the cost changes no digit shown."""
 SETTLE_ROUNDS = 8
 BAD_VIEW = 2.0
 """A view with this many times the scatter of all gets its pose found anew: perhaps its tilt has the wrong sign."""
@@ -249,7 +251,7 @@ def heldout_squares(observations: Observations, fit: Fit, folds: int) -> FloatAr
             fit.state.subset(train),
             weight=weight[train],
             prior_sigma_px=fit.sigma_px,
-            cost_tolerance=1e-6,
+            cost_tolerance=FOLD,
         ).state
         part = observations.subset(test)
         start = fit.state.subset(test)

@@ -24,6 +24,8 @@ TILTED_DEG = 15.0
 TILTED_VIEWS = 3
 CELLS = (4, 3)
 """The image in columns x rows of cells, for coverage."""
+ASKED_DEG = 95.0
+"""Beyond this angle off the axis nobody is asked to hold a board: it would have to be beside the camera."""
 CELL_CORNERS = 5
 """A cell with fewer corners than this is empty."""
 BAD_VIEW = 2.5
@@ -154,7 +156,7 @@ def _coverage(c: Calibration) -> list[str]:
         return []
     u, v = np.meshgrid((np.arange(CELLS[0]) + 0.5) * size[0], (np.arange(CELLS[1]) + 0.5) * size[1], indexing="ij")
     rays, valid = c.camera.unproject(np.stack([u, v], axis=-1))
-    empty = (count < CELL_CORNERS) & valid & (np.where(valid, rays[..., 2], -1.0) > np.cos(np.radians(95.0)))
+    empty = (count < CELL_CORNERS) & valid & (np.where(valid, rays[..., 2], -1.0) > np.cos(np.radians(ASKED_DEG)))
     if not empty.any():
         return []
     return [f"look: no corners in the {_in_words(empty)} of the image; hold the board there, tilted"]
