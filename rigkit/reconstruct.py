@@ -26,7 +26,7 @@ from rigkit.cloud import OrientedCloud
 from rigkit.errors import DegenerateError
 from rigkit.fundamental.metric import MetricPose, metric_pose, triangulate_matches
 from rigkit.fundamental.pose import choose_pose, essential_from_pose
-from rigkit.fundamental.refine import RefinedPose, refine_pose
+from rigkit.fundamental.refine import RefinedPose, refine_pose, rules_out
 from rigkit.fundamental.registry import fundamental_for
 from rigkit.fundamental.select import DEFAULT_LEVEL_RAD, pose_type_evidence
 from rigkit.fundamental.weights import WeightRule
@@ -236,7 +236,8 @@ class _Known:
     ----------
     E21 : (3, 3) linear solution.
     pose_type, level_sigma_rad, remarks : see `decide_pose_type`.
-    ends : of the refinement, from the linear solution and from the pose by which the boards were told apart.
+    ends : of the refinement, from the pose by which the boards were told apart and from the linear solution.
+    told : the first of these, None where it led nowhere.
     failure : why a start led nowhere.
     """
 
@@ -245,6 +246,7 @@ class _Known:
     level_sigma_rad: float | None
     remarks: tuple[str, ...]
     ends: tuple[RefinedPose, ...]
+    told: RefinedPose | None
     failure: DegenerateError | None
 
 
@@ -254,8 +256,10 @@ def _known_by_points(pair: MatchedPair, pose_type: PoseType, level_sigma_rad: fl
     m = pair.matches
     E21 = fundamental_for(PoseType.GENERAL).solve(m).E21
     pose_type, level_sigma_rad, remarks = decide_pose_type(pair.captured, pose_type, level_sigma_rad)
-    starts = (lambda: choose_pose(E21, m.rays1, m.rays2), lambda: pair.identity.cam2_from_cam1)
-    return _Known(E21, pose_type, level_sigma_rad, remarks, *_ends(pair, starts, pose_type, level_sigma_rad))
+    told, failure = _ends(pair, [lambda: pair.identity.cam2_from_cam1], pose_type, level_sigma_rad)
+    linear, other = _ends(pair, [lambda: choose_pose(E21, m.rays1, m.rays2)], pose_type, level_sigma_rad)
+    first = told[0] if told else None
+    return _Known(E21, pose_type, level_sigma_rad, remarks, (*told, *linear), first, failure or other)
 
 
 def _ends(
@@ -276,7 +280,8 @@ def _likeliest_pose(pair: MatchedPair, matches: Matches, rule: WeightRule, known
     """Return the pose of maximum likelihood among the ends of the refinement from every start there is.
 
     The linear solution of a pose type holds it exactly: where a level is off by half a degree and the corners are good,
-    it can land in another valley. The general solution and the pose by which the boards were told apart cannot.
+    it can land in another valley. The general solution and the pose by which the boards were told apart cannot. Points
+    of one plane are explained by two poses: that of the board, whose shape is known, stands unless they rule it out.
     """
 
     def of_type() -> Rigid3:
@@ -287,6 +292,8 @@ def _likeliest_pose(pair: MatchedPair, matches: Matches, rule: WeightRule, known
     if not (*known.ends, *ends):
         raise failure or known.failure or DegenerateError("no pose found")
     best = min((*known.ends, *ends), key=lambda end: end.cost)
+    if known.told is not None and not rules_out(pair.captured, best, known.told):
+        return known.told
     # In one valley all starts end alike, and estimators that do share what follows.
     return next(end for end in (*known.ends, *ends) if end.cost <= best.cost * (1.0 + SAME_COST))
 

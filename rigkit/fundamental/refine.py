@@ -26,7 +26,7 @@ from rigkit.geometry.sampson import epipolar_normals, sampson_distances
 from rigkit.matches import Matches
 from rigkit.posetype import PoseType
 
-__all__ = ["RefinedPose", "cauchy_weights", "estimate_pose", "project_to_type", "refine_pose"]
+__all__ = ["RefinedPose", "cauchy_weights", "estimate_pose", "project_to_type", "refine_pose", "rules_out"]
 
 SIGNIFICANT = 3.0
 """Standard deviations that the cost (chi square) of a pose must be higher by to rule it out."""
@@ -150,15 +150,18 @@ def _refuse_ambiguity(matches: Matches, best: RefinedPose, ends: list[RefinedPos
     """Raise DegenerateError if another pose explains the points of one plane as well as the best one."""
     for end in ends:
         turn, same = compare_poses(best.cam2_from_cam1, end.cam2_from_cam1)
-        if same:
-            continue
-        scale = max(best.variance_factor, 1.0)
-        chance = scale * _chance_difference(matches, best.cam2_from_cam1, end.cam2_from_cam1)
-        if _visible_cost(matches, end) - _visible_cost(matches, best) < SIGNIFICANT * chance:
+        if not same and not rules_out(matches, best, end):
             raise DegenerateError(
                 f"all {len(matches)} points lie on one plane and two poses {np.degrees(turn):.1f} deg apart "
                 "explain them equally well; add a board that is not parallel to it, or declare the pose type"
             )
+
+
+def rules_out(matches: Matches, better: RefinedPose, worse: RefinedPose) -> bool:
+    """Return whether `matches` are explained so much better by the one pose that the other is wrong."""
+    chance = _chance_difference(matches, better.cam2_from_cam1, worse.cam2_from_cam1)
+    difference = _visible_cost(matches, worse) - _visible_cost(matches, better)
+    return difference >= SIGNIFICANT * max(better.variance_factor, 1.0) * chance
 
 
 def _chance_difference(matches: Matches, first: Rigid3, second: Rigid3) -> float:
