@@ -28,8 +28,9 @@ GreyImage = NDArray[np.uint8] | NDArray[np.float32]
 BASE_PIXELS = 2.6e6
 """The finest level of the search has at most this many pixels; only the sub-pixel fit looks at larger images."""
 
-OCTAVES = 3
-"""Levels of the search, each of half the size of the one before: blurred corners are saddles only at coarse levels."""
+OCTAVES = 4
+"""Levels of the search, each of half the size of the one before: blurred corners are saddles only at coarse levels, and
+those that ink has joined, or that are round, only where that is less than a pixel. The fourth takes 1.5 % more."""
 
 SMOOTH = np.array([1.0, 4.0, 6.0, 4.0, 1.0], np.float32) / 16.0
 """Binomial of sigma 1."""
