@@ -34,6 +34,9 @@ __all__ = ["detect_boards"]
 FEWEST_OF_PART = 6
 """Corners of the smallest part of a board that something lies across."""
 
+FEWEST_OF_BOARD = 9
+"""Fewer than 3 x 3 corners are too often no board."""
+
 SAME_PX = 2.0
 """Corners of two detections nearer than this are one corner."""
 
@@ -48,14 +51,14 @@ def find_lattices(image: NDArray[np.generic], min_corners: int) -> list[RefinedL
     index = SaddleIndex(saddles)
     grown = grow_all(lattices, index, levels[0], functools.partial(_promising, grey, levels[0]))
     grown = [item for item in grown if item.count >= FEWEST_OF_PART]
-    if not any(item.solid or min_corners < 9 for item in grown):
+    if not any(item.solid or min_corners < FEWEST_OF_BOARD for item in grown):
         return []
     boards = [board for item in grown for part in split_folds(item) for board in split_necks(part)]
     parts = separate([tidy(board, size_px) for board in boards], FEWEST_OF_PART)
     boards = [board for board in join_parts(parts) if large(board, min_corners)]
     refined = zip(boards, refine(grey, boards), strict=True)
     found = [after for before, after in refined if trustworthy(after, before.count, min_corners)]
-    return [item for item in found if min_corners < 9 or compact(item.lattice, size_px)]
+    return [item for item in found if min_corners < FEWEST_OF_BOARD or compact(item.lattice, size_px)]
 
 
 def _promising(grey: GreyImage, finest: Level, lattice: Lattice) -> bool:
@@ -85,7 +88,7 @@ def detect_boards(
         rows; a part of a board whose borders show where it lies gets its place in the board's grid, any other part
         stays a grid of its own. A board is named only where one single given board has that size and one single
         detection fits it, or, a ChArUco board, by its markers.
-    min_corners : boards with fewer corners are not reported.
+    min_corners : boards with fewer corners are not reported, but for whole ones of `boards`.
     camera : the calibrated camera, if known: it shows which parts are of one board (`rigkit.corners.rejoin`) and where
         corners of known boards were missed, and fits all of them with windows and lines as it sees them
         (`rigkit.corners.guided`).
@@ -104,7 +107,8 @@ def detect_boards(
     plain = [board for board in known if board.markers is None]
     sizes = tuple(dict.fromkeys(board.size for board in plain))
     grey = grey_image(image)
-    lattices = find_lattices(grey, min_corners)
+    fewest = min([min_corners, *(max(columns * rows, FEWEST_OF_BOARD) for columns, rows in sizes)])
+    lattices = find_lattices(grey, fewest)
     marked: list[BoardDetection] = []
     if len(plain) < len(known):
         from rigkit.corners.charuco import charuco_boards
@@ -113,8 +117,14 @@ def detect_boards(
     lattices = [known_part(item, sizes) for item in lattices]
     placed = _placed(grey, lattices, plain, camera)
     found = complete_boards(grey, [*marked, *(_detection(item, sizes) for item in placed)], known, camera)
+    if fewest < min_corners:
+        found = tuple(item for item in found if len(item.grid) >= min_corners or _whole(item, sizes))
     ordered = sorted(found, key=_rank)
     return tuple(_named(_apart(ordered), plain))
+
+
+def _whole(item: BoardDetection, sizes: Sequence[tuple[int, int]]) -> bool:
+    return item.complete and (item.columns, item.rows) in sizes
 
 
 def _placed(

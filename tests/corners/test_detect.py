@@ -102,6 +102,16 @@ def test_not_named_where_two_boards_have_the_size(rng: np.random.Generator) -> N
     assert found.board_id is None
 
 
+def test_smallest_board_is_found_where_it_is_known(rng: np.random.Generator) -> None:
+    board = Board("a", 3, 3, 60.0, 60.0)
+    scene = single(board, [0.2, 0.15, 0.3], 620.0)
+    image = scene.image(rng)
+    assert detect_boards(image) == ()
+    (found,) = detect_boards(image, [board])
+    assert found.complete and found.board_id == "a"
+    assert np.abs(errors_by_position(found, scene.truth()[0][1])).max() < 0.1
+
+
 def test_board_cut_by_the_frame_keeps_what_is_in_view(rng: np.random.Generator) -> None:
     scene = single(Board("a", 9, 6, 30.0, 30.0), [0.2, 0.25, 0.1], 480.0, shift_mm=(150.0, 0.0))
     truth = scene.truth()[0][1]
