@@ -22,9 +22,13 @@ __all__ = ["TranslationSolver"]
 
 @dataclass(frozen=True, slots=True)
 class TranslationSolver:
-    """Two degrees of freedom; two equations."""
+    """Two degrees of freedom, or one with `horizontal` (t_y = 0); two equations, or one."""
 
-    degrees_of_freedom: int = 2
+    horizontal: bool = False
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        return 1 if self.horizontal else 2
 
     def solve(self, matches: Matches, weights: WeightRule | RowWeights | None = None) -> EpipolarEstimate:
         """Return E21 = [t]x of the least squares direction t; see FundamentalSolver."""
@@ -35,14 +39,18 @@ class TranslationSolver:
             d1 = np.swapaxes(matches.jacobians1, -1, -2)
             d2 = np.swapaxes(matches.jacobians2 @ np.nan_to_num(matches.A21), -1, -2)
             affinities = np.cross(d1, f2[:, None, :]) + np.cross(f1[:, None, :], d2)
+        columns = np.array([0, 2]) if self.horizontal else np.arange(3)
 
         def best(row_weights: RowWeights) -> FloatArray:
             check_count(matches, row_weights, self.degrees_of_freedom, "pure translation")
             more = affinities * row_weights.affinities[:, None, None]
-            s, vt = right_singular(np.concatenate([points * row_weights.points[:, None], more.reshape(-1, 3)]))
-            if s[1] < 1e-12 * np.abs(row_weights.points).max():
+            rows = np.concatenate([points * row_weights.points[:, None], more.reshape(-1, 3)])[:, columns]
+            s, vt = right_singular(rows)
+            if s[len(columns) - 2] < 1e-12 * np.abs(row_weights.points).max():
                 raise DegenerateError("the translation is not determined: the two images show the same rays")
-            return skew(vt[-1])
+            t = np.zeros(3)
+            t[columns] = vt[-1]
+            return skew(t)
 
         check_baseline(matches)
         E21, used = reweighted(matches, weights, best)
