@@ -7,7 +7,7 @@ likelihood refines the pose; rays are intersected optimally, affinities give nor
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -236,17 +236,17 @@ class _Known:
     ----------
     E21 : (3, 3) linear solution.
     pose_type, level_sigma_rad, remarks : see `decide_pose_type`.
-    ends : of the refinement, from the pose by which the boards were told apart and from the linear solution.
-    told : the first of these, None where it led nowhere.
-    failure : why a start led nowhere.
+    told, linear : ends of the refinement from the pose by which the boards were told apart and from the linear
+        solution, None where the start leads nowhere.
+    failure : why a start leads nowhere.
     """
 
     E21: Mat3
     pose_type: PoseType
     level_sigma_rad: float | None
     remarks: tuple[str, ...]
-    ends: tuple[RefinedPose, ...]
     told: RefinedPose | None
+    linear: RefinedPose | None
     failure: DegenerateError | None
 
 
@@ -256,24 +256,19 @@ def _known_by_points(pair: MatchedPair, pose_type: PoseType, level_sigma_rad: fl
     m = pair.matches
     E21 = fundamental_for(PoseType.GENERAL).solve(m).E21
     pose_type, level_sigma_rad, remarks = decide_pose_type(pair.captured, pose_type, level_sigma_rad)
-    told, failure = _ends(pair, [lambda: pair.identity.cam2_from_cam1], pose_type, level_sigma_rad)
-    linear, other = _ends(pair, [lambda: choose_pose(E21, m.rays1, m.rays2)], pose_type, level_sigma_rad)
-    first = told[0] if told else None
-    return _Known(E21, pose_type, level_sigma_rad, remarks, (*told, *linear), first, failure or other)
+    told, failure = _end(pair, lambda: pair.identity.cam2_from_cam1, pose_type, level_sigma_rad)
+    linear, other = _end(pair, lambda: choose_pose(E21, m.rays1, m.rays2), pose_type, level_sigma_rad)
+    return _Known(E21, pose_type, level_sigma_rad, remarks, told, linear, failure or other)
 
 
-def _ends(
-    pair: MatchedPair, starts: Iterable[Callable[[], Rigid3]], pose_type: PoseType, level_sigma_rad: float | None
-) -> tuple[tuple[RefinedPose, ...], DegenerateError | None]:
-    """Return the ends of the refinement from every start that can be refined, and the first reason why one cannot."""
-    ends: list[RefinedPose] = []
-    failure: DegenerateError | None = None
-    for start in starts:
-        try:
-            ends.append(refine_pose(pair.captured, start(), pose_type, level_sigma_rad))
-        except DegenerateError as error:
-            failure = failure or error
-    return tuple(ends), failure
+def _end(
+    pair: MatchedPair, start: Callable[[], Rigid3], pose_type: PoseType, level_sigma_rad: float | None
+) -> tuple[RefinedPose | None, DegenerateError | None]:
+    """Return the end of the refinement from a start, or why there is none."""
+    try:
+        return refine_pose(pair.captured, start(), pose_type, level_sigma_rad), None
+    except DegenerateError as error:
+        return None, error
 
 
 def _likeliest_pose(pair: MatchedPair, matches: Matches, rule: WeightRule, known: _Known) -> RefinedPose:
@@ -288,14 +283,15 @@ def _likeliest_pose(pair: MatchedPair, matches: Matches, rule: WeightRule, known
         estimate = fundamental_for(known.pose_type).solve(matches, rule)
         return choose_pose(estimate.E21, matches.rays1, matches.rays2, known.pose_type)
 
-    ends, failure = _ends(pair, [of_type], known.pose_type, known.level_sigma_rad)
-    if not (*known.ends, *ends):
+    typed, failure = _end(pair, of_type, known.pose_type, known.level_sigma_rad)
+    ends = [end for end in (known.told, known.linear, typed) if end is not None]
+    if not ends:
         raise failure or known.failure or DegenerateError("no pose found")
-    best = min((*known.ends, *ends), key=lambda end: end.cost)
+    best = min(ends, key=lambda end: end.cost)
     if known.told is not None and not rules_out(pair.captured, best, known.told):
         return known.told
     # In one valley all starts end alike, and estimators that do share what follows.
-    return next(end for end in (*known.ends, *ends) if end.cost <= best.cost * (1.0 + SAME_COST))
+    return next(end for end in ends if end.cost <= best.cost * (1.0 + SAME_COST))
 
 
 @lru_cache(maxsize=4)

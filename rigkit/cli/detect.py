@@ -36,7 +36,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("-o", "--output", metavar="CORNERS.csv", help="write the corners file")
     parser.add_argument("--overlay", metavar="DIR", help="write a picture of each image with its corners")
-    parser.add_argument("--min-corners", type=int, default=12, metavar="N", help="smallest board reported (12)")
+    parser.add_argument(
+        "--min-corners",
+        type=int,
+        default=12,
+        metavar="N",
+        help="fewest corners of a board whose size is not given (12)",
+    )
     parser.add_argument("-j", "--jobs", type=int, metavar="N", help="processes (default: one a core)")
     parser.add_argument("--force", action="store_true", help="replace existing files")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
@@ -44,11 +50,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import print_json
+    from rigkit.corners.detect import FEWEST_OF_BOARD
     from rigkit.io.board_file import load_board
     from rigkit.io.corners_file import write_corners
     from rigkit.io.files import ensure_writable
 
-    if args.min_corners < 9:
+    if args.min_corners < FEWEST_OF_BOARD:
         raise InputError(
             f"--min-corners {args.min_corners}: a chessboard of less than 3x3 corners cannot be told apart"
         )

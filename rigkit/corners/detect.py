@@ -29,7 +29,7 @@ from rigkit.corners.subpixel import RefinedLattice, refine
 from rigkit.corners.validate import compact, known_part, large, leans, sample_of, separate, tidy, trustworthy
 from rigkit.detections import BoardDetection
 
-__all__ = ["detect_boards"]
+__all__ = ["FEWEST_OF_BOARD", "detect_boards"]
 
 FEWEST_OF_PART = 6
 """Corners of the smallest part of a board that something lies across."""

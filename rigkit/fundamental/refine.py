@@ -26,10 +26,18 @@ from rigkit.geometry.sampson import epipolar_normals, sampson_distances
 from rigkit.matches import Matches
 from rigkit.posetype import PoseType
 
-__all__ = ["RefinedPose", "cauchy_weights", "estimate_pose", "project_to_type", "refine_pose", "rules_out"]
+__all__ = [
+    "SIGNIFICANT",
+    "RefinedPose",
+    "cauchy_weights",
+    "estimate_pose",
+    "project_to_type",
+    "refine_pose",
+    "rules_out",
+]
 
 SIGNIFICANT = 3.0
-"""Standard deviations that the cost (chi square) of a pose must be higher by to rule it out."""
+"""Standard deviations by which a pose must explain the matches worse than another one to be ruled out."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

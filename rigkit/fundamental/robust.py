@@ -22,7 +22,7 @@ from rigkit.fundamental.minimal import essential_from_five_rows, essential_from_
 from rigkit.fundamental.one_plane import compare_poses, twin_poses
 from rigkit.fundamental.planar import solve_planar_batch
 from rigkit.fundamental.pose import behind_sigmas, choose_pose, essential_from_pose
-from rigkit.fundamental.refine import RefinedPose, refine_pose
+from rigkit.fundamental.refine import SIGNIFICANT, RefinedPose, refine_pose
 from rigkit.fundamental.registry import fundamental_for
 from rigkit.fundamental.rows import PLANAR_ENTRIES, affinity_rows, essential_from_planar, point_rows
 from rigkit.fundamental.weights import affinity_distances, usable_affinities
@@ -51,8 +51,6 @@ LEAST_NOISE = 1.5
 """Noise level over the noise that the matches show: the loss still sees the tails, and few wrong matches."""
 NOISE_ROUNDS = 3
 """Each leaves out what the noise of the round before does not explain."""
-SIGNIFICANT = 3.0
-"""Standard deviations by which one of a plane's two poses must be better than the other."""
 GOOD_AFFINE = 0.1
 """Share of clean samples with an affinity that lead to the optimum (measured: a third at 0.05 noise of A)."""
 

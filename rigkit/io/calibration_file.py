@@ -23,6 +23,7 @@ from rigkit.cameras.registry import camera_model
 from rigkit.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.files import write_atomic
+from rigkit.io.text import read_text
 
 __all__ = [
     "SCHEMA",
@@ -130,12 +131,10 @@ def damage_named(path: str | Path) -> Iterator[None]:
 
 def _read(path: str | Path) -> dict[str, Any]:
     source = Path(path)
+    if not source.exists():
+        raise InputError(f"calibration '{source}' does not exist; run `rigkit calibrate` first")
     try:
-        data = json.loads(source.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError as error:
-        raise InputError(f"calibration '{source}' does not exist; run `rigkit calibrate` first") from error
-    except OSError as error:
-        raise InputError(f"calibration '{source}' cannot be read: {error.strerror}") from error
+        data = json.loads(read_text(source, "calibration"))
     except ValueError as error:
         raise InputError(f"'{source}': not a calibration file ({error}); calibrate again") from error
     found = data.get("schema") if isinstance(data, dict) else None
