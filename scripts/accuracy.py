@@ -26,6 +26,7 @@ from rigkit.io.manifest import Pair, load_dataset
 from rigkit.io.paper_tables import load_paper_tables
 from rigkit.pairing import MatchedPair
 from rigkit.validation.planes import fit_plane, normal_errors
+from rigkit.validation.tables import best_of
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -149,7 +150,7 @@ def measure(folder: Path, *, pairs: Sequence[str] = (), chain: str = "raw", jobs
 
 def best_method(methods: Mapping[str, Mapping[str, Any]]) -> str:
     """The estimator with the smallest mean normal error over the planes."""
-    return min(methods, key=lambda m: float(np.mean(methods[m]["mean_normal_deg"])))
+    return best_of({m: float(np.mean(found["mean_normal_deg"])) for m, found in methods.items()})
 
 
 def averages(pairs: Sequence[Mapping[str, Any]]) -> dict[str, tuple[float, float]]:
@@ -159,7 +160,7 @@ def averages(pairs: Sequence[Mapping[str, Any]]) -> dict[str, tuple[float, float
     """
     paper = load_paper_tables(ROOT / "datasets" / "hajder2021")
     score = {m: np.mean([p["methods"][m]["mean_normal_deg"] for p in pairs]) for m in AFFINE_METHODS}
-    best = min(score, key=lambda m: float(score[m]))
+    best = best_of({m: float(value) for m, value in score.items()})
     rows = {"orthogonality_deg": "orthogonality {}", "mean_normal_deg": "mean normal error {}"}
     labels = {"orthogonality_deg": ("1-2", "1-3", "2-3"), "mean_normal_deg": ("1", "2", "3")}
     out = {}

@@ -23,6 +23,7 @@ __all__ = [
     "average_table",
     "baseline_table",
     "best_method",
+    "best_of",
     "best_report",
     "build_tables",
     "check_table",
@@ -132,7 +133,7 @@ def best_method(reports: Sequence[ValidationReport]) -> str:
     methods = list(dict.fromkeys(report.affine_method for report in reports))
     pairs = {m: {r.pair_id for r in reports if r.affine_method == m} for m in methods}
     common = set.intersection(*pairs.values()) or {r.pair_id for r in reports}
-    return _least(
+    return best_of(
         {
             method: mean_normal_error([r for r in reports if r.affine_method == method and r.pair_id in common])
             for method in methods
@@ -143,7 +144,7 @@ def best_method(reports: Sequence[ValidationReport]) -> str:
 def best_report(reports: Sequence[ValidationReport]) -> ValidationReport:
     """Return the report with the smallest mean normal error, of the reports of one pair by several estimators."""
     by_method = {report.affine_method: report for report in reports}
-    return by_method[_least({method: mean_normal_error([report]) for method, report in by_method.items()})]
+    return by_method[best_of({method: mean_normal_error([report]) for method, report in by_method.items()})]
 
 
 def mean_normal_error(reports: Sequence[ValidationReport]) -> float:
@@ -152,7 +153,7 @@ def mean_normal_error(reports: Sequence[ValidationReport]) -> float:
     return float(np.mean(errors)) if errors else np.inf
 
 
-def _least(score: Mapping[str, float]) -> str:
+def best_of(score: Mapping[str, float]) -> str:
     """Return the name with the smallest score; of several within a tie the last, which is no worse and uses most."""
     least = min(score.values())
     return [method for method, value in score.items() if value <= least + TIE_DEG][-1]
