@@ -155,7 +155,8 @@ def _apart(found: Sequence[BoardDetection]) -> list[BoardDetection]:
     kept: list[int] = []
     for k, item in enumerate(found):
         others = (found[j] for j in kept if touching[j, k])
-        if not any(near_any(item.pixels, other.pixels, SAME_PX).mean() > 0.5 for other in others):
+        again = (np.count_nonzero(near_any(item.pixels, other.pixels, SAME_PX)) for other in others)
+        if not any(2 * int(count) > len(item.pixels) for count in again):
             kept.append(k)
     return [found[k] for k in kept]
 

@@ -6,13 +6,16 @@ cuts its lattice in two that continue each other: they are joined.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, IntArray
+from rigkit.corners.evenness import Unevenness, unevenness
 from rigkit.corners.lattice import Lattice, margins
 from rigkit.corners.local_fit import fit_cells
 
@@ -64,13 +67,15 @@ corner itself, and by a prediction whose standard deviation is at most so many t
 
 def split_folds(lattice: Lattice) -> list[Lattice]:
     """Return the parts of `lattice` between its folds; the corners on a fold belong to no board."""
-    at = _fold(lattice.pixels)
+    columns, rows = lattice.size
+    along_rows, along_columns = unevenness(lattice.pixels)
+    at = _fold(rows, along_rows)
     if at is not None:
         return [part for half in _halves(lattice, at) for part in split_folds(half)]
-    at = _fold(lattice.pixels.swapaxes(0, 1))
+    at = _fold(columns, along_columns)
     if at is not None:
         # A quarter turn makes the row into a column, counted from the other end.
-        halves = _halves(lattice.turned(1), lattice.size[1] - 1 - at)
+        halves = _halves(lattice.turned(1), rows - 1 - at)
         return [part.turned(3) for half in halves for part in split_folds(half)]
     return [lattice]
 
@@ -138,8 +143,7 @@ def _broad_parts(known: BoolArray) -> list[BoolArray]:
 
 def _same_board(one: _Part, two: _Part) -> bool:
     """Return whether two parts of one lattice continue each other."""
-    gap = one.pixels[:, None] - two.pixels
-    near, place = _carried_over(one, two, np.hypot(gap[..., 0], gap[..., 1]))
+    near, place = _carried_over(one, two, _squared_gaps(one, two))
     off = float(np.abs(place - two.grid[near])[:NEAREST_OUT].max())
     if not MEETS_CELLS <= off < MEETS_AT_ALL:
         return off < MEETS_CELLS
@@ -168,26 +172,16 @@ def _absorb(lattice: Lattice, groups: list[BoolArray]) -> None:
         loose &= ~added
 
 
-def _fold(pixels: FloatArray) -> int | None:
-    """Return the column of `pixels` (R, C, 2) at which the rows fold, None if they do not."""
-    columns = pixels.shape[1]
-    if columns < LEAST_FOR_FOLD:
+def _fold(rows: int, uneven: Unevenness) -> int | None:
+    """Return the column at which so many rows, as `uneven` as that, fold; None if they do not."""
+    least = max(LEAST_ROWS, 0.4 * rows)
+    steps = enumerate(zip(uneven.typical, uneven.seen, strict=True), start=1)
+    judged = [(bend, -column) for column, (bend, count) in steps if count >= least]
+    if len(judged) < LEAST_FOR_FOLD - 2:
         return None
-    step = pixels[:, 1:] - pixels[:, :-1]
-    bend = step[:, 1:] - step[:, :-1]
-    length = np.hypot(step[..., 0], step[..., 1])
-    relative = np.hypot(bend[..., 0], bend[..., 1]) / np.minimum(length[:, 1:], length[:, :-1])
-    seen = np.isfinite(relative).sum(axis=0)
-    enough = np.flatnonzero(seen >= max(LEAST_ROWS, 0.4 * len(pixels)))
-    if len(enough) < LEAST_FOR_FOLD - 2:
-        return None
-    seen = seen[enough]
-    ranked = np.sort(relative, axis=0)
-    typical = 0.5 * (ranked[(seen - 1) // 2, enough] + ranked[seen // 2, enough])
-    at = int(typical.argmax())
-    others = np.sort(typical)[:-1]
-    middle = 0.5 * (others[(len(others) - 1) // 2] + others[len(others) // 2])
-    return int(enough[at]) + 1 if typical[at] > max(FOLD, FOLD_FACTOR * middle) else None
+    *others, (sharpest, column) = sorted(judged)
+    middle = 0.5 * (others[(len(others) - 1) // 2][0] + others[len(others) // 2][0])
+    return -column if sharpest > max(FOLD, FOLD_FACTOR * middle) else None
 
 
 def join_parts(lattices: Sequence[Lattice]) -> list[Lattice]:
@@ -205,7 +199,12 @@ def join_parts(lattices: Sequence[Lattice]) -> list[Lattice]:
     return [part.lattice for part in parts]
 
 
-class _Part(NamedTuple):
+_Cell = Sequence[Sequence[float]]
+"""The sides of a cell along its row and its column, (u, v) px each."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
     """A lattice with its corners (N, 2), their (column, row), bounding box, and longest side of a cell."""
 
     lattice: Lattice
@@ -220,9 +219,15 @@ class _Part(NamedTuple):
         row, column = np.nonzero(lattice.known)
         pixels = lattice.pixels[row, column]
         steps = (lattice.pixels[:, 1:] - lattice.pixels[:, :-1], lattice.pixels[1:] - lattice.pixels[:-1])
-        side = max(float(np.fmax.reduce(np.hypot(s[..., 0], s[..., 1]), axis=None, initial=0.0)) for s in steps)
+        longest = (np.fmax.reduce(s[..., 0] ** 2 + s[..., 1] ** 2, axis=None, initial=0.0) for s in steps)
+        side = math.sqrt(max(longest))
         grid = np.stack([column, row], axis=-1)
         return cls(lattice, pixels, grid, pixels.min(axis=0), pixels.max(axis=0), side)
+
+    @cached_property
+    def cells(self) -> FloatArray:
+        """(N, 2, 2) sides of the cells at the corners."""
+        return fit_cells(self.lattice.pixels, self.lattice.known, degree=1).sides
 
 
 def _near(parts: Sequence[_Part]) -> list[tuple[int, int]]:
@@ -237,14 +242,14 @@ def _near(parts: Sequence[_Part]) -> list[tuple[int, int]]:
 
 def _joined(one: _Part, two: _Part) -> Lattice | None:
     """Return both lattices in one, None if `two` does not continue `one`."""
-    gap = one.pixels[:, None] - two.pixels
-    apart = np.hypot(gap[..., 0], gap[..., 1])
-    nearest = divmod(int(apart.argmin()), len(two.pixels))
-    cell = _cell(one, nearest[0])
-    longest = float(np.hypot(cell[:, 0], cell[:, 1]).max())
-    if not apart[nearest] < REACH * longest or not _alike(cell, _cell(two, nearest[1])):
+    squared = _squared_gaps(one, two)
+    nearest = divmod(int(squared.argmin()), len(two.pixels))
+    apart = math.sqrt(squared[nearest])
+    cell = one.cells[nearest[0]].tolist()
+    longest = max(math.hypot(*side) for side in cell)
+    if not apart < REACH * longest or not _alike(cell, two.cells[nearest[1]].tolist()):
         return None
-    near, place = _carried_over(one, two, apart)
+    near, place = _carried_over(one, two, squared)
     whole = np.rint(place)
     far_off = float(np.abs(place - whole).max())
     near, place, whole = near[:NEAREST_OUT], place[:NEAREST_OUT], whole[:NEAREST_OUT]
@@ -254,7 +259,7 @@ def _joined(one: _Part, two: _Part) -> Lattice | None:
     for quarter in range(4):
         shift = whole.astype(np.int64) - _turned_grid(two.grid[near], two.lattice.size, quarter)
         if (shift == shift[0]).all():
-            close = bool(apart[nearest] < DIAGONAL * GAP * longest)
+            close = apart < DIAGONAL * GAP * longest
             far = far_off < FAR_MEETS_CELLS
             united = _united(one.lattice, two.lattice.turned(quarter), shift[0], close, far)
             if united is None or off < MEETS_CELLS:
@@ -288,13 +293,22 @@ def _agree(pixels: FloatArray, one: BoolArray, two: BoolArray) -> bool:
     return False
 
 
-def _carried_over(one: _Part, two: _Part, apart: FloatArray) -> tuple[IntArray, FloatArray]:
+def _squared_gaps(one: _Part, two: _Part) -> FloatArray:
+    """Return the squared distances between the corners, (N, M)."""
+    across, down = (one.pixels[:, k, None] - two.pixels[:, k] for k in (0, 1))
+    across *= across
+    down *= down
+    across += down
+    return across
+
+
+def _carried_over(one: _Part, two: _Part, squared: FloatArray) -> tuple[IntArray, FloatArray]:
     """Return the FAR_OUT nearest corners of `two` and their (column, row) as the NEAREST_IN of `one` say, or infinity.
 
-    `apart` (N, M) are the distances between the corners.
+    `squared` (N, M) are the `_squared_gaps`.
     """
-    near2 = np.argsort(apart.min(axis=0), kind="stable")[:FAR_OUT]
-    near1 = np.argsort(apart[:, near2[:NEAREST_OUT]].min(axis=1), kind="stable")[:NEAREST_IN]
+    near2 = np.argsort(squared.min(axis=0), kind="stable")[:FAR_OUT]
+    near1 = np.argsort(squared[:, near2[:NEAREST_OUT]].min(axis=1), kind="stable")[:NEAREST_IN]
     grid_from_pixel = None
     if not (one.grid[near1] == one.grid[near1[0]]).all(axis=0).any():
         grid_from_pixel, _ = cv2.findHomography(one.pixels[near1], one.grid[near1].astype(np.float64), 0)
@@ -303,20 +317,15 @@ def _carried_over(one: _Part, two: _Part, apart: FloatArray) -> tuple[IntArray, 
     return near2, cv2.perspectiveTransform(two.pixels[near2][None], grid_from_pixel)[0]
 
 
-def _cell(part: _Part, corner: int) -> FloatArray:
-    """Return the two sides of the cell at a corner of `part`, (2, 2)."""
-    cells = np.zeros(part.lattice.known.shape, bool)
-    column, row = part.grid[corner]
-    cells[row, column] = True
-    fit = fit_cells(part.lattice.pixels, cells, degree=1)
-    return np.concatenate([fit.along_column, fit.along_row])
-
-
-def _alike(one: FloatArray, two: FloatArray) -> bool:
-    """Return whether the cell `two` (2, 2) is much the same as `one` after some quarter turn."""
-    turns = np.array([two, [two[1], -two[0]], -two, [-two[1], two[0]]])
-    apart = np.abs(turns - one).max(axis=(1, 2)).min()
-    return bool(apart < ALIKE * np.abs(one).max())
+def _alike(one: _Cell, two: _Cell) -> bool:
+    """Return whether the cell `two` is much the same as `one` after some quarter turn."""
+    most = ALIKE * max(abs(x) for side in one for x in side)
+    (u1, v1), (u2, v2) = two
+    for _ in range(4):
+        if all(abs(x - y) < most for x, y in zip((*one[0], *one[1]), (u1, v1, u2, v2), strict=True)):
+            return True
+        u1, v1, u2, v2 = u2, v2, -u1, -v1
+    return False
 
 
 def _turned_grid(grid: IntArray, size: tuple[int, int], quarter_turns: int) -> IntArray:

@@ -7,6 +7,7 @@ is a corner with the polarity and the directions that the lattice demands and if
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import cache, cached_property
 from typing import TYPE_CHECKING
 
@@ -130,7 +131,8 @@ def grow_all(
 
 def _covered(lattice: Lattice, corners: FloatArray) -> bool:
     """Return whether most of the corners of `lattice` are among `corners` (M, 2)."""
-    return bool(near_any(lattice.pixels[lattice.known], corners, SAME_PX).mean() > 0.5)
+    near = near_any(lattice.pixels[lattice.known], corners, SAME_PX)
+    return 2 * int(np.count_nonzero(near)) > len(near)
 
 
 def _grown(
@@ -154,7 +156,7 @@ def _grown(
 
 
 def _grow(lattice: Lattice, saddles: SaddleIndex, level: Level, rings: int) -> int:
-    """Grow `lattice` IN PLACE, by at most so many `rings`, each from all corners known before.
+    """Grow a `lattice` that nobody has looked at yet IN PLACE, by at most so many `rings`, each from all known before.
 
     Returns the rings that are left when it has reached the border of its arrays, -1 when it has grown all it can.
     """
@@ -163,8 +165,10 @@ def _grow(lattice: Lattice, saddles: SaddleIndex, level: Level, rings: int) -> i
         sheet = (lattice.pixels, lattice.contrast, 1.0 if lattice.rising else -1.0)
         brightness = (level.smooth, level.scale, level.offset)
         return grown(library, *sheet, *brightness, saddles.squares, _rules(), rings)
-    due = np.ones((2, *lattice.known.shape), bool)
+    due = np.ones((2, *lattice.contrast.shape), bool)
     for left in range(rings, 0, -1):
+        # A new look at corners that have changed.
+        lattice = replace(lattice)
         known = lattice.known
         if known[0].any() or known[-1].any() or known[:, 0].any() or known[:, -1].any():
             return left

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar
 
 import cv2
@@ -32,9 +33,9 @@ BLOCKS = ((3, 3, 1), (2, 4, 0), (4, 2, 0))
 alternate hang together in crooked chains."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class Lattice:
-    """Corners of one board, or of a part of it.
+    """Corners of one board, or of a part of it, which do not change: what is asked of them often is kept.
 
     Attributes
     ----------
@@ -48,17 +49,19 @@ class Lattice:
     contrast: FloatArray
     rising: bool
 
-    @property
+    @cached_property
     def known(self) -> BoolArray:
         return np.isfinite(self.pixels[..., 0])
 
-    @property
+    @cached_property
     def count(self) -> int:
         return int(np.count_nonzero(self.known))
 
-    @property
+    @cached_property
     def solid(self) -> bool:
         """Whether it has all corners of BLOCKS rows and columns somewhere, or of a larger block all but one."""
+        if self.count == self.known.size and min(self.size) >= 3:
+            return True
         known = self.known.astype(np.uint8)
         return any(
             cv2.boxFilter(known, -1, (columns, rows), normalize=False, borderType=cv2.BORDER_CONSTANT).max(initial=0)
@@ -73,9 +76,14 @@ class Lattice:
 
     def signs(self) -> FloatArray:
         """Return (R, C): +1 where brightness grows with the angle across the +column edge, else -1."""
-        rows, columns = self.pixels.shape[:2]
-        odd = (np.arange(rows)[:, None] + np.arange(columns) + int(not self.rising)) % 2
-        return np.where(odd == 1, -1.0, 1.0)
+        signs = np.full(self.pixels.shape[:2], self.sign_at(0, 0))
+        signs[1::2, ::2] *= -1.0
+        signs[::2, 1::2] *= -1.0
+        return signs
+
+    def sign_at(self, row: int, column: int) -> float:
+        """Return +1 where brightness grows with the angle across the +column edge of a corner, else -1."""
+        return 1.0 if self.rising != ((row + column) % 2 == 1) else -1.0
 
     def padded(self, rows: tuple[int, int], columns: tuple[int, int]) -> Lattice:
         """Return the lattice with so many empty rows and columns before and after it."""
@@ -200,8 +208,7 @@ def build_lattices(corners: Corners, links: Links) -> Iterator[Lattice]:
     """Return the lattices that closed squares of four linked corners make up, the largest first."""
     library = kernels("growth")
     if library is not None:
-        states = np.where(links.corner >= 0, 4 * links.corner + links.arm, -1)
-        count, label, grid, turn, members = components_of(library, states)
+        count, label, grid, turn, members = components_of(library, links.state)
     else:
         label, grid, turn = _components(links)
         count = int(label.max(initial=-1)) + 1
@@ -238,8 +245,7 @@ def _lattice(corners: Corners, mine: IntArray, cells: IntArray, turn: int) -> La
 def _components(links: Links) -> tuple[IntArray, IntArray, IntArray]:
     """Return per corner its lattice (-1 alone), its (column, row), and the arm that points to +column."""
     bound = quads(links)
-    links = Links(np.where(bound, links.corner, -1), links.arm)
-    return _walk(links)
+    return _walk(Links(np.where(bound, links.state, -1)))
 
 
 def _walk(links: Links) -> tuple[IntArray, IntArray, IntArray]:

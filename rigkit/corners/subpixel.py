@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import comb
 
 import cv2
 import numpy as np
@@ -20,6 +19,7 @@ from rigkit.corners.edge_model import REACH, Geometry, ends_of
 from rigkit.corners.lattice import Lattice, Sheet, padded
 from rigkit.corners.local_fit import LocalFit, fit_cells
 from rigkit.corners.response import GreyImage
+from rigkit.corners.scatter import excess_scatter
 
 __all__ = ["RefinedLattice", "refine"]
 
@@ -31,11 +31,11 @@ FIRST_BLUR = 1.0
 FIRST_SIGMA_PX = 0.1
 """How well corners are known before the first pass: saddles of a smoothed image."""
 
-FIRST_PASS = (9.0, 4, 0.02, False)
-LAST_PASS = (18.0, 8, 2e-3, True)
+FIRST_PASS = (8.0, 4, 0.02, False)
+LAST_PASS = (18.0, 8, 0.01, True)
 """Radius in px, Gauss-Newton steps at most, the step in px that ends them, and whether noise is told from other
 residuals and curvatures are fitted where loose: the first pass only has to bring the lattice to a few hundredths of a
-pixel."""
+pixel; after the last step of the last one there is a ten-thousandth to go."""
 
 LOOSE = 0.5
 """Curvatures are fitted where the lattice leaves them open by so much that the corner would move by more than this, in
@@ -65,14 +65,6 @@ COVERED_OFF = 3.5
 """A corner whose noise, relative to its contrast, exceeds this and this times the board's typical one, and that lies
 off by this times the typical deviation, is covered in part, by the edge of a ruler or of a hand: its sides are not
 alike. On rendered boards under a ruler the factor is 12 and more, on boards with marks in their squares seldom 6."""
-
-DIFFERENCES = (5, 6)
-FEWEST_DIFFERENCES = 16
-UNEXPLAINED = 1.25
-"""A scatter about the lattice less than this times the expected one is what chance makes of fifty corners."""
-
-MEDIAN_OF_NORMAL = 0.6745
-"""Median of the absolute value of a standard normal variable."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -149,7 +141,7 @@ def refine(image: GreyImage, lattices: Sequence[Lattice]) -> list[RefinedLattice
     checked = _checked(second, sheet.parts)
     # Where corners scatter about the lattice by more than the noise in the image explains (JPEG blocks, aliasing, wavy
     # paper), the sigmas of the board are raised to what is seen.
-    scatter = _scatter(checked, sheet.parts)
+    scatter = excess_scatter(checked.lattice.pixels, checked.sigma_px, sheet.parts)
     return [
         _part_of(checked, part, item.rising, float(raised))
         for part, item, raised in zip(sheet.parts, lattices, scatter, strict=True)
@@ -189,8 +181,7 @@ def _pass(
     """Fit all corners of the sheet `start`, known to `sigma_px` (R, C); those that fail are left out."""
     known = start.known
     shape = fit_cells(start.pixels, known)
-    sides = np.stack([shape.along_column, shape.along_row], axis=1)
-    lengths = np.maximum(np.sqrt((sides**2).sum(axis=2)), 1.0)
+    lengths = np.maximum(np.hypot(shape.sides[..., 0], shape.sides[..., 1]), 1.0)
     curvature, curvature_sigma = line_curvature(start.pixels, sigma_px, known, lengths)
     if last:
         # A parabola k / 2 t^2 lies k / 6 r^2 beside the corner in the mean over |t| < r.
@@ -199,7 +190,7 @@ def _pass(
     fit = fit_edges(
         image,
         start.pixels[known],
-        Geometry(sides, curvature, shape.gaps(), ends_of(known, known)),
+        Geometry(shape.sides, curvature, shape.gaps(), ends_of(known, known)),
         signs[known],
         blur[known],
         radius_px=radius_px,
@@ -207,18 +198,15 @@ def _pass(
         converged_px=converged_px,
         mirrored=last,
         curvature_sigma=curvature_sigma if last else None,
+        contrast=start.contrast[known] if last else None,
     )
-    found = known.copy()
     good = fit.valid & (fit.contrast > 0.0)
-    found[known] = good
-
-    def spread(values: FloatArray) -> FloatArray:
-        out = np.full(known.shape + values.shape[1:], np.nan)
-        out[found] = values[good]
-        return out
-
-    lattice = Lattice(spread(fit.pixels), spread(fit.contrast), start.rising)
-    return RefinedLattice(lattice, spread(fit.sigma_px), spread(fit.blur), spread(fit.residual), spread(fit.noise))
+    cells = np.flatnonzero(known)[good]
+    pixels, single = np.full((known.size, 2), np.nan), np.full((5, known.size), np.nan)
+    pixels[cells] = fit.pixels[good]
+    single[:, cells] = np.array([fit.contrast, fit.sigma_px, fit.blur, fit.residual, fit.noise])[:, good]
+    contrast, *rest = single.reshape(-1, *known.shape)
+    return RefinedLattice(Lattice(pixels.reshape(*known.shape, 2), contrast, start.rising), *rest)
 
 
 def _with_holes(lattice: Lattice, inside: BoolArray) -> tuple[Lattice, BoolArray]:
@@ -278,7 +266,8 @@ def _checked(item: RefinedLattice, parts: Sequence[Part]) -> RefinedLattice:
         out[known] = values
         return out
 
-    distance = np.linalg.norm(item.lattice.pixels[known] - shape.pixels, axis=1)
+    off = item.lattice.pixels[known] - shape.pixels
+    distance = np.hypot(off[:, 0], off[:, 1])
     # A prediction from a few corners on one side is no judge of another.
     judged = np.zeros_like(known)
     judged[known] = (shape.support >= FEWEST_CHECKED) & (shape.gain < 1.5)
@@ -296,67 +285,6 @@ def _checked(item: RefinedLattice, parts: Sequence[Part]) -> RefinedLattice:
         covered = relative[part] > max(COVERED, COVERED_FACTOR * usual)
         drop[part] = sure & (astray | (covered & (cells[part] > COVERED_OFF * typical)))
     return item.without(drop) if drop.any() else item
-
-
-def _scatter(item: RefinedLattice, parts: Sequence[Part]) -> FloatArray:
-    """Return how much more the corners of each part scatter about smooth rows and columns than their sigmas say, (P,).
-
-    Judged by the DIFFERENCES along rows and columns, with and without the best perspective taken away first: the one is
-    blind to strong perspective, the other to a fisheye's bend, and the calmest of them is right. At least 1.
-    """
-    known = item.lattice.known
-    judged = np.array([np.count_nonzero(known[part]) >= FEWEST_CHECKED for part in parts])
-    calmest = np.where(judged, np.inf, 1.0)
-    for flatten in (False, True):
-        values = item.lattice.pixels.copy() if flatten else item.lattice.pixels
-        for part in (parts[k] for k in np.flatnonzero(calmest > UNEXPLAINED).tolist() if flatten):
-            values[part] -= _best_plane(values[part])
-        for order in DIFFERENCES:
-            left = np.flatnonzero(calmest > UNEXPLAINED).tolist()
-            if not left:
-                return np.ones(len(parts))
-            rough = _roughness(values, item.sigma_px, order, [parts[k] for k in left])
-            calmest[left] = np.fmin(calmest[left], rough)
-    return np.where((calmest > UNEXPLAINED) & np.isfinite(calmest), calmest, 1.0)
-
-
-def _best_plane(pixels: FloatArray) -> FloatArray:
-    """Return (R, C, 2) where the corners of the best flat board through a pinhole would be; NaN where unknown."""
-    row, column = np.nonzero(np.isfinite(pixels[..., 0]))
-    grid = np.stack([column, row], axis=-1).astype(np.float64)
-    plane, _ = cv2.findHomography(grid, pixels[row, column], 0)
-    flat = np.full(pixels.shape, np.nan)
-    if plane is not None:
-        flat[row, column] = cv2.perspectiveTransform(grid[None], plane)[0]
-    return flat
-
-
-def _roughness(values: FloatArray, sigma: FloatArray, order: int, parts: Sequence[Part]) -> FloatArray:
-    """Return for each part the typical difference of `order` of `values` (R, C, 2) over the expected one, (P,).
-
-    NaN where there are few differences. Those across the border of a part are none: the rows between are empty.
-    """
-    factors = [float(comb(order, k)) ** 2 for k in range(order + 1)]
-    found: list[list[FloatArray]] = [[] for _ in parts]
-    for axis in (0, 1):
-        count = sigma.shape[axis] - order
-        if count <= 0:
-            continue
-        square = np.moveaxis(sigma**2, axis, 0)
-        variance = sum(factor * square[k : k + count] for k, factor in enumerate(factors))
-        step = np.abs(np.diff(np.moveaxis(values, axis, 0), order, axis=0))
-        ratio = np.moveaxis(step / np.sqrt(variance)[..., None], 0, axis)
-        for mine, (rows, columns) in zip(found, parts, strict=True):
-            here = ratio[rows, columns]
-            mine.append(here[np.isfinite(here)])
-    every = [np.concatenate(mine) if mine else np.zeros(0) for mine in found]
-    return np.array([_median(m) / MEDIAN_OF_NORMAL if len(m) >= FEWEST_DIFFERENCES else np.nan for m in every])
-
-
-def _median(values: FloatArray) -> float:
-    """Return the median; `np.median` takes ten times as long for a hundred values."""
-    ordered = np.sort(values)
-    return 0.5 * float(ordered[(len(values) - 1) // 2] + ordered[len(values) // 2])
 
 
 def _typical(values: FloatArray) -> float:

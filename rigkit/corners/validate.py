@@ -8,11 +8,13 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from rigkit.arrays import BoolArray, FloatArray
+from rigkit.corners.evenness import unevenness
 from rigkit.corners.lattice import MANY, Lattice
 from rigkit.corners.local_fit import fit_cells
 from rigkit.corners.nearby import near_any
 from rigkit.corners.response import Level, sample
 from rigkit.corners.subpixel import RefinedLattice
+from rigkit.native import lattice as native
 
 __all__ = ["compact", "known_part", "large", "leans", "sample_of", "separate", "tidy", "trustworthy"]
 
@@ -137,7 +139,7 @@ def sample_of(lattice: Lattice) -> Lattice | None:
     known = lattice.known
     many = lattice.count >= MANY
     side = LARGE_SAMPLE if many else SAMPLE
-    if min(known.shape) < side or (not many and (lattice.count < side**2 or known.mean() >= RAGGED)):
+    if min(known.shape) < side or (not many and not side**2 <= lattice.count < RAGGED * known.size):
         return None
     full = sliding_window_view(known, (side, side)).sum(axis=(2, 3))
     row, column = (int(at) for at in np.unravel_index(full.argmax(), full.shape))
@@ -158,6 +160,12 @@ def _shifts(lattice: Lattice, level: Level, reach: float, along: Sequence[float]
 
     They are looked for in a stripe of `reach` squares to both sides.
     """
+    library = native.loaded()
+    if library is not None:
+        seen = (level.smooth, level.scale, level.offset)
+        return native.shifts_of_edges(
+            library, lattice.pixels, lattice.rising, *seen, reach, along, STEPS_ACROSS, MOST_EDGES
+        )
     pixels, signs = level.to_level(lattice.pixels), lattice.signs()
     # The edges that squares start with, and how each square goes on from there: boards seen aslant are flat.
     first, right, below, last = pixels[:-1, :-1], pixels[:-1, 1:], pixels[1:, :-1], pixels[1:, 1:]
@@ -218,15 +226,7 @@ def trustworthy(refined: RefinedLattice, before: int, least: int) -> bool:
 
 def _uneven(lattice: Lattice) -> bool:
     """Return whether rows and columns follow each other at steps as different as no lens and no view makes them."""
-    for pixels in (lattice.pixels, lattice.pixels.swapaxes(0, 1)):
-        step = np.diff(pixels, axis=0)
-        length = np.hypot(step[..., 0], step[..., 1])
-        bend = np.diff(step, axis=0)
-        relative = np.hypot(bend[..., 0], bend[..., 1]) / np.minimum(length[1:], length[:-1])
-        relative = relative[np.isfinite(relative)]
-        if len(relative) and _middle(relative) > MAX_UNEVEN:
-            return True
-    return False
+    return any(line.every > MAX_UNEVEN for line in unevenness(lattice.pixels))
 
 
 def _middle(values: FloatArray) -> float:
