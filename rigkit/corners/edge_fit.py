@@ -8,6 +8,7 @@ on both sides, and so do not move the corner.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,9 +62,9 @@ MOST_MOVE_PX, MOST_TURN_RAD, MOST_BLUR_CHANGE, MOST_LIGHT_CHANGE = 1.0, 0.2, 0.3
 """A step is cut where it would leave the region in which the model is nearly linear: position, angles, relative blur,
 light."""
 
-BLUR_LAG = 10.0
-"""The last step may change s by so many times what it may move the corner: a wrong s hardly moves the corner, but adds
-to the residuals and so to the predicted sigma."""
+BLUR_LAG = 2.0
+"""The last step may change s by this part of it for each px that it may move the corner: a wrong s hardly moves the
+corner, but adds to the residuals and so to the predicted sigma, most of all on sharp edges."""
 
 FEWEST_MIRRORED, MOST_MIRRORED_PX = 12, 2.0
 """Noise is read from so many pixels with a mirror image at least, and not where a corner has ended so far from the
@@ -120,6 +121,7 @@ def fit_edges(
     converged_px: float = 1e-3,
     mirrored: bool = True,
     curvature_sigma: FloatArray | None = None,
+    contrast: FloatArray | None = None,
 ) -> EdgeFit:
     """Fit the edge model to `image` (as `grey_image` returns it) around the corners that are near `pixels` (N, 2).
 
@@ -132,7 +134,9 @@ def fit_edges(
     mirrored : tell noise from other residuals; otherwise all counts as noise.
     converged_px : the last step moves the corner by less than this; the next one would by a hundredth of it.
     curvature_sigma : (N, 2) how well the geometry's curvatures are known, 1/px; where 0, and without, both are kept.
+    contrast : (N,) expected contrast; where NaN, and without, it is read from the window.
     """
+    expected = np.full(len(pixels), np.nan) if contrast is None else contrast
     loose = np.zeros((len(pixels), 2)) if curvature_sigma is None else curvature_sigma
     least = ROUNDING_VARIANCE if image.dtype == np.uint8 else LEAST_VARIANCE
     fitted = fit_corners(
@@ -145,6 +149,7 @@ def fit_edges(
         geometry.ends,
         sign,
         blur,
+        expected,
         _rules(radius_px, iterations, converged_px, mirrored, least),
     )
     if fitted is not None:
@@ -155,11 +160,12 @@ def fit_edges(
     kept = np.count_nonzero(loose > 0.0, axis=1) < 2
     values = prior_mean.copy()
     values[:, [X, Y]] = pixels - window.centre
-    _brightness(values, window, geometry, sign)
+    _brightness(values, window, geometry, sign, expected)
     used = window.weight.sum(axis=1, dtype=np.float64)
     free = np.maximum(used - DETERMINED, 1.0)
     variance = np.full(len(pixels), np.inf)
     normal = np.zeros((len(pixels), PARAMETERS, PARAMETERS))
+    rest = np.zeros(window.weight.shape)
     active = np.ones(len(pixels), bool)
     diagonal = range(PARAMETERS)
     for _ in range(iterations):
@@ -176,15 +182,23 @@ def fit_edges(
         gradient = products[:, :-1, -1] + pull * (prior_mean - values)[active]
         step = np.linalg.solve(hessian, gradient[..., None])[..., 0]
         normal[active] = hessian
-        values[active] += _limited(step, values[active])
-        change = np.abs(step[:, [X, Y, S]]) / [1.0, 1.0, BLUR_LAG]
+        taken = _limited(step, values[active])
+        values[active] += taken
+        # What is left after a step is linear in it: the last one is small.
+        rest[active] = rows[:, -1] - (taken[:, None].astype(np.float32) @ rows[:, :-1])[:, 0]
+        change = np.abs(step[:, [X, Y, S]])
+        change[:, 2] /= BLUR_LAG * values[active, S]
         active[np.flatnonzero(active)[change.max(axis=1) <= converged_px]] = False
         if not active.any():
             break
-    noise = np.maximum(_noise(values, variance, window, geometry), least) if mirrored else variance
+    noise = variance
+    if mirrored:
+        variance = np.maximum((rest**2).sum(axis=1) / free, least)
+        noise = np.maximum(_noise(values, variance, window, rest), least)
     return _result(values, variance, noise, normal, window, pixels, geometry, sign)
 
 
+@functools.cache
 def _rules(radius_px: float, iterations: int, converged_px: float, mirrored: bool, least: float) -> Rules:
     return Rules(
         reach=REACH,
@@ -232,8 +246,11 @@ def _prior(geometry: Geometry, loose: FloatArray, blur: FloatArray, size: FloatA
     return mean, weight
 
 
-def _brightness(values: FloatArray, window: Window, geometry: Geometry, sign: FloatArray) -> None:
-    """Set a and b of `values` by linear least squares with everything else as it stands, from half of the pixels."""
+def _brightness(values: FloatArray, window: Window, geometry: Geometry, sign: FloatArray, contrast: FloatArray) -> None:
+    """Set a and b of `values` by linear least squares with everything else as it stands, from half of the pixels.
+
+    Where the contrast is known, b is half of it and a the mean: the first step finds a, in which the model is linear.
+    """
     every = np.arange(window.weight.shape[1]) // START_BLOCK % 2 == 0
     weight = window.weight * every
     pattern = pattern_of(values, window, geometry) * sign[:, None].astype(np.float32)
@@ -242,8 +259,11 @@ def _brightness(values: FloatArray, window: Window, geometry: Geometry, sign: Fl
     mean_i = (weight * window.value).sum(axis=1, dtype=np.float64) / total
     spread = (pattern - mean_p[:, None].astype(np.float32)) * weight
     slope = (spread * window.value).sum(axis=1) / np.maximum((spread**2).sum(axis=1), 1e-9)
-    values[:, B] = slope * sign
-    values[:, A] = mean_i - slope * mean_p
+    known = np.isfinite(contrast)
+    count = np.maximum(window.weight.sum(axis=1, dtype=np.float64), 1.0)
+    mean = (window.weight * window.value).sum(axis=1, dtype=np.float64) / count
+    values[:, B] = np.where(known, 0.5 * contrast, slope) * sign
+    values[:, A] = np.where(known, mean, mean_i - slope * mean_p)
 
 
 def _limited(step: FloatArray, values: FloatArray) -> FloatArray:
@@ -258,13 +278,12 @@ def _limited(step: FloatArray, values: FloatArray) -> FloatArray:
     return out
 
 
-def _noise(values: FloatArray, variance: FloatArray, window: Window, geometry: Geometry) -> FloatArray:
-    """Return the variance (N,) of the noise: of what the model leaves, less what is left at the mirrored pixel, too.
+def _noise(values: FloatArray, variance: FloatArray, window: Window, rest: FloatArray) -> FloatArray:
+    """Return the variance (N,) of the noise: of the `rest` (N, P) of the model, less what mirroring leaves, too.
 
     Mirrored at the corner, a pixel falls between four, which are interpolated; where one of them is not in the window
     it has no mirror image. Few such pixels: `variance`, that of all residuals.
     """
-    rest = linearise(values, window, geometry)[:, -1].astype(np.float64)
     used = window.weight > 0.0
     middle = int(max(np.abs(window.u).max(initial=0.0), np.abs(window.v).max(initial=0.0))) + 1
     across = 2 * middle + 1

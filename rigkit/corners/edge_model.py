@@ -99,12 +99,11 @@ class Geometry:
 
 def ends_of(known: BoolArray, cells: BoolArray) -> BoolArray:
     """Return the `ends` (M, 2, 2) of the `cells` of a lattice whose corners (R, C) are `known`."""
-    around = np.zeros((known.shape[0] + 2, known.shape[1] + 2), np.bool_)
-    around[1:-1, 1:-1] = known
-    row, column = np.nonzero(cells)
-    above, below = around[row, column + 1], around[row + 2, column + 1]
-    left, right = around[row + 1, column], around[row + 1, column + 2]
-    return ~np.stack([above, below, right, left], axis=-1).reshape(-1, 2, 2)
+    ends = np.ones((*known.shape, 4), np.bool_)
+    unknown = ~known
+    ends[1:, :, 0], ends[:-1, :, 1] = unknown[:-1], unknown[1:]
+    ends[:, :-1, 2], ends[:, 1:, 3] = unknown[:, 1:], unknown[:, :-1]
+    return ends[cells].reshape(-1, 2, 2)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

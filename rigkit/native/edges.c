@@ -8,7 +8,7 @@
 
 enum { X, Y, T1, T2, S, A, B, GX, GY, K1, K2, PARAMETERS };
 enum { FEWER = K1, ROWS = PARAMETERS + 1, LANES = 8, GROUPS = 8, BLOCK = LANES * GROUPS };
-enum { OUTCOMES = 8 };
+enum { OUTCOMES = 8, STRETCH = 16, CACHE_LINE = 64 };
 
 /* Eight numbers at once, wherever they lie. */
 typedef float lanes_t __attribute__((vector_size(4 * LANES), aligned(4)));
@@ -30,10 +30,12 @@ typedef struct {
     const uint8_t *ends;
 } geometry_t;
 
-/* The pixels of a corner, relative to (centre_u, centre_v), at most `radius` from it both ways. `rest` has room for what
- * the model leaves of them, `square` and `turned` for `across` x `across` pixels around the centre. */
+/* The pixels of a corner, relative to (centre_u, centre_v), at most `radius` from it both ways. `rows` has room for the
+ * rows of edge_model.linearise, a block of pixels after the other, `square` and `turned` for `across` x `across` pixels
+ * around the centre. */
 typedef struct {
-    float *u, *v, *value, *rest, *square, *turned;
+    float *u, *v, *value, *rows, *square, *turned;
+    int64_t room;
     int64_t count, across, radius;
     double centre_u, centre_v, size;
 } window_t;
@@ -55,19 +57,19 @@ typedef struct {
     double lo, hi;
 } range_t;
 
-/* Return where low <= slope x + offset <= high. */
-INLINE range_t between(double slope, double offset, double low, double high)
+/* Return where low <= x / inverse + offset <= high. */
+INLINE range_t between(double inverse, double offset, double low, double high)
 {
-    const double lo = (low - offset) / slope, hi = (high - offset) / slope;
-    /* A line along the row: dividing by zero has given infinities of both signs, or NaN at the very limit. */
-    if (slope == 0.0)
+    const double lo = (low - offset) * inverse, hi = (high - offset) * inverse;
+    /* A line along the row: infinity has given infinities of both signs, or NaN at the very limit. */
+    if (isinf(inverse))
         return low <= offset && offset <= high ? (range_t){-1e9, 1e9} : (range_t){1e9, -1e9};
     return lo < hi ? (range_t){lo, hi} : (range_t){hi, lo};
 }
 
-INLINE range_t band(double slope, double offset, double limit)
+INLINE range_t band(double inverse, double offset, double limit)
 {
-    return between(slope, offset, -limit, limit);
+    return between(inverse, offset, -limit, limit);
 }
 
 INLINE range_t both(range_t a, range_t b)
@@ -94,15 +96,21 @@ INLINE void take(window_t *window, const picture_t image, int64_t v, range_t ran
     const float *restrict floats = (const float *)image.brightness + start;
     float *restrict us = window->u + window->count, *restrict vs = window->v + window->count;
     float *restrict values = window->value + window->count;
-    for (int32_t k = 0; k < (int32_t)count; k++) {
-        us[k] = (float)((int32_t)first + k);
-        vs[k] = (float)v;
-    }
-    if (image.bytes)
+    /* In steps of known length: what is too much is written over, or not looked at. */
+    for (int32_t k = 0; k < (int32_t)count; k += STRETCH)
+        for (int32_t i = 0; i < STRETCH; i++) {
+            us[k + i] = (float)((int32_t)first + k + i);
+            vs[k + i] = (float)v;
+        }
+    if (!image.bytes)
+        memcpy(values, floats, (size_t)count * sizeof(float));
+    else if (start + count + STRETCH <= image.width * image.height)
+        for (int32_t k = 0; k < (int32_t)count; k += STRETCH)
+            for (int32_t i = 0; i < STRETCH; i++)
+                values[k + i] = (float)bytes[k + i];
+    else
         for (int32_t k = 0; k < (int32_t)count; k++)
             values[k] = (float)bytes[k];
-    else
-        memcpy(values, floats, (size_t)count * sizeof(float));
     window->count += count;
 }
 
@@ -142,20 +150,21 @@ static void collect(
     const range_t columns = {-window->centre_u, (double)image.width - 1.0 - window->centre_u};
     const double left = reach_to(at, 3, blur, rules), right = reach_to(at, 2, blur, rules);
     const double above = reach_to(at, 0, blur, rules), below = reach_to(at, 1, blur, rules);
+    const double columns_a = area / b[1], columns_b = -area / a[1];
     for (int64_t v = -most; v <= most; v++) {
         const double row = window->centre_v + (double)v;
         if (!(row >= 0.0 && row <= (double)(image.height - 1)))
             continue;
         const double half = sqrt(rules->radius_px * rules->radius_px - (double)(v * v));
-        /* Position in cells along side a and along side b, as functions of the column. */
-        const double cells[4] = {
-            b[1] / area, (-b[0] * ((double)v - off_v) - b[1] * off_u) / area,
-            -a[1] / area, (a[0] * ((double)v - off_v) + a[1] * off_u) / area};
-        range_t whole = both(between(cells[0], cells[1], -left, right), between(cells[2], cells[3], -above, below));
+        /* Position in cells along side a and along side b, in the column of the centre; it grows by one in so many
+         * columns. */
+        const double cells_a = (-b[0] * ((double)v - off_v) - b[1] * off_u) / area;
+        const double cells_b = (a[0] * ((double)v - off_v) + a[1] * off_u) / area;
+        range_t whole = both(between(columns_a, cells_a, -left, right), between(columns_b, cells_b, -above, below));
         whole = both(both(whole, columns), (range_t){-half, half});
         if (!(whole.lo <= whole.hi))
             continue;
-        range_t one = both(whole, band(cells[0], cells[1], far1)), two = both(whole, band(cells[2], cells[3], far2));
+        range_t one = both(whole, band(columns_a, cells_a, far1)), two = both(whole, band(columns_b, cells_b, far2));
         if (two.lo < one.lo) {
             const range_t swap = one;
             one = two;
@@ -275,6 +284,12 @@ INLINE void along_line(const line_t line, const float *u, const float *v, float 
         out->grown[i] += line.curvature * line.blur * out->slope[i];
 }
 
+/* The rows of the block of pixels that begins with `start`. */
+INLINE float (*rows_of(const window_t *window, int64_t start))[BLOCK]
+{
+    return (float(*)[BLOCK])(window->rows + start * ROWS);
+}
+
 /* edge_model._mixed. */
 INLINE float mixed(const edge_t *one, const edge_t *two, float rho, int i)
 {
@@ -283,8 +298,8 @@ INLINE float mixed(const edge_t *one, const edge_t *two, float rho, int i)
                       + rho * (0.5f * one->bow[i] * two->bow[i] + (1.0f / 6.0f) * rho * one->curl[i] * two->curl[i])));
 }
 
-/* Set `products` (rows of ROWS, lower half) to those of the first `parameters` rows of edge_model.linearise and the last,
- * the residuals, over all pixels. */
+/* Set the window's rows to the first `parameters` of edge_model.linearise and the last, the residuals, and `products`
+ * (rows of ROWS, lower half) to those of these rows over all pixels. */
 INLINE void multiply_rows(
     const int parameters, const double *values, const window_t *window, const geometry_t at, const rules_t *rules,
     double *products)
@@ -299,9 +314,11 @@ INLINE void multiply_rows(
     lanes_t sums[ROWS * (ROWS + 1) / 2];
     memset(sums, 0, sizeof sums);
     for (int64_t start = 0; start < window->count; start += BLOCK) {
-        const float *u = window->u + start, *v = window->v + start, *value = window->value + start;
+        const float *restrict u = window->u + start, *restrict v = window->v + start;
+        const float *restrict value = window->value + start;
+        /* Where they are not asked for afterwards, in one place, which stays in the cache. */
+        float(*restrict rows)[BLOCK] = rows_of(window, rules->mirrored ? start : 0);
         edge_t one, two;
-        float rows[ROWS][BLOCK];
         along_line(line1, u, v, x, y, &one);
         along_line(line2, u, v, x, y, &two);
         for (int i = 0; i < BLOCK; i++) {
@@ -410,6 +427,22 @@ static void brightness(double *values, const window_t *window, const geometry_t 
     values[A] = (sum_i - slope * sum_p) / n;
 }
 
+/* Start from the contrast 2 b and a mean brightness: the first step finds the latter, in which the model is linear. */
+static void level(double *values, const window_t *window, double half)
+{
+    lanes_t sums = {0.0f};
+    const int64_t whole = window->count / LANES * LANES;
+    for (int64_t i = 0; i < whole; i += LANES)
+        sums += *(const lanes_t *)(window->value + i);
+    double sum = 0.0;
+    for (int lane = 0; lane < LANES; lane++)
+        sum += (double)sums[lane];
+    for (int64_t i = whole; i < window->count; i++)
+        sum += (double)window->value[i];
+    values[A] = sum / (double)(window->count > 0 ? window->count : 1);
+    values[B] = half;
+}
+
 /* Factor the lower half of `matrix` (n rows of ROWS) in place, Cholesky, with one over the diagonal on the diagonal;
  * return whether it is positive definite. */
 static int factor(double *matrix, int n)
@@ -478,30 +511,34 @@ static void move(double *values, const double *step, int n, const rules_t *rules
     values[S] = clipped(values[S], rules->least_blur, rules->most_blur);
 }
 
-/* Set `rest` of the window to what the model leaves. */
+/* Set the residuals, the last of the window's rows, to what they are after the last `step` of `parameters`, small enough
+ * for them to be linear; return the sum of their squares. */
 FOR_EACH_PROCESSOR
-static void leave(const double *values, window_t *window, const geometry_t at, const rules_t *rules)
+static double leave(window_t *window, const double *step, int parameters)
 {
-    const float x = (float)values[X], y = (float)values[Y], base = (float)values[A], half = (float)values[B];
-    const float light_u = (float)(values[GX] / window->size), light_v = (float)(values[GY] / window->size);
-    const float rho = (float)cos(values[T1] - values[T2]);
-    const line_t line1 = line_of(values[T1], values[K1], at.gaps, values[S], rules);
-    const line_t line2 = line_of(values[T2], values[K2], at.gaps + 2, values[S], rules);
+    lanes_t sums = {0.0f};
     for (int64_t start = 0; start < window->count; start += BLOCK) {
-        const float *u = window->u + start, *v = window->v + start;
-        edge_t one, two;
-        along_line(line1, u, v, x, y, &one);
-        along_line(line2, u, v, x, y, &two);
-        for (int i = 0; i < BLOCK; i++)
-            window->rest[start + i] = window->value[start + i]
-                - (1.0f + light_u * u[i] + light_v * v[i]) * (base + half * mixed(&one, &two, rho, i));
+        float(*restrict rows)[BLOCK] = rows_of(window, start);
+        lanes_t *rest = (lanes_t *)rows[parameters];
+        for (int k = 0; k < parameters; k++) {
+            const lanes_t *row = (const lanes_t *)rows[k];
+            const float by = (float)step[k];
+            for (int group = 0; group < GROUPS; group++)
+                rest[group] -= by * row[group];
+        }
+        for (int group = 0; group < GROUPS; group++)
+            sums += rest[group] * rest[group];
     }
+    double sum = 0.0;
+    for (int lane = 0; lane < LANES; lane++)
+        sum += (double)sums[lane];
+    return sum;
 }
 
 /* Return the mean square of what the model leaves and mirroring at the corner changes, as that of independent noise, or
  * -1 where few pixels have a mirror image (edge_fit._noise). */
 FOR_EACH_PROCESSOR
-static double unmirrored(const double *values, window_t *window, const rules_t *rules)
+static double unmirrored(const double *values, window_t *window, int parameters, const rules_t *rules)
 {
     if (fabs(values[X]) > rules->most_mirrored || fabs(values[Y]) > rules->most_mirrored)
         return -1.0;
@@ -510,9 +547,13 @@ static double unmirrored(const double *values, window_t *window, const rules_t *
     float *square = window->square + middle * across + middle, *turned = window->turned + middle * across + middle;
     memset(window->square, 0xff, (size_t)(across * across) * sizeof(float)); /* NaN */
     memset(window->turned, 0xff, (size_t)(across * across) * sizeof(float));
-    for (int64_t i = 0; i < window->count; i++) {
-        const int32_t at = (int32_t)window->v[i] * across + (int32_t)window->u[i];
-        square[at] = turned[-at] = window->rest[i];
+    for (int64_t start = 0; start < window->count; start += BLOCK) {
+        const int64_t used = window->count - start < BLOCK ? window->count - start : BLOCK;
+        const float *u = window->u + start, *v = window->v + start, *rest = rows_of(window, start)[parameters];
+        for (int64_t i = 0; i < used; i++) {
+            const int32_t at = (int32_t)v[i] * across + (int32_t)u[i];
+            square[at] = turned[-at] = rest[i];
+        }
     }
     const double left = floor(2.0 * values[X]), top = floor(2.0 * values[Y]);
     const float right = (float)(2.0 * values[X] - left), below = (float)(2.0 * values[Y] - top);
@@ -558,9 +599,10 @@ static int surrounded(const window_t *window, float x, float y)
     return right >= 2 && left >= 2 && below >= 2 && above >= 2;
 }
 
-/* Fit one corner; `out` is u, v, sigma, s, 2 b, RMS residual, RMS noise, valid. */
+/* Fit one corner, of a `contrast` that may be unknown (NaN); `out` is u, v, sigma, s, 2 b, RMS residual, RMS noise, valid. */
 static void fit_corner(
-    window_t *window, const double pixel[2], const geometry_t at, double sign, double blur, const rules_t *rules, double *out)
+    window_t *window, const double pixel[2], const geometry_t at, double sign, double blur, double contrast,
+    const rules_t *rules, double *out)
 {
     const double turn = 1.0 / (rules->angle_sigma * rules->angle_sigma);
     const double width = 1.0 / (rules->log_blur_sigma * rules->log_blur_sigma * blur * blur);
@@ -576,8 +618,12 @@ static void fit_corner(
     memcpy(values, mean, sizeof values);
     values[X] = pixel[0] - window->centre_u;
     values[Y] = pixel[1] - window->centre_v;
-    brightness(values, window, at, rules, sign);
+    if (isfinite(contrast))
+        level(values, window, 0.5 * contrast * sign);
+    else
+        brightness(values, window, at, rules, sign);
     const int64_t more = window->count - FEWER;
+    double last[PARAMETERS] = {0.0};
     int solved = 0;
     for (int64_t turns = 0; turns < rules->iterations; turns++) {
         (n == FEWER ? normal_equations : all_normal_equations)(values, window, at, rules, products);
@@ -593,15 +639,20 @@ static void fit_corner(
             break;
         forward(products, step, n);
         backward(products, step, n);
+        for (int k = 0; k < n; k++)
+            last[k] = -values[k];
         move(values, step, n, rules);
+        for (int k = 0; k < n; k++)
+            last[k] += values[k];
         if (fabs(step[X]) <= rules->converged_px && fabs(step[Y]) <= rules->converged_px
-            && fabs(step[S]) <= rules->blur_lag * rules->converged_px)
+            && fabs(step[S]) <= rules->blur_lag * rules->converged_px * values[S])
             break;
     }
     double noise = variance;
     if (rules->mirrored && more > 0) {
-        leave(values, window, at, rules);
-        const double mean = unmirrored(values, window, rules);
+        variance = leave(window, last, n) / (double)more;
+        variance = variance > rules->least_variance ? variance : rules->least_variance;
+        const double mean = unmirrored(values, window, n, rules);
         noise = mean < 0.0 ? variance : mean * (double)window->count / (double)more;
         noise = noise > rules->least_variance ? noise : rules->least_variance;
     }
@@ -631,35 +682,37 @@ static int64_t across_square(const rules_t *rules)
 static int64_t room_of_window(double radius_px)
 {
     const int64_t side = 2 * (int64_t)floor(radius_px) + 1;
-    return side * side + BLOCK;
+    return (side * side / BLOCK + 2) * BLOCK;
 }
 
 /* Return how many floats of scratch fit_edges needs. */
 int64_t edges_scratch(const rules_t *rules)
 {
     const int64_t across = across_square(rules);
-    return 4 * room_of_window(rules->radius_px) + 2 * across * across;
+    return (3 + ROWS) * room_of_window(rules->radius_px) + 2 * across * across + CACHE_LINE / (int64_t)sizeof(float);
 }
 
 /* Fit the edge model around `count` corners (edge_fit.fit_edges). pixels (N, 2), sides (N, 2, 2), curvature and its sigma
- * (N, 2), gaps (N, 2, 2), ends (N, 2, 2), sign (N), blur (N), out (N, OUTCOMES); scratch as `edges_scratch` says, zeroed;
+ * (N, 2), gaps (N, 2, 2), ends (N, 2, 2), sign, blur and contrast (N), out (N, OUTCOMES); scratch as `edges_scratch` says, zeroed;
  * `grey` is of uint8_t if `bytes`, else of float. */
 void fit_edges(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *sides,
     const double *curvature, const double *curvature_sigma, const double *gaps, const double *sign, const double *blur,
-    const uint8_t *ends, const rules_t *rules, float *scratch, double *out)
+    const double *contrast, const uint8_t *ends, const rules_t *rules, float *scratch, double *out)
 {
     const picture_t image = {grey, width, height, bytes};
     const int64_t room = room_of_window(rules->radius_px), across = across_square(rules);
+    /* Vectors that lie across two lines of the cache take twice the time. */
+    scratch += (CACHE_LINE - (uintptr_t)scratch % CACHE_LINE) % CACHE_LINE / sizeof(float);
     window_t window = {
-        .u = scratch, .v = scratch + room, .value = scratch + 2 * room, .rest = scratch + 3 * room,
-        .square = scratch + 4 * room, .turned = scratch + 4 * room + across * across, .across = across,
+        .u = scratch, .v = scratch + room, .value = scratch + 2 * room, .rows = scratch + 3 * room,
+        .square = scratch + (3 + ROWS) * room, .turned = scratch + (3 + ROWS) * room + across * across, .across = across,
         .radius = (int64_t)floor(rules->radius_px)};
     for (int64_t n = 0; n < count; n++) {
         const geometry_t at = {
             sides + 4 * n, curvature + 2 * n, curvature_sigma + 2 * n, gaps + 4 * n, ends + 4 * n};
         collect(&window, image, pixels + 2 * n, at, blur[n], rules);
-        fit_corner(&window, pixels + 2 * n, at, sign[n], blur[n], rules, out + OUTCOMES * n);
+        fit_corner(&window, pixels + 2 * n, at, sign[n], blur[n], contrast[n], rules, out + OUTCOMES * n);
     }
 }
 

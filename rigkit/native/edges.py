@@ -76,7 +76,7 @@ def _library() -> ctypes.CDLL | None:
         library.edges_scratch.restype = count
         library.edges_scratch.argtypes = [array]
         library.fit_edges.restype = None
-        library.fit_edges.argtypes = [array, count, count, count, count, *[array] * 11]
+        library.fit_edges.argtypes = [array, count, count, count, count, *[array] * 12]
         library.line_bends.restype = None
         library.line_bends.argtypes = [array, array, array, count, count, array, array, array, array]
     return library
@@ -92,6 +92,7 @@ def fit_corners(
     ends: BoolArray,
     sign: FloatArray,
     blur: FloatArray,
+    contrast: FloatArray,
     rules: Rules,
 ) -> FloatArray | None:
     """Return the `OUTCOMES` of N corners, (N, 8), or None without the compiled kernel. Arguments as `fit_edges`."""
@@ -99,7 +100,7 @@ def fit_corners(
     if library is None:
         return None
     grey = np.ascontiguousarray(image)
-    parts = (pixels, sides, curvature, curvature_sigma, gaps, sign, blur)
+    parts = (pixels, sides, curvature, curvature_sigma, gaps, sign, blur, contrast)
     known = [np.ascontiguousarray(part, np.float64) for part in parts]
     edges = np.ascontiguousarray(ends, np.bool_)
     out = np.empty((len(pixels), OUTCOMES))

@@ -63,7 +63,9 @@ def test_compiled_fit_is_the_numpy_fit(
     # All steps: whether the last one is still taken may hang on rounding.
     # Curvatures of some are fitted, too.
     loose = np.where(rng.random((len(start), 1)) < 0.5, 0.0, rng.uniform(1e-4, 3e-3, (len(start), 2)))
-    options = {"radius_px": 14.0, "iterations": 6, "converged_px": 0.0, "curvature_sigma": loose}
+    # And of some the contrast is known, roughly.
+    contrast = np.where(rng.random(len(start)) < 0.5, np.nan, 150.0)
+    options = {"radius_px": 14.0, "iterations": 6, "converged_px": 0.0, "curvature_sigma": loose, "contrast": contrast}
     compiled, plain = both(image, start, geometry, sign, blur, monkeypatch=monkeypatch, **options)
     assert np.array_equal(compiled.valid, plain.valid)
     good = plain.valid & (np.abs(plain.contrast) > 20.0)
