@@ -143,10 +143,8 @@ class Guide:
         ones = np.ones(len(row))
         return LocalFit(
             here,
-            (right - left) / (2.0 * h),
-            (below - above) / (2.0 * h),
-            (right - 2.0 * here + left) / h**2,
-            (below - 2.0 * here + above) / h**2,
+            np.stack([right - left, below - above], axis=1) / (2.0 * h),
+            np.stack([right - 2.0 * here + left, below - 2.0 * here + above], axis=1) / h**2,
             ones,
             ones,
         ), np.asarray(valid.all(axis=0))

@@ -133,7 +133,7 @@ def fit_corners(
 
     `signs` (M,) as `Lattice.signs`; `blur` is the s expected. Windows end before the markers of a ChArUco board.
     """
-    sides = np.stack([shape.along_column, shape.along_row], axis=1)
+    sides = shape.sides
     geometry = Geometry(sides, shape.curvature(), shape.gaps(), ends_of(np.ones_like(cells), cells))
     width = _short_of_markers(board, sides, np.broadcast_to(np.asarray(blur, dtype=np.float64), (len(start),)))
     # What markers leave in the windows is no noise, but makes the corners uncertain all the same.

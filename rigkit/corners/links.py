@@ -33,9 +33,9 @@ CONTRAST_RATIO = 0.25
 LENGTH_RATIO = 2.1
 """Opposite neighbours differ less than this in distance, in any perspective a board can be read in."""
 
-ALONG = np.array([0.2, 0.35, 0.5, 0.65, 0.8])
+ALONG = np.array([0.5, 0.35, 0.65, 0.2, 0.8])
 MOST = 4
-"""An edge shows the right side dark at this many of the places `ALONG` it."""
+"""An edge shows the right side dark at this many of the places `ALONG` it, in the order in which clutter is told."""
 
 ASIDE, LEAST_ASIDE_PX, MOST_ASIDE_PX = 0.12, 1.0, 4.0
 """How far to the sides of an edge the brightness is read: a part of its length, within bounds."""
@@ -43,16 +43,24 @@ ASIDE, LEAST_ASIDE_PX, MOST_ASIDE_PX = 0.12, 1.0, 4.0
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Links:
-    """Mutual neighbours.
+    """Mutual neighbours of N corners.
 
     Attributes
     ----------
-    corner : (N, 4) index of the neighbour along each arm, -1 for none.
-    arm : (N, 4) the neighbour's arm that points back.
+    state : (N, 4) along each arm 4 * the neighbour + the arm of it that points back, -1 for none.
     """
 
-    corner: IntArray
-    arm: IntArray
+    state: IntArray
+
+    @property
+    def corner(self) -> IntArray:
+        """(N, 4) index of the neighbour, -1 for none."""
+        return self.state >> 2
+
+    @property
+    def arm(self) -> IntArray:
+        """(N, 4) the neighbour's arm that points back; 3 for none."""
+        return self.state & 3
 
 
 def edge_contrast(
@@ -74,13 +82,10 @@ def edge_contrast(
 def find_links(corners: Corners, level: Level) -> Links:
     """Return the mutual neighbours among `corners`; the brightness is read from `level` (the finest)."""
     count = len(corners)
-    nobody = Links(np.full((count, 4), -1), np.full((count, 4), -1))
     if count < 4:
-        return nobody
+        return Links(np.full((count, 4), -1))
     to = _compiled(corners, level)
-    if to is None:
-        to = _without_long(_mutual(corners, level), corners.pixels).reshape(-1, 4)
-    return Links(np.where(to >= 0, to // 4, -1), np.where(to >= 0, to % 4, -1))
+    return Links(_without_long(_mutual(corners, level), corners.pixels).reshape(-1, 4) if to is None else to)
 
 
 def _compiled(corners: Corners, level: Level) -> IntArray | None:
@@ -217,9 +222,9 @@ def _without_long(to: IntArray, pixels: FloatArray) -> IntArray:
 
 def quads(links: Links) -> BoolArray:
     """Return which links (N, 4) bound a closed square of four corners, on either side."""
-    count = len(links.corner)
-    there = links.corner >= 0
-    state = np.where(there, 4 * links.corner + links.arm, -1).ravel()
+    count = len(links.state)
+    there = links.state >= 0
+    state = links.state.ravel()
     turned = np.where(there, 4 * links.corner + (links.arm - 1) % 4, -1).ravel()
     start = np.arange(4 * count)
     walk = start

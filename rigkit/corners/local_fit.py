@@ -23,53 +23,67 @@ class LocalFit:
     Attributes
     ----------
     pixels : position at the cell itself.
-    along_column, along_row : first derivatives: the cell's sides.
-    bend_column, bend_row : second derivatives along the column direction and along the row direction.
+    sides : (M, 2, 2) first derivatives, along the column direction and along the row direction.
+    bends : (M, 2, 2) second derivatives likewise.
     support : (M,) number of corners behind the fit.
     gain : (M,) standard deviation of `pixels` for corners of standard deviation 1.
     """
 
     pixels: FloatArray
-    along_column: FloatArray
-    along_row: FloatArray
-    bend_column: FloatArray
-    bend_row: FloatArray
+    sides: FloatArray
+    bends: FloatArray
     support: FloatArray
     gain: FloatArray
+
+    @property
+    def along_column(self) -> FloatArray:
+        return self.sides[:, 0]
+
+    @property
+    def along_row(self) -> FloatArray:
+        return self.sides[:, 1]
+
+    @property
+    def bend_column(self) -> FloatArray:
+        return self.bends[:, 0]
+
+    @property
+    def bend_row(self) -> FloatArray:
+        return self.bends[:, 1]
 
     def curvature(self) -> FloatArray:
         """Return the curvature of the column and the row line at the cells, (M, 2) 1/px, positive towards +90 degrees.
 
         The direction of +90 degrees is that of growing angle from u to v.
         """
-        return np.stack(
-            [_curvature(self.along_column, self.bend_column), _curvature(self.along_row, self.bend_row)], axis=-1
-        )
+        (a, b), (c, d) = self.sides.T, self.bends.T
+        curvature: FloatArray = (a * d - b * c).T / np.maximum((self.sides**2).sum(axis=2), 1e-12) ** 1.5
+        return curvature
 
     def gaps(self) -> FloatArray:
         """Return how far the neighbouring column and row lines lie from those through the cells, (M, 2, 2) px.
 
         First index: the column line, the row line; second: before and after, in the direction of +90 degrees.
         """
-        a, b = self.along_column, self.along_row
-        area, row, column = _cross(a, b), 0.5 * _cross(a, self.bend_row), 0.5 * _cross(self.bend_column, b)
-        gaps = np.stack([area - row, area + row, area + column, area - column], axis=-1).reshape(-1, 2, 2)
+        (a, b), (c, d) = self.sides.transpose(1, 2, 0), self.bends.transpose(1, 2, 0)
+        area, row, column = _cross(a, b), 0.5 * _cross(a, d), 0.5 * _cross(c, b)
+        gaps = np.empty((2, 2, len(area)))
+        np.subtract(area, row, out=gaps[0, 0])
+        np.add(area, row, out=gaps[0, 1])
+        np.add(area, column, out=gaps[1, 0])
+        np.subtract(area, column, out=gaps[1, 1])
         np.abs(gaps, out=gaps)
         # A cell without sides has no neighbours: NaN.
         with np.errstate(invalid="ignore"):
-            gaps[:, 0] /= np.sqrt((a * a).sum(axis=1))[:, None]
-            gaps[:, 1] /= np.sqrt((b * b).sum(axis=1))[:, None]
-        return gaps
+            gaps[0] /= np.hypot(a[0], a[1])
+            gaps[1] /= np.hypot(b[0], b[1])
+        return gaps.transpose(2, 0, 1)
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    cross: FloatArray = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    """Return the cross products of vectors (2, M)."""
+    cross: FloatArray = a[0] * b[1] - a[1] * b[0]
     return cross
-
-
-def _curvature(first: FloatArray, second: FloatArray) -> FloatArray:
-    curvature: FloatArray = _cross(first, second) / np.maximum((first**2).sum(axis=1), 1e-12) ** 1.5
-    return curvature
 
 
 def fit_cells(
@@ -132,4 +146,5 @@ def fit_cells(
 
 def _local_fit(rows: FloatArray) -> LocalFit:
     """Return the fit from `rows` (M, 12): the fields of `LocalFit` one after the other."""
-    return LocalFit(rows[:, :2], rows[:, 2:4], rows[:, 4:6], rows[:, 6:8], rows[:, 8:10], rows[:, 10], rows[:, 11])
+    sides, bends = rows[:, 2:6].reshape(-1, 2, 2), rows[:, 6:10].reshape(-1, 2, 2)
+    return LocalFit(rows[:, :2], sides, bends, rows[:, 10], rows[:, 11])

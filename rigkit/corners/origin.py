@@ -27,8 +27,12 @@ def quarter_turns(lattice: Lattice, sizes: Sequence[tuple[int, int]] = ()) -> in
     if not any(fits):
         fits = [size[0] >= size[1] for size in turned]
     # The first corners of the four turns, and whether the edge that becomes +column has the sign of the old +column.
-    signs = lattice.signs()
-    rising = [signs[0, 0] > 0.0, signs[-1, 0] < 0.0, signs[-1, -1] > 0.0, signs[0, -1] < 0.0]
+    rising = [
+        lattice.sign_at(0, 0) > 0.0,
+        lattice.sign_at(rows - 1, 0) < 0.0,
+        lattice.sign_at(rows - 1, columns - 1) > 0.0,
+        lattice.sign_at(0, columns - 1) < 0.0,
+    ]
     dark = [fit and not bright for fit, bright in zip(fits, rising, strict=True)]
     allowed = dark if any(dark) else fits
     downwards = _downwards(lattice)
