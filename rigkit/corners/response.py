@@ -52,7 +52,7 @@ TYPICAL = 4e3
 EXTREME = 0.005
 """The span of brightness leaves out this part at either end: glints, dead pixels."""
 
-PIXELS_A_PEAK, MAX_PEAKS = 400, 4000
+PIXELS_A_PEAK, MAX_PEAKS = 480, 3200
 """Keep the strongest peaks of a level, one for so many of its pixels, or the second number if that is more: texture and
 noise have more, a board never."""
 
@@ -178,21 +178,23 @@ def _threshold(smooth: FloatImage) -> float:
     else:
         response = np.abs(_response(smooth)[::step, ::step]).ravel()
         brightness = smooth[1:-1:step, 1:-1:step].ravel()
-    middle = len(response) // 2
     few = int(EXTREME * len(brightness))
-    typical = float(np.partition(response, middle)[middle])
-    ordered = np.partition(brightness, [few, len(brightness) - 1 - few])
-    contrast = (max(float(ordered[-1 - few] - ordered[few]), LEAST_SPAN) / 200.0) ** 2
-    return float(np.clip(NOISE_FACTOR * typical, FLOOR * contrast, CEILING * contrast))
+    span = _ranked(brightness, len(brightness) - 1 - few) - _ranked(brightness, few)
+    contrast = (max(span, LEAST_SPAN) / 200.0) ** 2
+    return min(max(NOISE_FACTOR * _ranked(response, len(response) // 2), FLOOR * contrast), CEILING * contrast)
 
 
-def peaks(level: Level) -> tuple[IntArray, FloatImage]:
+def _ranked(values: FloatImage, at: int) -> float:
+    """Return what `at` of the `values` (N,) are smaller than or equal to; for two of them at once numpy is slow."""
+    return float(np.partition(values, at)[at])
+
+
+def peaks(level: Level) -> tuple[NDArray[np.signedinteger], FloatImage]:
     """Return the local maxima of the response above the threshold, (N, 2) as (u, v) of the level, row by row, and D."""
     most = max(MAX_PEAKS, level.smooth.size // PIXELS_A_PEAK)
     library = front.loaded()
     if library is not None:
-        at, height = front.peaks(library, level.smooth, level.threshold, most, AROUND, SHARES)
-        return np.asarray(at, np.int64), height
+        return front.peaks(library, level.smooth, level.threshold, most, AROUND, SHARES)
     response = _response(level.smooth)
     highest = cv2.dilate(response, np.ones((5, 5), np.uint8))
     mask = (response >= highest) & (response > level.threshold)

@@ -39,7 +39,7 @@ MAX_CENTRE = 0.16
 """Largest difference of the centre from the mean of the ring, relative to the contrast. Rings inside the four squares
 show less than 0.06; more where they reach beyond, which spoils the directions as well, and between dots or letters."""
 
-QUICK, QUICK_ODD, QUICK_CENTRE, QUICK_SHARP = 4, 0.5, 0.6, 1.3
+QUICK, QUICK_ODD, QUICK_CENTRE, QUICK_SHARP = 4, 0.5, 0.6, 1.12
 """Every so many samples tell most of what is no corner, at a quarter of the cost: the energy of the odd part relative
 to that of the even part, the centre off the mean relative to its deviation, the response relative to its variance. Of
 29157 rings that pass the other tests, in rendered and real images, two are lost; of those of noise and texture two in

@@ -17,9 +17,10 @@ __all__ = ["Corners", "Saddles", "find_corners", "saddle_step"]
 RADIUS = 2.6
 """Of the ring, in pixels of the level: fits squares of 6 px, and 5 where they are seen straight on."""
 
-MAX_SHARPNESS = 0.11
+MAX_SHARPNESS = 0.095
 """Largest response of a corner, relative to the square of its contrast on the ring. Edges without blur, smoothed as
-the level is, make 0.08, sharpened ones 0.09, whatever the angles and down to squares of 4 px; noise makes 0.12."""
+the level is, make 0.08, sharpened ones 0.09, whatever the angles and down to squares of 4 px; noise makes 0.12. Of the
+corners of boards in noise a few show more, which growth finds; of those that noise makes, a third."""
 
 KNOWN = 2.0
 """A corner this near to one of a finer level is the same, in pixels of its own level."""
@@ -30,10 +31,9 @@ MAX_STEP = 1.5
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Saddles:
-    """Saddle points in full-resolution pixels: (N, 2), and the scale (N,) of the level each was found on."""
+    """Saddle points in full-resolution pixels, (N, 2)."""
 
     pixels: FloatArray
-    scale: FloatArray
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -75,16 +75,14 @@ def saddle_step(smooth: FloatImage, at: IntArray) -> tuple[FloatArray, BoolArray
 def find_corners(levels: list[Level]) -> tuple[Corners, Saddles]:
     """Return the chessboard corners of all levels, each once (the finest level wins), and all saddles."""
     kept: list[Corners] = []
-    saddles: list[Saddles] = []
+    saddles: list[FloatArray] = []
     for level in levels:
         local, which, angles, contrast = _corners_of(level)
         full = level.to_full(local)
-        saddles.append(Saddles(full, np.full(len(full), level.scale)))
+        saddles.append(full)
         fresh = Corners(full[which], angles, contrast, np.full(len(which), level.scale))
         kept.append(_without_known(fresh, kept))
-    return _joined(kept), Saddles(
-        np.concatenate([s.pixels for s in saddles]), np.concatenate([s.scale for s in saddles])
-    )
+    return _joined(kept), Saddles(np.concatenate(saddles))
 
 
 def _corners_of(level: Level) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:

@@ -353,9 +353,8 @@ FOR_EACH_PROCESSOR int64_t find_corners(
             continue;
         near++;
         if (may_be_corner(image, rules, (float)pixel[0], (float)pixel[1], (float)radius, response[k]) &&
-            read_ring(image, *rules, (float)pixel[0], (float)pixel[1], (float)radius, angles + 2 * corners,
-                      contrast + corners) &&
-            response[k] <= most_sharp * contrast[corners] * contrast[corners])
+            read_ring(image, *rules, (float)pixel[0], (float)pixel[1], (float)radius, sqrt((double)response[k] / most_sharp),
+                      angles + 2 * corners, contrast + corners))
             which[corners++] = near - 1;
     }
     *found = corners;

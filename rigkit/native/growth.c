@@ -263,7 +263,7 @@ INLINE int fits(
     double radius = rules->ring_part * height / level->scale, angles[2];
     radius = radius > rules->min_ring ? radius : rules->min_ring;
     radius = radius < rules->max_ring ? radius : rules->max_ring;
-    if (!read_ring(level->image, *rules->ring, (float)u, (float)v, (float)radius, angles, contrast))
+    if (!read_ring(level->image, *rules->ring, (float)u, (float)v, (float)radius, 0.0, angles, contrast))
         return 0;
     if (!runs_along(angles[0], sign > 0.0 ? fit->along_column : fit->along_row, rules->line_sine) ||
         !runs_along(angles[1], sign > 0.0 ? fit->along_row : fit->along_column, rules->line_sine))

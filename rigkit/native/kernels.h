@@ -102,10 +102,11 @@ INLINE void ring_angles(
     angles[1] = angles[0] + quadrant;
 }
 
-/* Return whether the ring around (u, v) is that of a chessboard corner; if so, its two angles and its contrast
- * (corners.ring.read_rings). */
+/* Return whether the ring around (u, v) is that of a chessboard corner of at least a contrast; if so, its two angles and
+ * its contrast (corners.ring.read_rings). */
 INLINE int read_ring(
-    const image_t image, const ring_rules_t rules, float u, float v, float radius, double angles[2], double *contrast)
+    const image_t image, const ring_rules_t rules, float u, float v, float radius, double least, double angles[2],
+    double *contrast)
 {
     float ring[TURN], even[HALF], right[TURN], below[TURN];
     int32_t at[TURN];
@@ -144,7 +145,7 @@ INLINE int read_ring(
         odd_energy += odd * odd;
         energy += (even[k] - mean) * (even[k] - mean);
     }
-    if (!(odd_energy < (float)rules.most_odd * energy) || !(high > low))
+    if (!(odd_energy < (float)rules.most_odd * energy) || !(high > low) || !((double)high - (double)low >= least))
         return 0;
     if (!(fabsf(brightness_at(image, u, v) - mean) < (float)rules.most_centre * (high - low)))
         return 0;
