@@ -54,6 +54,9 @@ FAR = 4.0
 FILL = 0.8
 """Part of the picture that the box round the scene takes; the rest is for the numbers along its edges."""
 
+SIDE_PAD, ABOVE_PAD = 10.0, 24.0
+"""Points between the axis of depth and its name, seen from the side and from above: room for the numbers between."""
+
 CURVE_SAMPLES = 240
 JPEG_QUALITY = 85
 
@@ -166,8 +169,9 @@ def cloud_figure(reconstruction: Reconstruction, *, unit: str = "mm") -> Figure:
         axis.view_init(elev=elevation, azim=azimuth)
         _fit_equal(axis, reconstruction)
         axis.set_xlabel(f"x {unit}", fontsize=7)
-        axis.set_ylabel(f"z {unit}", fontsize=7)
-        if from_above := elevation > 45.0:
+        from_above = elevation > 45.0
+        axis.set_ylabel(f"z {unit}", fontsize=7, labelpad=ABOVE_PAD if from_above else SIDE_PAD)
+        if from_above:
             axis.set_zticks([])
         axis.set_zlabel("" if from_above else f"-y {unit}", fontsize=7)
         axis.tick_params(labelsize=6)

@@ -34,3 +34,22 @@ def test_the_cloud_s_axes_and_their_numbers_are_all_in_the_picture(baseline_mm: 
         assert drawn.x0 >= 0.0 and drawn.y0 >= 0.0 and drawn.x1 <= width and drawn.y1 <= height
         # And the scene fills it: no stamp in the middle.
         assert max(drawn.width / (0.5 * width), drawn.height / height) > 0.8
+
+
+@pytest.mark.parametrize("baseline_mm", [(300.0, 0.0, 0.0), (0.0, 0.0, -150.0), (250.0, 40.0, 90.0)])
+def test_no_axis_name_lies_over_a_number(baseline_mm: tuple[float, float, float]) -> None:
+    figure = cloud_figure(make_reconstruction(cam2_from_cam1=Rigid3(np.eye(3), np.array(baseline_mm))))
+    figure.canvas.draw()
+    checked = 0
+    for axes in figure.axes:
+        three = (axes.xaxis, axes.yaxis, axes.zaxis)
+        numbers = [
+            tick.label1.get_window_extent()
+            for axis in three
+            for tick in axis.get_major_ticks()
+            if axis.get_view_interval()[0] <= tick.get_loc() <= axis.get_view_interval()[1]
+        ]
+        for name in (axis.label for axis in three if axis.label.get_text()):
+            assert not any(name.get_window_extent().overlaps(number) for number in numbers), name.get_text()
+            checked += len(numbers)
+    assert checked > 40
