@@ -225,6 +225,8 @@ def _search(matches: Matches, kind: PoseType, rng: np.random.Generator) -> Robus
         if best is None or quality > best[0]:
             best = quality, found
     if best is None:
+        # Of a camera that did not move at all every sample fails: the reason is worth more than that.
+        check_baseline(matches)
         raise failure or DegenerateError("no pose found")
     return best[1]
 

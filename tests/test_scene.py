@@ -116,6 +116,13 @@ def test_what_cannot_be_reconstructed_is_said(rng):
         reconstruct_scene(same, REGULAR, REGULAR, pair_id="room")
 
 
+def test_a_camera_that_did_not_move_is_named(rng):
+    found, *_ = contaminated(rng, outliers=0.0)
+    still = replace(found, pixels2=found.pixels1, A21=np.tile(np.eye(2), (len(found), 1, 1)))
+    with pytest.raises(DegenerateError, match="no baseline"):
+        reconstruct_scene(still, REGULAR, REGULAR)
+
+
 @pytest.mark.parametrize("kind", ["general", "planar", "standard"])
 def test_chance_agreement_of_wrong_matches_is_refused(rng, kind):
     found, *_ = contaminated(rng, kind, outliers=1.0, count=60)

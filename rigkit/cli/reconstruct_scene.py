@@ -58,6 +58,11 @@ def run_scene(args: argparse.Namespace) -> int:
     images = None
     if args.images:
         images = (read_for(camera1, args.images[0], "image A"), read_for(camera2, args.images[1], "image B"))
+        if np.array_equal(*images):
+            raise InputError(
+                f"images A '{args.images[0]}' and B '{args.images[1]}' are the same picture to the last pixel: no "
+                "baseline; give two images taken from different places"
+            )
     found = _correspondences(args, images)
     level = None if args.level_sigma_deg is None else float(np.deg2rad(args.level_sigma_deg))
     scene = reconstruct_scene(

@@ -95,7 +95,8 @@ def test_bad_input_is_one_line(files: tuple[Path, Rigid3], capsys: pytest.Captur
     found, camera = str(folder / "found.csv"), str(folder / "camera.json")
     (folder / "flat.png").write_bytes(cv2.imencode(".png", np.full((240, 320), 90, np.uint8))[1].tobytes())
     (folder / "small.png").write_bytes(cv2.imencode(".png", np.full((80, 80), 90, np.uint8))[1].tobytes())
-    flat, small = str(folder / "flat.png"), str(folder / "small.png")
+    (folder / "dark.png").write_bytes(cv2.imencode(".png", np.full((240, 320), 30, np.uint8))[1].tobytes())
+    flat, dark, small = (str(folder / f"{name}.png") for name in ("flat", "dark", "small"))
     save_camera(folder / "little.json", SMALL)
     little = str(folder / "little.json")
     (folder / "few.csv").write_text("\n".join(Path(found).read_text().splitlines()[:5]))
@@ -109,7 +110,8 @@ def test_bad_input_is_one_line(files: tuple[Path, Rigid3], capsys: pytest.Captur
         (["reconstruct", "--correspondences", found, "--camera", camera, "--baseline-mm", "0"], 2, "baseline"),
         (["reconstruct", "--images", "gone.png", flat, "--camera", camera], 2, "gone.png"),
         (["reconstruct", "--images", small, small, "--camera", camera], 2, "80x80"),
-        (["reconstruct", "--images", flat, flat, "--camera", little], 3, "textured scene"),
+        (["reconstruct", "--images", flat, dark, "--camera", little], 3, "textured scene"),
+        (["reconstruct", "--images", flat, flat, "--camera", little], 2, "the same picture"),
     )
     for arguments, code, words in cases:
         assert main([*arguments, "-o", str(folder / "out")]) == code, arguments
