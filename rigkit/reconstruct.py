@@ -254,7 +254,11 @@ class _Known:
 def _known_by_points(pair: MatchedPair, pose_type: PoseType, level_sigma_rad: float | None) -> _Known:
     """Remembered, as in `decide_pose_type`: the answer is the same for every affine estimator."""
     m = pair.matches
-    E21 = fundamental_for(PoseType.GENERAL).solve(m).E21
+    try:
+        E21 = fundamental_for(PoseType.GENERAL).solve(m).E21
+    except DegenerateError:
+        # One board leaves it open; the pose by which the boards were told apart knows the board's shape.
+        E21 = essential_from_pose(pair.identity.cam2_from_cam1)
     pose_type, level_sigma_rad, remarks = decide_pose_type(pair.captured, pose_type, level_sigma_rad)
     told, failure = _end(pair, lambda: pair.identity.cam2_from_cam1, pose_type, level_sigma_rad)
     linear, other = _end(pair, lambda: choose_pose(E21, m.rays1, m.rays2), pose_type, level_sigma_rad)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from rigkit.arrays import Mat3
 from rigkit.fundamental.eight_point import NormalisedRows, essential_nearest, linear_epipolar
 from rigkit.fundamental.estimate import EpipolarEstimate, check_baseline, check_count, finish, reweighted
+from rigkit.fundamental.one_plane import refuse_one_plane
 from rigkit.fundamental.weights import RowWeights, WeightRule
 from rigkit.matches import Matches
 
@@ -20,7 +21,10 @@ class GeneralSolver:
     degrees_of_freedom: int = 7
 
     def solve(self, matches: Matches, weights: WeightRule | RowWeights | None = None) -> EpipolarEstimate:
-        """Return F21 (rank two) and the nearest E21; see FundamentalSolver."""
+        """Return F21 (rank two) and the nearest E21; see FundamentalSolver.
+
+        Raises DegenerateError where one plane explains the matches to within their noise.
+        """
         check_baseline(matches)
         rows = NormalisedRows(matches)
 
@@ -29,4 +33,5 @@ class GeneralSolver:
             return linear_epipolar(rows, row_weights)
 
         matrix, used = reweighted(matches, weights, linear)
+        refuse_one_plane(matches, used)
         return finish(matches, essential_nearest(matrix), matrix, used)

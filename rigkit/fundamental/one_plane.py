@@ -12,14 +12,23 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray, Mat3, Rays
+from rigkit.errors import DegenerateError
 from rigkit.fundamental.estimate import check_baseline, transfer_error
 from rigkit.fundamental.pose import parallax_noise
 from rigkit.fundamental.rows import right_singular
+from rigkit.fundamental.weights import RowWeights
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import cross, nearest_rotation, rotation_angle, skew, unit
 from rigkit.matches import Matches
 
-__all__ = ["compare_poses", "decompose_homography", "homography_of_rays", "one_plane_poses", "twin_poses"]
+__all__ = [
+    "compare_poses",
+    "decompose_homography",
+    "homography_of_rays",
+    "one_plane_poses",
+    "refuse_one_plane",
+    "twin_poses",
+]
 
 SAME_POSE = 5e-3
 """Two poses nearer than this (rad, and share of the baseline) mislead nobody."""
@@ -27,6 +36,9 @@ ONE_PLANE_SIGMAS = 3.0
 """Points whose homography transfers them within so many sigmas (rms) may lie on one plane."""
 AT_REST_SIGMAS = 3.3
 """A parallax, or one off a plane's, is noise below: one good point in a thousand has more."""
+PLANE_EXPLAINS_SIGMAS = 4.0
+"""A plane whose chi square is no more than this many standard deviations too large explains the matches."""
+HOMOGRAPHY_FREEDOM = 8
 NEARLY_ALL = 0.9
 """Of matches that fit some fit by chance, and of points some are seen on the wrong side of the horizon of a plane."""
 PLANE_ROUNDS = 5
@@ -64,6 +76,46 @@ def decompose_homography(H21: Mat3) -> tuple[tuple[Rigid3, FloatArray], ...]:
         t = (H21 - R) @ normal
         out += [(Rigid3(R, t), normal), (Rigid3(R, -t), -normal)]
     return tuple(out)
+
+
+def refuse_one_plane(matches: Matches, weights: RowWeights) -> None:
+    """Raise DegenerateError if one plane explains what `weights` let count, points and affinities, to within the noise.
+
+    Affinities of other planes through the same points determine what the points leave open; where they count without a
+    sigma nothing is refused.
+
+    Notes
+    -----
+    On a plane F = [t]_x H fits for every t: a linear solver returns one that the noise has chosen.
+    """
+    counted, also = weights.points > 0.0, weights.affinities > 0.0
+    freedom = 2 * int(counted.sum()) + 4 * int(also.sum()) - HOMOGRAPHY_FREEDOM
+    if counted.sum() < 4 or freedom <= 0 or not np.isfinite(weights.sigma_A[also]).all():
+        return
+    points = matches.select(counted)
+    H21 = homography_of_rays(points)
+    A = _affinities_of(points, H21)
+    sigma1, sigma2 = points.sigma1_px[:, None, None], points.sigma2_px[:, None, None]
+    covariance = sigma2**2 * np.eye(2) + sigma1**2 * (A @ np.swapaxes(A, -1, -2))
+    off = transfer_error(points, H21)
+    chi2 = float(np.sum(off * np.linalg.solve(covariance, off[..., None])[..., 0]))
+    if matches.A21 is not None:
+        by_affinity = matches.A21[also] - _affinities_of(matches.select(also), H21)
+        chi2 += float(np.sum((by_affinity / weights.sigma_A[also, None, None]) ** 2))
+    if chi2 < freedom + PLANE_EXPLAINS_SIGMAS * np.sqrt(2.0 * freedom):
+        raise DegenerateError(
+            f"the {int(counted.sum())} matches lie on one plane to within their noise, which leaves a general epipolar "
+            "geometry open; add points off that plane or declare the pose type"
+        )
+
+
+def _affinities_of(matches: Matches, H21: Mat3) -> FloatArray:
+    """Return the affinities (N, 2, 2) that the homography has at the matches."""
+    mapped = matches.rays1 @ H21.T
+    u, B = unit(mapped), np.swapaxes(matches.jacobians2, -1, -2)
+    moved = H21 @ matches.jacobians1 / np.linalg.norm(mapped, axis=1)[:, None, None]
+    across = moved - u[:, :, None] * (u[:, None, :] @ moved)
+    return np.asarray(np.linalg.solve(B @ matches.jacobians2, B @ across))
 
 
 def one_plane_poses(matches: Matches) -> tuple[Rigid3, ...]:

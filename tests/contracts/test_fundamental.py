@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.epipolar_scenes import FISHEYE, REGULAR, pair, pose_errors_deg
+from helpers.epipolar_scenes import FISHEYE, REGULAR, pair, plane_in_sight, pose_errors_deg
 from tolerances import EXACT_REL
 
 from rigkit.errors import DegenerateError, InputError
@@ -129,6 +129,36 @@ def test_pure_rotation_is_refused(rng, kind, noise_px):
     turned = Matches.from_cameras(REGULAR, REGULAR, matches.pixels1, target, sigma1_px=sigma, sigma2_px=sigma)
     with pytest.raises(DegenerateError, match=r"no baseline|do not determine|not determined"):
         fundamental_for(kind).solve(turned)
+
+
+@pytest.mark.parametrize("noise_px", [0.05, 1.0])
+def test_a_plane_leaves_a_general_geometry_open(rng, noise_px):
+    for _ in range(20):
+        matches, _ = plane_in_sight(rng, noise_px)
+        with pytest.raises(DegenerateError, match="one plane"):
+            fundamental_for("general").solve(matches)
+
+
+@pytest.mark.parametrize("weights", [None, "auto", "equal"])
+def test_affinities_of_other_planes_close_it(rng, weights):
+    """Points of one plane, each on a small facet of its own."""
+    matches, pose = plane_in_sight(rng, 0.05)
+    X = matches.rays1 * rng.uniform(900.0, 1500.0, (len(matches), 1))
+    tangents = np.linalg.svd(unit(-X + 0.5 * rng.normal(size=X.shape))[:, None, :])[2][:, 1:].swapaxes(1, 2)
+    depth1, depth2 = _depths(matches, pose)
+    J1, J2 = (
+        REGULAR.project_with_jacobians(rays * depth[:, None])[2]
+        for rays, depth in ((matches.rays1, depth1), (matches.rays2, depth2))
+    )
+    A21 = (J2 @ pose.rotation @ tangents) @ np.linalg.inv(J1 @ tangents)
+    found = fundamental_for("general").solve(matches.with_affinities(A21, np.full(len(matches), 1e-3)), weights)
+    assert same_up_to_sign(found.E21, essential_from_pose(pose)) < 0.05
+
+
+def _depths(matches, pose):
+    """Distances along the rays (N,) of both cameras where they meet, in mm."""
+    columns = np.stack([matches.rays1 @ pose.rotation.T, -matches.rays2], axis=-1)
+    return (np.linalg.pinv(columns) @ -pose.translation_mm).T
 
 
 @pytest.mark.parametrize(("kind", "count"), [("general", 7), ("planar", 2), ("translation", 1)])

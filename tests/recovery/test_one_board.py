@@ -18,6 +18,8 @@ SCENES = 8
 SIGMA_PX = 0.1
 FAR_DEG = 3.0
 """The other pose is up to 50 deg off, the right one in 240 scenes by at most 0.7 deg at this noise."""
+EXACT_MM = 1e-3
+"""Of a baseline of exact corners: rounding, and where the iterations stop."""
 MOST_SIGMAS = 4.0
 """Of the baselines of 40 scenes; the other pose misses them by 100 and more."""
 
@@ -32,3 +34,13 @@ def test_the_shape_of_the_board_tells_which_pose(rng: np.random.Generator, camer
         off = r.cam2_from_cam1.rotation @ scene.cam2_from_cam1.rotation.T
         assert np.rad2deg(rotation_angle(off)) < FAR_DEG
         assert abs(r.baseline_mm - scene.baseline_mm) < MOST_SIGMAS * r.baseline_sigma_mm
+
+
+def test_a_board_without_any_noise_is_no_exception(rng: np.random.Generator) -> None:
+    """Then the linear solution, which a plane leaves open, says so."""
+    camera = regular_camera()
+    for k in range(3):
+        scene = trihedral_pair(BOARDS, camera, PoseType.GENERAL, rng, distance=(0.9, 1.3), walls=False)
+        found = [[detection(BOARDS[k], view[k].pixels, rng, 0.0)] for view in scene.detections()]
+        r = reconstruct_pair(match_pair("one", camera, camera, *found, [BOARDS[k]]), pose_type=PoseType.GENERAL)
+        assert abs(r.baseline_mm - scene.baseline_mm) < EXACT_MM
