@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.errors import InputError
+from rigkit.io.tiff import as_stored, page_count
 
 __all__ = ["Image", "read_image", "to_grey"]
 
@@ -37,13 +38,13 @@ BMP_START = b"BM"
 def read_image(path: str | Path) -> Image:
     """Return the image as uint8 or uint16, (H, W) or (H, W, 3) in red, green, blue order.
 
-    Pixels come as the sensor wrote them: an orientation in the file's EXIF data is not applied, because a calibration
+    Pixels come as the sensor wrote them: an orientation in the file (EXIF, TIFF) is not applied, because a calibration
     belongs to the sensor. An alpha channel is dropped.
 
     Raises
     ------
     InputError
-        No such file, not an image, cut off or damaged, or a pixel type other than 8 or 16 bit.
+        No such file, not an image, several in one file, cut off or damaged, or a pixel type other than 8 or 16 bit.
     """
     source = Path(path)
     if source.is_dir():
@@ -57,9 +58,11 @@ def read_image(path: str | Path) -> Image:
     fault = _fault(data)
     if fault:
         raise InputError(f"image '{source}' is {fault}; copy it again from the camera")
+    if (pages := page_count(data)) > 1:
+        raise InputError(f"image '{source}' holds {pages} pages; save each as a file of its own")
     try:
         with _quiet_opencv():
-            raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+            raw = cv2.imdecode(np.frombuffer(as_stored(data), np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise InputError(f"image '{source}' cannot be decoded ({error.err}); convert it to PNG or JPEG") from error
     if raw is None:

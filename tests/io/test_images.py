@@ -6,6 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import PIL.Image
 import pytest
 
 from rigkit.errors import InputError
@@ -124,3 +125,51 @@ def test_what_is_no_image(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "real.tif"), np.zeros((4, 4), np.float32))
     with pytest.raises(InputError, match="float32"):
         read_image(tmp_path / "real.tif")
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize(("big", "deep"), [(False, False), (True, False), (False, True)])
+def test_an_orientation_is_not_applied(
+    tmp_path: Path, colour: np.ndarray, orientation: int, big: bool, deep: bool
+) -> None:
+    """A calibration belongs to the sensor, however the camera was held."""
+    pixels = colour[..., 0].astype(np.uint16) * 257 if deep else colour
+    for name, options in (("a.tif", {"big_tiff": big}), ("a.png", {}), ("a.jpg", {"quality": 100, "subsampling": 0})):
+        if deep and name == "a.jpg":
+            continue
+        exif = PIL.Image.Exif()
+        exif[0x0112] = orientation
+        PIL.Image.fromarray(pixels).save(tmp_path / name, exif=exif, **options)
+        found = read_image(tmp_path / name)
+        # What a JPEG loses of noise at full quality.
+        np.testing.assert_allclose(found, pixels, atol=8 if name == "a.jpg" else 0)
+
+
+def test_several_pages_are_refused_previews_are_not(tmp_path: Path, colour: np.ndarray) -> None:
+    first, *others = (PIL.Image.fromarray(np.roll(colour, k, axis=0)) for k in range(3))
+    first.save(tmp_path / "stack.tif", save_all=True, append_images=others)
+    with pytest.raises(InputError, match=r"stack.tif' holds 3 pages"):
+        read_image(tmp_path / "stack.tif")
+    first.save(tmp_path / "preview.tif", save_all=True, append_images=[first.resize((20, 15))])
+    np.testing.assert_array_equal(read_image(tmp_path / "preview.tif"), colour)
+
+
+def test_damaged_directories_of_a_tiff_end_in_words(
+    tmp_path: Path, colour: np.ndarray, rng: np.random.Generator
+) -> None:
+    data = save(tmp_path / "a.tif", colour)
+    start = int.from_bytes(data[4:8], "little")
+    for _ in range(200):
+        spoilt = bytearray(data)
+        for at in rng.integers(start, len(data), 3):
+            spoilt[at] = rng.integers(256)
+        (tmp_path / "b.tif").write_bytes(spoilt)
+        try:
+            read_image(tmp_path / "b.tif")
+        except InputError as error:
+            assert "b.tif" in str(error)
+    # A directory that is its own successor.
+    entries = int.from_bytes(data[start : start + 2], "little")
+    end = start + 2 + 12 * entries
+    (tmp_path / "b.tif").write_bytes(data[:end] + start.to_bytes(4, "little") + data[end + 4 :])
+    np.testing.assert_array_equal(read_image(tmp_path / "b.tif"), colour)

@@ -1,0 +1,88 @@
+"""TIFF files as far as decoders go astray: an orientation that they apply unasked, pages that they leave out unsaid.
+
+TIFF 6.0 and BigTIFF: a header of 8 (16) bytes, then a chain of directories, each a list of entries (tag, type, count,
+value).
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+__all__ = ["as_stored", "page_count"]
+
+NEW_SUBFILE_TYPE, WIDTH, HEIGHT, ORIENTATION = 254, 256, 257, 274
+REDUCED_OR_MASK = 1 | 4
+"""Bits of NewSubfileType: a smaller copy of another page, or its transparency."""
+AS_STORED = 1
+VALUE_BYTES = {1: 1, 3: 2, 4: 4, 16: 8}
+"""Sizes of the integer types."""
+
+
+class _Entry(NamedTuple):
+    """The value of an integer entry, and where it stands in the file."""
+
+    value: int
+    at: int
+    size: int
+
+
+def as_stored(data: bytes) -> bytes:
+    """Return the TIFF with its pixels declared to be upright as they are stored; other data come back as they are.
+
+    OpenCV turns and mirrors TIFF images by their orientation, whatever it is asked for.
+    """
+    order = _byte_order(data)
+    if order is None:
+        return data
+    for page in _pages(data, order):
+        entry = page.get(ORIENTATION)
+        if entry is not None and entry.value != AS_STORED:
+            data = data[: entry.at] + AS_STORED.to_bytes(entry.size, order) + data[entry.at + entry.size :]
+    return data
+
+
+def page_count(data: bytes) -> int:
+    """Return how many images as large as the first one a TIFF holds, without previews and masks; 1 for other data."""
+    order = _byte_order(data)
+    if order is None:
+        return 1
+    pages = [p for p in _pages(data, order) if not _value(p, NEW_SUBFILE_TYPE) & REDUCED_OR_MASK]
+    sizes = [(_value(p, WIDTH), _value(p, HEIGHT)) for p in pages]
+    return sum(size == sizes[0] for size in sizes) or 1
+
+
+def _value(page: dict[int, _Entry], tag: int) -> int:
+    return page[tag].value if tag in page else 0
+
+
+def _byte_order(data: bytes) -> Literal["little", "big"] | None:
+    if data[:4] in (b"II*\0", b"II+\0"):
+        return "little"
+    return "big" if data[:4] in (b"MM\0*", b"MM\0+") else None
+
+
+def _pages(data: bytes, order: Literal["little", "big"]) -> list[dict[int, _Entry]]:
+    """Return the integer entries of every directory by tag, as far as the file is whole."""
+
+    def number(at: int, size: int) -> int:
+        return int.from_bytes(data[at : at + size], order)
+
+    big = number(2, 2) == 43
+    word, count_bytes, entry_bytes = (8, 8, 20) if big else (4, 2, 12)
+    at = number(8 if big else 4, word)
+    pages: list[dict[int, _Entry]] = []
+    visited: set[int] = set()
+    while at and at + count_bytes <= len(data) and at not in visited:
+        visited.add(at)
+        first = at + count_bytes
+        end = first + entry_bytes * number(at, count_bytes)
+        if end > len(data):
+            break
+        page = {}
+        for entry in range(first, end, entry_bytes):
+            size = VALUE_BYTES.get(number(entry + 2, 2))
+            if size is not None and number(entry + 4, word) == 1:
+                page[number(entry, 2)] = _Entry(number(entry + 4 + word, size), entry + 4 + word, size)
+        pages.append(page)
+        at = number(end, word)
+    return pages
