@@ -144,7 +144,7 @@ def _export_cloud(args: argparse.Namespace) -> int:
     reconstruction = reconstruct_with(matched, pair, args.method, image1)
     files: dict[str, str | bytes] = {}
     if kind == "colmap":
-        model, notes = colmap_model(reconstruction, (pair.image1.name, pair.image2.name))
+        model, notes = colmap_model(reconstruction, (pair.image1, pair.image2))
         files |= model
         for words in notes:
             note(words)

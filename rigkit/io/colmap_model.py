@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+
 import numpy as np
 
 from rigkit.arrays import FloatArray, Mat3, Pixels
@@ -13,13 +16,14 @@ from rigkit.reconstruct import Reconstruction
 __all__ = ["colmap_model"]
 
 
-def colmap_model(reconstruction: Reconstruction, names: tuple[str, str]) -> tuple[dict[str, str], tuple[str, ...]]:
+def colmap_model(reconstruction: Reconstruction, images: tuple[Path, Path]) -> tuple[dict[str, str], tuple[str, ...]]:
     """Return the files by name, and what was lost on the way in words.
 
     Parameters
     ----------
     reconstruction : of one pair; the world is camera 1, lengths are mm.
-    names : file names of the two images.
+    images : files of the two images. The model names them by their paths within the folder that both are in, which is
+        COLMAP's image folder.
 
     Notes
     -----
@@ -29,13 +33,14 @@ def colmap_model(reconstruction: Reconstruction, names: tuple[str, str]) -> tupl
     one = reconstruction.camera1 is reconstruction.camera2
     cameras = {1: reconstruction.camera1} if one else {1: reconstruction.camera1, 2: reconstruction.camera2}
     text, written = write_colmap_cameras(cameras)
-    notes = tuple(w.note for w in written.values() if w.note)
+    names, renamed = _names(images)
+    notes = (*(w.note for w in written.values() if w.note), *renamed)
     views = ((Rigid3.identity(), reconstruction.pixels1, 1), (reconstruction.cam2_from_cam1, reconstruction.pixels2, 2))
-    images = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then X Y POINT3D_ID of every corner"]
+    lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then X Y POINT3D_ID of every corner"]
     for (pose, pixels, number), name in zip(views, names, strict=True):
         numbers = [*_quaternion(pose.rotation), *pose.translation_mm]
         head = " ".join(f"{v:.17g}" for v in numbers)
-        images += [f"{number} {head} {1 if one else number} {name}", _observations(pixels)]
+        lines += [f"{number} {head} {1 if one else number} {name}", _observations(pixels)]
     cloud = reconstruction.cloud
     points = ["# POINT3D_ID X Y Z R G B ERROR TRACK as (IMAGE_ID POINT2D_IDX)"]
     for n, (x, colour) in enumerate(zip(cloud.points_mm, cloud.colours, strict=True)):
@@ -43,10 +48,22 @@ def colmap_model(reconstruction: Reconstruction, names: tuple[str, str]) -> tupl
         points.append(f"{n + 1} {place} {' '.join(map(str, colour))} {reconstruction.sampson_rms_px:.6g} 1 {n} 2 {n}")
     files = {
         "cameras.txt": text,
-        "images.txt": "\n".join(images) + "\n",
+        "images.txt": "\n".join(lines) + "\n",
         "points3D.txt": "\n".join(points) + "\n",
     }
     return files, notes
+
+
+def _names(images: tuple[Path, Path]) -> tuple[list[str], tuple[str, ...]]:
+    """Return what COLMAP may call the images, different names without blanks, and what a user has to do for it."""
+    whole = [Path(os.path.abspath(path)) for path in images]
+    folder = os.path.commonpath([path.parent for path in whole])
+    names = [path.relative_to(folder).as_posix() for path in whole]
+    blank = [name for name in names if name.split() != [name]]
+    if not blank:
+        return names, ()
+    words = f"COLMAP ends a name at its first blank: '{blank[0]}' is written with '_' instead; rename the file to match"
+    return ["_".join(name.split(" ")) for name in names], (words,)
 
 
 def _observations(pixels: Pixels) -> str:

@@ -16,7 +16,15 @@ from typing import Any
 from rigkit.errors import InputError
 from rigkit.io.text import read_text
 
-__all__ = ["TomlTable", "read_toml"]
+__all__ = ["TomlTable", "named_path", "read_toml"]
+
+
+def named_path(path: Path) -> Path:
+    """Return the absolute path of a file under its own name: that of a link, not of what it leads to.
+
+    Frames, views and reports go by names of images; a store of data (git-annex, DVC) links them to checksums.
+    """
+    return path.parent.resolve() / path.name
 
 
 class TomlTable:
@@ -98,7 +106,7 @@ class TomlTable:
 
     def path_to(self, key: str, *, hint: str) -> Path:
         """Return a required path, taken from the folder of the file."""
-        return (self.path.parent / self.text(key, hint=hint)).resolve()
+        return named_path(self.path.parent / self.text(key, hint=hint))
 
     def table(self, key: str, *, hint: str) -> TomlTable:
         """Return a required table."""

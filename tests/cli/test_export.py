@@ -48,6 +48,32 @@ def test_a_cloud_as_colmap_model_and_npz(tmp_path: Path, capsys: pytest.CaptureF
     assert main(["export", *source, "-o", str(tmp_path / "cloud.npz")]) == 2
 
 
+@pytest.mark.parametrize(
+    ("files", "names"),
+    [
+        (("left/0001.jpg", "right/0001.jpg"), ("left/0001.jpg", "right/0001.jpg")),
+        (("my rig/a 1.jpg", "my rig/a 2.jpg"), ("a_1.jpg", "a_2.jpg")),
+        (("my rig/left/ä.jpg", "my rig/right one/ä.jpg"), ("left/ä.jpg", "right_one/ä.jpg")),
+    ],
+)
+def test_a_colmap_model_names_its_two_images_differently(
+    files: tuple[str, str], names: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import pycolmap
+
+    text = (LAB / "dataset.toml").read_text(encoding="utf-8").replace("../../calib", str(REPOSITORY / "calib"))
+    for file, old in zip(files, ("view1.jpg", "view2.jpg"), strict=True):
+        target = tmp_path / file
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.symlink_to(LAB / "images" / "regular-general" / old)
+        text = text.replace(f"images/regular-general/{old}", file)
+    (tmp_path / "dataset.toml").write_text(text, encoding="utf-8")
+    assert main(["export", str(tmp_path), "-p", "regular-general", "-o", str(tmp_path / "m"), "--to", "colmap"]) == 0
+    model = pycolmap.Reconstruction(str(tmp_path / "m"))
+    assert tuple(model.images[k].name for k in sorted(model.images)) == names
+    assert ("rename the file" in capsys.readouterr().err) == (" " in "".join(files).replace("my rig/", ""))
+
+
 def test_what_is_missing_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export", str(LAB), "-o", str(tmp_path / "x.ply")]) == 2
     assert "--pair" in capsys.readouterr().err
