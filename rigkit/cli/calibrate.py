@@ -182,6 +182,10 @@ def session_corners(session: Session, progress: Progress) -> dict[str, FoundCorn
         if not found:
             whose = "" if session.camera is None else f" of camera '{session.camera}'"
             raise InputError(f"{session.path}: no image matches 'images'{whose}, and no corners are kept beside it")
+        note(
+            f"{session.path}: no image matches 'images'; the corners of {len(found)} images kept in "
+            f"{session.corners_path.name} are used"
+        )
     hashes = {name: image_hash(path) for path, name in zip(session.images, _image_names(session), strict=True)}
     paths = dict(zip(hashes, session.images, strict=True))
     for name, digest in hashes.items():
@@ -209,6 +213,8 @@ def session_corners(session: Session, progress: Progress) -> dict[str, FoundCorn
     if camera is not None:
         look(usable, camera)
     found = {name: found[name] for name in paths or found}
+    if paths:
+        cache.keep(paths)
     try:
         cache.save()
     except InputError as error:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -79,6 +79,12 @@ class CornerCache:
         entry = {"sha256": digest, "size_px": list(found.size_px), "through_camera": found.through_camera}
         self._entries[name] = entry | {"boards": boards}
         self._changed = True
+
+    def keep(self, names: Collection[str]) -> None:
+        """Forget all images but these: what a person removed from a session must not come back with the cache."""
+        kept = {name: entry for name, entry in self._entries.items() if name in names}
+        self._changed |= len(kept) < len(self._entries)
+        self._entries = kept
 
     def save(self) -> None:
         """Write the file if anything is new."""

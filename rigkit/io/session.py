@@ -23,7 +23,7 @@ from rigkit.calibration.shape import SHAPES
 from rigkit.cameras.registry import MODELS, check_order
 from rigkit.errors import InputError
 from rigkit.io.board_file import load_board
-from rigkit.io.toml_reader import TomlTable, read_toml
+from rigkit.io.toml_reader import TomlTable, named_path, read_toml
 
 __all__ = ["SCHEMA", "Session", "boards_of", "images_of", "load_session", "options_of"]
 
@@ -100,7 +100,7 @@ def images_of(table: TomlTable) -> tuple[Path, ...]:
         patterns: tuple[str, ...] = (table.text("images", hint=hint),)
     except InputError:
         patterns = table.texts("images", hint=hint)
-    found: dict[Path, None] = {}
+    found: dict[Path, Path] = {}
     absent = []
     for pattern in patterns:
         # Only what the person wrote is a pattern, and no file's own name: both may have brackets in them.
@@ -108,12 +108,14 @@ def images_of(table: TomlTable) -> tuple[Path, ...]:
         matches = [root / m for m in sorted(glob.glob(pattern, root_dir=root))]
         if not matches and (root / pattern).is_file():
             matches = [root / pattern]
-        found |= {m.resolve(): None for m in matches if m.is_file()}
+        for match in filter(Path.is_file, matches):
+            # The same file twice is one image, under the name by which it was found first.
+            found.setdefault(match.resolve(), named_path(match))
         absent += [pattern] if not matches else []
     # No image at all is well where corners are kept; one of several is a mistake.
     if found and absent:
         raise table.error(f"'images': nothing matches '{absent[0]}'; correct or remove it")
-    return tuple(found)
+    return tuple(found.values())
 
 
 def boards_of(table: TomlTable) -> tuple[Board, ...]:

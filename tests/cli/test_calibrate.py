@@ -64,7 +64,9 @@ def test_from_images_to_file_and_again_without_images(session: Path, capsys: pyt
         path.unlink()
     assert main(["calibrate", str(session), "--force", "-r", str(session.parent / "page.html")]) == 0
     assert "gone; the corners kept" in (session.parent / "page.html").read_text()
-    assert "held-out RMS" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "held-out RMS" in said.out
+    assert "no image matches 'images'; the corners of 5 images kept in corners.json are used" in said.err
     again = load_calibration(session.parent / "calibration.json")
     assert np.array_equal(again.camera.parameters, result.camera.parameters)
 
@@ -77,6 +79,30 @@ def test_a_changed_image_is_looked_at_again(session: Path) -> None:
     after = load_calibration(session.parent / "calibration.json")
     assert not np.array_equal(before.views[1].pixels, after.views[1].pixels)
     assert np.array_equal(after.views[0].pixels, after.views[1].pixels)
+
+
+def test_removed_images_do_not_come_back_with_the_kept_corners(session: Path) -> None:
+    assert main(["calibrate", str(session)]) == 0
+    (session.parent / "03.jpg").unlink()
+    assert main(["calibrate", str(session), "--force"]) == 0
+    for path in session.parent.glob("*.jpg"):
+        path.unlink()
+    assert main(["calibrate", str(session), "--force"]) == 0
+    views = load_calibration(session.parent / "calibration.json").views
+    assert [v.image for v in views] == ["00.jpg", "01.jpg", "02.jpg", "04.jpg"]
+
+
+def test_linked_images_go_by_their_own_names(session: Path) -> None:
+    """As stores of data lay them out: links to files that are named by their checksums."""
+    store = session.parent / "store"
+    store.mkdir()
+    for k, path in enumerate(sorted(session.parent.glob("*.jpg"))):
+        target = path.rename(store / f"SHA256E-{997 * k}.jpg")
+        path.symlink_to(target)
+    (session.parent / "twice.jpg").symlink_to(store / "SHA256E-0.jpg")
+    assert main(["calibrate", str(session)]) == 0
+    views = load_calibration(session.parent / "calibration.json").views
+    assert [v.image for v in views] == [f"{k:02d}.jpg" for k in range(5)]
 
 
 def test_bad_input(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
