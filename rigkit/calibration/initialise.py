@@ -19,7 +19,7 @@ import numpy as np
 
 from rigkit.arrays import FloatArray, Mat3, Points
 from rigkit.calibration.observations import Observations, median_of
-from rigkit.calibration.radial_alignment import Alignment, align, distortion_centre
+from rigkit.calibration.radial_alignment import MAD_TO_SIGMA, TURN_SIGMAS, Alignment, align, distortion_centre
 from rigkit.calibration.state import State, evaluate
 from rigkit.cameras.base import Camera, RadialCurve, image_center
 from rigkit.errors import InputError
@@ -39,6 +39,20 @@ FALLBACK_FOV_RAD = (0.7, 1.4, 2.1, 3.1)
 SAMPLES = 96
 ORTHONORMAL = 1e-12
 """Departure from a rotation that is rounding."""
+COUNTED = 0.1
+"""Corners of less weight are outliers: they do not say how far out the image was seen."""
+ON_AXIS, NEAR_AXIS = 1e-4, 1e-3
+"""Radii, as shares of the largest: kept off zero, where they divide; and up to which a corner says nothing of depth."""
+NOTHING = 1e-9
+"""Keeps lengths (px, mm) and what is of their size off zero, where they divide."""
+NOTHING_RAD = 1e-6
+"""The same of an angle."""
+TINY = 1e-300
+"""The same of sums of squares of any scale."""
+RIDGE = 1e-12
+"""Of the unit diagonal: keeps the normal matrix of views that leave the polynomial open invertible."""
+FLIPS = 10
+"""Rounds of the signs at the most; each lowers the residual, and the first that changes nothing is the last."""
 
 
 def initialise(
@@ -76,7 +90,7 @@ def _starts(
     offset = pixels - centre[:, None]
     alignment = align(offset, board, observations.weight)
     rho = np.sqrt(offset[:, 0] ** 2 + offset[:, 1] ** 2)
-    rho_max = float(rho[alignment.weight > 0.1].max())
+    rho_max = float(rho[alignment.weight > COUNTED].max())
     depths = _Depths(alignment, offset, rho / rho_max, board)
     tried = (depths.curve(exponents) for exponents in EXPONENTS)
     curve = next((c for c in tried if c is not None), None)
@@ -128,11 +142,11 @@ class _Depths:
 
     def __init__(self, alignment: Alignment, offset: FloatArray, rho: FloatArray, board: FloatArray) -> None:
         xy = alignment.camera_xy(board)
-        self._safe = np.maximum(rho, 1e-4)
+        self._safe = np.maximum(rho, ON_AXIS)
         self._rho, self._weight = rho, alignment.weight
-        length = np.maximum(np.sqrt(offset[:, 0] ** 2 + offset[:, 1] ** 2), 1e-9)
+        length = np.maximum(np.sqrt(offset[:, 0] ** 2 + offset[:, 1] ** 2), NOTHING)
         self._s = (xy * offset).sum(axis=1) / length
-        self._used = (alignment.weight > 0.0) & (self._s > 0.0) & (rho > 1e-3)
+        self._used = (alignment.weight > 0.0) & (self._s > 0.0) & (rho > NEAR_AXIS)
         # Of each view: s rho^(k - 1) for each exponent k, the depth, and one for t3.
         self._rows = rows = np.ones((len(rho), len(EXPONENTS[0]) + 2, rho.shape[1]))
         np.divide(self._s, self._safe, out=rows[:, 0])
@@ -151,14 +165,14 @@ class _Depths:
         which = [*(EXPONENTS[0].index(k) for k in exponents), -2]
         s, depth = self._s, self._rows[:, -2] + self._middle[:, -2, None]
         # d rho / d z of the lens turns residuals of z into residuals of rho; at first for a lens of 45 degrees.
-        slope = self._safe**2 / (np.maximum(s, 1e-9) * (1.0 + self._safe**2))
+        slope = self._safe**2 / (np.maximum(s, NOTHING) * (1.0 + self._safe**2))
         weight = np.where(self._used, self._weight * slope, 0.0)
         a, sign, t3 = self._joint(which, weight, None)
         for _ in range(ROUNDS - 1):
             z = (a @ self._rows[:, which[:-1]]) + (self._middle[:, which[:-1]] @ a)[:, None]
-            slope = s / np.maximum(s * s + z * z, 1e-300)
+            slope = s / np.maximum(s * s + z * z, TINY)
             residual = np.abs(z - t3[:, None] - sign[:, None] * depth) * slope
-            scale = 2.5 * 1.4826 * median_of(residual[self._used]) + 1e-9
+            scale = TURN_SIGMAS * MAD_TO_SIGMA * median_of(residual[self._used]) + NOTHING
             weight = np.where(self._used, self._weight * slope / (1.0 + (residual / scale) ** 2), 0.0)
             a, sign, t3 = self._joint(which, weight, sign)
         radius = np.linspace(0.0, 1.0, SAMPLES)
@@ -171,9 +185,9 @@ class _Depths:
         """Return what `curve` does for a curve that is known, with all signs plus."""
         angle = np.interp(self._rho, np.linspace(0.0, 1.0, SAMPLES), theta)
         weight = self._weight * np.sin(angle) ** 2
-        z = self._s / np.tan(np.maximum(angle, 1e-6))
+        z = self._s / np.tan(np.maximum(angle, NOTHING_RAD))
         depth = self._rows[:, -2] + self._middle[:, -2, None]
-        t3 = (weight * (z - depth)).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-12)
+        t3 = (weight * (z - depth)).sum(axis=1) / np.maximum(weight.sum(axis=1), TINY)
         return theta, np.ones(len(t3)), t3
 
     def _joint(
@@ -185,18 +199,18 @@ class _Depths:
         `sign` is where the search for the signs starts; None: from scratch.
         """
         moments = (self._rows * (weight * weight)[:, None]) @ np.swapaxes(self._rows, -1, -2)
-        total = np.maximum(moments[:, -1, -1], 1e-300)
+        total = np.maximum(moments[:, -1, -1], TINY)
         mean = moments[:, which, -1] / total[:, None]
         central = moments[:, which][:, :, which] - total[:, None, None] * mean[:, :, None] * mean[:, None]
         normal = central[:, :-1, :-1].sum(axis=0)
-        scale = np.sqrt(np.diag(normal)) + 1e-300
-        normal = normal / scale[:, None] / scale + 1e-12 * np.eye(len(scale))
+        scale = np.sqrt(np.diag(normal)) + TINY
+        normal = normal / scale[:, None] / scale + RIDGE * np.eye(len(scale))
         cross = central[:, :-1, -1].T / scale[:, None]
         if sign is None:
             explained = np.asarray(np.linalg.solve(np.linalg.cholesky(normal), cross), dtype=np.float64)
             sign = _signs(explained, central[:, -1, -1])
         a = np.linalg.solve(normal, cross @ sign)
-        for _ in range(10):
+        for _ in range(FLIPS):
             flipped = np.where(cross.T @ a < 0.0, -1.0, 1.0)
             if (flipped == sign).all():
                 break
@@ -216,6 +230,6 @@ def _signs(explained: FloatArray, size2: FloatArray) -> FloatArray:
     if views <= ENUMERATE:
         patterns = np.array([(1.0, *p) for p in itertools.product((1.0, -1.0), repeat=views - 1)])
         return np.asarray(patterns[((patterns @ explained.T) ** 2).sum(axis=1).argmax()])
-    scaled = explained / np.sqrt(np.maximum(size2, 1e-300))
+    scaled = explained / np.sqrt(np.maximum(size2, TINY))
     vector = np.linalg.eigh(scaled @ scaled.T)[1][:, -1]
     return np.where(vector @ scaled < 0.0, -1.0, 1.0)

@@ -27,6 +27,15 @@ SUSPICIOUS = 8.0
 """A largest residual of more than this many robust sigmas sends the view through random subsets."""
 SHIFT = 1e-13
 """Of the trace, keeps the normal matrix of exact corners invertible."""
+TURN_SIGMAS = 2.5
+"""Residuals of so many robust sigmas count half."""
+MAD_TO_SIGMA = 1.4826
+LEAST_SIGMA_PX = 1e-6
+"""Exact corners scatter by rounding alone, far below any noise; weights are one over it."""
+ON_AXIS = 1e-3
+"""Of a view's largest radius: nearer to the axis a corner has no direction, and its weight no end."""
+FAR_EPIPOLE = 1e-9
+"""Homogeneous coordinate of a unit vector that lies at infinity."""
 INVERSE_STEPS = 3
 """Each brings the vector nearer by the ratio of the two smallest eigenvalues, the noise against the view's tilt."""
 SQUARE_ROW, SQUARE_COLUMN = np.triu_indices(3)
@@ -79,7 +88,7 @@ def align(offset: FloatArray, board: FloatArray, weight: FloatArray) -> Alignmen
     robust = weight
     for _ in range(ROUNDS):
         sigma = _sigma(residual, used)
-        robust = np.where(used, weight / (1.0 + (residual / (2.5 * sigma[:, None])) ** 2), 0.0)
+        robust = np.where(used, weight / (1.0 + (residual / (TURN_SIGMAS * sigma[:, None])) ** 2), 0.0)
         h = views.fit(robust / radius, h)
         residual, radius = views.residual(h)
         if not bad.any():
@@ -139,7 +148,7 @@ class _Views:
         xy = self.camera_xy(h)
         x, y = xy[..., 0, :], xy[..., 1, :]
         radius = np.sqrt(x * x + y * y)
-        radius = np.maximum(radius, 1e-3 * radius.max(axis=-1, keepdims=True) + np.finfo(float).tiny)
+        radius = np.maximum(radius, ON_AXIS * radius.max(axis=-1, keepdims=True) + np.finfo(float).tiny)
         return np.abs(self._u * y - self._v * x) / radius, radius
 
 
@@ -148,7 +157,7 @@ def _sigma(residual: FloatArray, used: np.ndarray) -> FloatArray:
     middle = np.maximum(used.sum(axis=1) - 1, 0) // 2
     ordered = np.partition(np.where(used, residual, np.inf), np.unique(middle), axis=1)
     median = ordered[np.arange(len(used)), middle]
-    return np.maximum(1.4826 * np.where(np.isfinite(median), median, 0.0), 1e-6)
+    return np.maximum(MAD_TO_SIGMA * np.where(np.isfinite(median), median, 0.0), LEAST_SIGMA_PX)
 
 
 def _best_subset(offset: FloatArray, local: FloatArray, used: np.ndarray) -> FloatArray:
@@ -193,6 +202,6 @@ def distortion_centre(pixels: FloatArray, board: FloatArray, weight: FloatArray,
     # A view whose second smallest eigenvalue is as small as the first leaves its F open.
     certain = np.clip(1.0 - np.maximum(values[:, 0], 0.0) / np.maximum(values[:, 1], np.finfo(float).tiny), 0.0, 1.0)
     epipole = np.linalg.eigh(np.einsum("v,vij,vkj->ik", certain, F, F))[1][:, 0]
-    if abs(epipole[2]) < 1e-9:
+    if abs(epipole[2]) < FAR_EPIPOLE:
         return guess
     return np.asarray(guess + size * epipole[:2] / epipole[2])
