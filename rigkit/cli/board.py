@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,9 @@ HELP = "a board to print, true to scale (PDF and SVG), and its measured size bac
 
 MARKER_SHARE = 0.75
 """Side of a marker in squares: large enough to be read, with white left around it for the corners."""
+
+MOST_UNEVEN = 1.05
+"""Ratio of the stretches along and across a sheet: printers are a per cent apart, misread rulers more."""
 
 BOARD_SIZE = re.compile(r"^(\d+)[xX](\d+)$")
 
@@ -42,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.boards import Board
-    from rigkit.io.board_file import load_board
+    from rigkit.io.board_file import load_layout
     from rigkit.io.files import write_together
     from rigkit.report.board_sheet import board_sheet, pdf_bytes, svg_text
 
@@ -56,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     elif args.charuco or args.marker_mm is not None or args.first_marker or args.legacy:
         raise InputError("board: a board file says itself what markers it has; give a size such as 9x6 with --charuco")
     else:
-        board = load_board(Path(args.size))
+        board = load_layout(args.size)
     sheet = board_sheet(board, args.paper)
     if args.ruler_x_mm is not None or args.ruler_y_mm is not None:
         return _store_measured(args, board, sheet.ruler_x_mm, sheet.ruler_y_mm)
@@ -67,7 +71,9 @@ def run(args: argparse.Namespace) -> int:
         f"{args.output}.svg": svg_text(sheet),
     }
     if size is not None:
-        files[f"{args.output}.toml"] = _board_toml(board, "nominal: print, measure both rulers, run rigkit board again")
+        own = Path(f"{args.output}.toml")
+        board = replace(board, board_id=own.stem)
+        files[str(own)] = _board_toml(board, "nominal: print, measure both rulers, run rigkit board again", own)
     write_together({Path(path): data for path, data in files.items()}, force=args.force)
     for path in files:
         print(path)
@@ -86,7 +92,7 @@ def _markers(args: argparse.Namespace) -> Markers | None:
 
 
 def _store_measured(args: argparse.Namespace, board: Board, ruler_x_mm: float, ruler_y_mm: float) -> int:
-    from rigkit.boards import Board
+    from rigkit.io.board_file import with_squares
     from rigkit.io.files import write_atomic
 
     path = Path(args.size)
@@ -97,24 +103,31 @@ def _store_measured(args: argparse.Namespace, board: Board, ruler_x_mm: float, r
     for measured, nominal in ((args.ruler_x_mm, ruler_x_mm), (args.ruler_y_mm, ruler_y_mm)):
         if not 0.5 < measured / nominal < 2.0:
             raise InputError(f"board: a ruler of {nominal:g} mm cannot measure {measured:g} mm; check the reading")
-    x = board.square_x_mm * args.ruler_x_mm / ruler_x_mm
-    y = board.square_y_mm * args.ruler_y_mm / ruler_y_mm
+    stretch_x, stretch_y = args.ruler_x_mm / ruler_x_mm, args.ruler_y_mm / ruler_y_mm
+    if not 1.0 / MOST_UNEVEN < stretch_x / stretch_y < MOST_UNEVEN:
+        raise InputError(
+            f"board: rulers of {ruler_x_mm:g} and {ruler_y_mm:g} mm that read {args.ruler_x_mm:g} and "
+            f"{args.ruler_y_mm:g}: no printer stretches its two directions so differently; check the readings"
+        )
+    x, y = board.square_x_mm * stretch_x, board.square_y_mm * stretch_y
     sigma = None
     if args.sigma_mm is not None:
         sigma = args.sigma_mm * max(board.square_x_mm / ruler_x_mm, board.square_y_mm / ruler_y_mm)
-    markers = board.markers
-    if markers is not None:
-        markers = replace(markers, side_mm=markers.side_mm * (x / board.square_x_mm + y / board.square_y_mm) / 2.0)
-    measured_board = Board(board.board_id, board.columns, board.rows, x, y, sigma, markers)
+    measured_board = replace(with_squares(board, x, y), square_sigma_mm=sigma)
     words = f"measured: rulers of {ruler_x_mm:g} and {ruler_y_mm:g} mm read {args.ruler_x_mm:g} and {args.ruler_y_mm:g}"
-    write_atomic(path, _board_toml(measured_board, words), force=True)
+    write_atomic(path, _board_toml(measured_board, words, path, layout=board), force=True)
     print(f"{path}: squares {x:.4f} x {y:.4f} mm")
     return 0
 
 
-def _board_toml(board: Board, comment: str) -> str:
+def _board_toml(board: Board, comment: str, path: Path, *, layout: Board | None = None) -> str:
+    """Return the board's file; with the `layout` that was printed where the squares are measured ones."""
     lines = [f"# {comment}", 'schema = "rigkit.board/1"', f"columns = {board.columns}", f"rows = {board.rows}"]
+    if board.board_id != path.stem:
+        lines.append(f"id = {json.dumps(board.board_id, ensure_ascii=False)}")
     lines += [f"square_x_mm = {board.square_x_mm:.6g}", f"square_y_mm = {board.square_y_mm:.6g}"]
+    if layout is not None:
+        lines += [f"printed_x_mm = {layout.square_x_mm:.6g}", f"printed_y_mm = {layout.square_y_mm:.6g}"]
     if board.square_sigma_mm is not None:
         lines.append(f"square_sigma_mm = {board.square_sigma_mm:.4g}")
     if board.markers is not None:

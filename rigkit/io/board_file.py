@@ -8,6 +8,8 @@
     square_mm = 30.0         # or square_x_mm and square_y_mm
     square_sigma_mm = 0.05   # optional: how well it was measured
     id = "a9x6_30"           # optional: by default the file's name
+    printed_x_mm = 30.0      # optional, both: squares as laid out for printing, which `rigkit board` notes when the
+    printed_y_mm = 30.0      # measured print goes into the file
 
 A ChArUco board has four keys more; without them it is read as a chessboard::
 
@@ -19,16 +21,18 @@ A ChArUco board has four keys more; without them it is read as a chessboard::
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from rigkit.boards import Board, Markers, marker_rectangles
 from rigkit.io.toml_reader import TomlTable, read_toml
 
-__all__ = ["SCHEMA", "board_from_table", "load_board"]
+__all__ = ["SCHEMA", "board_from_table", "load_board", "load_layout", "with_squares"]
 
 SCHEMA = "rigkit.board/1"
 MOST_CORNERS = 1000
 """Along one side: no image resolves more."""
+BOTH_PRINTED = "printed_x_mm = 30.0 and printed_y_mm = 30.0"
 SQUARES_MM = (0.1, 5000.0)
 """Sizes outside are slips of the unit, 0.03 for 0.03 m."""
 
@@ -42,6 +46,31 @@ def load_board(path: str | Path) -> Board:
     board = board_from_table(table, Path(path).stem)
     table.done()
     return board
+
+
+def load_layout(path: str | Path) -> Board:
+    """Return the board of the file as it was laid out for printing: as it is, unless its print was measured since.
+
+    Raises InputError like `load_board`.
+    """
+    board, printed = load_board(path), _printed(read_toml(path, SCHEMA))
+    return board if printed is None else with_squares(board, *printed)
+
+
+def with_squares(board: Board, x_mm: float, y_mm: float) -> Board:
+    """Return the board with squares of another size, and markers that grew with them."""
+    markers = board.markers
+    if markers is not None:
+        growth = (x_mm / board.square_x_mm + y_mm / board.square_y_mm) / 2.0
+        markers = replace(markers, side_mm=markers.side_mm * growth)
+    return replace(board, square_x_mm=x_mm, square_y_mm=y_mm, markers=markers)
+
+
+def _printed(table: TomlTable) -> tuple[float, float] | None:
+    """Return the sides of the squares as laid out for printing where the file has them."""
+    if not (table.has("printed_x_mm") or table.has("printed_y_mm")):
+        return None
+    return table.number("printed_x_mm", hint=BOTH_PRINTED), table.number("printed_y_mm", hint=BOTH_PRINTED)
 
 
 def board_from_table(table: TomlTable, default_id: str) -> Board:
@@ -59,7 +88,7 @@ def board_from_table(table: TomlTable, default_id: str) -> Board:
         x, y = table.number("square_x_mm", hint=both), table.number("square_y_mm", hint=both)
     else:
         x = y = table.number("square_mm", hint="square_mm = 30.0 (measured with a ruler over many squares)")
-    for side in (x, y):
+    for side in (x, y, *(_printed(table) or ())):
         if not SQUARES_MM[0] <= side <= SQUARES_MM[1]:
             raise table.error(f"squares of {side:g} mm are outside {SQUARES_MM[0]:g} to {SQUARES_MM[1]:g} mm; write mm")
     sigma = None

@@ -1,0 +1,66 @@
+"""`rigkit board`: what is printed, and the measured print back into the board's file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rigkit.cli.main import main
+from rigkit.io.board_file import load_board
+
+READ = ["--ruler-x-mm", "249", "--ruler-y-mm", "169.49"]
+"""Of rulers of 250 and 170 mm."""
+
+
+@pytest.fixture
+def board(tmp_path: Path) -> Path:
+    assert main(["board", "9x6", "--square-mm", "25", "-o", str(tmp_path / "b")]) == 0
+    return tmp_path / "b.toml"
+
+
+def test_measuring_the_same_print_again_changes_nothing(board: Path) -> None:
+    for _ in range(3):
+        assert main(["board", str(board), *READ, "--sigma-mm", "0.5"]) == 0
+        found = load_board(board)
+        assert (found.square_x_mm, found.square_y_mm) == pytest.approx((24.9, 24.925), abs=1e-9)
+        assert found.square_sigma_mm == pytest.approx(25.0 * 0.5 / 170.0, rel=1e-3)
+    # A reading is corrected, not multiplied.
+    assert main(["board", str(board), "--ruler-x-mm", "250", "--ruler-y-mm", "170"]) == 0
+    assert load_board(board).square_x_mm == load_board(board).square_y_mm == 25.0
+
+
+def test_another_print_of_a_measured_board_is_the_same_sheet(board: Path) -> None:
+    assert main(["board", str(board), *READ]) == 0
+    assert main(["board", str(board), "-o", str(board.with_name("again"))]) == 0
+    before, again = (board.with_name(name).read_text(encoding="utf-8") for name in ("b.svg", "again.svg"))
+    assert before == again
+
+
+def test_a_board_keeps_its_name(board: Path) -> None:
+    name = 'wall "ä"'
+    board.write_text(board.read_text() + "id = 'wall \"ä\"'\n", encoding="utf-8")
+    assert main(["board", str(board), *READ]) == 0
+    assert load_board(board).board_id == name
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--ruler-x-mm", "249"], "both rulers"),
+        (["--ruler-x-mm", "24.9", "--ruler-y-mm", "16.9"], "cannot measure"),
+        (["--ruler-x-mm", "249", "--ruler-y-mm", "159"], "check the readings"),
+    ],
+)
+def test_misread_rulers(board: Path, options: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    before = board.read_bytes()
+    assert main(["board", str(board), *options]) == 2
+    assert said in capsys.readouterr().err
+    assert board.read_bytes() == before
+
+
+@pytest.mark.parametrize("keys", ["printed_x_mm = 25\n", "printed_x_mm = 25\nprinted_y_mm = 0.02\n"])
+def test_half_a_layout_is_refused(board: Path, keys: str, capsys: pytest.CaptureFixture[str]) -> None:
+    board.write_text(board.read_text() + keys)
+    assert main(["board", str(board), *READ]) == 2
+    assert "b.toml" in capsys.readouterr().err
