@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     session = load_session(args.session)
     target = args.output or session.calibration_path
     page = page_path(args.report, target)
-    ensure_writable([target, *page], force=args.force)
+    ensure_writable([target, *page], force=args.force, inputs=[session.path, *session.images])
     started = time.monotonic()
     calibration = calibrate_session(session, progress_on_stderr())
     save_calibration(target, calibration, force=args.force)

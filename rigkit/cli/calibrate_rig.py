@@ -37,7 +37,8 @@ def run_rig(args: argparse.Namespace) -> int:
     boards = [target.with_name(f"{target.stem}-boards.json")] if session.rigid_boards else []
     page = page_path(args.report, target)
     rig_file = [target] if several else []
-    ensure_writable([*rig_file, *beside.values(), *boards, *page], force=args.force)
+    inputs = [session.path, *(image for own in session.cameras.values() for image in own.images)]
+    ensure_writable([*rig_file, *beside.values(), *boards, *page], force=args.force, inputs=inputs)
     started = time.monotonic()
     rig = calibrate_rig_session(session, progress_on_stderr())
     checks = measured_checks(session, rig)

@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
         "crosscheck.md": tables_to_markdown([table]),
         "crosscheck.json": tables_to_json([table]),
     }
-    write_results(out, files, force=args.force)
+    write_results(out, files, force=args.force, inputs=dataset.inputs)
     passed = not failures and all(report.passed for report in reports)
     if args.json:
         pairs = [report.to_dict() for report in reports]

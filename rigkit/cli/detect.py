@@ -65,7 +65,8 @@ def run(args: argparse.Namespace) -> int:
     boards = [load_board(path) for path in args.board]
     camera = _camera(args.camera, boards)
     overlays = _overlay_paths(images, args.overlay)
-    ensure_writable([*([args.output] if args.output else []), *filter(None, overlays)], force=args.force)
+    outputs = [*([args.output] if args.output else []), *filter(None, overlays)]
+    ensure_writable(outputs, force=args.force, inputs=[*images, *args.board, *([args.camera] if args.camera else [])])
     found = _detect_all(images, overlays, (boards, camera, args.min_corners), args)
     if not any(found.values()):
         raise CheckFailed(f"no chessboard found in {len(images)} images; check focus and exposure, or --min-corners")

@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
         other = args.b if rigs[0] else args.a
         raise InputError(f"diff: a rig and a camera; compare '{other}' with the calibration beside the rig")
     if args.output is not None:
-        ensure_writable(args.output, force=args.force)
+        ensure_writable(args.output, force=args.force, inputs=(args.a, args.b))
     figures = _cameras(args.a, args.b, args.output, force=args.force)
     print_json(figures) if args.json else print(_camera_in_words(figures))
     return EXIT_DIFFERENT if figures["same"] is False else 0

@@ -45,7 +45,7 @@ def _export_camera(args: argparse.Namespace) -> int:
     kind = args.to or ("rigkit" if args.output.suffix == ".json" else None)
     if kind not in CAMERA_FORMATS:
         raise InputError(f"export: say the camera's format with --to, one of {', '.join(CAMERA_FORMATS)}")
-    ensure_writable(args.output, force=args.force)
+    ensure_writable(args.output, force=args.force, inputs=[args.source])
     camera = _read_camera(args.source, args.source_format)
     if kind == "rigkit":
         save_camera(args.output, camera, force=args.force)
@@ -136,7 +136,7 @@ def _export_cloud(args: argparse.Namespace) -> int:
         raise InputError(f"export: say which pair with --pair: {', '.join(p.pair_id for p in dataset.pairs)}")
     pair = dataset.pair(args.pair) if args.pair else dataset.pairs[0]
     if kind != "colmap":
-        ensure_writable(args.output, force=args.force)
+        ensure_writable(args.output, force=args.force, inputs=dataset.inputs)
     pair.require_images()
     cameras = load_cameras(dataset.select([pair.pair_id]), recalibrate=False, progress=progress_on_stderr())
     camera1, camera2 = cameras[pair.camera1.camera_id].camera, cameras[pair.camera2.camera_id].camera
@@ -148,7 +148,7 @@ def _export_cloud(args: argparse.Namespace) -> int:
         files |= model
         for words in notes:
             note(words)
-        write_results(args.output, files, force=args.force)
+        write_results(args.output, files, force=args.force, inputs=dataset.inputs)
     else:
         data = ply_bytes(reconstruction.cloud) if kind == "ply" else cloud_npz(reconstruction)
         write_results(args.output.parent, {args.output.name: data}, force=args.force)

@@ -47,8 +47,8 @@ def run(args: argparse.Namespace) -> int:
         _length("--square-mm", args.square_mm)
     root = args.folder.resolve()
     target = args.output or root / "dataset.toml"
-    ensure_writable(target, force=args.force)
     images = find_images(root)
+    ensure_writable(target, force=args.force, inputs=images)
     progress = progress_on_stderr()
     sightings = []
     for done, path in enumerate(images, start=1):

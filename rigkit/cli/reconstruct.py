@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     files: dict[str, str | bytes] = {}
     for outcome in outcomes:
         files.update(outcome.files)
-    write_results(out, files, force=args.force)
+    write_results(out, files, force=args.force, inputs=dataset.inputs)
     for outcome in outcomes:
         for words in outcome.result["notes"]:
             note(f"{outcome.result['pair']}: {words}")

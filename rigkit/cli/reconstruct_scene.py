@@ -77,7 +77,8 @@ def run_scene(args: argparse.Namespace) -> int:
     )
     r = scene.reconstruction
     unit = "mm" if scene.metric else "baselines"
-    write_results(out, _files(args, scene, found, images), force=args.force)
+    inputs = [path for path in (*(args.images or ()), args.correspondences, args.camera, args.camera2) if path]
+    write_results(out, _files(args, scene, found, images), force=args.force, inputs=inputs)
     for words in r.notes:
         note(f"{name}: {words}")
     result: dict[str, Any] = {

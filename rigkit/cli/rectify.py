@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     if args.camera is None:
         raise InputError("rectify: --camera is missing; give the camera's calibration.json")
     _ensure_kind(args.output)
-    ensure_writable(args.output, force=args.force)
+    ensure_writable(args.output, force=args.force, inputs=(args.image, args.camera))
     camera = load_camera(args.camera)
     target = target_camera(
         camera,
@@ -91,7 +91,7 @@ def _run_stereo(args: argparse.Namespace) -> int:
     (camera1, cam1_from_rig), (camera2, cam2_from_rig) = (rig[name] for name in names)
     out = Path(args.output)
     outputs = [str(out.with_name(f"{out.stem}-{i}{out.suffix}")) for i in (1, 2)]
-    ensure_writable(outputs, force=args.force)
+    ensure_writable(outputs, force=args.force, inputs=(args.image, args.image2, args.rig))
     pair = rectify_pair(camera1, camera2, cam2_from_rig @ cam1_from_rig.inverse(), projection=args.projection)
     images, maps = (args.image, args.image2), (pair.map1, pair.map2)
     done = [_write(args, image, remap, o) for image, remap, o in zip(images, maps, outputs, strict=True)]

@@ -245,7 +245,7 @@ def finish(
         shown = [table for table in tables if table.key not in ("checks", "estimators")] + _calibrations(dataset)
         title = f"rigkit validation: {dataset.name}"
         files["report.html"] = build_page(title, lead, passed, shown, sections, _provenance(args, dataset))
-    write_results(out, files, force=args.force)
+    write_results(out, files, force=args.force, inputs=dataset.inputs)
     if args.json:
         print_json(
             {

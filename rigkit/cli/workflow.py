@@ -111,11 +111,15 @@ def _chosen_folder(args: argparse.Namespace, name: str) -> Path:
     return next(folder for folder in names if not folder.exists())
 
 
-def write_results(folder: Path, files: Mapping[str, str | bytes], *, force: bool) -> None:
-    """Write all files (relative path -> content) into `folder`, or none."""
-    from rigkit.io.files import write_together
+def write_results(
+    folder: Path, files: Mapping[str, str | bytes], *, force: bool, inputs: Iterable[str | Path] = ()
+) -> None:
+    """Write all files (relative path -> content) into `folder`, or none; never over one of `inputs`."""
+    from rigkit.io.files import ensure_writable, write_together
 
-    write_together({folder / name: data for name, data in files.items()}, force=force)
+    placed = {folder / name: data for name, data in files.items()}
+    ensure_writable(placed, force=force, inputs=inputs)
+    write_together(placed, force=force)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

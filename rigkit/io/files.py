@@ -13,13 +13,24 @@ from rigkit.errors import InputError
 __all__ = ["ensure_folder_writable", "ensure_writable", "write_atomic", "write_together"]
 
 
-def ensure_writable(paths: str | Path | Iterable[str | Path], *, force: bool = False) -> None:
+def ensure_writable(
+    paths: str | Path | Iterable[str | Path], *, force: bool = False, inputs: Iterable[str | Path] = ()
+) -> None:
     """Raise InputError if one of `paths` could not be written: call it before work that takes long.
 
-    A path that exists is refused without `force`; so is a folder in its place, and a parent that is a file.
+    A path that exists is refused without `force`; so is a folder in its place, and a parent that is a file. With force
+    too, no file is written over one of `inputs`, which the work reads, nor two to the same path.
     """
+    read = {Path(path).resolve() for path in inputs}
+    written: set[Path] = set()
     for path in [paths] if isinstance(paths, str | Path) else paths:
         target = Path(path)
+        whole = target.resolve()
+        if whole in read:
+            raise InputError(f"cannot write '{target}': this command reads it, and it would be lost; give another name")
+        if whole in written:
+            raise InputError(f"cannot write '{target}' twice, for two results; give them different names")
+        written.add(whole)
         if target.is_dir():
             raise InputError(f"cannot write '{target}': a folder of that name exists; give another name")
         if target.exists() and not force:

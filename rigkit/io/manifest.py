@@ -92,6 +92,11 @@ class Dataset:
     cameras: tuple[CameraEntry, ...]
     pairs: tuple[Pair, ...]
 
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """The files that a person made, which no result may be written over."""
+        return (self.manifest, *(image for pair in self.pairs for image in (pair.image1, pair.image2)))
+
     def pair(self, pair_id: str) -> Pair:
         """Return the pair of that name; raises InputError that lists the known ones."""
         return _named(pair_id, {p.pair_id: p for p in self.pairs}, f"{self.manifest}: pair")

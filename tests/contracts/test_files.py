@@ -166,6 +166,17 @@ def test_no_folder_stays_where_one_below_it_cannot_be_made(tmp_path: Path, monke
     assert os.listdir(tmp_path) == []
 
 
+def test_nothing_is_written_over_what_is_read_nor_twice(tmp_path: Path) -> None:
+    (tmp_path / "image.png").write_text("x")
+    (tmp_path / "link.png").symlink_to(tmp_path / "image.png")
+    for name in ("image.png", "link.png", "../" + tmp_path.name + "/image.png"):
+        with pytest.raises(InputError, match="it would be lost"):
+            ensure_writable(tmp_path / name, force=True, inputs=[tmp_path / "other.png", tmp_path / "image.png"])
+    with pytest.raises(InputError, match="twice"):
+        ensure_writable([tmp_path / "a", tmp_path / "b" / ".." / "a"], force=True)
+    ensure_writable(tmp_path / "image.png", force=True, inputs=[tmp_path / "other.png"])
+
+
 def test_what_cannot_be_written_is_known_before_the_work(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     ensure_writable([tmp_path / "a", tmp_path / "deep" / "b"])

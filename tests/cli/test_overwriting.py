@@ -1,0 +1,67 @@
+"""With --force results are replaced, never what a command reads: raw images, sessions, calibrations, manifests."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from helpers.data import REPOSITORY
+
+from rigkit.cli.main import main
+
+LAB = REPOSITORY / "datasets" / "lab-a"
+LENS = REPOSITORY / "calib" / "cameras" / "mvca020_r61" / "calibration.json"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A pair, its board, a calibration and a session."""
+    pair = LAB / "images" / "regular-general"
+    for k in (1, 2):
+        shutil.copy(pair / f"view{k}.jpg", tmp_path / f"view{k}.png")
+    shutil.copy(LENS, tmp_path / "camera.json")
+    shutil.copy(LENS, tmp_path / "other.json")
+    (tmp_path / "board.toml").write_text('schema = "rigkit.board/1"\ncolumns = 8\nrows = 6\nsquare_mm = 50\n')
+    (tmp_path / "session.toml").write_text(
+        'schema = "rigkit.session/1"\nimages = "view*.png"\nboard = "board.toml"\nmodel = "brown"\n'
+    )
+    text = (LAB / "dataset.toml").read_text(encoding="utf-8").replace("../../calib", str(REPOSITORY / "calib"))
+    (tmp_path / "dataset.toml").write_text(text.replace("images/regular-general/view1.jpg", "pair/cloud.png"))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "detect view1.png view2.png --overlay .",
+        "detect view1.png -o view1.png",
+        "detect view1.png --board board.toml -o board.toml",
+        "rectify view1.png --camera camera.json -o view1.png",
+        "rectify view1.png --camera camera.json -o ../{here}/view1.png",
+        "export camera.json --to kalibr -o camera.json",
+        "calibrate session.toml -o session.toml",
+        "calibrate session.toml -o new.json -r new.json",
+        "diff camera.json other.json -o other.json",
+    ],
+)
+def test_no_input_is_lost(command: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert main([*command.format(here=folder.name).split(), "--force"]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and "cannot write" in lines[0]
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_no_image_of_a_data_set_is_lost(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    image = folder / "regular-general" / "cloud.png"
+    image.parent.mkdir()
+    shutil.copy(LAB / "images" / "regular-general" / "view1.jpg", image)
+    text = (folder / "dataset.toml").read_text().replace("pair/cloud.png", "regular-general/cloud.png")
+    second = str(LAB / "images" / "regular-general" / "view2.jpg")
+    (folder / "dataset.toml").write_text(text.replace("images/regular-general/view2.jpg", second))
+    before = image.read_bytes()
+    assert main(["reconstruct", ".", "-p", "regular-general", "-o", ".", "--force", "-j", "1"]) == 2
+    assert "it would be lost" in capsys.readouterr().err
+    assert image.read_bytes() == before
