@@ -19,7 +19,9 @@ CLOUD_FORMATS = ("ply", "npz", "colmap")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("source", type=Path, help="a camera file, or a data set (then --pair)")
+    parser.add_argument(
+        "source", type=Path, help="a camera file, a rig (as Kalibr's camchain), or a data set (then --pair)"
+    )
     parser.add_argument("-o", "--output", type=Path, required=True, help="file to write (a folder for a COLMAP model)")
     parser.add_argument(
         "--to", choices=sorted({*CAMERA_FORMATS, *CLOUD_FORMATS}), help="format (default: by the ending)"
@@ -35,7 +37,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     if args.source.is_dir() or args.source.suffix == ".toml":
         return _export_cloud(args)
-    return _export_camera(args)
+    from rigkit.io.rig_file import is_rig_file
+
+    return _export_rig(args) if is_rig_file(args.source) else _export_camera(args)
+
+
+def _export_rig(args: argparse.Namespace) -> int:
+    from rigkit.interop.kalibr import write_kalibr
+    from rigkit.io.files import ensure_writable, write_atomic
+    from rigkit.io.rig_file import load_rig
+
+    if args.to != "kalibr":
+        raise InputError(
+            f"export: '{args.source}' is a rig, which goes out with --to kalibr; for other formats export the "
+            f"calibrations of its cameras, beside it: {args.source.stem}-CAMERA.json"
+        )
+    ensure_writable(args.output, force=args.force, inputs=[args.source])
+    rig = load_rig(args.source)
+    chain = write_kalibr([camera for camera, _ in rig.values()], [pose for _, pose in rig.values()])
+    write_atomic(args.output, chain.text, force=args.force)
+    print(f"{args.output}: kalibr, at most {max(one.max_error_px for one in chain.cameras):.4g} px from the rig given")
+    for k, (name, one) in enumerate(zip(rig, chain.cameras, strict=True)):
+        note(f"cam{k} is '{name}'" + (f"; {one.note}" if one.note else ""))
+    return 0
 
 
 def _export_camera(args: argparse.Namespace) -> int:

@@ -87,7 +87,8 @@ def best_accepted(camera: Camera, accepted: Sequence[Accepted], format_name: str
             c = convert_camera(camera, kind.model, order=kind.order, fixed=kind.zero)
         except InputError:
             continue
-        note = f"{format_name} has no {camera.model} model: refitted as {kind.model}, off by {c.max_px:.3g} px at most"
+        lacks = f"{camera.model} model" + (" with these terms" if kind.model == camera.model else "")
+        note = f"{format_name} has no {lacks}: refitted as {kind.model}, off by {c.max_px:.3g} px at most"
         if c.covered < 1.0:
             reach = min(np.degrees(c.reach_rad), np.degrees(c.camera.max_angle_rad))
             note += f" within {reach:.0f} degrees of the axis ({100.0 * c.covered:.0f} % of the image); wrong beyond"

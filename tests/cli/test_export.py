@@ -1,13 +1,19 @@
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.data import REPOSITORY
 
+from rigkit.cameras.brown import Brown
+from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cli.main import main
-from rigkit.io.calibration_file import load_camera
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
+from rigkit.interop.kalibr import read_kalibr
+from rigkit.io.calibration_file import camera_to_json, load_camera
 
 CALIBRATION = REPOSITORY / "calib" / "cameras" / "mvca020_fe185" / "calibration.json"
 LAB = REPOSITORY / "datasets" / "lab-a"
@@ -46,6 +52,31 @@ def test_a_cloud_as_colmap_model_and_npz(tmp_path: Path, capsys: pytest.CaptureF
     theirs = np.stack([model.points3D[i].xyz for i in sorted(model.points3D)])
     assert np.abs(theirs - data["points_mm"]).max() < 1e-9
     assert main(["export", *source, "-o", str(tmp_path / "cloud.npz")]) == 2
+
+
+def test_a_rig_goes_out_as_a_camchain(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    left = Brown((640, 480), np.array([534.0, 534.2, 341.7, 238.9, -0.28, 0.1, 0.001, 0.0002, 0.0]))
+    right = KannalaBrandt((800, 600), np.array([300.0, 301.0, 398.0, 303.0, -0.02, 0.002, 0.0, 0.0]))
+    # The rig's frame is nobody's: what Kalibr keeps is one camera against the other.
+    poses = (
+        Rigid3(exp_so3(np.array([0.1, 0.0, -0.2])), [5.0, 6.0, 7.0]),
+        Rigid3(exp_so3(np.array([0.0, 0.3, 0.1])), [-250.0, 4.0, 9.0]),
+    )
+    entries = [
+        {"name": name, "camera": camera_to_json(camera), "cam_from_rig": pose.matrix()[:3].tolist(), "rms_px": 0.1}
+        for name, camera, pose in zip(("left", "right"), (left, right), poses, strict=True)
+    ]
+    rig, chain = tmp_path / "rig.json", tmp_path / "chain.yaml"
+    rig.write_text(json.dumps({"schema": "rigkit.rig/1", "cameras": entries}))
+    assert main(["export", str(rig), "--to", "kalibr", "-o", str(chain)]) == 0
+    said = capsys.readouterr()
+    assert "at most 0 px" in said.out and "cam0 is 'left'" in said.err and "cam1 is 'right'" in said.err
+    (one, two), (_, cam1_from_cam0) = read_kalibr(chain.read_text())
+    np.testing.assert_allclose(one.parameters, left.parameters, atol=1e-12)
+    np.testing.assert_allclose(two.parameters, right.parameters, atol=1e-12)
+    np.testing.assert_allclose(cam1_from_cam0.matrix(), (poses[1] @ poses[0].inverse()).matrix(), atol=1e-9)
+    assert main(["export", str(rig), "--to", "opencv", "-o", str(tmp_path / "x.yml")]) == 2
+    assert "rig-CAMERA.json" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
