@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -21,6 +23,12 @@ SIDES = (
     (re.compile(r"(right|_r|-r|view2|cam2|_2|-2|b)$", re.IGNORECASE), 2),
 )
 """How people mark the two images of a pair at the end of a name."""
+
+SIDE_FOLDERS = (
+    (re.compile(r"(left|cam(era)?[_-]?0*1)$", re.IGNORECASE), 1),
+    (re.compile(r"(right|cam(era)?[_-]?0*2)$", re.IGNORECASE), 2),
+)
+"""The same of a folder; mere numbers and letters are more often those of pairs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,32 +66,51 @@ def board_sizes(detections: Sequence[BoardDetection]) -> tuple[tuple[int, int], 
 
 
 def group_pairs(sightings: Sequence[Sighting], root: Path) -> list[FoundPair]:
-    """Return the pairs: images whose names differ only in how the two sides are marked, or the two of a folder.
+    """Return the pairs: images whose names differ only in how the two sides are marked, images of one name in two
+    folders that are marked so, or the two of a folder.
 
     Images that show no board are left out.
     """
-    useful = [s for s in sightings if s.boards]
-    by_stem: dict[tuple[Path, str], dict[int, Sighting]] = {}
-    for sighting in useful:
-        for pattern, side in SIDES:
-            stem, count = pattern.subn("", sighting.image.stem)
-            if count:
-                by_stem.setdefault((sighting.image.parent, stem.rstrip("_- ")), {})[side] = sighting
-                break
-    pairs = [
-        FoundPair(_pair_name(parent, stem, root), both[1], both[2])
-        for (parent, stem), both in by_stem.items()
-        if len(both) == 2
-    ]
-    taken = {s.image for pair in pairs for s in (pair.first, pair.second)}
+    free = [s for s in sightings if s.boards]
+    pairs: list[FoundPair] = []
+    for marked in (_by_name, _by_folder):
+        sides: dict[tuple[Path, str], dict[int, Sighting]] = {}
+        for sighting in free:
+            found = marked(sighting.image, root)
+            if found is not None:
+                place, side = found
+                sides.setdefault(place, {})[side] = sighting
+        pairs += [FoundPair(_pair_name(*place, root), s[1], s[2]) for place, s in sides.items() if len(s) == 2]
+        taken = {s.image for pair in pairs for s in (pair.first, pair.second)}
+        free = [s for s in free if s.image not in taken]
     by_folder: dict[Path, list[Sighting]] = {}
-    for sighting in useful:
-        if sighting.image not in taken:
-            by_folder.setdefault(sighting.image.parent, []).append(sighting)
+    for sighting in free:
+        by_folder.setdefault(sighting.image.parent, []).append(sighting)
     for parent, two in by_folder.items():
         if len(two) == 2:
             pairs.append(FoundPair(_pair_name(parent, "", root), two[0], two[1]))
     return sorted(pairs, key=lambda pair: pair.name)
+
+
+def _by_name(image: Path, root: Path) -> tuple[tuple[Path, str], int] | None:
+    """Return folder and name without the mark of the side, and that side (1 or 2); None where there is no mark."""
+    found = _side(image.stem, SIDES)
+    return None if found is None else ((image.parent, found[0]), found[1])
+
+
+def _by_folder(image: Path, root: Path) -> tuple[tuple[Path, str], int] | None:
+    """Return the same of an image in a folder that is marked: left/0001.png."""
+    parent = image.parent
+    found = None if parent == root else _side(parent.name, SIDE_FOLDERS)
+    return None if found is None else ((parent.parent / found[0], image.stem), found[1])
+
+
+def _side(name: str, marks: Sequence[tuple[re.Pattern[str], int]]) -> tuple[str, int] | None:
+    for pattern, side in marks:
+        rest, count = pattern.subn("", name)
+        if count:
+            return rest.rstrip("_- "), side
+    return None
 
 
 def manifest_text(
@@ -109,13 +136,14 @@ def manifest_text(
     """
     if not pairs:
         raise InputError(
-            "init: no two images look like a pair; name them ...left/...right or view1/view2, or by folder"
+            "init: no two images look like a pair; name them ...left/...right or view1/view2, put them into folders "
+            "named so, or each pair into a folder of its own"
         )
     most = max((s.boards for pair in pairs for s in (pair.first, pair.second)), key=len)
     counts = Counter(most)
     out = ["# Started by `rigkit init`; what a person measured is for a person to check.", f'schema = "{SCHEMA}"']
     out += [
-        f'name = "{name}"',
+        f"name = {_quoted(name)}",
         "",
         f"# Most boards in one image: {', '.join(f'{n} of {c}x{r}' for (c, r), n in counts.items())}.",
     ]
@@ -124,10 +152,11 @@ def manifest_text(
         out += [f"square_mm = {square_mm:g}", ""]
     size = pairs[0].first.size_px
     out += [
-        f"# Images are {size[0]}x{size[1]} px.",
+        f"# Images are {size[0]}x{size[1]} px, taken as those of one camera that was moved. Where there are two,",
+        "# add another [[cameras]] with its own calibration, and name it in camera2 below.",
         "[[cameras]]",
         'id = "camera"',
-        f'calibration = "{calibration}"',
+        f"calibration = {_quoted(calibration)}",
         "",
     ]
     boards = ", ".join(f'"plane{n}"' for n in range(1, len(most) + 1))
@@ -135,7 +164,9 @@ def manifest_text(
         seen = " and ".join(_words(s) for s in (pair.first, pair.second))
         out += [f"# Complete boards found: {seen}.", "[[pairs]]", f'id = "{pair.name}"']
         out += ['camera1 = "camera"', 'camera2 = "camera"']
-        out += [f'image{i} = "{_relative(s.image, root)}"' for i, s in enumerate((pair.first, pair.second), start=1)]
+        out += [
+            f"image{i} = {_quoted(_relative(s.image, root))}" for i, s in enumerate((pair.first, pair.second), start=1)
+        ]
         out += [f'pose_type = "{pose_types[pair.name]}"', f"boards = [{boards}]", "", "[pairs.truth]"]
         if pair.name in baselines:
             value, sigma = baselines[pair.name]
@@ -149,6 +180,11 @@ def manifest_text(
     return "\n".join(out)
 
 
+def _quoted(text: str) -> str:
+    """Return a basic string of TOML, which has the escapes of JSON."""
+    return json.dumps(text, ensure_ascii=False)
+
+
 def _pair_name(parent: Path, stem: str, root: Path) -> str:
     parts = [part for part in parent.relative_to(root).parts if part not in ("images", ".")]
     words = "-".join([*parts, stem] if stem else parts) or "pair"
@@ -160,6 +196,4 @@ def _words(sighting: Sighting) -> str:
 
 
 def _relative(path: Path, root: Path) -> str:
-    import os
-
     return Path(os.path.relpath(path, root)).as_posix()

@@ -8,6 +8,7 @@ from helpers.data import REPOSITORY
 
 from rigkit.cli.main import main
 from rigkit.io.manifest import load_dataset
+from rigkit.io.manifest_writer import Sighting, group_pairs
 
 IMAGES = REPOSITORY / "datasets" / "lab-a" / "images"
 CALIBRATION = REPOSITORY / "calib" / "cameras" / "mvca020_fe185" / "calibration.json"
@@ -30,6 +31,30 @@ def test_a_folder_becomes_a_manifest_that_loads(tmp_path: Path, capsys: pytest.C
     before = (tmp_path / "dataset.toml").read_text()
     assert main(["init", str(tmp_path), *options]) == 2
     assert (tmp_path / "dataset.toml").read_text() == before
+
+
+def test_folders_of_two_sides_and_names_with_quotes(tmp_path: Path) -> None:
+    root = tmp_path / 'the "lab"'
+    for side, number in (("left", 1), ("right", 2)):
+        (root / side).mkdir(parents=True)
+        for name, pair in (("0001", "fisheye-general"), ('b "2"', "fisheye-standard")):
+            shutil.copy(IMAGES / pair / f"view{number}.jpg", root / side / f"{name}.jpg")
+    options = ["--square-mm", "50", "--pose-type", "general", "--calibration", str(CALIBRATION)]
+    assert main(["init", str(root), *options]) == 0
+    dataset = load_dataset(root)
+    assert dataset.name == 'the "lab"'
+    named = {p.pair_id: tuple(i.relative_to(root).as_posix() for i in (p.image1, p.image2)) for p in dataset.pairs}
+    assert named == {"0001": ("left/0001.jpg", "right/0001.jpg"), "b-2-": ('left/b "2".jpg', 'right/b "2".jpg')}
+
+
+@pytest.mark.parametrize("folders", [("pose_1", "pose_2"), ("day-a", "day-b")])
+def test_folders_of_pairs_stay_so(tmp_path: Path, folders: tuple[str, str]) -> None:
+    root = tmp_path.resolve()
+    sightings = [Sighting(root / f / f"{n}.jpg", (800, 600), ((8, 6),)) for f in folders for n in ("x", "y")]
+    pairs = group_pairs(sightings, root)
+    assert [(p.name, p.first.image.name, p.second.image.name) for p in pairs] == [
+        (f, "x.jpg", "y.jpg") for f in folders
+    ]
 
 
 def test_what_images_cannot_tell_must_be_said(
