@@ -56,8 +56,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import note, print_json, progress_on_stderr
-    from rigkit.io.calibration_file import save_calibration
-    from rigkit.io.files import ensure_writable
+    from rigkit.io.calibration_file import calibration_text
+    from rigkit.io.files import ensure_writable, write_together
     from rigkit.io.rig_session import is_rig_session
     from rigkit.io.session import load_session
 
@@ -71,11 +71,12 @@ def run(args: argparse.Namespace) -> int:
     ensure_writable([target, *page], force=args.force, inputs=[session.path, *session.images])
     started = time.monotonic()
     calibration = calibrate_session(session, progress_on_stderr())
-    save_calibration(target, calibration, force=args.force)
+    files = {target: calibration_text(calibration)}
     for path in page:
-        from rigkit.cli.calibration_report import write_report
+        from rigkit.cli.calibration_report import report_page
 
-        write_report(path, session, calibration, target, force=args.force)
+        files |= {path: report_page(session, calibration, files)}
+    write_together(files, force=args.force)
     note(f"{', '.join(str(p) for p in (target, *page))} written, {time.monotonic() - started:.1f} s")
     if args.json:
         print_json(summary(calibration))
@@ -186,7 +187,7 @@ def session_corners(session: Session, progress: Progress) -> dict[str, FoundCorn
             f"{session.path}: no image matches 'images'; the corners of {len(found)} images kept in "
             f"{session.corners_path.name} are used"
         )
-    hashes = {name: image_hash(path) for path, name in zip(session.images, _image_names(session), strict=True)}
+    hashes = {name: image_hash(path) for path, name in zip(session.images, image_names(session), strict=True)}
     paths = dict(zip(hashes, session.images, strict=True))
     for name, digest in hashes.items():
         item = cache.get(name, digest)
@@ -249,7 +250,7 @@ def first_camera(session: Session, found: Mapping[str, FoundCorners]) -> Camera 
         return None
 
 
-def _image_names(session: Session) -> list[str]:
+def image_names(session: Session) -> list[str]:
     """Return a name for each image: of two that are called alike in several folders, with the folder."""
     common = Counter(path.name for path in session.images)
     home = session.path.resolve().parent

@@ -25,9 +25,9 @@ def run_rig(args: argparse.Namespace) -> int:
     """Calibrate the rig of `args.session`; return 1 if something measured disagrees."""
     from rigkit.cli.calibrate import page_path
     from rigkit.cli.console import note, print_json, progress_on_stderr
-    from rigkit.io.calibration_file import save_calibration
-    from rigkit.io.files import ensure_writable
-    from rigkit.io.rig_file import save_board_rigs, save_rig
+    from rigkit.io.calibration_file import calibration_text
+    from rigkit.io.files import ensure_writable, write_together
+    from rigkit.io.rig_file import board_rigs_text, rig_text
     from rigkit.io.rig_session import load_rig_session
 
     session = load_rig_session(args.session)
@@ -42,18 +42,15 @@ def run_rig(args: argparse.Namespace) -> int:
     started = time.monotonic()
     rig = calibrate_rig_session(session, progress_on_stderr())
     checks = measured_checks(session, rig)
-    for path in rig_file:
-        save_rig(path, rig, force=args.force)
-    for camera in rig.cameras:
-        save_calibration(beside[camera.name], judged(camera.calibration), force=args.force)
-    for path in boards:
-        save_board_rigs(path, rig.board_rigs, force=args.force)
+    files = {path: rig_text(rig) for path in rig_file}
+    files |= {beside[camera.name]: calibration_text(judged(camera.calibration)) for camera in rig.cameras}
+    files |= {path: board_rigs_text(rig.board_rigs) for path in boards}
     for path in page:
-        from rigkit.cli.calibration_report import write_rig_report
+        from rigkit.cli.calibration_report import rig_report_page
 
-        write_rig_report(path, session, rig, checks, target, force=args.force)
-    written = (*rig_file, *beside.values(), *boards, *page)
-    note(f"{', '.join(str(p) for p in written)} written, {time.monotonic() - started:.1f} s")
+        files |= {path: rig_report_page(session, rig, checks, files)}
+    write_together(files, force=args.force)
+    note(f"{', '.join(str(p) for p in files)} written, {time.monotonic() - started:.1f} s")
     if args.json:
         print_json(summary(rig, checks))
     else:

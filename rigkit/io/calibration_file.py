@@ -27,6 +27,7 @@ from rigkit.io.text import read_text
 
 __all__ = [
     "SCHEMA",
+    "calibration_text",
     "camera_from_json",
     "camera_to_json",
     "damage_named",
@@ -47,6 +48,11 @@ KEYS = {
 
 def save_calibration(path: str | Path, calibration: Calibration, *, force: bool = False) -> None:
     """Write the calibration; raises InputError where the file exists and `force` is not set."""
+    write_atomic(path, calibration_text(calibration), force=force)
+
+
+def calibration_text(calibration: Calibration) -> str:
+    """Return the content of the calibration's file."""
     c = calibration
     data = {
         "schema": SCHEMA,
@@ -73,7 +79,7 @@ def save_calibration(path: str | Path, calibration: Calibration, *, force: bool 
         ],
         "views": [_view_out(v) for v in c.views],
     }
-    write_atomic(path, _dumps(data), force=force)
+    return _dumps(data)
 
 
 def save_camera(path: str | Path, camera: Camera, *, force: bool = False) -> None:

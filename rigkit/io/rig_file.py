@@ -20,10 +20,9 @@ from rigkit.cameras.base import Camera
 from rigkit.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibration_file import camera_from_json, camera_to_json, damage_named
-from rigkit.io.files import write_atomic
 
-__all__ = ["BOARDS_SCHEMA", "SCHEMA", "SavedRig", "is_rig_file", "load_board_rigs", "load_rig", "load_saved_rig"]
-__all__ += ["save_board_rigs", "save_rig"]
+__all__ = ["BOARDS_SCHEMA", "SCHEMA", "SavedRig", "board_rigs_text", "is_rig_file", "load_board_rigs", "load_rig"]
+__all__ += ["load_saved_rig", "rig_text"]
 
 SCHEMA = "rigkit.rig/1"
 BOARDS_SCHEMA = "rigkit.board_rig/1"
@@ -52,8 +51,8 @@ class SavedRig:
         return np.asarray(self.covariance[first:, first:])
 
 
-def save_rig(path: str | Path, rig: RigCalibration, *, force: bool = False) -> None:
-    """Write the rig; raises InputError where the file exists and `force` is not set."""
+def rig_text(rig: RigCalibration) -> str:
+    """Return the content of the rig's file."""
     pairs = [(a, b, *rig.baseline_mm(a, b)) for a, b in combinations([c.name for c in rig.cameras], 2)]
     data = {
         "schema": SCHEMA,
@@ -75,7 +74,7 @@ def save_rig(path: str | Path, rig: RigCalibration, *, force: bool = False) -> N
         ],
         "covariance": rig.covariance.tolist(),
     }
-    write_atomic(path, json.dumps(data, indent=1, allow_nan=False) + "\n", force=force)
+    return json.dumps(data, indent=1, allow_nan=False) + "\n"
 
 
 def load_rig(path: str | Path) -> dict[str, tuple[Camera, Rigid3]]:
@@ -112,8 +111,8 @@ def is_rig_file(path: str | Path) -> bool:
     return isinstance(data, dict) and data.get("schema") == SCHEMA
 
 
-def save_board_rigs(path: str | Path, rigs: Sequence[BoardRig], *, force: bool = False) -> None:
-    """Write boards on one mount, with their angles; raises InputError where the file exists and `force` is not set."""
+def board_rigs_text(rigs: Sequence[BoardRig]) -> str:
+    """Return the content of the file of boards on one mount, with their angles."""
     data = {
         "schema": BOARDS_SCHEMA,
         "rigs": [
@@ -141,7 +140,7 @@ def save_board_rigs(path: str | Path, rigs: Sequence[BoardRig], *, force: bool =
             for rig in rigs
         ],
     }
-    write_atomic(path, json.dumps(data, indent=1, allow_nan=False) + "\n", force=force)
+    return json.dumps(data, indent=1, allow_nan=False) + "\n"
 
 
 def load_board_rigs(path: str | Path) -> tuple[BoardRig, ...]:

@@ -21,6 +21,7 @@ from rigkit.cli.main import main
 from rigkit.detections import BoardDetection
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import nearest_rotation
+from rigkit.io import files
 from rigkit.io.calibration_file import load_calibration
 from rigkit.io.corner_cache import CornerCache, FoundCorners
 from rigkit.io.session import load_session
@@ -146,9 +147,31 @@ def test_images_of_one_name_in_two_folders(session: Path) -> None:
         folder.mkdir(exist_ok=True)
         path.rename(folder / f"{k // 2}.jpg")
     session.write_text(SESSION.replace('"*.jpg"', '"day*/*.jpg"'))
-    assert main(["calibrate", str(session)]) == 0
+    assert main(["calibrate", str(session), "--report"]) == 0
+    assert (session.parent / "calibration.html").read_text().count("data:image/jpeg") == 5
     views = load_calibration(session.parent / "calibration.json").views
     assert sorted(v.image for v in views) == ["2.jpg", "day0/0.jpg", "day0/1.jpg", "day1/0.jpg", "day1/1.jpg"]
+
+
+def test_a_disk_that_fills_up_leaves_all_files_as_they_were(
+    session: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["calibrate", str(session), "--report"]) == 0
+    before = {path.name: path.read_bytes() for path in session.parent.iterdir()}
+    fill = files._fill
+
+    def until_the_page(handle: int, data: bytes) -> None:
+        if data.startswith(b"<!"):
+            os.close(handle)
+            raise OSError(28, "No space left on device")
+        fill(handle, data)
+
+    monkeypatch.setattr(files, "_fill", until_the_page)
+    session.write_text(SESSION.replace("kannala_brandt", "eucm"))
+    before["session.toml"] = session.read_bytes()
+    assert main(["calibrate", str(session), "--report", "--force"]) == 2
+    assert "calibration.html': No space left on device; nothing was changed" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in session.parent.iterdir()} == before
 
 
 def test_session_where_nothing_can_be_written(
