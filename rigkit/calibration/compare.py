@@ -9,12 +9,16 @@ import numpy as np
 from rigkit.arrays import FloatArray, Pixels
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import projection_design, projection_uncertainty
+from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import CameraDifference, compare_cameras
+from rigkit.cameras.convert import refit_camera
 
 __all__ = ["CalibrationComparison", "compare_calibrations"]
 
 SAMPLES = 2000
 """Draws of the null distribution: the chance is then known to 0.005 near 0.05."""
+REFIT_SIGMA = 0.5
+"""What the models make of one lens is known from a refit to about half: poses and noise had their part in the fits."""
 SAME_CHANCE = 0.01
 """A difference this unlikely for one and the same camera makes it two."""
 
@@ -27,14 +31,17 @@ class CalibrationComparison:
     ----------
     difference : over the image, after the best rotation.
     predicted_px : (rows, columns) predicted rms difference of two calibrations of one camera, NaN where not covered.
-    ratio : rms over the image of difference / predicted: about 1 for one and the same camera.
-    chance : probability of a ratio at least this large if both were calibrations of the same, unchanged camera.
+    ratio : rms over the image of difference / predicted: about 1 for one and the same camera in one model.
+    chance : probability of a ratio at least this large if both were calibrations of the same, unchanged camera, each in
+        its own model.
+    same_model : both are of one model and size.
     """
 
     difference: CameraDifference
     predicted_px: FloatArray
     ratio: float
     chance: float
+    same_model: bool
 
     @property
     def same(self) -> bool:
@@ -52,7 +59,9 @@ def compare_calibrations(
     -----
     The null distribution of the ratio is sampled: both calibrations' errors are drawn from their covariances, turned
     into differences over the image by the projection's derivatives, and the best rotation is taken out of each with the
-    same weights as it is taken out of the difference found.
+    same weights as it is taken out of the difference found. Models of different kinds or sizes show one lens
+    differently, which no covariance knows: that difference, from each camera refitted as the other is modelled, is a
+    part of the null.
     """
     difference = compare_cameras(a.camera, b.camera, grid=grid)
     # The rotation is fitted where both calibrations know what they say: extrapolated corners must not turn it.
@@ -69,12 +78,37 @@ def compare_calibrations(
     turn = root * np.concatenate([design[:, -3:] for design in designs], axis=1)
     rng = np.random.default_rng(seed)
     drawn = root * (_draw(a, designs[0], rng) - _draw(b, designs[1], rng))
+    by_model = root * _by_model(a, b, difference)[:, None]
+    if by_model.any():
+        drawn += by_model * (1.0 + REFIT_SIGMA * rng.normal(size=SAMPLES))
     drawn = drawn - turn @ np.linalg.lstsq(turn, drawn, rcond=None)[0]
     null = (drawn.reshape(len(pixels), 2, SAMPLES) ** 2).sum(axis=1).mean(axis=0)
     predicted = np.full(covered.shape, np.nan)
     predicted[covered] = np.sqrt(variance)
     chance = float((1 + np.count_nonzero(null >= found)) / (SAMPLES + 1))
-    return CalibrationComparison(difference, predicted, float(np.sqrt(found)), chance)
+    return CalibrationComparison(
+        difference, predicted, float(np.sqrt(found)), chance, _kind(a.camera) == _kind(b.camera)
+    )
+
+
+def _by_model(a: Calibration, b: Calibration, difference: CameraDifference) -> FloatArray:
+    """Return the difference (2 M,), px at the covered pixels, that the two models alone make of one lens."""
+    pixels = difference.pixels[difference.covered]
+    out = np.zeros((len(pixels), 2))
+    if _kind(a.camera) == _kind(b.camera):
+        return out.reshape(-1)
+    for sign, lens, like, like_from_lens in ((1.0, a, b, difference.b_from_a), (-1.0, b, a, difference.b_from_a.T)):
+        # The lens in the other's model, fitted as that was: where that had its corners.
+        at = np.concatenate([view.pixels for view in like.views])
+        rays, valid = lens.camera.unproject(at)
+        refitted = refit_camera(like.camera, rays[valid] @ like_from_lens.T, at[valid])
+        projected, valid = refitted.project(_rays(lens, pixels) @ like_from_lens.T)
+        out += sign * np.where(valid[:, None], projected - pixels, 0.0)
+    return out.reshape(-1)
+
+
+def _kind(camera: Camera) -> tuple[str, int]:
+    return camera.model, camera.parameters.size
 
 
 def _variance(a: Calibration, b: Calibration, difference: CameraDifference) -> tuple[FloatArray, Pixels]:

@@ -12,7 +12,7 @@ from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.cameras.registry import camera_model
 from rigkit.errors import InputError
 
-__all__ = ["Conversion", "convert_camera", "fit_camera"]
+__all__ = ["Conversion", "convert_camera", "fit_camera", "refit_camera"]
 
 GRID = (64, 48)
 """Pixels of the source at which the two cameras are held against each other."""
@@ -116,11 +116,18 @@ def fit_camera(
     Raises InputError where the model has no start for this lens.
     """
     theta = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
-    start = _start(model, size_px, theta, pixels, centre_px, order)
-    free = _free(start, fixed)
+    return refit_camera(_start(model, size_px, theta, pixels, centre_px, order), rays, pixels, fixed=fixed)
+
+
+def refit_camera(start: Camera, rays: Rays, pixels: Pixels, *, fixed: Sequence[str] = ()) -> Camera:
+    """Return `start` with the parameters, but for those `fixed`, that project `rays` (N, 3) nearest to `pixels` (N, 2).
+
+    Rays that the start cannot see, or only at the edge of its field of view, are left out.
+    """
+    theta = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
     used = theta < INSIDE * start.max_angle_rad
     used[used] &= start.project(rays[used])[1]
-    return _descend(start, rays[used], pixels[used], free)
+    return _descend(start, rays[used], pixels[used], _free(start, fixed))
 
 
 def _grid(camera: Camera) -> Pixels:

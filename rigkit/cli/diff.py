@@ -65,6 +65,7 @@ def _cameras(a: Path, b: Path, output: Path | None = None, *, force: bool = Fals
         "ratio": None if result is None else result.ratio,
         "chance": None if result is None else result.chance,
         "same": None if result is None else result.same,
+        "same_model": None if result is None else result.same_model,
     }
 
 
@@ -78,6 +79,7 @@ def _camera_in_words(figures: dict[str, Any]) -> str:
     verdict = "the same camera" if figures["same"] else "NOT the same camera, or a moved lens"
     return line + (
         f"{figures['ratio']:.2f} times what the uncertainties predict (chance {figures['chance']:.3g}): {verdict}"
+        + ("" if figures["same_model"] else "; the chance allows for what their different models make of one lens")
     )
 
 

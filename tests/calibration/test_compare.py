@@ -43,3 +43,39 @@ def test_a_moved_lens_is_another_camera(calibrations: list[Calibration]) -> None
     result = compare_calibrations(a, moved)
     assert not result.same
     assert result.ratio > 2.0
+
+
+@pytest.fixture(scope="module")
+def in_other_models() -> dict[str, list[Calibration]]:
+    """Calibrations of the same camera in other models, from other views, exact enough for the models to show."""
+    out: dict[str, list[Calibration]] = {}
+    kinds = {"kannala_brandt": None, "scaramuzza 5": 5, "scaramuzza 6": 6}
+    for (name, degree), offset in zip(kinds.items(), (20, 40, 60), strict=True):
+        for seed in range(3):
+            camera = lens("fish")
+            rng = np.random.default_rng(offset + seed)
+            views, _, _ = random_views(camera, 14, rng, reach_deg=REACH_DEG["fish"], noise_px=0.1)
+            model = name.split()[0]
+            result = calibrate(views, camera.size_px, model=model, degree=degree, board="flat", folds=0)
+            out.setdefault(name, []).append(result)
+    return out
+
+
+def test_one_camera_in_two_models_is_one_camera(in_other_models: dict[str, list[Calibration]]) -> None:
+    """The polynomials are off this lens by several times what chance does to them."""
+    ratios = []
+    for a, b in itertools.combinations(in_other_models, 2):
+        for first, second in zip(in_other_models[a], in_other_models[b], strict=True):
+            result = compare_calibrations(first, second)
+            assert result.same and not result.same_model, (a, b, result.ratio)
+            ratios.append(result.ratio)
+    # Were the models not allowed for, these would be other cameras.
+    assert max(ratios) > 1.5
+
+
+def test_a_moved_lens_is_another_camera_in_another_model_too(in_other_models: dict[str, list[Calibration]]) -> None:
+    for name in ("scaramuzza 5", "scaramuzza 6"):
+        for first, second in zip(in_other_models["kannala_brandt"], in_other_models[name], strict=True):
+            grown = np.array(first.camera.parameters)
+            grown[:2] += MOVED_PX
+            assert not compare_calibrations(replace(first, camera=first.camera.with_parameters(grown)), second).same
