@@ -25,8 +25,9 @@ from rigkit.corners.origin import quarter_turns
 from rigkit.corners.rejoin import rejoined
 from rigkit.corners.response import GreyImage, Level, grey_image, pyramid
 from rigkit.corners.saddle import find_corners
+from rigkit.corners.seams import parted, ruffled, without_misfits
 from rigkit.corners.subpixel import RefinedLattice, refine
-from rigkit.corners.validate import compact, known_part, large, leans, sample_of, separate, tidy, trustworthy
+from rigkit.corners.validate import compact, known_part, large, leans, sample_of, separate, tidy, too_large, trustworthy
 from rigkit.detections import BoardDetection
 
 __all__ = ["FEWEST_OF_BOARD", "detect_boards"]
@@ -41,8 +42,13 @@ SAME_PX = 2.0
 """Corners of two detections nearer than this are one corner."""
 
 
-def find_lattices(image: NDArray[np.generic], min_corners: int) -> list[RefinedLattice]:
-    """Return the lattices of all boards of `image`, refined, in no particular order and orientation."""
+def find_lattices(
+    image: NDArray[np.generic], min_corners: int, sizes: Sequence[tuple[int, int]] = ()
+) -> list[RefinedLattice]:
+    """Return the lattices of all boards of `image`, refined, in no particular order and orientation.
+
+    `sizes` : (columns, rows) of all boards that may be in it, if known.
+    """
     grey = grey_image(image)
     size_px = (grey.shape[1], grey.shape[0])
     levels = pyramid(grey)
@@ -56,9 +62,27 @@ def find_lattices(image: NDArray[np.generic], min_corners: int) -> list[RefinedL
     boards = [board for item in grown for part in split_folds(item) for board in split_necks(part)]
     parts = separate([tidy(board, size_px) for board in boards], FEWEST_OF_PART)
     boards = [board for board in join_parts(parts) if large(board, min_corners)]
-    refined = zip(boards, refine(grey, boards), strict=True)
-    found = [after for before, after in refined if trustworthy(after, before.count, min_corners)]
+    found = _fitted(grey, boards, min_corners, sizes)
     return [item for item in found if min_corners < FEWEST_OF_BOARD or compact(item.lattice, size_px)]
+
+
+def _fitted(
+    grey: GreyImage, boards: Sequence[Lattice], min_corners: int, sizes: Sequence[tuple[int, int]]
+) -> list[RefinedLattice]:
+    """Return those of `boards` that the fit confirms, refined, without what belongs to others that they touch."""
+    refined = zip(boards, refine(grey, boards), strict=True)
+    size_px = (grey.shape[1], grey.shape[0])
+    out = []
+    for item in (after for before, after in refined if trustworthy(after, before.count, min_corners)):
+        own = without_misfits(item, size_px)
+        parts = parted(own, several=too_large(own.lattice, sizes)) if ruffled(item, size_px) else [own]
+        if len(parts) == 1:
+            out += [own] if large(own.lattice, min_corners) else []
+            continue
+        # The edges on the other side of a seam had a say in these corners.
+        alone = [part.lattice.trimmed() for part in parts]
+        out += _fitted(grey, [part for part in alone if large(part, min_corners)], min_corners, sizes)
+    return out
 
 
 def _promising(grey: GreyImage, finest: Level, lattice: Lattice) -> bool:
@@ -108,7 +132,7 @@ def detect_boards(
     sizes = tuple(dict.fromkeys(board.size for board in plain))
     grey = grey_image(image)
     fewest = min([min_corners, *(max(columns * rows, FEWEST_OF_BOARD) for columns, rows in sizes)])
-    lattices = find_lattices(grey, fewest)
+    lattices = find_lattices(grey, fewest, sizes if len(plain) == len(known) else ())
     marked: list[BoardDetection] = []
     if len(plain) < len(known):
         from rigkit.corners.charuco import charuco_boards

@@ -112,15 +112,20 @@ class Lattice:
             contrast=np.where(drop, np.nan, self.contrast),
         )
 
-    def trimmed(self) -> Lattice:
-        """Return the lattice without empty outer rows and columns."""
+    @property
+    def extent(self) -> tuple[slice, slice]:
+        """Rows and columns from the first to the last that is not empty."""
         known = self.known
         rows, columns = (np.asarray(known.any(axis=axis)) for axis in (1, 0))
         if not rows.any():
-            return self.cut(slice(0, 0), slice(0, 0))
+            return slice(0, 0), slice(0, 0)
         top, bottom = int(rows.argmax()), len(rows) - int(rows[::-1].argmax())
         left, right = int(columns.argmax()), len(columns) - int(columns[::-1].argmax())
-        return self.cut(slice(top, bottom), slice(left, right))
+        return slice(top, bottom), slice(left, right)
+
+    def trimmed(self) -> Lattice:
+        """Return the lattice without empty outer rows and columns."""
+        return self.cut(*self.extent)
 
     def turned(self, quarter_turns: int) -> Lattice:
         """Return the same corners with the first corner moved by `quarter_turns` x 90 degrees (still right-handed).

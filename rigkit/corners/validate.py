@@ -16,7 +16,18 @@ from rigkit.corners.response import Level, sample
 from rigkit.corners.subpixel import RefinedLattice
 from rigkit.native import lattice as native
 
-__all__ = ["compact", "known_part", "large", "leans", "sample_of", "separate", "tidy", "trustworthy"]
+__all__ = [
+    "compact",
+    "known_part",
+    "large",
+    "leans",
+    "sample_of",
+    "separate",
+    "stray_row",
+    "tidy",
+    "too_large",
+    "trustworthy",
+]
 
 STRAY_ROW = 2
 """An outer row of so many corners or fewer, most of whose other corners should be in view too, is not of the board."""
@@ -78,14 +89,14 @@ def tidy(lattice: Lattice, size_px: tuple[int, int]) -> Lattice:
 
     `size_px` is the (width, height) of the full-resolution image.
     """
-    stray = _stray_row(lattice, size_px)
+    stray = stray_row(lattice, size_px)
     while stray is not None:
         lattice = lattice.without(stray).trimmed()
-        stray = _stray_row(lattice, size_px)
+        stray = stray_row(lattice, size_px)
     return lattice
 
 
-def _stray_row(lattice: Lattice, size_px: tuple[int, int]) -> BoolArray | None:
+def stray_row(lattice: Lattice, size_px: tuple[int, int]) -> BoolArray | None:
     """Return the first outer row or column (as a mask) that has strayed into the lattice, None if there is none."""
     known = lattice.known
     if min(known.shape) < 3:
@@ -232,6 +243,12 @@ def _uneven(lattice: Lattice) -> bool:
 def _middle(values: FloatArray) -> float:
     """Return the (upper) median; for some fifty values, np.median costs ten times as much."""
     return float(np.sort(values)[len(values) // 2])
+
+
+def too_large(lattice: Lattice, sizes: Sequence[tuple[int, int]]) -> bool:
+    """Return whether `lattice` is larger than all of the known `sizes` by more than stray rows; False for none."""
+    short, long = sorted(lattice.size)
+    return bool(sizes) and all(short > min(size) + MAX_EXTRA or long > max(size) + MAX_EXTRA for size in sizes)
 
 
 def known_part(refined: RefinedLattice, sizes: Sequence[tuple[int, int]]) -> RefinedLattice:
