@@ -197,17 +197,6 @@ class Sheet:
             parts.append(part)
         return cls(pixels, contrast, signs, tuple(parts))
 
-    @property
-    def known(self) -> BoolArray:
-        return np.isfinite(self.pixels[..., 0])
-
-    def lattices(self, like: Sequence[Lattice]) -> list[Lattice]:
-        """Return the lattices as they are in the sheet now; `like` are those it was made of."""
-        return [
-            Lattice(self.pixels[part], self.contrast[part], item.rising)
-            for part, item in zip(self.parts, like, strict=True)
-        ]
-
 
 def build_lattices(corners: Corners, links: Links) -> Iterator[Lattice]:
     """Return the lattices that closed squares of four linked corners make up, the largest first."""

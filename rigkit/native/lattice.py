@@ -16,9 +16,6 @@ from rigkit.native import address, kernels
 
 __all__ = ["ScatterRules", "excess_scatter", "loaded", "shifts_of_edges", "uneven_steps"]
 
-MOST_ORDER = 8
-"""As in lattice.c: differences of higher order are not counted on."""
-
 ROOM_FOR_SCATTER = 7
 """Numbers that lattice.c keeps for each corner."""
 
