@@ -18,6 +18,7 @@ from rigkit.corners.border import place_part
 from rigkit.corners.fold import join_parts, split_folds, split_necks
 from rigkit.corners.grow import SaddleIndex, grow_all
 from rigkit.corners.guided import complete_boards
+from rigkit.corners.impulses import without_impulses
 from rigkit.corners.lattice import Lattice, build_lattices
 from rigkit.corners.links import find_links
 from rigkit.corners.nearby import near_any
@@ -130,7 +131,7 @@ def detect_boards(
     known = boards or ()
     plain = [board for board in known if board.markers is None]
     sizes = tuple(dict.fromkeys(board.size for board in plain))
-    grey = grey_image(image)
+    grey = without_impulses(grey_image(image))
     fewest = min([min_corners, *(max(columns * rows, FEWEST_OF_BOARD) for columns, rows in sizes)])
     lattices = find_lattices(grey, fewest, sizes if len(plain) == len(known) else ())
     marked: list[BoardDetection] = []
