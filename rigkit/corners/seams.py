@@ -54,8 +54,9 @@ TWO_SHEETS = 2.5
 """Two quadratic surfaces, one on each side, leave so many times less than one cubic surface through both where they are
 two boards. In 248 lattices of single boards, up to the rims of fisheyes, at most 1.8 times."""
 
-JUMP = 0.02
-"""Seen from both sides the seam is so far apart, in cells: at a crease of the paper the sides meet."""
+JUMP, MEETING = 0.02, np.linspace(0.0, 1.0, 5)
+"""Seen from both sides the seam is so far apart, in cells: at a crease of the paper the sides meet. It is anywhere
+between the columns, and looked for in these parts of the way."""
 
 FLOOR_CELLS = 1e-3
 """No printed board is truer than this."""
@@ -184,11 +185,13 @@ def _seams(sums: _Sums, wide: int, several: bool) -> list[_Seam]:
     floor = both.variance / np.maximum(both.corners, 1) + FLOOR_CELLS**2
     alone = (apart1 + apart2) / np.maximum(both.corners - taken, 1) + floor
     ratio = np.sqrt(together / np.maximum(both.corners - CUBIC, 1) / alone)
-    middle = _terms(_scaled(0.5 * (start + end) - 0.5, columns)[:, None], _scaled(np.arange(rows), rows))
-    off = ((middle[..., :QUADRATIC] @ (one - two)) ** 2).sum(axis=2)
-    # Where the sides have no row in common they are far apart in any case.
+    # How far apart the sides have rows that they share, anywhere from the last column of one to the first of the other.
+    between = start + MEETING[:, None] * (wide + 1) - 1.0
+    terms = _terms(_scaled(between, columns)[..., None], _scaled(np.arange(rows), rows))[..., :QUADRATIC]
+    off = ((terms @ (one - two)) ** 2).sum(axis=3)
     common = (left.in_row > 0) & (right.in_row > 0)
-    jump = np.where(common, off, 0.0).sum(axis=1) / np.maximum(common.sum(axis=1), 1)
+    jump = np.where(common, off, 0.0).sum(axis=2).min(axis=0) / np.maximum(common.sum(axis=1), 1)
+    # Where they share none they are far apart in any case.
     two_sheets = (ratio > TWO_SHEETS) & ((jump > JUMP**2) | ~common.any(axis=1))
     which = np.flatnonzero(possible & (two_sheets | several))
     return [_Seam(float(ratio[k]), int(start[k]), int(end[k]), float(np.sqrt(alone[k]))) for k in which]

@@ -128,10 +128,12 @@ def test_a_sheet_is_cut_where_it_jumps_and_nowhere_else(rng: np.random.Generator
         assert [part.lattice.trimmed().size for part in parted(sheet(two))] == [(7, 6), (7, 6)]
 
 
-def test_a_crease_is_no_seam_unless_there_must_be_one(rng: np.random.Generator) -> None:
-    """A folded sheet bends at the crease, but its sides meet there."""
+@pytest.mark.parametrize("at", [7.0, 7.5])
+@pytest.mark.parametrize("bend", [0.04, 0.2])
+def test_a_crease_is_no_seam_unless_there_must_be_one(at: float, bend: float, rng: np.random.Generator) -> None:
+    """A folded sheet bends at the crease, but its sides meet there, on a corner or within a square."""
     creased = smooth(14, 7) + rng.normal(0.0, 0.01, (7, 14, 2))
-    creased[:, 7:] += 0.04 * 20.0 * (np.arange(7.0)[:, None] * [0.0, 1.0])
+    creased += bend * 20.0 * np.maximum(np.arange(14.0) - at, 0.0)[:, None] * [0.6, 0.8]
     assert len(parted(sheet(creased))) == 1
     assert len(parted(sheet(creased), several=True)) == 2
 
