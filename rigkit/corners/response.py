@@ -90,7 +90,7 @@ def grey_image(image: NDArray[np.generic]) -> GreyImage:
     """Return an 8- or 16-bit, grey or RGB(A) image in grey levels 0..255: uint8 as such, all others as float32.
 
     16-bit images are scaled by their own brightest value (the 99.9 % quantile), because 10- and 12-bit sensors do not
-    fill the range. Floating-point images are taken as 0..255 as they are.
+    fill the range. Floating-point images are taken as 0..255 as they are, NaN as dark.
 
     Raises
     ------
@@ -104,10 +104,12 @@ def grey_image(image: NDArray[np.generic]) -> GreyImage:
         raise InputError(f"image: expected (H, W) or (H, W, 3 or 4), got {array.shape}; pass one image at a time")
     if min(array.shape[:2]) < 16:
         raise InputError(f"image: {array.shape[1]}x{array.shape[0]} pixels are too few to hold a chessboard")
+    # Files say in which order their bytes are; it is no other type.
+    array = array.astype(array.dtype.newbyteorder("="), copy=False)
     if array.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
         raise InputError(f"image: type {array.dtype} is not supported; convert it to uint8 or uint16")
-    if array.dtype == np.float64:
-        array = array.astype(np.float32)
+    if array.dtype.kind == "f":
+        array = _finite(array)
     if array.ndim == 3:
         array = cv2.cvtColor(array, cv2.COLOR_RGB2GRAY if array.shape[2] == 3 else cv2.COLOR_RGBA2GRAY)
     if array.dtype == np.uint8:
@@ -118,6 +120,18 @@ def grey_image(image: NDArray[np.generic]) -> GreyImage:
         brightest = float(np.quantile(grey[::step, ::step], 0.999))
         grey = np.minimum(grey * np.float32(255.0 / max(brightest, 1.0)), np.float32(255.0))
     return grey
+
+
+def _finite(image: NDArray[np.generic]) -> FloatImage:
+    """Return a floating-point image as float32, with what is no number as dark, and what is infinite as bright, as the
+    rest gets."""
+    with np.errstate(over="ignore"):
+        values: FloatImage = image.astype(np.float32, copy=False)
+        if np.isfinite(values.sum(dtype=np.float64)):
+            return values
+    seen = values[np.isfinite(values)]
+    low, high = (float(seen.min()), float(seen.max())) if len(seen) else (0.0, 0.0)
+    return np.nan_to_num(values, nan=low, posinf=high, neginf=low)
 
 
 def pyramid(grey: GreyImage) -> list[Level]:

@@ -183,6 +183,26 @@ def test_bits_and_colours_do_not_matter() -> None:
         assert np.abs(found.pixels - expected.pixels).max() < SAME_PX
 
 
+@pytest.mark.parametrize("dtype", [">u2", ">f4", ">f8"])
+def test_byte_order_does_not_matter(dtype: str) -> None:
+    image = single(Board("a", 9, 6, 30.0, 30.0), [0.3, 0.2, 0.1], 600.0).image(np.random.default_rng(1), bits=16)
+    (expected,) = detect_boards(image.astype(dtype[1:]))
+    (found,) = detect_boards(image.astype(dtype))
+    assert np.array_equal(found.pixels, expected.pixels)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300])
+def test_what_is_no_number_hides_no_more_than_itself(value: float, rng: np.random.Generator) -> None:
+    scene = single(Board("a", 9, 6, 30.0, 30.0), [0.3, 0.2, 0.1], 600.0)
+    image = scene.image(rng).astype(np.float64)
+    image[230:236, 300:306] = value
+    image[rng.random(image.shape) < 0.001] = value
+    (found,) = detect_boards(image)
+    assert len(found.grid) >= 48
+    assert np.abs(errors_by_position(found, scene.truth()[0][1])).max() < 0.1
+    assert detect_boards(np.full((100, 100), value)) == ()
+
+
 def test_same_answer_twice_and_the_image_unchanged(rng: np.random.Generator) -> None:
     image = corner_scene(rng, regular(), 1250.0).image(rng)
     before = image.copy()
