@@ -31,6 +31,9 @@ the borders of boards that overlap all but those that are taken for a row."""
 SIGMAS = 5.0
 """And by more than so many of its own standard deviations: what is uncertain may lie aside."""
 
+IN_PLACE = 3.0
+"""A suspect nearer than this, in the same units, to either of the predictions is none."""
+
 LEAST_MISFIT = 0.02
 """Residual relative to the contrast below which nothing is suspect: rounding and compression are uneven, too."""
 
@@ -110,22 +113,37 @@ def without_misfits(item: RefinedLattice, size_px: tuple[int, int]) -> RefinedLa
     pixels = item.lattice.without(suspect).pixels
     usual = fit_cells(pixels, judges, leave_out=True)
     expected = _middle(np.hypot(*(usual.pixels - pixels[judges]).T) / _cell_px(usual))
-    astray = np.ones(np.count_nonzero(suspect), np.bool_)
-    for degree, ridge in BENDS:
-        shape = fit_cells(pixels, suspect, degree=degree, ridge=ridge)
-        off = np.hypot(*(shape.pixels - item.lattice.pixels[suspect]).T)
-        allowed = ASTRAY * expected * np.hypot(1.0, shape.gain) * _cell_px(shape)
-        astray &= (shape.support >= FEWEST) & (off > np.maximum(allowed, SIGMAS * item.sigma_px[suspect]))
-    drop = np.zeros_like(known)
-    drop[suspect] = astray
-    if not drop.any():
+    astray, in_place = _judged(item, suspect, expected)
+    # Under the edge of a shadow whole rows are suspect: those that are in place say where the rows beyond them are.
+    while astray.any() and in_place.any():
+        suspect = suspect & ~in_place
+        astray, in_place = _judged(item, suspect, expected)
+    if not astray.any():
         return item
-    rest: BoolArray | None = drop
+    rest: BoolArray | None = astray
     while rest is not None:
         item = item.without(rest)
         item = item.cut(*item.lattice.extent)
         rest = stray_row(item.lattice, size_px)
     return item
+
+
+def _judged(item: RefinedLattice, suspect: BoolArray, expected: float) -> tuple[BoolArray, BoolArray]:
+    """Return which of the `suspect` corners (R, C) are not where the others have them, and which clearly are.
+
+    The others are mostly as good as `expected`, in cells.
+    """
+    pixels = item.lattice.without(suspect).pixels
+    astray, in_place = np.zeros((2, *suspect.shape), np.bool_)
+    astray[suspect] = True
+    for degree, ridge in BENDS:
+        shape = fit_cells(pixels, suspect, degree=degree, ridge=ridge)
+        off = np.hypot(*(shape.pixels - item.lattice.pixels[suspect]).T)
+        good = expected * np.hypot(1.0, shape.gain) * _cell_px(shape)
+        judged = shape.support >= FEWEST
+        astray[suspect] &= judged & (off > np.maximum(ASTRAY * good, SIGMAS * item.sigma_px[suspect]))
+        in_place[suspect] |= judged & (off < IN_PLACE * good)
+    return astray, in_place
 
 
 def parted(item: RefinedLattice, *, several: bool = False) -> list[RefinedLattice]:
