@@ -18,6 +18,9 @@ from rigkit.corners.subpixel import RefinedLattice
 from rigkit.detections import BoardDetection
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
+from rigkit.synthetic.bench_scenes import CONDITIONS, three_boards
+from rigkit.synthetic.bench_score import FoundBoard, score
+from rigkit.synthetic.photometry import develop
 from rigkit.synthetic.scene import PlacedBoard
 
 WRONG_PX = 0.3
@@ -171,3 +174,12 @@ def test_what_fits_badly_goes_where_it_lies_aside_and_else_stays(rng: np.random.
     assert kept.known.all()
     loose = replace(item, residual=residual, sigma_px=np.full((6, 9), 1.0))
     assert without_misfits(loose, SIZE_PX).lattice.known.all()
+
+
+def test_rows_under_the_edge_of_a_shadow_are_of_the_board() -> None:
+    """They fit badly, two outer rows at once, and what the rest says of the outermost is only nearly so."""
+    scene = three_boards(np.random.default_rng(0))
+    optics, photometry = CONDITIONS["shadow"]
+    image = np.asarray(develop(scene.radiance(optics), photometry, np.random.default_rng(0)))
+    total = score(scene, [FoundBoard.of(item) for item in detect_boards(image)])
+    assert total.recall == 1.0
