@@ -42,7 +42,7 @@ from rigkit.corners.edge_model import (
     pattern_of,
 )
 from rigkit.corners.response import GreyImage
-from rigkit.native.edges import Rules, fit_corners
+from rigkit.native.edges import LAGS, Rules, fit_corners
 
 __all__ = ["BLUR_RANGE", "EdgeFit", "fit_edges"]
 
@@ -97,6 +97,9 @@ class EdgeFit:
     contrast : (N,) 2 b, negative if bright and dark are the other way round than expected.
     residual : (N,) root mean square, grey levels.
     noise : (N,) the same of the part that mirroring changes, as that of independent noise.
+    used : (N,) number of pixels.
+    products, pairs : (N, 13) for each of `native.edges.LAGS` the sum of the products of what mirroring changes at two
+        pixels so far apart, and of how many; 0 where the noise is not known or that of rounding.
     valid : (N,) the fit converged near its start, with pixels on all sides.
     """
 
@@ -106,6 +109,9 @@ class EdgeFit:
     contrast: FloatArray
     residual: FloatArray
     noise: FloatArray
+    used: FloatArray
+    products: FloatArray
+    pairs: FloatArray
     valid: BoolArray
 
 
@@ -153,8 +159,9 @@ def fit_edges(
         _rules(radius_px, iterations, converged_px, mirrored, least),
     )
     if fitted is not None:
-        _, _, sigma_px, width, contrast, residual, noise, valid = fitted.T
-        return EdgeFit(fitted[:, :2], sigma_px, width, contrast, residual, noise, valid > 0.5)
+        _, _, sigma_px, width, contrast, residual, noise, valid, used = fitted[:, : -2 * len(LAGS)].T
+        products, pairs = fitted[:, -2 * len(LAGS) : -len(LAGS)], fitted[:, -len(LAGS) :]
+        return EdgeFit(fitted[:, :2], sigma_px, width, contrast, residual, noise, used, products, pairs, valid > 0.5)
     window = collect(image, pixels, geometry, blur, radius_px)
     prior_mean, prior = _prior(geometry, loose, blur, window.size)
     kept = np.count_nonzero(loose > 0.0, axis=1) < 2
@@ -191,11 +198,13 @@ def fit_edges(
         active[np.flatnonzero(active)[change.max(axis=1) <= converged_px]] = False
         if not active.any():
             break
-    noise = variance
+    noise, lags = variance, np.zeros((2, len(pixels), len(LAGS)))
     if mirrored:
         variance = np.maximum((rest**2).sum(axis=1) / free, least)
-        noise = np.maximum(_noise(values, variance, window, rest), least)
-    return _result(values, variance, noise, normal, window, pixels, geometry, sign)
+        noise, lags = _noise(values, variance, window, rest)
+        lags[:, noise <= least] = 0.0
+        noise = np.maximum(noise, least)
+    return _result(values, variance, noise, lags, normal, window, pixels, geometry, sign)
 
 
 @functools.cache
@@ -278,11 +287,12 @@ def _limited(step: FloatArray, values: FloatArray) -> FloatArray:
     return out
 
 
-def _noise(values: FloatArray, variance: FloatArray, window: Window, rest: FloatArray) -> FloatArray:
+def _noise(values: FloatArray, variance: FloatArray, window: Window, rest: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the variance (N,) of the noise: of the `rest` (N, P) of the model, less what mirroring leaves, too.
 
     Mirrored at the corner, a pixel falls between four, which are interpolated; where one of them is not in the window
-    it has no mirror image. Few such pixels: `variance`, that of all residuals.
+    it has no mirror image. Few such pixels: `variance`, that of all residuals. The second result are `products` and
+    `pairs` of `EdgeFit`, (2, N, 13).
     """
     used = window.weight > 0.0
     middle = int(max(np.abs(window.u).max(initial=0.0), np.abs(window.v).max(initial=0.0))) + 1
@@ -314,7 +324,29 @@ def _noise(values: FloatArray, variance: FloatArray, window: Window, rest: Float
     apart = mean.sum(axis=1) / np.maximum(pairs, 1) / spread * count / np.maximum(count - DETERMINED, 1)
     enough = (pairs >= FEWEST_MIRRORED) & (count > DETERMINED)
     enough &= np.abs(values[:, [X, Y]]).max(axis=1) <= MOST_MIRRORED_PX
-    return np.where(enough, apart, variance)
+    lags = _lag_products(np.where(paired, change, 0.0), paired, window, np.floor(values[:, Y]))
+    return np.where(enough, apart, variance), np.where(enough[:, None], lags, 0.0)
+
+
+def _lag_products(change: FloatArray, paired: BoolArray, window: Window, last: FloatArray) -> FloatArray:
+    """Return `products` and `pairs` of `EdgeFit` (2, N, 13) from what mirroring changes at the `paired` pixels (N, P).
+
+    Rows after `last` (N,) are left out: they are mirror images of the others.
+    """
+    paired = paired & (window.v <= last[:, None])
+    middle = int(max(np.abs(window.u).max(initial=0.0), np.abs(window.v).max(initial=0.0))) + 1
+    across = 2 * middle + 1
+    u, v = (part.astype(np.int64)[paired] + middle for part in (window.u, window.v))
+    owner = np.nonzero(paired)[0]
+    # A margin of nothing, for pixels beyond the window.
+    square = np.zeros((2, len(change), across + 4, across + 4))
+    square[0, owner, v + 2, u + 2], square[1, owner, v + 2, u + 2] = change[paired], 1.0
+    here = square[:, :, 2:-2, 2:-2]
+    out = [
+        (here * square[:, :, 2 + down : across + 2 + down, 2 + right : across + 2 + right]).sum(axis=(2, 3))
+        for down, right in LAGS
+    ]
+    return np.stack(out, axis=-1)
 
 
 def _surrounded(pixels: FloatArray, window: Window) -> BoolArray:
@@ -329,6 +361,7 @@ def _result(
     values: FloatArray,
     variance: FloatArray,
     noise: FloatArray,
+    lags: FloatArray,
     normal: FloatArray,
     window: Window,
     start: FloatArray,
@@ -349,5 +382,8 @@ def _result(
         2.0 * values[:, B] * sign,
         np.sqrt(variance),
         np.sqrt(noise),
+        window.weight.sum(axis=1, dtype=np.float64),
+        lags[0],
+        lags[1],
         valid,
     )

@@ -8,7 +8,8 @@
 
 enum { X, Y, T1, T2, S, A, B, GX, GY, K1, K2, PARAMETERS };
 enum { FEWER = K1, ROWS = PARAMETERS + 1, LANES = 8, GROUPS = 8, BLOCK = LANES * GROUPS };
-enum { OUTCOMES = 8, STRETCH = 16, CACHE_LINE = 64 };
+enum { LAG = 2, ACROSS_LAGS = 2 * LAG + 1, LAGS = LAG * ACROSS_LAGS + LAG + 1, OUTCOMES = 9 + 2 * LAGS };
+enum { STRETCH = 16, CACHE_LINE = 64 };
 
 /* Eight numbers at once, wherever they lie. */
 typedef float lanes_t __attribute__((vector_size(4 * LANES), aligned(4)));
@@ -31,11 +32,10 @@ typedef struct {
 } geometry_t;
 
 /* The pixels of a corner, relative to (centre_u, centre_v), at most `radius` from it both ways. `rows` has room for the
- * rows of edge_model.linearise, a block of pixels after the other, `square` and `turned` for `across` x `across` pixels
- * around the centre. */
+ * rows of edge_model.linearise, a block of pixels after the other, `square`, `turned`, `change` and `paired` for `across`
+ * x `across` pixels around the centre. */
 typedef struct {
-    float *u, *v, *value, *rows, *square, *turned;
-    int64_t room;
+    float *u, *v, *value, *rows, *square, *turned, *change, *paired;
     int64_t count, across, radius;
     double centre_u, centre_v, size;
 } window_t;
@@ -545,6 +545,7 @@ static double unmirrored(const double *values, window_t *window, int parameters,
     /* What is left as a picture, and turned by half a turn: then mirror images are read in the order of the pixels. */
     const int32_t across = (int32_t)window->across, middle = across / 2, radius = (int32_t)window->radius;
     float *square = window->square + middle * across + middle, *turned = window->turned + middle * across + middle;
+    float *changes = window->change + middle * across + middle, *shown = window->paired + middle * across + middle;
     memset(window->square, 0xff, (size_t)(across * across) * sizeof(float)); /* NaN */
     memset(window->turned, 0xff, (size_t)(across * across) * sizeof(float));
     for (int64_t start = 0; start < window->count; start += BLOCK) {
@@ -559,9 +560,10 @@ static double unmirrored(const double *values, window_t *window, int parameters,
     const float right = (float)(2.0 * values[X] - left), below = (float)(2.0 * values[Y] - top);
     const float w00 = (1.0f - right) * (1.0f - below), w10 = right * (1.0f - below);
     const float w01 = (1.0f - right) * below, w11 = right * below;
+    const lanes_t one = (lanes_t){0.0f} + 1.0f;
     lanes_t sums = {0.0f};
     mask_t pairs = {0};
-    for (int32_t v = -radius; v <= radius; v++) {
+    for (int32_t v = (int32_t)window->v[0]; v <= (int32_t)window->v[window->count - 1]; v++) {
         const float *restrict here = square + v * across - radius;
         const float *restrict there = turned + (v - (int32_t)top) * across - (int32_t)left - radius;
         const float *restrict above = there - across;
@@ -571,7 +573,10 @@ static double unmirrored(const double *values, window_t *window, int parameters,
             const lanes_t far = w01 * *(const lanes_t *)(above + u) + w11 * *(const lanes_t *)(above + u - 1);
             const lanes_t change = *(const lanes_t *)(here + u) - (near + far);
             const mask_t paired = change == change;
-            sums += (lanes_t)((mask_t)(change * change) & paired);
+            const lanes_t part = (lanes_t)((mask_t)change & paired);
+            *(lanes_t *)(changes + v * across - radius + u) = part;
+            *(lanes_t *)(shown + v * across - radius + u) = (lanes_t)((mask_t)one & paired);
+            sums += part * part;
             pairs -= paired;
         }
     }
@@ -583,6 +588,46 @@ static double unmirrored(const double *values, window_t *window, int parameters,
     }
     const double spread = 1.0 + (double)(w00 * w00 + w10 * w10 + w01 * w01 + w11 * w11);
     return count >= rules->fewest_mirrored ? sum / (double)count / spread : -1.0;
+}
+
+/* Set `out` to the sums of the products of what mirroring changes at two pixels that are one of LAGS apart, and behind them
+ * to the numbers of such pairs, in the half of the window above `y`: the other half mirrors it (edge_fit._lag_products). */
+FOR_EACH_PROCESSOR
+static void lag_products(const window_t *window, double y, double *out)
+{
+    const int32_t across = (int32_t)window->across, middle = across / 2, radius = (int32_t)window->radius;
+    const float *changes = window->change + middle * across + middle - radius;
+    const float *shown = window->paired + middle * across + middle - radius;
+    const int32_t first = (int32_t)window->v[0], last = (int32_t)floor(y);
+    for (int32_t up = 0; up <= LAG; up++) {
+        lanes_t s0 = {0.0f}, s1 = s0, s2 = s0, s3 = s0, s4 = s0, n0 = s0, n1 = s0, n2 = s0, n3 = s0, n4 = s0;
+        for (int32_t v = first + up; v <= last; v++) {
+            const float *here = changes + v * across, *seen = shown + v * across;
+            const float *above = here - up * across, *beyond = seen - up * across;
+            for (int32_t u = 0; u <= 2 * radius; u += LANES) {
+                const lanes_t change = *(const lanes_t *)(here + u), paired = *(const lanes_t *)(seen + u);
+                s0 += change * *(const lanes_t *)(above + u - 2);
+                s1 += change * *(const lanes_t *)(above + u - 1);
+                s2 += change * *(const lanes_t *)(above + u);
+                s3 += change * *(const lanes_t *)(above + u + 1);
+                s4 += change * *(const lanes_t *)(above + u + 2);
+                n0 += paired * *(const lanes_t *)(beyond + u - 2);
+                n1 += paired * *(const lanes_t *)(beyond + u - 1);
+                n2 += paired * *(const lanes_t *)(beyond + u);
+                n3 += paired * *(const lanes_t *)(beyond + u + 1);
+                n4 += paired * *(const lanes_t *)(beyond + u + 2);
+            }
+        }
+        const lanes_t sums[ACROSS_LAGS] = {s0, s1, s2, s3, s4}, pairs[ACROSS_LAGS] = {n0, n1, n2, n3, n4};
+        /* In the row itself, lags to the left are those to the right. */
+        for (int k = up ? 0 : LAG; k < ACROSS_LAGS; k++, out++) {
+            out[0] = out[LAGS] = 0.0;
+            for (int lane = 0; lane < LANES; lane++) {
+                out[0] += (double)sums[k][lane];
+                out[LAGS] += (double)pairs[k][lane];
+            }
+        }
+    }
 }
 
 /* Return whether there are pixels on all sides of (x, y) (edge_fit._surrounded). */
@@ -599,7 +644,8 @@ static int surrounded(const window_t *window, float x, float y)
     return right >= 2 && left >= 2 && below >= 2 && above >= 2;
 }
 
-/* Fit one corner, of a `contrast` that may be unknown (NaN); `out` is u, v, sigma, s, 2 b, RMS residual, RMS noise, valid. */
+/* Fit one corner, of a `contrast` that may be unknown (NaN); `out` is u, v, sigma, s, 2 b, RMS residual, RMS noise, valid,
+ * pixels, sums and numbers of `lag_products`, none where the noise is not known or is that of rounding. */
 static void fit_corner(
     window_t *window, const double pixel[2], const geometry_t at, double sign, double blur, double contrast,
     const rules_t *rules, double *out)
@@ -649,11 +695,14 @@ static void fit_corner(
             break;
     }
     double noise = variance;
+    memset(out + OUTCOMES - 2 * LAGS, 0, 2 * LAGS * sizeof(double));
     if (rules->mirrored && more > 0) {
         variance = leave(window, last, n) / (double)more;
         variance = variance > rules->least_variance ? variance : rules->least_variance;
         const double mean = unmirrored(values, window, n, rules);
         noise = mean < 0.0 ? variance : mean * (double)window->count / (double)more;
+        if (mean >= 0.0 && noise > rules->least_variance)
+            lag_products(window, values[Y], out + OUTCOMES - 2 * LAGS);
         noise = noise > rules->least_variance ? noise : rules->least_variance;
     }
     const double spread = solved ? 0.5 * noise * (inverse_at(products, X, n) + inverse_at(products, Y, n)) : NAN;
@@ -671,6 +720,7 @@ static void fit_corner(
     out[5] = sqrt(variance);
     out[6] = sqrt(noise);
     out[7] = (double)valid;
+    out[8] = (double)window->count;
 }
 
 /* Side of the square that holds the window and, around it, nothing where mirror images may fall. */
@@ -689,7 +739,7 @@ static int64_t room_of_window(double radius_px)
 int64_t edges_scratch(const rules_t *rules)
 {
     const int64_t across = across_square(rules);
-    return (3 + ROWS) * room_of_window(rules->radius_px) + 2 * across * across + CACHE_LINE / (int64_t)sizeof(float);
+    return (3 + ROWS) * room_of_window(rules->radius_px) + 4 * across * across + CACHE_LINE / (int64_t)sizeof(float);
 }
 
 /* Fit the edge model around `count` corners (edge_fit.fit_edges). pixels (N, 2), sides (N, 2, 2), curvature and its sigma
@@ -704,9 +754,11 @@ void fit_edges(
     const int64_t room = room_of_window(rules->radius_px), across = across_square(rules);
     /* Vectors that lie across two lines of the cache take twice the time. */
     scratch += (CACHE_LINE - (uintptr_t)scratch % CACHE_LINE) % CACHE_LINE / sizeof(float);
+    float *pictures = scratch + (3 + ROWS) * room;
     window_t window = {
         .u = scratch, .v = scratch + room, .value = scratch + 2 * room, .rows = scratch + 3 * room,
-        .square = scratch + (3 + ROWS) * room, .turned = scratch + (3 + ROWS) * room + across * across, .across = across,
+        .square = pictures, .turned = pictures + across * across, .change = pictures + 2 * across * across,
+        .paired = pictures + 3 * across * across, .across = across,
         .radius = (int64_t)floor(rules->radius_px)};
     for (int64_t n = 0; n < count; n++) {
         const geometry_t at = {

@@ -12,10 +12,14 @@ from numpy.typing import NDArray
 from rigkit.arrays import BoolArray, FloatArray
 from rigkit.native import address, kernels
 
-__all__ = ["OUTCOMES", "BendRules", "Rules", "fit_corners", "line_bends"]
+__all__ = ["LAGS", "OUTCOMES", "BendRules", "Rules", "fit_corners", "line_bends"]
 
-OUTCOMES = 8
-"""Numbers that come out of a corner: u, v, sigma, s, 2 b, RMS residual, RMS noise, whether it is valid."""
+LAGS = tuple((-up, right) for up in range(3) for right in range(-2, 3) if up or right >= 0)
+"""How far, in rows and columns, two pixels lie apart whose noise is compared; the opposite ones are the same."""
+
+OUTCOMES = 9 + 2 * len(LAGS)
+"""Numbers that come out of a corner: u, v, sigma, s, 2 b, RMS residual, RMS noise, whether it is valid, its pixels, for
+each of the `LAGS` the sum of products of the noise, and of how many."""
 
 
 class Rules(ctypes.Structure):
@@ -95,7 +99,7 @@ def fit_corners(
     contrast: FloatArray,
     rules: Rules,
 ) -> FloatArray | None:
-    """Return the `OUTCOMES` of N corners, (N, 8), or None without the compiled kernel. Arguments as `fit_edges`."""
+    """Return the `OUTCOMES` of N corners, (N, 35), or None without the compiled kernel. Arguments as `fit_edges`."""
     library = _library()
     if library is None:
         return None

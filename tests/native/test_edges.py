@@ -27,6 +27,9 @@ ROUNDING_PX = 5e-5
 ROUNDING_REL = 2e-3
 """Of sigma and residual: a pixel whose place on the window's edge is decided by rounding is one of two hundred."""
 
+SAME_PAIRS_REL = 0.02
+"""Of the sums over pairs of pixels, likewise: a pixel has a mirror image or not, and is one of a hundred."""
+
 
 def both(*arguments: object, monkeypatch: pytest.MonkeyPatch, **options: object) -> tuple[EdgeFit, EdgeFit]:
     compiled = fit_edges(*arguments, **options)  # type: ignore[arg-type]
@@ -74,6 +77,11 @@ def test_compiled_fit_is_the_numpy_fit(
     for name in ("sigma_px", "blur", "contrast", "residual", "noise"):
         ours, theirs = getattr(compiled, name)[good], getattr(plain, name)[good]
         assert np.abs(ours / theirs - 1.0).max() < ROUNDING_REL, name
+    assert np.array_equal(compiled.pairs > 0.0, plain.pairs > 0.0)
+    assert np.count_nonzero(plain.pairs[good, 0]) > 40
+    for ours, theirs in ((compiled.pairs, plain.pairs), (compiled.products, plain.products)):
+        assert np.abs(ours - theirs)[good].max() <= SAME_PAIRS_REL * theirs[good, :1].max()
+    assert np.abs(compiled.used - plain.used).max() <= 2.0
 
 
 def test_same_pixels_whatever_the_cell(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
