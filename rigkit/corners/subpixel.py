@@ -14,6 +14,7 @@ import numpy as np
 
 from rigkit.arrays import BoolArray, FloatArray
 from rigkit.corners.bends import line_curvature
+from rigkit.corners.correlation import sigma_factors
 from rigkit.corners.edge_fit import BLUR_RANGE, fit_edges
 from rigkit.corners.edge_model import REACH, Geometry, ends_of
 from rigkit.corners.lattice import Lattice, Sheet, padded
@@ -135,7 +136,9 @@ def refine(image: GreyImage, lattices: Sequence[Lattice]) -> list[RefinedLattice
     blur, unknown = np.full(sheet.signs.shape, FIRST_BLUR), np.full(sheet.signs.shape, FIRST_SIGMA_PX)
     first = _pass(image, start, sheet.signs, blur, unknown, *FIRST_PASS)
     start, holes = _with_holes(first.lattice, sheet.signs != 0.0)
-    second = _pass(image, start, sheet.signs, _typical_blur(first, sheet.parts), first.sigma_px, *LAST_PASS)
+    second = _pass(
+        image, start, sheet.signs, _typical_blur(first, sheet.parts), first.sigma_px, *LAST_PASS, sheet.parts
+    )
     if holes.any():
         second = _confirmed(second, start, holes)
     checked = _checked(second, sheet.parts)
@@ -177,8 +180,12 @@ def _pass(
     iterations: int,
     converged_px: float,
     last: bool,
+    parts: Sequence[Part] = (),
 ) -> RefinedLattice:
-    """Fit all corners of the sheet `start`, known to `sigma_px` (R, C); those that fail are left out."""
+    """Fit all corners of the sheet `start`, known to `sigma_px` (R, C); those that fail are left out.
+
+    The last pass tells how the noise of neighbouring pixels is correlated, on each of the `parts`.
+    """
     known = start.known
     shape = fit_cells(start.pixels, known)
     lengths = np.maximum(np.hypot(shape.sides[..., 0], shape.sides[..., 1]), 1.0)
@@ -201,10 +208,17 @@ def _pass(
         contrast=start.contrast[known] if last else None,
     )
     good = fit.valid & (fit.contrast > 0.0)
+    fitted_sigma = fit.sigma_px
+    if last:
+        owner = np.zeros(known.shape, np.int64)
+        for k, part in enumerate(parts):
+            owner[part] = k
+        mine = owner[known]
+        fitted_sigma = fitted_sigma * sigma_factors(fit, good, shape.sides, mine, len(parts), radius_px)[mine]
     cells = np.flatnonzero(known)[good]
     pixels, single = np.full((known.size, 2), np.nan), np.full((5, known.size), np.nan)
     pixels[cells] = fit.pixels[good]
-    single[:, cells] = np.array([fit.contrast, fit.sigma_px, fit.blur, fit.residual, fit.noise])[:, good]
+    single[:, cells] = np.array([fit.contrast, fitted_sigma, fit.blur, fit.residual, fit.noise])[:, good]
     contrast, *rest = single.reshape(-1, *known.shape)
     return RefinedLattice(Lattice(pixels.reshape(*known.shape, 2), contrast, start.rising), *rest)
 
