@@ -173,6 +173,8 @@ def _completed(image: GreyImage, found: BoardDetection, board: Board, camera: Ca
     row, column = np.nonzero(state.known)
     if len(row) < FEWEST:
         return found
+    # Noise that cancels from pixel to pixel lets sigmas be smaller; where they must be larger, the scatter shows it.
+    state = replace(state, sigma_px=min(1.0, _known_factor(found, opened)) * state.sigma_px)
     sigma = _scatter(guide, state) * state.sigma_px[row, column]
     return replace(found, grid=np.stack([column, row], axis=-1), pixels=state.pixels[row, column], sigma_px=sigma)
 
@@ -180,9 +182,7 @@ def _completed(image: GreyImage, found: BoardDetection, board: Board, camera: Ca
 def _with_added(guide: Guide, found: BoardDetection, opened: BoardState, state: BoardState) -> BoardDetection:
     """Return `found` with those corners of `state` that it has not, but for any that contradict the others."""
     added = state.known & ~opened.known & (_contradiction(guide, state, state) <= 1.0)
-    # Sigmas that the detector has raised to what it saw of the corners' scatter are raised here, too.
-    raised = found.sigma_px / opened.sigma_px[found.grid[:, 1], found.grid[:, 0]]
-    sigma = max(1.0, float(np.nanmedian(raised))) * state.sigma_px
+    sigma = _known_factor(found, opened) * state.sigma_px
     row, column = np.nonzero(added)
     grid = np.concatenate([found.grid, np.stack([column, row], axis=-1)])
     order = np.lexsort((grid[:, 0], grid[:, 1]))
@@ -192,6 +192,11 @@ def _with_added(guide: Guide, found: BoardDetection, opened: BoardState, state: 
         pixels=np.concatenate([found.pixels, state.pixels[row, column]])[order],
         sigma_px=np.concatenate([found.sigma_px, sigma[row, column]])[order],
     )
+
+
+def _known_factor(found: BoardDetection, opened: BoardState) -> float:
+    """Return the factor that the detector, which saw scatter and noise of the board as a whole, gave its sigmas."""
+    return float(np.nanmedian(found.sigma_px / opened.sigma_px[found.grid[:, 1], found.grid[:, 0]]))
 
 
 def _scatter(guide: Guide, state: BoardState) -> float:

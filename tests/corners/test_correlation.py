@@ -125,12 +125,17 @@ def compressed(levels: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("degrade", "blur_px", "noise", "scale"),
-    [(demosaiced, 1.1, 5.0, 1.0), (enlarged, 0.8, 3.0, 2.0), (compressed, 0.6, 0.5, 1.0)],
-    ids=["demosaiced", "enlarged", "jpeg"],
+    ("degrade", "blur_px", "noise", "scale", "guided"),
+    [
+        (demosaiced, 1.1, 5.0, 1.0, False),
+        (enlarged, 0.8, 3.0, 2.0, False),
+        (compressed, 0.6, 0.5, 1.0, False),
+        (compressed, 0.6, 0.5, 1.0, True),
+    ],
+    ids=["demosaiced", "enlarged", "jpeg", "jpeg-camera"],
 )
 def test_boards_in_images_as_they_come(
-    degrade: Callable[[np.ndarray], np.ndarray], blur_px: float, noise: float, scale: float
+    degrade: Callable[[np.ndarray], np.ndarray], blur_px: float, noise: float, scale: float, guided: bool
 ) -> None:
     """Boards of sixteen corners: too few for their scatter about smooth rows to tell."""
     board = Board("a", 4, 4, 30.0, 30.0)
@@ -142,7 +147,7 @@ def test_boards_in_images_as_they_come(
         image = degrade(np.clip(np.rint(levels + white), 0, 255).astype(np.uint8))
         (truth,) = scene.truth()
         tree = cKDTree((truth.pixels + 0.5) * scale - 0.5)
-        (found,) = detect_boards(image)
+        (found,) = detect_boards(image, [board], camera=scene.camera if guided else None)
         distance, nearest = tree.query(found.pixels)
         errors.append((found.pixels - tree.data[nearest])[distance < scale])
         sigmas.append(found.sigma_px[distance < scale])
