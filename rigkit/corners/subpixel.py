@@ -15,7 +15,7 @@ import numpy as np
 from rigkit.arrays import BoolArray, FloatArray
 from rigkit.corners.bends import line_curvature
 from rigkit.corners.correlation import sigma_factors
-from rigkit.corners.edge_fit import BLUR_RANGE, fit_edges
+from rigkit.corners.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
 from rigkit.corners.edge_model import REACH, Geometry, ends_of
 from rigkit.corners.lattice import Lattice, Sheet, padded
 from rigkit.corners.local_fit import LocalFit, fit_cells
@@ -29,14 +29,10 @@ Part = tuple[slice, slice]
 FIRST_BLUR = 1.0
 """s that the first pass starts from, px."""
 
-FIRST_SIGMA_PX = 0.1
-"""How well corners are known before the first pass: saddles of a smoothed image."""
-
-FIRST_PASS = (8.0, 4, 0.02, False)
-LAST_PASS = (18.0, 8, 0.01, True)
-"""Radius in px, Gauss-Newton steps at most, the step in px that ends them, and whether noise is told from other
-residuals and curvatures are fitted where loose: the first pass only has to bring the lattice to a few hundredths of a
-pixel; after the last step of the last one there is a ten-thousandth to go."""
+FIRST_PASS = (8.0, 4, 0.02)
+LAST_PASS = (18.0, 8, 0.01)
+"""Radius in px, Gauss-Newton steps at most, and the step in px that ends them: the first pass only has to bring the
+lattice to a few hundredths of a pixel; after the last step of the last one there is a ten-thousandth to go."""
 
 LOOSE = 0.5
 """Curvatures are fitted where the lattice leaves them open by so much that the corner would move by more than this, in
@@ -133,15 +129,12 @@ def refine(image: GreyImage, lattices: Sequence[Lattice]) -> list[RefinedLattice
     # All lattices lie on one sheet, so that each step is one call.
     sheet = Sheet.of(lattices)
     start = Lattice(sheet.pixels, sheet.contrast, True)
-    blur, unknown = np.full(sheet.signs.shape, FIRST_BLUR), np.full(sheet.signs.shape, FIRST_SIGMA_PX)
-    first = _pass(image, start, sheet.signs, blur, unknown, *FIRST_PASS)
+    first = _first_pass(image, start, sheet.signs)
     start, holes = _with_holes(first.lattice, sheet.signs != 0.0)
-    second = _pass(
-        image, start, sheet.signs, _typical_blur(first, sheet.parts), first.sigma_px, *LAST_PASS, sheet.parts
-    )
+    last = _last_pass(image, start, sheet.signs, _typical_blur(first, sheet.parts), first.sigma_px, sheet.parts)
     if holes.any():
-        second = _confirmed(second, start, holes)
-    checked = _checked(second, sheet.parts)
+        last = _confirmed(last, start, holes)
+    checked = _checked(last, sheet.parts)
     # Where corners scatter about the lattice by more than the noise in the image explains (JPEG blocks, aliasing, wavy
     # paper), the sigmas of the board are raised to what is seen.
     scatter = excess_scatter(checked.lattice.pixels, checked.sigma_px, sheet.parts)
@@ -170,30 +163,45 @@ def _typical_blur(item: RefinedLattice, parts: Sequence[Part]) -> FloatArray:
     return blur.clip(*BLUR_RANGE)
 
 
-def _pass(
+def _first_pass(image: GreyImage, start: Lattice, signs: FloatArray) -> RefinedLattice:
+    """Fit all corners of the sheet `start`, known to about a tenth of a pixel; those that fail are left out."""
+    known = start.known
+    shape = fit_cells(start.pixels, known)
+    radius_px, iterations, converged_px = FIRST_PASS
+    fit = fit_edges(
+        image,
+        start.pixels[known],
+        Geometry(shape.sides, shape.curvature(), shape.gaps(), ends_of(known, known)),
+        signs[known],
+        np.full(start.count, FIRST_BLUR),
+        radius_px=radius_px,
+        iterations=iterations,
+        converged_px=converged_px,
+        mirrored=False,
+    )
+    return _spread(start, fit, fit.sigma_px)
+
+
+def _last_pass(
     image: GreyImage,
     start: Lattice,
     signs: FloatArray,
     blur: FloatArray,
     sigma_px: FloatArray,
-    radius_px: float,
-    iterations: int,
-    converged_px: float,
-    last: bool,
-    parts: Sequence[Part] = (),
+    parts: Sequence[Part],
 ) -> RefinedLattice:
     """Fit all corners of the sheet `start`, known to `sigma_px` (R, C); those that fail are left out.
 
-    The last pass tells how the noise of neighbouring pixels is correlated, on each of the `parts`.
+    Noise is told from other residuals, and how that of neighbouring pixels is correlated on each of the `parts`.
     """
     known = start.known
     shape = fit_cells(start.pixels, known)
     lengths = np.maximum(np.hypot(shape.sides[..., 0], shape.sides[..., 1]), 1.0)
     curvature, curvature_sigma = line_curvature(start.pixels, sigma_px, known, lengths)
-    if last:
-        # A parabola k / 2 t^2 lies k / 6 r^2 beside the corner in the mean over |t| < r.
-        beside = curvature_sigma * np.minimum(radius_px, REACH * lengths) ** 2 / 6.0
-        curvature_sigma[(beside <= LOOSE * sigma_px[known][:, None]).all(axis=1)] = 0.0
+    radius_px, iterations, converged_px = LAST_PASS
+    # A parabola k / 2 t^2 lies k / 6 r^2 beside the corner in the mean over |t| < r.
+    beside = curvature_sigma * np.minimum(radius_px, REACH * lengths) ** 2 / 6.0
+    curvature_sigma[(beside <= LOOSE * sigma_px[known][:, None]).all(axis=1)] = 0.0
     fit = fit_edges(
         image,
         start.pixels[known],
@@ -203,24 +211,26 @@ def _pass(
         radius_px=radius_px,
         iterations=iterations,
         converged_px=converged_px,
-        mirrored=last,
-        curvature_sigma=curvature_sigma if last else None,
-        contrast=start.contrast[known] if last else None,
+        curvature_sigma=curvature_sigma,
+        contrast=start.contrast[known],
     )
+    owner = np.zeros(known.shape, np.int64)
+    for k, part in enumerate(parts):
+        owner[part] = k
+    mine = owner[known]
+    factors = sigma_factors(fit, fit.valid & (fit.contrast > 0.0), shape.sides, mine, len(parts), radius_px)
+    return _spread(start, fit, fit.sigma_px * factors[mine])
+
+
+def _spread(start: Lattice, fit: EdgeFit, sigma_px: FloatArray) -> RefinedLattice:
+    """Return the sheet `start` with its corners as fitted, without those that failed."""
     good = fit.valid & (fit.contrast > 0.0)
-    fitted_sigma = fit.sigma_px
-    if last:
-        owner = np.zeros(known.shape, np.int64)
-        for k, part in enumerate(parts):
-            owner[part] = k
-        mine = owner[known]
-        fitted_sigma = fitted_sigma * sigma_factors(fit, good, shape.sides, mine, len(parts), radius_px)[mine]
-    cells = np.flatnonzero(known)[good]
-    pixels, single = np.full((known.size, 2), np.nan), np.full((5, known.size), np.nan)
+    cells, shape = np.flatnonzero(start.known)[good], start.contrast.shape
+    pixels, single = np.full((start.known.size, 2), np.nan), np.full((5, start.known.size), np.nan)
     pixels[cells] = fit.pixels[good]
-    single[:, cells] = np.array([fit.contrast, fitted_sigma, fit.blur, fit.residual, fit.noise])[:, good]
-    contrast, *rest = single.reshape(-1, *known.shape)
-    return RefinedLattice(Lattice(pixels.reshape(*known.shape, 2), contrast, start.rising), *rest)
+    single[:, cells] = np.array([fit.contrast, sigma_px, fit.blur, fit.residual, fit.noise])[:, good]
+    contrast, *rest = single.reshape(-1, *shape)
+    return RefinedLattice(Lattice(pixels.reshape(*shape, 2), contrast, start.rising), *rest)
 
 
 def _with_holes(lattice: Lattice, inside: BoolArray) -> tuple[Lattice, BoolArray]:

@@ -776,38 +776,39 @@ typedef struct {
     int64_t reach;
 } bend_rules_t;
 
-/* The normal equations of a line's Taylor coefficients, in sides of the cell, without their prior. */
+/* The normal equations of a line's Taylor coefficients, in sides of the cell, without their prior: row i, column j of the
+ * matrix is moment i + j. */
 typedef struct {
-    double normal[TERMS][TERMS], right[TERMS][2];
+    double moment[2 * TERMS - 1], right[TERMS][2];
 } taylor_t;
 
 /* Set `out` to the most probable coefficients along both axes, if they are known beforehand to be of size `sigma`, and
  * return the standard deviation of the second. */
-static double most_probable(const taylor_t *line, const double sigma[TERMS], double free, double out[TERMS][2])
+INLINE double most_probable(const taylor_t *line, const double sigma[TERMS], double free, double out[TERMS][2])
 {
-    /* Beside the two axes, a column of the inverse. */
+    /* Beside the two axes, a column of the inverse; one over the diagonal on the diagonal. */
     double lower[TERMS][TERMS], right[TERMS][3] = {{0.0}};
     right[2][2] = 1.0;
     for (int j = 0; j < TERMS; j++) {
         right[j][0] = line->right[j][0] * sigma[j];
         right[j][1] = line->right[j][1] * sigma[j];
         for (int i = j; i < TERMS; i++) {
-            double sum = line->normal[i][j] * sigma[i] * sigma[j] + (i > j ? 0.0 : j < 2 ? free : 1.0);
+            double sum = line->moment[i + j] * sigma[i] * sigma[j] + (i > j ? 0.0 : j < 2 ? free : 1.0);
             for (int k = 0; k < j; k++)
                 sum -= lower[i][k] * lower[j][k];
-            lower[i][j] = i == j ? sqrt(sum) : sum / lower[j][j];
+            lower[i][j] = i == j ? 1.0 / sqrt(sum) : sum * lower[j][j];
         }
         for (int axis = 0; axis < 3; axis++) {
             for (int k = 0; k < j; k++)
                 right[j][axis] -= lower[j][k] * right[k][axis];
-            right[j][axis] /= lower[j][j];
+            right[j][axis] *= lower[j][j];
         }
     }
     for (int j = TERMS - 1; j >= 0; j--)
         for (int axis = 0; axis < 3; axis++) {
             for (int k = j + 1; k < TERMS; k++)
                 right[j][axis] -= lower[k][j] * right[k][axis];
-            right[j][axis] /= lower[j][j];
+            right[j][axis] *= lower[j][j];
         }
     for (int j = 0; j < TERMS; j++)
         for (int axis = 0; axis < 2; axis++)
@@ -816,11 +817,12 @@ static double most_probable(const taylor_t *line, const double sigma[TERMS], dou
 }
 
 /* Set `out` to the curvature at place `at` of a line of `count` corners, `stride` cells apart, and its sigma. */
-static void line_bend(
+INLINE void line_bend(
     const double *pixels, const double *sigma, int64_t stride, int64_t at, int64_t count, double side,
     const bend_rules_t *rules, double *out, double *out_sigma)
 {
     taylor_t line = {0};
+    const double per_side = 1.0 / side;
     for (int64_t step = -rules->reach; step <= rules->reach; step++) {
         if (at + step < 0 || at + step >= count)
             continue;
@@ -828,17 +830,16 @@ static void line_bend(
         double wide = sigma[step * stride];
         if (!isfinite(wide) || !isfinite(other[0]))
             continue;
-        wide = (wide > rules->least_sigma ? wide : rules->least_sigma) / side;
-        const double weight = 1.0 / (wide * wide);
-        const double off[2] = {(other[0] - pixels[0]) / side, (other[1] - pixels[1]) / side};
-        double power[TERMS] = {1.0};
-        for (int k = 1; k < TERMS; k++)
-            power[k] = power[k - 1] * (double)step;
-        for (int i = 0; i < TERMS; i++) {
-            for (int j = 0; j <= i; j++)
-                line.normal[i][j] += weight * power[i] * power[j];
-            line.right[i][0] += weight * power[i] * off[0];
-            line.right[i][1] += weight * power[i] * off[1];
+        wide = per_side * (wide > rules->least_sigma ? wide : rules->least_sigma);
+        const double u = (other[0] - pixels[0]) * per_side, v = (other[1] - pixels[1]) * per_side;
+        double moment = 1.0 / (wide * wide);
+        for (int k = 0; k < 2 * TERMS - 1; k++) {
+            line.moment[k] += moment;
+            if (k < TERMS) {
+                line.right[k][0] += moment * u;
+                line.right[k][1] += moment * v;
+            }
+            moment *= (double)step;
         }
     }
     double expected[TERMS] = {1.0}, found[TERMS][2];
@@ -864,6 +865,7 @@ static void line_bend(
 
 /* Set `out` (M, 2) to the curvature of row and column at the M wanted cells and `out_sigma` to its standard deviation
  * (corners.bends.line_curvature). */
+FOR_EACH_PROCESSOR
 void line_bends(
     const double *pixels, const double *sigma, const uint8_t *wanted, int64_t rows, int64_t columns, const double *sides,
     const bend_rules_t *rules, double *out, double *out_sigma)
