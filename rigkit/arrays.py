@@ -26,8 +26,12 @@ __all__ = [
     "Rays",
     "as_array",
     "as_indices",
+    "in_8_bits",
     "without_nan",
 ]
+
+BRIGHT_SHARE = 0.999
+"""Of the pixels; the rest may be brighter than the image's bits: hot, or a glint."""
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -81,6 +85,18 @@ def as_indices(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> In
     _check_shape(array, shape, name)
     array.flags.writeable = False
     return array
+
+
+def in_8_bits(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return an image of 8 bits as it is, one of 16 by the upper eight of those bits that its bright pixels need.
+
+    Cameras of 10 and 12 bits fill the lower bits of 16.
+    """
+    if image.dtype == np.uint8:
+        return image
+    bright = int(np.quantile(image[::8, ::8], BRIGHT_SHARE)) if image.size else 0
+    bits = min(max(bright.bit_length(), 8), 16)
+    return np.asarray(np.minimum(image, (1 << bits) - 1) >> (bits - 8), dtype=np.uint8)
 
 
 def _check_shape(array: NDArray[Any], shape: tuple[int | None, ...], name: str) -> None:

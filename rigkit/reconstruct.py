@@ -19,7 +19,7 @@ from rigkit.affine.affinities import Affinities, EpipolarNormals
 from rigkit.affine.geometry_noise import geometry_covariance
 from rigkit.affine.normal import estimate_normals
 from rigkit.affine.registry import affines_from_directions, needs_epipolar
-from rigkit.arrays import Affines, BoolArray, FloatArray, Mat3, Pixels
+from rigkit.arrays import Affines, BoolArray, FloatArray, Mat3, Pixels, in_8_bits
 from rigkit.boards import Board
 from rigkit.cameras.base import Camera
 from rigkit.cloud import OrientedCloud
@@ -391,8 +391,6 @@ def _colours(image: NDArray[np.generic] | None, pixels: Pixels) -> NDArray[np.ui
     if image is None:
         return np.full((len(pixels), 3), GREY, dtype=np.uint8)
     column, row = np.rint(pixels).astype(np.int64).T
-    values = image[np.clip(row, 0, image.shape[0] - 1), np.clip(column, 0, image.shape[1] - 1)]
-    if image.dtype == np.uint16:
-        values = values.astype(np.uint16) >> 8
+    values = in_8_bits(image)[np.clip(row, 0, image.shape[0] - 1), np.clip(column, 0, image.shape[1] - 1)]
     grey = values[:, None] if values.ndim == 1 else values
     return np.ascontiguousarray(np.broadcast_to(grey, (len(pixels), 3)), dtype=np.uint8)

@@ -168,3 +168,14 @@ def test_images_of_textured_walls(rng, lens):
     assert np.median(np.linalg.norm(cloud.points_mm - points, axis=1)) < 2.5
     grey = images[0][tuple(np.rint(found.pixels1[scene.kept]).astype(int).T[::-1])]
     np.testing.assert_array_equal(cloud.colours, np.repeat(grey[:, None], 3, axis=1))
+
+
+@pytest.mark.parametrize("bits", [8, 12, 16])
+def test_colours_of_deep_images_are_no_darker(rng, bits):
+    found, *_ = contaminated(rng, outliers=0.0)
+    width, height = REGULAR.size_px
+    grey = np.broadcast_to(np.linspace(20.0, 250.0, width).astype(np.uint8), (height, width))
+    image = grey if bits == 8 else grey.astype(np.uint16) << (bits - 8)
+    scene = reconstruct_scene(found, REGULAR, REGULAR, image1=image)
+    column = np.rint(found.pixels1[scene.kept, 0]).astype(int)
+    np.testing.assert_array_equal(scene.reconstruction.cloud.colours[:, 0], grey[0, column])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.refine_patches import refine_patches
-from rigkit.arrays import BoolArray, FloatArray, IntArray, Pixels
+from rigkit.arrays import BoolArray, FloatArray, IntArray, Pixels, in_8_bits
 from rigkit.errors import DegenerateError, InputError
 
 __all__ = ["match_affine_features"]
@@ -110,8 +110,7 @@ def _grey(image: NDArray[Any], name: str) -> NDArray[np.uint8]:
         )
     if min(array.shape[:2]) < MIN_SIZE_PX:
         raise InputError(f"affine features, {name}: at least {MIN_SIZE_PX} px a side, got {array.shape[:2]}")
-    if array.dtype == np.uint16:
-        array = (array >> 8).astype(np.uint8)
+    array = in_8_bits(array)
     if array.ndim == 3:
         array = cv2.cvtColor(np.ascontiguousarray(array), cv2.COLOR_RGB2GRAY)
     return np.ascontiguousarray(array)

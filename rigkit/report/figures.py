@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.arrays import FloatArray, Pixels
+from rigkit.arrays import FloatArray, Pixels, in_8_bits
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import CameraDifference
 from rigkit.geometry.rigid3 import Rigid3
@@ -302,7 +302,7 @@ def _fitted(image: NDArray[Any], width: float, height: float) -> NDArray[np.uint
     size = (max(round(scale * image.shape[1]), 1), max(round(scale * image.shape[0]), 1))
     small: NDArray[Any] = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if scale < 1.0 else image
     if image.ndim == 3:
-        return (small >> 8).astype(np.uint8) if image.dtype == np.uint16 else small
+        return in_8_bits(small)
     low, high = int(image.min()), int(image.max())
     shown = ((small.astype(np.float32) - low) * (255.0 / max(high - low, 1))).astype(np.uint8)
     return np.repeat(shown[..., None], 3, axis=2)

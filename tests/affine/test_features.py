@@ -150,3 +150,18 @@ def test_colour_and_16_bits_give_the_same(images: tuple[np.ndarray, np.ndarray])
     deep = match_affine_features(*(v.astype(np.uint16) << 8 for v in images), **options)
     np.testing.assert_array_equal(plain.pixels2, colour.pixels2)
     np.testing.assert_array_equal(plain.pixels2, deep.pixels2)
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 16])
+def test_sensors_that_fill_the_lower_bits_of_16_give_the_same(images: tuple[np.ndarray, np.ndarray], bits: int) -> None:
+    plain = match_affine_features(*images, tilts=(1.0,))
+    deep = [image.astype(np.uint16) << (bits - 8) for image in images]
+    # A hot pixel is no reason to take all others for dark.
+    deep[0][4, 4] = 65535
+    found = match_affine_features(*deep, tilts=(1.0,))
+    assert abs(len(found) - len(plain)) < 0.05 * len(plain)
+    same = [np.flatnonzero((np.abs(plain.pixels1 - q) < 1e-9).all(axis=1)) for q in found.pixels1]
+    both = [(i[0], j) for j, i in enumerate(same) if i.size]
+    assert len(both) > 0.95 * len(plain)
+    i, j = np.array(both).T
+    np.testing.assert_allclose(found.pixels2[j], plain.pixels2[i], atol=0.01)
