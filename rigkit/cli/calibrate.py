@@ -185,7 +185,7 @@ def session_corners(session: Session, progress: Progress) -> dict[str, FoundCorn
             raise InputError(f"{session.path}: no image matches 'images'{whose}, and no corners are kept beside it")
         note(
             f"{session.path}: no image matches 'images'; the corners of {len(found)} images kept in "
-            f"{session.corners_path.name} are used"
+            f"{session.corners_path.name} are used" + ("" if cache.current else ", found by another version of rigkit")
         )
     hashes = {name: image_hash(path) for path, name in zip(session.images, image_names(session), strict=True)}
     paths = dict(zip(hashes, session.images, strict=True))

@@ -1,7 +1,7 @@
 """Corners found before, beside the session, so that calibrating again needs no images.
 
 An entry holds as long as the image (by its hash), the detector (by the hash of its source) and the sizes of the boards
-are the same.
+are the same; where the images are gone, those of an earlier detector are better than none.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
-import rigkit.corners
 from rigkit.boards import Board
 from rigkit.detections import BoardDetection
 from rigkit.errors import InputError
 from rigkit.io.files import write_atomic
+from rigkit.io.sources import source_hash
 
 __all__ = ["CornerCache", "FoundCorners", "image_hash"]
 
@@ -47,15 +47,20 @@ class CornerCache:
 
     def __init__(self, path: Path, boards: Sequence[Board]) -> None:
         self.path = path
-        self.detector = _detector_version() + " " + " ".join(_target(b) for b in boards)
+        targets = " ".join(_target(b) for b in boards)
+        self.detector = f"{source_hash('corners', 'native')} {targets}"
+        self.current = True
+        """Whether the entries are of this detector."""
         self._entries: dict[str, dict[str, Any]] = {}
         self._changed = False
         try:
             data = json.loads(path.read_text(encoding="utf-8"))
-            if isinstance(data, dict) and data.get("schema") == SCHEMA and data.get("detector") == self.detector:
+            if isinstance(data, dict) and data.get("schema") == SCHEMA:
+                if data["detector"].partition(" ")[2] != targets:
+                    return
                 for entry in data["images"].values():
                     str(entry["sha256"]), _found_in(entry)
-                self._entries = data["images"]
+                self._entries, self.current = data["images"], data["detector"] == self.detector
         except (OSError, ValueError, TypeError, KeyError, AttributeError, InputError):
             # A cache that cannot be read is as good as none: it is written anew.
             return
@@ -69,13 +74,15 @@ class CornerCache:
         """Return the corners of image `name` if its hash is `digest`; None as digest takes what is there (the image is
         gone)."""
         entry = self._entries.get(name)
-        if entry is None or (digest is not None and entry["sha256"] != digest):
+        if entry is None or (digest is not None and (entry["sha256"] != digest or not self.current)):
             return None
         return _found_in(entry)
 
     def put(self, name: str, digest: str, found: FoundCorners) -> None:
         """Remember the corners of an image."""
         boards = [_detection_out(d) for d in found.detections]
+        if not self.current:
+            self._entries, self.current = {}, True
         entry = {"sha256": digest, "size_px": list(found.size_px), "through_camera": found.through_camera}
         self._entries[name] = entry | {"boards": boards}
         self._changed = True
@@ -103,13 +110,6 @@ def _target(board: Board) -> str:
 def image_hash(path: Path) -> str:
     """Return the SHA-256 of the file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def _detector_version() -> str:
-    digest = hashlib.sha256()
-    for path in sorted(Path(rigkit.corners.__path__[0]).glob("*.py")):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:16]
 
 
 def _detection_out(d: BoardDetection) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from rigkit.errors import InputError
 from rigkit.io.files import write_atomic
+from rigkit.io.sources import source_hash
 from rigkit.processes import worker_pool
 from rigkit.progress import Progress, silent
 from rigkit.validation.study import Study, chunk_count, run_chunk
@@ -29,8 +30,8 @@ Errors = NDArray[np.float32]
 
 
 def study_key(study: Study) -> str:
-    """Return a name for everything that determines the study's numbers."""
-    text = json.dumps(study.to_dict() | {"name": "", "title": ""}, sort_keys=True, default=str)
+    """Return a name for everything that determines the study's numbers, rigkit's own code among it."""
+    text = json.dumps(study.to_dict() | {"name": "", "title": "", "code": source_hash()}, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

@@ -93,6 +93,35 @@ def test_removed_images_do_not_come_back_with_the_kept_corners(session: Path) ->
     assert [v.image for v in views] == ["00.jpg", "01.jpg", "02.jpg", "04.jpg"]
 
 
+def test_corners_of_an_earlier_detector_serve_where_the_images_are_gone(
+    session: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["calibrate", str(session)]) == 0
+    kept = session.parent / "corners.json"
+    data = json.loads(kept.read_text())
+    # As an earlier detector left them: one image fewer, and every corner elsewhere.
+    data["detector"] = "0123456789abcdef" + data["detector"][16:]
+    del data["images"]["04.jpg"]
+    for entry in data["images"].values():
+        entry["boards"][0]["pixels"] = [[u + 5.0, v] for u, v in entry["boards"][0]["pixels"]]
+    kept.write_text(json.dumps(data))
+    images = {path: path.read_bytes() for path in session.parent.glob("*.jpg")}
+    for path in images:
+        path.unlink()
+    capsys.readouterr()
+    centre = load_calibration(session.parent / "calibration.json").camera.parameters[2]
+    assert main(["calibrate", str(session), "--force"]) == 0
+    assert "corners of 4 images kept in corners.json are used, found by another version" in capsys.readouterr().err
+    found = load_calibration(session.parent / "calibration.json")
+    assert len(found.views) == 4 and found.camera.parameters[2] - centre == pytest.approx(5.0, abs=0.5)
+    # With the images they are found anew, all of them.
+    for path, content in images.items():
+        path.write_bytes(content)
+    assert main(["calibrate", str(session), "--force"]) == 0
+    found = load_calibration(session.parent / "calibration.json")
+    assert len(found.views) == 5 and found.camera.parameters[2] == pytest.approx(centre, abs=1e-9)
+
+
 def test_linked_images_go_by_their_own_names(session: Path) -> None:
     """As stores of data lay them out: links to files that are named by their checksums."""
     store = session.parent / "store"
