@@ -11,7 +11,7 @@ from rigkit.cameras.panorama import Cylindrical, Equirectangular
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.errors import InputError
 
-__all__ = ["PROJECTIONS", "Projection", "target_camera"]
+__all__ = ["PROJECTIONS", "Projection", "field_across", "target_camera"]
 
 Projection = Literal["perspective", "cylindrical", "equirectangular"]
 PROJECTIONS: tuple[Projection, ...] = ("perspective", "cylindrical", "equirectangular")
@@ -42,7 +42,7 @@ def target_camera(
     """
     if projection not in PROJECTIONS:
         raise InputError(f"projection '{projection}' is unknown; known: {', '.join(PROJECTIONS)}")
-    hfov = min(DEFAULT_RAD[projection], _own_field(camera)) if hfov_rad is None else float(hfov_rad)
+    hfov = min(DEFAULT_RAD[projection], field_across(camera)) if hfov_rad is None else float(hfov_rad)
     if not 0.0 < hfov <= WIDEST_RAD[projection]:
         raise InputError(
             f"field of view of {np.degrees(hfov):g} degrees: a {projection} image shows more than 0 and at most "
@@ -68,8 +68,8 @@ def target_camera(
     return Cylindrical(size, parameters) if projection == "cylindrical" else Equirectangular(size, parameters)
 
 
-def _own_field(camera: Camera) -> float:
-    """Return the angle between the rays at the left and the right edge of the source, on the row of its axis."""
+def field_across(camera: Camera) -> float:
+    """Return the angle, rad, between the rays at the left and the right edge of the image, on the row of the axis."""
     centre, _ = camera.project(np.array([0.0, 0.0, 1.0]))
     u = np.linspace(-0.5, camera.size_px[0] - 0.5, 201)
     rays, valid = camera.unproject(np.stack([u, np.full_like(u, centre[1])], axis=-1))

@@ -63,6 +63,9 @@ def _export_rig(args: argparse.Namespace) -> int:
 
 
 def _export_camera(args: argparse.Namespace) -> int:
+    import numpy as np
+
+    from rigkit.cameras.targets import field_across
     from rigkit.io.calibration_file import save_camera
     from rigkit.io.files import ensure_writable, write_atomic
 
@@ -73,7 +76,9 @@ def _export_camera(args: argparse.Namespace) -> int:
     camera = _read_camera(args.source, args.source_format)
     if kind == "rigkit":
         save_camera(args.output, camera, force=args.force)
-        print(args.output)
+        across = np.degrees(field_across(camera))
+        width, height = camera.size_px
+        print(f"{args.output}: {camera.model}, {width}x{height} px, sees {across:.1f} degrees across")
         return 0
     text, worst_px, words = _written(camera, kind)
     write_atomic(args.output, text, force=args.force)

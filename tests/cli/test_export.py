@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,8 @@ def test_a_camera_goes_out_and_comes_back(kind: str, tmp_path: Path, capsys: pyt
     assert main(["export", str(CALIBRATION), "--to", kind, "-o", str(there)]) == 0
     assert "px from the camera given" in capsys.readouterr().out
     assert main(["export", str(there), "--from", kind, "-o", str(back)]) == 0
+    # A person sees at once whether the file was understood: a fisheye taken for a regular lens sees less.
+    assert re.search(r"back.json: \w+, 1624x1240 px, sees 1[56]\d\.\d degrees across", capsys.readouterr().out)
     ours, theirs = load_camera(CALIBRATION), load_camera(back)
     u, v = np.meshgrid(np.linspace(300, 1300, 21), np.linspace(200, 1000, 17))
     pixels = np.stack([u, v], axis=-1)
