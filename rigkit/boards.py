@@ -60,11 +60,18 @@ class Board:
     markers: Markers | None = None
 
     def __post_init__(self) -> None:
+        if not all(isinstance(count, int | np.integer) for count in (self.columns, self.rows)):
+            raise InputError(
+                f"board '{self.board_id}': columns and rows are whole numbers, got {self.columns!r} and {self.rows!r}"
+            )
         if self.columns < 2 or self.rows < 2:
             raise InputError(f"board '{self.board_id}': at least 2x2 inner corners, got {self.columns}x{self.rows}")
         for side in (self.square_x_mm, self.square_y_mm):
             if not (np.isfinite(side) and side > 0.0):
                 raise InputError(f"board '{self.board_id}': the square size must be positive, got {side} mm")
+        sigma = self.square_sigma_mm
+        if sigma is not None and not (np.isfinite(sigma) and sigma >= 0.0):
+            raise InputError(f"board '{self.board_id}': square_sigma_mm cannot be {sigma}")
         if self.markers is not None and not 0.0 < self.markers.side_mm < min(self.square_x_mm, self.square_y_mm):
             raise InputError(
                 f"board '{self.board_id}': markers of {self.markers.side_mm} mm do not fit into its squares; "

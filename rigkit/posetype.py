@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from enum import StrEnum
 
+from rigkit.errors import InputError
+
 __all__ = ["PoseType"]
 
 
@@ -20,3 +22,7 @@ class PoseType(StrEnum):
     STANDARD = "standard"
     FORWARD = "forward"
     AUTO = "auto"
+
+    @classmethod
+    def _missing_(cls, value: object) -> None:
+        raise InputError(f"pose type '{value}' is unknown; known: {', '.join(cls)}")

@@ -92,12 +92,14 @@ def calibrate(
     Raises
     ------
     InputError
-        No view, corners outside the image, unknown model or board shape.
+        No view, corners outside the image, unknown model or board shape, a number of folds without a meaning.
     DegenerateError
         The views do not determine the camera.
     """
     if board not in (*SHAPES, "auto"):
         raise InputError(f"board shape '{board}' is unknown; known: auto, {', '.join(SHAPES)}")
+    if folds < 0 or folds == 1:
+        raise InputError(f"cross-validation in {folds} folds: give 2 or more, or 0 for none")
     wanted = _wanted(model, degree)
     used, dropped = usable_views(views, size_px)
     observations = Observations.from_views(used)

@@ -94,10 +94,10 @@ class Camera(ABC):
     """The sizes that a model of several sizes can have: Brown's numbers of distortion terms, Scaramuzza's degrees."""
 
     def __post_init__(self) -> None:
-        width, height = (int(v) for v in self.size_px)
-        if width < 1 or height < 1:
-            raise InputError(f"camera size {self.size_px}: width and height must be positive")
-        object.__setattr__(self, "size_px", (width, height))
+        size = as_array(self.size_px, (2,), "camera size")
+        if (size < 1.0).any() or (size != np.round(size)).any():
+            raise InputError(f"camera size {self.size_px}: width and height must be positive whole numbers")
+        object.__setattr__(self, "size_px", (int(size[0]), int(size[1])))
         array = as_array(self.parameters, (None,), f"{self.model} parameters")
         object.__setattr__(self, "parameters", array)
         names = self.parameter_names()
@@ -156,7 +156,7 @@ class Camera(ABC):
 
         The length of a point does not matter. Invalid (outside the model's field of view, at the centre, NaN): NaN.
         """
-        points = np.asarray(points, dtype=np.float64)
+        points = _rows(points, 3, "points")
         batch = points.shape[:-1]
         flat = points.reshape(-1, 3)
         with np.errstate(all="ignore"):
@@ -167,7 +167,7 @@ class Camera(ABC):
 
     def unproject(self, pixels: Pixels) -> tuple[Rays, BoolArray]:
         """Return the unit rays of pixels (..., 2) in the camera frame, and where they are valid (NaN elsewhere)."""
-        pixels = np.asarray(pixels, dtype=np.float64)
+        pixels = _rows(pixels, 2, "pixels")
         batch = pixels.shape[:-1]
         flat = pixels.reshape(-1, 2)
         with np.errstate(all="ignore"):
@@ -207,7 +207,7 @@ class Camera(ABC):
         The Jacobians are NaN where invalid. They are views of memory in the order (2, 3, ...) and (2, P, ...):
         a solver that wants long contiguous rows moves the last two axes to the front at no cost.
         """
-        points = np.asarray(points, dtype=np.float64)
+        points = _rows(points, 3, "points")
         batch = points.shape[:-1]
         flat = points.reshape(-1, 3)
         by_point = np.zeros((2, 3, flat.shape[0]))
@@ -247,7 +247,7 @@ class Camera(ABC):
 
     def on_image(self, pixels: Pixels) -> BoolArray:
         """Say which pixels (..., 2) lie on the sensor, whose outermost pixels reach half a pixel further out."""
-        pixels = np.asarray(pixels, dtype=np.float64)
+        pixels = _rows(pixels, 2, "pixels")
         limit = np.array(self.size_px) - 0.5
         with np.errstate(invalid="ignore"):
             return np.asarray(((pixels >= -0.5) & (pixels <= limit)).all(axis=-1))
@@ -263,3 +263,11 @@ def _blank(values: FloatArray, valid: BoolArray) -> None:
     """Write NaN into the rows of a fresh array that are not valid."""
     if not valid.all():
         values[~valid] = np.nan
+
+
+def _rows(values: ArrayLike, size: int, name: str) -> FloatArray:
+    """Return float64 (..., size); raises InputError for any other shape, such as coordinates in columns."""
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim == 0 or array.shape[-1] != size:
+        raise InputError(f"{name}: expected shape (..., {size}), got {array.shape}")
+    return array

@@ -66,7 +66,7 @@ def _export_camera(args: argparse.Namespace) -> int:
     import numpy as np
 
     from rigkit.cameras.targets import field_across
-    from rigkit.io.calibration_file import save_camera
+    from rigkit.io.calibration_file import refuse_mirrored, save_camera
     from rigkit.io.files import ensure_writable, write_atomic
 
     kind = args.to or ("rigkit" if args.output.suffix == ".json" else None)
@@ -74,6 +74,7 @@ def _export_camera(args: argparse.Namespace) -> int:
         raise InputError(f"export: say the camera's format with --to, one of {', '.join(CAMERA_FORMATS)}")
     ensure_writable(args.output, force=args.force, inputs=[args.source])
     camera = _read_camera(args.source, args.source_format)
+    refuse_mirrored(camera, args.source)
     if kind == "rigkit":
         save_camera(args.output, camera, force=args.force)
         across = np.degrees(field_across(camera))

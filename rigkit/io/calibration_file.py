@@ -34,6 +34,7 @@ __all__ = [
     "is_calibration",
     "load_calibration",
     "load_camera",
+    "refuse_mirrored",
     "save_calibration",
     "save_camera",
 ]
@@ -180,7 +181,18 @@ def camera_from_json(data: Any, path: str | Path) -> Camera:
     names = camera.parameter_names()
     if tuple(data["parameters"]) != names:
         raise InputError(f"'{path}': parameters of a {camera.model} camera must be {', '.join(names)}, in this order")
+    refuse_mirrored(camera, path)
     return camera
+
+
+def refuse_mirrored(camera: Camera, path: str | Path) -> None:
+    """Raise InputError that names the file `path` where a focal length is not positive."""
+    for name, value in zip(camera.parameter_names(), camera.parameters.tolist(), strict=True):
+        if name in ("fx", "fy") and not value > 0.0:
+            raise InputError(
+                f"'{path}': {name} = {value:g}; focal lengths are positive here, with x to the right, y down and z "
+                "forward: turn the axes of the program that wrote the file"
+            )
 
 
 def _view_out(view: ViewResult) -> dict[str, Any]:
