@@ -102,7 +102,8 @@ def sigma_factors(
     excess = (weight * change).sum(axis=1) / left - 1.0
     # Products of independent noise have this variance at all lags but none.
     chance = (weight[:, 1:] ** 2 / (count * pairs)[:, 1:]).sum(axis=1) * (change[:, 0] / left) ** 2
-    doubt = chance + (LOST_ERROR * share / left) ** 2
+    # What is not known of `left` goes with the quotient: small windows, of which the fit takes most, say nothing.
+    doubt = chance + ((1.0 + excess) * LOST_ERROR * share / left) ** 2
     sure = np.maximum(1.0 - doubt / np.maximum(excess**2, 1e-12), 0.0) * member.any(axis=1)
     factors: FloatArray = np.sqrt(np.maximum(1.0 + sure * excess, LEAST_FACTOR**2))
     return factors

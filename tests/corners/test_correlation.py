@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,12 +12,12 @@ import pytest
 from scipy.spatial import cKDTree
 
 from rigkit.boards import Board
-from rigkit.corners import edge_fit
+from rigkit.corners import edge_fit, subpixel
 from rigkit.corners.correlation import sigma_factors
 from rigkit.corners.detect import detect_boards
 from rigkit.corners.edge_fit import EdgeFit, fit_edges
 from rigkit.corners.edge_model import Geometry
-from rigkit.synthetic.bench_scenes import BENCH_PHOTOMETRY, one_board
+from rigkit.synthetic.bench_scenes import BENCH_PHOTOMETRY, one_board, small_board
 from rigkit.synthetic.render import Optics
 
 RADIUS_PX, SIDE_PX = 16.0, 32.0
@@ -154,3 +155,19 @@ def test_boards_in_images_as_they_come(
     every, predicted = np.concatenate(errors), np.concatenate(sigmas)
     assert len(every) > 350
     assert BOARD_BAND[0] < np.sqrt((every**2).mean() / (predicted**2).mean()) < BOARD_BAND[1]
+
+
+def test_windows_of_few_pixels_say_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blurred squares of 6 px: the fit takes nearly all of the noise in their windows."""
+    seen: list[np.ndarray] = []
+
+    def kept(*arguments: Any) -> np.ndarray:
+        seen.append(sigma_factors(*arguments))
+        return seen[-1]
+
+    monkeypatch.setattr(subpixel, "sigma_factors", kept)
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        detect_boards(small_board(rng, square_px=6.0).render(blur_px=2.0, noise_levels=1.0, rng=rng))
+    assert sum(len(factors) for factors in seen) >= 4
+    assert all((factors == 1.0).all() for factors in seen)
