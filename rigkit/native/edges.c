@@ -57,14 +57,12 @@ typedef struct {
     double lo, hi;
 } range_t;
 
-/* Return where low <= x / inverse + offset <= high. */
+/* Return where low <= x / inverse + offset <= high: of a line along the row, with an infinite inverse, everywhere or
+ * nowhere. */
 INLINE range_t between(double inverse, double offset, double low, double high)
 {
     const double lo = (low - offset) * inverse, hi = (high - offset) * inverse;
-    /* A line along the row: infinity has given infinities of both signs, or NaN at the very limit. */
-    if (isinf(inverse))
-        return low <= offset && offset <= high ? (range_t){-1e9, 1e9} : (range_t){1e9, -1e9};
-    return lo < hi ? (range_t){lo, hi} : (range_t){hi, lo};
+    return (range_t){lo < hi ? lo : hi, lo < hi ? hi : lo};
 }
 
 INLINE range_t band(double inverse, double offset, double limit)
@@ -83,33 +81,28 @@ typedef struct {
     int64_t width, height, bytes;
 } picture_t;
 
-INLINE void take(window_t *window, const picture_t image, int64_t v, range_t range)
+/* Append `count` pixels of row `v` from column `first` on, both from the centre. */
+INLINE void take(window_t *window, const picture_t image, int64_t v, int32_t first, int32_t count)
 {
-    /* Nothing, or NaN: no place in the image. */
-    if (!(range.lo <= range.hi))
-        return;
-    const int64_t first = (int64_t)ceil(range.lo), count = (int64_t)floor(range.hi) - first + 1;
-    if (count <= 0)
-        return;
     const int64_t start = ((int64_t)window->centre_v + v) * image.width + (int64_t)window->centre_u + first;
     const uint8_t *restrict bytes = (const uint8_t *)image.brightness + start;
     const float *restrict floats = (const float *)image.brightness + start;
     float *restrict us = window->u + window->count, *restrict vs = window->v + window->count;
     float *restrict values = window->value + window->count;
     /* In steps of known length: what is too much is written over, or not looked at. */
-    for (int32_t k = 0; k < (int32_t)count; k += STRETCH)
+    for (int32_t k = 0; k < count; k += STRETCH)
         for (int32_t i = 0; i < STRETCH; i++) {
-            us[k + i] = (float)((int32_t)first + k + i);
+            us[k + i] = (float)(first + k + i);
             vs[k + i] = (float)v;
         }
     if (!image.bytes)
         memcpy(values, floats, (size_t)count * sizeof(float));
     else if (start + count + STRETCH <= image.width * image.height)
-        for (int32_t k = 0; k < (int32_t)count; k += STRETCH)
+        for (int32_t k = 0; k < count; k += STRETCH)
             for (int32_t i = 0; i < STRETCH; i++)
                 values[k + i] = (float)bytes[k + i];
     else
-        for (int32_t k = 0; k < (int32_t)count; k++)
+        for (int32_t k = 0; k < count; k++)
             values[k] = (float)bytes[k];
     window->count += count;
 }
@@ -150,35 +143,39 @@ static void collect(
     const range_t columns = {-window->centre_u, (double)image.width - 1.0 - window->centre_u};
     const double left = reach_to(at, 3, blur, rules), right = reach_to(at, 2, blur, rules);
     const double above = reach_to(at, 0, blur, rules), below = reach_to(at, 1, blur, rules);
-    const double columns_a = area / b[1], columns_b = -area / a[1];
-    for (int64_t v = -most; v <= most; v++) {
-        const double row = window->centre_v + (double)v;
-        if (!(row >= 0.0 && row <= (double)(image.height - 1)))
-            continue;
-        const double half = sqrt(rules->radius_px * rules->radius_px - (double)(v * v));
-        /* Position in cells along side a and along side b, in the column of the centre; it grows by one in so many
-         * columns. */
-        const double cells_a = (-b[0] * ((double)v - off_v) - b[1] * off_u) / area;
-        const double cells_b = (a[0] * ((double)v - off_v) + a[1] * off_u) / area;
-        range_t whole = both(between(columns_a, cells_a, -left, right), between(columns_b, cells_b, -above, below));
-        whole = both(both(whole, columns), (range_t){-half, half});
-        if (!(whole.lo <= whole.hi))
-            continue;
-        range_t one = both(whole, band(columns_a, cells_a, far1)), two = both(whole, band(columns_b, cells_b, far2));
-        if (two.lo < one.lo) {
-            const range_t swap = one;
-            one = two;
-            two = swap;
+    const double columns_a = area / b[1], columns_b = -area / a[1], per_area = 1.0 / area;
+    const double square = rules->radius_px * rules->radius_px, rest = (double)image.height - 1.0 - window->centre_v;
+    const int64_t top = -window->centre_v > -(double)most ? -(int64_t)window->centre_v : -most;
+    const int64_t bottom = rest < (double)most ? (int64_t)rest : most;
+    for (int64_t start = top; start <= bottom; start += BLOCK) {
+        /* Where the one or two stretches of each row lie: without branches, many rows at once. */
+        const int32_t rows = bottom - start < BLOCK ? (int32_t)(bottom - start) + 1 : BLOCK;
+        int32_t first[2][BLOCK], count[2][BLOCK];
+        for (int32_t k = 0; k < rows; k++) {
+            const double v = (double)((int32_t)start + k), half = sqrt(square - v * v);
+            /* Position in cells along side a and along side b, in the column of the centre; it grows by one in so many
+             * columns. */
+            const double cells_a = (-b[0] * (v - off_v) - b[1] * off_u) * per_area;
+            const double cells_b = (a[0] * (v - off_v) + a[1] * off_u) * per_area;
+            range_t whole = both(between(columns_a, cells_a, -left, right), between(columns_b, cells_b, -above, below));
+            whole = both(both(whole, columns), (range_t){-half, half});
+            const range_t near_a = both(whole, band(columns_a, cells_a, far1));
+            const range_t near_b = both(whole, band(columns_b, cells_b, far2));
+            const int a_first = near_a.lo <= near_b.lo || !(near_b.lo <= near_b.hi), some_a = near_a.lo <= near_a.hi;
+            const int swap = !some_a || !a_first;
+            const double lo1 = ceil(swap ? near_b.lo : near_a.lo), hi1 = floor(swap ? near_b.hi : near_a.hi);
+            const double lo2 = ceil(swap ? near_a.lo : near_b.lo), hi2 = floor(swap ? near_a.hi : near_b.hi);
+            const int one = lo1 <= hi1, two = lo2 <= hi2, joined = one & two & (hi1 + 1.0 >= lo2);
+            const double end = joined ? (hi1 > hi2 ? hi1 : hi2) : hi1;
+            first[0][k] = one ? (int32_t)lo1 : 0;
+            count[0][k] = one ? (int32_t)(end - lo1) + 1 : 0;
+            first[1][k] = two ? (int32_t)lo2 : 0;
+            count[1][k] = two & !joined ? (int32_t)(hi2 - lo2) + 1 : 0;
         }
-        if (one.lo > one.hi) {
-            one = two;
-            two.lo = INFINITY;
-        } else if (two.lo <= two.hi && floor(one.hi) + 1.0 >= ceil(two.lo)) {
-            one.hi = one.hi > two.hi ? one.hi : two.hi;
-            two.lo = INFINITY;
-        }
-        take(window, image, v, one);
-        take(window, image, v, two);
+        for (int32_t k = 0; k < rows; k++)
+            for (int part = 0; part < 2; part++)
+                if (count[part][k])
+                    take(window, image, start + k, first[part][k], count[part][k]);
     }
 }
 
