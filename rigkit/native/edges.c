@@ -15,6 +15,12 @@ enum { STRETCH = 16, CACHE_LINE = 64 };
 typedef float lanes_t __attribute__((vector_size(4 * LANES), aligned(4)));
 typedef int32_t mask_t __attribute__((vector_size(4 * LANES)));
 
+/* Pixels that are taken from the image together, wider and wider. */
+typedef uint8_t bytes_t __attribute__((vector_size(STRETCH)));
+typedef uint16_t halves_t __attribute__((vector_size(2 * STRETCH)));
+typedef int32_t words_t __attribute__((vector_size(4 * STRETCH)));
+typedef float bright_t __attribute__((vector_size(4 * STRETCH), aligned(4)));
+
 /* The constants of corners.edge_model and corners.edge_fit, under their names there (rigkit.native.edges.Rules). */
 typedef struct {
     double reach, end_sigmas, least_reach, near_sigmas, near_px, tail_sigmas, pixel_kurtosis, sharp_blur;
@@ -90,17 +96,22 @@ INLINE void take(window_t *window, const picture_t image, int64_t v, int32_t fir
     float *restrict us = window->u + window->count, *restrict vs = window->v + window->count;
     float *restrict values = window->value + window->count;
     /* In steps of known length: what is too much is written over, or not looked at. */
-    for (int32_t k = 0; k < count; k += STRETCH)
-        for (int32_t i = 0; i < STRETCH; i++) {
-            us[k + i] = (float)(first + k + i);
-            vs[k + i] = (float)v;
-        }
+    const bright_t steps = {
+        0.0f, 1.0f, 2.0f, 3.0f, 4.0f, 5.0f, 6.0f, 7.0f, 8.0f, 9.0f, 10.0f, 11.0f, 12.0f, 13.0f, 14.0f, 15.0f};
+    for (int32_t k = 0; k < count; k += STRETCH) {
+        *(bright_t *)(us + k) = steps + (float)(first + k);
+        *(bright_t *)(vs + k) = (bright_t){0.0f} + (float)v;
+    }
     if (!image.bytes)
         memcpy(values, floats, (size_t)count * sizeof(float));
     else if (start + count + STRETCH <= image.width * image.height)
-        for (int32_t k = 0; k < count; k += STRETCH)
-            for (int32_t i = 0; i < STRETCH; i++)
-                values[k + i] = (float)bytes[k + i];
+        for (int32_t k = 0; k < count; k += STRETCH) {
+            /* Twice as wide at a time, which is what processors can do: GCC 12 takes one pixel after the other elsewise. */
+            bytes_t stretch;
+            memcpy(&stretch, bytes + k, sizeof stretch);
+            const words_t words = __builtin_convertvector(__builtin_convertvector(stretch, halves_t), words_t);
+            *(bright_t *)(values + k) = __builtin_convertvector(words, bright_t);
+        }
     else
         for (int32_t k = 0; k < count; k++)
             values[k] = (float)bytes[k];
