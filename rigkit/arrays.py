@@ -27,6 +27,7 @@ __all__ = [
     "as_array",
     "as_indices",
     "in_8_bits",
+    "upper_median",
     "without_nan",
 ]
 
@@ -118,3 +119,9 @@ def without_nan(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [without_nan(inner) for inner in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def upper_median(values: FloatArray) -> float:
+    """Return the median of N > 0 numbers, the upper one of two; for some fifty np.median takes ten times as long."""
+    half = len(values) // 2
+    return float(np.partition(values, half)[half])

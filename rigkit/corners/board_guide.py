@@ -21,7 +21,7 @@ from rigkit.geometry.board_pose import board_poses, ray_residuals
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 
-__all__ = ["FEWEST", "UNSOUND", "BoardState", "Guide", "cell_areas"]
+__all__ = ["FEWEST", "UNSOUND", "BoardState", "Guide"]
 
 HALF_STEP = 0.4
 """Derivatives of the projection are chords of this many squares to either side: as far as the window reaches."""
@@ -173,15 +173,8 @@ def _pose(board: Board, camera: Camera, state: BoardState, start: Rigid3 | None)
         weighted = (jacobian * weight[:, None, None]).reshape(-1, 6)
         step = np.linalg.lstsq(weighted.T @ jacobian.reshape(-1, 6), -weighted.T @ residual.ravel(), rcond=None)[0]
         rotation, translation = exp_so3(step[:3]) @ rotation, translation + step[3:]
-    area = float(np.median(cell_areas(fit_cells(state.pixels, state.known, degree=1))))
+    area = float(np.median(fit_cells(state.pixels, state.known, degree=1).areas()))
     side = np.sqrt(max(area, 1.0))
     if not float(np.median(off)) < max(POSE_PX, POSE_CELLS * side):
         return None
     return Rigid3(rotation, translation)
-
-
-def cell_areas(shape: LocalFit) -> FloatArray:
-    """Return the areas (M,) of the cells, px^2, negative where they are folded over."""
-    a, b = shape.along_column, shape.along_row
-    area: FloatArray = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-    return area

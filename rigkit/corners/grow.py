@@ -256,16 +256,10 @@ def _longest(fit: LocalFit) -> FloatArray:
     return longest
 
 
-def _area(fit: LocalFit) -> FloatArray:
-    a, b = fit.along_column, fit.along_row
-    area: FloatArray = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-    return area
-
-
 def _in_cells(fit: LocalFit, owner: IntArray, pixels: FloatArray) -> FloatArray:
     """Return how far `pixels` lie from the predictions of the cells `owner`, in cells (infinite for folded cells)."""
     off = pixels - fit.pixels[owner]
-    a, b, area = fit.along_column[owner], fit.along_row[owner], _area(fit)[owner]
+    a, b, area = fit.along_column[owner], fit.along_row[owner], fit.areas()[owner]
     safe = np.where(area > LEAST_AREA, area, np.nan)
     column = (off[:, 0] * b[:, 1] - off[:, 1] * b[:, 0]) / safe
     row = (a[:, 0] * off[:, 1] - a[:, 1] * off[:, 0]) / safe
@@ -277,7 +271,7 @@ def _fits(
 ) -> tuple[FloatArray, BoolArray]:
     """Return the contrast at `pixels` and whether they can be the corners of the cells `owner`."""
     local = level.to_level(pixels)
-    height = _area(fit)[owner] / np.maximum(_longest(fit)[owner], 1e-9) / level.scale
+    height = fit.areas()[owner] / np.maximum(_longest(fit)[owner], 1e-9) / level.scale
     rings = read_rings(level.smooth, local, np.clip(RING * height, MIN_RING_PX, MAX_RING_PX), ODD, CENTRE)
     sign = lattice.signs()[cell[owner, 0], cell[owner, 1]]
     a, b = fit.along_column[owner], fit.along_row[owner]

@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 from rigkit.arrays import BoolArray, FloatArray
 from rigkit.boards import Board
 from rigkit.cameras.base import Camera
-from rigkit.corners.board_guide import FEWEST, UNSOUND, BoardState, Guide, cell_areas
+from rigkit.corners.board_guide import FEWEST, UNSOUND, BoardState, Guide
 from rigkit.corners.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
 from rigkit.corners.edge_model import NEAR_PX, NEAR_SIGMAS, Geometry, ends_of
 from rigkit.corners.local_fit import LocalFit, fit_cells
 from rigkit.corners.response import GreyImage, grey_image
+from rigkit.corners.scatter import UNEXPLAINED
 from rigkit.detections import BoardDetection
 
 __all__ = ["complete_boards", "fit_corners"]
@@ -60,9 +61,6 @@ own standard deviation together, is covered in part."""
 
 FLOOR_PX = 0.01
 """No camera and no printed board is truer than this."""
-
-UNEXPLAINED = 1.25
-"""A scatter less than this times the expected one is what chance makes of fifty corners."""
 
 MEDIAN_OF_RAYLEIGH = 1.1774
 """Median distance from the mean of a normal point in the plane, in standard deviations per axis."""
@@ -245,7 +243,7 @@ def _added(image: GreyImage, guide: Guide, state: BoardState) -> BoardState | No
     with np.errstate(invalid="ignore"):
         inside = (shape.pixels > MARGIN_PX) & (shape.pixels < np.array([width, height]) - 1.0 - MARGIN_PX)
         usable = predicted & inside.all(axis=1) & (side > LEAST_SIDE_PX)
-        usable &= cell_areas(shape) > 0.25 * side**2
+        usable &= shape.areas() > 0.25 * side**2
     if not usable.any():
         return None
     cells = missing.copy()

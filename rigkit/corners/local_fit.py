@@ -51,6 +51,15 @@ class LocalFit:
     def bend_row(self) -> FloatArray:
         return self.bends[:, 1]
 
+    def areas(self) -> FloatArray:
+        """Return the areas (M,) of the cells, px^2, negative where they are folded over."""
+        return _cross(*self.sides.transpose(1, 2, 0))
+
+    def cell_px(self) -> FloatArray:
+        """Return the sides (M,) of squares as large as the cells, px, at least 1."""
+        side: FloatArray = np.sqrt(np.maximum(self.areas(), 1.0))
+        return side
+
     def curvature(self) -> FloatArray:
         """Return the curvature of the column and the row line at the cells, (M, 2) 1/px, positive towards +90 degrees.
 

@@ -11,7 +11,7 @@ import numpy as np
 from rigkit.arrays import FloatArray
 from rigkit.native import lattice as native
 
-__all__ = ["excess_scatter"]
+__all__ = ["UNEXPLAINED", "excess_scatter"]
 
 DIFFERENCES = (5, 6)
 FEWEST_CORNERS, FEWEST_DIFFERENCES = 12, 16

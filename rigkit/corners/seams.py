@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.arrays import BoolArray, FloatArray, IntArray
-from rigkit.corners.local_fit import LocalFit, fit_cells
+from rigkit.arrays import BoolArray, FloatArray, IntArray, upper_median
+from rigkit.corners.local_fit import fit_cells
 from rigkit.corners.subpixel import RefinedLattice
 from rigkit.corners.validate import stray_row
 
@@ -106,14 +106,14 @@ def without_misfits(item: RefinedLattice, size_px: tuple[int, int]) -> RefinedLa
     known = item.lattice.known
     relative = np.zeros(known.shape)
     relative[known] = item.residual[known] / item.lattice.contrast[known]
-    typical = _middle(relative[known])
+    typical = upper_median(relative[known])
     suspect = relative > max(MISFIT * typical, LEAST_MISFIT)
     judges = known & ~suspect
     if not suspect.any() or np.count_nonzero(judges) < FEWEST:
         return item
     pixels = item.lattice.without(suspect).pixels
     usual = fit_cells(pixels, judges, leave_out=True)
-    expected = _middle(np.hypot(*(usual.pixels - pixels[judges]).T) / _cell_px(usual))
+    expected = upper_median(np.hypot(*(usual.pixels - pixels[judges]).T) / usual.cell_px())
     astray, in_place = _judged(item, suspect, expected)
     # Under the edge of a shadow whole rows are suspect: those that are in place say where the rows beyond them are.
     while astray.any() and in_place.any():
@@ -140,7 +140,7 @@ def _judged(item: RefinedLattice, suspect: BoolArray, expected: float) -> tuple[
     for degree, ridge in BENDS:
         shape = fit_cells(pixels, suspect, degree=degree, ridge=ridge)
         off = np.hypot(*(shape.pixels - item.lattice.pixels[suspect]).T)
-        good = expected * np.hypot(1.0, shape.gain) * _cell_px(shape)
+        good = expected * np.hypot(1.0, shape.gain) * shape.cell_px()
         judged = shape.support >= FEWEST
         astray[suspect] &= judged & (off > np.maximum(ASTRAY * good, SIGMAS * item.sigma_px[suspect]))
         in_place[suspect] |= judged & (off < IN_PLACE * good)
@@ -289,15 +289,3 @@ def _terms(x: FloatArray, y: FloatArray) -> FloatArray:
     x, y = np.broadcast_arrays(x, y)
     xx, xy, yy = x * x, x * y, y * y
     return np.stack([np.ones_like(xy), x, y, xx, xy, yy, xx * x, xx * y, x * yy, yy * y], axis=-1)
-
-
-def _cell_px(shape: LocalFit) -> FloatArray:
-    """Return the side in px of a square as large as the cell (M,)."""
-    a, b = shape.along_column, shape.along_row
-    return np.asarray(np.sqrt(np.maximum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], 1.0)))
-
-
-def _middle(values: FloatArray) -> float:
-    """Return the (upper) median."""
-    half = len(values) // 2
-    return float(np.partition(values, half)[half])

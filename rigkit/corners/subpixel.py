@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray
+from rigkit.arrays import BoolArray, FloatArray, upper_median
 from rigkit.corners.bends import line_curvature
 from rigkit.corners.correlation import sigma_factors
 from rigkit.corners.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
 from rigkit.corners.edge_model import REACH, Geometry, ends_of
 from rigkit.corners.lattice import Lattice, Sheet, padded
-from rigkit.corners.local_fit import LocalFit, fit_cells
+from rigkit.corners.local_fit import fit_cells
 from rigkit.corners.response import GreyImage
 from rigkit.corners.scatter import excess_scatter
 
@@ -158,7 +158,7 @@ def _typical_blur(item: RefinedLattice, parts: Sequence[Part]) -> FloatArray:
         mine = item.blur_px[part]
         known = np.isfinite(mine)
         if known.any():
-            typical = _typical(mine[known])
+            typical = upper_median(mine[known])
             blur[part] = np.where(known, np.clip(mine, 0.7 * typical, 1.4 * typical), typical)
     return blur.clip(*BLUR_RANGE)
 
@@ -255,19 +255,12 @@ def _confirmed(item: RefinedLattice, start: Lattice, holes: BoolArray) -> Refine
     contrast = item.lattice.contrast
     moved = np.linalg.norm(item.lattice.pixels - start.pixels, axis=2)
     cell = np.full(known.shape, np.nan)
-    cell[holes] = _cell_px(fit_cells(start.pixels, holes, degree=1))
+    cell[holes] = fit_cells(start.pixels, holes, degree=1).cell_px()
     with np.errstate(invalid="ignore"):
         good = (moved < HOLE_MOVE * cell) & (contrast > HOLE_CONTRAST * _around(contrast, settled))
         good &= item.residual < HOLE_RESIDUAL * _around(item.residual, settled)
         good &= item.sigma_px < HOLE_SIGMA * _around(item.sigma_px, settled)
     return item.without(holes & ~good)
-
-
-def _cell_px(shape: LocalFit) -> FloatArray:
-    """Return the side in px of a square as large as the cell (M,)."""
-    area = shape.along_column[:, 0] * shape.along_row[:, 1] - shape.along_column[:, 1] * shape.along_row[:, 0]
-    side: FloatArray = np.sqrt(np.maximum(area, 1.0))
-    return side
 
 
 def _around(values: FloatArray, known: BoolArray) -> FloatArray:
@@ -295,7 +288,7 @@ def _checked(item: RefinedLattice, parts: Sequence[Part]) -> RefinedLattice:
     # A prediction from a few corners on one side is no judge of another.
     judged = np.zeros_like(known)
     judged[known] = (shape.support >= FEWEST_CHECKED) & (shape.gain < 1.5)
-    cells = spread(distance / _cell_px(shape))
+    cells = spread(distance / shape.cell_px())
     excess = spread(distance / (item.sigma_px[known] * np.hypot(1.0, shape.gain)))
     relative = item.noise / item.lattice.contrast
     drop = np.zeros_like(known)
@@ -303,15 +296,9 @@ def _checked(item: RefinedLattice, parts: Sequence[Part]) -> RefinedLattice:
         here, sure = known[part], judged[part]
         if here.sum() < FEWEST_CHECKED or sure.sum() < FEWEST_JUDGED:
             continue
-        typical = _typical(cells[part][sure])
-        usual = _typical(relative[part][here])
+        typical = upper_median(cells[part][sure])
+        usual = upper_median(relative[part][here])
         astray = (cells[part] > max(ASTRAY_CELLS, ASTRAY_FACTOR * typical)) & (excess[part] > ASTRAY_FACTOR)
         covered = relative[part] > max(COVERED, COVERED_FACTOR * usual)
         drop[part] = sure & (astray | (covered & (cells[part] > COVERED_OFF * typical)))
     return item.without(drop) if drop.any() else item
-
-
-def _typical(values: FloatArray) -> float:
-    """Return the median of some `values`, the upper one of two."""
-    half = len(values) // 2
-    return float(np.partition(values, half)[half])

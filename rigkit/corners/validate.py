@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from rigkit.arrays import BoolArray, FloatArray
+from rigkit.arrays import BoolArray, FloatArray, upper_median
 from rigkit.corners.evenness import unevenness
 from rigkit.corners.lattice import MANY, Lattice
 from rigkit.corners.local_fit import fit_cells
@@ -225,24 +225,18 @@ def trustworthy(refined: RefinedLattice, before: int, least: int) -> bool:
     known = lattice.known
     relative = refined.residual[known] / lattice.contrast[known]
     unexplained = relative**2 - (NOISE_LEVELS / lattice.contrast[known]) ** 2
-    if _middle(relative) > MAX_RESIDUAL or _middle(unexplained) > MAX_UNEXPLAINED**2:
+    if upper_median(relative) > MAX_RESIDUAL or upper_median(unexplained) > MAX_UNEXPLAINED**2:
         return False
     if _uneven(lattice):
         return False
     shape = fit_cells(lattice.pixels, known, degree=1)
-    area = shape.along_column[:, 0] * shape.along_row[:, 1] - shape.along_column[:, 1] * shape.along_row[:, 0]
-    in_cells = refined.worst_sigma_px[known] / np.sqrt(np.maximum(area, 1e-6))
-    return _middle(in_cells) < MAX_RELATIVE_SIGMA
+    in_cells = refined.worst_sigma_px[known] / np.sqrt(np.maximum(shape.areas(), 1e-6))
+    return upper_median(in_cells) < MAX_RELATIVE_SIGMA
 
 
 def _uneven(lattice: Lattice) -> bool:
     """Return whether rows and columns follow each other at steps as different as no lens and no view makes them."""
     return any(line.every > MAX_UNEVEN for line in unevenness(lattice.pixels))
-
-
-def _middle(values: FloatArray) -> float:
-    """Return the (upper) median; for some fifty values, np.median costs ten times as much."""
-    return float(np.sort(values)[len(values) // 2])
 
 
 def too_large(lattice: Lattice, sizes: Sequence[tuple[int, int]]) -> bool:
