@@ -1,4 +1,4 @@
-"""The optional compiled kernels of rigkit.native, one library a C file; everything else is in pyproject.toml.
+"""The optional compiled kernels of rigkit.kernels, one library a C file; everything else is in pyproject.toml.
 
 Without a C compiler the package installs and works all the same, slower.
 """
@@ -8,14 +8,14 @@ from pathlib import Path
 
 from setuptools import Extension, setup
 
-HEADER = Path("rigkit/native/kernels.h")
+HEADER = Path("rigkit/kernels/kernels.h")
 
 
 def library(source: Path) -> Extension:
     # The loader compares this with the files beside it: a library that was built from others is not used.
     digest = hashlib.sha256(source.read_bytes() + HEADER.read_bytes()).hexdigest()[:16]
     return Extension(
-        f"rigkit.native._{source.stem}",
+        f"rigkit.kernels._{source.stem}",
         sources=[str(source)],
         depends=[str(HEADER)],
         define_macros=[("RIGKIT_SOURCE", f'"{digest}"')],

@@ -24,7 +24,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, nearest_rotation, rotation_angle
 from rigkit.io.manifest import Pair, load_dataset
 from rigkit.io.paper_tables import load_paper_tables
-from rigkit.pairing import MatchedPair
+from rigkit.reconstruction.pairing import MatchedPair
 from rigkit.validation.planes import fit_plane, normal_errors
 from rigkit.validation.tables import best_of
 

@@ -39,7 +39,6 @@ from benchmark_calibration_peers import (
 )
 from helpers.calibration_scenes import BOARD, REACH_DEG, SIZE, lens, projection_difference, random_views
 
-from rigkit.boards import Board
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.initialise import initialise
 from rigkit.calibration.observations import Observations
@@ -47,8 +46,9 @@ from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.solver import solve
 from rigkit.cameras.base import Camera
 from rigkit.cameras.kannala_brandt import KannalaBrandt
-from rigkit.detections import BoardView
-from rigkit.errors import RigkitError
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import RigkitError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 

@@ -21,7 +21,7 @@ from rigkit.calibration.state import State
 from rigkit.cameras.base import Camera
 from rigkit.cameras.brown import Brown
 from rigkit.cameras.kannala_brandt import KannalaBrandt
-from rigkit.detections import BoardView
+from rigkit.core.detections import BoardView
 
 DEBIAN_PYTHON = "/usr/bin/python3"
 MRCAL_WORKER = Path(__file__).with_name("mrcal_worker.py")

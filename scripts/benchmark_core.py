@@ -29,18 +29,22 @@ from rigkit.affine.normal import normals_from_affines
 from rigkit.affine.registry import AFFINE_METHODS, affines_from_directions
 from rigkit.affine.surface import affines_from_normals
 from rigkit.cameras.pinhole import Pinhole
-from rigkit.fundamental.minimal import essential_from_five_rows, essential_from_six_rows, fundamental_from_seven_rows
-from rigkit.fundamental.planar import solve_planar_batch
-from rigkit.fundamental.pose import essential_from_pose
-from rigkit.fundamental.refine import estimate_pose, refine_pose
-from rigkit.fundamental.registry import fundamental_for
-from rigkit.fundamental.robust import robust_pose
-from rigkit.fundamental.rows import PLANAR_ENTRIES, affinity_rows, point_rows
+from rigkit.core.matches import DirectionPairs, Matches
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, exp_so3, rotation_angle, unit
 from rigkit.geometry.triangulation import correct_hartley_sturm, correct_lindstrom, triangulate_rays
-from rigkit.matches import DirectionPairs, Matches
+from rigkit.relative_pose.refinement.refine import estimate_pose, refine_pose
+from rigkit.relative_pose.robust.robust import robust_pose
+from rigkit.relative_pose.solvers.minimal import (
+    essential_from_five_rows,
+    essential_from_six_rows,
+    fundamental_from_seven_rows,
+)
+from rigkit.relative_pose.solvers.planar import solve_planar_batch
+from rigkit.relative_pose.solvers.pose import essential_from_pose
+from rigkit.relative_pose.solvers.registry import fundamental_for
+from rigkit.relative_pose.solvers.rows import PLANAR_ENTRIES, affinity_rows, point_rows
 
 CAMERA = Pinhole((1624, 1240), np.array([1350.0, 1350.0, 800.0, 620.0]))
 POSE = Rigid3(exp_so3(np.array([0.0, 0.1, 0.0])), [-290.0, 0.0, -70.0])

@@ -31,12 +31,10 @@ import cv2
 import numpy as np
 from benchmark_peers import DETECTORS, INSTALL, PEERS, Answer, Worker
 
-from rigkit.corners.detect import detect_boards
-from rigkit.corners.identify import identify_pair
-from rigkit.errors import RigkitError
-from rigkit.synthetic.bench_blanks import BLANKS, blank
-from rigkit.synthetic.bench_pairs import EQUAL_BOARDS, PairVerdict, equal_boards_pair, judge_pair
-from rigkit.synthetic.bench_scenes import (
+from rigkit.benchmark.blanks import BLANKS, blank
+from rigkit.benchmark.corner_bound import corner_information, position_bound
+from rigkit.benchmark.pairs import EQUAL_BOARDS, PairVerdict, equal_boards_pair, judge_pair
+from rigkit.benchmark.scenes import (
     BENCH_PHOTOMETRY,
     CONDITIONS,
     LENSES,
@@ -48,8 +46,10 @@ from rigkit.synthetic.bench_scenes import (
     small_board,
     three_boards,
 )
-from rigkit.synthetic.bench_score import FoundBoard, Score, score
-from rigkit.synthetic.corner_bound import corner_information, position_bound
+from rigkit.benchmark.score import FoundBoard, Score, score
+from rigkit.core.errors import RigkitError
+from rigkit.detection.detect import detect_boards
+from rigkit.identification.identify import identify_pair
 from rigkit.synthetic.photometry import develop
 from rigkit.synthetic.render import Optics
 

@@ -47,7 +47,7 @@ class Detector:
 
 
 def load_rigkit() -> Detect:
-    from rigkit.corners.detect import detect_boards
+    from rigkit.detection.detect import detect_boards
 
     return lambda image, sizes: [(d.pixels, d.grid, d.sigma_px) for d in detect_boards(image)]
 

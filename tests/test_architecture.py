@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ast
+import functools
 import subprocess
 import sys
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import pytest
@@ -13,23 +15,24 @@ PACKAGE = Path(__file__).resolve().parents[1] / "rigkit"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
 LAYERS: tuple[tuple[str, ...], ...] = (
-    ("errors", "arrays", "native"),
-    ("geometry", "boards", "detections", "matches", "cloud", "posetype", "processes", "progress", "truth"),
+    ("kernels",),
+    ("core",),
+    ("geometry", "optim"),
     ("cameras",),
-    ("corners", "affine", "fundamental", "calibration", "synthetic", "interop"),
-    ("reconstruct", "pairing", "scene"),
-    ("validation",),
+    ("rectification",),
+    ("affine", "relative_pose", "calibration", "synthetic", "interop"),
+    ("detection", "identification", "targets"),
+    ("reconstruction",),
+    ("validation", "study", "benchmark"),
     ("io",),
-    ("report",),
+    ("report", "coach"),
+    ("workflows",),
     ("cli",),
 )
+"""From the ground up; a part imports rows below its own; `core.arrays` and `core.errors` are for all."""
 LEVEL = {name: level for level, row in enumerate(LAYERS) for name in row}
 
-CONTRACTS_FROM_ABOVE = {("matches", "cameras")}
-"""`Matches.from_cameras` needs the camera protocol (cameras.base), nothing else of that layer."""
-
-SAME_ROW_MAY_IMPORT = {0, 1, 4}
-"""Rows of single modules; the packages of row 3 must not know each other."""
+FOR_ALL = {"rigkit.core.arrays", "rigkit.core.errors"}
 
 MAX_LINES = 400
 
@@ -54,22 +57,73 @@ def imports_of(tree: ast.AST) -> list[str]:
     return found
 
 
+def module_of(path: Path) -> str:
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+@functools.cache
+def import_graph() -> dict[str, set[str]]:
+    """Which modules of rigkit each module imports, wherever in it the import stands."""
+    known = {module_of(path) for path in MODULES}
+    graph: dict[str, set[str]] = {}
+    for path in MODULES:
+        wanted: set[str] = set()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                inner = {f"{node.module}.{alias.name}" for alias in node.names} & known
+                wanted |= inner or {node.module}
+            elif isinstance(node, ast.Import):
+                wanted |= {alias.name for alias in node.names}
+        graph[module_of(path)] = (wanted & known) - {module_of(path), "rigkit"}
+    return graph
+
+
+def circles(graph: Mapping[str, Iterable[str]]) -> list[str]:
+    """Return the nodes on a circle: what is left when nodes that need nothing that is left are taken away."""
+    left = {node: set(targets) for node, targets in graph.items()}
+    while True:
+        leaves = {node for node, targets in left.items() if not targets & set(left)}
+        if not leaves:
+            return sorted(left)
+        left = {node: targets for node, targets in left.items() if node not in leaves}
+
+
 @pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
 def test_a_module_imports_only_rows_below(path: Path) -> None:
     own = part_of(path)
-    if own == "__init__":
+    if own in {"__init__", "__main__"}:
         return
     assert own in LEVEL, f"{own} is in no layer"
-    for name in imports_of(ast.parse(path.read_text())):
-        parts = name.split(".")
-        if parts[0] != "rigkit" or len(parts) < 2 or parts[1] == own:
-            continue
-        other = parts[1]
-        if (own, other) in CONTRACTS_FROM_ABOVE:
-            continue
-        lower = LEVEL[other] < LEVEL[own]
-        same = LEVEL[other] == LEVEL[own] and LEVEL[own] in SAME_ROW_MAY_IMPORT
-        assert lower or same, f"{path.relative_to(PACKAGE)} imports {name}, which is not below it"
+    for name in import_graph()[module_of(path)] - FOR_ALL:
+        other = name.split(".")[1]
+        assert other == own or LEVEL[other] < LEVEL[own], (
+            f"{path.relative_to(PACKAGE)} imports {name}, which is not below it"
+        )
+
+
+def test_no_module_is_part_of_a_circle() -> None:
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": set()}) == ["a", "b", "c"]
+    assert circles(import_graph()) == []
+
+
+def room_of(module: str) -> str:
+    """The folder of a module that lies in a folder of a part, else the module itself."""
+    return ".".join(module.split(".")[:3])
+
+
+def test_no_folder_is_part_of_a_circle() -> None:
+    """Also the folders inside a part: what stands beside them counts as a folder of its own."""
+    for part in sorted({module.split(".")[1] for module in import_graph() if "." in module}):
+        graph: dict[str, set[str]] = {}
+        for module, targets in import_graph().items():
+            if module.startswith(f"rigkit.{part}."):
+                own = room_of(module)
+                graph.setdefault(own, set()).update(
+                    room_of(target) for target in targets if target.startswith(f"rigkit.{part}.")
+                )
+                graph[own].discard(own)
+        assert circles(graph) == [], part
 
 
 def test_one_camera_knows_nothing_of_rigs() -> None:

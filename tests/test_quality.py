@@ -30,7 +30,7 @@ def test_mypy_strict() -> None:
     run("mypy")
 
 
-@pytest.mark.parametrize("module", ["rigkit", "rigkit.boards", "rigkit.geometry.rigid3"])
+@pytest.mark.parametrize("module", ["rigkit", "rigkit.core.boards", "rigkit.geometry.rigid3"])
 def test_doctests(module: str) -> None:
     result = doctest.testmod(importlib.import_module(module))
     assert result.attempted > 0

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigkit.arrays import Affines, BoolArray, FloatArray, Mat3, Pixels, RayJacobians, Rays, as_array
-from rigkit.errors import InputError
+from rigkit.core.arrays import Affines, BoolArray, FloatArray, Mat3, Pixels, RayJacobians, Rays, as_array
+from rigkit.core.errors import InputError
+from rigkit.core.matches import DirectionPairs
 from rigkit.geometry.sampson import epipolar_normals
-from rigkit.matches import DirectionPairs
 
 __all__ = ["Affinities", "DirectionNoise", "EpipolarNormals"]
 

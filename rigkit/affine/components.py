@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray
-from rigkit.matches import DirectionPairs
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.matches import DirectionPairs
 
 __all__ = ["PlanarDirections", "blocks", "finite", "first_of", "smallest_singular", "solve_each", "unit_weights"]
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from rigkit.affine.affinities import EpipolarNormals
 from rigkit.affine.components import finite
-from rigkit.arrays import Affines, BoolArray, FloatArray
-from rigkit.errors import InputError
+from rigkit.core.arrays import Affines, BoolArray, FloatArray
+from rigkit.core.errors import InputError
 
 __all__ = ["correct_affines", "correct_frames", "epipolar_residuals"]
 

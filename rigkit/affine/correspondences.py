@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import Affines, BoolArray, FloatArray, IntArray, Pixels, as_array
 from rigkit.cameras.base import Camera
-from rigkit.errors import InputError
-from rigkit.matches import DirectionPairs, Matches
+from rigkit.core.arrays import Affines, BoolArray, FloatArray, IntArray, Pixels, as_array
+from rigkit.core.errors import InputError
+from rigkit.core.matches import DirectionPairs, Matches
 
 __all__ = ["Correspondences"]
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from rigkit.affine.affinities import EpipolarNormals
 from rigkit.affine.components import PlanarDirections, finite, first_of, smallest_singular, solve_each, unit_weights
-from rigkit.arrays import Affines, BoolArray, FloatArray
-from rigkit.matches import DirectionPairs
+from rigkit.core.arrays import Affines, BoolArray, FloatArray
+from rigkit.core.matches import DirectionPairs
 
 __all__ = ["epipolar_alignment", "epipolar_block", "epipolar_sensitivity", "soft_epipolar", "usable_directions"]
 

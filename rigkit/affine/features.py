@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.refine_patches import refine_patches
-from rigkit.arrays import BoolArray, FloatArray, IntArray, Pixels, in_8_bits
-from rigkit.errors import DegenerateError, InputError
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, in_8_bits
+from rigkit.core.errors import DegenerateError, InputError
 
 __all__ = ["match_affine_features"]
 

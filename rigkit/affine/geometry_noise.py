@@ -12,7 +12,7 @@ import numpy as np
 
 from rigkit.affine.affinities import EpipolarNormals
 from rigkit.affine.normal import normals_from_affines
-from rigkit.arrays import Affines, FloatArray, RayJacobians, Rays
+from rigkit.core.arrays import Affines, FloatArray, RayJacobians, Rays
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, skew, unit

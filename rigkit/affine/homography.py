@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.affine.components import finite
-from rigkit.arrays import Affines, BoolArray, FloatArray, Mat3, Normals, Pixels
-from rigkit.errors import DegenerateError, InputError
+from rigkit.core.arrays import Affines, BoolArray, FloatArray, Mat3, Normals, Pixels
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
 

@@ -11,9 +11,9 @@ import numpy as np
 from rigkit.affine.affinities import Affinities, DirectionNoise, EpipolarNormals
 from rigkit.affine.components import finite
 from rigkit.affine.registry import MIN_CONDITIONING
-from rigkit.arrays import BoolArray, FloatArray
-from rigkit.errors import InputError
-from rigkit.matches import DirectionPairs
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.errors import InputError
+from rigkit.core.matches import DirectionPairs
 
 __all__ = ["affines_from_mixed_directions"]
 

@@ -14,8 +14,8 @@ import numpy as np
 
 from rigkit.affine.components import blocks, finite
 from rigkit.affine.surface import linear_gauge
-from rigkit.arrays import Affines, BoolArray, FloatArray, Normals
-from rigkit.errors import InputError
+from rigkit.core.arrays import Affines, BoolArray, FloatArray, Normals
+from rigkit.core.errors import InputError
 from rigkit.geometry.rotation import angle_between
 
 __all__ = [

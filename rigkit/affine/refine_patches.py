@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.arrays import Affines, BoolArray, FloatArray, Pixels
+from rigkit.core.arrays import Affines, BoolArray, FloatArray, Pixels
 
 __all__ = ["RefinedPatches", "refine_patches"]
 

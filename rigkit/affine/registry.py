@@ -9,9 +9,9 @@ from rigkit.affine.components import PlanarDirections, blocks, finite, first_of
 from rigkit.affine.epipolar import epipolar_block, epipolar_sensitivity, soft_epipolar, usable_directions
 from rigkit.affine.scaled import scaled_block, scaled_sensitivity
 from rigkit.affine.unscaled import SCALES, determinant_block, determinant_sensitivity
-from rigkit.arrays import Affines, BoolArray, FloatArray, Mat3, as_array
-from rigkit.errors import InputError
-from rigkit.matches import DirectionPairs
+from rigkit.core.arrays import Affines, BoolArray, FloatArray, Mat3, as_array
+from rigkit.core.errors import InputError
+from rigkit.core.matches import DirectionPairs
 
 __all__ = ["AFFINE_METHODS", "MIN_CONDITIONING", "affines_from_directions", "needs_epipolar", "needs_lengths"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.affine.components import PlanarDirections, smallest_singular, solve_each, unit_weights
-from rigkit.arrays import Affines, BoolArray, FloatArray
-from rigkit.matches import DirectionPairs
+from rigkit.core.arrays import Affines, BoolArray, FloatArray
+from rigkit.core.matches import DirectionPairs
 
 __all__ = ["scaled_block", "scaled_sensitivity"]
 

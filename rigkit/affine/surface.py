@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigkit.arrays import Affines, BoolArray, FloatArray, Normals
+from rigkit.core.arrays import Affines, BoolArray, FloatArray, Normals
 
 __all__ = ["LinearGauge", "affines_from_normals", "affines_from_normals_by_minors", "linear_gauge"]
 

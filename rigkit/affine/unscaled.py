@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rigkit.affine.components import PlanarDirections, first_of, solve_each, unit_weights
-from rigkit.arrays import Affines, BoolArray, FloatArray
-from rigkit.errors import InputError
-from rigkit.matches import DirectionPairs
+from rigkit.core.arrays import Affines, BoolArray, FloatArray
+from rigkit.core.errors import InputError
+from rigkit.core.matches import DirectionPairs
 
 __all__ = ["SCALES", "determinant_block", "determinant_from_lengths", "determinant_sensitivity", "shape_block"]
 

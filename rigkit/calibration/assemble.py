@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, Points
 from rigkit.calibration.fit import Fit
-from rigkit.calibration.normal import Normal
+from rigkit.calibration.normal_equations import Normal
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import BoardShape, Calibration, Candidate, Outlier, ViewResult
 from rigkit.calibration.shape import ShapeModel
 from rigkit.calibration.solver import with_priors
 from rigkit.calibration.state import State
-from rigkit.errors import DegenerateError
+from rigkit.core.arrays import FloatArray, Points
+from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
 

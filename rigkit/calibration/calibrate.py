@@ -11,9 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray
 from rigkit.calibration.assemble import assemble, require_determined
-from rigkit.calibration.counting import miscounted, recounted
+from rigkit.calibration.board_orientation import miscounted, recounted
 from rigkit.calibration.evidence import fit_shapes
 from rigkit.calibration.fit import Fit, fit_kept, fit_model, heldout_squares, robust_sigma
 from rigkit.calibration.linearise import normal_equations
@@ -26,9 +25,10 @@ from rigkit.calibration.usable import usable_views
 from rigkit.calibration.verdicts import judge
 from rigkit.cameras.base import Camera
 from rigkit.cameras.registry import MODELS, camera_model, check_order
-from rigkit.detections import BoardView
-from rigkit.errors import DegenerateError, InputError
-from rigkit.progress import Progress, silent
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.progress import Progress, silent
 
 __all__ = ["DEGREES_TRIED", "FOLDS", "calibrate"]
 

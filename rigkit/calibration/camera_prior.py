@@ -10,8 +10,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, IntArray
 from rigkit.cameras.base import Camera, image_center
+from rigkit.core.arrays import FloatArray, IntArray
 
 __all__ = ["camera_prior"]
 

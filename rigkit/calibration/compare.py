@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, Pixels
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import projection_design, projection_uncertainty
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import CameraDifference, compare_cameras
 from rigkit.cameras.convert import refit_camera
+from rigkit.core.arrays import FloatArray, Pixels
 
 __all__ = ["CalibrationComparison", "compare_calibrations"]
 

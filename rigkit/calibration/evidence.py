@@ -14,14 +14,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray
 from rigkit.calibration.fit import Fit, fit_kept, inliers, sigma_of
 from rigkit.calibration.linearise import normal_equations
-from rigkit.calibration.normal import Normal
+from rigkit.calibration.normal_equations import Normal
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.shape import released_groups, shape_model, warp_groups
 from rigkit.calibration.solver import solve, with_priors
 from rigkit.calibration.state import State, evaluate
+from rigkit.core.arrays import BoolArray, FloatArray
 
 __all__ = ["fit_shapes"]
 

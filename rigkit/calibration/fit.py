@@ -6,17 +6,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, IntArray
 from rigkit.calibration.initialise import initialise
 from rigkit.calibration.linearise import normal_equations
-from rigkit.calibration.normal import Normal, Residuals
+from rigkit.calibration.normal_equations import Normal, Residuals
 from rigkit.calibration.observations import Observations, median_of
 from rigkit.calibration.poses import find_poses, refine_poses
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.solver import solve
 from rigkit.calibration.state import State, evaluate
 from rigkit.cameras.base import Camera, image_center
-from rigkit.errors import DegenerateError
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.errors import DegenerateError
 
 __all__ = ["OUTLIER_SIGMAS", "Fit", "fit_kept", "fit_model", "heldout_squares", "inliers", "robust_sigma", "sigma_of"]
 

@@ -17,12 +17,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, Mat3, Points
 from rigkit.calibration.observations import Observations, median_of
 from rigkit.calibration.radial_alignment import MAD_TO_SIGMA, TURN_SIGMAS, Alignment, align, distortion_centre
 from rigkit.calibration.state import State, evaluate
 from rigkit.cameras.base import Camera, RadialCurve, image_center
-from rigkit.errors import InputError
+from rigkit.core.arrays import FloatArray, Mat3, Points
+from rigkit.core.errors import InputError
 from rigkit.geometry.rotation import nearest_rotation
 
 __all__ = ["initialise", "start_error"]

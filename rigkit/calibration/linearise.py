@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, IntArray, Mat3, Points
-from rigkit.calibration.normal import Normal, Residuals
+from rigkit.calibration.normal_equations import Normal, Residuals
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.shape import ShapeModel
 from rigkit.calibration.state import State, lost_px
 from rigkit.cameras.base import Camera
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Points
 
 __all__ = ["normal_equations", "view_products"]
 

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray
 from rigkit.calibration.fit import Fit
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.solver import solve
 from rigkit.calibration.state import State, evaluate
+from rigkit.core.arrays import BoolArray, FloatArray
 
 __all__ = ["moved_lens"]
 

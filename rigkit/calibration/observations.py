@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, IntArray, Points
-from rigkit.boards import Board
-from rigkit.detections import BoardView
-from rigkit.errors import InputError
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import InputError
 
 __all__ = ["Observations", "median_of"]
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, Mat3, Points
 from rigkit.calibration.linearise import normal_equations
-from rigkit.calibration.normal import Normal
+from rigkit.calibration.normal_equations import Normal
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.radial_alignment import align
 from rigkit.calibration.state import State
+from rigkit.core.arrays import FloatArray, Mat3, Points
 from rigkit.geometry.rotation import exp_so3, nearest_rotation
 
 __all__ = ["find_poses", "refine_each", "refine_poses"]

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
+from rigkit.core.arrays import FloatArray
 
 __all__ = ["Alignment", "align", "distortion_centre"]
 

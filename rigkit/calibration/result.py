@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, IntArray, Pixels, Points, as_array, as_indices
-from rigkit.boards import Board
 from rigkit.cameras.base import Camera
-from rigkit.detections import BoardView
-from rigkit.errors import InputError
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, Points, as_array, as_indices
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 
 __all__ = ["BoardShape", "Calibration", "Candidate", "Convergence", "Outlier", "ViewResult"]

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, IntArray, Points
 from rigkit.calibration.observations import Observations
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
 
 __all__ = ["SHAPES", "ShapeModel", "often_seen", "released_groups", "released_sigma", "shape_model", "warp_groups"]
 

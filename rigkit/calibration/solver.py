@@ -16,13 +16,13 @@ from typing import TypeVar
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
 from rigkit.calibration.linearise import normal_equations
-from rigkit.calibration.normal import Normal, Step
+from rigkit.calibration.normal_equations import Normal, Step
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.state import State
-from rigkit.errors import RigkitError
+from rigkit.core.arrays import FloatArray
+from rigkit.core.errors import RigkitError
 from rigkit.geometry.rotation import exp_so3
 
 __all__ = ["Linearised", "Solution", "minimise", "solve", "with_priors"]

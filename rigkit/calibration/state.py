@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, IntArray, Mat3, Points
-from rigkit.calibration.normal import Residuals
+from rigkit.calibration.normal_equations import Residuals
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.shape import ShapeModel, shape_model
 from rigkit.cameras.base import Camera
+from rigkit.core.arrays import FloatArray, IntArray, Mat3, Points
 
 __all__ = ["State", "evaluate", "lost_px"]
 

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, IntArray, Pixels, Points
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, Points
 
 __all__ = ["Uncertainty", "projection_design", "projection_uncertainty", "uncertainty_at_corners", "uncertainty_map"]
 __all__ += ["worst_direction"]

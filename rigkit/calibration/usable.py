@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, IntArray, Pixels
-from rigkit.boards import Board
-from rigkit.detections import BoardDetection, BoardView
-from rigkit.errors import InputError
+from rigkit.core.arrays import FloatArray, IntArray, Pixels
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection, BoardView
+from rigkit.core.errors import InputError
 
 __all__ = ["MIN_CORNERS", "other_size", "usable_views", "views_of_image"]
 

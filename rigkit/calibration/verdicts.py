@@ -12,10 +12,10 @@ from typing import Protocol
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, IntArray
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import uncertainty_at_corners
 from rigkit.cameras.base import image_center
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 
 __all__ = ["headline", "judge", "judge_session"]
 

@@ -13,8 +13,8 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigkit.arrays import BoolArray, FloatArray, Pixels, Points, RayJacobians, Rays, as_array
-from rigkit.errors import InputError
+from rigkit.core.arrays import BoolArray, FloatArray, Pixels, Points, RayJacobians, Rays, as_array
+from rigkit.core.errors import InputError
 
 __all__ = ["Camera", "RadialCurve", "image_center"]
 

@@ -10,10 +10,10 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray
 from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.cameras.monotone import first_root, horner
-from rigkit.errors import InputError
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.errors import InputError
 
 __all__ = ["Brown"]
 

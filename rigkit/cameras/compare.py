@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, Mat3, Pixels
 from rigkit.cameras.base import Camera
-from rigkit.errors import DegenerateError, InputError
+from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Pixels
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import exp_so3, nearest_rotation, rotation_angle, skew
 
 __all__ = ["CameraDifference", "compare_cameras"]

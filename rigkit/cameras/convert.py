@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, Pixels, Rays
 from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.cameras.registry import camera_model
-from rigkit.errors import InputError
+from rigkit.core.arrays import FloatArray, Pixels, Rays
+from rigkit.core.errors import InputError
 
 __all__ = ["Conversion", "convert_camera", "fit_camera", "refit_camera"]
 

@@ -11,10 +11,10 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray
 from rigkit.cameras.base import RadialCurve
 from rigkit.cameras.radial import FocalCamera, ScaleDerivatives, fit_shape
-from rigkit.errors import InputError
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.errors import InputError
 
 __all__ = ["EUCM"]
 

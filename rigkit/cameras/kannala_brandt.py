@@ -11,10 +11,10 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, IntArray
 from rigkit.cameras.base import RadialCurve
 from rigkit.cameras.monotone import first_root, horner, invert_increasing
 from rigkit.cameras.radial import FocalCamera, ScaleDerivatives
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 
 __all__ = ["KannalaBrandt"]
 

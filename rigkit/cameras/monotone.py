@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, IntArray
-from rigkit.errors import InputError
+from rigkit.core.arrays import FloatArray, IntArray
+from rigkit.core.errors import InputError
 
 __all__ = ["first_root", "horner", "invert_increasing"]
 

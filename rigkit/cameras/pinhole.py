@@ -7,9 +7,9 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, Mat3
 from rigkit.cameras.base import RadialCurve
 from rigkit.cameras.radial import FocalCamera, ScaleDerivatives
+from rigkit.core.arrays import BoolArray, FloatArray, Mat3
 
 __all__ = ["Pinhole"]
 

@@ -13,9 +13,9 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray
 from rigkit.cameras.base import Camera, RadialCurve
-from rigkit.errors import InputError
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.errors import InputError
 
 __all__ = ["FocalCamera", "RadialCamera", "ScaleDerivatives", "fit_shape"]
 

@@ -10,7 +10,7 @@ from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.cameras.scaramuzza import Scaramuzza
 from rigkit.cameras.ucm import UCM
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 
 __all__ = ["MODELS", "camera_model", "check_order"]
 

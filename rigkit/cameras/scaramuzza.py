@@ -12,11 +12,11 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, IntArray
 from rigkit.cameras.base import RadialCurve, image_center
 from rigkit.cameras.monotone import first_root, horner, invert_increasing
 from rigkit.cameras.radial import RadialCamera, ScaleDerivatives
-from rigkit.errors import InputError
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.errors import InputError
 
 __all__ = ["DEFAULT_DEGREE", "DEGREES", "Scaramuzza"]
 

@@ -9,10 +9,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 
 if TYPE_CHECKING:
-    from rigkit.boards import Board, Markers
+    from rigkit.core.boards import Board, Markers
 
 HELP = "a board to print, true to scale (PDF and SVG), and its measured size back into the board file"
 
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.boards import Board
+    from rigkit.core.boards import Board
     from rigkit.io.board_file import load_layout
     from rigkit.io.files import write_together
     from rigkit.report.board_sheet import board_sheet, pdf_bytes, svg_text
@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _markers(args: argparse.Namespace) -> Markers | None:
-    from rigkit.boards import Markers
+    from rigkit.core.boards import Markers
 
     if args.charuco is None:
         if args.marker_mm is not None or args.first_marker or args.legacy:

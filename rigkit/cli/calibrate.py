@@ -12,12 +12,12 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from rigkit.progress import Progress, silent
+from rigkit.core.progress import Progress, silent
 
 if TYPE_CHECKING:
     from rigkit.calibration.result import Calibration
     from rigkit.cameras.base import Camera
-    from rigkit.detections import BoardView
+    from rigkit.core.detections import BoardView
     from rigkit.io.corner_cache import FoundCorners
     from rigkit.io.session import Session
 
@@ -125,7 +125,7 @@ def session_views(
     Raises InputError where there is no view, or the boards clearly have another size than stated.
     """
     from rigkit.calibration.usable import other_size, views_of_image
-    from rigkit.errors import InputError
+    from rigkit.core.errors import InputError
 
     size_px = _common_size(session, found)
     views, dropped = [], []
@@ -153,7 +153,7 @@ def session_views(
 
 def _common_size(session: Session, found: Mapping[str, FoundCorners]) -> tuple[int, int]:
     """Return the size that most images have; raises InputError where as many as a third have another."""
-    from rigkit.errors import InputError
+    from rigkit.core.errors import InputError
 
     counts = Counter(item.size_px for item in found.values()).most_common()
     if len(counts) > 1 and ODD_SIZES * counts[1][1] >= len(found):
@@ -173,7 +173,7 @@ def session_corners(session: Session, progress: Progress) -> dict[str, FoundCorn
     which few large squares through a wide lens do not, and what is covered.
     """
     from rigkit.cli.console import note
-    from rigkit.errors import InputError
+    from rigkit.core.errors import InputError
     from rigkit.io.corner_cache import CornerCache, image_hash
 
     cache = CornerCache(session.corners_path, session.boards)
@@ -224,7 +224,7 @@ def session_corners(session: Session, progress: Progress) -> dict[str, FoundCorn
 
 
 def _found_in(path: Path, session: Session, camera: Camera | None) -> FoundCorners:
-    from rigkit.corners.detect import detect_boards
+    from rigkit.detection.detect import detect_boards
     from rigkit.io.corner_cache import FoundCorners
     from rigkit.io.images import read_image
 
@@ -236,7 +236,7 @@ def _found_in(path: Path, session: Session, camera: Camera | None) -> FoundCorne
 def first_camera(session: Session, found: Mapping[str, FoundCorners]) -> Camera | None:
     """Return a camera calibrated quickly from `found`; None where it cannot be: the calibration proper says why."""
     from rigkit.calibration.calibrate import calibrate
-    from rigkit.errors import RigkitError
+    from rigkit.core.errors import RigkitError
 
     try:
         views, size_px, _ = session_views(session, found)

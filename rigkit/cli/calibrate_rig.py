@@ -8,7 +8,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rigkit.progress import Progress, silent
+from rigkit.core.progress import Progress, silent
 
 if TYPE_CHECKING:
     from rigkit.calibration.result import Calibration

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rigkit.boards import Board
     from rigkit.calibration.result import Calibration, ViewResult
     from rigkit.calibration.rig.result import RigCalibration
+    from rigkit.core.boards import Board
     from rigkit.io.rig_session import RigSession
     from rigkit.io.session import Session
     from rigkit.validation.checks import Check
@@ -60,7 +60,7 @@ def _boards_in_words(boards: Sequence[Board]) -> str:
 def _thumbnails(session: Session, calibration: Calibration) -> dict[str, bytes]:
     """Return a small picture of every image that is there, used or left out, with the corners found in it."""
     from rigkit.cli.calibrate import image_names
-    from rigkit.errors import InputError
+    from rigkit.core.errors import InputError
     from rigkit.io.images import read_image
     from rigkit.report.calibration_page import thumbnail_jpeg
 

@@ -7,7 +7,7 @@ import sys
 import time
 from typing import Any
 
-from rigkit.progress import Progress
+from rigkit.core.progress import Progress
 
 __all__ = ["note", "print_json", "progress_on_stderr"]
 

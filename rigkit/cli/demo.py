@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 
 HELP = "render a small fisheye capture and run the whole job on it; needs no data"
 

@@ -9,12 +9,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rigkit.errors import CheckFailed, InputError
+from rigkit.core.errors import CheckFailed, InputError
 
 if TYPE_CHECKING:
-    from rigkit.boards import Board
     from rigkit.cameras.base import Camera
-    from rigkit.detections import BoardDetection
+    from rigkit.core.boards import Board
+    from rigkit.core.detections import BoardDetection
 
     How = tuple[list[Board], Camera | None, int]
     """Boards, camera and the smallest number of corners: the same for all images."""
@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import print_json
-    from rigkit.corners.detect import FEWEST_OF_BOARD
+    from rigkit.detection.detect import FEWEST_OF_BOARD
     from rigkit.io.board_file import load_board
     from rigkit.io.corners_file import write_corners
     from rigkit.io.files import ensure_writable
@@ -125,7 +125,7 @@ def _detect_all(
 ) -> dict[str, tuple[BoardDetection, ...]]:
     """Return the detections per image in the order of `images`, whatever the number of processes."""
     from rigkit.cli.console import progress_on_stderr
-    from rigkit.processes import worker_pool
+    from rigkit.core.processes import worker_pool
 
     progress = progress_on_stderr()
     tasks = [(image, overlay, how, args.force) for image, overlay in zip(images, overlays, strict=True)]
@@ -149,7 +149,7 @@ def detect_one(task: tuple[Path, Path | None, How, bool]) -> tuple[BoardDetectio
     """Detect the boards of one image and write its overlay; at module level for other processes to find."""
     import cv2
 
-    from rigkit.corners.detect import detect_boards
+    from rigkit.detection.detect import detect_boards
     from rigkit.io.files import write_atomic
     from rigkit.io.images import read_image
     from rigkit.report.overlay import draw_boards

@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import print_json
-    from rigkit.errors import InputError
+    from rigkit.core.errors import InputError
     from rigkit.io.files import ensure_writable
     from rigkit.io.rig_file import is_rig_file
 
@@ -88,7 +88,7 @@ def _rigs(a: Path, b: Path) -> dict[str, Any]:
     from dataclasses import asdict
 
     from rigkit.calibration.rig.compare import compare_mounts
-    from rigkit.errors import InputError
+    from rigkit.core.errors import InputError
     from rigkit.io.rig_file import load_saved_rig
 
     first, second = load_saved_rig(a), load_saved_rig(b)

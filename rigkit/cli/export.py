@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rigkit.cli.console import note
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 
 if TYPE_CHECKING:
     from rigkit.cameras.base import Camera
@@ -65,9 +65,9 @@ def _export_rig(args: argparse.Namespace) -> int:
 def _export_camera(args: argparse.Namespace) -> int:
     import numpy as np
 
-    from rigkit.cameras.targets import field_across
     from rigkit.io.calibration_file import refuse_mirrored, save_camera
     from rigkit.io.files import ensure_writable, write_atomic
+    from rigkit.rectification.targets import field_across
 
     kind = args.to or ("rigkit" if args.output.suffix == ".json" else None)
     if kind not in CAMERA_FORMATS:

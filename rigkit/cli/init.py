@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rigkit.cli.console import note, progress_on_stderr
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 
 if TYPE_CHECKING:
     from rigkit.io.manifest_writer import FoundPair
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.corners.detect import detect_boards
+    from rigkit.detection.detect import detect_boards
     from rigkit.io.files import ensure_writable, write_atomic
     from rigkit.io.images import read_image, to_grey
     from rigkit.io.manifest import load_dataset

@@ -18,7 +18,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 
-from rigkit.errors import RigkitError
+from rigkit.core.errors import RigkitError
 
 __all__ = ["VERBS", "main"]
 

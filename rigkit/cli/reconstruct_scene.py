@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from rigkit.cli.console import note, print_json, progress_on_stderr
 from rigkit.cli.workflow import output_folder, read_for, write_results
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 
 if TYPE_CHECKING:
     from rigkit.affine.correspondences import Correspondences
@@ -49,7 +49,7 @@ def run_scene(args: argparse.Namespace) -> int:
     import numpy as np
 
     from rigkit.io.calibration_file import load_camera
-    from rigkit.scene import reconstruct_scene
+    from rigkit.reconstruction.scene import reconstruct_scene
 
     name = Path(args.correspondences or args.images[0]).stem
     out = output_folder(args, name)

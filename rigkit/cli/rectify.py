@@ -7,10 +7,10 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 
 if TYPE_CHECKING:
-    from rigkit.cameras.rectify import RectifyMap
+    from rigkit.rectification.rectify import RectifyMap
 
 HELP = "perspective, cylindrical or equirectangular image from any camera's image, or a stereo pair"
 
@@ -53,10 +53,10 @@ def run(args: argparse.Namespace) -> int:
         return _run_stereo(args)
     import numpy as np
 
-    from rigkit.cameras.rectify import rectify_map, rotation_from_view_angles
-    from rigkit.cameras.targets import target_camera
     from rigkit.io.calibration_file import load_camera
     from rigkit.io.files import ensure_writable
+    from rigkit.rectification.rectify import rectify_map, rotation_from_view_angles
+    from rigkit.rectification.targets import target_camera
 
     if args.camera is None:
         raise InputError("rectify: --camera is missing; give the camera's calibration.json")
@@ -74,9 +74,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run_stereo(args: argparse.Namespace) -> int:
-    from rigkit.cameras.stereo import rectify_pair
     from rigkit.io.files import ensure_writable
     from rigkit.io.rig_file import load_rig
+    from rigkit.rectification.stereo import rectify_pair
 
     if args.image2 is None or args.rig is None:
         raise InputError("rectify: a stereo pair needs two images and --rig RIG.json")

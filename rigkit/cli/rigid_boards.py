@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rigkit.boards import Board
     from rigkit.calibration.rig.result import RigCalibration
-    from rigkit.detections import BoardDetection
+    from rigkit.core.boards import Board
+    from rigkit.core.detections import BoardDetection
     from rigkit.io.corner_cache import FoundCorners
     from rigkit.io.rig_session import RigSession
 
@@ -17,8 +17,8 @@ __all__ = ["named_as_listed", "named_by_rule", "require_distinct"]
 
 def require_distinct(session: RigSession) -> None:
     """Raise InputError where a rig of cameras has boards that nothing tells apart: alike, and not on one mount."""
-    from rigkit.corners.candidates import board_kinds
-    from rigkit.errors import InputError
+    from rigkit.core.errors import InputError
+    from rigkit.identification.placements import board_kinds
 
     if len(session.cameras) < 2:
         return
@@ -67,11 +67,11 @@ def _vacant(detection: BoardDetection, group: list[Board], taken: set[str | None
 
 
 def named_by_rule(session: RigSession, rig: RigCalibration) -> RigCalibration:
-    """Return the rig with boards that look alike called as `rigkit.corners.naming` has it, in the first image that
-    shows the most of them: by the session's layout, or in the order listed."""
+    """Return the rig with boards that look alike called as `identification.names` has it, in the first image that shows
+    the most of them: by the session's layout, or in the order listed."""
     from rigkit.calibration.rig.board_names import renamed
-    from rigkit.corners.candidates import board_kinds
-    from rigkit.corners.naming import Located, name_boards
+    from rigkit.identification.names import Located, name_boards
+    from rigkit.identification.placements import board_kinds
 
     boards = {b.board_id: b for own in session.cameras.values() for b in own.boards}
     names: dict[str, str] = {}

@@ -23,12 +23,12 @@ def run(args: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from rigkit.cli.console import note, print_json, progress_on_stderr
-    from rigkit.errors import InputError
+    from rigkit.core.errors import InputError
     from rigkit.io.files import ensure_writable, write_together
     from rigkit.io.study_file import load_study
     from rigkit.io.study_run import run_study
     from rigkit.report.study_figure import study_figure
-    from rigkit.validation.study_table import tabulate
+    from rigkit.study.table import tabulate
 
     if args.jobs < 1:
         raise InputError(f"simulate: --jobs must be at least 1, got {args.jobs}")

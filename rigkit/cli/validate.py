@@ -25,13 +25,13 @@ from rigkit.cli.workflow import (
     shifts_of,
     write_results,
 )
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 
 if TYPE_CHECKING:
     from rigkit.cli.workflow import LoadedCamera, PairFailure
     from rigkit.io.manifest import Dataset, Pair
-    from rigkit.pairing import MatchedPair
-    from rigkit.reconstruct import Reconstruction
+    from rigkit.reconstruction.pairing import MatchedPair
+    from rigkit.reconstruction.reconstruct import Reconstruction
     from rigkit.report.page import PairSection
     from rigkit.validation.checks import ValidationReport
     from rigkit.validation.crosscheck import CrossCheckReport
@@ -112,7 +112,7 @@ class PairOutcome:
 
 def validate_pair(job: PairJob) -> PairOutcome:
     """Reconstruct one pair with every estimator and judge each."""
-    from rigkit.errors import RigkitError
+    from rigkit.core.errors import RigkitError
     from rigkit.validation.diagnose import camera_suspects
 
     pair = job.pair

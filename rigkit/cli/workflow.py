@@ -16,17 +16,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from rigkit.cli.console import note
-from rigkit.errors import DegenerateError, InputError, RigkitError
-from rigkit.processes import worker_pool
+from rigkit.core.errors import DegenerateError, InputError, RigkitError
+from rigkit.core.processes import worker_pool
 
 if TYPE_CHECKING:
-    from rigkit.arrays import FloatArray
     from rigkit.cameras.base import Camera
-    from rigkit.detections import BoardDetection
+    from rigkit.core.arrays import FloatArray
+    from rigkit.core.detections import BoardDetection
+    from rigkit.core.progress import Progress
     from rigkit.io.manifest import Dataset, Pair
-    from rigkit.pairing import MatchedPair
-    from rigkit.progress import Progress
-    from rigkit.reconstruct import Reconstruction
+    from rigkit.reconstruction.pairing import MatchedPair
+    from rigkit.reconstruction.reconstruct import Reconstruction
     from rigkit.validation.intrinsics import CalibrationShifts
 
 __all__ = [
@@ -179,7 +179,7 @@ def find_boards(pair: Pair, camera1: Camera, camera2: Camera) -> tuple[Detection
     The cameras show where corners were missed, which parts are of one board, what is covered, and how lines bend; a
     camera that no pose of a board fits is left aside.
     """
-    from rigkit.corners.detect import detect_boards
+    from rigkit.detection.detect import detect_boards
     from rigkit.io.images import to_grey
 
     images = []
@@ -226,7 +226,7 @@ def match_found(
     chain: str,
 ) -> MatchedPair:
     """Match the boards found in the two images of a pair as the manifest declares it."""
-    from rigkit.pairing import match_pair
+    from rigkit.reconstruction.pairing import match_pair
 
     return match_pair(
         pair.pair_id,
@@ -245,7 +245,7 @@ def reconstruct_with(matched: MatchedPair, pair: Pair, method: str, image1: Any 
     """Reconstruct matched corners as the manifest declares the pair."""
     import numpy as np
 
-    from rigkit.reconstruct import reconstruct_pair
+    from rigkit.reconstruction.reconstruct import reconstruct_pair
 
     level = None if pair.level_sigma_deg is None else float(np.deg2rad(pair.level_sigma_deg))
     return reconstruct_pair(

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, Points, Rays, as_array
-from rigkit.errors import DegenerateError, InputError
+from rigkit.core.arrays import FloatArray, Points, Rays, as_array
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, nearest_rotation, skew
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, Points, RayJacobians, Rays
+from rigkit.core.arrays import FloatArray, Points, RayJacobians, Rays
 from rigkit.geometry.rigid3 import Rigid3
 
 __all__ = ["pair_projection_jacobians", "projection_jacobian"]

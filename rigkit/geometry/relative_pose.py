@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
+from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigkit.arrays import FloatArray, Mat3, Points, as_array
-from rigkit.errors import InputError
+from rigkit.core.arrays import FloatArray, Mat3, Points, as_array
+from rigkit.core.errors import InputError
 from rigkit.geometry.rotation import nearest_rotation, unit
 
 __all__ = ["Rigid3", "cam_from_world_look_at"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, Mat3
+from rigkit.core.arrays import FloatArray, Mat3
 
 __all__ = ["angle_between", "cross", "exp_so3", "log_so3", "nearest_rotation", "rotation_angle", "skew", "unit"]
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, Mat3, RayJacobians, Rays
+from rigkit.core.arrays import FloatArray, Mat3, RayJacobians, Rays
 
 __all__ = ["epipolar_normals", "sampson_distances"]
 

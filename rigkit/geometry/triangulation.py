@@ -14,8 +14,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, Mat3, Pixels, Points, RayJacobians, Rays
-from rigkit.errors import InputError
+from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Pixels, Points, RayJacobians, Rays
+from rigkit.core.errors import InputError
 from rigkit.geometry.projection_jacobian import projection_jacobian
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import cross, skew, unit

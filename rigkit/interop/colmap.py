@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, IntArray, Pixels, Points, Rays
 from rigkit.cameras.base import Camera
-from rigkit.errors import DegenerateError
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, Points, Rays
+from rigkit.core.errors import DegenerateError
 from rigkit.geometry.relative_pose import relative_pose, relative_pose_covariance
 from rigkit.geometry.rigid3 import Rigid3
 

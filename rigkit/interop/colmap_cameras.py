@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
 from rigkit.cameras.base import Camera
 from rigkit.cameras.registry import camera_model
-from rigkit.errors import InputError
+from rigkit.core.arrays import FloatArray
+from rigkit.core.errors import InputError
 from rigkit.interop.colmap import HALF_PIXEL
 from rigkit.interop.exchange import Accepted, Written, best_accepted
 

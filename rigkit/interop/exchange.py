@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
 from rigkit.cameras.base import Camera
 from rigkit.cameras.convert import convert_camera
 from rigkit.cameras.ucm import UCM
-from rigkit.errors import InputError
+from rigkit.core.arrays import FloatArray
+from rigkit.core.errors import InputError
 
 __all__ = ["Accepted", "Written", "best_accepted", "field", "numbers", "unified_from_xi", "unified_with_xi"]
 

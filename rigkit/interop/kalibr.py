@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
 from rigkit.cameras.base import Camera
 from rigkit.cameras.registry import camera_model
-from rigkit.errors import InputError
+from rigkit.core.arrays import FloatArray
+from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.interop.exchange import (
     Accepted,

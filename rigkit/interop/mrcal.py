@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, Pixels, Rays
 from rigkit.cameras.base import Camera
 from rigkit.cameras.convert import fit_camera
 from rigkit.cameras.registry import camera_model
-from rigkit.errors import InputError
+from rigkit.core.arrays import BoolArray, FloatArray, Pixels, Rays
+from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
 from rigkit.interop.exchange import Accepted, Written, best_accepted, field, numbers

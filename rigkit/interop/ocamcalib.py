@@ -11,10 +11,10 @@ import json
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, Mat3
 from rigkit.cameras.base import Camera
 from rigkit.cameras.scaramuzza import DEGREES, Scaramuzza
-from rigkit.errors import InputError
+from rigkit.core.arrays import FloatArray, Mat3
+from rigkit.core.errors import InputError
 from rigkit.interop.exchange import Accepted, Chosen, Written, best_accepted, numbers
 
 __all__ = ["read_ocamcalib", "read_py_ocamcalib", "write_ocamcalib"]

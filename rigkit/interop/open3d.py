@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, Mat3, Normals, Points, as_array
-from rigkit.cloud import OrientedCloud
-from rigkit.errors import DegenerateError
+from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Normals, Points, as_array
+from rigkit.core.cloud import OrientedCloud
+from rigkit.core.errors import DegenerateError
 
 __all__ = ["from_open3d", "mean_and_covariance", "plane_inliers", "to_open3d"]
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
 from rigkit.cameras.base import Camera
 from rigkit.cameras.registry import camera_model
-from rigkit.errors import InputError
+from rigkit.core.arrays import FloatArray
+from rigkit.core.errors import InputError
 from rigkit.interop.exchange import Accepted, Written, best_accepted, field, numbers, unified_from_xi, unified_with_xi
 from rigkit.interop.simple_yaml import parse_yaml
 

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
 from rigkit.cameras.base import Camera
 from rigkit.cameras.registry import camera_model
-from rigkit.errors import InputError
+from rigkit.core.arrays import FloatArray
+from rigkit.core.errors import InputError
 from rigkit.interop.exchange import Accepted, Written, best_accepted, field, numbers
 from rigkit.interop.simple_yaml import flow, parse_yaml
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 
 __all__ = ["flow", "parse_yaml"]
 

@@ -24,7 +24,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from rigkit.boards import Board, Markers, marker_rectangles
+from rigkit.core.boards import Board, Markers, marker_rectangles
 from rigkit.io.toml_reader import TomlTable, read_toml
 
 __all__ = ["SCHEMA", "board_from_table", "load_board", "load_layout", "with_squares"]

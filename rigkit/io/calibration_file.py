@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, without_nan
 from rigkit.calibration.result import BoardShape, Calibration, Candidate, Convergence, Outlier, ViewResult
 from rigkit.cameras.base import Camera
 from rigkit.cameras.registry import camera_model
-from rigkit.errors import InputError
+from rigkit.core.arrays import FloatArray, without_nan
+from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.files import write_atomic
 from rigkit.io.text import read_text

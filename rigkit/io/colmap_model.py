@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, Mat3, Pixels
+from rigkit.core.arrays import FloatArray, Mat3, Pixels
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.interop.colmap import HALF_PIXEL
 from rigkit.interop.colmap_cameras import write_colmap_cameras
-from rigkit.reconstruct import Reconstruction
+from rigkit.reconstruction.reconstruct import Reconstruction
 
 __all__ = ["colmap_model"]
 

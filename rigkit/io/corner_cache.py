@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from rigkit.boards import Board
-from rigkit.detections import BoardDetection
-from rigkit.errors import InputError
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
+from rigkit.core.errors import InputError
 from rigkit.io.files import write_atomic
 from rigkit.io.sources import source_hash
 

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rigkit.boards import Board
-from rigkit.detections import BoardDetection
-from rigkit.errors import InputError
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
+from rigkit.core.errors import InputError
 from rigkit.io.files import write_atomic
 from rigkit.io.text import read_text
 

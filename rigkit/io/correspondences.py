@@ -20,10 +20,10 @@ from pathlib import Path
 import numpy as np
 
 from rigkit.affine.correspondences import Correspondences
-from rigkit.arrays import FloatArray
-from rigkit.errors import InputError
+from rigkit.core.arrays import FloatArray
+from rigkit.core.errors import InputError
+from rigkit.core.matches import DirectionPairs
 from rigkit.io.files import write_atomic
-from rigkit.matches import DirectionPairs
 
 __all__ = ["correspondences_text", "read_correspondences", "write_correspondences"]
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 
 __all__ = ["ensure_folder_writable", "ensure_writable", "write_atomic", "write_together"]
 

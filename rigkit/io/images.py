@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 from rigkit.io.tiff import as_stored, page_count
 
 __all__ = ["Image", "read_image", "to_grey"]

@@ -7,15 +7,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
-from rigkit.boards import Board
-from rigkit.corners.naming import SIDES
-from rigkit.errors import InputError
+from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
+from rigkit.core.posetype import PoseType
+from rigkit.core.truth import PairTruth
+from rigkit.identification.names import SIDES
 from rigkit.io.board_file import board_from_table, load_board
 from rigkit.io.toml_reader import TomlTable, read_toml
 from rigkit.io.truth_csv import load_truth_csv
 from rigkit.io.truth_file import truth_from_table
-from rigkit.posetype import PoseType
-from rigkit.truth import PairTruth
 
 __all__ = ["SCHEMA", "CameraEntry", "Dataset", "Pair", "load_dataset"]
 

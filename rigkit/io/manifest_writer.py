@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rigkit.detections import BoardDetection
-from rigkit.errors import InputError
+from rigkit.core.detections import BoardDetection
+from rigkit.core.errors import InputError
 from rigkit.io.manifest import SCHEMA
 
 __all__ = ["FoundPair", "Sighting", "board_sizes", "find_images", "group_pairs", "manifest_text"]

@@ -6,7 +6,7 @@ import io
 
 import numpy as np
 
-from rigkit.reconstruct import Reconstruction
+from rigkit.reconstruction.reconstruct import Reconstruction
 
 __all__ = ["cloud_npz"]
 

@@ -6,7 +6,7 @@ import csv
 import io
 from pathlib import Path
 
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 from rigkit.io.text import read_text
 from rigkit.validation.tables import PaperTables
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.cloud import OrientedCloud
-from rigkit.errors import InputError
+from rigkit.core.cloud import OrientedCloud
+from rigkit.core.errors import InputError
 from rigkit.io.files import write_atomic
 
 __all__ = ["ply_bytes", "read_ply", "write_ply"]

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, as_array
-from rigkit.boards import Board
 from rigkit.calibration.rig.board_rig import BoardRig, PlacedBoard
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.base import Camera
-from rigkit.errors import InputError
+from rigkit.core.arrays import FloatArray, as_array
+from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibration_file import camera_from_json, camera_to_json, damage_named
 

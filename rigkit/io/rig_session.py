@@ -43,13 +43,13 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path, PurePath
 
-from rigkit.boards import Board
-from rigkit.corners.naming import SIDES
-from rigkit.errors import InputError
+from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
+from rigkit.core.truth import MeasuredLength, PairTruth
+from rigkit.identification.names import SIDES
 from rigkit.io.session import SCHEMA, Session, boards_of, images_of, options_of
 from rigkit.io.toml_reader import TomlTable, read_toml
 from rigkit.io.truth_file import truth_from_table
-from rigkit.truth import MeasuredLength, PairTruth
 
 __all__ = [
     "FRAMES",

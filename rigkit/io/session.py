@@ -18,10 +18,10 @@ import glob
 from dataclasses import dataclass
 from pathlib import Path
 
-from rigkit.boards import Board
 from rigkit.calibration.shape import SHAPES
 from rigkit.cameras.registry import MODELS, check_order
-from rigkit.errors import InputError
+from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
 from rigkit.io.board_file import load_board
 from rigkit.io.toml_reader import TomlTable, named_path, read_toml
 

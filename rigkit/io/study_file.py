@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from rigkit.boards import Board
+from rigkit.core.boards import Board
+from rigkit.core.posetype import PoseType
 from rigkit.io.toml_reader import TomlTable, read_toml
-from rigkit.posetype import PoseType
+from rigkit.study.study import NOISE_KINDS, Claim, Study
+from rigkit.study.table import CELL_KEYS
 from rigkit.synthetic.noise import NoisyImages
-from rigkit.validation.study import NOISE_KINDS, Claim, Study
-from rigkit.validation.study_table import CELL_KEYS
 
 __all__ = ["SCHEMA", "load_study"]
 

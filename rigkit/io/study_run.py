@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
+from rigkit.core.processes import worker_pool
+from rigkit.core.progress import Progress, silent
 from rigkit.io.files import write_atomic
 from rigkit.io.sources import source_hash
-from rigkit.processes import worker_pool
-from rigkit.progress import Progress, silent
-from rigkit.validation.study import Study, chunk_count, run_chunk
+from rigkit.study.study import Study, chunk_count, run_chunk
 
 __all__ = ["run_study", "study_key"]
 

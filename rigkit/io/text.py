@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 
 __all__ = ["read_text"]
 

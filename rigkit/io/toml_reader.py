@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 from rigkit.io.text import read_text
 
 __all__ = ["TomlTable", "named_path", "read_toml"]

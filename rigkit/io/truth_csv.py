@@ -21,11 +21,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rigkit.boards import Board
-from rigkit.errors import InputError
+from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
+from rigkit.core.truth import MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
 from rigkit.io.text import read_text
 from rigkit.io.truth_file import make_angle, make_distance
-from rigkit.truth import MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
 
 __all__ = ["load_truth_csv"]
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from rigkit.boards import Board
-from rigkit.errors import InputError
+from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
+from rigkit.core.truth import Feature, MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
 from rigkit.io.toml_reader import TomlTable
-from rigkit.truth import Feature, MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
 
 __all__ = ["truth_from_table"]
 

@@ -11,8 +11,8 @@ from html import escape
 
 import numpy as np
 
-from rigkit.boards import Board, marker_rectangles
-from rigkit.errors import InputError
+from rigkit.core.boards import Board, marker_rectangles
+from rigkit.core.errors import InputError
 
 __all__ = ["PAPERS", "Sheet", "board_sheet", "pdf_bytes", "svg_text"]
 

@@ -7,9 +7,9 @@ from html import escape
 import cv2
 import numpy as np
 
-from rigkit.arrays import FloatArray, Pixels
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import projection_uncertainty, uncertainty_map
+from rigkit.core.arrays import FloatArray, Pixels
 
 __all__ = ["coverage_svg", "pattern_svg", "residuals_svg", "uncertainty_svg"]
 

@@ -7,10 +7,10 @@ from html import escape
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
+from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rotation import angle_between
 from rigkit.geometry.triangulation import correct_rays_px
-from rigkit.reconstruct import Reconstruction
+from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.report.figures import board_colour
 from rigkit.validation.checks import ValidationReport
 

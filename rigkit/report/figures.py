@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.arrays import FloatArray, Pixels, in_8_bits
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import CameraDifference
+from rigkit.core.arrays import FloatArray, Pixels, in_8_bits
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.reconstruct import Reconstruction
+from rigkit.reconstruction.reconstruct import Reconstruction
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.detections import BoardDetection
+from rigkit.core.detections import BoardDetection
 
 __all__ = ["draw_boards"]
 

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
+from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.reconstruct import Reconstruction
+from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.report.tables import below, measured_words
 from rigkit.validation.tables import Cell, Column, Table
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.affine.correspondences import Correspondences
+from rigkit.reconstruction.scene import SceneReconstruction
 from rigkit.report.figures import as_png, pair_axes
-from rigkit.scene import SceneReconstruction
 
 __all__ = ["normals_png"]
 

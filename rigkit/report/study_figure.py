@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from rigkit.validation.study import PLANES
-from rigkit.validation.study_table import ALL_PLANES, Cell, StudyTable
+from rigkit.study.study import PLANES
+from rigkit.study.table import ALL_PLANES, Cell, StudyTable
 
 __all__ = ["study_figure"]
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import uncertainty_at_corners
-from rigkit.reconstruct import Reconstruction
+from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.report.page import PairSection, scene_of
 from rigkit.report.tables import measured_words
 from rigkit.validation.checks import ValidationReport

@@ -16,13 +16,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.boards import Board
 from rigkit.cameras.base import Camera
 from rigkit.cameras.kannala_brandt import KannalaBrandt
-from rigkit.errors import DegenerateError, InputError
+from rigkit.core.boards import Board
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.posetype import PoseType
+from rigkit.core.progress import Progress, silent
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.posetype import PoseType
-from rigkit.progress import Progress, silent
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.placing import place_board, sees_paper

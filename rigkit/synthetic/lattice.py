@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, Pixels
+from rigkit.core.arrays import FloatArray, Pixels
 
 __all__ = ["chord_directions", "harmonic_directions"]
 

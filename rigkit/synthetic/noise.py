@@ -6,8 +6,8 @@ from enum import StrEnum
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, Pixels
-from rigkit.matches import DirectionPairs
+from rigkit.core.arrays import FloatArray, Pixels
+from rigkit.core.matches import DirectionPairs
 
 __all__ = ["NoisyImages", "corner_noise", "rotate_directions", "turn"]
 

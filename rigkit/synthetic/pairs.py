@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.arrays import FloatArray, Normals, Points
-from rigkit.boards import Board
 from rigkit.cameras.base import Camera
-from rigkit.detections import BoardDetection
-from rigkit.errors import DegenerateError, InputError
+from rigkit.core.arrays import FloatArray, Normals, Points
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3, cam_from_world_look_at
 from rigkit.geometry.rotation import exp_so3, unit
-from rigkit.posetype import PoseType
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import Panel, PlacedBoard, exact_detection, room_walls, trihedral

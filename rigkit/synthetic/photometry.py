@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.arrays import FloatArray
-from rigkit.errors import InputError
+from rigkit.core.arrays import FloatArray
+from rigkit.core.errors import InputError
 
 __all__ = ["Photometry", "Shadow", "develop"]
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
-from rigkit.boards import Board
 from rigkit.cameras.base import Camera
+from rigkit.core.arrays import FloatArray
+from rigkit.core.boards import Board
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit
 from rigkit.synthetic.scene import PlacedBoard

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, IntArray, Mat3, Normals, Points, as_array, as_indices
-from rigkit.boards import Board
-from rigkit.errors import DegenerateError, InputError
+from rigkit.core.arrays import FloatArray, IntArray, Mat3, Normals, Points, as_array, as_indices
+from rigkit.core.boards import Board
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.posetype import PoseType
 from rigkit.geometry.rotation import exp_so3, unit
-from rigkit.posetype import PoseType
 
 __all__ = ["PairBatch", "general_pairs", "special_pairs"]
 

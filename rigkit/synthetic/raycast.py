@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.arrays import BoolArray, FloatArray
-from rigkit.boards import marker_rectangles
 from rigkit.cameras.base import Camera
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.boards import marker_rectangles
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.synthetic.scene import Panel, PlacedBoard
 

@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from rigkit.arrays import FloatArray
 from rigkit.cameras.base import Camera
-from rigkit.errors import InputError
+from rigkit.core.arrays import FloatArray
+from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.synthetic.photometry import Photometry, develop
 from rigkit.synthetic.raycast import FULL, PART, Chart, Float32, Surface, board_surface, paint, panel_surface

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, Mat3, Pixels, Points, as_array
-from rigkit.boards import Board
 from rigkit.cameras.base import Camera
-from rigkit.detections import BoardDetection, BoardView
-from rigkit.errors import InputError
+from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Pixels, Points, as_array
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection, BoardView
+from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import unit
 

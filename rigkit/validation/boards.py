@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, IntArray, Mat3, Normals, Points
-from rigkit.boards import Board
-from rigkit.errors import DegenerateError
-from rigkit.truth import Feature
+from rigkit.core.arrays import FloatArray, IntArray, Mat3, Normals, Points
+from rigkit.core.boards import Board
+from rigkit.core.errors import DegenerateError
+from rigkit.core.truth import Feature
 from rigkit.validation.planes import NormalErrors, Plane, fit_moved, fit_plane, normal_errors
 
 __all__ = ["BoardResult", "Lattice", "Placed", "fit_lattice", "measure_board", "place_moved"]

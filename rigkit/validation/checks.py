@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from rigkit.arrays import without_nan
-from rigkit.errors import InputError
-from rigkit.reconstruct import Reconstruction
-from rigkit.truth import PairTruth
+from rigkit.core.arrays import without_nan
+from rigkit.core.errors import InputError
+from rigkit.core.truth import PairTruth
+from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.validation.boards import BoardResult
 from rigkit.validation.intrinsics import CalibrationShifts
 from rigkit.validation.measure import Measured, measure

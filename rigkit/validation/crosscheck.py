@@ -15,14 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, without_nan
-from rigkit.errors import DegenerateError, InputError
+from rigkit.core.arrays import FloatArray, without_nan
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, log_so3, rotation_angle, unit
 from rigkit.interop.colmap import colmap_pair, solve_pair
-from rigkit.reconstruct import Reconstruction
+from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.validation.checks import Check, judge
-from rigkit.validation.colmap_way import colmap_reconstruction
+from rigkit.validation.colmap_method import colmap_reconstruction
 from rigkit.validation.intrinsics import CalibrationShifts
 from rigkit.validation.measure import Measured, measure
 from rigkit.validation.planes import face_angle, fit_moved

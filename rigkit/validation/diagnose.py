@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rigkit.boards import Board
 from rigkit.cameras.base import Camera
-from rigkit.detections import BoardDetection
-from rigkit.errors import DegenerateError, InputError
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.board_pose import board_pose
 from rigkit.validation.checks import Check, ValidationReport
 

@@ -13,14 +13,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray
 from rigkit.cameras.base import Camera
-from rigkit.fundamental.metric import triangulate_matches
-from rigkit.fundamental.refine import refine_pose
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.matches import Matches
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.scale import metric_scale
-from rigkit.matches import Matches
-from rigkit.reconstruct import Reconstruction
+from rigkit.reconstruction.metric import triangulate_matches
+from rigkit.reconstruction.reconstruct import Reconstruction
+from rigkit.reconstruction.scale import metric_scale
+from rigkit.relative_pose.refinement.refine import refine_pose
 
 __all__ = ["CalibrationShifts", "calibration_shifts"]
 

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, Mat3, Normals, Points, as_array
-from rigkit.errors import DegenerateError, InputError
+from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Normals, Points, as_array
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import angle_between
 from rigkit.interop.open3d import mean_and_covariance, plane_inliers
 

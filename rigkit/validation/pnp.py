@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, Points, Rays
-from rigkit.errors import DegenerateError
+from rigkit.core.arrays import FloatArray, Points, Rays
+from rigkit.core.errors import DegenerateError
 from rigkit.geometry.board_pose import BoardPose, board_pose, moved_board_poses
 from rigkit.geometry.relative_pose import relative_pose, relative_pose_covariance
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3, skew
-from rigkit.reconstruct import Reconstruction
+from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.validation.planes import angle_jacobian, face_angle
 
 __all__ = ["AnglesDeg", "PnpResult", "moved_pnp", "planar_pnp"]

@@ -12,7 +12,7 @@ from itertools import combinations
 
 import numpy as np
 
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 from rigkit.validation.checks import ValidationReport
 
 __all__ = [

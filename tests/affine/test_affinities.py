@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from rigkit.affine.affinities import Affinities, DirectionNoise, EpipolarNormals
-from rigkit.errors import InputError
-from rigkit.matches import DirectionPairs
+from rigkit.core.errors import InputError
+from rigkit.core.matches import DirectionPairs
 
 
 def test_noise_of_a_board_recovers_what_edges_share(rng: np.random.Generator) -> None:

@@ -12,7 +12,7 @@ from rigkit.affine.correct import correct_affines, correct_frames, epipolar_resi
 from rigkit.affine.normal import normals_from_affines
 from rigkit.affine.surface import affines_from_normals
 from rigkit.cameras.base import Camera
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit
 

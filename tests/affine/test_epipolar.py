@@ -11,9 +11,9 @@ from rigkit.affine.affinities import EpipolarNormals
 from rigkit.affine.epipolar import epipolar_alignment
 from rigkit.affine.normal import normals_from_affines
 from rigkit.affine.registry import affines_from_directions
+from rigkit.core.matches import DirectionPairs
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, skew, unit
-from rigkit.matches import DirectionPairs
 
 SAME_NORMAL_DEG = 1e-9
 POSE = Rigid3(exp_so3(np.array([0.1, -0.3, 0.15])), [-260.0, 60.0, 90.0])

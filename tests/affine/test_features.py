@@ -13,7 +13,7 @@ from rigkit.affine.homography import affines_from_homography
 from rigkit.affine.normal import normals_from_affines
 from rigkit.affine.refine_patches import refine_patches
 from rigkit.cameras.pinhole import Pinhole
-from rigkit.errors import DegenerateError, InputError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3

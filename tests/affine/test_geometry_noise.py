@@ -11,11 +11,11 @@ from rigkit.affine.geometry_noise import geometry_covariance
 from rigkit.affine.normal import estimate_normals, normals_from_affines
 from rigkit.affine.registry import affines_from_directions
 from rigkit.cameras.base import Camera
+from rigkit.core.matches import Matches
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, skew
 from rigkit.geometry.triangulation import triangulate_rays
-from rigkit.matches import Matches
 
 PREDICTED = 0.12
 """Root mean square over 48 corners x 150 trials; a corner beside the epipole weighs heavily."""

@@ -14,7 +14,7 @@ from rigkit.affine.homography import (
     homography_from_affines,
     homography_from_plane,
 )
-from rigkit.errors import DegenerateError, InputError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, skew
 

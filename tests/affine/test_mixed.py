@@ -9,8 +9,8 @@ from helpers.affine_scenes import Corners, general_pairs, turned
 from rigkit.affine.affinities import DirectionNoise
 from rigkit.affine.mixed import affines_from_mixed_directions
 from rigkit.affine.registry import affines_from_directions
-from rigkit.errors import InputError
-from rigkit.matches import DirectionPairs
+from rigkit.core.errors import InputError
+from rigkit.core.matches import DirectionPairs
 
 MC_RELATIVE = 0.12
 """Second moments of 4000 trials, first order."""

@@ -16,10 +16,10 @@ from rigkit.affine.normal import (
 )
 from rigkit.affine.registry import affines_from_directions
 from rigkit.affine.surface import affines_from_normals
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
+from rigkit.core.matches import DirectionPairs
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit
-from rigkit.matches import DirectionPairs
 
 EXACT_DEG = 1e-9
 PREDICTED = 0.10

@@ -10,8 +10,8 @@ from tolerances import EXACT_REL
 
 from rigkit.affine.normal import normals_from_affines
 from rigkit.affine.registry import affines_from_directions
+from rigkit.core.matches import DirectionPairs
 from rigkit.geometry.rotation import unit
-from rigkit.matches import DirectionPairs
 
 B = np.fliplr(np.diag([1.0, -1.0, -1.0, 1.0]))
 SAME_COST_REL = 1e-9

@@ -13,9 +13,9 @@ from helpers.data import REPOSITORY
 from rigkit.affine.affinities import EpipolarNormals
 from rigkit.affine.normal import normals_from_affines
 from rigkit.affine.registry import AFFINE_METHODS, affines_from_directions
-from rigkit.fundamental.planar import solve_planar_batch
-from rigkit.fundamental.pose import essential_from_pose
 from rigkit.geometry.triangulation import triangulate_rays
+from rigkit.relative_pose.solvers.planar import solve_planar_batch
+from rigkit.relative_pose.solvers.pose import essential_from_pose
 
 CORNERS = 200
 LOOP_ABS = 1e-8

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from helpers.epipolar_scenes import REGULAR, pair, pose_errors_deg
 
-from rigkit.fundamental.pose import choose_pose, decompose_essential
-from rigkit.fundamental.refine import estimate_pose
-from rigkit.fundamental.registry import fundamental_for
-from rigkit.fundamental.robust import robust_pose
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.triangulation import triangulate_pixels
+from rigkit.relative_pose.refinement.refine import estimate_pose
+from rigkit.relative_pose.robust.robust import robust_pose
+from rigkit.relative_pose.solvers.pose import choose_pose, decompose_essential
+from rigkit.relative_pose.solvers.registry import fundamental_for
 
 
 def same_up_to_sign(a, b):
@@ -84,7 +84,7 @@ def test_robust_pose_is_no_worse_than_colmaps(rng):
         m, pose, _ = pair(rng, 150, noise_px=0.5)
         q2 = np.array(m.pixels2)
         q2[:50] = rng.uniform([0, 0], [1624, 1240], (50, 2))
-        from rigkit.matches import Matches
+        from rigkit.core.matches import Matches
 
         wild = Matches.from_cameras(REGULAR, REGULAR, m.pixels1, q2, sigma1_px=m.sigma1_px, sigma2_px=m.sigma2_px)
         index = np.repeat(np.arange(150, dtype=np.uint32)[:, None], 2, axis=1)

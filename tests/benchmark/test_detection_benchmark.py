@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from helpers.data import REPOSITORY
 
-from rigkit.boards import Board
-from rigkit.synthetic.bench_scenes import one_board
+from rigkit.benchmark.scenes import one_board
+from rigkit.core.boards import Board
 
 SCRIPTS = REPOSITORY / "scripts"
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 
-from rigkit.boards import Board
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.shape import shape_model
-from rigkit.detections import BoardView
-from rigkit.errors import DegenerateError, InputError
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import DegenerateError, InputError
 
 
 def reg_views(count: int, rng: np.random.Generator) -> list[BoardView]:

@@ -10,18 +10,18 @@ import pytest
 from helpers.board_rig_scenes import ALIKE, DIFFERENT, corner_of_a_room, target_views
 from helpers.calibration_scenes import lens
 
-from rigkit.boards import Board
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.rig.board_rig import BoardRig, PlacedBoard
 from rigkit.calibration.rig.board_ties import suggest_ties
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.base import Camera
-from rigkit.detections import BoardView
-from rigkit.errors import DegenerateError, InputError
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.truth import Feature
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, exp_so3
-from rigkit.truth import Feature
 
 NOISE_PX = 0.1
 SIGMAS = 4.0

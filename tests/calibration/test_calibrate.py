@@ -16,7 +16,6 @@ from helpers.calibration_scenes import (
     with_outliers,
 )
 
-from rigkit.boards import Board
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.initialise import initialise, start_error
 from rigkit.calibration.observations import Observations
@@ -25,8 +24,9 @@ from rigkit.calibration.state import State, evaluate
 from rigkit.calibration.uncertainty import uncertainty_at_corners
 from rigkit.cameras.double_sphere import DoubleSphere
 from rigkit.cameras.registry import MODELS
-from rigkit.detections import BoardView
-from rigkit.errors import DegenerateError, InputError
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import DegenerateError, InputError
 
 NOISE_PX = 0.2
 START_PX = 2.0

@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 from helpers.calibration_scenes import BOARD, lens
 
-from rigkit.boards import Board
 from rigkit.calibration.camera_prior import camera_prior
-from rigkit.calibration.normal import Step
+from rigkit.calibration.normal_equations import Step
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.overdispersion import frame_spread
 from rigkit.calibration.rig.solver import rig_normal
-from rigkit.calibration.rig.spread import frame_spread
 from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.calibration.rig.uncertainty import transfer_covariance, transfer_uncertainty
 from rigkit.calibration.shape import shape_model
 from rigkit.calibration.state import evaluate
 from rigkit.cameras.base import Camera
-from rigkit.detections import BoardView
-from rigkit.errors import InputError
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
 

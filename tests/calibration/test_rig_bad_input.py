@@ -10,13 +10,13 @@ import pytest
 from helpers.board_rig_scenes import ALIKE, corner_of_a_room, target_views
 from helpers.calibration_scenes import BOARD, lens
 
-from rigkit.boards import Board
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.compare import compare_mounts
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.base import Camera
-from rigkit.detections import BoardView
-from rigkit.errors import InputError
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 

@@ -7,11 +7,11 @@ import pytest
 from calibration.test_rig import MODELS, Views, mounts, rig_views, sizes
 from helpers.calibration_scenes import BOARD
 
-from rigkit.arrays import FloatArray
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.flatness import shape_error
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.state import RigObservations, RigState
+from rigkit.core.arrays import FloatArray
 
 FRAMES = 14
 PREDICTED = 0.3

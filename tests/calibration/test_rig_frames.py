@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from calibration.test_rig import NOISE_PX, SIGMAS, Views, mounts, rig_views, sizes
 
-from rigkit.boards import Board
 from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.observations import Seen
 from rigkit.calibration.rig.result import RigCalibration
-from rigkit.calibration.rig.seen import Seen
-from rigkit.detections import BoardView
-from rigkit.errors import DegenerateError
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, rotation_angle
 

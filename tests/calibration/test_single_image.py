@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from helpers.calibration_scenes import lens
 
-from rigkit.boards import Board
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.uncertainty import projection_uncertainty
 from rigkit.calibration.usable import views_of_image
-from rigkit.detections import BoardDetection, BoardView
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection, BoardView
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, exp_so3
 

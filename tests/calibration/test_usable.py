@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.boards import Board
 from rigkit.calibration.usable import other_size
-from rigkit.detections import BoardDetection
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
 
 STATED = (Board("stated", 9, 7, 30.0, 30.0),)
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 
-from rigkit.boards import Board
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.verdicts import judge_session
+from rigkit.core.boards import Board
 
 
 def said(result: Calibration, words: str) -> bool:

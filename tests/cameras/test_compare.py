@@ -11,7 +11,7 @@ from rigkit.cameras.compare import compare_cameras
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.cameras.registry import camera_model
-from rigkit.errors import DegenerateError, InputError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import rotation_angle
 
 CAMERAS = sample_cameras()

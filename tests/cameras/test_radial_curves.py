@@ -11,7 +11,7 @@ from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.cameras.registry import MODELS
 from rigkit.cameras.scaramuzza import DEGREES, Scaramuzza
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 
 SIZE_PX = (1624, 1240)
 CENTRE_PX = np.array([805.0, 622.0])

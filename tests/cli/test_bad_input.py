@@ -226,7 +226,7 @@ def test_a_failed_run_leaves_old_results(write: Write, tmp_path: Path, capsys: p
 def test_two_boards_are_reconstructed_and_the_third_is_said_to_be_missing(
     write: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from rigkit.corners.detect import detect_boards
+    from rigkit.detection.detect import detect_boards
 
     image = np.asarray(cv2.imread(str(IMAGES / "view2.jpg"), cv2.IMREAD_GRAYSCALE))
     lost = min(detect_boards(image), key=lambda d: d.pixels[:, 0].mean())

@@ -13,12 +13,12 @@ import pytest
 from helpers.calibration_scenes import random_views
 from helpers.data import REPOSITORY
 
-from rigkit.boards import Board
 from rigkit.cameras.brown import Brown
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cli.calibrate import first_camera
 from rigkit.cli.main import main
-from rigkit.detections import BoardDetection
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import nearest_rotation
 from rigkit.io import files

@@ -11,10 +11,10 @@ from calibration.test_rig import Views, mounts, rig_views
 from helpers.board_rig_scenes import ALIKE, corner_of_a_room, target_views
 from helpers.calibration_scenes import lens
 
-from rigkit.boards import Board
 from rigkit.cli.calibrate_rig import calibrate_camera
 from rigkit.cli.main import main
-from rigkit.detections import BoardDetection
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibration_file import load_calibration
 from rigkit.io.corner_cache import CornerCache, FoundCorners

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
-from rigkit.boards import Board
+from rigkit.benchmark.scenes import bench_camera, one_board
 from rigkit.cli.main import main
+from rigkit.core.boards import Board
 from rigkit.io.board_file import load_board
-from rigkit.synthetic.bench_scenes import bench_camera, one_board
 
 PX_PER_MM = 8.0
 

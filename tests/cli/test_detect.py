@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from helpers.detection_scenes import single
 
-from rigkit.boards import Board
 from rigkit.cli.main import main
+from rigkit.core.boards import Board
 from rigkit.io.corners_file import read_corners
 
 BOARD_TOML = """schema = "rigkit.board/1"

@@ -12,15 +12,15 @@ from pathlib import Path
 import pytest
 
 from rigkit.cli.main import main
-from rigkit.errors import InputError
-from rigkit.processes import worker_pool
+from rigkit.core.errors import InputError
+from rigkit.core.processes import worker_pool
 
 WORK = """
 import os, sys, time
 from pathlib import Path
 from rigkit.cli.main import main
 from rigkit.io.files import write_together
-from rigkit.processes import worker_pool
+from rigkit.core.processes import worker_pool
 
 def work(path):
     Path(path).write_text(str(os.getpid()))

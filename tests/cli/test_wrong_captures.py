@@ -11,13 +11,13 @@ import cv2
 import numpy as np
 import pytest
 
-from rigkit.boards import Board
 from rigkit.cameras.base import Camera
 from rigkit.cameras.brown import Brown
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cli.main import main
+from rigkit.core.boards import Board
+from rigkit.core.posetype import PoseType
 from rigkit.io.calibration_file import save_camera
-from rigkit.posetype import PoseType
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics

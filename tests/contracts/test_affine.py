@@ -9,10 +9,10 @@ from tolerances import EXACT_REL
 
 from rigkit.affine.affinities import DirectionNoise, EpipolarNormals
 from rigkit.affine.registry import AFFINE_METHODS, affines_from_directions, needs_epipolar, needs_lengths
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
+from rigkit.core.matches import DirectionPairs
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.matches import DirectionPairs
 
 POSE = Rigid3(exp_so3(np.array([0.1, -0.3, 0.15])), [-260.0, 60.0, 90.0])
 BOARDS = [

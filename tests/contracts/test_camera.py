@@ -10,7 +10,7 @@ from tolerances import JACOBIAN_REL, ROUND_TRIP_PX
 
 from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.cameras.registry import MODELS
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 
 CAMERAS = sample_cameras()
 VALID_SHARE = 0.9

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from helpers.reconstructions import make_reconstruction
 
-from rigkit.cloud import OrientedCloud
-from rigkit.errors import InputError
+from rigkit.core.cloud import OrientedCloud
+from rigkit.core.errors import InputError
 from rigkit.io import files
 from rigkit.io.files import ensure_folder_writable, ensure_writable, write_atomic, write_together
 from rigkit.io.ply import read_ply, write_ply

@@ -7,12 +7,12 @@ import pytest
 from helpers.epipolar_scenes import FISHEYE, REGULAR, pair, plane_in_sight, pose_errors_deg
 from tolerances import EXACT_REL
 
-from rigkit.errors import DegenerateError, InputError
-from rigkit.fundamental.pose import choose_pose, essential_from_pose, hypothesis_poses
-from rigkit.fundamental.registry import SOLVERS, fundamental_for
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.matches import Matches
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, skew, unit
-from rigkit.matches import Matches
+from rigkit.relative_pose.solvers.pose import choose_pose, essential_from_pose, hypothesis_poses
+from rigkit.relative_pose.solvers.registry import SOLVERS, fundamental_for
 
 CAMERAS = {"pinhole": REGULAR, "fisheye": FISHEYE}
 KINDS = sorted(SOLVERS)

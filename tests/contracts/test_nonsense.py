@@ -13,7 +13,7 @@ import rigkit
 import rigkit.io.calibration_file
 from rigkit.cameras.registry import camera_model
 from rigkit.cli.main import main
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 
 PINHOLE = camera_model("pinhole")((640, 480), [500.0, 500.0, 320.0, 240.0])
 

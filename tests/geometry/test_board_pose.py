@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from rigkit.boards import Board
-from rigkit.errors import DegenerateError, InputError
+from rigkit.core.boards import Board
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.board_pose import board_pose, board_poses, moved_board_poses, ray_residuals, tangent_bases
 from rigkit.geometry.rotation import exp_so3, log_so3, rotation_angle, unit
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tolerances import ROUNDING
 
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3, cam_from_world_look_at
 from rigkit.geometry.rotation import angle_between, exp_so3, log_so3, nearest_rotation, rotation_angle, skew
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, exp_so3, skew, unit
 from rigkit.geometry.sampson import sampson_distances

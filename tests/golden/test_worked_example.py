@@ -11,10 +11,10 @@ from rigkit.affine.normal import normals_from_affines
 from rigkit.affine.registry import affines_from_directions
 from rigkit.affine.surface import affines_from_normals
 from rigkit.cameras.pinhole import Pinhole
+from rigkit.core.matches import DirectionPairs, Matches
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, exp_so3, skew, unit
-from rigkit.matches import DirectionPairs, Matches
 
 PRINTED = 1.5e-10
 """The example is printed to ten decimals."""

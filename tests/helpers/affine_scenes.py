@@ -11,10 +11,10 @@ from rigkit.affine.surface import affines_from_normals
 from rigkit.cameras.base import Camera
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
+from rigkit.core.matches import DirectionPairs, Matches
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3, cam_from_world_look_at
 from rigkit.geometry.rotation import exp_so3, skew, unit
-from rigkit.matches import DirectionPairs, Matches
 
 REGULAR = Pinhole((1600, 1240), np.array([1350.0, 1350.0, 800.0, 620.0]))
 FISHEYE = KannalaBrandt((1600, 1240), np.array([560.0, 556.0, 798.0, 622.0, -0.02, 0.004, -0.002, 0.0003]))

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rigkit.boards import Board
 from rigkit.cameras.base import Camera
-from rigkit.detections import BoardView
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from helpers.data import shared_data
-from rigkit.boards import Board
 from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
-from rigkit.detections import BoardDetection
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
 from rigkit.geometry.rigid3 import Rigid3, cam_from_world_look_at
 from rigkit.geometry.rotation import exp_so3
 

@@ -6,12 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
-from rigkit.boards import Board
 from rigkit.cameras.base import Camera
 from rigkit.cameras.brown import Brown
 from rigkit.cameras.kannala_brandt import KannalaBrandt
-from rigkit.detections import BoardView
+from rigkit.core.arrays import FloatArray
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
 from rigkit.geometry.rotation import exp_so3, unit
 
 SIZE = (1624, 1240)

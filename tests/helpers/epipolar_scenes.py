@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigkit.boards import Board
 from rigkit.cameras.base import Camera
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
+from rigkit.core.boards import Board
+from rigkit.core.matches import Matches
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, exp_so3, rotation_angle, unit
-from rigkit.matches import Matches
 
 REGULAR = Pinhole((1624, 1240), np.array([1350.0, 1340.0, 800.0, 620.0]))
 FISHEYE = KannalaBrandt((1624, 1240), np.array([420.0, 418.0, 810.0, 622.0, -0.02, 0.004, -0.002, 0.0003]))

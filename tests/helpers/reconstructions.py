@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.boards import Board
 from rigkit.cameras.base import Camera
 from rigkit.cameras.pinhole import Pinhole
-from rigkit.cloud import OrientedCloud
+from rigkit.core.boards import Board
+from rigkit.core.cloud import OrientedCloud
+from rigkit.core.matches import Matches
+from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, skew, unit
-from rigkit.matches import Matches
-from rigkit.posetype import PoseType
-from rigkit.reconstruct import Reconstruction
+from rigkit.reconstruction.reconstruct import Reconstruction
 
 BOARDS = tuple(Board(name, 8, 6, 50.0, 50.0) for name in ("plane1", "plane2", "plane3"))
 CAM2_FROM_CAM1 = Rigid3(exp_so3(np.array([0.05, -0.25, 0.08])), np.array([280.0, 60.0, 80.0]))

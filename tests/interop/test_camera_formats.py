@@ -17,7 +17,7 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import compare_cameras
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.cameras.scaramuzza import Scaramuzza
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.interop.colmap_cameras import read_colmap_cameras, write_colmap_cameras

@@ -11,7 +11,7 @@ from helpers.calibration_scenes import SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 from rigkit.io.board_file import load_board
 from rigkit.io.calibration_file import load_calibration, load_camera, save_calibration, save_camera
 from rigkit.io.session import load_session

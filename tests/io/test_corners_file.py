@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rigkit.boards import Board
-from rigkit.detections import BoardDetection
-from rigkit.errors import InputError
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
+from rigkit.core.errors import InputError
 from rigkit.io.corners_file import COLUMNS, read_corners, write_corners
 
 WRITTEN_PX = 1e-5

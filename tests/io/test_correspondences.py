@@ -9,9 +9,9 @@ import pytest
 
 from rigkit.affine.correspondences import Correspondences
 from rigkit.cameras.pinhole import Pinhole
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
+from rigkit.core.matches import DirectionPairs
 from rigkit.io.correspondences import read_correspondences, write_correspondences
-from rigkit.matches import DirectionPairs
 
 FIELDS = ("pixels1", "pixels2", "A21", "sigma_px", "sigma_A")
 

@@ -9,7 +9,7 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 from rigkit.io.images import read_image, to_grey
 
 

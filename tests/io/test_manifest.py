@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
+from rigkit.core.posetype import PoseType
+from rigkit.core.truth import Feature
 from rigkit.io.manifest import load_dataset
-from rigkit.posetype import PoseType
-from rigkit.truth import Feature
 
 REPO = Path(__file__).parents[2]
 TEXT = """

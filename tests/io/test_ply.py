@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from helpers.reconstructions import make_reconstruction
 
-from rigkit.cloud import OrientedCloud
-from rigkit.errors import InputError
+from rigkit.core.cloud import OrientedCloud
+from rigkit.core.errors import InputError
 from rigkit.io.ply import ply_bytes, read_ply, write_ply
 
 

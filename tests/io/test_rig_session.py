@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from rigkit.cli.main import main
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 from rigkit.io.rig_session import ONE, frames_of_images, is_rig_session, load_rig_session
 from rigkit.io.session import load_session
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
+from rigkit.core.posetype import PoseType
 from rigkit.io.study_file import load_study
 from rigkit.io.study_run import run_study, study_key
-from rigkit.posetype import PoseType
 from rigkit.synthetic.noise import NoisyImages
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 from helpers.data import shared_data
 
-from rigkit.arrays import FloatArray
-from rigkit.boards import Board
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.poses import find_poses, refine_poses
@@ -20,8 +18,10 @@ from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.state import State, evaluate
 from rigkit.calibration.usable import views_of_image
 from rigkit.cameras.base import Camera
-from rigkit.corners.detect import detect_boards
-from rigkit.detections import BoardView
+from rigkit.core.arrays import FloatArray
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
+from rigkit.detection.detect import detect_boards
 from rigkit.geometry.rotation import exp_so3
 from rigkit.io.images import read_image
 

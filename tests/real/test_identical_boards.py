@@ -10,10 +10,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rigkit.corners.detect import detect_boards
-from rigkit.corners.identify import identify_pair
-from rigkit.synthetic.bench_pairs import EQUAL_BOARDS, PairVerdict, equal_boards_pair, judge_pair
-from rigkit.synthetic.bench_scenes import BENCH_PHOTOMETRY, bench_field_deg
+from rigkit.benchmark.pairs import EQUAL_BOARDS, PairVerdict, equal_boards_pair, judge_pair
+from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, bench_field_deg
+from rigkit.detection.detect import detect_boards
+from rigkit.identification.identify import identify_pair
 from rigkit.synthetic.render import Optics
 
 BATCH = 10

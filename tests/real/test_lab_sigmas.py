@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from helpers.data import REPOSITORY, shared_data
 
-from rigkit.boards import Board
 from rigkit.cameras.base import Camera
 from rigkit.cli.workflow import load_cameras, match_found, reconstruct_with
-from rigkit.detections import BoardDetection
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
+from rigkit.core.progress import silent
+from rigkit.core.truth import MeasuredAngle, MeasuredLength, PairTruth
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.manifest import load_dataset
-from rigkit.progress import silent
-from rigkit.truth import MeasuredAngle, MeasuredLength, PairTruth
 from rigkit.validation.checks import validate
 
 SIGMA_PX = 0.03

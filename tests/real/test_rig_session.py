@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from helpers.data import shared_data
 
-from rigkit.boards import Board
 from rigkit.cli.main import main
+from rigkit.core.boards import Board
+from rigkit.core.truth import Feature
 from rigkit.io.calibration_file import load_calibration, load_camera
 from rigkit.io.rig_file import load_board_rigs, load_rig
-from rigkit.truth import Feature
 
 pytestmark = pytest.mark.real
 

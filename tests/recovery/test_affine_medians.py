@@ -11,11 +11,11 @@ import pytest
 from helpers.affine_scenes import GRID, REGULAR, SQUARE_MM, Corners, angles_deg, general_pairs, special_pairs, turned
 
 from rigkit.affine.affinities import DirectionNoise
+from rigkit.affine.directions import direction_field
 from rigkit.affine.normal import estimate_normals, normals_from_affines
 from rigkit.affine.registry import AFFINE_METHODS, affines_from_directions
-from rigkit.corners.directions import direction_field
-from rigkit.detections import BoardDetection
-from rigkit.matches import DirectionPairs
+from rigkit.core.detections import BoardDetection
+from rigkit.core.matches import DirectionPairs
 
 STAT_REL = 0.15
 """60 reseeded runs lie within 12 % of the figures for fixed poses (sd 2 %), within 22 % for random planar poses."""

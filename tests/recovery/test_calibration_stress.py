@@ -9,7 +9,7 @@ import pytest
 from helpers.calibration_scenes import CENTRE, REACH_DEG, SIZE, lens, random_views, with_outliers
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.errors import DegenerateError
+from rigkit.core.errors import DegenerateError
 
 FEW_SEEDS, SEEDS = 2, 20
 RMS_FACTOR = 1.25

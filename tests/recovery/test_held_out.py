@@ -10,22 +10,22 @@ import cv2
 import numpy as np
 import pytest
 
-from rigkit.arrays import FloatArray
-from rigkit.boards import Board
 from rigkit.cameras.base import Camera, image_center
 from rigkit.cameras.brown import Brown
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.cli.main import main
-from rigkit.corners.detect import detect_boards
-from rigkit.detections import BoardDetection
-from rigkit.errors import DegenerateError
+from rigkit.core.arrays import FloatArray
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
+from rigkit.core.errors import DegenerateError
+from rigkit.core.posetype import PoseType
+from rigkit.detection.detect import detect_boards
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, rotation_angle
 from rigkit.io.calibration_file import save_camera
-from rigkit.pairing import match_pair
-from rigkit.posetype import PoseType
-from rigkit.reconstruct import Reconstruction, reconstruct_pair
+from rigkit.reconstruction.pairing import match_pair
+from rigkit.reconstruction.reconstruct import Reconstruction, reconstruct_pair
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
 from rigkit.synthetic.photometry import Photometry, Shadow
 from rigkit.synthetic.render import Optics, render
@@ -102,7 +102,7 @@ def test_a_wrongly_declared_pose_type_is_named(monkeypatch: pytest.MonkeyPatch) 
 
     (note,) = reconstruct_pair(pair, pose_type="forward").notes[:1]
     assert re.search(words.replace("standard", "forward"), note)
-    monkeypatch.setattr("rigkit.reconstruct.metric_pose", no_scale)
+    monkeypatch.setattr("rigkit.reconstruction.reconstruct.metric_pose", no_scale)
     with pytest.raises(DegenerateError, match=f"no scale.*{words}"):
         reconstruct_pair(pair, pose_type="standard", level_sigma_rad=np.radians(0.2))
 

@@ -15,7 +15,6 @@ from helpers.board_scenes import detection, fisheye_camera, regular_camera
 from helpers.calibration_scenes import REACH_DEG, SIZE, lens, random_views
 from helpers.reconstructions import BOARDS
 
-from rigkit.arrays import FloatArray
 from rigkit.calibration.assemble import assemble
 from rigkit.calibration.fit import fit_kept
 from rigkit.calibration.initialise import initialise
@@ -23,11 +22,12 @@ from rigkit.calibration.observations import Observations
 from rigkit.calibration.solver import solve
 from rigkit.cameras.base import Camera
 from rigkit.cameras.registry import MODELS
-from rigkit.pairing import match_pair
-from rigkit.posetype import PoseType
-from rigkit.reconstruct import reconstruct_pair
+from rigkit.core.arrays import FloatArray
+from rigkit.core.posetype import PoseType
+from rigkit.core.truth import MeasuredAngle, MeasuredLength, PairTruth
+from rigkit.reconstruction.pairing import match_pair
+from rigkit.reconstruction.reconstruct import reconstruct_pair
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
-from rigkit.truth import MeasuredAngle, MeasuredLength, PairTruth
 from rigkit.validation.checks import ValidationReport, validate
 from rigkit.validation.intrinsics import calibration_shifts
 

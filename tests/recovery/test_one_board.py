@@ -8,10 +8,10 @@ from helpers.board_scenes import detection, fisheye_camera, regular_camera
 from helpers.reconstructions import BOARDS
 
 from rigkit.cameras.base import Camera
+from rigkit.core.posetype import PoseType
 from rigkit.geometry.rotation import rotation_angle
-from rigkit.pairing import match_pair
-from rigkit.posetype import PoseType
-from rigkit.reconstruct import reconstruct_pair
+from rigkit.reconstruction.pairing import match_pair
+from rigkit.reconstruction.reconstruct import reconstruct_pair
 from rigkit.synthetic.pairs import trihedral_pair
 
 SCENES = 8

@@ -13,14 +13,14 @@ from helpers.epipolar_scenes import pair, pose_errors_deg
 
 from rigkit.affine.affinities import EpipolarNormals
 from rigkit.affine.registry import affines_from_directions
-from rigkit.errors import DegenerateError, RigkitError
-from rigkit.fundamental.minimal import planar_from_two_rows
-from rigkit.fundamental.pose import choose_pose
-from rigkit.fundamental.refine import estimate_pose
-from rigkit.fundamental.registry import fundamental_for
-from rigkit.fundamental.rows import PLANAR_ENTRIES, point_rows
-from rigkit.fundamental.weights import estimate_sigma_A
-from rigkit.matches import DirectionPairs
+from rigkit.core.errors import DegenerateError, RigkitError
+from rigkit.core.matches import DirectionPairs
+from rigkit.relative_pose.refinement.refine import estimate_pose
+from rigkit.relative_pose.solvers.minimal import planar_from_two_rows
+from rigkit.relative_pose.solvers.pose import choose_pose
+from rigkit.relative_pose.solvers.registry import fundamental_for
+from rigkit.relative_pose.solvers.rows import PLANAR_ENTRIES, point_rows
+from rigkit.relative_pose.solvers.weights import estimate_sigma_A
 
 BOOTSTRAPS = 300
 LOST = (180.0, 180.0)

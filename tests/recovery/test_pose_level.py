@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from helpers.epipolar_scenes import board_pair, pose_errors_deg
 
-from rigkit.errors import RigkitError
-from rigkit.fundamental.metric import triangulate_matches
-from rigkit.fundamental.refine import estimate_pose
+from rigkit.core.errors import RigkitError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit
-from rigkit.geometry.scale import metric_scale
+from rigkit.reconstruction.metric import triangulate_matches
+from rigkit.reconstruction.scale import metric_scale
+from rigkit.relative_pose.refinement.refine import estimate_pose
 
 from helpers.epipolar_scenes import BOARDS  # isort: skip
 

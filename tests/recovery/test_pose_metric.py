@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from helpers.epipolar_scenes import BOARDS, FISHEYE, REGULAR, board_pair
 
-from rigkit.fundamental.metric import metric_pose, triangulate_matches
-from rigkit.fundamental.refine import refine_pose
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
+from rigkit.reconstruction.metric import metric_pose, triangulate_matches
+from rigkit.relative_pose.refinement.refine import refine_pose
 
 RUNS = 100
 SIGMA_REL = 0.15

@@ -7,8 +7,8 @@ import zlib
 import numpy as np
 import pytest
 
-from rigkit.boards import Board
-from rigkit.errors import InputError
+from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
 from rigkit.report.board_sheet import board_sheet, pdf_bytes, svg_text
 
 POINTS_PER_MM = 72.0 / 25.4

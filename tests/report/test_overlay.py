@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.boards import Board
-from rigkit.detections import BoardDetection
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
 from rigkit.report.overlay import COLOURS, draw_boards
 
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from helpers.reconstructions import make_reconstruction
 
+from rigkit.core.truth import MeasuredAngle, PairTruth
 from rigkit.report.figures import as_jpeg, cloud_png
 from rigkit.report.page import build_page
 from rigkit.report.validation_page import pair_section, summary_table
-from rigkit.truth import MeasuredAngle, PairTruth
 from rigkit.validation.checks import validate
 
 QUIET = [

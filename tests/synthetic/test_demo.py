@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.board_file import load_board
 from rigkit.io.manifest import load_dataset

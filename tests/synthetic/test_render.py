@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from rigkit.boards import Board
 from rigkit.cameras.base import Camera
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
-from rigkit.errors import InputError
+from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3, cam_from_world_look_at
 from rigkit.geometry.rotation import exp_so3
 from rigkit.synthetic.photometry import Photometry, Shadow, develop

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from tolerances import EXACT_REL, ROUNDING
 
-from rigkit.boards import Board
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
-from rigkit.errors import DegenerateError, InputError
+from rigkit.core.boards import Board
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3, cam_from_world_look_at
 from rigkit.geometry.rotation import log_so3, skew
-from rigkit.posetype import PoseType
 from rigkit.synthetic.pairs import relative_pose, trihedral_pair
 from rigkit.synthetic.scene import PlacedBoard, exact_view, room_walls, trihedral
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from tolerances import EXACT_REL
 
-from rigkit.boards import Board
-from rigkit.errors import DegenerateError, InputError
+from rigkit.core.boards import Board
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.matches import DirectionPairs
+from rigkit.core.posetype import PoseType
 from rigkit.geometry.rotation import unit
-from rigkit.matches import DirectionPairs
-from rigkit.posetype import PoseType
 from rigkit.synthetic.lattice import chord_directions, harmonic_directions
 from rigkit.synthetic.noise import NoisyImages, corner_noise, rotate_directions
 from rigkit.synthetic.poses import PairBatch, general_pairs, special_pairs

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from helpers.reconstructions import BOARDS, CAM2_FROM_CAM1, make_reconstruction
 
-from rigkit.errors import DegenerateError, InputError
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.truth import Feature, MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.triangulation import triangulate_rays
-from rigkit.reconstruct import Reconstruction
-from rigkit.truth import Feature, MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
+from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.validation.checks import judge, validate, validate_each
 from rigkit.validation.measure import Measured, measure
 

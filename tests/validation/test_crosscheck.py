@@ -13,12 +13,12 @@ from helpers.reconstructions import BOARDS, CAM2_FROM_CAM1, make_reconstruction,
 from rigkit.cameras.base import Camera
 from rigkit.cameras.brown import Brown
 from rigkit.cameras.eucm import EUCM
-from rigkit.errors import DegenerateError
+from rigkit.core.errors import DegenerateError
 from rigkit.geometry.relative_pose import relative_pose, relative_pose_covariance
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
 from rigkit.interop.colmap import colmap_pair, solve_pair
-from rigkit.reconstruct import Reconstruction
+from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.validation.crosscheck import ADJUSTED, PNP, crosscheck
 from rigkit.validation.intrinsics import calibration_shifts
 from rigkit.validation.measure import measure

@@ -9,11 +9,11 @@ import pytest
 from helpers.board_scenes import detection, fisheye_camera, regular_camera, trihedral_scene
 from helpers.reconstructions import BOARDS, CAM2_FROM_CAM1, make_reconstruction
 
-from rigkit.boards import Board
 from rigkit.cameras.base import Camera
 from rigkit.cameras.pinhole import Pinhole
-from rigkit.detections import BoardDetection
-from rigkit.truth import Feature, MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
+from rigkit.core.truth import Feature, MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
 from rigkit.validation.checks import ValidationReport, validate
 from rigkit.validation.diagnose import camera_fit, camera_suspects, suspects
 

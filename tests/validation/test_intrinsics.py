@@ -8,8 +8,8 @@ from helpers.board_scenes import fisheye_camera
 from helpers.reconstructions import make_reconstruction
 
 from rigkit.cameras.base import Camera
-from rigkit.reconstruct import Reconstruction
-from rigkit.truth import MeasuredAngle, MeasuredLength, PairTruth
+from rigkit.core.truth import MeasuredAngle, MeasuredLength, PairTruth
+from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.validation.checks import validate
 from rigkit.validation.intrinsics import calibration_shifts, principal_axes
 from rigkit.validation.measure import measure

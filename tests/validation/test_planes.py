@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from helpers.reconstructions import BOARDS, make_reconstruction, trihedral_poses
 
-from rigkit.boards import Board
-from rigkit.errors import DegenerateError, InputError
+from rigkit.core.boards import Board
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import angle_between, exp_so3
 from rigkit.interop.open3d import mean_and_covariance, plane_inliers, to_open3d
 from rigkit.validation.boards import fit_lattice, measure_board

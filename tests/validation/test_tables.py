@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from helpers.reconstructions import make_reconstruction
 
-from rigkit.errors import InputError
+from rigkit.core.errors import InputError
+from rigkit.core.truth import MeasuredAngle, MeasuredLength, PairTruth
 from rigkit.io.paper_tables import load_paper_tables
 from rigkit.report.page import table_html
 from rigkit.report.tables import (
@@ -25,7 +26,6 @@ from rigkit.report.tables import (
     tables_to_markdown,
     tables_to_text,
 )
-from rigkit.truth import MeasuredAngle, MeasuredLength, PairTruth
 from rigkit.validation.checks import ValidationReport, validate
 from rigkit.validation.tables import Cell, Column, PaperTables, Table, best_method, best_report, build_tables
 

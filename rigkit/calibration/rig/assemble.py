@@ -7,18 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
-from rigkit.boards import Board
 from rigkit.calibration.assemble import board_shapes, motion_of_world
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.rig.board_rig import BoardRig, PlacedBoard
 from rigkit.calibration.rig.flatness import shape_error
 from rigkit.calibration.rig.joint import JointRig
+from rigkit.calibration.rig.observations import Places
 from rigkit.calibration.rig.result import RigCalibration, RigCamera
-from rigkit.calibration.rig.seen import Places
 from rigkit.calibration.rig.solver import carried
 from rigkit.calibration.rig.state import Layout, RigObservations
-from rigkit.errors import DegenerateError
+from rigkit.core.arrays import FloatArray
+from rigkit.core.boards import Board
+from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 
 __all__ = ["assemble_rig", "residual_sigma"]

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
-from rigkit.boards import Board
-from rigkit.calibration.counting import same_looks
-from rigkit.calibration.rig.seen import Places, Seen, Sights, outer_corners
-from rigkit.errors import InputError
+from rigkit.calibration.board_orientation import same_looks
+from rigkit.calibration.rig.observations import Places, Seen, Sights, outer_corners
+from rigkit.core.arrays import FloatArray
+from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import nearest_rotation
 

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, Points, as_array
-from rigkit.boards import Board
-from rigkit.errors import InputError
+from rigkit.core.arrays import FloatArray, Points, as_array
+from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
+from rigkit.core.truth import Feature
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, skew
-from rigkit.truth import Feature
 
 __all__ = ["BoardRig", "PlacedBoard"]
 

@@ -6,14 +6,14 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
-from rigkit.boards import Board
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.board_places import board_places
 from rigkit.calibration.rig.joint import solve_jointly
-from rigkit.calibration.rig.seen import Sights, seen_by
-from rigkit.detections import BoardView
-from rigkit.errors import RigkitError
-from rigkit.progress import silent
+from rigkit.calibration.rig.observations import Sights, seen_by
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import RigkitError
+from rigkit.core.progress import silent
 
 __all__ = ["suggest_ties"]
 

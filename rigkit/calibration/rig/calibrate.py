@@ -11,20 +11,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from rigkit.boards import Board
 from rigkit.calibration.calibrate import FOLDS, calibrate
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.assemble import assemble_rig, residual_sigma
 from rigkit.calibration.rig.board_places import board_places
 from rigkit.calibration.rig.heldout import heldout_rms
 from rigkit.calibration.rig.joint import solve_jointly
+from rigkit.calibration.rig.observations import Places, Sights, seen_by
+from rigkit.calibration.rig.overdispersion import frame_spread
 from rigkit.calibration.rig.result import RigCalibration
-from rigkit.calibration.rig.seen import Places, Sights, seen_by
-from rigkit.calibration.rig.spread import frame_spread
 from rigkit.calibration.rig.verdicts import judge_rig
-from rigkit.detections import BoardView
-from rigkit.errors import DegenerateError, InputError
-from rigkit.progress import Progress, silent
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.progress import Progress, silent
 
 __all__ = ["calibrate_rig"]
 

@@ -8,7 +8,7 @@ from math import exp
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
+from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import log_so3
 

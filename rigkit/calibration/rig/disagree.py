@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.rig.seen import Sights
+from rigkit.calibration.rig.observations import Sights
 from rigkit.calibration.rig.solver import RigSolution
 from rigkit.calibration.rig.state import Key, RigObservations
 

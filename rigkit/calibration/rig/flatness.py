@@ -10,10 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.arrays import FloatArray
 from rigkit.calibration.rig.solver import rig_normal
 from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.calibration.shape import SHAPES, shape_model
+from rigkit.core.arrays import FloatArray
 
 __all__ = ["shape_error"]
 

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points
-from rigkit.calibration.counting import same_looks
-from rigkit.calibration.rig.seen import Places, Seen, Sights, outer_corners, turns_of
+from rigkit.calibration.board_orientation import same_looks
+from rigkit.calibration.rig.observations import Places, Seen, Sights, outer_corners, turns_of
 from rigkit.calibration.rig.state import Key
 from rigkit.cameras.base import Camera
-from rigkit.errors import InputError
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points
+from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import nearest_rotation, rotation_angle
 

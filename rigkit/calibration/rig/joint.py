@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, IntArray
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.disagree import (
@@ -23,13 +22,14 @@ from rigkit.calibration.rig.disagree import (
     why,
 )
 from rigkit.calibration.rig.frames import apart, first_frames, mounts_of, turned_alike
-from rigkit.calibration.rig.seen import Places, Sights
+from rigkit.calibration.rig.observations import Places, Sights
 from rigkit.calibration.rig.shape import common_shape
 from rigkit.calibration.rig.solver import RigSolution, solve_rig
 from rigkit.calibration.rig.state import Key, RigObservations, RigState
-from rigkit.errors import DegenerateError, InputError
+from rigkit.core.arrays import FloatArray, IntArray
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.progress import Progress
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.progress import Progress
 
 __all__ = ["JointRig", "solve_jointly"]
 

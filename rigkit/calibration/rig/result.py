@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, as_array
 from rigkit.calibration.result import Calibration, Convergence
 from rigkit.calibration.rig.board_rig import BoardRig
 from rigkit.cameras.base import Camera
-from rigkit.errors import InputError
+from rigkit.core.arrays import FloatArray, as_array
+from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
 

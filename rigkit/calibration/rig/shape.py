@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, Points
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.shape import SHAPES, ShapeModel, released_groups, shape_model, warp_groups
+from rigkit.core.arrays import FloatArray, Points
 
 __all__ = ["common_shape"]
 

@@ -15,13 +15,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.arrays import FloatArray, IntArray, Mat3, Points
 from rigkit.calibration.linearise import normal_equations
-from rigkit.calibration.normal import Normal, Residuals
+from rigkit.calibration.normal_equations import Normal, Residuals
 from rigkit.calibration.poses import refine_each
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.calibration.solver import COST_TOLERANCE, Linearised, minimise
+from rigkit.core.arrays import FloatArray, IntArray, Mat3, Points
 from rigkit.geometry.rotation import skew
 
 __all__ = ["Carried", "RigSolution", "carried", "refine_frames", "rig_normal", "solve_rig"]

@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.arrays import BoolArray, FloatArray, IntArray, Mat3, Points
-from rigkit.calibration.normal import Step
+from rigkit.calibration.normal_equations import Step
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.shape import ShapeModel
 from rigkit.calibration.state import State
 from rigkit.cameras.base import Camera
-from rigkit.errors import RigkitError
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Points
+from rigkit.core.errors import RigkitError
 from rigkit.geometry.rotation import exp_so3
 
 __all__ = ["Key", "Layout", "RigObservations", "RigState"]

@@ -1,0 +1,1 @@
+"""What measures detection: scenes with exact truth, their scores, the Cramer-Rao bound."""

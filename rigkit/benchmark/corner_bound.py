@@ -1,0 +1,126 @@
+"""How well corners can be placed at all: the Cramer-Rao bound of every corner of a rendered scene.
+
+The image of a corner is taken to depend on nine unknowns: its position (2), the directions of the two lines (2), the
+blur (1), and brightness, contrast and the light's gradient (4), from the pixels of its own cell: those nearer to it,
+along the cell's sides, than to its neighbours. Held as known: that lines are straight but for what the lens bends,
+that blur and noise are the same over the cell, the noise's level. Corners are bound one by one: that they belong to one
+plane and one lens is not used. The bound is that of unbiased estimators that know nothing beforehand: one that expects
+angles near those of the board's rows, or a light that is nearly even, may come out a little below it on small,
+foreshortened, noisy squares.
+
+The derivatives are differences of rendered images, noise-free and before rounding: the scene moved by a part of a
+pixel along u and v, and blurred a little more or less. Moving one line only is a motion of the picture that shears
+along the other line.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, BenchScene
+from rigkit.core.arrays import FloatArray
+from rigkit.core.detections import BoardDetection
+from rigkit.core.errors import InputError
+from rigkit.synthetic.photometry import develop
+from rigkit.synthetic.render import Optics
+
+__all__ = ["ROUNDING_VARIANCE", "corner_information", "position_bound"]
+
+ROUNDING_VARIANCE = 1.0 / 12.0
+"""Of rounding to whole grey levels, which is noise wherever brightness varies: it bounds noise-free images, too."""
+SHIFT_PX = 0.07
+"""Half width of the differences: the third derivative of an edge of blur 0.3 adds less than one per cent."""
+BLUR_STEP_PX = 0.02
+HALF_CELL = 0.5
+"""Pixels of a cell: up to this from the corner along both sides."""
+PARAMETERS = 9
+
+
+def corner_information(scene: BenchScene, blur_px: float) -> tuple[FloatArray, ...]:
+    """Return for each board of `scene.truth()` the Fisher information (N, 9, 9) of its corners at noise of variance 1
+    (grey levels squared); the first two parameters are u and v, px.
+
+    Divide by the noise's variance, ROUNDING_VARIANCE included. NaN where a cell holds too few pixels.
+    """
+    slopes = []
+    for axis in (0, 1):
+        before, after = (_levels(_shifted(scene, axis, sign * SHIFT_PX), blur_px) for sign in (-1, 1))
+        slopes.append((after - before) / (2.0 * SHIFT_PX))
+    sharper, wider = (_levels(scene, blur_px + sign * BLUR_STEP_PX) for sign in (-1, 1))
+    pictures = np.stack([*slopes, (wider - sharper) / (2.0 * BLUR_STEP_PX), 0.5 * (wider + sharper)])
+    return tuple(_of_board(detection, pictures) for detection in scene.truth())
+
+
+def position_bound(information: FloatArray, noise_levels: float) -> FloatArray:
+    """Return the smallest covariances (N, 2, 2) of the position, px^2, for noise (grey levels) and rounding."""
+    variance = noise_levels**2 + ROUNDING_VARIANCE
+    known = np.isfinite(information).all(axis=(1, 2))
+    out = np.full((len(information), 2, 2), np.nan)
+    out[known] = np.linalg.inv(information[known])[:, :2, :2] * variance
+    return out
+
+
+def _levels(scene: BenchScene, blur_px: float) -> FloatArray:
+    """Return the noise-free picture in grey levels, not rounded."""
+    picture = scene.radiance(Optics(blur_px))
+    # The light is the same whatever is in the picture: that of a white one, in steps of 1/257 of a level.
+    light = develop(np.ones_like(picture), replace(BENCH_PHOTOMETRY, bits=16)) / 257.0
+    return picture * light
+
+
+def _shifted(scene: BenchScene, axis: int, by_px: float) -> BenchScene:
+    """Return the scene with its whole picture moved along u (axis 0) or v (axis 1)."""
+    names = list(scene.camera.parameter_names())
+    centre = ("cx", "cy")[axis]
+    if centre not in names:
+        raise InputError(f"corner bound: a {scene.camera.model} camera has no {centre} to shift the picture by")
+    parameters = scene.camera.parameters.copy()
+    parameters[names.index(centre)] += by_px
+    return replace(scene, camera=scene.camera.with_parameters(parameters))
+
+
+def _of_board(detection: BoardDetection, pictures: FloatArray) -> FloatArray:
+    lattice = detection.lattice()
+    columns = [_centred(lattice, axis) for axis in (1, 0)]
+    out = np.full((len(detection.grid), PARAMETERS, PARAMETERS), np.nan)
+    for n, ((column, row), centre) in enumerate(zip(detection.grid, detection.pixels, strict=True)):
+        sides = np.stack([step[row, column] for step in columns])
+        rows = _derivatives(centre, sides, pictures)
+        if rows.shape[1] > PARAMETERS:
+            out[n] = rows @ rows.T
+    return out
+
+
+def _centred(lattice: FloatArray, axis: int) -> FloatArray:
+    """Return the cell's side (rows, columns, 2) along columns (axis 1) or rows (axis 0), px, one-sided at the ends."""
+    step = np.diff(lattice, axis=axis)
+    pad = np.full_like(np.take(step, [0], axis=axis), np.nan)
+    before, after = np.concatenate([pad, step], axis=axis), np.concatenate([step, pad], axis=axis)
+    mean = np.where(np.isnan(before), after, np.where(np.isnan(after), before, 0.5 * (before + after)))
+    return np.asarray(mean)
+
+
+def _derivatives(centre: FloatArray, sides: FloatArray, pictures: FloatArray) -> FloatArray:
+    """Return the derivatives (9, P) of the pixels of the cell round `centre` with `sides` (2, 2)."""
+    reach = HALF_CELL * np.abs(sides).sum(axis=0)
+    height, width = pictures.shape[1:]
+    low = np.maximum(np.ceil(centre - reach), 0).astype(int)
+    high = np.minimum(np.floor(centre + reach), [width - 1, height - 1]).astype(int)
+    if not np.isfinite(sides).all() or (high < low).any():
+        return np.zeros((PARAMETERS, 0))
+    v, u = np.mgrid[low[1] : high[1] + 1, low[0] : high[0] + 1]
+    offset = np.stack([u.ravel() - centre[0], v.ravel() - centre[1]])
+    cells = np.linalg.solve(sides.T, offset)
+    inside = (np.abs(cells) <= HALF_CELL).all(axis=0)
+    cut = pictures[:, low[1] : high[1] + 1, low[0] : high[0] + 1].reshape(len(pictures), -1)[:, inside]
+    by_u, by_v, by_blur, light = cut
+    du, dv = offset[:, inside]
+    # To turn line 1 alone, points move along line 2 in proportion to how far out along line 1 they are.
+    turns = [
+        cells[k, inside] * (by_u * sides[1 - k, 0] + by_v * sides[1 - k, 1]) / np.linalg.norm(sides[1 - k])
+        for k in (0, 1)
+    ]
+    size = float(np.linalg.norm(reach))
+    return np.stack([by_u, by_v, *turns, by_blur, np.ones_like(light), light, light * du / size, light * dv / size])

@@ -1,0 +1,240 @@
+"""Boards that look the same turned: which views count such a board from another end than the others do.
+
+No image tells its first corner, and a flat board does not care. Where corners are not quite where a flat board has
+them, a view that counts from the other end shows them elsewhere. Of the departure, what stays the same under the turn
+says nothing; the rest changes its sign. So every view has a sign, and the signs under which the views agree best on one
+departure are sought (the largest s^T K s, with K from what each view says alone). Then each view is judged by the
+others: is the departure that they have in common found in it as counted, or turned?
+
+A lens that is not quite its model, or a sheet bent differently from view to view, displaces neighbours alike. It must
+not pass for the board: from each view every displacement that is a quadratic field over the board is taken out, its
+pose among them. What is left are the errors of the print and bends of higher order, and these are the board's own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from rigkit.calibration.fit import Fit
+from rigkit.calibration.observations import Observations
+from rigkit.calibration.shape import often_seen, released_sigma
+from rigkit.calibration.state import State
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3
+from rigkit.core.boards import Board
+from rigkit.geometry.rigid3 import Rigid3
+
+__all__ = ["board_turn", "grid_turned", "miscounted", "recounted", "same_looks"]
+
+SURE = 10.0
+"""Log odds from which a view is turned: 20000 to 1, as most views are counted alike to begin with. Measured on boards
+whose first corner is known: up to 4.3 for the wrong end, 8 to 70 for views that were turned."""
+KNOWN = 0.5
+"""A departure that this part of the views does not show for sure is none: its signs are those of chance."""
+
+
+def same_looks(board: Board) -> tuple[int, ...]:
+    """Return the quarter turns after which the board looks as before."""
+    if not board.looks_same_turned:
+        return (0,)
+    square = board.columns == board.rows and board.columns % 2 == 0 and board.square_x_mm == board.square_y_mm
+    return (0, 1, 2, 3) if square else (0, 2)
+
+
+def grid_turned(grid: IntArray, size: tuple[int, int], quarter_turns: int) -> IntArray:
+    """Return (column, row) (N, 2) of corners, on a board of `size`, when they are counted from another corner."""
+    (column, row), (columns, rows) = grid.T, size
+    for _ in range(quarter_turns):
+        column, row = rows - 1 - row, column
+        columns, rows = rows, columns
+    return np.stack([column, row], axis=-1)
+
+
+@lru_cache(maxsize=256)
+def board_turn(board: Board, quarter_turns: int) -> Rigid3:
+    """Return counted_from_old: the frame of a board whose corners are counted from another corner, from the old one."""
+    angle = 0.5 * np.pi * quarter_turns
+    turn = np.rint([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
+    far = (np.array(board.size) - 1) * [board.square_x_mm, board.square_y_mm]
+    corners = np.array([[0.0, 0.0, 0.0], [far[0], far[1], 0.0]])
+    # After the turn the grid must again begin at zero.
+    return Rigid3(turn, -(corners @ turn.T).min(axis=0))
+
+
+def recounted(
+    observations: Observations, state: State, views: BoolArray, quarter_turns: int
+) -> tuple[Observations, State]:
+    """Return the same with the boards of the chosen `views` (V,) counted from another end. Residuals of flat boards do
+    not change."""
+    rotation, translation, corner = state.rotation.copy(), state.translation_mm.copy(), observations.corner.copy()
+    turned = list(observations.views)
+    for i in np.flatnonzero(views).tolist():
+        view = turned[i]
+        grid = grid_turned(view.grid, view.board.size, quarter_turns)
+        turned[i] = replace(view, grid=grid)
+        corner[i, : len(grid)] = observations.first_row[observations.board[i]] + grid @ [1, view.board.columns]
+        back = board_turn(view.board, quarter_turns).inverse()
+        translation[i] += rotation[i] @ back.translation_mm
+        rotation[i] = rotation[i] @ back.rotation
+    observations = replace(observations, views=tuple(turned), corner=corner)
+    return observations, replace(state, rotation=rotation, translation_mm=translation)
+
+
+def miscounted(observations: Observations, fit: Fit, quarter_turns: int) -> BoolArray:
+    """Return the views (V,) that surely count their board by so many quarter turns otherwise than most do."""
+    out = np.zeros(len(observations.views), dtype=bool)
+    often = often_seen(observations)
+    for b, board in enumerate(observations.boards):
+        if often[b] and quarter_turns in same_looks(board):
+            views = np.flatnonzero(observations.board == b)
+            odds = _Patterns.of(observations, fit, b, views, _Turn.of(board, quarter_turns)).log_odds()
+            alike, turned = odds > SURE, odds < -SURE
+            if alike.sum() + turned.sum() > KNOWN * len(views):
+                # Which end is the first is for most views to say.
+                out[views] = turned if turned.sum() <= alike.sum() else alike
+    return out
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Turn:
+    """What a turn does to M corners: corner i becomes number `place[i]`, a displacement d there `rotation` d. After
+    `order` turns all is as before."""
+
+    place: IntArray
+    rotation: Mat3
+    order: int
+
+    @classmethod
+    def of(cls, board: Board, quarter_turns: int) -> _Turn:
+        column, row = grid_turned(board.grid(), board.size, quarter_turns).T
+        rotation = board_turn(board, quarter_turns).rotation
+        return cls(row * board.columns + column, rotation, 4 // quarter_turns)
+
+    def summed(self, values: FloatArray, sign: float) -> FloatArray:
+        """Return the part of vectors (..., M, 3) that the turn leaves as it is (`sign` 1) or makes its opposite (-1),
+        times the order; of matrices (..., M, 3, 3) where `sign` is 0 the sum over the corners that are tied by it."""
+        total, here, turn = np.zeros_like(values), np.arange(len(self.place)), np.eye(3)
+        for k in range(self.order):
+            if sign:
+                total += sign**k * (values[..., here, :] @ turn)
+            else:
+                total += turn.T @ values[..., here, :, :] @ turn
+            here, turn = self.place[here], self.rotation @ turn
+        return total
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Patterns:
+    """What is left of the residuals of one board in V views, in standard deviations.
+
+    Attributes
+    ----------
+    left : (V, 2 C) residuals without the quadratic fields.
+    by_board : (V, 2 C, 3) derivatives by the displacement of each corner.
+    fields : (V, 2 C, K) orthonormal basis of what was taken out.
+    corner : (V, C) number of each corner on the board.
+    pull : (V, M, 3) what each view says about the departure that changes its sign under the turn,
+    information : (V, M, 3, 3) and how much.
+    prior : (3,) inverse variances of a corner's departure.
+    """
+
+    left: FloatArray
+    by_board: FloatArray
+    fields: FloatArray
+    corner: IntArray
+    pull: FloatArray
+    information: FloatArray
+    prior: FloatArray
+
+    @classmethod
+    def of(cls, observations: Observations, fit: Fit, b: int, views: IntArray, turn: _Turn) -> _Patterns:
+        rows = slice(observations.first_row[b], observations.first_row[b + 1])
+        board, points = observations.boards[b], fit.state.shape.points(fit.state.unknowns)
+        flat = board.points()
+        points[rows] = flat + turn.summed(points[rows] - flat, 1.0) / turn.order
+        part, state = observations.subset(views), fit.state.subset(views).with_boards_held()
+        state = replace(state, shape=replace(state.shape, flat=points))
+        in_cam, _ = state.points_in_cam(part)
+        pixels, valid, by_point, _ = state.camera.project_with_jacobians(in_cam)
+        weight = np.where(valid & fit.kept[views], part.weight, 0.0)
+        # What does not project is NaN: no multiple of it is zero.
+        residual = np.where(weight[..., None] > 0.0, weight[..., None] * (part.pixels - pixels), 0.0)
+        by_board = weight[..., None, None] * (by_point @ state.rotation[:, None])
+        by_board = np.where(weight[..., None, None] > 0.0, by_board, 0.0)
+        corner = np.where(part.present, part.corner - rows.start, 0)
+        x, y = (flat[:, :2] / np.abs(flat).max())[corner].transpose(2, 0, 1)
+        monomials = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+        shown = (by_board[..., None] * monomials[:, :, None, None, :]).reshape(len(views), 2 * corner.shape[1], -1)
+        fields = np.linalg.qr(shown)[0]
+        left = residual.reshape(len(views), -1)
+        left = left - _within(fields, left)
+        freedom = 2 * int((weight > 0.0).sum()) - fields.shape[2] * len(views)
+        sigma = float(np.sqrt((left**2).sum() / max(freedom, 1))) or 1.0
+        by_board, left = by_board / sigma, left / sigma
+        pull = np.zeros((len(views), len(flat), 3))
+        information = np.zeros((len(views), len(flat), 3, 3))
+        index = np.nonzero(weight > 0.0)
+        at = index[0], corner[index]
+        pull[at] = np.einsum("ncij,nci->ncj", by_board, left.reshape(residual.shape))[index]
+        information[at] = (np.swapaxes(by_board, -1, -2) @ by_board)[index]
+        return cls(
+            left,
+            by_board.reshape(*left.shape, 3),
+            fields,
+            corner,
+            turn.summed(pull, -1.0),
+            turn.summed(information, 0.0),
+            turn.order / released_sigma(flat) ** 2,
+        )
+
+    def log_odds(self) -> FloatArray:
+        """Return for each view (V,) the log odds that it is counted as the others are, rather than turned."""
+        views = len(self.left)
+        prior = self.prior * np.eye(3)
+        total = self.information.sum(axis=0) + prior
+        told = np.linalg.solve(total, self.pull[..., None])[..., 0].reshape(views, -1)
+        alike = told @ self.pull.reshape(views, -1).T
+        others = _agreeing_without_each(alike - np.diag(np.diag(alike)))
+        rest = total - self.information
+        departure = np.linalg.solve(rest, np.tensordot(others, self.pull, axes=1)[..., None])[..., 0]
+        here = np.repeat(np.take_along_axis(departure, self.corner[..., None], axis=1), 2, axis=1)
+        expected = (self.by_board * here).sum(axis=-1)
+        expected = expected - _within(self.fields, expected)
+        size = np.maximum(np.linalg.norm(expected, axis=1), np.finfo(float).tiny)
+        # Of a view that is counted like the others, `size` on average, with a spread of one if the others are right.
+        found = (self.left * expected).sum(axis=1) / size
+        spread = max(1.0, float(((np.abs(found) - size) ** 2).mean()))
+        return np.asarray(2.0 * found * size / spread)
+
+
+def _within(basis: FloatArray, values: FloatArray) -> FloatArray:
+    """Return the part of `values` (V, N) that lies in the orthonormal `basis` (V, N, K)."""
+    return np.asarray((basis @ (np.swapaxes(basis, -1, -2) @ values[..., None]))[..., 0])
+
+
+def _agreeing_without_each(alike: FloatArray) -> FloatArray:
+    """Return for each view (V, V) the signs on which the others agree without what it says, zero for itself: those that
+    make s^T `alike` s large, most of them plus. The diagonal of `alike` is zero."""
+    signs = _improved(alike, np.where(np.linalg.eigh(alike)[1][:, -1:].T < 0.0, -1.0, 1.0))
+    own = np.where(np.eye(len(alike)) > 0.0, 0.0, signs if signs.sum() >= 0.0 else -signs)
+    found = _improved(alike, own)
+    return np.where((found * own).sum(axis=1, keepdims=True) >= 0.0, found, -found)
+
+
+def _improved(alike: FloatArray, signs: FloatArray) -> FloatArray:
+    """Return sets of signs (N, V), each with the worst one turned as long as its s^T `alike` s gains by it; what is
+    zero stays zero and says nothing."""
+    signs = signs.copy()
+    left = np.arange(len(signs))
+    # Every turn gains; the end is for gains that are rounding.
+    for _ in range(signs.shape[1] ** 2):
+        gain = signs[left] * (signs[left] @ alike)
+        worst = np.argmin(gain, axis=1)
+        gains = gain[np.arange(len(left)), worst] < 0.0
+        left, worst = left[gains], worst[gains]
+        if not left.size:
+            break
+        signs[left, worst] *= -1.0
+    return signs

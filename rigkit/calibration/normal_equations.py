@@ -1,0 +1,220 @@
+"""Normal equations of the calibration: priors, their damped solution by Schur complement, and their covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rigkit.calibration.camera_prior import camera_prior
+from rigkit.calibration.observations import Observations
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import BoolArray, FloatArray
+
+__all__ = ["Normal", "Residuals", "Step"]
+
+MAX_CONDITION = 1e12
+"""A pose whose scaled block is worse has directions that its corners leave open: fewer than three of them."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Step:
+    """A proposed step and the decrease of the cost that the quadratic model promises for it."""
+
+    globals: FloatArray
+    poses: FloatArray
+    predicted: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Residuals:
+    """Measured minus projected, (V, C, 2) px, and where the corner projects at all.
+
+    Where it does not, `px` is the diagonal of the image: worse than any other, so that no step gains by losing corners.
+    """
+
+    px: FloatArray
+    valid: BoolArray
+
+    def norm(self, observations: Observations) -> FloatArray:
+        """Return |r| (V, C), infinite where the corner does not project, NaN where padded."""
+        length = np.where(self.valid, np.linalg.norm(self.px, axis=-1), np.inf)
+        return np.where(observations.present, length, np.nan)
+
+    def weighted(self, observations: Observations) -> FloatArray:
+        """Return |r| (V, C) times the weight, infinite where the corner does not project, zero where padded."""
+        u, v = self.px[..., 0], self.px[..., 1]
+        length = np.sqrt(u * u + v * v) * observations.weight
+        return length if self.valid.all() else np.where(self.valid | ~observations.present, length, np.inf)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Normal:
+    """Blocks of J^T W J and J^T W r: g for the G globals, p for the 6 numbers of each of V poses.
+
+    Attributes
+    ----------
+    gg (G, G), gp (V, G, 6), pp (V, 6, 6), g (G,), p (V, 6).
+    costs : (V,) cost of each view's residuals, px^2.
+    residuals : of the corners, not weighted; those of all cameras of a rig one after the other.
+    prior_cost : what the priors add to the cost, px^2.
+    points_from : the globals from here on are released board points: three each, coupled within a point only. None
+        where there are none.
+    """
+
+    gg: FloatArray
+    gp: FloatArray
+    pp: FloatArray
+    g: FloatArray
+    p: FloatArray
+    costs: FloatArray
+    residuals: tuple[Residuals, ...]
+    prior_cost: float = 0.0
+    points_from: int | None = None
+
+    def with_priors(
+        self,
+        cameras: Sequence[tuple[slice, Camera]],
+        shape: slice,
+        shape_sigma: FloatArray,
+        unknowns: FloatArray,
+        sigma_px: float,
+    ) -> Normal:
+        """Add the priors of cameras and zero-mean priors of the shape's unknowns, where each stands among the globals.
+
+        `sigma_px` is the standard deviation of a corner: what a residual of one px weighs against a prior.
+        """
+        gg, g, cost = self.gg.copy(), self.g.copy(), 0.0
+        for own, camera in cameras:
+            rows, residual = camera_prior(camera)
+            gg[own, own] += sigma_px**2 * rows.T @ rows
+            g[own] -= sigma_px**2 * rows.T @ residual
+            cost += sigma_px**2 * float(residual @ residual)
+        if unknowns.size:
+            weight = (sigma_px / shape_sigma) ** 2
+            diagonal = np.arange(shape.start, shape.stop)
+            gg[diagonal, diagonal] += weight
+            g[shape] -= weight * unknowns
+            cost += float((weight * unknowns**2).sum())
+        return replace(self, gg=gg, g=g, prior_cost=cost)
+
+    @property
+    def cost(self) -> float:
+        """The cost, priors included, infinite where the state makes no camera."""
+        total = float(self.costs.sum()) + self.prior_cost
+        return total if np.isfinite(total) else np.inf
+
+    def step(self, damping: float) -> Step | None:
+        """Return the damped Gauss-Newton step, None where the damped system is not positive definite."""
+        damping_g, damping_p = damping * _diagonal(self.gg), damping * _diagonal(self.pp)
+        first = self.points_from
+        many = first is not None and len(self.g) - first > 6 * len(self.pp)
+        try:
+            solve = self._eliminate_points if many else self._eliminate_poses
+            step_g, step_p = solve(damping_g, damping_p)
+        except np.linalg.LinAlgError:
+            return None
+        if not (np.isfinite(step_g).all() and np.isfinite(step_p).all()):
+            return None
+        # Decrease of the undamped model for the damped step: h^T (mu D h + b).
+        predicted = float(step_g @ (damping_g * step_g + self.g))
+        predicted += float((step_p * (damping_p * step_p + self.p)).sum())
+        return Step(step_g, step_p, predicted)
+
+    def _eliminate_poses(self, damping_g: FloatArray, damping_p: FloatArray) -> tuple[FloatArray, FloatArray]:
+        count = len(self.g)
+        coupled = np.concatenate([self.gp, self.p[:, None]], axis=1)
+        back = np.linalg.inv(_damped(self.pp, damping_p)) @ np.swapaxes(coupled, -1, -2)
+        through = _gemm(self.gp, back)
+        reduced = _damped(self.gg, damping_g) - through[:, :count]
+        step_g = _solve_positive(reduced, self.g - through[:, count])
+        return step_g, -(back @ np.append(step_g, -1.0))
+
+    def _eliminate_points(self, damping_g: FloatArray, damping_p: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Eliminate the released points by their 3x3 blocks: with many points and few views the system of the other
+        globals and all poses is the smaller one."""
+        p, views = int(self.points_from or 0), len(self.pp)
+        count = (len(self.g) - p) // 3
+        each = np.arange(count)
+        own = self.gg[p:, p:].reshape(count, 3, count, 3)[each, :, each, :]
+        inverse = np.linalg.inv(_damped(own, damping_g[p:].reshape(count, 3)))
+        system = np.zeros((p + 6 * views, p + 6 * views))
+        system[:p, :p] = self.gg[:p, :p] + np.diag(damping_g[:p])
+        system[:p, p:] = np.moveaxis(self.gp[:, :p], 0, 1).reshape(p, -1)
+        system[p:, :p] = system[:p, p:].T
+        blocks = system[p:, p:].reshape(views, 6, views, 6)
+        blocks[np.arange(views), :, np.arange(views), :] = _damped(self.pp, damping_p)
+        coupling = np.concatenate([self.gg[:p, p:], np.moveaxis(self.gp[:, p:], 1, 2).reshape(-1, 3 * count)])
+        back = np.einsum("amk,mkl->aml", coupling.reshape(-1, count, 3), inverse).reshape(len(coupling), -1)
+        rhs = np.concatenate([self.g[:p], self.p.ravel()]) - back @ self.g[p:]
+        step = _solve_positive(system - back @ coupling.T, rhs)
+        points = (inverse @ (self.g[p:] - coupling.T @ step).reshape(count, 3, 1)).reshape(-1)
+        return np.concatenate([step[:p], points]), step[p:].reshape(views, 6)
+
+    def covariance(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return S^-1 (G, G), W = pp^-1 gp^T (V, 6, G) and pp^-1 (V, 6, 6): the covariance of globals g and poses p
+        for unit residuals is cov(g) = S^-1, cov(p_v, g) = -W_v S^-1, cov(p_v, p_u) = W_v S^-1 W_u^T + [v = u] pp_v^-1.
+
+        Directions that the data leave open get the pseudo-inverse's zero only after scaling to unit diagonal.
+        """
+        inverse = _inverse(self.pp)
+        back = inverse @ np.swapaxes(self.gp, -1, -2)
+        reduced = self.gg - _gemm(self.gp, back)
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(reduced), np.finfo(float).tiny))
+        scaled = 0.5 * (reduced + reduced.T) * scale[:, None] * scale
+        try:
+            inner = np.linalg.inv(scaled)
+        except np.linalg.LinAlgError:
+            inner = np.linalg.pinv(scaled, hermitian=True)
+        return np.asarray(inner * scale[:, None] * scale), back, np.asarray(inverse)
+
+
+def _diagonal(matrix: FloatArray) -> FloatArray:
+    """Return the diagonal (..., K) for Marquardt's scaling, one where it vanishes. Its entries are not compared: they
+    have units of their own, and those of a polynomial's coefficients lie 40 powers of ten apart."""
+    diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
+    return np.where(diagonal > 0.0, diagonal, 1.0)
+
+
+def _damped(matrices: FloatArray, damping: FloatArray) -> FloatArray:
+    """Return matrices (..., K, K) with `damping` (..., K) added to their diagonals."""
+    out = np.array(matrices, order="C")
+    count = damping.shape[-1]
+    out.reshape(*damping.shape[:-1], count * count)[..., :: count + 1] += damping
+    return out
+
+
+def _inverse(pp: FloatArray) -> FloatArray:
+    """Return the inverses of the poses' blocks (V, 6, 6); the pseudo-inverses where the corners leave a pose open."""
+    scale = 1.0 / np.sqrt(_diagonal(pp))
+    scale = scale[:, :, None] * scale[:, None]
+    scaled = pp * scale
+    try:
+        inverse = np.linalg.inv(scaled)
+    except np.linalg.LinAlgError:
+        inverse = np.full_like(pp, np.inf)
+    # The scaled blocks have unit diagonals, so this bounds their condition within a factor of six.
+    doubtful = ~(np.abs(inverse).max(axis=(1, 2)) < MAX_CONDITION)
+    inverse *= scale
+    if doubtful.any():
+        inverse[doubtful] = np.linalg.pinv(pp[doubtful], hermitian=True)
+    return np.asarray(inverse)
+
+
+def _gemm(gp: FloatArray, back: FloatArray) -> FloatArray:
+    """Return sum over views of gp_v @ back_v as one matrix product."""
+    return np.asarray(gp.transpose(1, 0, 2).reshape(gp.shape[1], -1) @ back.reshape(-1, back.shape[-1]))
+
+
+def _solve_positive(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
+    """Solve after scaling to unit diagonal; raises LinAlgError where the matrix is not positive definite."""
+    if not len(rhs):
+        return rhs
+    diagonal = np.diag(matrix)
+    if not (diagonal > 0.0).all():
+        raise np.linalg.LinAlgError
+    scale = 1.0 / np.sqrt(diagonal)
+    scaled = matrix * scale[:, None] * scale
+    np.linalg.cholesky(scaled)
+    return np.asarray(np.linalg.solve(scaled, rhs * scale) * scale)

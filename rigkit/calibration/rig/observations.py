@@ -1,0 +1,89 @@
+"""A board as a camera of a rig saw it, and the ways in which a board that looks the same turned can be counted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rigkit.calibration.board_orientation import board_turn, grid_turned, same_looks
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.rig.state import Key
+from rigkit.core.arrays import BoolArray, FloatArray, Points
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
+from rigkit.geometry.rigid3 import Rigid3
+
+__all__ = ["Places", "Seen", "Sights", "outer_corners", "seen_by", "turns_of"]
+
+Places = Mapping[str, tuple[str, Rigid3]]
+"""Board -> its target and target_from_board, of the boards that are mounted to others."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Seen:
+    """A board in an image, as the camera's own calibration left it.
+
+    Attributes
+    ----------
+    view, kept, cam_from_board : as in the calibration.
+    squared_px : (N,) squared 2-D residuals of the corners there.
+    frame : everything of this frame was taken at one moment.
+    key : (frame, target), or a name of its own: everything with this key shares one pose.
+    """
+
+    view: BoardView
+    kept: BoolArray
+    cam_from_board: Rigid3
+    squared_px: FloatArray
+    frame: str
+    key: Key
+
+    @property
+    def board_id(self) -> str:
+        return self.view.board.board_id
+
+    def counted(self, quarter_turns: int, board: Board | None = None) -> Seen:
+        """Return the same with the corners counted from another corner, as those of `board` where one is given (of the
+        same size, turned likewise)."""
+        if quarter_turns == 0 and board is None:
+            return self
+        old = self.view.board
+        view = replace(
+            self.view,
+            grid=grid_turned(self.view.grid, old.size, quarter_turns),
+            board=old if board is None else board,
+        )
+        return replace(self, view=view, cam_from_board=self.cam_from_board @ board_turn(old, quarter_turns).inverse())
+
+
+Sights = dict[tuple[str, str], Seen]
+"""What a camera saw, by (frame, board)."""
+
+
+def outer_corners(board: Board) -> Points:
+    """Return the four outer corners in the board's frame, (4, 3) mm."""
+    far = [(board.columns - 1) * board.square_x_mm, (board.rows - 1) * board.square_y_mm, 0.0]
+    return np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 0.0]]) * far
+
+
+def turns_of(board: Board) -> tuple[Rigid3, ...]:
+    """Return counted_from_old of every way in which the board can be counted."""
+    return tuple(board_turn(board, turns) for turns in same_looks(board))
+
+
+def seen_by(own: Sequence[tuple[str, BoardView]], result: Calibration) -> Sights:
+    """Return the views that the camera's own calibration used, counted as it counts them; every board is a target of
+    its own."""
+    used = {(v.image, v.board_id): v for v in result.views}
+    out = {}
+    for frame, view in own:
+        entry = used.get((view.image, view.board.board_id))
+        if entry is not None:
+            squared = np.nan_to_num((entry.residuals_px**2).sum(axis=1))
+            if (view.grid != entry.grid).any():
+                view = replace(view, grid=entry.grid)
+            key = (frame, view.board.board_id)
+            out[key] = Seen(view, entry.kept, entry.cam_from_board, squared, frame, key)
+    return out

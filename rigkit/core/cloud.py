@@ -1,0 +1,61 @@
+"""Oriented point clouds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.core.arrays import FloatArray, IntArray, Normals, Points, as_array, as_indices
+from rigkit.core.errors import InputError
+
+__all__ = ["OrientedCloud"]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class OrientedCloud:
+    """Points with normals, in the frame of camera 1.
+
+    Attributes
+    ----------
+    points_mm : (N, 3)
+    normals : (N, 3) unit, facing camera 1 (n . x < 0).
+    colours : (N, 3) uint8, red green blue.
+    board_index : (N,) int, index into `board_ids`; -1 where the point is on no board.
+    grid : (N, 2) int, (column, row) on the board.
+    sigma_mm : (N,) predicted standard deviation of the point (root of the covariance's largest eigenvalue).
+    normal_sigma_rad : (N,) predicted rms angle of the normal.
+    board_ids : names of the boards.
+    """
+
+    points_mm: Points
+    normals: Normals
+    colours: NDArray[np.uint8]
+    board_index: IntArray
+    grid: IntArray
+    sigma_mm: FloatArray
+    normal_sigma_rad: FloatArray
+    board_ids: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        n = len(np.asarray(self.points_mm))
+        object.__setattr__(self, "points_mm", as_array(self.points_mm, (n, 3), "points_mm"))
+        object.__setattr__(self, "normals", as_array(self.normals, (n, 3), "normals"))
+        object.__setattr__(self, "board_index", as_indices(self.board_index, (n,), "board_index"))
+        object.__setattr__(self, "grid", as_indices(self.grid, (n, 2), "grid"))
+        object.__setattr__(self, "sigma_mm", as_array(self.sigma_mm, (n,), "sigma_mm", finite=False))
+        sigma = as_array(self.normal_sigma_rad, (n,), "normal_sigma_rad", finite=False)
+        object.__setattr__(self, "normal_sigma_rad", sigma)
+        colours = np.array(self.colours, dtype=np.uint8)
+        if colours.shape != (n, 3):
+            raise InputError(f"colours: expected {n}x3, got {colours.shape}")
+        colours.flags.writeable = False
+        object.__setattr__(self, "colours", colours)
+
+    def __len__(self) -> int:
+        return len(self.points_mm)
+
+    def on_board(self, board_id: str) -> NDArray[np.bool_]:
+        """Return the mask of the points on one board."""
+        return np.asarray(self.board_index == self.board_ids.index(board_id))

@@ -1,0 +1,128 @@
+"""What was seen of a board in an image."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rigkit.core.arrays import FloatArray, IntArray, Pixels, Points, as_array, as_indices
+from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
+
+__all__ = ["BoardDetection", "BoardView", "common_corners"]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class BoardDetection:
+    """Corners of one board in one image.
+
+    Attributes
+    ----------
+    board_id : the board's name; None while unknown (several boards of one size, or no size given).
+    columns, rows : size of the grid found (of the board, where that is known).
+    grid : (N, 2) int, (column, row) of each corner, right-handed (x right, y down, z away from the viewer), sorted row
+        by row. Need not be complete.
+    pixels : (N, 2)
+    sigma_px : (N,) predicted standard deviation per axis.
+    """
+
+    board_id: str | None
+    columns: int
+    rows: int
+    grid: IntArray
+    pixels: Pixels
+    sigma_px: FloatArray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "grid", as_indices(self.grid, (None, 2), "grid"))
+        n = len(self.grid)
+        object.__setattr__(self, "pixels", as_array(self.pixels, (n, 2), "pixels"))
+        object.__setattr__(self, "sigma_px", as_array(self.sigma_px, (n,), "sigma_px"))
+        inside = (self.grid >= 0).all() and (self.grid < [self.columns, self.rows]).all()
+        if not inside:
+            raise InputError(f"board detection: a corner lies outside the {self.columns}x{self.rows} grid")
+
+    @property
+    def complete(self) -> bool:
+        return len(self.grid) == self.columns * self.rows
+
+    def turned(self, quarter_turns: int) -> BoardDetection:
+        """Return the same corners with the first corner moved by `quarter_turns` x 90 degrees (still right-handed)."""
+        column, row = self.grid[:, 0], self.grid[:, 1]
+        columns, rows = self.columns, self.rows
+        for _ in range(quarter_turns % 4):
+            column, row = rows - 1 - row, column
+            columns, rows = rows, columns
+        order = np.lexsort((column, row))
+        return BoardDetection(
+            self.board_id,
+            columns,
+            rows,
+            np.stack([column, row], axis=-1)[order],
+            self.pixels[order],
+            self.sigma_px[order],
+        )
+
+    def named(self, board_id: str) -> BoardDetection:
+        return replace(self, board_id=board_id)
+
+    def lattice(self) -> FloatArray:
+        """Return the pixels as (rows, columns, 2), NaN where a corner was not found."""
+        out = np.full((self.rows, self.columns, 2), np.nan)
+        out[self.grid[:, 1], self.grid[:, 0]] = self.pixels
+        return out
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class BoardView:
+    """One board in one image with its object points: the unit of calibration.
+
+    Attributes
+    ----------
+    image : name of the image, for reports.
+    board : the board.
+    grid : (N, 2) int corner indices.
+    pixels : (N, 2)
+    sigma_px : (N,)
+    """
+
+    image: str
+    board: Board
+    grid: IntArray
+    pixels: Pixels
+    sigma_px: FloatArray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "grid", as_indices(self.grid, (None, 2), "grid"))
+        n = len(self.grid)
+        object.__setattr__(self, "pixels", as_array(self.pixels, (n, 2), "pixels"))
+        object.__setattr__(self, "sigma_px", as_array(self.sigma_px, (n,), "sigma_px"))
+
+    @classmethod
+    def from_detection(cls, image: str, detection: BoardDetection, boards: Sequence[Board]) -> BoardView:
+        """Attach the board that the detection names; raises InputError where it names none of `boards`."""
+        for board in boards:
+            if board.board_id == detection.board_id:
+                return cls(image, board, detection.grid, detection.pixels, detection.sigma_px)
+        raise InputError(f"image '{image}': no board is called '{detection.board_id}'")
+
+    def points(self) -> Points:
+        """Return the corners in the board frame, (N, 3) mm."""
+        return self.board.points(self.grid)
+
+
+def common_corners(detection1: BoardDetection, detection2: BoardDetection) -> tuple[IntArray, IntArray, IntArray]:
+    """Return grid (N, 2) of the corners seen in both, row by row, and their indices (N,) into either detection.
+
+    >>> d = BoardDetection("a", 3, 2, [[0, 0], [1, 0], [2, 1]], np.zeros((3, 2)), np.ones(3))
+    >>> e = BoardDetection("a", 3, 2, [[1, 0], [0, 1], [2, 1]], np.zeros((3, 2)), np.ones(3))
+    >>> grid, first, second = common_corners(d, e)
+    >>> grid.tolist(), first.tolist(), second.tolist()
+    ([[1, 0], [2, 1]], [1, 2], [0, 2])
+    """
+    width = max(detection1.columns, detection2.columns)
+    keys = [d.grid[:, 1] * width + d.grid[:, 0] for d in (detection1, detection2)]
+    _, first, second = np.intersect1d(keys[0], keys[1], assume_unique=True, return_indices=True)
+    return detection1.grid[first], first, second

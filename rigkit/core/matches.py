@@ -1,0 +1,212 @@
+"""Corresponding points, directions and affinities of a pair of images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar, Protocol
+
+import numpy as np
+
+from rigkit.core.arrays import (
+    Affines,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Mat3,
+    Pixels,
+    RayJacobians,
+    Rays,
+    as_array,
+    as_indices,
+)
+from rigkit.core.errors import InputError
+
+__all__ = ["CentralCamera", "DirectionPairs", "Matches"]
+
+
+class CentralCamera(Protocol):
+    """What geometry asks of a camera (`rigkit.cameras.base.Camera` in full)."""
+
+    def unproject(self, pixels: Pixels) -> tuple[Rays, BoolArray]:
+        """Return unit rays and which of them exist."""
+
+    def ray_jacobian(self, pixels: Pixels) -> RayJacobians:
+        """Return d ray / d pixel, (..., 3, 2)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class DirectionPairs:
+    """Corresponding image directions at N points, K directions each.
+
+    Attributes
+    ----------
+    image1, image2 : (N, K, 2) px; direction k of point n in either image. Lengths are meaningful where `scaled`.
+    valid : (N, K) bool; invalid directions are ignored by every estimator.
+    scaled : whether |image2| / |image1| is the true local stretch (harmonic lengths on a chessboard).
+    kinds : K names, here ("horizontal", "vertical", "diagonal").
+    pixels1, pixels2 : (N, 2) where the directions are, or None.
+    """
+
+    HORIZONTAL: ClassVar[int] = 0
+    VERTICAL: ClassVar[int] = 1
+    DIAGONAL: ClassVar[int] = 2
+
+    image1: FloatArray
+    image2: FloatArray
+    valid: BoolArray
+    scaled: bool = True
+    kinds: tuple[str, ...] = ("horizontal", "vertical", "diagonal")
+    pixels1: Pixels | None = None
+    pixels2: Pixels | None = None
+
+    def __post_init__(self) -> None:
+        first = np.asarray(self.image1)
+        if first.ndim != 3:
+            raise InputError(f"directions: expected shape NxKx2, got {first.shape}")
+        n, k = first.shape[:2]
+        object.__setattr__(self, "image1", as_array(self.image1, (n, k, 2), "directions in image 1", finite=False))
+        object.__setattr__(self, "image2", as_array(self.image2, (n, k, 2), "directions in image 2", finite=False))
+        valid = np.array(self.valid, dtype=bool)
+        if valid.shape != (n, k):
+            raise InputError(f"directions: valid must be {n}x{k}, got {valid.shape}")
+        finite = np.isfinite(self.image1).all(axis=-1) & np.isfinite(self.image2).all(axis=-1)
+        valid &= finite
+        valid.flags.writeable = False
+        object.__setattr__(self, "valid", valid)
+        if len(self.kinds) != k:
+            raise InputError(f"directions: {k} directions a point but {len(self.kinds)} kinds")
+        for name in ("pixels1", "pixels2"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, as_array(getattr(self, name), (n, 2), f"directions' {name}"))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Matches:
+    """N corresponding points of two images, with all that the geometry needs to know of the two cameras there.
+
+    Attributes
+    ----------
+    pixels1, pixels2 : (N, 2)
+    rays1, rays2 : (N, 3) unit rays of those pixels in their camera's frame.
+    jacobians1, jacobians2 : (N, 3, 2) d ray / d pixel.
+    sigma1_px, sigma2_px : (N,) corner standard deviation per axis.
+    board_index : (N,) int, which board; -1 where none.
+    grid : (N, 2) int, (column, row) on that board.
+    K1, K2 : (3, 3) pinhole matrices where the pixels are those of perspective views, else None (raw fisheye).
+    A21 : (N, 2, 2) affinity from image 1 to image 2 in these pixels, or None; NaN where there is none.
+    sigma_A : (N,) standard deviation of an entry of A21, or None.
+    """
+
+    pixels1: Pixels
+    pixels2: Pixels
+    rays1: Rays
+    rays2: Rays
+    jacobians1: RayJacobians
+    jacobians2: RayJacobians
+    sigma1_px: FloatArray
+    sigma2_px: FloatArray
+    board_index: IntArray
+    grid: IntArray
+    K1: Mat3 | None = None
+    K2: Mat3 | None = None
+    A21: Affines | None = None
+    sigma_A: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        n = len(np.asarray(self.pixels1))
+        shapes: dict[str, tuple[int | None, ...]] = {
+            "pixels1": (n, 2),
+            "pixels2": (n, 2),
+            "rays1": (n, 3),
+            "rays2": (n, 3),
+            "jacobians1": (n, 3, 2),
+            "jacobians2": (n, 3, 2),
+            "sigma1_px": (n,),
+            "sigma2_px": (n,),
+        }
+        for name, shape in shapes.items():
+            object.__setattr__(self, name, as_array(getattr(self, name), shape, name))
+        object.__setattr__(self, "board_index", as_indices(self.board_index, (n,), "board_index"))
+        object.__setattr__(self, "grid", as_indices(self.grid, (n, 2), "grid"))
+        optional: dict[str, tuple[int | None, ...]] = {
+            "K1": (3, 3),
+            "K2": (3, 3),
+            "A21": (n, 2, 2),
+            "sigma_A": (n,),
+        }
+        for name, shape in optional.items():
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, as_array(getattr(self, name), shape, name, finite=name.startswith("K")))
+
+    def __len__(self) -> int:
+        return len(self.pixels1)
+
+    @classmethod
+    def from_cameras(
+        cls,
+        camera1: CentralCamera,
+        camera2: CentralCamera,
+        pixels1: Pixels,
+        pixels2: Pixels,
+        *,
+        sigma1_px: FloatArray | None = None,
+        sigma2_px: FloatArray | None = None,
+        board_index: IntArray | None = None,
+        grid: IntArray | None = None,
+        A21: Affines | None = None,
+        sigma_A: FloatArray | None = None,
+    ) -> Matches:
+        """Fill rays and Jacobians from the cameras. K1 and K2 are set where a camera is a plain pinhole.
+
+        Raises InputError where a pixel has no ray in its camera.
+        """
+        n = len(pixels1)
+        rays1, valid1 = camera1.unproject(pixels1)
+        rays2, valid2 = camera2.unproject(pixels2)
+        if not (valid1.all() and valid2.all()):
+            lost = int(n - (valid1 & valid2).sum())
+            raise InputError(f"matches: {lost} of {n} points lie outside a camera's field of view; remove them first")
+        ones = np.ones(n)
+        return cls(
+            pixels1,
+            pixels2,
+            rays1,
+            rays2,
+            camera1.ray_jacobian(pixels1),
+            camera2.ray_jacobian(pixels2),
+            ones if sigma1_px is None else sigma1_px,
+            ones if sigma2_px is None else sigma2_px,
+            np.full(n, -1) if board_index is None else board_index,
+            np.zeros((n, 2), dtype=np.int64) if grid is None else grid,
+            getattr(camera1, "K", None),
+            getattr(camera2, "K", None),
+            A21,
+            sigma_A,
+        )
+
+    def with_affinities(self, A21: Affines, sigma_A: FloatArray | None = None) -> Matches:
+        """Return the same matches with affinities."""
+        return replace(self, A21=A21, sigma_A=sigma_A)
+
+    def select(self, which: BoolArray | IntArray) -> Matches:
+        """Return the matches picked by a mask or by indices."""
+
+        def pick(array: FloatArray | None) -> FloatArray | None:
+            return None if array is None else array[which]
+
+        return Matches(
+            self.pixels1[which],
+            self.pixels2[which],
+            self.rays1[which],
+            self.rays2[which],
+            self.jacobians1[which],
+            self.jacobians2[which],
+            self.sigma1_px[which],
+            self.sigma2_px[which],
+            self.board_index[which],
+            self.grid[which],
+            self.K1,
+            self.K2,
+            pick(self.A21),
+            pick(self.sigma_A),
+        )

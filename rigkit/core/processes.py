@@ -1,0 +1,81 @@
+"""Work in several processes, none of which outlives the program, however it ends."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from typing import ParamSpec, TypeVar
+
+from rigkit.core.errors import InputError
+
+__all__ = ["worker_pool"]
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+
+@contextmanager
+def _terminal_silent() -> Iterator[None]:
+    """Let processes that start here leave Ctrl-C and a closed terminal to their parent: all of a group are told.
+
+    They inherit the mask; handlers of their own would come after a second of imports.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+class _Pool(ProcessPoolExecutor):
+    """A pool that starts its processes silently, as it does where work is submitted."""
+
+    def submit(
+        self, fn: Callable[Arguments, Result], /, *args: Arguments.args, **kwargs: Arguments.kwargs
+    ) -> Future[Result]:
+        with _terminal_silent():
+            return super().submit(fn, *args, **kwargs)
+
+
+@contextmanager
+def worker_pool(count: int) -> Iterator[ProcessPoolExecutor]:
+    """Give a pool of `count` fresh processes for the length of a `with` block.
+
+    An exception in the block, an interrupt among them, ends work under way instead of waiting for it. If this process
+    is killed, its workers notice and end. If a worker is killed, InputError says so.
+    """
+    others = set(multiprocessing.active_children())
+    # "spawn": a fork after OpenCV has started its threads can hang.
+    with _terminal_silent():
+        pool = _Pool(count, mp_context=multiprocessing.get_context("spawn"), initializer=_end_with_parent)
+    try:
+        yield pool
+    except BrokenProcessPool as error:
+        raise InputError(
+            "a process ended before its work was done, perhaps for want of memory; use fewer (-j 1), which shows any "
+            "other reason too"
+        ) from error
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in set(multiprocessing.active_children()) - others:
+            process.terminate()
+        raise
+    pool.shutdown()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        # A worker that waits for its next task holds both ends of the queue: nothing else would wake it.
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

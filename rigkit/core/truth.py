@@ -1,0 +1,123 @@
+"""What a person measured of a pair with a rule, a square or a level, and how sure they were."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.core.errors import InputError
+
+__all__ = ["Feature", "MeasuredAngle", "MeasuredDistance", "MeasuredLength", "PairTruth"]
+
+FEATURE = re.compile(r"^(?P<board>.+?)(?:\[\s*(?P<column>\d+)\s*,\s*(?P<row>\d+)\s*\]|(?P<centre>\.centre))?$")
+
+
+@dataclass(frozen=True, slots=True)
+class Feature:
+    """Something on a board that a rule can be laid against.
+
+    Written "plane1[0,5]" for the corner in column 0 and row 5, "plane1.centre" for the middle of the corner grid, and
+    "plane1" for the board's whole plane.
+
+    >>> Feature.parse("plane1[7,0]")
+    Feature(board_id='plane1', grid=(7, 0), centre=False)
+    >>> str(Feature.parse("floor.centre"))
+    'floor.centre'
+    """
+
+    board_id: str
+    grid: tuple[int, int] | None = None
+    centre: bool = False
+
+    @classmethod
+    def parse(cls, text: str) -> Feature:
+        """Read the written form; raises InputError where it is none."""
+        match = FEATURE.match(text.strip())
+        if match is None:
+            raise InputError(f"'{text}' names nothing on a board; write plane1[0,5], plane1.centre or plane1")
+        grid = None if match["column"] is None else (int(match["column"]), int(match["row"]))
+        return cls(match["board"], grid, match["centre"] is not None)
+
+    @property
+    def is_plane(self) -> bool:
+        return self.grid is None and not self.centre
+
+    def __str__(self) -> str:
+        if self.grid is not None:
+            return f"{self.board_id}[{self.grid[0]},{self.grid[1]}]"
+        return f"{self.board_id}.centre" if self.centre else self.board_id
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredLength:
+    """A length in mm with its standard deviation and how it was measured."""
+
+    value_mm: float
+    sigma_mm: float
+    how: str
+
+    def __post_init__(self) -> None:
+        _check("length", self.value_mm, self.sigma_mm, "mm")
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredAngle:
+    """The angle between boards `a` and `b` as a protractor laid across the two faces shows it, 0 to 180 degrees.
+
+    It is 180 degrees minus the angle between the normals that face the camera: a corner of a room that opens wider than
+    a right angle is more than 90 degrees.
+    """
+
+    a: str
+    b: str
+    value_deg: float
+    sigma_deg: float
+    how: str
+
+    def __post_init__(self) -> None:
+        if self.a == self.b:
+            raise InputError(f"angle: '{self.a}' has no angle with itself; name two boards")
+        _check(f"angle {self.a}-{self.b}", self.value_deg, self.sigma_deg, "deg")
+        if self.value_deg > 180.0:
+            raise InputError(f"angle {self.a}-{self.b}: {self.value_deg} deg is more than 180; write the angle itself")
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredDistance:
+    """The distance in mm between two features of boards; from a point to a plane it is perpendicular."""
+
+    a: Feature
+    b: Feature
+    value_mm: float
+    sigma_mm: float
+    how: str
+
+    def __post_init__(self) -> None:
+        _check(f"distance {self.a} to {self.b}", self.value_mm, self.sigma_mm, "mm")
+        if self.a.is_plane and self.b.is_plane:
+            raise InputError(f"distance {self.a} to {self.b}: two planes have no one distance; name a corner of one")
+
+
+@dataclass(frozen=True, slots=True)
+class PairTruth:
+    """Everything that a person measured of one pair; empty where nobody did."""
+
+    baseline: MeasuredLength | None = None
+    angles: tuple[MeasuredAngle, ...] = ()
+    distances: tuple[MeasuredDistance, ...] = ()
+
+    @property
+    def count(self) -> int:
+        """How many measurements there are."""
+        return (self.baseline is not None) + len(self.angles) + len(self.distances)
+
+
+def _check(what: str, value: float, sigma: float, unit: str) -> None:
+    if not (np.isfinite(value) and value > 0.0):
+        raise InputError(f"{what}: a measured value must be positive, got {value} {unit}")
+    if not (np.isfinite(sigma) and sigma > 0.0):
+        raise InputError(
+            f"{what}: sigma must be positive, got {sigma} {unit}; say how far off the measurement may well be"
+        )

@@ -1,1 +1,0 @@
-"""Finding chessboards and their corners, telling boards apart, directions at corners."""

@@ -1,0 +1,184 @@
+"""ChArUco boards: the corners of our own detector, with their places in the board from OpenCV's markers.
+
+OpenCV reads the markers and says roughly where which corner is. Those corners name the lattices found in the image
+(turn and shift by vote, so that a misread marker does nothing), fill in what a lattice has missed, and stand in for it
+where none was found. Where the corners are exactly, the edge model says, as for any board.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.boards import Board, Markers
+from rigkit.core.detections import BoardDetection
+from rigkit.detection.guided.guided import fit_corners
+from rigkit.detection.lattice.lattice import Lattice
+from rigkit.detection.lattice.local_fit import fit_cells
+from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.subpixel.subpixel import RefinedLattice, refine
+
+__all__ = ["charuco_boards"]
+
+SAME_CELLS = 0.2
+"""A marker's corner and a corner of a lattice are one within so many sides of a cell."""
+
+FEWEST_VOTES, AGREEING = 3, 0.7
+"""Corners, and which part of them, that must give a lattice the same place in the board."""
+
+SEED_CONTRAST = 100.0
+"""Contrast that a corner starts with, grey levels: the fit measures it."""
+
+
+def charuco_boards(
+    image: GreyImage, found: Sequence[RefinedLattice], boards: Sequence[Board], min_corners: int
+) -> tuple[list[BoardDetection], list[RefinedLattice]]:
+    """Return the ChArUco boards in an image, named and on their own grids, and the lattices that are none.
+
+    Parameters
+    ----------
+    image : grey, 0..255.
+    found : all lattices of the image.
+    boards : the ChArUco boards that may be there.
+    min_corners : boards with fewer corners are not returned.
+    """
+    eight_bit = np.clip(np.rint(image), 0, 255).astype(np.uint8)
+    rest = list(found)
+    out = []
+    for board in boards:
+        if board.markers is None:
+            continue
+        grid, pixels = _marked_corners(eight_bit, board, board.markers)
+        if not len(grid):
+            continue
+        whole = _empty(board)
+        left = []
+        for item in rest:
+            placed = _placed(item.lattice, grid, pixels, board)
+            if placed is None:
+                left.append(item)
+            else:
+                whole = _united(whole, placed)
+        whole = _united(whole, _of(board, grid, pixels))
+        (refined,) = refine(image, [whole])
+        refined = _beside_markers(image, refined, board)
+        if refined.lattice.count >= min_corners:
+            out.append(_detection(refined, board))
+            rest = left
+    return out, rest
+
+
+def _marked_corners(image: np.ndarray, board: Board, markers: Markers) -> tuple[IntArray, FloatArray]:
+    """Return (column, row) and rough pixels of the corners that OpenCV finds between the markers, (N, 2) each."""
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, markers.dictionary))
+    size = (board.columns + 1, board.rows + 1)
+    ids = np.arange(markers.first_id, markers.first_id + (size[0] * size[1] + int(not board.first_black)) // 2)
+    side = float(np.sqrt(board.square_x_mm * board.square_y_mm))
+    target = cv2.aruco.CharucoBoard(size, side, markers.side_mm, dictionary, ids)
+    target.setLegacyPattern(markers.legacy_pattern)
+    corners, numbers, _, _ = cv2.aruco.CharucoDetector(target).detectBoard(image)
+    if numbers is None or corners is None:
+        return np.zeros((0, 2), np.int64), np.zeros((0, 2))
+    row, column = np.divmod(np.asarray(numbers, dtype=np.int64).ravel(), board.columns)
+    return np.stack([column, row], axis=-1), np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+
+
+def _empty(board: Board) -> Lattice:
+    shape = (board.rows, board.columns)
+    # Across the first edge brightness grows downwards, with the angle, where the square below it is white; that has
+    # the colour of the square before the first corner.
+    return Lattice(np.full((*shape, 2), np.nan), np.full(shape, np.nan), not board.first_black)
+
+
+def _of(board: Board, grid: IntArray, pixels: FloatArray) -> Lattice:
+    out = _empty(board)
+    out.pixels[grid[:, 1], grid[:, 0]] = pixels
+    out.contrast[grid[:, 1], grid[:, 0]] = SEED_CONTRAST
+    return out
+
+
+def _united(one: Lattice, two: Lattice) -> Lattice:
+    """Return the corners of `one`, and those of `two` where it has none."""
+    known = one.known
+    return Lattice(
+        np.where(known[..., None], one.pixels, two.pixels), np.where(known, one.contrast, two.contrast), one.rising
+    )
+
+
+def _placed(lattice: Lattice, grid: IntArray, pixels: FloatArray, board: Board) -> Lattice | None:
+    """Return `lattice` on the grid of the board where the marked corners say so with one voice, else None."""
+    known = lattice.known
+    corners = lattice.pixels[known]
+    distance = np.linalg.norm(corners[:, None] - pixels, axis=2)
+    nearest = distance.argmin(axis=0)
+    near: BoolArray = distance[nearest, np.arange(len(pixels))] < SAME_CELLS * _side(lattice)
+    if near.sum() < FEWEST_VOTES:
+        return None
+    row, column = np.nonzero(known)
+    cell = np.stack([column, row], axis=-1)[nearest[near]]
+    best: tuple[int, Lattice, IntArray] | None = None
+    columns, rows = lattice.size
+    for turns in range(4):
+        shift, votes = np.unique(grid[near] - cell, axis=0, return_counts=True)
+        if best is None or votes.max() > best[0]:
+            best = (int(votes.max()), lattice.turned(turns), shift[votes.argmax()])
+        # As `Lattice.turned`.
+        cell = np.stack([rows - 1 - cell[:, 1], cell[:, 0]], axis=-1)
+        columns, rows = rows, columns
+    if best is None or best[0] < max(FEWEST_VOTES, AGREEING * near.sum()):
+        return None
+    return _onto(best[1], best[2], board)
+
+
+def _side(lattice: Lattice) -> float:
+    steps = [np.linalg.norm(np.diff(lattice.pixels, axis=axis), axis=2).ravel() for axis in (0, 1)]
+    return float(np.nanmedian(np.concatenate(steps)))
+
+
+def _onto(lattice: Lattice, shift: IntArray, board: Board) -> Lattice:
+    """Return the board's lattice with the corners of `lattice`, moved by (column, row); what sticks out is left out."""
+    row, column = np.nonzero(lattice.known)
+    place = np.stack([column, row], axis=-1) + shift
+    inside = ((place >= 0) & (place < board.size)).all(axis=1)
+    row, column, place = row[inside], column[inside], place[inside]
+    out = _empty(board)
+    out.pixels[place[:, 1], place[:, 0]] = lattice.pixels[row, column]
+    out.contrast[place[:, 1], place[:, 0]] = lattice.contrast[row, column]
+    return out
+
+
+def _beside_markers(image: GreyImage, refined: RefinedLattice, board: Board) -> RefinedLattice:
+    """Return the corners fitted anew with windows that leave the markers out; those that then fail are dropped."""
+    lattice = refined.lattice
+    known = lattice.known
+    if not known.any():
+        return refined
+    shape, blur = fit_cells(lattice.pixels, known), float(np.median(refined.blur_px[known]))
+    fit = fit_corners(image, board, known, shape, lattice.pixels[known], lattice.signs()[known], blur)
+
+    def spread(values: FloatArray) -> FloatArray:
+        out = np.full((*known.shape, *values.shape[1:]), np.nan)
+        out[known] = values
+        return out
+
+    narrow = replace(
+        refined,
+        lattice=Lattice(spread(fit.pixels), spread(fit.contrast), lattice.rising),
+        sigma_px=spread(fit.sigma_px),
+        blur_px=spread(fit.blur),
+        residual=spread(fit.residual),
+    )
+    drop = known.copy()
+    drop[known] = ~fit.valid | (fit.contrast <= 0.0)
+    return narrow.without(drop)
+
+
+def _detection(refined: RefinedLattice, board: Board) -> BoardDetection:
+    row, column = np.nonzero(refined.lattice.known)
+    grid = np.stack([column, row], axis=-1)
+    pixels, sigma = refined.lattice.pixels[row, column], refined.sigma_px[row, column]
+    return BoardDetection(board.board_id, board.columns, board.rows, grid, pixels, sigma)

@@ -1,0 +1,1 @@
+"""What speaks against a grid being a board: patterns, discontinuities, borders."""

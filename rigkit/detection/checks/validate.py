@@ -1,0 +1,282 @@
+"""Which lattices are boards: squares that close, rows that are rows, one board to a place, sizes that are known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from rigkit.core.arrays import BoolArray, FloatArray, upper_median
+from rigkit.detection.lattice.lattice import MANY, Lattice
+from rigkit.detection.lattice.local_fit import fit_cells
+from rigkit.detection.lattice.spacing import unevenness
+from rigkit.detection.saddles.nearby import near_any
+from rigkit.detection.saddles.response import Level, sample
+from rigkit.detection.subpixel.subpixel import RefinedLattice
+from rigkit.kernels import lattice as native
+
+__all__ = [
+    "compact",
+    "known_part",
+    "large",
+    "leans",
+    "sample_of",
+    "separate",
+    "stray_row",
+    "tidy",
+    "too_large",
+    "trustworthy",
+]
+
+STRAY_ROW = 2
+"""An outer row of so many corners or fewer, most of whose other corners should be in view too, is not of the board."""
+
+FRAME_CELLS = 0.5
+"""A corner predicted nearer than this to the frame may be missing for a good reason, in cells."""
+
+SHARED_PX = 2.0
+"""Corners of two lattices nearer than this are the same."""
+
+MAX_RELATIVE_SIGMA = 0.011
+"""Corners more uncertain than this, in cells, make no board: keys, letters, weave."""
+
+MAX_RESIDUAL = 0.25
+MAX_UNEXPLAINED, NOISE_LEVELS = 0.185, 10.0
+"""Largest typical residual of the edge model, relative to the contrast, and the part of it that noise (of so many grey
+levels) does not explain. Dots in rows have saddles between them, too, and show 0.2; boards 0.03 to 0.07 with motion,
+saturation or compression, 0.13 where a camera sharpens strongly, 0.175 in black and white without any grey."""
+
+MAX_LOST = 0.4
+"""Largest part of a lattice's corners that the sub-pixel fit may refuse: beside what covers a board there are many."""
+
+LARGE_SAMPLE, SAMPLE, RAGGED = 7, 5, 0.75
+"""Rows and columns by which a lattice of many corners is judged, or a smaller one that fills less than this part of its
+rows and columns."""
+
+FEWEST_ROWS = 3
+"""Rows and columns of the smallest board."""
+
+MAX_UNEVEN = 0.5
+"""Typical difference of neighbouring steps, relative to the shorter: boards show at most 0.35, near the rim of a strong
+fisheye; the crossings of a cloth's stripes 0.7."""
+
+STEPS_ACROSS, MOST_EDGES = 16, 256
+"""Between two corners the edge runs straight. It is looked for in so many steps across, of so many edges."""
+
+NEAR, MAX_DARK, MAX_BRIGHT = 0.12, 0.024, 0.036
+"""Halfway, in a stripe of NEAR to both sides, it lies aside by at most so much towards the bright or the dark squares,
+in squares: on 300 boards by 0.01 and 0.016. Lenses bend edges to the dark side as often as to the bright one."""
+
+WIDE, ALONG, MAX_SHIFT, MAX_BOW = 0.25, (0.2, 0.5, 0.8), 0.1, 0.04
+"""Ink that spreads, thin print, and light that saturates, shift edges by more, up to 0.08, but all along. They show in
+a wider stripe, into which markers in the squares reach, and in so many parts of their length. Rounded corners bow them
+by 0.01; threads shift by 0.15, dots by 0.08 to 0.2, and bow as much."""
+
+RARELY_BY_CHANCE, NEARLY_FULL, BY_CHANCE = 24, 0.9, 24
+"""A board of fewer corners than the first has most of those between them, or somewhere a full block in so many squares:
+codes and mosaics have such blocks, too, but hardly one in 2^23 places, and one crooked chain of 24 in 126 pages."""
+
+MAX_EXTRA = 2
+"""Rows and columns that may be too many, when a grid is larger than the board it may be."""
+
+WORSE = 1.5
+"""Corners of rows that do not belong to the board fit so many times worse."""
+
+
+def tidy(lattice: Lattice, size_px: tuple[int, int]) -> Lattice:
+    """Return `lattice` without stray outer rows, trimmed.
+
+    `size_px` is the (width, height) of the full-resolution image.
+    """
+    stray = stray_row(lattice, size_px)
+    while stray is not None:
+        lattice = lattice.without(stray).trimmed()
+        stray = stray_row(lattice, size_px)
+    return lattice
+
+
+def stray_row(lattice: Lattice, size_px: tuple[int, int]) -> BoolArray | None:
+    """Return the first outer row or column (as a mask) that has strayed into the lattice, None if there is none."""
+    known = lattice.known
+    if min(known.shape) < 3:
+        return None
+    for outer in ((0, slice(None)), (-1, slice(None)), (slice(None), 0), (slice(None), -1)):
+        have = int(np.count_nonzero(known[outer]))
+        if have > STRAY_ROW:
+            continue
+        row = np.zeros_like(known)
+        row[outer] = True
+        rest = lattice.without(row)
+        missing = row & ~known
+        shape = fit_cells(rest.pixels, missing, degree=2, radius=3, ridge=(0.02, 1.0))
+        side = np.abs(shape.along_column) + np.abs(shape.along_row)
+        margin = FRAME_CELLS * side
+        inside = (shape.pixels > margin) & (shape.pixels < np.array(size_px) - 1.0 - margin)
+        if have < int((inside.all(axis=1) & (shape.support >= 3)).sum()):
+            return row
+    return None
+
+
+def large(lattice: Lattice, least: int) -> bool:
+    """Return whether `lattice` has `least` corners and, if that is to be a board (9), three rows and three columns."""
+    return lattice.count >= least and min(lattice.size) >= (FEWEST_ROWS if least >= FEWEST_ROWS**2 else 2)
+
+
+def separate(lattices: Sequence[Lattice], least: int) -> list[Lattice]:
+    """Return those of `lattices` that are `large` enough and share no corners with a larger one."""
+    candidates = sorted((item for item in lattices if large(item, least)), key=lambda item: -item.count)
+    corners = [item.pixels[item.known] for item in candidates]
+    low = np.array([mine.min(axis=0) for mine in corners]) - SHARED_PX
+    high = np.array([mine.max(axis=0) for mine in corners])
+    kept: list[int] = []
+    for k, mine in enumerate(corners):
+        touching = ((low[:k] < high[k]) & (low[k] < high[:k])).all(axis=1)
+        if not any(_overlap(mine, corners[j]) for j in kept if touching[j]):
+            kept.append(k)
+    return [candidates[k] for k in kept]
+
+
+def _overlap(mine: FloatArray, theirs: FloatArray) -> bool:
+    """Return whether more than one of the corners `mine` (N, 2) is among `theirs` (M, 2)."""
+    return bool(np.count_nonzero(near_any(mine, theirs, SHARED_PX)) > 1)
+
+
+def sample_of(lattice: Lattice) -> Lattice | None:
+    """Return the fullest block of some rows and columns of a lattice that is large or ragged; None for others.
+
+    A page of dots makes thousands of corners, with many gaps: a look at a few tells that they are none.
+    """
+    known = lattice.known
+    many = lattice.count >= MANY
+    side = LARGE_SAMPLE if many else SAMPLE
+    if min(known.shape) < side or (not many and not side**2 <= lattice.count < RAGGED * known.size):
+        return None
+    full = sliding_window_view(known, (side, side)).sum(axis=(2, 3))
+    row, column = (int(at) for at in np.unravel_index(full.argmax(), full.shape))
+    return lattice.cut(slice(row, row + side), slice(column, column + side))
+
+
+def leans(lattice: Lattice, level: Level) -> bool:
+    """Return whether the edges of `lattice`, as `level` shows them, lie aside of the corners that they join, or bow."""
+    (shift,) = _shifts(lattice, level, NEAR, (0.5,))
+    if -MAX_DARK < shift < MAX_BRIGHT:
+        return False
+    start, middle, end = _shifts(lattice, level, WIDE, ALONG)
+    return not (abs(middle) < MAX_SHIFT and abs(middle - 0.5 * (start + end)) < MAX_BOW)
+
+
+def _shifts(lattice: Lattice, level: Level, reach: float, along: Sequence[float]) -> FloatArray:
+    """Return how far edges lie on the dark side of their corners' line, at parts `along` (K,) of it, in squares.
+
+    They are looked for in a stripe of `reach` squares to both sides.
+    """
+    library = native.loaded()
+    if library is not None:
+        seen = (level.smooth, level.scale, level.offset)
+        return native.shifts_of_edges(
+            library, lattice.pixels, lattice.rising, *seen, reach, along, STEPS_ACROSS, MOST_EDGES
+        )
+    pixels, signs = level.to_level(lattice.pixels), lattice.signs()
+    # The edges that squares start with, and how each square goes on from there: boards seen aslant are flat.
+    first, right, below, last = pixels[:-1, :-1], pixels[:-1, 1:], pixels[1:, :-1], pixels[1:, 1:]
+    edges = (
+        (first, right, 0.5 * (below + last - first - right), signs[:-1, :-1]),
+        (first, below, 0.5 * (right + last - first - below), signs[:-1, :-1]),
+    )
+    start, end, across, sign = (np.concatenate([e[k].reshape(-1, *e[k].shape[2:]) for e in edges]) for k in range(4))
+    there = np.flatnonzero(np.isfinite(across[:, 0]))
+    there = there[:: max(len(there) // MOST_EDGES, 1)]
+    start, chord, across = start[there], (end - start)[there], (reach * sign[there])[:, None] * across[there]
+    on_chord = start + np.array(along)[:, None, None] * chord
+    places = on_chord[:, None] + np.linspace(-1.0, 1.0, STEPS_ACROSS + 1)[:, None, None] * across
+    values = sample(level.smooth, places).sum(axis=2, dtype=np.float64)
+    # The mean of a step from dark to bright says where it is, however sharp it is.
+    dark, bright = values[:, 0], values[:, -1]
+    mean = (values.sum(axis=1) - 0.5 * (dark + bright)) / STEPS_ACROSS
+    return np.asarray(2.0 * reach * (mean - 0.5 * (dark + bright)) / np.maximum(bright - dark, 1e-9))
+
+
+def compact(lattice: Lattice, size_px: tuple[int, int]) -> bool:
+    """Return whether `lattice` is large, nearly full, or has a full block as large as chance does not make.
+
+    Squares of random brightness that happen to alternate make crooked chains of corners; what covers a board, or the
+    frame of the image (`size_px` is its width and height), leaves blocks.
+    """
+    known = lattice.known
+    if lattice.count >= RARELY_BY_CHANCE or known.mean() >= NEARLY_FULL:
+        return True
+    missing = fit_cells(lattice.pixels, ~known, degree=1)
+    full = known.copy()
+    full[~known] = ((missing.pixels < 0.0) | (missing.pixels > np.array(size_px) - 1.0)).any(axis=1)
+    rows, columns = full.shape
+    for high in range(2, rows + 1):
+        wide = max(2, -(-BY_CHANCE // (high + 1)) - 1)
+        if wide <= columns and sliding_window_view(full, (high, wide)).all(axis=(2, 3)).any():
+            return True
+    return False
+
+
+def trustworthy(refined: RefinedLattice, before: int, least: int) -> bool:
+    """Return whether what the fit left of a lattice of `before` corners is a board."""
+    lattice = refined.lattice
+    if lattice.count < max(least, (1.0 - MAX_LOST) * before) or min(lattice.size) < FEWEST_ROWS:
+        return False
+    known = lattice.known
+    relative = refined.residual[known] / lattice.contrast[known]
+    unexplained = relative**2 - (NOISE_LEVELS / lattice.contrast[known]) ** 2
+    if upper_median(relative) > MAX_RESIDUAL or upper_median(unexplained) > MAX_UNEXPLAINED**2:
+        return False
+    if _uneven(lattice):
+        return False
+    shape = fit_cells(lattice.pixels, known, degree=1)
+    in_cells = refined.worst_sigma_px[known] / np.sqrt(np.maximum(shape.areas(), 1e-6))
+    return upper_median(in_cells) < MAX_RELATIVE_SIGMA
+
+
+def _uneven(lattice: Lattice) -> bool:
+    """Return whether rows and columns follow each other at steps as different as no lens and no view makes them."""
+    return any(line.every > MAX_UNEVEN for line in unevenness(lattice.pixels))
+
+
+def too_large(lattice: Lattice, sizes: Sequence[tuple[int, int]]) -> bool:
+    """Return whether `lattice` is larger than all of the known `sizes` by more than stray rows; False for none."""
+    short, long = sorted(lattice.size)
+    return bool(sizes) and all(short > min(size) + MAX_EXTRA or long > max(size) + MAX_EXTRA for size in sizes)
+
+
+def known_part(refined: RefinedLattice, sizes: Sequence[tuple[int, int]]) -> RefinedLattice:
+    """Return the part of a grid that is a board of a known size, where what sticks out clearly is none of it.
+
+    The outer border of a board, or what lies beside it, sometimes passes for a row of corners: few of them, or corners
+    that fit badly. A grid of a known size, or one whose extra rows are as good as the others, comes back as it is.
+    """
+    rows, columns = refined.lattice.known.shape
+    both = {(r, c) for c, r in sizes} | {(c, r) for c, r in sizes}
+    if (rows, columns) in both or not both:
+        return refined
+    relative = refined.residual / np.where(refined.lattice.known, refined.lattice.contrast, 1.0)
+    best: tuple[int, float, RefinedLattice] | None = None
+    for r, c in both:
+        if r > rows or c > columns or rows - r + columns - c > MAX_EXTRA:
+            continue
+        for top in range(rows - r + 1):
+            for left in range(columns - c + 1):
+                part = (slice(top, top + r), slice(left, left + c))
+                inside = np.zeros((rows, columns), bool)
+                inside[part] = True
+                if not _sticks_out(refined.lattice.known, relative, inside):
+                    continue
+                rank = (int(refined.lattice.known[part].sum()), -float(np.nanmedian(relative[part])))
+                if best is None or rank > best[:2]:
+                    best = (*rank, refined.cut(*part))
+    return refined if best is None else best[2]
+
+
+def _sticks_out(known: BoolArray, relative: np.ndarray, inside: BoolArray) -> bool:
+    """Return whether the corners outside `inside` are few or fit badly, and those inside are nearly all there."""
+    outside = ~inside
+    if known[inside].mean() < 0.9:
+        return False
+    few = known[outside].mean() < 0.5
+    return bool(few or np.nanmedian(relative[outside & known]) > WORSE * np.nanmedian(relative[inside & known]))

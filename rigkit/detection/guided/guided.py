@@ -1,0 +1,324 @@
+"""A second look at boards that are known: where corners are still missing, and where all of them are exactly.
+
+A board of known size says which corners there should be, a calibrated camera where (from the board's pose), and how the
+lines through them run and bend; without a camera the corners around say so. The edge model is fitted there; what it
+finds counts by the same evidence as any corner: contrast of the right sign, a residual like that of its neighbours, and
+a place where the prediction has it. What something covers stays missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
+from rigkit.detection.guided.board_guide import FEWEST, UNSOUND, BoardState, Guide
+from rigkit.detection.lattice.local_fit import LocalFit, fit_cells
+from rigkit.detection.saddles.response import GreyImage, grey_image
+from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
+from rigkit.detection.subpixel.edge_model import NEAR_PX, NEAR_SIGMAS, Geometry, ends_of
+from rigkit.detection.subpixel.scatter import UNEXPLAINED
+
+__all__ = ["complete_boards", "fit_corners"]
+
+RADIUS_PX, STEPS = 18.0, 8
+"""Radius of the window and Gauss-Newton steps, as in the last pass of `rigkit.detection.subpixel.subpixel`."""
+
+FIRST_BLUR = 1.0
+"""s that the first fit of the corners found starts from, px."""
+
+WIDE_BLUR_CELLS = 0.05
+"""A missing corner is first sought with edges so wide, in sides of the cell: they reach as far as predictions err."""
+
+MARKER_BLURS = 2.0
+"""The edges of a ChArUco board's markers reach so many s towards the corners."""
+
+ROUNDS = 40
+"""Rounds of adding at most, without a camera one ring of corners each: more than any board has rows or columns."""
+
+LEAST_SIDE_PX = 4.0
+"""Corners of smaller cells are not told from noise."""
+
+MARGIN_PX = 1.5
+"""Corners nearer to the frame have no pixels on all sides."""
+
+MOVED_CELLS = 0.12
+MOVED_FACTOR = 8.0
+MOVED_PX = 0.3
+"""How far a corner may lie from its prediction: in sides of its cell; where a camera predicts, also times what the
+found corners lie off theirs, but this many px in any case."""
+
+ASTRAY_FACTOR = 5.0
+"""A corner that lies off where the camera and the corners around have it by more than this, times what is usual and its
+own standard deviation together, is covered in part."""
+
+FLOOR_PX = 0.01
+"""No camera and no printed board is truer than this."""
+
+MEDIAN_OF_RAYLEIGH = 1.1774
+"""Median distance from the mean of a normal point in the plane, in standard deviations per axis."""
+
+LEAST_CONTRAST = 0.15
+"""Contrast relative to the found corners' around: a glint takes most of it, but not all."""
+
+MOST_RESIDUAL, MOST_RESIDUAL_ALONE = 1.6, 1.3
+"""Residual in grey levels relative to that of the found corners, with and without a camera that says where the corner
+is: pixels of another thing raise it."""
+
+MOST_RESIDUAL_MARKED = 3.0
+"""The same on ChArUco boards, where what the windows see of the markers differs from corner to corner."""
+
+MOST_SIGMA_CELLS = 0.03
+"""Largest predicted standard deviation, in sides of the cell."""
+
+
+def complete_boards(
+    image: NDArray[np.generic],
+    detections: Sequence[BoardDetection],
+    boards: Sequence[Board],
+    camera: Camera | None = None,
+) -> tuple[BoardDetection, ...]:
+    """Return `detections` with the corners added that were missed, in the same order.
+
+    Parameters
+    ----------
+    image : what the detections were found in; as for `rigkit.detect_boards`.
+    detections : of these, boards of a listed size are completed; others come back as they are.
+    boards : the boards that may be in the image.
+    camera : the calibrated camera, if known. It predicts corners far from those found, and all corners are fitted anew
+        with windows and lines as it sees them; corners that contradict it are dropped. Where no pose of the board
+        explains the corners found, it is left aside.
+
+    Raises
+    ------
+    InputError
+        `image` is not an image of a supported type.
+    """
+    grey = grey_image(image)
+    out = []
+    for found in detections:
+        board = _board_of(found, boards)
+        worth = board is not None and len(found.grid) >= FEWEST
+        worth &= camera is not None or not found.complete
+        out.append(_completed(grey, found, board, camera) if worth and board is not None else found)
+    return tuple(out)
+
+
+def _board_of(found: BoardDetection, boards: Sequence[Board]) -> Board | None:
+    """Return a board of the detection's grid, the one it names if it names one."""
+    fitting = [b for b in boards if b.size == (found.columns, found.rows)]
+    named = [b for b in fitting if b.board_id == found.board_id]
+    return next(iter(named or [b for b in fitting if b.markers is None]), None)
+
+
+def fit_corners(
+    image: GreyImage,
+    board: Board,
+    cells: BoolArray,
+    shape: LocalFit,
+    start: FloatArray,
+    signs: FloatArray,
+    blur: FloatArray | float,
+) -> EdgeFit:
+    """Fit the edge model to the M `cells` (R, C) of `board` from `start` (M, 2); `shape` is theirs.
+
+    `signs` (M,) as `Lattice.signs`; `blur` is the s expected. Windows end before the markers of a ChArUco board.
+    """
+    sides = shape.sides
+    geometry = Geometry(sides, shape.curvature(), shape.gaps(), ends_of(np.ones_like(cells), cells))
+    width = _short_of_markers(board, sides, np.broadcast_to(np.asarray(blur, dtype=np.float64), (len(start),)))
+    # What markers leave in the windows is no noise, but makes the corners uncertain all the same.
+    plain = board.markers is None
+    return fit_edges(image, start, geometry, signs, width, radius_px=RADIUS_PX, iterations=STEPS, mirrored=plain)
+
+
+def _short_of_markers(board: Board, sides: FloatArray, blur: FloatArray) -> FloatArray:
+    """Return the s (M,) to start from, so small that the windows, a few s to either side of a line, are narrow."""
+    if board.markers is not None:
+        squares = np.array([board.square_x_mm, board.square_y_mm])
+        gap = (0.5 * (1.0 - board.markers.side_mm / squares) * np.linalg.norm(sides, axis=2)).min(axis=1)
+        blur = np.minimum(blur, (gap - MARKER_BLURS * blur - NEAR_PX) / NEAR_SIGMAS)
+    return np.clip(blur, *BLUR_RANGE)
+
+
+def _completed(image: GreyImage, found: BoardDetection, board: Board, camera: Camera | None) -> BoardDetection:
+    opened = _opened(image, found, board)
+    if opened is None:
+        return found
+    state = opened
+    guide = Guide.of(board, camera, state)
+    if guide.camera is not None:
+        state = _unanimous(guide, _again(image, guide, state))
+    before = state
+    for _ in range(ROUNDS):
+        guide = guide.by(state)
+        more = _added(image, guide, state)
+        if more is None:
+            break
+        state = more
+    if guide.camera is None:
+        return found if state is before else _with_added(guide, found, opened, state)
+    if state is not before:
+        state = _unanimous(guide, _again(image, guide, state))
+    state = state.without(~np.isfinite(state.sigma_px))
+    row, column = np.nonzero(state.known)
+    if len(row) < FEWEST:
+        return found
+    # Noise that cancels from pixel to pixel lets sigmas be smaller; where they must be larger, the scatter shows it.
+    state = replace(state, sigma_px=min(1.0, _known_factor(found, opened)) * state.sigma_px)
+    sigma = _scatter(guide, state) * state.sigma_px[row, column]
+    return replace(found, grid=np.stack([column, row], axis=-1), pixels=state.pixels[row, column], sigma_px=sigma)
+
+
+def _with_added(guide: Guide, found: BoardDetection, opened: BoardState, state: BoardState) -> BoardDetection:
+    """Return `found` with those corners of `state` that it has not, but for any that contradict the others."""
+    added = state.known & ~opened.known & (_contradiction(guide, state, state) <= 1.0)
+    sigma = _known_factor(found, opened) * state.sigma_px
+    row, column = np.nonzero(added)
+    grid = np.concatenate([found.grid, np.stack([column, row], axis=-1)])
+    order = np.lexsort((grid[:, 0], grid[:, 1]))
+    return replace(
+        found,
+        grid=grid[order],
+        pixels=np.concatenate([found.pixels, state.pixels[row, column]])[order],
+        sigma_px=np.concatenate([found.sigma_px, sigma[row, column]])[order],
+    )
+
+
+def _known_factor(found: BoardDetection, opened: BoardState) -> float:
+    """Return the factor that the detector, which saw scatter and noise of the board as a whole, gave its sigmas."""
+    return float(np.nanmedian(found.sigma_px / opened.sigma_px[found.grid[:, 1], found.grid[:, 0]]))
+
+
+def _scatter(guide: Guide, state: BoardState) -> float:
+    """Return how much more the corners scatter about where camera and neighbours have them than their sigmas say."""
+    cells = state.known
+    shape, seen = guide.at(state, cells)
+    if not seen.any():
+        return 1.0
+    off = np.linalg.norm(state.pixels[cells] - shape.pixels, axis=1)
+    ratio = float(np.median((off / (state.sigma_px[cells] * shape.gain))[seen])) / MEDIAN_OF_RAYLEIGH
+    return ratio if ratio > UNEXPLAINED else 1.0
+
+
+def _opened(image: GreyImage, found: BoardDetection, board: Board) -> BoardState | None:
+    """Return what the fit says of the corners found; None where they do not alternate like a chessboard's."""
+    shape = (found.rows, found.columns)
+    empty = np.full(shape, np.nan)
+    signs = np.where(np.add.outer(np.arange(shape[0]), np.arange(shape[1])) % 2 == 1, -1.0, 1.0)
+    state = BoardState(found.lattice(), empty, empty, empty, empty, signs)
+    cells = state.known
+    if not (cells.any(axis=0).sum() >= 3 and cells.any(axis=1).sum() >= 3):
+        return None
+    local = fit_cells(state.pixels, cells)
+    fit = fit_corners(image, board, cells, local, state.pixels[cells], signs[cells], FIRST_BLUR)
+    if np.median(fit.contrast) < 0.0:
+        state = replace(state, signs=-signs)
+    # Once more: the fit ends when the corner stands still, and its residual means something only with the right blur.
+    blur = float(np.median(fit.blur))
+    fit = fit_corners(image, board, cells, local, state.pixels[cells], state.signs[cells], blur)
+    good = fit.valid & (fit.contrast > 0.0)
+    if good.sum() < FEWEST:
+        return None
+    # The corners stay where the detector has put them: only what the fit says of them is taken.
+    opened = state.with_fit(cells, fit, good)
+    return replace(opened, pixels=state.pixels)
+
+
+def _added(image: GreyImage, guide: Guide, state: BoardState) -> BoardState | None:
+    """Return the state with those missing corners that can be added now, None where there are none."""
+    missing = ~state.known
+    if not missing.any():
+        return None
+    shape, predicted = guide.at(state, missing)
+    side = np.minimum(np.linalg.norm(shape.along_column, axis=1), np.linalg.norm(shape.along_row, axis=1))
+    height, width = image.shape
+    with np.errstate(invalid="ignore"):
+        inside = (shape.pixels > MARGIN_PX) & (shape.pixels < np.array([width, height]) - 1.0 - MARGIN_PX)
+        usable = predicted & inside.all(axis=1) & (side > LEAST_SIDE_PX)
+        usable &= shape.areas() > 0.25 * side**2
+    if not usable.any():
+        return None
+    cells = missing.copy()
+    cells[missing] = usable
+    shape = _of(shape, usable)
+    side = side[usable]
+    blur = float(np.nanmedian(state.blur))
+    signs = state.signs[cells]
+    wide = np.maximum(blur, WIDE_BLUR_CELLS * side)
+    rough = fit_corners(image, guide.board, cells, shape, shape.pixels, signs, wide)
+    start = np.where(rough.valid[:, None], rough.pixels, shape.pixels)
+    fit = fit_corners(image, guide.board, cells, shape, start, signs, blur)
+    good = _confirmed(guide, state, shape, side, fit)
+    return state.with_fit(cells, fit, good) if good.any() else None
+
+
+def _of(shape: LocalFit, keep: BoolArray) -> LocalFit:
+    return LocalFit(*(getattr(shape, name)[keep] for name in LocalFit.__slots__))
+
+
+def _confirmed(guide: Guide, state: BoardState, shape: LocalFit, side: FloatArray, fit: EdgeFit) -> BoolArray:
+    """Return which of the corners fitted at cells of `shape` are what was predicted there."""
+    known = state.known
+    moved = np.linalg.norm(fit.pixels - shape.pixels, axis=1)
+    limit = MOVED_CELLS * side
+    if guide.camera is not None:
+        usual = float(np.median(np.linalg.norm(state.pixels[known] - guide.at(state, known)[0].pixels, axis=1)))
+        limit = np.minimum(limit, np.maximum(MOVED_FACTOR * usual * shape.gain, MOVED_PX))
+    contrast, residual = float(np.nanmedian(state.contrast)), float(np.nanmedian(state.residual))
+    good = fit.valid & (moved < limit) & (fit.contrast > LEAST_CONTRAST * contrast)
+    # Noise is the same at any contrast; what the model gets wrong grows with it.
+    most = MOST_RESIDUAL if guide.camera is not None else MOST_RESIDUAL_ALONE
+    most = most if guide.board.markers is None else MOST_RESIDUAL_MARKED
+    good &= fit.residual < most * residual * np.maximum(1.0, fit.contrast / contrast)
+    good &= fit.sigma_px < MOST_SIGMA_CELLS * side
+    return np.asarray(good)
+
+
+def _again(image: GreyImage, guide: Guide, state: BoardState) -> BoardState:
+    """Return the state with every corner fitted anew as the camera sees it."""
+    cells = state.known.copy()
+    shape, seen = guide.at(state, cells)
+    # At the end of a lens model's field a corner may be seen but not the half squares around it: it stays as it is.
+    cells[cells] = seen
+    if not seen.any():
+        return state
+    blur = float(np.nanmedian(state.blur))
+    fit = fit_corners(image, guide.board, cells, _of(shape, seen), state.pixels[cells], state.signs[cells], blur)
+    return state.with_fit(cells, fit, fit.valid & (fit.contrast > 0.0))
+
+
+def _unanimous(guide: Guide, state: BoardState) -> BoardState:
+    """Return the state without the corners that contradict the camera and the corners around them.
+
+    Those that contradict the most go first: they may be all that speaks against their neighbours.
+    """
+    rest = state
+    for _ in range(ROUNDS):
+        share = _contradiction(guide, rest, rest)
+        astray = (share > 1.0) & (share >= cv2.dilate(share, np.ones((5, 5))))
+        if not astray.any():
+            break
+        rest = rest.without(astray)
+        guide = guide.by(rest)
+    return state.without(_contradiction(guide, state, rest) > 1.0)
+
+
+def _contradiction(guide: Guide, state: BoardState, judges: BoardState) -> FloatArray:
+    """Return (R, C) how far each corner of `state` lies off where `judges` have it, 1 at most allowed; 0 for none."""
+    cells, own = state.known, judges.known
+    off = np.zeros(cells.shape)
+    shape, _ = guide.at(judges, cells)
+    # Where the lens model ends nothing is said.
+    off[cells] = np.nan_to_num(np.linalg.norm(state.pixels[cells] - shape.pixels, axis=1) / np.maximum(shape.gain, 1.0))
+    usual = max(float(np.median(off[own])), FLOOR_PX) if own.any() else FLOOR_PX
+    sigma = np.minimum(np.where(cells, state.sigma_px, 1.0), UNSOUND * state.usual_sigma)
+    allowed = ASTRAY_FACTOR * np.hypot(usual, sigma)
+    return np.where(cells, off / allowed, 0.0)

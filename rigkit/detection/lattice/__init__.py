@@ -1,0 +1,1 @@
+"""From loose corners to grids: links, growth, where a grid splits."""

@@ -1,0 +1,352 @@
+"""Where one lattice is really several boards, and where several lattices are really one board.
+
+Boards whose squares meet at a seam grow together into one lattice that folds there: it is cut. A ruler across a board
+cuts its lattice in two that continue each other: they are joined.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.detection.lattice.lattice import Lattice, margins
+from rigkit.detection.lattice.local_fit import fit_cells
+from rigkit.detection.lattice.spacing import Unevenness, unevenness
+
+__all__ = ["join_parts", "split_folds", "split_necks"]
+
+FOLD = 0.16
+FOLD_FACTOR = 3.5
+"""A lattice folds at a row or column where neighbouring steps differ by more than this (relative to the step), and by
+more than this factor times what is typical of it: perspective and fisheyes bend everywhere, a seam bends once."""
+
+LEAST_FOR_FOLD = 5
+"""Columns or rows needed to say what is typical."""
+
+LEAST_ROWS = 4
+"""Rows that must fold at a column."""
+
+CONTINUES_CELLS = 0.1
+"""A column that goes on smoothly lies this near to where the others say, in cells."""
+
+GAP, SLANTED = 2, 3
+"""Parts of one board are at most so many steps apart along a row or column, or along both where so many corners see one
+of the other part: separate boards have their outer squares and margins between, or touch at a corner."""
+
+FAR_GAP, FAR_MEETS_CELLS, FAR_OUT, FAR_FACING = 3, 0.1, 24, 2
+"""A step more if so many corners of the other part, and not only the nearest, are where they should be, and if two see
+one of the first along their row or column."""
+
+DIAGONAL, REACH = 1.5, 3.3
+"""A diagonal step is so many times as long as a side, and a little more; the nearest corners of parts a step further
+apart are so many sides apart, at most."""
+
+NEAREST_IN, NEAREST_OUT = 16, 6
+"""Corners of the one part that carry its rows over, and of the other that must meet them."""
+
+ALIKE = 0.5
+"""Sides of neighbouring cells across the gap differ less than this, relative to the longer side."""
+
+MEETS_CELLS, MEETS_AT_ALL = 0.15, 0.42
+"""Corners of the other part lie this near to where a homography of the one says, in cells; within the larger of the
+two, a lens may have bent the rows, and the parts are asked what lies between them."""
+
+AGREES_CELLS, BETWEEN = 0.12, 8
+"""So far apart is what the two parts say of the cells between them, in cells, for the cells that both know best."""
+
+LOOSE_CELLS, MAX_GAIN = 0.08, 8.0
+"""A corner that hangs on to a lattice is this near to where the others say, in cells for a prediction as good as a
+corner itself, and by a prediction whose standard deviation is at most so many times that of a corner."""
+
+
+def split_folds(lattice: Lattice) -> list[Lattice]:
+    """Return the parts of `lattice` between its folds; the corners on a fold belong to no board."""
+    columns, rows = lattice.size
+    along_rows, along_columns = unevenness(lattice.pixels)
+    at = _fold(rows, along_rows)
+    if at is not None:
+        return [part for half in _halves(lattice, at) for part in split_folds(half)]
+    at = _fold(columns, along_columns)
+    if at is not None:
+        # A quarter turn makes the row into a column, counted from the other end.
+        halves = _halves(lattice.turned(1), rows - 1 - at)
+        return [part.turned(3) for half in halves for part in split_folds(half)]
+    return [lattice]
+
+
+def _halves(lattice: Lattice, at: int) -> tuple[Lattice, Lattice]:
+    """Return what lies on either side of the column `at`, which goes with the one side whose rows it continues.
+
+    A column on the seam itself continues both, and is dropped.
+    """
+    columns, rows = lattice.size
+    every = slice(0, rows)
+    continues = [_continues(lattice, part, at) for part in (slice(0, at), slice(at + 1, columns))]
+    left = at + 1 if continues == [True, False] else at
+    right = at if continues == [False, True] else at + 1
+    return lattice.cut(every, slice(0, left)), lattice.cut(every, slice(right, columns))
+
+
+def _continues(lattice: Lattice, part: slice, at: int) -> bool:
+    """Return whether the corners of column `at` are where the columns `part` say."""
+    pixels = np.full(lattice.pixels.shape, np.nan)
+    pixels[:, part] = lattice.pixels[:, part]
+    cells = np.zeros(lattice.known.shape, bool)
+    cells[:, at] = lattice.known[:, at]
+    shape = fit_cells(pixels, cells, degree=2, ridge=(0.02, 1.0))
+    side = np.minimum(np.linalg.norm(shape.along_column, axis=1), np.linalg.norm(shape.along_row, axis=1))
+    off = np.linalg.norm(shape.pixels - lattice.pixels[cells], axis=1)
+    return bool(np.median(off / np.maximum(side, 1e-9)) < CONTINUES_CELLS)
+
+
+def split_necks(lattice: Lattice) -> list[Lattice]:
+    """Return the boards in `lattice`, without corners that are not where the others say.
+
+    Boards that touch at an odd angle hang together by a few corners that are none. So the broad parts of a lattice, of
+    nine corners in a square, belong together if they continue each other; the corners between them go to the part that
+    foretells them.
+    """
+    known = lattice.known
+    if known.all() and min(known.shape) >= 2:
+        return [lattice]
+    groups: list[BoolArray] = []
+    for broad in _broad_parts(known):
+        part = _Part.of(lattice.without(~broad))
+        for number, group in enumerate(groups):
+            if _same_board(_Part.of(lattice.without(~group)), part):
+                groups[number] = group | broad
+                break
+        else:
+            groups.append(broad)
+    _absorb(lattice, groups)
+    return [lattice.without(~group).trimmed() for group in groups]
+
+
+def _broad_parts(known: BoolArray) -> list[BoolArray]:
+    """Return the parts of `known` (R, C) that squares of nine corners (or else of four) make up, the largest first."""
+    for side in (3, 2):
+        square = np.ones((side, side), np.uint8)
+        fits = cv2.erode(known.astype(np.uint8), square, anchor=(0, 0), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+        squares = cv2.dilate(fits, square, anchor=(side - 1, side - 1))
+        count, label, stats, _ = cv2.connectedComponentsWithStats(squares, connectivity=4)
+        if count > 1:
+            order = 1 + np.argsort(-stats[1:, cv2.CC_STAT_AREA], kind="stable")
+            return [label == number for number in order]
+    return []
+
+
+def _same_board(one: _Part, two: _Part) -> bool:
+    """Return whether two parts of one lattice continue each other."""
+    near, place = _carried_over(one, two, _squared_gaps(one, two))
+    off = float(np.abs(place - two.grid[near])[:NEAREST_OUT].max())
+    if not MEETS_CELLS <= off < MEETS_AT_ALL:
+        return off < MEETS_CELLS
+    pixels = np.where(one.lattice.known[..., None], one.lattice.pixels, two.lattice.pixels)
+    return _agree(pixels, one.lattice.known, two.lattice.known)
+
+
+def _absorb(lattice: Lattice, groups: list[BoolArray]) -> None:
+    """Add the other corners of `lattice`, ring by ring, to those of the `groups` (IN PLACE) that foretell them."""
+    loose = lattice.known & ~np.any(groups, axis=0) if groups else np.zeros_like(lattice.known)
+    while loose.any():
+        off = np.full((len(groups), *loose.shape), np.inf)
+        for number, group in enumerate(groups):
+            fit = fit_cells(lattice.without(~group).pixels, loose, degree=2, width=1.3, ridge=(0.02, 1.0))
+            side = np.minimum(np.hypot(*fit.along_column.T), np.hypot(*fit.along_row.T))
+            distance = np.hypot(*(fit.pixels - lattice.pixels[loose]).T)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                cells = distance / (side * np.hypot(1.0, fit.gain))
+            off[number][loose] = np.where((fit.support >= 3) & (fit.gain < MAX_GAIN), cells, np.inf)
+        best = off.argmin(axis=0)
+        added = loose & (off.min(axis=0) < LOOSE_CELLS)
+        if not added.any():
+            break
+        for number, group in enumerate(groups):
+            groups[number] = group | (added & (best == number))
+        loose &= ~added
+
+
+def _fold(rows: int, uneven: Unevenness) -> int | None:
+    """Return the column at which so many rows, as `uneven` as that, fold; None if they do not."""
+    least = max(LEAST_ROWS, 0.4 * rows)
+    steps = enumerate(zip(uneven.typical, uneven.seen, strict=True), start=1)
+    judged = [(bend, -column) for column, (bend, count) in steps if count >= least]
+    if len(judged) < LEAST_FOR_FOLD - 2:
+        return None
+    *others, (sharpest, column) = sorted(judged)
+    middle = 0.5 * (others[(len(others) - 1) // 2][0] + others[len(others) // 2][0])
+    return -column if sharpest > max(FOLD, FOLD_FACTOR * middle) else None
+
+
+def join_parts(lattices: Sequence[Lattice]) -> list[Lattice]:
+    """Return `lattices` with those joined that continue each other's rows and columns across a short gap."""
+    parts = [_Part.of(item) for item in sorted(lattices, key=lambda item: -item.count) if item.count >= 6]
+    done = False
+    while not done:
+        done = True
+        for i, j in _near(parts):
+            joined = _joined(parts[i], parts[j])
+            if joined is not None:
+                parts = [_Part.of(joined), *(item for k, item in enumerate(parts) if k not in (i, j))]
+                done = False
+                break
+    return [part.lattice for part in parts]
+
+
+_Cell = Sequence[Sequence[float]]
+"""The sides of a cell along its row and its column, (u, v) px each."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """A lattice with its corners (N, 2), their (column, row), bounding box, and longest side of a cell."""
+
+    lattice: Lattice
+    pixels: FloatArray
+    grid: IntArray
+    low: FloatArray
+    high: FloatArray
+    side_px: float
+
+    @classmethod
+    def of(cls, lattice: Lattice) -> _Part:
+        row, column = np.nonzero(lattice.known)
+        pixels = lattice.pixels[row, column]
+        steps = (lattice.pixels[:, 1:] - lattice.pixels[:, :-1], lattice.pixels[1:] - lattice.pixels[:-1])
+        longest = (np.fmax.reduce(s[..., 0] ** 2 + s[..., 1] ** 2, axis=None, initial=0.0) for s in steps)
+        side = math.sqrt(max(longest))
+        grid = np.stack([column, row], axis=-1)
+        return cls(lattice, pixels, grid, pixels.min(axis=0), pixels.max(axis=0), side)
+
+    @cached_property
+    def cells(self) -> FloatArray:
+        """(N, 2, 2) sides of the cells at the corners."""
+        return fit_cells(self.lattice.pixels, self.lattice.known, degree=1).sides
+
+
+def _near(parts: Sequence[_Part]) -> list[tuple[int, int]]:
+    """Return the pairs whose bounding boxes come within FAR_GAP sides of a cell of the first, at its largest."""
+    if len(parts) < 2:
+        return []
+    low, high = np.array([item.low for item in parts]), np.array([item.high for item in parts])
+    gap = (np.maximum(low[:, None], low) - np.minimum(high[:, None], high)).max(axis=2)
+    near = np.triu(gap < FAR_GAP * np.array([[item.side_px] for item in parts]), 1)
+    return [(int(i), int(j)) for i, j in np.argwhere(near)]
+
+
+def _joined(one: _Part, two: _Part) -> Lattice | None:
+    """Return both lattices in one, None if `two` does not continue `one`."""
+    squared = _squared_gaps(one, two)
+    nearest = divmod(int(squared.argmin()), len(two.pixels))
+    apart = math.sqrt(squared[nearest])
+    cell = one.cells[nearest[0]].tolist()
+    longest = max(math.hypot(*side) for side in cell)
+    if not apart < REACH * longest or not _alike(cell, two.cells[nearest[1]].tolist()):
+        return None
+    near, place = _carried_over(one, two, squared)
+    whole = np.rint(place)
+    far_off = float(np.abs(place - whole).max())
+    near, place, whole = near[:NEAREST_OUT], place[:NEAREST_OUT], whole[:NEAREST_OUT]
+    off = float(np.abs(place - whole).max())
+    if not off < MEETS_AT_ALL:
+        return None
+    for quarter in range(4):
+        shift = whole.astype(np.int64) - _turned_grid(two.grid[near], two.lattice.size, quarter)
+        if (shift == shift[0]).all():
+            close = apart < DIAGONAL * GAP * longest
+            far = far_off < FAR_MEETS_CELLS
+            united = _united(one.lattice, two.lattice.turned(quarter), shift[0], close, far)
+            if united is None or off < MEETS_CELLS:
+                return united
+            left, top = np.maximum(0, -shift[0])
+            mine = np.zeros(united.known.shape, bool)
+            mine[top : top + one.lattice.size[1], left : left + one.lattice.size[0]] = one.lattice.known
+            return united if _agree(united.pixels, mine, united.known & ~mine) else None
+    return None
+
+
+def _agree(pixels: FloatArray, one: BoolArray, two: BoolArray) -> bool:
+    """Return whether two parts of the corners `pixels` (R, C, 2) say the same of the cells between them.
+
+    Each goes on as a smooth surface to half way, whatever the lens: the stiffer one bears corners that the ruler covers
+    in part, the more pliant one rows that bend strongly.
+    """
+    reach = np.ones((2 * GAP + 1, 2 * GAP + 1), np.uint8)
+    between = (cv2.dilate(one.astype(np.uint8), reach) > 0) & (cv2.dilate(two.astype(np.uint8), reach) > 0)
+    for degree, ridge in ((2, (0.02, 1.0)), (3, (1e-3, 1e-2))):
+        mine, theirs = (
+            fit_cells(np.where(part[..., None], pixels, np.nan), between, degree=degree, width=1.3, ridge=ridge)
+            for part in (one, two)
+        )
+        gain = np.where((mine.support > 3) & (theirs.support > 3), np.maximum(mine.gain, theirs.gain), np.inf)
+        best = np.argsort(gain)[: min(BETWEEN, int(np.isfinite(gain).sum()))]
+        side = np.minimum(np.hypot(*mine.along_column[best].T), np.hypot(*mine.along_row[best].T))
+        apart = np.hypot(*(mine.pixels - theirs.pixels)[best].T) / np.maximum(side, 1e-9)
+        if len(best) and np.median(apart) < AGREES_CELLS:
+            return True
+    return False
+
+
+def _squared_gaps(one: _Part, two: _Part) -> FloatArray:
+    """Return the squared distances between the corners, (N, M)."""
+    across, down = (one.pixels[:, k, None] - two.pixels[:, k] for k in (0, 1))
+    across *= across
+    down *= down
+    across += down
+    return across
+
+
+def _carried_over(one: _Part, two: _Part, squared: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Return the FAR_OUT nearest corners of `two` and their (column, row) as the NEAREST_IN of `one` say, or infinity.
+
+    `squared` (N, M) are the `_squared_gaps`.
+    """
+    near2 = np.argsort(squared.min(axis=0), kind="stable")[:FAR_OUT]
+    near1 = np.argsort(squared[:, near2[:NEAREST_OUT]].min(axis=1), kind="stable")[:NEAREST_IN]
+    grid_from_pixel = None
+    if not (one.grid[near1] == one.grid[near1[0]]).all(axis=0).any():
+        grid_from_pixel, _ = cv2.findHomography(one.pixels[near1], one.grid[near1].astype(np.float64), 0)
+    if grid_from_pixel is None:
+        return near2, np.full((len(near2), 2), np.inf)
+    return near2, cv2.perspectiveTransform(two.pixels[near2][None], grid_from_pixel)[0]
+
+
+def _alike(one: _Cell, two: _Cell) -> bool:
+    """Return whether the cell `two` is much the same as `one` after some quarter turn."""
+    most = ALIKE * max(abs(x) for side in one for x in side)
+    (u1, v1), (u2, v2) = two
+    for _ in range(4):
+        if all(abs(x - y) < most for x, y in zip((*one[0], *one[1]), (u1, v1, u2, v2), strict=True)):
+            return True
+        u1, v1, u2, v2 = u2, v2, -u1, -v1
+    return False
+
+
+def _turned_grid(grid: IntArray, size: tuple[int, int], quarter_turns: int) -> IntArray:
+    columns, rows = size
+    for _ in range(quarter_turns):
+        grid = np.stack([rows - 1 - grid[:, 1], grid[:, 0]], axis=1)
+        columns, rows = rows, columns
+    return grid
+
+
+def _facing(one: Lattice, two: Lattice, steps: int, shape: int = cv2.MORPH_CROSS) -> int:
+    """Return how many corners of `two` have one of `one` at most so many steps along row or column (or both)."""
+    reach = cv2.getStructuringElement(shape, (2 * steps + 1, 2 * steps + 1))
+    return int(np.count_nonzero((cv2.dilate(one.known.astype(np.uint8), reach) > 0) & two.known))
+
+
+def _united(one: Lattice, two: Lattice, shift: IntArray, near: bool, far: bool) -> Lattice | None:
+    """Return `two`, moved by `shift` (columns, rows), put into `one`; None if they overlap, differ or are far apart."""
+    first, second = (item.padded(*m) for item, m in zip((one, two), margins(one.size, two.size, shift), strict=True))
+    if first.rising != second.rising or (first.known & second.known).any():
+        return None
+    beside = near and (_facing(first, second, GAP) or _facing(first, second, GAP, cv2.MORPH_RECT) >= SLANTED)
+    beyond = far and _facing(first, second, FAR_GAP) >= FAR_FACING
+    return first.filled(second) if beside or beyond else None

@@ -1,0 +1,1 @@
+"""Where corners of a chessboard may be: brightness, rings, saddle points."""

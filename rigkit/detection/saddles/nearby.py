@@ -1,0 +1,22 @@
+"""Which points have another nearby."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.kernels import front
+
+__all__ = ["near_any"]
+
+
+def near_any(points: FloatArray, others: FloatArray, reach_px: float) -> BoolArray:
+    """Return which of `points` (N, 2) lie within `reach_px` of any of `others` (M, 2), in the same pixels."""
+    if not len(points) or not len(others):
+        return np.zeros(len(points), np.bool_)
+    library = front.loaded()
+    if library is not None:
+        return front.near_any(library, points, others, reach_px)
+    from scipy.spatial import cKDTree
+
+    return np.asarray(cKDTree(others).query(points)[0] <= reach_px, dtype=np.bool_)

@@ -1,0 +1,266 @@
+"""Where an image could have a chessboard corner: an image pyramid, its saddle response, and the peaks of the response.
+
+A chessboard corner is a saddle of the brightness. On an image L smoothed a little, the response is minus the
+determinant of the Hessian, D = Lxy^2 - Lxx Lyy: large at saddles, zero along straight edges, negative at blobs, and
+indifferent to the direction of the lines. What counts as large follows from the image's own median response, that is
+its noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.errors import InputError
+from rigkit.kernels import front
+
+__all__ = ["FloatImage", "GreyImage", "Level", "grey_image", "peaks", "pyramid", "sample"]
+
+FloatImage = NDArray[np.float32]
+
+GreyImage = NDArray[np.uint8] | NDArray[np.float32]
+"""Grey levels 0..255. Those of an 8-bit camera stay bytes: four times the memory costs as much time as the search."""
+
+BASE_PIXELS = 2.6e6
+"""The finest level of the search has at most this many pixels; only the sub-pixel fit looks at larger images."""
+
+OCTAVES = 4
+"""Levels of the search, each of half the size of the one before: blurred corners are saddles only at coarse levels, and
+those that ink has joined, or that are round, only where that is less than a pixel. The fourth takes 1.5 % more."""
+
+SMOOTH = np.array([1.0, 4.0, 6.0, 4.0, 1.0], np.float32) / 16.0
+"""Binomial of sigma 1."""
+
+NOISE_FACTOR = 8.0
+"""A peak stands out of the noise from this multiple of the median |D| upwards."""
+
+FLOOR, CEILING = 2.0, 16.0
+"""Bounds of the threshold on D for an image that spans 200 grey levels, in (grey levels per px^2)^2; they go with the
+square of the span. Below the floor is only quantisation and compression, and the median of a richly textured image must
+not hide the corners of a board in it."""
+
+LEAST_SPAN = 2.5
+"""An image that spans fewer grey levels shows nothing but its quantisation."""
+
+TYPICAL = 4e3
+"""Pixels that the median response and the span of brightness are taken from: the median is good to 3 %."""
+
+EXTREME = 0.005
+"""The span of brightness leaves out this part at either end: glints, dead pixels."""
+
+PIXELS_A_PEAK, MAX_PEAKS = 480, 3200
+"""Keep the strongest peaks of a level, one for so many of its pixels, or the second number if that is more: texture and
+noise have more, a board never."""
+
+AROUND, SHARES = 32, 1024
+"""How strong a peak is, is seen beside the strongest one in its square of so many pixels, to one part in so many: a
+board in the shade has weaker corners than a page of text in the sun."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Level:
+    """One level of the pyramid.
+
+    Attributes
+    ----------
+    smooth : (H, W) float32, 0..255.
+    threshold : smallest D of a peak.
+    scale, offset : full-resolution pixel = scale * level pixel + offset.
+    """
+
+    smooth: FloatImage
+    threshold: float
+    scale: float
+    offset: float
+
+    def to_level(self, pixels: FloatArray) -> FloatArray:
+        """Return full-resolution `pixels` in pixels of this level."""
+        return (pixels - self.offset) / self.scale
+
+    def to_full(self, pixels: FloatArray) -> FloatArray:
+        """Return pixels of this level in full-resolution pixels."""
+        return pixels * self.scale + self.offset
+
+
+def grey_image(image: NDArray[np.generic]) -> GreyImage:
+    """Return an 8- or 16-bit, grey or RGB(A) image in grey levels 0..255: uint8 as such, all others as float32.
+
+    16-bit images are scaled by their own brightest value (the 99.9 % quantile), because 10- and 12-bit sensors do not
+    fill the range. Floating-point images are taken as 0..255 as they are, NaN as dark.
+
+    Raises
+    ------
+    InputError
+        Not an image of 1, 3 or 4 channels, or of another type, or smaller than 16x16.
+    """
+    array = np.asarray(image)
+    if array.ndim == 3 and array.shape[2] == 1:
+        array = array[:, :, 0]
+    if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] not in (3, 4)):
+        raise InputError(f"image: expected (H, W) or (H, W, 3 or 4), got {array.shape}; pass one image at a time")
+    if min(array.shape[:2]) < 16:
+        raise InputError(f"image: {array.shape[1]}x{array.shape[0]} pixels are too few to hold a chessboard")
+    # Files say in which order their bytes are; it is no other type.
+    array = array.astype(array.dtype.newbyteorder("="), copy=False)
+    if array.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
+        raise InputError(f"image: type {array.dtype} is not supported; convert it to uint8 or uint16")
+    if array.dtype.kind == "f":
+        array = _finite(array)
+    if array.ndim == 3:
+        array = cv2.cvtColor(array, cv2.COLOR_RGB2GRAY if array.shape[2] == 3 else cv2.COLOR_RGBA2GRAY)
+    if array.dtype == np.uint8:
+        return np.ascontiguousarray(array, np.uint8)
+    grey = np.ascontiguousarray(array, np.float32)
+    if array.dtype == np.uint16:
+        step = max(1, int(np.sqrt(grey.size / 1e5)))
+        brightest = float(np.quantile(grey[::step, ::step], 0.999))
+        grey = np.minimum(grey * np.float32(255.0 / max(brightest, 1.0)), np.float32(255.0))
+    return grey
+
+
+def _finite(image: NDArray[np.generic]) -> FloatImage:
+    """Return a floating-point image as float32, with what is no number as dark, and what is infinite as bright, as the
+    rest gets."""
+    with np.errstate(over="ignore"):
+        values: FloatImage = image.astype(np.float32, copy=False)
+        if np.isfinite(values.sum(dtype=np.float64)):
+            return values
+    seen = values[np.isfinite(values)]
+    low, high = (float(seen.min()), float(seen.max())) if len(seen) else (0.0, 0.0)
+    return np.nan_to_num(values, nan=low, posinf=high, neginf=low)
+
+
+def pyramid(grey: GreyImage) -> list[Level]:
+    """Return the levels of the search, the finest first."""
+    scale = 1
+    while grey.size > scale**2 * BASE_PIXELS:
+        scale *= 2
+    base, offset = _shrunk(grey, scale), 0.5 * (scale - 1.0)
+    levels: list[Level] = []
+    while len(levels) < OCTAVES and min(base.shape) >= 16:
+        smooth, base = _smoothed(base)
+        levels.append(Level(smooth, _threshold(smooth), float(scale), offset))
+        scale *= 2
+    return levels
+
+
+def _shrunk(grey: GreyImage, factor: int) -> GreyImage:
+    """Return the means of `factor` x `factor` pixels."""
+    if factor == 1:
+        return grey
+    library = front.loaded()
+    if library is not None:
+        return front.shrunk(library, grey, factor)
+    height, width = grey.shape[0] // factor, grey.shape[1] // factor
+    whole = grey[: factor * height, : factor * width]
+    mean = cv2.resize(whole.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(mean, np.float32)
+
+
+def _smoothed(image: GreyImage) -> tuple[FloatImage, FloatImage]:
+    """Return `image` smoothed, and every second pixel of every second row of that."""
+    library = front.loaded()
+    if library is not None:
+        return front.smoothed(library, image, SMOOTH)
+    smooth = np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, SMOOTH, SMOOTH, borderType=cv2.BORDER_REPLICATE), np.float32)
+    return smooth, np.ascontiguousarray(smooth[::2, ::2])
+
+
+def _response(smooth: FloatImage) -> FloatImage:
+    """Return D of the inner pixels of `smooth` (H, W), (H - 2, W - 2)."""
+    second = np.array([1.0, -2.0, 1.0], np.float32)
+    first = np.array([-0.5, 0.0, 0.5], np.float32)
+    lxx = cv2.filter2D(smooth, cv2.CV_32F, second[None])
+    lyy = cv2.filter2D(smooth, cv2.CV_32F, second[:, None])
+    lxy = cv2.sepFilter2D(smooth, cv2.CV_32F, first, first)
+    # In place: fresh pages of memory cost as much as the arithmetic.
+    cv2.multiply(lxx, lyy, dst=lxx)
+    cv2.multiply(lxy, lxy, dst=lxy)
+    return np.asarray(cv2.subtract(lxy, lxx, dst=lxy), np.float32)[1:-1, 1:-1]
+
+
+def _threshold(smooth: FloatImage) -> float:
+    """Return the smallest D of a peak."""
+    step = max(1, int(np.sqrt(smooth.size / TYPICAL)))
+    library = front.loaded()
+    if library is not None:
+        response, brightness = front.typical(library, smooth, step)
+    else:
+        response = np.abs(_response(smooth)[::step, ::step]).ravel()
+        brightness = smooth[1:-1:step, 1:-1:step].ravel()
+    few = int(EXTREME * len(brightness))
+    span = _ranked(brightness, len(brightness) - 1 - few) - _ranked(brightness, few)
+    contrast = (max(span, LEAST_SPAN) / 200.0) ** 2
+    return min(max(NOISE_FACTOR * _ranked(response, len(response) // 2), FLOOR * contrast), CEILING * contrast)
+
+
+def _ranked(values: FloatImage, at: int) -> float:
+    """Return what `at` of the `values` (N,) are smaller than or equal to; for two of them at once numpy is slow."""
+    return float(np.partition(values, at)[at])
+
+
+def peaks(level: Level) -> tuple[NDArray[np.signedinteger], FloatImage]:
+    """Return the local maxima of the response above the threshold, (N, 2) as (u, v) of the level, row by row, and D."""
+    most = max(MAX_PEAKS, level.smooth.size // PIXELS_A_PEAK)
+    library = front.loaded()
+    if library is not None:
+        return front.peaks(library, level.smooth, level.threshold, most, AROUND, SHARES)
+    response = _response(level.smooth)
+    highest = cv2.dilate(response, np.ones((5, 5), np.uint8))
+    mask = (response >= highest) & (response > level.threshold)
+    mask[:2] = mask[-2:] = False
+    mask[:, :2] = mask[:, -2:] = False
+    flat = np.flatnonzero(mask)
+    flat = flat[~_repeated(response.ravel(), flat, response.shape[1])]
+    v, u = np.divmod(flat, response.shape[1])
+    places, heights = np.stack([u, v], axis=-1) + 1, response.ravel()[flat]
+    kept = _strongest(places, heights, most) if len(places) > most else slice(None)
+    return places[kept], heights[kept]
+
+
+def _strongest(at: IntArray, height: FloatImage, most: int) -> BoolArray:
+    """Return which of the peaks `at` (N, 2) of `height` (N,) are the `most` strongest in their surroundings.
+
+    More where the last ones are equally strong.
+    """
+    column, row = (at // AROUND).T
+    square = row * (int(column.max()) + 1) + column
+    strongest = np.zeros(int(square.max()) + 1, np.float32)
+    np.maximum.at(strongest, square, height)
+    # Beyond what float32 holds one is as strong as the other.
+    share = (np.float32(SHARES) * np.nan_to_num(height / strongest[square], nan=1.0)).astype(np.int64)
+    at_least = np.cumsum(np.bincount(share, minlength=SHARES + 1)[::-1])[::-1]
+    return np.asarray(share >= np.flatnonzero(at_least >= most)[-1], np.bool_)
+
+
+def _repeated(response: FloatImage, flat: IntArray, width: int) -> NDArray[np.bool_]:
+    """Return which peaks have an equal one before them in their neighbourhood: a corner between pixels makes two."""
+    value = response[flat]
+    repeated = np.zeros(len(flat), bool)
+    for dv, du in ((0, -1), (0, -2), *((dv, du) for dv in (-1, -2) for du in (-2, -1, 0, 1, 2))):
+        repeated |= response[flat + dv * width + du] == value
+    return repeated
+
+
+def sample(image: GreyImage, pixels: NDArray[np.floating]) -> FloatImage:
+    """Return `image` at `pixels` (..., 2), bilinear, the border repeated; (...) float32."""
+    flat = np.asarray(pixels, np.float32).reshape(-1, 2)
+    if image.dtype == np.uint8:
+        # OpenCV would round to whole grey levels. Only the part that is looked at is converted.
+        seen = flat[np.isfinite(flat).all(axis=1)]
+        if len(seen):
+            last = np.array(image.shape[::-1]) - 1
+            low, high = (f(seen, axis=0).clip(0, last).astype(int) for f in (np.min, np.max))
+            image = image[low[1] : high[1] + 2, low[0] : high[0] + 2]
+            flat = flat - low.astype(np.float32)
+        image = image.astype(np.float32)
+    width = 1024
+    padded = np.zeros((-(-max(len(flat), 1) // width) * width, 2), np.float32)
+    padded[: len(flat)] = flat
+    grid = padded.reshape(-1, width, 2)
+    values = cv2.remap(image, grid[..., 0], grid[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(values, np.float32).reshape(-1)[: len(flat)].reshape(pixels.shape[:-1])

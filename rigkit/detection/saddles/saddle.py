@@ -1,0 +1,117 @@
+"""Chessboard corners of an image as loose points: peaks of the saddle response that pass the ring test."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.detection.saddles.nearby import near_any
+from rigkit.detection.saddles.response import FloatImage, Level, peaks
+from rigkit.detection.saddles.ring import may_be_corners, read_rings, ring_rules
+from rigkit.kernels import front
+
+__all__ = ["Corners", "Saddles", "find_corners", "saddle_step"]
+
+RADIUS = 2.6
+"""Of the ring, in pixels of the level: fits squares of 6 px, and 5 where they are seen straight on."""
+
+MAX_SHARPNESS = 0.095
+"""Largest response of a corner, relative to the square of its contrast on the ring. Edges without blur, smoothed as
+the level is, make 0.08, sharpened ones 0.09, whatever the angles and down to squares of 4 px; noise makes 0.12. Of the
+corners of boards in noise a few show more, which growth finds; of those that noise makes, a third."""
+
+KNOWN = 2.0
+"""A corner this near to one of a finer level is the same, in pixels of its own level."""
+
+MAX_STEP = 1.5
+"""A Newton step to the saddle that leads further than this from the peak of the response went astray, level px."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Saddles:
+    """Saddle points in full-resolution pixels, (N, 2)."""
+
+    pixels: FloatArray
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Corners:
+    """Loose chessboard corners.
+
+    Attributes
+    ----------
+    pixels : (N, 2) full resolution, a few tenths of a pixel good.
+    angles : (N, 2) rad, lines A and B as in `Rings`.
+    contrast : (N,) grey levels.
+    scale : (N,) of the level on which the corner was found.
+    """
+
+    pixels: FloatArray
+    angles: FloatArray
+    contrast: FloatArray
+    scale: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+
+def saddle_step(smooth: FloatImage, at: IntArray) -> tuple[FloatArray, BoolArray]:
+    """Return the stationary point next to each of the pixels `at` (N, 2), and whether it is a saddle and near."""
+    u, v = at[:, 0], at[:, 1]
+    patch = {(i, j): smooth[v + j, u + i].astype(np.float64) for i in (-1, 0, 1) for j in (-1, 0, 1)}
+    gu, gv = 0.5 * (patch[1, 0] - patch[-1, 0]), 0.5 * (patch[0, 1] - patch[0, -1])
+    huu = patch[1, 0] + patch[-1, 0] - 2.0 * patch[0, 0]
+    hvv = patch[0, 1] + patch[0, -1] - 2.0 * patch[0, 0]
+    huv = 0.25 * (patch[1, 1] + patch[-1, -1] - patch[1, -1] - patch[-1, 1])
+    det = huu * hvv - huv**2
+    safe = np.where(det < 0.0, det, -1.0)
+    step = np.stack([(huv * gv - hvv * gu) / safe, (huv * gu - huu * gv) / safe], axis=-1)
+    near = (det < 0.0) & (np.abs(step).max(axis=1) <= MAX_STEP)
+    return at + step, near
+
+
+def find_corners(levels: list[Level]) -> tuple[Corners, Saddles]:
+    """Return the chessboard corners of all levels, each once (the finest level wins), and all saddles."""
+    kept: list[Corners] = []
+    saddles: list[FloatArray] = []
+    for level in levels:
+        local, which, angles, contrast = _corners_of(level)
+        full = level.to_full(local)
+        saddles.append(full)
+        fresh = Corners(full[which], angles, contrast, np.full(len(which), level.scale))
+        kept.append(_without_known(fresh, kept))
+    return _joined(kept), Saddles(np.concatenate(saddles))
+
+
+def _corners_of(level: Level) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
+    """Return the saddles of `level` in its own pixels, and of those that are corners: which, angles, contrast."""
+    at, response = peaks(level)
+    library = front.loaded()
+    if library is not None:
+        return front.corners(library, level.smooth, at, response, RADIUS, MAX_STEP, MAX_SHARPNESS, ring_rules())
+    found, near = saddle_step(level.smooth, at)
+    found, response = found[near], response[near]
+    which = np.flatnonzero(may_be_corners(level.smooth, found, RADIUS, response))
+    rings = read_rings(level.smooth, found[which], RADIUS)
+    good = rings.valid & (response[which] <= MAX_SHARPNESS * rings.contrast**2)
+    return found, which[good], rings.angles[good], rings.contrast[good]
+
+
+def _without_known(fresh: Corners, known: list[Corners]) -> Corners:
+    """Return those of `fresh` that no finer level has found already."""
+    if not len(fresh) or not any(len(k) for k in known):
+        return fresh
+    before = np.concatenate([k.pixels for k in known])
+    new = ~near_any(fresh.pixels, before, KNOWN * float(fresh.scale[0]))
+    return Corners(fresh.pixels[new], fresh.angles[new], fresh.contrast[new], fresh.scale[new])
+
+
+def _joined(parts: list[Corners]) -> Corners:
+    return Corners(
+        np.concatenate([p.pixels for p in parts]),
+        np.concatenate([p.angles for p in parts]),
+        np.concatenate([p.contrast for p in parts]),
+        np.concatenate([p.scale for p in parts]),
+    )

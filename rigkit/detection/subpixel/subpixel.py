@@ -1,0 +1,304 @@
+"""Corners of whole lattices to a hundredth of a pixel: the edge model at every corner, guided by the lattice.
+
+The lattice says which way the lines run, how far the cell reaches, and how the lines bend; the fit says where the
+corners are, and so gives a better lattice for a second pass, which also tries the cells that were left empty.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from rigkit.core.arrays import BoolArray, FloatArray, upper_median
+from rigkit.detection.lattice.lattice import Lattice, Sheet, padded
+from rigkit.detection.lattice.local_fit import fit_cells
+from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.subpixel.correlation import sigma_factors
+from rigkit.detection.subpixel.edge_curvature import line_curvature
+from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
+from rigkit.detection.subpixel.edge_model import REACH, Geometry, ends_of
+from rigkit.detection.subpixel.scatter import excess_scatter
+
+__all__ = ["RefinedLattice", "refine"]
+
+Part = tuple[slice, slice]
+
+FIRST_BLUR = 1.0
+"""s that the first pass starts from, px."""
+
+FIRST_PASS = (8.0, 4, 0.02)
+LAST_PASS = (18.0, 8, 0.01)
+"""Radius in px, Gauss-Newton steps at most, and the step in px that ends them: the first pass only has to bring the
+lattice to a few hundredths of a pixel; after the last step of the last one there is a ten-thousandth to go."""
+
+LOOSE = 0.5
+"""Curvatures are fitted where the lattice leaves them open by so much that the corner would move by more than this, in
+sigmas of the first pass: the edges then know them better. Everywhere it would take a quarter more time."""
+
+FEWEST_NEIGHBOURS = 3
+"""An empty cell is tried if so many of its eight neighbours are known."""
+
+FEWEST_CHECKED = 12
+FEWEST_JUDGED = 9
+"""A board of fewer corners, or of fewer that so many others predict, is not checked against itself."""
+
+HOLE_MOVE = 0.12
+HOLE_CONTRAST = 0.3
+HOLE_RESIDUAL = 2.0
+HOLE_SIGMA = 3.0
+"""What a corner in an empty cell must show: how far from its prediction (cells); contrast, relative residual and sigma
+relative to the corners around it."""
+
+ASTRAY_CELLS = 0.06
+ASTRAY_FACTOR = 8.0
+"""A corner further than this from where its neighbours say (in cells; and times the board's typical deviation; and
+times the standard deviation expected of it) is something else: a finger, a glint, the end of a ruler."""
+
+COVERED, COVERED_FACTOR = 0.03, 6.0
+COVERED_OFF = 3.5
+"""A corner whose noise, relative to its contrast, exceeds this and this times the board's typical one, and that lies
+off by this times the typical deviation, is covered in part, by the edge of a ruler or of a hand: its sides are not
+alike. On rendered boards under a ruler the factor is 12 and more, on boards with marks in their squares seldom 6."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RefinedLattice:
+    """A lattice with what the fit says of each corner, (R, C) each and NaN where unknown.
+
+    Attributes
+    ----------
+    lattice : the corners.
+    sigma_px, blur_px : predicted standard deviation, width of the edges.
+    residual, noise : RMS of what the fit leaves and of the part of it that is noise, grey levels.
+    """
+
+    lattice: Lattice
+    sigma_px: FloatArray
+    blur_px: FloatArray
+    residual: FloatArray
+    noise: FloatArray
+
+    @property
+    def worst_sigma_px(self) -> FloatArray:
+        """(R, C) standard deviation if all that the fit leaves were noise: large for what is no chessboard."""
+        # Of few pixels, those with mirror images may have more noise than all of them have residuals.
+        worst: FloatArray = self.sigma_px * np.maximum(self.residual / self.noise, 1.0)
+        return worst
+
+    def without(self, drop: BoolArray) -> RefinedLattice:
+        """Return this with the corners `drop` (R, C) forgotten."""
+        rest = (np.where(drop, np.nan, values) for values in self._values())
+        return RefinedLattice(self.lattice.without(drop), *rest)
+
+    def cut(self, rows: slice, columns: slice) -> RefinedLattice:
+        """Return the part of `rows` and `columns`."""
+        rest = (values[rows, columns] for values in self._values())
+        return RefinedLattice(self.lattice.cut(rows, columns), *rest)
+
+    def padded(self, rows: tuple[int, int], columns: tuple[int, int]) -> RefinedLattice:
+        """Return this with so many empty rows and columns before and after."""
+        rest = (padded(values, rows, columns) for values in self._values())
+        return RefinedLattice(self.lattice.padded(rows, columns), *rest)
+
+    def turned(self, quarter_turns: int) -> RefinedLattice:
+        """Return this counted from another corner, as `Lattice.turned`."""
+        rest = (np.rot90(values, -quarter_turns) for values in self._values())
+        return RefinedLattice(self.lattice.turned(quarter_turns), *rest)
+
+    def filled(self, other: RefinedLattice) -> RefinedLattice:
+        """Return this with the corners of `other`, of the same size, where it has none."""
+        known = self.lattice.known
+        pairs = zip(self._values(), other._values(), strict=True)
+        return RefinedLattice(self.lattice.filled(other.lattice), *(np.where(known, *pair) for pair in pairs))
+
+    def _values(self) -> tuple[FloatArray, ...]:
+        return (self.sigma_px, self.blur_px, self.residual, self.noise)
+
+
+def refine(image: GreyImage, lattices: Sequence[Lattice]) -> list[RefinedLattice]:
+    """Return `lattices` with their corners placed by the edge model on the full-resolution grey `image`.
+
+    Corners whose fit fails or that contradict their neighbours are dropped; corners in empty cells that the fit
+    confirms are added.
+    """
+    if not lattices:
+        return []
+    # All lattices lie on one sheet, so that each step is one call.
+    sheet = Sheet.of(lattices)
+    start = Lattice(sheet.pixels, sheet.contrast, True)
+    first = _first_pass(image, start, sheet.signs)
+    start, holes = _with_holes(first.lattice, sheet.signs != 0.0)
+    last = _last_pass(image, start, sheet.signs, _typical_blur(first, sheet.parts), first.sigma_px, sheet.parts)
+    if holes.any():
+        last = _confirmed(last, start, holes)
+    checked = _checked(last, sheet.parts)
+    # Where corners scatter about the lattice by more than the noise in the image explains (JPEG blocks, aliasing, wavy
+    # paper), the sigmas of the board are raised to what is seen.
+    scatter = excess_scatter(checked.lattice.pixels, checked.sigma_px, sheet.parts)
+    return [
+        _part_of(checked, part, item.rising, float(raised))
+        for part, item, raised in zip(sheet.parts, lattices, scatter, strict=True)
+    ]
+
+
+def _part_of(sheet: RefinedLattice, part: Part, rising: bool, raised: float) -> RefinedLattice:
+    """Return the lattice at `part` of the sheet, its sigmas `raised` by a factor."""
+    lattice = Lattice(sheet.lattice.pixels[part], sheet.lattice.contrast[part], rising)
+    sigma_px = sheet.sigma_px[part] * raised
+    return RefinedLattice(lattice, sigma_px, sheet.blur_px[part], sheet.residual[part], sheet.noise[part])
+
+
+def _typical_blur(item: RefinedLattice, parts: Sequence[Part]) -> FloatArray:
+    """Return (R, C) the blur of each corner, kept near what is typical of its board."""
+    blur = np.full(item.blur_px.shape, FIRST_BLUR)
+    for part in parts:
+        mine = item.blur_px[part]
+        known = np.isfinite(mine)
+        if known.any():
+            typical = upper_median(mine[known])
+            blur[part] = np.where(known, np.clip(mine, 0.7 * typical, 1.4 * typical), typical)
+    return blur.clip(*BLUR_RANGE)
+
+
+def _first_pass(image: GreyImage, start: Lattice, signs: FloatArray) -> RefinedLattice:
+    """Fit all corners of the sheet `start`, known to about a tenth of a pixel; those that fail are left out."""
+    known = start.known
+    shape = fit_cells(start.pixels, known)
+    radius_px, iterations, converged_px = FIRST_PASS
+    fit = fit_edges(
+        image,
+        start.pixels[known],
+        Geometry(shape.sides, shape.curvature(), shape.gaps(), ends_of(known, known)),
+        signs[known],
+        np.full(start.count, FIRST_BLUR),
+        radius_px=radius_px,
+        iterations=iterations,
+        converged_px=converged_px,
+        mirrored=False,
+    )
+    return _spread(start, fit, fit.sigma_px)
+
+
+def _last_pass(
+    image: GreyImage,
+    start: Lattice,
+    signs: FloatArray,
+    blur: FloatArray,
+    sigma_px: FloatArray,
+    parts: Sequence[Part],
+) -> RefinedLattice:
+    """Fit all corners of the sheet `start`, known to `sigma_px` (R, C); those that fail are left out.
+
+    Noise is told from other residuals, and how that of neighbouring pixels is correlated on each of the `parts`.
+    """
+    known = start.known
+    shape = fit_cells(start.pixels, known)
+    lengths = np.maximum(np.hypot(shape.sides[..., 0], shape.sides[..., 1]), 1.0)
+    curvature, curvature_sigma = line_curvature(start.pixels, sigma_px, known, lengths)
+    radius_px, iterations, converged_px = LAST_PASS
+    # A parabola k / 2 t^2 lies k / 6 r^2 beside the corner in the mean over |t| < r.
+    beside = curvature_sigma * np.minimum(radius_px, REACH * lengths) ** 2 / 6.0
+    curvature_sigma[(beside <= LOOSE * sigma_px[known][:, None]).all(axis=1)] = 0.0
+    fit = fit_edges(
+        image,
+        start.pixels[known],
+        Geometry(shape.sides, curvature, shape.gaps(), ends_of(known, known)),
+        signs[known],
+        blur[known],
+        radius_px=radius_px,
+        iterations=iterations,
+        converged_px=converged_px,
+        curvature_sigma=curvature_sigma,
+        contrast=start.contrast[known],
+    )
+    owner = np.zeros(known.shape, np.int64)
+    for k, part in enumerate(parts):
+        owner[part] = k
+    mine = owner[known]
+    factors = sigma_factors(fit, fit.valid & (fit.contrast > 0.0), shape.sides, mine, len(parts), radius_px)
+    return _spread(start, fit, fit.sigma_px * factors[mine])
+
+
+def _spread(start: Lattice, fit: EdgeFit, sigma_px: FloatArray) -> RefinedLattice:
+    """Return the sheet `start` with its corners as fitted, without those that failed."""
+    good = fit.valid & (fit.contrast > 0.0)
+    cells, shape = np.flatnonzero(start.known)[good], start.contrast.shape
+    pixels, single = np.full((start.known.size, 2), np.nan), np.full((5, start.known.size), np.nan)
+    pixels[cells] = fit.pixels[good]
+    single[:, cells] = np.array([fit.contrast, sigma_px, fit.blur, fit.residual, fit.noise])[:, good]
+    contrast, *rest = single.reshape(-1, *shape)
+    return RefinedLattice(Lattice(pixels.reshape(*shape, 2), contrast, start.rising), *rest)
+
+
+def _with_holes(lattice: Lattice, inside: BoolArray) -> tuple[Lattice, BoolArray]:
+    """Return the lattice with predictions in the empty cells `inside` among known ones, and which cells these are."""
+    known = lattice.known
+    holes: BoolArray = inside & ~known
+    if holes.any():
+        around = cv2.boxFilter(known.astype(np.uint8), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        holes &= around >= FEWEST_NEIGHBOURS
+    if not holes.any():
+        return lattice, holes
+    shape = fit_cells(lattice.pixels, holes, degree=2, ridge=(1e-3, 1.0))
+    pixels = lattice.pixels.copy()
+    pixels[holes] = shape.pixels
+    return Lattice(pixels, lattice.contrast, lattice.rising), holes
+
+
+def _confirmed(item: RefinedLattice, start: Lattice, holes: BoolArray) -> RefinedLattice:
+    """Return `item` without those of the `holes` where the fit saw no proper corner."""
+    known = item.lattice.known
+    settled = known & ~holes
+    contrast = item.lattice.contrast
+    moved = np.linalg.norm(item.lattice.pixels - start.pixels, axis=2)
+    cell = np.full(known.shape, np.nan)
+    cell[holes] = fit_cells(start.pixels, holes, degree=1).cell_px()
+    with np.errstate(invalid="ignore"):
+        good = (moved < HOLE_MOVE * cell) & (contrast > HOLE_CONTRAST * _around(contrast, settled))
+        good &= item.residual < HOLE_RESIDUAL * _around(item.residual, settled)
+        good &= item.sigma_px < HOLE_SIGMA * _around(item.sigma_px, settled)
+    return item.without(holes & ~good)
+
+
+def _around(values: FloatArray, known: BoolArray) -> FloatArray:
+    """Return the mean of `values` (R, C) over the `known` among each cell and its eight neighbours, NaN for none."""
+    box = np.ones((3, 3))
+    total, count = (
+        cv2.filter2D(part, cv2.CV_64F, box, borderType=cv2.BORDER_CONSTANT)
+        for part in (np.where(known, values, 0.0), known.astype(np.float64))
+    )
+    return np.where(count > 0.5, total / np.maximum(count, 0.5), np.nan)
+
+
+def _checked(item: RefinedLattice, parts: Sequence[Part]) -> RefinedLattice:
+    """Return `item` without corners that are covered in part or lie where their neighbours say they cannot."""
+    known = item.lattice.known
+    shape = fit_cells(item.lattice.pixels, known, leave_out=True)
+
+    def spread(values: FloatArray) -> FloatArray:
+        out = np.full(known.shape, np.nan)
+        out[known] = values
+        return out
+
+    off = item.lattice.pixels[known] - shape.pixels
+    distance = np.hypot(off[:, 0], off[:, 1])
+    # A prediction from a few corners on one side is no judge of another.
+    judged = np.zeros_like(known)
+    judged[known] = (shape.support >= FEWEST_CHECKED) & (shape.gain < 1.5)
+    cells = spread(distance / shape.cell_px())
+    excess = spread(distance / (item.sigma_px[known] * np.hypot(1.0, shape.gain)))
+    relative = item.noise / item.lattice.contrast
+    drop = np.zeros_like(known)
+    for part in parts:
+        here, sure = known[part], judged[part]
+        if here.sum() < FEWEST_CHECKED or sure.sum() < FEWEST_JUDGED:
+            continue
+        typical = upper_median(cells[part][sure])
+        usual = upper_median(relative[part][here])
+        astray = (cells[part] > max(ASTRAY_CELLS, ASTRAY_FACTOR * typical)) & (excess[part] > ASTRAY_FACTOR)
+        covered = relative[part] > max(COVERED, COVERED_FACTOR * usual)
+        drop[part] = sure & (astray | (covered & (cells[part] > COVERED_OFF * typical)))
+    return item.without(drop) if drop.any() else item

@@ -1,1 +1,0 @@
-"""Epipolar geometry from points and affinities, one solver a file."""

@@ -1,0 +1,1 @@
+"""Which board is which, and which of its corners is the first."""

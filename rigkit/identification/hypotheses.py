@@ -1,0 +1,237 @@
+"""Which board of image 1 is which board of image 2: hypotheses from single boards, completed and refined jointly.
+
+One detection in either image, taken for the same board in the same position, fixes the relative pose of the cameras; it
+predicts all other boards in image 2. The detections that agree complete the assignment, and a joint least squares over
+all their corners scores it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.core.arrays import FloatArray, IntArray, Points
+from rigkit.core.detections import BoardDetection
+from rigkit.identification.joint_pose import JointPose, refine_joint
+from rigkit.identification.observations import Link, View
+from rigkit.identification.placements import BoardKind
+
+__all__ = ["Solution", "forced_rms_px", "solutions"]
+
+SEED_GATE = 2.0
+"""Squares by which a board may miss the prediction from one other board: its tilt is uncertain, its lever long."""
+REJOIN_GATE = 0.5
+"""Squares by which a board may miss the prediction of a joint fit to be tried as part of it."""
+MAX_SEEDS = 300
+MAX_SOLUTIONS = 20
+MAX_ROUNDS = 4
+SEARCH_TOLERANCE = 1e-3
+"""Fits that only decide who belongs need no more digits."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Solution:
+    """A whole assignment with its joint fit.
+
+    Attributes
+    ----------
+    links : the boards taken to be seen in both images.
+    pose : the joint fit, boards in the order of `links`.
+    chi2_1, chi2_2 : chi2 of every detection in image 1 and 2, at most that of giving it up.
+    """
+
+    links: tuple[Link, ...]
+    pose: JointPose
+    chi2_1: FloatArray
+    chi2_2: FloatArray
+
+    @property
+    def chi2(self) -> float:
+        return float(self.chi2_1.sum() + self.chi2_2.sum())
+
+    def rms_px(self, view1: View, view2: View) -> float:
+        """Return the rms distance of the corners (2-D, both images) from the joint fit."""
+        return float(np.sqrt(self.pose.squared_px.sum() / _corner_count(self.links, view1, view2)))
+
+    def differs_from(self, other: Solution) -> bool:
+        """Say whether the two contradict each other: one detection, but another partner or position."""
+        mine = {("1", s.first): (s.second, s.key) for s in self.links} | {("2", s.second): s.first for s in self.links}
+        return any(
+            mine.get(("1", s.first), (s.second, s.key)) != (s.second, s.key)
+            or mine.get(("2", s.second), s.first) != s.first
+            for s in other.links
+        )
+
+
+def _corner_count(links: Sequence[Link], view1: View, view2: View) -> int:
+    return sum(len(view1.sights[s.first].rays) + len(view2.sights[s.second].rays) for s in links)
+
+
+def solutions(links: Sequence[Link], view1: View, view2: View, kinds: Sequence[BoardKind]) -> list[Solution]:
+    """Return distinct assignments with their joint fits, best first."""
+    predictor = _Predictor.build(links, view2, kinds)
+    # Whole boards first: a part whose place on the board is open makes many links, most of them wrong.
+    open_places = Counter((s.first, s.second) for s in links)
+    seeds = np.array(sorted(range(len(links)), key=lambda n: open_places[links[n].first, links[n].second])[:MAX_SEEDS])
+    motions = predictor.cam2_from_board[seeds] @ np.linalg.inv(predictor.cam1_from_board[seeds])
+    misses = predictor.misses(motions)
+    starts: dict[frozenset[tuple[int, tuple[int, ...]]], tuple[float, FloatArray, list[int]]] = {}
+    for motion, miss in zip(motions, misses, strict=True):
+        chosen = _choose(miss, SEED_GATE, links, kinds)
+        total = sum(min(float(miss[n]), SEED_GATE) ** 2 for n in chosen) - SEED_GATE**2 * len(chosen)
+        name = frozenset((links[n].first, (links[n].second, *links[n].key)) for n in chosen)
+        if name not in starts or total < starts[name][0]:
+            starts[name] = (total, motion, chosen)
+    found: dict[frozenset[tuple[int, tuple[int, ...]]], Solution] = {}
+    for _, motion, chosen in sorted(starts.values(), key=lambda s: s[0])[:MAX_SOLUTIONS]:
+        solution = _settle(motion, chosen, links, predictor, view1, view2, kinds)
+        name = frozenset((s.first, (s.second, *s.key)) for s in solution.links)
+        if name not in found or solution.chi2 < found[name].chi2:
+            found[name] = solution
+    return sorted(found.values(), key=lambda s: s.chi2)
+
+
+def forced_rms_px(
+    solution: Solution, links: Sequence[Link], view1: View, view2: View, kinds: Sequence[BoardKind]
+) -> tuple[int, float]:
+    """Return how many boards, and with what rms (px, 2-D per corner), fit if the solution has to explain all it can."""
+    predictor = _Predictor.build(links, view2, kinds)
+    miss = predictor.misses(solution.pose.cam2_from_cam1[None])[0]
+    mine = {s.key: (s.first, s.second) for s in solution.links}
+    own = np.array([mine.get(s.key) == (s.first, s.second) for s in links])
+    chosen = [links[n] for n in _choose(np.where(own, miss - miss.max() - 1.0, miss), np.inf, links, kinds)]
+    pose = _fit(solution.pose.cam2_from_cam1, chosen, view1, view2, kinds, SEARCH_TOLERANCE)
+    return len(chosen), float(np.sqrt(pose.squared_px.sum() / _corner_count(chosen, view1, view2)))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Predictor:
+    """Where the outermost corners of each link's second detection are predicted, given the relative pose."""
+
+    cam1_from_board: FloatArray
+    cam2_from_board: FloatArray
+    in_cam1: Points
+    rays: FloatArray
+    bases: FloatArray
+    spacing_px: FloatArray
+
+    @classmethod
+    def build(cls, links: Sequence[Link], view2: View, kinds: Sequence[BoardKind]) -> _Predictor:
+        in_cam1, rays, bases = [], [], []
+        for link in links:
+            detection, sight = view2.detections[link.second], view2.sights[link.second]
+            outer = _outermost(detection)
+            points = kinds[link.kind].board.points(link.placement2.grid_of(detection)[outer])
+            in_cam1.append(points @ link.cam1_from_board[:3, :3].T + link.cam1_from_board[:3, 3])
+            rays.append(sight.rays[outer])
+            bases.append(sight.bases[outer])
+        return cls(
+            np.stack([s.cam1_from_board for s in links]),
+            np.stack([s.cam2_from_board for s in links]),
+            np.stack(in_cam1),
+            np.stack(rays),
+            np.stack(bases),
+            view2.spacing_px[[s.second for s in links]],
+        )
+
+    def misses(self, motions: FloatArray) -> FloatArray:
+        """Return the rms distance (S, L) of predicted from seen corners in squares, for each motion (S, 4, 4)."""
+        x = np.einsum("sij,lpj->slpi", motions[:, :3, :3], self.in_cam1) + motions[:, None, None, :3, 3]
+        u = x / np.linalg.norm(x, axis=-1, keepdims=True)
+        closeness = np.maximum(1.0 + np.einsum("slpi,lpi->slp", u, self.rays), 1e-9)[..., None]
+        offset = 2.0 * np.einsum("lpki,slpi->slpk", self.bases, u) / closeness
+        return np.asarray(np.sqrt((offset**2).sum(axis=-1).mean(axis=-1)) / self.spacing_px)
+
+
+def _outermost(detection: BoardDetection) -> IntArray:
+    """Return the indices of the corners furthest along the four diagonals of the grid."""
+    total, difference = detection.grid.sum(axis=1), detection.grid[:, 0] - detection.grid[:, 1]
+    return np.array([np.argmin(total), np.argmax(difference), np.argmax(total), np.argmin(difference)])
+
+
+def _choose(miss: FloatArray, gate: float, links: Sequence[Link], kinds: Sequence[BoardKind]) -> list[int]:
+    """Return the links taken greedily by rising miss: each detection once, no kind more often than it has boards."""
+    chosen: list[int] = []
+    first, second, used = set(), set(), [0] * len(kinds)
+    order = np.argsort(miss, kind="stable")
+    for n in order[miss[order] < gate]:
+        link = links[n]
+        if link.first in first or link.second in second or used[link.kind] == len(kinds[link.kind].boards):
+            continue
+        first.add(link.first)
+        second.add(link.second)
+        used[link.kind] += 1
+        chosen.append(int(n))
+    return sorted(chosen)
+
+
+def _settle(
+    motion: FloatArray,
+    chosen: list[int],
+    links: Sequence[Link],
+    predictor: _Predictor,
+    view1: View,
+    view2: View,
+    kinds: Sequence[BoardKind],
+) -> Solution:
+    """Refine an assignment, drop boards that do not fit, add those that then do, until nothing changes."""
+
+    def fit(candidates: list[int], start: FloatArray) -> tuple[float, JointPose]:
+        """By how many gates the worst board misses, and the joint fit."""
+        some = [links[n] for n in candidates]
+        pose = _fit(start, some, view1, view2, kinds, SEARCH_TOLERANCE)
+        return _worst(pose, some, view1, view2), pose
+
+    seen: set[tuple[int, ...]] = set()
+    for _ in range(MAX_ROUNDS):
+        seen.add(tuple(chosen))
+        worst, pose = fit(chosen, motion)
+        while worst > 1.0 and len(chosen) > 1:
+            # The board that does not fit spoils the fit of the others: find it by leaving out each in turn.
+            parts = [chosen[:k] + chosen[k + 1 :] for k in range(len(chosen))]
+            fits = [fit(part, motion) for part in parts]
+            k = min(range(len(parts)), key=lambda k: fits[k][0])
+            chosen, (worst, pose) = parts[k], fits[k]
+        motion = pose.cam2_from_cam1
+        wider = _choose(predictor.misses(motion[None])[0], REJOIN_GATE, links, kinds)
+        if len(wider) < len(chosen) or tuple(wider) in seen:
+            break
+        chosen = wider
+    kept = tuple(links[n] for n in chosen)
+    pose = _fit(motion, kept, view1, view2, kinds)
+    chi2_1, chi2_2 = view1.give_up(), view2.give_up()
+    for link, (one, two) in zip(kept, pose.chi2, strict=True):
+        chi2_1[link.first] = min(one, chi2_1[link.first])
+        chi2_2[link.second] = min(two, chi2_2[link.second])
+    return Solution(kept, pose, chi2_1, chi2_2)
+
+
+def _fit(
+    motion: FloatArray,
+    links: Sequence[Link],
+    view1: View,
+    view2: View,
+    kinds: Sequence[BoardKind],
+    tolerance: float = 1e-9,
+) -> JointPose:
+    return refine_joint(
+        motion,
+        np.stack([s.cam1_from_board for s in links]),
+        [view1.sights[s.first] for s in links],
+        [kinds[s.kind].board.points(s.placement1.grid_of(view1.detections[s.first])) for s in links],
+        [view2.sights[s.second] for s in links],
+        [kinds[s.kind].board.points(s.placement2.grid_of(view2.detections[s.second])) for s in links],
+        tolerance=tolerance,
+    )
+
+
+def _worst(pose: JointPose, links: Sequence[Link], view1: View, view2: View) -> float:
+    """Return the largest rms distance of a board in one of the images, in units of the gate."""
+    gates = []
+    for link, squared in zip(links, pose.squared_px, strict=True):
+        counts = [len(view1.sights[link.first].rays), len(view2.sights[link.second].rays)]
+        gates += [*(np.sqrt(squared / counts) / [view1.gate_px[link.first], view2.gate_px[link.second]])]
+    return float(max(gates))

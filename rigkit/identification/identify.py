@@ -1,0 +1,328 @@
+"""Names and orientation of the boards found: in the two images of a pair by geometry, in one image by size.
+
+Boards may be all different, partly equal or all equal, and may look the same turned. Every way in which one detection
+of image 1 can be one of image 2 fixes a relative pose of the cameras, which all other boards support or contradict; the
+assignment with the smallest joint residual wins, and says by how much.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import FloatArray
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection, common_corners
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.identification.hypotheses import Solution, forced_rms_px, solutions
+from rigkit.identification.joint_pose import JointPose, Sight, refine_joint
+from rigkit.identification.names import Located, first_corner_turn, name_boards
+from rigkit.identification.observations import GridPoses, Link, View, links_between
+from rigkit.identification.pair_identity import PairIdentity
+from rigkit.identification.placements import BoardKind, Placement, board_kinds, describe, placements, possible_kinds
+
+__all__ = ["PairIdentity", "common_corners", "identify_pair", "identify_single"]
+
+LOG_ODDS = float(np.log(1000.0))
+"""Odds of a thousand to one decide between two assignments; below, the geometry leaves a tie."""
+FLOOR_PX = 0.01
+"""No camera and no printed board is truer than this: smaller misfits decide nothing."""
+MAX_RIVALS = 6
+"""Rivals that are made to explain all boards, for the runner-up's residual."""
+
+
+def identify_pair(
+    detections1: Sequence[BoardDetection],
+    detections2: Sequence[BoardDetection],
+    boards: Sequence[Board],
+    camera1: Camera,
+    camera2: Camera,
+    *,
+    layout: Mapping[str, str] | None = None,
+) -> PairIdentity:
+    """Return the boards of two images named and turned alike, and the relative pose that they imply.
+
+    Parameters
+    ----------
+    detections1, detections2 : what was found in either image; a board id that is given is kept.
+    boards : the boards that may be there.
+    camera1, camera2 : the calibrated cameras, in whose pixels the detections are.
+    layout : where boards that look alike hang, by board id: "left", "right", "floor", "ceiling" or "back" (see
+        `rigkit.identification.names`, which also states the rule without it).
+
+    Raises
+    ------
+    InputError
+        No boards, unknown names in `layout`, one name for two detections of an image.
+    DegenerateError
+        No listed board is seen in both images.
+
+    Notes
+    -----
+    With n boards in both images the joint fit takes 6 (n - 1) degrees of freedom from the free one (every board its own
+    pose in every image); the excess of chi2 over the free fit is what an assignment has to answer for, noise and an
+    imperfect calibration alike. With an unknown scale of these errors the odds of two assignments are
+    (excess_b / excess_a) ** (3 (n - 1)): one board alone never decides, several do unless their arrangement is itself
+    symmetric. Ties within 1000 : 1 go to the smallest roll between the cameras, and are reported.
+    """
+    kinds = _checked_kinds(boards)
+    views = (
+        View.of(detections1, kinds, camera1, "image 1"),
+        View.of(detections2, kinds, camera2, "image 2"),
+    )
+    links, free1, free2 = links_between(*views, kinds)
+    if not links:
+        raise DegenerateError(_nothing_shared(views, kinds))
+    ranked = solutions(links, *views, kinds)
+    best = ranked[0]
+    tied = [s for s in ranked if s is best or _log_odds(best, s, free1, free2, views) < LOG_ODDS]
+    winner = min(tied, key=lambda s: (-len(s.links), sum(x.against_colour for x in s.links), _roll_rad(s)))
+    rivals = [s for s in ranked if s.differs_from(winner)]
+    runner_up_px = _runner_up_px(winner, rivals, links, views, kinds)
+    return _result(winner, runner_up_px, tied, views, kinds, boards, layout)
+
+
+def identify_single(detections: Sequence[BoardDetection], boards: Sequence[Board]) -> tuple[BoardDetection, ...]:
+    """Return the detections of one image (a calibration image) that are listed boards, named, on the board's grid.
+
+    Of several whole detections of one board the one with the most corners is kept. A part of a grid counts where only
+    one board not seen whole can hold it; it takes the first position that fits, its pose takes up the difference. What
+    fits no board is left out.
+
+    Raises
+    ------
+    InputError
+        No boards, or a detection without a name that may be any of several boards of one size.
+    """
+    kinds = _checked_kinds(boards)
+    by_id = {b.board_id: BoardKind((b,)) for b in boards}
+    out: dict[str, BoardDetection] = {}
+
+    def whole(detection: BoardDetection) -> bool:
+        return any(sorted(k.board.size) == sorted((detection.columns, detection.rows)) for k in kinds)
+
+    candidates = list(zip(detections, possible_kinds(detections, kinds), strict=True))
+    for detection, possible in sorted(candidates, key=lambda c: (not whole(c[0]), -len(c[0].grid))):
+        ids = [i for k in possible for i in kinds[k].ids]
+        if detection.board_id in ids:
+            ids = [str(detection.board_id)]
+        elif possible and whole(detection) and len(kinds[possible[0]].ids) > 1:
+            raise InputError(
+                f"boards {', '.join(ids)} look alike: one image cannot tell them apart; list only the one that it shows"
+            )
+        vacant = [i for i in (ids[:1] if whole(detection) else ids) if i not in out]
+        if len(vacant) == 1:
+            kind = by_id[vacant[0]]
+            out[vacant[0]] = placements(detection, kind)[0].apply(detection, kind.board).named(vacant[0])
+    return tuple(out[b.board_id] for b in boards if b.board_id in out)
+
+
+def _checked_kinds(boards: Sequence[Board]) -> tuple[BoardKind, ...]:
+    if not boards:
+        raise InputError("identifying boards: no boards are listed; give at least one")
+    ids = [b.board_id for b in boards]
+    if len(set(ids)) < len(ids):
+        raise InputError(f"identifying boards: a board id is listed twice ({', '.join(ids)}); give each board its own")
+    return board_kinds(boards)
+
+
+def _nothing_shared(views: tuple[View, View], kinds: Sequence[BoardKind]) -> str:
+    counts = [sum(bool(k) for k in view.kinds) for view in views]
+    listed = ", ".join(f"{i} ({k.board.columns}x{k.board.rows})" for k in kinds for i in k.ids)
+    return (
+        f"no listed board is seen in both images (listed boards in image 1: {counts[0]}, in image 2: {counts[1]}; "
+        f"listed: {listed}); check the board sizes and that both images show the same boards"
+    )
+
+
+def _roll_rad(solution: Solution) -> float:
+    """Return how far camera 2 is turned against camera 1 about the optical axis: the twist of the rotation about z."""
+    r = solution.pose.cam2_from_cam1[:3, :3]
+    return abs(float(np.arctan2(r[1, 0] - r[0, 1], r[0, 0] + r[1, 1])))
+
+
+def _log_odds(best: Solution, other: Solution, free1: FloatArray, free2: FloatArray, views: tuple[View, View]) -> float:
+    """Return the log odds of the best assignment against another (see the notes of `identify_pair`)."""
+    first, second = [s.first for s in best.links], [s.second for s in best.links]
+    free = float(free1[first].sum() + free2[second].sum())
+    counts = [len(views[0].sights[i].rays) for i in first] + [len(views[1].sights[j].rays) for j in second]
+    sigma2 = [np.mean(views[0].sights[i].sigma_px ** -2.0) for i in first]
+    sigma2 += [np.mean(views[1].sights[j].sigma_px ** -2.0) for j in second]
+    constraints = 6 * (len(best.links) - 1)
+    noise = free / max(2 * sum(counts) - 6 * len(counts), 1)
+    floor = max(constraints, 1) * max(noise, FLOOR_PX**2 * float(np.mean(sigma2)))
+    excess = max(float(best.chi2_1[first].sum() + best.chi2_2[second].sum()) - free, floor)
+    return 0.5 * constraints * float(np.log((excess + max(other.chi2 - best.chi2, 0.0)) / excess))
+
+
+def _tie_note(winner: Solution, others: Sequence[Solution]) -> str:
+    roll = np.degrees(_roll_rad(winner))
+    next_roll = np.degrees(min(_roll_rad(s) for s in others))
+    what = "one board alone" if len(winner.links) == 1 else "the arrangement of the boards"
+    why = "with the smallest roll" if roll <= next_roll else "that the boards' colours speak for, not the smallest roll"
+    return (
+        f"ambiguous: {what} cannot tell {len(others) + 1} assignments apart; took the one {why} "
+        f"between the cameras ({roll:.1f} degrees, next {next_roll:.1f}); boards of different sizes would settle it"
+    )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Seen:
+    """A board of some kind: where it is, which detection shows it in image 1 and 2, and how that is placed."""
+
+    located: Located
+    index: tuple[int | None, int | None]
+    placement: tuple[Placement, Placement]
+
+
+def _seen(
+    winner: Solution, views: tuple[View, View], kinds: Sequence[BoardKind]
+) -> tuple[list[_Seen], list[tuple[int, int]]]:
+    """Return the boards of the winner, then those of one image only as far as they are listed, and what is left over.
+
+    What is left over: (image 0 or 1, detection).
+    """
+    out = []
+    for link, pose in zip(winner.links, winner.pose.cam1_from_board, strict=True):
+        name = views[0].detections[link.first].board_id or views[1].detections[link.second].board_id
+        out.append(_Seen(Located(link.kind, pose, name), (link.first, link.second), (link.placement1, link.placement2)))
+    vacant = [len(kind.boards) - sum(s.located.kind == k for s in out) for k, kind in enumerate(kinds)]
+    left_over = []
+    cam1_from_cam = (np.eye(4), np.linalg.inv(winner.pose.cam2_from_cam1))
+    for v, view in enumerate(views):
+        taken = {s.index[v] for s in out}
+        poses = GridPoses(view)
+        for n in sorted(set(range(len(view.detections))) - taken, key=lambda n: -len(view.detections[n].grid)):
+            taken_names = {s.located.board_id for s in out} - {None}
+            free = [] if view.detections[n].board_id in taken_names else view.kinds[n]
+            k = next((k for k in free if vacant[k] > 0), None)
+            where = placements(view.detections[n], kinds[k])[0] if k is not None else None
+            found = poses.placed(n, kinds[k], where) if k is not None and where is not None else []
+            if k is None or where is None or not found:
+                left_over.append((v, n))
+                continue
+            vacant[k] -= 1
+            located = Located(k, cam1_from_cam[v] @ found[0][0], view.detections[n].board_id)
+            out.append(_Seen(located, (n, None) if v == 0 else (None, n), (where, where)))
+    return out, left_over
+
+
+def _result(
+    winner: Solution,
+    runner_up_px: float,
+    tied: Sequence[Solution],
+    views: tuple[View, View],
+    kinds: Sequence[BoardKind],
+    boards: Sequence[Board],
+    layout: Mapping[str, str] | None,
+) -> PairIdentity:
+    """Name and turn the winner's boards, refine with each board's own squares, and sum up."""
+    seen, left_over = _seen(winner, views, kinds)
+    names, notes = name_boards([s.located for s in seen], kinds, layout)
+    by_id = {b.board_id: b for b in boards}
+    centres = [s.located.centre(kinds[s.located.kind].board) for s in seen]
+    detections: tuple[dict[str, BoardDetection], dict[str, BoardDetection]] = ({}, {})
+    start: dict[str, FloatArray] = {}
+    for n, (item, name) in enumerate(zip(seen, names, strict=True)):
+        kind, board = kinds[item.located.kind], by_id[name]
+        others = [c for k, c in enumerate(centres) if k != n]
+        turn = first_corner_turn(item.located, kind, board, others)
+        for v in (0, 1):
+            index = item.index[v]
+            if index is not None:
+                placed = item.placement[v].apply(views[v].detections[index], kind.board)
+                detections[v][name] = placed.turned(turn).named(name)
+        whole = BoardDetection(None, *kind.board.size, np.zeros((0, 2), int), np.zeros((0, 2)), np.zeros(0))
+        start[name] = item.located.cam1_from_board @ np.linalg.inv(Placement(turn).board_from_grid(whole, board))
+    both = [b.board_id for b in boards if b.board_id in detections[0] and b.board_id in detections[1]]
+    pose = _refined(winner.pose.cam2_from_cam1, start, both, detections, by_id, views)
+    for k, board_id in enumerate(both):
+        start[board_id] = pose.cam1_from_board[k]
+    corners = np.array([[len(d[i].grid) for d in detections] for i in both])
+    per_board = np.sqrt(pose.squared_px.sum(axis=1) / corners.sum(axis=1))
+    contradicting = [s for s in tied if s.differs_from(winner)]
+    lost = [_why_left_over(v, views[v], n) for v, n in left_over]
+    ordered = [[*both, *(b.board_id for b in boards if b.board_id in d and b.board_id not in both)] for d in detections]
+    return PairIdentity(
+        tuple(detections[0][i] for i in ordered[0]),
+        tuple(detections[1][i] for i in ordered[1]),
+        Rigid3.from_matrix(pose.cam2_from_cam1),
+        {i: Rigid3.from_matrix(m) for i, m in start.items()},
+        float(np.sqrt(pose.squared_px.sum() / corners.sum())),
+        runner_up_px,
+        dict(zip(both, per_board.tolist(), strict=True)),
+        bool(contradicting),
+        _missing(boards, detections, both),
+        (
+            *views[0].notes,
+            *views[1].notes,
+            *notes,
+            *lost,
+            *([_tie_note(winner, contradicting)] if contradicting else []),
+        ),
+    )
+
+
+def _refined(
+    cam2_from_cam1: FloatArray,
+    cam1_from_board: Mapping[str, FloatArray],
+    both: Sequence[str],
+    detections: tuple[Mapping[str, BoardDetection], Mapping[str, BoardDetection]],
+    boards: Mapping[str, Board],
+    views: tuple[View, View],
+) -> JointPose:
+    sights = [
+        [Sight.of(view.camera, d[i].pixels, d[i].sigma_px, i) for i in both]
+        for view, d in zip(views, detections, strict=True)
+    ]
+    points = [[boards[i].points(d[i].grid) for i in both] for d in detections]
+    return refine_joint(
+        cam2_from_cam1, np.stack([cam1_from_board[i] for i in both]), sights[0], points[0], sights[1], points[1]
+    )
+
+
+def _runner_up_px(
+    winner: Solution,
+    rivals: Sequence[Solution],
+    links: Sequence[Link],
+    views: tuple[View, View],
+    kinds: Sequence[BoardKind],
+) -> float:
+    """Return the smallest rms of a joint fit of at least as many boards among the best rivals."""
+    enough = len(winner.links)
+    fits = [
+        (enough, s.rms_px(*views)) if len(s.links) >= enough else forced_rms_px(s, links, *views, kinds)
+        for s in rivals[:MAX_RIVALS]
+    ]
+    return min((rms for count, rms in fits if count >= enough), default=float("inf"))
+
+
+def _why_left_over(image: int, view: View, index: int) -> str:
+    what = f"image {image + 1}: {describe(view.detections[index])}"
+    if view.kinds[index]:
+        return f"{what} fits no board still free: one too many, or moved between the images"
+    return f"{what} is none of the boards listed"
+
+
+def _missing(
+    boards: Sequence[Board],
+    detections: tuple[Mapping[str, BoardDetection], Mapping[str, BoardDetection]],
+    both: Sequence[str],
+) -> dict[str, str]:
+    out = {}
+    for board in boards:
+        i = board.board_id
+        if i in both:
+            continue
+        size = f"{board.columns}x{board.rows} corners"
+        if i in detections[0]:
+            out[i] = f"{size}: seen in image 1 only"
+        elif i in detections[1]:
+            out[i] = f"{size}: seen in image 2 only"
+        else:
+            out[i] = f"{size}: not seen in either image"
+    return out

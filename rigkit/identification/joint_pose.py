@@ -1,0 +1,160 @@
+"""Poses of two cameras and of the boards that both see by least squares over all corners: a small bundle adjustment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import FloatArray, IntArray, Pixels, Points, Rays
+from rigkit.core.errors import InputError
+from rigkit.geometry.board_pose import point_residuals
+from rigkit.geometry.rotation import exp_so3, skew
+
+__all__ = ["JointPose", "Sight", "refine_joint"]
+
+MAX_STEPS = 30
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Sight:
+    """Corners of one board in one image, ready for residuals in pixels.
+
+    Attributes
+    ----------
+    rays : (N, 3) unit.
+    bases : (N, 2, 3) pseudo-inverse of d ray / d pixel: turns an offset of the ray into one of the pixel.
+    sigma_px : (N,)
+    """
+
+    rays: Rays
+    bases: FloatArray
+    sigma_px: FloatArray
+
+    @classmethod
+    def of(cls, camera: Camera, pixels: Pixels, sigma_px: FloatArray, where: str) -> Sight:
+        """Build from pixels; raises InputError, naming `where`, where a pixel has no ray."""
+        rays, seen = camera.unproject(pixels)
+        if not seen.all():
+            lost = int((~seen).sum())
+            raise InputError(f"{where}: {lost} corners lie outside the camera's field of view; check the calibration")
+        return cls(rays, np.asarray(np.linalg.pinv(camera.ray_jacobian(pixels)), dtype=np.float64), sigma_px)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class JointPose:
+    """Result of `refine_joint`.
+
+    Attributes
+    ----------
+    cam2_from_cam1 : (4, 4)
+    cam1_from_board : (B, 4, 4)
+    squared_px : (B, 2) sum over corners of the squared distance, board by board, in image 1 and 2.
+    chi2 : (B, 2) the same in units of the corners' variances.
+    """
+
+    cam2_from_cam1: FloatArray
+    cam1_from_board: FloatArray
+    squared_px: FloatArray
+    chi2: FloatArray
+
+
+@dataclass(slots=True)
+class _Observations:
+    """All corners of one image: rays, whitened bases, board points, board index."""
+
+    rays: Rays
+    bases: FloatArray
+    points: Points
+    board: IntArray
+    sigma_px: FloatArray
+
+    @classmethod
+    def stack(cls, sights: Sequence[Sight], points: Sequence[Points]) -> _Observations:
+        sigma = np.concatenate([s.sigma_px for s in sights])
+        bases = np.concatenate([s.bases for s in sights]) / sigma[:, None, None]
+        board = np.repeat(np.arange(len(sights)), [len(p) for p in points])
+        return cls(np.concatenate([s.rays for s in sights]), bases, np.concatenate(points), board, sigma)
+
+
+def refine_joint(
+    cam2_from_cam1: FloatArray,
+    cam1_from_board: FloatArray,
+    sights1: Sequence[Sight],
+    points1: Sequence[Points],
+    sights2: Sequence[Sight],
+    points2: Sequence[Points],
+    *,
+    tolerance: float = 1e-9,
+) -> JointPose:
+    """Return relative pose and board poses that minimise the whitened distances of all corners in both images.
+
+    Parameters
+    ----------
+    cam2_from_cam1, cam1_from_board : (4, 4) and (B, 4, 4) where to start.
+    sights1, sights2 : B boards as either image sees them.
+    points1, points2 : their corners in the frame of their board, mm; the two images need not see the same ones.
+    tolerance : stop when a step gains less than this part of the cost.
+    """
+    images = _Observations.stack(sights1, points1), _Observations.stack(sights2, points2)
+    motion, boards = cam2_from_cam1.copy(), cam1_from_board.copy()
+    residual, jacobian = _evaluate(images, motion, boards)
+    cost, damping = float(residual @ residual), 1e-6
+    for _ in range(MAX_STEPS):
+        normal = jacobian.T @ jacobian
+        normal[np.diag_indices_from(normal)] *= 1.0 + damping
+        step = np.asarray(-np.linalg.solve(normal, jacobian.T @ residual), dtype=np.float64).reshape(-1, 6)
+        trial = _moved(motion, step[0]), _moved(boards, step[1:])
+        trial_residual, trial_jacobian = _evaluate(images, *trial)
+        trial_cost = float(trial_residual @ trial_residual)
+        if trial_cost < cost:
+            settled = cost - trial_cost <= tolerance * cost
+            (motion, boards), residual, jacobian, cost = trial, trial_residual, trial_jacobian, trial_cost
+            damping = max(damping * 0.1, 1e-9)
+            if settled:
+                break
+        else:
+            damping = max(damping * 10.0, 1e-4)
+            if damping > 1e4:
+                break
+    split = np.split(residual.reshape(-1, 2), [len(images[0].rays)])
+    chi2, squared = np.zeros((len(boards), 2)), np.zeros((len(boards), 2))
+    for k, (image, part) in enumerate(zip(images, split, strict=True)):
+        each = (part**2).sum(axis=1)
+        chi2[:, k] = np.bincount(image.board, each, len(boards))
+        squared[:, k] = np.bincount(image.board, each * image.sigma_px**2, len(boards))
+    return JointPose(motion, boards, squared, chi2)
+
+
+def _moved(pose: FloatArray, step: FloatArray) -> FloatArray:
+    """Return poses (..., 4, 4) changed by (w, v): R' = exp([w]x) R, t' = t + v."""
+    out = pose.copy()
+    out[..., :3, :3] = exp_so3(step[..., :3]) @ pose[..., :3, :3]
+    out[..., :3, 3] += step[..., 3:]
+    return out
+
+
+def _evaluate(
+    images: tuple[_Observations, _Observations], motion: FloatArray, boards: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return whitened residuals of image 1, then 2, (2N,), and their derivatives by the motion, then the boards."""
+    residuals, jacobians = [], []
+    for k, image in enumerate(images):
+        pose = boards[image.board]
+        turned = (pose[:, :3, :3] @ image.points[..., None])[..., 0]
+        x = turned + pose[:, :3, 3]
+        n = len(x)
+        jacobian = np.zeros((n, 2, 1 + len(boards), 6))
+        if k == 0:
+            residual, by_x = point_residuals(image.rays, image.bases, x)
+        else:
+            swung = x @ motion[:3, :3].T
+            residual, by_y = point_residuals(image.rays, image.bases, swung + motion[:3, 3])
+            jacobian[:, :, 0] = np.concatenate([-by_y @ skew(swung), by_y], axis=-1)
+            by_x = by_y @ motion[:3, :3]
+        jacobian[np.arange(n), :, 1 + image.board] = np.concatenate([-by_x @ skew(turned), by_x], axis=-1)
+        residuals.append(residual.reshape(-1))
+        jacobians.append(jacobian.reshape(2 * n, -1))
+    return np.concatenate(residuals), np.concatenate(jacobians)

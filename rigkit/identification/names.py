@@ -1,0 +1,184 @@
+"""Which of several boards that look alike is which in the list, and which of its corners is the first.
+
+Nothing on such boards tells them apart, so a rule does; it looks at the scene from camera 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.core.arrays import FloatArray
+from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
+from rigkit.identification.placements import BoardKind
+
+__all__ = ["SIDES", "Located", "first_corner_turn", "name_boards"]
+
+SIDES: Mapping[str, tuple[float, float, float]] = {
+    "left": (1.0, 0.0, 0.0),
+    "right": (-1.0, 0.0, 0.0),
+    "floor": (0.0, -1.0, 0.0),
+    "ceiling": (0.0, 1.0, 0.0),
+    "back": (0.0, 0.0, -1.0),
+}
+"""Where a board may hang, and the way its face then looks in the frame of camera 1."""
+THREE = ("right", "floor", "left")
+"""Three boards of one kind, in the order listed: clockwise round the floor of a corner."""
+LEVEL_COSINE = float(np.sqrt(0.5))
+"""A board within 45 degrees of level lies on the floor or the ceiling."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Located:
+    """A board of a kind whose place is known: `cam1_from_board` (4, 4) in the frame of the kind's first board."""
+
+    kind: int
+    cam1_from_board: FloatArray
+    board_id: str | None = None
+
+    def centre(self, board: Board) -> FloatArray:
+        """Return the centre of the board, (3,) mm in camera 1."""
+        return np.asarray(self.cam1_from_board[:3, :3] @ board.points().mean(axis=0) + self.cam1_from_board[:3, 3])
+
+    @property
+    def face(self) -> FloatArray:
+        """The normal that looks at the viewer, whatever the hand of the grid."""
+        normal = self.cam1_from_board[:3, 2]
+        return np.asarray(-np.sign(normal @ self.cam1_from_board[:3, 3]) * normal)
+
+
+def name_boards(
+    located: Sequence[Located], kinds: Sequence[BoardKind], layout: Mapping[str, str] | None = None
+) -> tuple[list[str], tuple[str, ...]]:
+    """Return a board id for each located board, and notes. No kind may have more located than listed boards.
+
+    The rule, where several boards of a kind are listed: names that are known stay; then boards in `layout` go to the
+    sides it says; then boards listed upright (columns x rows swapped) to those seen so; the rest are taken in the order
+    listed, clockwise round the centre of all boards as camera 1 sees them, from opposite the floor or ceiling board
+    (from twelve o'clock if there is none): in a corner the right wall, the floor, the left wall. Where only some
+    of three are in sight, each is named by its side in that order.
+    """
+    notes: list[str] = []
+    names: list[str | None] = [item.board_id for item in located]
+    _check(layout, kinds)
+    clock = _clock(located, kinds)
+    for k, kind in enumerate(kinds):
+        free = [n for n, item in enumerate(located) if item.kind == k and names[n] is None]
+        ids = [board_id for board_id in kind.ids if board_id not in names]
+        if not free or not ids:
+            continue
+        if len(kind.ids) > 1:
+            sides = {i: layout[i] for i in ids if i in layout} if layout else {}
+            if not sides and len(ids) == len(kind.ids) == len(THREE) and len(free) < len(THREE):
+                sides = dict(zip(ids, THREE, strict=True))
+                notes.append(
+                    f"{len(free)} of the equal boards {', '.join(ids)} in sight: named by side ("
+                    + ", ".join(f"{i} {side}" for i, side in sides.items())
+                    + "); give a layout if they hang otherwise"
+                )
+            _by_side(located, names, free, sides)
+            free = [n for n in free if names[n] is None]
+            ids = [i for i in ids if i not in names]
+            order = _from_opposite_level(free, located, clock)
+            for board, n in _by_shape(order, ids, located, kind):
+                names[n] = board
+        else:
+            names[free[0]] = ids[0]
+    return [str(name) for name in names], tuple(notes)
+
+
+def first_corner_turn(item: Located, kind: BoardKind, board: Board, others: Sequence[FloatArray]) -> int:
+    """Return the quarter turns from the kind's frame to that of `board`, one of its boards.
+
+    Where the board looks the same turned, the first corner is, of those possible, the end of the board nearest to the
+    centres of the `others` (3,), mm; without others, the one from which the columns run most nearly to the right in
+    camera 1. Where columns + rows is odd the colours have told the first corner already, on a ChArUco board the
+    markers.
+    """
+    turns: tuple[int, ...] = (0, 2) if kind.board.size == board.size else (1, 3)
+    if kind.board.columns == kind.board.rows and kind.board.square_x_mm == kind.board.square_y_mm:
+        turns = (0, 2) if kind.board.columns % 2 == 0 else (0, 1, 2, 3)
+    if (board.columns + board.rows) % 2 == 1 or board.markers is not None:
+        return turns[0]
+    columns, rows = kind.board.columns - 1, kind.board.rows - 1
+    # The corner that `BoardDetection.turned` makes the first, and the direction of the columns from there.
+    first = {0: (0, 0), 1: (0, rows), 2: (columns, rows), 3: (columns, 0)}
+    along = {0: (1, 0), 1: (0, -1), 2: (-1, 0), 3: (0, 1)}
+    squares = np.array([kind.board.square_x_mm, kind.board.square_y_mm])
+
+    def badness(turn: int) -> float:
+        if others:
+            corner = item.cam1_from_board[:3, :2] @ (first[turn] * squares) + item.cam1_from_board[:3, 3]
+            return float(np.linalg.norm(corner - np.mean(others, axis=0)))
+        return -float(item.cam1_from_board[0, :2] @ np.array(along[turn]))
+
+    return min(turns, key=lambda turn: (round(badness(turn), 6), turn))
+
+
+def _check(layout: Mapping[str, str] | None, kinds: Sequence[BoardKind]) -> None:
+    known = {board_id for kind in kinds for board_id in kind.ids}
+    for board_id, side in (layout or {}).items():
+        if board_id not in known:
+            raise InputError(f"layout: no board is called '{board_id}'; known: {', '.join(sorted(known))}")
+        if side not in SIDES:
+            raise InputError(f"layout: board '{board_id}': side '{side}' is unknown; known: {', '.join(SIDES)}")
+
+
+def _clock(located: Sequence[Located], kinds: Sequence[BoardKind]) -> FloatArray:
+    """Return where each board lies round the common centre, radians clockwise from twelve o'clock in camera 1."""
+    centres = np.array([item.centre(kinds[item.kind].board) for item in located]).reshape(-1, 3)
+    rays = centres / np.linalg.norm(centres, axis=1, keepdims=True)
+    right, down = _image_axes(rays.mean(axis=0))
+    return np.asarray(np.arctan2(rays @ right, -(rays @ down)) % (2.0 * np.pi))
+
+
+def _image_axes(towards: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the unit vectors to the right and down, across the line of sight `towards` (3,)."""
+    sight = towards / np.linalg.norm(towards)
+    right = np.cross([0.0, 1.0, 0.0], sight)
+    length = np.linalg.norm(right)
+    right = right / length if length > 1e-9 else np.array([1.0, 0.0, 0.0])
+    return right, np.cross(sight, right)
+
+
+def _from_opposite_level(free: list[int], located: Sequence[Located], clock: FloatArray) -> list[int]:
+    """Return boards clockwise, from opposite the one that lies most nearly level, if any does."""
+    if not free:
+        return []
+    level = max(free, key=lambda n: abs(located[n].face[1]))
+    start = clock[level] + np.pi if abs(located[level].face[1]) > LEVEL_COSINE else 0.0
+    return sorted(free, key=lambda n: ((clock[n] - start) % (2.0 * np.pi), n))
+
+
+def _by_side(located: Sequence[Located], names: list[str | None], free: list[int], sides: Mapping[str, str]) -> None:
+    """Give the boards with a side to the located boards that face most nearly as that side does."""
+    from scipy.optimize import linear_sum_assignment
+
+    if not sides:
+        return
+    ids = list(sides)
+    likeness = np.array([[located[n].face @ SIDES[sides[i]] for i in ids] for n in free])
+    for row, column in zip(*linear_sum_assignment(-likeness), strict=True):
+        names[free[row]] = ids[column]
+
+
+def _by_shape(order: list[int], ids: list[str], located: Sequence[Located], kind: BoardKind) -> list[tuple[str, int]]:
+    """Pair ids with boards in the order given, boards listed upright with those that stand more upright."""
+    shape = {board.board_id: board.size for board in kind.boards}
+    alike = [i for i in ids if shape[i] == kind.board.size]
+    swapped = [i for i in ids if shape[i] != kind.board.size]
+    if not swapped or not alike:
+        return list(zip(ids, order, strict=False))
+
+    def tilt(n: int) -> float:
+        right, down = _image_axes(located[n].centre(kind.board))
+        along = located[n].cam1_from_board[:3, 0]
+        return float(np.arctan2(abs(along @ down), abs(along @ right)))
+
+    lying = set(sorted(order, key=tilt)[: len(alike)])
+    first = [n for n in order if n in lying]
+    rest = [n for n in order if n not in lying]
+    return [*zip(alike, first, strict=False), *zip(swapped, rest, strict=False)]

@@ -1,0 +1,160 @@
+"""Which detection may be which board, in which position: what a single image leaves open.
+
+A placement takes the grid of a detection to the grid of a board: some quarter turns, then a shift. Boards whose grids
+and squares are equal, as listed or turned by 90 degrees, form one kind: nothing but geometry tells them apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.core.arrays import FloatArray, IntArray
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
+
+__all__ = ["BoardKind", "Placement", "board_kinds", "describe", "placements", "possible_kinds"]
+
+SAME_SQUARE_REL = 0.03
+"""Squares that differ by less are not told apart by their size."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class BoardKind:
+    """Boards that look alike. The first one lends its frame."""
+
+    boards: tuple[Board, ...]
+
+    @property
+    def board(self) -> Board:
+        return self.boards[0]
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        return tuple(b.board_id for b in self.boards)
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """board grid = grid of `detection.turned(quarter_turns)` + (columns, rows)."""
+
+    quarter_turns: int
+    columns: int = 0
+    rows: int = 0
+
+    def grid_of(self, detection: BoardDetection) -> IntArray:
+        """Return the board grid (N, 2) of the detection's corners, in the detection's order."""
+        return self._place(detection.grid, detection)
+
+    def apply(self, detection: BoardDetection, board: Board) -> BoardDetection:
+        """Return the detection on the board's own grid."""
+        turned = detection.turned(self.quarter_turns)
+        grid = turned.grid + np.array([self.columns, self.rows])
+        return BoardDetection(detection.board_id, board.columns, board.rows, grid, turned.pixels, turned.sigma_px)
+
+    def board_from_grid(self, detection: BoardDetection, board: Board) -> FloatArray:
+        """Return the rigid motion (4, 4), mm, from the frame of the detection's grid to that of the board."""
+        origin, along_x, along_y = self._place(np.array([[0, 0], [1, 0], [0, 1]]), detection).astype(np.float64)
+        out = np.eye(4)
+        out[:2, 0], out[:2, 1] = along_x - origin, along_y - origin
+        out[:2, 3] = origin * [board.square_x_mm, board.square_y_mm]
+        return out
+
+    def relative_to(self, first: Placement, detection1: BoardDetection, detection2: BoardDetection) -> tuple[int, ...]:
+        """Return a key that is equal for all pairs of placements that put detection 2 alike onto detection 1."""
+        on_board = self._place(np.array([[0, 0], [1, 0], [0, 1]]), detection2)
+        size = (detection1.columns, detection1.rows)
+        turned_size = size if first.quarter_turns % 2 == 0 else size[::-1]
+        shifted = on_board - np.array([first.columns, first.rows])
+        back = _turn(shifted, turned_size, -first.quarter_turns % 4)
+        return tuple(int(v) for v in back.ravel())
+
+    def _place(self, grid: IntArray, detection: BoardDetection) -> IntArray:
+        turned = _turn(grid, (detection.columns, detection.rows), self.quarter_turns)
+        return np.asarray(turned + np.array([self.columns, self.rows]), dtype=np.int64)
+
+
+def _turn(grid: IntArray, size: tuple[int, int], quarter_turns: int) -> IntArray:
+    """Return grid positions (N, 2) of a columns x rows grid after `quarter_turns`, as `BoardDetection.turned`."""
+    column, row = grid[:, 0], grid[:, 1]
+    columns, rows = size
+    for _ in range(quarter_turns):
+        column, row = rows - 1 - row, column
+        columns, rows = rows, columns
+    return np.stack([column, row], axis=-1)
+
+
+def board_kinds(boards: Sequence[Board]) -> tuple[BoardKind, ...]:
+    """Group boards that look alike, in the order of their first members."""
+    groups: list[list[Board]] = []
+    for board in boards:
+        for group in groups:
+            if _alike(board, group[0]):
+                group.append(board)
+                break
+        else:
+            groups.append([board])
+    return tuple(BoardKind(tuple(group)) for group in groups)
+
+
+def _alike(a: Board, b: Board) -> bool:
+    if a.markers is not None or b.markers is not None:
+        return False
+
+    def close(x: float, y: float) -> bool:
+        return abs(x - y) <= SAME_SQUARE_REL * max(x, y)
+
+    same = a.size == b.size and close(a.square_x_mm, b.square_x_mm) and close(a.square_y_mm, b.square_y_mm)
+    turned = a.size == b.size[::-1] and close(a.square_x_mm, b.square_y_mm) and close(a.square_y_mm, b.square_x_mm)
+    return same or turned
+
+
+def possible_kinds(detections: Sequence[BoardDetection], kinds: Sequence[BoardKind]) -> list[list[int]]:
+    """Return for each detection of one image the kinds that it may be (indices into `kinds`; none: not listed).
+
+    A name settles the kind. A whole grid is what its size says, unless more grids of that size were found than there
+    are boards: then each may also be part of a larger board, as any smaller grid may.
+    """
+    named = {board_id: k for k, kind in enumerate(kinds) for board_id in kind.ids}
+    out: list[list[int]] = []
+    sizes = [tuple(sorted((d.columns, d.rows))) for d in detections]
+    for d, size in zip(detections, sizes, strict=True):
+        if d.board_id in named:
+            out.append([named[d.board_id]])
+            continue
+        # A ChArUco board is known by its markers, that is by name, or not at all.
+        plain = [k for k, kind in enumerate(kinds) if kind.board.markers is None]
+        whole = [k for k in plain if tuple(sorted(kinds[k].board.size)) == size]
+        crowded = sizes.count(size) > sum(len(kinds[k].boards) for k in whole)
+        larger = [k for k in plain if k not in whole and placements(d, kinds[k])]
+        out.append(whole + larger if crowded or not whole else whole)
+    return out
+
+
+def placements(detection: BoardDetection, kind: BoardKind) -> list[Placement]:
+    """Return the ways to put a detection onto a board of its kind, most likely first; none where it does not fit.
+
+    Where columns + rows is odd the detector's convention (the square outside the first corner is dark) leaves one way
+    to place a whole grid; a square grid may have been turned by 90 degrees against the convention, which comes last.
+    """
+    columns, rows = kind.board.size
+    if kind.board.markers is not None:
+        return [Placement(0)]
+    whole = sorted((detection.columns, detection.rows)) == sorted((columns, rows))
+    if whole and (columns + rows) % 2 == 1:
+        return [Placement(0 if detection.columns == columns else 1)]
+    out = []
+    for turn in (0, 2, 1, 3):
+        size = (detection.columns, detection.rows) if turn % 2 == 0 else (detection.rows, detection.columns)
+        out += [
+            Placement(turn, right, down) for down in range(rows - size[1] + 1) for right in range(columns - size[0] + 1)
+        ]
+    return out
+
+
+def describe(detection: BoardDetection) -> str:
+    """Return words by which a person finds a detection in the image."""
+    u, v = detection.pixels.mean(axis=0)
+    return f"the {detection.columns}x{detection.rows} grid round ({u:.0f}, {v:.0f})"

@@ -1,0 +1,506 @@
+/* Lattices of corners: local polynomial fits, rows and columns from links, growth ring by ring.
+ *
+ * The definitions are in rigkit.detection.lattice.local_fit, .lattice and .grow; the numbers come from there. */
+#include "kernels.h"
+
+enum { MOST_TERMS = 10, MOST_DEGREE = 3, MOST_RADIUS = 3, MOST_TRIED = 16 };
+
+/* The smallest pull on any term: no pivot of the exact normal equations is smaller, whatever rounding makes of it. */
+static const double LEAST_PULL = 1e-12;
+static const double LINEAR_PULL = 1e-9;
+
+/* A cell's polynomial: see LocalFit. */
+typedef struct {
+    double pixel[2], along_column[2], along_row[2], bend_column[2], bend_row[2], support, gain;
+} fit_t;
+
+typedef struct {
+    int64_t degree, radius, leave_out;
+    double width, ridge[2];
+} fit_rules_t;
+
+/* Solve the n x n symmetric `matrix` for three right-hand sides in place (LDL'). */
+INLINE void solve(double matrix[MOST_TERMS][MOST_TERMS], double right[MOST_TERMS][3], const int n)
+{
+    for (int k = 0; k < n; k++) {
+        const double pivot = matrix[k][k] > LEAST_PULL ? matrix[k][k] : LEAST_PULL;
+        const double inverse = 1.0 / pivot;
+        for (int i = k + 1; i < n; i++) {
+            const double factor = matrix[k][i] * inverse;
+            for (int j = i; j < n; j++)
+                matrix[i][j] -= factor * matrix[k][j];
+            for (int side = 0; side < 3; side++)
+                right[i][side] -= factor * right[k][side];
+        }
+        matrix[k][k] = pivot;
+    }
+    for (int k = n - 1; k >= 0; k--)
+        for (int side = 0; side < 3; side++) {
+            double sum = right[k][side];
+            for (int j = k + 1; j < n; j++)
+                sum -= matrix[k][j] * right[j][side];
+            right[k][side] = sum / matrix[k][k];
+        }
+}
+
+/* Fit a polynomial of `degree` (known when compiling, so that all loops unroll) around the cell (row, column) of
+ * `lattice` (rows, columns, 2), NaN where unknown. `bell` are the weights of steps 0, 1, ... along one direction. */
+INLINE void fit_polynomial(
+    const double *lattice, int64_t rows, int64_t columns, int64_t row, int64_t column, const int degree,
+    const fit_rules_t *rules, const double *bell, fit_t *out)
+{
+    static const int power_c[MOST_TERMS] = {0, 1, 0, 2, 1, 0, 3, 2, 1, 0};
+    static const int power_r[MOST_TERMS] = {0, 0, 1, 0, 1, 2, 0, 1, 2, 3};
+    const int terms = (degree + 1) * (degree + 2) / 2;
+    const int64_t radius = rules->radius;
+    const int64_t low_r = row - radius > 0 ? row - radius : 0, low_c = column - radius > 0 ? column - radius : 0;
+    const int64_t high_r = row + radius < rows - 1 ? row + radius : rows - 1;
+    const int64_t high_c = column + radius < columns - 1 ? column + radius : columns - 1;
+    /* Sums of weight * column^i * row^j, and those with the positions (from a corner nearby, against cancellation). */
+    double moment[2 * MOST_DEGREE + 1][2 * MOST_DEGREE + 1] = {{0.0}}, position[MOST_TERMS][2] = {{0.0}};
+    double weights[2 * MOST_RADIUS + 1][2 * MOST_RADIUS + 1];
+    double near_u = 0.0, near_v = 0.0;
+    int64_t support = 0;
+    for (int64_t r = low_r; r <= high_r; r++) {
+        double line[2 * MOST_DEGREE + 1] = {0.0}, line_u[MOST_DEGREE + 1] = {0.0}, line_v[MOST_DEGREE + 1] = {0.0};
+        const double y = (double)(r - row);
+        int64_t found = 0;
+        for (int64_t c = low_c; c <= high_c; c++) {
+            const double *pixel = lattice + 2 * (r * columns + c);
+            const double u = pixel[0], v = pixel[1];
+            const int known = u == u && !(rules->leave_out && r == row && c == column);
+            double *weight = &weights[r - low_r][c - low_c];
+            *weight = 0.0;
+            if (!known)
+                continue;
+            if (support + found == 0) {
+                near_u = u;
+                near_v = v;
+            }
+            found++;
+            const double x = (double)(c - column);
+            double power = *weight = bell[r < row ? row - r : r - row] * bell[c < column ? column - c : c - column];
+            for (int i = 0; i <= 2 * degree; i++) {
+                line[i] += power;
+                if (i <= degree) {
+                    line_u[i] += power * (u - near_u);
+                    line_v[i] += power * (v - near_v);
+                }
+                power *= x;
+            }
+        }
+        if (!found)
+            continue;
+        support += found;
+        double powers[2 * MOST_DEGREE + 1];
+        powers[0] = 1.0;
+        for (int j = 1; j <= 2 * degree; j++)
+            powers[j] = powers[j - 1] * y;
+        for (int i = 0; i <= 2 * degree; i++)
+            for (int j = 0; i + j <= 2 * degree; j++)
+                moment[i][j] += line[i] * powers[j];
+        for (int k = 0; k < terms; k++) {
+            position[k][0] += line_u[power_c[k]] * powers[power_r[k]];
+            position[k][1] += line_v[power_c[k]] * powers[power_r[k]];
+        }
+    }
+    const double total = moment[0][0] > LEAST_PULL ? moment[0][0] : LEAST_PULL;
+    const double centre_u = position[0][0] / total, centre_v = position[0][1] / total;
+    double normal[MOST_TERMS][MOST_TERMS], solved[MOST_TERMS][3];
+    const double pull[MOST_DEGREE + 1] = {LEAST_PULL, LINEAR_PULL, rules->ridge[0], rules->ridge[1]};
+    for (int k = 0; k < terms; k++) {
+        for (int j = k; j < terms; j++)
+            normal[k][j] = moment[power_c[k] + power_c[j]][power_r[k] + power_r[j]];
+        solved[k][0] = position[k][0] - centre_u * normal[0][k];
+        solved[k][1] = position[k][1] - centre_v * normal[0][k];
+        solved[k][2] = k == 0;
+    }
+    for (int k = 0; k < terms; k++)
+        normal[k][k] += pull[power_c[k] + power_r[k]];
+    solve(normal, solved, terms);
+    double gain = 0.0;
+    for (int64_t r = low_r; r <= high_r; r++) {
+        const double y = (double)(r - row);
+        for (int64_t c = low_c; c <= high_c; c++) {
+            const double x = (double)(c - column);
+            double lever = solved[0][2] + x * solved[1][2] + y * solved[2][2];
+            if (degree > 1)
+                lever += x * x * solved[3][2] + x * y * solved[4][2] + y * y * solved[5][2];
+            if (degree > 2)
+                lever += x * x * (x * solved[6][2] + y * solved[7][2]) + y * y * (x * solved[8][2] + y * solved[9][2]);
+            lever *= weights[r - low_r][c - low_c];
+            gain += lever * lever;
+        }
+    }
+    out->pixel[0] = solved[0][0] + centre_u + near_u;
+    out->pixel[1] = solved[0][1] + centre_v + near_v;
+    for (int side = 0; side < 2; side++) {
+        out->along_column[side] = solved[1][side];
+        out->along_row[side] = solved[2][side];
+        out->bend_column[side] = degree > 1 ? 2.0 * solved[3][side] : 0.0;
+        out->bend_row[side] = degree > 1 ? 2.0 * solved[5][side] : 0.0;
+    }
+    out->support = (double)support;
+    out->gain = sqrt(gain);
+}
+
+INLINE void fit_cell(
+    const double *lattice, int64_t rows, int64_t columns, int64_t row, int64_t column, const fit_rules_t *rules,
+    const double *bell, fit_t *out)
+{
+    if (rules->degree == 1)
+        fit_polynomial(lattice, rows, columns, row, column, 1, rules, bell, out);
+    else if (rules->degree == 2)
+        fit_polynomial(lattice, rows, columns, row, column, 2, rules, bell, out);
+    else
+        fit_polynomial(lattice, rows, columns, row, column, 3, rules, bell, out);
+}
+
+INLINE void fill_bell(const fit_rules_t *rules, double *bell)
+{
+    for (int64_t step = 0; step <= rules->radius; step++)
+        bell[step] = exp(-0.5 * (double)(step * step) / (rules->width * rules->width));
+}
+
+/* detection.lattice.local_fit.fit_cells for the cells marked in `cells` (rows, columns), row by row. */
+void fit_cells(
+    const double *lattice, int64_t rows, int64_t columns, const uint8_t *cells, const fit_rules_t *rules, fit_t *out);
+FOR_EACH_PROCESSOR void fit_cells(
+    const double *lattice, int64_t rows, int64_t columns, const uint8_t *cells, const fit_rules_t *rules, fit_t *out)
+{
+    double bell[MOST_RADIUS + 1];
+    fill_bell(rules, bell);
+    for (int64_t row = 0; row < rows; row++)
+        for (int64_t column = 0; column < columns; column++)
+            if (cells[row * columns + column])
+                fit_cell(lattice, rows, columns, row, column, rules, bell, out++);
+}
+
+/* Sort the `count` > 0 points into squares, in `memory` (squares_memory). */
+void sort_points(const double *points, int64_t count, int32_t *memory, squares_t *out);
+FOR_EACH_PROCESSOR void sort_points(const double *points, int64_t count, int32_t *memory, squares_t *out)
+{
+    fill_squares(points, count, 1.0, memory, out);
+}
+
+int64_t squares_memory(int64_t count);
+int64_t squares_memory(int64_t count) { return SQUARES_MEMORY(count); }
+
+/* Find the (at most `most`) nearest points within `reach` of (u, v), the nearest first; return how many. */
+static int64_t nearest_points(const squares_t *squares, double u, double v, double reach, int64_t most, int64_t *found)
+{
+    double distance[MOST_TRIED];
+    int64_t count = 0;
+    const int64_t low_c = square_at(u - reach, squares->left, squares->side, squares->columns);
+    const int64_t high_c = square_at(u + reach, squares->left, squares->side, squares->columns);
+    const int64_t low_r = square_at(v - reach, squares->top, squares->side, squares->rows);
+    const int64_t high_r = square_at(v + reach, squares->top, squares->side, squares->rows);
+    for (int64_t row = low_r; row <= high_r; row++) {
+        const int32_t *first = squares->first + row * squares->columns;
+        for (int32_t k = first[low_c]; k < first[high_c + 1]; k++) {
+            const double du = squares->points[2 * squares->order[k]] - u;
+            const double dv = squares->points[2 * squares->order[k] + 1] - v;
+            const double here = du * du + dv * dv;
+            if (!(here <= reach * reach) || (count == most && here >= distance[count - 1]))
+                continue;
+            int64_t at = count < most ? count++ : count - 1;
+            for (; at > 0 && distance[at - 1] > here; at--) {
+                distance[at] = distance[at - 1];
+                found[at] = found[at - 1];
+            }
+            distance[at] = here;
+            found[at] = squares->order[k];
+        }
+    }
+    return count;
+}
+
+/* See the constants of detection.lattice.grow, detection.lattice.links and detection.saddles.ring. */
+typedef struct {
+    fit_rules_t predictions[2];
+    const ring_rules_t *ring;
+    const double *along;
+    int64_t places, most, tried, fewest;
+    double reach, ring_part, min_ring, max_ring, line_sine, contrast_ratio, aside, min_aside, max_aside, least_area;
+} growth_rules_t;
+
+/* The brightness of a level: full-resolution pixel = scale * level pixel + offset. */
+typedef struct {
+    image_t image;
+    double scale, offset;
+} level_t;
+
+/* A lattice within empty cells; `sign` of the cell (0, 0) is +1 where brightness grows with the angle across its +column
+ * edge. `due[k]` marks the cells to be tried with prediction k. */
+typedef struct {
+    double *pixels, *contrast;
+    uint8_t *due[2];
+    int64_t rows, columns;
+    double sign;
+} sheet_t;
+
+INLINE int is_known(const sheet_t *sheet, int64_t row, int64_t column)
+{
+    if (row < 0 || column < 0 || row >= sheet->rows || column >= sheet->columns)
+        return 0;
+    const double u = sheet->pixels[2 * (row * sheet->columns + column)];
+    return u == u;
+}
+
+INLINE int runs_along(double angle, const double *vector, double line_sine)
+{
+    const double cross = cos(angle) * vector[1] - sin(angle) * vector[0];
+    return fabs(cross) < line_sine * sqrt(vector[0] * vector[0] + vector[1] * vector[1]);
+}
+
+/* Return whether the saddle at (u, v) can be the corner of the cell, and its contrast (detection.lattice.grow._fits). */
+INLINE int fits(
+    const sheet_t *sheet, const level_t *level, const growth_rules_t *rules, const fit_t *fit, int64_t row,
+    int64_t column, double height, const double *pixel, double *contrast)
+{
+    const double u = (pixel[0] - level->offset) / level->scale, v = (pixel[1] - level->offset) / level->scale;
+    const double sign = (row + column) % 2 ? -sheet->sign : sheet->sign;
+    double radius = rules->ring_part * height / level->scale, angles[2];
+    radius = radius > rules->min_ring ? radius : rules->min_ring;
+    radius = radius < rules->max_ring ? radius : rules->max_ring;
+    if (!read_ring(level->image, *rules->ring, (float)u, (float)v, (float)radius, 0.0, angles, contrast))
+        return 0;
+    if (!runs_along(angles[0], sign > 0.0 ? fit->along_column : fit->along_row, rules->line_sine) ||
+        !runs_along(angles[1], sign > 0.0 ? fit->along_row : fit->along_column, rules->line_sine))
+        return 0;
+    static const int64_t step_c[4] = {1, 0, -1, 0}, step_r[4] = {0, 1, 0, -1};
+    for (int direction = 0; direction < 4; direction++) {
+        const int64_t r = row + step_r[direction], c = column + step_c[direction];
+        if (!is_known(sheet, r, c))
+            continue;
+        const double *end = sheet->pixels + 2 * (r * sheet->columns + c);
+        const double end_u = (end[0] - level->offset) / level->scale, end_v = (end[1] - level->offset) / level->scale;
+        const double side = direction % 2 ? -sign : sign;
+        const double there = sheet->contrast[r * sheet->columns + c];
+        const double weakest = rules->contrast_ratio * (there < *contrast ? there : *contrast);
+        double aside = rules->aside * sqrt((end_u - u) * (end_u - u) + (end_v - v) * (end_v - v));
+        aside = aside > rules->min_aside ? aside : rules->min_aside;
+        aside = aside < rules->max_aside ? aside : rules->max_aside;
+        if (!edge_seen(level->image, rules->along, rules->places, rules->most, u, v, end_u, end_v, side, aside, weakest))
+            return 0;
+    }
+    return 1;
+}
+
+/* Try the saddles near the prediction of one empty cell; return whether one fits, its pixel and contrast in `out`. */
+INLINE int try_cell(
+    const sheet_t *sheet, const level_t *level, const squares_t *saddles, const growth_rules_t *rules,
+    const fit_rules_t *prediction, const double *bell, int64_t row, int64_t column, double out[3])
+{
+    fit_t fit;
+    fit_cell(sheet->pixels, sheet->rows, sheet->columns, row, column, prediction, bell, &fit);
+    if (fit.support < (double)rules->fewest)
+        return 0;
+    const double place_u = (fit.pixel[0] - level->offset) / level->scale;
+    const double place_v = (fit.pixel[1] - level->offset) / level->scale;
+    if (!(place_u > 0.0 && place_v > 0.0 && place_u < (double)(level->image.width - 1) &&
+          place_v < (double)(level->image.height - 1)))
+        return 0;
+    const double *a = fit.along_column, *b = fit.along_row;
+    const double side_a = sqrt(a[0] * a[0] + a[1] * a[1]), side_b = sqrt(b[0] * b[0] + b[1] * b[1]);
+    const double longest = side_a > side_b ? side_a : side_b, area = a[0] * b[1] - a[1] * b[0];
+    if (!(area > rules->least_area))
+        return 0;
+    int64_t near[MOST_TRIED];
+    double off[MOST_TRIED];
+    const int64_t count =
+        nearest_points(saddles, fit.pixel[0], fit.pixel[1], rules->reach * longest, rules->tried, near);
+    for (int64_t k = 0; k < count; k++) {
+        const double *at = saddles->points + 2 * near[k];
+        const double du = at[0] - fit.pixel[0], dv = at[1] - fit.pixel[1];
+        off[k] = hypot(du * b[1] - dv * b[0], a[0] * dv - a[1] * du) / area;
+    }
+    /* The nearest in cells that fits: so try them in that order. */
+    for (int64_t k = 0; k < count; k++) {
+        int64_t best = -1;
+        for (int64_t j = 0; j < count; j++)
+            if (off[j] < rules->reach && (best < 0 || off[j] < off[best]))
+                best = j;
+        if (best < 0)
+            return 0;
+        off[best] = rules->reach;
+        const double *at = saddles->points + 2 * near[best];
+        if (fits(sheet, level, rules, &fit, row, column, area / longest, at, &out[2])) {
+            out[0] = at[0];
+            out[1] = at[1];
+            return 1;
+        }
+    }
+    return 0;
+}
+
+INLINE int has_neighbour(const sheet_t *sheet, int64_t row, int64_t column)
+{
+    return is_known(sheet, row - 1, column) || is_known(sheet, row, column - 1) || is_known(sheet, row + 1, column) ||
+           is_known(sheet, row, column + 1);
+}
+
+static int touches_border(const sheet_t *sheet)
+{
+    for (int64_t c = 0; c < sheet->columns; c++)
+        if (is_known(sheet, 0, c) || is_known(sheet, sheet->rows - 1, c))
+            return 1;
+    for (int64_t r = 0; r < sheet->rows; r++)
+        if (is_known(sheet, r, 0) || is_known(sheet, r, sheet->columns - 1))
+            return 1;
+    return 0;
+}
+
+/* Grow one lattice in place by at most `rings` rings (detection.lattice.grow.grow). `fresh` (rows * columns, 3) and `where`
+ * (rows * columns) are scratch. Returns the rings that are left, 0 or more, if it needs a wider sheet to grow on; -1 if
+ * it has grown all it can. */
+int64_t grow_lattice(
+    sheet_t *sheet, const level_t *level, const squares_t *saddles, const growth_rules_t *rules, int64_t rings,
+    double *fresh, int64_t *where);
+FOR_EACH_PROCESSOR int64_t grow_lattice(
+    sheet_t *sheet, const level_t *level, const squares_t *saddles, const growth_rules_t *rules, int64_t rings,
+    double *fresh, int64_t *where)
+{
+    const int64_t rows = sheet->rows, columns = sheet->columns;
+    for (; rings > 0; rings--) {
+        if (touches_border(sheet))
+            return rings;
+        int64_t count = 0;
+        for (int way = 0; way < 2 && count == 0; way++) {
+            const fit_rules_t *prediction = &rules->predictions[way];
+            double bell[MOST_RADIUS + 1];
+            fill_bell(prediction, bell);
+            for (int64_t row = 0; row < rows; row++)
+                for (int64_t column = 0; column < columns; column++) {
+                    const int64_t cell = row * columns + column;
+                    if (!sheet->due[way][cell] || is_known(sheet, row, column) || !has_neighbour(sheet, row, column))
+                        continue;
+                    sheet->due[way][cell] = 0;
+                    if (try_cell(sheet, level, saddles, rules, prediction, bell, row, column, fresh + 3 * count))
+                        where[count++] = cell;
+                }
+        }
+        if (!count)
+            return -1;
+        for (int64_t k = 0; k < count; k++) {
+            sheet->pixels[2 * where[k]] = fresh[3 * k];
+            sheet->pixels[2 * where[k] + 1] = fresh[3 * k + 1];
+            sheet->contrast[where[k]] = fresh[3 * k + 2];
+            /* What failed before may be foretold otherwise now, within the reach of the fits. */
+            const int64_t row = where[k] / columns, column = where[k] % columns;
+            for (int64_t r = row - MOST_RADIUS; r <= row + MOST_RADIUS; r++)
+                for (int64_t c = column - MOST_RADIUS; c <= column + MOST_RADIUS; c++)
+                    if (r >= 0 && c >= 0 && r < rows && c < columns)
+                        sheet->due[0][r * columns + c] = sheet->due[1][r * columns + c] = 1;
+        }
+    }
+    return -1;
+}
+
+/* Links as states: state 4 * corner + arm leads to the state 4 * its neighbour + the arm that points back, or to -1. */
+static int compare(const void *one, const void *two)
+{
+    const int64_t a = *(const int64_t *)one, b = *(const int64_t *)two;
+    return (a > b) - (a < b);
+}
+
+/* Keep the links that bound a closed square on either side (detection.lattice.links.quads). */
+static void keep_quads(int64_t count, int64_t *to, uint8_t *bound)
+{
+    memset(bound, 0, (size_t)(4 * count));
+    for (int64_t start = 0; start < 4 * count; start++) {
+        int64_t state = start;
+        for (int step = 0; step < 4 && state >= 0; step++)
+            state = to[state] < 0 ? -1 : to[state] / 4 * 4 + (to[state] + 3) % 4;
+        if (state == start)
+            bound[start] = bound[to[start]] = 1;
+    }
+    for (int64_t state = 0; state < 4 * count; state++)
+        if (!bound[state])
+            to[state] = -1;
+}
+
+/* Give a column and a row to every linked corner, and the arm that points to +column (detection.lattice.lattice._walk). `label` is
+ * -1 for corners without links; `members` lists the corners of the lattices one lattice after the other. Returns the
+ * number of lattices. `queue` (2 * count) is scratch. */
+static int64_t walk(
+    int64_t count, const int64_t *to, int64_t *label, int64_t *grid, int64_t *turn, int64_t *members, int64_t *queue)
+{
+    static const int64_t step_c[4] = {1, 0, -1, 0}, step_r[4] = {0, 1, 0, -1};
+    enum { UNSEEN = -2, ALONE = -1 };
+    int64_t lattices = 0, listed = 0;
+    for (int64_t i = 0; i < count; i++) {
+        label[i] = to[4 * i] >= 0 || to[4 * i + 1] >= 0 || to[4 * i + 2] >= 0 || to[4 * i + 3] >= 0 ? UNSEEN : ALONE;
+        grid[2 * i] = grid[2 * i + 1] = turn[i] = 0;
+    }
+    for (int64_t i = 0; i < count; i++) {
+        if (label[i] != UNSEEN)
+            continue;
+        /* The whole component, to start from its best linked corner. */
+        const int64_t first = listed;
+        int64_t root = i, most = 0;
+        members[listed++] = i;
+        label[i] = lattices;
+        for (int64_t k = first; k < listed; k++) {
+            int64_t degree = 0;
+            for (int arm = 0; arm < 4; arm++) {
+                if (to[4 * members[k] + arm] < 0)
+                    continue;
+                degree++;
+                const int64_t end = to[4 * members[k] + arm] / 4;
+                if (label[end] == UNSEEN) {
+                    label[end] = lattices;
+                    members[listed++] = end;
+                }
+            }
+            if (degree > most || (degree == most && members[k] < root)) {
+                most = degree;
+                root = members[k];
+            }
+        }
+        /* Then ring by ring; the label is the number of the lattice again when a corner has its place. */
+        for (int64_t k = first; k < listed; k++)
+            label[members[k]] = UNSEEN;
+        int64_t *frontier = queue, *next = queue + count, size = 1;
+        frontier[0] = root;
+        label[root] = lattices;
+        while (size) {
+            int64_t added = 0;
+            for (int64_t k = 0; k < size; k++)
+                for (int64_t arm = 0; arm < 4; arm++) {
+                    const int64_t start = frontier[k], state = to[4 * start + arm];
+                    if (state < 0 || label[state / 4] != UNSEEN)
+                        continue;
+                    const int64_t end = state / 4, direction = (arm - turn[start] + 4) % 4;
+                    label[end] = lattices;
+                    grid[2 * end] = grid[2 * start] + step_c[direction];
+                    grid[2 * end + 1] = grid[2 * start + 1] + step_r[direction];
+                    turn[end] = (state % 4 - direction + 6) % 4;
+                    next[added++] = end;
+                }
+            qsort(next, (size_t)added, sizeof(int64_t), compare);
+            int64_t *swap = frontier;
+            frontier = next;
+            next = swap;
+            size = added;
+        }
+        for (int64_t k = first; k < listed; k++)
+            if (label[members[k]] == UNSEEN)
+                label[members[k]] = ALONE; /* Links are mutual, so there are none; but nothing is listed twice. */
+        lattices++;
+    }
+    return lattices;
+}
+
+/* detection.lattice.lattice: the lattices of the links `to` (count, 4), which are changed. Returns how many; label, grid (count, 2),
+ * turn and members as in `walk`. `queue` (2 * count) and `bound` (4 * count) are scratch. */
+int64_t find_components(
+    int64_t count, int64_t *to, int64_t *label, int64_t *grid, int64_t *turn, int64_t *members, int64_t *queue,
+    uint8_t *bound);
+int64_t find_components(
+    int64_t count, int64_t *to, int64_t *label, int64_t *grid, int64_t *turn, int64_t *members, int64_t *queue,
+    uint8_t *bound)
+{
+    keep_quads(count, to, bound);
+    return walk(count, to, label, grid, turn, members, queue);
+}

@@ -1,0 +1,241 @@
+/* Conventions of the kernels: C-contiguous arrays, sizes as int64_t, images row by row as float (0..255), pixel (0, 0) the
+ * centre of the top-left pixel. Kernels check nothing: their Python callers own types, shapes and sizes. */
+#ifndef RIGKIT_KERNELS_H
+#define RIGKIT_KERNELS_H
+
+#include <math.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+/* On a hot function: also compiled for newer processors, chosen when the library is loaded. By what they can do:
+ * "arch=haswell" would be chosen on a Haswell alone. */
+#if defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 12 && defined(__x86_64__) && defined(__gnu_linux__)
+#define FOR_EACH_PROCESSOR __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
+#else
+#define FOR_EACH_PROCESSOR
+#endif
+
+/* What a small function that hot loops call needs to be vectorised with them. */
+#if defined(__GNUC__)
+#define INLINE static inline __attribute__((always_inline, unused))
+#else
+#define INLINE static inline
+#endif
+
+/* An image of brightness. */
+typedef struct {
+    const float *brightness;
+    int64_t width, height;
+} image_t;
+
+/* Return `image` at (u, v), bilinear, the border repeated (detection.saddles.response.sample). */
+INLINE float brightness_at(const image_t image, float u, float v)
+{
+    const int32_t width = (int32_t)image.width;
+    const float most_u = (float)(image.width - 1), most_v = (float)(image.height - 1);
+    u = u > 0.0f ? u : 0.0f;
+    v = v > 0.0f ? v : 0.0f;
+    u = u < most_u ? u : most_u;
+    v = v < most_v ? v : most_v;
+    int32_t left = (int32_t)u, top = (int32_t)v;
+    left = left < width - 2 ? left : width - 2;
+    top = top < (int32_t)image.height - 2 ? top : (int32_t)image.height - 2;
+    const float right = u - (float)left, below = v - (float)top;
+    const float *at = image.brightness + (ptrdiff_t)top * width + left;
+    const float upper = at[0] + right * (at[1] - at[0]);
+    const float lower = at[width] + right * (at[width + 1] - at[width]);
+    return upper + below * (lower - upper);
+}
+
+#define PI 3.14159265358979323846
+/* Samples of a ring in half a turn (detection.saddles.ring): known here, the loops over them need no counting. */
+enum { HALF = 16, TURN = 2 * HALF };
+
+/* How rings are read (detection.saddles.ring): `circle` holds the (u, v) of HALF samples in half a turn and of their opposites;
+ * `gains` R_2 / R_4 over the ratio of harmonic 2 at half the radius to that on the ring, from 1/4 to 1. */
+typedef struct {
+    const float *circle;
+    const double *gains;
+    int64_t gain_count;
+    double most_odd, most_centre, most_cosine, quick_odd, quick_centre, quick_sharp;
+} ring_rules_t;
+
+/* Return the two angles of a corner from the `even` part of its ring (detection.saddles.ring._angles). */
+INLINE void ring_angles(
+    const image_t image, const ring_rules_t *rules, float u, float v, float radius, const float *even, double angles[2])
+{
+    const float *circle = rules->circle;
+    float second_u = 0.0f, second_v = 0.0f, fourth_u = 0.0f, fourth_v = 0.0f, inner_u = 0.0f, inner_v = 0.0f;
+    for (int64_t k = 0; k < HALF; k++) {
+        const float *two = circle + 2 * (2 * k % TURN), *four = circle + 2 * (4 * k % TURN);
+        second_u += even[k] * two[0];
+        second_v -= even[k] * two[1];
+        fourth_u += even[k] * four[0];
+        fourth_v -= even[k] * four[1];
+    }
+    for (int64_t k = 0; k < TURN; k += 2) {
+        const float *two = circle + 2 * (2 * k % TURN);
+        const float part_u = 0.5f * radius * circle[2 * k], part_v = 0.5f * radius * circle[2 * k + 1];
+        const float here = brightness_at(image, u + part_u, v + part_v);
+        inner_u += here * two[0];
+        inner_v -= here * two[1];
+    }
+    double size = sqrt((double)second_u * second_u + (double)second_v * second_v);
+    size = size > 1e-20 ? size : 1e-20;
+    const double phase_u = second_u / size, phase_v = second_v / size;
+    /* Twice half of all samples of a whole turn, of which every second is taken. */
+    const double ratio = (inner_u * phase_u + inner_v * phase_v) / size;
+    double place = (ratio - 0.25) / 0.75 * (double)(rules->gain_count - 1);
+    place = place > 0.0 ? place : 0.0;
+    place = place < (double)(rules->gain_count - 1) ? place : (double)(rules->gain_count - 1);
+    int64_t at = (int64_t)place;
+    at = at < rules->gain_count - 2 ? at : rules->gain_count - 2;
+    const double gain = rules->gains[at] + (place - (double)at) * (rules->gains[at + 1] - rules->gains[at]);
+    const double twice_u = phase_u * phase_u - phase_v * phase_v, twice_v = 2.0 * phase_u * phase_v;
+    double cosine = gain * (fourth_u * twice_u + fourth_v * twice_v) / size;
+    cosine = cosine < rules->most_cosine ? cosine : rules->most_cosine;
+    cosine = cosine > -rules->most_cosine ? cosine : -rules->most_cosine;
+    const double quadrant = acos(cosine), first = -0.5 * (atan2(phase_v, phase_u) + quadrant);
+    angles[0] = first < 0.0 ? first + PI : first;
+    angles[1] = angles[0] + quadrant;
+}
+
+/* Return whether the ring around (u, v) is that of a chessboard corner of at least a contrast; if so, its two angles and
+ * its contrast (detection.saddles.ring.read_rings). */
+INLINE int read_ring(
+    const image_t image, const ring_rules_t rules, float u, float v, float radius, double least, double angles[2],
+    double *contrast)
+{
+    float ring[TURN], even[HALF], right[TURN], below[TURN];
+    int32_t at[TURN];
+    const int32_t width = (int32_t)image.width, height = (int32_t)image.height;
+    const float most_u = (float)(width - 1), most_v = (float)(height - 1);
+    /* As brightness_at, but first all places, which vectorises, then all reads. */
+    for (int64_t k = 0; k < TURN; k++) {
+        float sample_u = u + radius * rules.circle[2 * k], sample_v = v + radius * rules.circle[2 * k + 1];
+        sample_u = sample_u > 0.0f ? sample_u : 0.0f;
+        sample_v = sample_v > 0.0f ? sample_v : 0.0f;
+        sample_u = sample_u < most_u ? sample_u : most_u;
+        sample_v = sample_v < most_v ? sample_v : most_v;
+        int32_t left = (int32_t)sample_u, top = (int32_t)sample_v;
+        left = left < width - 2 ? left : width - 2;
+        top = top < height - 2 ? top : height - 2;
+        right[k] = sample_u - (float)left;
+        below[k] = sample_v - (float)top;
+        at[k] = top * width + left;
+    }
+    for (int64_t k = 0; k < TURN; k++) {
+        const float *upper = image.brightness + at[k], *lower = upper + width;
+        const float above = upper[0] + right[k] * (upper[1] - upper[0]);
+        ring[k] = above + below[k] * (lower[0] + right[k] * (lower[1] - lower[0]) - above);
+    }
+    float low = 1e30f, high = -1e30f, mean = 0.0f, odd_energy = 0.0f, energy = 0.0f;
+    for (int64_t k = 0; k < HALF; k++)
+        even[k] = 0.5f * (ring[k] + ring[HALF + k]);
+    for (int64_t k = 0; k < HALF; k++) {
+        low = even[k] < low ? even[k] : low;
+        high = even[k] > high ? even[k] : high;
+        mean += even[k];
+    }
+    mean /= (float)HALF;
+    for (int64_t k = 0; k < HALF; k++) {
+        const float odd = 0.5f * (ring[k] - ring[HALF + k]);
+        odd_energy += odd * odd;
+        energy += (even[k] - mean) * (even[k] - mean);
+    }
+    if (!(odd_energy < (float)rules.most_odd * energy) || !(high > low) || !((double)high - (double)low >= least))
+        return 0;
+    if (!(fabsf(brightness_at(image, u, v) - mean) < (float)rules.most_centre * (high - low)))
+        return 0;
+    const float middle = 0.5f * (low + high);
+    int64_t rises = 0;
+    for (int64_t k = 0; k < HALF; k++)
+        rises += even[k + 1 < HALF ? k + 1 : 0] > middle && !(even[k] > middle);
+    if (rises != 1)
+        return 0;
+    ring_angles(image, &rules, u, v, radius, even, angles);
+    *contrast = (double)high - (double)low;
+    return 1;
+}
+
+/* Return whether at `most` or more of the `places` `along` the edge from (u, v) to (end_u, end_v) the side that should be
+ * brighter (sign +1: where angles grow from u to v, seen from the start) is so by more than `weakest`
+ * (detection.lattice.links.edge_contrast). */
+INLINE int edge_seen(
+    const image_t image, const double *along, int64_t places, int64_t most, double u, double v, double end_u,
+    double end_v, double sign, double offset, double weakest)
+{
+    const double chord_u = end_u - u, chord_v = end_v - v;
+    double length = sqrt(chord_u * chord_u + chord_v * chord_v);
+    length = length > 1e-9 ? length : 1e-9;
+    const double aside_u = -sign * offset * chord_v / length, aside_v = sign * offset * chord_u / length;
+    /* Clutter is told from an edge by the first places. */
+    int64_t unseen = 0;
+    for (int64_t k = 0; k < places && unseen <= places - most; k++) {
+        const double at_u = u + along[k] * chord_u, at_v = v + along[k] * chord_v;
+        const float bright = brightness_at(image, (float)(at_u + aside_u), (float)(at_v + aside_v));
+        const float dark = brightness_at(image, (float)(at_u - aside_u), (float)(at_v - aside_v));
+        unseen += !((double)(bright - dark) > weakest);
+    }
+    return unseen <= places - most;
+}
+
+/* Points in squares: those of square b are order[first[b]] to order[first[b + 1] - 1]. */
+typedef struct {
+    const double *points;
+    int32_t *first, *order;
+    int64_t columns, rows;
+    double left, top, side;
+} squares_t;
+
+/* At most so many squares for so many points: smaller ones leave more of them to look into, larger ones more points that
+ * are too far. */
+#define MOST_SQUARES(count) ((count) / 2 + 8)
+
+/* int32_t that `fill_squares` needs. */
+#define SQUARES_MEMORY(count) (MOST_SQUARES(count) + 1 + 2 * (count))
+
+INLINE int64_t square_at(double position, double least, double side, int64_t count)
+{
+    const double place = (position - least) / side;
+    return place > 0.0 ? (place < (double)count ? (int64_t)place : count - 1) : 0;
+}
+
+/* Sort `count` > 0 points into squares of at least `side`, in `memory` (SQUARES_MEMORY), which must outlive `out`. */
+INLINE void fill_squares(const double *points, int64_t count, double side, int32_t *memory, squares_t *out)
+{
+    double left = points[0], right = left, top = points[1], bottom = top;
+    for (int64_t i = 1; i < count; i++) {
+        const double u = points[2 * i], v = points[2 * i + 1];
+        left = u < left ? u : left;
+        right = u > right ? u : right;
+        top = v < top ? v : top;
+        bottom = v > bottom ? v : bottom;
+    }
+    while (((right - left) / side + 1.0) * ((bottom - top) / side + 1.0) > (double)MOST_SQUARES(count))
+        side *= 1.4;
+    const int64_t columns = (int64_t)((right - left) / side) + 1, rows = (int64_t)((bottom - top) / side) + 1;
+    const int64_t size = columns * rows;
+    const squares_t squares = {points, memory, memory + size + 1, columns, rows, left, top, side};
+    *out = squares;
+    int32_t *first = squares.first, *order = squares.order, *square = order + count;
+    memset(first, 0, (size_t)(size + 1) * sizeof(int32_t));
+    for (int64_t i = 0; i < count; i++) {
+        square[i] = (int32_t)(square_at(points[2 * i + 1], top, side, rows) * columns +
+                              square_at(points[2 * i], left, side, columns));
+        first[square[i]]++;
+    }
+    /* The end of each square; filling it from there moves that to its start. */
+    for (int64_t b = 1; b <= size; b++)
+        first[b] += first[b - 1];
+    for (int64_t i = count - 1; i >= 0; i--)
+        order[--first[square[i]]] = (int32_t)i;
+}
+
+/* The source that this library was built from (setup.py). */
+const char *rigkit_source(void);
+const char *rigkit_source(void) { return RIGKIT_SOURCE; }
+
+#endif

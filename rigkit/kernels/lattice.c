@@ -1,0 +1,279 @@
+/* What is judged of whole lattices: how evenly their rows run, how much their corners scatter about smooth rows, where
+ * the edges between them lie.
+ *
+ * The definitions are in rigkit.detection.lattice.spacing, .scatter and .validate; the numbers come from there. */
+#include "kernels.h"
+
+/* Return what `at` of the `values` are not above and the others not below; the values change places (Hoare's FIND). */
+static double ranked(double *values, int64_t count, int64_t at)
+{
+    int64_t low = 0, high = count - 1;
+    while (low < high) {
+        const double pivot = values[at];
+        int64_t i = low, j = high;
+        while (i <= j) {
+            while (values[i] < pivot)
+                i++;
+            while (pivot < values[j])
+                j--;
+            if (i <= j) {
+                const double swap = values[i];
+                values[i++] = values[j];
+                values[j--] = swap;
+            }
+        }
+        low = j < at ? i : low;
+        high = at < i ? j : high;
+    }
+    return values[at];
+}
+
+static double median(double *values, int64_t count)
+{
+    return 0.5 * (ranked(values, count, (count - 1) / 2) + ranked(values, count, count / 2));
+}
+
+/* Set `typical` to the median of how neighbouring steps differ at each inner column of `rows` x `columns` pixels, so many
+ * doubles apart, and `seen` to how many steps these are; return the upper median of all, NaN for none. */
+static double uneven_columns(
+    const double *pixels, int64_t rows, int64_t columns, int64_t row_stride, int64_t column_stride, double *scratch,
+    double *typical, int64_t *seen)
+{
+    double *every = scratch, *here = scratch + rows * columns;
+    int64_t all = 0;
+    for (int64_t column = 0; column < columns - 2; column++) {
+        int64_t count = 0;
+        for (int64_t row = 0; row < rows; row++) {
+            const double *a = pixels + row * row_stride + column * column_stride;
+            const double *b = a + column_stride, *c = b + column_stride;
+            const double u1 = b[0] - a[0], v1 = b[1] - a[1], u2 = c[0] - b[0], v2 = c[1] - b[1];
+            const double one = u1 * u1 + v1 * v1, two = u2 * u2 + v2 * v2;
+            const double bend = (u2 - u1) * (u2 - u1) + (v2 - v1) * (v2 - v1);
+            const double relative = sqrt(bend / (one < two ? one : two));
+            if (isfinite(relative))
+                here[count++] = every[all++] = relative;
+        }
+        seen[column] = count;
+        typical[column] = count ? median(here, count) : NAN;
+    }
+    return all ? ranked(every, all, all / 2) : NAN;
+}
+
+/* Set `typical` and `seen` to the above for the inner columns, then for the inner rows, and `every` to the two medians of
+ * all (detection.lattice.spacing.unevenness). `scratch` has room for twice as many numbers as there are corners. */
+void uneven_steps(
+    const double *pixels, int64_t rows, int64_t columns, double *scratch, double *typical, int64_t *seen, double *every)
+{
+    const int64_t inner = columns > 2 ? columns - 2 : 0;
+    every[0] = uneven_columns(pixels, rows, columns, 2 * columns, 2, scratch, typical, seen);
+    every[1] = uneven_columns(pixels, columns, rows, 2, 2 * columns, scratch, typical + inner, seen + inner);
+}
+
+/* The constants of detection.subpixel.scatter (rigkit.kernels.lattice.ScatterRules). */
+typedef struct {
+    double unexplained, median_of_normal;
+    int64_t fewest_corners, fewest_differences, first_order, last_order;
+} scatter_rules_t;
+
+enum { MOST_ORDER = 8, PLANE = 8 };
+
+/* A part of a sheet, one row after the other: corners, their variance, and room for four numbers for each of them. */
+typedef struct {
+    double *pixels, *variance, *room;
+    int64_t rows, columns;
+} part_t;
+
+/* Return the typical difference of `order` over the expected one, NaN for few (detection.subpixel.scatter._roughness). */
+static double roughness(const part_t part, int64_t order, const scatter_rules_t *rules)
+{
+    double factor[MOST_ORDER + 1] = {1.0};
+    for (int64_t k = 1; k <= order; k++)
+        factor[k] = -factor[k - 1] * (double)(order + 1 - k) / (double)k;
+    int64_t count = 0;
+    for (int along_row = 0; along_row < 2; along_row++) {
+        const int64_t stride = along_row ? 1 : part.columns;
+        const int64_t rows = part.rows - (along_row ? 0 : order), columns = part.columns - (along_row ? order : 0);
+        for (int64_t row = 0; row < rows; row++)
+            for (int64_t column = 0; column < columns; column++) {
+                const int64_t start = row * part.columns + column;
+                double u = 0.0, v = 0.0, variance = 0.0;
+                for (int64_t k = 0; k <= order; k++) {
+                    const int64_t at = start + k * stride;
+                    u += factor[k] * part.pixels[2 * at];
+                    v += factor[k] * part.pixels[2 * at + 1];
+                    variance += factor[k] * factor[k] * part.variance[at];
+                }
+                const double inverse = 1.0 / sqrt(variance);
+                if (isfinite(u * inverse) && isfinite(v * inverse)) {
+                    part.room[count++] = fabs(u * inverse);
+                    part.room[count++] = fabs(v * inverse);
+                }
+            }
+    }
+    return count >= rules->fewest_differences ? median(part.room, count) / rules->median_of_normal : NAN;
+}
+
+/* Solve `matrix` x = `right` for a positive definite matrix, of which the lower half is given, in place; return whether it
+ * is so. */
+static int solve(double matrix[PLANE][PLANE], double right[PLANE])
+{
+    for (int j = 0; j < PLANE; j++) {
+        for (int i = j; i < PLANE; i++) {
+            double sum = matrix[i][j];
+            for (int k = 0; k < j; k++)
+                sum -= matrix[i][k] * matrix[j][k];
+            if (i == j && !(sum > 0.0))
+                return 0;
+            matrix[i][j] = i == j ? sqrt(sum) : sum / matrix[j][j];
+        }
+        for (int k = 0; k < j; k++)
+            right[j] -= matrix[j][k] * right[k];
+        right[j] /= matrix[j][j];
+    }
+    for (int j = PLANE - 1; j >= 0; j--) {
+        for (int k = j + 1; k < PLANE; k++)
+            right[j] -= matrix[k][j] * right[k];
+        right[j] /= matrix[j][j];
+    }
+    return 1;
+}
+
+/* Take from the corners where those of the best flat board through a pinhole would be (detection.subpixel.scatter._best_plane). */
+static void flatten(const part_t part)
+{
+    const int64_t size = part.rows * part.columns;
+    double mean[2] = {0.0}, spread = 0.0, count = 0.0;
+    for (int64_t i = 0; i < size; i++)
+        if (isfinite(part.pixels[2 * i])) {
+            mean[0] += part.pixels[2 * i];
+            mean[1] += part.pixels[2 * i + 1];
+            count += 1.0;
+        }
+    mean[0] /= count;
+    mean[1] /= count;
+    for (int64_t i = 0; i < size; i++)
+        if (isfinite(part.pixels[2 * i]))
+            spread += fabs(part.pixels[2 * i] - mean[0]) + fabs(part.pixels[2 * i + 1] - mean[1]);
+    const double unit = spread / count;
+    double normal[PLANE][PLANE] = {{0.0}}, found[PLANE] = {0.0};
+    for (int64_t i = 0; i < size; i++) {
+        if (!isfinite(part.pixels[2 * i]))
+            continue;
+        const double x = 2.0 * (double)(i % part.columns) / (double)part.columns - 1.0;
+        const double y = 2.0 * (double)(i / part.columns) / (double)part.rows - 1.0;
+        for (int axis = 0; axis < 2; axis++) {
+            const double p = (part.pixels[2 * i + axis] - mean[axis]) / unit;
+            double row[PLANE] = {0.0};
+            row[3 * axis] = x;
+            row[3 * axis + 1] = y;
+            row[3 * axis + 2] = 1.0;
+            row[6] = -p * x;
+            row[7] = -p * y;
+            for (int j = 0; j < PLANE; j++) {
+                for (int k = 0; k <= j; k++)
+                    normal[j][k] += row[j] * row[k];
+                found[j] += row[j] * p;
+            }
+        }
+    }
+    const int solved = solve(normal, found);
+    for (int64_t i = 0; i < size; i++) {
+        const double x = 2.0 * (double)(i % part.columns) / (double)part.columns - 1.0;
+        const double y = 2.0 * (double)(i / part.columns) / (double)part.rows - 1.0;
+        const double depth = found[6] * x + found[7] * y + 1.0;
+        for (int axis = 0; axis < 2; axis++) {
+            const double *h = found + 3 * axis;
+            const double flat = (h[0] * x + h[1] * y + h[2]) / depth * unit + mean[axis];
+            part.pixels[2 * i + axis] -= solved ? flat : NAN;
+        }
+    }
+}
+
+/* Set `out` to how much more the corners of each of `count` parts of a sheet, `width` corners wide, scatter than their
+ * sigmas say (detection.subpixel.scatter.excess_scatter). `parts` are top, left, rows, columns; `scratch` has room for seven numbers
+ * for each corner of a part. */
+void excess_scatter(
+    const double *pixels, const double *sigma, int64_t width, const int64_t *parts, int64_t count,
+    const scatter_rules_t *rules, double *scratch, double *out)
+{
+    for (int64_t n = 0; n < count; n++) {
+        const int64_t *at = parts + 4 * n, size = at[2] * at[3];
+        const part_t part = {scratch, scratch + 2 * size, scratch + 3 * size, at[2], at[3]};
+        int64_t known = 0;
+        for (int64_t i = 0; i < size; i++) {
+            const int64_t cell = (at[0] + i / at[3]) * width + at[1] + i % at[3];
+            part.pixels[2 * i] = pixels[2 * cell];
+            part.pixels[2 * i + 1] = pixels[2 * cell + 1];
+            part.variance[i] = sigma[cell] * sigma[cell];
+            known += isfinite(pixels[2 * cell]) != 0;
+        }
+        double calmest = known < rules->fewest_corners ? 1.0 : INFINITY;
+        for (int flat = 0; flat < 2; flat++)
+            for (int64_t order = rules->first_order; order <= rules->last_order && calmest > rules->unexplained; order++) {
+                if (flat && order == rules->first_order)
+                    flatten(part);
+                calmest = fmin(calmest, roughness(part, order, rules));
+            }
+        out[n] = calmest > rules->unexplained && isfinite(calmest) ? calmest : 1.0;
+    }
+}
+
+/* A square's four corners at (row, column) and after it, in pixels of the level; return whether all are known. */
+static int square_of(
+    const double *pixels, int64_t columns, int64_t row, int64_t column, double scale, double offset, double out[4][2])
+{
+    double sum = 0.0;
+    for (int k = 0; k < 4; k++) {
+        const double *at = pixels + 2 * ((row + k / 2) * columns + column + k % 2);
+        for (int axis = 0; axis < 2; axis++)
+            sum += out[k][axis] = (at[axis] - offset) / scale;
+    }
+    return isfinite(sum);
+}
+
+/* Set `out` to how far the edges of a lattice lie on the dark side of their corners' line, at `parts` places `along` it
+ * (detection.checks.validate._shifts). `sign` is that of the first corner; `sums` has room for parts x (steps + 1). */
+FOR_EACH_PROCESSOR
+void edge_shifts(
+    const double *pixels, int64_t rows, int64_t columns, double sign, const float *brightness, int64_t width,
+    int64_t height, double scale, double offset, double reach, const double *along, int64_t parts, int64_t steps,
+    int64_t most, double *sums, double *out)
+{
+    const image_t image = {brightness, width, height};
+    double corner[4][2];
+    int64_t count = 0, next = 0;
+    for (int64_t row = 0; row + 1 < rows; row++)
+        for (int64_t column = 0; column + 1 < columns; column++)
+            count += 2 * square_of(pixels, columns, row, column, scale, offset, corner);
+    const int64_t every = count / most > 1 ? count / most : 1;
+    memset(sums, 0, (size_t)(parts * (steps + 1)) * sizeof(double));
+    for (int down = 0; down < 2; down++)
+        for (int64_t row = 0; row + 1 < rows; row++)
+            for (int64_t column = 0; column + 1 < columns; column++) {
+                if (!square_of(pixels, columns, row, column, scale, offset, corner) || next++ % every)
+                    continue;
+                /* The edge that the square starts with, and how the square goes on from there. */
+                const double *start = corner[0], *end = corner[1 + down], *aside = corner[2 - down], *last = corner[3];
+                const double side = 0.5 * reach * ((row + column) % 2 ? -sign : sign);
+                const double across_u = side * (aside[0] + last[0] - start[0] - end[0]);
+                const double across_v = side * (aside[1] + last[1] - start[1] - end[1]);
+                for (int64_t k = 0; k < parts; k++) {
+                    const double u = start[0] + along[k] * (end[0] - start[0]);
+                    const double v = start[1] + along[k] * (end[1] - start[1]);
+                    for (int64_t s = 0; s <= steps; s++) {
+                        const double step = 2.0 * (double)s / (double)steps - 1.0;
+                        const float seen = brightness_at(image, (float)(u + step * across_u), (float)(v + step * across_v));
+                        sums[k * (steps + 1) + s] += (double)seen;
+                    }
+                }
+            }
+    for (int64_t k = 0; k < parts; k++) {
+        /* The mean of a step from dark to bright says where it is, however sharp it is. */
+        const double *sum = sums + k * (steps + 1), dark = sum[0], bright = sum[steps];
+        const double middle = 0.5 * (dark + bright), contrast = bright - dark > 1e-9 ? bright - dark : 1e-9;
+        double mean = -middle;
+        for (int64_t s = 0; s <= steps; s++)
+            mean += sum[s];
+        out[k] = 2.0 * reach * (mean / (double)steps - middle) / contrast;
+    }
+}

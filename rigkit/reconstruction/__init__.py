@@ -1,0 +1,1 @@
+"""From two images' corners or correspondences to an oriented cloud in millimetres."""

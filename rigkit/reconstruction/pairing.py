@@ -1,0 +1,341 @@
+"""From the boards found in two images to matched corners and directions in the coordinates the pipeline works in."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import permutations, product
+from typing import Literal
+
+import numpy as np
+
+from rigkit.affine.affinities import DirectionNoise
+from rigkit.affine.directions import Support, direction_field
+from rigkit.cameras.base import Camera
+from rigkit.cameras.pinhole import Pinhole
+from rigkit.core.arrays import FloatArray, Pixels
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection, common_corners
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.matches import DirectionPairs, Matches
+from rigkit.core.truth import MeasuredAngle
+from rigkit.geometry.rotation import angle_between
+from rigkit.identification.identify import identify_pair
+from rigkit.identification.pair_identity import PairIdentity
+from rigkit.identification.placements import board_kinds
+
+__all__ = ["Chain", "MatchedPair", "match_pair"]
+
+Chain = Literal["raw", "rectified"]
+
+MAX_RECTIFIED_RAD = np.deg2rad(75.0)
+"""A perspective view along the camera's axis stretches a pixel there by 1 / cos^2 = 15; beyond it the raw chain is the
+only sensible one."""
+
+POSED_SIGMA_DEG = 0.3
+"""How well the boards' poses in a pair show the angle between two of them, at the worst."""
+NAMING_ODDS = 2.0 * np.log(1000.0)
+"""Angles speak for other names of boards that look alike where chi2 is smaller by so much, and alike for all names
+within so much of the smallest: as the odds in `rigkit.identification.identify`."""
+NAMING_COVERAGE = 4.0
+"""Largest deviation of an angle, in sigmas, under the names it speaks for."""
+MOST_ALIKE = 6
+"""More boards of one kind are not told apart by angles: their orders are too many to try."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class MatchedPair:
+    """Two images of the same boards, corner by corner.
+
+    Attributes
+    ----------
+    pair_id : name of the pair.
+    camera1, camera2 : calibrated cameras of the images as captured.
+    boards : boards seen in both images, in the order of `matches.board_index`.
+    identity : how boards and corners were told apart.
+    chain : "raw": `matches` are in captured pixels; "rectified": in perspective views along each camera's axis.
+    captured : the corners in captured pixels, where their noise is the same in all directions.
+    matches : the corners in the coordinates of `chain`.
+    directions : at the same corners, in the coordinates of `chain`.
+    noise : predicted covariance of the directions.
+    """
+
+    pair_id: str
+    camera1: Camera
+    camera2: Camera
+    boards: tuple[Board, ...]
+    identity: PairIdentity
+    chain: Chain
+    captured: Matches
+    matches: Matches
+    directions: DirectionPairs
+    noise: DirectionNoise
+    notes: tuple[str, ...] = ()
+
+    def noisier(self, factor: float) -> MatchedPair:
+        """Return the same pair with all standard deviations of corners and directions multiplied by `factor`."""
+
+        def scaled(matches: Matches) -> Matches:
+            return replace(matches, sigma1_px=matches.sigma1_px * factor, sigma2_px=matches.sigma2_px * factor)
+
+        noise = DirectionNoise(self.noise.covariance1 * factor**2, self.noise.covariance2 * factor**2)
+        return replace(self, captured=scaled(self.captured), matches=scaled(self.matches), noise=noise)
+
+    def in_chain(self, chain: Chain, *, support: Support = "patch", window: int | None = 2) -> MatchedPair:
+        """Return the same corners, told apart as they are, in the coordinates of another chain; see `match_pair`."""
+        both = (self.camera1, self.camera2)
+        return _matched(self.pair_id, *both, self.boards, self.identity, chain, support, window)
+
+
+def match_pair(
+    pair_id: str,
+    camera1: Camera,
+    camera2: Camera,
+    detections1: Sequence[BoardDetection],
+    detections2: Sequence[BoardDetection],
+    boards: Sequence[Board],
+    *,
+    layout: Mapping[str, str] | None = None,
+    angles: Sequence[MeasuredAngle] = (),
+    chain: Chain = "raw",
+    support: Support = "patch",
+    window: int | None = 2,
+) -> MatchedPair:
+    """Tell the boards apart, match their corners, and take directions.
+
+    Parameters
+    ----------
+    pair_id : for messages.
+    camera1, camera2 : the cameras; one object twice where one camera was moved.
+    detections1, detections2 : all boards found in either image.
+    boards : the boards that stand there.
+    layout : board id -> "left", "right", "floor", "ceiling" or "back" where a person said so.
+    angles : between boards, as measured: they tell boards that look alike apart where no layout does.
+    chain : coordinates to work in.
+    support, window : what a direction is estimated from, see `direction_field`.
+
+    Raises
+    ------
+    InputError
+        No board is seen in both images.
+    DegenerateError
+        `chain` is "rectified" and a corner lies too far off the axis.
+    """
+    _check_sizes(pair_id, (*detections1, *detections2), boards)
+    identity = identify_pair(detections1, detections2, boards, camera1, camera2, layout=layout)
+    given = {d.board_id for d in (*detections1, *detections2)} | set(layout or ())
+    fitting = _names_by_angles(identity, [b for b in boards if b.board_id not in given], angles)
+    if fitting:
+        before, names = identity, fitting[0]
+        first, second = (
+            [replace(d, board_id=names.get(str(d.board_id), d.board_id)) for d in found]
+            for found in (identity.detections1, identity.detections2)
+        )
+        identity = identify_pair(first, second, boards, camera1, camera2, layout=layout)
+        said = f"boards {', '.join(sorted(names))} look alike and were told apart by the measured angles"
+        if len(fitting) > 1:
+            said += f", which {len(fitting)} ways to name the boards fit: the one with the fewest changes was taken"
+        identity = replace(identity, notes=(*before.notes, f"{said}; a layout would say for certain which is which"))
+    return _matched(pair_id, camera1, camera2, boards, identity, chain, support, window)
+
+
+def _matched(
+    pair_id: str,
+    camera1: Camera,
+    camera2: Camera,
+    boards: Sequence[Board],
+    identity: PairIdentity,
+    chain: Chain,
+    support: Support,
+    window: int | None,
+) -> MatchedPair:
+    """Match the corners of boards told apart, and take directions; else as `match_pair`."""
+    pairs, unseen = _with_rays(identity.pairs(), camera1, camera2)
+    if not pairs:
+        reasons = "; ".join(f"{name}: {why}" for name, why in identity.missing.items())
+        raise InputError(f"pair '{pair_id}': no board is seen in both images ({reasons}); check images and boards")
+    by_id = {board.board_id: board for board in boards}
+    used = tuple(by_id[str(first.board_id)] for first, _ in pairs)
+    captured = _gather(camera1, camera2, pairs)
+    view1, view2 = camera1, camera2
+    viewed = pairs
+    if chain == "rectified":
+        view1, view2 = _axis_view(camera1, captured.rays1, pair_id), _axis_view(camera2, captured.rays2, pair_id)
+        viewed = tuple((_in_view(a, camera1, view1), _in_view(b, camera2, view2)) for a, b in pairs)
+    matches = captured if chain == "raw" else _gather(view1, view2, viewed)
+    directions, noise = _directions(viewed, view1, view2, support, window, matches)
+    notes = [f"board '{name}': {why}" for name, why in identity.missing.items()]
+    if unseen:
+        notes.append(f"{unseen} corners lie outside the calibrated field of view and were left out")
+    return MatchedPair(
+        pair_id,
+        camera1,
+        camera2,
+        used,
+        identity,
+        chain,
+        captured,
+        matches,
+        directions,
+        noise,
+        (*notes, *identity.notes),
+    )
+
+
+def _names_by_angles(
+    identity: PairIdentity, boards: Sequence[Board], angles: Sequence[MeasuredAngle]
+) -> list[dict[str, str]]:
+    """Return other names for those of `boards` that look alike, if the angles speak for them clearly; else nothing.
+
+    Where they speak for several ways to name the boards, those are all returned, the fewest changes first.
+    """
+    faces = {}
+    for board_id, pose in identity.cam1_from_board.items():
+        normal = pose.rotation[:, 2]
+        faces[board_id] = -np.sign(normal @ pose.translation_mm) * normal
+    known = [a for a in angles if a.a in faces and a.b in faces]
+    choices = list(_other_names([b for b in boards if b.board_id in faces])) if known else []
+    if not choices:
+        return []
+
+    def deviations(names: Mapping[str, str]) -> FloatArray:
+        """Return how far each angle is off if the board called k is truly `names[k]`, in sigmas."""
+        face_of = {names.get(k, k): face for k, face in faces.items()}
+        ours = [180.0 - np.rad2deg(angle_between(face_of[a.a], face_of[a.b])) for a in known]
+        sigma = np.hypot([a.sigma_deg for a in known], POSED_SIGMA_DEG)
+        return np.asarray((np.array(ours) - [a.value_deg for a in known]) / sigma)
+
+    own, *others = (deviations(names) for names in ({}, *choices))
+    chi2 = np.sum(np.square(others), axis=1)
+    enough = min(float(chi2.min()) + NAMING_ODDS, float(own @ own) - NAMING_ODDS)
+    fitting = [n for n, off in enumerate(others) if chi2[n] <= enough and np.abs(off).max() <= NAMING_COVERAGE]
+    # Right angles say the same of several names: then as few as possible are changed.
+    renamed = [{k: other for k, other in choices[n].items() if k != other} for n in fitting]
+    return sorted(renamed, key=len)
+
+
+def _other_names(boards: Sequence[Board]) -> Iterator[dict[str, str]]:
+    """Yield every way to exchange the names of boards that look alike."""
+    alike = [kind.ids for kind in board_kinds(boards) if 1 < len(kind.ids) <= MOST_ALIKE]
+    for orders in product(*(permutations(ids) for ids in alike)):
+        names = {a: b for ids, order in zip(alike, orders, strict=True) for a, b in zip(ids, order, strict=True)}
+        if any(a != b for a, b in names.items()):
+            yield names
+
+
+def _check_sizes(pair_id: str, detections: Sequence[BoardDetection], boards: Sequence[Board]) -> None:
+    """Refuse boards of another size than declared.
+
+    A part of a larger board may be seen; but where nothing has a declared size, and complete grids of one other size
+    come again and again, the boards are of that size.
+    """
+    declared = {frozenset(board.size) for board in boards}
+    sizes = Counter(f"{d.columns}x{d.rows}" for d in detections if d.complete)
+    if any(frozenset((d.columns, d.rows)) in declared for d in detections) or not sizes:
+        return
+    size, count = sizes.most_common(1)[0]
+    if count >= 2:
+        listed = ", ".join(sorted({f"{board.columns}x{board.rows}" for board in boards}))
+        raise InputError(
+            f"pair '{pair_id}': the boards listed have {listed} inner corners, but {count} complete grids of {size} "
+            "were found; correct columns and rows in the board file"
+        )
+
+
+def _with_rays(
+    pairs: Sequence[tuple[BoardDetection, BoardDetection]], camera1: Camera, camera2: Camera
+) -> tuple[tuple[tuple[BoardDetection, BoardDetection], ...], int]:
+    """Leave out corners that have no ray in their camera; return the pairs and how many were left out."""
+    out = []
+    dropped = 0
+    for pair in pairs:
+        kept = []
+        for detection, camera in zip(pair, (camera1, camera2), strict=True):
+            _, seen = camera.unproject(detection.pixels)
+            dropped += int((~seen).sum())
+            grid, pixels, sigma_px = detection.grid[seen], detection.pixels[seen], detection.sigma_px[seen]
+            kept.append(replace(detection, grid=grid, pixels=pixels, sigma_px=sigma_px))
+        out.append((kept[0], kept[1]))
+    return tuple(out), dropped
+
+
+def _gather(camera1: Camera, camera2: Camera, pairs: Sequence[tuple[BoardDetection, BoardDetection]]) -> Matches:
+    """Return the corners that both images share, board after board."""
+    common = [common_corners(a, b) for a, b in pairs]
+    return Matches.from_cameras(
+        camera1,
+        camera2,
+        np.concatenate([a.pixels[i] for (a, _), (_, i, _) in zip(pairs, common, strict=True)]),
+        np.concatenate([b.pixels[j] for (_, b), (_, _, j) in zip(pairs, common, strict=True)]),
+        sigma1_px=np.concatenate([a.sigma_px[i] for (a, _), (_, i, _) in zip(pairs, common, strict=True)]),
+        sigma2_px=np.concatenate([b.sigma_px[j] for (_, b), (_, _, j) in zip(pairs, common, strict=True)]),
+        board_index=np.repeat(np.arange(len(pairs)), [len(grid) for grid, _, _ in common]),
+        grid=np.concatenate([grid for grid, _, _ in common]),
+    )
+
+
+def _directions(
+    pairs: Sequence[tuple[BoardDetection, BoardDetection]],
+    view1: Camera,
+    view2: Camera,
+    support: Support,
+    window: int | None,
+    matches: Matches,
+) -> tuple[DirectionPairs, DirectionNoise]:
+    vectors: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+    covariances: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+    shared: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+    valid = []
+    for first, second in pairs:
+        _, i, j = common_corners(first, second)
+        field1 = direction_field(first, view1, support=support, window=window)
+        field2 = direction_field(second, view2, support=support, window=window)
+        for k, (field, index) in enumerate(((field1, i), (field2, j))):
+            vectors[k].append(field.vectors[index])
+            covariances[k].append(field.covariance[index])
+            shared[k].append(field.shared[index])
+        valid.append(field1.valid[i] & field2.valid[j])
+    directions = DirectionPairs(
+        np.concatenate(vectors[0]),
+        np.concatenate(vectors[1]),
+        np.concatenate(valid),
+        pixels1=matches.pixels1,
+        pixels2=matches.pixels2,
+    )
+    noise = DirectionNoise.of_board(*(np.concatenate(parts) for parts in (*covariances, *shared)))
+    return directions, noise
+
+
+def _axis_view(camera: Camera, rays: FloatArray, pair_id: str) -> Pinhole:
+    """Return the perspective view along the camera's own axis, at the scale of its centre; unbounded in size."""
+    widest = float(np.arccos(np.clip(rays[:, 2].min(), -1.0, 1.0)))
+    if widest > MAX_RECTIFIED_RAD:
+        raise DegenerateError(
+            f"pair '{pair_id}': a corner lies {np.rad2deg(widest):.0f} deg off the axis, too far for a perspective "
+            "view; use the raw chain (--chain raw)"
+        )
+    centre, _ = camera.project(np.array([0.0, 0.0, 1.0]))
+    return Pinhole(camera.size_px, np.array([camera.focal_px, camera.focal_px, centre[0], centre[1]]))
+
+
+def _in_view(detection: BoardDetection, camera: Camera, view: Pinhole) -> BoardDetection:
+    """Return the detection in a perspective view; sigmas grow with the local magnification."""
+    rays, _ = camera.unproject(detection.pixels)
+    pixels, _, by_point, _ = view.project_with_jacobians(rays)
+    local = by_point @ camera.ray_jacobian(detection.pixels)
+    magnification = np.linalg.norm(local, axis=(1, 2)) / np.sqrt(2.0)
+    return BoardDetection(
+        detection.board_id,
+        detection.columns,
+        detection.rows,
+        detection.grid,
+        _whole(pixels),
+        detection.sigma_px * magnification,
+    )
+
+
+def _whole(pixels: Pixels) -> Pixels:
+    if not np.isfinite(pixels).all():
+        raise DegenerateError("a corner lies behind the perspective view; use the raw chain (--chain raw)")
+    return pixels

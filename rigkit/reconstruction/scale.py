@@ -1,0 +1,185 @@
+"""The metric scale of a reconstruction from chessboards whose squares were measured.
+
+Each board is a rigid, scaled copy of its grid: p_i = k (R g_i + c) with p in the unit of the reconstruction and g in
+mm. The scale is that of maximum likelihood under the points' covariances, robust to single bad corners. It uses all
+distances on the board at once, and is several times more precise than the median of neighbouring corners' distances.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rigkit.core.arrays import FloatArray, IntArray, Points
+from rigkit.core.boards import Board
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.geometry.rotation import exp_so3, nearest_rotation, skew
+
+__all__ = ["board_scales", "metric_scale", "scale_and_gradient"]
+
+MIN_CORNERS = 4
+OUTLYING = 14.2
+"""Squared distance in sigmas (three components) from which a corner loses weight: one in 400 Gaussian ones does."""
+ITERATIONS = 15
+
+
+def metric_scale(
+    points_unit: Points,
+    board_index: IntArray,
+    grid: IntArray,
+    boards: Sequence[Board],
+    covariances: FloatArray | None = None,
+) -> tuple[float, float]:
+    """Return the factor from the reconstruction's unit to mm and its standard deviation.
+
+    Parameters
+    ----------
+    points_unit : (N, 3) triangulated corners; NaN rows are ignored.
+    board_index : (N,) index into `boards`; -1 where the point is on none.
+    grid : (N, 2) int, (column, row).
+    boards : with their measured squares; a stated `square_sigma_mm` enters the standard deviation, and the weight.
+    covariances : (N, 3, 3) of the points in the unit of the reconstruction; None: equal and estimated from the fit.
+
+    Raises
+    ------
+    DegenerateError
+        No board has enough corners.
+
+    Notes
+    -----
+    The standard deviation holds for the given pose of the cameras; what the uncertainty of the pose adds is the
+    business of whoever knows it.
+    """
+    scale, sigma, _ = scale_and_gradient(points_unit, board_index, grid, boards, covariances)
+    return scale, sigma
+
+
+def scale_and_gradient(
+    points_unit: Points,
+    board_index: IntArray,
+    grid: IntArray,
+    boards: Sequence[Board],
+    covariances: FloatArray | None = None,
+) -> tuple[float, float, FloatArray]:
+    """Return what `metric_scale` returns, and how the scale moves with every point, (N, 3).
+
+    The derivative is that of the least-squares problem with the weights as they ended: zero for points that took no
+    part, and for those that lost all their weight.
+    """
+    scales, sigmas, slopes = _fit_boards(points_unit, board_index, grid, boards, covariances)
+    known = np.isfinite(scales)
+    if not known.any():
+        raise DegenerateError(
+            f"no scale: none of {len(boards)} boards has {MIN_CORNERS} triangulated corners that span it"
+        )
+    square = [(board.square_sigma_mm or 0.0) / min(board.square_x_mm, board.square_y_mm) for board in boards]
+    variance = sigmas**2 + (scales * np.array(square)) ** 2
+    weights = np.where(known, 1.0 / np.maximum(np.where(known, variance, 1.0), 1e-300), 0.0)
+    total = weights.sum()
+    gradient = np.einsum("b,bni->ni", weights, slopes) / total
+    return float(np.sum(weights * np.where(known, scales, 0.0)) / total), float(total**-0.5), gradient
+
+
+def board_scales(
+    points_unit: Points,
+    board_index: IntArray,
+    grid: IntArray,
+    boards: Sequence[Board],
+    covariances: FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Return scale and standard deviation of every board by itself (B,), NaN where it has too few corners.
+
+    Boards that disagree by many standard deviations have a wrong square size or a wrong pose under them. Parameters as
+    in `metric_scale`; the squares' own sigma is not included here.
+    """
+    scales, sigmas, _ = _fit_boards(points_unit, board_index, grid, boards, covariances)
+    return scales, sigmas
+
+
+def _fit_boards(
+    points_unit: Points,
+    board_index: IntArray,
+    grid: IntArray,
+    boards: Sequence[Board],
+    covariances: FloatArray | None,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return scale and sigma of every board (B,), NaN where it has none, and the scales' gradients (B, N, 3)."""
+    points = np.asarray(points_unit, dtype=np.float64)
+    index, cells = np.asarray(board_index), np.asarray(grid)
+    if len(index) != len(points) or len(cells) != len(points):
+        raise InputError(f"scale: {len(points)} points, {len(index)} board indices and {len(cells)} grid positions")
+    finite = np.isfinite(points).all(axis=1)
+    if covariances is not None:
+        finite &= np.isfinite(covariances).all(axis=(-2, -1))
+    scales, sigmas = np.full(len(boards), np.nan), np.full(len(boards), np.nan)
+    slopes = np.zeros((len(boards), len(points), 3))
+    for b, board in enumerate(boards):
+        on = finite & (index == b)
+        if on.sum() < MIN_CORNERS:
+            continue
+        model = board.points(cells[on])
+        # Corners in a row leave the rotation about it open, but the scale is determined: two spreads are asked all the
+        # same, because a single row is what a wrong detection looks like.
+        if np.linalg.matrix_rank(model - model.mean(axis=0)) < 2:
+            continue
+        found = _similarity_scale(points[on], model, None if covariances is None else covariances[on])
+        if found is not None:
+            scales[b], sigmas[b], slopes[b, on] = found
+    return scales, sigmas, slopes
+
+
+def _similarity_scale(
+    points: Points, model: Points, covariances: FloatArray | None
+) -> tuple[float, float, FloatArray] | None:
+    """Return mm per unit, its standard deviation and its gradient (N, 3) for one board; None without a scale."""
+    centred = model - model.mean(axis=0)
+    k, R, c = _robust_start(points, centred)
+    if not k > 0.0:
+        return None
+    if covariances is None:
+        whiten = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+    else:
+        floor = 1e-12 * np.trace(covariances, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        whiten = np.linalg.inv(np.linalg.cholesky(covariances + floor))
+    noise, gram = 1.0, np.eye(7)
+    for iteration in range(ITERATIONS):
+        turned = centred @ R.T
+        residual = np.einsum("nij,nj->ni", whiten, points - k * turned - c)
+        square = np.sum(residual**2, axis=1)
+        if covariances is None:
+            # Three components of a point; the median of their sum of squares is 2.37 variances.
+            noise = max(float(np.median(square)) / 2.366, 1e-300)
+        w = np.minimum(1.0, noise * OUTLYING / np.maximum(square, 1e-300)) ** 2
+        J = np.concatenate([turned[:, :, None], -k * skew(turned), np.broadcast_to(np.eye(3), whiten.shape)], axis=2)
+        J = whiten @ J
+        gram = np.einsum("n,nij,nik->jk", w, J, J)
+        step = np.linalg.solve(gram, np.einsum("n,nij,ni->j", w, J, residual))
+        k, R, c = k + step[0], exp_so3(step[1:4]) @ R, c + step[4:]
+        if iteration > 1 and abs(step[0]) < 1e-10 * k:
+            break
+    if not k > 0.0:
+        return None
+    spread = float(np.sum(w * square)) / max(3.0 * w.sum() - 7.0, 1.0)
+    spread = spread if covariances is None else max(spread, 1.0)
+    inverse = np.linalg.inv(gram)
+    by_point = np.einsum("j,n,nij,nik->nk", inverse[0], w, J, whiten)
+    return 1.0 / k, float(np.sqrt(spread * inverse[0, 0])) / k**2, -by_point / k**2
+
+
+def _robust_start(points: Points, centred: Points) -> tuple[float, FloatArray, FloatArray]:
+    """Return unit per mm (median of all distance ratios), rotation and centre to begin with."""
+    first, second = np.triu_indices(len(points), 1)
+    between = np.linalg.norm(points[first] - points[second], axis=1)
+    grid = np.linalg.norm(centred[first] - centred[second], axis=1)
+    k = float(np.median(between[grid > 0.0] / grid[grid > 0.0]))
+    c = np.median(points, axis=0)
+    R = nearest_rotation((points - c).T @ centred)
+    for _ in range(5):
+        off = points - k * centred @ R.T - c
+        size = np.linalg.norm(off, axis=1)
+        w = 1.0 / np.maximum(size, 0.1 * np.median(size) + 1e-300)
+        mean_p, mean_m = w @ points / w.sum(), w @ centred / w.sum()
+        R = nearest_rotation((points - mean_p).T * w @ (centred - mean_m))
+        c = mean_p - k * R @ mean_m
+    return k, R, c

@@ -1,0 +1,223 @@
+"""From the image of any camera to the image of any other with the same centre: pixels exactly, images by resampling."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Pixels, as_array
+from rigkit.core.errors import InputError
+from rigkit.geometry.rotation import nearest_rotation
+
+__all__ = ["Interpolation", "RectifyMap", "rectify_map", "rotation_from_view_angles"]
+
+Interpolation = Literal["spline", "lanczos", "linear", "nearest"]
+
+ROTATION_TOLERANCE = 1e-6
+"""A matrix further than this from orthonormal is a mistake, not rounding."""
+CHUNK_PIXELS = 1 << 18
+"""Pixels resampled at a time: bounds the memory of large targets."""
+MAX_SUPERSAMPLING = 8
+"""Samples a pixel and axis at the most, where a target shows the source much smaller."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RectifyMap:
+    """The map from images of `camera` to images of `target`, which has the same centre and is turned against it.
+
+    Attributes
+    ----------
+    target_from_cam : (3, 3) rotation.
+    """
+
+    camera: Camera
+    target: Camera
+    target_from_cam: Mat3
+
+    def pixels(self, pixels: Pixels) -> tuple[Pixels, BoolArray]:
+        """Return where pixels (..., 2) of the camera come to lie in the target, and where they do."""
+        rays, seen = self.camera.unproject(pixels)
+        out, valid = self.target.project(rays @ self.target_from_cam.T)
+        return out, valid & seen
+
+    def source_pixels(self, pixels: Pixels) -> tuple[Pixels, BoolArray]:
+        """Return where pixels (..., 2) of the target come from in the camera, and where they do."""
+        rays, seen = self.target.unproject(pixels)
+        out, valid = self.camera.project(rays @ self.target_from_cam)
+        return out, valid & seen
+
+    def jacobians(self, pixels: Pixels) -> FloatArray:
+        """Return d target pixel / d camera pixel (..., 2, 2) at pixels (..., 2) of the camera; NaN where there is none.
+
+        An affinity between raw images becomes J2 A21 J1^-1 between the rectified ones; a corner's covariance J C J^T.
+        """
+        rays, _ = self.camera.unproject(pixels)
+        _, _, by_point, _ = self.target.project_with_jacobians(rays @ self.target_from_cam.T)
+        return np.asarray(by_point @ self.target_from_cam @ self.camera.ray_jacobian(pixels))
+
+    def scale(self, pixels: Pixels) -> FloatArray:
+        """Return target pixels per camera pixel (...,), the root of the ratio of areas: `sigma_px` grows by it."""
+        return np.asarray(np.sqrt(np.abs(np.linalg.det(self.jacobians(pixels)))))
+
+    def image(
+        self,
+        image: NDArray[Any],
+        *,
+        interpolation: Interpolation = "spline",
+        antialias: bool = True,
+        fill: float = 0.0,
+    ) -> NDArray[Any]:
+        """Return the image (h, w) or (h, w, channels) as `target` sees it, in the same dtype.
+
+        Parameters
+        ----------
+        interpolation : "spline" is the cubic B-spline that passes through the samples: it keeps positions exactly,
+            which OpenCV's cubic and Lanczos kernels do to some hundredths of a pixel only.
+        antialias : where the target shows the source smaller, average several samples a pixel instead of skipping
+            source pixels.
+        fill : value where the camera does not see, or has no pixel.
+        """
+        image = np.asarray(image)
+        width, height = self.camera.size_px
+        if image.shape[:2] != (height, width) or image.ndim not in (2, 3):
+            raise InputError(
+                f"image of {image.shape[1] if image.ndim > 1 else 0} x {image.shape[0]} px, but the camera was "
+                f"calibrated at {width} x {height}; take the image size of the calibration"
+            )
+        sampler = _Sampler(image, interpolation)
+        samples = self._supersampling() if antialias else 1
+        columns, rows = self.target.size_px
+        out = np.empty((rows, columns, *image.shape[2:]), dtype=np.float64)
+        shifts = (np.arange(samples) + 0.5) / samples - 0.5
+        for band in _bands(rows, columns):
+            grid = np.stack(np.meshgrid(np.arange(columns, dtype=np.float64), band.astype(np.float64)), axis=-1)
+            total = np.zeros((*grid.shape[:2], *image.shape[2:]))
+            weight = np.zeros(grid.shape[:2])
+            for dv in shifts:
+                for du in shifts:
+                    source, valid = self.source_pixels(grid + np.array([du, dv]))
+                    valid &= self.camera.on_image(source)
+                    total[valid] += sampler(source[valid])
+                    weight += valid
+            # Half of the samples decide whether the pixel is seen: the border neither grows nor frays.
+            seen = weight >= 0.5 * samples * samples
+            mean = total[seen] / weight[seen].reshape(-1, *(1,) * (image.ndim - 2))
+            out[band] = fill
+            out[band[0] : band[-1] + 1][seen] = mean
+        return _as_dtype(out, image.dtype)
+
+    def coverage(self) -> BoolArray:
+        """Say which pixels (h, w) of the target the camera sees."""
+        columns, rows = self.target.size_px
+        grid = np.stack(np.meshgrid(np.arange(columns, dtype=np.float64), np.arange(rows, dtype=np.float64)), axis=-1)
+        source, valid = self.source_pixels(grid)
+        return valid & self.camera.on_image(source)
+
+    def _supersampling(self) -> int:
+        """Samples a pixel and axis: source pixels per target pixel, where it is large (90 % quantile)."""
+        columns, rows = self.target.size_px
+        u, v = np.linspace(0.0, columns - 1.0, 41), np.linspace(0.0, rows - 1.0, 41)
+        source, valid = self.source_pixels(np.stack(np.meshgrid(u, v), axis=-1))
+        source = source[valid & self.camera.on_image(source)]
+        scale = self.scale(source) if source.size else np.ones(1)
+        scale = scale[np.isfinite(scale) & (scale > 0.0)]
+        if not scale.size:
+            return 1
+        return int(np.clip(np.round(1.0 / np.quantile(scale, 0.1)), 1, MAX_SUPERSAMPLING))
+
+
+def rectify_map(camera: Camera, target: Camera, *, target_from_cam: ArrayLike | None = None) -> RectifyMap:
+    """Return the map from images of `camera` to images of `target`.
+
+    Parameters
+    ----------
+    target_from_cam : (3, 3) rotation, by default none: x_in_target = target_from_cam @ x_in_cam.
+
+    Raises InputError where `target_from_cam` is not a rotation.
+    """
+    matrix = as_array(np.eye(3) if target_from_cam is None else target_from_cam, (3, 3), "target_from_cam")
+    rotation = nearest_rotation(matrix)
+    if np.abs(rotation - matrix).max() > ROTATION_TOLERANCE:
+        raise InputError("target_from_cam: not a rotation matrix (orthonormal, determinant +1)")
+    return RectifyMap(camera, target, as_array(rotation, (3, 3), "target_from_cam"))
+
+
+def rotation_from_view_angles(yaw_rad: float, pitch_rad: float, roll_rad: float = 0.0) -> Mat3:
+    """Return target_from_cam of a view turned by `yaw_rad` to the right, `pitch_rad` up, `roll_rad` clockwise.
+
+    Yaw turns about the camera's y axis, then pitch about the new x axis, then roll about the new viewing direction.
+    """
+    cy, sy = np.cos(yaw_rad), np.sin(yaw_rad)
+    cp, sp = np.cos(pitch_rad), np.sin(pitch_rad)
+    cr, sr = np.cos(roll_rad), np.sin(roll_rad)
+    yaw = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
+    pitch = np.array([[1.0, 0.0, 0.0], [0.0, cp, -sp], [0.0, sp, cp]])
+    roll = np.array([[cr, -sr, 0.0], [sr, cr, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray((yaw @ pitch @ roll).T)
+
+
+class _Sampler:
+    """Values of an image between its pixels; at the border the outermost pixels are continued."""
+
+    def __init__(self, image: NDArray[Any], interpolation: Interpolation) -> None:
+        self._shape = image.shape[2:]
+        self._flag: int | None = {
+            "spline": None,
+            "lanczos": cv2.INTER_LANCZOS4,
+            "linear": cv2.INTER_LINEAR,
+            "nearest": cv2.INTER_NEAREST,
+        }.get(interpolation, -1)
+        if self._flag == -1:
+            raise InputError(f"interpolation '{interpolation}' is unknown; known: spline, lanczos, linear, nearest")
+        planes = np.moveaxis(image.reshape(*image.shape[:2], -1), -1, 0)
+        if self._flag is None:
+            from scipy import ndimage
+
+            self._planes: list[NDArray[Any]] = [
+                ndimage.spline_filter(p.astype(np.float64), order=3, mode="mirror") for p in planes
+            ]
+        else:
+            self._planes = [np.ascontiguousarray(p, dtype=np.float32) for p in planes]
+
+    def __call__(self, pixels: Pixels) -> FloatArray:
+        """Return the values (N, *channels) at pixels (N, 2)."""
+        if not pixels.size:
+            return np.zeros((0, *self._shape))
+        if self._flag is None:
+            from scipy import ndimage
+
+            height, width = self._planes[0].shape
+            v, u = np.clip(pixels[:, 1], 0.0, height - 1.0), np.clip(pixels[:, 0], 0.0, width - 1.0)
+            values = [ndimage.map_coordinates(p, (v, u), order=3, mode="mirror", prefilter=False) for p in self._planes]
+        else:
+            # remap takes images of at most 32767 columns: the list of pixels is folded into rows.
+            width = 4096
+            padded: NDArray[np.float32] = np.zeros((2, -(-len(pixels) // width) * width), dtype=np.float32)
+            padded[:, : len(pixels)] = pixels.T
+            columns, rows = padded.reshape(2, -1, width)
+            values = [
+                cv2.remap(p, columns, rows, self._flag, borderMode=cv2.BORDER_REPLICATE).reshape(-1)[: len(pixels)]
+                for p in self._planes
+            ]
+        return np.stack(values, axis=-1).astype(np.float64).reshape(len(pixels), *self._shape)
+
+
+def _bands(rows: int, columns: int) -> Iterator[NDArray[np.int64]]:
+    """Yield the row numbers of bands of at most CHUNK_PIXELS pixels."""
+    step = max(1, CHUNK_PIXELS // columns)
+    for first in range(0, rows, step):
+        yield np.arange(first, min(first + step, rows))
+
+
+def _as_dtype(image: FloatArray, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Round and clip to an integer dtype, or cast."""
+    if np.issubdtype(dtype, np.integer):
+        info = np.iinfo(dtype)
+        return np.clip(np.rint(image), info.min, info.max).astype(dtype)
+    return image.astype(dtype)

@@ -1,0 +1,159 @@
+"""Stereo-rectified pairs of any two cameras: corresponding points come to lie in the same row.
+
+Every plane through the baseline becomes a row of the perspective image, and of the panoramas around the baseline
+(S. Abraham, W. Foerstner, "Fish-eye-stereo calibration and epipolar rectification", ISPRS 2005): these also serve
+fields of view beyond 180 degrees and a camera that moves forward.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from rigkit.cameras.base import Camera
+from rigkit.cameras.pinhole import Pinhole
+from rigkit.core.arrays import FloatArray, Mat3
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import angle_between, unit
+from rigkit.rectification.panorama import EpipolarCylindrical, EpipolarEquirectangular
+from rigkit.rectification.rectify import RectifyMap, rectify_map
+
+__all__ = ["StereoProjection", "StereoRectification", "rectify_pair"]
+
+StereoProjection = Literal["perspective", "cylindrical", "equirectangular"]
+
+_TARGETS: dict[str, type[Camera]] = {
+    "perspective": Pinhole,
+    "cylindrical": EpipolarCylindrical,
+    "equirectangular": EpipolarEquirectangular,
+}
+_REACH = {
+    "perspective": (np.tan(np.radians(60.0)), np.tan(np.radians(60.0))),
+    "cylindrical": (np.tan(np.radians(60.0)), np.pi),
+    "equirectangular": (np.radians(85.0), np.pi),
+}
+"""Half extents (along, across the baseline) in the target's own units: beyond them the image is stretched too much."""
+MIN_ANGLE_RAD = np.radians(15.0)
+"""Baseline and viewing direction nearer than this: a perspective image perpendicular to the baseline shows neither."""
+SAMPLES = 41
+"""Pixels a side of each image from which the extent of the targets is found."""
+MAX_ENLARGEMENT = 3.0
+"""Width or height of the target against the larger source at the most."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class StereoRectification:
+    """Two maps into images of one camera model and size, whose rows correspond.
+
+    Attributes
+    ----------
+    map1, map2 : the maps of the two cameras; `map1.target` and `map2.target` are one.
+    rect2_from_rect1 : no rotation; translation (-baseline, 0, 0) with camera 2 to the right, (baseline, 0, 0) else.
+    """
+
+    map1: RectifyMap
+    map2: RectifyMap
+    rect2_from_rect1: Rigid3
+
+    @property
+    def baseline_mm(self) -> float:
+        return float(np.linalg.norm(self.rect2_from_rect1.translation_mm))
+
+
+def rectify_pair(
+    camera1: Camera,
+    camera2: Camera,
+    cam2_from_cam1: Rigid3,
+    *,
+    projection: StereoProjection = "perspective",
+    focal_px: float | None = None,
+) -> StereoRectification:
+    """Return the rectification of a pair of cameras of any models.
+
+    Parameters
+    ----------
+    projection : "perspective" for ordinary lenses and side-by-side cameras; "cylindrical" and "equirectangular" around
+        the baseline for wide ones, the latter for every direction of the baseline.
+    focal_px : px per radian at the target's centre; by default that which keeps the sources' resolution in the median.
+
+    The target covers the rows that both cameras see, and all columns that either sees, out to the reach of the
+    projection.
+
+    Raises
+    ------
+    InputError
+        `projection` is unknown.
+    DegenerateError
+        No baseline; a baseline along the view in a perspective rectification; no common field of view.
+    """
+    if projection not in _TARGETS:
+        raise InputError(f"projection '{projection}' is unknown; known: {', '.join(_TARGETS)}")
+    rect_from_cam1 = _common_rotation(cam2_from_cam1, projection)
+    rect_from_cam2 = rect_from_cam1 @ cam2_from_cam1.rotation.T
+    model = _TARGETS[projection]
+    plain = model((1, 1), np.array([1.0, 1.0, 0.0, 0.0]))
+    maps = [
+        rectify_map(camera, plain, target_from_cam=rotation)
+        for camera, rotation in ((camera1, rect_from_cam1), (camera2, rect_from_cam2))
+    ]
+    low, high, scale = _extent(maps, np.array(_REACH[projection]))
+    focal = float(1.0 / scale) if focal_px is None else float(focal_px)
+    largest = MAX_ENLARGEMENT * max(*camera1.size_px, *camera2.size_px)
+    if focal_px is None:
+        focal = min(focal, largest / float((high - low).max()))
+    size = np.ceil(focal * (high - low)).astype(int) + 1
+    target = model((int(size[0]), int(size[1])), np.array([focal, focal, *(-focal * low)]))
+    return StereoRectification(
+        rectify_map(camera1, target, target_from_cam=rect_from_cam1),
+        rectify_map(camera2, target, target_from_cam=rect_from_cam2),
+        Rigid3(np.eye(3), rect_from_cam2 @ cam2_from_cam1.translation_mm),
+    )
+
+
+def _common_rotation(cam2_from_cam1: Rigid3, projection: str) -> Mat3:
+    """Return rect_from_cam1: x along the baseline, to the right; z as near as can be to both viewing directions."""
+    centre2 = cam2_from_cam1.inverse().translation_mm
+    x = unit(centre2)
+    if not np.isfinite(x).all():
+        raise DegenerateError("stereo rectification: the two cameras have the same centre; rows need a baseline")
+    axes2_in_cam1 = cam2_from_cam1.rotation.T
+    right, forward = np.eye(3) + axes2_in_cam1, unit(np.eye(3)[:, 2] + axes2_in_cam1[:, 2])
+    if x @ right[:, 0] < 0.0:
+        x = -x
+    angle = float(angle_between(x, forward))
+    angle = min(angle, np.pi - angle)
+    if projection == "perspective" and not angle >= MIN_ANGLE_RAD:
+        raise DegenerateError(
+            f"stereo rectification: the baseline is {np.degrees(angle):.0f} degrees off the viewing direction; "
+            "take the projection 'equirectangular'"
+        )
+    across = np.cross(forward, x)
+    # A baseline along the view leaves the turn about it open: then the cameras' down stays down.
+    y = unit(across) if np.linalg.norm(across) > 1e-3 else unit(right[:, 1] - (right[:, 1] @ x) * x)
+    return np.stack([x, y, np.cross(x, y)])
+
+
+def _extent(maps: list[RectifyMap], reach: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Return low and high corner of the target in units of its focal length, and target per source scale (median)."""
+    lows, highs, scales = [], [], []
+    for remap in maps:
+        width, height = remap.camera.size_px
+        grid = np.stack(
+            np.meshgrid(np.linspace(0.0, width - 1.0, SAMPLES), np.linspace(0.0, height - 1.0, SAMPLES)), axis=-1
+        )
+        there, valid = remap.pixels(grid)
+        valid &= (np.abs(np.where(valid[..., None], there, np.inf)) <= reach).all(axis=-1)
+        if not valid.any():
+            raise DegenerateError("stereo rectification: a camera looks away from the plane that both could share")
+        lows.append(there[valid].min(axis=0))
+        highs.append(there[valid].max(axis=0))
+        scales.append(remap.scale(grid[valid]))
+    low, high = np.minimum(*lows), np.maximum(*highs)
+    low[1], high[1] = max(lows[0][1], lows[1][1]), min(highs[0][1], highs[1][1])
+    if low[1] >= high[1]:
+        raise DegenerateError("stereo rectification: the two cameras have no row in common; check cam2_from_cam1")
+    scale = np.concatenate(scales)
+    return low, high, float(np.median(scale[np.isfinite(scale)]))

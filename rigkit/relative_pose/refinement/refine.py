@@ -1,0 +1,255 @@
+"""Maximum likelihood pose from points and affinities, with the pose type as a constraint or as a soft prior.
+
+Levenberg-Marquardt on the five degrees of freedom of the relative pose. The pose type is either exact (planar two
+degrees of freedom, standard and forward none) or, with `level_sigma_rad`, a Gaussian prior on the deviations from it: a
+spirit level that holds to 0.2 degrees is neither ignored nor believed exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rigkit.core.arrays import FloatArray
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.matches import Matches
+from rigkit.core.posetype import PoseType
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3, unit
+from rigkit.geometry.sampson import epipolar_normals, sampson_distances
+from rigkit.relative_pose.refinement.pose_problem import Minimum, PoseProblem, RobustWeights, cauchy_weights
+from rigkit.relative_pose.refinement.residuals import whitened_affinities
+from rigkit.relative_pose.solvers.planar_ambiguity import compare_poses, one_plane_poses
+from rigkit.relative_pose.solvers.pose import behind_sigmas, choose_pose, essential_from_pose, translation_basis
+from rigkit.relative_pose.solvers.registry import fundamental_for
+from rigkit.relative_pose.solvers.weights import (
+    LEAST_SIGMA_A,
+    RowWeights,
+    WeightRule,
+    estimate_sigma_A,
+    usable_affinities,
+)
+
+__all__ = [
+    "SIGNIFICANT",
+    "RefinedPose",
+    "cauchy_weights",
+    "estimate_pose",
+    "project_to_type",
+    "refine_pose",
+    "rules_out",
+]
+
+SIGNIFICANT = 3.0
+"""Standard deviations by which a pose must explain the matches worse than another one to be ruled out."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RefinedPose:
+    """A refined relative pose.
+
+    Attributes
+    ----------
+    cam2_from_cam1 : pose with |translation| = 1.
+    covariance : (6, 6) of (left rotation perturbation rad, translation); rank five, and less under a constraint. It
+        follows from the sigmas of the matches; multiply it by `variance_factor` where those are not trusted.
+    sampson_rms_px : root mean square of the Sampson distances of all points.
+    cost : sum of squared residuals in sigmas, with the prior's.
+    variance_factor : cost of the data over the number of residuals less degrees of freedom; 1 if the sigmas are right.
+    weights : (N,) factors of the squared residuals in the last iteration; 1 unless robust.
+    iterations : of the minimisation; `converged` says whether its last step was small.
+    """
+
+    cam2_from_cam1: Rigid3
+    covariance: FloatArray
+    sampson_rms_px: float
+    cost: float
+    variance_factor: float
+    weights: FloatArray
+    iterations: int
+    converged: bool
+
+
+def refine_pose(
+    matches: Matches,
+    start: Rigid3,
+    pose_type: PoseType | str = PoseType.GENERAL,
+    level_sigma_rad: float | None = None,
+    *,
+    covariance_A: FloatArray | None = None,
+    robust: RobustWeights | None = None,
+    point_weights: FloatArray | None = None,
+) -> RefinedPose:
+    """Return the pose of maximum likelihood near `start`.
+
+    Parameters
+    ----------
+    matches : affinities take part where they have a sigma_A (or `covariance_A`): leave it out for affinities that were
+        computed from the epipolar geometry or from the very same corners.
+    start : its translation's length does not matter.
+    pose_type : exact constraint, unless `level_sigma_rad` makes it a prior.
+    level_sigma_rad : standard deviation of each deviation from the pose type.
+    covariance_A : (N, 4, 4) covariance of the row-major entries of A21.
+    robust : weight function for contaminated matches, `cauchy_weights` for example.
+    point_weights : (N,) fixed factors of the squared residuals of each match.
+
+    Raises
+    ------
+    InputError
+        Fewer residuals than degrees of freedom; a pose type that cannot be refined ("auto").
+    DegenerateError
+        The start has no baseline, or the pose is not determined.
+    """
+    if str(pose_type) not in ("general", "planar", "standard", "forward"):
+        raise InputError(
+            f"pose type '{pose_type}' cannot be refined; decide on one of general, planar, standard, forward"
+        )
+    if level_sigma_rad is not None and not level_sigma_rad > 0.0:
+        raise InputError(f"level sigma must be positive, got {level_sigma_rad} rad; leave it out for an exact level")
+    exact = level_sigma_rad is None
+    problem = PoseProblem(matches, str(pose_type), level_sigma_rad, covariance_A, robust, point_weights)
+    R, t = project_to_type(start, pose_type) if exact else _split(start)
+    return _result(problem, problem.minimum(R, t))
+
+
+def estimate_pose(
+    matches: Matches,
+    pose_type: PoseType | str = PoseType.GENERAL,
+    level_sigma_rad: float | None = None,
+    *,
+    weights: WeightRule | RowWeights | None = None,
+    robust: RobustWeights | None = None,
+) -> RefinedPose:
+    """Return the refined pose from scratch: linear solution, cheirality, maximum likelihood.
+
+    With a soft level the minimisation starts from the exact pose type and from the general solution, and the better
+    end is kept. With the rule "auto" sigma_A is estimated from the data and set in the matches.
+    """
+    if str(pose_type) == PoseType.GENERAL:
+        level_sigma_rad = None
+    kinds = [str(pose_type)] if level_sigma_rad is None else [str(pose_type), "general"]
+    starts: list[Rigid3] = []
+    failure: DegenerateError | InputError | None = None
+    for kind in kinds:
+        try:
+            estimate = fundamental_for(kind).solve(matches, weights)
+            starts.append(choose_pose(estimate.E21, matches.rays1, matches.rays2, kind))
+        except (DegenerateError, InputError) as error:
+            failure = failure or error
+    flat = one_plane_poses(matches) if "general" in kinds else ()
+    starts += flat
+    matches = _with_sigma(matches, starts, weights)
+    ends: list[RefinedPose] = []
+    for start in starts:
+        try:
+            ends.append(refine_pose(matches, start, pose_type, level_sigma_rad, robust=robust))
+        except DegenerateError as error:
+            failure = failure or error
+    if not ends:
+        raise failure or DegenerateError("no pose found")
+    best = min(ends, key=lambda end: _visible_cost(matches, end))
+    if flat:
+        _refuse_ambiguity(matches, best, ends)
+    return best
+
+
+def _visible_cost(matches: Matches, end: RefinedPose) -> float:
+    """Return the cost with what it takes to bring the points that are behind a camera to infinity."""
+    return end.cost + float(np.sum(end.weights * behind_sigmas(matches, end.cam2_from_cam1) ** 2))
+
+
+def _refuse_ambiguity(matches: Matches, best: RefinedPose, ends: list[RefinedPose]) -> None:
+    """Raise DegenerateError if another pose explains the points of one plane as well as the best one."""
+    for end in ends:
+        turn, same = compare_poses(best.cam2_from_cam1, end.cam2_from_cam1)
+        if not same and not rules_out(matches, best, end):
+            raise DegenerateError(
+                f"all {len(matches)} points lie on one plane and two poses {np.degrees(turn):.1f} deg apart "
+                "explain them equally well; add a board that is not parallel to it, or declare the pose type"
+            )
+
+
+def rules_out(matches: Matches, better: RefinedPose, worse: RefinedPose) -> bool:
+    """Return whether `matches` are explained so much better by the one pose that the other is wrong."""
+    chance = _chance_difference(matches, better.cam2_from_cam1, worse.cam2_from_cam1)
+    difference = _visible_cost(matches, worse) - _visible_cost(matches, better)
+    return difference >= SIGNIFICANT * max(better.variance_factor, 1.0) * chance
+
+
+def _chance_difference(matches: Matches, first: Rigid3, second: Rigid3) -> float:
+    """Return the standard deviation of the difference of two poses' costs where both are true, for all the matches say.
+
+    A residual is the noise across an epipolar line, and another pose has other lines: of two normal residuals with the
+    correlation c the squares differ by 4 (1 - c^2) in the mean square. Along with SIGNIFICANT itself, for the pose.
+    """
+    m, which = matches, whitened_affinities(matches)[1]
+    lines1, lines2 = [], []
+    for pose in (first, second):
+        _, n1, n2 = epipolar_normals(essential_from_pose(pose), m.rays1, m.rays2, m.jacobians1, m.jacobians2)
+        lines1.append(unit(np.concatenate([m.sigma1_px[:, None] * n1, m.sigma2_px[:, None] * n2], axis=1)))
+        lines2.append(unit(n2[which]))
+    independent = [1.0 - np.nan_to_num(np.sum(a * b, axis=1)) ** 2 for a, b in (lines1, lines2)]
+    return float(np.sqrt(SIGNIFICANT**2 + 4.0 * independent[0].sum() + 8.0 * independent[1].sum()))
+
+
+def project_to_type(pose: Rigid3, pose_type: PoseType | str) -> tuple[FloatArray, FloatArray]:
+    """Return rotation (3, 3) and unit translation (3,) of the pose of that type nearest to `pose`."""
+    R, t = _split(pose)
+    kind = str(pose_type)
+    if kind == PoseType.PLANAR:
+        angle = np.arctan2(R[0, 2] - R[2, 0], R[0, 0] + R[2, 2])
+        R, t = exp_so3(np.array([0.0, angle, 0.0])), np.array([t[0], 0.0, t[2]])
+    elif kind in (PoseType.STANDARD, PoseType.FORWARD):
+        keep = 0 if kind == PoseType.STANDARD else 2
+        R, t = np.eye(3), np.where(np.arange(3) == keep, t, 0.0)
+    if not np.linalg.norm(t) > 1e-6:
+        raise DegenerateError(f"the start of the refinement has no translation that pose type '{kind}' allows")
+    return R, unit(t)
+
+
+def _split(pose: Rigid3) -> tuple[FloatArray, FloatArray]:
+    if not np.linalg.norm(pose.translation_mm) > 0.0:
+        raise DegenerateError("the start of the refinement has no baseline")
+    return np.array(pose.rotation), unit(pose.translation_mm)
+
+
+def _with_sigma(matches: Matches, starts: Sequence[Rigid3], weights: WeightRule | RowWeights | None) -> Matches:
+    """Return the matches with the sigma_A that the weight rule stands for: one for all starts, of the best of them."""
+    if weights == "points" or (weights == "auto" and not usable_affinities(matches).any()):
+        return replace(matches, A21=None, sigma_A=None)
+    if weights == "auto" and starts:
+        least = min(estimate_sigma_A(matches, essential_from_pose(start)) for start in starts)
+        return replace(matches, sigma_A=np.full(len(matches), max(least, LEAST_SIGMA_A)))
+    return matches
+
+
+def _result(problem: PoseProblem, end: Minimum) -> RefinedPose:
+    matches, root, freedom = problem.matches, np.sqrt(end.weights), len(problem.free())
+    r, J = end.residuals * root, end.jacobian[:, problem.free()] * root[:, None]
+    gram = J.T @ J
+    if freedom and np.linalg.eigvalsh(gram)[0] <= 1e-14 * np.trace(gram):
+        raise DegenerateError(
+            "the matches do not determine the pose (all on one plane in a critical position, or no baseline); "
+            "add points off that plane or declare the pose type"
+        )
+    to_six = np.zeros((6, 5))
+    to_six[:3, :3] = np.eye(3)
+    to_six[3:, 3:] = translation_basis(end.t).T
+    spread = to_six[:, problem.free()]
+    covariance = spread @ np.linalg.inv(gram) @ spread.T if freedom else np.zeros((6, 6))
+    data, n = r[: len(r) - end.priors], len(matches)
+    pose = Rigid3(end.R, end.t)
+    E21 = essential_from_pose(pose)
+    px = sampson_distances(E21, matches.rays1, matches.rays2, matches.jacobians1, matches.jacobians2)
+    return RefinedPose(
+        pose,
+        covariance,
+        float(np.sqrt(np.mean(px**2))),
+        float(r @ r),
+        float(data @ data) / max(len(r) - freedom, 1),
+        end.weights[:n],
+        end.iterations,
+        end.converged,
+    )

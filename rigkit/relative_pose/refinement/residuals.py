@@ -1,0 +1,154 @@
+"""Residuals of a relative pose in standard deviations, with their derivatives: what the refinement minimises.
+
+The pose is (R, t), |t| = 1, perturbed by R <- exp(w) R and t <- t + b1 T1 + b2 T2 with T1, T2 perpendicular to t.
+
+Points: the reprojection error itself, not its first-order approximation. For each pair of pixels the nearest pair that
+satisfies the epipolar geometry is found (two linearisations); the residual is the signed length of that displacement
+in sigmas, and by the envelope theorem its derivative is that of the constraint at the corrected rays over its standard
+deviation. Affinities: (A^T n2 + n1) whitened by M C M^T, C the covariance of A and M = d(A^T n2)/dA, and what the
+pixels' noise adds to it (weights.pixel_share); with C = sigma_A^2 I that is division by the root of sigma_A^2 |n2|^2
+and that share.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.core.arrays import FloatArray, IntArray
+from rigkit.core.matches import Matches
+from rigkit.core.posetype import PoseType
+from rigkit.geometry.rotation import cross, log_so3, skew
+from rigkit.geometry.sampson import epipolar_normals
+from rigkit.geometry.triangulation import correct_rays_px
+from rigkit.relative_pose.solvers.weights import pixel_share, usable_affinities
+
+__all__ = ["affinity_terms", "level_terms", "point_terms", "whitened_affinities"]
+
+
+def point_terms(matches: Matches, R: FloatArray, t: FloatArray, basis: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the signed reprojection distances (N,) in sigmas and their Jacobian (N, 5)."""
+    E21 = skew(t) @ R
+    b1, b2, s1, s2 = matches.jacobians1, matches.jacobians2, matches.sigma1_px, matches.sigma2_px
+    f1, f2, dq1, dq2 = correct_rays_px(
+        matches.rays1, matches.rays2, E21, b1, b2, sigma1_px=s1, sigma2_px=s2, iterations=1
+    )
+    # The Jacobians are those of the measured pixels: across a displacement of a pixel they do not change visibly.
+    c, n1, n2 = epipolar_normals(E21, f1, f2, b1, b2)
+    at_measured = c - np.sum(n1 * dq1, axis=-1) - np.sum(n2 * dq2, axis=-1)
+    sigma = np.sqrt(s1**2 * np.sum(n1 * n1, axis=-1) + s2**2 * np.sum(n2 * n2, axis=-1))
+    sigma = np.where(sigma > 0.0, sigma, np.inf)
+    turned = f1 @ R.T
+    by_rotation = cross(turned, cross(f2, t))
+    by_direction = cross(turned, f2) @ basis.T
+    jacobian = np.concatenate([by_rotation, by_direction], axis=1) / sigma[:, None]
+    return at_measured / sigma, jacobian
+
+
+def affinity_terms(
+    matches: Matches, R: FloatArray, t: FloatArray, basis: FloatArray, covariance_A: FloatArray | None
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Return whitened affinity residuals (K, 2), their Jacobian (K, 2, 5) and which matches (K,) they belong to.
+
+    `covariance_A` (N, 4, 4) of the row-major entries of A21; None takes sigma_A of the matches. Without either there
+    are no affinity residuals.
+    """
+    which = _chosen(matches, covariance_A)
+    if not len(which):
+        return np.zeros((0, 2)), np.zeros((0, 2, 5)), which
+    m = matches.select(which)
+    assert m.A21 is not None
+    f1, f2, b1, b2, A = m.rays1, m.rays2, m.jacobians1, m.jacobians2, m.A21
+    turned = f1 @ R.T
+    # E f1 = t x (R f1) and E^T f2 = R^T (f2 x t), and their derivatives by (w, b).
+    line2, line1 = cross(t, turned), cross(f2, t)
+    by2 = np.concatenate([-skew(t) @ skew(turned), -skew(turned) @ basis.T], axis=-1)
+    by1 = np.concatenate([skew(line1), skew(f2) @ basis.T], axis=-1)
+    n2 = (line2[:, None, :] @ b2)[:, 0]
+    n1 = ((line1 @ R)[:, None, :] @ b1)[:, 0]
+    dn2 = np.swapaxes(b2, -1, -2) @ by2
+    dn1 = np.swapaxes(b1, -1, -2) @ (R.T @ by1)
+    g = (n2[:, None, :] @ A)[:, 0] + n1
+    dg = np.swapaxes(A, -1, -2) @ dn2 + dn1
+    share = pixel_share(m, skew(t) @ R)
+    if covariance_A is None:
+        assert m.sigma_A is not None
+        variance = m.sigma_A**2 * np.sum(n2**2, axis=1) + share
+        variance = np.where(variance > 0.0, variance, np.inf)
+        along = m.sigma_A[:, None] ** 2 * np.sum(n2[:, :, None] * dn2, axis=1) + _half_slope(m, R, t, basis)
+        along /= variance[:, None]
+        scale = 1.0 / np.sqrt(variance)
+        jacobian = (dg - g[:, :, None] * along[:, None, :]) * scale[:, None, None]
+        return g * scale[:, None], jacobian, which
+    M = np.zeros((which.size, 2, 4))
+    M[:, 0, 0], M[:, 0, 2] = n2[:, 0], n2[:, 1]
+    M[:, 1, 1], M[:, 1, 3] = n2[:, 0], n2[:, 1]
+    of_g = M @ covariance_A[which] @ np.swapaxes(M, -1, -2) + share[:, None, None] * np.eye(2)
+    floor = 1e-12 * np.trace(of_g, axis1=1, axis2=2)[:, None, None] + 1e-300
+    whiten = np.linalg.inv(np.linalg.cholesky(of_g + floor * np.eye(2)))
+    return (whiten @ g[..., None])[..., 0], whiten @ dg, which
+
+
+def _half_slope(matches: Matches, R: FloatArray, t: FloatArray, basis: FloatArray) -> FloatArray:
+    """Return half the derivative (K, 5) of `pixel_share`: a sum of squares, of M = B2^T E B1."""
+    m = matches
+    assert m.A21 is not None
+    C = R @ m.jacobians1
+    M = np.swapaxes(m.jacobians2, -1, -2) @ (skew(t) @ C)
+    s1, s2 = (s[:, None, None] ** 2 for s in (m.sigma1_px, m.sigma2_px))
+    C, P = (np.swapaxes(v, -1, -2) for v in (C, m.jacobians2 @ (s1 * m.A21 @ np.swapaxes(m.A21, -1, -2) @ M + s2 * M)))
+    by_rotation, by_direction = cross(C, cross(P, t)).sum(axis=1), cross(C, P).sum(axis=1)
+    return 0.5 * np.concatenate([by_rotation, by_direction @ basis.T], axis=1)
+
+
+def whitened_affinities(matches: Matches) -> tuple[FloatArray, IntArray]:
+    """Return what `affinity_terms` takes from the matches, for its kernel: 25 rows (25, K), and which matches (K,).
+
+    Rays of both images, columns of their ray Jacobians by pixel coordinate, the entries of A21, the variances of its
+    entries and of the pixels of both images.
+    """
+    which = _chosen(matches, None)
+    if not len(which):
+        return np.zeros((25, 0)), which
+    assert matches.A21 is not None and matches.sigma_A is not None
+    columns = [b[which].T.reshape(6, -1) for b in (matches.jacobians1, matches.jacobians2)]
+    entries = matches.A21[which].reshape(-1, 4).T
+    rays = matches.rays1[which].T, matches.rays2[which].T
+    sigmas = np.stack([matches.sigma_A[which], matches.sigma1_px[which], matches.sigma2_px[which]])
+    return np.concatenate([*rays, *columns, entries, sigmas**2]), which
+
+
+def _chosen(matches: Matches, covariance_A: FloatArray | None) -> IntArray:
+    """Return which matches (K,) have an affinity of known uncertainty."""
+    usable = usable_affinities(matches)
+    if covariance_A is not None:
+        usable &= np.isfinite(covariance_A).all(axis=(-2, -1))
+    elif matches.sigma_A is not None:
+        usable &= np.isfinite(matches.sigma_A) & (matches.sigma_A > 0.0)
+    else:
+        usable[:] = False
+    return np.flatnonzero(usable).astype(np.int64)
+
+
+def level_terms(
+    pose_type: PoseType | str, R: FloatArray, t: FloatArray, basis: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the deviations (K,) in radians of a pose from its type, and their Jacobian (K, 5).
+
+    Planar: the x and z components of the image of the vertical axis, and t_y. Standard and forward: the rotation vector
+    and the two components of t across x or z. General: nothing.
+    """
+    kind = str(pose_type)
+    if kind == PoseType.PLANAR:
+        vertical = R[:, 1]
+        values = np.array([vertical[0], vertical[2], t[1]])
+        by_rotation = np.concatenate([-skew(vertical)[[0, 2]], np.zeros((1, 3))])
+        by_direction = np.concatenate([np.zeros((2, 2)), basis[:, 1][None]])
+        return values, np.concatenate([by_rotation, by_direction], axis=1)
+    if kind in (PoseType.STANDARD, PoseType.FORWARD):
+        across = [1, 2] if kind == PoseType.STANDARD else [0, 1]
+        jacobian = np.zeros((5, 5))
+        # The rotation is small where this prior has a say: d log(exp(w) R) = dw.
+        jacobian[:3, :3] = np.eye(3)
+        jacobian[3:, 3:] = basis[:, across].T
+        return np.concatenate([log_so3(R), t[across]]), jacobian
+    return np.zeros(0), np.zeros((0, 5))

@@ -1,0 +1,203 @@
+"""Which pose type do the matches speak for, and does the declared one hold?
+
+For each type the marginal likelihood of the points (Laplace's approximation) under "the pose is of this type up to the
+spirit level's sigma": a type is preferred over a more general one if its deviations are no larger than noise and level
+allow, because it spends no probability on poses that were not taken. The noise is that of the matches' sigmas,
+corrected by what the general fit leaves over. A declared type is contradicted if the deviations of the general fit
+from it cannot come from noise and level together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rigkit.core.arrays import FloatArray
+from rigkit.core.errors import DegenerateError, InputError, RigkitError
+from rigkit.core.matches import Matches
+from rigkit.core.posetype import PoseType
+from rigkit.relative_pose.refinement.refine import RefinedPose, estimate_pose, refine_pose
+from rigkit.relative_pose.refinement.residuals import level_terms
+from rigkit.relative_pose.solvers.pose import translation_basis
+
+__all__ = ["DEFAULT_LEVEL_RAD", "PoseTypeEvidence", "TypeEvidence", "pose_type_evidence"]
+
+DEFAULT_LEVEL_RAD = float(np.radians(0.2))
+"""What a carefully set spirit level on a tripod holds to, where nobody says."""
+
+CONTRADICTION_P = 1e-3
+"""Chance with which a true declaration would be called contradicted."""
+
+SIGMA_BELIEF = 4.0
+"""The stated sigmas count as much as this many residuals when the noise level is corrected from the fit."""
+
+TYPES = (PoseType.GENERAL, PoseType.PLANAR, PoseType.STANDARD, PoseType.FORWARD)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TypeEvidence:
+    """What the matches say about one pose type.
+
+    Attributes
+    ----------
+    pose_type : which.
+    log_evidence : log marginal likelihood, relative to the best type (so 0 for the best, negative for the others).
+    probability : posterior probability if all four types were equally likely beforehand.
+    chi2, residuals : sum of squared residuals of the points in sigmas (stated ones) and their number.
+    deviation_rad : largest deviation of the general fit from the type: an angle out of the vertical axis, of the
+        rotation, or of the translation's direction. Zero for the general type.
+    p_value : chance of deviations at least this large from noise and level, if the type were true.
+    refined : the pose under this type (soft level).
+    """
+
+    pose_type: PoseType
+    log_evidence: float
+    probability: float
+    chi2: float
+    residuals: int
+    deviation_rad: float
+    p_value: float
+    refined: RefinedPose
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PoseTypeEvidence:
+    """Evidence for every pose type that could be fitted, best first.
+
+    Attributes
+    ----------
+    types : one entry a type, by falling evidence.
+    level_sigma_rad : the level that was assumed.
+    noise_factor : factor of the stated corner sigmas that the general fit suggests.
+    """
+
+    types: tuple[TypeEvidence, ...]
+    level_sigma_rad: float
+    noise_factor: float
+
+    @property
+    def choice(self) -> PoseType:
+        """The type with the highest evidence."""
+        return self.types[0].pose_type
+
+    def of(self, pose_type: PoseType | str) -> TypeEvidence | None:
+        """Return the evidence for one type; None where it could not be fitted."""
+        return next((entry for entry in self.types if entry.pose_type == str(pose_type)), None)
+
+    def contradiction(self, declared: PoseType | str) -> str | None:
+        """Return a sentence with the figures if the matches contradict the declared type, else None."""
+        if str(declared) in (PoseType.AUTO, PoseType.GENERAL):
+            return None
+        entry = self.of(declared)
+        if entry is None:
+            return f"declared '{declared}', but no pose of that type puts the points in front of both cameras"
+        if entry.p_value >= CONTRADICTION_P:
+            return None
+        instead = (
+            "though no other type fits better" if str(declared) == self.choice else f"they speak for '{self.choice}'"
+        )
+        off, level = np.degrees(entry.deviation_rad), np.degrees(self.level_sigma_rad)
+        return (
+            f"declared '{declared}', but the matches show a deviation of {off:.2f} deg from it "
+            f"(level {level:.2f} deg; chance {entry.p_value:.1e}); {instead}"
+        )
+
+
+def pose_type_evidence(matches: Matches, level_sigma_rad: float | None = None) -> PoseTypeEvidence:
+    """Return the evidence of the points of `matches` for general, planar, standard and forward.
+
+    Affinities are not used: what matters here is far better known from the points. `level_sigma_rad` None stands for
+    DEFAULT_LEVEL_RAD.
+
+    Raises
+    ------
+    DegenerateError, InputError
+        No type can be fitted (no baseline, too few matches).
+    """
+    level = DEFAULT_LEVEL_RAD if level_sigma_rad is None else float(level_sigma_rad)
+    if not level > 0.0:
+        raise InputError(f"level sigma must be positive, got {level} rad")
+    fits = _fits(matches, level)
+    general = fits.get(PoseType.GENERAL)
+    n = len(matches)
+    noise2 = 1.0
+    if general is not None:
+        left = max(n - 5, 0)
+        noise2 = (general.variance_factor * left + SIGMA_BELIEF) / (left + SIGMA_BELIEF)
+    raw = {kind: _log_evidence(fit, kind, level, noise2) for kind, fit in fits.items()}
+    top = max(raw.values())
+    total = sum(np.exp(value - top) for value in raw.values())
+    entries = []
+    for kind, fit in fits.items():
+        deviation, p = _deviation(general, kind, level, noise2)
+        chi2 = fit.cost - _prior_cost(fit, kind, level)
+        probability = float(np.exp(raw[kind] - top) / total)
+        entries.append(TypeEvidence(kind, raw[kind] - top, probability, chi2, n, deviation, p, fit))
+    entries.sort(key=lambda entry: -entry.log_evidence)
+    return PoseTypeEvidence(tuple(entries), level, float(np.sqrt(noise2)))
+
+
+def _fits(matches: Matches, level: float) -> dict[PoseType, RefinedPose]:
+    """Return the soft fit of every type that has one."""
+    fits: dict[PoseType, RefinedPose] = {}
+    failure: RigkitError | None = None
+    for kind in reversed(TYPES):
+        try:
+            soft = None if kind == PoseType.GENERAL else level
+            fits[kind] = estimate_pose(matches, kind, soft, weights="points")
+        except (DegenerateError, InputError) as error:
+            failure = error
+    if not fits:
+        raise failure or DegenerateError("no pose type fits the matches")
+    # The general optimum is no worse than any other type's: where it is, it was a local one.
+    for kind, fit in list(fits.items()):
+        best = fits.get(PoseType.GENERAL)
+        if best is None or fit.cost - _prior_cost(fit, kind, level) < best.cost:
+            try:
+                fits[PoseType.GENERAL] = refine_pose(replace(matches, A21=None, sigma_A=None), fit.cam2_from_cam1)
+            except (DegenerateError, InputError):
+                continue
+    return fits
+
+
+def _level_parts(fit: RefinedPose, kind: PoseType) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return deviations (K,), their Jacobian (K, 5), and the covariance (5, 5) of the pose."""
+    pose = fit.cam2_from_cam1
+    basis = translation_basis(pose.translation_mm)
+    values, jacobian = level_terms(kind, pose.rotation, pose.translation_mm, basis)
+    to_five = np.zeros((5, 6))
+    to_five[:3, :3], to_five[3:, 3:] = np.eye(3), basis
+    return values, jacobian, to_five @ fit.covariance @ to_five.T
+
+
+def _prior_cost(fit: RefinedPose, kind: PoseType, level: float) -> float:
+    values, _, _ = _level_parts(fit, kind)
+    return float(np.sum((values / level) ** 2))
+
+
+def _log_evidence(fit: RefinedPose, kind: PoseType, level: float, noise2: float) -> float:
+    """Return the log marginal likelihood by Laplace's approximation, up to what all types share."""
+    values, jacobian, covariance = _level_parts(fit, kind)
+    prior = jacobian.T @ jacobian / level**2
+    # The refinement took the stated sigmas; the noise level corrects the data's share only.
+    data = (np.linalg.inv(covariance) - prior) / noise2
+    curvature = data + prior
+    log = -0.5 * (fit.cost - np.sum((values / level) ** 2)) / noise2 - 0.5 * np.sum((values / level) ** 2)
+    log += 2.5 * np.log(2.0 * np.pi) - 0.5 * np.linalg.slogdet(curvature)[1]
+    # Prior density: uniform over what the type leaves free (rotations 8 pi^2, directions 4 pi, each angle 2 pi, the
+    # sign of a fixed direction 2), Gaussian in what it fixes.
+    free = {PoseType.GENERAL: np.log(32.0 * np.pi**3), PoseType.PLANAR: np.log(4.0 * np.pi**2)}.get(kind, np.log(2.0))
+    return float(log - free - len(values) * 0.5 * np.log(2.0 * np.pi * level**2))
+
+
+def _deviation(general: RefinedPose | None, kind: PoseType, level: float, noise2: float) -> tuple[float, float]:
+    """Return the largest deviation of the general fit from the type, rad, and its chance under the type."""
+    from scipy.special import gammaincc
+
+    if general is None or kind == PoseType.GENERAL:
+        return 0.0, 1.0
+    values, jacobian, covariance = _level_parts(general, kind)
+    spread = noise2 * jacobian @ covariance @ jacobian.T + level**2 * np.eye(len(values))
+    distance2 = float(values @ np.linalg.solve(spread, values))
+    return float(np.abs(values).max()), float(gammaincc(0.5 * len(values), 0.5 * distance2))

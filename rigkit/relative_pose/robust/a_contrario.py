@@ -1,0 +1,73 @@
+"""Is an agreement of matches with a pose more than chance? Boards and facades agree with many poses in part."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import inf, lgamma
+
+import numpy as np
+
+from rigkit.core.arrays import BoolArray
+from rigkit.core.matches import Matches
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.sampson import sampson_distances
+from rigkit.relative_pose.solvers.pose import essential_from_pose
+
+__all__ = ["log_false_alarms"]
+
+SHIFTS = 40
+"""Wrong partners tried for every point: the chance of a fit becomes known to a few per cent."""
+
+
+def log_false_alarms(
+    matches: Matches, pose: Rigid3, inliers: BoolArray, affinity_fits: BoolArray, freedom: int, gate: float
+) -> float:
+    """Return the log of how many poses would be expected to do as well if all matches were wrong.
+
+    Infinite for fewer matches than a pose can always be made to fit.
+
+    Parameters
+    ----------
+    matches : all of them.
+    pose : found by a search through minimal samples; its length does not matter.
+    inliers : (N,) matches that agree with it, by point and by affinity.
+    affinity_fits : (N,) whether the affinity passes its test; True where there is none.
+    freedom : degrees of freedom of the pose.
+    gate : points fit within this many sigmas.
+
+    Notes
+    -----
+    N C(N, k) C(k, freedom) p^(k - freedom) with k inliers (Moisan and Stival, "A probabilistic criterion to detect
+    rigid point matches between two images and estimate the fundamental matrix"). How often (p) a wrong match fits is
+    seen from the points themselves, partnered wrongly on purpose, and from the affinities of those that do not fit.
+    """
+    n, k = len(matches), int(inliers.sum())
+    if k < freedom:
+        return inf
+    fitting = total = 0
+    for shift in range(1, min(n, SHIFTS + 1)):
+        other = np.roll(np.arange(n), shift)
+        wrong = replace(
+            matches,
+            pixels2=matches.pixels2[other],
+            rays2=matches.rays2[other],
+            jacobians2=matches.jacobians2[other],
+            sigma2_px=matches.sigma2_px[other],
+        )
+        fitting += int(_fits(wrong, pose, gate).sum())
+        total += n
+    by_point = (fitting + 1.0) / (total + 1.0)
+    apart = ~_fits(matches, pose, gate)
+    by_affinity = (affinity_fits[apart].sum() + 1.0) / (apart.sum() + 1.0)
+    log_chance = float(np.log(by_point * by_affinity))
+    return float(np.log(n)) + _log_choose(n, k) + _log_choose(k, freedom) + (k - freedom) * log_chance
+
+
+def _fits(m: Matches, pose: Rigid3, gate: float) -> BoolArray:
+    E21 = essential_from_pose(pose)
+    r = sampson_distances(E21, m.rays1, m.rays2, m.jacobians1, m.jacobians2, m.sigma1_px, m.sigma2_px)
+    return np.asarray(np.abs(r) < gate)
+
+
+def _log_choose(n: int, k: int) -> float:
+    return lgamma(n + 1.0) - lgamma(k + 1.0) - lgamma(n - k + 1.0)

@@ -1,0 +1,37 @@
+"""General motion: F by the normalised eight-point method on points and noise-weighted affinities, E by projection."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from rigkit.core.arrays import Mat3
+from rigkit.core.matches import Matches
+from rigkit.relative_pose.solvers.eight_point import NormalisedRows, essential_nearest, linear_epipolar
+from rigkit.relative_pose.solvers.estimate import EpipolarEstimate, check_baseline, check_count, finish, reweighted
+from rigkit.relative_pose.solvers.planar_ambiguity import refuse_one_plane
+from rigkit.relative_pose.solvers.weights import RowWeights, WeightRule
+
+__all__ = ["GeneralSolver"]
+
+
+@dataclass(frozen=True, slots=True)
+class GeneralSolver:
+    """At least eight equations: eight points, three affine correspondences, or a mixture."""
+
+    degrees_of_freedom: int = 7
+
+    def solve(self, matches: Matches, weights: WeightRule | RowWeights | None = None) -> EpipolarEstimate:
+        """Return F21 (rank two) and the nearest E21; see FundamentalSolver.
+
+        Raises DegenerateError where one plane explains the matches to within their noise.
+        """
+        check_baseline(matches)
+        rows = NormalisedRows(matches)
+
+        def linear(row_weights: RowWeights) -> Mat3:
+            check_count(matches, row_weights, 8, "general epipolar geometry")
+            return linear_epipolar(rows, row_weights)
+
+        matrix, used = reweighted(matches, weights, linear)
+        refuse_one_plane(matches, used)
+        return finish(matches, essential_nearest(matrix), matrix, used)

@@ -1,0 +1,209 @@
+"""Planar motion: rotation about the vertical axis, translation in the horizontal plane; the global optimum.
+
+E = [[0, e1, 0], [e2, 0, e3], [0, e4, 0]] with e = (-cos phi, cos(phi - theta), -sin(phi - theta), sin phi), that is
+e1^2 + e4^2 = e2^2 + e3^2 = 1. The least squares problem min e^T G e under these two constraints has no duality gap
+(Brickman 1961): min = 2 max_mu lambda_min(G + mu J), J = diag(1, -1, -1, 1), a concave problem in one unknown. It
+replaces the polynomial solvers of Hajder and Barath ("Relative planar motion for vehicle-mounted cameras from a
+single affine correspondence", 2020) and of Guan et al., takes any number of rows, and is batched.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.core.arrays import FloatArray, Mat3
+from rigkit.core.errors import DegenerateError
+from rigkit.core.matches import Matches
+from rigkit.relative_pose.solvers.estimate import EpipolarEstimate, check_baseline, check_count, finish, reweighted
+from rigkit.relative_pose.solvers.rows import PLANAR_ENTRIES, affinity_rows, essential_from_planar, point_rows
+from rigkit.relative_pose.solvers.weights import RowWeights, WeightRule
+
+__all__ = ["PlanarSolver", "rotated_matches", "solve_planar_batch"]
+
+J_SIGN = np.array([1.0, -1.0, -1.0, 1.0])
+NEWTON_STEPS = 12
+BISECTIONS = 50
+STATIONARY = 1e-10
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PlanarSolver:
+    """Two degrees of freedom; at least three equations (three points or one affine correspondence).
+
+    Attributes
+    ----------
+    level1_from_cam1, level2_from_cam2 : (3, 3) rotations into frames whose y axis is vertical, where the cameras are
+        not level (from an accelerometer, say); None where they are.
+    """
+
+    level1_from_cam1: Mat3 | None = None
+    level2_from_cam2: Mat3 | None = None
+    degrees_of_freedom: int = 2
+
+    def solve(self, matches: Matches, weights: WeightRule | RowWeights | None = None) -> EpipolarEstimate:
+        """Return the globally optimal planar E21; see FundamentalSolver."""
+        level1 = np.eye(3) if self.level1_from_cam1 is None else np.asarray(self.level1_from_cam1)
+        level2 = np.eye(3) if self.level2_from_cam2 is None else np.asarray(self.level2_from_cam2)
+        level = rotated_matches(matches, level1, level2)
+        entries = np.array(PLANAR_ENTRIES)
+        points = point_rows(level.rays1, level.rays2)[:, entries]
+        affinities = None
+        if level.A21 is not None:
+            affinities = affinity_rows(
+                level.rays1, level.rays2, level.jacobians1, level.jacobians2, np.nan_to_num(level.A21)
+            )[..., entries]
+
+        def best(row_weights: RowWeights) -> FloatArray:
+            check_count(matches, row_weights, 3, "planar motion")
+            rows = points * row_weights.points[:, None]
+            if affinities is not None:
+                more = affinities * row_weights.affinities[:, None, None]
+                rows = np.concatenate([rows, more.reshape(-1, 4)])
+            gram = rows.T @ rows
+            values = np.linalg.eigvalsh(gram)
+            if values[2] <= 1e-14 * values[3]:
+                raise DegenerateError(
+                    "planar motion is not determined: the points lie on the horizon or there is no baseline; "
+                    "use points above or below the camera's height"
+                )
+            return essential_from_planar(solve_planar_batch(gram[None])[0][0])
+
+        check_baseline(matches)
+        E_level, used = reweighted(level, weights, best)
+        E21 = level2.T @ E_level @ level1
+        return finish(matches, E21, E21, used)
+
+
+def solve_planar_batch(gram: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the global minimisers e (B, 4) of e^T gram e and the minima (B,), both pairs of e of unit norm.
+
+    `gram` (B, 4, 4) is rows^T rows of each problem, the rows on (e1, e2, e3, e4). The sign of e is free.
+
+    Notes
+    -----
+    Newton on the derivative v^T J v of the concave dual, kept inside a bracket; where the smallest eigenvalue is double
+    at the optimum (a kink) the bracket is halved instead, and its two end vectors are combined so that e^T J e = 0. Two
+    Newton steps on (phi, phi - theta) remove what the squared condition of the Gram matrix cost.
+    """
+    G = np.asarray(gram, dtype=np.float64)
+    size = np.trace(G, axis1=1, axis2=2)
+    G = G / np.where(size > 0.0, size, 1.0)[:, None, None]
+    e = _dual_optimum(G)
+    e = _unit_pairs(e)
+    e = _polished(G, e)
+    return e, np.einsum("bi,bij,bj->b", e, G, e) * size
+
+
+def _dual_optimum(G: FloatArray) -> FloatArray:
+    """Return e (B, 4) with e^T J e = 0 at the maximum of lambda_min(G + mu J)."""
+    count = len(G)
+    out = np.empty((count, 4))
+    low, high = np.full(count, -1.0), np.full(count, 1.0)
+    # End vectors of the bracket: v^T J v is +1 at mu = -1 and -1 at mu = 1 in the limit.
+    v_low, v_high = np.zeros((count, 4)), np.zeros((count, 4))
+    mu, todo = np.zeros(count), np.arange(count)
+    for step in range(NEWTON_STEPS + BISECTIONS):
+        values, vectors = np.linalg.eigh(G[todo] + mu[todo, None, None] * np.diag(J_SIGN))
+        v = vectors[:, :, 0]
+        along = np.einsum("bi,bik->bk", v * J_SIGN, vectors)
+        slope = along[:, 0]
+        rising = slope > 0.0
+        low[todo[rising]], v_low[todo[rising]] = mu[todo[rising]], v[rising]
+        high[todo[~rising]], v_high[todo[~rising]] = mu[todo[~rising]], v[~rising]
+        done = np.abs(slope) < STATIONARY
+        out[todo[done]] = v[done]
+        gap = np.minimum(values[:, :1] - values[:, 1:], -1e-300)
+        curvature = 2.0 * np.sum(along[:, 1:] ** 2 / gap, axis=1)
+        newton = mu[todo] - slope / np.minimum(curvature, -1e-300)
+        middle = 0.5 * (low[todo] + high[todo])
+        inside = (newton > low[todo]) & (newton < high[todo]) & (step < NEWTON_STEPS)
+        mu[todo] = np.where(inside, newton, middle)
+        todo = todo[~done]
+        if todo.size == 0:
+            return out
+    out[todo] = _on_constraint(G[todo], *_both_ends(G[todo], low[todo], high[todo], v_low[todo], v_high[todo]))
+    return out
+
+
+def _both_ends(
+    G: FloatArray, low: FloatArray, high: FloatArray, v_low: FloatArray, v_high: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the end vectors, computing those of ends that the iteration never visited."""
+    out = []
+    for mu, v in ((low, v_low), (high, v_high)):
+        fresh = np.linalg.eigh(G + mu[:, None, None] * np.diag(J_SIGN))[1][:, :, 0]
+        out.append(np.where(np.any(v != 0.0, axis=1, keepdims=True), v, fresh))
+    return out[0], out[1]
+
+
+def _on_constraint(G: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the better of the two combinations a + s b with e^T J e = 0; a^T J a >= 0 >= b^T J b."""
+    aa, ab, bb = (np.sum(x * J_SIGN * y, axis=1) for x, y in ((a, a), (a, b), (b, b)))
+    root = np.sqrt(np.maximum(ab * ab - aa * bb, 0.0))
+    # Homogeneous roots (s : w) of bb s^2 + 2 ab s w + aa w^2.
+    stable = -(ab + np.where(ab < 0.0, -root, root))
+    candidates = np.stack([a * bb[:, None] + b * stable[:, None], a * stable[:, None] + b * aa[:, None]], axis=1)
+    length = np.linalg.norm(candidates, axis=2, keepdims=True)
+    candidates = np.where(length > 0.0, candidates / np.where(length > 0.0, length, 1.0), a[:, None, :])
+    cost = np.einsum("bki,bij,bkj->bk", candidates, G, candidates)
+    cost = np.where(length[..., 0] > 0.0, cost, np.inf)
+    return np.asarray(candidates[np.arange(len(G)), np.argmin(cost, axis=1)])
+
+
+def _unit_pairs(e: FloatArray) -> FloatArray:
+    outer, inner = np.hypot(e[:, 0], e[:, 3]), np.hypot(e[:, 1], e[:, 2])
+    return np.asarray(e / np.where(J_SIGN > 0.0, outer[:, None], inner[:, None]))
+
+
+def _polished(G: FloatArray, e: FloatArray) -> FloatArray:
+    """Return e after Newton steps on its two angles, each kept where the cost does not rise."""
+    cost = np.einsum("bi,bij,bj->b", e, G, e)
+    for _ in range(2):
+        # d e / d angle: a quarter turn of the pair (e1, e4) and of (e2, e3).
+        turn = np.zeros((len(e), 2, 4))
+        turn[:, 0, 0], turn[:, 0, 3] = -e[:, 3], e[:, 0]
+        turn[:, 1, 1], turn[:, 1, 2] = -e[:, 2], e[:, 1]
+        Ge = np.einsum("bij,bj->bi", G, e)
+        gradient = np.einsum("bki,bi->bk", turn, Ge)
+        hessian = np.einsum("bki,bij,blj->bkl", turn, G, turn)
+        hessian[:, 0, 0] -= e[:, 0] * Ge[:, 0] + e[:, 3] * Ge[:, 3]
+        hessian[:, 1, 1] -= e[:, 1] * Ge[:, 1] + e[:, 2] * Ge[:, 2]
+        det = hessian[:, 0, 0] * hessian[:, 1, 1] - hessian[:, 0, 1] ** 2
+        safe = np.where(det > 0.0, det, np.inf)
+        step = np.stack(
+            [
+                (hessian[:, 1, 1] * gradient[:, 0] - hessian[:, 0, 1] * gradient[:, 1]) / safe,
+                (hessian[:, 0, 0] * gradient[:, 1] - hessian[:, 0, 1] * gradient[:, 0]) / safe,
+            ],
+            axis=1,
+        )
+        moved = _unit_pairs(e - np.einsum("bk,bki->bi", step, turn))
+        moved_cost = np.einsum("bi,bij,bj->b", moved, G, moved)
+        better = moved_cost <= cost
+        e, cost = np.where(better[:, None], moved, e), np.where(better, moved_cost, cost)
+    return e
+
+
+def rotated_matches(matches: Matches, rotation1: Mat3, rotation2: Mat3) -> Matches:
+    """Return the matches as cameras turned by `rotation1` and `rotation2` (new_from_old) would see them.
+
+    Pixels, and with them affinities and sigmas, stay: only the rays turn, and no longer belong to a pinhole.
+    """
+    return Matches(
+        matches.pixels1,
+        matches.pixels2,
+        matches.rays1 @ rotation1.T,
+        matches.rays2 @ rotation2.T,
+        rotation1 @ matches.jacobians1,
+        rotation2 @ matches.jacobians2,
+        matches.sigma1_px,
+        matches.sigma2_px,
+        matches.board_index,
+        matches.grid,
+        None,
+        None,
+        matches.A21,
+        matches.sigma_A,
+    )

@@ -1,0 +1,188 @@
+"""Poses from points that all lie on one plane, where the linear epipolar solvers are blind.
+
+f2 ~ H f1 with H = R + t n^T / d (plane n . X = d in the frame of camera 1). H comes linearly, two poses from its
+singular vectors (Ma, Soatto, Kosecka, Sastry, "An Invitation to 3-D Vision", 5.3.3). Often both put all points in
+front of both cameras: then one plane does not determine the pose and no algorithm can.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Rays
+from rigkit.core.errors import DegenerateError
+from rigkit.core.matches import Matches
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import cross, nearest_rotation, rotation_angle, skew, unit
+from rigkit.relative_pose.solvers.estimate import check_baseline, transfer_error
+from rigkit.relative_pose.solvers.pose import parallax_noise
+from rigkit.relative_pose.solvers.rows import right_singular
+from rigkit.relative_pose.solvers.weights import RowWeights
+
+__all__ = [
+    "compare_poses",
+    "decompose_homography",
+    "homography_of_rays",
+    "one_plane_poses",
+    "refuse_one_plane",
+    "twin_poses",
+]
+
+SAME_POSE = 5e-3
+"""Two poses nearer than this (rad, and share of the baseline) mislead nobody."""
+ONE_PLANE_SIGMAS = 3.0
+"""Points whose homography transfers them within so many sigmas (rms) may lie on one plane."""
+AT_REST_SIGMAS = 3.3
+"""A parallax, or one off a plane's, is noise below: one good point in a thousand has more."""
+PLANE_EXPLAINS_SIGMAS = 4.0
+"""A plane whose chi square is no more than this many standard deviations too large explains the matches."""
+HOMOGRAPHY_FREEDOM = 8
+NEARLY_ALL = 0.9
+"""Of matches that fit some fit by chance, and of points some are seen on the wrong side of the horizon of a plane."""
+PLANE_ROUNDS = 5
+"""Of weighting anew: where half of the points lie on a plane, each halves what they are off it until that is noise."""
+
+
+def homography_of_rays(matches: Matches) -> Mat3:
+    """Return H21 (3, 3) with f2 ~ H f1, middle singular value 1, and f2 . H f1 > 0 for most points."""
+    rows = (skew(matches.rays2)[:, :, :, None] * matches.rays1[:, None, None, :]).reshape(-1, 9)
+    H = right_singular(rows)[1][-1].reshape(3, 3)
+    side = np.sum(matches.rays2 * (matches.rays1 @ H.T), axis=1)
+    H = H if np.median(side) >= 0.0 else -H
+    middle = np.linalg.svd(H, compute_uv=False)[1]
+    return np.asarray(H / (middle if middle > 0.0 else 1.0))
+
+
+def decompose_homography(H21: Mat3) -> tuple[tuple[Rigid3, FloatArray], ...]:
+    """Return the poses (translation in units of the plane's distance) and plane normals of `H21`, up to four.
+
+    Nothing for a rotation (all singular values equal): there is no baseline.
+    """
+    values, vectors = np.linalg.eigh(H21.T @ H21)
+    v3, v2, v1 = vectors.T
+    low, high = values[0], values[2]
+    if high - low < 1e-12:
+        return ()
+    lean, rest = np.sqrt(max(1.0 - low, 0.0)), np.sqrt(max(high - 1.0, 0.0))
+    out = []
+    for sign in (1.0, -1.0):
+        u = unit(lean * v1 + sign * rest * v3)
+        normal = np.cross(v2, u)
+        before = np.stack([v2, u, normal], axis=1)
+        after = np.stack([H21 @ v2, H21 @ u, np.cross(H21 @ v2, H21 @ u)], axis=1)
+        R = nearest_rotation(after @ before.T)
+        t = (H21 - R) @ normal
+        out += [(Rigid3(R, t), normal), (Rigid3(R, -t), -normal)]
+    return tuple(out)
+
+
+def refuse_one_plane(matches: Matches, weights: RowWeights) -> None:
+    """Raise DegenerateError if one plane explains what `weights` let count, points and affinities, to within the noise.
+
+    Affinities of other planes through the same points determine what the points leave open; where they count without a
+    sigma nothing is refused.
+
+    Notes
+    -----
+    On a plane F = [t]_x H fits for every t: a linear solver returns one that the noise has chosen.
+    """
+    counted, also = weights.points > 0.0, weights.affinities > 0.0
+    freedom = 2 * int(counted.sum()) + 4 * int(also.sum()) - HOMOGRAPHY_FREEDOM
+    if counted.sum() < 4 or freedom <= 0 or not np.isfinite(weights.sigma_A[also]).all():
+        return
+    points = matches.select(counted)
+    H21 = homography_of_rays(points)
+    A = _affinities_of(points, H21)
+    sigma1, sigma2 = points.sigma1_px[:, None, None], points.sigma2_px[:, None, None]
+    covariance = sigma2**2 * np.eye(2) + sigma1**2 * (A @ np.swapaxes(A, -1, -2))
+    off = transfer_error(points, H21)
+    chi2 = float(np.sum(off * np.linalg.solve(covariance, off[..., None])[..., 0]))
+    if matches.A21 is not None:
+        by_affinity = matches.A21[also] - _affinities_of(matches.select(also), H21)
+        chi2 += float(np.sum((by_affinity / weights.sigma_A[also, None, None]) ** 2))
+    if chi2 < freedom + PLANE_EXPLAINS_SIGMAS * np.sqrt(2.0 * freedom):
+        raise DegenerateError(
+            f"the {int(counted.sum())} matches lie on one plane to within their noise, which leaves a general epipolar "
+            "geometry open; add points off that plane or declare the pose type"
+        )
+
+
+def _affinities_of(matches: Matches, H21: Mat3) -> FloatArray:
+    """Return the affinities (N, 2, 2) that the homography has at the matches."""
+    mapped = matches.rays1 @ H21.T
+    u, B = unit(mapped), np.swapaxes(matches.jacobians2, -1, -2)
+    moved = H21 @ matches.jacobians1 / np.linalg.norm(mapped, axis=1)[:, None, None]
+    across = moved - u[:, :, None] * (u[:, None, :] @ moved)
+    return np.asarray(np.linalg.solve(B @ matches.jacobians2, B @ across))
+
+
+def one_plane_poses(matches: Matches) -> tuple[Rigid3, ...]:
+    """Return the poses (unit baseline) of the plane that all points may lie on; nothing if they do not lie on one.
+
+    Only poses with all points on the visible side of the plane's half-space, d > 0, are returned: at most two. Raises
+    DegenerateError where that plane is at infinity: a rotation explains the matches.
+    """
+    if len(matches) < 4:
+        return ()
+    H21 = homography_of_rays(matches)
+    square = np.sum(transfer_error(matches, H21) ** 2, axis=1) / (matches.sigma1_px**2 + matches.sigma2_px**2)
+    if np.mean(square) > 2.0 * ONE_PLANE_SIGMAS**2:
+        return ()
+    check_baseline(matches)
+    return _visible(matches.rays1, H21)
+
+
+def twin_poses(matches: Matches, among: BoolArray, noise: float, pose: Rigid3) -> tuple[Rigid3, ...]:
+    """Return the other poses (unit baseline) of the plane on which most points lie under `pose`; nothing without one.
+
+    Parameters
+    ----------
+    matches, among : those (N,) that agree with the epipolar geometry of the pose; a few may be wrong all the same.
+    noise : of the matches, in their sigmas.
+    pose : unit baseline.
+
+    Raises DegenerateError where a rotation alone explains nearly all of them.
+
+    Notes
+    -----
+    The parallax of a point on the plane n . x = 1 is |t x f2| (n . f1), linear in n: least squares with Cauchy weights.
+    """
+    rays1, f2, t = matches.rays1[among], matches.rays2[among], pose.translation_mm
+    across, sigma = cross(t, f2), noise * parallax_noise(matches)[among]
+    reach = np.sqrt(np.sum(across**2, axis=1))
+    parallax = np.sum(cross(f2, rays1 @ pose.rotation.T) * unit(across), axis=1) / sigma
+    still = np.abs(parallax) < AT_REST_SIGMAS
+    if still.mean() > NEARLY_ALL:
+        m = matches.select(np.flatnonzero(among)[still])
+        check_baseline(replace(m, sigma1_px=noise * m.sigma1_px, sigma2_px=noise * m.sigma2_px))
+    rows, weights, before = rays1 * (reach / sigma)[:, None], np.ones(len(f2)), np.inf
+    for _ in range(PLANE_ROUNDS):
+        weighted = (rows * weights[:, None]).T
+        gram = weighted @ rows
+        normal = np.linalg.solve(gram + 1e-12 * np.trace(gram) * np.eye(3), weighted @ parallax)
+        off = np.abs(parallax - rows @ normal)
+        middle = float(np.median(off))
+        if middle > max(0.5 * before, AT_REST_SIGMAS):
+            return ()
+        weights, before = 1.0 / (1.0 + (off / max(1.0, middle)) ** 2), middle
+    H21 = pose.rotation + np.outer(t, normal)
+    twins = _visible(rays1[off < AT_REST_SIGMAS], H21 / np.linalg.svd(H21, compute_uv=False)[1])
+    return tuple(twin for twin in twins if not compare_poses(pose, twin)[1])
+
+
+def compare_poses(first: Rigid3, second: Rigid3) -> tuple[float, bool]:
+    """Return the angle in radians between two rotations, and whether the poses (unit baseline) are the same."""
+    difference = first @ second.inverse()
+    turn = float(rotation_angle(difference.rotation))
+    return turn, max(turn, float(np.linalg.norm(difference.translation_mm))) < SAME_POSE
+
+
+def _visible(rays1: Rays, H21: Mat3) -> tuple[Rigid3, ...]:
+    """Return the poses (unit baseline) of `H21` whose plane is in front of camera 1 where the points are."""
+    poses = []
+    for pose, normal in decompose_homography(H21):
+        if np.mean(rays1 @ normal > 0.0) > NEARLY_ALL and np.linalg.norm(pose.translation_mm) > 0.0:
+            poses.append(Rigid3(pose.rotation, unit(pose.translation_mm)))
+    return tuple(poses)

@@ -1,0 +1,135 @@
+"""From an essential matrix to the relative pose, by cheirality along rays."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.core.arrays import FloatArray, IntArray, Mat3, Rays
+from rigkit.core.errors import DegenerateError
+from rigkit.core.matches import Matches
+from rigkit.core.posetype import PoseType
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import cross, log_so3, skew
+from rigkit.geometry.triangulation import ray_ranges
+from rigkit.relative_pose.solvers.eight_point import essential_nearest
+
+__all__ = [
+    "behind_sigmas",
+    "choose_pose",
+    "decompose_essential",
+    "essential_from_pose",
+    "free_directions",
+    "hypothesis_poses",
+    "parallax_noise",
+    "rotations_and_direction",
+    "translation_basis",
+]
+
+
+def essential_from_pose(cam2_from_cam1: Rigid3) -> Mat3:
+    """Return E21 = [t]x R with unit Frobenius norm; raises DegenerateError without a baseline."""
+    E21 = skew(cam2_from_cam1.translation_mm) @ cam2_from_cam1.rotation
+    size = float(np.linalg.norm(E21))
+    if size == 0.0:
+        raise DegenerateError("no baseline: the pose has a zero translation and no epipolar geometry")
+    return np.asarray(E21 / size)
+
+
+def rotations_and_direction(E21: Mat3) -> tuple[Mat3, Mat3, FloatArray]:
+    """Return two rotations (N, 3, 3) and a unit direction (N, 3) with E = [t]x R up to sign and size, E essential.
+
+    The rotations differ by half a turn about the baseline.
+
+    Notes
+    -----
+    E E^T = I - t t^T with |E|_F^2 = 2, the cofactors of E are t t^T R, and [t]x E is t t^T R - R.
+    """
+    E = E21 * np.sqrt(2.0 / np.einsum("nij,nij->n", E21, E21))[:, None, None]
+    outer = np.eye(3) - E @ np.swapaxes(E, 1, 2)
+    every, largest = np.arange(len(E)), np.argmax(np.einsum("nii->ni", outer), axis=1)
+    t = outer[every, largest] / np.sqrt(outer[every, largest, largest])[:, None]
+    columns = np.swapaxes(E, 1, 2)
+    cofactors = np.swapaxes(cross(columns[:, [1, 2, 0]], columns[:, [2, 0, 1]]), 1, 2)
+    across = skew(t) @ E
+    return cofactors - across, cofactors + across, t
+
+
+def decompose_essential(E21: Mat3) -> tuple[Rigid3, ...]:
+    """Return the four poses cam2_from_cam1 (unit baseline) of the essential matrix nearest to `E21` up to sign."""
+    first, second, t = rotations_and_direction(essential_nearest(E21)[None])
+    return Rigid3.stack(np.concatenate([first, first, second, second]), np.concatenate([t, -t, t, -t]))
+
+
+def hypothesis_poses(E21: Mat3, pose_type: PoseType | str = PoseType.GENERAL) -> tuple[Rigid3, ...]:
+    """Return the poses of `E21` that the pose type allows: four in general.
+
+    The second rotation differs from the first by half a turn about the baseline. It is no rotation about the vertical
+    axis if the first one is: planar motion keeps two poses, and without rotation two are kept as well.
+    """
+    poses = decompose_essential(E21)
+    if str(pose_type) == PoseType.GENERAL:
+        return poses
+    if str(pose_type) == PoseType.PLANAR:
+        off = [float(np.linalg.norm(pose.rotation[:, 1] - [0.0, 1.0, 0.0])) for pose in poses]
+    else:
+        off = [float(np.linalg.norm(log_so3(pose.rotation))) for pose in poses]
+    nearest = min(off[0], off[2])
+    return tuple(pose for pose, value in zip(poses, off, strict=True) if value <= nearest + 1e-6)
+
+
+def choose_pose(E21: Mat3, rays1: Rays, rays2: Rays, pose_type: PoseType | str = PoseType.GENERAL) -> Rigid3:
+    """Return the pose (unit baseline) that puts most points at a positive range along both rays.
+
+    Raises DegenerateError where no pose puts more than half of the points there, or two do so equally (points at
+    infinity, no baseline).
+    """
+    poses = hypothesis_poses(E21, pose_type)
+    # The poses come in pairs of opposite translations, which turn the signs of all ranges.
+    counts = [count for pose in poses[::2] for count in _in_front(pose, rays1, rays2)]
+    order = sorted(range(len(poses)), key=counts.__getitem__, reverse=True)
+    best, second = counts[order[0]], counts[order[1]]
+    if best <= 0.5 * len(rays1) or best == second:
+        raise DegenerateError(
+            f"cheirality does not decide the pose: the best two hypotheses put {best} and {second} of {len(rays1)} "
+            "points in front of both cameras; check that the two images are matched rightly and have a baseline"
+        )
+    return poses[order[0]]
+
+
+def behind_sigmas(matches: Matches, cam2_from_cam1: Rigid3) -> FloatArray:
+    """Return by how many sigmas of parallax each match (N,) is behind a camera; 0 in front of both.
+
+    The nearest point that both cameras can see is then at infinity: that far the pixels would have to move.
+    """
+    range1, range2, defined = ray_ranges(matches.rays1, matches.rays2, cam2_from_cam1)
+    behind = defined & ((range1 < 0.0) | (range2 < 0.0))
+    parallax = np.linalg.norm(cross(matches.rays2, matches.rays1 @ cam2_from_cam1.rotation.T), axis=1)
+    return np.asarray(np.divide(parallax, parallax_noise(matches), out=np.zeros(len(matches)), where=behind))
+
+
+def parallax_noise(matches: Matches) -> FloatArray:
+    """Return the standard deviation (N,) in radians of the angle between the rays of each match, along a line."""
+    m = matches
+    size1, size2 = (np.sqrt(0.5 * np.sum(b * b, axis=(1, 2))) for b in (m.jacobians1, m.jacobians2))
+    return np.asarray(np.hypot(m.sigma1_px * size1, m.sigma2_px * size2))
+
+
+def _in_front(pose: Rigid3, rays1: Rays, rays2: Rays) -> tuple[int, int]:
+    """Return how many points lie in front of both cameras, and how many with the opposite translation."""
+    range1, range2, defined = ray_ranges(rays1, rays2, pose)
+    ahead = [np.sum(defined & (sign * range1 > 0.0) & (sign * range2 > 0.0)) for sign in (1.0, -1.0)]
+    return int(ahead[0]), int(ahead[1])
+
+
+def translation_basis(direction: FloatArray) -> FloatArray:
+    """Return two unit vectors (..., 2, 3) across `direction` (..., 3), at right angles, the first horizontal."""
+    t = np.asarray(direction, dtype=np.float64)
+    size = np.hypot(t[..., 0], t[..., 2])[..., None]
+    across = np.stack([t[..., 2], np.zeros(t.shape[:-1]), -t[..., 0]], axis=-1)
+    first = np.where(size > 1e-9, across / np.maximum(size, 1e-9), [1.0, 0.0, 0.0])
+    return np.stack([first, cross(t, first)], axis=-2)
+
+
+def free_directions(pose_type: PoseType | str) -> IntArray:
+    """Return which of (w, b) a pose type leaves free: w the rotation, b the direction along `translation_basis`."""
+    return np.array({"general": [0, 1, 2, 3, 4], "planar": [1, 3]}.get(str(pose_type), []), dtype=np.int64)

@@ -1,0 +1,36 @@
+"""Solvers of the epipolar geometry by pose type."""
+
+from __future__ import annotations
+
+from rigkit.core.errors import InputError
+from rigkit.relative_pose.solvers.estimate import FundamentalSolver
+from rigkit.relative_pose.solvers.fixed import FixedSolver
+from rigkit.relative_pose.solvers.general import GeneralSolver
+from rigkit.relative_pose.solvers.planar import PlanarSolver
+from rigkit.relative_pose.solvers.translation import TranslationSolver
+
+__all__ = ["SOLVERS", "fundamental_for"]
+
+SOLVERS: dict[str, FundamentalSolver] = {
+    "general": GeneralSolver(),
+    "planar": PlanarSolver(),
+    "standard": FixedSolver((1.0, 0.0, 0.0)),
+    "forward": FixedSolver((0.0, 0.0, 1.0)),
+    "translation": TranslationSolver(),
+}
+
+
+def fundamental_for(pose_type: str, *, motion: str | None = None) -> FundamentalSolver:
+    """Return the solver for a pose type.
+
+    `motion` overrides the solver, not the pose type: motion="planar" runs the planar solver on standard and forward
+    pairs too, as the paper does. Raises InputError for an unknown name; "auto" has to be decided first (select).
+
+    >>> fundamental_for("planar").degrees_of_freedom
+    2
+    """
+    name = str(motion or pose_type)
+    if name not in SOLVERS:
+        hint = "; decide it with pose_type_evidence first" if name == "auto" else ""
+        raise InputError(f"no epipolar solver is called '{name}'; known: {', '.join(sorted(SOLVERS))}{hint}")
+    return SOLVERS[name]

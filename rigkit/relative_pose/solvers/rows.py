@@ -1,0 +1,66 @@
+"""Linear equations of points and affinities on E, for any central camera.
+
+With rays f, ray Jacobians B and the affinity A of a match, on the row-major vec(E)::
+
+    point      f2 f1^T                                    f2^T E f1 = 0
+    affinity j f2 (B1 e_j)^T + (B2 A e_j) f1^T            (A^T n2 + n1)_j = 0
+
+The affinity's rows are the derivative of the point's row along the surface, in the pixel units of image 1: therefore
+their noise is sigma_A |n2|, far from an epipole, where that of the point's row is sqrt(sigma1^2 |n1|^2 + sigma2^2
+|n2|^2). Homogeneous pixels (u, v, 1) with the Jacobian [I; 0] give the equations on F. Reference: Barath and Hajder;
+Eichhardt and Barath, "Optimal multi-view correction of local affine frames" (central cameras); Hajder, "Affine
+Correspondences in Stereo Vision".
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.core.arrays import Affines, FloatArray, RayJacobians, Rays
+
+__all__ = ["PLANAR_ENTRIES", "affinity_rows", "essential_from_planar", "planar_angles", "point_rows", "right_singular"]
+
+PLANAR_ENTRIES = (1, 3, 5, 7)
+"""Entries of the row-major E that planar motion leaves: E = [[0, e1, 0], [e2, 0, e3], [0, e4, 0]]."""
+
+
+def point_rows(rays1: Rays, rays2: Rays) -> FloatArray:
+    """Return the rows (..., 9) of points."""
+    return np.asarray((rays2[..., :, None] * rays1[..., None, :]).reshape(*rays1.shape[:-1], 9))
+
+
+def affinity_rows(
+    rays1: Rays, rays2: Rays, jacobians1: RayJacobians, jacobians2: RayJacobians, A21: Affines
+) -> FloatArray:
+    """Return the two rows (..., 2, 9) of affinities."""
+    first = rays2[..., None, :, None] * np.swapaxes(jacobians1, -1, -2)[..., :, None, :]
+    second = np.swapaxes(jacobians2 @ A21, -1, -2)[..., :, :, None] * rays1[..., None, None, :]
+    return np.asarray((first + second).reshape(*rays1.shape[:-1], 2, 9))
+
+
+def essential_from_planar(e: FloatArray) -> FloatArray:
+    """Return E (..., 3, 3) of the planar entries (..., 4)."""
+    out = np.zeros((*e.shape[:-1], 9))
+    out[..., PLANAR_ENTRIES] = e
+    return out.reshape(*e.shape[:-1], 3, 3)
+
+
+def planar_angles(e: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return (theta, phi) of planar entries (..., 4): R = rotation by theta about y, t = (sin phi, 0, cos phi).
+
+    e = (-cos phi, cos(phi - theta), -sin(phi - theta), sin phi). The opposite e has the same theta and phi + pi.
+    """
+    phi = np.arctan2(e[..., 3], -e[..., 0])
+    return phi - np.arctan2(-e[..., 2], e[..., 1]), phi
+
+
+def right_singular(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return all singular values (K,), zeros included, and right singular vectors (K, K) of rows (M, K).
+
+    The triangular factor first: the left vectors of thousands of rows are never formed. With fewer rows than columns
+    the last vectors exist only in the full basis.
+    """
+    columns = rows.shape[1]
+    square = np.linalg.qr(rows, mode="r") if len(rows) > columns else rows
+    _, s, vt = np.linalg.svd(square, full_matrices=True)
+    return np.concatenate([s, np.zeros(columns - len(s))]), vt

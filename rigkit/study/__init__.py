@@ -1,0 +1,1 @@
+"""Synthetic studies: the estimators over noise, pose types and boards."""

@@ -1,0 +1,205 @@
+"""Numbers of a synthetic study: box-plot statistics a cell, and the statements that they bear out or not."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.core.errors import InputError
+from rigkit.study.study import PLANES, Claim, Study
+
+__all__ = ["ALL_PLANES", "CELL_KEYS", "Cell", "StudyTable", "Verdict", "tabulate"]
+
+ALL_PLANES = 0
+"""`Cell.plane` of the cell over all planes together."""
+WHISKER_IQR = 1.5
+"""Whiskers end at the last value within this many interquartile ranges of the box, as in the paper's figures."""
+EXACT_DEG = 1e-5
+"""Below this an estimate is exact (errors are kept in single precision): two exact ones are not compared."""
+CELL_KEYS = ("pose_type", "sigma", "method", "plane")
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """Angular errors of normals, degrees, over trials and corners.
+
+    Attributes
+    ----------
+    pose_type, sigma, method, plane : which cell; plane 1, 2, 3 or 0 for all.
+    count, missing : corners with and without an estimate.
+    """
+
+    pose_type: str
+    sigma: float
+    method: str
+    plane: int
+    count: int
+    missing: int
+    median_deg: float
+    q25_deg: float
+    q75_deg: float
+    whisker_low_deg: float
+    whisker_high_deg: float
+    mean_deg: float
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """In how many of all comparisons a claim holds, and the worst one that contradicts it."""
+
+    text: str
+    holds_in: int
+    comparisons: int
+    against: str
+
+    @property
+    def words(self) -> str:
+        if self.holds_in == self.comparisons:
+            return f"holds (in all {self.comparisons} comparisons)"
+        if self.holds_in == 0:
+            return f"does not hold (in none of {self.comparisons} comparisons); {self.against}"
+        return f"holds in {self.holds_in} of {self.comparisons} comparisons only; {self.against}"
+
+
+@dataclass(frozen=True, slots=True)
+class StudyTable:
+    """Every cell of a study and the verdicts on its claims."""
+
+    study: Study
+    cells: tuple[Cell, ...]
+    verdicts: tuple[Verdict, ...]
+
+    def cell(self, **which: Any) -> Cell:
+        """Return the one cell with these keys (plane: all unless said); raises InputError if there is not just one."""
+        found = _select(self.cells, {"plane": ALL_PLANES, **which})
+        if len(found) != 1:
+            raise InputError(
+                f"study '{self.study.name}': {len(found)} cells match {which}; name one of each of {CELL_KEYS}"
+            )
+        return found[0]
+
+    def to_dict(self) -> dict[str, Any]:
+        verdicts = [asdict(v) | {"verdict": v.words} for v in self.verdicts]
+        study = self.study.to_dict() | {"unit": self.study.unit}
+        cells = [{key: _number(value) for key, value in asdict(c).items()} for c in self.cells]
+        return {"schema": "rigkit.study_result/1", "study": study, "cells": cells, "claims": verdicts}
+
+    def to_csv(self) -> str:
+        text = io.StringIO()
+        names = list(Cell.__slots__)
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow([f"sigma_{self.study.unit}" if name == "sigma" else name for name in names])
+        for cell in self.cells:
+            values = (getattr(cell, name) for name in names)
+            writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in values])
+        return text.getvalue()
+
+    def to_markdown(self) -> str:
+        """Return a table a pose type (rows: noise and plane, columns: methods; median [quartiles]) and the verdicts."""
+        study = self.study
+        lines = [
+            f"# {study.title}",
+            "",
+            f"Angle between estimated and true normal, degrees: median [quartiles]; {_setup(study)}.",
+        ]
+        for pose_type in study.pose_types:
+            lines += ["", f"## {pose_type} motion", ""]
+            lines += [f"| noise, {study.unit} | plane | " + " | ".join(study.methods) + " |"]
+            lines += ["|---|---|" + "---|" * len(study.methods)]
+            for sigma in study.sigmas:
+                for plane in (*range(1, PLANES + 1), ALL_PLANES):
+                    row = [
+                        self.cell(pose_type=str(pose_type), sigma=sigma, method=m, plane=plane) for m in study.methods
+                    ]
+                    text = " | ".join(f"{c.median_deg:.2f} [{c.q25_deg:.2f}, {c.q75_deg:.2f}]" for c in row)
+                    lines.append(f"| {sigma:g} | {plane or 'all'} | {text} |")
+        missing = sum(c.missing for c in self.cells if c.plane == ALL_PLANES)
+        if missing:
+            lines += ["", f"{missing} estimates are missing: their directions do not determine an affinity."]
+        if self.verdicts:
+            lines += ["", "## Statements", ""] + [f"- {v.text}: **{v.words}**" for v in self.verdicts]
+        return "\n".join(lines) + "\n"
+
+
+def _number(value: Any) -> Any:
+    """Return the value as JSON can hold it: no number where there is none."""
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def tabulate(study: Study, chunks: Sequence[NDArray[np.float32]]) -> StudyTable:
+    """Return the statistics of all chunks, in the order that `run_chunk` numbers them."""
+    errors = np.concatenate(chunks, axis=3)
+    if errors.shape[3] != study.trials:
+        raise InputError(f"study '{study.name}': {errors.shape[3]} of {study.trials} trials; run the missing chunks")
+    cells = tuple(_cells(study, errors))
+    return StudyTable(study, cells, tuple(_judge(claim, cells) for claim in study.claims))
+
+
+def _cells(study: Study, errors: NDArray[np.float32]) -> Iterator[Cell]:
+    per_board = study.board.corner_count
+    for p, pose_type in enumerate(study.pose_types):
+        for s, sigma in enumerate(study.sigmas):
+            for m, method in enumerate(study.methods):
+                for plane in range(PLANES + 1):
+                    block = errors[p, s, m]
+                    if plane != ALL_PLANES:
+                        block = block[:, (plane - 1) * per_board : plane * per_board]
+                    yield Cell(str(pose_type), sigma, method, plane, *_box(block.ravel()))
+
+
+def _box(values: NDArray[np.float32]) -> tuple[Any, ...]:
+    good = np.sort(values[np.isfinite(values)].astype(np.float64))
+    missing = values.size - good.size
+    if not good.size:
+        return (0, missing, *[float("nan")] * 6)
+    q25, median, q75 = np.percentile(good, [25.0, 50.0, 75.0])
+    reach = WHISKER_IQR * (q75 - q25)
+    low = good[np.searchsorted(good, q25 - reach, side="left")]
+    high = good[np.searchsorted(good, q75 + reach, side="right") - 1]
+    return (good.size, missing, *(float(v) for v in (median, q25, q75, low, high, good.mean())))
+
+
+def _select(cells: Sequence[Cell], which: dict[str, Any]) -> list[Cell]:
+    return [c for c in cells if all(getattr(c, key) == value for key, value in which.items())]
+
+
+def _judge(claim: Claim, cells: Sequence[Cell]) -> Verdict:
+    """Compare each cell of one side with each of the other that agrees in what neither side names."""
+    free = [key for key in CELL_KEYS if key not in claim.smaller and key not in claim.larger]
+    default = {"plane": ALL_PLANES} if "plane" in free else {}
+    holds, total, against, excess = 0, 0, "", -np.inf
+    for small in _select(cells, claim.smaller | default):
+        for large in _select(cells, claim.larger | default):
+            if any(getattr(small, key) != getattr(large, key) for key in free):
+                continue
+            if max(small.median_deg, large.median_deg) < EXACT_DEG:
+                continue
+            total += 1
+            difference = small.median_deg - large.median_deg
+            if difference < 0.0:
+                holds += 1
+            elif not difference <= excess:
+                excess = difference
+                against = (
+                    f"against it: {_name(small)} {small.median_deg:.2f} deg, {_name(large)} {large.median_deg:.2f} deg"
+                )
+    if not total:
+        raise InputError(f"claim '{claim.text}': no two cells of this study can be compared; check its keys and values")
+    return Verdict(claim.text, holds, total, against)
+
+
+def _name(cell: Cell) -> str:
+    plane = f"plane {cell.plane}" if cell.plane else "all planes"
+    return f"{cell.method} {cell.pose_type} {plane} at {cell.sigma:g}"
+
+
+def _setup(study: Study) -> str:
+    images = {"1": "image 1", "2": "image 2", "both": "both images"}[str(study.images)]
+    corners = PLANES * study.board.corner_count
+    return f"noise on {study.noise} of {images}; {study.trials} trials of {corners} corners"

@@ -1,0 +1,146 @@
+"""ChArUco boards: named and placed by their markers, corners as fine as on chessboards with markers between them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from rigkit.benchmark.scenes import BenchScene, bench_camera, one_board
+from rigkit.core.boards import Board, Markers, marker_rectangles
+from rigkit.core.detections import BoardDetection
+from rigkit.core.errors import InputError
+from rigkit.detection.charuco import _marked_corners
+from rigkit.detection.detect import detect_boards
+from rigkit.detection.saddles.response import grey_image
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.synthetic.photometry import Photometry
+from rigkit.synthetic.render import Optics
+from rigkit.synthetic.scene import Panel, PlacedBoard
+
+BOARD = Board("c", 9, 6, 30.0, 30.0, None, Markers("DICT_5X5_100", 21.0))
+ROUNDED_LEVELS = 0.51
+"""Our image is rounded to whole grey levels, OpenCV's enlarged drawing, averaged, is not."""
+
+
+def errors(found: BoardDetection, truth: BoardDetection) -> np.ndarray:
+    """Return found minus true pixels by grid position: a board in another place would be off by whole squares."""
+    return found.pixels - truth.lattice()[found.grid[:, 1], found.grid[:, 0]]
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+@pytest.mark.parametrize("size", [(6, 5), (6, 4)])
+def test_the_pattern_is_opencvs(size: tuple[int, int], legacy: bool) -> None:
+    board = Board("c", *size, 30.0, 30.0, None, Markers("DICT_4X4_50", 20.0, 3, legacy))
+    camera = bench_camera("regular")
+    square_px, border_px = 40, 40
+    depth = camera.parameters[0] * 30.0 / square_px
+    first = np.array([border_px + square_px - 0.5] * 2)
+    place = Rigid3(np.eye(3), np.array([*((first - camera.parameters[2:]) * depth / camera.parameters[0]), depth]))
+    scene = BenchScene("front", (PlacedBoard(board, place, white=1.0, black=0.0),), (), camera)
+    image = scene.render(optics=Optics(0.0), photometry=Photometry(exposure=1.0))
+    across, down = size[0] + 1, size[1] + 1
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    ids = np.arange(3, 3 + (across * down + 1) // 2)[: len(np.argwhere(np.add.outer(range(down), range(across)) % 2))]
+    reference = cv2.aruco.CharucoBoard((across, down), 30.0, 20.0, dictionary, ids)
+    reference.setLegacyPattern(legacy)
+    # 180 px a square: whole pixels a module, and small to 40 by averaging.
+    drawn = reference.generateImage((180 * across, 180 * down), marginSize=0).astype(np.float32)
+    expected = cv2.resize(drawn, (square_px * across, square_px * down), interpolation=cv2.INTER_AREA)
+    part = image[border_px:, border_px:][: expected.shape[0], : expected.shape[1]]
+    assert np.abs(part - expected).max() < ROUNDED_LEVELS
+
+
+def test_rows_and_columns_of_modules_cover_the_same() -> None:
+    areas = [marker_rectangles(BOARD, upright=upright)[:, 2:].prod(axis=1).sum() for upright in (False, True)]
+    assert areas[0] == pytest.approx(areas[1])
+    assert len(marker_rectangles(Board("p", 9, 6, 30.0, 30.0))) == 0
+
+
+@pytest.mark.parametrize("lens", ["regular", "fisheye"])
+def test_every_corner_has_its_own_number_and_is_finer_than_opencvs(lens: str) -> None:
+    ours, theirs, sigmas = [], [], []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        scene = one_board(rng, lens=lens, board=BOARD)
+        image = scene.render(noise_levels=2.0, rng=rng)
+        truth = scene.truth()[0]
+        (found,) = detect_boards(image, [BOARD])
+        assert found.board_id == "c"
+        assert len(found.grid) >= 48
+        ours.append(errors(found, truth))
+        sigmas.append(ours[-1] / found.sigma_px[:, None])
+        assert BOARD.markers is not None
+        grid, pixels = _marked_corners(image, BOARD, BOARD.markers)
+        theirs.append(pixels - truth.lattice()[grid[:, 1], grid[:, 0]])
+    rms = [float(np.sqrt((np.concatenate(e) ** 2).mean())) for e in (ours, theirs)]
+    assert rms[0] < 0.02
+    assert rms[0] < 0.5 * rms[1]
+    # Cautious rather than bold: what the markers add to the residual is taken for noise.
+    assert np.sqrt((np.concatenate(sigmas) ** 2).mean()) < 1.2
+
+
+def test_a_part_keeps_its_numbers(rng: np.random.Generator) -> None:
+    """Three columns of the board are out of the image, and something lies over its middle."""
+    scene = one_board(rng, board=BOARD, max_tilt_deg=20.0)
+    placed = scene.boards[0]
+    cover = Panel(placed.world_from_board @ Rigid3(np.eye(3), np.array([120.0, 60.0, -2.0])), 70.0, 300.0, 0.4)
+    scene = replace(scene, occluders=(cover,))
+    found = detect_boards(scene.render(noise_levels=2.0, rng=rng), [BOARD])
+    assert found[0].board_id == "c"
+    assert not found[0].complete
+    off = np.linalg.norm(errors(found[0], scene.truth()[0]), axis=1)
+    assert len(off) > 20
+    assert np.median(off) < 0.03
+    assert off.max() < 1.0
+
+
+def test_two_boards_of_one_size_are_told_apart_by_their_markers(rng: np.random.Generator) -> None:
+    """Chessboards of this size would look alike, and the same turned by 180 degrees."""
+    names = ("a", "b")
+    boards = [Board(n, 5, 5, 30.0, 30.0, None, Markers("DICT_4X4_100", 21.0, 18 * k)) for k, n in enumerate(names)]
+    camera = bench_camera("regular")
+    turn = np.diag([-1.0, -1.0, 1.0])
+    left = PlacedBoard(boards[0], Rigid3(turn, np.array([-20.0, 60.0, 500.0])))
+    right = PlacedBoard(boards[1], Rigid3(np.eye(3), np.array([50.0, -60.0, 500.0])))
+    scene = BenchScene("two", (left, right), (), camera)
+    found = {d.board_id: d for d in detect_boards(scene.render(noise_levels=2.0, rng=rng), boards[::-1])}
+    assert set(found) == set(names)
+    for truth in scene.truth():
+        assert np.abs(errors(found[truth.board_id], truth)).max() < 0.2
+
+
+def test_declared_as_a_chessboard_it_is_read_as_one(rng: np.random.Generator) -> None:
+    scene = one_board(rng, board=BOARD)
+    image = scene.render(noise_levels=2.0, rng=rng)
+    (found,) = detect_boards(image, [Board("plain", 9, 6, 30.0, 30.0)])
+    assert (found.board_id, found.complete) == ("plain", True)
+    truth = scene.truth()[0]
+    off = [np.abs(errors(found, t)).max() for t in (truth, truth.turned(2))]
+    assert min(off) < 0.2
+
+
+def test_a_chessboard_is_no_charuco_board(rng: np.random.Generator) -> None:
+    scene = one_board(rng, board=Board("plain", 9, 6, 30.0, 30.0))
+    (found,) = detect_boards(scene.render(noise_levels=2.0, rng=rng), [BOARD])
+    assert found.board_id is None
+
+
+@pytest.mark.parametrize(
+    "markers", [Markers("DICT_4X4_50", 20.0, 30), Markers("DICT_NONE", 20.0), Markers("CORNER_REFINE_NONE", 20.0)]
+)
+def test_markers_that_cannot_be_are_refused(markers: Markers) -> None:
+    with pytest.raises(InputError, match="board 'c'"):
+        marker_rectangles(replace(BOARD, markers=markers))
+    with pytest.raises(InputError, match="do not fit"):
+        replace(BOARD, markers=replace(markers, side_mm=30.0))
+
+
+def test_grey_values_of_sixteen_bit_images_reach_the_markers() -> None:
+    scene = one_board(np.random.default_rng(1), board=BOARD)
+    deep = scene.render(photometry=Photometry(bits=16))
+    assert grey_image(deep).max() <= 255.0
+    (found,) = detect_boards(deep, [BOARD])
+    assert found.board_id == "c"

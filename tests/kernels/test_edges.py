@@ -1,0 +1,141 @@
+"""The compiled edge fit against its definition in numpy, on a rendered chessboard."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rigkit.cameras.kannala_brandt import KannalaBrandt
+from rigkit.core.boards import Board
+from rigkit.detection.lattice.local_fit import fit_cells
+from rigkit.detection.subpixel import edge_curvature as bends
+from rigkit.detection.subpixel import edge_fit
+from rigkit.detection.subpixel.edge_curvature import line_curvature
+from rigkit.detection.subpixel.edge_fit import EdgeFit, fit_edges
+from rigkit.detection.subpixel.edge_model import Geometry, ends_of
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
+from rigkit.kernels import kernels
+from rigkit.synthetic.photometry import Photometry, develop
+from rigkit.synthetic.render import Optics, radiance
+from rigkit.synthetic.scene import PlacedBoard
+
+pytestmark = pytest.mark.skipif(kernels("edges") is None, reason="compiled kernels are not built")
+
+ROUNDING_PX = 5e-5
+"""Both sum some hundred float32 products of 1e-7 relative error, in another order."""
+
+ROUNDING_REL = 2e-3
+"""Of sigma and residual: a pixel whose place on the window's edge is decided by rounding is one of two hundred."""
+
+SAME_PAIRS_REL = 0.02
+"""Of the sums over pairs of pixels, likewise: a pixel has a mirror image or not, and is one of a hundred."""
+
+
+def both(*arguments: object, monkeypatch: pytest.MonkeyPatch, **options: object) -> tuple[EdgeFit, EdgeFit]:
+    compiled = fit_edges(*arguments, **options)  # type: ignore[arg-type]
+    monkeypatch.setattr(edge_fit, "fit_corners", lambda *_: None)
+    plain = fit_edges(*arguments, **options)  # type: ignore[arg-type]
+    monkeypatch.undo()
+    return compiled, plain
+
+
+def scene(blur_px: float, noise: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return an image of a tilted board in a fisheye and its true corners (R, C, 2); some lie at the frame."""
+    board = Board("b", 9, 7, 30.0, 30.0)
+    camera = KannalaBrandt((320, 240), np.array([180.0, 180.0, 161.3, 118.7, -0.01, 0.0, 0.0, 0.0]))
+    turn = exp_so3(np.array([0.5, -0.3, 0.4]))
+    placed = PlacedBoard(board, Rigid3(turn, np.array([20.0, 10.0, 210.0]) - turn @ np.array([120.0, 90.0, 0.0])))
+    optics = Optics(blur_px=blur_px)
+    light = radiance((placed,), camera, Rigid3.identity(), optics=optics)
+    image = np.asarray(develop(light, Photometry(noise_levels=noise), rng)).astype(np.float32)
+    return image, placed.see(camera, Rigid3.identity())[0].reshape(7, 9, 2)
+
+
+@pytest.mark.parametrize(("blur_px", "noise"), [(0.3, 0.0), (0.7, 2.0), (2.0, 5.0)])
+def test_compiled_fit_is_the_numpy_fit(
+    blur_px: float, noise: float, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image, truth = scene(blur_px, noise, rng)
+    shape = fit_cells(truth, np.ones(truth.shape[:2], bool))
+    sides, cells = np.stack([shape.along_column, shape.along_row], axis=1), np.ones(truth.shape[:2], bool)
+    geometry = Geometry(sides, shape.curvature(), shape.gaps(), ends_of(cells, cells))
+    row, column = np.indices(truth.shape[:2])
+    sign = np.where((row + column) % 2 == 0, 1.0, -1.0).ravel()
+    start = truth.reshape(-1, 2) + rng.uniform(-0.3, 0.3, (truth.size // 2, 2))
+    blur = np.full(len(start), 1.0)
+    # All steps: whether the last one is still taken may hang on rounding.
+    # Curvatures of some are fitted, too.
+    loose = np.where(rng.random((len(start), 1)) < 0.5, 0.0, rng.uniform(1e-4, 3e-3, (len(start), 2)))
+    # And of some the contrast is known, roughly.
+    contrast = np.where(rng.random(len(start)) < 0.5, np.nan, 150.0)
+    options = {"radius_px": 14.0, "iterations": 6, "converged_px": 0.0, "curvature_sigma": loose, "contrast": contrast}
+    compiled, plain = both(image, start, geometry, sign, blur, monkeypatch=monkeypatch, **options)
+    assert np.array_equal(compiled.valid, plain.valid)
+    good = plain.valid & (np.abs(plain.contrast) > 20.0)
+    assert good.sum() > 40
+    assert np.abs(compiled.pixels - plain.pixels)[good].max() < ROUNDING_PX
+    for name in ("sigma_px", "blur", "contrast", "residual", "noise"):
+        ours, theirs = getattr(compiled, name)[good], getattr(plain, name)[good]
+        assert np.abs(ours / theirs - 1.0).max() < ROUNDING_REL, name
+    assert np.array_equal(compiled.pairs > 0.0, plain.pairs > 0.0)
+    assert np.count_nonzero(plain.pairs[good, 0]) > 40
+    for ours, theirs in ((compiled.pairs, plain.pairs), (compiled.products, plain.products)):
+        assert np.abs(ours - theirs)[good].max() <= SAME_PAIRS_REL * theirs[good, :1].max()
+    assert np.abs(compiled.used - plain.used).max() <= 2.0
+
+
+def test_same_pixels_whatever_the_cell(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Random cells, some slender, some along the rows, some beyond the image: the same windows, so the same fit."""
+    image = rng.uniform(0.0, 255.0, (60, 80)).astype(np.float32)
+    pixels = rng.uniform([-3.0, -3.0], [83.0, 63.0], (300, 2))
+    angle, turn = rng.uniform(-np.pi, np.pi, 300), rng.uniform(0.2, 2.9, 300)
+    angle[:60], turn[:30] = 0.0, 0.5 * np.pi
+    length = rng.uniform(4.0, 40.0, (300, 2))
+    sides = np.stack(
+        [
+            length[:, :1] * np.stack([np.cos(angle), np.sin(angle)], axis=1),
+            length[:, 1:] * np.stack([np.cos(angle + turn), np.sin(angle + turn)], axis=1),
+        ],
+        axis=1,
+    )
+    geometry = Geometry(
+        sides, rng.normal(0.0, 0.01, (300, 2)), rng.uniform(4.0, 30.0, (300, 2, 2)), rng.random((300, 2, 2)) < 0.3
+    )
+    # One step: on noise, later ones go wherever rounding sends them.
+    options = {"radius_px": 9.0, "iterations": 1}
+    arguments = (image, pixels, geometry, np.ones(300), rng.uniform(0.5, 2.0, 300))
+    compiled, plain = both(*arguments, monkeypatch=monkeypatch, **options)
+    assert np.array_equal(compiled.valid, plain.valid)
+    assert plain.valid.sum() > 100
+    assert np.abs(compiled.pixels - plain.pixels)[plain.valid].max() < 1e-3
+    assert np.abs(compiled.residual / plain.residual - 1.0)[plain.valid].max() < 1e-4
+
+
+def test_compiled_bends_are_the_numpy_ones(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With gaps, corners not to be relied on, and corners alone on their line."""
+    pixels = scene(0.7, 0.0, rng)[1] + rng.normal(0.0, 0.02, (7, 9, 2))
+    pixels[rng.random((7, 9)) < 0.2] = np.nan
+    pixels[3, [0, 1, 3, 4, 5, 6, 7, 8]] = np.nan
+    cells = np.isfinite(pixels[..., 0])
+    sigma = np.where(rng.random((7, 9)) < 0.1, np.nan, rng.uniform(1e-4, 0.1, (7, 9)))
+    sides = rng.uniform(10.0, 30.0, (int(cells.sum()), 2))
+    compiled = line_curvature(pixels, sigma, cells, sides)
+    monkeypatch.setattr(bends, "line_bends", lambda *_: None)
+    plain = line_curvature(pixels, sigma, cells, sides)
+    for ours, theirs in zip(compiled, plain, strict=True):
+        assert np.isfinite(theirs).all()
+        assert np.abs(theirs).max() > 1e-4
+        assert np.abs(ours - theirs).max() < 1e-9
+
+
+def test_a_corner_of_no_known_place_or_shape_is_not_fitted(rng: np.random.Generator) -> None:
+    image, truth = scene(0.7, 2.0, rng)
+    shape = fit_cells(truth, np.ones(truth.shape[:2], bool))
+    sides = np.stack([shape.along_column, shape.along_row], axis=1)
+    start = truth.reshape(-1, 2).copy()
+    start[0], start[1], sides[2], sides[3] = np.nan, np.inf, np.nan, -np.inf
+    ends = np.zeros((len(start), 2, 2), bool)
+    geometry = Geometry(sides, shape.curvature(), shape.gaps(), ends)
+    fit = fit_edges(image, start, geometry, np.ones(len(start)), np.full(len(start), 0.7), radius_px=18.0, iterations=8)
+    assert not fit.valid[:4].any()
