@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations, product
 from typing import Literal
 
 import numpy as np
@@ -20,10 +19,9 @@ from rigkit.core.detections import BoardDetection, common_corners
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import DirectionPairs, Matches
 from rigkit.core.truth import MeasuredAngle
-from rigkit.geometry.rotation import angle_between
 from rigkit.identification.identify import identify_pair
+from rigkit.identification.measured_angles import ids_by_angles
 from rigkit.identification.pair_identity import PairIdentity
-from rigkit.identification.placements import board_kinds
 
 __all__ = ["Chain", "MatchedPair", "match_pair"]
 
@@ -32,16 +30,6 @@ Chain = Literal["raw", "rectified"]
 MAX_RECTIFIED_RAD = np.deg2rad(75.0)
 """A perspective view along the camera's axis stretches a pixel there by 1 / cos^2 = 15; beyond it the raw chain is the
 only sensible one."""
-
-POSED_SIGMA_DEG = 0.3
-"""How well the boards' poses in a pair show the angle between two of them, at the worst."""
-NAMING_ODDS = 2.0 * np.log(1000.0)
-"""Angles speak for other names of boards that look alike where chi2 is smaller by so much, and alike for all names
-within so much of the smallest: as the odds in `rigkit.identification.identify`."""
-NAMING_COVERAGE = 4.0
-"""Largest deviation of an angle, in sigmas, under the names it speaks for."""
-MOST_ALIKE = 6
-"""More boards of one kind are not told apart by angles: their orders are too many to try."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -125,7 +113,7 @@ def match_pair(
     _check_sizes(pair_id, (*detections1, *detections2), boards)
     identity = identify_pair(detections1, detections2, boards, camera1, camera2, layout=layout)
     given = {d.board_id for d in (*detections1, *detections2)} | set(layout or ())
-    fitting = _names_by_angles(identity, [b for b in boards if b.board_id not in given], angles)
+    fitting = ids_by_angles(identity, [b for b in boards if b.board_id not in given], angles)
     if fitting:
         before, names = identity, fitting[0]
         first, second = (
@@ -181,47 +169,6 @@ def _matched(
         noise,
         (*notes, *identity.notes),
     )
-
-
-def _names_by_angles(
-    identity: PairIdentity, boards: Sequence[Board], angles: Sequence[MeasuredAngle]
-) -> list[dict[str, str]]:
-    """Return other names for those of `boards` that look alike, if the angles speak for them clearly; else nothing.
-
-    Where they speak for several ways to name the boards, those are all returned, the fewest changes first.
-    """
-    faces = {}
-    for board_id, pose in identity.cam1_from_board.items():
-        normal = pose.rotation[:, 2]
-        faces[board_id] = -np.sign(normal @ pose.translation_mm) * normal
-    known = [a for a in angles if a.a in faces and a.b in faces]
-    choices = list(_other_names([b for b in boards if b.board_id in faces])) if known else []
-    if not choices:
-        return []
-
-    def deviations(names: Mapping[str, str]) -> FloatArray:
-        """Return how far each angle is off if the board called k is truly `names[k]`, in sigmas."""
-        face_of = {names.get(k, k): face for k, face in faces.items()}
-        ours = [180.0 - np.rad2deg(angle_between(face_of[a.a], face_of[a.b])) for a in known]
-        sigma = np.hypot([a.sigma_deg for a in known], POSED_SIGMA_DEG)
-        return np.asarray((np.array(ours) - [a.value_deg for a in known]) / sigma)
-
-    own, *others = (deviations(names) for names in ({}, *choices))
-    chi2 = np.sum(np.square(others), axis=1)
-    enough = min(float(chi2.min()) + NAMING_ODDS, float(own @ own) - NAMING_ODDS)
-    fitting = [n for n, off in enumerate(others) if chi2[n] <= enough and np.abs(off).max() <= NAMING_COVERAGE]
-    # Right angles say the same of several names: then as few as possible are changed.
-    renamed = [{k: other for k, other in choices[n].items() if k != other} for n in fitting]
-    return sorted(renamed, key=len)
-
-
-def _other_names(boards: Sequence[Board]) -> Iterator[dict[str, str]]:
-    """Yield every way to exchange the names of boards that look alike."""
-    alike = [kind.ids for kind in board_kinds(boards) if 1 < len(kind.ids) <= MOST_ALIKE]
-    for orders in product(*(permutations(ids) for ids in alike)):
-        names = {a: b for ids, order in zip(alike, orders, strict=True) for a, b in zip(ids, order, strict=True)}
-        if any(a != b for a, b in names.items()):
-            yield names
 
 
 def _check_sizes(pair_id: str, detections: Sequence[BoardDetection], boards: Sequence[Board]) -> None:
