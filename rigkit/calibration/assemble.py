@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.calibration.fit import Fit
-from rigkit.calibration.normal_equations import Normal
+from rigkit.calibration.normal_equations import NormalEquations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import BoardShape, Calibration, Candidate, Outlier, ViewResult
 from rigkit.calibration.shape import ShapeModel
@@ -20,7 +20,7 @@ __all__ = ["assemble", "board_shapes", "motion_of_world", "require_determined", 
 
 UNKNOWN_SHARE = 0.05
 """A projection that is uncertain by this part of the image's width, where the boards were, is not determined."""
-LEAST_SIGMA_PX = 0.02
+MIN_SIGMA_PX = 0.02
 """No corner is better than this: keeps data without noise from looking determined by rounding."""
 
 
@@ -64,7 +64,7 @@ def _outliers(observations: Observations, fit: Fit) -> tuple[Outlier, ...]:
     return tuple(out)
 
 
-def solution_normal(fit: Fit) -> Normal:
+def solution_normal(fit: Fit) -> NormalEquations:
     """Return the normal equations at the solution, in px^-2, priors of the shape included."""
     return with_priors(fit.data, fit.state, fit.sigma_px)
 
@@ -82,7 +82,7 @@ def motion_of_world(translation_mm: Points) -> FloatArray:
     return lever
 
 
-def frame_covariance(normal: Normal, state: State) -> FloatArray:
+def frame_covariance(normal: NormalEquations, state: State) -> FloatArray:
     """Return the covariance, for unit residuals, of the P parameters and of the mean motion of the boards (w, t).
 
     The boards on average move a point x in the camera frame by W x x + T, W and T the means of `motion_of_world`.
@@ -107,7 +107,7 @@ def require_determined(result: Calibration, at_corners_px: FloatArray) -> None:
     the uncertainty there."""
     sigma = float(np.nanmedian(at_corners_px)) if np.isfinite(at_corners_px).any() else np.inf
     if result.sigma_px > 0.0:
-        sigma *= max(result.sigma_px, LEAST_SIGMA_PX) / result.sigma_px
+        sigma *= max(result.sigma_px, MIN_SIGMA_PX) / result.sigma_px
     if not sigma < UNKNOWN_SHARE * result.camera.size_px[0]:
         raise DegenerateError(
             "calibration: the views leave the focal length open (all boards nearly parallel to the image, or too few "

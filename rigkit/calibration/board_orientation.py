@@ -26,7 +26,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3
 from rigkit.core.boards import Board
 from rigkit.geometry.rigid3 import Rigid3
 
-__all__ = ["board_turn", "grid_turned", "miscounted", "recounted", "same_looks"]
+__all__ = ["board_turn", "grid_turned", "same_looks", "turned_views", "with_views_turned"]
 
 SURE = 10.0
 """Log odds from which a view is turned: 20000 to 1, as most views are counted alike to begin with. Measured on boards
@@ -63,7 +63,7 @@ def board_turn(board: Board, quarter_turns: int) -> Rigid3:
     return Rigid3(turn, -(corners @ turn.T).min(axis=0))
 
 
-def recounted(
+def with_views_turned(
     observations: Observations, state: State, views: BoolArray, quarter_turns: int
 ) -> tuple[Observations, State]:
     """Return the same with the boards of the chosen `views` (V,) counted from another end. Residuals of flat boards do
@@ -82,7 +82,7 @@ def recounted(
     return observations, replace(state, rotation=rotation, translation_mm=translation)
 
 
-def miscounted(observations: Observations, fit: Fit, quarter_turns: int) -> BoolArray:
+def turned_views(observations: Observations, fit: Fit, quarter_turns: int) -> BoolArray:
     """Return the views (V,) that surely count their board by so many quarter turns otherwise than most do."""
     out = np.zeros(len(observations.views), dtype=bool)
     often = often_seen(observations)
@@ -125,7 +125,7 @@ class _Turn:
         return total
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class _Patterns:
     """What is left of the residuals of one board in V views, in standard deviations.
 
@@ -180,13 +180,13 @@ class _Patterns:
         pull[at] = np.einsum("ncij,nci->ncj", by_board, left.reshape(residual.shape))[index]
         information[at] = (np.swapaxes(by_board, -1, -2) @ by_board)[index]
         return cls(
-            left,
-            by_board.reshape(*left.shape, 3),
-            fields,
-            corner,
-            turn.summed(pull, -1.0),
-            turn.summed(information, 0.0),
-            turn.order / released_sigma(flat) ** 2,
+            left=left,
+            by_board=by_board.reshape(*left.shape, 3),
+            fields=fields,
+            corner=corner,
+            pull=turn.summed(pull, -1.0),
+            information=turn.summed(information, 0.0),
+            prior=turn.order / released_sigma(flat) ** 2,
         )
 
     def log_odds(self) -> FloatArray:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.calibration.assemble import assemble, require_determined
-from rigkit.calibration.board_orientation import miscounted, recounted
+from rigkit.calibration.board_orientation import turned_views, with_views_turned
 from rigkit.calibration.evidence import fit_shapes
 from rigkit.calibration.fit import Fit, fit_kept, fit_model, heldout_squares, robust_sigma
 from rigkit.calibration.linearise import normal_equations
@@ -28,6 +28,7 @@ from rigkit.cameras.registry import MODELS, camera_model, check_order
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.findings import Finding, Severity
 from rigkit.core.progress import Progress, silent
 
 __all__ = ["DEGREES_TRIED", "FOLDS", "calibrate"]
@@ -157,13 +158,17 @@ def _beyond(chosen: _Option) -> list[tuple[str, type[Camera], int | None]]:
     return [(f"{camera.model} {order}", type(camera), order) for order in more]
 
 
-def _at_the_end(beyond: Sequence[tuple[str, type[Camera], int | None]], result: Calibration) -> list[str]:
+def _at_the_end(beyond: Sequence[tuple[str, type[Camera], int | None]], result: Calibration) -> list[Finding]:
     """Say that the lens may ask for more than the model has, where the largest size of all is the best."""
     if not beyond or not any(c.name == beyond[-1][0] and c.chosen for c in result.candidates):
         return []
     return [
-        f"look: {beyond[-1][0]} is the largest there is of its kind, and the best: the lens may ask for more, most "
-        'towards its rim; try model = "auto"'
+        Finding(
+            severity=Severity.LOOK,
+            message=f"{beyond[-1][0]} is the largest there is of its kind, and the best: the lens may ask for more, "
+            "most towards its rim",
+            remedy='try model = "auto"',
+        )
     ]
 
 
@@ -249,9 +254,9 @@ def _fit_shapes(observations: Observations, flat: _Option, board: str) -> tuple[
     fits = fit_shapes(observations, flat.fit, board)
     for quarter_turns in (1, 2):
         *_, richest = fits.values()
-        views = miscounted(observations, richest, quarter_turns)
+        views = turned_views(observations, richest, quarter_turns)
         if views.any():
-            observations, state = recounted(observations, flat.fit.state, views, quarter_turns)
+            observations, state = with_views_turned(observations, flat.fit.state, views, quarter_turns)
             data = normal_equations(observations, state, flat.fit.weight(observations))
             flat = replace(flat, fit=replace(flat.fit, state=state, data=data))
             fits = fit_shapes(observations, flat.fit, board)

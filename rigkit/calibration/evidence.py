@@ -16,7 +16,7 @@ import numpy as np
 
 from rigkit.calibration.fit import Fit, fit_kept, inliers, sigma_of
 from rigkit.calibration.linearise import normal_equations
-from rigkit.calibration.normal_equations import Normal
+from rigkit.calibration.normal_equations import NormalEquations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.shape import released_groups, shape_model, warp_groups
 from rigkit.calibration.solver import solve, with_priors
@@ -33,7 +33,7 @@ OPEN = 1e-9
 """A direction of which the views know this part of what they know of the best is open: it is rounding."""
 COARSE = 1e-4
 """The rounds stop where a step promises less than this part of the cost: sizes are known to a tenth at best."""
-LEAST = 1e-4
+MIN_SIZE = 1e-4
 """A size falls to no less than this part of the first one in a round: on exact data it would fall to nothing."""
 
 
@@ -77,7 +77,7 @@ def _stray(observations: Observations, state: State, kept: BoolArray) -> bool:
     return bool(less.sum() > variance * (count + STRAY_SIGMAS * np.sqrt(2.0 * count)))
 
 
-def _own_blocks(normal: Normal, points: int) -> FloatArray:
+def _own_blocks(normal: NormalEquations, points: int) -> FloatArray:
     """Return the 3x3 blocks (M, 3, 3) of the released corners."""
     each, start = np.arange(points), len(normal.g) - 3 * points
     return np.asarray(normal.gg[start:, start:].reshape(points, 3, points, 3)[each, :, each, :])
@@ -102,7 +102,7 @@ def _evident(observations: Observations, state: State, kept: BoolArray) -> tuple
     return state, kept
 
 
-def _sizes(observations: Observations, state: State, normal: Normal, sigma_px: float) -> FloatArray:
+def _sizes(observations: Observations, state: State, normal: NormalEquations, sigma_px: float) -> FloatArray:
     """Return the prior standard deviation of each unknown of the shape."""
     sizes = state.shape.sigma.copy()
     known = 1.0 - _variance(state, normal) * sigma_px**2 / sizes**2
@@ -111,11 +111,11 @@ def _sizes(observations: Observations, state: State, normal: Normal, sigma_px: f
     for group in groups:
         if (gamma := float(known[group].sum())) > 0.0:
             found = np.sqrt((state.unknowns[group] ** 2).sum() / gamma)
-            sizes[group] = max(float(found), LEAST * float(sizes[group].max()))
+            sizes[group] = max(float(found), MIN_SIZE * float(sizes[group].max()))
     return sizes
 
 
-def _variance(state: State, normal: Normal) -> FloatArray:
+def _variance(state: State, normal: NormalEquations) -> FloatArray:
     """Return the variance of each unknown of the shape for corners of unit variance. That of a released corner is taken
     with the others held: against the exact one its sizes come out the same within a tenth, without the inverse of a
     matrix of thousands."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from rigkit.calibration.initialise import initialise
 from rigkit.calibration.linearise import normal_equations
-from rigkit.calibration.normal_equations import Normal, Residuals
+from rigkit.calibration.normal_equations import NormalEquations, Residuals
 from rigkit.calibration.observations import Observations, median_of
 from rigkit.calibration.poses import find_poses, refine_poses
 from rigkit.calibration.result import Convergence
@@ -52,7 +52,7 @@ class Fit:
     sigma per coordinate of a corner, how the solver ended."""
 
     state: State
-    data: Normal
+    data: NormalEquations
     kept: BoolArray
     sigma_px: float
     convergence: Convergence
@@ -139,10 +139,10 @@ class _Found:
     state: State
     norm: FloatArray
     sigma_px: float
-    data: Normal | None = None
+    data: NormalEquations | None = None
 
     @classmethod
-    def at(cls, state: State, data: Normal, observations: Observations) -> _Found:
+    def at(cls, state: State, data: NormalEquations, observations: Observations) -> _Found:
         """Return the state with what follows from the normal equations there."""
         norm = data.residuals[0].weighted(observations)
         return cls(state, norm, sigma_of(norm, observations.present), data)
@@ -195,7 +195,7 @@ def _settled(
     norm: FloatArray,
     kept: BoolArray,
     rounds: int,
-    data: Normal | None = None,
+    data: NormalEquations | None = None,
 ) -> Fit:
     """As `fit_kept`, with the weighted residuals `norm` of the state, and the normal equations of the kept corners
     there, where they are known."""

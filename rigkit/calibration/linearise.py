@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.normal_equations import Normal, Residuals
+from rigkit.calibration.normal_equations import NormalEquations, Residuals
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.shape import ShapeModel
 from rigkit.calibration.state import State, lost_px
@@ -27,7 +27,7 @@ BLOCK = 8192
 
 def normal_equations(
     observations: Observations, state: State, weight: FloatArray | None = None, loss_px: float | None = None
-) -> Normal:
+) -> NormalEquations:
     """Return the normal equations and the cost at `state`, without priors.
 
     `weight` (V, C) multiplies the residuals, by default the observations' own; `loss_px` is the scale of the Cauchy
@@ -55,7 +55,7 @@ def normal_equations(
         if released is not None:
             by_board = _by_board(rows, state.rotation[block])
             released.add(rows, by_board, observations.corner[block], observations.present[block], block.start)
-    normal = Normal(gg, gp, pp, g, p, costs, (residuals,))
+    normal = NormalEquations(gg=gg, gp=gp, pp=pp, g=g, p=p, costs=costs, residuals=(residuals,))
     return normal if released is None else released.appended(normal)
 
 
@@ -198,7 +198,7 @@ class _Released:
         starts = np.flatnonzero(np.diff(index, prepend=-1))
         self._own[index[starts]] += np.add.reduceat(cross, starts, axis=0)
 
-    def appended(self, normal: Normal) -> Normal:
+    def appended(self, normal: NormalEquations) -> NormalEquations:
         """Return the normal equations with these unknowns after the others."""
         points, p = len(self._own), len(normal.g)
         total = p + 3 * points

@@ -14,6 +14,7 @@ from rigkit.calibration.observations import Observations
 from rigkit.calibration.solver import solve
 from rigkit.calibration.state import State, evaluate
 from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.findings import Finding, Severity
 
 __all__ = ["moved_lens"]
 
@@ -27,7 +28,7 @@ one lens with flat, bent and wavy boards, 1.5 and more for 2 % of focal length."
 TOLERANCE = 1e-6
 
 
-def moved_lens(observations: Observations, fit: Fit) -> tuple[str, ...]:
+def moved_lens(observations: Observations, fit: Fit) -> tuple[Finding, ...]:
     """Return a verdict if the two halves of the images, in the order given, have different intrinsics."""
     images = list(dict.fromkeys(observations.images))
     if len(images) < MIN_IMAGES:
@@ -45,9 +46,12 @@ def moved_lens(observations: Observations, fit: Fit) -> tuple[str, ...]:
         if distance < AGAINST_PLACE * _apart(observations, fit, state, half[number]):
             return ()
     return (
-        f"bad: the lens (or the board) was another one in the second half of the images, from "
-        f"'{images[len(images) // 2]}' on ({distance:.0f} standard deviations): focus, zoom or mount moved; calibrate "
-        "the halves apart, or retake all",
+        Finding(
+            severity=Severity.BAD,
+            message="the lens (or the board) was another one in the second half of the images, from "
+            f"'{images[len(images) // 2]}' on ({distance:.0f} standard deviations): focus, zoom or mount moved",
+            remedy="calibrate the halves apart, or retake all",
+        ),
     )
 
 

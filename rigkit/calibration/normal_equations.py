@@ -12,7 +12,7 @@ from rigkit.calibration.observations import Observations
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray
 
-__all__ = ["Normal", "Residuals", "Step"]
+__all__ = ["NormalEquations", "Residuals", "Step"]
 
 MAX_CONDITION = 1e12
 """A pose whose scaled block is worse has directions that its corners leave open: fewer than three of them."""
@@ -49,8 +49,8 @@ class Residuals:
         return length if self.valid.all() else np.where(self.valid | ~observations.present, length, np.inf)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Normal:
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class NormalEquations:
     """Blocks of J^T W J and J^T W r: g for the G globals, p for the 6 numbers of each of V poses.
 
     Attributes
@@ -80,7 +80,7 @@ class Normal:
         shape_sigma: FloatArray,
         unknowns: FloatArray,
         sigma_px: float,
-    ) -> Normal:
+    ) -> NormalEquations:
         """Add the priors of cameras and zero-mean priors of the shape's unknowns, where each stands among the globals.
 
         `sigma_px` is the standard deviation of a corner: what a residual of one px weighs against a prior.

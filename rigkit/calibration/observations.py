@@ -34,7 +34,7 @@ class Workspace:
         return self._memory[:size].reshape(shape)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Observations:
     """Corners of V views, padded to C corners.
 
@@ -95,7 +95,17 @@ class Observations:
             corner.reshape(-1)[flat] += place
         weight = _weights(sigma, present)
         table = tuple(boards.values())
-        return cls(tuple(views), pixels, corner, sigma, weight, present, table, first_row, board)
+        return cls(
+            views=tuple(views),
+            pixels=pixels,
+            corner=corner,
+            sigma_px=sigma,
+            weight=weight,
+            present=present,
+            boards=table,
+            first_row=first_row,
+            board=board,
+        )
 
     def table(self) -> Points:
         """Return the flat corners of all boards, (M, 3) mm."""

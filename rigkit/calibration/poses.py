@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.calibration.linearise import normal_equations
-from rigkit.calibration.normal_equations import Normal
+from rigkit.calibration.normal_equations import NormalEquations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.radial_alignment import align
 from rigkit.calibration.state import State
@@ -23,8 +23,8 @@ TOLERANCE = 1e-10
 START_TOLERANCE = 1e-5
 """or this, of a pose that is only where a solve begins: a robust loss takes dozens of steps for the last digits."""
 DAMPING_START = 1e-6
-DAMPING_MAX = 1e10
-DAMPING_LEAST = 1e-12
+MAX_DAMPING = 1e10
+MIN_DAMPING = 1e-12
 """A view of which hardly a corner projects does not determine its pose: less than this would leave it singular."""
 
 
@@ -40,7 +40,7 @@ def refine_poses(
 
     held = state.with_boards_held()
 
-    def linearise(rotation: Mat3, translation_mm: Points) -> Normal:
+    def linearise(rotation: Mat3, translation_mm: Points) -> NormalEquations:
         moved = replace(held, rotation=rotation, translation_mm=translation_mm)
         return normal_equations(observations, moved, weight, loss_px)
 
@@ -51,7 +51,7 @@ def refine_poses(
 def refine_each(
     rotation: Mat3,
     translation_mm: Points,
-    linearise: Callable[[Mat3, Points], Normal],
+    linearise: Callable[[Mat3, Points], NormalEquations],
     tolerance: float = TOLERANCE,
 ) -> tuple[Mat3, Points, FloatArray]:
     """Return poses (N, 3, 3), (N, 3) each at its own minimum and their costs (N,): Levenberg-Marquardt with a damping
@@ -73,10 +73,10 @@ def refine_each(
         better = active & (there.costs < cost)
         rotation = np.where(better[:, None, None], turned, rotation)
         translation_mm = np.where(better[:, None], shifted, translation_mm)
-        active &= (predicted > tolerance * cost) & (damping < DAMPING_MAX)
+        active &= (predicted > tolerance * cost) & (damping < MAX_DAMPING)
         pp, p = np.where(better[:, None, None], there.pp, pp), np.where(better[:, None], there.p, p)
         cost = np.where(better, there.costs, cost)
-        damping = np.where(better, np.maximum(0.1 * damping, DAMPING_LEAST), 10.0 * damping)
+        damping = np.where(better, np.maximum(0.1 * damping, MIN_DAMPING), 10.0 * damping)
     return rotation, translation_mm, cost
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,12 +12,13 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, Points, 
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
+from rigkit.core.findings import Finding
 from rigkit.geometry.rigid3 import Rigid3
 
 __all__ = ["BoardShape", "Calibration", "Candidate", "Convergence", "Outlier", "ViewResult"]
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class ViewResult:
     """One board in one image, after the calibration.
 
@@ -69,6 +70,13 @@ class ViewResult:
                 object.__setattr__(one, name, value)
             out.append(one)
         return tuple(out)
+
+    def __repr__(self) -> str:
+        used = int(np.count_nonzero(self.kept))
+        return (
+            f"ViewResult('{self.image}', board '{self.board_id}': {used} of {len(self.grid)} corners used, RMS "
+            f"{self.rms_px:.3f} px)"
+        )
 
     @property
     def rms_px(self) -> float:
@@ -134,6 +142,12 @@ class BoardShape:
     def __post_init__(self) -> None:
         object.__setattr__(self, "points_mm", as_array(self.points_mm, (None, 3), "points_mm"))
 
+    def __repr__(self) -> str:
+        return (
+            f"BoardShape('{self.board_id}', {self.kind}: {len(self.points_mm)} corners, off a plane by "
+            f"{self.bow_mm:.3f} mm, x longer than y by {100.0 * self.aspect:.3f} %)"
+        )
+
     @classmethod
     def of(cls, board: Board, kind: str, points_mm: Points) -> BoardShape:
         """Return the shape of `board` with its corners at `points_mm`, bow and aspect from them."""
@@ -147,7 +161,7 @@ class BoardShape:
         return cls(board.board_id, kind, points_mm, bow, float(scale[0] / scale[1] - 1.0))
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Calibration:
     """A calibrated camera with everything a person needs to judge it.
 
@@ -168,7 +182,7 @@ class Calibration:
     candidates : models, degrees and board shapes tried.
     convergence : of the final solve.
     boards : shapes of the boards.
-    verdicts : what is good and what is not, in words.
+    verdicts : what is good and what is not, the headline first.
     """
 
     camera: Camera
@@ -183,7 +197,7 @@ class Calibration:
     candidates: tuple[Candidate, ...]
     convergence: Convergence
     boards: tuple[BoardShape, ...]
-    verdicts: tuple[str, ...] = field(default=())
+    verdicts: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
         p = self.camera.parameters.size
@@ -192,6 +206,19 @@ class Calibration:
         object.__setattr__(self, "frame_covariance", frame)
         if not self.views:
             raise InputError("calibration: no view was used; a calibration without data cannot be built")
+
+    def __repr__(self) -> str:
+        width, height = self.camera.size_px
+        held = "not available" if self.heldout_rms_px is None else f"{self.heldout_rms_px:.4f} px"
+        images = len({view.image for view in self.views})
+        lines = [
+            f"Calibration of a {self.camera.model} camera, {width}x{height} px: held-out RMS {held}, training RMS "
+            f"{self.rms_px:.4f} px",
+            f"  {self.corner_count} corners in {len(self.views)} views of {images} images; {len(self.outliers)} "
+            f"corners and {len(self.dropped)} images left out",
+            *(f"  {finding}" for finding in self.verdicts[:1]),
+        ]
+        return "\n".join(lines)
 
     @property
     def parameter_sigmas(self) -> FloatArray:

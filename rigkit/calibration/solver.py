@@ -17,7 +17,7 @@ from typing import TypeVar
 import numpy as np
 
 from rigkit.calibration.linearise import normal_equations
-from rigkit.calibration.normal_equations import Normal, Step
+from rigkit.calibration.normal_equations import NormalEquations, Step
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.state import State
@@ -25,7 +25,7 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import RigkitError
 from rigkit.geometry.rotation import exp_so3
 
-__all__ = ["Linearised", "Solution", "minimise", "solve", "with_priors"]
+__all__ = ["CameraSolution", "Linearised", "minimise", "solve", "with_priors"]
 
 S = TypeVar("S")
 
@@ -39,27 +39,27 @@ would hold their combinations back. A step that goes too far is refused and the 
 DAMPING_SHRINK = 0.01
 """For the same reason; with Nielsen's 1/3 it would be dozens of steps."""
 DAMPING_GROWTH = 4.0
-DAMPING_MAX = 1e12
+MAX_DAMPING = 1e12
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Linearised:
     """The problem around a state: the normal equations of the corners, and those with all priors added."""
 
-    data: Normal
-    normal: Normal
+    data: NormalEquations
+    normal: NormalEquations
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Solution:
+class CameraSolution:
     """The state found, the normal equations of its corners (without priors), and how the solver ended."""
 
     state: State
-    data: Normal
+    data: NormalEquations
     convergence: Convergence
 
 
-def with_priors(data: Normal, state: State, sigma_px: float) -> Normal:
+def with_priors(data: NormalEquations, state: State, sigma_px: float) -> NormalEquations:
     """Return the normal equations with the priors of camera and shape added; `sigma_px` is the standard deviation of a
     corner."""
     p = state.camera.parameters.size
@@ -76,8 +76,8 @@ def solve(
     prior_sigma_px: float = 0.2,
     max_iterations: int = MAX_ITERATIONS,
     cost_tolerance: float = COST_TOLERANCE,
-    at_start: Normal | None = None,
-) -> Solution:
+    at_start: NormalEquations | None = None,
+) -> CameraSolution:
     """Return the state that minimises the weighted residuals from `start`, and how the solver ended. Never raises for
     lack of data: what is not determined stays where it started.
 
@@ -94,7 +94,7 @@ def solve(
     solver = _Solver(observations, weight, loss_px, prior_sigma_px)
     here = None if at_start is None else solver.with_priors(start, at_start)
     state, last, convergence = minimise(start, solver.linearise, _moved, max_iterations, cost_tolerance, here)
-    return Solution(state, last.data, convergence)
+    return CameraSolution(state, last.data, convergence)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -107,7 +107,7 @@ class _Solver:
     def linearise(self, state: State) -> Linearised:
         return self.with_priors(state, normal_equations(self.observations, state, self.weight, self.loss_px))
 
-    def with_priors(self, state: State, data: Normal) -> Linearised:
+    def with_priors(self, state: State, data: NormalEquations) -> Linearised:
         return Linearised(data, with_priors(data, state, self.prior_sigma_px))
 
 
@@ -131,7 +131,7 @@ def minimise(
         step = here.normal.step(damping)
         if step is None:
             damping, growth = damping * growth, growth * 2.0
-            if damping > DAMPING_MAX:
+            if damping > MAX_DAMPING:
                 return state, here, Convergence(iteration, False, "the normal equations are singular")
             continue
         if step.predicted <= tolerance * here.normal.cost:
@@ -147,7 +147,7 @@ def minimise(
             damping, growth = damping * max(DAMPING_SHRINK, 1.0 - (2.0 * gain - 1.0) ** 3), DAMPING_GROWTH
         else:
             damping, growth = damping * growth, growth * 2.0
-            if damping > DAMPING_MAX:
+            if damping > MAX_DAMPING:
                 return state, here, Convergence(iteration, True, "no smaller cost nearby")
     return state, here, Convergence(max_iterations, False, f"stopped after {max_iterations} iterations")
 

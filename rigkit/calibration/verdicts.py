@@ -1,7 +1,6 @@
 """What a person should know about a calibration, in sentences: what is wrong, how one can tell, what to do.
 
-Every verdict starts with "good:", "look:" (worth a look) or "bad:". The limits are constants here; none depends on the
-result that it judges.
+The limits are constants here; none depends on the result that it judges.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import uncertainty_at_corners
 from rigkit.cameras.base import image_center
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.findings import Finding, Severity
 
 __all__ = ["headline", "judge", "judge_session"]
 
@@ -62,8 +62,8 @@ class Judged(Protocol):
 
 
 def judge(
-    calibration: Calibration, also: Sequence[str] = (), *, at_corners_px: FloatArray | None = None
-) -> tuple[str, ...]:
+    calibration: Calibration, also: Sequence[Finding] = (), *, at_corners_px: FloatArray | None = None
+) -> tuple[Finding, ...]:
     """Return the verdicts, the headline first; `also` are verdicts found elsewhere, `at_corners_px` is what
     `uncertainty_at_corners` returns, where it is known already."""
     found = [
@@ -82,69 +82,80 @@ def judge(
     if not calibration.convergence.converged:
         found.insert(
             0,
-            f"bad: the solver did not converge ({calibration.convergence.reason}): the model may not fit this lens; "
-            'try model = "auto", or add views with the board tilted',
+            _bad(
+                f"the solver did not converge ({calibration.convergence.reason}): the model may not fit this lens",
+                'try model = "auto", or add views with the board tilted',
+            ),
         )
     return (headline(calibration, found), *found)
 
 
 def judge_session(
-    calibration: Calibration, dropped: Sequence[tuple[str, str]], also: Sequence[str] = ()
-) -> tuple[str, ...]:
+    calibration: Calibration, dropped: Sequence[tuple[str, str]], also: Sequence[Finding] = ()
+) -> tuple[Finding, ...]:
     """Return the verdicts of the calibration together with those on images that gave no view at all, and others."""
     found = [*_left_out(dropped), *calibration.verdicts[1:], *also]
     return (headline(calibration, found), *found)
 
 
-def headline(result: Judged, found: Sequence[str]) -> str:
+def headline(result: Judged, found: Sequence[Finding]) -> Finding:
     """Return the first verdict, from all others."""
     held = result.heldout_rms_px
     error = f"training RMS {result.rms_px:.3f} px" if held is None else f"held-out RMS {held:.3f} px"
-    bad = sum(v.startswith("bad") for v in found)
+    bad = sum(finding.severity is Severity.BAD for finding in found)
     if bad:
-        return f"bad: {error}, but {bad} of the remarks below must be dealt with first"
+        return _bad(f"{error}, but {bad} of the remarks below must be dealt with first")
     remarks = {0: "", 1: "; 1 remark below"}.get(len(found), f"; {len(found)} remarks below")
-    return f"good: {error}{remarks}"
+    return Finding(severity=Severity.GOOD, message=f"{error}{remarks}")
 
 
-def _left_out(dropped: Sequence[tuple[str, str]]) -> list[str]:
+def _look(message: str, remedy: str | None = None, image: str | None = None) -> Finding:
+    return Finding(severity=Severity.LOOK, message=message, image=image, remedy=remedy)
+
+
+def _bad(message: str, remedy: str | None = None) -> Finding:
+    return Finding(severity=Severity.BAD, message=message, remedy=remedy)
+
+
+def _left_out(dropped: Sequence[tuple[str, str]]) -> list[Finding]:
     """Name the images left out, or how many for each reason."""
     if len(dropped) <= NAMED:
-        return [f"look: image '{image}' is left out: {reason}" for image, reason in dropped]
+        return [_look(f"image '{image}' is left out: {reason}", image=image) for image, reason in dropped]
     reasons = Counter(reason for _, reason in dropped)
     first = {reason: image for image, reason in reversed(dropped)}
     return [
-        f"look: {count} images are left out, '{first[reason]}' the first: {reason}"
+        _look(f"{count} images are left out, '{first[reason]}' the first: {reason}")
         if count > 1
-        else f"look: image '{first[reason]}' is left out: {reason}"
+        else _look(f"image '{first[reason]}' is left out: {reason}", image=first[reason])
         for reason, count in reasons.most_common(NAMED)
     ]
 
 
-def _tilts(c: Calibration) -> list[str]:
+def _tilts(c: Calibration) -> list[Finding]:
     """Boards parallel to the image plane say nothing about the focal length."""
     axes = np.array([v.cam_from_board.rotation[2, 2] for v in c.views])
     tilted = int((np.abs(axes) < np.cos(np.radians(TILTED_DEG))).sum())
     if tilted >= min(TILTED_VIEWS, len(c.views)):
         return []
     return [
-        f"bad: the board is tilted by more than {TILTED_DEG:.0f} degrees against the image in {tilted} of "
-        f"{len(c.views)} views only; take at least {TILTED_VIEWS} with the board tilted by 20 to 50 degrees, about "
-        "different axes"
+        _bad(
+            f"the board is tilted by more than {TILTED_DEG:.0f} degrees against the image in {tilted} of "
+            f"{len(c.views)} views only",
+            f"take at least {TILTED_VIEWS} with the board tilted by 20 to 50 degrees, about different axes",
+        )
     ]
 
 
-def _images(c: Calibration) -> list[str]:
+def _images(c: Calibration) -> list[Finding]:
     count = len({v.image for v in c.views})
     if count >= FEW_IMAGES:
         return []
     images = f"{count} images" if count > 1 else "1 image"
-    return [
-        f"look: {images} only; take at least {FEW_IMAGES}, better 15, to know how good the calibration is elsewhere"
-    ]
+    remedy = f"take at least {FEW_IMAGES}, better 15, to know how good the calibration is elsewhere"
+    return [_look(f"{images} only", remedy)]
 
 
-def _coverage(c: Calibration) -> list[str]:
+def _coverage(c: Calibration) -> list[Finding]:
     """Name the cells of the image that no board reached, where the lens has an image at all."""
     width, height = c.camera.size_px
     kept = np.concatenate([v.kept for v in c.views])
@@ -159,7 +170,7 @@ def _coverage(c: Calibration) -> list[str]:
     empty = (count < CELL_CORNERS) & valid & (np.where(valid, rays[..., 2], -1.0) > np.cos(np.radians(ASKED_DEG)))
     if not empty.any():
         return []
-    return [f"look: no corners in the {_in_words(empty)} of the image; hold the board there, tilted"]
+    return [_look(f"no corners in the {_in_words(empty)} of the image", "hold the board there, tilted")]
 
 
 def _in_words(cells: BoolArray) -> str:
@@ -178,7 +189,7 @@ def _cell(c: Calibration, pixel: FloatArray) -> str:
     return f"{NAMES_V[j]} {NAMES_U[i]}"
 
 
-def _views(c: Calibration) -> list[str]:
+def _views(c: Calibration) -> list[Finding]:
     if len(c.views) < 3:
         return []
     lengths = np.array([len(v.grid) for v in c.views])
@@ -204,7 +215,8 @@ def _views(c: Calibration) -> list[str]:
             what = f"has {far} outliers among its {lengths[i]} corners"
         else:
             continue
-        found.append(f"look: image '{view.image}' {what}; look whether the board or the camera moved, and retake it")
+        remedy = "look whether the board or the camera moved, and retake it"
+        found.append(_look(f"image '{view.image}' {what}", remedy, view.image))
     return found
 
 
@@ -217,7 +229,7 @@ def _medians(values: FloatArray, count: IntArray) -> FloatArray:
     return np.asarray(0.5 * (padded[row, (count - 1) // 2] + padded[row, count // 2]))
 
 
-def _pattern(c: Calibration) -> list[str]:
+def _pattern(c: Calibration) -> list[Finding]:
     """Residuals of neighbours agree where a lens or a board is not what the model says."""
     grid = np.concatenate([v.grid for v in c.views])
     kept = np.concatenate([v.kept for v in c.views])
@@ -234,37 +246,43 @@ def _pattern(c: Calibration) -> list[str]:
         power += 0.5 * float((squared[one] * there[other] + squared[other] * there[one]).sum())
     if not power > 0.0 or products / power < PATTERN:
         return []
-    what = f"look: residuals of neighbouring corners agree (correlation {products / power:.2f}): "
+    what = f"residuals of neighbouring corners agree (correlation {products / power:.2f}): "
     lenses = {candidate.name.split()[0] for candidate in c.candidates} - {"board"}
     if all(board.kind == "flat" for board in c.boards) and not any(t.name == "board released" for t in c.candidates):
-        return [what + 'the board\'s shape or the lens model does not fit; try board_shape = "auto" or a flatter board']
+        remedy = 'try board_shape = "auto" or a flatter board'
+        return [_look(what + "the board's shape or the lens model does not fit", remedy)]
     if len(lenses) < 2:
-        return [what + 'the lens model, or the board\'s shape, does not quite fit; try model = "auto"']
-    return [what + "neither the lens models nor the boards' shapes follow all of it; take a board that does not bend"]
+        return [_look(what + "the lens model, or the board's shape, does not quite fit", 'try model = "auto"')]
+    what += "neither the lens models nor the boards' shapes follow all of it"
+    return [_look(what, "take a board that does not bend")]
 
 
-def _overfit(c: Calibration) -> list[str]:
+def _overfit(c: Calibration) -> list[Finding]:
     if c.heldout_rms_px is None or c.heldout_rms_px <= OVERFIT * c.rms_px:
         return []
     return [
-        f"look: held-out RMS is {c.heldout_rms_px / c.rms_px:.2f} times the training RMS: the images are too few for "
-        "this model, or some image is unlike the others; take more"
+        _look(
+            f"held-out RMS is {c.heldout_rms_px / c.rms_px:.2f} times the training RMS: the images are too few for "
+            "this model, or some image is unlike the others",
+            "take more",
+        )
     ]
 
 
-def _unsure(c: Calibration, inside: FloatArray) -> list[str]:
+def _unsure(c: Calibration, inside: FloatArray) -> list[Finding]:
     worst = float(np.nanmax(inside)) if np.isfinite(inside).any() else np.inf
     if worst <= UNSURE_PX:
         return []
-    what = f"bad: the projection is uncertain by up to {worst:.1f} px (one standard deviation) where the boards were"
+    what = f"the projection is uncertain by up to {worst:.1f} px (one standard deviation) where the boards were"
     if not np.isfinite(worst):
-        return [what + "; take more views, with the board tilted"]
+        return [_bad(what, "take more views, with the board tilted")]
     pixels = np.concatenate([view.pixels[view.kept] for view in c.views])
     place = pixels[np.linspace(0, len(pixels) - 1, len(inside)).astype(np.int64)[np.nanargmax(inside)]]
-    return [f"{what}, most in the {_cell(c, place)} of the image; take more views there, with the board tilted"]
+    what += f", most in the {_cell(c, place)} of the image"
+    return [_bad(what, "take more views there, with the board tilted")]
 
 
-def _boards(c: Calibration) -> list[str]:
+def _boards(c: Calibration) -> list[Finding]:
     """What the solved shapes say: a bow, or squares longer one way than the other."""
     out = []
     for board in c.boards:
@@ -273,25 +291,32 @@ def _boards(c: Calibration) -> list[str]:
         extent = float(np.linalg.norm(np.ptp(board.points_mm, axis=0)))
         if board.bow_mm > 2e-3 * extent:
             out.append(
-                f"look: board '{board.board_id}' departs from a plane by {board.bow_mm:.2f} mm; its shape is part of "
-                "the solution, but glue it to something flat: it may bend otherwise next time"
+                _look(
+                    f"board '{board.board_id}' departs from a plane by {board.bow_mm:.2f} mm",
+                    "its shape is part of the solution, but glue it to something flat: it may bend otherwise next time",
+                )
             )
         if abs(board.aspect) > ASPECT:
             longer, other = ("x", "y") if board.aspect > 0 else ("y", "x")
             out.append(
-                f"look: board '{board.board_id}' has squares {100 * abs(board.aspect):.2f} % longer in {longer} than "
-                f"stated, compared with {other}; measure square_x_mm and square_y_mm again"
+                _look(
+                    f"board '{board.board_id}' has squares {100 * abs(board.aspect):.2f} % longer in {longer} than "
+                    f"stated, compared with {other}",
+                    "measure square_x_mm and square_y_mm again",
+                )
             )
     return out
 
 
-def _outliers(c: Calibration) -> list[str]:
+def _outliers(c: Calibration) -> list[Finding]:
     far = [outlier for outlier in c.outliers if not outlier.residual_px <= SMALL_PX]
     share = len(far) / max(len(c.outliers) + c.corner_count, 1)
     if share <= OUTLIER_SHARE:
         return []
     image, count = Counter(outlier.image for outlier in far).most_common(1)[0]
     return [
-        f"look: {100 * share:.1f} % of the corners are outliers, most of them ({count}) in '{image}'; check exposure, "
-        "focus and motion blur there"
+        _look(
+            f"{100 * share:.1f} % of the corners are outliers, most of them ({count}) in '{image}'",
+            "check exposure, focus and motion blur there",
+        )
     ]

@@ -41,6 +41,12 @@ class CameraDifference:
     covered: BoolArray
     b_from_a: Mat3
 
+    def __repr__(self) -> str:
+        return (
+            f"CameraDifference(rms {self.rms_px:.3f} px, at most {self.max_px:.3f} px over {100.0 * self.coverage:.0f} "
+            f"% of the image, after a rotation of {self.rotation_deg:.4f} deg)"
+        )
+
     @property
     def map_px(self) -> FloatArray:
         """Length of the difference (rows, columns), NaN where not covered."""

@@ -272,7 +272,7 @@ def summary(calibration: Calibration) -> dict[str, Any]:
         "views": [{"image": v.image, "board": v.board_id, "rms_px": v.rms_px} for v in calibration.views],
         "dropped": [{"image": image, "reason": reason} for image, reason in calibration.dropped],
         "outliers": len(calibration.outliers),
-        "verdicts": list(calibration.verdicts),
+        "verdicts": [str(finding) for finding in calibration.verdicts],
     }
 
 
@@ -298,4 +298,4 @@ def describe(calibration: Calibration) -> str:
         if math.isfinite(c.rms_px)
     ]
     lines += [f"{c.name}: {c.reason}" for c in calibration.candidates if not math.isfinite(c.rms_px)]
-    return "\n".join([*lines, *calibration.verdicts])
+    return "\n".join([*lines, *map(str, calibration.verdicts)])

@@ -164,8 +164,8 @@ def summary(rig: RigCalibration, checks: list[Check]) -> dict[str, Any]:
         "heldout_rms_px": rig.heldout_rms_px,
         "rms_px": rig.rms_px,
         "sigma_px": rig.sigma_px,
-        "spread": rig.spread,
-        "verdicts": list(rig.verdicts),
+        "overdispersion": rig.overdispersion,
+        "verdicts": [str(finding) for finding in rig.verdicts],
         "cameras": [
             {
                 "name": camera.name,
@@ -221,7 +221,7 @@ def describe(rig: RigCalibration, checks: list[Check]) -> str:
     count = len(rig.cameras)
     lines = [
         f"{count} camera{'s' if count > 1 else ''}, {rig.shared_count} poses shared by several views: {held}, training "
-        f"RMS {rig.rms_px:.4f} px; frames spread {rig.spread:.2f} times as independent corners would"
+        f"RMS {rig.rms_px:.4f} px; frames scatter {rig.overdispersion:.2f} times as independent corners would"
     ]
     for camera, alone in zip(rig.cameras, rig.single, strict=True):
         held = "not available" if alone.heldout_rms_px is None else f"{alone.heldout_rms_px:.4f} px"
@@ -247,4 +247,4 @@ def describe(rig: RigCalibration, checks: list[Check]) -> str:
     for camera, alone in zip(rig.cameras, rig.single, strict=True):
         lines += [f"{camera.name}: dropped {image}: {reason}" for image, reason in alone.dropped]
         lines += [f"{camera.name} alone: {verdict}" for verdict in alone.verdicts]
-    return "\n".join([*lines, *rig.verdicts])
+    return "\n".join([*lines, *map(str, rig.verdicts)])

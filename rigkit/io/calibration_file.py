@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -21,6 +21,7 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.registry import camera_model
 from rigkit.core.arrays import FloatArray, without_nan
 from rigkit.core.errors import InputError
+from rigkit.core.findings import Finding, Severity
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.files import write_atomic
 from rigkit.io.text import read_text
@@ -31,6 +32,8 @@ __all__ = [
     "camera_from_json",
     "camera_to_json",
     "damage_named",
+    "findings_from_json",
+    "findings_to_json",
     "is_calibration",
     "load_calibration",
     "load_camera",
@@ -61,7 +64,7 @@ def calibration_text(calibration: Calibration) -> str:
         "rms_px": c.rms_px,
         "heldout_rms_px": c.heldout_rms_px,
         "sigma_px": c.sigma_px,
-        "verdicts": list(c.verdicts),
+        "verdicts": findings_to_json(c.verdicts),
         "candidates": [asdict(v) for v in c.candidates],
         "convergence": asdict(c.convergence),
         "dropped": [list(v) for v in c.dropped],
@@ -122,7 +125,7 @@ def load_calibration(path: str | Path) -> Calibration:
             candidates=tuple(Candidate(**_finite(v, ("rms_px",))) for v in data["candidates"]),
             convergence=Convergence(**data["convergence"]),
             boards=tuple(BoardShape(**v) for v in data["boards"]),
-            verdicts=tuple(str(v) for v in data["verdicts"]),
+            verdicts=findings_from_json(data["verdicts"]),
         )
 
 
@@ -183,6 +186,22 @@ def camera_from_json(data: Any, path: str | Path) -> Camera:
         raise InputError(f"'{path}': parameters of a {camera.model} camera must be {', '.join(names)}, in this order")
     refuse_mirrored(camera, path)
     return camera
+
+
+def findings_to_json(findings: Sequence[Finding]) -> list[dict[str, str]]:
+    """Return findings as they stand in files: what does not apply is left out."""
+    return [{key: str(value) for key, value in asdict(f).items() if value is not None} for f in findings]
+
+
+def findings_from_json(data: Sequence[Any]) -> tuple[Finding, ...]:
+    """Return the findings of a file; former files have them as lines that begin with the severity."""
+    out = []
+    for entry in data:
+        if isinstance(entry, str):
+            severity, _, message = entry.partition(": ")
+            entry = {"severity": severity, "message": message}
+        out.append(Finding(**{**entry, "severity": Severity(entry["severity"])}))
+    return tuple(out)
 
 
 def refuse_mirrored(camera: Camera, path: str | Path) -> None:

@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from rigkit.calibration.rig.board_rig import BoardRig, PlacedBoard
+from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, as_array
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.io.calibration_file import camera_from_json, camera_to_json, damage_named
+from rigkit.io.calibration_file import camera_from_json, camera_to_json, damage_named, findings_to_json
 
 __all__ = ["BOARDS_SCHEMA", "SCHEMA", "SavedRig", "board_rigs_text", "is_rig_file", "load_board_rigs", "load_rig"]
 __all__ += ["load_saved_rig", "rig_text"]
@@ -27,9 +27,11 @@ __all__ += ["load_saved_rig", "rig_text"]
 SCHEMA = "rigkit.rig/1"
 BOARDS_SCHEMA = "rigkit.board_rig/1"
 KEYS = {
-    "schema", "cameras", "rms_px", "heldout_rms_px", "sigma_px", "spread", "scale_sigma", "covariance", "baselines",
-    "verdicts",
+    "schema", "cameras", "rms_px", "heldout_rms_px", "sigma_px", "overdispersion", "scale_sigma", "covariance",
+    "baselines", "verdicts",
 }  # fmt: skip
+FORMER_KEYS = {"spread"}
+"""What `overdispersion` was called."""
 CAMERA_KEYS = {"name", "camera", "cam_from_rig", "rms_px"}
 BOARD_KEYS = {"board_id", "size", "square_mm", "square_sigma_mm", "points_mm", "target_from_board"}
 
@@ -59,9 +61,9 @@ def rig_text(rig: RigCalibration) -> str:
         "heldout_rms_px": rig.heldout_rms_px,
         "rms_px": rig.rms_px,
         "sigma_px": rig.sigma_px,
-        "spread": rig.spread,
+        "overdispersion": rig.overdispersion,
         "scale_sigma": rig.scale_sigma,
-        "verdicts": list(rig.verdicts),
+        "verdicts": findings_to_json(rig.verdicts),
         "baselines": [{"from": a, "to": b, "value_mm": v, "sigma_mm": s} for a, b, v, s in pairs],
         "cameras": [
             {
@@ -87,7 +89,7 @@ def load_saved_rig(path: str | Path) -> SavedRig:
 
     Raises InputError for a missing or damaged file, another schema or an unknown key.
     """
-    data = _read(path, SCHEMA, KEYS)
+    data = _read(path, SCHEMA, KEYS | FORMER_KEYS)
     cameras: dict[str, tuple[Camera, Rigid3]] = {}
     with damage_named(path):
         for entry in data["cameras"]:
@@ -158,13 +160,13 @@ def load_board_rigs(path: str | Path) -> tuple[BoardRig, ...]:
         )
 
 
-def _placed(entry: dict[str, Any], path: str | Path) -> PlacedBoard:
+def _placed(entry: dict[str, Any], path: str | Path) -> MountedBoard:
     if set(entry) != BOARD_KEYS:
         raise InputError(f"'{path}': a board must have the keys {', '.join(sorted(BOARD_KEYS))}, and no others")
     (columns, rows), (along_x, along_y), sigma = entry["size"], entry["square_mm"], entry["square_sigma_mm"]
     known = None if sigma is None else float(sigma)
     board = Board(str(entry["board_id"]), int(columns), int(rows), float(along_x), float(along_y), known)
-    return PlacedBoard(board, np.array(entry["points_mm"]), Rigid3.from_matrix(entry["target_from_board"]))
+    return MountedBoard(board, np.array(entry["points_mm"]), Rigid3.from_matrix(entry["target_from_board"]))
 
 
 def _read(path: str | Path, schema: str, keys: set[str]) -> dict[str, Any]:

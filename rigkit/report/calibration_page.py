@@ -106,9 +106,8 @@ def _headline(c: Calibration) -> str:
 def _verdicts(c: Calibration) -> str:
     lines = []
     for verdict in c.verdicts:
-        kind, _, words = verdict.partition(":")
-        colour = VERDICTS.get(kind, "look")
-        lines.append(f'<p><span class="verdict {colour}">{escape(kind)}</span> {escape(words.strip())}</p>')
+        colour = VERDICTS[verdict.severity]
+        lines.append(f'<p><span class="verdict {colour}">{verdict.severity}</span> {escape(verdict.text)}</p>')
     return "".join(lines)
 
 
@@ -161,7 +160,7 @@ def _views(section: CalibrationSection) -> str:
     shown: set[str] = set()
     rows = []
     for view in c.views:
-        remarks = " ".join(v.partition(":")[2].strip() for v in c.verdicts if f"image '{view.image}'" in v)
+        remarks = " ".join(v.text for v in c.verdicts if v.image == view.image)
         middle = view.cam_from_board.apply(
             next(b.points_mm for b in c.boards if b.board_id == view.board_id).mean(axis=0)
         )

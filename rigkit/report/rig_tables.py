@@ -60,11 +60,11 @@ def _cameras(rig: RigCalibration) -> Table:
             )
         )
     held = "not available (too few frames)" if rig.heldout_rms_px is None else f"{rig.heldout_rms_px:.3f} px"
-    note = " ".join(f"{verdict[:1].upper()}{verdict[1:]}." for verdict in rig.verdicts) + (
+    note = " ".join(f"{verdict.severity.capitalize()}: {verdict.text}." for verdict in rig.verdicts) + (
         " All intrinsics and mounts solved together. Held-out RMS, over frames that took no part and with one pose for "
         f"all cameras: {held}; training RMS {rig.rms_px:.3f} px over {rig.corner_count} corners, {rig.shared_count} "
-        f"poses shared by several views. Frames disagree {rig.spread:.2f} times as much as independent corners would; "
-        "all sigmas count that in. The frame is that of the first camera."
+        f"poses shared by several views. Frames disagree {rig.overdispersion:.2f} times as much as independent corners "
+        "would; all sigmas count that in. The frame is that of the first camera."
     )
     return Table("rig", "Cameras of the rig", columns, tuple(rows), note)
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import uncertainty_at_corners
+from rigkit.core.findings import Severity
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.report.page import PairSection, scene_of
 from rigkit.report.tables import measured_words
@@ -70,7 +71,7 @@ def camera_table(calibrations: Mapping[str, Calibration]) -> Table:
     for name, c in calibrations.items():
         uncertainty = uncertainty_at_corners(c)
         middle, high = np.nanquantile(uncertainty, [0.5, 0.95])
-        remarks = sum(not verdict.startswith("good") for verdict in c.verdicts)
+        remarks = sum(verdict.severity is not Severity.GOOD for verdict in c.verdicts)
         rows.append(
             (
                 Cell(name),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.calibration_scenes import REACH_DEG, SIZE, lens, projection_difference, random_views
 
-from rigkit.calibration.board_orientation import board_turn, grid_turned, recounted, same_looks
+from rigkit.calibration.board_orientation import board_turn, grid_turned, same_looks, with_views_turned
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration
@@ -137,7 +137,7 @@ def test_recounting_moves_no_flat_corner(board: Board, quarter_turns: int, rng: 
     views, rotation, translation = random_views(lens("reg"), 3, rng, reach_deg=30.0, board=board)
     observations = Observations.from_views(views)
     state = State.start(lens("reg"), rotation, translation, observations)
-    again, moved = recounted(observations, state, np.array([True, False, True]), quarter_turns)
+    again, moved = with_views_turned(observations, state, np.array([True, False, True]), quarter_turns)
     assert (again.views[1].grid == views[1].grid).all() and (again.views[0].grid != views[0].grid).any()
     assert np.allclose(evaluate(moved, again).px, evaluate(state, observations).px, atol=1e-8)
     back = board_turn(board, quarter_turns).apply(board.points())
@@ -154,6 +154,6 @@ def test_recounting_keeps_the_table_of_boards(rng: np.random.Generator) -> None:
     both = Observations.from_views([(*views[0], *views[1])[i] for i in order]).subset(np.arange(1, 4))
     poses = np.concatenate(rotation)[order[1:]], np.concatenate(translation)[order[1:]]
     state = State.start(lens("reg"), *poses, both)
-    again, moved = recounted(both, state, np.array([True, True, False]), 2)
+    again, moved = with_views_turned(both, state, np.array([True, True, False]), 2)
     off = evaluate(moved, again).px - evaluate(state, both).px
     assert np.abs(off[both.present]).max() < 1e-8

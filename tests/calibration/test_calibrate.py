@@ -81,8 +81,8 @@ def test_a_lens_of_220_degrees_takes_the_largest_degree_and_is_told_so(rng: np.r
         float(np.sqrt((projection_difference(c.camera, camera, 105.0) ** 2).mean())) for c in (result, eight)
     )
     assert off < 0.5 * before
-    assert any("scaramuzza 10 is the largest there is" in verdict for verdict in result.verdicts)
-    assert not any("largest there is" in verdict for verdict in eight.verdicts)
+    assert any("scaramuzza 10 is the largest there is" in verdict.message for verdict in result.verdicts)
+    assert not any("largest there is" in verdict.message for verdict in eight.verdicts)
 
 
 def test_rational_brown_converges(rng: np.random.Generator) -> None:

@@ -13,7 +13,7 @@ from rigkit.calibration.camera_prior import camera_prior
 from rigkit.calibration.normal_equations import Step
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.rig.calibrate import calibrate_rig
-from rigkit.calibration.rig.overdispersion import frame_spread
+from rigkit.calibration.rig.overdispersion import frame_overdispersion
 from rigkit.calibration.rig.solver import rig_normal
 from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.calibration.rig.uncertainty import transfer_covariance, transfer_uncertainty
@@ -129,14 +129,14 @@ def test_gradient_and_gauss_newton_matrix(kind: str, tied: bool, rng: np.random.
     observations = RigObservations(tuple(cameras), tuple(weights), shape, (frame, frame), keys, (False, tied))
     poses = len(keys)
     state = RigState(
-        tuple(mounts()[name][0] for name in names),
-        np.array([mounts()[name][1].rotation for name in names]),
-        np.array([mounts()[name][1].translation_mm for name in names]),
-        exp_so3(0.3 * rng.normal(size=(poses, 3))),
-        np.array([-60.0, -40.0, 600.0]) + 20.0 * rng.normal(size=(poses, 3)),
-        np.array([np.eye(3), exp_so3(0.5 * rng.normal(size=3)) if tied else np.eye(3)]),
-        np.array([np.zeros(3), 80.0 * rng.normal(size=3) if tied else np.zeros(3)]),
-        0.3 * rng.normal(size=shape.count),
+        cameras=tuple(mounts()[name][0] for name in names),
+        mount_rotation=np.array([mounts()[name][1].rotation for name in names]),
+        mount_mm=np.array([mounts()[name][1].translation_mm for name in names]),
+        frame_rotation=exp_so3(0.3 * rng.normal(size=(poses, 3))),
+        frame_mm=np.array([-60.0, -40.0, 600.0]) + 20.0 * rng.normal(size=(poses, 3)),
+        board_rotation=np.array([np.eye(3), exp_so3(0.5 * rng.normal(size=3)) if tied else np.eye(3)]),
+        board_mm=np.array([np.zeros(3), 80.0 * rng.normal(size=3) if tied else np.zeros(3)]),
+        unknowns=0.3 * rng.normal(size=shape.count),
     )
     layout = state.layout(observations)
     assert layout.count == 17 + 6 + (6 if tied else 0) + shape.count
@@ -243,7 +243,7 @@ def test_cameras_of_different_noise_keep_their_own(rng: np.random.Generator) -> 
     ]
     rig = calibrate_rig(views, sizes(), model=MODELS, folds=0)
     sharp, alone = rig.cameras[0].calibration, rig.single[0]
-    assert (sharp.parameter_sigmas[:4] / rig.spread < 1.05 * alone.parameter_sigmas[:4]).all()
+    assert (sharp.parameter_sigmas[:4] / rig.overdispersion < 1.05 * alone.parameter_sigmas[:4]).all()
 
 
 def test_transfer_is_as_sure_as_it_says() -> None:
@@ -270,15 +270,15 @@ def test_transfer_is_as_sure_as_it_says() -> None:
     assert transfer is not None and 0.0 < transfer.median_px < transfer.worst_px
 
 
-def test_spread_has_no_bias_with_few_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_overdispersion_has_no_bias_with_few_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     """Six frames hold the solution fast: what each has pulled it by is counted."""
     squared = []
 
     def recorded(*args: Any) -> float:
-        squared.append(frame_spread(*args) ** 2)
+        squared.append(frame_overdispersion(*args) ** 2)
         return 1.0
 
-    monkeypatch.setattr("rigkit.calibration.rig.calibrate.frame_spread", recorded)
+    monkeypatch.setattr("rigkit.calibration.rig.calibrate.frame_overdispersion", recorded)
     for seed in range(16):
         views = {n: own for n, own in rig_views(np.random.default_rng(seed), 6).items() if n != "fish"}
         calibrate_rig(views, sizes(), model=MODELS, folds=0)
@@ -286,19 +286,19 @@ def test_spread_has_no_bias_with_few_frames(monkeypatch: pytest.MonkeyPatch) -> 
     assert np.mean(squared) == pytest.approx(1.0, abs=0.2)
 
 
-def test_spread_is_one_for_noise_and_more_for_errors_in_common() -> None:
+def test_overdispersion_is_one_for_noise_and_more_for_errors_in_common() -> None:
     """Boards that are not what they are said to be: sigmas grow, and with them the truth stays within reach."""
     clean, bumpy, z = [], [], []
     for seed in range(8):
         rng = np.random.default_rng(seed)
         views = {n: own for n, own in rig_views(rng, 12).items() if n != "fish"}
-        clean.append(calibrate_rig(views, sizes(), model=MODELS, folds=0).spread)
+        clean.append(calibrate_rig(views, sizes(), model=MODELS, folds=0).overdispersion)
         column = np.zeros((54, 3))
         column[:, 0] = 0.12 * rng.normal(size=9)[BOARD.grid()[:, 0]]
         column[:, 2] = 0.3 * (np.linspace(-1.0, 1.0, 9)[BOARD.grid()[:, 0]] ** 2)
         views = {n: own for n, own in rig_views(rng, 12, bumps_mm=column).items() if n != "fish"}
         rig = calibrate_rig(views, sizes(), model=MODELS, folds=0)
-        bumpy.append(rig.spread)
+        bumpy.append(rig.overdispersion)
         length, sigma = rig.baseline_mm("reg", "wide")
         z.append((length - np.linalg.norm(mounts()["wide"][1].translation_mm)) / sigma)
     assert np.mean(clean) < 1.1 and np.mean(bumpy) > 1.15

@@ -9,7 +9,7 @@ import pytest
 from calibration.test_rig import NOISE_PX, SIGMAS, Views, mounts, rig_views, sizes
 
 from rigkit.calibration.rig.calibrate import calibrate_rig
-from rigkit.calibration.rig.observations import Seen
+from rigkit.calibration.rig.observations import Observation
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
@@ -128,7 +128,7 @@ def test_one_pose_of_a_board_that_looks_the_same_turned_is_said(rng: np.random.G
                 (frame if k == 0 else f"{name}{frame}", only_part(view, board, bool(rng.random() < 0.5)))
             )
     rig = calibrate_rig(views, sizes(), model=MODELS)
-    assert any("look the same turned" in verdict for verdict in rig.verdicts)
+    assert any("look the same turned" in verdict.message for verdict in rig.verdicts)
     true = mounts()["wide"][1]
     assert np.degrees(rotation_angle(rig.cameras[1].cam_from_rig.rotation @ true.rotation.T)) < 2.0
 
@@ -137,8 +137,10 @@ def test_one_pose_of_a_board_that_looks_the_same_turned_is_said(rng: np.random.G
 def test_turned_counts_the_same_corners_from_elsewhere(board: Board, rng: np.random.Generator) -> None:
     pose = Rigid3(exp_so3(rng.normal(size=3)), rng.normal(size=3) * 100.0)
     view = BoardView("i", board, board.grid(), rng.random((board.corner_count, 2)), np.ones(board.corner_count))
-    seen = Seen(view, np.ones(board.corner_count, dtype=bool), pose, np.zeros(board.corner_count), "f", ("f", "b"))
+    seen = Observation(
+        view, np.ones(board.corner_count, dtype=bool), pose, np.zeros(board.corner_count), "f", ("f", "b")
+    )
     for turns in (2,) if board.columns != board.rows else (1, 2, 3):
-        other = seen.counted(turns)
+        other = seen.turned(turns)
         assert not np.array_equal(other.view.grid, view.grid)
         assert np.allclose(other.cam_from_board.apply(other.view.points()), pose.apply(view.points()))

@@ -162,3 +162,22 @@ def test_whatever_stands_in_a_file_is_read_or_the_file_is_named(
             assert str(path) in str(error) and "\n" not in str(error)
             refused += 1
     assert refused > 200
+
+
+def test_verdicts_of_former_files(calibration: Calibration, tmp_path: Path) -> None:
+    path = tmp_path / "calibration.json"
+    save_calibration(path, calibration)
+    data = json.loads(path.read_text())
+    assert data["verdicts"][0]["severity"] == calibration.verdicts[0].severity
+    data["verdicts"] = [str(finding) for finding in calibration.verdicts]
+    path.write_text(json.dumps(data))
+    back = load_calibration(path)
+    assert [str(f) for f in back.verdicts] == data["verdicts"]
+    assert [f.severity for f in back.verdicts] == [f.severity for f in calibration.verdicts]
+
+
+def test_prints_in_a_few_lines(calibration: Calibration) -> None:
+    shown = [calibration, calibration.views[0], calibration.boards[0]]
+    for words in map(repr, shown):
+        assert len(words.splitlines()) <= 5 and len(words) < 500
+    assert calibration.camera.model in repr(calibration) and calibration.views[0].image in repr(calibration.views[0])

@@ -9,12 +9,12 @@ import numpy as np
 
 from rigkit.calibration.assemble import board_shapes, motion_of_world
 from rigkit.calibration.result import Calibration, ViewResult
-from rigkit.calibration.rig.board_rig import BoardRig, PlacedBoard
+from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
 from rigkit.calibration.rig.flatness import shape_error
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.observations import Places
 from rigkit.calibration.rig.result import RigCalibration, RigCamera
-from rigkit.calibration.rig.solver import carried
+from rigkit.calibration.rig.solver import pose_jacobians
 from rigkit.calibration.rig.state import Layout, RigObservations
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
@@ -30,10 +30,10 @@ def assemble_rig(
     joint: JointRig,
     places: Places,
     heldout: tuple[float | None, tuple[float | None, ...]],
-    spread: float,
+    overdispersion: float,
 ) -> RigCalibration:
-    """Return the rig; `heldout` is the error of frames that took no part, over all cameras and of each, and `spread` by
-    how much more the frames disagree than the corners' scatter explains.
+    """Return the rig; `heldout` is the error of frames that took no part, over all cameras and of each, and
+    `overdispersion` by how much more the frames disagree than the corners' scatter explains.
 
     Raises DegenerateError where there are fewer corners than unknowns.
     """
@@ -41,10 +41,10 @@ def assemble_rig(
     layout = state.layout(observations)
     sigma = residual_sigma(joint)
     unit, back, own = normal.covariance()
-    off = shape_error(observations, state, sigma * spread)
+    off = shape_error(observations, state, sigma * overdispersion)
     if off.any():
-        unit[: len(off), : len(off)] += np.outer(off, off) / (sigma * spread) ** 2
-    covariance = unit * (sigma * spread) ** 2
+        unit[: len(off), : len(off)] += np.outer(off, off) / (sigma * overdispersion) ** 2
+    covariance = unit * (sigma * overdispersion) ** 2
     boards = observations.cameras[0].boards
     points = observations.shape.points(state.unknowns)
     first_row = observations.cameras[0].first_row
@@ -58,7 +58,7 @@ def assemble_rig(
         px = np.where(residuals.valid[..., None], residuals.px, np.nan)
         poses = Rigid3.stack(alone.rotation, alone.translation_mm)
         views = ViewResult.of_views(observations.cameras[c].views, poses, px, kept)
-        frame = _frame_covariance(observations, joint, layout, c, unit, back, own) * (sigma * spread) ** 2
+        frame = _frame_covariance(observations, joint, layout, c, unit, back, own) * (sigma * overdispersion) ** 2
         p = alone.camera.parameters.size
         of_camera = replace(
             single[c],
@@ -83,7 +83,7 @@ def assemble_rig(
         heldout_rms_px=heldout[0],
         covariance=covariance[: last.stop, : last.stop],
         sigma_px=sigma,
-        spread=spread,
+        overdispersion=overdispersion,
         single=single,
         convergence=joint.solution.convergence,
         corner_count=everything.size,
@@ -128,7 +128,7 @@ def _frame_covariance(
     translation = state.of_camera(c, observations).translation_mm
     f = observations.frame[c]
     lever = motion_of_world(translation) / max(len(f), 1)
-    by = carried(observations, state, c, translation)
+    by = pose_jacobians(observations, state, c, translation)
     through_target = lever @ by.target
     # The targets' poses follow the globals, pose = -W globals + what is their own.
     mean = np.zeros((6, layout.count)) - np.einsum("vij,vjg->ig", through_target, back[f])
@@ -164,7 +164,7 @@ def _board_rigs(
     for target in dict.fromkeys(target for target, _ in places.values()):
         names = sorted((n for n, (t, _) in places.items() if t == target and n in index), key=lambda n: n != target)
         placed = tuple(
-            PlacedBoard(boards[index[n]], shapes[n], Rigid3(state.board_rotation[index[n]], state.board_mm[index[n]]))
+            MountedBoard(boards[index[n]], shapes[n], Rigid3(state.board_rotation[index[n]], state.board_mm[index[n]]))
             for n in names
         )
         runs = [layout.boards[index[n]] for n in names[1:]]

@@ -14,10 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.calibration.board_orientation import same_looks
-from rigkit.calibration.rig.observations import Places, Seen, Sights, outer_corners
+from rigkit.calibration.rig.observations import FrameObservations, Observation, Places, outer_corners
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
+from rigkit.core.findings import Finding, Severity
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import nearest_rotation
 
@@ -37,7 +38,7 @@ FLOOR = 1e-6
 class _Way:
     """One way of naming and counting a board seen, with its outer corners there, (4, 3) mm."""
 
-    seen: Seen
+    seen: Observation
     corners: FloatArray
 
 
@@ -52,10 +53,10 @@ class _Entry:
 
 
 def board_places(
-    groups: Sequence[Sequence[str]], seen: Sequence[Sights], boards: Mapping[str, Board]
-) -> tuple[list[Sights], Places, tuple[str, ...]]:
+    groups: Sequence[Sequence[str]], seen: Sequence[FrameObservations], boards: Mapping[str, Board]
+) -> tuple[list[FrameObservations], Places, tuple[Finding, ...]]:
     """Return the views with the boards of every group named and counted alike and given the key of their target, the
-    places of the boards, and what could not be tied, in words.
+    places of the boards, and what could not be tied.
 
     Parameters
     ----------
@@ -70,7 +71,7 @@ def board_places(
     """
     out = [dict(own) for own in seen]
     places: dict[str, tuple[str, Rigid3]] = {}
-    notes: list[str] = []
+    notes: list[Finding] = []
     for group in groups:
         members = [boards[name] for name in group]
         scenes = _scenes(out, members)
@@ -106,8 +107,11 @@ def board_places(
                 own[(alone, board_id)] = replace(before, key=(alone, board_id))
         if open_scenes:
             notes.append(
-                f"look: in {open_scenes} of {len(scenes)} images nothing tells which of the boards {', '.join(group)} "
-                "is which; there they count as boards of their own"
+                Finding(
+                    severity=Severity.LOOK,
+                    message=f"in {open_scenes} of {len(scenes)} images nothing tells which of the boards "
+                    f"{', '.join(group)} is which; there they count as boards of their own",
+                )
             )
     return out, places, tuple(notes)
 
@@ -127,7 +131,7 @@ def _never_read(
     return next((name for name in group if name not in known and not read.get(name, True)), None)
 
 
-def _scenes(seen: Sequence[Sights], members: Sequence[Board]) -> list[list[_Entry]]:
+def _scenes(seen: Sequence[FrameObservations], members: Sequence[Board]) -> list[list[_Entry]]:
     """Return the boards of the group in every image of every camera."""
     names = {b.board_id for b in members}
     scenes: dict[tuple[int, str], list[_Entry]] = {}
@@ -140,7 +144,7 @@ def _scenes(seen: Sequence[Sights], members: Sequence[Board]) -> list[list[_Entr
     return list(scenes.values())
 
 
-def _ways(entry: Seen, members: Sequence[Board]) -> list[_Way]:
+def _ways(entry: Observation, members: Sequence[Board]) -> list[_Way]:
     """Return every way to name and count the board; the one given comes first."""
     own = entry.view.board
     found = []
@@ -152,12 +156,12 @@ def _ways(entry: Seen, members: Sequence[Board]) -> list[_Way]:
         across = across and board.square_y_mm == own.square_x_mm
         turns = [*(same_looks(own) if straight else ()), *((1, 3) if across and own.columns != own.rows else ())]
         for count in turns:
-            seen = entry.counted(count, board)
+            seen = entry.turned(count, board)
             found.append(_Way(seen, seen.cam_from_board.apply(outer_corners(board))))
     return found
 
 
-Reading = dict[int, Seen]
+Reading = dict[int, Observation]
 """Number of the board in its scene -> how it is read."""
 
 

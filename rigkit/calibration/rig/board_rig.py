@@ -13,11 +13,11 @@ from rigkit.core.truth import Feature
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, skew
 
-__all__ = ["BoardRig", "PlacedBoard"]
+__all__ = ["BoardRig", "MountedBoard"]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class PlacedBoard:
+class MountedBoard:
     """A board, its solved corners (columns * rows, 3) mm in its own frame, and its place on the target."""
 
     board: Board
@@ -26,6 +26,9 @@ class PlacedBoard:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points_mm", as_array(self.points_mm, (self.board.corner_count, 3), "points_mm"))
+
+    def __repr__(self) -> str:
+        return f"MountedBoard({self.board!r}, {len(self.points_mm)} solved corners, {self.target_from_board!r})"
 
     def point(self, feature: Feature) -> FloatArray:
         """Return where a corner or the centre is in the board's frame, (3,) mm."""
@@ -40,7 +43,7 @@ class PlacedBoard:
 
     @property
     def face(self) -> FloatArray:
-        """Normal of the face in the target's frame, towards whoever looks at it."""
+        """NormalEquations of the face in the target's frame, towards whoever looks at it."""
         return -self.target_from_board.rotation[:, 2]
 
 
@@ -56,7 +59,7 @@ class BoardRig:
     scale_sigma : relative standard deviation of all lengths, from how well the squares were measured.
     """
 
-    boards: tuple[PlacedBoard, ...]
+    boards: tuple[MountedBoard, ...]
     covariance: FloatArray
     image_count: int
     scale_sigma: float = 0.0
@@ -64,6 +67,9 @@ class BoardRig:
     def __post_init__(self) -> None:
         size = 6 * (len(self.boards) - 1)
         object.__setattr__(self, "covariance", as_array(self.covariance, (size, size), "covariance"))
+
+    def __repr__(self) -> str:
+        return f"BoardRig of {', '.join(self.names)}, in {self.image_count} images"
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -9,10 +9,11 @@ from dataclasses import replace
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.board_places import board_places
 from rigkit.calibration.rig.joint import solve_jointly
-from rigkit.calibration.rig.observations import Sights, seen_by
+from rigkit.calibration.rig.observations import FrameObservations, frame_observations
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import RigkitError
+from rigkit.core.findings import Finding, Severity
 from rigkit.core.progress import silent
 
 __all__ = ["suggest_ties"]
@@ -25,7 +26,7 @@ a millimetre against each other some tens."""
 NAMES = "{0} boards of {1}x{2} corners"
 
 
-def suggest_ties(views: Sequence[BoardView], calibration: Calibration) -> tuple[str, ...]:
+def suggest_ties(views: Sequence[BoardView], calibration: Calibration) -> tuple[Finding, ...]:
     """Return a verdict if boards kept their places to each other in all images that show several, else nothing.
 
     `views` are those of the calibration, with their boards.
@@ -54,17 +55,21 @@ def suggest_ties(views: Sequence[BoardView], calibration: Calibration) -> tuple[
     how = "give each a board file with an id of its own, and write" if alike else "write"
     listed = ", ".join(f'"{name}"' for name in group) if not alike else "..."
     return (
-        f"look: the {words} kept their places to each other in {joint.shared_count} images; {how} [[rigid_boards]] "
-        f"with boards = [{listed}] in the session: the camera gets surer, and the boards' angles come out",
+        Finding(
+            severity=Severity.LOOK,
+            message=f"the {words} kept their places to each other in {joint.shared_count} images",
+            remedy=f"{how} [[rigid_boards]] with boards = [{listed}] in the session: the camera gets surer, and the "
+            "boards' angles come out",
+        ),
     )
 
 
-def _by_size(views: Sequence[tuple[str, BoardView]], calibration: Calibration) -> Sights:
+def _by_size(views: Sequence[tuple[str, BoardView]], calibration: Calibration) -> FrameObservations:
     """Return what the camera saw, boards without a name of their own called by their size and number in the image."""
-    out: Sights = {}
+    out: FrameObservations = {}
     count: Counter[tuple[str, str]] = Counter()
     often = Counter(view.board.board_id for _, view in views)
-    for entry in seen_by(views, calibration).values():
+    for entry in frame_observations(views, calibration).values():
         board = entry.view.board
         name = board.board_id
         if often[name] == 1:

@@ -17,13 +17,14 @@ from rigkit.calibration.rig.assemble import assemble_rig, residual_sigma
 from rigkit.calibration.rig.board_places import board_places
 from rigkit.calibration.rig.heldout import heldout_rms
 from rigkit.calibration.rig.joint import solve_jointly
-from rigkit.calibration.rig.observations import Places, Sights, seen_by
-from rigkit.calibration.rig.overdispersion import frame_spread
+from rigkit.calibration.rig.observations import FrameObservations, Places, frame_observations
+from rigkit.calibration.rig.overdispersion import frame_overdispersion
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.verdicts import judge_rig
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.findings import Finding
 from rigkit.core.progress import Progress, silent
 
 __all__ = ["calibrate_rig"]
@@ -73,9 +74,9 @@ def calibrate_rig(
         _require_one_image(name, own)
     options = _Options(sizes_px, model, degree, board, folds)
     single = options.each_alone(views, progress)
-    seen = [seen_by(own, result) for own, result in zip(views.values(), single, strict=True)]
+    seen = [frame_observations(own, result) for own, result in zip(views.values(), single, strict=True)]
     places: Places = {}
-    notes: tuple[str, ...] = ()
+    notes: tuple[Finding, ...] = ()
     if rigid_boards:
         boards = _boards(views, rigid_boards)
         named, places, notes = board_places(rigid_boards, seen, boards)
@@ -83,14 +84,16 @@ def calibrate_rig(
             # The boards' shapes were those of mixtures.
             views = {name: [(e.frame, e.view) for e in own.values()] for name, own in zip(views, named, strict=True)}
             single = options.each_alone(views, progress)
-            again = [seen_by(own, result) for own, result in zip(views.values(), single, strict=True)]
+            again = [frame_observations(own, result) for own, result in zip(views.values(), single, strict=True)]
             named, places, notes = board_places(rigid_boards, again, boards)
         seen = named
     joint = solve_jointly(list(views), seen, single, places, progress)
     solution = joint.solution
-    spread = frame_spread(joint.observations, solution.state, solution.normal, joint.frames, residual_sigma(joint))
+    overdispersion = frame_overdispersion(
+        joint.observations, solution.state, solution.normal, joint.frames, residual_sigma(joint)
+    )
     heldout = heldout_rms(joint, folds)
-    rig = assemble_rig(list(views), single, joint, places, heldout, max(1.0, spread))
+    rig = assemble_rig(list(views), single, joint, places, heldout, max(1.0, overdispersion))
     return replace(rig, verdicts=judge_rig(rig, (*notes, *joint.notes)))
 
 
@@ -154,7 +157,7 @@ def _boards(views: Views, groups: Sequence[Sequence[str]]) -> dict[str, Board]:
     return boards
 
 
-def _renamed(before: Sequence[Sights], after: Sequence[Sights]) -> bool:
+def _renamed(before: Sequence[FrameObservations], after: Sequence[FrameObservations]) -> bool:
     """Say whether any board was given another name or first corner."""
     return any(
         old.keys() != new.keys() or any(old[key].view is not new[key].view for key in old)

@@ -15,11 +15,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.rig.observations import Sights
+from rigkit.calibration.rig.observations import FrameObservations
 from rigkit.calibration.rig.solver import RigSolution
 from rigkit.calibration.rig.state import Key, RigObservations
 
-__all__ = ["DISAGREES", "FAR_APART", "LEAST_PX", "bad_ones", "cost_of_sharing", "masked", "part", "part_far"]
+__all__ = ["DISAGREES", "FAR_APART", "MIN_PX", "bad_ones", "cost_of_sharing", "masked", "part", "part_far"]
 __all__ += ["shared_keys", "usual_cost", "why"]
 
 FAR_APART = 12.0
@@ -28,19 +28,21 @@ times the usual distance is a board that moved. Less is left to the joint solve,
 DISAGREES = 3.5
 """After it, sharing a pose costs a target six numbers for every view but one: on average sigma each. More than this
 many times sigma (or the usual, where lens and board are not quite what the models say) is no chance."""
-LEAST_PX = 0.02
+MIN_PX = 0.02
 """No corner is better than this: without noise the usual residual is rounding, and many times that is rounding too."""
 FEW = 12
 """Among so few targets a bad one can hide: it pulls the mounts to itself, and all look bad."""
 
 
-def shared_keys(seen: Sequence[Sights]) -> dict[Key, int]:
+def shared_keys(seen: Sequence[FrameObservations]) -> dict[Key, int]:
     """Return the targets of which several views share a pose, and how many."""
     count = Counter(entry.key for own in seen for entry in own.values())
     return {key: n for key, n in count.items() if n > 1}
 
 
-def cost_of_sharing(observations: RigObservations, solution: RigSolution, seen: Sequence[Sights]) -> dict[Key, float]:
+def cost_of_sharing(
+    observations: RigObservations, solution: RigSolution, seen: Sequence[FrameObservations]
+) -> dict[Key, float]:
     """Return what it costs every shared target that its views have one pose, px^2 for each of the six numbers that
     every view but one gives up. A view that is bad in itself is no reason to distrust the moment."""
     poses = len(observations.keys)
@@ -60,7 +62,7 @@ def usual_cost(cost: Mapping[Key, float], sigma_px: float, *, mean: bool = False
     the mean, where all are taken for good."""
     ordered = sorted(cost.values()) or [0.0]
     usual = float(np.mean(ordered)) if mean else ordered[(len(ordered) - 1) // 2]
-    return max(usual, max(sigma_px, LEAST_PX) ** 2)
+    return max(usual, max(sigma_px, MIN_PX) ** 2)
 
 
 def bad_ones(cost: Mapping[Key, float], usual: float) -> list[Key]:
@@ -72,13 +74,13 @@ def bad_ones(cost: Mapping[Key, float], usual: float) -> list[Key]:
 def masked(cost: Mapping[Key, float], sigma_px: float) -> bool:
     """Say whether one of few targets may be bad although none stands out."""
     worst = max(cost.values(), default=0.0)
-    return 2 < len(cost) <= FEW and worst > DISAGREES**2 * max(sigma_px, LEAST_PX) ** 2
+    return 2 < len(cost) <= FEW and worst > DISAGREES**2 * max(sigma_px, MIN_PX) ** 2
 
 
-def part_far(seen: list[Sights], off_px: Mapping[Key, float]) -> list[tuple[str, str, str]]:
+def part_far(seen: list[FrameObservations], off_px: Mapping[Key, float]) -> list[tuple[str, str, str]]:
     """Part the targets whose views put them far apart, by `off_px`; return (frame, target, reason)."""
     shared = shared_keys(seen)
-    usual = max(float(np.median([off_px[key] for key in shared])) if shared else 0.0, LEAST_PX)
+    usual = max(float(np.median([off_px[key] for key in shared])) if shared else 0.0, MIN_PX)
     worst = max((off_px[key] for key in shared), default=0.0)
     out = []
     for key in sorted(shared):
@@ -89,7 +91,7 @@ def part_far(seen: list[Sights], off_px: Mapping[Key, float]) -> list[tuple[str,
     return out
 
 
-def why(seen: Sequence[Sights], key: Key, how: str) -> str:
+def why(seen: Sequence[FrameObservations], key: Key, how: str) -> str:
     """Return in words why a target is left out."""
     cameras = [k for k, own in enumerate(seen) if any(e.key == key for e in own.values())]
     if len(cameras) > 1:
@@ -100,7 +102,7 @@ def why(seen: Sequence[Sights], key: Key, how: str) -> str:
     return f"its boards disagree on where it is ({how}); one of them was moved against the others"
 
 
-def part(seen: list[Sights], key: Key) -> None:
+def part(seen: list[FrameObservations], key: Key) -> None:
     """Give every view of the target a pose of its own: they still support their camera's intrinsics."""
     for k, own in enumerate(seen):
         for place, entry in own.items():

@@ -12,11 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.calibration.board_orientation import same_looks
-from rigkit.calibration.rig.observations import Places, Seen, Sights, outer_corners, turns_of
+from rigkit.calibration.rig.observations import FrameObservations, Observation, Places, outer_corners, turns_of
 from rigkit.calibration.rig.state import Key
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points
 from rigkit.core.errors import InputError
+from rigkit.core.findings import Finding, Severity
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import nearest_rotation, rotation_angle
 
@@ -47,13 +48,13 @@ def _stack(motions: Sequence[Rigid3]) -> tuple[Mat3, Points]:
     return np.array([m.rotation for m in motions]), np.array([m.translation_mm for m in motions])
 
 
-def _places_of(entries: Sequence[Seen], places: Places) -> tuple[Mat3, Points]:
+def _places_of(entries: Sequence[Observation], places: Places) -> tuple[Mat3, Points]:
     """Return target_from_board of the board of every entry, (n, 3, 3) and (n, 3)."""
     alone = ("", Rigid3.identity())
     return _stack([places.get(e.board_id, alone)[1] for e in entries])
 
 
-def target_poses(entries: Sequence[Seen], places: Places) -> tuple[Mat3, Points]:
+def target_poses(entries: Sequence[Observation], places: Places) -> tuple[Mat3, Points]:
     """Return cam_from_target of every entry, as its board has it, (n, 3, 3) and (n, 3)."""
     rotation, shift = _stack([e.cam_from_board for e in entries])
     if places:
@@ -63,9 +64,9 @@ def target_poses(entries: Sequence[Seen], places: Places) -> tuple[Mat3, Points]
     return rotation, shift
 
 
-def _most_seen(own: Sights) -> dict[Key, Seen]:
+def _most_seen(own: FrameObservations) -> dict[Key, Observation]:
     """Return the entry with the most corners of every key."""
-    out: dict[Key, Seen] = {}
+    out: dict[Key, Observation] = {}
     for entry in own.values():
         known = out.get(entry.key)
         if known is None or entry.kept.sum() > known.kept.sum():
@@ -73,7 +74,7 @@ def _most_seen(own: Sights) -> dict[Key, Seen]:
     return out
 
 
-def _targets(own: Sights, places: Places) -> dict[Key, _Target]:
+def _targets(own: FrameObservations, places: Places) -> dict[Key, _Target]:
     best = _most_seen(own)
     if not best:
         return {}
@@ -92,15 +93,17 @@ _FRAME = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0,
 ALONE = (Rigid3.identity(),)
 
 
-def mounts_of(names: Sequence[str], seen: Sequence[Sights], places: Places) -> tuple[list[Rigid3], tuple[str, ...]]:
+def mounts_of(
+    names: Sequence[str], seen: Sequence[FrameObservations], places: Places
+) -> tuple[list[Rigid3], tuple[Finding, ...]]:
     """Return cam_from_rig of every camera, along a tree of pairs that share the most targets, and what is not sure
-    about them, in words.
+    about them.
 
     Raises InputError where a camera shares none.
     """
     targets = [_targets(own, places) for own in seen]
     mounts: dict[int, Rigid3] = {0: Rigid3.identity()}
-    notes: list[str] = []
+    notes: list[Finding] = []
     while len(mounts) < len(seen):
         edges = [(i, j) for i in mounts for j in range(len(seen)) if j not in mounts]
         i, j = max(edges, key=lambda e: len(targets[e[0]].keys() & targets[e[1]].keys()))
@@ -113,10 +116,14 @@ def mounts_of(names: Sequence[str], seen: Sequence[Sights], places: Places) -> t
         motion, rival = _motion([(targets[i][key], targets[j][key]) for key in shared])
         if rival is not None:
             notes.append(
-                f"look: cameras '{names[i]}' and '{names[j]}' share {len(shared)} boards, which look the same turned: "
-                f"turned by {np.degrees(rotation_angle(rival.rotation @ motion.rotation.T)):.0f} deg the one against "
-                "the other would fit as well; the smaller turn is taken. Tilt the board differently in more frames, or "
-                "use one with an odd and an even number of corners"
+                Finding(
+                    severity=Severity.LOOK,
+                    message=f"cameras '{names[i]}' and '{names[j]}' share {len(shared)} boards, which look the same "
+                    f"turned: turned by {np.degrees(rotation_angle(rival.rotation @ motion.rotation.T)):.0f} deg the "
+                    "one against the other would fit as well; the smaller turn is taken",
+                    remedy="tilt the board differently in more frames, or use one with an odd and an even number of "
+                    "corners",
+                )
             )
         mounts[j] = motion @ mounts[i]
     return [mounts[k] for k in range(len(seen))], tuple(notes)
@@ -158,11 +165,13 @@ def _motion(pairs: Sequence[tuple[_Target, _Target]]) -> tuple[Rigid3, Rigid3 | 
     return middle, Rigid3(rotation[tried[others[0]]], shift[tried[others[0]]]) if others else None
 
 
-def turned_alike(seen: Sequence[Sights], mounts: Sequence[Rigid3], places: Places) -> list[Sights]:
+def turned_alike(
+    seen: Sequence[FrameObservations], mounts: Sequence[Rigid3], places: Places
+) -> list[FrameObservations]:
     """Return the views with every board counted from the corner from which the first camera that sees it counts."""
-    out: list[Sights] = []
+    out: list[FrameObservations] = []
     for k, own in enumerate(seen):
-        mine: Sights = {}
+        mine: FrameObservations = {}
         for key, entry in own.items():
             before = next((i for i in range(k) if key in seen[i]), None)
             looks = same_looks(entry.view.board)
@@ -171,7 +180,7 @@ def turned_alike(seen: Sequence[Sights], mounts: Sequence[Rigid3], places: Place
                 continue
             expected = mounts[k] @ mounts[before].inverse() @ out[before][key].cam_from_board
             points = entry.view.board.points()
-            ways = [entry.counted(turns) for turns in looks]
+            ways = [entry.turned(turns) for turns in looks]
             off = [float(np.linalg.norm(w.cam_from_board.apply(points) - expected.apply(points))) for w in ways]
             mine[key] = ways[int(np.argmin(off))]
         out.append(mine)
@@ -179,7 +188,7 @@ def turned_alike(seen: Sequence[Sights], mounts: Sequence[Rigid3], places: Place
 
 
 def apart(
-    seen: Sequence[Sights], mounts: Sequence[Rigid3], cameras: Sequence[Camera], places: Places
+    seen: Sequence[FrameObservations], mounts: Sequence[Rigid3], cameras: Sequence[Camera], places: Places
 ) -> dict[Key, float]:
     """Return how far apart the boards that share a pose put each other, in px: of two cameras the better of the two
     directions (a board's pose may be bad in one of the images), the worst pair of cameras or of boards."""
@@ -202,14 +211,14 @@ class _Corners:
     """All corners that a camera saw, entry by entry: the entries, how many corners each has, the corners on their
     boards (N, 3) mm and in the image (N, 2), and which were kept (N,)."""
 
-    entries: list[Seen]
+    entries: list[Observation]
     counts: IntArray
     points: Points
     pixels: Pixels
     kept: BoolArray
 
     @classmethod
-    def of(cls, own: Sights) -> _Corners:
+    def of(cls, own: FrameObservations) -> _Corners:
         entries = list(own.values())
         boards = {e.board_id: e.view.board for e in entries}
         table = {name: board.points() for name, board in boards.items()}
@@ -220,7 +229,7 @@ class _Corners:
 
 
 def _transfer_px(
-    first: Mapping[Key, Seen], second: _Corners, motion: Rigid3, camera: Camera, places: Places
+    first: Mapping[Key, Observation], second: _Corners, motion: Rigid3, camera: Camera, places: Places
 ) -> dict[Key, float]:
     """Return the RMS distance of each target's corners in the second camera from where the first's pose puts them, the
     worst board where there are several."""
@@ -249,10 +258,10 @@ def _transfer_px(
 
 
 def first_frames(
-    keys: Sequence[Key], seen: Sequence[Sights], mounts: Sequence[Rigid3], places: Places
+    keys: Sequence[Key], seen: Sequence[FrameObservations], mounts: Sequence[Rigid3], places: Places
 ) -> tuple[Mat3, Points]:
     """Return rig_from_target of every key, from the view that has the most of its corners."""
-    best: dict[Key, tuple[int, int, Seen]] = {}
+    best: dict[Key, tuple[int, int, Observation]] = {}
     for k, own in enumerate(seen):
         for key, entry in _most_seen(own).items():
             count = int(entry.kept.sum())

@@ -11,7 +11,7 @@ from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.disagree import (
     DISAGREES,
-    LEAST_PX,
+    MIN_PX,
     bad_ones,
     cost_of_sharing,
     masked,
@@ -22,12 +22,13 @@ from rigkit.calibration.rig.disagree import (
     why,
 )
 from rigkit.calibration.rig.frames import apart, first_frames, mounts_of, turned_alike
-from rigkit.calibration.rig.observations import Places, Sights
+from rigkit.calibration.rig.observations import FrameObservations, Places
 from rigkit.calibration.rig.shape import common_shape
 from rigkit.calibration.rig.solver import RigSolution, solve_rig
 from rigkit.calibration.rig.state import Key, RigObservations, RigState
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.findings import Finding
 from rigkit.core.progress import Progress
 from rigkit.geometry.rigid3 import Rigid3
 
@@ -42,7 +43,7 @@ TRIED = 6
 """Of few targets that all look bad, the worst ones are left out for trial, one by one."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class JointRig:
     """A solved rig.
 
@@ -53,16 +54,16 @@ class JointRig:
     sigma_px : prior standard deviation of a corner of median quality, from the cameras alone.
     cost_sigmas : how many sigmas sharing a pose usually costs; about 1 where the models hold.
     left_out : (frame, target, reason).
-    notes : what is not sure, in words.
+    notes : what is not sure.
     """
 
     observations: RigObservations
     solution: RigSolution
-    seen: tuple[Sights, ...]
+    seen: tuple[FrameObservations, ...]
     sigma_px: float
     cost_sigmas: float
     left_out: tuple[tuple[str, str, str], ...]
-    notes: tuple[str, ...]
+    notes: tuple[Finding, ...]
 
     @property
     def frames(self) -> IntArray:
@@ -79,7 +80,7 @@ class JointRig:
 
 def solve_jointly(
     names: Sequence[str],
-    seen: Sequence[Sights],
+    seen: Sequence[FrameObservations],
     single: Sequence[Calibration],
     places: Places,
     progress: Progress,
@@ -105,39 +106,55 @@ def solve_jointly(
         if not worse or i == MAX_ROUNDS - 1:
             break
         for key in worse:
-            how = f"{np.sqrt(cost[key] / max(sigma, LEAST_PX) ** 2):.1f} times the corners' noise"
+            how = f"{np.sqrt(cost[key] / max(sigma, MIN_PX) ** 2):.1f} times the corners' noise"
             left_out.append((*key, why(seen, key, how)))
             part(seen, key)
         state = solution.state
         mounts = [Rigid3(r, t) for r, t in zip(state.mount_rotation, state.mount_mm, strict=True)]
     progress("rig", MAX_ROUNDS, MAX_ROUNDS)
-    usual_sigmas = float(np.sqrt(usual) / max(sigma, LEAST_PX))
+    usual_sigmas = float(np.sqrt(usual) / max(sigma, MIN_PX))
     if usual_sigmas > NOTHING_IN_COMMON:
         raise DegenerateError(
             f"rig: that views share their boards' poses costs {usual_sigmas:.0f} times the corners' noise: they "
             f"disagree on where the boards are; {_advice(seen)}"
         )
-    return JointRig(observations, solution, tuple(seen), sigma, usual_sigmas, tuple(left_out), notes)
+    return JointRig(
+        observations=observations,
+        solution=solution,
+        seen=tuple(seen),
+        sigma_px=sigma,
+        cost_sigmas=usual_sigmas,
+        left_out=tuple(left_out),
+        notes=notes,
+    )
 
 
 def _solved(
-    seen: Sequence[Sights], mounts: Sequence[Rigid3], single: Sequence[Calibration], places: Places, sigma: float
+    seen: Sequence[FrameObservations],
+    mounts: Sequence[Rigid3],
+    single: Sequence[Calibration],
+    places: Places,
+    sigma: float,
 ) -> tuple[RigObservations, RigSolution]:
     observations, unknowns = _observations(seen, single, places, sigma)
+    frame_rotation, frame_mm = first_frames(observations.keys, seen, mounts, places)
+    board_rotation, board_mm = _board_poses(observations.cameras[0], places)
     start = RigState(
-        tuple(result.camera for result in single),
-        np.array([m.rotation for m in mounts]),
-        np.array([m.translation_mm for m in mounts]),
-        *first_frames(observations.keys, seen, mounts, places),
-        *_board_poses(observations.cameras[0], places),
-        unknowns,
+        cameras=tuple(result.camera for result in single),
+        mount_rotation=np.array([m.rotation for m in mounts]),
+        mount_mm=np.array([m.translation_mm for m in mounts]),
+        frame_rotation=frame_rotation,
+        frame_mm=frame_mm,
+        board_rotation=board_rotation,
+        board_mm=board_mm,
+        unknowns=unknowns,
     )
     return observations, solve_rig(observations, start, sigma)
 
 
 def _one_bad(
     names: Sequence[str],
-    seen: Sequence[Sights],
+    seen: Sequence[FrameObservations],
     mounts: Sequence[Rigid3],
     single: Sequence[Calibration],
     places: Places,
@@ -168,7 +185,7 @@ def _sigma(single: Sequence[Calibration]) -> float:
 
 
 def _observations(
-    seen: Sequence[Sights], single: Sequence[Calibration], places: Places, sigma: float
+    seen: Sequence[FrameObservations], single: Sequence[Calibration], places: Places, sigma: float
 ) -> tuple[RigObservations, FloatArray]:
     """Pad the views of all cameras to one table of boards, weighted by how well each camera alone saw its corners, and
     return the first unknowns of the boards' shape."""
@@ -185,7 +202,7 @@ def _observations(
         squared[observations.present] = np.concatenate([e.squared_px for e in own])
         observations = observations.with_common_error(squared, kept)
         # Cameras differ in how sharp they are: a residual counts in its own camera's standard deviations.
-        better = sigma / max(alone.sigma_px, LEAST_PX) if sigma > LEAST_PX else 1.0
+        better = sigma / max(alone.sigma_px, MIN_PX) if sigma > MIN_PX else 1.0
         cameras.append(observations)
         weights.append(np.where(kept, better * observations.weight, 0.0))
         frame.append(np.array([keys[e.key] for e in own], dtype=np.int64))
@@ -202,7 +219,9 @@ def _board_poses(observations: Observations, places: Places) -> tuple[FloatArray
     return np.array([p.rotation for p in poses]), np.array([p.translation_mm for p in poses])
 
 
-def _require_agreement(names: Sequence[str], seen: Sequence[Sights], places: Places, left: int, shared: int) -> None:
+def _require_agreement(
+    names: Sequence[str], seen: Sequence[FrameObservations], places: Places, left: int, shared: int
+) -> None:
     """Raise DegenerateError where so much was left out that the rest means nothing."""
     if not left:
         return
@@ -220,7 +239,7 @@ def _require_agreement(names: Sequence[str], seen: Sequence[Sights], places: Pla
         ) from error
 
 
-def _advice(seen: Sequence[Sights]) -> str:
+def _advice(seen: Sequence[FrameObservations]) -> str:
     if len(seen) > 1:
         return "check that the images of a frame were taken at one moment"
     return "check that the boards do not move against each other"

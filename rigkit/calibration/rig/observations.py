@@ -15,14 +15,14 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
 
-__all__ = ["Places", "Seen", "Sights", "outer_corners", "seen_by", "turns_of"]
+__all__ = ["FrameObservations", "Observation", "Places", "frame_observations", "outer_corners", "turns_of"]
 
 Places = Mapping[str, tuple[str, Rigid3]]
 """Board -> its target and target_from_board, of the boards that are mounted to others."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Seen:
+class Observation:
     """A board in an image, as the camera's own calibration left it.
 
     Attributes
@@ -44,7 +44,7 @@ class Seen:
     def board_id(self) -> str:
         return self.view.board.board_id
 
-    def counted(self, quarter_turns: int, board: Board | None = None) -> Seen:
+    def turned(self, quarter_turns: int, board: Board | None = None) -> Observation:
         """Return the same with the corners counted from another corner, as those of `board` where one is given (of the
         same size, turned likewise)."""
         if quarter_turns == 0 and board is None:
@@ -58,7 +58,7 @@ class Seen:
         return replace(self, view=view, cam_from_board=self.cam_from_board @ board_turn(old, quarter_turns).inverse())
 
 
-Sights = dict[tuple[str, str], Seen]
+FrameObservations = dict[tuple[str, str], Observation]
 """What a camera saw, by (frame, board)."""
 
 
@@ -73,7 +73,7 @@ def turns_of(board: Board) -> tuple[Rigid3, ...]:
     return tuple(board_turn(board, turns) for turns in same_looks(board))
 
 
-def seen_by(own: Sequence[tuple[str, BoardView]], result: Calibration) -> Sights:
+def frame_observations(own: Sequence[tuple[str, BoardView]], result: Calibration) -> FrameObservations:
     """Return the views that the camera's own calibration used, counted as it counts them; every board is a target of
     its own."""
     used = {(v.image, v.board_id): v for v in result.views}
@@ -85,5 +85,5 @@ def seen_by(own: Sequence[tuple[str, BoardView]], result: Calibration) -> Sights
             if (view.grid != entry.grid).any():
                 view = replace(view, grid=entry.grid)
             key = (frame, view.board.board_id)
-            out[key] = Seen(view, entry.kept, entry.cam_from_board, squared, frame, key)
+            out[key] = Observation(view, entry.kept, entry.cam_from_board, squared, frame, key)
     return out

@@ -9,7 +9,7 @@ independent corners of standard deviation sigma have
     E sum u_f u_f^T = sigma^2 S^-1 (sum H_f - H_f S^-1 H_f) S^-1,
 
 where the second term is what each frame has already pulled the solution to itself. The ratio of the two, measured in
-the globals' own covariance, is the spread's square; it has no bias however few the frames are.
+the globals' own covariance, is the overdispersion's square; it has no bias however few the frames are.
 
 Reference: J. G. MacKinnon, M. D. Webb, "Cluster-robust inference: a guide to empirical practice", Journal of
 Econometrics 232, 2023.
@@ -20,12 +20,12 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.calibration.linearise import view_products
-from rigkit.calibration.normal_equations import Normal
-from rigkit.calibration.rig.solver import carried
+from rigkit.calibration.normal_equations import NormalEquations
+from rigkit.calibration.rig.solver import pose_jacobians
 from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.core.arrays import FloatArray, IntArray
 
-__all__ = ["MIN_FRAMES", "frame_spread"]
+__all__ = ["MIN_FRAMES", "frame_overdispersion"]
 
 MIN_FRAMES = 4
 """Fewer frames say nothing about how they differ."""
@@ -33,10 +33,10 @@ RANK = 1e-12
 """Combinations of globals with less than this part of the largest information are not determined."""
 
 
-def frame_spread(
-    observations: RigObservations, state: RigState, normal: Normal, frame: IntArray, sigma_px: float
+def frame_overdispersion(
+    observations: RigObservations, state: RigState, normal: NormalEquations, frame: IntArray, sigma_px: float
 ) -> float:
-    """Return the spread, a ratio of standard deviations: 1 on average where the errors of corners are independent.
+    """Return the overdispersion, a ratio of standard deviations: 1 on average where corners are independent.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def _by_frame(observations: RigObservations, state: RigState, frame: IntArray) -
         alone = state.of_camera(c, observations)
         product = view_products(own, alone, observations.weights[c])
         p = alone.camera.parameters.size
-        by = carried(observations, state, c, alone.translation_mm)
+        by = pose_jacobians(observations, state, c, alone.translation_mm)
         at = frame[observations.frame[c]]
         for b in np.unique(own.board).tolist():
             # Views of one board touch the same unknowns: its place, their camera and its mount.

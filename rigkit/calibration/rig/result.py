@@ -11,6 +11,7 @@ from rigkit.calibration.rig.board_rig import BoardRig
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, as_array
 from rigkit.core.errors import InputError
+from rigkit.core.findings import Finding
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
 
@@ -35,7 +36,7 @@ class RigCamera:
         return self.calibration.rms_px
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class RigCalibration:
     """A calibrated rig.
 
@@ -48,9 +49,9 @@ class RigCalibration:
     covariance : of all intrinsics, camera by camera, then of the mounts of all cameras but the first: left perturbation
         (rad) and translation (mm), six each.
     sigma_px : standard deviation of a corner per coordinate, of median quality.
-    spread : by how much more the frames disagree than the corners' scatter alone explains, as a ratio of standard
-        deviations: 1 where the errors of a frame's corners are independent. All covariances count it in, and by how
-        much cameras and mounts would move if the boards' corners were free.
+    overdispersion : by how much more the frames disagree than the corners' scatter alone explains, as a ratio of
+        standard deviations: 1 where the errors of a frame's corners are independent. All covariances count it in, and
+        by how much cameras and mounts would move if the boards' corners were free.
     single : each camera calibrated alone, with its own verdicts.
     convergence : of the joint solve.
     corner_count : corners used.
@@ -59,7 +60,7 @@ class RigCalibration:
         the mounts do not.
     scale_sigma : relative standard deviation of all lengths, from how well the boards' squares were measured.
     board_rigs : boards that are mounted to each other.
-    verdicts : what is good and what is not, in words, the headline first.
+    verdicts : what is good and what is not, the headline first.
     """
 
     cameras: tuple[RigCamera, ...]
@@ -67,7 +68,7 @@ class RigCalibration:
     heldout_rms_px: float | None
     covariance: FloatArray
     sigma_px: float
-    spread: float
+    overdispersion: float
     single: tuple[Calibration, ...]
     convergence: Convergence
     corner_count: int = 0
@@ -75,11 +76,22 @@ class RigCalibration:
     left_out: tuple[tuple[str, str, str], ...] = ()
     scale_sigma: float = 0.0
     board_rigs: tuple[BoardRig, ...] = ()
-    verdicts: tuple[str, ...] = ()
+    verdicts: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
         count = sum(c.camera.parameters.size for c in self.cameras) + 6 * (len(self.cameras) - 1)
         object.__setattr__(self, "covariance", as_array(self.covariance, (count, count), "covariance"))
+
+    def __repr__(self) -> str:
+        held = "not available" if self.heldout_rms_px is None else f"{self.heldout_rms_px:.4f} px"
+        lines = [
+            f"RigCalibration of {', '.join(camera.name for camera in self.cameras)}: held-out RMS {held}, training RMS "
+            f"{self.rms_px:.4f} px",
+            f"  {self.corner_count} corners, {self.shared_count} boards seen by several views at once, "
+            f"{len(self.left_out)} left out",
+            *(f"  {finding}" for finding in self.verdicts[:1]),
+        ]
+        return "\n".join(lines)
 
     def index(self, name: str) -> int:
         """Return the position of the camera `name`; raises InputError that lists the names."""

@@ -14,7 +14,7 @@ from rigkit.core.arrays import FloatArray, Points
 
 __all__ = ["common_shape"]
 
-LEAST = 1e-4
+MIN_SIZE = 1e-4
 """A prior falls to no less than this part of the usual one: on exact data it would fall to nothing."""
 
 
@@ -60,5 +60,5 @@ def _found(observations: Observations, shape: ShapeModel, unknowns: FloatArray) 
         groups += released_groups(observations, shape.basis.shape[-1])
     for group in groups:
         found = float(np.sqrt((unknowns[group] ** 2).mean()))
-        sizes[group] = max(found, LEAST * float(sizes[group].max()))
+        sizes[group] = max(found, MIN_SIZE * float(sizes[group].max()))
     return sizes

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.calibration.linearise import normal_equations
-from rigkit.calibration.normal_equations import Normal, Residuals
+from rigkit.calibration.normal_equations import NormalEquations, Residuals
 from rigkit.calibration.poses import refine_each
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.rig.state import RigObservations, RigState
@@ -24,11 +24,11 @@ from rigkit.calibration.solver import COST_TOLERANCE, Linearised, minimise
 from rigkit.core.arrays import FloatArray, IntArray, Mat3, Points
 from rigkit.geometry.rotation import skew
 
-__all__ = ["Carried", "RigSolution", "carried", "refine_frames", "rig_normal", "solve_rig"]
+__all__ = ["PoseJacobians", "RigSolution", "pose_jacobians", "refine_frames", "rig_normal", "solve_rig"]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Carried:
+class PoseJacobians:
     """How a view's own pose (w_cam, dt_cam) follows from the poses of target, mount and place: (V, 6, 6) or (6, 6)
     each; `place` is None where no target has several boards."""
 
@@ -42,11 +42,11 @@ class RigSolution:
     """The state found, the normal equations there with all priors, and how the solver ended."""
 
     state: RigState
-    normal: Normal
+    normal: NormalEquations
     convergence: Convergence
 
 
-def carried(observations: RigObservations, state: RigState, c: int, translation_mm: FloatArray) -> Carried:
+def pose_jacobians(observations: RigObservations, state: RigState, c: int, translation_mm: FloatArray) -> PoseJacobians:
     """Return how the views of camera `c`, at `translation_mm` (V, 3) from it, follow from the rig's poses."""
     turn = state.mount_rotation[c]
     target = np.zeros((6, 6))
@@ -55,16 +55,16 @@ def carried(observations: RigObservations, state: RigState, c: int, translation_
     mount[:] = np.eye(6)
     mount[:, 3:, :3] = -skew(translation_mm - state.mount_mm[c])
     if not observations.tied:
-        return Carried(target, mount, None)
+        return PoseJacobians(target, mount, None)
     place = np.zeros_like(mount)
     place[:, :3, :3] = place[:, 3:, 3:] = turn @ state.frame_rotation[observations.frame[c]]
     lever = np.einsum("vij,vj->vi", place[:, :3, :3], state.board_mm[observations.cameras[c].board])
     each = np.broadcast_to(target, mount.shape).copy()
     each[:, 3:, :3] = -skew(lever) @ turn
-    return Carried(each, mount, place)
+    return PoseJacobians(each, mount, place)
 
 
-def rig_normal(observations: RigObservations, state: RigState, sigma_px: float = 0.0) -> Normal:
+def rig_normal(observations: RigObservations, state: RigState, sigma_px: float = 0.0) -> NormalEquations:
     """Return the normal equations over the globals (`RigState.layout`) and the targets' poses.
 
     `sigma_px`, the standard deviation of a corner, sets residuals against the priors of cameras and shape; zero for no
@@ -81,7 +81,7 @@ def rig_normal(observations: RigObservations, state: RigState, sigma_px: float =
         n = normal_equations(own, alone, observations.weights[c])
         residuals += n.residuals
         f = observations.frame[c]
-        by = carried(observations, state, c, alone.translation_mm)
+        by = pose_jacobians(observations, state, c, alone.translation_mm)
         k, size = layout.cameras[c], alone.camera.parameters.size
         parts: list[tuple[slice, slice]] = [(k, slice(0, size))]
         if layout.shape.stop > layout.shape.start:
@@ -121,7 +121,7 @@ def rig_normal(observations: RigObservations, state: RigState, sigma_px: float =
     released = None
     if observations.shape.kind == "released":
         released = layout.shape.start + observations.shape.basis.shape[-1]
-    normal = Normal(gg, gp, pp, g, p, costs, residuals, points_from=released)
+    normal = NormalEquations(gg=gg, gp=gp, pp=pp, g=g, p=p, costs=costs, residuals=residuals, points_from=released)
     cameras = list(zip(layout.cameras, state.cameras, strict=True))
     return normal.with_priors(cameras, layout.shape, observations.shape.sigma, state.unknowns, sigma_px)
 
@@ -158,7 +158,7 @@ def refine_frames(observations: RigObservations, state: RigState) -> RigState:
     seen = replace(observations, shape=observations.shape.held(state.unknowns))
     held = replace(state, unknowns=np.zeros(0))
 
-    def linearise(rotation: Mat3, translation_mm: Points) -> Normal:
+    def linearise(rotation: Mat3, translation_mm: Points) -> NormalEquations:
         return rig_normal(seen, replace(held, frame_rotation=rotation, frame_mm=translation_mm))
 
     rotation, translation_mm, _ = refine_each(state.frame_rotation, state.frame_mm, linearise)

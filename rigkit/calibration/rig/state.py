@@ -97,7 +97,7 @@ class RigObservations:
         )
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class RigState:
     """Cameras, their mounts cam_from_rig (n, 3, 3), (n, 3) mm, the first the identity, rig_from_target of every key
     (F, 3, 3), (F, 3) mm, target_from_board of every board (B, 3, 3), (B, 3) mm, and the shape's unknowns."""
@@ -137,14 +137,14 @@ class RigState:
                 return None
         mounts, boards = _steps(step.globals, layout.mounts), _steps(step.globals, layout.boards)
         return RigState(
-            tuple(cameras),
-            exp_so3(mounts[:, :3]) @ self.mount_rotation,
-            self.mount_mm + mounts[:, 3:],
-            exp_so3(step.poses[:, :3]) @ self.frame_rotation,
-            self.frame_mm + step.poses[:, 3:],
-            exp_so3(boards[:, :3]) @ self.board_rotation,
-            self.board_mm + boards[:, 3:],
-            self.unknowns + step.globals[layout.shape],
+            cameras=tuple(cameras),
+            mount_rotation=exp_so3(mounts[:, :3]) @ self.mount_rotation,
+            mount_mm=self.mount_mm + mounts[:, 3:],
+            frame_rotation=exp_so3(step.poses[:, :3]) @ self.frame_rotation,
+            frame_mm=self.frame_mm + step.poses[:, 3:],
+            board_rotation=exp_so3(boards[:, :3]) @ self.board_rotation,
+            board_mm=self.board_mm + boards[:, 3:],
+            unknowns=self.unknowns + step.globals[layout.shape],
         )
 
     def with_frames(self, other: RigState) -> RigState:

@@ -11,6 +11,7 @@ from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.uncertainty import transfer_uncertainty
 from rigkit.calibration.uncertainty import uncertainty_at_corners
 from rigkit.calibration.verdicts import headline
+from rigkit.core.findings import Finding, Severity
 
 __all__ = ["judge_rig"]
 
@@ -18,67 +19,88 @@ FEW_SHARED = 5
 """A mount has six numbers: fewer shared boards leave hardly anything to check it by."""
 UNSURE_PX = 1.0
 """Standard deviation, in the worst direction, of a projection or of where another camera's point must appear."""
-SPREAD = 2.0
+OVERDISPERSED = 2.0
 """Frames that disagree by this many times what the corners' scatter explains have an error in common."""
 WORSE = 1.5
 """Held-out error in the rig over that of the cameras alone."""
 MANY_LEFT_OUT = 0.2
 
 
-def judge_rig(rig: RigCalibration, notes: Sequence[str] = ()) -> tuple[str, ...]:
+def judge_rig(rig: RigCalibration, notes: Sequence[Finding] = ()) -> tuple[Finding, ...]:
     """Return the verdicts, the headline first; `notes` are verdicts found elsewhere."""
-    found = [*notes, *_shared(rig), *_unsure(rig), *_spread(rig), *_worse(rig)]
+    found = [*notes, *_shared(rig), *_unsure(rig), *_overdispersed(rig), *_worse(rig)]
     if not rig.convergence.converged:
-        found.insert(0, f"bad: the joint solution did not converge ({rig.convergence.reason})")
+        found.insert(0, _bad(f"the joint solution did not converge ({rig.convergence.reason})"))
     return (headline(rig, found), *found)
 
 
-def _shared(rig: RigCalibration) -> list[str]:
+def _look(message: str, remedy: str | None = None) -> Finding:
+    return Finding(severity=Severity.LOOK, message=message, remedy=remedy)
+
+
+def _bad(message: str, remedy: str | None = None) -> Finding:
+    return Finding(severity=Severity.BAD, message=message, remedy=remedy)
+
+
+def _shared(rig: RigCalibration) -> list[Finding]:
     out = []
     if len(rig.cameras) > 1 and rig.shared_count < FEW_SHARED:
         out.append(
-            f"look: {rig.shared_count} boards are seen by several cameras at once; take at least {FEW_SHARED} frames "
-            "in which they are"
+            _look(
+                f"{rig.shared_count} boards are seen by several cameras at once",
+                f"take at least {FEW_SHARED} frames in which they are",
+            )
         )
     total = rig.shared_count + len(rig.left_out)
     if len(rig.left_out) > MANY_LEFT_OUT * total:
         out.append(
-            f"look: {len(rig.left_out)} of {total} boards that several views share were left out because the views "
-            "disagree on them; fix rig and boards while the images are taken, and trigger the cameras together"
+            _look(
+                f"{len(rig.left_out)} of {total} boards that several views share were left out because the views "
+                "disagree on them",
+                "fix rig and boards while the images are taken, and trigger the cameras together",
+            )
         )
     return out
 
 
-def _unsure(rig: RigCalibration) -> list[str]:
+def _unsure(rig: RigCalibration) -> list[Finding]:
     out = []
     for camera in rig.cameras:
         worst = float(np.nanmax(uncertainty_at_corners(camera.calibration)))
         if worst > UNSURE_PX:
             out.append(
-                f"bad: the projection of camera '{camera.name}' is uncertain by up to {worst:.1f} px where the boards "
-                "were; take more frames, the boards tilted"
+                _bad(
+                    f"the projection of camera '{camera.name}' is uncertain by up to {worst:.1f} px where the boards "
+                    "were",
+                    "take more frames, the boards tilted",
+                )
             )
     for a, b in combinations([c.name for c in rig.cameras], 2):
         transfer = transfer_uncertainty(rig, a, b)
         if transfer is not None and transfer.median_px > UNSURE_PX:
             out.append(
-                f"bad: where points of camera '{a}' must appear in camera '{b}' is uncertain by "
-                f"{transfer.median_px:.1f} px; take more frames that both see, or that link them"
+                _bad(
+                    f"where points of camera '{a}' must appear in camera '{b}' is uncertain by "
+                    f"{transfer.median_px:.1f} px",
+                    "take more frames that both see, or that link them",
+                )
             )
     return out
 
 
-def _spread(rig: RigCalibration) -> list[str]:
-    if rig.spread <= SPREAD:
+def _overdispersed(rig: RigCalibration) -> list[Finding]:
+    if rig.overdispersion <= OVERDISPERSED:
         return []
     return [
-        f"look: the frames disagree by {rig.spread:.1f} times what the corners' scatter explains; all sigmas count it "
-        "in. Boards or lenses are not quite as the models say, or cameras not quite of one moment: board_shape and "
-        'model "auto" may help, a flatter board does'
+        _look(
+            f"the frames disagree by {rig.overdispersion:.1f} times what the corners' scatter explains; all sigmas "
+            "count it in. Boards or lenses are not quite as the models say, or cameras not quite of one moment: "
+            'board_shape and model "auto" may help, a flatter board does'
+        )
     ]
 
 
-def _worse(rig: RigCalibration) -> list[str]:
+def _worse(rig: RigCalibration) -> list[Finding]:
     alone = [c.heldout_rms_px for c in rig.single]
     together = rig.heldout_rms_px
     known = [a for a in alone if a is not None]
@@ -88,10 +110,12 @@ def _worse(rig: RigCalibration) -> list[str]:
     if together <= WORSE * usual:
         return []
     return [
-        f"look: frames that took no part are off by {together / usual:.1f} times as much as for the cameras alone: "
-        + (
-            "the cameras were not quite of one moment, or a mount gives way"
-            if len(rig.cameras) > 1
-            else "the boards give way against each other"
+        _look(
+            f"frames that took no part are off by {together / usual:.1f} times as much as for the cameras alone: "
+            + (
+                "the cameras were not quite of one moment, or a mount gives way"
+                if len(rig.cameras) > 1
+                else "the boards give way against each other"
+            )
         )
     ]
