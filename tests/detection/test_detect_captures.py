@@ -15,8 +15,9 @@ from rigkit.detection.detect import detect_boards
 
 pytestmark = pytest.mark.real
 
-LAB_RMS_PX = 0.05
-"""What the main job asks for; the renderer's sub-samples alone make 0.02 to 0.03 of near-vertical edges."""
+PATH_TRACED = ("regular-general", "regular-planar")
+LAB_RMS_PX = {True: 0.05, False: 0.02}
+"""Of path-traced images, whose noise is four times as strong, and of the others: a fifth to a half above the noise."""
 
 
 @pytest.mark.parametrize("lens", ["regular", "fisheye"])
@@ -31,7 +32,7 @@ def test_lab_captures(lens: str, pose: str) -> None:
         matched = match(found, exact)
         assert len({id(d) for d in matched}) == 3
         errors = [errors_by_position(d, pixels) for d, (_, pixels) in zip(matched, exact, strict=True)]
-        assert np.sqrt((np.concatenate(errors) ** 2).sum(axis=1).mean()) < LAB_RMS_PX
+        assert np.sqrt((np.concatenate(errors) ** 2).sum(axis=1).mean()) < LAB_RMS_PX[f"{lens}-{pose}" in PATH_TRACED]
 
 
 @pytest.mark.parametrize("name, count", [("e1", 1), ("e2", 3), ("e3", 7), ("e5", 12), ("e6", 0)])

@@ -9,19 +9,20 @@ from typing import Any
 import pytest
 from helpers.data import REPOSITORY, shared_data
 
-CORNER_RMS_PX = 0.05
-"""2-D; 0.03 is what the images' noise allows, the rest is JPEG."""
-ORTHOGONALITY_DEG = {"general": 0.12, "planar": 0.12, "standard": 0.12, "forward": 0.9}
-MEAN_NORMAL_DEG = {"general": 0.4, "planar": 0.4, "standard": 0.4, "forward": 3.5}
+PATH_TRACED = ("regular-general", "regular-planar")
+"""Noisier images, and noise that neighbouring pixels share."""
+CORNER_RMS_PX = {True: 0.05, False: 0.015}
+"""2-D, of path-traced images and of the others: a fifth above what their noise allows."""
+ORTHOGONALITY_DEG = {"general": 0.06, "planar": 0.12, "standard": 0.03, "forward": 0.4}
+MEAN_NORMAL_DEG = {"general": 0.1, "planar": 0.2, "standard": 0.05, "forward": 0.6}
 """Forward motion: the effective baseline is the distance from the focus of expansion; the plane ahead is lost first."""
-BASELINE_PERCENT = 0.15
+BASELINE_PERCENT = 0.1
 ROTATION_DEG = 0.015
 
-PAPER_OVER_OURS = {"orthogonality_deg": 12.0, "mean_normal_deg": 4.0, "baseline_mm": 20.0}
-"""What the averages over the cells of the paper's tables should gain by at least."""
+PAPER_OVER_OURS = {"orthogonality_deg": 40.0, "mean_normal_deg": 30.0, "baseline_mm": 200.0}
+"""What the averages over the cells of the paper's tables should gain by at least; these captures are rendered."""
 
-FEWEST_CORNERS = 143
-"""Of 144: one corner of fisheye-forward is placed 0.13 px off, five times what is usual there, and the camera knows."""
+CORNERS = 144
 
 PAIRS = [f"{lens}-{pose}" for lens in ("regular", "fisheye") for pose in ORTHOGONALITY_DEG]
 
@@ -48,9 +49,9 @@ def measured(request: pytest.FixtureRequest) -> dict[str, Any]:
 def test_pair_against_truth(measured: dict[str, Any], pair_id: str) -> None:
     pair = measured[pair_id]
     pose = pair_id.split("-")[1]
-    assert pair["corners"] >= FEWEST_CORNERS
+    assert pair["corners"] == CORNERS
     assert pair["matched"]
-    assert pair["corner_rms_px"] <= CORNER_RMS_PX
+    assert pair["corner_rms_px"] <= CORNER_RMS_PX[pair_id in PATH_TRACED]
     assert set(pair["methods"]) == {"F2UDIR", "F3UDIR", "DET3UDIR", "2SDIR", "3SDIR"}
     best = pair["methods"][load_accuracy().best_method(pair["methods"])]
     assert max(best["orthogonality_deg"]) <= ORTHOGONALITY_DEG[pose]
