@@ -152,7 +152,7 @@ def _written(camera: Camera, kind: str) -> tuple[str, float, str]:
 def _export_cloud(args: argparse.Namespace) -> int:
     from rigkit.cli.console import progress_on_stderr
     from rigkit.cli.workflow import load_cameras, match_images, reconstruct_with, write_results
-    from rigkit.io.colmap_model import colmap_model
+    from rigkit.interop.colmap_model import colmap_model
     from rigkit.io.files import ensure_writable
     from rigkit.io.manifest import load_dataset
     from rigkit.io.npz import cloud_npz
@@ -174,7 +174,14 @@ def _export_cloud(args: argparse.Namespace) -> int:
     reconstruction = reconstruct_with(matched, pair, args.method, image1)
     files: dict[str, str | bytes] = {}
     if kind == "colmap":
-        model, notes = colmap_model(reconstruction, (pair.image1, pair.image2))
+        model, notes = colmap_model(
+            (reconstruction.camera1, reconstruction.camera2),
+            reconstruction.cam2_from_cam1,
+            (reconstruction.pixels1, reconstruction.pixels2),
+            reconstruction.cloud,
+            (pair.image1, pair.image2),
+            error_px=reconstruction.sampson_rms_px,
+        )
         files |= model
         for words in notes:
             note(words)

@@ -22,7 +22,7 @@ from rigkit.interop.exchange import (
     unified_from_xi,
     unified_with_xi,
 )
-from rigkit.interop.simple_yaml import flow, parse_yaml
+from rigkit.interop.yaml_text import flow, parse_yaml
 
 __all__ = ["KalibrChain", "read_kalibr", "write_kalibr"]
 

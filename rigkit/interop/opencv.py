@@ -14,7 +14,7 @@ from rigkit.cameras.registry import camera_model
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 from rigkit.interop.exchange import Accepted, Written, best_accepted, field, numbers, unified_from_xi, unified_with_xi
-from rigkit.interop.simple_yaml import parse_yaml
+from rigkit.interop.yaml_text import parse_yaml
 
 __all__ = ["read_opencv", "write_opencv"]
 

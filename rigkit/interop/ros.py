@@ -12,7 +12,7 @@ from rigkit.cameras.registry import camera_model
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 from rigkit.interop.exchange import Accepted, Written, best_accepted, field, numbers
-from rigkit.interop.simple_yaml import flow, parse_yaml
+from rigkit.interop.yaml_text import flow, parse_yaml
 
 __all__ = ["read_camera_info", "write_camera_info"]
 

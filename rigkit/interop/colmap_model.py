@@ -1,4 +1,4 @@
-"""A reconstruction as COLMAP's text model: cameras.txt, images.txt, points3D.txt."""
+"""A pair and its cloud as COLMAP's text model: cameras.txt, images.txt, points3D.txt."""
 
 from __future__ import annotations
 
@@ -7,45 +7,54 @@ from pathlib import Path
 
 import numpy as np
 
+from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, Mat3, Pixels
+from rigkit.core.cloud import OrientedCloud
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.interop.colmap import HALF_PIXEL
 from rigkit.interop.colmap_cameras import write_colmap_cameras
-from rigkit.reconstruction.reconstruct import Reconstruction
 
 __all__ = ["colmap_model"]
 
 
-def colmap_model(reconstruction: Reconstruction, images: tuple[Path, Path]) -> tuple[dict[str, str], tuple[str, ...]]:
+def colmap_model(
+    cameras: tuple[Camera, Camera],
+    cam2_from_cam1: Rigid3,
+    pixels: tuple[Pixels, Pixels],
+    cloud: OrientedCloud,
+    images: tuple[Path, Path],
+    *,
+    error_px: float,
+) -> tuple[dict[str, str], tuple[str, ...]]:
     """Return the files by name, and what was lost on the way in words.
 
     Parameters
     ----------
-    reconstruction : of one pair; the world is camera 1, lengths are mm.
+    cameras : of the two images; one camera object in both places becomes one camera of the model.
+    cam2_from_cam1 : in mm; the world is camera 1.
+    pixels : (N, 2) of either image, where the points of the cloud were observed.
+    cloud : the N points.
     images : files of the two images. The model names them by their paths within the folder that both are in, which is
         COLMAP's image folder.
+    error_px : the error that every point is stated with.
 
     Notes
     -----
-    Where both images are of one camera object, the model has one camera. A lens that COLMAP has no model for is
-    refitted, and its largest error stated.
+    A lens that COLMAP has no model for is refitted, and its largest error stated.
     """
-    one = reconstruction.camera1 is reconstruction.camera2
-    cameras = {1: reconstruction.camera1} if one else {1: reconstruction.camera1, 2: reconstruction.camera2}
-    text, written = write_colmap_cameras(cameras)
+    one = cameras[0] is cameras[1]
+    text, written = write_colmap_cameras({1: cameras[0]} if one else {1: cameras[0], 2: cameras[1]})
     names, renamed = _names(images)
     notes = (*(w.note for w in written.values() if w.note), *renamed)
-    views = ((Rigid3.identity(), reconstruction.pixels1, 1), (reconstruction.cam2_from_cam1, reconstruction.pixels2, 2))
     lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then X Y POINT3D_ID of every corner"]
-    for (pose, pixels, number), name in zip(views, names, strict=True):
+    for number, pose in ((1, Rigid3.identity()), (2, cam2_from_cam1)):
         numbers = [*_quaternion(pose.rotation), *pose.translation_mm]
         head = " ".join(f"{v:.17g}" for v in numbers)
-        lines += [f"{number} {head} {1 if one else number} {name}", _observations(pixels)]
-    cloud = reconstruction.cloud
+        lines += [f"{number} {head} {1 if one else number} {names[number - 1]}", _observations(pixels[number - 1])]
     points = ["# POINT3D_ID X Y Z R G B ERROR TRACK as (IMAGE_ID POINT2D_IDX)"]
     for n, (x, colour) in enumerate(zip(cloud.points_mm, cloud.colours, strict=True)):
         place = " ".join(f"{v:.17g}" for v in x)
-        points.append(f"{n + 1} {place} {' '.join(map(str, colour))} {reconstruction.sampson_rms_px:.6g} 1 {n} 2 {n}")
+        points.append(f"{n + 1} {place} {' '.join(map(str, colour))} {error_px:.6g} 1 {n} 2 {n}")
     files = {
         "cameras.txt": text,
         "images.txt": "\n".join(lines) + "\n",
