@@ -15,12 +15,12 @@ from rigkit.cli.workflow import (
     exit_code_of,
     failed_pairs,
     find_boards,
+    geometry_of,
     load_cameras,
     match_found,
     output_folder,
     over_pairs,
     reconstruct_other_chain,
-    reconstruct_with,
     select_dataset,
     shifts_of,
     write_results,
@@ -132,12 +132,14 @@ def validate_pair(job: PairJob) -> PairOutcome:
 def _judge(job: PairJob, matched: MatchedPair, image1: Any, image2: Any, causes: tuple[str, ...]) -> PairOutcome:
     from rigkit.affine.registry import AFFINE_METHODS
     from rigkit.io.ply import ply_bytes
+    from rigkit.reconstruction.reconstruct import reconstruct_from
     from rigkit.validation.checks import validate_each
     from rigkit.validation.crosscheck import crosscheck
     from rigkit.validation.tables import best_report
 
     pair = job.pair
-    reconstructions = {method: reconstruct_with(matched, pair, method, image1) for method in AFFINE_METHODS}
+    geometry = geometry_of(matched, pair)
+    reconstructions = {m: reconstruct_from(geometry, affine_method=m, image1=image1) for m in AFFINE_METHODS}
     shifts = _shifts(reconstructions, job)
     reports = validate_each(list(reconstructions.values()), pair.truth, [shifts[m] for m in reconstructions])
     best = best_report(reports)
@@ -161,12 +163,14 @@ def _shifts(reconstructions: Mapping[str, Reconstruction], job: PairJob) -> dict
     The likelihood sees the corners, not the affinities: estimators that kept the same corners share the answer.
     """
     cameras = (job.cameras[job.pair.camera1.camera_id], job.cameras[job.pair.camera2.camera_id])
-    known: dict[bytes, CalibrationShifts | None] = {}
-    for reconstruction in reconstructions.values():
-        corners = reconstruction.pixels1.tobytes()
-        if corners not in known:
-            known[corners] = shifts_of(reconstruction, *cameras)
-    return {method: known[r.pixels1.tobytes()] for method, r in reconstructions.items()}
+    known: list[tuple[Reconstruction, CalibrationShifts | None]] = []
+    out: dict[str, CalibrationShifts | None] = {}
+    for method, reconstruction in reconstructions.items():
+        same = [shifts for first, shifts in known if first.same_points(reconstruction)]
+        out[method] = same[0] if same else shifts_of(reconstruction, *cameras)
+        if not same:
+            known.append((reconstruction, out[method]))
+    return out
 
 
 def _pictures(

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rigkit.core.detections import BoardDetection
     from rigkit.core.progress import Progress
     from rigkit.io.manifest import Dataset, Pair
+    from rigkit.reconstruction.geometry import PairGeometry
     from rigkit.reconstruction.pairing import MatchedPair
     from rigkit.reconstruction.reconstruct import Reconstruction
     from rigkit.validation.intrinsics import CalibrationShifts
@@ -36,6 +37,7 @@ __all__ = [
     "exit_code_of",
     "failed_pairs",
     "find_boards",
+    "geometry_of",
     "load_cameras",
     "match_found",
     "match_images",
@@ -241,16 +243,21 @@ def match_found(
     )
 
 
-def reconstruct_with(matched: MatchedPair, pair: Pair, method: str, image1: Any = None) -> Reconstruction:
-    """Reconstruct matched corners as the manifest declares the pair."""
+def geometry_of(matched: MatchedPair, pair: Pair) -> PairGeometry:
+    """Return pose and points of matched corners as the manifest declares the pair."""
     import numpy as np
 
-    from rigkit.reconstruction.reconstruct import reconstruct_pair
+    from rigkit.reconstruction.geometry import pair_geometry
 
     level = None if pair.level_sigma_deg is None else float(np.deg2rad(pair.level_sigma_deg))
-    return reconstruct_pair(
-        matched, pose_type=pair.pose_type, affine_method=method, level_sigma_rad=level, image1=image1
-    )
+    return pair_geometry(matched, pose_type=pair.pose_type, level_sigma_rad=level)
+
+
+def reconstruct_with(matched: MatchedPair, pair: Pair, method: str, image1: Any = None) -> Reconstruction:
+    """Reconstruct matched corners as the manifest declares the pair."""
+    from rigkit.reconstruction.reconstruct import reconstruct_from
+
+    return reconstruct_from(geometry_of(matched, pair), affine_method=method, image1=image1)
 
 
 def shifts_of(reconstruction: Reconstruction, camera1: LoadedCamera, camera2: LoadedCamera) -> CalibrationShifts | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from rigkit.geometry.triangulation import point_covariances, triangulate_rays
 from rigkit.reconstruction.scale import scale_and_gradient
 from rigkit.relative_pose.solvers.pose import translation_basis
 
-__all__ = ["MetricPose", "metric_pose", "triangulate_matches"]
+__all__ = ["MetricPose", "TriangulatedPoints", "metric_pose", "triangulate_matches"]
 
 POSE_STEP_RAD = 1e-5
 """For central differences: far above rounding, far below where the scale bends."""
@@ -39,10 +40,18 @@ class MetricPose:
     baseline_sigma_mm: float
 
 
+class TriangulatedPoints(NamedTuple):
+    """Points (N, 3) in the frame of camera 1, their covariances (N, 3, 3), and which of them (N,) are valid."""
+
+    points: Points
+    covariance: FloatArray
+    valid: BoolArray
+
+
 def triangulate_matches(
     matches: Matches, cam2_from_cam1: Rigid3, pose_covariance: FloatArray | None = None
-) -> tuple[Points, FloatArray, BoolArray]:
-    """Return points (N, 3) in the frame of camera 1, covariances (N, 3, 3) and where they are valid.
+) -> TriangulatedPoints:
+    """Intersect the rays of all matches.
 
     The unit is that of the pose's translation. See `point_covariances` for the pose's share.
     """
@@ -59,7 +68,7 @@ def triangulate_matches(
         m.sigma2_px,
         pose_covariance,
     )
-    return points, covariance, valid
+    return TriangulatedPoints(points, covariance, valid)
 
 
 def _points(m: Matches, cam2_from_cam1: Rigid3) -> tuple[Points, BoolArray]:

@@ -24,7 +24,9 @@ from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.sampson import sampson_distances
-from rigkit.reconstruction.reconstruct import Reconstruction, decide_pose_type, oriented_cloud
+from rigkit.reconstruction.geometry import decide_pose_type
+from rigkit.reconstruction.metric import triangulate_matches
+from rigkit.reconstruction.reconstruct import Reconstruction, colours_at, oriented_cloud
 from rigkit.relative_pose.refinement.marginal import marginal_quality
 from rigkit.relative_pose.refinement.refine import RefinedPose, cauchy_weights, refine_pose
 from rigkit.relative_pose.robust.a_contrario import log_false_alarms
@@ -131,24 +133,24 @@ def reconstruct_scene(
     inliers[np.flatnonzero(seen)[fit.inliers]] = True
     by_affinities = fit.matches.with_affinities(affinities.A21, fit.matches.sigma_A)
     reconstruction = Reconstruction(
-        pair_id,
-        fit.pose_type,
-        "directions" if correspondences.A21 is None else "given affinities",
-        camera1,
-        camera2,
-        (),
-        by_affinities.select(chosen),
-        matches.pixels1[chosen],
-        matches.pixels2[chosen],
-        _scaled(fit.refined.cam2_from_cam1, scale),
-        _scaled_covariance(fit.refined.covariance, scale),
-        essential_from_pose(fit.refined.cam2_from_cam1),
-        cloud,
-        scale,
-        0.0,
-        fit.refined.sampson_rms_px,
-        tuple(notes),
-        fit.level_sigma_rad,
+        pair_id=pair_id,
+        pose_type=fit.pose_type,
+        affine_method="directions" if correspondences.A21 is None else "given affinities",
+        camera1=camera1,
+        camera2=camera2,
+        boards=(),
+        matches=by_affinities.select(chosen),
+        pixels1=matches.pixels1[chosen],
+        pixels2=matches.pixels2[chosen],
+        cam2_from_cam1=_scaled(fit.refined.cam2_from_cam1, scale),
+        pose_covariance=_scaled_covariance(fit.refined.covariance, scale),
+        E21=essential_from_pose(fit.refined.cam2_from_cam1),
+        cloud=cloud,
+        baseline_mm=scale,
+        baseline_sigma_mm=0.0,
+        sampson_rms_px=fit.refined.sampson_rms_px,
+        notes=tuple(notes),
+        level_sigma_rad=fit.level_sigma_rad,
     )
     sigma_A = fit.matches.sigma_A
     return SceneReconstruction(
@@ -195,8 +197,9 @@ def _fit(matches: Matches, declared: PoseType, level_sigma_rad: float | None, rn
         fitting = matches.select(inliers)
         if k == 0:
             check_baseline(fitting)
-            pose_type, level_sigma_rad, remark = decide_pose_type(fitting, declared, level_sigma_rad)
-            notes += remark
+            decision = decide_pose_type(fitting, declared, level_sigma_rad)
+            pose_type, level_sigma_rad = decision.pose_type, decision.level_sigma_rad
+            notes += decision.notes
         refined = refine_pose(fitting, pose, pose_type, level_sigma_rad, robust=cauchy_weights)
         pose = refined.cam2_from_cam1
         inliers = _agreeing(matches, pose)
@@ -337,7 +340,9 @@ def _cloud(
         _scaled(fit.refined.cam2_from_cam1, scale),
         _scaled_covariance(fit.refined.covariance, scale),
     )
-    cloud, kept = oriented_cloud(fit.matches, fit.matches, pose, covariance, affinities, image1=image1)
+    points = triangulate_matches(fit.matches, pose, covariance)
+    colours = colours_at(image1, fit.matches.pixels1)
+    cloud, kept = oriented_cloud(points, fit.matches, pose, covariance, affinities, colours=colours)
     sure = cloud.sigma_mm < MAX_RANGE_SIGMA * np.linalg.norm(cloud.points_mm, axis=1)
     if not sure.any():
         raise DegenerateError("no point's distance is known; the baseline is too short for this scene")

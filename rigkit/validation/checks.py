@@ -194,16 +194,14 @@ def validate_each(
 
     Estimators that kept the same corners have the same points, whose planes are fitted once.
     """
-    known: dict[tuple[bytes | int, ...], Measured] = {}
+    known: list[tuple[Reconstruction, CalibrationShifts | None, Measured]] = []
     reports = []
     for reconstruction, moved in zip(reconstructions, shifts, strict=True):
-        r = reconstruction
-        arrays = (r.cloud.points_mm, r.pixels1, np.array([] if r.pose_covariance is None else r.pose_covariance))
-        key: tuple[bytes | int, ...] = (*(array.tobytes() for array in arrays), id(moved))
-        if key not in known:
-            known[key] = measure(r, moved)
-        measured = known[key].with_normals(r)
-        reports.append(_report(reconstruction, measured, truth, moved, COVERAGE))
+        measured = next((m for r, s, m in known if s is moved and r.same_points(reconstruction)), None)
+        if measured is None:
+            measured = measure(reconstruction, moved)
+            known.append((reconstruction, moved, measured))
+        reports.append(_report(reconstruction, measured.with_normals(reconstruction), truth, moved, COVERAGE))
     return tuple(reports)
 
 

@@ -1,0 +1,187 @@
+"""What the corners of a pair say before any affinity: pose type, pose, scale and points, computed once a pair.
+
+Points give the epipolar geometry; maximum likelihood refines the pose under the pair's pose type from every start there
+is; the squares give the scale; rays are intersected optimally. Affine estimators differ in their normals only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rigkit.core.arrays import Mat3
+from rigkit.core.errors import DegenerateError
+from rigkit.core.matches import Matches
+from rigkit.core.posetype import PoseType
+from rigkit.reconstruction.metric import MetricPose, TriangulatedPoints, metric_pose, triangulate_matches
+from rigkit.relative_pose.refinement.refine import RefinedPose, refine_pose, rules_out
+from rigkit.relative_pose.refinement.select import DEFAULT_LEVEL_RAD, PoseTypeEvidence, pose_type_evidence
+from rigkit.relative_pose.solvers.pose import choose_pose, essential_from_pose
+from rigkit.relative_pose.solvers.registry import fundamental_for
+
+if TYPE_CHECKING:
+    from rigkit.reconstruction.pairing import MatchedPair
+
+__all__ = ["PairGeometry", "PoseTypeDecision", "decide_pose_type", "pair_geometry"]
+
+MAX_BASELINE_SIGMA = 0.2
+"""A baseline known to no better than a fifth of itself is no baseline: whatever is built on it is noise."""
+
+NOTABLE_SCATTER = 2.0
+"""Corners that scatter this many times more than predicted are worth a word: blur, JPEG, a bad calibration."""
+
+SAME_COST = 1e-9
+"""Costs that differ by less than this part are one minimum, reached from two sides."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PoseTypeDecision:
+    """The pose type to use, and what the matches say of it.
+
+    Attributes
+    ----------
+    declared : as a person declared it.
+    pose_type : the type to use (never AUTO).
+    level_sigma_rad : how well the type is taken to hold; None: exactly, or it is general.
+    evidence : for every type; None where the general type was declared, which nothing contradicts.
+    notes : the choice under AUTO, or what contradicts the declaration, in words.
+    """
+
+    declared: PoseType
+    pose_type: PoseType
+    level_sigma_rad: float | None
+    evidence: PoseTypeEvidence | None
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class PairGeometry:
+    """What does not depend on the affine estimator.
+
+    Attributes
+    ----------
+    pair : the matched corners, with sigmas that fit what is seen.
+    decision : the pose type, and the evidence for it.
+    refined : pose of maximum likelihood, unit baseline.
+    metric : the pose in mm, with its covariance.
+    E21 : (3, 3) essential matrix of that pose, unit Frobenius norm.
+    points : every corner, triangulated, mm in the frame of camera 1.
+    notes : what was dropped, assumed or contradicted, in words.
+    """
+
+    pair: MatchedPair
+    decision: PoseTypeDecision
+    refined: RefinedPose
+    metric: MetricPose
+    E21: Mat3
+    points: TriangulatedPoints
+    notes: tuple[str, ...]
+
+    @property
+    def pose_type(self) -> PoseType:
+        """The pose type used (never AUTO)."""
+        return self.decision.pose_type
+
+
+def pair_geometry(
+    pair: MatchedPair, *, pose_type: PoseType | str, level_sigma_rad: float | None = None
+) -> PairGeometry:
+    """Return pose, scale and points of one pair.
+
+    Parameters
+    ----------
+    pair : matched corners, from `match_pair`.
+    pose_type : as a person declared it; AUTO takes the type that the data support best. A declared type that the data
+        contradict is used as told, and `notes` gives the figure.
+    level_sigma_rad : how well the spirit level held: the pose type is a soft prior in the refinement. None: as well as
+        a carefully set level does (DEFAULT_LEVEL_RAD); 0: the pose type is exact.
+
+    Raises
+    ------
+    DegenerateError
+        No baseline, or geometry that does not determine the pose.
+    """
+    declared = PoseType(pose_type)
+    contradiction: tuple[str, ...] = ()
+    try:
+        decision = decide_pose_type(pair.captured, declared, level_sigma_rad)
+        contradiction = () if declared is PoseType.AUTO else decision.notes
+        return _in_mm(pair, decision, _likeliest_pose(pair, decision))
+    except DegenerateError as error:
+        # A declaration that does not hold is the likeliest reason of a pose that makes no sense.
+        raise DegenerateError("; ".join((f"pair '{pair.pair_id}': {error}", *contradiction))) from error
+
+
+def decide_pose_type(captured: Matches, declared: PoseType, level_sigma_rad: float | None) -> PoseTypeDecision:
+    """Return the pose type to use for the matches, in captured pixels; see `pair_geometry`."""
+    if declared is PoseType.GENERAL:
+        return PoseTypeDecision(declared, declared, None, None, ())
+    level = DEFAULT_LEVEL_RAD if level_sigma_rad is None else level_sigma_rad
+    evidence = pose_type_evidence(captured, level or None)
+    if declared is PoseType.AUTO:
+        chosen = evidence.types[0]
+        words = f"pose type '{chosen.pose_type}' chosen (probability {chosen.probability:.3f})"
+        # The evidence is for the type up to a level's accuracy, not for an exact one that nobody declared.
+        soft = None if chosen.pose_type is PoseType.GENERAL else evidence.level_sigma_rad
+        return PoseTypeDecision(declared, chosen.pose_type, soft, evidence, (words,))
+    contradiction = evidence.contradiction(declared)
+    notes = () if contradiction is None else (contradiction,)
+    return PoseTypeDecision(declared, declared, level or None, evidence, notes)
+
+
+def _likeliest_pose(pair: MatchedPair, decision: PoseTypeDecision) -> RefinedPose:
+    """Return the pose of maximum likelihood among the ends of the refinement from every start there is.
+
+    The linear solution of a pose type holds it exactly: where a level is off by half a degree and the corners are good,
+    it can land in another valley. The general solution and the pose by which the boards were told apart cannot. Points
+    of one plane are explained by two poses: that of the board, whose shape is known, stands unless they rule it out.
+    """
+    kind, level, m = decision.pose_type, decision.level_sigma_rad, pair.matches
+
+    def end(solver: PoseType | None) -> RefinedPose | DegenerateError:
+        try:
+            start = pair.identity.cam2_from_cam1
+            if solver is not None:
+                start = choose_pose(fundamental_for(solver).solve(m, "points").E21, m.rays1, m.rays2, solver)
+            return refine_pose(pair.captured, start, kind, level)
+        except DegenerateError as error:
+            return error
+
+    identified = end(None)
+    found = [identified, *(end(solver) for solver in dict.fromkeys((PoseType.GENERAL, kind)))]
+    ends = [one for one in found if isinstance(one, RefinedPose)]
+    if not ends:
+        raise next(failure for failure in reversed(found) if isinstance(failure, DegenerateError))
+    best = min(ends, key=lambda one: one.cost)
+    if isinstance(identified, RefinedPose) and not rules_out(pair.captured, best, identified):
+        return identified
+    return next(one for one in ends if one.cost <= best.cost * (1.0 + SAME_COST))
+
+
+def _in_mm(pair: MatchedPair, decision: PoseTypeDecision, refined: RefinedPose) -> PairGeometry:
+    """Return the geometry of a pair with the scale of its squares, and sigmas that fit what is seen."""
+    notes = [*pair.notes, *decision.notes]
+    scatter = float(np.sqrt(refined.variance_factor))
+    if scatter > 1.0:
+        # The corners miss the epipolar geometry by more than their sigmas promise: believe what is seen.
+        pair = pair.noisier(scatter)
+        refined = refine_pose(pair.captured, refined.cam2_from_cam1, decision.pose_type, decision.level_sigma_rad)
+    if scatter > NOTABLE_SCATTER:
+        notes.append(f"corners scatter {scatter:.1f} times as much as predicted; all sigmas were enlarged to match")
+    metric = metric_pose(pair.captured, refined.cam2_from_cam1, refined.covariance, pair.boards)
+    if metric.baseline_sigma_mm > MAX_BASELINE_SIGMA * metric.baseline_mm:
+        raise DegenerateError(
+            f"the baseline is {metric.baseline_mm:.2f} mm, known to no better than {metric.baseline_sigma_mm:.2f} mm: "
+            "too short for these boards; move the camera further between the images"
+        )
+    return PairGeometry(
+        pair=pair,
+        decision=decision,
+        refined=refined,
+        metric=metric,
+        E21=essential_from_pose(metric.cam2_from_cam1),
+        points=triangulate_matches(pair.captured, metric.cam2_from_cam1, metric.covariance),
+        notes=tuple(notes),
+    )
