@@ -15,13 +15,17 @@ from rigkit.core.errors import InputError
 
 __all__ = ["BLANKS", "blank"]
 
-NOISE_LEVELS = 2.0
-BLUR_PX = 0.7
+BLANK_NOISE_LEVELS = 2.0
+BLANK_BLUR_PX = 0.7
 WORDS = "of the lens and a board that no one can see from here while it is not there but every corner counts"
 
 
 def blank(
-    name: str, rng: np.random.Generator, size_px: tuple[int, int] = (640, 480), *, noise_levels: float = NOISE_LEVELS
+    name: str,
+    rng: np.random.Generator,
+    size_px: tuple[int, int] = (640, 480),
+    *,
+    noise_levels: float = BLANK_NOISE_LEVELS,
 ) -> NDArray[np.uint8]:
     """Return the picture `name` of `BLANKS` as a camera sees it: blurred, with sensor noise, uint8 (height, width).
 
@@ -29,7 +33,7 @@ def blank(
     """
     if name not in BLANKS:
         raise InputError(f"blank picture: '{name}' is unknown; known: {', '.join(BLANKS)}")
-    levels = cv2.GaussianBlur(BLANKS[name](rng, size_px), (0, 0), BLUR_PX)
+    levels = cv2.GaussianBlur(BLANKS[name](rng, size_px), (0, 0), BLANK_BLUR_PX)
     levels = levels + noise_levels * rng.standard_normal(levels.shape, dtype=np.float32)
     return np.asarray(np.clip(np.rint(levels), 0, 255), dtype=np.uint8)
 

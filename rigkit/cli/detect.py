@@ -50,12 +50,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import print_json
-    from rigkit.detection.detect import FEWEST_OF_BOARD
+    from rigkit.detection.detect import MIN_BOARD_CORNERS
     from rigkit.io.board_file import load_board
     from rigkit.io.corners_file import write_corners
     from rigkit.io.files import ensure_writable
 
-    if args.min_corners < FEWEST_OF_BOARD:
+    if args.min_corners < MIN_BOARD_CORNERS:
         raise InputError(
             f"--min-corners {args.min_corners}: a chessboard of less than 3x3 corners cannot be told apart"
         )

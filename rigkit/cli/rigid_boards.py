@@ -67,10 +67,12 @@ def _vacant(detection: BoardDetection, group: list[Board], taken: set[str | None
 
 
 def named_by_rule(session: RigSession, rig: RigCalibration) -> RigCalibration:
-    """Return the rig with boards that look alike called as `identification.names` has it, in the first image that shows
-    the most of them: by the session's layout, or in the order listed."""
+    """Return the rig with boards that look alike called as `identification.board_ids` says.
+
+    It looks at the first image that shows the most of them, and follows the session's layout or the order listed.
+    """
     from rigkit.calibration.rig.board_names import renamed
-    from rigkit.identification.names import Located, name_boards
+    from rigkit.identification.board_ids import LocatedBoard, assign_board_ids
     from rigkit.identification.placements import board_kinds
 
     boards = {b.board_id: b for own in session.cameras.values() for b in own.boards}
@@ -86,8 +88,8 @@ def named_by_rule(session: RigSession, rig: RigCalibration) -> RigCalibration:
         owner = {i: k for k, kind in enumerate(kinds) for i in kind.ids}
         # Of one kind, boards listed across have another frame: their names stay as they are.
         loose = [i for i in shown if boards[i].size == kinds[owner[i]].board.size and len(kinds[owner[i]].ids) > 1]
-        located = [Located(owner[i], pose, None if i in loose else i) for i, pose in shown.items()]
-        found, _ = name_boards(located, kinds, group.layout or None)
+        located = [LocatedBoard(owner[i], pose, None if i in loose else i) for i, pose in shown.items()]
+        found, _ = assign_board_ids(located, kinds, group.layout or None)
         names |= {old: new for old, new in zip(shown, found, strict=True) if old != new}
     # Names that nobody has taken over go round, so that every board keeps exactly one.
     free = [n for n in names if n not in names.values()]

@@ -27,7 +27,7 @@ __all__ = ["charuco_boards"]
 SAME_CELLS = 0.2
 """A marker's corner and a corner of a lattice are one within so many sides of a cell."""
 
-FEWEST_VOTES, AGREEING = 3, 0.7
+MIN_VOTES, AGREEING_VOTES = 3, 0.7
 """Corners, and which part of them, that must give a lattice the same place in the board."""
 
 SEED_CONTRAST = 100.0
@@ -115,8 +115,8 @@ def _placed(lattice: Lattice, grid: IntArray, pixels: FloatArray, board: Board) 
     corners = lattice.pixels[known]
     distance = np.linalg.norm(corners[:, None] - pixels, axis=2)
     nearest = distance.argmin(axis=0)
-    near: BoolArray = distance[nearest, np.arange(len(pixels))] < SAME_CELLS * _side(lattice)
-    if near.sum() < FEWEST_VOTES:
+    near: BoolArray = distance[nearest, np.arange(len(pixels))] < SAME_CELLS * _side_px(lattice)
+    if near.sum() < MIN_VOTES:
         return None
     row, column = np.nonzero(known)
     cell = np.stack([column, row], axis=-1)[nearest[near]]
@@ -129,12 +129,12 @@ def _placed(lattice: Lattice, grid: IntArray, pixels: FloatArray, board: Board) 
         # As `Lattice.turned`.
         cell = np.stack([rows - 1 - cell[:, 1], cell[:, 0]], axis=-1)
         columns, rows = rows, columns
-    if best is None or best[0] < max(FEWEST_VOTES, AGREEING * near.sum()):
+    if best is None or best[0] < max(MIN_VOTES, AGREEING_VOTES * near.sum()):
         return None
     return _onto(best[1], best[2], board)
 
 
-def _side(lattice: Lattice) -> float:
+def _side_px(lattice: Lattice) -> float:
     steps = [np.linalg.norm(np.diff(lattice.pixels, axis=axis), axis=2).ravel() for axis in (0, 1)]
     return float(np.nanmedian(np.concatenate(steps)))
 

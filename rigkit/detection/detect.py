@@ -16,12 +16,12 @@ from rigkit.core.arrays import IntArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.detection.checks.border import place_part
-from rigkit.detection.checks.discontinuity import parted, ruffled, without_misfits
+from rigkit.detection.checks.discontinuity import may_be_discontinuous, split_at_discontinuities, without_outliers
 from rigkit.detection.checks.validate import (
     compact,
+    has_edge_offset,
     known_part,
     large,
-    leans,
     sample_of,
     separate,
     tidy,
@@ -34,22 +34,22 @@ from rigkit.detection.lattice.grow import SaddleIndex, grow_all
 from rigkit.detection.lattice.lattice import Lattice, build_lattices
 from rigkit.detection.lattice.links import find_links
 from rigkit.detection.lattice.origin import quarter_turns
-from rigkit.detection.lattice.split import join_parts, split_folds, split_necks
-from rigkit.detection.saddles.bad_pixels import without_impulses
+from rigkit.detection.lattice.split import join_parts, split_at_turns, split_necks
+from rigkit.detection.saddles.bad_pixels import without_bad_pixels
 from rigkit.detection.saddles.nearby import near_any
 from rigkit.detection.saddles.response import GreyImage, Level, grey_image, pyramid
 from rigkit.detection.saddles.saddle import find_corners
 from rigkit.detection.subpixel.subpixel import RefinedLattice, refine
 
-__all__ = ["FEWEST_OF_BOARD", "detect_boards"]
+__all__ = ["MIN_BOARD_CORNERS", "detect_boards"]
 
-FEWEST_OF_PART = 6
+MIN_PART_CORNERS = 6
 """Corners of the smallest part of a board that something lies across."""
 
-FEWEST_OF_BOARD = 9
+MIN_BOARD_CORNERS = 9
 """Fewer than 3 x 3 corners are too often no board."""
 
-SAME_PX = 2.0
+SAME_CORNER_PX = 2.0
 """Corners of two detections nearer than this are one corner."""
 
 
@@ -67,14 +67,14 @@ def find_lattices(
     lattices = build_lattices(corners, find_links(corners, levels[0]))
     index = SaddleIndex(saddles)
     grown = grow_all(lattices, index, levels[0], functools.partial(_promising, grey, levels[0]))
-    grown = [item for item in grown if item.count >= FEWEST_OF_PART]
-    if not any(item.solid or min_corners < FEWEST_OF_BOARD for item in grown):
+    grown = [item for item in grown if item.count >= MIN_PART_CORNERS]
+    if not any(item.solid or min_corners < MIN_BOARD_CORNERS for item in grown):
         return []
-    boards = [board for item in grown for part in split_folds(item) for board in split_necks(part)]
-    parts = separate([tidy(board, size_px) for board in boards], FEWEST_OF_PART)
+    boards = [board for item in grown for part in split_at_turns(item) for board in split_necks(part)]
+    parts = separate([tidy(board, size_px) for board in boards], MIN_PART_CORNERS)
     boards = [board for board in join_parts(parts) if large(board, min_corners)]
     found = _fitted(grey, boards, min_corners, sizes)
-    return [item for item in found if min_corners < FEWEST_OF_BOARD or compact(item.lattice, size_px)]
+    return [item for item in found if min_corners < MIN_BOARD_CORNERS or compact(item.lattice, size_px)]
 
 
 def _fitted(
@@ -85,8 +85,12 @@ def _fitted(
     size_px = (grey.shape[1], grey.shape[0])
     out = []
     for item in (after for before, after in refined if trustworthy(after, before.count, min_corners)):
-        own = without_misfits(item, size_px)
-        parts = parted(own, several=too_large(own.lattice, sizes)) if ruffled(item, size_px) else [own]
+        own = without_outliers(item, size_px)
+        parts = (
+            split_at_discontinuities(own, several=too_large(own.lattice, sizes))
+            if may_be_discontinuous(item, size_px)
+            else [own]
+        )
         if len(parts) == 1:
             out += [own] if large(own.lattice, min_corners) else []
             continue
@@ -98,7 +102,7 @@ def _fitted(
 
 def _promising(grey: GreyImage, finest: Level, lattice: Lattice) -> bool:
     """Return whether `lattice` may be a board, as far as a quick look at its edges and a sample of it tell."""
-    if lattice.solid and leans(lattice, finest):
+    if lattice.solid and has_edge_offset(lattice, finest):
         return False
     sample = sample_of(lattice)
     if sample is None:
@@ -141,8 +145,8 @@ def detect_boards(
     known = boards or ()
     plain = [board for board in known if board.markers is None]
     sizes = tuple(dict.fromkeys(board.size for board in plain))
-    grey = without_impulses(grey_image(image))
-    fewest = min([min_corners, *(max(columns * rows, FEWEST_OF_BOARD) for columns, rows in sizes)])
+    grey = without_bad_pixels(grey_image(image))
+    fewest = min([min_corners, *(max(columns * rows, MIN_BOARD_CORNERS) for columns, rows in sizes)])
     lattices = find_lattices(grey, fewest, sizes if len(plain) == len(known) else ())
     marked: list[BoardDetection] = []
     if len(plain) < len(known):
@@ -155,7 +159,7 @@ def detect_boards(
     if fewest < min_corners:
         found = tuple(item for item in found if len(item.grid) >= min_corners or _whole(item, sizes))
     ordered = sorted(found, key=_rank)
-    return tuple(_named(_apart(ordered), plain))
+    return tuple(_with_ids(_without_repeated(ordered), plain))
 
 
 def _whole(item: BoardDetection, sizes: Sequence[tuple[int, int]]) -> bool:
@@ -180,17 +184,17 @@ def _rank(item: BoardDetection) -> tuple[int, float, float]:
     return -len(item.grid), round(float(v), 3), round(float(u), 3)
 
 
-def _apart(found: Sequence[BoardDetection]) -> list[BoardDetection]:
+def _without_repeated(found: Sequence[BoardDetection]) -> list[BoardDetection]:
     """Return those of `found`, the largest first, that are not for the most part corners of one before them.
 
     A board that something lies across is found in parts; the largest, completed, has the corners of the others.
     """
     low, high = (np.array([f(item.pixels, axis=0) for item in found]).reshape(-1, 2) for f in (np.min, np.max))
-    touching = np.asarray(((low[:, None] < high + SAME_PX) & (low < high[:, None] + SAME_PX)).all(axis=2))
+    touching = np.asarray(((low[:, None] < high + SAME_CORNER_PX) & (low < high[:, None] + SAME_CORNER_PX)).all(axis=2))
     kept: list[int] = []
     for k, item in enumerate(found):
         others = (found[j] for j in kept if touching[j, k])
-        again = (np.count_nonzero(near_any(item.pixels, other.pixels, SAME_PX)) for other in others)
+        again = (np.count_nonzero(near_any(item.pixels, other.pixels, SAME_CORNER_PX)) for other in others)
         if not any(2 * int(count) > len(item.pixels) for count in again):
             kept.append(k)
     return [found[k] for k in kept]
@@ -215,7 +219,7 @@ def _detection(refined: RefinedLattice, sizes: Sequence[tuple[int, int]]) -> Boa
     )
 
 
-def _named(found: list[BoardDetection], boards: Sequence[Board]) -> list[BoardDetection]:
+def _with_ids(found: list[BoardDetection], boards: Sequence[Board]) -> list[BoardDetection]:
     """Return `found` with the names of those boards that only one detection, and that only this board, can be."""
     out = list(found)
     for board in boards:

@@ -18,10 +18,10 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection, common_corners
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.identification.hypotheses import Solution, forced_rms_px, solutions
-from rigkit.identification.joint_pose import JointPose, Sight, refine_joint
-from rigkit.identification.names import Located, first_corner_turn, name_boards
-from rigkit.identification.observations import GridPoses, Link, View, links_between
+from rigkit.identification.assignments import Assignment, forced_rms_px, ranked_assignments
+from rigkit.identification.board_ids import LocatedBoard, assign_board_ids, first_corner_turn
+from rigkit.identification.board_matches import BoardMatch, GridPoses, ImageObservations, matches_between
+from rigkit.identification.joint_pose import BoardObservation, JointPose, refine_joint
 from rigkit.identification.pair_identity import PairIdentity
 from rigkit.identification.placements import BoardKind, Placement, board_kinds, describe, placements, possible_kinds
 
@@ -29,7 +29,7 @@ __all__ = ["PairIdentity", "common_corners", "identify_pair", "identify_single"]
 
 LOG_ODDS = float(np.log(1000.0))
 """Odds of a thousand to one decide between two assignments; below, the geometry leaves a tie."""
-FLOOR_PX = 0.01
+MISFIT_FLOOR_PX = 0.01
 """No camera and no printed board is truer than this: smaller misfits decide nothing."""
 MAX_RIVALS = 6
 """Rivals that are made to explain all boards, for the runner-up's residual."""
@@ -52,7 +52,7 @@ def identify_pair(
     boards : the boards that may be there.
     camera1, camera2 : the calibrated cameras, in whose pixels the detections are.
     layout : where boards that look alike hang, by board id: "left", "right", "floor", "ceiling" or "back" (see
-        `rigkit.identification.names`, which also states the rule without it).
+        `rigkit.identification.board_ids`, which also states the rule without it).
 
     Raises
     ------
@@ -71,18 +71,18 @@ def identify_pair(
     """
     kinds = _checked_kinds(boards)
     views = (
-        View.of(detections1, kinds, camera1, "image 1"),
-        View.of(detections2, kinds, camera2, "image 2"),
+        ImageObservations.of(detections1, kinds, camera1, "image 1"),
+        ImageObservations.of(detections2, kinds, camera2, "image 2"),
     )
-    links, free1, free2 = links_between(*views, kinds)
-    if not links:
+    matches, free1, free2 = matches_between(*views, kinds)
+    if not matches:
         raise DegenerateError(_nothing_shared(views, kinds))
-    ranked = solutions(links, *views, kinds)
+    ranked = ranked_assignments(matches, *views, kinds)
     best = ranked[0]
     tied = [s for s in ranked if s is best or _log_odds(best, s, free1, free2, views) < LOG_ODDS]
-    winner = min(tied, key=lambda s: (-len(s.links), sum(x.against_colour for x in s.links), _roll_rad(s)))
+    winner = min(tied, key=lambda s: (-len(s.matches), sum(x.against_colour for x in s.matches), _roll_rad(s)))
     rivals = [s for s in ranked if s.differs_from(winner)]
-    runner_up_px = _runner_up_px(winner, rivals, links, views, kinds)
+    runner_up_px = _runner_up_px(winner, rivals, matches, views, kinds)
     return _result(winner, runner_up_px, tied, views, kinds, boards, layout)
 
 
@@ -130,7 +130,7 @@ def _checked_kinds(boards: Sequence[Board]) -> tuple[BoardKind, ...]:
     return board_kinds(boards)
 
 
-def _nothing_shared(views: tuple[View, View], kinds: Sequence[BoardKind]) -> str:
+def _nothing_shared(views: tuple[ImageObservations, ImageObservations], kinds: Sequence[BoardKind]) -> str:
     counts = [sum(bool(k) for k in view.kinds) for view in views]
     listed = ", ".join(f"{i} ({k.board.columns}x{k.board.rows})" for k in kinds for i in k.ids)
     return (
@@ -139,30 +139,36 @@ def _nothing_shared(views: tuple[View, View], kinds: Sequence[BoardKind]) -> str
     )
 
 
-def _roll_rad(solution: Solution) -> float:
+def _roll_rad(assignment: Assignment) -> float:
     """Return how far camera 2 is turned against camera 1 about the optical axis: the twist of the rotation about z."""
-    r = solution.pose.cam2_from_cam1[:3, :3]
+    r = assignment.pose.cam2_from_cam1[:3, :3]
     return abs(float(np.arctan2(r[1, 0] - r[0, 1], r[0, 0] + r[1, 1])))
 
 
-def _log_odds(best: Solution, other: Solution, free1: FloatArray, free2: FloatArray, views: tuple[View, View]) -> float:
+def _log_odds(
+    best: Assignment,
+    other: Assignment,
+    free1: FloatArray,
+    free2: FloatArray,
+    views: tuple[ImageObservations, ImageObservations],
+) -> float:
     """Return the log odds of the best assignment against another (see the notes of `identify_pair`)."""
-    first, second = [s.first for s in best.links], [s.second for s in best.links]
+    first, second = [s.first for s in best.matches], [s.second for s in best.matches]
     free = float(free1[first].sum() + free2[second].sum())
-    counts = [len(views[0].sights[i].rays) for i in first] + [len(views[1].sights[j].rays) for j in second]
-    sigma2 = [np.mean(views[0].sights[i].sigma_px ** -2.0) for i in first]
-    sigma2 += [np.mean(views[1].sights[j].sigma_px ** -2.0) for j in second]
-    constraints = 6 * (len(best.links) - 1)
+    counts = [len(views[0].observations[i].rays) for i in first] + [len(views[1].observations[j].rays) for j in second]
+    sigma2 = [np.mean(views[0].observations[i].sigma_px ** -2.0) for i in first]
+    sigma2 += [np.mean(views[1].observations[j].sigma_px ** -2.0) for j in second]
+    constraints = 6 * (len(best.matches) - 1)
     noise = free / max(2 * sum(counts) - 6 * len(counts), 1)
-    floor = max(constraints, 1) * max(noise, FLOOR_PX**2 * float(np.mean(sigma2)))
+    floor = max(constraints, 1) * max(noise, MISFIT_FLOOR_PX**2 * float(np.mean(sigma2)))
     excess = max(float(best.chi2_1[first].sum() + best.chi2_2[second].sum()) - free, floor)
     return 0.5 * constraints * float(np.log((excess + max(other.chi2 - best.chi2, 0.0)) / excess))
 
 
-def _tie_note(winner: Solution, others: Sequence[Solution]) -> str:
+def _tie_note(winner: Assignment, others: Sequence[Assignment]) -> str:
     roll = np.degrees(_roll_rad(winner))
     next_roll = np.degrees(min(_roll_rad(s) for s in others))
-    what = "one board alone" if len(winner.links) == 1 else "the arrangement of the boards"
+    what = "one board alone" if len(winner.matches) == 1 else "the arrangement of the boards"
     why = "with the smallest roll" if roll <= next_roll else "that the boards' colours speak for, not the smallest roll"
     return (
         f"ambiguous: {what} cannot tell {len(others) + 1} assignments apart; took the one {why} "
@@ -171,25 +177,29 @@ def _tie_note(winner: Solution, others: Sequence[Solution]) -> str:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Seen:
+class _IdentifiedBoard:
     """A board of some kind: where it is, which detection shows it in image 1 and 2, and how that is placed."""
 
-    located: Located
+    located: LocatedBoard
     index: tuple[int | None, int | None]
     placement: tuple[Placement, Placement]
 
 
-def _seen(
-    winner: Solution, views: tuple[View, View], kinds: Sequence[BoardKind]
-) -> tuple[list[_Seen], list[tuple[int, int]]]:
+def _identified_boards(
+    winner: Assignment, views: tuple[ImageObservations, ImageObservations], kinds: Sequence[BoardKind]
+) -> tuple[list[_IdentifiedBoard], list[tuple[int, int]]]:
     """Return the boards of the winner, then those of one image only as far as they are listed, and what is left over.
 
     What is left over: (image 0 or 1, detection).
     """
     out = []
-    for link, pose in zip(winner.links, winner.pose.cam1_from_board, strict=True):
-        name = views[0].detections[link.first].board_id or views[1].detections[link.second].board_id
-        out.append(_Seen(Located(link.kind, pose, name), (link.first, link.second), (link.placement1, link.placement2)))
+    for match, pose in zip(winner.matches, winner.pose.cam1_from_board, strict=True):
+        name = views[0].detections[match.first].board_id or views[1].detections[match.second].board_id
+        out.append(
+            _IdentifiedBoard(
+                LocatedBoard(match.kind, pose, name), (match.first, match.second), (match.placement1, match.placement2)
+            )
+        )
     vacant = [len(kind.boards) - sum(s.located.kind == k for s in out) for k, kind in enumerate(kinds)]
     left_over = []
     cam1_from_cam = (np.eye(4), np.linalg.inv(winner.pose.cam2_from_cam1))
@@ -206,23 +216,23 @@ def _seen(
                 left_over.append((v, n))
                 continue
             vacant[k] -= 1
-            located = Located(k, cam1_from_cam[v] @ found[0][0], view.detections[n].board_id)
-            out.append(_Seen(located, (n, None) if v == 0 else (None, n), (where, where)))
+            located = LocatedBoard(k, cam1_from_cam[v] @ found[0][0], view.detections[n].board_id)
+            out.append(_IdentifiedBoard(located, (n, None) if v == 0 else (None, n), (where, where)))
     return out, left_over
 
 
 def _result(
-    winner: Solution,
+    winner: Assignment,
     runner_up_px: float,
-    tied: Sequence[Solution],
-    views: tuple[View, View],
+    tied: Sequence[Assignment],
+    views: tuple[ImageObservations, ImageObservations],
     kinds: Sequence[BoardKind],
     boards: Sequence[Board],
     layout: Mapping[str, str] | None,
 ) -> PairIdentity:
     """Name and turn the winner's boards, refine with each board's own squares, and sum up."""
-    seen, left_over = _seen(winner, views, kinds)
-    names, notes = name_boards([s.located for s in seen], kinds, layout)
+    seen, left_over = _identified_boards(winner, views, kinds)
+    names, notes = assign_board_ids([s.located for s in seen], kinds, layout)
     by_id = {b.board_id: b for b in boards}
     centres = [s.located.centre(kinds[s.located.kind].board) for s in seen]
     detections: tuple[dict[str, BoardDetection], dict[str, BoardDetection]] = ({}, {})
@@ -273,35 +283,40 @@ def _refined(
     both: Sequence[str],
     detections: tuple[Mapping[str, BoardDetection], Mapping[str, BoardDetection]],
     boards: Mapping[str, Board],
-    views: tuple[View, View],
+    views: tuple[ImageObservations, ImageObservations],
 ) -> JointPose:
-    sights = [
-        [Sight.of(view.camera, d[i].pixels, d[i].sigma_px, i) for i in both]
+    observations = [
+        [BoardObservation.of(view.camera, d[i].pixels, d[i].sigma_px, i) for i in both]
         for view, d in zip(views, detections, strict=True)
     ]
     points = [[boards[i].points(d[i].grid) for i in both] for d in detections]
     return refine_joint(
-        cam2_from_cam1, np.stack([cam1_from_board[i] for i in both]), sights[0], points[0], sights[1], points[1]
+        cam2_from_cam1,
+        np.stack([cam1_from_board[i] for i in both]),
+        observations[0],
+        points[0],
+        observations[1],
+        points[1],
     )
 
 
 def _runner_up_px(
-    winner: Solution,
-    rivals: Sequence[Solution],
-    links: Sequence[Link],
-    views: tuple[View, View],
+    winner: Assignment,
+    rivals: Sequence[Assignment],
+    matches: Sequence[BoardMatch],
+    views: tuple[ImageObservations, ImageObservations],
     kinds: Sequence[BoardKind],
 ) -> float:
     """Return the smallest rms of a joint fit of at least as many boards among the best rivals."""
-    enough = len(winner.links)
+    enough = len(winner.matches)
     fits = [
-        (enough, s.rms_px(*views)) if len(s.links) >= enough else forced_rms_px(s, links, *views, kinds)
+        (enough, s.rms_px(*views)) if len(s.matches) >= enough else forced_rms_px(s, matches, *views, kinds)
         for s in rivals[:MAX_RIVALS]
     ]
     return min((rms for count, rms in fits if count >= enough), default=float("inf"))
 
 
-def _why_left_over(image: int, view: View, index: int) -> str:
+def _why_left_over(image: int, view: ImageObservations, index: int) -> str:
     what = f"image {image + 1}: {describe(view.detections[index])}"
     if view.kinds[index]:
         return f"{what} fits no board still free: one too many, or moved between the images"

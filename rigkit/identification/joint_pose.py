@@ -13,13 +13,13 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.board_pose import point_residuals
 from rigkit.geometry.rotation import exp_so3, skew
 
-__all__ = ["JointPose", "Sight", "refine_joint"]
+__all__ = ["BoardObservation", "JointPose", "refine_joint"]
 
-MAX_STEPS = 30
+MAX_JOINT_STEPS = 30
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Sight:
+class BoardObservation:
     """Corners of one board in one image, ready for residuals in pixels.
 
     Attributes
@@ -34,7 +34,7 @@ class Sight:
     sigma_px: FloatArray
 
     @classmethod
-    def of(cls, camera: Camera, pixels: Pixels, sigma_px: FloatArray, where: str) -> Sight:
+    def of(cls, camera: Camera, pixels: Pixels, sigma_px: FloatArray, where: str) -> BoardObservation:
         """Build from pixels; raises InputError, naming `where`, where a pixel has no ray."""
         rays, seen = camera.unproject(pixels)
         if not seen.all():
@@ -62,7 +62,7 @@ class JointPose:
 
 
 @dataclass(slots=True)
-class _Observations:
+class _StackedObservations:
     """All corners of one image: rays, whitened bases, board points, board index."""
 
     rays: Rays
@@ -72,19 +72,19 @@ class _Observations:
     sigma_px: FloatArray
 
     @classmethod
-    def stack(cls, sights: Sequence[Sight], points: Sequence[Points]) -> _Observations:
-        sigma = np.concatenate([s.sigma_px for s in sights])
-        bases = np.concatenate([s.bases for s in sights]) / sigma[:, None, None]
-        board = np.repeat(np.arange(len(sights)), [len(p) for p in points])
-        return cls(np.concatenate([s.rays for s in sights]), bases, np.concatenate(points), board, sigma)
+    def stack(cls, observations: Sequence[BoardObservation], points: Sequence[Points]) -> _StackedObservations:
+        sigma = np.concatenate([s.sigma_px for s in observations])
+        bases = np.concatenate([s.bases for s in observations]) / sigma[:, None, None]
+        board = np.repeat(np.arange(len(observations)), [len(p) for p in points])
+        return cls(np.concatenate([s.rays for s in observations]), bases, np.concatenate(points), board, sigma)
 
 
 def refine_joint(
     cam2_from_cam1: FloatArray,
     cam1_from_board: FloatArray,
-    sights1: Sequence[Sight],
+    observations1: Sequence[BoardObservation],
     points1: Sequence[Points],
-    sights2: Sequence[Sight],
+    observations2: Sequence[BoardObservation],
     points2: Sequence[Points],
     *,
     tolerance: float = 1e-9,
@@ -94,15 +94,15 @@ def refine_joint(
     Parameters
     ----------
     cam2_from_cam1, cam1_from_board : (4, 4) and (B, 4, 4) where to start.
-    sights1, sights2 : B boards as either image sees them.
+    observations1, observations2 : B boards as either image sees them.
     points1, points2 : their corners in the frame of their board, mm; the two images need not see the same ones.
     tolerance : stop when a step gains less than this part of the cost.
     """
-    images = _Observations.stack(sights1, points1), _Observations.stack(sights2, points2)
+    images = _StackedObservations.stack(observations1, points1), _StackedObservations.stack(observations2, points2)
     motion, boards = cam2_from_cam1.copy(), cam1_from_board.copy()
     residual, jacobian = _evaluate(images, motion, boards)
     cost, damping = float(residual @ residual), 1e-6
-    for _ in range(MAX_STEPS):
+    for _ in range(MAX_JOINT_STEPS):
         normal = jacobian.T @ jacobian
         normal[np.diag_indices_from(normal)] *= 1.0 + damping
         step = np.asarray(-np.linalg.solve(normal, jacobian.T @ residual), dtype=np.float64).reshape(-1, 6)
@@ -137,7 +137,7 @@ def _moved(pose: FloatArray, step: FloatArray) -> FloatArray:
 
 
 def _evaluate(
-    images: tuple[_Observations, _Observations], motion: FloatArray, boards: FloatArray
+    images: tuple[_StackedObservations, _StackedObservations], motion: FloatArray, boards: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return whitened residuals of image 1, then 2, (2N,), and their derivatives by the motion, then the boards."""
     residuals, jacobians = [], []

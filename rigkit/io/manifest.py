@@ -11,7 +11,7 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.posetype import PoseType
 from rigkit.core.truth import PairTruth
-from rigkit.identification.names import SIDES
+from rigkit.identification.board_ids import BOARD_SIDES
 from rigkit.io.board_file import board_from_table, load_board
 from rigkit.io.toml_reader import TomlTable, read_toml
 from rigkit.io.truth_csv import load_truth_csv
@@ -205,7 +205,7 @@ def _layout(table: TomlTable, names: Sequence[str]) -> dict[str, str]:
     out = {}
     for board_id in inner.names():
         _named(board_id, dict.fromkeys(names, 0), f"{inner.path}: {inner.where}: board")
-        out[board_id] = inner.text(board_id, hint=f'{board_id} = "left"', choices=tuple(SIDES))
+        out[board_id] = inner.text(board_id, hint=f'{board_id} = "left"', choices=tuple(BOARD_SIDES))
     return out
 
 

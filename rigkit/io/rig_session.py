@@ -46,7 +46,7 @@ from pathlib import Path, PurePath
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.truth import MeasuredLength, PairTruth
-from rigkit.identification.names import SIDES
+from rigkit.identification.board_ids import BOARD_SIDES
 from rigkit.io.session import SCHEMA, Session, boards_of, images_of, options_of
 from rigkit.io.toml_reader import TomlTable, read_toml
 from rigkit.io.truth_file import truth_from_table
@@ -173,7 +173,9 @@ def _rigid_boards(table: TomlTable, boards: Sequence[Board]) -> tuple[RigidBoard
         layout: dict[str, str] = {}
         if entry.has("layout"):
             sides = entry.table("layout", hint='layout = { left = "left", floor = "floor" }')
-            layout = {name: sides.text(name, hint=f'{name} = "left"', choices=tuple(SIDES)) for name in sides.names()}
+            layout = {
+                name: sides.text(name, hint=f'{name} = "left"', choices=tuple(BOARD_SIDES)) for name in sides.names()
+            }
             for name in layout:
                 if name not in names:
                     raise entry.error(f"layout: '{name}' is none of its boards, {', '.join(names)}")

@@ -10,7 +10,7 @@ from rigkit.benchmark.blanks import BLANKS, blank
 from rigkit.benchmark.scenes import CONDITIONS, one_board, three_boards
 from rigkit.benchmark.score import FoundBoard, Score, score
 from rigkit.detection.detect import detect_boards
-from rigkit.detection.saddles.bad_pixels import without_impulses
+from rigkit.detection.saddles.bad_pixels import without_bad_pixels
 
 RMS_PX = {0.001: 0.009, 0.03: 0.035}
 """Without bad pixels 0.0062, at a noise of 2; left as they are, they make 0.0135 and 0.075 of it."""
@@ -50,7 +50,7 @@ def test_a_line_that_loses_one_pixel_in_seventeen(rng: np.random.Generator) -> N
 def test_bad_pixels_and_no_others_are_replaced(dtype: type, rng: np.random.Generator) -> None:
     clean = three_boards(rng).render(noise_levels=2.0, rng=rng)
     spoiled = with_salt(clean, 0.01, rng)
-    repaired = without_impulses(spoiled.astype(dtype))
+    repaired = without_bad_pixels(spoiled.astype(dtype))
     assert repaired.dtype == dtype
     bad = spoiled != clean
     assert np.array_equal(repaired[~bad], clean[~bad])
@@ -63,7 +63,7 @@ def test_bad_pixels_and_no_others_are_replaced(dtype: type, rng: np.random.Gener
 def test_good_pictures_stay_as_they_are(name: str, rng: np.random.Generator) -> None:
     optics, photometry = CONDITIONS[name]
     image = three_boards(rng).render(optics=optics, photometry=photometry, rng=rng).astype(np.float32)
-    assert without_impulses(image) is image
+    assert without_bad_pixels(image) is image
 
 
 @pytest.mark.parametrize("name", BLANKS)

@@ -9,7 +9,7 @@ import pytest
 from rigkit.benchmark.blanks import BLANKS, blank
 from rigkit.benchmark.scenes import one_board
 from rigkit.detection import detect
-from rigkit.detection.checks.validate import compact, leans
+from rigkit.detection.checks.validate import compact, has_edge_offset
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.lattice import grow
 from rigkit.detection.lattice.lattice import Lattice
@@ -91,7 +91,7 @@ def test_edges_of_dots_lean_and_those_of_boards_do_not(rng: np.random.Generator)
     for picture in (image, bright, 255.0 - image.astype(np.float32)):
         level = pyramid(grey_image(picture))[0]
         either = [Lattice(board.pixels, board.contrast, rising) for rising in (True, False)]
-        assert [leans(item, level) for item in either].count(False) >= 1
+        assert [has_edge_offset(item, level) for item in either].count(False) >= 1
     # Discs that nearly touch, and the middles of the gaps between two of them.
     page = np.full(SIZE_PX[::-1], 205, np.uint8)
     for v in range(40, 440, 30):
@@ -100,4 +100,4 @@ def test_edges_of_dots_lean_and_those_of_boards_do_not(rng: np.random.Generator)
     step = np.array([[15.0, 15.0], [-15.0, 15.0]])
     grid = np.stack(np.meshgrid(np.arange(6), np.arange(6)), axis=-1)
     gaps = Lattice(grid @ step + np.array([215.0, 100.0]), np.full((6, 6), 100.0), True)
-    assert leans(gaps, pyramid(grey_image(page))[0])
+    assert has_edge_offset(gaps, pyramid(grey_image(page))[0])

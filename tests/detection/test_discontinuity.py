@@ -14,7 +14,7 @@ from rigkit.benchmark.scenes import CONDITIONS, three_boards
 from rigkit.benchmark.score import FoundBoard, score
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
-from rigkit.detection.checks.discontinuity import parted, ruffled, without_misfits
+from rigkit.detection.checks.discontinuity import may_be_discontinuous, split_at_discontinuities, without_outliers
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.subpixel.subpixel import RefinedLattice
@@ -118,17 +118,17 @@ def smooth(columns: int, rows: int, bend: float = 0.0) -> np.ndarray:
 
 def test_a_sheet_is_cut_where_it_jumps_and_nowhere_else(rng: np.random.Generator) -> None:
     plain = smooth(15, 6, -0.005) + rng.normal(0.0, 0.01, (6, 15, 2))
-    assert len(parted(sheet(plain))) == 1
+    assert len(split_at_discontinuities(sheet(plain))) == 1
     for moved in ([0.0, 2.0], [2.0, 0.0], [0.0, -2.0]):
         two = plain.copy()
         two[:, 8:] += moved
-        parts = parted(sheet(two))
+        parts = split_at_discontinuities(sheet(two))
         assert [part.lattice.trimmed().size for part in parts] == [(8, 6), (7, 6)]
-        turned = parted(sheet(two.swapaxes(0, 1)[..., ::-1]))
+        turned = split_at_discontinuities(sheet(two.swapaxes(0, 1)[..., ::-1]))
         assert [part.lattice.trimmed().size for part in turned] == [(6, 8), (6, 7)]
         # A column on the seam continues neither side.
         two[:, 7] += 0.5 * np.array(moved) * rng.choice([-1.0, 1.0], (6, 1))
-        assert [part.lattice.trimmed().size for part in parted(sheet(two))] == [(7, 6), (7, 6)]
+        assert [part.lattice.trimmed().size for part in split_at_discontinuities(sheet(two))] == [(7, 6), (7, 6)]
 
 
 @pytest.mark.parametrize("at", [7.0, 7.5])
@@ -137,43 +137,43 @@ def test_a_crease_is_no_seam_unless_there_must_be_one(at: float, bend: float, rn
     """A folded sheet bends at the crease, but its sides meet there, on a corner or within a square."""
     creased = smooth(14, 7) + rng.normal(0.0, 0.01, (7, 14, 2))
     creased += bend * 20.0 * np.maximum(np.arange(14.0) - at, 0.0)[:, None] * [0.6, 0.8]
-    assert len(parted(sheet(creased))) == 1
-    assert len(parted(sheet(creased), several=True)) == 2
+    assert len(split_at_discontinuities(sheet(creased))) == 1
+    assert len(split_at_discontinuities(sheet(creased), several=True)) == 2
 
 
 def test_parts_of_a_board_that_something_covers_stay_together(rng: np.random.Generator) -> None:
     covered = smooth(14, 8, -0.05) + rng.normal(0.0, 0.01, (8, 14, 2))
     covered[:4, 5:7] = np.nan
     covered[4:, 6:9] = np.nan
-    assert len(parted(sheet(covered))) == 1
+    assert len(split_at_discontinuities(sheet(covered))) == 1
 
 
 def test_a_quick_look_tells_most_boards() -> None:
     whole = sheet(smooth(8, 6))
-    assert not ruffled(whole, SIZE_PX)
+    assert not may_be_discontinuous(whole, SIZE_PX)
     hidden = whole.without(np.add.outer(np.arange(6), np.arange(8)) < 3)
-    assert ruffled(hidden, SIZE_PX)
+    assert may_be_discontinuous(hidden, SIZE_PX)
     # What the frame cuts off is not missing.
     moved = hidden.lattice.pixels - [50.0, 50.0]
-    assert not ruffled(replace(hidden, lattice=replace(hidden.lattice, pixels=moved)), SIZE_PX)
+    assert not may_be_discontinuous(replace(hidden, lattice=replace(hidden.lattice, pixels=moved)), SIZE_PX)
     uneven = whole.residual.copy()
     uneven[:, 3] *= 1.5
-    assert ruffled(replace(whole, residual=uneven), SIZE_PX)
+    assert may_be_discontinuous(replace(whole, residual=uneven), SIZE_PX)
 
 
 def test_what_fits_badly_goes_where_it_lies_aside_and_else_stays(rng: np.random.Generator) -> None:
     pixels = smooth(9, 6) + rng.normal(0.0, 0.01, (6, 9, 2))
     pixels[:, 8] += [3.0, 0.0]
     item = sheet(pixels)
-    assert without_misfits(item, SIZE_PX) is item, "no corner fits badly"
+    assert without_outliers(item, SIZE_PX) is item, "no corner fits badly"
     residual = item.residual.copy()
     residual[:, 8] *= 3.0
     residual[2, 4] *= 3.0
-    kept = without_misfits(replace(item, residual=residual), SIZE_PX).lattice
+    kept = without_outliers(replace(item, residual=residual), SIZE_PX).lattice
     assert kept.size == (8, 6)
     assert kept.known.all()
     loose = replace(item, residual=residual, sigma_px=np.full((6, 9), 1.0))
-    assert without_misfits(loose, SIZE_PX).lattice.known.all()
+    assert without_outliers(loose, SIZE_PX).lattice.known.all()
 
 
 def test_rows_under_the_edge_of_a_shadow_are_of_the_board() -> None:

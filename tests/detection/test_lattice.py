@@ -8,7 +8,7 @@ import pytest
 from rigkit.core.detections import BoardDetection
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
-from rigkit.detection.lattice.split import join_parts, split_folds, split_necks
+from rigkit.detection.lattice.split import join_parts, split_at_turns, split_necks
 
 ROUNDING_PX = 1e-6
 """Normal equations of a 7x7 neighbourhood with their slight ridge."""
@@ -77,10 +77,10 @@ def test_fold_is_cut_and_smooth_bending_is_not() -> None:
     u = np.where(column <= 6, 20.0 * column, 120.0 + 14.0 * (column - 6))
     v = 20.0 * row + np.where(column <= 6, 0.0, 9.0 * (column - 6))
     folded = Lattice(np.stack([u, v], axis=-1), np.ones((6, 13)), True)
-    assert sorted(part.size for part in split_folds(folded)) == [(6, 6), (6, 6)]
+    assert sorted(part.size for part in split_at_turns(folded)) == [(6, 6), (6, 6)]
     angle = np.radians(7.0) * (column - 6.0)
     bent = np.stack([(200.0 + 20 * row) * np.sin(angle), (200.0 + 20 * row) * np.cos(angle)], axis=-1)
-    assert len(split_folds(Lattice(bent, np.ones((6, 13)), True))) == 1
+    assert len(split_at_turns(Lattice(bent, np.ones((6, 13)), True))) == 1
 
 
 def test_parts_join_across_a_lost_row_in_any_rotation() -> None:

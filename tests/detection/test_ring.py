@@ -11,7 +11,7 @@ from rigkit.core.boards import Board
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import grey_image, pyramid
 from rigkit.detection.saddles.ring import read_rings
-from rigkit.detection.saddles.saddle import RADIUS, find_corners
+from rigkit.detection.saddles.saddle import RING_RADIUS, find_corners
 
 DIRECTION_DEG = 3.0
 """Of lines through an ideal corner of 25 degrees: sampled pixels and bilinear reads are no Gaussian. The places
@@ -33,7 +33,7 @@ def ideal_corner(first_deg: float, opening_deg: float, blur_px: float) -> np.nda
 
 @pytest.mark.parametrize("opening", [25.0, 50.0, 90.0, 130.0, 155.0])
 @pytest.mark.parametrize("blur", [1.0, 1.5, 2.0])
-@pytest.mark.parametrize("radius", [RADIUS, 4.6])
+@pytest.mark.parametrize("radius", [RING_RADIUS, 4.6])
 def test_directions_of_blurred_corners(opening: float, blur: float, radius: float) -> None:
     for first in (0.0, 33.0, 100.0, 170.0):
         image = ideal_corner(first, opening, blur).astype(np.float32)
@@ -52,7 +52,7 @@ def test_ring_beyond_the_squares_is_refused() -> None:
     image = (fine % 2 * 160.0 + 40.0).reshape(40, FINE, 40, FINE).mean(axis=(1, 3)).astype(np.float32)
     image = cv2.GaussianBlur(image, (0, 0), 1.0)
     corner = np.array([[19.5, 19.5]])
-    assert read_rings(image, corner, RADIUS).valid.all()
+    assert read_rings(image, corner, RING_RADIUS).valid.all()
     assert not read_rings(image, corner, 6.0).valid.any()
 
 

@@ -10,8 +10,8 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
 from rigkit.geometry.rotation import exp_so3
+from rigkit.identification.board_ids import LocatedBoard, assign_board_ids, first_corner_turn
 from rigkit.identification.identify import identify_pair
-from rigkit.identification.names import Located, first_corner_turn, name_boards
 from rigkit.identification.placements import Placement, board_kinds
 
 EQUAL = tuple(Board(i, 8, 6, 50.0, 50.0) for i in ("one", "two", "three"))
@@ -25,7 +25,7 @@ FACES = {
 PLACES = {"left": (-600, 0, 1500), "right": (600, 0, 1500), "floor": (0, 500, 1500), "ceiling": (0, -500, 1500)}
 
 
-def hanging(side: str, kind: int = 0, upright: bool = False, turn_rad: float = 0.0) -> Located:
+def hanging(side: str, kind: int = 0, upright: bool = False, turn_rad: float = 0.0) -> LocatedBoard:
     """A board in the middle of a side of a room that camera 1 looks into; the whole room turned about the view."""
     into = -np.array(FACES[side])
     level = np.array([0.0, 0.0, 1.0]) if abs(into[2]) < 0.5 else np.array([1.0, 0.0, 0.0])
@@ -35,7 +35,7 @@ def hanging(side: str, kind: int = 0, upright: bool = False, turn_rad: float = 0
     out[:3, 3] = np.array(PLACES.get(side, (0, 0, 2000))) - out[:3, :3] @ EQUAL[0].points().mean(axis=0)
     room = np.eye(4)
     room[:3, :3] = exp_so3(np.array([0.0, 0.0, turn_rad]))
-    return Located(kind, room @ out)
+    return LocatedBoard(kind, room @ out)
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 25.0, -25.0])
@@ -43,27 +43,27 @@ def hanging(side: str, kind: int = 0, upright: bool = False, turn_rad: float = 0
 def test_clockwise_from_opposite_the_floor(order: tuple[str, ...], turn_deg: float) -> None:
     """Right wall, floor, left wall, in whatever order they were found, and with the camera rolled."""
     seen = [hanging(side, turn_rad=np.radians(turn_deg)) for side in order]
-    names, notes = name_boards(seen, board_kinds(EQUAL))
+    names, notes = assign_board_ids(seen, board_kinds(EQUAL))
     assert dict(zip(order, names, strict=True)) == {"right": "one", "floor": "two", "left": "three"}
     assert notes == ()
 
 
 def test_clockwise_from_opposite_the_ceiling() -> None:
-    names, _ = name_boards([hanging(s) for s in ("right", "ceiling", "left")], board_kinds(EQUAL))
+    names, _ = assign_board_ids([hanging(s) for s in ("right", "ceiling", "left")], board_kinds(EQUAL))
     assert names == ["three", "two", "one"]
 
 
 def test_layout_overrides_the_rule() -> None:
     order = ("right", "floor", "left")
     layout = {"one": "left", "two": "floor", "three": "right"}
-    names, _ = name_boards([hanging(s) for s in order], board_kinds(EQUAL), layout)
+    names, _ = assign_board_ids([hanging(s) for s in order], board_kinds(EQUAL), layout)
     assert names == ["three", "two", "one"]
-    names, _ = name_boards([hanging(s) for s in order], board_kinds(EQUAL), {"one": "floor"})
+    names, _ = assign_board_ids([hanging(s) for s in order], board_kinds(EQUAL), {"one": "floor"})
     assert names[1] == "one" and sorted(names) == ["one", "three", "two"]
 
 
 def test_two_of_three_are_named_by_their_sides_and_it_is_said() -> None:
-    names, notes = name_boards([hanging("left"), hanging("floor")], board_kinds(EQUAL))
+    names, notes = assign_board_ids([hanging("left"), hanging("floor")], board_kinds(EQUAL))
     assert names == ["three", "two"]
     assert "layout" in notes[0]
 
@@ -73,23 +73,23 @@ def test_a_board_listed_upright_is_one_seen_upright() -> None:
     (kind,) = board_kinds(boards)
     for upright_side, lying_side in (("left", "right"), ("right", "left")):
         seen = [hanging(upright_side, upright=True), hanging(lying_side)]
-        assert name_boards(seen, (kind,))[0] == ["standing", "lying"]
+        assert assign_board_ids(seen, (kind,))[0] == ["standing", "lying"]
 
 
 def test_kinds_and_names_of_different_boards() -> None:
     boards = (*EQUAL[:1], Board("small", 8, 6, 30.0, 30.0), Board("other", 7, 6, 50.0, 50.0), EQUAL[1])
     kinds = board_kinds(boards)
     assert [k.ids for k in kinds] == [("one", "two"), ("small",), ("other",)]
-    names, _ = name_boards([hanging("left", 1), hanging("right", 2), hanging("floor", 0)], kinds)
+    names, _ = assign_board_ids([hanging("left", 1), hanging("right", 2), hanging("floor", 0)], kinds)
     assert names[:2] == ["small", "other"] and names[2] == "one"
 
 
 def test_bad_layout() -> None:
     kinds = board_kinds(EQUAL)
     with pytest.raises(InputError, match="no board is called 'four'"):
-        name_boards([hanging("left")], kinds, {"four": "left"})
+        assign_board_ids([hanging("left")], kinds, {"four": "left"})
     with pytest.raises(InputError, match="side 'north'"):
-        name_boards([hanging("left")], kinds, {"one": "north"})
+        assign_board_ids([hanging("left")], kinds, {"one": "north"})
 
 
 def test_first_corner_is_the_one_nearest_to_the_other_boards() -> None:

@@ -10,7 +10,7 @@ from helpers.detection_scenes import corner_scene, regular
 
 from rigkit.detection.checks import validate
 from rigkit.detection.detect import find_lattices
-from rigkit.detection.lattice.spacing import unevenness
+from rigkit.detection.lattice.spacing import spacing_changes
 from rigkit.detection.saddles.response import grey_image, pyramid
 from rigkit.detection.subpixel.scatter import excess_scatter
 from rigkit.kernels import kernels
@@ -50,9 +50,9 @@ def test_unevenness(
     missing: float, shape: tuple[int, int], rng: np.random.Generator, in_numpy: Callable[[], None]
 ) -> None:
     pixels = board(rng, missing, 0.5)[: shape[0], : shape[1]]
-    compiled = unevenness(pixels)
+    compiled = spacing_changes(pixels)
     in_numpy()
-    for ours, theirs in zip(compiled, unevenness(pixels), strict=True):
+    for ours, theirs in zip(compiled, spacing_changes(pixels), strict=True):
         assert ours.seen == theirs.seen
         assert np.allclose([*ours.typical, ours.every], [*theirs.typical, theirs.every], rtol=ROUNDING, equal_nan=True)
 
@@ -61,7 +61,7 @@ def test_unevenness_of_a_seam() -> None:
     """Steps of 10 px, and of 15 px after the third of seven columns: there they differ by half of the shorter."""
     column = np.array([0.0, 10.0, 20.0, 35.0, 50.0, 65.0, 80.0])
     pixels = np.stack(np.meshgrid(column, 10.0 * np.arange(5.0)), axis=-1)
-    rows, columns = unevenness(pixels)
+    rows, columns = spacing_changes(pixels)
     assert np.allclose(rows.typical, [0.0, 0.5, 0.0, 0.0, 0.0]) and rows.seen == [5] * 5
     assert (rows.every, columns.every) == (0.0, 0.0) and columns.typical == [0.0] * 3
 
@@ -100,10 +100,10 @@ def test_where_edges_lie(holes: float, rng: np.random.Generator, in_numpy: Calla
     lattices = [item.lattice for item in find_lattices(grey, 12)]
     assert len(lattices) == 3
     lattices = [item.without(rng.random(item.known.shape) < holes) for item in lattices]
-    ways = [(validate.NEAR, (0.5,)), (validate.WIDE, validate.ALONG)]
-    compiled = [validate._shifts(item, level, *way) for item in lattices for way in ways]
+    ways = [(validate.NARROW_STRIPE, (0.5,)), (validate.WIDE_STRIPE, validate.OFFSET_PARTS)]
+    compiled = [validate._edge_offsets(item, level, *way) for item in lattices for way in ways]
     in_numpy()
-    plain = [validate._shifts(item, level, *way) for item in lattices for way in ways]
+    plain = [validate._edge_offsets(item, level, *way) for item in lattices for way in ways]
     for ours, theirs in zip(compiled, plain, strict=True):
         assert np.abs(ours - theirs).max() < SAMPLED_CELLS
         assert np.abs(theirs).max() < validate.MAX_DARK

@@ -23,10 +23,10 @@ from rigkit.detection.subpixel.subpixel import RefinedLattice
 
 __all__ = ["Side", "place_part", "sides"]
 
-LEAST_CELL_PX = 6.0
+MIN_CELL_PX = 6.0
 """In smaller squares a quarter of one is not told from its edges."""
 
-FEWEST, STEADY_GAIN = 6, 12.0
+MIN_SUPPORT, MAX_BORDER_GAIN = 6, 12.0
 """Corners behind a prediction, and its standard deviation for corners of standard deviation 1: of a few hundredths of a
 pixel, that is less than a tenth of a square."""
 
@@ -60,19 +60,19 @@ SAME_LEVEL = 0.15
 """Two borders of one board with this difference in brightness beyond, on the same scale, bear each other out: where
 there is no white margin, a sheet that lies along the squares looks like a border, but not like another one."""
 
-LEAST_STEP = 0.3
+MIN_STEP = 0.3
 """Steps of brightness from which the end of a square is looked for, on the same scale."""
 
 DARK = 0.35
 """The next dark square is darker than this, on the same scale."""
 
-LEAST_CONTRAST = 0.5
+MIN_OUTER_CONTRAST = 0.5
 """Contrast of the outer squares relative to that of the corners: squares that something covers say nothing."""
 
-LEAST_OF_KIND = 2
+MIN_OF_KIND = 2
 """Dark and white squares that must have been seen to end, or to go on, each."""
 
-AGREEING = 0.8
+AGREEING_SQUARES = 0.8
 """Part of the squares seen that must say the same."""
 
 
@@ -147,23 +147,23 @@ def _above(image: GreyImage, lattice: Lattice) -> Beyond:
     """Return what lies beyond the first row of `lattice`."""
     squares = _Squares.above(lattice)
     usable = squares.usable(image)
-    if usable.sum() < 2 * LEAST_OF_KIND:
+    if usable.sum() < 2 * MIN_OF_KIND:
         return Beyond(Side.UNKNOWN)
     inner, outer, beyond = (squares.brightness(image, places) for places in (-SQUARE, SQUARE, BEYOND))
     contrast = np.where(squares.bright, outer - inner, inner - outer)
-    usable &= contrast > LEAST_CONTRAST * float(np.nanmedian(lattice.contrast))
-    if any((usable & kind).sum() < LEAST_OF_KIND for kind in (squares.bright, ~squares.bright)):
+    usable &= contrast > MIN_OUTER_CONTRAST * float(np.nanmedian(lattice.contrast))
+    if any((usable & kind).sum() < MIN_OF_KIND for kind in (squares.bright, ~squares.bright)):
         return Beyond(Side.UNKNOWN)
     dark = np.minimum(inner, outer)
     relative = (beyond - dark) / np.maximum(contrast, 1e-3)
     level = float(np.median(relative[usable]))
-    steps = np.abs(beyond - outer) > LEAST_STEP * contrast
+    steps = np.abs(beyond - outer) > MIN_STEP * contrast
     border = squares.end_on_one_line(image, outer, beyond, usable & steps) | ~steps
     border &= np.abs(relative - level) < EVEN
-    if (usable & steps).sum() >= LEAST_OF_KIND and border[usable].mean() >= AGREEING:
+    if (usable & steps).sum() >= MIN_OF_KIND and border[usable].mean() >= AGREEING_SQUARES:
         return Beyond(Side.BORDER, level)
     goes_on = np.where(squares.bright, relative < DARK, relative > 1.0 - DARK)
-    return Beyond(Side.GOES_ON if goes_on[usable].mean() >= AGREEING else Side.UNKNOWN)
+    return Beyond(Side.GOES_ON if goes_on[usable].mean() >= AGREEING_SQUARES else Side.UNKNOWN)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -216,9 +216,9 @@ class _Squares:
         corners = self.at(np.array([1.0, 1.0, BEYOND[-1], BEYOND[-1]]), np.array([-0.5, 0.5, -0.5, 0.5]))
         inside = ((corners >= 0.0) & (corners <= np.array([width, height]) - 1.0)).all(axis=(1, 2))
         shape = self.shape
-        sound = (shape.support >= FEWEST) & (shape.gain < STEADY_GAIN)
+        sound = (shape.support >= MIN_SUPPORT) & (shape.gain < MAX_BORDER_GAIN)
         side = np.minimum(np.linalg.norm(shape.along_column, axis=1), np.linalg.norm(shape.along_row, axis=1))
-        sound &= side > LEAST_CELL_PX
+        sound &= side > MIN_CELL_PX
         both = sound.reshape(2, count + 1)
         sound = both[0] & both[1]
         return np.asarray(inside & self.near & sound[:-1] & sound[1:])

@@ -17,34 +17,34 @@ from rigkit.detection.checks.validate import stray_row
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.subpixel.subpixel import RefinedLattice
 
-__all__ = ["parted", "ruffled", "without_misfits"]
+__all__ = ["may_be_discontinuous", "split_at_discontinuities", "without_outliers"]
 
-MISFIT = 2.0
+SUSPECT_FACTOR = 2.0
 """A corner whose residual, relative to its contrast, exceeds the typical one of the board by this factor is suspect:
 chance makes 1.15, the rim of a fisheye at most 3; squares that are not one board's make 2 to 20."""
 
-ASTRAY = 8.0
+OUTLIER_FACTOR = 8.0
 """A suspect is dropped that lies further from where the others have it than this times what is typical of the board and
 good to expect of the prediction. By the more pliant of the predictions alone that is 7 of 2302 suspects in pictures of
 single boards, half of them real, and 220 of 252 on the borders of boards that overlap: the rest lie in line with a row.
 """
 
-SIGMAS = 5.0
+MIN_OUTLIER_SIGMAS = 5.0
 """And by more than so many of its own standard deviations: what is uncertain may lie aside."""
 
 IN_PLACE = 3.0
 """A suspect nearer than this, in the same units, to either of the predictions is none."""
 
-LEAST_MISFIT = 0.02
+MIN_SUSPECT_RESIDUAL = 0.02
 """Residual relative to the contrast below which nothing is suspect: rounding and compression are uneven, too."""
 
-FEWEST = 8
+MIN_JUDGES = 8
 """Corners behind a prediction that convicts."""
 
-BENDS = ((2, (0.02, 1.0)), (3, (1e-3, 1e-2)))
+PREDICTIONS = ((2, (0.02, 1.0)), (3, (1e-3, 1e-2)))
 """Degrees and ridges of the predictions, which must agree: one is steady, the other follows the rim of a fisheye."""
 
-UNEVEN, SOME = 1.3, 3
+UNUSUAL, MIN_UNUSUAL = 1.3, 3
 """A seam shows: so many corners have residuals beyond this times the typical one."""
 
 WINDOW = 5
@@ -54,7 +54,7 @@ WIDTHS = (1, 0, 2)
 """Columns on the seam, of neither side: where boards touch there is one. The first shows every seam, the others
 where it is."""
 
-TWO_SHEETS = 2.5
+TWO_SURFACES = 2.5
 """Two quadratic surfaces, one on each side, leave so many times less than one cubic surface through both where they are
 two boards. In 248 lattices of single boards, up to the rims of fisheyes, at most 1.8 times."""
 
@@ -65,23 +65,23 @@ between the columns, and looked for in these parts of the way."""
 FLOOR_CELLS = 1e-3
 """No printed board is truer than this."""
 
-FEWEST_BESIDE, FEWEST_FREE = 5, 6
+MIN_BESIDE, MIN_FREE = 5, 6
 """Corners on each side of a seam, and in all beyond what the surfaces take up."""
 
 AS_SMOOTH = 1.3
 """What the two sides leave at the clearest seam and, at most, at a narrower one that is taken for it."""
 
-RIDGE = 1e-9
+SURFACE_RIDGE = 1e-9
 """On normal equations of terms of about 1: what too few columns leave open stays 0."""
 
 CUBIC, QUADRATIC = 10, 6
 """Terms of the surfaces."""
 
-DETERMINED = np.array([0, 3, 5, 6])
+DETERMINED_TERMS = np.array([0, 3, 5, 6])
 """Terms of a quadratic surface that 0, 1, 2, and more columns determine."""
 
 
-def ruffled(item: RefinedLattice, size_px: tuple[int, int]) -> bool:
+def may_be_discontinuous(item: RefinedLattice, size_px: tuple[int, int]) -> bool:
     """Return whether `item` may have a seam; a quick look. `size_px` is the (width, height) of the image.
 
     Corners on a seam fit badly, and where boards are not side by side, corners are missing that the frame does not cut
@@ -89,16 +89,16 @@ def ruffled(item: RefinedLattice, size_px: tuple[int, int]) -> bool:
     """
     known = item.lattice.known
     relative = np.sort(item.residual[known] / item.lattice.contrast[known])
-    if len(relative) > SOME and float(relative[-SOME]) > UNEVEN * float(relative[len(relative) // 2]):
+    if len(relative) > MIN_UNUSUAL and float(relative[-MIN_UNUSUAL]) > UNUSUAL * float(relative[len(relative) // 2]):
         return True
     if known.all():
         return False
     missing = fit_cells(item.lattice.pixels, ~known, degree=1).pixels
     inside = ((missing > 0.0) & (missing < np.array(size_px) - 1.0)).all(axis=1)
-    return int(np.count_nonzero(inside)) >= SOME
+    return int(np.count_nonzero(inside)) >= MIN_UNUSUAL
 
 
-def without_misfits(item: RefinedLattice, size_px: tuple[int, int]) -> RefinedLattice:
+def without_outliers(item: RefinedLattice, size_px: tuple[int, int]) -> RefinedLattice:
     """Return `item` without corners that fit badly and are not where the others have them, trimmed.
 
     What these leave of an outer row goes with them. `size_px` is the (width, height) of the image.
@@ -107,9 +107,9 @@ def without_misfits(item: RefinedLattice, size_px: tuple[int, int]) -> RefinedLa
     relative = np.zeros(known.shape)
     relative[known] = item.residual[known] / item.lattice.contrast[known]
     typical = upper_median(relative[known])
-    suspect = relative > max(MISFIT * typical, LEAST_MISFIT)
+    suspect = relative > max(SUSPECT_FACTOR * typical, MIN_SUSPECT_RESIDUAL)
     judges = known & ~suspect
-    if not suspect.any() or np.count_nonzero(judges) < FEWEST:
+    if not suspect.any() or np.count_nonzero(judges) < MIN_JUDGES:
         return item
     pixels = item.lattice.without(suspect).pixels
     usual = fit_cells(pixels, judges, leave_out=True)
@@ -137,34 +137,36 @@ def _judged(item: RefinedLattice, suspect: BoolArray, expected: float) -> tuple[
     pixels = item.lattice.without(suspect).pixels
     astray, in_place = np.zeros((2, *suspect.shape), np.bool_)
     astray[suspect] = True
-    for degree, ridge in BENDS:
+    for degree, ridge in PREDICTIONS:
         shape = fit_cells(pixels, suspect, degree=degree, ridge=ridge)
         off = np.hypot(*(shape.pixels - item.lattice.pixels[suspect]).T)
         good = expected * np.hypot(1.0, shape.gain) * shape.cell_px()
-        judged = shape.support >= FEWEST
-        astray[suspect] &= judged & (off > np.maximum(ASTRAY * good, SIGMAS * item.sigma_px[suspect]))
+        judged = shape.support >= MIN_JUDGES
+        astray[suspect] &= judged & (
+            off > np.maximum(OUTLIER_FACTOR * good, MIN_OUTLIER_SIGMAS * item.sigma_px[suspect])
+        )
         in_place[suspect] |= judged & (off < IN_PLACE * good)
     return astray, in_place
 
 
-def parted(item: RefinedLattice, *, several: bool = False) -> list[RefinedLattice]:
+def split_at_discontinuities(item: RefinedLattice, *, several: bool = False) -> list[RefinedLattice]:
     """Return the boards that `item` is made of, without the corners on their seams.
 
     several : it is known to be more than one, so the clearest seam is one, however well the two go together.
     """
-    if item.lattice.count < 2 * FEWEST_BESIDE + FEWEST_FREE:
+    if item.lattice.count < 2 * MIN_BESIDE + MIN_FREE:
         return [item]
-    across = _seam(item.lattice.pixels, item.sigma_px, several)
-    down = _seam(item.lattice.pixels.swapaxes(0, 1), item.sigma_px.T, several)
+    across = _clearest_split(item.lattice.pixels, item.sigma_px, several)
+    down = _clearest_split(item.lattice.pixels.swapaxes(0, 1), item.sigma_px.T, several)
     every, best = slice(0, None), max(across, down, key=lambda seam: seam.ratio)
     if best.ratio == 0.0:
         return [item]
     sides = (slice(0, best.start), slice(best.end, None))
     cuts = [(every, side) if best is across else (side, every) for side in sides]
-    return [part for cut in cuts for part in parted(item.cut(*cut))]
+    return [part for cut in cuts for part in split_at_discontinuities(item.cut(*cut))]
 
 
-class _Seam(NamedTuple):
+class _Split(NamedTuple):
     """Columns `start` to `end` (exclusive) of a lattice lie between two boards that fit `ratio` times better alone."""
 
     ratio: float
@@ -174,21 +176,21 @@ class _Seam(NamedTuple):
     """What the two leave, RMS in cells."""
 
 
-def _seam(pixels: FloatArray, sigma_px: FloatArray, several: bool) -> _Seam:
+def _clearest_split(pixels: FloatArray, sigma_px: FloatArray, several: bool) -> _Split:
     """Return the clearest seam between columns of `pixels` (R, C, 2), of ratio 0 if there is none."""
     sums = _Sums.of(pixels, sigma_px)
-    found: list[_Seam] = []
+    found: list[_Split] = []
     for wide in WIDTHS:
-        found += _seams(sums, wide, several)
+        found += _splits(sums, wide, several)
         if not found:
             break
-    clearest = max(found, key=lambda seam: seam.ratio, default=_Seam(0.0, 0, 0))
+    clearest = max(found, key=lambda seam: seam.ratio, default=_Split(0.0, 0, 0))
     # Corners that either side is as smooth with are not on the seam.
     as_good = [seam for seam in found if seam.alone <= AS_SMOOTH * clearest.alone]
     return min(as_good, key=lambda seam: (seam.end - seam.start, -seam.ratio), default=clearest)
 
 
-def _seams(sums: _Sums, wide: int, several: bool) -> list[_Seam]:
+def _splits(sums: _Sums, wide: int, several: bool) -> list[_Split]:
     """Return the seams that `wide` columns may lie on; `sums` are over the first columns."""
     columns, rows = len(sums.columns) - 1, sums.in_row.shape[1]
     start = np.arange(1, columns - wide)
@@ -197,7 +199,7 @@ def _seams(sums: _Sums, wide: int, several: bool) -> list[_Seam]:
     right = sums.between(end, np.minimum(columns, end + WINDOW))
     both = left.with_all_of(right)
     taken = left.determined() + right.determined()
-    possible = (np.minimum(left.corners, right.corners) >= FEWEST_BESIDE) & (both.corners - taken >= FEWEST_FREE)
+    possible = (np.minimum(left.corners, right.corners) >= MIN_BESIDE) & (both.corners - taken >= MIN_FREE)
     one, apart1 = left.fitted(QUADRATIC)
     two, apart2 = right.fitted(QUADRATIC)
     _, together = both.fitted(CUBIC)
@@ -211,9 +213,9 @@ def _seams(sums: _Sums, wide: int, several: bool) -> list[_Seam]:
     common = (left.in_row > 0) & (right.in_row > 0)
     jump = np.where(common, off, 0.0).sum(axis=2).min(axis=0) / np.maximum(common.sum(axis=1), 1)
     # Where they share none they are far apart in any case.
-    two_sheets = (ratio > TWO_SHEETS) & ((jump > JUMP**2) | ~common.any(axis=1))
+    two_sheets = (ratio > TWO_SURFACES) & ((jump > JUMP**2) | ~common.any(axis=1))
     which = np.flatnonzero(possible & (two_sheets | several))
-    return [_Seam(float(ratio[k]), int(start[k]), int(end[k]), float(np.sqrt(alone[k]))) for k in which]
+    return [_Split(float(ratio[k]), int(start[k]), int(end[k]), float(np.sqrt(alone[k]))) for k in which]
 
 
 class _Sums(NamedTuple):
@@ -269,11 +271,11 @@ class _Sums(NamedTuple):
 
     def determined(self) -> IntArray:
         """Return how many terms of a quadratic surface the columns determine, (M,)."""
-        return np.asarray(DETERMINED[np.minimum(self.columns, 3.0).astype(np.int64)], dtype=np.int64)
+        return np.asarray(DETERMINED_TERMS[np.minimum(self.columns, 3.0).astype(np.int64)], dtype=np.int64)
 
     def fitted(self, terms: int) -> tuple[FloatArray, FloatArray]:
         """Return the surfaces (M, terms, 2) of the first so many terms and the mean square that they leave, times N."""
-        normal = self.normal[:, :terms, :terms] + RIDGE * np.eye(terms)
+        normal = self.normal[:, :terms, :terms] + SURFACE_RIDGE * np.eye(terms)
         right = self.right[:, :terms]
         surface = np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
         return surface, np.maximum(0.5 * (self.square - (right * surface).sum(axis=(1, 2))), 0.0)

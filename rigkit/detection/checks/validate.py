@@ -10,7 +10,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from rigkit.core.arrays import BoolArray, FloatArray, upper_median
 from rigkit.detection.lattice.lattice import MANY, Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
-from rigkit.detection.lattice.spacing import unevenness
+from rigkit.detection.lattice.spacing import spacing_changes
 from rigkit.detection.saddles.nearby import near_any
 from rigkit.detection.saddles.response import Level, sample
 from rigkit.detection.subpixel.subpixel import RefinedLattice
@@ -18,9 +18,9 @@ from rigkit.kernels import lattice as native
 
 __all__ = [
     "compact",
+    "has_edge_offset",
     "known_part",
     "large",
-    "leans",
     "sample_of",
     "separate",
     "stray_row",
@@ -42,7 +42,7 @@ MAX_RELATIVE_SIGMA = 0.011
 """Corners more uncertain than this, in cells, make no board: keys, letters, weave."""
 
 MAX_RESIDUAL = 0.25
-MAX_UNEXPLAINED, NOISE_LEVELS = 0.185, 10.0
+MAX_UNEXPLAINED, FORGIVEN_NOISE = 0.185, 10.0
 """Largest typical residual of the edge model, relative to the contrast, and the part of it that noise (of so many grey
 levels) does not explain. Dots in rows have saddles between them, too, and show 0.2; boards 0.03 to 0.07 with motion,
 saturation or compression, 0.13 where a camera sharpens strongly, 0.175 in black and white without any grey."""
@@ -54,21 +54,22 @@ LARGE_SAMPLE, SAMPLE, RAGGED = 7, 5, 0.75
 """Rows and columns by which a lattice of many corners is judged, or a smaller one that fills less than this part of its
 rows and columns."""
 
-FEWEST_ROWS = 3
+MIN_ROWS = 3
 """Rows and columns of the smallest board."""
 
-MAX_UNEVEN = 0.5
+MAX_SPACING_CHANGE = 0.5
 """Typical difference of neighbouring steps, relative to the shorter: boards show at most 0.35, near the rim of a strong
 fisheye; the crossings of a cloth's stripes 0.7."""
 
-STEPS_ACROSS, MOST_EDGES = 16, 256
+STEPS_ACROSS, MAX_EDGES = 16, 256
 """Between two corners the edge runs straight. It is looked for in so many steps across, of so many edges."""
 
-NEAR, MAX_DARK, MAX_BRIGHT = 0.12, 0.024, 0.036
-"""Halfway, in a stripe of NEAR to both sides, it lies aside by at most so much towards the bright or the dark squares,
-in squares: on 300 boards by 0.01 and 0.016. Lenses bend edges to the dark side as often as to the bright one."""
+NARROW_STRIPE, MAX_DARK, MAX_BRIGHT = 0.12, 0.024, 0.036
+"""Halfway, in a stripe of NARROW_STRIPE to both sides, it lies aside by at most so much towards the bright or the dark
+squares, in squares: on 300 boards by 0.01 and 0.016. Lenses bend edges to the dark side as often as to the bright
+one."""
 
-WIDE, ALONG, MAX_SHIFT, MAX_BOW = 0.25, (0.2, 0.5, 0.8), 0.1, 0.04
+WIDE_STRIPE, OFFSET_PARTS, MAX_SHIFT, MAX_BOW = 0.25, (0.2, 0.5, 0.8), 0.1, 0.04
 """Ink that spreads, thin print, and light that saturates, shift edges by more, up to 0.08, but all along. They show in
 a wider stripe, into which markers in the squares reach, and in so many parts of their length. Rounded corners bow them
 by 0.01; threads shift by 0.15, dots by 0.08 to 0.2, and bow as much."""
@@ -80,7 +81,7 @@ codes and mosaics have such blocks, too, but hardly one in 2^23 places, and one 
 MAX_EXTRA = 2
 """Rows and columns that may be too many, when a grid is larger than the board it may be."""
 
-WORSE = 1.5
+WORSE_FIT = 1.5
 """Corners of rows that do not belong to the board fit so many times worse."""
 
 
@@ -120,7 +121,7 @@ def stray_row(lattice: Lattice, size_px: tuple[int, int]) -> BoolArray | None:
 
 def large(lattice: Lattice, least: int) -> bool:
     """Return whether `lattice` has `least` corners and, if that is to be a board (9), three rows and three columns."""
-    return lattice.count >= least and min(lattice.size) >= (FEWEST_ROWS if least >= FEWEST_ROWS**2 else 2)
+    return lattice.count >= least and min(lattice.size) >= (MIN_ROWS if least >= MIN_ROWS**2 else 2)
 
 
 def separate(lattices: Sequence[Lattice], least: int) -> list[Lattice]:
@@ -157,16 +158,16 @@ def sample_of(lattice: Lattice) -> Lattice | None:
     return lattice.cut(slice(row, row + side), slice(column, column + side))
 
 
-def leans(lattice: Lattice, level: Level) -> bool:
+def has_edge_offset(lattice: Lattice, level: Level) -> bool:
     """Return whether the edges of `lattice`, as `level` shows them, lie aside of the corners that they join, or bow."""
-    (shift,) = _shifts(lattice, level, NEAR, (0.5,))
+    (shift,) = _edge_offsets(lattice, level, NARROW_STRIPE, (0.5,))
     if -MAX_DARK < shift < MAX_BRIGHT:
         return False
-    start, middle, end = _shifts(lattice, level, WIDE, ALONG)
+    start, middle, end = _edge_offsets(lattice, level, WIDE_STRIPE, OFFSET_PARTS)
     return not (abs(middle) < MAX_SHIFT and abs(middle - 0.5 * (start + end)) < MAX_BOW)
 
 
-def _shifts(lattice: Lattice, level: Level, reach: float, along: Sequence[float]) -> FloatArray:
+def _edge_offsets(lattice: Lattice, level: Level, reach: float, along: Sequence[float]) -> FloatArray:
     """Return how far edges lie on the dark side of their corners' line, at parts `along` (K,) of it, in squares.
 
     They are looked for in a stripe of `reach` squares to both sides.
@@ -175,7 +176,7 @@ def _shifts(lattice: Lattice, level: Level, reach: float, along: Sequence[float]
     if library is not None:
         seen = (level.smooth, level.scale, level.offset)
         return native.shifts_of_edges(
-            library, lattice.pixels, lattice.rising, *seen, reach, along, STEPS_ACROSS, MOST_EDGES
+            library, lattice.pixels, lattice.rising, *seen, reach, along, STEPS_ACROSS, MAX_EDGES
         )
     pixels, signs = level.to_level(lattice.pixels), lattice.signs()
     # The edges that squares start with, and how each square goes on from there: boards seen aslant are flat.
@@ -186,7 +187,7 @@ def _shifts(lattice: Lattice, level: Level, reach: float, along: Sequence[float]
     )
     start, end, across, sign = (np.concatenate([e[k].reshape(-1, *e[k].shape[2:]) for e in edges]) for k in range(4))
     there = np.flatnonzero(np.isfinite(across[:, 0]))
-    there = there[:: max(len(there) // MOST_EDGES, 1)]
+    there = there[:: max(len(there) // MAX_EDGES, 1)]
     start, chord, across = start[there], (end - start)[there], (reach * sign[there])[:, None] * across[there]
     on_chord = start + np.array(along)[:, None, None] * chord
     places = on_chord[:, None] + np.linspace(-1.0, 1.0, STEPS_ACROSS + 1)[:, None, None] * across
@@ -220,23 +221,23 @@ def compact(lattice: Lattice, size_px: tuple[int, int]) -> bool:
 def trustworthy(refined: RefinedLattice, before: int, least: int) -> bool:
     """Return whether what the fit left of a lattice of `before` corners is a board."""
     lattice = refined.lattice
-    if lattice.count < max(least, (1.0 - MAX_LOST) * before) or min(lattice.size) < FEWEST_ROWS:
+    if lattice.count < max(least, (1.0 - MAX_LOST) * before) or min(lattice.size) < MIN_ROWS:
         return False
     known = lattice.known
     relative = refined.residual[known] / lattice.contrast[known]
-    unexplained = relative**2 - (NOISE_LEVELS / lattice.contrast[known]) ** 2
+    unexplained = relative**2 - (FORGIVEN_NOISE / lattice.contrast[known]) ** 2
     if upper_median(relative) > MAX_RESIDUAL or upper_median(unexplained) > MAX_UNEXPLAINED**2:
         return False
-    if _uneven(lattice):
+    if _irregular(lattice):
         return False
     shape = fit_cells(lattice.pixels, known, degree=1)
     in_cells = refined.worst_sigma_px[known] / np.sqrt(np.maximum(shape.areas(), 1e-6))
     return upper_median(in_cells) < MAX_RELATIVE_SIGMA
 
 
-def _uneven(lattice: Lattice) -> bool:
+def _irregular(lattice: Lattice) -> bool:
     """Return whether rows and columns follow each other at steps as different as no lens and no view makes them."""
-    return any(line.every > MAX_UNEVEN for line in unevenness(lattice.pixels))
+    return any(line.every > MAX_SPACING_CHANGE for line in spacing_changes(lattice.pixels))
 
 
 def too_large(lattice: Lattice, sizes: Sequence[tuple[int, int]]) -> bool:
@@ -279,4 +280,4 @@ def _sticks_out(known: BoolArray, relative: np.ndarray, inside: BoolArray) -> bo
     if known[inside].mean() < 0.9:
         return False
     few = known[outside].mean() < 0.5
-    return bool(few or np.nanmedian(relative[outside & known]) > WORSE * np.nanmedian(relative[inside & known]))
+    return bool(few or np.nanmedian(relative[outside & known]) > WORSE_FIT * np.nanmedian(relative[inside & known]))

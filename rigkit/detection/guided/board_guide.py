@@ -21,15 +21,15 @@ from rigkit.geometry.board_pose import board_poses, ray_residuals
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 
-__all__ = ["FEWEST", "UNSOUND", "BoardState", "Guide"]
+__all__ = ["MIN_GUIDE_CORNERS", "UNSOUND", "BoardState", "Guide"]
 
 HALF_STEP = 0.4
 """Derivatives of the projection are chords of this many squares to either side: as far as the window reaches."""
 
-FEWEST = 12
+MIN_GUIDE_CORNERS = 12
 """Corners found that a board must have to be a guide."""
 
-STEADY_GAIN = 4.0
+MAX_GUIDE_GAIN = 4.0
 """Predictions from corners around count up to this standard deviation, for corners of standard deviation 1."""
 
 CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
@@ -117,7 +117,7 @@ class Guide:
         if self.camera is None or self.cam_from_board is None:
             shape = fit_cells(state.pixels, cells, degree=3, ridge=(1e-3, 1e-2), leave_out=True)
             beside = cv2.dilate(state.known.astype(np.uint8), CROSS)[cells] > 0
-            return shape, np.asarray(beside & (shape.support >= 6) & (shape.gain < STEADY_GAIN))
+            return shape, np.asarray(beside & (shape.support >= 6) & (shape.gain < MAX_GUIDE_GAIN))
         shape, valid = self._projected(self.camera, self.cam_from_board, cells)
         sound = state.known & (state.sigma_px < UNSOUND * state.usual_sigma)
         if sound.any():
@@ -155,7 +155,7 @@ def _pose(board: Board, camera: Camera, state: BoardState, start: Rigid3 | None)
     row, column = np.nonzero(state.known)
     pixels = state.pixels[row, column]
     rays, seen = camera.unproject(pixels)
-    if seen.sum() < FEWEST:
+    if seen.sum() < MIN_GUIDE_CORNERS:
         return None
     rays, points = rays[seen], board.points(np.stack([column, row], axis=-1)[seen])
     bases = np.asarray(np.linalg.pinv(camera.ray_jacobian(pixels[seen])), dtype=np.float64)

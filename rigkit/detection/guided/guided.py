@@ -19,7 +19,7 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
-from rigkit.detection.guided.board_guide import FEWEST, UNSOUND, BoardState, Guide
+from rigkit.detection.guided.board_guide import MIN_GUIDE_CORNERS, UNSOUND, BoardState, Guide
 from rigkit.detection.lattice.local_fit import LocalFit, fit_cells
 from rigkit.detection.saddles.response import GreyImage, grey_image
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
@@ -28,10 +28,10 @@ from rigkit.detection.subpixel.scatter import UNEXPLAINED
 
 __all__ = ["complete_boards", "fit_corners"]
 
-RADIUS_PX, STEPS = 18.0, 8
+RADIUS_PX, FIT_STEPS = 18.0, 8
 """Radius of the window and Gauss-Newton steps, as in the last pass of `rigkit.detection.subpixel.subpixel`."""
 
-FIRST_BLUR = 1.0
+START_BLUR_PX = 1.0
 """s that the first fit of the corners found starts from, px."""
 
 WIDE_BLUR_CELLS = 0.05
@@ -40,10 +40,10 @@ WIDE_BLUR_CELLS = 0.05
 MARKER_BLURS = 2.0
 """The edges of a ChArUco board's markers reach so many s towards the corners."""
 
-ROUNDS = 40
+MAX_GUIDE_ROUNDS = 40
 """Rounds of adding at most, without a camera one ring of corners each: more than any board has rows or columns."""
 
-LEAST_SIDE_PX = 4.0
+MIN_SIDE_PX = 4.0
 """Corners of smaller cells are not told from noise."""
 
 MARGIN_PX = 1.5
@@ -55,27 +55,27 @@ MOVED_PX = 0.3
 """How far a corner may lie from its prediction: in sides of its cell; where a camera predicts, also times what the
 found corners lie off theirs, but this many px in any case."""
 
-ASTRAY_FACTOR = 5.0
+OUTLIER_GUIDE_FACTOR = 5.0
 """A corner that lies off where the camera and the corners around have it by more than this, times what is usual and its
 own standard deviation together, is covered in part."""
 
-FLOOR_PX = 0.01
+SCATTER_FLOOR_PX = 0.01
 """No camera and no printed board is truer than this."""
 
 MEDIAN_OF_RAYLEIGH = 1.1774
 """Median distance from the mean of a normal point in the plane, in standard deviations per axis."""
 
-LEAST_CONTRAST = 0.15
+MIN_ADDED_CONTRAST = 0.15
 """Contrast relative to the found corners' around: a glint takes most of it, but not all."""
 
-MOST_RESIDUAL, MOST_RESIDUAL_ALONE = 1.6, 1.3
+MAX_ADDED_RESIDUAL, MAX_ADDED_RESIDUAL_ALONE = 1.6, 1.3
 """Residual in grey levels relative to that of the found corners, with and without a camera that says where the corner
 is: pixels of another thing raise it."""
 
-MOST_RESIDUAL_MARKED = 3.0
+MAX_ADDED_RESIDUAL_MARKED = 3.0
 """The same on ChArUco boards, where what the windows see of the markers differs from corner to corner."""
 
-MOST_SIGMA_CELLS = 0.03
+MAX_SIGMA_CELLS = 0.03
 """Largest predicted standard deviation, in sides of the cell."""
 
 
@@ -105,7 +105,7 @@ def complete_boards(
     out = []
     for found in detections:
         board = _board_of(found, boards)
-        worth = board is not None and len(found.grid) >= FEWEST
+        worth = board is not None and len(found.grid) >= MIN_GUIDE_CORNERS
         worth &= camera is not None or not found.complete
         out.append(_completed(grey, found, board, camera) if worth and board is not None else found)
     return tuple(out)
@@ -136,7 +136,7 @@ def fit_corners(
     width = _short_of_markers(board, sides, np.broadcast_to(np.asarray(blur, dtype=np.float64), (len(start),)))
     # What markers leave in the windows is no noise, but makes the corners uncertain all the same.
     plain = board.markers is None
-    return fit_edges(image, start, geometry, signs, width, radius_px=RADIUS_PX, iterations=STEPS, mirrored=plain)
+    return fit_edges(image, start, geometry, signs, width, radius_px=RADIUS_PX, iterations=FIT_STEPS, mirrored=plain)
 
 
 def _short_of_markers(board: Board, sides: FloatArray, blur: FloatArray) -> FloatArray:
@@ -157,7 +157,7 @@ def _completed(image: GreyImage, found: BoardDetection, board: Board, camera: Ca
     if guide.camera is not None:
         state = _unanimous(guide, _again(image, guide, state))
     before = state
-    for _ in range(ROUNDS):
+    for _ in range(MAX_GUIDE_ROUNDS):
         guide = guide.by(state)
         more = _added(image, guide, state)
         if more is None:
@@ -169,7 +169,7 @@ def _completed(image: GreyImage, found: BoardDetection, board: Board, camera: Ca
         state = _unanimous(guide, _again(image, guide, state))
     state = state.without(~np.isfinite(state.sigma_px))
     row, column = np.nonzero(state.known)
-    if len(row) < FEWEST:
+    if len(row) < MIN_GUIDE_CORNERS:
         return found
     # Noise that cancels from pixel to pixel lets sigmas be smaller; where they must be larger, the scatter shows it.
     state = replace(state, sigma_px=min(1.0, _known_factor(found, opened)) * state.sigma_px)
@@ -218,14 +218,14 @@ def _opened(image: GreyImage, found: BoardDetection, board: Board) -> BoardState
     if not (cells.any(axis=0).sum() >= 3 and cells.any(axis=1).sum() >= 3):
         return None
     local = fit_cells(state.pixels, cells)
-    fit = fit_corners(image, board, cells, local, state.pixels[cells], signs[cells], FIRST_BLUR)
+    fit = fit_corners(image, board, cells, local, state.pixels[cells], signs[cells], START_BLUR_PX)
     if np.median(fit.contrast) < 0.0:
         state = replace(state, signs=-signs)
     # Once more: the fit ends when the corner stands still, and its residual means something only with the right blur.
     blur = float(np.median(fit.blur))
     fit = fit_corners(image, board, cells, local, state.pixels[cells], state.signs[cells], blur)
     good = fit.valid & (fit.contrast > 0.0)
-    if good.sum() < FEWEST:
+    if good.sum() < MIN_GUIDE_CORNERS:
         return None
     # The corners stay where the detector has put them: only what the fit says of them is taken.
     opened = state.with_fit(cells, fit, good)
@@ -242,7 +242,7 @@ def _added(image: GreyImage, guide: Guide, state: BoardState) -> BoardState | No
     height, width = image.shape
     with np.errstate(invalid="ignore"):
         inside = (shape.pixels > MARGIN_PX) & (shape.pixels < np.array([width, height]) - 1.0 - MARGIN_PX)
-        usable = predicted & inside.all(axis=1) & (side > LEAST_SIDE_PX)
+        usable = predicted & inside.all(axis=1) & (side > MIN_SIDE_PX)
         usable &= shape.areas() > 0.25 * side**2
     if not usable.any():
         return None
@@ -273,12 +273,12 @@ def _confirmed(guide: Guide, state: BoardState, shape: LocalFit, side: FloatArra
         usual = float(np.median(np.linalg.norm(state.pixels[known] - guide.at(state, known)[0].pixels, axis=1)))
         limit = np.minimum(limit, np.maximum(MOVED_FACTOR * usual * shape.gain, MOVED_PX))
     contrast, residual = float(np.nanmedian(state.contrast)), float(np.nanmedian(state.residual))
-    good = fit.valid & (moved < limit) & (fit.contrast > LEAST_CONTRAST * contrast)
+    good = fit.valid & (moved < limit) & (fit.contrast > MIN_ADDED_CONTRAST * contrast)
     # Noise is the same at any contrast; what the model gets wrong grows with it.
-    most = MOST_RESIDUAL if guide.camera is not None else MOST_RESIDUAL_ALONE
-    most = most if guide.board.markers is None else MOST_RESIDUAL_MARKED
+    most = MAX_ADDED_RESIDUAL if guide.camera is not None else MAX_ADDED_RESIDUAL_ALONE
+    most = most if guide.board.markers is None else MAX_ADDED_RESIDUAL_MARKED
     good &= fit.residual < most * residual * np.maximum(1.0, fit.contrast / contrast)
-    good &= fit.sigma_px < MOST_SIGMA_CELLS * side
+    good &= fit.sigma_px < MAX_SIGMA_CELLS * side
     return np.asarray(good)
 
 
@@ -301,7 +301,7 @@ def _unanimous(guide: Guide, state: BoardState) -> BoardState:
     Those that contradict the most go first: they may be all that speaks against their neighbours.
     """
     rest = state
-    for _ in range(ROUNDS):
+    for _ in range(MAX_GUIDE_ROUNDS):
         share = _contradiction(guide, rest, rest)
         astray = (share > 1.0) & (share >= cv2.dilate(share, np.ones((5, 5))))
         if not astray.any():
@@ -318,7 +318,7 @@ def _contradiction(guide: Guide, state: BoardState, judges: BoardState) -> Float
     shape, _ = guide.at(judges, cells)
     # Where the lens model ends nothing is said.
     off[cells] = np.nan_to_num(np.linalg.norm(state.pixels[cells] - shape.pixels, axis=1) / np.maximum(shape.gain, 1.0))
-    usual = max(float(np.median(off[own])), FLOOR_PX) if own.any() else FLOOR_PX
+    usual = max(float(np.median(off[own])), SCATTER_FLOOR_PX) if own.any() else SCATTER_FLOOR_PX
     sigma = np.minimum(np.where(cells, state.sigma_px, 1.0), UNSOUND * state.usual_sigma)
-    allowed = ASTRAY_FACTOR * np.hypot(usual, sigma)
+    allowed = OUTLIER_GUIDE_FACTOR * np.hypot(usual, sigma)
     return np.where(cells, off / allowed, 0.0)

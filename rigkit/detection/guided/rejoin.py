@@ -21,7 +21,7 @@ from rigkit.geometry.rigid3 import Rigid3
 
 __all__ = ["rejoined"]
 
-FEWEST = 12
+MIN_REJOINED_CORNERS = 12
 """Corners from which on a part has a pose that says where the rest of its board is."""
 
 OFF_GRID = 0.15
@@ -31,7 +31,7 @@ wall, or a board beside it, is off by any part of a square."""
 OFF_PLANE, OFF_PLANE_PX = 0.03, 0.5
 """Median distance of the smaller part from where the pose of both together has it, in squares or (the larger) in px."""
 
-SAME_PX = 2.0
+SAME_REJOINED_PX = 2.0
 """What both parts have is one corner if it lies this near, and else they are no parts of one board."""
 
 
@@ -64,7 +64,7 @@ def rejoined(parts: Sequence[RefinedLattice], boards: Sequence[Board], camera: C
 
 def _both(one: RefinedLattice, two: RefinedLattice, boards: Sequence[Board], camera: Camera) -> RefinedLattice | None:
     """Return the larger part `one` with `two` in its place; None where they are not of one board."""
-    if one.lattice.count < FEWEST:
+    if one.lattice.count < MIN_REJOINED_CORNERS:
         return None
     for side_mm in {board.square_x_mm for board in boards}:
         sizes = {size for b in boards if b.square_x_mm == side_mm for size in (b.size, b.size[::-1])}
@@ -84,7 +84,7 @@ def _poses(lattice: Lattice, side_mm: float, camera: Camera) -> list[Rigid3]:
     row, column = np.nonzero(lattice.known)
     pixels = lattice.pixels[row, column]
     rays, seen = camera.unproject(pixels)
-    if seen.sum() < FEWEST:
+    if seen.sum() < MIN_REJOINED_CORNERS:
         return []
     points = side_mm * np.stack([column, row, np.zeros(len(row))], axis=-1, dtype=np.float64)
     bases = np.asarray(np.linalg.pinv(camera.ray_jacobian(pixels[seen])), dtype=np.float64)
@@ -134,7 +134,7 @@ def _united(
     known = first.lattice.known
     twice = known & second.lattice.known
     apart = np.linalg.norm(first.lattice.pixels - second.lattice.pixels, axis=-1)[twice]
-    if (apart > SAME_PX).any():
+    if (apart > SAME_REJOINED_PX).any():
         return None
     return first.filled(second)
 

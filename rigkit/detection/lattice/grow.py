@@ -14,8 +14,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
-from rigkit.detection.lattice.lattice import MANY, STEPS, Lattice
-from rigkit.detection.lattice.links import ALONG, CONTRAST_RATIO, MOST, edge_contrast
+from rigkit.detection.lattice.lattice import GRID_DIRECTIONS, MANY, Lattice
+from rigkit.detection.lattice.links import (
+    ASIDE,
+    CONTRAST_RATIO,
+    EDGE_PLACES,
+    MAX_ASIDE_PX,
+    MIN_ASIDE_PX,
+    MIN_EDGE_PLACES,
+    edge_contrast,
+)
 from rigkit.detection.lattice.local_fit import LocalFit, fit_cells
 from rigkit.detection.saddles.nearby import near_any
 from rigkit.detection.saddles.response import Level
@@ -39,20 +47,20 @@ STIFF = (2, (0.02, 1.0))
 PLIANT = (3, (1e-3, 1e-2))
 """Degree and ridge of the prediction: one is steady with few neighbours, the other follows the rim of a fisheye."""
 
-WIDTH, RADIUS = 1.3, 3
+FIT_WIDTH, FIT_RADIUS = 1.3, 3
 """Standard deviation of the weight and reach of the predictions, cells."""
 
-FEWEST = 3
+MIN_FORETELLING = 3
 """Known corners that foretell another."""
 
 MAX_GROWN, MAX_FRUITLESS = 96, 16
 """So many lattices are grown, or so many in a row without a board: those of boards come first, being larger, and
 clutter can make hundreds, of one square each."""
 
-REACH = 0.25
+GROWTH_REACH = 0.25
 """A corner lies within this of its prediction, in cells."""
 
-TRIED = 6
+MAX_SADDLES_TRIED = 6
 """Saddles tried for a cell."""
 
 RING = 0.3
@@ -67,13 +75,10 @@ shadow may cross it, and the ring may reach beyond the squares of flat or small 
 LINE_SINE = float(np.sin(np.radians(25.0)))
 """How well the ring's lines must follow the lattice."""
 
-ASIDE, MIN_ASIDE_PX, MAX_ASIDE_PX = 0.12, 1.0, 4.0
-"""How far from an edge its sides are looked at: part of its length, within bounds."""
-
-LEAST_AREA = 1.0
+MIN_AREA_PX2 = 1.0
 """Cells of fewer px^2 are none."""
 
-SAME_PX = 1.4
+GROWN_AGAIN_PX = 1.4
 """Corners nearer than this are one: found again on a coarser level."""
 
 
@@ -97,10 +102,11 @@ class SaddleIndex:
         return Squares.of(library, self.pixels)
 
     def nearest(self, pixels: FloatArray, reach_px: FloatArray) -> tuple[IntArray, BoolArray]:
-        """Return the TRIED nearest saddles of each of `pixels` (M, 2) and which of them lie within `reach_px` (M,)."""
+        """Return the MAX_SADDLES_TRIED nearest saddles of each of `pixels` (M, 2), and which lie within `reach_px`."""
         if not len(self.pixels) or not len(pixels):
-            return np.zeros((len(pixels), TRIED), np.int64), np.zeros((len(pixels), TRIED), bool)
-        distance, index = self._tree.query(pixels, k=TRIED)
+            none = (len(pixels), MAX_SADDLES_TRIED)
+            return np.zeros(none, np.int64), np.zeros(none, bool)
+        distance, index = self._tree.query(pixels, k=MAX_SADDLES_TRIED)
         found = distance <= reach_px[:, None]
         return np.where(found, index, 0), found
 
@@ -131,7 +137,7 @@ def grow_all(
 
 def _covered(lattice: Lattice, corners: FloatArray) -> bool:
     """Return whether most of the corners of `lattice` are among `corners` (M, 2)."""
-    near = near_any(lattice.pixels[lattice.known], corners, SAME_PX)
+    near = near_any(lattice.pixels[lattice.known], corners, GROWN_AGAIN_PX)
     return 2 * int(np.count_nonzero(near)) > len(near)
 
 
@@ -175,7 +181,7 @@ def _grow(lattice: Lattice, saddles: SaddleIndex, level: Level, rings: int) -> i
         for way, (degree, ridge) in enumerate((STIFF, PLIANT)):
             cells = _beside(known) & due[way]
             due[way] &= ~cells
-            fit = fit_cells(lattice.pixels, cells, degree=degree, radius=RADIUS, width=WIDTH, ridge=ridge)
+            fit = fit_cells(lattice.pixels, cells, degree=degree, radius=FIT_RADIUS, width=FIT_WIDTH, ridge=ridge)
             added = _added(lattice, np.argwhere(cells), fit, saddles, level)
             if added.any():
                 break
@@ -189,10 +195,10 @@ def _grow(lattice: Lattice, saddles: SaddleIndex, level: Level, rings: int) -> i
 @cache
 def _rules() -> GrowthRules:
     numbers: dict[str, float] = {
-        "most": MOST,
-        "tried": TRIED,
-        "fewest": FEWEST,
-        "reach": REACH,
+        "most": MIN_EDGE_PLACES,
+        "tried": MAX_SADDLES_TRIED,
+        "fewest": MIN_FORETELLING,
+        "reach": GROWTH_REACH,
         "ring_part": RING,
         "min_ring": MIN_RING_PX,
         "max_ring": MAX_RING_PX,
@@ -201,17 +207,17 @@ def _rules() -> GrowthRules:
         "aside": ASIDE,
         "min_aside": MIN_ASIDE_PX,
         "max_aside": MAX_ASIDE_PX,
-        "least_area": LEAST_AREA,
+        "least_area": MIN_AREA_PX2,
     }
-    predictions = [FitRules(degree, RADIUS, False, WIDTH, ridge) for degree, ridge in (STIFF, PLIANT)]
-    return GrowthRules.make(predictions, ring_rules(ODD, CENTRE), ALONG, **numbers)
+    predictions = [FitRules(degree, FIT_RADIUS, False, FIT_WIDTH, ridge) for degree, ridge in (STIFF, PLIANT)]
+    return GrowthRules.make(predictions, ring_rules(ODD, CENTRE), EDGE_PLACES, **numbers)
 
 
 def _widened(cells: BoolArray) -> BoolArray:
-    """Return the cells within RADIUS of `cells`."""
+    """Return the cells within FIT_RADIUS of `cells`."""
     rows, columns = cells.shape
-    padded = np.pad(cells, RADIUS)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, (2 * RADIUS + 1, 2 * RADIUS + 1))
+    padded = np.pad(cells, FIT_RADIUS)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (2 * FIT_RADIUS + 1, 2 * FIT_RADIUS + 1))
     widened: BoolArray = windows.any(axis=(2, 3)).reshape(rows, columns)
     return widened
 
@@ -221,12 +227,14 @@ def _added(lattice: Lattice, cell: IntArray, fit: LocalFit, saddles: SaddleIndex
     added = np.zeros(lattice.known.shape, bool)
     height, width = level.smooth.shape
     place = level.to_level(fit.pixels)
-    usable = (fit.support >= FEWEST) & (place > 0.0).all(axis=1) & (place < [width - 1, height - 1]).all(axis=1)
-    index, found = saddles.nearest(fit.pixels, np.where(usable, REACH * _longest(fit), 0.0))
+    usable = (
+        (fit.support >= MIN_FORETELLING) & (place > 0.0).all(axis=1) & (place < [width - 1, height - 1]).all(axis=1)
+    )
+    index, found = saddles.nearest(fit.pixels, np.where(usable, GROWTH_REACH * _longest(fit), 0.0))
     owner, slot = np.nonzero(found & usable[:, None])
     pixels = saddles.pixels[index[owner, slot]]
     distance = _in_cells(fit, owner, pixels)
-    near = distance < REACH
+    near = distance < GROWTH_REACH
     owner, pixels, distance = owner[near], pixels[near], distance[near]
     if not len(owner):
         return added
@@ -260,7 +268,7 @@ def _in_cells(fit: LocalFit, owner: IntArray, pixels: FloatArray) -> FloatArray:
     """Return how far `pixels` lie from the predictions of the cells `owner`, in cells (infinite for folded cells)."""
     off = pixels - fit.pixels[owner]
     a, b, area = fit.along_column[owner], fit.along_row[owner], fit.areas()[owner]
-    safe = np.where(area > LEAST_AREA, area, np.nan)
+    safe = np.where(area > MIN_AREA_PX2, area, np.nan)
     column = (off[:, 0] * b[:, 1] - off[:, 1] * b[:, 0]) / safe
     row = (a[:, 0] * off[:, 1] - a[:, 1] * off[:, 0]) / safe
     return np.nan_to_num(np.hypot(column, row), nan=np.inf)
@@ -287,7 +295,7 @@ def _edges_seen(
     lattice: Lattice, level: Level, cell: IntArray, local: FloatArray, sign: FloatArray, contrast: FloatArray
 ) -> BoolArray:
     """Return whether the edges from `local` (M, 2), in the cells `cell` (M, 2), to all known neighbours are there."""
-    beside = cell[:, None] + STEPS[:, ::-1]
+    beside = cell[:, None] + GRID_DIRECTIONS[:, ::-1]
     inside = ((beside >= 0) & (beside < lattice.known.shape)).all(axis=2)
     row, column = np.moveaxis(np.where(inside[..., None], beside, 0), 2, 0)
     which, direction = np.nonzero(inside & lattice.known[row, column])
@@ -298,7 +306,7 @@ def _edges_seen(
     difference = edge_contrast(level.smooth, local[which], end, side, aside)
     weakest = CONTRAST_RATIO * np.minimum(lattice.contrast[row, column][which, direction], contrast[which])
     seen = np.ones(len(cell), np.bool_)
-    seen[which[(difference > weakest[:, None]).sum(axis=1) < MOST]] = False
+    seen[which[(difference > weakest[:, None]).sum(axis=1) < MIN_EDGE_PLACES]] = False
     return seen
 
 

@@ -20,9 +20,9 @@ from rigkit.detection.saddles.saddle import Corners
 from rigkit.kernels import kernels
 from rigkit.kernels.growth import components_of
 
-__all__ = ["MANY", "STEPS", "Lattice", "Sheet", "build_lattices", "margins", "padded"]
+__all__ = ["GRID_DIRECTIONS", "MANY", "Lattice", "LatticeStack", "build_lattices", "margins", "padded"]
 
-STEPS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
+GRID_DIRECTIONS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
 """(column, row) of the four grid directions."""
 
 MANY = 200
@@ -168,7 +168,7 @@ def margins(one: tuple[int, int], two: tuple[int, int], shift: IntArray) -> tupl
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Sheet:
+class LatticeStack:
     """Several lattices one below the other in common arrays, with GAP empty rows between: one call serves them all.
 
     Attributes
@@ -185,7 +185,7 @@ class Sheet:
     parts: tuple[tuple[slice, slice], ...]
 
     @classmethod
-    def of(cls, lattices: Sequence[Lattice]) -> Sheet:
+    def of(cls, lattices: Sequence[Lattice]) -> LatticeStack:
         tops = np.cumsum([0, *(item.pixels.shape[0] + cls.GAP for item in lattices)])
         columns = max((item.pixels.shape[1] for item in lattices), default=0)
         pixels = np.full((int(tops[-1]), columns, 2), np.nan)
@@ -272,7 +272,7 @@ def _walk(links: Links) -> tuple[IntArray, IntArray, IntArray]:
         end, first = np.unique(end, return_index=True)
         start, arm, back = start[first], arm[first], back[first]
         direction = (arm - turn[start]) % 4
-        grid[end] = grid[start] + STEPS[direction]
+        grid[end] = grid[start] + GRID_DIRECTIONS[direction]
         turn[end] = (back - direction - 2) % 4
         done[end] = True
         frontier = end

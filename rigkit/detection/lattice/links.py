@@ -33,11 +33,11 @@ CONTRAST_RATIO = 0.25
 LENGTH_RATIO = 2.1
 """Opposite neighbours differ less than this in distance, in any perspective a board can be read in."""
 
-ALONG = np.array([0.5, 0.35, 0.65, 0.2, 0.8])
-MOST = 4
-"""An edge shows the right side dark at this many of the places `ALONG` it, in the order in which clutter is told."""
+EDGE_PLACES = np.array([0.5, 0.35, 0.65, 0.2, 0.8])
+MIN_EDGE_PLACES = 4
+"""An edge shows the right side dark at this many of these parts of its length. Their order rejects clutter soonest."""
 
-ASIDE, LEAST_ASIDE_PX, MOST_ASIDE_PX = 0.12, 1.0, 4.0
+ASIDE, MIN_ASIDE_PX, MAX_ASIDE_PX = 0.12, 1.0, 4.0
 """How far to the sides of an edge the brightness is read: a part of its length, within bounds."""
 
 
@@ -66,7 +66,7 @@ class Links:
 def edge_contrast(
     image: FloatImage, start: FloatArray, end: FloatArray, sign: FloatArray, offset_px: FloatArray
 ) -> FloatArray:
-    """Return how much brighter the expected side of the edges `start` -> `end` (M, 2) is, at the places ALONG, (M, 5).
+    """Return how much brighter the expected side of the edges `start` -> `end` (M, 2) is, (M, 5) at EDGE_PLACES.
 
     `sign` is +1 where brightness grows with the angle (from u to v) around the start; `offset_px` (M,) is how far from
     the chord both sides are sampled.
@@ -74,7 +74,7 @@ def edge_contrast(
     chord = end - start
     length = np.maximum(np.linalg.norm(chord, axis=1), 1e-9)
     normal = np.stack([-chord[:, 1], chord[:, 0]], axis=1) / length[:, None]
-    along = start[:, None] + ALONG[:, None] * chord[:, None]
+    along = start[:, None] + EDGE_PLACES[:, None] * chord[:, None]
     aside = (sign * offset_px)[:, None, None] * normal[:, None]
     return np.asarray(sample(image, along + aside) - sample(image, along - aside), dtype=np.float64)
 
@@ -99,7 +99,7 @@ def _compiled(corners: Corners, level: Level) -> IntArray | None:
         arm_vectors(corners.angles)[:, :2],
         corners.contrast,
         _bounds(corners.contrast),
-        MOST_ASIDE_PX * corners.scale / level.scale,
+        MAX_ASIDE_PX * corners.scale / level.scale,
         level.smooth,
         level.scale,
         level.offset,
@@ -111,13 +111,13 @@ def _compiled(corners: Corners, level: Level) -> IntArray | None:
 def _link_rules() -> front.LinkRules:
     return front.LinkRules.make(
         NEIGHBOURS,
-        ALONG,
-        MOST,
+        EDGE_PLACES,
+        MIN_EDGE_PLACES,
         arm_cosine=ARM_COSINE,
         contrast_ratio=CONTRAST_RATIO,
         length_ratio=LENGTH_RATIO,
         aside=ASIDE,
-        least_aside=LEAST_ASIDE_PX,
+        least_aside=MIN_ASIDE_PX,
     )
 
 
@@ -199,11 +199,11 @@ def _edge_seen(corners: Corners, level: Level, start: IntArray, arm: IntArray, e
     """Return whether the edge between the corners is there, with the polarity of the arm."""
     first, last = level.to_level(corners.pixels[start]), level.to_level(corners.pixels[end])
     length = np.linalg.norm(last - first, axis=1)
-    offset = np.clip(ASIDE * length, LEAST_ASIDE_PX, MOST_ASIDE_PX * corners.scale[start] / level.scale)
+    offset = np.clip(ASIDE * length, MIN_ASIDE_PX, MAX_ASIDE_PX * corners.scale[start] / level.scale)
     sign = np.where(arm % 2 == 0, 1.0, -1.0)
     difference = edge_contrast(level.smooth, first, last, sign, offset)
     weakest = CONTRAST_RATIO * np.minimum(corners.contrast[start], corners.contrast[end])
-    return np.asarray((difference > weakest[:, None]).sum(axis=1) >= MOST, dtype=np.bool_)
+    return np.asarray((difference > weakest[:, None]).sum(axis=1) >= MIN_EDGE_PLACES, dtype=np.bool_)
 
 
 def _without_long(to: IntArray, pixels: FloatArray) -> IntArray:

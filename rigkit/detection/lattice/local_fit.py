@@ -13,7 +13,7 @@ from rigkit.kernels.growth import FitRules, fit
 __all__ = ["LocalFit", "fit_cells"]
 
 POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
-TERMS = {1: 3, 2: 6, 3: 10}
+TERMS_OF_DEGREE = {1: 3, 2: 6, 3: 10}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -122,7 +122,7 @@ def fit_cells(
         return _local_fit(fit(library, lattice, cells, rules))
     side = 2 * radius + 1
     step_r, step_c = (a.ravel() - radius for a in np.divmod(np.arange(side * side), side))
-    powers = POWERS[: TERMS[degree]]
+    powers = POWERS[: TERMS_OF_DEGREE[degree]]
     design = np.stack([step_c**i * step_r**j for i, j in powers], axis=-1).astype(np.float64)
     weight = np.exp(-0.5 * (step_c**2 + step_r**2) / width**2)
     if leave_out:

@@ -9,10 +9,10 @@ import numpy as np
 from rigkit.core.arrays import FloatArray
 from rigkit.kernels import lattice as native
 
-__all__ = ["Unevenness", "unevenness"]
+__all__ = ["SpacingChange", "spacing_changes"]
 
 
-class Unevenness(NamedTuple):
+class SpacingChange(NamedTuple):
     """How the steps before and after the inner corners of the rows differ, relative to the shorter step.
 
     Attributes
@@ -26,20 +26,22 @@ class Unevenness(NamedTuple):
     every: float
 
 
-def unevenness(pixels: FloatArray) -> tuple[Unevenness, Unevenness]:
+def spacing_changes(pixels: FloatArray) -> tuple[SpacingChange, SpacingChange]:
     """Return how uneven the rows of `pixels` (R, C, 2) are, and its columns; NaN where no corner is known."""
     library = native.loaded()
     if library is None:
-        return _uneven_rows(pixels), _uneven_rows(pixels.swapaxes(0, 1))
+        return _changes_along_rows(pixels), _changes_along_rows(pixels.swapaxes(0, 1))
     typical, seen, every = native.uneven_steps(library, pixels)
     inner = max(pixels.shape[1] - 2, 0)
-    return Unevenness(typical[:inner], seen[:inner], every[0]), Unevenness(typical[inner:], seen[inner:], every[1])
+    return SpacingChange(typical[:inner], seen[:inner], every[0]), SpacingChange(
+        typical[inner:], seen[inner:], every[1]
+    )
 
 
-def _uneven_rows(pixels: FloatArray) -> Unevenness:
+def _changes_along_rows(pixels: FloatArray) -> SpacingChange:
     columns = pixels.shape[1]
     if columns < 3:
-        return Unevenness([], [], np.nan)
+        return SpacingChange([], [], np.nan)
     step = pixels[:, 1:] - pixels[:, :-1]
     bend = step[:, 1:] - step[:, :-1]
     length = np.hypot(step[..., 0], step[..., 1])
@@ -47,7 +49,7 @@ def _uneven_rows(pixels: FloatArray) -> Unevenness:
         relative = np.hypot(bend[..., 0], bend[..., 1]) / np.minimum(length[:, 1:], length[:, :-1])
     here = [column[np.isfinite(column)] for column in relative.T]
     every = np.sort(np.concatenate(here))
-    return Unevenness(
+    return SpacingChange(
         [float(np.median(column)) if len(column) else np.nan for column in here],
         [len(column) for column in here],
         float(every[len(every) // 2]) if len(every) else np.nan,

@@ -17,19 +17,19 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.lattice.lattice import Lattice, margins
 from rigkit.detection.lattice.local_fit import fit_cells
-from rigkit.detection.lattice.spacing import Unevenness, unevenness
+from rigkit.detection.lattice.spacing import SpacingChange, spacing_changes
 
-__all__ = ["join_parts", "split_folds", "split_necks"]
+__all__ = ["join_parts", "split_at_turns", "split_necks"]
 
-FOLD = 0.16
-FOLD_FACTOR = 3.5
+MIN_TURN = 0.16
+TURN_FACTOR = 3.5
 """A lattice folds at a row or column where neighbouring steps differ by more than this (relative to the step), and by
 more than this factor times what is typical of it: perspective and fisheyes bend everywhere, a seam bends once."""
 
-LEAST_FOR_FOLD = 5
+MIN_FOR_TYPICAL = 5
 """Columns or rows needed to say what is typical."""
 
-LEAST_ROWS = 4
+MIN_TURNED_ROWS = 4
 """Rows that must fold at a column."""
 
 CONTINUES_CELLS = 0.1
@@ -43,7 +43,7 @@ FAR_GAP, FAR_MEETS_CELLS, FAR_OUT, FAR_FACING = 3, 0.1, 24, 2
 """A step more if so many corners of the other part, and not only the nearest, are where they should be, and if two see
 one of the first along their row or column."""
 
-DIAGONAL, REACH = 1.5, 3.3
+DIAGONAL, JOIN_REACH = 1.5, 3.3
 """A diagonal step is so many times as long as a side, and a little more; the nearest corners of parts a step further
 apart are so many sides apart, at most."""
 
@@ -65,18 +65,18 @@ LOOSE_CELLS, MAX_GAIN = 0.08, 8.0
 corner itself, and by a prediction whose standard deviation is at most so many times that of a corner."""
 
 
-def split_folds(lattice: Lattice) -> list[Lattice]:
+def split_at_turns(lattice: Lattice) -> list[Lattice]:
     """Return the parts of `lattice` between its folds; the corners on a fold belong to no board."""
     columns, rows = lattice.size
-    along_rows, along_columns = unevenness(lattice.pixels)
-    at = _fold(rows, along_rows)
+    along_rows, along_columns = spacing_changes(lattice.pixels)
+    at = _sharpest_turn(rows, along_rows)
     if at is not None:
-        return [part for half in _halves(lattice, at) for part in split_folds(half)]
-    at = _fold(columns, along_columns)
+        return [part for half in _halves(lattice, at) for part in split_at_turns(half)]
+    at = _sharpest_turn(columns, along_columns)
     if at is not None:
         # A quarter turn makes the row into a column, counted from the other end.
         halves = _halves(lattice.turned(1), rows - 1 - at)
-        return [part.turned(3) for half in halves for part in split_folds(half)]
+        return [part.turned(3) for half in halves for part in split_at_turns(half)]
     return [lattice]
 
 
@@ -117,9 +117,9 @@ def split_necks(lattice: Lattice) -> list[Lattice]:
         return [lattice]
     groups: list[BoolArray] = []
     for broad in _broad_parts(known):
-        part = _Part.of(lattice.without(~broad))
+        part = _LatticePart.of(lattice.without(~broad))
         for number, group in enumerate(groups):
-            if _same_board(_Part.of(lattice.without(~group)), part):
+            if _same_board(_LatticePart.of(lattice.without(~group)), part):
                 groups[number] = group | broad
                 break
         else:
@@ -141,7 +141,7 @@ def _broad_parts(known: BoolArray) -> list[BoolArray]:
     return []
 
 
-def _same_board(one: _Part, two: _Part) -> bool:
+def _same_board(one: _LatticePart, two: _LatticePart) -> bool:
     """Return whether two parts of one lattice continue each other."""
     near, place = _carried_over(one, two, _squared_gaps(one, two))
     off = float(np.abs(place - two.grid[near])[:NEAREST_OUT].max())
@@ -172,28 +172,28 @@ def _absorb(lattice: Lattice, groups: list[BoolArray]) -> None:
         loose &= ~added
 
 
-def _fold(rows: int, uneven: Unevenness) -> int | None:
+def _sharpest_turn(rows: int, uneven: SpacingChange) -> int | None:
     """Return the column at which so many rows, as `uneven` as that, fold; None if they do not."""
-    least = max(LEAST_ROWS, 0.4 * rows)
+    least = max(MIN_TURNED_ROWS, 0.4 * rows)
     steps = enumerate(zip(uneven.typical, uneven.seen, strict=True), start=1)
     judged = [(bend, -column) for column, (bend, count) in steps if count >= least]
-    if len(judged) < LEAST_FOR_FOLD - 2:
+    if len(judged) < MIN_FOR_TYPICAL - 2:
         return None
     *others, (sharpest, column) = sorted(judged)
     middle = 0.5 * (others[(len(others) - 1) // 2][0] + others[len(others) // 2][0])
-    return -column if sharpest > max(FOLD, FOLD_FACTOR * middle) else None
+    return -column if sharpest > max(MIN_TURN, TURN_FACTOR * middle) else None
 
 
 def join_parts(lattices: Sequence[Lattice]) -> list[Lattice]:
     """Return `lattices` with those joined that continue each other's rows and columns across a short gap."""
-    parts = [_Part.of(item) for item in sorted(lattices, key=lambda item: -item.count) if item.count >= 6]
+    parts = [_LatticePart.of(item) for item in sorted(lattices, key=lambda item: -item.count) if item.count >= 6]
     done = False
     while not done:
         done = True
         for i, j in _near(parts):
             joined = _joined(parts[i], parts[j])
             if joined is not None:
-                parts = [_Part.of(joined), *(item for k, item in enumerate(parts) if k not in (i, j))]
+                parts = [_LatticePart.of(joined), *(item for k, item in enumerate(parts) if k not in (i, j))]
                 done = False
                 break
     return [part.lattice for part in parts]
@@ -204,7 +204,7 @@ _Cell = Sequence[Sequence[float]]
 
 
 @dataclass(frozen=True, eq=False)
-class _Part:
+class _LatticePart:
     """A lattice with its corners (N, 2), their (column, row), bounding box, and longest side of a cell."""
 
     lattice: Lattice
@@ -215,7 +215,7 @@ class _Part:
     side_px: float
 
     @classmethod
-    def of(cls, lattice: Lattice) -> _Part:
+    def of(cls, lattice: Lattice) -> _LatticePart:
         row, column = np.nonzero(lattice.known)
         pixels = lattice.pixels[row, column]
         steps = (lattice.pixels[:, 1:] - lattice.pixels[:, :-1], lattice.pixels[1:] - lattice.pixels[:-1])
@@ -230,7 +230,7 @@ class _Part:
         return fit_cells(self.lattice.pixels, self.lattice.known, degree=1).sides
 
 
-def _near(parts: Sequence[_Part]) -> list[tuple[int, int]]:
+def _near(parts: Sequence[_LatticePart]) -> list[tuple[int, int]]:
     """Return the pairs whose bounding boxes come within FAR_GAP sides of a cell of the first, at its largest."""
     if len(parts) < 2:
         return []
@@ -240,14 +240,14 @@ def _near(parts: Sequence[_Part]) -> list[tuple[int, int]]:
     return [(int(i), int(j)) for i, j in np.argwhere(near)]
 
 
-def _joined(one: _Part, two: _Part) -> Lattice | None:
+def _joined(one: _LatticePart, two: _LatticePart) -> Lattice | None:
     """Return both lattices in one, None if `two` does not continue `one`."""
     squared = _squared_gaps(one, two)
     nearest = divmod(int(squared.argmin()), len(two.pixels))
     apart = math.sqrt(squared[nearest])
     cell = one.cells[nearest[0]].tolist()
     longest = max(math.hypot(*side) for side in cell)
-    if not apart < REACH * longest or not _alike(cell, two.cells[nearest[1]].tolist()):
+    if not apart < JOIN_REACH * longest or not _alike(cell, two.cells[nearest[1]].tolist()):
         return None
     near, place = _carried_over(one, two, squared)
     whole = np.rint(place)
@@ -293,7 +293,7 @@ def _agree(pixels: FloatArray, one: BoolArray, two: BoolArray) -> bool:
     return False
 
 
-def _squared_gaps(one: _Part, two: _Part) -> FloatArray:
+def _squared_gaps(one: _LatticePart, two: _LatticePart) -> FloatArray:
     """Return the squared distances between the corners, (N, M)."""
     across, down = (one.pixels[:, k, None] - two.pixels[:, k] for k in (0, 1))
     across *= across
@@ -302,7 +302,7 @@ def _squared_gaps(one: _Part, two: _Part) -> FloatArray:
     return across
 
 
-def _carried_over(one: _Part, two: _Part, squared: FloatArray) -> tuple[IntArray, FloatArray]:
+def _carried_over(one: _LatticePart, two: _LatticePart, squared: FloatArray) -> tuple[IntArray, FloatArray]:
     """Return the FAR_OUT nearest corners of `two` and their (column, row) as the NEAREST_IN of `one` say, or infinity.
 
     `squared` (N, M) are the `_squared_gaps`.

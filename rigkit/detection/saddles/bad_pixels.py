@@ -12,35 +12,35 @@ import numpy as np
 from rigkit.core.arrays import IntArray
 from rigkit.detection.saddles.response import GreyImage
 
-__all__ = ["without_impulses"]
+__all__ = ["without_bad_pixels"]
 
 LOOKED_AT = 6000
 """Pixels of the sparse look, in whole rows."""
 
-EVIDENT = 3
+MIN_EVIDENT = 3
 """So many of them stand out where an image has bad pixels: one in 2000. Fewer move few corners, and by little."""
 
-NOISE_FACTOR, SPAN_SHARE = 8.0, 0.15
+BAD_PIXEL_SIGMAS, SPAN_SHARE = 8.0, 0.15
 """A pixel stands out if it differs from its neighbours by so many standard deviations of the noise, and by this part of
 the range of brightness: sharpened corners ring by less."""
 
-CLEAR_OF = 7
+MIN_CLEAR_OF = 7
 """A bad pixel is so much brighter than so many of its eight neighbours, or so much darker: where many are bad, some lie
 side by side. Of the corner of a square, five neighbours are."""
 
-ROUNDS = 2
+REPAIR_ROUNDS = 2
 """What three bad pixels in a row have hidden of each other shows when those beside them are gone."""
 
-AROUND: IntArray = np.array([(v, u) for v in (-1, 0, 1) for u in (-1, 0, 1) if v or u])
+NEIGHBOUR_STEPS: IntArray = np.array([(v, u) for v in (-1, 0, 1) for u in (-1, 0, 1) if v or u])
 
 
-def without_impulses(grey: GreyImage) -> GreyImage:
+def without_bad_pixels(grey: GreyImage) -> GreyImage:
     """Return `grey` with its bad pixels replaced by the median of the good ones around them; as it is without any."""
     step = _evident(grey)
     if step is None:
         return grey
     out = grey.copy()
-    for _ in range(ROUNDS):
+    for _ in range(REPAIR_ROUNDS):
         _repair(out, step)
     return out
 
@@ -60,25 +60,25 @@ def _evident(grey: GreyImage) -> float | None:
     least = cv2.min(cv2.min(side_low[:, :-2], side_low[:, 2:]), low[:, 1:-1])
     # Bytes stop at zero.
     beyond = cv2.max(cv2.subtract(inner, most), cv2.subtract(least, inner))
-    if np.count_nonzero(beyond > SPAN_SHARE * span) < EVIDENT:
+    if np.count_nonzero(beyond > SPAN_SHARE * span) < MIN_EVIDENT:
         return None
     rough = np.abs(here - 0.5 * above - 0.5 * below).ravel()
     # The difference of a pixel and the mean of two has a median of 0.6745 sqrt(1.5) sigma.
     sigma = float(np.partition(rough, len(rough) // 2)[len(rough) // 2]) / 0.826
-    step = max(NOISE_FACTOR * sigma, SPAN_SHARE * span)
-    return step if np.count_nonzero(beyond > step) >= EVIDENT else None
+    step = max(BAD_PIXEL_SIGMAS * sigma, SPAN_SHARE * span)
+    return step if np.count_nonzero(beyond > step) >= MIN_EVIDENT else None
 
 
 def _repair(image: GreyImage, step: float) -> None:
     """Replace the pixels that stand out by `step` by the median of those around them that do not, IN PLACE."""
     height, width = image.shape
     row, column = np.nonzero(cv2.absdiff(image, cv2.medianBlur(image, 3)) > step)
-    rows, columns = row[:, None] + AROUND[:, 0], column[:, None] + AROUND[:, 1]
+    rows, columns = row[:, None] + NEIGHBOUR_STEPS[:, 0], column[:, None] + NEIGHBOUR_STEPS[:, 1]
     inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
     rows, columns = np.where(inside, rows, row[:, None]), np.where(inside, columns, column[:, None])
     own, around = image[row, column].astype(np.float32)[:, None], image[rows, columns].astype(np.float32)
     # Where the frame ends nothing contradicts.
-    brighter, darker = (((step < off) | ~inside).sum(axis=1) >= CLEAR_OF for off in (own - around, around - own))
+    brighter, darker = (((step < off) | ~inside).sum(axis=1) >= MIN_CLEAR_OF for off in (own - around, around - own))
     bad = np.zeros(image.shape, bool)
     which = np.flatnonzero(brighter | darker)
     bad[row[which], column[which]] = True

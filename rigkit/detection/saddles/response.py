@@ -38,12 +38,12 @@ SMOOTH = np.array([1.0, 4.0, 6.0, 4.0, 1.0], np.float32) / 16.0
 NOISE_FACTOR = 8.0
 """A peak stands out of the noise from this multiple of the median |D| upwards."""
 
-FLOOR, CEILING = 2.0, 16.0
+THRESHOLD_FLOOR, THRESHOLD_CEILING = 2.0, 16.0
 """Bounds of the threshold on D for an image that spans 200 grey levels, in (grey levels per px^2)^2; they go with the
 square of the span. Below the floor is only quantisation and compression, and the median of a richly textured image must
 not hide the corners of a board in it."""
 
-LEAST_SPAN = 2.5
+MIN_SPAN = 2.5
 """An image that spans fewer grey levels shows nothing but its quantisation."""
 
 TYPICAL = 4e3
@@ -56,7 +56,7 @@ PIXELS_A_PEAK, MAX_PEAKS = 480, 3200
 """Keep the strongest peaks of a level, one for so many of its pixels, or the second number if that is more: texture and
 noise have more, a board never."""
 
-AROUND, SHARES = 32, 1024
+PEAK_SQUARE_PX, SHARES = 32, 1024
 """How strong a peak is, is seen beside the strongest one in its square of so many pixels, to one part in so many: a
 board in the shade has weaker corners than a page of text in the sun."""
 
@@ -194,8 +194,11 @@ def _threshold(smooth: FloatImage) -> float:
         brightness = smooth[1:-1:step, 1:-1:step].ravel()
     few = int(EXTREME * len(brightness))
     span = _ranked(brightness, len(brightness) - 1 - few) - _ranked(brightness, few)
-    contrast = (max(span, LEAST_SPAN) / 200.0) ** 2
-    return min(max(NOISE_FACTOR * _ranked(response, len(response) // 2), FLOOR * contrast), CEILING * contrast)
+    contrast = (max(span, MIN_SPAN) / 200.0) ** 2
+    return min(
+        max(NOISE_FACTOR * _ranked(response, len(response) // 2), THRESHOLD_FLOOR * contrast),
+        THRESHOLD_CEILING * contrast,
+    )
 
 
 def _ranked(values: FloatImage, at: int) -> float:
@@ -208,7 +211,7 @@ def peaks(level: Level) -> tuple[NDArray[np.signedinteger], FloatImage]:
     most = max(MAX_PEAKS, level.smooth.size // PIXELS_A_PEAK)
     library = front.loaded()
     if library is not None:
-        return front.peaks(library, level.smooth, level.threshold, most, AROUND, SHARES)
+        return front.peaks(library, level.smooth, level.threshold, most, PEAK_SQUARE_PX, SHARES)
     response = _response(level.smooth)
     highest = cv2.dilate(response, np.ones((5, 5), np.uint8))
     mask = (response >= highest) & (response > level.threshold)
@@ -227,7 +230,7 @@ def _strongest(at: IntArray, height: FloatImage, most: int) -> BoolArray:
 
     More where the last ones are equally strong.
     """
-    column, row = (at // AROUND).T
+    column, row = (at // PEAK_SQUARE_PX).T
     square = row * (int(column.max()) + 1) + column
     strongest = np.zeros(int(square.max()) + 1, np.float32)
     np.maximum.at(strongest, square, height)

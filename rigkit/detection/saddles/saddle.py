@@ -14,7 +14,7 @@ from rigkit.kernels import front
 
 __all__ = ["Corners", "Saddles", "find_corners", "saddle_step"]
 
-RADIUS = 2.6
+RING_RADIUS = 2.6
 """Of the ring, in pixels of the level: fits squares of 6 px, and 5 where they are seen straight on."""
 
 MAX_SHARPNESS = 0.095
@@ -22,7 +22,7 @@ MAX_SHARPNESS = 0.095
 the level is, make 0.08, sharpened ones 0.09, whatever the angles and down to squares of 4 px; noise makes 0.12. Of the
 corners of boards in noise a few show more, which growth finds; of those that noise makes, a third."""
 
-KNOWN = 2.0
+KNOWN_PX = 2.0
 """A corner this near to one of a finer level is the same, in pixels of its own level."""
 
 MAX_STEP = 1.5
@@ -90,11 +90,11 @@ def _corners_of(level: Level) -> tuple[FloatArray, IntArray, FloatArray, FloatAr
     at, response = peaks(level)
     library = front.loaded()
     if library is not None:
-        return front.corners(library, level.smooth, at, response, RADIUS, MAX_STEP, MAX_SHARPNESS, ring_rules())
+        return front.corners(library, level.smooth, at, response, RING_RADIUS, MAX_STEP, MAX_SHARPNESS, ring_rules())
     found, near = saddle_step(level.smooth, at)
     found, response = found[near], response[near]
-    which = np.flatnonzero(may_be_corners(level.smooth, found, RADIUS, response))
-    rings = read_rings(level.smooth, found[which], RADIUS)
+    which = np.flatnonzero(may_be_corners(level.smooth, found, RING_RADIUS, response))
+    rings = read_rings(level.smooth, found[which], RING_RADIUS)
     good = rings.valid & (response[which] <= MAX_SHARPNESS * rings.contrast**2)
     return found, which[good], rings.angles[good], rings.contrast[good]
 
@@ -104,7 +104,7 @@ def _without_known(fresh: Corners, known: list[Corners]) -> Corners:
     if not len(fresh) or not any(len(k) for k in known):
         return fresh
     before = np.concatenate([k.pixels for k in known])
-    new = ~near_any(fresh.pixels, before, KNOWN * float(fresh.scale[0]))
+    new = ~near_any(fresh.pixels, before, KNOWN_PX * float(fresh.scale[0]))
     return Corners(fresh.pixels[new], fresh.angles[new], fresh.contrast[new], fresh.scale[new])
 
 

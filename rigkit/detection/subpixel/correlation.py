@@ -28,13 +28,13 @@ s from 0.4 to 2 px and squares of 25 and 50 px."""
 LOST_ERROR = 0.3
 """How well it is known what the fit takes out of the noise, relative: squares of 8 to 50 px, sharp and blurred."""
 
-LEAST_LEFT = 0.05
+MIN_LEFT = 0.05
 """A smaller share of the noise than this, left by the fit, would say nothing."""
 
-COVERED = 2.0
+COVERED_TIMES = 2.0
 """Where there is so many times the noise that is usual on the board, it is not the camera's alone."""
 
-LEAST_FACTOR = 0.5
+MIN_SIGMA_FACTOR = 0.5
 """Of sigma: noise that cancels over a few pixels never does so altogether."""
 
 _ROW, _COLUMN = np.array(LAGS, dtype=np.float64).T
@@ -82,7 +82,7 @@ def sigma_factors(
     member, noise = owner[seen] == np.arange(boards)[:, None], fit.noise[seen]
     # A hand or a ruler in the window is no noise, but as much the same from pixel to pixel as anything can be.
     usual = np.exp((member @ np.log(noise)) / np.maximum(member.sum(axis=1), 1))
-    member &= noise <= COVERED * usual[:, None]
+    member &= noise <= COVERED_TIMES * usual[:, None]
     twice = 2.0 * fit.pixels
     part = twice - np.floor(twice)
     blend = part * (1.0 - part)
@@ -98,14 +98,14 @@ def sigma_factors(
     blended = _WHOLE + (shape[:, 6:] @ _BETWEEN).reshape(-1, len(LAGS), len(LAGS))
     weight = np.linalg.solve(np.swapaxes(blended, 1, 2), (_TIMES * influence)[..., None])[..., 0]
     share = lost / np.maximum(shape[:, 5], 1.0)
-    left = np.maximum(1.0 - share, LEAST_LEFT)
+    left = np.maximum(1.0 - share, MIN_LEFT)
     excess = (weight * change).sum(axis=1) / left - 1.0
     # Products of independent noise have this variance at all lags but none.
     chance = (weight[:, 1:] ** 2 / (count * pairs)[:, 1:]).sum(axis=1) * (change[:, 0] / left) ** 2
     # What is not known of `left` goes with the quotient: small windows, of which the fit takes most, say nothing.
     doubt = chance + ((1.0 + excess) * LOST_ERROR * share / left) ** 2
     sure = np.maximum(1.0 - doubt / np.maximum(excess**2, 1e-12), 0.0) * member.any(axis=1)
-    factors: FloatArray = np.sqrt(np.maximum(1.0 + sure * excess, LEAST_FACTOR**2))
+    factors: FloatArray = np.sqrt(np.maximum(1.0 + sure * excess, MIN_SIGMA_FACTOR**2))
     return factors
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray
-from rigkit.detection.lattice.lattice import Sheet
+from rigkit.detection.lattice.lattice import LatticeStack
 from rigkit.kernels.edges import BendRules, line_bends
 
 __all__ = ["line_curvature"]
@@ -24,13 +24,13 @@ DECAY = 0.1
 BENT_RAD = 0.06
 """Where this phi is seen, DECAY would be too strict: the third coefficient, phi^2 / 2, then exceeds DECAY^3."""
 
-LINE_REACH = Sheet.GAP
+LINE_REACH = LatticeStack.GAP
 """Corners so many cells away are used: on a sheet, further ones may be another board's."""
 
-TERMS = 6
+COEFFICIENTS = 6
 """Coefficients of order 0 to 5."""
 
-LEAST_SIGMA_PX = 1e-3
+MIN_CORNER_SIGMA_PX = 1e-3
 """No corner is taken to be better than this."""
 
 FREE = 1e-6
@@ -51,16 +51,16 @@ def line_curvature(
     cells : (R, C) bool, row by row.
     sides_px : (M, 2) lengths of the cell's sides along row and column.
     """
-    rules = BendRules(DECAY, LEAST_SIGMA_PX, FREE, BENT_RAD, LINE_REACH)
+    rules = BendRules(DECAY, MIN_CORNER_SIGMA_PX, FREE, BENT_RAD, LINE_REACH)
     compiled = line_bends(pixels, sigma_px, cells, sides_px, rules)
     if compiled is not None:
         return compiled
     steps = np.arange(-LINE_REACH, LINE_REACH + 1)
-    design = steps[:, None].astype(np.float64) ** np.arange(TERMS)
+    design = steps[:, None].astype(np.float64) ** np.arange(COEFFICIENTS)
     products = (design[:, :, None] * design[:, None, :]).reshape(len(steps), -1)
-    decay = DECAY ** np.arange(TERMS)
+    decay = DECAY ** np.arange(COEFFICIENTS)
     known = np.isfinite(sigma_px) & np.isfinite(pixels[..., 0])
-    weight = np.where(known, np.maximum(sigma_px, LEAST_SIGMA_PX) ** -2.0, 0.0)
+    weight = np.where(known, np.maximum(sigma_px, MIN_CORNER_SIGMA_PX) ** -2.0, 0.0)
     row, column = np.nonzero(cells)
     out, out_sigma = np.empty((2, len(row), 2))
     for line, (along_row, along_column) in enumerate(((0, 1), (1, 0))):
@@ -70,15 +70,15 @@ def line_curvature(
         side = sides_px[:, line, None]
         weights = np.where(inside, weight[r, c], 0.0) * side**2
         off = np.where((weights > 0.0)[..., None], pixels[r, c] - pixels[row, column][:, None], 0.0) / side[..., None]
-        normal = (weights @ products).reshape(-1, TERMS, TERMS)
+        normal = (weights @ products).reshape(-1, COEFFICIENTS, COEFFICIENTS)
         right = design.T @ (weights[..., None] * off)
-        found, sigma = _most_probable(normal, right, np.broadcast_to(decay, (len(row), TERMS)))
+        found, sigma = _most_probable(normal, right, np.broadcast_to(decay, (len(row), COEFFICIENTS)))
         size = np.linalg.norm(found, axis=2)
         turn = np.maximum(2.0 * size[:, 2], np.sqrt(2.0 * size[:, 3]))
         bent = turn > BENT_RAD
         if bent.any():
             expected: FloatArray = np.repeat(decay[None], np.count_nonzero(bent), axis=0)
-            expected[:, 2:] = np.maximum(decay[2:], 0.5 * turn[bent, None] ** np.arange(1, TERMS - 1))
+            expected[:, 2:] = np.maximum(decay[2:], 0.5 * turn[bent, None] ** np.arange(1, COEFFICIENTS - 1))
             found[bent], sigma[bent] = _most_probable(normal[bent], right[bent], expected)
         first, second = found[:, 1], 2.0 * found[:, 2]
         cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
@@ -89,8 +89,8 @@ def line_curvature(
 
 
 def _most_probable(normal: FloatArray, right: FloatArray, expected: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the coefficients (M, TERMS, 2) that are `expected` (M, TERMS) in size, and the second's sigma (M,)."""
-    prior = np.diag([FREE, FREE, *[1.0] * (TERMS - 2)])
+    """Return the coefficients (M, K, 2) that are `expected` (M, K) in size, and the second's sigma (M,)."""
+    prior = np.diag([FREE, FREE, *[1.0] * (COEFFICIENTS - 2)])
     inverse = np.linalg.inv(normal * expected[:, :, None] * expected[:, None, :] + prior)
     found = expected[..., None] * (inverse @ (expected[..., None] * right))
     return found, expected[:, 2] * np.sqrt(inverse[:, 2, 2])

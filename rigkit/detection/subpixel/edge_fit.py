@@ -21,16 +21,16 @@ from rigkit.detection.subpixel.edge_model import (
     GY,
     K1,
     K2,
-    LEAST_REACH,
+    MIN_REACH,
     NEAR_PX,
     NEAR_SIGMAS,
     PARAMETERS,
     PIXEL_KURTOSIS,
-    REACH,
     SHARP_BLUR_PX,
     T1,
     T2,
     TAIL_SIGMAS,
+    WINDOW_REACH,
     A,
     B,
     Geometry,
@@ -46,7 +46,7 @@ from rigkit.kernels.edges import LAGS, Rules, fit_corners
 
 __all__ = ["BLUR_RANGE", "EdgeFit", "fit_edges"]
 
-DETERMINED = K1
+MIN_DETERMINED_PIXELS = K1
 """So many parameters only the pixels determine; the curvatures of the lines are mostly the lattice's."""
 
 BLUR_RANGE = (0.28, 5.0)
@@ -58,7 +58,7 @@ LIGHT_SIGMA_PER_PX = 0.01
 """How well the lattice's angles, the start's log s and an even light (g = 0) are known beforehand. These matter only
 where squares are so small that the pixels cannot tell; there, a gradient of the light passes for a shifted corner."""
 
-MOST_MOVE_PX, MOST_TURN_RAD, MOST_BLUR_CHANGE, MOST_LIGHT_CHANGE = 1.0, 0.2, 0.3, 0.3
+MAX_MOVE_PX, MAX_TURN_RAD, MAX_BLUR_CHANGE, MAX_LIGHT_CHANGE = 1.0, 0.2, 0.3, 0.3
 """A step is cut where it would leave the region in which the model is nearly linear: position, angles, relative blur,
 light."""
 
@@ -66,7 +66,7 @@ BLUR_LAG = 2.0
 """The last step may change s by this part of it for each px that it may move the corner: a wrong s hardly moves the
 corner, but adds to the residuals and so to the predicted sigma, most of all on sharp edges."""
 
-FEWEST_MIRRORED, MOST_MIRRORED_PX = 12, 2.0
+MIN_MIRRORED, MAX_MIRRORED_PX = 12, 2.0
 """Noise is read from so many pixels with a mirror image at least, and not where a corner has ended so far from the
 middle of its window: little of the window has a mirror image then."""
 
@@ -77,8 +77,8 @@ ROUNDING_VARIANCE = 1.0 / 12.0
 """Of grey levels, the least in 8-bit images: in flat squares rounding is the same everywhere and leaves nothing, but at
 the edges, where the corner comes from, its error varies evenly over a level."""
 
-LEAST_VARIANCE = 1e-6
-RIDGE = 1e-9
+MIN_VARIANCE = 1e-6
+FIT_RIDGE = 1e-9
 """Of grey levels, and on the normal equations' diagonal: keep an image without noise or without contrast solvable."""
 
 VALID_MOVE_PX, VALID_MOVE_CELLS = 1.5, 0.2
@@ -144,7 +144,7 @@ def fit_edges(
     """
     expected = np.full(len(pixels), np.nan) if contrast is None else contrast
     loose = np.zeros((len(pixels), 2)) if curvature_sigma is None else curvature_sigma
-    least = ROUNDING_VARIANCE if image.dtype == np.uint8 else LEAST_VARIANCE
+    least = ROUNDING_VARIANCE if image.dtype == np.uint8 else MIN_VARIANCE
     fitted = fit_corners(
         image,
         pixels,
@@ -169,7 +169,7 @@ def fit_edges(
     values[:, [X, Y]] = pixels - window.centre
     _brightness(values, window, geometry, sign, expected)
     used = window.weight.sum(axis=1, dtype=np.float64)
-    free = np.maximum(used - DETERMINED, 1.0)
+    free = np.maximum(used - MIN_DETERMINED_PIXELS, 1.0)
     variance = np.full(len(pixels), np.inf)
     normal = np.zeros((len(pixels), PARAMETERS, PARAMETERS))
     rest = np.zeros(window.weight.shape)
@@ -185,7 +185,7 @@ def fit_edges(
         variance[active] = np.maximum(products[:, -1, -1] / free[active], least)
         pull = prior[active] * variance[active, None]
         hessian = products[:, :-1, :-1]
-        hessian[:, diagonal, diagonal] += pull + RIDGE
+        hessian[:, diagonal, diagonal] += pull + FIT_RIDGE
         gradient = products[:, :-1, -1] + pull * (prior_mean - values)[active]
         step = np.linalg.solve(hessian, gradient[..., None])[..., 0]
         normal[active] = hessian
@@ -210,9 +210,9 @@ def fit_edges(
 @functools.cache
 def _rules(radius_px: float, iterations: int, converged_px: float, mirrored: bool, least: float) -> Rules:
     return Rules(
-        reach=REACH,
+        reach=WINDOW_REACH,
         end_sigmas=END_SIGMAS,
-        least_reach=LEAST_REACH,
+        least_reach=MIN_REACH,
         near_sigmas=NEAR_SIGMAS,
         near_px=NEAR_PX,
         tail_sigmas=TAIL_SIGMAS,
@@ -223,21 +223,21 @@ def _rules(radius_px: float, iterations: int, converged_px: float, mirrored: boo
         angle_sigma=ANGLE_SIGMA_RAD,
         log_blur_sigma=LOG_BLUR_SIGMA,
         light_sigma=LIGHT_SIGMA_PER_PX,
-        most_move_px=MOST_MOVE_PX,
-        most_turn=MOST_TURN_RAD,
-        most_blur_change=MOST_BLUR_CHANGE,
-        most_light_change=MOST_LIGHT_CHANGE,
+        most_move_px=MAX_MOVE_PX,
+        most_turn=MAX_TURN_RAD,
+        most_blur_change=MAX_BLUR_CHANGE,
+        most_light_change=MAX_LIGHT_CHANGE,
         least_variance=least,
-        ridge=RIDGE,
+        ridge=FIT_RIDGE,
         converged_px=converged_px,
         blur_lag=BLUR_LAG,
         valid_move_px=VALID_MOVE_PX,
         valid_move_cells=VALID_MOVE_CELLS,
-        most_mirrored=MOST_MIRRORED_PX,
+        most_mirrored=MAX_MIRRORED_PX,
         radius_px=radius_px,
         iterations=iterations,
         mirrored=mirrored,
-        fewest_mirrored=FEWEST_MIRRORED,
+        fewest_mirrored=MIN_MIRRORED,
     )
 
 
@@ -278,10 +278,10 @@ def _brightness(values: FloatArray, window: Window, geometry: Geometry, sign: Fl
 def _limited(step: FloatArray, values: FloatArray) -> FloatArray:
     """Return the step, cut where it would leave the region in which the model is nearly linear."""
     limit = np.full(step.shape, np.inf)
-    limit[:, [X, Y]] = MOST_MOVE_PX
-    limit[:, [T1, T2]] = MOST_TURN_RAD
-    limit[:, S] = MOST_BLUR_CHANGE * values[:, S]
-    limit[:, [GX, GY]] = MOST_LIGHT_CHANGE
+    limit[:, [X, Y]] = MAX_MOVE_PX
+    limit[:, [T1, T2]] = MAX_TURN_RAD
+    limit[:, S] = MAX_BLUR_CHANGE * values[:, S]
+    limit[:, [GX, GY]] = MAX_LIGHT_CHANGE
     out = np.clip(step, -limit, limit)
     out[:, S] = np.clip(values[:, S] + out[:, S], *BLUR_RANGE) - values[:, S]
     return out
@@ -321,9 +321,9 @@ def _noise(values: FloatArray, variance: FloatArray, window: Window, rest: Float
     paired = np.isfinite(change)
     pairs, count = paired.sum(axis=1), used.sum(axis=1)
     mean = np.where(paired, change, 0.0) ** 2
-    apart = mean.sum(axis=1) / np.maximum(pairs, 1) / spread * count / np.maximum(count - DETERMINED, 1)
-    enough = (pairs >= FEWEST_MIRRORED) & (count > DETERMINED)
-    enough &= np.abs(values[:, [X, Y]]).max(axis=1) <= MOST_MIRRORED_PX
+    apart = mean.sum(axis=1) / np.maximum(pairs, 1) / spread * count / np.maximum(count - MIN_DETERMINED_PIXELS, 1)
+    enough = (pairs >= MIN_MIRRORED) & (count > MIN_DETERMINED_PIXELS)
+    enough &= np.abs(values[:, [X, Y]]).max(axis=1) <= MAX_MIRRORED_PX
     lags = _lag_products(np.where(paired, change, 0.0), paired, window, np.floor(values[:, Y]))
     return np.where(enough, apart, variance), np.where(enough[:, None], lags, 0.0)
 
@@ -374,7 +374,7 @@ def _result(
     moved = np.linalg.norm(pixels - start, axis=1)
     longest = np.linalg.norm(geometry.sides, axis=2).max(axis=1)
     valid = (moved < np.maximum(VALID_MOVE_PX, VALID_MOVE_CELLS * longest)) & (spread > 0.0) & np.isfinite(spread)
-    valid &= (window.weight.sum(axis=1) > DETERMINED) & _surrounded(pixels, window)
+    valid &= (window.weight.sum(axis=1) > MIN_DETERMINED_PIXELS) & _surrounded(pixels, window)
     return EdgeFit(
         pixels,
         np.sqrt(np.where(valid, spread, 0.0)),

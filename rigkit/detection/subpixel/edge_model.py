@@ -26,14 +26,14 @@ from rigkit.detection.saddles.response import GreyImage
 
 __all__ = [
     "END_SIGMAS",
-    "LEAST_REACH",
+    "MIN_REACH",
     "NEAR_PX",
     "NEAR_SIGMAS",
     "PARAMETERS",
     "PIXEL_KURTOSIS",
-    "REACH",
     "SHARP_BLUR_PX",
     "TAIL_SIGMAS",
+    "WINDOW_REACH",
     "Geometry",
     "Window",
     "collect",
@@ -56,7 +56,7 @@ PIXEL_KURTOSIS = -1.0 / 120.0
 SHARP_BLUR_PX = 0.6
 """Below this s the pixel's square shows: a series in its cumulants would be wrong by half a grey level at s = 0.4."""
 
-REACH = 0.5
+WINDOW_REACH = 0.5
 """Pixels are used up to this from the corner along the sides of its cell: the windows of neighbouring corners meet and
 do not overlap, so that every pixel is used and the errors of neighbours are independent."""
 
@@ -64,7 +64,7 @@ NEAR_SIGMAS, NEAR_PX = 3.0, 1.5
 """Pixels are used so near to one of the lines (s and px added up): those beyond only repeat how bright squares are."""
 
 END_SIGMAS = 2.5
-LEAST_REACH = 0.25
+MIN_REACH = 0.25
 """Where the lattice ends, what lies behind the next line is not known: paper, a narrow margin, another square. Pixels
 nearer to that line, s, are left out, but never those so near to the corner, in cells."""
 
@@ -92,7 +92,7 @@ class Geometry:
     def reach(self, blur: FloatArray) -> FloatArray:
         """Return (N, 2, 2) how far the window reaches, in cells: along both sides, backwards and forwards."""
         left = 1.0 - END_SIGMAS * blur[:, None, None] / np.maximum(self.gaps, 1e-9)
-        out = np.where(self.ends, np.clip(left, LEAST_REACH, REACH), REACH)
+        out = np.where(self.ends, np.clip(left, MIN_REACH, WINDOW_REACH), WINDOW_REACH)
         # +90 degrees from line 1, which runs along the first side, is forwards along the second; from line 2 backwards.
         return np.stack([out[:, 1, ::-1], out[:, 0]], axis=1)
 
@@ -125,7 +125,7 @@ def collect(image: GreyImage, pixels: FloatArray, geometry: Geometry, blur: Floa
     """Return the pixels of `image` near the two lines of each corner, inside its cell and `radius_px`."""
     height, width = image.shape
     a, b = geometry.sides[:, 0], geometry.sides[:, 1]
-    radius = np.minimum(REACH * (np.abs(a) + np.abs(b)).max(axis=1), radius_px)
+    radius = np.minimum(WINDOW_REACH * (np.abs(a) + np.abs(b)).max(axis=1), radius_px)
     reach = int(np.ceil(radius.max(initial=2.0)))
     offset = np.arange(-reach, reach + 1)
     du, dv = (o.ravel() for o in np.meshgrid(offset, offset))
@@ -168,7 +168,7 @@ def _step(distance: Float32, blur: Float32, flat: Float32, gaps: Float32) -> tup
     into the window: their steps are taken away. Far from both they add up to nothing: one is -1, the other +1.
     """
     total = _edge(distance, blur, flat)
-    tight = (gaps * (1.0 - REACH) < TAIL_SIGMAS * blur).any(axis=1)
+    tight = (gaps * (1.0 - WINDOW_REACH) < TAIL_SIGMAS * blur).any(axis=1)
     if tight.any():
         near, beside = distance[tight], gaps[tight]
         for place in (-beside[:, :1], beside[:, 1:]):

@@ -14,7 +14,7 @@ from rigkit.kernels import lattice as native
 __all__ = ["UNEXPLAINED", "excess_scatter"]
 
 DIFFERENCES = (5, 6)
-FEWEST_CORNERS, FEWEST_DIFFERENCES = 12, 16
+MIN_SCATTER_CORNERS, MIN_DIFFERENCES = 12, 16
 """Orders of the differences along rows and columns, and how many corners and differences there must be."""
 
 UNEXPLAINED = 1.25
@@ -47,15 +47,15 @@ def _rules() -> native.ScatterRules:
     return native.ScatterRules(
         unexplained=UNEXPLAINED,
         median_of_normal=MEDIAN_OF_NORMAL,
-        fewest_corners=FEWEST_CORNERS,
-        fewest_differences=FEWEST_DIFFERENCES,
+        fewest_corners=MIN_SCATTER_CORNERS,
+        fewest_differences=MIN_DIFFERENCES,
         first_order=DIFFERENCES[0],
         last_order=DIFFERENCES[-1],
     )
 
 
 def _excess(pixels: FloatArray, sigma_px: FloatArray) -> float:
-    if np.count_nonzero(np.isfinite(pixels[..., 0])) < FEWEST_CORNERS:
+    if np.count_nonzero(np.isfinite(pixels[..., 0])) < MIN_SCATTER_CORNERS:
         return 1.0
     calmest = np.inf
     for flatten in (False, True):
@@ -108,4 +108,4 @@ def _roughness(values: FloatArray, sigma_px: FloatArray, order: int) -> float:
         ratio = np.abs(np.diff(moved, order, axis=0)) / np.sqrt(variance)[..., None]
         found.append(ratio[np.isfinite(ratio)])
     every = np.concatenate(found) if found else np.zeros(0)
-    return float(np.median(every)) / MEDIAN_OF_NORMAL if len(every) >= FEWEST_DIFFERENCES else np.nan
+    return float(np.median(every)) / MEDIAN_OF_NORMAL if len(every) >= MIN_DIFFERENCES else np.nan

@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, upper_median
-from rigkit.detection.lattice.lattice import Lattice, Sheet, padded
+from rigkit.detection.lattice.lattice import Lattice, LatticeStack, padded
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.correlation import sigma_factors
 from rigkit.detection.subpixel.edge_curvature import line_curvature
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
-from rigkit.detection.subpixel.edge_model import REACH, Geometry, ends_of
+from rigkit.detection.subpixel.edge_model import WINDOW_REACH, Geometry, ends_of
 from rigkit.detection.subpixel.scatter import excess_scatter
 
 __all__ = ["RefinedLattice", "refine"]
@@ -34,15 +34,15 @@ LAST_PASS = (18.0, 8, 0.01)
 """Radius in px, Gauss-Newton steps at most, and the step in px that ends them: the first pass only has to bring the
 lattice to a few hundredths of a pixel; after the last step of the last one there is a ten-thousandth to go."""
 
-LOOSE = 0.5
+LOOSE_CURVATURE = 0.5
 """Curvatures are fitted where the lattice leaves them open by so much that the corner would move by more than this, in
 sigmas of the first pass: the edges then know them better. Everywhere it would take a quarter more time."""
 
-FEWEST_NEIGHBOURS = 3
+MIN_NEIGHBOURS = 3
 """An empty cell is tried if so many of its eight neighbours are known."""
 
-FEWEST_CHECKED = 12
-FEWEST_JUDGED = 9
+MIN_CHECKED = 12
+MIN_JUDGED = 9
 """A board of fewer corners, or of fewer that so many others predict, is not checked against itself."""
 
 HOLE_MOVE = 0.12
@@ -52,12 +52,12 @@ HOLE_SIGMA = 3.0
 """What a corner in an empty cell must show: how far from its prediction (cells); contrast, relative residual and sigma
 relative to the corners around it."""
 
-ASTRAY_CELLS = 0.06
-ASTRAY_FACTOR = 8.0
+OUTLIER_CELLS = 0.06
+OUTLIER_SIGMAS = 8.0
 """A corner further than this from where its neighbours say (in cells; and times the board's typical deviation; and
 times the standard deviation expected of it) is something else: a finger, a glint, the end of a ruler."""
 
-COVERED, COVERED_FACTOR = 0.03, 6.0
+COVERED_NOISE, COVERED_FACTOR = 0.03, 6.0
 COVERED_OFF = 3.5
 """A corner whose noise, relative to its contrast, exceeds this and this times the board's typical one, and that lies
 off by this times the typical deviation, is covered in part, by the edge of a ruler or of a hand: its sides are not
@@ -127,7 +127,7 @@ def refine(image: GreyImage, lattices: Sequence[Lattice]) -> list[RefinedLattice
     if not lattices:
         return []
     # All lattices lie on one sheet, so that each step is one call.
-    sheet = Sheet.of(lattices)
+    sheet = LatticeStack.of(lattices)
     start = Lattice(sheet.pixels, sheet.contrast, True)
     first = _first_pass(image, start, sheet.signs)
     start, holes = _with_holes(first.lattice, sheet.signs != 0.0)
@@ -200,8 +200,8 @@ def _last_pass(
     curvature, curvature_sigma = line_curvature(start.pixels, sigma_px, known, lengths)
     radius_px, iterations, converged_px = LAST_PASS
     # A parabola k / 2 t^2 lies k / 6 r^2 beside the corner in the mean over |t| < r.
-    beside = curvature_sigma * np.minimum(radius_px, REACH * lengths) ** 2 / 6.0
-    curvature_sigma[(beside <= LOOSE * sigma_px[known][:, None]).all(axis=1)] = 0.0
+    beside = curvature_sigma * np.minimum(radius_px, WINDOW_REACH * lengths) ** 2 / 6.0
+    curvature_sigma[(beside <= LOOSE_CURVATURE * sigma_px[known][:, None]).all(axis=1)] = 0.0
     fit = fit_edges(
         image,
         start.pixels[known],
@@ -239,7 +239,7 @@ def _with_holes(lattice: Lattice, inside: BoolArray) -> tuple[Lattice, BoolArray
     holes: BoolArray = inside & ~known
     if holes.any():
         around = cv2.boxFilter(known.astype(np.uint8), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
-        holes &= around >= FEWEST_NEIGHBOURS
+        holes &= around >= MIN_NEIGHBOURS
     if not holes.any():
         return lattice, holes
     shape = fit_cells(lattice.pixels, holes, degree=2, ridge=(1e-3, 1.0))
@@ -287,18 +287,18 @@ def _checked(item: RefinedLattice, parts: Sequence[Part]) -> RefinedLattice:
     distance = np.hypot(off[:, 0], off[:, 1])
     # A prediction from a few corners on one side is no judge of another.
     judged = np.zeros_like(known)
-    judged[known] = (shape.support >= FEWEST_CHECKED) & (shape.gain < 1.5)
+    judged[known] = (shape.support >= MIN_CHECKED) & (shape.gain < 1.5)
     cells = spread(distance / shape.cell_px())
     excess = spread(distance / (item.sigma_px[known] * np.hypot(1.0, shape.gain)))
     relative = item.noise / item.lattice.contrast
     drop = np.zeros_like(known)
     for part in parts:
         here, sure = known[part], judged[part]
-        if here.sum() < FEWEST_CHECKED or sure.sum() < FEWEST_JUDGED:
+        if here.sum() < MIN_CHECKED or sure.sum() < MIN_JUDGED:
             continue
         typical = upper_median(cells[part][sure])
         usual = upper_median(relative[part][here])
-        astray = (cells[part] > max(ASTRAY_CELLS, ASTRAY_FACTOR * typical)) & (excess[part] > ASTRAY_FACTOR)
-        covered = relative[part] > max(COVERED, COVERED_FACTOR * usual)
+        astray = (cells[part] > max(OUTLIER_CELLS, OUTLIER_SIGMAS * typical)) & (excess[part] > OUTLIER_SIGMAS)
+        covered = relative[part] > max(COVERED_NOISE, COVERED_FACTOR * usual)
         drop[part] = sure & (astray | (covered & (cells[part] > COVERED_OFF * typical)))
     return item.without(drop) if drop.any() else item

@@ -15,24 +15,24 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.board_pose import board_poses, ray_residuals
-from rigkit.identification.joint_pose import Sight
+from rigkit.identification.joint_pose import BoardObservation
 from rigkit.identification.placements import BoardKind, Placement, describe, placements, possible_kinds
 
-__all__ = ["GridPoses", "Link", "View", "links_between"]
+__all__ = ["BoardMatch", "GridPoses", "ImageObservations", "matches_between"]
 
 GATE_SQUARES = 0.1
 GATE_PX = 2.0
 GATE_SMALL_SQUARES = 0.25
 """How far (rms) a board may miss the joint fit and still count as seen there: a tenth of a square; on small squares
 2 px, for noise and calibration errors, but never more than a quarter of a square."""
-MIN_CORNERS = 4
+MIN_OBSERVED_CORNERS = 4
 TILT_RMS_RATIO = 3.0
 TILT_RMS_PX = 0.5
 """The reversed tilt of a board is tried too where its rms is within this ratio, or this many px, of the better one."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Link:
+class BoardMatch:
     """Detection `first` of image 1 and `second` of image 2 taken for one board of a kind.
 
     Attributes
@@ -56,25 +56,27 @@ class Link:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class View:
+class ImageObservations:
     """The detections of one image with all that does not depend on the other image.
 
     Attributes
     ----------
     detections : without names that are not listed and corners that have no ray.
-    sights, spacing_px, kinds : by detection: rays, distance of neighbours, the kinds that it may be.
+    observations, spacing_px, kinds : by detection: rays, distance of neighbours, the kinds that it may be.
     notes : what was left out.
     """
 
     camera: Camera
     detections: tuple[BoardDetection, ...]
-    sights: tuple[Sight, ...]
+    observations: tuple[BoardObservation, ...]
     spacing_px: FloatArray
     kinds: list[list[int]]
     notes: tuple[str, ...]
 
     @classmethod
-    def of(cls, detections: Sequence[BoardDetection], kinds: Sequence[BoardKind], camera: Camera, image: str) -> View:
+    def of(
+        cls, detections: Sequence[BoardDetection], kinds: Sequence[BoardKind], camera: Camera, image: str
+    ) -> ImageObservations:
         """Build for the detections of `image` (its name in messages); raises InputError where a name comes twice."""
         listed = {board_id for kind in kinds for board_id in kind.ids}
         kept: list[BoardDetection] = []
@@ -92,11 +94,11 @@ class View:
             part = BoardDetection(
                 name, found.columns, found.rows, found.grid[seen], found.pixels[seen], found.sigma_px[seen]
             )
-            if len(part.grid) >= MIN_CORNERS:
+            if len(part.grid) >= MIN_OBSERVED_CORNERS:
                 kept.append(part)
-        sights = tuple(Sight.of(camera, d.pixels, d.sigma_px, image) for d in kept)
+        observations = tuple(BoardObservation.of(camera, d.pixels, d.sigma_px, image) for d in kept)
         spacing = np.array([_spacing(d) for d in kept])
-        return cls(camera, tuple(kept), sights, spacing, possible_kinds(kept, kinds), tuple(notes))
+        return cls(camera, tuple(kept), observations, spacing, possible_kinds(kept, kinds), tuple(notes))
 
     @property
     def gate_px(self) -> FloatArray:
@@ -106,8 +108,8 @@ class View:
 
     def give_up(self) -> FloatArray:
         """Return the chi2 (D,) of each detection when all its corners miss by the gate."""
-        both = zip(self.gate_px, self.sights, strict=True)
-        return np.array([((gate / sight.sigma_px) ** 2).sum() for gate, sight in both])
+        both = zip(self.gate_px, self.observations, strict=True)
+        return np.array([((gate / observation.sigma_px) ** 2).sum() for gate, observation in both])
 
 
 def _spacing(detection: BoardDetection) -> float:
@@ -121,7 +123,7 @@ def _spacing(detection: BoardDetection) -> float:
 class GridPoses:
     """Poses of detections in the frame of their own grid, each computed once."""
 
-    def __init__(self, view: View) -> None:
+    def __init__(self, view: ImageObservations) -> None:
         self.view = view
         self.known: dict[tuple[int, float, float], list[tuple[FloatArray, float]]] = {}
 
@@ -129,18 +131,20 @@ class GridPoses:
         """Return [(cam_from_grid (4, 4), chi2)] of the plausible tilts, best first; none where degenerate."""
         name = (index, step_x_mm, step_y_mm)
         if name not in self.known:
-            detection, sight = self.view.detections[index], self.view.sights[index]
+            detection, observation = self.view.detections[index], self.view.observations[index]
             points = np.column_stack([detection.grid * [step_x_mm, step_y_mm], np.zeros(len(detection.grid))])
             try:
-                found = board_poses(sight.rays, points, sight.sigma_px, bases=sight.bases)
+                found = board_poses(observation.rays, points, observation.sigma_px, bases=observation.bases)
             except DegenerateError:
                 found = ()
             limit = max(TILT_RMS_RATIO * found[0].rms_rad, TILT_RMS_PX) if found else 0.0
             self.known[name] = []
             for pose in (p for p in found if p.rms_rad <= limit):
                 rigid = pose.cam_from_board
-                residual, _ = ray_residuals(sight.rays, sight.bases, points, rigid.rotation, rigid.translation_mm)
-                chi2 = float(((residual / sight.sigma_px[:, None]) ** 2).sum())
+                residual, _ = ray_residuals(
+                    observation.rays, observation.bases, points, rigid.rotation, rigid.translation_mm
+                )
+                chi2 = float(((residual / observation.sigma_px[:, None]) ** 2).sum())
                 self.known[name].append((rigid.matrix(), chi2))
         return self.known[name]
 
@@ -153,16 +157,18 @@ class GridPoses:
         return [(pose @ grid_from_board, chi2) for pose, chi2 in self.of(index, *steps)]
 
 
-def links_between(view1: View, view2: View, kinds: Sequence[BoardKind]) -> tuple[list[Link], FloatArray, FloatArray]:
+def matches_between(
+    view1: ImageObservations, view2: ImageObservations, kinds: Sequence[BoardKind]
+) -> tuple[list[BoardMatch], FloatArray, FloatArray]:
     """Return all links, and the free chi2 of each detection (its own pose, its best kind; NaN where it has none)."""
     poses1, poses2 = GridPoses(view1), GridPoses(view2)
-    links: list[Link] = []
+    matches: list[BoardMatch] = []
     for i, detection1 in enumerate(view1.detections):
         for j, detection2 in enumerate(view2.detections):
             if len({detection1.board_id, detection2.board_id} - {None}) > 1:
                 continue
             for k in sorted(set(view1.kinds[i]) & set(view2.kinds[j])):
-                links += _links_of_pair(i, j, k, kinds[k], poses1, poses2)
+                matches += _matches_of_pair(i, j, k, kinds[k], poses1, poses2)
     free = []
     for view, poses in ((view1, poses1), (view2, poses2)):
         best = np.full(len(view.detections), np.nan)
@@ -170,13 +176,13 @@ def links_between(view1: View, view2: View, kinds: Sequence[BoardKind]) -> tuple
             for _, chi2 in found:
                 best[index] = np.fmin(best[index], chi2)
         free.append(best)
-    return links, free[0], free[1]
+    return matches, free[0], free[1]
 
 
-def _links_of_pair(i: int, j: int, k: int, kind: BoardKind, poses1: GridPoses, poses2: GridPoses) -> list[Link]:
+def _matches_of_pair(i: int, j: int, k: int, kind: BoardKind, poses1: GridPoses, poses2: GridPoses) -> list[BoardMatch]:
     detection1, detection2 = poses1.view.detections[i], poses2.view.detections[j]
     square = kind.board.columns == kind.board.rows and detection1.complete and detection2.complete
-    links, keys = [], set()
+    matches, keys = [], set()
     for placement1 in placements(detection1, kind):
         for placement2 in placements(detection2, kind):
             key = (k, *placement2.relative_to(placement1, detection1, detection2))
@@ -187,5 +193,5 @@ def _links_of_pair(i: int, j: int, k: int, kind: BoardKind, poses1: GridPoses, p
             against = square and kind.board.columns % 2 == 1 and odd
             for pose1, _ in poses1.placed(i, kind, placement1):
                 for pose2, _ in poses2.placed(j, kind, placement2):
-                    links.append(Link(i, j, k, key, placement1, placement2, pose1, pose2, against))
-    return links
+                    matches.append(BoardMatch(i, j, k, key, placement1, placement2, pose1, pose2, against))
+    return matches

@@ -15,9 +15,9 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.identification.placements import BoardKind
 
-__all__ = ["SIDES", "Located", "first_corner_turn", "name_boards"]
+__all__ = ["BOARD_SIDES", "LocatedBoard", "assign_board_ids", "first_corner_turn"]
 
-SIDES: Mapping[str, tuple[float, float, float]] = {
+BOARD_SIDES: Mapping[str, tuple[float, float, float]] = {
     "left": (1.0, 0.0, 0.0),
     "right": (-1.0, 0.0, 0.0),
     "floor": (0.0, -1.0, 0.0),
@@ -32,7 +32,7 @@ LEVEL_COSINE = float(np.sqrt(0.5))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Located:
+class LocatedBoard:
     """A board of a kind whose place is known: `cam1_from_board` (4, 4) in the frame of the kind's first board."""
 
     kind: int
@@ -50,8 +50,8 @@ class Located:
         return np.asarray(-np.sign(normal @ self.cam1_from_board[:3, 3]) * normal)
 
 
-def name_boards(
-    located: Sequence[Located], kinds: Sequence[BoardKind], layout: Mapping[str, str] | None = None
+def assign_board_ids(
+    located: Sequence[LocatedBoard], kinds: Sequence[BoardKind], layout: Mapping[str, str] | None = None
 ) -> tuple[list[str], tuple[str, ...]]:
     """Return a board id for each located board, and notes. No kind may have more located than listed boards.
 
@@ -90,7 +90,7 @@ def name_boards(
     return [str(name) for name in names], tuple(notes)
 
 
-def first_corner_turn(item: Located, kind: BoardKind, board: Board, others: Sequence[FloatArray]) -> int:
+def first_corner_turn(item: LocatedBoard, kind: BoardKind, board: Board, others: Sequence[FloatArray]) -> int:
     """Return the quarter turns from the kind's frame to that of `board`, one of its boards.
 
     Where the board looks the same turned, the first corner is, of those possible, the end of the board nearest to the
@@ -123,11 +123,11 @@ def _check(layout: Mapping[str, str] | None, kinds: Sequence[BoardKind]) -> None
     for board_id, side in (layout or {}).items():
         if board_id not in known:
             raise InputError(f"layout: no board is called '{board_id}'; known: {', '.join(sorted(known))}")
-        if side not in SIDES:
-            raise InputError(f"layout: board '{board_id}': side '{side}' is unknown; known: {', '.join(SIDES)}")
+        if side not in BOARD_SIDES:
+            raise InputError(f"layout: board '{board_id}': side '{side}' is unknown; known: {', '.join(BOARD_SIDES)}")
 
 
-def _clock(located: Sequence[Located], kinds: Sequence[BoardKind]) -> FloatArray:
+def _clock(located: Sequence[LocatedBoard], kinds: Sequence[BoardKind]) -> FloatArray:
     """Return where each board lies round the common centre, radians clockwise from twelve o'clock in camera 1."""
     centres = np.array([item.centre(kinds[item.kind].board) for item in located]).reshape(-1, 3)
     rays = centres / np.linalg.norm(centres, axis=1, keepdims=True)
@@ -144,7 +144,7 @@ def _image_axes(towards: FloatArray) -> tuple[FloatArray, FloatArray]:
     return right, np.cross(sight, right)
 
 
-def _from_opposite_level(free: list[int], located: Sequence[Located], clock: FloatArray) -> list[int]:
+def _from_opposite_level(free: list[int], located: Sequence[LocatedBoard], clock: FloatArray) -> list[int]:
     """Return boards clockwise, from opposite the one that lies most nearly level, if any does."""
     if not free:
         return []
@@ -153,19 +153,23 @@ def _from_opposite_level(free: list[int], located: Sequence[Located], clock: Flo
     return sorted(free, key=lambda n: ((clock[n] - start) % (2.0 * np.pi), n))
 
 
-def _by_side(located: Sequence[Located], names: list[str | None], free: list[int], sides: Mapping[str, str]) -> None:
+def _by_side(
+    located: Sequence[LocatedBoard], names: list[str | None], free: list[int], sides: Mapping[str, str]
+) -> None:
     """Give the boards with a side to the located boards that face most nearly as that side does."""
     from scipy.optimize import linear_sum_assignment
 
     if not sides:
         return
     ids = list(sides)
-    likeness = np.array([[located[n].face @ SIDES[sides[i]] for i in ids] for n in free])
+    likeness = np.array([[located[n].face @ BOARD_SIDES[sides[i]] for i in ids] for n in free])
     for row, column in zip(*linear_sum_assignment(-likeness), strict=True):
         names[free[row]] = ids[column]
 
 
-def _by_shape(order: list[int], ids: list[str], located: Sequence[Located], kind: BoardKind) -> list[tuple[str, int]]:
+def _by_shape(
+    order: list[int], ids: list[str], located: Sequence[LocatedBoard], kind: BoardKind
+) -> list[tuple[str, int]]:
     """Pair ids with boards in the order given, boards listed upright with those that stand more upright."""
     shape = {board.board_id: board.size for board in kind.boards}
     alike = [i for i in ids if shape[i] == kind.board.size]

@@ -15,35 +15,35 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray, IntArray, Points
 from rigkit.core.detections import BoardDetection
+from rigkit.identification.board_matches import BoardMatch, ImageObservations
 from rigkit.identification.joint_pose import JointPose, refine_joint
-from rigkit.identification.observations import Link, View
 from rigkit.identification.placements import BoardKind
 
-__all__ = ["Solution", "forced_rms_px", "solutions"]
+__all__ = ["Assignment", "forced_rms_px", "ranked_assignments"]
 
 SEED_GATE = 2.0
 """Squares by which a board may miss the prediction from one other board: its tilt is uncertain, its lever long."""
 REJOIN_GATE = 0.5
 """Squares by which a board may miss the prediction of a joint fit to be tried as part of it."""
 MAX_SEEDS = 300
-MAX_SOLUTIONS = 20
-MAX_ROUNDS = 4
+MAX_ASSIGNMENTS = 20
+MAX_SETTLE_ROUNDS = 4
 SEARCH_TOLERANCE = 1e-3
 """Fits that only decide who belongs need no more digits."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Solution:
+class Assignment:
     """A whole assignment with its joint fit.
 
     Attributes
     ----------
-    links : the boards taken to be seen in both images.
-    pose : the joint fit, boards in the order of `links`.
+    matches : the boards taken to be seen in both images.
+    pose : the joint fit, boards in the order of `matches`.
     chi2_1, chi2_2 : chi2 of every detection in image 1 and 2, at most that of giving it up.
     """
 
-    links: tuple[Link, ...]
+    matches: tuple[BoardMatch, ...]
     pose: JointPose
     chi2_1: FloatArray
     chi2_2: FloatArray
@@ -52,58 +52,68 @@ class Solution:
     def chi2(self) -> float:
         return float(self.chi2_1.sum() + self.chi2_2.sum())
 
-    def rms_px(self, view1: View, view2: View) -> float:
+    def rms_px(self, view1: ImageObservations, view2: ImageObservations) -> float:
         """Return the rms distance of the corners (2-D, both images) from the joint fit."""
-        return float(np.sqrt(self.pose.squared_px.sum() / _corner_count(self.links, view1, view2)))
+        return float(np.sqrt(self.pose.squared_px.sum() / _corner_count(self.matches, view1, view2)))
 
-    def differs_from(self, other: Solution) -> bool:
+    def differs_from(self, other: Assignment) -> bool:
         """Say whether the two contradict each other: one detection, but another partner or position."""
-        mine = {("1", s.first): (s.second, s.key) for s in self.links} | {("2", s.second): s.first for s in self.links}
+        mine = {("1", s.first): (s.second, s.key) for s in self.matches} | {
+            ("2", s.second): s.first for s in self.matches
+        }
         return any(
             mine.get(("1", s.first), (s.second, s.key)) != (s.second, s.key)
             or mine.get(("2", s.second), s.first) != s.first
-            for s in other.links
+            for s in other.matches
         )
 
 
-def _corner_count(links: Sequence[Link], view1: View, view2: View) -> int:
-    return sum(len(view1.sights[s.first].rays) + len(view2.sights[s.second].rays) for s in links)
+def _corner_count(matches: Sequence[BoardMatch], view1: ImageObservations, view2: ImageObservations) -> int:
+    return sum(len(view1.observations[s.first].rays) + len(view2.observations[s.second].rays) for s in matches)
 
 
-def solutions(links: Sequence[Link], view1: View, view2: View, kinds: Sequence[BoardKind]) -> list[Solution]:
+def ranked_assignments(
+    matches: Sequence[BoardMatch], view1: ImageObservations, view2: ImageObservations, kinds: Sequence[BoardKind]
+) -> list[Assignment]:
     """Return distinct assignments with their joint fits, best first."""
-    predictor = _Predictor.build(links, view2, kinds)
+    predictor = _Predictor.build(matches, view2, kinds)
     # Whole boards first: a part whose place on the board is open makes many links, most of them wrong.
-    open_places = Counter((s.first, s.second) for s in links)
-    seeds = np.array(sorted(range(len(links)), key=lambda n: open_places[links[n].first, links[n].second])[:MAX_SEEDS])
+    open_places = Counter((s.first, s.second) for s in matches)
+    seeds = np.array(
+        sorted(range(len(matches)), key=lambda n: open_places[matches[n].first, matches[n].second])[:MAX_SEEDS]
+    )
     motions = predictor.cam2_from_board[seeds] @ np.linalg.inv(predictor.cam1_from_board[seeds])
     misses = predictor.misses(motions)
     starts: dict[frozenset[tuple[int, tuple[int, ...]]], tuple[float, FloatArray, list[int]]] = {}
     for motion, miss in zip(motions, misses, strict=True):
-        chosen = _choose(miss, SEED_GATE, links, kinds)
+        chosen = _choose(miss, SEED_GATE, matches, kinds)
         total = sum(min(float(miss[n]), SEED_GATE) ** 2 for n in chosen) - SEED_GATE**2 * len(chosen)
-        name = frozenset((links[n].first, (links[n].second, *links[n].key)) for n in chosen)
+        name = frozenset((matches[n].first, (matches[n].second, *matches[n].key)) for n in chosen)
         if name not in starts or total < starts[name][0]:
             starts[name] = (total, motion, chosen)
-    found: dict[frozenset[tuple[int, tuple[int, ...]]], Solution] = {}
-    for _, motion, chosen in sorted(starts.values(), key=lambda s: s[0])[:MAX_SOLUTIONS]:
-        solution = _settle(motion, chosen, links, predictor, view1, view2, kinds)
-        name = frozenset((s.first, (s.second, *s.key)) for s in solution.links)
-        if name not in found or solution.chi2 < found[name].chi2:
-            found[name] = solution
+    found: dict[frozenset[tuple[int, tuple[int, ...]]], Assignment] = {}
+    for _, motion, chosen in sorted(starts.values(), key=lambda s: s[0])[:MAX_ASSIGNMENTS]:
+        assignment = _settle(motion, chosen, matches, predictor, view1, view2, kinds)
+        name = frozenset((s.first, (s.second, *s.key)) for s in assignment.matches)
+        if name not in found or assignment.chi2 < found[name].chi2:
+            found[name] = assignment
     return sorted(found.values(), key=lambda s: s.chi2)
 
 
 def forced_rms_px(
-    solution: Solution, links: Sequence[Link], view1: View, view2: View, kinds: Sequence[BoardKind]
+    assignment: Assignment,
+    matches: Sequence[BoardMatch],
+    view1: ImageObservations,
+    view2: ImageObservations,
+    kinds: Sequence[BoardKind],
 ) -> tuple[int, float]:
     """Return how many boards, and with what rms (px, 2-D per corner), fit if the solution has to explain all it can."""
-    predictor = _Predictor.build(links, view2, kinds)
-    miss = predictor.misses(solution.pose.cam2_from_cam1[None])[0]
-    mine = {s.key: (s.first, s.second) for s in solution.links}
-    own = np.array([mine.get(s.key) == (s.first, s.second) for s in links])
-    chosen = [links[n] for n in _choose(np.where(own, miss - miss.max() - 1.0, miss), np.inf, links, kinds)]
-    pose = _fit(solution.pose.cam2_from_cam1, chosen, view1, view2, kinds, SEARCH_TOLERANCE)
+    predictor = _Predictor.build(matches, view2, kinds)
+    miss = predictor.misses(assignment.pose.cam2_from_cam1[None])[0]
+    mine = {s.key: (s.first, s.second) for s in assignment.matches}
+    own = np.array([mine.get(s.key) == (s.first, s.second) for s in matches])
+    chosen = [matches[n] for n in _choose(np.where(own, miss - miss.max() - 1.0, miss), np.inf, matches, kinds)]
+    pose = _fit(assignment.pose.cam2_from_cam1, chosen, view1, view2, kinds, SEARCH_TOLERANCE)
     return len(chosen), float(np.sqrt(pose.squared_px.sum() / _corner_count(chosen, view1, view2)))
 
 
@@ -119,22 +129,22 @@ class _Predictor:
     spacing_px: FloatArray
 
     @classmethod
-    def build(cls, links: Sequence[Link], view2: View, kinds: Sequence[BoardKind]) -> _Predictor:
+    def build(cls, matches: Sequence[BoardMatch], view2: ImageObservations, kinds: Sequence[BoardKind]) -> _Predictor:
         in_cam1, rays, bases = [], [], []
-        for link in links:
-            detection, sight = view2.detections[link.second], view2.sights[link.second]
+        for match in matches:
+            detection, observation = view2.detections[match.second], view2.observations[match.second]
             outer = _outermost(detection)
-            points = kinds[link.kind].board.points(link.placement2.grid_of(detection)[outer])
-            in_cam1.append(points @ link.cam1_from_board[:3, :3].T + link.cam1_from_board[:3, 3])
-            rays.append(sight.rays[outer])
-            bases.append(sight.bases[outer])
+            points = kinds[match.kind].board.points(match.placement2.grid_of(detection)[outer])
+            in_cam1.append(points @ match.cam1_from_board[:3, :3].T + match.cam1_from_board[:3, 3])
+            rays.append(observation.rays[outer])
+            bases.append(observation.bases[outer])
         return cls(
-            np.stack([s.cam1_from_board for s in links]),
-            np.stack([s.cam2_from_board for s in links]),
+            np.stack([s.cam1_from_board for s in matches]),
+            np.stack([s.cam2_from_board for s in matches]),
             np.stack(in_cam1),
             np.stack(rays),
             np.stack(bases),
-            view2.spacing_px[[s.second for s in links]],
+            view2.spacing_px[[s.second for s in matches]],
         )
 
     def misses(self, motions: FloatArray) -> FloatArray:
@@ -152,18 +162,18 @@ def _outermost(detection: BoardDetection) -> IntArray:
     return np.array([np.argmin(total), np.argmax(difference), np.argmax(total), np.argmin(difference)])
 
 
-def _choose(miss: FloatArray, gate: float, links: Sequence[Link], kinds: Sequence[BoardKind]) -> list[int]:
+def _choose(miss: FloatArray, gate: float, matches: Sequence[BoardMatch], kinds: Sequence[BoardKind]) -> list[int]:
     """Return the links taken greedily by rising miss: each detection once, no kind more often than it has boards."""
     chosen: list[int] = []
     first, second, used = set(), set(), [0] * len(kinds)
     order = np.argsort(miss, kind="stable")
     for n in order[miss[order] < gate]:
-        link = links[n]
-        if link.first in first or link.second in second or used[link.kind] == len(kinds[link.kind].boards):
+        match = matches[n]
+        if match.first in first or match.second in second or used[match.kind] == len(kinds[match.kind].boards):
             continue
-        first.add(link.first)
-        second.add(link.second)
-        used[link.kind] += 1
+        first.add(match.first)
+        second.add(match.second)
+        used[match.kind] += 1
         chosen.append(int(n))
     return sorted(chosen)
 
@@ -171,22 +181,22 @@ def _choose(miss: FloatArray, gate: float, links: Sequence[Link], kinds: Sequenc
 def _settle(
     motion: FloatArray,
     chosen: list[int],
-    links: Sequence[Link],
+    matches: Sequence[BoardMatch],
     predictor: _Predictor,
-    view1: View,
-    view2: View,
+    view1: ImageObservations,
+    view2: ImageObservations,
     kinds: Sequence[BoardKind],
-) -> Solution:
+) -> Assignment:
     """Refine an assignment, drop boards that do not fit, add those that then do, until nothing changes."""
 
     def fit(candidates: list[int], start: FloatArray) -> tuple[float, JointPose]:
         """By how many gates the worst board misses, and the joint fit."""
-        some = [links[n] for n in candidates]
+        some = [matches[n] for n in candidates]
         pose = _fit(start, some, view1, view2, kinds, SEARCH_TOLERANCE)
         return _worst(pose, some, view1, view2), pose
 
     seen: set[tuple[int, ...]] = set()
-    for _ in range(MAX_ROUNDS):
+    for _ in range(MAX_SETTLE_ROUNDS):
         seen.add(tuple(chosen))
         worst, pose = fit(chosen, motion)
         while worst > 1.0 and len(chosen) > 1:
@@ -196,42 +206,42 @@ def _settle(
             k = min(range(len(parts)), key=lambda k: fits[k][0])
             chosen, (worst, pose) = parts[k], fits[k]
         motion = pose.cam2_from_cam1
-        wider = _choose(predictor.misses(motion[None])[0], REJOIN_GATE, links, kinds)
+        wider = _choose(predictor.misses(motion[None])[0], REJOIN_GATE, matches, kinds)
         if len(wider) < len(chosen) or tuple(wider) in seen:
             break
         chosen = wider
-    kept = tuple(links[n] for n in chosen)
+    kept = tuple(matches[n] for n in chosen)
     pose = _fit(motion, kept, view1, view2, kinds)
     chi2_1, chi2_2 = view1.give_up(), view2.give_up()
-    for link, (one, two) in zip(kept, pose.chi2, strict=True):
-        chi2_1[link.first] = min(one, chi2_1[link.first])
-        chi2_2[link.second] = min(two, chi2_2[link.second])
-    return Solution(kept, pose, chi2_1, chi2_2)
+    for match, (one, two) in zip(kept, pose.chi2, strict=True):
+        chi2_1[match.first] = min(one, chi2_1[match.first])
+        chi2_2[match.second] = min(two, chi2_2[match.second])
+    return Assignment(kept, pose, chi2_1, chi2_2)
 
 
 def _fit(
     motion: FloatArray,
-    links: Sequence[Link],
-    view1: View,
-    view2: View,
+    matches: Sequence[BoardMatch],
+    view1: ImageObservations,
+    view2: ImageObservations,
     kinds: Sequence[BoardKind],
     tolerance: float = 1e-9,
 ) -> JointPose:
     return refine_joint(
         motion,
-        np.stack([s.cam1_from_board for s in links]),
-        [view1.sights[s.first] for s in links],
-        [kinds[s.kind].board.points(s.placement1.grid_of(view1.detections[s.first])) for s in links],
-        [view2.sights[s.second] for s in links],
-        [kinds[s.kind].board.points(s.placement2.grid_of(view2.detections[s.second])) for s in links],
+        np.stack([s.cam1_from_board for s in matches]),
+        [view1.observations[s.first] for s in matches],
+        [kinds[s.kind].board.points(s.placement1.grid_of(view1.detections[s.first])) for s in matches],
+        [view2.observations[s.second] for s in matches],
+        [kinds[s.kind].board.points(s.placement2.grid_of(view2.detections[s.second])) for s in matches],
         tolerance=tolerance,
     )
 
 
-def _worst(pose: JointPose, links: Sequence[Link], view1: View, view2: View) -> float:
+def _worst(pose: JointPose, matches: Sequence[BoardMatch], view1: ImageObservations, view2: ImageObservations) -> float:
     """Return the largest rms distance of a board in one of the images, in units of the gate."""
     gates = []
-    for link, squared in zip(links, pose.squared_px, strict=True):
-        counts = [len(view1.sights[link.first].rays), len(view2.sights[link.second].rays)]
-        gates += [*(np.sqrt(squared / counts) / [view1.gate_px[link.first], view2.gate_px[link.second]])]
+    for match, squared in zip(matches, pose.squared_px, strict=True):
+        counts = [len(view1.observations[match.first].rays), len(view2.observations[match.second].rays)]
+        gates += [*(np.sqrt(squared / counts) / [view1.gate_px[match.first], view2.gate_px[match.second]])]
     return float(max(gates))
