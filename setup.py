@@ -1,27 +1,76 @@
-"""The optional compiled kernels of rigkit.kernels, one library a C file; everything else is in pyproject.toml.
+"""Builds the library of rigkit.kernels into a wheel for any Python 3; everything else is in pyproject.toml."""
 
-Without a C compiler the package installs and works all the same, slower.
-"""
+from __future__ import annotations
 
-import hashlib
+import runpy
+import shutil
+import sys
 from pathlib import Path
 
 from setuptools import Extension, setup
+from setuptools.command.bdist_wheel import bdist_wheel
+from setuptools.command.build_ext import build_ext
 
-HEADER = Path("rigkit/kernels/kernels.h")
-
-
-def library(source: Path) -> Extension:
-    # The loader compares this with the files beside it: a library that was built from others is not used.
-    digest = hashlib.sha256(source.read_bytes() + HEADER.read_bytes()).hexdigest()[:16]
-    return Extension(
-        f"rigkit.kernels._{source.stem}",
-        sources=[str(source)],
-        depends=[str(HEADER)],
-        define_macros=[("RIGKIT_SOURCE", f'"{digest}"')],
-        extra_compile_args=["-O3", "-std=gnu11", "-Wall", "-fno-math-errno", "-fno-trapping-math", "-fopenmp-simd"],
-        optional=True,
-    )
+FOLDER = Path("rigkit/kernels")
+BUILDING = runpy.run_path(str(FOLDER / "building.py"))
+LIBRARY = BUILDING["library_name"]()
 
 
-setup(ext_modules=[library(source) for source in sorted(HEADER.parent.glob("*.c"))])
+class build_kernels(build_ext):
+    """One library that knows nothing of Python, and beside it the record that rigkit checks before it loads it."""
+
+    def get_ext_filename(self, fullname: str) -> str:
+        return str(Path(*fullname.split(".")).with_name(LIBRARY))
+
+    def get_libraries(self, ext: Extension) -> list[str]:
+        return ext.libraries
+
+    def get_export_symbols(self, ext: Extension) -> list[str]:
+        # The C files say what they export.
+        return []
+
+    def build_extension(self, ext: Extension) -> None:
+        library = Path(self.get_ext_fullpath(ext.name))
+        library.parent.mkdir(parents=True, exist_ok=True)
+        if sys.platform == "win32":
+            # Visual C++ lacks the vector extensions; this compiler comes with pip (pyproject.toml).
+            zig = [sys.executable, "-m", "ziglang", "cc", "-target", "x86_64-windows-gnu", "-fno-sanitize=undefined"]
+            self.spawn([*zig, *BUILDING["FLAGS"], "-s", "-shared", *ext.sources, "-o", str(library)])
+            compiler = "ziglang"
+        else:
+            super().build_extension(ext)
+            compiler = " ".join(self.compiler.compiler_so[:1])
+        BUILDING["write_record"](library, FOLDER, compiler)
+
+    def copy_extensions_to_source(self) -> None:
+        super().copy_extensions_to_source()
+        for ext in self.extensions:
+            record = Path(self.get_ext_fullpath(ext.name)).with_suffix(".json")
+            built = Path(self.build_lib, self.get_ext_filename(self.get_ext_fullname(ext.name))).with_suffix(".json")
+            if not record.exists() or built.resolve() != record.resolve():
+                shutil.copyfile(built, FOLDER / record.name)
+
+    def get_outputs(self) -> list[str]:
+        outputs = super().get_outputs()
+        return [*outputs, *(str(Path(name).with_suffix(".json")) for name in outputs if name.endswith(LIBRARY))]
+
+
+class py3_wheel(bdist_wheel):
+    """A wheel for the platform, whatever the version of Python."""
+
+    def get_tag(self) -> tuple[str, str, str]:
+        return ("py3", "none", super().get_tag()[2])
+
+
+setup(
+    ext_modules=[
+        Extension(
+            "rigkit.kernels.rigkit_kernels",
+            sources=[str(path) for path in BUILDING["sources"](FOLDER)],
+            depends=[str(path) for path in FOLDER.glob("*.h")],
+            extra_compile_args=list(BUILDING["FLAGS"]),
+            libraries=[] if sys.platform == "win32" else ["m"],
+        )
+    ],
+    cmdclass={"build_ext": build_kernels, "bdist_wheel": py3_wheel},
+)

@@ -58,7 +58,7 @@ set_up() {
         rm -rf "$venv"
         "$python" -m venv "$venv"
     fi
-    wanted="$extras $(cat "$root/pyproject.toml" "$root/setup.py" "$root/scripts/setup.sh" "$root"/rigkit/kernels/*.[ch] | cksum)"
+    wanted="$extras $(cat "$root/pyproject.toml" "$root/setup.py" "$root/scripts/setup.sh" "$root"/rigkit/kernels/*.[ch] "$root/rigkit/kernels/building.py" | cksum)"
     stamp="$venv/.rigkit-installed"
     # The tests' set-up contains the plain one.
     if ! { [ -x "$venv/bin/rigkit" ] && grep -qxF -e "$wanted" -e "[dev] ${wanted#* }" "$stamp" 2>/dev/null; }; then

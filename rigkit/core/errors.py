@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["CheckFailed", "DegenerateError", "InputError", "RigkitError"]
+__all__ = ["CheckFailed", "DegenerateError", "InputError", "InstallationError", "RigkitError"]
 
 
 class RigkitError(Exception):
@@ -19,6 +19,12 @@ class CheckFailed(RigkitError):
 
 class InputError(RigkitError):
     """What was handed in cannot be used: a file, an option, an array."""
+
+    exit_code = 2
+
+
+class InstallationError(RigkitError):
+    """A part of rigkit itself is missing or does not fit: the message says what to type."""
 
     exit_code = 2
 

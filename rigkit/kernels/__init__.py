@@ -1,54 +1,71 @@
-"""Compiled kernels for the loops that numpy is slow at. Without them everything works, slower.
+"""The compiled kernels: loops that numpy is slow at, in plain C, one library called through ctypes.
 
-They are plain C called through ctypes, one library a C file, built when the package is installed (setup.py) if the
-machine has a C compiler. Every kernel repeats one function of the package that is written in numpy, gives the same
-result to rounding (tests compare them), and is called by that function alone.
+api.h declares what Python calls, once for both sides; `calls` checks every argument against it. The library is built
+when the package is installed (setup.py) and is part of it: without it, detection and relative pose raise
+InstallationError. The functions in numpy that the kernels are compared with are in tests/kernels/reference.
 """
 
 from __future__ import annotations
 
 import ctypes
 import functools
-import hashlib
-import importlib.util
-import os
+import sys
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import NDArray
+from rigkit.core.errors import InstallationError
+from rigkit.kernels.building import library_name, mismatch, source_hash
 
-__all__ = ["address", "kernels"]
+__all__ = ["Kernels", "about", "kernels"]
 
-SWITCH = "RIGKIT_NATIVE"
-"""Environment variable: 0 leaves the kernels unused."""
+FOLDER = Path(__file__).parent
+
+
+class Kernels:
+    """The functions of api.h, each a `calls.Kernel`, by their names."""
+
+    def __init__(self, path: Path) -> None:
+        from rigkit.kernels.calls import NAMES, Kernel
+        from rigkit.kernels.declarations import header
+
+        library = ctypes.CDLL(str(path))
+        for name in header().functions:
+            setattr(self, name, Kernel(name, library))
+        NAMES.update(vars(self))
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(f"api.h declares no function '{name}'")
 
 
 @functools.cache
-def kernels(name: str) -> ctypes.CDLL | None:
-    """Return the library built from NAME.c: None where there is none, NAME.c has changed or gone, or `SWITCH` is 0."""
-    if os.environ.get(SWITCH) == "0":
-        return None
-    found = importlib.util.find_spec(f"rigkit.kernels._{name}")
-    if found is None or found.origin is None:
-        return None
+def kernels() -> Kernels:
+    """Return the kernels; raises InstallationError where they are missing, damaged or built from other sources."""
+    path = FOLDER / library_name()
+    wrong = mismatch(path)
+    if wrong is not None:
+        raise InstallationError(f"the compiled kernels {wrong} ({path}); {_remedy()}")
+    # Every wrapper declares its structures, which the functions name.
+    from rigkit.kernels import edges, front, growth, lattice, minimal, pose  # noqa: F401
+
     try:
-        library = ctypes.CDLL(found.origin)
-        library.rigkit_source.restype = ctypes.c_char_p
-        built_from = library.rigkit_source().decode()
-        folder = Path(__file__).parent
-        source = (folder / f"{name}.c").read_bytes() + (folder / "kernels.h").read_bytes()
-    except (OSError, AttributeError):
-        return None
-    return library if built_from == hashlib.sha256(source).hexdigest()[:16] else None
+        return Kernels(path)
+    except OSError as error:
+        raise InstallationError(f"the compiled kernels do not load ({error}); {_remedy()}") from error
 
 
-def address(array: NDArray[Any]) -> int:
-    """Return the address of the first value of a contiguous `array`, which must outlive its use.
-
-    `array.ctypes.data` takes four times as long, and a detection needs two hundred addresses.
-    """
+def about() -> str:
+    """Return what `rigkit --version` says of the kernels: the hash of their sources, and the instruction set."""
     try:
-        return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        # Read-only, or empty.
-        return int(array.ctypes.data)
+        chosen = kernels().instruction_set().decode()
+    except InstallationError as error:
+        return str(error)
+    return f"{source_hash(FOLDER)}, {chosen}"
+
+
+def _remedy() -> str:
+    """Return what to type."""
+    checkout = FOLDER.parents[1]
+    if (checkout / "setup.py").is_file():
+        install = f"'{sys.executable}' -m pip install --no-deps -e '{checkout}'"
+        return f"with a C compiler (gcc or clang) installed type: {install}"
+    return f"type: '{sys.executable}' -m pip install --no-deps --force-reinstall rigkit"

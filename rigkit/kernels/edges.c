@@ -8,7 +8,6 @@
 
 enum { X, Y, T1, T2, S, A, B, GX, GY, K1, K2, PARAMETERS };
 enum { FEWER = K1, ROWS = PARAMETERS + 1, LANES = 8, GROUPS = 8, BLOCK = LANES * GROUPS };
-enum { LAG = 2, ACROSS_LAGS = 2 * LAG + 1, LAGS = LAG * ACROSS_LAGS + LAG + 1, OUTCOMES = 9 + 2 * LAGS };
 enum { STRETCH = 16, CACHE_LINE = 64 };
 
 /* Eight numbers at once, wherever they lie. */
@@ -20,15 +19,6 @@ typedef uint8_t bytes_t __attribute__((vector_size(STRETCH)));
 typedef uint16_t halves_t __attribute__((vector_size(2 * STRETCH)));
 typedef int32_t words_t __attribute__((vector_size(4 * STRETCH)));
 typedef float bright_t __attribute__((vector_size(4 * STRETCH), aligned(4)));
-
-/* The constants of detection.subpixel.edge_model and detection.subpixel.edge_fit, under their names there (rigkit.kernels.edges.Rules). */
-typedef struct {
-    double reach, end_sigmas, least_reach, near_sigmas, near_px, tail_sigmas, pixel_kurtosis, sharp_blur;
-    double least_blur, most_blur, angle_sigma, log_blur_sigma, light_sigma;
-    double most_move_px, most_turn, most_blur_change, most_light_change;
-    double least_variance, ridge, converged_px, blur_lag, valid_move_px, valid_move_cells, most_mirrored, radius_px;
-    int64_t iterations, mirrored, fewest_mirrored;
-} rules_t;
 
 /* What the lattice says of a corner: its cell's sides, the curvature of its lines and how uncertain it is, where their
  * neighbours are, and which of these have no corner of the lattice. */
@@ -119,7 +109,7 @@ INLINE void take(window_t *window, const picture_t image, int64_t v, int32_t fir
 }
 
 /* Return how far the window reaches towards neighbouring line `k` (edge_model.Geometry.reach). */
-INLINE double reach_to(const geometry_t at, int k, double blur, const rules_t *rules)
+INLINE double reach_to(const geometry_t at, int k, double blur, const edge_rules_t *rules)
 {
     if (!at.ends[k])
         return rules->reach;
@@ -131,7 +121,7 @@ INLINE double reach_to(const geometry_t at, int k, double blur, const rules_t *r
  * near the two lines. */
 FOR_EACH_PROCESSOR
 static void collect(
-    window_t *window, const picture_t image, const double pixel[2], const geometry_t at, double blur, const rules_t *rules)
+    window_t *window, const picture_t image, const double pixel[2], const geometry_t at, double blur, const edge_rules_t *rules)
 {
     const double *a = at.sides, *b = at.sides + 2;
     double area = a[0] * b[1] - a[1] * b[0];
@@ -224,7 +214,7 @@ INLINE void blurred_edge(float x, float kurtosis, float out[5])
     out[4] = x * slope - 4.0f * third;
 }
 
-INLINE line_t line_of(double angle, double curvature, const double gaps[2], double blur, const rules_t *rules)
+INLINE line_t line_of(double angle, double curvature, const double gaps[2], double blur, const edge_rules_t *rules)
 {
     const double cosine = cos(angle), sine = sin(angle), c2 = cosine * cosine, s2 = sine * sine, b2 = blur * blur;
     const double flat = rules->pixel_kurtosis * (c2 * c2 + s2 * s2);
@@ -309,7 +299,7 @@ INLINE float mixed(const edge_t *one, const edge_t *two, float rho, int i)
 /* Set the window's rows to the first `parameters` of edge_model.linearise and the last, the residuals, and `products`
  * (rows of ROWS, lower half) to those of these rows over all pixels. */
 INLINE void multiply_rows(
-    const int parameters, const double *values, const window_t *window, const geometry_t at, const rules_t *rules,
+    const int parameters, const double *values, const window_t *window, const geometry_t at, const edge_rules_t *rules,
     double *products)
 {
     const float x = (float)values[X], y = (float)values[Y], blur = (float)values[S];
@@ -380,14 +370,14 @@ INLINE void multiply_rows(
 
 FOR_EACH_PROCESSOR
 static void normal_equations(
-    const double *values, const window_t *window, const geometry_t at, const rules_t *rules, double *products)
+    const double *values, const window_t *window, const geometry_t at, const edge_rules_t *rules, double *products)
 {
     multiply_rows(FEWER, values, window, at, rules, products);
 }
 
 FOR_EACH_PROCESSOR
 static void all_normal_equations(
-    const double *values, const window_t *window, const geometry_t at, const rules_t *rules, double *products)
+    const double *values, const window_t *window, const geometry_t at, const edge_rules_t *rules, double *products)
 {
     multiply_rows(PARAMETERS, values, window, at, rules, products);
 }
@@ -395,7 +385,7 @@ static void all_normal_equations(
 /* Set a and b by linear least squares with everything else as it stands (edge_fit._brightness); every second block says
  * enough. */
 FOR_EACH_PROCESSOR
-static void brightness(double *values, const window_t *window, const geometry_t at, const rules_t *rules, double sign)
+static void brightness(double *values, const window_t *window, const geometry_t at, const edge_rules_t *rules, double sign)
 {
     const float x = (float)values[X], y = (float)values[Y];
     const float rho = (float)cos(values[T1] - values[T2]);
@@ -509,7 +499,7 @@ static double clipped(double value, double low, double high)
 }
 
 /* Move `values` by `step`, cut where it would leave the region in which the model is nearly linear (edge_fit._limited). */
-static void move(double *values, const double *step, int n, const rules_t *rules)
+static void move(double *values, const double *step, int n, const edge_rules_t *rules)
 {
     const double limits[PARAMETERS] = {
         rules->most_move_px, rules->most_move_px, rules->most_turn, rules->most_turn, rules->most_blur_change * values[S],
@@ -546,7 +536,7 @@ static double leave(window_t *window, const double *step, int parameters)
 /* Return the mean square of what the model leaves and mirroring at the corner changes, as that of independent noise, or
  * -1 where few pixels have a mirror image (edge_fit._noise). */
 FOR_EACH_PROCESSOR
-static double unmirrored(const double *values, window_t *window, int parameters, const rules_t *rules)
+static double unmirrored(const double *values, window_t *window, int parameters, const edge_rules_t *rules)
 {
     if (fabs(values[X]) > rules->most_mirrored || fabs(values[Y]) > rules->most_mirrored)
         return -1.0;
@@ -656,7 +646,7 @@ static int surrounded(const window_t *window, float x, float y)
  * pixels, sums and numbers of `lag_products`, none where the noise is not known or is that of rounding. */
 static void fit_corner(
     window_t *window, const double pixel[2], const geometry_t at, double sign, double blur, double contrast,
-    const rules_t *rules, double *out)
+    const edge_rules_t *rules, double *out)
 {
     const double turn = 1.0 / (rules->angle_sigma * rules->angle_sigma);
     const double width = 1.0 / (rules->log_blur_sigma * rules->log_blur_sigma * blur * blur);
@@ -732,7 +722,7 @@ static void fit_corner(
 }
 
 /* Side of the square that holds the window and, around it, nothing where mirror images may fall. */
-static int64_t across_square(const rules_t *rules)
+static int64_t across_square(const edge_rules_t *rules)
 {
     return 2 * ((int64_t)floor(rules->radius_px) + (int64_t)ceil(2.0 * rules->most_mirrored) + LANES) + 1;
 }
@@ -744,7 +734,7 @@ static int64_t room_of_window(double radius_px)
 }
 
 /* Return how many floats of scratch fit_edges needs. */
-int64_t edges_scratch(const rules_t *rules)
+int64_t edges_scratch(const edge_rules_t *rules)
 {
     const int64_t across = across_square(rules);
     return (3 + ROWS) * room_of_window(rules->radius_px) + 4 * across * across + CACHE_LINE / (int64_t)sizeof(float);
@@ -756,7 +746,7 @@ int64_t edges_scratch(const rules_t *rules)
 void fit_edges(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *sides,
     const double *curvature, const double *curvature_sigma, const double *gaps, const double *sign, const double *blur,
-    const double *contrast, const uint8_t *ends, const rules_t *rules, float *scratch, double *out)
+    const double *contrast, const uint8_t *ends, const edge_rules_t *rules, float *scratch, double *out)
 {
     const picture_t image = {grey, width, height, bytes};
     const int64_t room = room_of_window(rules->radius_px), across = across_square(rules);
@@ -777,12 +767,6 @@ void fit_edges(
 }
 
 enum { TERMS = 6 };
-
-/* The constants of detection.subpixel.edge_curvature (rigkit.kernels.edges.BendRules). */
-typedef struct {
-    double decay, least_sigma, free, bent;
-    int64_t reach;
-} bend_rules_t;
 
 /* The normal equations of a line's Taylor coefficients, in sides of the cell, without their prior: row i, column j of the
  * matrix is moment i + j. */
@@ -875,9 +859,10 @@ INLINE void line_bend(
  * (detection.subpixel.edge_curvature.line_curvature). */
 FOR_EACH_PROCESSOR
 void line_bends(
-    const double *pixels, const double *sigma, const uint8_t *wanted, int64_t rows, int64_t columns, const double *sides,
-    const bend_rules_t *rules, double *out, double *out_sigma)
+    const double *pixels, const double *sigma, const uint8_t *wanted, int64_t rows, int64_t columns, int64_t count,
+    const double *sides, const bend_rules_t *rules, double *out, double *out_sigma)
 {
+    (void)count;
     for (int64_t row = 0; row < rows; row++)
         for (int64_t column = 0; column < columns; column++) {
             const int64_t cell = row * columns + column;

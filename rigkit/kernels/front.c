@@ -3,11 +3,7 @@
  * The definitions are in rigkit.detection.saddles.response, .saddle, .ring and .links; the numbers come from there. */
 #include "kernels.h"
 
-/* Pixels that the tests of a row are made for at a time: the results stay in registers and the first cache. */
-enum { STRIP = 64 };
-
 /* The means of factor x factor pixels: out (height / factor, width / factor). `sums` (width) is scratch. */
-void shrink_floats(const float *image, int64_t height, int64_t width, int64_t factor, float *sums, float *out);
 FOR_EACH_PROCESSOR void shrink_floats(
     const float *restrict image, int64_t height, int64_t width, int64_t factor, float *restrict sums,
     float *restrict out)
@@ -31,7 +27,6 @@ FOR_EACH_PROCESSOR void shrink_floats(
 }
 
 /* The same of bytes; sums of at most 256 rows fit 16 bits. */
-void shrink_bytes(const uint8_t *image, int64_t height, int64_t width, int64_t factor, uint16_t *sums, float *out);
 FOR_EACH_PROCESSOR void shrink_bytes(
     const uint8_t *restrict image, int64_t height, int64_t width, int64_t factor, uint16_t *restrict sums,
     float *restrict out)
@@ -68,8 +63,6 @@ INLINE rows_t rows_around(int64_t v, int64_t height, int64_t width)
 
 /* Smooth with the kernel (outer, inner, centre, inner, outer) both ways, the border repeated; `half` gets every second
  * pixel of every second row. `column` (width + 4) is scratch. */
-void smooth_floats(
-    const float *image, int64_t height, int64_t width, const float *kernel, float *column, float *out, float *half);
 FOR_EACH_PROCESSOR void smooth_floats(
     const float *restrict image, int64_t height, int64_t width, const float *restrict kernel, float *restrict column,
     float *restrict out, float *restrict half)
@@ -97,9 +90,6 @@ FOR_EACH_PROCESSOR void smooth_floats(
 }
 
 /* The same of bytes with a kernel of small integers over `whole`: exact, as long as whole^2 * 255 fits 16 bits. */
-void smooth_bytes(
-    const uint8_t *image, int64_t height, int64_t width, const float *kernel, float whole, uint16_t *column, float *out,
-    float *half);
 FOR_EACH_PROCESSOR void smooth_bytes(
     const uint8_t *restrict image, int64_t height, int64_t width, const float *restrict kernel, float whole,
     uint16_t *restrict column, float *restrict out, float *restrict half)
@@ -140,8 +130,6 @@ INLINE float saddle_response(const float *at, int64_t width)
 }
 
 /* |response| and brightness at every step-th inner pixel of every step-th inner row, row by row. */
-void typical_values(
-    const float *smooth, int64_t height, int64_t width, int64_t step, float *response, float *brightness);
 void typical_values(
     const float *smooth, int64_t height, int64_t width, int64_t step, float *response, float *brightness)
 {
@@ -208,9 +196,6 @@ INLINE int32_t fill_response(const float *restrict from, int64_t width, int64_t 
 
 /* detection.saddles.response.peaks: (u, v) and response of the peaks, row by row; returns how many. There is at most one peak in
  * 3x3 pixels. `scratch` holds 5 * (width + STRIP + 4) floats, `high` 5 * (width / STRIP + 1) bytes. */
-int64_t find_peaks(
-    const float *smooth, int64_t height, int64_t width, float threshold, float *scratch, uint8_t *high, int32_t *at,
-    float *response);
 FOR_EACH_PROCESSOR int64_t find_peaks(
     const float *smooth, int64_t height, int64_t width, float threshold, float *scratch, uint8_t *high, int32_t *at,
     float *response)
@@ -258,12 +243,10 @@ FOR_EACH_PROCESSOR int64_t find_peaks(
  * ((height / side + 1) * (width / side + 1)), `bins` (`finest` + 1), both zeroed, and `share` (count) are scratch. Returns
  * how many are left. */
 int64_t keep_strongest(
-    int32_t *at, float *response, int64_t count, int64_t width, int64_t side, int64_t most, int64_t finest,
-    float *squares, int32_t *bins, int32_t *share);
-int64_t keep_strongest(
-    int32_t *at, float *response, int64_t count, int64_t width, int64_t side, int64_t most, int64_t finest,
-    float *squares, int32_t *bins, int32_t *share)
+    int32_t *at, float *response, int64_t count, int64_t height, int64_t width, int64_t side, int64_t most,
+    int64_t finest, float *squares, int32_t *bins, int32_t *share)
 {
+    (void)height;
     const int32_t across = (int32_t)(width / side) + 1, step = (int32_t)side;
     for (int32_t k = 0, row = -1, first = 0; k < (int32_t)count; k++) {
         if (at[2 * k + 1] != row) {
@@ -337,10 +320,6 @@ INLINE int may_be_corner(
 /* The corners of one level among `count` peaks of `response`: `saddles` (count, 2) gets those with a saddle nearby,
  * `which`, `angles` (count, 2) and `contrast` those of them that are corners: their ring is valid and they are no sharper
  * than `most_sharp`. Returns the number of saddles and, in `found`, of corners. */
-int64_t find_corners(
-    image_t image, const ring_rules_t *rules, double radius, double most_step, double most_sharp, const int32_t *peaks,
-    const float *response, int64_t count, double *saddles, int64_t *which, double *angles, double *contrast,
-    int64_t *found);
 FOR_EACH_PROCESSOR int64_t find_corners(
     image_t image, const ring_rules_t *rules, double radius, double most_step, double most_sharp, const int32_t *peaks,
     const float *response, int64_t count, double *saddles, int64_t *which, double *angles, double *contrast,
@@ -362,8 +341,6 @@ FOR_EACH_PROCESSOR int64_t find_corners(
 }
 
 /* Mark those of `fresh` (count, 2) that lie within `reach` of one of `known`. Returns 0 without memory. */
-int64_t mark_known(
-    const double *fresh, int64_t count, const double *known, int64_t known_count, double reach, uint8_t *mark);
 int64_t mark_known(
     const double *fresh, int64_t count, const double *known, int64_t known_count, double reach, uint8_t *mark)
 {
@@ -389,19 +366,6 @@ int64_t mark_known(
     free(scratch);
     return 1;
 }
-
-/* The constants of detection.lattice.links. */
-typedef struct {
-    int64_t neighbours, places, most;
-    const double *along;
-    double arm_cosine, contrast_ratio, length_ratio, aside, least_aside;
-} link_rules_t;
-
-/* The corners and the level that their edges are read from. */
-typedef struct {
-    const double *pixels, *lines, *contrast, *least, *most, *reach;
-    int64_t count;
-} corners_t;
 
 /* A corner that may be the neighbour along an arm. */
 typedef struct {
@@ -594,9 +558,6 @@ static double link_length(const double *pixels, int64_t i, int64_t to)
 /* detection.lattice.links.find_links: both[4 * i + arm] = 4 * neighbour + its arm, -1 for none. Of the corners, `lines` (count, 4)
  * are the unit vectors of A and B, `least` and `most` bound the contrast of those looked at, `reach` is the most `aside`.
  * `nearest` (count, 4) is scratch. Returns 0 without memory. */
-int64_t find_links(
-    const corners_t *corners, image_t image, double scale, double offset, const link_rules_t *rules, int64_t *nearest,
-    int64_t *both);
 FOR_EACH_PROCESSOR int64_t find_links(
     const corners_t *corners, image_t image, double scale, double offset, const link_rules_t *rules, int64_t *nearest,
     int64_t *both)

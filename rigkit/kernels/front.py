@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-import ctypes
-import functools
-from ctypes import POINTER, Structure, byref, c_double, c_float, c_int64, c_void_p
-from typing import ClassVar
-
 import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
-from rigkit.kernels import address, kernels
+from rigkit.kernels import Kernels, kernels
+from rigkit.kernels.calls import Struct, structure
+from rigkit.kernels.declarations import header
 
 __all__ = ["LinkRules", "RingRules", "corners", "links", "loaded", "near_any", "peaks", "shrunk", "smoothed", "typical"]
 
-STRIP = 64
-"""As in front.c: rows of scratch memory are longer than the image by this and a peak's neighbourhood."""
-
-HALF = 16
-"""Samples of a ring in half a turn, as in kernels.h."""
+STRIP, HALF = (header().constants[name] for name in ("STRIP", "HALF"))
 
 WHOLE = 16.0
 """A kernel of multiples of 1/16 smooths bytes exactly in integers of 16 bits."""
@@ -31,103 +24,61 @@ Image = NDArray[np.float32]
 Picture = NDArray[np.uint8] | NDArray[np.float32]
 
 
-class RingRules(Structure):
-    """ring_rules_t; `make` also keeps the arrays that it points to."""
-
-    _fields_: ClassVar = [
-        *((name, c_void_p) for name in ("circle", "gains")),
-        ("gain_count", c_int64),
-        *(
-            (name, c_double)
-            for name in ("most_odd", "most_centre", "most_cosine", "quick_odd", "quick_centre", "quick_sharp")
-        ),
-    ]
+@structure("ring_rules_t")
+class RingRules(Struct):
+    """How rings are read."""
 
     @classmethod
     def make(cls, circle: Image, gains: FloatArray, **numbers: float) -> RingRules:
         """Return the rules; `circle` (2 * HALF, 2) are the samples of a ring of radius 1."""
-        if circle.shape != (2 * HALF, 2):
-            raise ValueError(f"ring of {len(circle)} samples: the kernels read {2 * HALF}, HALF in kernels.h")
-        kept = np.ascontiguousarray(circle, np.float32), np.ascontiguousarray(gains, np.float64)
-        rules = cls(address(kept[0]), address(kept[1]), len(kept[1]), **numbers)
-        rules.kept = kept
-        return rules
+        samples, gains = np.ascontiguousarray(circle, np.float32), np.ascontiguousarray(gains, np.float64)
+        return cls.of(circle=samples, gains=gains, gain_count=len(gains), **numbers)
 
 
-class LinkRules(Structure):
-    """link_rules_t; `make` also keeps the array that it points to."""
-
-    _fields_: ClassVar = [
-        *((name, c_int64) for name in ("neighbours", "places", "most")),
-        ("along", c_void_p),
-        *((name, c_double) for name in ("arm_cosine", "contrast_ratio", "length_ratio", "aside", "least_aside")),
-    ]
+@structure("link_rules_t")
+class LinkRules(Struct):
+    """How links are found."""
 
     @classmethod
     def make(cls, neighbours: int, along: FloatArray, most: int, **numbers: float) -> LinkRules:
         """Return the rules; `along` are the places of an edge that are looked at."""
-        kept = np.ascontiguousarray(along, np.float64)
-        rules = cls(neighbours, len(kept), most, address(kept), **numbers)
-        rules.kept = kept
-        return rules
+        places = np.ascontiguousarray(along, np.float64)
+        return cls.of(neighbours=neighbours, along=places, places=len(places), most=most, **numbers)
 
 
-class _Image(Structure):
-    _fields_: ClassVar = [("brightness", c_void_p), ("width", c_int64), ("height", c_int64)]
+@structure("image_t")
+class ImageOf(Struct):
+    """An image of brightness, float32."""
 
     @classmethod
-    def of(cls, image: Image) -> _Image:
-        return cls(address(image), image.shape[1], image.shape[0])
+    def make(cls, image: Image) -> ImageOf:
+        height, width = image.shape
+        return cls.of(brightness=image, height=height, width=width)
 
 
-class _Corners(Structure):
-    _fields_: ClassVar = [
-        *((name, c_void_p) for name in ("pixels", "lines", "contrast", "least", "most", "reach")),
-        ("count", c_int64),
-    ]
+@structure("corners_t")
+class _Corners(Struct):
+    """The corners that links are sought for."""
 
 
-@functools.cache
-def loaded() -> ctypes.CDLL | None:
-    """Return the library, None where the kernels are not to be had."""
-    library = kernels("front")
-    if library is None:
-        return None
-    array, size = c_void_p, c_int64
-    library.shrink_floats.argtypes = [array, size, size, size, array, array]
-    library.shrink_bytes.argtypes = library.shrink_floats.argtypes
-    library.smooth_floats.argtypes = [array, size, size, *[array] * 4]
-    library.smooth_bytes.argtypes = [array, size, size, array, c_float, *[array] * 3]
-    library.typical_values.argtypes = [array, size, size, size, array, array]
-    for name in ("shrink_floats", "shrink_bytes", "smooth_floats", "smooth_bytes", "typical_values"):
-        getattr(library, name).restype = None
-    library.find_peaks.argtypes = [array, size, size, c_float, *[array] * 4]
-    library.keep_strongest.argtypes = [array, array, *[size] * 5, *[array] * 3]
-    rings = (_Image, POINTER(RingRules), c_double, c_double, c_double)
-    library.find_corners.argtypes = [*rings, array, array, size, *[array] * 5]
-    library.mark_known.argtypes = [array, size, array, size, c_double, array]
-    library.find_links.argtypes = [
-        *(POINTER(_Corners), _Image, c_double, c_double, POINTER(LinkRules)),
-        *(array, array),
-    ]
-    for name in ("find_peaks", "keep_strongest", "find_corners", "mark_known", "find_links"):
-        getattr(library, name).restype = size
-    return library
+def loaded() -> Kernels:
+    """Return the kernels()."""
+    return kernels()
 
 
-def shrunk(library: ctypes.CDLL, image: Picture, factor: int) -> Image:
+def shrunk(image: Picture, factor: int) -> Image:
     """Return the means of `factor` x `factor` pixels."""
     height, width = image.shape
     bytewise = image.dtype == np.uint8 and factor <= MOST_SUMMED
     image = image if bytewise else image.astype(np.float32, copy=False)
     sums = np.empty(width, np.uint16 if bytewise else np.float32)
     out = np.empty((height // factor, width // factor), np.float32)
-    shrink = library.shrink_bytes if bytewise else library.shrink_floats
-    shrink(address(image), height, width, factor, address(sums), address(out))
+    shrink = kernels().shrink_bytes if bytewise else kernels().shrink_floats
+    shrink(np.ascontiguousarray(image), height, width, factor, sums, out)
     return out
 
 
-def smoothed(library: ctypes.CDLL, image: Picture, kernel: Image) -> tuple[Image, Image]:
+def smoothed(image: Picture, kernel: Image) -> tuple[Image, Image]:
     """Return `image` smoothed with the symmetric `kernel` (5,), of multiples of 1/WHOLE, both ways, and every second of
     its pixels both ways."""
     height, width = image.shape
@@ -137,26 +88,22 @@ def smoothed(library: ctypes.CDLL, image: Picture, kernel: Image) -> tuple[Image
     smooth, half = block[: height * width].reshape(height, width), block[height * width :].reshape(-1, half_width)
     if image.dtype == np.uint8:
         column = np.empty(width + 4, np.uint16)
-        arrays = (address(column), address(smooth), address(half))
-        library.smooth_bytes(address(image), height, width, address(kernel), WHOLE, *arrays)
+        kernels().smooth_bytes(np.ascontiguousarray(image), height, width, kernel, WHOLE, column, smooth, half)
     else:
-        column = np.empty(width + 4, np.float32)
-        arrays = (address(column), address(smooth), address(half))
-        library.smooth_floats(address(image), height, width, address(kernel), *arrays)
+        sums = np.empty(width + 4, np.float32)
+        kernels().smooth_floats(np.ascontiguousarray(image), height, width, kernel, sums, smooth, half)
     return smooth, half
 
 
-def typical(library: ctypes.CDLL, smooth: Image, step: int) -> tuple[Image, Image]:
+def typical(smooth: Image, step: int) -> tuple[Image, Image]:
     """Return |response| and brightness at every `step`-th inner pixel of every `step`-th inner row."""
     height, width = smooth.shape
     out = np.empty((2, -(-(height - 2) // step) * -(-(width - 2) // step)), np.float32)
-    library.typical_values(address(smooth), height, width, step, address(out[0]), address(out[1]))
+    kernels().typical_values(smooth, height, width, step, out[0], out[1])
     return out[0], out[1]
 
 
-def peaks(
-    library: ctypes.CDLL, smooth: Image, threshold: float, limit: int, side: int, finest: int
-) -> tuple[NDArray[np.int32], Image]:
+def peaks(smooth: Image, threshold: float, limit: int, side: int, finest: int) -> tuple[NDArray[np.int32], Image]:
     """Return (u, v) and response of the peaks above `threshold`, row by row.
 
     Of more than `limit` peaks, about so many are kept: those strongest beside the strongest in their square of `side`
@@ -166,20 +113,16 @@ def peaks(
     most = (height // 3 + 1) * (width // 3 + 1)
     at, response = np.empty((most, 2), np.int32), np.empty(most, np.float32)
     scratch, high = np.empty(5 * (width + STRIP + 4), np.float32), np.empty(5 * (width // STRIP + 1), np.uint8)
-    arrays = (scratch, high, at, response)
-    found = library.find_peaks(address(smooth), height, width, threshold, *(address(array) for array in arrays))
+    found = kernels().find_peaks(smooth, height, width, threshold, scratch, high, at, response)
+    at, response = at[:found], response[:found]
     if found > limit:
         squares = np.zeros((height // side + 1) * (width // side + 1), np.float32)
         bins, share = np.zeros(finest + 1, np.int32), np.empty(found, np.int32)
-        scratch_of_it = (address(squares), address(bins), address(share))
-        found = library.keep_strongest(
-            address(at), address(response), found, width, side, limit, finest, *scratch_of_it
-        )
+        found = kernels().keep_strongest(at, response, found, height, width, side, limit, finest, squares, bins, share)
     return at[:found], response[:found]
 
 
 def corners(
-    library: ctypes.CDLL,
     smooth: Image,
     at: NDArray[np.signedinteger],
     response: Image,
@@ -190,31 +133,28 @@ def corners(
 ) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
     """Return the saddles next to the peaks `at` (N, 2); of the corners among them: which, angles (M, 2), contrast."""
     at, response = np.ascontiguousarray(at, np.int32), np.ascontiguousarray(response, np.float32)
-    count, found = len(at), c_int64()
+    count, found = len(at), np.zeros(1, np.int64)
     pixels, which = np.empty((count, 2)), np.empty(count, np.int64)
     # A ring is read before it is known whether it is kept.
     angles, contrast = np.empty((count + 1, 2)), np.empty(count + 1)
-    near = library.find_corners(
-        *(_Image.of(smooth), byref(rules), radius, most_step, most_sharp),
-        *(address(at), address(response), count),
-        *(address(array) for array in (pixels, which, angles, contrast)),
-        byref(found),
+    near = kernels().find_corners(
+        *(ImageOf.make(smooth), rules, radius, most_step, most_sharp),
+        *(at, response, count, pixels, which, angles, contrast, found),
     )
-    size = found.value
+    size = int(found[0])
     return pixels[:near], which[:size], angles[:size], contrast[:size]
 
 
-def near_any(library: ctypes.CDLL, fresh: FloatArray, known: FloatArray, reach: float) -> BoolArray:
+def near_any(fresh: FloatArray, known: FloatArray, reach: float) -> BoolArray:
     """Return which of `fresh` (N, 2) lie within `reach` of any of `known` (M, 2), M > 0."""
     fresh, known = np.ascontiguousarray(fresh, np.float64), np.ascontiguousarray(known, np.float64)
     mark = np.empty(len(fresh), np.bool_)
-    if not library.mark_known(address(fresh), len(fresh), address(known), len(known), reach, address(mark)):
+    if not kernels().mark_known(fresh, len(fresh), known, len(known), reach, mark):
         raise MemoryError
     return mark
 
 
 def links(
-    library: ctypes.CDLL,
     pixels: FloatArray,
     lines: FloatArray,
     contrast: FloatArray,
@@ -231,9 +171,9 @@ def links(
     largest distance of the places that are looked at from the edge.
     """
     arrays = [np.ascontiguousarray(a, np.float64) for a in (pixels, lines, contrast, *bounds, reach)]
-    given = _Corners(*(address(array) for array in arrays), len(pixels))
-    out = np.empty((2, len(pixels), 4), np.int64)
-    place = (address(out[0]), address(out[1]))
-    if not library.find_links(byref(given), _Image.of(image), scale, offset, byref(rules), *place):
+    names = ("pixels", "lines", "contrast", "least", "most", "reach")
+    given = _Corners.of(**dict(zip(names, arrays, strict=True)), count=len(pixels))
+    nearest, both = np.empty((2, len(pixels), 4), np.int64)
+    if not kernels().find_links(given, ImageOf.make(image), scale, offset, rules, nearest, both):
         raise MemoryError
-    return np.asarray(out[1])
+    return np.asarray(both)

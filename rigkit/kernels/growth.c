@@ -14,11 +14,6 @@ typedef struct {
     double pixel[2], along_column[2], along_row[2], bend_column[2], bend_row[2], support, gain;
 } fit_t;
 
-typedef struct {
-    int64_t degree, radius, leave_out;
-    double width, ridge[2];
-} fit_rules_t;
-
 /* Solve the n x n symmetric `matrix` for three right-hand sides in place (LDL'). */
 INLINE void solve(double matrix[MOST_TERMS][MOST_TERMS], double right[MOST_TERMS][3], const int n)
 {
@@ -163,27 +158,26 @@ INLINE void fill_bell(const fit_rules_t *rules, double *bell)
 }
 
 /* detection.lattice.local_fit.fit_cells for the cells marked in `cells` (rows, columns), row by row. */
-void fit_cells(
-    const double *lattice, int64_t rows, int64_t columns, const uint8_t *cells, const fit_rules_t *rules, fit_t *out);
 FOR_EACH_PROCESSOR void fit_cells(
-    const double *lattice, int64_t rows, int64_t columns, const uint8_t *cells, const fit_rules_t *rules, fit_t *out)
+    const double *lattice, int64_t rows, int64_t columns, const uint8_t *cells, const fit_rules_t *rules, int64_t count,
+    double *out)
 {
+    (void)count;
+    fit_t *fits = (fit_t *)out;
     double bell[MOST_RADIUS + 1];
     fill_bell(rules, bell);
     for (int64_t row = 0; row < rows; row++)
         for (int64_t column = 0; column < columns; column++)
             if (cells[row * columns + column])
-                fit_cell(lattice, rows, columns, row, column, rules, bell, out++);
+                fit_cell(lattice, rows, columns, row, column, rules, bell, fits++);
 }
 
 /* Sort the `count` > 0 points into squares, in `memory` (squares_memory). */
-void sort_points(const double *points, int64_t count, int32_t *memory, squares_t *out);
 FOR_EACH_PROCESSOR void sort_points(const double *points, int64_t count, int32_t *memory, squares_t *out)
 {
     fill_squares(points, count, 1.0, memory, out);
 }
 
-int64_t squares_memory(int64_t count);
 int64_t squares_memory(int64_t count) { return SQUARES_MEMORY(count); }
 
 /* Find the (at most `most`) nearest points within `reach` of (u, v), the nearest first; return how many. */
@@ -215,30 +209,6 @@ static int64_t nearest_points(const squares_t *squares, double u, double v, doub
     return count;
 }
 
-/* See the constants of detection.lattice.grow, detection.lattice.links and detection.saddles.ring. */
-typedef struct {
-    fit_rules_t predictions[2];
-    const ring_rules_t *ring;
-    const double *along;
-    int64_t places, most, tried, fewest;
-    double reach, ring_part, min_ring, max_ring, line_sine, contrast_ratio, aside, min_aside, max_aside, least_area;
-} growth_rules_t;
-
-/* The brightness of a level: full-resolution pixel = scale * level pixel + offset. */
-typedef struct {
-    image_t image;
-    double scale, offset;
-} level_t;
-
-/* A lattice within empty cells; `sign` of the cell (0, 0) is +1 where brightness grows with the angle across its +column
- * edge. `due[k]` marks the cells to be tried with prediction k. */
-typedef struct {
-    double *pixels, *contrast;
-    uint8_t *due[2];
-    int64_t rows, columns;
-    double sign;
-} sheet_t;
-
 INLINE int is_known(const sheet_t *sheet, int64_t row, int64_t column)
 {
     if (row < 0 || column < 0 || row >= sheet->rows || column >= sheet->columns)
@@ -255,7 +225,7 @@ INLINE int runs_along(double angle, const double *vector, double line_sine)
 
 /* Return whether the saddle at (u, v) can be the corner of the cell, and its contrast (detection.lattice.grow._fits). */
 INLINE int fits(
-    const sheet_t *sheet, const level_t *level, const growth_rules_t *rules, const fit_t *fit, int64_t row,
+    const sheet_t *sheet, const pyramid_level_t *level, const growth_rules_t *rules, const fit_t *fit, int64_t row,
     int64_t column, double height, const double *pixel, double *contrast)
 {
     const double u = (pixel[0] - level->offset) / level->scale, v = (pixel[1] - level->offset) / level->scale;
@@ -289,7 +259,7 @@ INLINE int fits(
 
 /* Try the saddles near the prediction of one empty cell; return whether one fits, its pixel and contrast in `out`. */
 INLINE int try_cell(
-    const sheet_t *sheet, const level_t *level, const squares_t *saddles, const growth_rules_t *rules,
+    const sheet_t *sheet, const pyramid_level_t *level, const squares_t *saddles, const growth_rules_t *rules,
     const fit_rules_t *prediction, const double *bell, int64_t row, int64_t column, double out[3])
 {
     fit_t fit;
@@ -354,11 +324,8 @@ static int touches_border(const sheet_t *sheet)
 /* Grow one lattice in place by at most `rings` rings (detection.lattice.grow.grow). `fresh` (rows * columns, 3) and `where`
  * (rows * columns) are scratch. Returns the rings that are left, 0 or more, if it needs a wider sheet to grow on; -1 if
  * it has grown all it can. */
-int64_t grow_lattice(
-    sheet_t *sheet, const level_t *level, const squares_t *saddles, const growth_rules_t *rules, int64_t rings,
-    double *fresh, int64_t *where);
 FOR_EACH_PROCESSOR int64_t grow_lattice(
-    sheet_t *sheet, const level_t *level, const squares_t *saddles, const growth_rules_t *rules, int64_t rings,
+    sheet_t *sheet, const pyramid_level_t *level, const squares_t *saddles, const growth_rules_t *rules, int64_t rings,
     double *fresh, int64_t *where)
 {
     const int64_t rows = sheet->rows, columns = sheet->columns;
@@ -373,9 +340,9 @@ FOR_EACH_PROCESSOR int64_t grow_lattice(
             for (int64_t row = 0; row < rows; row++)
                 for (int64_t column = 0; column < columns; column++) {
                     const int64_t cell = row * columns + column;
-                    if (!sheet->due[way][cell] || is_known(sheet, row, column) || !has_neighbour(sheet, row, column))
+                    if (!sheet->due[way * rows * columns + cell] || is_known(sheet, row, column) || !has_neighbour(sheet, row, column))
                         continue;
-                    sheet->due[way][cell] = 0;
+                    sheet->due[way * rows * columns + cell] = 0;
                     if (try_cell(sheet, level, saddles, rules, prediction, bell, row, column, fresh + 3 * count))
                         where[count++] = cell;
                 }
@@ -391,7 +358,7 @@ FOR_EACH_PROCESSOR int64_t grow_lattice(
             for (int64_t r = row - MOST_RADIUS; r <= row + MOST_RADIUS; r++)
                 for (int64_t c = column - MOST_RADIUS; c <= column + MOST_RADIUS; c++)
                     if (r >= 0 && c >= 0 && r < rows && c < columns)
-                        sheet->due[0][r * columns + c] = sheet->due[1][r * columns + c] = 1;
+                        sheet->due[r * columns + c] = sheet->due[(rows + r) * columns + c] = 1;
         }
     }
     return -1;
@@ -494,9 +461,6 @@ static int64_t walk(
 
 /* detection.lattice.lattice: the lattices of the links `to` (count, 4), which are changed. Returns how many; label, grid (count, 2),
  * turn and members as in `walk`. `queue` (2 * count) and `bound` (4 * count) are scratch. */
-int64_t find_components(
-    int64_t count, int64_t *to, int64_t *label, int64_t *grid, int64_t *turn, int64_t *members, int64_t *queue,
-    uint8_t *bound);
 int64_t find_components(
     int64_t count, int64_t *to, int64_t *label, int64_t *grid, int64_t *turn, int64_t *members, int64_t *queue,
     uint8_t *bound)

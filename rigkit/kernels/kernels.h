@@ -9,26 +9,24 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "api.h"
+
 /* On a hot function: also compiled for newer processors, chosen when the library is loaded. By what they can do:
  * "arch=haswell" would be chosen on a Haswell alone. */
-#if defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 12 && defined(__x86_64__) && defined(__gnu_linux__)
+#if defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 12 && defined(__x86_64__) && defined(__GLIBC__)
+#define PROCESSORS 1
 #define FOR_EACH_PROCESSOR __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
 #else
+#define PROCESSORS 0
 #define FOR_EACH_PROCESSOR
 #endif
 
-/* What a small function that hot loops call needs to be vectorised with them. */
-#if defined(__GNUC__)
-#define INLINE static inline __attribute__((always_inline, unused))
-#else
-#define INLINE static inline
+#if !defined(__GNUC__) && !defined(__clang__)
+#error "needs vector extensions: compile with gcc or clang (on Windows clang-cl, or the clang of the package ziglang)"
 #endif
 
-/* An image of brightness. */
-typedef struct {
-    const float *brightness;
-    int64_t width, height;
-} image_t;
+/* What a small function that hot loops call needs to be vectorised with them. */
+#define INLINE static inline __attribute__((always_inline, unused))
 
 /* Return `image` at (u, v), bilinear, the border repeated (detection.saddles.response.sample). */
 INLINE float brightness_at(const image_t image, float u, float v)
@@ -50,18 +48,6 @@ INLINE float brightness_at(const image_t image, float u, float v)
 }
 
 #define PI 3.14159265358979323846
-/* Samples of a ring in half a turn (detection.saddles.ring): known here, the loops over them need no counting. */
-enum { HALF = 16, TURN = 2 * HALF };
-
-/* How rings are read (detection.saddles.ring): `circle` holds the (u, v) of HALF samples in half a turn and of their opposites;
- * `gains` R_2 / R_4 over the ratio of harmonic 2 at half the radius to that on the ring, from 1/4 to 1. */
-typedef struct {
-    const float *circle;
-    const double *gains;
-    int64_t gain_count;
-    double most_odd, most_centre, most_cosine, quick_odd, quick_centre, quick_sharp;
-} ring_rules_t;
-
 /* Return the two angles of a corner from the `even` part of its ring (detection.saddles.ring._angles). */
 INLINE void ring_angles(
     const image_t image, const ring_rules_t *rules, float u, float v, float radius, const float *even, double angles[2])
@@ -182,14 +168,6 @@ INLINE int edge_seen(
     return unseen <= places - most;
 }
 
-/* Points in squares: those of square b are order[first[b]] to order[first[b + 1] - 1]. */
-typedef struct {
-    const double *points;
-    int32_t *first, *order;
-    int64_t columns, rows;
-    double left, top, side;
-} squares_t;
-
 /* At most so many squares for so many points: smaller ones leave more of them to look into, larger ones more points that
  * are too far. */
 #define MOST_SQUARES(count) ((count) / 2 + 8)
@@ -233,9 +211,5 @@ INLINE void fill_squares(const double *points, int64_t count, double side, int32
     for (int64_t i = count - 1; i >= 0; i--)
         order[--first[square[i]]] = (int32_t)i;
 }
-
-/* The source that this library was built from (setup.py). */
-const char *rigkit_source(void);
-const char *rigkit_source(void) { return RIGKIT_SOURCE; }
 
 #endif

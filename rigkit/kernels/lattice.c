@@ -62,18 +62,14 @@ static double uneven_columns(
 /* Set `typical` and `seen` to the above for the inner columns, then for the inner rows, and `every` to the two medians of
  * all (detection.lattice.spacing.unevenness). `scratch` has room for twice as many numbers as there are corners. */
 void uneven_steps(
-    const double *pixels, int64_t rows, int64_t columns, double *scratch, double *typical, int64_t *seen, double *every)
+    const double *pixels, int64_t rows, int64_t columns, double *scratch, int64_t all, double *typical,
+    int64_t *seen, double *every)
 {
+    (void)all;
     const int64_t inner = columns > 2 ? columns - 2 : 0;
     every[0] = uneven_columns(pixels, rows, columns, 2 * columns, 2, scratch, typical, seen);
     every[1] = uneven_columns(pixels, columns, rows, 2, 2 * columns, scratch, typical + inner, seen + inner);
 }
-
-/* The constants of detection.subpixel.scatter (rigkit.kernels.lattice.ScatterRules). */
-typedef struct {
-    double unexplained, median_of_normal;
-    int64_t fewest_corners, fewest_differences, first_order, last_order;
-} scatter_rules_t;
 
 enum { MOST_ORDER = 8, PLANE = 8 };
 
@@ -193,9 +189,10 @@ static void flatten(const part_t part)
  * sigmas say (detection.subpixel.scatter.excess_scatter). `parts` are top, left, rows, columns; `scratch` has room for seven numbers
  * for each corner of a part. */
 void excess_scatter(
-    const double *pixels, const double *sigma, int64_t width, const int64_t *parts, int64_t count,
+    const double *pixels, const double *sigma, int64_t height, int64_t width, const int64_t *parts, int64_t count,
     const scatter_rules_t *rules, double *scratch, double *out)
 {
+    (void)height;
     for (int64_t n = 0; n < count; n++) {
         const int64_t *at = parts + 4 * n, size = at[2] * at[3];
         const part_t part = {scratch, scratch + 2 * size, scratch + 3 * size, at[2], at[3]};
@@ -235,11 +232,9 @@ static int square_of(
  * (detection.checks.validate._shifts). `sign` is that of the first corner; `sums` has room for parts x (steps + 1). */
 FOR_EACH_PROCESSOR
 void edge_shifts(
-    const double *pixels, int64_t rows, int64_t columns, double sign, const float *brightness, int64_t width,
-    int64_t height, double scale, double offset, double reach, const double *along, int64_t parts, int64_t steps,
-    int64_t most, double *sums, double *out)
+    const double *pixels, int64_t rows, int64_t columns, double sign, const image_t image, double scale, double offset,
+    double reach, const double *along, int64_t parts, int64_t steps, int64_t most, double *sums, double *out)
 {
-    const image_t image = {brightness, width, height};
     double corner[4][2];
     int64_t count = 0, next = 0;
     for (int64_t row = 0; row + 1 < rows; row++)

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import ctypes
-import functools
 from collections.abc import Sequence
-from ctypes import POINTER, Structure, byref, c_double, c_int64, c_void_p
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.arrays import FloatArray
-from rigkit.kernels import address, kernels
+from rigkit.kernels import Kernels, kernels
+from rigkit.kernels.calls import Struct, structure
+from rigkit.kernels.front import ImageOf
 
 __all__ = ["ScatterRules", "excess_scatter", "loaded", "shifts_of_edges", "uneven_steps"]
 
@@ -20,37 +18,17 @@ ROOM_FOR_SCATTER = 7
 """Numbers that lattice.c keeps for each corner."""
 
 
-class ScatterRules(Structure):
-    """scatter_rules_t."""
-
-    _fields_: ClassVar = [
-        *((name, c_double) for name in ("unexplained", "median_of_normal")),
-        *((name, c_int64) for name in ("fewest_corners", "fewest_differences", "first_order", "last_order")),
-    ]
+@structure("scatter_rules_t")
+class ScatterRules(Struct):
+    """The constants of `detection.subpixel.scatter`."""
 
 
-@functools.cache
-def loaded() -> ctypes.CDLL | None:
-    """Return the library with its arguments declared, None where there is none."""
-    library = kernels("lattice")
-    if library is not None:
-        library.uneven_steps.argtypes = [c_void_p, c_int64, c_int64, *[c_void_p] * 4]
-        library.uneven_steps.restype = None
-        library.excess_scatter.argtypes = [
-            *(c_void_p, c_void_p, c_int64, c_void_p, c_int64),
-            *(POINTER(ScatterRules), c_void_p, c_void_p),
-        ]
-        library.excess_scatter.restype = None
-        library.edge_shifts.argtypes = [
-            *(c_void_p, c_int64, c_int64, c_double),
-            *(c_void_p, c_int64, c_int64, c_double, c_double),
-            *(c_double, c_void_p, c_int64, c_int64, c_int64, c_void_p, c_void_p),
-        ]
-        library.edge_shifts.restype = None
-    return library
+def loaded() -> Kernels:
+    """Return the kernels()."""
+    return kernels()
 
 
-def uneven_steps(library: ctypes.CDLL, pixels: FloatArray) -> tuple[list[float], list[int], tuple[float, float]]:
+def uneven_steps(pixels: FloatArray) -> tuple[list[float], list[int], tuple[float, float]]:
     """Return what `detection.lattice.spacing.unevenness` does of `pixels` (R, C, 2).
 
     That is `typical` and `seen` of the inner columns and then of the inner rows, and `every` of both.
@@ -59,15 +37,13 @@ def uneven_steps(library: ctypes.CDLL, pixels: FloatArray) -> tuple[list[float],
     rows, columns = pixels.shape[:2]
     inner = max(columns - 2, 0) + max(rows - 2, 0)
     numbers, seen = np.empty(2 * rows * columns + inner + 2), np.empty(inner, np.int64)
-    start = address(numbers)
-    typical = start + 16 * rows * columns
-    library.uneven_steps(address(pixels), rows, columns, start, typical, address(seen), typical + 8 * inner)
-    *uneven, along_rows, along_columns = numbers[2 * rows * columns :].tolist()
-    return uneven, seen.tolist(), (along_rows, along_columns)
+    scratch, typical, every = np.split(numbers, [2 * rows * columns, 2 * rows * columns + inner])
+    kernels().uneven_steps(pixels, rows, columns, scratch, inner, typical, seen, every)
+    along_rows, along_columns = every.tolist()
+    return typical.tolist(), seen.tolist(), (along_rows, along_columns)
 
 
 def excess_scatter(
-    library: ctypes.CDLL,
     pixels: FloatArray,
     sigma_px: FloatArray,
     parts: Sequence[tuple[slice, slice]],
@@ -80,13 +56,11 @@ def excess_scatter(
         np.int64,
     ).reshape(-1, 4)
     scratch, out = np.empty(ROOM_FOR_SCATTER * sigma_px.size), np.empty(len(where))
-    arrays = (address(where), len(where), byref(rules), address(scratch), address(out))
-    library.excess_scatter(address(pixels), address(sigma_px), sigma_px.shape[1], *arrays)
+    kernels().excess_scatter(pixels, sigma_px, *sigma_px.shape, where, len(where), rules, scratch, out)
     return out
 
 
 def shifts_of_edges(
-    library: ctypes.CDLL,
     pixels: FloatArray,
     rising: bool,
     image: NDArray[np.float32],
@@ -101,11 +75,9 @@ def shifts_of_edges(
     pixels, image = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(image, np.float32)
     places = np.array(along, np.float64)
     rows, columns = pixels.shape[:2]
-    height, width = image.shape
     sums, out = np.empty((len(places), steps + 1)), np.empty(len(places))
-    library.edge_shifts(
-        *(address(pixels), rows, columns, 1.0 if rising else -1.0),
-        *(address(image), width, height, scale, offset, reach),
-        *(address(places), len(places), steps, most, address(sums), address(out)),
+    kernels().edge_shifts(
+        *(pixels, rows, columns, 1.0 if rising else -1.0, ImageOf.make(image), scale, offset, reach),
+        *(places, len(places), steps, most, sums, out),
     )
     return out

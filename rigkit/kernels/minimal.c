@@ -9,7 +9,6 @@
 #define CUBICS 10
 #define MONOMIALS 20
 #define DEGREE 10
-#define MOST_ROOTS 10
 /* Roots of the polynomial lose digits on the way to it: solutions worse than this are polished. */
 #define EXACT 1e-11
 /* What is worse than this afterwards, far above the rounding even of double roots, was none. */
@@ -559,7 +558,6 @@ INLINE void solve_six(const double *rows, double *E)
 }
 
 /* `rows` (count, 5, 9) -> `out` (count, 10, 9). */
-void five_rows(const double *rows, int64_t count, double *out);
 FOR_EACH_PROCESSOR void five_rows(const double *rows, int64_t count, double *out)
 {
     for (int64_t b = 0; b < count; b++)
@@ -567,7 +565,6 @@ FOR_EACH_PROCESSOR void five_rows(const double *rows, int64_t count, double *out
 }
 
 /* `rows` (count, 6, 9) -> `out` (count, 9). */
-void six_rows(const double *rows, int64_t count, double *out);
 FOR_EACH_PROCESSOR void six_rows(const double *rows, int64_t count, double *out)
 {
     for (int64_t b = 0; b < count; b++)

@@ -111,7 +111,6 @@ INLINE double weight_of(double r, level_t level)
 }
 
 /* SampsonRows.residuals: E (hypotheses, 9) -> out (hypotheses, count). */
-void residuals(const double *packed, int64_t count, const double *E, int64_t hypotheses, double *out);
 FOR_EACH_PROCESSOR void residuals(const double *packed, int64_t count, const double *E, int64_t hypotheses, double *out)
 {
     block_t block;
@@ -124,7 +123,6 @@ FOR_EACH_PROCESSOR void residuals(const double *packed, int64_t count, const dou
 }
 
 /* SampsonRows.quality: the sums over the matches of E (hypotheses, 9). */
-void qualities(const double *packed, int64_t count, const double *E, int64_t hypotheses, double noise, double *out);
 FOR_EACH_PROCESSOR void qualities(
     const double *packed, int64_t count, const double *E, int64_t hypotheses, double noise, double *out)
 {
@@ -147,9 +145,6 @@ FOR_EACH_PROCESSOR void qualities(
 
 /* SampsonRows.quality_ahead: the greatest of the four sums of E = [t]x R with both rotations (hypotheses, 2, 9) and both
  * signs of t (hypotheses, 3), over the matches that are not behind a camera by a parallax of so many `sigmas`. */
-void qualities_ahead(
-    const double *packed, int64_t count, const double *R, const double *t, int64_t hypotheses, double noise, double sigmas,
-    double *out);
 FOR_EACH_PROCESSOR void qualities_ahead(
     const double *packed, int64_t count, const double *R, const double *t, int64_t hypotheses, double noise, double sigmas,
     double *out)
@@ -334,9 +329,6 @@ INLINE double sum_up(const double *packed, int64_t count, level_t level, const p
 }
 
 /* SampsonRows.improved: R (hypotheses, 9) and t (hypotheses, 3) move to the best quality at `noise`. */
-void improve(
-    const double *packed, int64_t count, double *R, double *t, double noise, int64_t hypotheses,
-    const int64_t *free, int64_t freedom, int64_t most_steps, double settled);
 FOR_EACH_PROCESSOR void improve(
     const double *packed, int64_t count, double *R, double *t, double noise, int64_t hypotheses,
     const int64_t *free, int64_t freedom, int64_t most_steps, double settled)
@@ -370,15 +362,6 @@ FOR_EACH_PROCESSOR void improve(
     }
 }
 
-/* What the maximum likelihood pose is sought from (pose_problem.PoseProblem). `affine` are 25 rows of `chosen` numbers
- * (residuals.whitened_affinities). */
-typedef struct {
-    const double *packed, *affine, *point_weights;
-    const int64_t *which, *free;
-    int64_t count, chosen, freedom, loss, most_iterations;
-    double scale, tolerance;
-} problem_t;
-
 /* All residuals in sigmas, with derivatives J (5, rows): first the points, then the first, then the second of each
  * affinity. */
 typedef struct {
@@ -386,7 +369,7 @@ typedef struct {
 } terms_t;
 
 /* residuals.point_terms. */
-INLINE void point_terms(const problem_t *p, const pose_t pose, int64_t rows, terms_t out)
+INLINE void point_terms(const pose_problem_t *p, const pose_t pose, int64_t rows, terms_t out)
 {
     const int64_t count = p->count;
     const double *packed = p->packed;
@@ -422,7 +405,7 @@ INLINE void point_terms(const problem_t *p, const pose_t pose, int64_t rows, ter
 /* residuals.affinity_terms with sigma_A. With a = R f1, C = R B1 and the columns B of B2 the gradients are n2 = B . (t x a)
  * and n1 = C . (f2 x t); by rotation a x (B x t) and C x (f2 x t), by direction a x B and C x f2. In the pixels' share of
  * the variance (weights.pixel_share) M = B . (t x C). */
-INLINE void affinity_terms(const problem_t *p, const pose_t pose, int64_t rows, terms_t out)
+INLINE void affinity_terms(const pose_problem_t *p, const pose_t pose, int64_t rows, terms_t out)
 {
     const int64_t count = p->count, chosen = p->chosen;
     const double *at = p->affine;
@@ -484,7 +467,7 @@ INLINE void affinity_terms(const problem_t *p, const pose_t pose, int64_t rows, 
 }
 
 /* Return the weight by one of the losses: none, Cauchy, marginal (PoseProblem._loss). */
-INLINE double robust_weight(const problem_t *p, double r)
+INLINE double robust_weight(const pose_problem_t *p, double r)
 {
     if (p->loss == 1)
         return 1.0 / (1.0 + (r / p->scale) * (r / p->scale));
@@ -492,7 +475,7 @@ INLINE double robust_weight(const problem_t *p, double r)
 }
 
 /* PoseProblem._weights. */
-INLINE void weigh(const problem_t *p, const double *r, double *w)
+INLINE void weigh(const pose_problem_t *p, const double *r, double *w)
 {
     for (int64_t i = 0; i < p->count; i++)
         w[i] = p->point_weights[i] * robust_weight(p, r[i]);
@@ -513,21 +496,20 @@ INLINE double weighted_squares(const double *w, const double *r, int64_t rows)
 }
 
 /* Where row i of numpy's order is here: there the two of an affinity follow each other. */
-INLINE int64_t place_of(const problem_t *p, int64_t i)
+INLINE int64_t place_of(const pose_problem_t *p, int64_t i)
 {
     const int64_t k = i - p->count;
     return k < 0 ? i : p->count + k / 2 + k % 2 * p->chosen;
 }
 
 /* PoseProblem._minimum: R (9,) and t (3,) move to the minimum; `r`, `w` (rows,) and `J` (rows, 5) there, `rows` = count + 2
- * chosen. Returns the iterations, negative if not converged; 0 without freedom, and -1000 without memory. */
-int64_t minimise(const problem_t *p, double *R, double *t, double *r, double *J, double *w);
-FOR_EACH_PROCESSOR int64_t minimise(const problem_t *p, double *R, double *t, double *r, double *J, double *w)
+ * chosen. Returns the iterations, negative if not converged; 0 without freedom, and NO_MEMORY without memory. */
+FOR_EACH_PROCESSOR int64_t minimise(const pose_problem_t *p, double *R, double *t, double *r, double *J, double *w)
 {
     const int64_t rows = p->count + 2 * p->chosen;
     double *memory = malloc(sizeof(double) * (size_t)(13 * rows + 1));
     if (!memory)
-        return -1000;
+        return NO_MEMORY;
     terms_t here = {memory, memory + rows}, there = {memory + 6 * rows, memory + 7 * rows};
     double *weights = memory + 12 * rows, damping = 1e-6, step[5];
     pose_t pose;

@@ -15,12 +15,9 @@ from rigkit.detection.subpixel.edge_fit import EdgeFit, fit_edges
 from rigkit.detection.subpixel.edge_model import Geometry, ends_of
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.kernels import kernels
 from rigkit.synthetic.photometry import Photometry, develop
 from rigkit.synthetic.render import Optics, radiance
 from rigkit.synthetic.scene import PlacedBoard
-
-pytestmark = pytest.mark.skipif(kernels("edges") is None, reason="compiled kernels are not built")
 
 ROUNDING_PX = 5e-5
 """Both sum some hundred float32 products of 1e-7 relative error, in another order."""

@@ -16,8 +16,6 @@ from rigkit.detection.saddles.response import Level, grey_image, peaks, pyramid
 from rigkit.detection.saddles.saddle import Corners, find_corners
 from rigkit.kernels import front
 
-pytestmark = pytest.mark.skipif(front.loaded() is None, reason="the kernels are not built")
-
 SMOOTH_LEVELS = 1e-4
 """Sums of 25 single-precision products of grey levels."""
 

@@ -1,27 +1,153 @@
-"""`kernels` takes a library only for the source that it was built from."""
+"""The library is taken only whole and for the sources it was built from; every call of it is checked."""
 
 from __future__ import annotations
 
-import importlib.util
+import ctypes
 import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from rigkit import kernels as native
+import rigkit.kernels as package
+from rigkit.core.errors import InstallationError
+from rigkit.kernels import kernels
+from rigkit.kernels.building import library_name, mismatch
+from rigkit.kernels.calls import Struct, structure
+from rigkit.kernels.declarations import header, parsed
+from rigkit.kernels.front import ImageOf
+from rigkit.kernels.growth import FitRules
+from rigkit.kernels.pose import qualities
 
-FRONT = importlib.util.find_spec("rigkit.kernels._front")
+
+@pytest.fixture
+def copy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder with the library and its sources, which `kernels` looks into."""
+    folder = tmp_path / "rigkit" / "kernels"
+    shutil.copytree(package.FOLDER, folder, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(package, "FOLDER", folder)
+    yield folder
 
 
-@pytest.mark.skipif(FRONT is None, reason="the kernels are not built")
-@pytest.mark.parametrize("source", ["its own", "changed", "gone"])
-def test_a_library_counts_only_beside_its_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str) -> None:
-    here = Path(native.__file__).parent
-    current = native.kernels.__wrapped__("front") is not None
-    shutil.copy(here / "kernels.h", tmp_path)
-    if source != "gone":
-        text = (here / "front.c").read_text(encoding="utf-8")
-        (tmp_path / "front.c").write_text(text + ("" if source == "its own" else "\n/* */\n"), encoding="utf-8")
-    monkeypatch.setattr(native, "__file__", str(tmp_path / "__init__.py"))
-    found = native.kernels.__wrapped__("front")
-    assert (found is not None) == (current and source == "its own")
+def test_a_whole_library_of_these_sources_is_taken(copy: Path) -> None:
+    assert mismatch(copy / library_name()) is None
+    assert kernels.__wrapped__().instruction_set()
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "said"),
+    [
+        (library_name(), None, "are missing"),
+        (Path(library_name()).with_suffix(".json").name, None, "no record"),
+        (Path(library_name()).with_suffix(".json").name, lambda b: b"{", "no record"),
+        (library_name(), lambda b: b[: len(b) // 2], "are damaged"),
+        (library_name(), lambda b: b[:-1] + bytes([b[-1] ^ 1]), "are damaged"),
+        ("front.c", lambda b: b + b"/* */", "are stale"),
+        ("api.h", lambda b: b + b"/* */", "are stale"),
+        ("pose.c", None, "are stale"),
+    ],
+)
+def test_what_is_missing_cut_or_stale_is_refused(copy: Path, file: str, change: object, said: str) -> None:
+    path = copy / file
+    before = path.read_bytes()
+    path.unlink()
+    if callable(change):
+        path.write_bytes(change(before))
+    with pytest.raises(InstallationError, match=said) as error:
+        kernels.__wrapped__()
+    assert "pip install" in str(error.value)
+
+
+def test_line_ends_of_another_system_are_no_change(copy: Path) -> None:
+    path = copy / "front.c"
+    path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
+    assert mismatch(copy / library_name()) is None
+
+
+def test_help_needs_no_kernels() -> None:
+    code = (
+        "import sys, rigkit; from rigkit.cli.main import main\n"
+        "try: main(['--help'])\nexcept SystemExit: pass\n"
+        "sys.exit(any(name.startswith('rigkit.kernels') for name in sys.modules))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], stdout=subprocess.DEVNULL, check=False).returncode == 0
+
+
+def test_every_function_is_declared_once_and_there() -> None:
+    declared = header().functions
+    assert len(declared) > 20
+    assert {name for name in declared if getattr(kernels(), name) is None} == set()
+    with pytest.raises(AttributeError, match="declares no function 'grow'"):
+        kernels().grow  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        np.zeros((18, 9)).astype(np.float32),
+        np.zeros((17, 9)),
+        np.zeros((18, 9, 1)),
+        np.zeros((9, 18)).T,
+        np.zeros((18, 18))[:, ::2],
+        np.zeros((36, 9))[::2],
+    ],
+    ids=["dtype", "shape", "dimensions", "transposed", "strided", "rows"],
+)
+def test_an_array_of_another_kind_is_refused(wrong: np.ndarray) -> None:
+    assert qualities(np.ones((18, 9)), np.ones((2, 3, 3)), 2.0).shape == (2,)
+    with pytest.raises(TypeError, match="qualities: 'packed' is"):
+        qualities(wrong, np.ones((2, 3, 3)), 2.0)
+
+
+def test_a_read_only_array_is_taken_and_an_empty_one() -> None:
+    packed = np.ones((18, 9))
+    packed.flags.writeable = False
+    assert qualities(packed, np.ones((2, 3, 3)), 2.0).shape == (2,)
+    assert qualities(packed, np.ones((0, 3, 3)), 2.0).shape == (0,)
+    turned = np.zeros((9, 18)).T
+    turned.flags.writeable = False
+    with pytest.raises(TypeError, match="not C-contiguous"):
+        qualities(turned, np.ones((2, 3, 3)), 2.0)
+
+
+def test_arguments_are_counted() -> None:
+    with pytest.raises(TypeError, match="wants packed, count, E, hypotheses, noise, out"):
+        kernels().qualities(np.ones((18, 9)), 9)
+
+
+def test_members_are_checked() -> None:
+    with pytest.raises(TypeError, match="'brightness' is float64"):
+        ImageOf.make(np.zeros((4, 5)))
+    with pytest.raises(TypeError, match="'brightness' is float32"):
+        ImageOf.of(brightness=np.zeros((4, 5), np.float32), height=5, width=4)
+    with pytest.raises(TypeError, match="wants brightness, width, height"):
+        ImageOf.of(brightness=np.zeros((4, 5), np.float32))
+
+
+def test_the_header_is_read_as_c_reads_it() -> None:
+    """Members in their order; sizes and offsets are then those of C, which ctypes follows."""
+    assert [name for name, _ in FitRules._fields_] == ["degree", "radius", "leave_out", "width", "ridge"]
+    assert ctypes.sizeof(FitRules) == 3 * 8 + 3 * 8
+    found = parsed(
+        "enum { A = 3, B = 2 * A };  /* int64_t none; */\n#define X 1\n"
+        "typedef struct { double a, b[B]; ARRAY(const float, c, n / 2, B); int64_t n; } s_t;\n"
+        "EXPORT void f(const s_t *s, ARRAY(void, any, s.n), double x);"
+    )
+    assert found.constants == {"A": 3, "B": 6}
+    assert [(m.name, m.length) for m in found.structures["s_t"]] == [("a", None), ("b", 6), ("c", None), ("n", None)]
+    assert found.structures["s_t"][2].array.shape == "(n // 2, B,)"
+    assert [(p.name, p.pointer, p.array is None) for p in found.functions["f"]] == [
+        ("s", True, True),
+        ("any", False, False),
+        ("x", False, True),
+    ]
+    with pytest.raises(ValueError, match="cannot read"):
+        parsed("EXPORT void f(double (*x)(int64_t));")
+
+
+def test_only_declared_structures_can_be_made() -> None:
+    with pytest.raises(KeyError):
+        structure("nothing_t")(type("Nothing", (Struct,), {}))

@@ -13,9 +13,6 @@ from rigkit.detection.detect import find_lattices
 from rigkit.detection.lattice.spacing import spacing_changes
 from rigkit.detection.saddles.response import grey_image, pyramid
 from rigkit.detection.subpixel.scatter import excess_scatter
-from rigkit.kernels import kernels
-
-pytestmark = pytest.mark.skipif(kernels("lattice") is None, reason="the kernels are not built")
 
 ROUNDING = 1e-9
 """Relative: differences of fifth and sixth order of pixels lose six digits."""

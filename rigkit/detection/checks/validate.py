@@ -175,9 +175,7 @@ def _edge_offsets(lattice: Lattice, level: Level, reach: float, along: Sequence[
     library = native.loaded()
     if library is not None:
         seen = (level.smooth, level.scale, level.offset)
-        return native.shifts_of_edges(
-            library, lattice.pixels, lattice.rising, *seen, reach, along, STEPS_ACROSS, MAX_EDGES
-        )
+        return native.shifts_of_edges(lattice.pixels, lattice.rising, *seen, reach, along, STEPS_ACROSS, MAX_EDGES)
     pixels, signs = level.to_level(lattice.pixels), lattice.signs()
     # The edges that squares start with, and how each square goes on from there: boards seen aslant are flat.
     first, right, below, last = pixels[:-1, :-1], pixels[:-1, 1:], pixels[1:, :-1], pixels[1:, 1:]

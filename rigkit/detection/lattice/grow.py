@@ -97,9 +97,7 @@ class SaddleIndex:
     @cached_property
     def squares(self) -> Squares:
         """The saddles as the kernels want them."""
-        library = kernels("growth")
-        assert library is not None
-        return Squares.of(library, self.pixels)
+        return Squares.sorted(self.pixels)
 
     def nearest(self, pixels: FloatArray, reach_px: FloatArray) -> tuple[IntArray, BoolArray]:
         """Return the MAX_SADDLES_TRIED nearest saddles of each of `pixels` (M, 2), and which lie within `reach_px`."""
@@ -166,11 +164,11 @@ def _grow(lattice: Lattice, saddles: SaddleIndex, level: Level, rings: int) -> i
 
     Returns the rings that are left when it has reached the border of its arrays, -1 when it has grown all it can.
     """
-    library = kernels("growth")
+    library = kernels()
     if library is not None:
         sheet = (lattice.pixels, lattice.contrast, 1.0 if lattice.rising else -1.0)
         brightness = (level.smooth, level.scale, level.offset)
-        return grown(library, *sheet, *brightness, saddles.squares, _rules(), rings)
+        return grown(*sheet, *brightness, saddles.squares, _rules(), rings)
     due = np.ones((2, *lattice.contrast.shape), bool)
     for left in range(rings, 0, -1):
         # A new look at corners that have changed.

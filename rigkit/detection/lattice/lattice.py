@@ -200,9 +200,9 @@ class LatticeStack:
 
 def build_lattices(corners: Corners, links: Links) -> Iterator[Lattice]:
     """Return the lattices that closed squares of four linked corners make up, the largest first."""
-    library = kernels("growth")
+    library = kernels()
     if library is not None:
-        count, label, grid, turn, members = components_of(library, links.state)
+        count, label, grid, turn, members = components_of(links.state)
     else:
         label, grid, turn = _components(links)
         count = int(label.max(initial=-1)) + 1

@@ -94,7 +94,6 @@ def _compiled(corners: Corners, level: Level) -> IntArray | None:
     if library is None:
         return None
     return front.links(
-        library,
         corners.pixels,
         arm_vectors(corners.angles)[:, :2],
         corners.contrast,

@@ -116,10 +116,10 @@ def fit_cells(
         neighbours leave open from running wild.
     leave_out : ignore the corner of the cell itself, to predict it from its neighbours.
     """
-    library = kernels("growth")
+    library = kernels()
     if library is not None:
         rules = FitRules(degree, radius, leave_out, width, ridge)
-        return _local_fit(fit(library, lattice, cells, rules))
+        return _local_fit(fit(lattice, cells, rules))
     side = 2 * radius + 1
     step_r, step_c = (a.ravel() - radius for a in np.divmod(np.arange(side * side), side))
     powers = POWERS[: TERMS_OF_DEGREE[degree]]

@@ -31,7 +31,7 @@ def spacing_changes(pixels: FloatArray) -> tuple[SpacingChange, SpacingChange]:
     library = native.loaded()
     if library is None:
         return _changes_along_rows(pixels), _changes_along_rows(pixels.swapaxes(0, 1))
-    typical, seen, every = native.uneven_steps(library, pixels)
+    typical, seen, every = native.uneven_steps(pixels)
     inner = max(pixels.shape[1] - 2, 0)
     return SpacingChange(typical[:inner], seen[:inner], every[0]), SpacingChange(
         typical[inner:], seen[inner:], every[1]

@@ -16,7 +16,7 @@ def near_any(points: FloatArray, others: FloatArray, reach_px: float) -> BoolArr
         return np.zeros(len(points), np.bool_)
     library = front.loaded()
     if library is not None:
-        return front.near_any(library, points, others, reach_px)
+        return front.near_any(points, others, reach_px)
     from scipy.spatial import cKDTree
 
     return np.asarray(cKDTree(others).query(points)[0] <= reach_px, dtype=np.bool_)

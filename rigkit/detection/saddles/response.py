@@ -154,7 +154,7 @@ def _shrunk(grey: GreyImage, factor: int) -> GreyImage:
         return grey
     library = front.loaded()
     if library is not None:
-        return front.shrunk(library, grey, factor)
+        return front.shrunk(grey, factor)
     height, width = grey.shape[0] // factor, grey.shape[1] // factor
     whole = grey[: factor * height, : factor * width]
     mean = cv2.resize(whole.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
@@ -165,7 +165,7 @@ def _smoothed(image: GreyImage) -> tuple[FloatImage, FloatImage]:
     """Return `image` smoothed, and every second pixel of every second row of that."""
     library = front.loaded()
     if library is not None:
-        return front.smoothed(library, image, SMOOTH)
+        return front.smoothed(image, SMOOTH)
     smooth = np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, SMOOTH, SMOOTH, borderType=cv2.BORDER_REPLICATE), np.float32)
     return smooth, np.ascontiguousarray(smooth[::2, ::2])
 
@@ -188,7 +188,7 @@ def _threshold(smooth: FloatImage) -> float:
     step = max(1, int(np.sqrt(smooth.size / TYPICAL)))
     library = front.loaded()
     if library is not None:
-        response, brightness = front.typical(library, smooth, step)
+        response, brightness = front.typical(smooth, step)
     else:
         response = np.abs(_response(smooth)[::step, ::step]).ravel()
         brightness = smooth[1:-1:step, 1:-1:step].ravel()
@@ -211,7 +211,7 @@ def peaks(level: Level) -> tuple[NDArray[np.signedinteger], FloatImage]:
     most = max(MAX_PEAKS, level.smooth.size // PIXELS_A_PEAK)
     library = front.loaded()
     if library is not None:
-        return front.peaks(library, level.smooth, level.threshold, most, PEAK_SQUARE_PX, SHARES)
+        return front.peaks(level.smooth, level.threshold, most, PEAK_SQUARE_PX, SHARES)
     response = _response(level.smooth)
     highest = cv2.dilate(response, np.ones((5, 5), np.uint8))
     mask = (response >= highest) & (response > level.threshold)

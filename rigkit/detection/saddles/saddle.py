@@ -90,7 +90,7 @@ def _corners_of(level: Level) -> tuple[FloatArray, IntArray, FloatArray, FloatAr
     at, response = peaks(level)
     library = front.loaded()
     if library is not None:
-        return front.corners(library, level.smooth, at, response, RING_RADIUS, MAX_STEP, MAX_SHARPNESS, ring_rules())
+        return front.corners(level.smooth, at, response, RING_RADIUS, MAX_STEP, MAX_SHARPNESS, ring_rules())
     found, near = saddle_step(level.smooth, at)
     found, response = found[near], response[near]
     which = np.flatnonzero(may_be_corners(level.smooth, found, RING_RADIUS, response))

@@ -38,7 +38,7 @@ def excess_scatter(pixels: FloatArray, sigma_px: FloatArray, parts: Sequence[tup
     """
     library = native.loaded()
     if library is not None:
-        return native.excess_scatter(library, pixels, sigma_px, parts, _rules())
+        return native.excess_scatter(pixels, sigma_px, parts, _rules())
     return np.array([_excess(pixels[part], sigma_px[part]) for part in parts])
 
 

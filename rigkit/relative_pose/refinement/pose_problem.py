@@ -12,7 +12,7 @@ from rigkit.core.errors import InputError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rotation import exp_so3, unit
-from rigkit.kernels import pose as native
+from rigkit.kernels import pose as kernel
 from rigkit.relative_pose.refinement.local import SampsonRows
 from rigkit.relative_pose.refinement.marginal import MarginalLoss
 from rigkit.relative_pose.refinement.residuals import affinity_terms, level_terms, point_terms, whitened_affinities
@@ -75,12 +75,12 @@ class PoseProblem:
         """Return the minimum near a pose; raises InputError where the residuals are too few."""
         loss = self._loss()
         plain = self.level_sigma_rad is None and self.covariance_A is None
-        if plain and loss is not None and (library := native.loaded()) is not None:
+        if plain and loss is not None:
             affine, which = whitened_affinities(self.matches)
             self._require(len(self.matches) + 2 * len(which))
             packed, limits = SampsonRows.of(self.matches).packed, (MAX_ITERATIONS, STEP_TOLERANCE)
             given = (packed, affine, which, self._own_weights())
-            end = native.minimise(library, *given, loss, self.free(), R, t, *limits)
+            end = kernel.minimise(*given, loss, self.free(), R, t, *limits)
             return Minimum(*end[:5], 0, *end[5:])
         return self._minimum(R, t)
 

@@ -1,0 +1,70 @@
+"""How the kernels are compiled, and the record that says what a library was built from.
+
+The standard library alone: setup.py and scripts/cross_compile.py run this file before rigkit is installed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+from pathlib import Path
+
+__all__ = ["FLAGS", "library_name", "mismatch", "source_hash", "sources", "write_record"]
+
+FLAGS = (
+    *("-O3", "-std=c11", "-g0", "-fvisibility=hidden", "-Wall", "-Wno-unknown-pragmas"),
+    # Nothing here reads errno or the flags of floating-point exceptions.
+    *("-fno-math-errno", "-fno-trapping-math"),
+    # Products that feed sums are fused where the processor can; compilers differ in what they do if they are not told.
+    *("-ffp-contract=fast", "-fopenmp-simd"),
+)
+"""For gcc and clang. No -ffast-math: missing corners are NaN."""
+
+
+def library_name(platform: str = sys.platform) -> str:
+    """Return the library's file name, the same for every version of Python."""
+    suffixes = {"win32": "rigkit_kernels.dll", "darwin": "librigkit_kernels.dylib"}
+    return suffixes.get(platform, "librigkit_kernels.so")
+
+
+def sources(folder: Path) -> list[Path]:
+    """Return the C files of `folder`."""
+    return sorted(folder.glob("*.c"))
+
+
+def source_hash(folder: Path) -> str:
+    """Return a hash of the C files and headers of `folder`, and of how they are compiled."""
+    digest = hashlib.sha256(" ".join(FLAGS).encode())
+    for path in sorted([*folder.glob("*.c"), *folder.glob("*.h")]):
+        # Line ends differ between systems and mean nothing.
+        digest.update(path.name.encode() + b"\0" + path.read_bytes().replace(b"\r\n", b"\n"))
+    return digest.hexdigest()[:16]
+
+
+def write_record(library: Path, folder: Path, compiler: str) -> Path:
+    """Write beside `library` what it was built from, the sources in `folder`, and its own hash; return that file."""
+    record = {"sources": source_hash(folder), "library": _hash_of(library), "compiler": compiler}
+    path = library.with_suffix(".json")
+    path.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    return path
+
+
+def mismatch(library: Path) -> str | None:
+    """Return what is wrong with `library`, which lies beside its sources: None if it is whole and built from them."""
+    if not library.is_file():
+        return "are missing"
+    try:
+        record = json.loads(library.with_suffix(".json").read_text(encoding="utf-8"))
+        built_from, whole = record["sources"], record["library"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return "have no record of what they were built from"
+    if whole != _hash_of(library):
+        return "are damaged: the library is not the one that was built"
+    if built_from != source_hash(library.parent):
+        return "are stale: the C files changed after they were built"
+    return None
+
+
+def _hash_of(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -1,0 +1,141 @@
+"""Reads api.h: from its functions, structures and constants come the calls of `rigkit.kernels`, and their checks.
+
+The header is a small part of C (see there), which a few patterns read.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from types import CodeType
+
+import numpy as np
+
+__all__ = ["Array", "Declaration", "Header", "header"]
+
+SCALARS: dict[str, type[ctypes.c_int64] | type[ctypes.c_double] | type[ctypes.c_float]] = {
+    "int64_t": ctypes.c_int64,
+    "double": ctypes.c_double,
+    "float": ctypes.c_float,
+}
+
+DTYPES: dict[str, np.dtype[np.generic] | None] = {
+    "uint8_t": np.dtype(np.uint8),
+    "uint16_t": np.dtype(np.uint16),
+    "int32_t": np.dtype(np.int32),
+    "int64_t": np.dtype(np.int64),
+    "float": np.dtype(np.float32),
+    "double": np.dtype(np.float64),
+    "void": None,
+}
+"""NumPy's name of a C type; `void` is of any."""
+
+
+@dataclass(frozen=True, slots=True)
+class Array:
+    """An array that is passed by its address: its type, None for any, and what its shape must be."""
+
+    dtype: np.dtype[np.generic] | None
+    shape: str
+
+    def code(self) -> CodeType:
+        return compile(self.shape, "api.h", "eval")
+
+
+@dataclass(frozen=True, slots=True)
+class Declaration:
+    """A member of a structure or a parameter of a function.
+
+    Attributes
+    ----------
+    type : name of a scalar or of a structure, "char" for text.
+    array : what is known of it if it is an array.
+    pointer : whether it is the address of a value or structure.
+    length : of a member that is several values, else None.
+    """
+
+    name: str
+    type: str
+    array: Array | None = None
+    pointer: bool = False
+    length: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """All of api.h: constants, members of structures, parameters and results of functions."""
+
+    constants: dict[str, int]
+    structures: dict[str, list[Declaration]]
+    functions: dict[str, list[Declaration]]
+    results: dict[str, Declaration]
+
+
+@functools.cache
+def header() -> Header:
+    """Return what api.h declares; raises ValueError where it is not as plain as it says of itself."""
+    text = (Path(__file__).parent / "api.h").read_text(encoding="utf-8")
+    return parsed(text)
+
+
+def parsed(text: str) -> Header:
+    """Return what the header `text` declares."""
+    text = re.sub(r"/\*.*?\*/", " ", text, flags=re.DOTALL)
+    text = re.sub(r"^\s*#.*$", "", text, flags=re.MULTILINE)
+    constants: dict[str, int] = {}
+    for body in re.findall(r"\benum\s*\{(.*?)\}\s*;", text, flags=re.DOTALL):
+        for entry in _split(body):
+            name, value = (part.strip() for part in entry.split("=", 1))
+            constants[name] = int(eval(_python(value), {"__builtins__": {}}, constants))
+    structures = {}
+    for body, name in re.findall(r"\btypedef\s+struct\s*\{(.*?)\}\s*(\w+)\s*;", text, flags=re.DOTALL):
+        structures[name] = [member for line in body.split(";") if line.strip() for member in _declared(line, constants)]
+    functions, results = {}, {}
+    for result, name, body in re.findall(r"\bEXPORT\s+([\w\s*]*?)(\w+)\((.*?)\)\s*;", text, flags=re.DOTALL):
+        parameters = [] if body.strip() == "void" else _split(body)
+        functions[name] = [_declared(part, constants)[0] for part in parameters]
+        results[name] = _declared(f"{result} {name}", constants)[0]
+    if text.count("EXPORT") != len(functions):
+        raise ValueError("api.h: a function is not declared in the way that can be read")
+    return Header(constants, structures, functions, results)
+
+
+def _split(text: str) -> list[str]:
+    """Return what commas outside brackets separate."""
+    parts, depth = [""], 0
+    for letter in text:
+        depth += (letter in "([{") - (letter in ")]}")
+        if letter == "," and depth == 0:
+            parts.append("")
+        else:
+            parts[-1] += letter
+    return [part.strip() for part in parts if part.strip()]
+
+
+def _python(expression: str) -> str:
+    """Return C arithmetic on sizes, which are not negative, as Python's."""
+    return expression.replace("/", "//")
+
+
+def _declared(text: str, constants: dict[str, int]) -> list[Declaration]:
+    """Return what one declaration declares: several members if it names several."""
+    text = " ".join(text.split())
+    if found := re.fullmatch(r"ARRAY\((?:const )?(\w+), (\w+), (.*)\)", text):
+        kind, name, sizes = found.groups()
+        return [Declaration(name, kind, Array(DTYPES[kind], f"({_python(sizes)},)"))]
+    found = re.fullmatch(r"(?:const )?(\w+) (.*)", text)
+    if found is None:
+        raise ValueError(f"api.h: cannot read {text!r}")
+    kind, names = found.groups()
+    out = []
+    for name in _split(names):
+        parts = re.fullmatch(r"(\*?)\s*(\w+)(?:\[(\w+)\])?", name)
+        if parts is None:
+            raise ValueError(f"api.h: cannot read {text!r}")
+        star, plain, length = parts.groups()
+        many = None if length is None else int(constants.get(length, length))
+        out.append(Declaration(plain, kind, None, star == "*", many))
+    return out
