@@ -29,59 +29,205 @@ inside, degrees in files and reports.
 from __future__ import annotations
 
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING
 
-__version__ = "0.1.0"
+if TYPE_CHECKING:
+    from rigkit.affine.normal import normals_from_affines
+    from rigkit.affine.registry import affines_from_directions
+    from rigkit.calibration.calibrate import calibrate
+    from rigkit.calibration.result import Calibration
+    from rigkit.calibration.rig.calibrate import calibrate_rig
+    from rigkit.calibration.rig.result import RigCalibration
+    from rigkit.cameras.base import Camera
+    from rigkit.cameras.compare import CameraDifference, compare_cameras
+    from rigkit.cameras.registry import camera_model
+    from rigkit.core.boards import Board
+    from rigkit.core.cloud import OrientedCloud
+    from rigkit.core.detections import BoardDetection, BoardView
+    from rigkit.core.errors import DegenerateError, InputError, RigkitError
+    from rigkit.core.matches import DirectionPairs, Matches
+    from rigkit.core.posetype import PoseType
+    from rigkit.core.truth import PairTruth
+    from rigkit.detection.detect import detect_boards
+    from rigkit.detection.guided.guided import complete_boards
+    from rigkit.geometry.rigid3 import Rigid3
+    from rigkit.identification.identify import identify_pair
+    from rigkit.io.calibration_file import load_calibration, load_camera, save_calibration
+    from rigkit.io.images import read_image
+    from rigkit.io.manifest import Dataset, load_dataset
+    from rigkit.io.ply import read_ply, write_ply
+    from rigkit.io.rig_file import load_rig
+    from rigkit.io.rig_session import RigSession, load_rig_session
+    from rigkit.io.session import Session, load_session
+    from rigkit.reconstruction.pairing import MatchedPair, match_pair
+    from rigkit.reconstruction.reconstruct import Reconstruction, reconstruct_pair
+    from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene
+    from rigkit.rectification.rectify import rectify_map
+    from rigkit.relative_pose.solvers.registry import fundamental_for
+    from rigkit.report.calibration_page import CalibrationSection, build_calibration_page
+    from rigkit.validation.checks import ValidationReport, validate
+    from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
 
-_PUBLIC = {
-    "Board": "rigkit.core.boards",
-    "BoardDetection": "rigkit.core.detections",
-    "BoardView": "rigkit.core.detections",
-    "Calibration": "rigkit.calibration.result",
-    "Camera": "rigkit.cameras.base",
-    "DegenerateError": "rigkit.core.errors",
-    "DirectionPairs": "rigkit.core.matches",
-    "InputError": "rigkit.core.errors",
-    "MatchedPair": "rigkit.reconstruction.pairing",
-    "Matches": "rigkit.core.matches",
-    "OrientedCloud": "rigkit.core.cloud",
-    "PairTruth": "rigkit.core.truth",
-    "PoseType": "rigkit.core.posetype",
-    "Reconstruction": "rigkit.reconstruction.reconstruct",
-    "Rigid3": "rigkit.geometry.rigid3",
-    "RigkitError": "rigkit.core.errors",
-    "affines_from_directions": "rigkit.affine.registry",
-    "calibrate": "rigkit.calibration.calibrate",
-    "camera_model": "rigkit.cameras.registry",
-    "compare_cameras": "rigkit.cameras.compare",
-    "complete_boards": "rigkit.detection.guided.guided",
-    "crosscheck": "rigkit.validation.crosscheck",
-    "detect_boards": "rigkit.detection.detect",
-    "fundamental_for": "rigkit.relative_pose.solvers.registry",
-    "identify_pair": "rigkit.identification.identify",
-    "load_calibration": "rigkit.io.calibration_file",
-    "load_camera": "rigkit.io.calibration_file",
-    "load_dataset": "rigkit.io.manifest",
-    "match_pair": "rigkit.reconstruction.pairing",
-    "normals_from_affines": "rigkit.affine.normal",
-    "read_image": "rigkit.io.images",
-    "read_ply": "rigkit.io.ply",
-    "reconstruct_pair": "rigkit.reconstruction.reconstruct",
-    "reconstruct_scene": "rigkit.reconstruction.scene",
-    "rectify_map": "rigkit.rectification.rectify",
-    "save_calibration": "rigkit.io.calibration_file",
-    "validate": "rigkit.validation.checks",
-    "write_ply": "rigkit.io.ply",
+    __version__: str
+
+__all__ = [
+    "Board",
+    "BoardDetection",
+    "BoardView",
+    "Calibration",
+    "CalibrationSection",
+    "Camera",
+    "CameraDifference",
+    "CrossCheckReport",
+    "Dataset",
+    "DegenerateError",
+    "DirectionPairs",
+    "InputError",
+    "MatchedPair",
+    "Matches",
+    "OrientedCloud",
+    "PairTruth",
+    "PoseType",
+    "Reconstruction",
+    "RigCalibration",
+    "RigSession",
+    "Rigid3",
+    "RigkitError",
+    "SceneReconstruction",
+    "Session",
+    "ValidationReport",
+    "affines_from_directions",
+    "build_calibration_page",
+    "calibrate",
+    "calibrate_rig",
+    "camera_model",
+    "compare_cameras",
+    "complete_boards",
+    "crosscheck",
+    "detect_boards",
+    "fundamental_for",
+    "identify_pair",
+    "load_calibration",
+    "load_camera",
+    "load_dataset",
+    "load_rig",
+    "load_rig_session",
+    "load_session",
+    "match_pair",
+    "normals_from_affines",
+    "read_image",
+    "read_ply",
+    "reconstruct_pair",
+    "reconstruct_scene",
+    "rectify_map",
+    "save_calibration",
+    "validate",
+    "write_ply",
+]
+
+_NAMES_OF = {
+    "rigkit.affine.normal": ("normals_from_affines",),
+    "rigkit.affine.registry": ("affines_from_directions",),
+    "rigkit.calibration.calibrate": ("calibrate",),
+    "rigkit.calibration.result": ("Calibration",),
+    "rigkit.calibration.rig.calibrate": ("calibrate_rig",),
+    "rigkit.calibration.rig.result": ("RigCalibration",),
+    "rigkit.cameras.base": ("Camera",),
+    "rigkit.cameras.compare": (
+        "CameraDifference",
+        "compare_cameras",
+    ),
+    "rigkit.cameras.registry": ("camera_model",),
+    "rigkit.core.boards": ("Board",),
+    "rigkit.core.cloud": ("OrientedCloud",),
+    "rigkit.core.detections": (
+        "BoardDetection",
+        "BoardView",
+    ),
+    "rigkit.core.errors": (
+        "DegenerateError",
+        "InputError",
+        "RigkitError",
+    ),
+    "rigkit.core.matches": (
+        "DirectionPairs",
+        "Matches",
+    ),
+    "rigkit.core.posetype": ("PoseType",),
+    "rigkit.core.truth": ("PairTruth",),
+    "rigkit.detection.detect": ("detect_boards",),
+    "rigkit.detection.guided.guided": ("complete_boards",),
+    "rigkit.geometry.rigid3": ("Rigid3",),
+    "rigkit.identification.identify": ("identify_pair",),
+    "rigkit.io.calibration_file": (
+        "load_calibration",
+        "load_camera",
+        "save_calibration",
+    ),
+    "rigkit.io.images": ("read_image",),
+    "rigkit.io.manifest": (
+        "Dataset",
+        "load_dataset",
+    ),
+    "rigkit.io.ply": (
+        "read_ply",
+        "write_ply",
+    ),
+    "rigkit.io.rig_file": ("load_rig",),
+    "rigkit.io.rig_session": (
+        "RigSession",
+        "load_rig_session",
+    ),
+    "rigkit.io.session": (
+        "Session",
+        "load_session",
+    ),
+    "rigkit.reconstruction.pairing": (
+        "MatchedPair",
+        "match_pair",
+    ),
+    "rigkit.reconstruction.reconstruct": (
+        "Reconstruction",
+        "reconstruct_pair",
+    ),
+    "rigkit.reconstruction.scene": (
+        "SceneReconstruction",
+        "reconstruct_scene",
+    ),
+    "rigkit.rectification.rectify": ("rectify_map",),
+    "rigkit.relative_pose.solvers.registry": ("fundamental_for",),
+    "rigkit.report.calibration_page": (
+        "CalibrationSection",
+        "build_calibration_page",
+    ),
+    "rigkit.validation.checks": (
+        "ValidationReport",
+        "validate",
+    ),
+    "rigkit.validation.crosscheck": (
+        "CrossCheckReport",
+        "crosscheck",
+    ),
 }
+"""Module -> the public names in it, as imported above for type checkers."""
 
-__all__ = sorted(_PUBLIC)
+_HOMES = {name: module for module, names in _NAMES_OF.items() for name in names}
 
 
-def __getattr__(name: str) -> Any:
-    """Import public names on first use, so that `import rigkit` and `rigkit --help` stay quick."""
-    if name in _PUBLIC:
-        return getattr(importlib.import_module(_PUBLIC[name]), name)
-    raise AttributeError(f"module 'rigkit' has no attribute '{name}'")
+if not TYPE_CHECKING:
+    # Hidden from type checkers, which would take every misspelt name for one that it finds.
+    def __getattr__(name: str) -> object:
+        """Import public names on first use, so that `import rigkit` and `rigkit --help` stay quick."""
+        if name in _HOMES:
+            found = getattr(importlib.import_module(_HOMES[name]), name)
+        elif name == "__version__":
+            from importlib.metadata import version
+
+            found = version("rigkit")
+        else:
+            raise AttributeError(f"module 'rigkit' has no attribute '{name}'")
+        globals()[name] = found
+        return found
 
 
 def __dir__() -> list[str]:

@@ -17,7 +17,7 @@ ROTATION_TOLERANCE = 1e-4
 """A matrix further than this from orthonormal is a mistake (a scale, a transposed homogeneous matrix), not rounding."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, init=False)
 class Rigid3:
     """A rigid motion: `x_in_b = b_from_a.apply(x_in_a)`.
 
@@ -37,10 +37,10 @@ class Rigid3:
     rotation: Mat3
     translation_mm: FloatArray
 
-    def __post_init__(self) -> None:
-        matrix = as_array(self.rotation, (3, 3), "rotation")
+    def __init__(self, rotation: ArrayLike, translation_mm: ArrayLike) -> None:
+        matrix = as_array(rotation, (3, 3), "rotation")
         object.__setattr__(self, "rotation", as_array(_checked(matrix), (3, 3), "rotation"))
-        object.__setattr__(self, "translation_mm", as_array(self.translation_mm, (3,), "translation_mm"))
+        object.__setattr__(self, "translation_mm", as_array(translation_mm, (3,), "translation_mm"))
 
     @classmethod
     def stack(cls, rotation: Mat3, translation_mm: FloatArray) -> tuple[Rigid3, ...]:

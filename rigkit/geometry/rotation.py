@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rigkit.core.arrays import FloatArray, Mat3
 
@@ -25,7 +26,7 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)
 
 
-def exp_so3(rotation_vector: FloatArray) -> Mat3:
+def exp_so3(rotation_vector: ArrayLike) -> Mat3:
     """Return the rotation by |w| radians about w. `rotation_vector` (..., 3) -> (..., 3, 3), exact at zero."""
     w = np.asarray(rotation_vector, dtype=np.float64)
     angle = np.linalg.norm(w, axis=-1)[..., None, None]

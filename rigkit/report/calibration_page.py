@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from html import escape
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,7 +12,7 @@ import numpy as np
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.io.images import Image
 from rigkit.report.calibration_drawings import coverage_svg, pattern_svg, residuals_svg, uncertainty_svg
-from rigkit.report.page import facts_html, page_html, table_html
+from rigkit.report.render import data_uri, drawing, render, shown_table
 from rigkit.validation.tables import Cell, Column, Table
 
 __all__ = ["CalibrationSection", "build_calibration_page", "thumbnail_jpeg"]
@@ -49,13 +48,13 @@ def build_calibration_page(
     summary: Sequence[Table] = (),
 ) -> str:
     """Return the page as text; everything it needs is inside it. `summary` are tables of what the cameras share."""
-    several = len(sections) > 1
-    links = "".join(f'<a href="#{escape(s.name)}">{escape(s.name)}</a>' for s in sections)
-    return page_html(
-        title,
-        f'<p class="lead">{escape(lead)}</p>{f"<nav>{links}</nav>" if several else ""}'
-        f"{''.join(table_html(t) for t in summary)}"
-        f"{''.join(_section(s, heading=several) for s in sections)}{facts_html(provenance)}",
+    return render(
+        "calibration.html",
+        title=title,
+        lead=lead,
+        summary=[shown_table(table) for table in summary],
+        sections=[_shown(section) for section in sections],
+        provenance=provenance,
     )
 
 
@@ -79,36 +78,36 @@ def thumbnail_jpeg(image: Image, views: Sequence[ViewResult] = ()) -> bytes:
     return bytes(cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1])
 
 
-def _section(section: CalibrationSection, *, heading: bool) -> str:
+def _shown(section: CalibrationSection) -> dict[str, Any]:
+    """Return one camera in words and pictures, as the template shows it."""
     c = section.calibration
-    drawings = "".join(f"<div><h3>{escape(name)}</h3>{draw(c)}</div>" for name, draw in DRAWINGS)
-    return (
-        f'<section id="{escape(section.name)}">{f"<h2>{escape(section.name)}</h2>" if heading else ""}'
-        f'{_headline(c)}{_verdicts(c)}<div class="drawings">{drawings}</div>'
-        f"{table_html(_parameters(c))}{table_html(_candidates(c))}{table_html(_boards(c))}"
-        f"{_views(section)}{_dropped(section)}</section>"
-    )
+    sources = {name: data_uri("image/jpeg", data) for name, data in section.thumbnails.items()}
+    return {
+        "name": section.name,
+        "heldout": "not available (too few images)" if c.heldout_rms_px is None else f"{c.heldout_rms_px:.3f} px",
+        "training": f"{c.rms_px:.3f} px",
+        "basis": _basis(c),
+        "findings": _findings(c),
+        "drawings": [(name, drawing(draw(c))) for name, draw in DRAWINGS],
+        "tables": [shown_table(table) for table in (_parameters(c), _candidates(c), _boards(c))],
+        "views": _views(c, sources),
+        "dropped": [(image, reason, sources.get(image)) for image, reason in c.dropped],
+    }
 
 
-def _headline(c: Calibration) -> str:
+def _basis(c: Calibration) -> str:
     width, height = c.camera.size_px
-    held = "not available (too few images)" if c.heldout_rms_px is None else f"{c.heldout_rms_px:.3f} px"
     return (
-        f'<p class="headline">held-out RMS <b>{held}</b> <span class="soft">training RMS {c.rms_px:.3f} px</span></p>'
-        f"<p>{escape(c.camera.model)} camera, {width} x {height} px, {c.corner_count} corners in {len(c.views)} views "
+        f"{c.camera.model} camera, {width} x {height} px, {c.corner_count} corners in {len(c.views)} views "
         f"of {len({v.image for v in c.views})} images, {len(c.outliers)} corners and {len(c.dropped)} images left out; "
-        f"a corner scatters by {c.sigma_px:.3f} px per axis; solver: {escape(c.convergence.reason)} after "
-        f'{c.convergence.iterations} steps.</p><p class="soft">Both RMS are sqrt(mean |residual|²) over corners. Held '
-        "out: on images that took no part, with the lens frozen and only the board's pose fitted.</p>"
+        f"a corner scatters by {c.sigma_px:.3f} px per axis; solver: {c.convergence.reason} after "
+        f"{c.convergence.iterations} steps."
     )
 
 
-def _verdicts(c: Calibration) -> str:
-    lines = []
-    for verdict in c.verdicts:
-        colour = VERDICTS[verdict.severity]
-        lines.append(f'<p><span class="verdict {colour}">{verdict.severity}</span> {escape(verdict.text)}</p>')
-    return "".join(lines)
+def _findings(c: Calibration) -> list[tuple[str, str, str]]:
+    """Return severity, colour and words of each finding."""
+    return [(str(found.severity), VERDICTS[found.severity], found.text) for found in c.verdicts]
 
 
 def _parameters(c: Calibration) -> Table:
@@ -149,57 +148,29 @@ def _boards(c: Calibration) -> Table:
     return Table("boards", "Boards as the solution has them", columns, rows)
 
 
-def _views(section: CalibrationSection) -> str:
-    c = section.calibration
-    head = "".join(
-        f"<th{' class=text' if k in (1, 2, 8) else ''}>{words}</th>"
-        for k, words in enumerate(
-            ("", "image", "board", "RMS, px", "corners used", "left out", "distance, mm", "tilt, deg", "remark")
-        )
-    )
+def _views(c: Calibration, sources: Mapping[str, str]) -> list[dict[str, Any]]:
+    """Return the rows of the images: each image is shown with the first of its boards."""
+    middle_mm = {board.board_id: board.points_mm.mean(axis=0) for board in c.boards}
     shown: set[str] = set()
-    rows = []
+    rows: list[dict[str, Any]] = []
     for view in c.views:
-        remarks = " ".join(v.text for v in c.verdicts if v.image == view.image)
-        middle = view.cam_from_board.apply(
-            next(b.points_mm for b in c.boards if b.board_id == view.board_id).mean(axis=0)
+        rows.append(
+            {
+                "image": view.image,
+                "board_id": view.board_id,
+                "picture": None if view.image in shown else sources.get(view.image),
+                "rms_px": view.rms_px,
+                "used": int(view.kept.sum()),
+                "left_out": int((~view.kept).sum()),
+                "distance_mm": float(np.linalg.norm(view.cam_from_board.apply(middle_mm[view.board_id]))),
+                "tilt_deg": np.degrees(np.arccos(np.clip(abs(view.cam_from_board.rotation[2, 2]), 0.0, 1.0))),
+                "remarks": _remarks(c, view.image),
+            }
         )
-        distance = float(np.linalg.norm(middle))
-        tilt = np.degrees(np.arccos(np.clip(abs(view.cam_from_board.rotation[2, 2]), 0.0, 1.0)))
-        cells = [
-            _picture(section, view.image) if view.image not in shown else "<td></td>",
-            f'<td class="text">{escape(view.image)}</td><td class="text">{escape(view.board_id)}</td>',
-            f"<td{' class=fail' if remarks else ''}>{view.rms_px:.3f}</td><td>{int(view.kept.sum())}</td>",
-            f"<td>{int((~view.kept).sum())}</td><td>{distance:.0f}</td><td>{tilt:.0f}</td>",
-            f'<td class="text words">{escape(remarks)}</td>',
-        ]
         shown.add(view.image)
-        rows.append(f"<tr>{''.join(cells)}</tr>")
-    note = '<p class="soft">Tilt: between the board and the image plane.</p>'
-    return _picture_table("Images", head, "".join(rows)) + note
+    return rows
 
 
-def _dropped(section: CalibrationSection) -> str:
-    rows = "".join(
-        f'<tr>{_picture(section, image)}<td class="text">{escape(image)}</td>'
-        f'<td class="text words">{escape(reason)}</td></tr>'
-        for image, reason in section.calibration.dropped
-    )
-    if not rows:
-        return ""
-    return _picture_table("Left out", "<th></th><th class=text>image</th><th class=text>why</th>", rows)
-
-
-def _picture_table(title: str, head: str, rows: str) -> str:
-    return (
-        f'<h3>{title}</h3><div class="scroll"><table class="pictures"><thead><tr>{head}</tr></thead>'
-        f"<tbody>{rows}</tbody></table></div>"
-    )
-
-
-def _picture(section: CalibrationSection, image: str) -> str:
-    data = section.thumbnails.get(image)
-    if data is None:
-        return "<td></td>"
-    source = f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
-    return f'<td><img alt="{escape(image)}" loading="lazy" src="{source}"></td>'
+def _remarks(c: Calibration, image: str) -> str:
+    """Return what the verdicts say of one image."""
+    return " ".join(found.text for found in c.verdicts if found.image == image)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,6 +15,7 @@ from rigkit.validation.tables import Cell, Column, Table
 
 __all__ = [
     "below",
+    "column_label",
     "measured_words",
     "tables_to_csv",
     "tables_to_json",
@@ -24,6 +26,9 @@ __all__ = [
 
 MOST_DECIMALS = 6
 """Of a value with its sigma: nanometres."""
+
+FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""What a spreadsheet takes for the beginning of a formula."""
 
 LATEX = {
     "\\": r"\textbackslash{}",
@@ -47,15 +52,20 @@ def tables_to_markdown(tables: Sequence[Table]) -> str:
     """Return all tables as Markdown: the paper's number in brackets, sigma behind a plus-minus, the best one bold."""
     parts = []
     for table in tables:
-        head = [_escape_markdown(_label(column)) for column in table.columns]
-        lines = [f"## {table.title}", "", _bar(head), _bar([":--" if left else "--:" for left in _left(table)])]
+        head = [_escape_markdown(column_label(column)) for column in table.columns]
+        lines = [
+            f"## {_escape_markdown(table.title)}",
+            "",
+            _bar(head),
+            _bar([":--" if left else "--:" for left in _left(table)]),
+        ]
         for row in table.rows:
             cells = []
             for cell, column in zip(row, table.columns, strict=True):
                 text = _escape_markdown(_text(cell, column))
                 cells.append(f"**{text}**" if text and (cell.best or cell.failed) else text)
             lines.append(_bar(cells))
-        lines += ["", *filter(None, [below(table)])]
+        lines += ["", *filter(None, [_escape_markdown(below(table))])]
         parts.append("\n".join(lines).rstrip() + "\n")
     return "\n".join(parts)
 
@@ -70,7 +80,7 @@ def tables_to_csv(tables: Sequence[Table]) -> str:
     for i, table in enumerate(tables):
         if i:
             out.write("\n")
-        out.write(f"# {table.title}\n")
+        out.write(f"# {_one_line(table.title)}\n")
         extra = [_extra(table, j) for j in range(len(table.columns))]
         head: list[str] = []
         for column, (with_sigma, with_paper) in zip(table.columns, extra, strict=True):
@@ -78,7 +88,7 @@ def tables_to_csv(tables: Sequence[Table]) -> str:
             head.append(column.label + unit)
             head += [f"{column.label} sigma{unit}"] if with_sigma else []
             head += [f"{column.label} paper{unit}"] if with_paper else []
-        writer.writerow(head)
+        writer.writerow([_in_cell(label) for label in head])
         for row in table.rows:
             cells: list[str] = []
             for cell, (with_sigma, with_paper) in zip(row, extra, strict=True):
@@ -93,7 +103,7 @@ def tables_to_latex(tables: Sequence[Table]) -> str:
     r"""Return all tables as LaTeX floats that need \usepackage{booktabs}, and graphicx for wide ones."""
     parts = []
     for table in tables:
-        head = " & ".join(_escape_latex(_label(column)) for column in table.columns)
+        head = " & ".join(_escape_latex(column_label(column)) for column in table.columns)
         lines = [
             r"\begin{table}",
             r"\centering",
@@ -138,8 +148,10 @@ def tables_to_text(tables: Sequence[Table]) -> str:
     """Return all tables with aligned columns, for a terminal."""
     parts = []
     for table in tables:
-        grid = [[_label(column) for column in table.columns]]
-        grid += [[_text(c, column) for c, column in zip(row, table.columns, strict=True)] for row in table.rows]
+        grid = [[_one_line(column_label(column)) for column in table.columns]]
+        grid += [
+            [_one_line(_text(c, column)) for c, column in zip(row, table.columns, strict=True)] for row in table.rows
+        ]
         widths = [max(len(line[j]) for line in grid) for j in range(len(table.columns))]
         pad = [str.ljust if left else str.rjust for left in _left(table)]
         lines = ["  ".join(p(t, w) for p, t, w in zip(pad, line, widths, strict=True)).rstrip() for line in grid]
@@ -156,7 +168,8 @@ def _cell_dict(cell: Cell) -> Any:
     return {"value": value, **more, **marks} if more or marks else value
 
 
-def _label(column: Column) -> str:
+def column_label(column: Column) -> str:
+    """Return the head of a column, with its unit."""
     return f"{column.label}, {column.unit}" if column.unit else column.label
 
 
@@ -205,7 +218,7 @@ def _exact(value: float | str | None) -> str:
     if value is None or (isinstance(value, float) and not np.isfinite(value)):
         return ""
     if isinstance(value, str):
-        return value
+        return _in_cell(value)
     return str(int(value)) if float(value).is_integer() else repr(float(value))
 
 
@@ -213,8 +226,27 @@ def _bar(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
+def _in_cell(text: str) -> str:
+    """Return words for a spreadsheet, which takes a cell that begins like a formula for one: those are quoted."""
+    return f"'{text}" if text.startswith(FORMULA) and not _is_number(text) else text
+
+
+def _one_line(text: str) -> str:
+    """Return words without line ends or other control characters, which a terminal would obey."""
+    return "".join(letter if letter.isprintable() else " " for letter in text)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
 def _escape_markdown(text: str) -> str:
-    return text.replace("|", r"\|").replace("*", r"\*").replace("\n", " ")
+    """Return words as Markdown shows them: no markup, no HTML, no line of their own."""
+    return re.sub(r"[\\`*|<>\[\]]", r"\\\g<0>", _one_line(text))
 
 
 def _escape_latex(text: str) -> str:

@@ -17,7 +17,7 @@ from helpers.reconstructions import make_reconstruction
 from rigkit.core.errors import InputError
 from rigkit.core.truth import MeasuredAngle, MeasuredLength, PairTruth
 from rigkit.io.paper_tables import load_paper_tables
-from rigkit.report.page import table_html
+from rigkit.report.render import table_html
 from rigkit.report.tables import (
     measured_words,
     tables_to_csv,

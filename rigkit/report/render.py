@@ -1,0 +1,85 @@
+"""Pages from templates: whatever comes from a file or a person is escaped, only our own drawings go in as they are."""
+
+from __future__ import annotations
+
+import base64
+import functools
+from importlib import resources
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rigkit.report.tables import below, column_label, measured_words
+from rigkit.validation.tables import Cell, Column, Table
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+__all__ = ["data_uri", "drawing", "render", "shown_table", "table_html"]
+
+
+def render(template: str, **context: Any) -> str:
+    """Return `template`, a file of rigkit/report/templates, filled with `context`."""
+    return _environment().get_template(template).render(**context)
+
+
+def data_uri(mime: str, data: bytes) -> str:
+    """Return what stands in an image's `src`, so that the page needs no other file."""
+    return f"data:{mime};base64,{base64.b64encode(data).decode()}"
+
+
+def drawing(svg: str) -> Any:
+    """Mark SVG of rigkit itself, whose words are escaped already, to go into a page as it is."""
+    from markupsafe import Markup
+
+    return Markup(svg)
+
+
+def table_html(table: Table) -> str:
+    """Return one table as HTML: sigmas after ±, the paper's number in brackets, verdicts in colour."""
+    return render("table.html", table=shown_table(table))
+
+
+def shown_table(table: Table) -> dict[str, Any]:
+    """Return a table in words, as the template `table.html` shows it."""
+    words = [any(isinstance(row[j].value, str) for row in table.rows) for j in range(len(table.columns))]
+    return {
+        "title": table.title,
+        "head": [(column_label(column), text) for column, text in zip(table.columns, words, strict=True)],
+        "rows": [[_shown_cell(c, column) for c, column in zip(row, table.columns, strict=True)] for row in table.rows],
+        "below": below(table),
+    }
+
+
+def _shown_cell(cell: Cell, column: Column) -> dict[str, Any]:
+    if isinstance(cell.value, str):
+        kind = "fail" if cell.failed else "pass" if cell.value == "pass" else "text"
+        return {"words": cell.value, "kind": kind, "best": False, "paper": None}
+    words = "–"
+    if cell.value is not None and np.isfinite(cell.value):
+        words = measured_words(cell.value, cell.sigma, column.decimals)
+    return {"words": words, "kind": "fail" if cell.failed else "", "best": cell.best, "paper": cell.paper}
+
+
+@functools.cache
+def _environment() -> Environment:
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    made = Environment(
+        loader=PackageLoader("rigkit.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    # Also "<" in a string of JSON is escaped, so no name in it can end or open a script element.
+    made.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
+    made.globals["asset"] = _asset
+    return made
+
+
+@functools.cache
+def _asset(name: str) -> Any:
+    """Return a style sheet or script of the package, as it is."""
+    return drawing(resources.files("rigkit.report").joinpath(name).read_text(encoding="utf-8"))
