@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 from pathlib import Path
 
 import numpy as np
@@ -55,3 +56,18 @@ def test_rectification_of_points_and_images_agree() -> None:
     near = np.linalg.norm(found[:, None] - mapped[None], axis=2).min(axis=1)
     assert len(found) == 144
     assert np.sqrt(np.mean(near**2)) < 0.1  # px: interpolation and a stretched view
+
+
+def test_names_for_type_checkers_are_those_that_are_imported_on_first_use() -> None:
+    """What stands under TYPE_CHECKING, `__all__` and the table of homes are the same names."""
+    tree = ast.parse(Path(str(rigkit.__file__)).read_text(encoding="utf-8"))
+    checked = next(node for node in tree.body if isinstance(node, ast.If))
+    declared = {
+        alias.name: node.module for node in checked.body if isinstance(node, ast.ImportFrom) for alias in node.names
+    }
+    assert declared == vars(rigkit)["_HOMES"]
+    assert sorted(declared) == rigkit.__all__
+
+
+def test_the_version_is_the_installed_ones() -> None:
+    assert tuple(int(part) for part in rigkit.__version__.split(".")[:2]) >= (0, 1)

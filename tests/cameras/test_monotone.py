@@ -18,13 +18,13 @@ from rigkit.cameras.monotone import first_root, horner, invert_increasing
     ],
 )
 @pytest.mark.parametrize("count", [3, 129])
-def test_inverse(function, slope, end, count, rng: np.random.Generator) -> None:  # type: ignore[no-untyped-def]
+def test_inverse(function, slope, end, count, rng: np.random.Generator) -> None:
     """Values come back even through a table of three points; the slope is zero at an end or in the middle."""
     knots = np.linspace(0.0, end, count)
     values = function(knots)
     target = np.concatenate([values[[0, -1]], rng.uniform(values[0], values[-1], 1000)])
 
-    def residual(x, index):  # type: ignore[no-untyped-def]
+    def residual(x, index):
         return function(x) - (target if index is None else target[index]), slope(x)
 
     with np.errstate(all="ignore"):

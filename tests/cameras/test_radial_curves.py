@@ -35,7 +35,7 @@ def _curve(fov_deg: int) -> tuple[np.ndarray, np.ndarray]:
     return theta, focal * theta * (1.0 + sum(c * theta ** (2 * i) for i, c in enumerate(k, start=1)))
 
 
-def _radius(camera, theta: np.ndarray) -> np.ndarray:  # type: ignore[no-untyped-def]
+def _radius(camera, theta: np.ndarray) -> np.ndarray:
     pixels, valid = camera.project(np.stack([np.sin(theta), np.zeros_like(theta), np.cos(theta)], axis=-1))
     assert valid.all()
     return np.asarray(pixels[:, 0] - CENTRE_PX[0])

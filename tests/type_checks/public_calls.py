@@ -14,7 +14,6 @@ import rigkit
 # Wrong types, missing and unknown arguments, misspelt names.
 rigkit.Board("a", "oops", 6, 50.0, 50.0)  # type: ignore[arg-type]
 rigkit.Board("a", 8, 6, 50.0)  # type: ignore[call-arg]
-rigkit.Rigid3("no matrix", [0.0, 0.0, 0.0])  # type: ignore[arg-type]
 rigkit.detect_boards(1)  # type: ignore[arg-type]
 rigkit.detect_boards(rigkit.read_image(Path("a.png")), boards=3)  # type: ignore[arg-type]
 rigkit.detect_bords(rigkit.read_image(Path("a.png")))  # type: ignore[attr-defined]
