@@ -157,11 +157,11 @@ class _Patterns:
         part, state = observations.subset(views), fit.state.subset(views).with_boards_held()
         state = replace(state, shape=replace(state.shape, flat=points))
         in_cam, _ = state.points_in_cam(part)
-        pixels, valid, by_point, _ = state.camera.project_with_jacobians(in_cam)
+        pixels, valid, d_pixels_d_point, _ = state.camera.project_with_jacobians(in_cam)
         weight = np.where(valid & fit.kept[views], part.weight, 0.0)
         # What does not project is NaN: no multiple of it is zero.
         residual = np.where(weight[..., None] > 0.0, weight[..., None] * (part.pixels - pixels), 0.0)
-        by_board = weight[..., None, None] * (by_point @ state.rotation[:, None])
+        by_board = weight[..., None, None] * (d_pixels_d_point @ state.rotation[:, None])
         by_board = np.where(weight[..., None, None] > 0.0, by_board, 0.0)
         corner = np.where(part.present, part.corner - rows.start, 0)
         x, y = (flat[:, :2] / np.abs(flat).max())[corner].transpose(2, 0, 1)

@@ -147,9 +147,14 @@ class Camera(ABC):
 
     @abstractmethod
     def _derivatives(
-        self, x: FloatArray, y: FloatArray, z: FloatArray, by_point: FloatArray, by_parameter: FloatArray | None
+        self,
+        x: FloatArray,
+        y: FloatArray,
+        z: FloatArray,
+        d_pixels_d_point: FloatArray,
+        d_pixels_d_parameters: FloatArray | None,
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Project, fill `by_point` (2, 3, N) and, unless None, `by_parameter` (2, P, N)."""
+        """Project, fill `d_pixels_d_point` (2, 3, N) and, unless None, `d_pixels_d_parameters` (2, P, N)."""
 
     def project(self, points: Points) -> tuple[Pixels, BoolArray]:
         """Return the pixels of points (..., 3) given in the camera frame, and where they are valid.
@@ -188,16 +193,17 @@ class Camera(ABC):
         """
         rays, valid = self.unproject(pixels)
         x, y, z = rays.reshape(-1, 3).T
-        by_point = np.empty((2, 3, x.size))
+        d_pixels_d_point = np.empty((2, 3, x.size))
         with np.errstate(all="ignore"):
-            self._derivatives(x, y, z, by_point, None)
+            self._derivatives(x, y, z, d_pixels_d_point, None)
             uu, uv, vv = (
-                np.einsum("kn,kn->n", by_point[i], by_point[j], optimize=False) for i, j in ((0, 0), (0, 1), (1, 1))
+                np.einsum("kn,kn->n", d_pixels_d_point[i], d_pixels_d_point[j], optimize=False)
+                for i, j in ((0, 0), (0, 1), (1, 1))
             )
             determinant = uu * vv - uv * uv
             out = np.empty((3, 2, x.size))
-            out[:, 0] = (by_point[0] * vv - by_point[1] * uv) / determinant
-            out[:, 1] = (by_point[1] * uu - by_point[0] * uv) / determinant
+            out[:, 0] = (d_pixels_d_point[0] * vv - d_pixels_d_point[1] * uv) / determinant
+            out[:, 1] = (d_pixels_d_point[1] * uu - d_pixels_d_point[0] * uv) / determinant
         out[..., ~valid.reshape(-1)] = np.nan
         return np.moveaxis(out.reshape(3, 2, *valid.shape), (0, 1), (-2, -1))
 
@@ -210,33 +216,39 @@ class Camera(ABC):
         points = _rows(points, 3, "points")
         batch = points.shape[:-1]
         flat = points.reshape(-1, 3)
-        by_point = np.zeros((2, 3, flat.shape[0]))
-        by_parameter = np.zeros((2, self.parameters.size, flat.shape[0]))
+        d_pixels_d_point = np.zeros((2, 3, flat.shape[0]))
+        d_pixels_d_parameters = np.zeros((2, self.parameters.size, flat.shape[0]))
         with np.errstate(all="ignore"):
-            u, v, valid = self._derivatives(flat[:, 0], flat[:, 1], flat[:, 2], by_point, by_parameter)
+            u, v, valid = self._derivatives(flat[:, 0], flat[:, 1], flat[:, 2], d_pixels_d_point, d_pixels_d_parameters)
         pixels = np.stack([u, v], axis=-1)
         if not valid.all():
             _blank(pixels, valid)
-            by_point[..., ~valid] = np.nan
-            by_parameter[..., ~valid] = np.nan
+            d_pixels_d_point[..., ~valid] = np.nan
+            d_pixels_d_parameters[..., ~valid] = np.nan
         return (
             pixels.reshape(*batch, 2),
             valid.reshape(batch),
-            np.moveaxis(by_point.reshape(2, 3, *batch), (0, 1), (-2, -1)),
-            np.moveaxis(by_parameter.reshape(2, self.parameters.size, *batch), (0, 1), (-2, -1)),
+            np.moveaxis(d_pixels_d_point.reshape(2, 3, *batch), (0, 1), (-2, -1)),
+            np.moveaxis(d_pixels_d_parameters.reshape(2, self.parameters.size, *batch), (0, 1), (-2, -1)),
         )
 
     def derivatives(
-        self, x: FloatArray, y: FloatArray, z: FloatArray, by_point: FloatArray, by_parameter: FloatArray
+        self,
+        x: FloatArray,
+        y: FloatArray,
+        z: FloatArray,
+        d_pixels_d_point: FloatArray,
+        d_pixels_d_parameters: FloatArray,
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Project N points given by flat coordinates and write the Jacobians into `by_point` (2, 3, N) and
-        `by_parameter` (2, P, N): `project_with_jacobians` into memory that the caller keeps.
+        """Project N points given by flat coordinates and write the Jacobians into `d_pixels_d_point` (2, 3, N) and
+        `d_pixels_d_parameters` (2, P, N): `project_with_jacobians` into memory that the caller keeps.
 
-        Return u, v and valid, each (N,); what is not valid is left arbitrary, NaN too. Entries of `by_parameter` that
-        are zero for every camera of the model are not written: the caller provides the zeros.
+        Return u, v and valid, each (N,); what is not valid is left arbitrary, NaN too. Entries of
+        `d_pixels_d_parameters` that are zero for every camera of the model are not written: the caller provides the
+        zeros.
         """
         with np.errstate(all="ignore"):
-            return self._derivatives(x, y, z, by_point, by_parameter)
+            return self._derivatives(x, y, z, d_pixels_d_point, d_pixels_d_parameters)
 
     def with_parameters(self, parameters: ArrayLike) -> Self:
         """Return the same model and size with other parameters.
@@ -255,8 +267,8 @@ class Camera(ABC):
     @property
     def focal_px(self) -> float:
         """Pixels per radian on the optical axis: the scale of an angular error, whatever the model."""
-        _, _, by_point, _ = self.project_with_jacobians(np.array([0.0, 0.0, 1.0]))
-        return float(np.sqrt(abs(np.linalg.det(by_point[:, :2]))))
+        _, _, d_pixels_d_point, _ = self.project_with_jacobians(np.array([0.0, 0.0, 1.0]))
+        return float(np.sqrt(abs(np.linalg.det(d_pixels_d_point[:, :2]))))
 
 
 def _blank(values: FloatArray, valid: BoolArray) -> None:

@@ -192,7 +192,12 @@ class Brown(Camera):
         return np.asarray(found / np.where(radius > 0.0, radius, 1.0) * m)
 
     def _derivatives(
-        self, x: FloatArray, y: FloatArray, z: FloatArray, by_point: FloatArray, by_parameter: FloatArray | None
+        self,
+        x: FloatArray,
+        y: FloatArray,
+        z: FloatArray,
+        d_pixels_d_point: FloatArray,
+        d_pixels_d_parameters: FloatArray | None,
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
         inverse, plane, squares, t, valid = self._plane(x, y, z)
         factor, denominator = self._radial(t)
@@ -201,19 +206,19 @@ class Brown(Camera):
         fx, fy, cx, cy = self.parameters[:4].tolist()
         for row, focal in enumerate((fx, fy)):
             scale = focal * inverse
-            by_x, by_y, by_z = by_point[row]
+            by_x, by_y, by_z = d_pixels_d_point[row]
             np.multiply(scale, slope[row], out=by_x)
             np.multiply(scale, slope[row + 1], out=by_y)
             np.multiply(by_x, plane[0], out=by_z)
             by_z += by_y * plane[1]
             np.negative(by_z, out=by_z)
-        if by_parameter is not None:
-            by_parameter[0, 0], by_parameter[1, 1] = m
-            by_parameter[0, 2] = by_parameter[1, 3] = 1.0
+        if d_pixels_d_parameters is not None:
+            d_pixels_d_parameters[0, 0], d_pixels_d_parameters[1, 1] = m
+            d_pixels_d_parameters[0, 2] = d_pixels_d_parameters[1, 3] = 1.0
             # Rows of p1, p2: (2 x y, t + 2 x^2) and (t + 2 y^2, 2 x y).
-            np.multiply(fx, tangential[1::-1], out=by_parameter[0, 6:8])
-            np.multiply(fy, tangential[:0:-1], out=by_parameter[1, 6:8])
-            for ray, out in ((fx * plane[0], by_parameter[0]), (fy * plane[1], by_parameter[1])):
+            np.multiply(fx, tangential[1::-1], out=d_pixels_d_parameters[0, 6:8])
+            np.multiply(fy, tangential[:0:-1], out=d_pixels_d_parameters[1, 6:8])
+            for ray, out in ((fx * plane[0], d_pixels_d_parameters[0]), (fy * plane[1], d_pixels_d_parameters[1])):
                 _fill_radial(out, ray, t, factor, denominator)
         return fx * m[0] + cx, fy * m[1] + cy, valid
 

@@ -128,11 +128,11 @@ def _best_rotation(rays: FloatArray, pixels: FloatArray, weight: FloatArray, b: 
     rotation = nearest_rotation(covariance) if seen.sum() >= 3 else np.eye(3)
     for _ in range(STEPS):
         turned = rays @ rotation.T
-        projected, valid, by_point, _ = b.project_with_jacobians(turned)
+        projected, valid, d_pixels_d_point, _ = b.project_with_jacobians(turned)
         if valid.sum() < 3:
             break
         # d pixel / d w for the turn exp([w]x) on the left: J d(w x ray) = -J [ray]x w.
-        by_turn = -by_point[valid] @ skew(turned[valid])
+        by_turn = -d_pixels_d_point[valid] @ skew(turned[valid])
         residual = projected[valid] - pixels[valid]
         w = weight[valid]
         normal = np.einsum("n,nki,nkj->ij", w, by_turn, by_turn)

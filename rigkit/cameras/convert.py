@@ -171,8 +171,8 @@ def _descend(camera: Camera, rays: Rays, pixels: Pixels, free: FloatArray) -> Ca
     """Return the camera after a damped Gauss-Newton descent of the projection error over the free directions."""
     cost, damping = _cost(camera, rays, pixels), 1e-6
     for _ in range(STEPS):
-        projected, _, _, by_parameter = camera.project_with_jacobians(rays)
-        j = (by_parameter @ free).reshape(-1, free.shape[1])
+        projected, _, _, d_pixels_d_parameters = camera.project_with_jacobians(rays)
+        j = (d_pixels_d_parameters @ free).reshape(-1, free.shape[1])
         size = np.maximum(np.linalg.norm(j, axis=0), 1e-300)
         j /= size
         residual = (pixels - projected).reshape(-1)

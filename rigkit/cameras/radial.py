@@ -78,26 +78,31 @@ class RadialCamera(Camera):
         return mx * sine, my * sine, cosine, valid
 
     def _derivatives(
-        self, x: FloatArray, y: FloatArray, z: FloatArray, by_point: FloatArray, by_parameter: FloatArray | None
+        self,
+        x: FloatArray,
+        y: FloatArray,
+        z: FloatArray,
+        d_pixels_d_point: FloatArray,
+        d_pixels_d_parameters: FloatArray | None,
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        d = self._scale_derivatives(x * x + y * y, z, by_parameter is not None)
+        d = self._scale_derivatives(x * x + y * y, z, d_pixels_d_parameters is not None)
         l00, l01, l11, cx, cy = self._linear()
         mx, my = d.scale * x, d.scale * y
         # L (x, y): with it d pixel / d point = s L [I 0] + L (x, y) (by_r x, by_r y, by_z).
         lx, ly = l00 * x + l01 * y, l11 * y
         rx, ry = d.by_r * x, d.by_r * y
-        np.multiply(lx, rx, out=by_point[0, 0])
-        by_point[0, 0] += l00 * d.scale
-        np.multiply(lx, ry, out=by_point[0, 1])
+        np.multiply(lx, rx, out=d_pixels_d_point[0, 0])
+        d_pixels_d_point[0, 0] += l00 * d.scale
+        np.multiply(lx, ry, out=d_pixels_d_point[0, 1])
         if l01:
-            by_point[0, 1] += l01 * d.scale
-        np.multiply(lx, d.by_z, out=by_point[0, 2])
-        np.multiply(ly, rx, out=by_point[1, 0])
-        np.multiply(ly, ry, out=by_point[1, 1])
-        by_point[1, 1] += l11 * d.scale
-        np.multiply(ly, d.by_z, out=by_point[1, 2])
-        if by_parameter is not None:
-            self._fill_parameters(by_parameter, (mx, my), tuple((lx * b, ly * b) for b in d.by_shape))
+            d_pixels_d_point[0, 1] += l01 * d.scale
+        np.multiply(lx, d.by_z, out=d_pixels_d_point[0, 2])
+        np.multiply(ly, rx, out=d_pixels_d_point[1, 0])
+        np.multiply(ly, ry, out=d_pixels_d_point[1, 1])
+        d_pixels_d_point[1, 1] += l11 * d.scale
+        np.multiply(ly, d.by_z, out=d_pixels_d_point[1, 2])
+        if d_pixels_d_parameters is not None:
+            self._fill_parameters(d_pixels_d_parameters, (mx, my), tuple((lx * b, ly * b) for b in d.by_shape))
         return l00 * mx + l01 * my + cx, l11 * my + cy, d.valid
 
 

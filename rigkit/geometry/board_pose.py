@@ -175,8 +175,8 @@ def point_residuals(rays: Rays, bases: FloatArray, points: Points) -> tuple[Floa
     closeness = np.maximum(1.0 + (u * rays).sum(axis=-1), 1e-9)[..., None]
     tangent = (bases @ u[..., None])[..., 0]
     by_u = (2.0 / closeness)[..., None] * (bases - (tangent / closeness)[..., None] * rays[..., None, :])
-    by_point = (by_u - (by_u @ u[..., None]) * u[..., None, :]) / length[..., None]
-    return 2.0 * tangent / closeness, by_point
+    d_residuals_d_point = (by_u - (by_u @ u[..., None]) * u[..., None, :]) / length[..., None]
+    return 2.0 * tangent / closeness, d_residuals_d_point
 
 
 def _flatten(points: Points) -> tuple[Rigid3, FloatArray]:

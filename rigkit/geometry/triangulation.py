@@ -258,19 +258,22 @@ def point_covariances(
     the points.
     """
     in_cam2 = cam2_from_cam1.apply(points)
-    by_point1 = projection_jacobian(rays1, jacobians1, np.linalg.norm(points, axis=-1))
-    by_point_cam2 = projection_jacobian(rays2, jacobians2, np.linalg.norm(in_cam2, axis=-1))
-    by_point2 = by_point_cam2 @ cam2_from_cam1.rotation
+    d_pixels1_d_point = projection_jacobian(rays1, jacobians1, np.linalg.norm(points, axis=-1))
+    d_pixels2_d_point_in_cam2 = projection_jacobian(rays2, jacobians2, np.linalg.norm(in_cam2, axis=-1))
+    d_pixels2_d_point = d_pixels2_d_point_in_cam2 @ cam2_from_cam1.rotation
     w1, w2 = (np.asarray(s, dtype=np.float64)[..., None, None] ** -2.0 for s in (sigma1_px, sigma2_px))
-    information = w1 * np.swapaxes(by_point1, -1, -2) @ by_point1 + w2 * np.swapaxes(by_point2, -1, -2) @ by_point2
+    information = (
+        w1 * np.swapaxes(d_pixels1_d_point, -1, -2) @ d_pixels1_d_point
+        + w2 * np.swapaxes(d_pixels2_d_point, -1, -2) @ d_pixels2_d_point
+    )
     bad = ~np.isfinite(information).all(axis=(-2, -1), keepdims=True)
     covariance = np.linalg.inv(np.where(bad, np.eye(3), information))
     if pose_covariance is not None:
         rotated = in_cam2 - cam2_from_cam1.translation_mm
-        by_pose = by_point_cam2 @ np.concatenate(
+        d_pixels2_d_pose = d_pixels2_d_point_in_cam2 @ np.concatenate(
             [-skew(rotated), np.broadcast_to(np.eye(3), (*rotated.shape, 3))], axis=-1
         )
-        gain = covariance @ (w2 * np.swapaxes(by_point2, -1, -2) @ by_pose)
+        gain = covariance @ (w2 * np.swapaxes(d_pixels2_d_point, -1, -2) @ d_pixels2_d_pose)
         covariance = covariance + gain @ pose_covariance @ np.swapaxes(gain, -1, -2)
     return np.where(bad, np.nan, covariance)
 

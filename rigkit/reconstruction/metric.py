@@ -111,14 +111,14 @@ def metric_pose(
     def points_at(step: FloatArray) -> Points:
         return _points(matches, Rigid3(exp_so3(step[:3]) @ R, unit(t + step[3:])))[0]
 
-    scale, sigma, by_point = scale_and_gradient(points, matches.board_index, matches.grid, boards, covariance)
+    scale, sigma, d_scale_d_points = scale_and_gradient(points, matches.board_index, matches.grid, boards, covariance)
     directions = np.zeros((5, 6))
     directions[:3, :3], directions[3:, 3:] = np.eye(3), translation_basis(t)
     by_direction = []
     for d in directions:
         motion = (points_at(POSE_STEP_RAD * d) - points_at(-POSE_STEP_RAD * d)) / (2.0 * POSE_STEP_RAD)
         # A point without a triangulation takes no part.
-        by_direction.append(float(np.sum(by_point * np.nan_to_num(motion))))
+        by_direction.append(float(np.sum(d_scale_d_points * np.nan_to_num(motion))))
     gradient = np.array(by_direction) @ directions
     to_metric = np.zeros((6, 6))
     to_metric[:3, :3] = np.eye(3)

@@ -269,8 +269,8 @@ def _axis_view(camera: Camera, rays: FloatArray, pair_id: str) -> Pinhole:
 def _in_view(detection: BoardDetection, camera: Camera, view: Pinhole) -> BoardDetection:
     """Return the detection in a perspective view; sigmas grow with the local magnification."""
     rays, _ = camera.unproject(detection.pixels)
-    pixels, _, by_point, _ = view.project_with_jacobians(rays)
-    local = by_point @ camera.ray_jacobian(detection.pixels)
+    pixels, _, d_pixels_d_point, _ = view.project_with_jacobians(rays)
+    local = d_pixels_d_point @ camera.ray_jacobian(detection.pixels)
     magnification = np.linalg.norm(local, axis=(1, 2)) / np.sqrt(2.0)
     return BoardDetection(
         detection.board_id,

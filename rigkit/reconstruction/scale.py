@@ -163,8 +163,8 @@ def _similarity_scale(
     spread = float(np.sum(w * square)) / max(3.0 * w.sum() - 7.0, 1.0)
     spread = spread if covariances is None else max(spread, 1.0)
     inverse = np.linalg.inv(gram)
-    by_point = np.einsum("j,n,nij,nik->nk", inverse[0], w, J, whiten)
-    return 1.0 / k, float(np.sqrt(spread * inverse[0, 0])) / k**2, -by_point / k**2
+    d_scale_d_points = np.einsum("j,n,nij,nik->nk", inverse[0], w, J, whiten)
+    return 1.0 / k, float(np.sqrt(spread * inverse[0, 0])) / k**2, -d_scale_d_points / k**2
 
 
 def _robust_start(points: Points, centred: Points) -> tuple[float, FloatArray, FloatArray]:

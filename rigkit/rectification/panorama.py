@@ -69,20 +69,33 @@ class Panorama(Camera):
         return x, y, z, valid & (np.abs(across) <= np.pi)
 
     def _derivatives(
-        self, x: FloatArray, y: FloatArray, z: FloatArray, by_point: FloatArray, by_parameter: FloatArray | None
+        self,
+        x: FloatArray,
+        y: FloatArray,
+        z: FloatArray,
+        d_pixels_d_point: FloatArray,
+        d_pixels_d_parameters: FloatArray | None,
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
         i, j = (1, 0) if self.horizontal_axis else (0, 1)
         a, b = (y, x) if self.horizontal_axis else (x, y)
         h = np.sqrt(a * a + z * z)
         _, by_b, by_h = self._rise(b, h)
         across, along = self.parameters[i], self.parameters[j]
-        by_point[i, i], by_point[i, j], by_point[i, 2] = across * z / (h * h), 0.0, -across * a / (h * h)
-        by_point[j, i], by_point[j, j], by_point[j, 2] = along * by_h * a / h, along * by_b, along * by_h * z / h
+        d_pixels_d_point[i, i], d_pixels_d_point[i, j], d_pixels_d_point[i, 2] = (
+            across * z / (h * h),
+            0.0,
+            -across * a / (h * h),
+        )
+        d_pixels_d_point[j, i], d_pixels_d_point[j, j], d_pixels_d_point[j, 2] = (
+            along * by_h * a / h,
+            along * by_b,
+            along * by_h * z / h,
+        )
         u, v, valid = self._project(x, y, z)
-        if by_parameter is not None:
+        if d_pixels_d_parameters is not None:
             fx, fy, cx, cy = self.parameters.tolist()
-            by_parameter[0, 0], by_parameter[1, 1] = (u - cx) / fx, (v - cy) / fy
-            by_parameter[0, 2] = by_parameter[1, 3] = 1.0
+            d_pixels_d_parameters[0, 0], d_pixels_d_parameters[1, 1] = (u - cx) / fx, (v - cy) / fy
+            d_pixels_d_parameters[0, 2] = d_pixels_d_parameters[1, 3] = 1.0
         return u, v, valid
 
 

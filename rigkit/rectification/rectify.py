@@ -58,8 +58,8 @@ class RectifyMap:
         An affinity between raw images becomes J2 A21 J1^-1 between the rectified ones; a corner's covariance J C J^T.
         """
         rays, _ = self.camera.unproject(pixels)
-        _, _, by_point, _ = self.target.project_with_jacobians(rays @ self.target_from_cam.T)
-        return np.asarray(by_point @ self.target_from_cam @ self.camera.ray_jacobian(pixels))
+        _, _, d_pixels_d_point, _ = self.target.project_with_jacobians(rays @ self.target_from_cam.T)
+        return np.asarray(d_pixels_d_point @ self.target_from_cam @ self.camera.ray_jacobian(pixels))
 
     def scale(self, pixels: Pixels) -> FloatArray:
         """Return target pixels per camera pixel (...,), the root of the ratio of areas: `sigma_px` grows by it."""

@@ -90,10 +90,10 @@ def _turn_to(axis: FloatArray) -> Mat3:
 
 def _matching_focal(rays: Rays, turned: Rays, camera: Camera) -> float:
     """Return the focal length at which target and source have the same pixels per area in the median over the rays."""
-    _, valid, by_point, _ = camera.project_with_jacobians(rays)
+    _, valid, d_pixels_d_point, _ = camera.project_with_jacobians(rays)
     if not valid.any():
         raise InputError("view: the camera sees none of the rays")
-    by_point = by_point[valid]
+    d_pixels_d_point = d_pixels_d_point[valid]
     # Pixels per steradian of the source, 1 / sqrt(det B^T B), and of a pinhole of focal length 1: 1 / cos^3.
-    density = np.sqrt(np.linalg.det(by_point @ np.swapaxes(by_point, -1, -2)))
+    density = np.sqrt(np.linalg.det(d_pixels_d_point @ np.swapaxes(d_pixels_d_point, -1, -2)))
     return float(np.sqrt(np.median(density * turned[valid, 2] ** 3)))

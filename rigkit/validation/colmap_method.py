@@ -31,7 +31,7 @@ def colmap_reconstruction(reconstruction: Reconstruction, pair: ColmapPair, resu
     # COLMAP's covariance is for corners of 1 px; 4N residuals fix 3N + 5 unknowns.
     variance = max(result.rms_px**2 * 2.0 * len(which) / max(len(which) - 5, 1), BEST_CORNER_PX**2)
     spread = variance * _spread(reconstruction, which, unit_points, result.adjusted)
-    scale, scale_sigma, by_point = scale_and_gradient(unit_points, *known, spread)
+    scale, scale_sigma, d_scale_d_points = scale_and_gradient(unit_points, *known, spread)
     picked = {name: getattr(cloud, name)[which] for name in PER_POINT}
     metric = replace(
         reconstruction,
@@ -49,7 +49,7 @@ def colmap_reconstruction(reconstruction: Reconstruction, pair: ColmapPair, resu
     across = np.diag([1.0] * 3 + [scale] * 3) @ result.adjusted_covariance @ np.diag([1.0] * 3 + [scale] * 3)
     # A point without a triangulation takes no part.
     moves = [(np.nan_to_num(motion), step) for motion, step in points_by_pose(metric)]
-    slope = np.array([np.sum(by_point * motion) / (scale * step) for motion, step in moves])
+    slope = np.array([np.sum(d_scale_d_points * motion) / (scale * step) for motion, step in moves])
     along = np.eye(6)
     along[3:] += np.outer(result.adjusted.translation_mm, slope)
     covariance = along @ across @ along.T * variance

@@ -31,9 +31,9 @@ def true_directions(scene: Scene, board: Board, image: int) -> np.ndarray:
     pose = scene.cam1_from_board[board.board_id]
     pose = pose if image == 1 else scene.cam2_from_cam1 @ pose
     camera = scene.camera1 if image == 1 else scene.camera2
-    _, _, by_point, _ = camera.project_with_jacobians(pose.apply(board.points()))
-    horizontal = by_point @ (pose.rotation[:, 0] * board.square_x_mm)
-    vertical = by_point @ (pose.rotation[:, 1] * board.square_y_mm)
+    _, _, d_pixels_d_point, _ = camera.project_with_jacobians(pose.apply(board.points()))
+    horizontal = d_pixels_d_point @ (pose.rotation[:, 0] * board.square_x_mm)
+    vertical = d_pixels_d_point @ (pose.rotation[:, 1] * board.square_y_mm)
     return np.stack([horizontal, vertical, horizontal + vertical], axis=1)
 
 

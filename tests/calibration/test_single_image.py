@@ -54,8 +54,8 @@ def test_one_image_of_three_boards(name: str, model: str, rng: np.random.Generat
     rays, _ = truth.unproject(pixels)
     rotation = np.eye(3)
     for _ in range(6):
-        projected, seen, by_point, _ = result.camera.project_with_jacobians(rays @ rotation.T)
-        design = np.cross((rays @ rotation.T)[:, None, :], by_point).reshape(-1, 3)
+        projected, seen, d_pixels_d_point, _ = result.camera.project_with_jacobians(rays @ rotation.T)
+        design = np.cross((rays @ rotation.T)[:, None, :], d_pixels_d_point).reshape(-1, 3)
         rotation = exp_so3(np.linalg.lstsq(design, (pixels - projected).reshape(-1), rcond=None)[0]) @ rotation
     assert seen.all()
     off = np.sqrt(((projected - pixels) ** 2).sum(axis=1).mean())

@@ -177,12 +177,12 @@ def test_polynomials_of_high_degree_are_no_harder(degree: int, rng: np.random.Ge
     assert found.convergence.iterations <= FEW_ITERATIONS
     state = found.state
     points, lever = state.points_in_cam(observations)
-    pixels, _, by_point, by_camera = state.camera.project_with_jacobians(points)
+    pixels, _, d_pixels_d_point, by_camera = state.camera.project_with_jacobians(points)
     count = by_camera.shape[-1]
     design = np.zeros((*pixels.shape, count + 6 * len(views)))
     design[..., :count] = by_camera
     for k, own in enumerate(np.split(design[..., count:], len(views), axis=-1)):
-        own[k, ..., :3], own[k, ..., 3:] = np.cross(lever[k][:, None], by_point[k]), by_point[k]
+        own[k, ..., :3], own[k, ..., 3:] = np.cross(lever[k][:, None], d_pixels_d_point[k]), d_pixels_d_point[k]
     design = design.reshape(-1, design.shape[-1])
     residual = (observations.pixels - pixels).reshape(-1)
     design /= np.linalg.norm(design, axis=0)

@@ -29,9 +29,9 @@ def test_strong_tangential_distortion_folds_nothing_inside(camera: Brown, rng: n
     r = edge * np.sqrt(rng.uniform(0.0, 0.995, 5000))
     phi = rng.uniform(-np.pi, np.pi, 5000)
     points = np.stack([r * np.cos(phi), r * np.sin(phi), np.ones(5000)], axis=-1)
-    pixels, valid, by_point, _ = camera.project_with_jacobians(points)
+    pixels, valid, d_pixels_d_point, _ = camera.project_with_jacobians(points)
     assert valid.all()
-    assert (np.linalg.det(by_point[..., :2]) > 0.0).all()
+    assert (np.linalg.det(d_pixels_d_point[..., :2]) > 0.0).all()
     rays, seen = camera.unproject(pixels)
     assert seen.all()
     assert np.abs(rays / rays[:, 2:] - points).max() < ROUND_TRIP_RAY

@@ -94,24 +94,24 @@ def test_image_is_not_mirrored(camera: Camera) -> None:
 
 def test_jacobian_by_point(camera: Camera, rng: np.random.Generator) -> None:
     points = rays_within(_field(camera), 400, rng) * rng.uniform(0.3, 3.0, (400, 1))
-    pixels, valid, by_point, _ = camera.project_with_jacobians(points)
+    pixels, valid, d_pixels_d_point, _ = camera.project_with_jacobians(points)
     assert valid.all()
     assert np.abs(pixels - camera.project(points)[0]).max() < ROUND_TRIP_PX
     numeric = central_difference(lambda p: camera.project(p)[0], points, 1e-6)
     scale = np.abs(numeric).max(axis=(-1, -2), keepdims=True)
     checked = np.isfinite(numeric).all(axis=(-1, -2))
     assert checked.mean() >= VALID_SHARE
-    assert (np.abs(by_point - numeric) / scale)[checked].max() < JACOBIAN_REL
+    assert (np.abs(d_pixels_d_point - numeric) / scale)[checked].max() < JACOBIAN_REL
 
 
 def test_jacobian_by_parameters(camera: Camera, rng: np.random.Generator) -> None:
     points = rays_within(_field(camera), 400, rng) * rng.uniform(0.3, 3.0, (400, 1))
-    _, valid, _, by_parameter = camera.project_with_jacobians(points)
+    _, valid, _, d_pixels_d_parameters = camera.project_with_jacobians(points)
     assert valid.all()
-    assert by_parameter.shape == (400, 2, camera.parameters.size)
+    assert d_pixels_d_parameters.shape == (400, 2, camera.parameters.size)
     for k, name in enumerate(camera.parameter_names()):
         # A step that moves the pixels by about 1e-3 px, whatever the unit of the parameter is.
-        h = 1e-3 / np.abs(by_parameter[..., k]).max()
+        h = 1e-3 / np.abs(d_pixels_d_parameters[..., k]).max()
         up, down = camera.parameters.copy(), camera.parameters.copy()
         up[k] += h
         down[k] -= h
@@ -120,7 +120,7 @@ def test_jacobian_by_parameters(camera: Camera, rng: np.random.Generator) -> Non
         )
         checked = np.isfinite(numeric).all(axis=-1)
         assert checked.mean() >= VALID_SHARE, name
-        error = np.abs(by_parameter[..., k] - numeric)[checked].max() / np.abs(numeric[checked]).max()
+        error = np.abs(d_pixels_d_parameters[..., k] - numeric)[checked].max() / np.abs(numeric[checked]).max()
         assert error < JACOBIAN_REL, name
 
 
@@ -142,8 +142,8 @@ def test_ray_jacobian(camera: Camera) -> None:
 def test_projection_and_ray_jacobian_are_inverse(camera: Camera) -> None:
     pixels = _valid_pixels(camera)
     rays, _ = camera.unproject(pixels)
-    _, valid, by_point, _ = camera.project_with_jacobians(rays)
-    product = by_point @ camera.ray_jacobian(pixels)
+    _, valid, d_pixels_d_point, _ = camera.project_with_jacobians(rays)
+    product = d_pixels_d_point @ camera.ray_jacobian(pixels)
     assert valid.mean() >= VALID_SHARE
     inner = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]) < 0.95 * camera.max_angle_rad
     assert np.abs(product - np.eye(2))[valid & inner].max() < ROUND_TRIP_PX
@@ -163,10 +163,10 @@ def test_valid_just_inside_and_not_just_outside(camera: Camera, rng: np.random.G
         pixels, valid = camera.project(rays)
         assert (valid == expected).all()
         assert (np.isfinite(pixels).all(axis=-1) == expected).all()
-        _, valid, by_point, by_parameter = camera.project_with_jacobians(rays)
+        _, valid, d_pixels_d_point, d_pixels_d_parameters = camera.project_with_jacobians(rays)
         assert (valid == expected).all()
-        assert (np.isfinite(by_point).all(axis=(-1, -2)) == expected).all()
-        assert (np.isfinite(by_parameter).all(axis=(-1, -2)) == expected).all()
+        assert (np.isfinite(d_pixels_d_point).all(axis=(-1, -2)) == expected).all()
+        assert (np.isfinite(d_pixels_d_parameters).all(axis=(-1, -2)) == expected).all()
 
 
 def test_no_two_rays_share_a_pixel(camera: Camera, rng: np.random.Generator) -> None:
@@ -199,14 +199,14 @@ def test_broadcasting(camera: Camera, rng: np.random.Generator, batch: tuple[int
     size = camera.parameters.size
     pixels, valid = camera.project(points)
     rays, seen = camera.unproject(pixels)
-    again, also, by_point, by_parameter = camera.project_with_jacobians(points)
+    again, also, d_pixels_d_point, d_pixels_d_parameters = camera.project_with_jacobians(points)
     assert pixels.shape == again.shape == (*batch, 2)
     assert valid.shape == also.shape == seen.shape == batch
     assert rays.shape == (*batch, 3)
-    assert by_point.shape == (*batch, 2, 3)
-    assert by_parameter.shape == (*batch, 2, size)
+    assert d_pixels_d_point.shape == (*batch, 2, 3)
+    assert d_pixels_d_parameters.shape == (*batch, 2, size)
     assert camera.ray_jacobian(pixels).shape == (*batch, 3, 2)
-    assert all(a.dtype == np.float64 for a in (pixels, rays, by_point, by_parameter))
+    assert all(a.dtype == np.float64 for a in (pixels, rays, d_pixels_d_point, d_pixels_d_parameters))
     assert valid.all() and seen.all() and also.all()
     if count:
         one = camera.project(points.reshape(-1, 3)[0])[0]
@@ -234,10 +234,10 @@ def test_nan_in_gives_invalid_out(camera: Camera) -> None:
     pixels, valid = camera.project(points)
     assert valid.tolist() == [False] * 5 + [True]
     assert np.isnan(pixels[:-1]).all()
-    _, valid, by_point, by_parameter = camera.project_with_jacobians(points)
+    _, valid, d_pixels_d_point, d_pixels_d_parameters = camera.project_with_jacobians(points)
     assert valid.tolist() == [False] * 5 + [True]
-    assert np.isnan(by_point[:-1]).all() and np.isnan(by_parameter[:-1]).all()
-    assert np.isfinite(by_point[-1]).all() and np.isfinite(by_parameter[-1]).all()
+    assert np.isnan(d_pixels_d_point[:-1]).all() and np.isnan(d_pixels_d_parameters[:-1]).all()
+    assert np.isfinite(d_pixels_d_point[-1]).all() and np.isfinite(d_pixels_d_parameters[-1]).all()
     wrong = np.array([[np.nan, 100.0], [100.0, np.nan], [np.inf, 100.0], [640.0, 480.0]])
     rays, valid = camera.unproject(wrong)
     assert valid.tolist() == [False, False, False, True]

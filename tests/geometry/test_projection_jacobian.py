@@ -23,10 +23,10 @@ def test_equals_the_derivative_of_project(label: str, rng: np.random.Generator) 
     assert len(rays) > 20
     ranges = rng.uniform(500.0, 2000.0, len(rays))
     jacobians = projection_jacobian(rays, camera.ray_jacobian(pixels), ranges)
-    _, seen, by_point, _ = camera.project_with_jacobians(rays * ranges[:, None])
+    _, seen, d_pixels_d_point, _ = camera.project_with_jacobians(rays * ranges[:, None])
     assert seen.mean() > 0.9
-    scale = np.abs(by_point[seen]).max(axis=(1, 2), keepdims=True)
-    np.testing.assert_allclose((jacobians[seen] - by_point[seen]) / scale, 0.0, atol=JACOBIAN_REL)
+    scale = np.abs(d_pixels_d_point[seen]).max(axis=(1, 2), keepdims=True)
+    np.testing.assert_allclose((jacobians[seen] - d_pixels_d_point[seen]) / scale, 0.0, atol=JACOBIAN_REL)
 
 
 def test_second_camera_is_differentiated_in_the_frame_of_the_first(rng: np.random.Generator) -> None:

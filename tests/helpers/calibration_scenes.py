@@ -113,9 +113,9 @@ def projection_difference(
     rotation = np.eye(3)
     for _ in range(6):
         turned = rays @ rotation.T
-        projected, seen, by_point, _ = camera.project_with_jacobians(turned)
+        projected, seen, d_pixels_d_point, _ = camera.project_with_jacobians(turned)
         assert seen.mean() > 0.98
-        design = np.cross(turned[:, None, :], by_point)[seen].reshape(-1, 3)
+        design = np.cross(turned[:, None, :], d_pixels_d_point)[seen].reshape(-1, 3)
         step = np.linalg.lstsq(design, (pixels - projected)[seen].reshape(-1), rcond=None)[0]
         rotation = exp_so3(step) @ rotation
     projected, seen = camera.project(rays @ rotation.T)

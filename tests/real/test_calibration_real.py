@@ -63,9 +63,9 @@ def _rms_against(result: Calibration, truth: dict[str, list[float]], views: list
     rotation = np.eye(3)
     for _ in range(6):
         turned = rays @ rotation.T
-        projected, seen, by_point, _ = result.camera.project_with_jacobians(turned)
+        projected, seen, d_pixels_d_point, _ = result.camera.project_with_jacobians(turned)
         assert seen.all()
-        design = np.cross(turned[:, None, :], by_point).reshape(-1, 3)
+        design = np.cross(turned[:, None, :], d_pixels_d_point).reshape(-1, 3)
         rotation = exp_so3(np.linalg.lstsq(design, (pixels - projected).reshape(-1), rcond=None)[0]) @ rotation
     difference = result.camera.project(rays @ rotation.T)[0] - pixels
     return float(np.sqrt((difference**2).sum(axis=1).mean()))

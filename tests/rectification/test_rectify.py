@@ -56,9 +56,9 @@ def test_panoramas_by_their_formulas(name: str, rng: np.random.Generator) -> Non
     assert np.abs(again - rays).max() < 1e-10
     inner = np.abs(rays[:, :2]).max(axis=-1) < 0.95
     assert inner.mean() > 0.7
-    _, _, by_point, by_parameter = camera.project_with_jacobians(rays[inner])
+    _, _, d_pixels_d_point, d_pixels_d_parameters = camera.project_with_jacobians(rays[inner])
     numeric = central_difference(lambda p: camera.project(p)[0], rays[inner], 1e-6)
-    assert np.abs(by_point - numeric).max() < JACOBIAN_REL * np.abs(numeric).max()
+    assert np.abs(d_pixels_d_point - numeric).max() < JACOBIAN_REL * np.abs(numeric).max()
     numeric = np.stack(
         [
             (camera.with_parameters(camera.parameters + h).project(rays[inner])[0] - pixels[inner]) / h.sum()
@@ -66,9 +66,9 @@ def test_panoramas_by_their_formulas(name: str, rng: np.random.Generator) -> Non
         ],
         axis=-1,
     )
-    assert np.abs(by_parameter - numeric).max() < JACOBIAN_REL
+    assert np.abs(d_pixels_d_parameters - numeric).max() < JACOBIAN_REL
     jacobian = camera.ray_jacobian(pixels[inner])
-    assert np.abs(by_point @ jacobian - np.eye(2)).max() < ROUND_TRIP_PX
+    assert np.abs(d_pixels_d_point @ jacobian - np.eye(2)).max() < ROUND_TRIP_PX
 
 
 @pytest.mark.parametrize("name", sorted(PANORAMAS))
