@@ -11,6 +11,8 @@ from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.cameras.registry import camera_model
 from rigkit.core.arrays import FloatArray, Pixels, Rays
 from rigkit.core.errors import InputError
+from rigkit.optim.damping import Damping, Stop
+from rigkit.optim.levenberg_marquardt import DenseStep, LinearisedProblem, damped_step, minimise
 
 __all__ = ["Conversion", "convert_camera", "fit_camera", "refit_camera"]
 
@@ -26,7 +28,10 @@ WIDE_RAD = np.radians(60.0)
 STEPS = 60
 HALVINGS = 8
 SETTLED = 1e-10
-"""The fit stops where a step gains less than this share of the cost, or the cost is rounding."""
+"""The fit stops where a step gains less than this share of the cost,"""
+ROUNDING_PX = 1e-10
+"""or where pixels are met this well."""
+DAMPING = Damping(start=1e-6, ceiling=1e6)
 INSIDE = 0.995
 """Rays within this share of the start's field of view take part: at its edge the derivatives have no end."""
 
@@ -167,39 +172,44 @@ def _start(
         raise _NoStart(f"camera conversion: a {model.model} camera cannot follow this lens ({error})") from error
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class _Fit(LinearisedProblem):
+    """A camera against rays and pixels, moved along the columns of `free` (P, F)."""
+
+    camera: Camera
+    rays: Rays
+    pixels: Pixels
+    free: FloatArray
+    sum_of_squares: float
+
+    @property
+    def cost(self) -> float:
+        """Sum of squared errors, infinite where a point is not seen."""
+        return self.sum_of_squares
+
+    def step(self, damping: float) -> DenseStep | None:
+        projected, _, _, d_pixels_d_parameters = self.camera.project_with_jacobians(self.rays)
+        jacobian = (d_pixels_d_parameters @ self.free).reshape(-1, self.free.shape[1])
+        return damped_step(jacobian, (projected - self.pixels).reshape(-1), damping)
+
+
 def _descend(camera: Camera, rays: Rays, pixels: Pixels, free: FloatArray) -> Camera:
-    """Return the camera after a damped Gauss-Newton descent of the projection error over the free directions."""
-    cost, damping = _cost(camera, rays, pixels), 1e-6
-    for _ in range(STEPS):
-        projected, _, _, d_pixels_d_parameters = camera.project_with_jacobians(rays)
-        j = (d_pixels_d_parameters @ free).reshape(-1, free.shape[1])
-        size = np.maximum(np.linalg.norm(j, axis=0), 1e-300)
-        j /= size
-        residual = (pixels - projected).reshape(-1)
-        step = free @ (np.linalg.solve(j.T @ j + damping * np.eye(size.size), j.T @ residual) / size)
-        moved, new_cost = _moved(camera, step, rays, pixels)
-        if not new_cost < cost:
-            damping *= 10.0
-            if damping > 1e6:
-                break
-            continue
-        done = cost - new_cost <= SETTLED * cost or new_cost < 1e-20 * residual.size
-        camera, cost, damping = moved, new_cost, 0.1 * damping
-        if done:
-            break
-    return camera
+    """Return the camera after a damped descent of the projection error over the free directions."""
 
+    def linearise(state: Camera) -> _Fit:
+        return _Fit(state, rays, pixels, free, _cost(state, rays, pixels))
 
-def _moved(camera: Camera, step: FloatArray, rays: Rays, pixels: Pixels) -> tuple[Camera, float]:
-    """Return the camera after the step and its cost; a step out of the model's domain is halved until it is inside."""
-    for _ in range(HALVINGS):
-        try:
-            moved = camera.with_parameters(camera.parameters + step)
-        except InputError:
-            step = 0.5 * step
-            continue
-        return moved, _cost(moved, rays, pixels)
-    return camera, np.inf
+    def moved(state: Camera, step: DenseStep) -> Camera | None:
+        change = free @ step.change
+        for _ in range(HALVINGS):  # a step out of the model's domain is halved until it is inside
+            try:
+                return state.with_parameters(state.parameters + change)
+            except InputError:
+                change = 0.5 * change
+        return None
+
+    stop = Stop(steps=STEPS, gain=SETTLED, cost=ROUNDING_PX**2 * pixels.size)
+    return minimise(camera, linearise, moved, DAMPING, stop).state
 
 
 def _cost(camera: Camera, rays: Rays, pixels: Pixels) -> float:

@@ -16,13 +16,15 @@ import numpy as np
 from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import InputError
+from rigkit.optim.damping import Damping, Stop
+from rigkit.optim.levenberg_marquardt import DenseStep, LinearisedProblem, damped_step, minimise
 
 __all__ = ["FocalCamera", "RadialCamera", "ScaleDerivatives", "fit_shape"]
 
 FIT_STEPS = 40
-FIT_MAX_DAMPING = 1e3
 FIT_SETTLED = 1e-6
 """The descent stops where a step gains less than this share of the cost."""
+FIT_DAMPING = Damping(start=1e-6, ceiling=5e3)
 
 
 class ScaleDerivatives(NamedTuple):
@@ -159,35 +161,43 @@ def _descend(camera: _Focal, points: FloatArray, radius: FloatArray) -> tuple[fl
     reached = pixels[:, 0] - centre
     focal = float(reached @ radius / (reached @ reached))
     camera = camera.with_parameters([focal, focal, *camera.parameters[2:]])
-    cost, damping = _curve_cost(camera, points, radius), 1e-6
-    for _ in range(FIT_STEPS):
-        pixels, _, _, jacobian = camera.project_with_jacobians(points)
-        # The points lie in the plane y = 0: u depends on fx alone, which then stands for both focal lengths.
-        j = np.delete(jacobian[:, 0], (1, 2, 3), axis=1)
-        # Columns of length 1; one of length 0 (beta, where alpha = 0) must not make the system singular.
-        size = np.maximum(np.linalg.norm(j, axis=0), 1e-300)
-        j = j / size
-        step = np.linalg.solve(j.T @ j + damping * np.eye(size.size), j.T @ (centre + radius - pixels[:, 0])) / size
-        trial = camera.parameters.copy()
-        trial[0] += step[0]
+
+    def linearise(state: _Focal) -> _CurveFit:
+        return _CurveFit(state, points, radius, _curve_cost(state, points, radius))
+
+    def moved(state: _Focal, step: DenseStep) -> _Focal | None:
+        trial = state.parameters.copy()
+        trial[0] += step.change[0]
         trial[1] = trial[0]
-        trial[4:] += step[1:]
+        trial[4:] += step.change[1:]
         try:
-            moved = camera.with_parameters(trial)
+            return state.with_parameters(trial)
         except InputError:
-            damping *= 10.0
-            continue
-        new_cost = _curve_cost(moved, points, radius)
-        if not new_cost < cost:
-            if damping > FIT_MAX_DAMPING:
-                break
-            damping *= 10.0
-            continue
-        done = cost - new_cost <= FIT_SETTLED * cost
-        camera, cost, damping = moved, new_cost, damping * 0.1
-        if done:
-            break
-    return cost, camera
+            return None
+
+    end = minimise(camera, linearise, moved, FIT_DAMPING, Stop(steps=FIT_STEPS, gain=FIT_SETTLED))
+    return end.problem.cost, end.state
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _CurveFit(LinearisedProblem):
+    """A camera against the radii (N,) at which points (N, 3) of the plane y = 0 are seen."""
+
+    camera: RadialCamera
+    points: FloatArray
+    radius: FloatArray
+    sum_of_squares: float
+
+    @property
+    def cost(self) -> float:
+        """Sum of squared errors, infinite where a point is not seen."""
+        return self.sum_of_squares
+
+    def step(self, damping: float) -> DenseStep | None:
+        pixels, _, _, jacobian = self.camera.project_with_jacobians(self.points)
+        # The points lie in the plane y = 0: u depends on fx alone, which then stands for both focal lengths.
+        by_shape = np.delete(jacobian[:, 0], (1, 2, 3), axis=1)
+        return damped_step(by_shape, pixels[:, 0] - (self.camera.parameters[2] + self.radius), damping)
 
 
 def _curve_cost(camera: RadialCamera, points: FloatArray, radius: FloatArray) -> float:

@@ -11,10 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.core.arrays import FloatArray, Points, Rays, as_array
+from rigkit.core.arrays import BoolArray, FloatArray, Points, Rays, as_array
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, nearest_rotation, skew
+from rigkit.optim.batched import BatchedProblem, minimise_each
+from rigkit.optim.damping import Damping, Stop
 
 __all__ = [
     "BoardPose",
@@ -30,9 +32,10 @@ MIN_SPREAD = 1e-6
 """Points are collinear where their second principal extent is below this part of the first."""
 MIN_HOMOGRAPHY_GAP = 1e-9
 """The homography is not unique where the second smallest singular value is below this part of the largest."""
-MAX_STEPS = 50
 STEP_TOLERANCE = 1e-12
 """Stop when a step gains less than this part of the cost, or moves the pose by less than this part of a radian."""
+STOP = Stop(steps=50, gain=STEP_TOLERANCE)
+DAMPING = Damping(start=1e-4, floor=1e-12, ceiling=1e6)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -236,35 +239,24 @@ def _refine(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Levenberg-Marquardt on weighted ray residuals, all start poses (K, ...) at once; returns poses and costs (K,)."""
 
-    def evaluate(r: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        residual, jacobian = ray_residuals(rays, bases, flat, r, t)
-        residual = (residual * weight[:, None]).reshape(len(r), -1)
-        jacobian = (jacobian * weight[:, None, None]).reshape(len(r), -1, 6)
-        return (residual**2).sum(axis=1), residual, jacobian
+    def linearise(poses: tuple[FloatArray, ...]) -> BatchedProblem:
+        residual, jacobian = ray_residuals(rays, bases, flat, *poses)
+        residual = (residual * weight[:, None]).reshape(len(poses[0]), -1)
+        jacobian = (jacobian * weight[:, None, None]).reshape(len(poses[0]), -1, 6)
+        transposed = np.swapaxes(jacobian, 1, 2)
+        descent = -(transposed @ residual[..., None])[..., 0]
+        return BatchedProblem(transposed @ jacobian, descent, (residual**2).sum(axis=1))
 
-    cost, residual, jacobian = evaluate(rotation, translation)
-    damping = np.full(len(rotation), 1e-4)
-    for _ in range(MAX_STEPS):
-        normal = np.swapaxes(jacobian, 1, 2) @ jacobian
-        gradient = (np.swapaxes(jacobian, 1, 2) @ residual[..., None])[..., 0]
-        diagonal = np.einsum("kii->ki", normal)
-        damped = normal + (damping[:, None] * diagonal)[..., None] * np.eye(6)
-        step = -np.linalg.solve(damped, gradient[..., None])[..., 0]
-        trial_r, trial_t = exp_so3(step[:, :3]) @ rotation, translation + step[:, 3:]
-        trial_cost, trial_residual, trial_jacobian = evaluate(trial_r, trial_t)
-        better = trial_cost < cost
-        gain = np.where(better, cost - trial_cost, 0.0)
-        size = np.abs(step[:, :3]).max(axis=1) + np.abs(step[:, 3:]).max(axis=1) / np.linalg.norm(translation, axis=1)
-        settled = np.where(better, gain <= STEP_TOLERANCE * cost, damping > 1e6) | (size < STEP_TOLERANCE)
-        rotation = np.where(better[:, None, None], trial_r, rotation)
-        translation = np.where(better[:, None], trial_t, translation)
-        residual = np.where(better[:, None], trial_residual, residual)
-        jacobian = np.where(better[:, None, None], trial_jacobian, jacobian)
-        cost = np.where(better, trial_cost, cost)
-        damping = np.where(better, np.maximum(damping * 0.1, 1e-12), damping * 10.0)
-        if settled.all():
-            break
-    return rotation, translation, cost
+    def moved(poses: tuple[FloatArray, ...], step: FloatArray) -> tuple[FloatArray, ...]:
+        return exp_so3(step[:, :3]) @ poses[0], poses[1] + step[:, 3:]
+
+    def small(poses: tuple[FloatArray, ...], step: FloatArray) -> BoolArray:
+        moved_by = np.abs(step[:, 3:]).max(axis=1) / np.linalg.norm(poses[1], axis=1)
+        return np.asarray(np.abs(step[:, :3]).max(axis=1) + moved_by < STEP_TOLERANCE)
+
+    start = (rotation, translation)
+    found, cost = minimise_each(start, linearise, moved, DAMPING, STOP, small=small, until_all=True)
+    return found[0], found[1], cost
 
 
 def _differ(rotation: FloatArray, translation: FloatArray, flat: FloatArray, cost: FloatArray) -> bool:

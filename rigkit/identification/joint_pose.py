@@ -12,10 +12,13 @@ from rigkit.core.arrays import FloatArray, IntArray, Pixels, Points, Rays
 from rigkit.core.errors import InputError
 from rigkit.geometry.board_pose import point_residuals
 from rigkit.geometry.rotation import exp_so3, skew
+from rigkit.optim.damping import Damping, Stop
+from rigkit.optim.levenberg_marquardt import DenseProblem, DenseStep, minimise
 
 __all__ = ["BoardObservation", "JointPose", "refine_joint"]
 
 MAX_JOINT_STEPS = 30
+DAMPING = Damping(start=1e-6, floor=1e-9, refused_floor=1e-4, ceiling=1e4)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -99,26 +102,18 @@ def refine_joint(
     tolerance : stop when a step gains less than this part of the cost.
     """
     images = _StackedObservations.stack(observations1, points1), _StackedObservations.stack(observations2, points2)
-    motion, boards = cam2_from_cam1.copy(), cam1_from_board.copy()
-    residual, jacobian = _evaluate(images, motion, boards)
-    cost, damping = float(residual @ residual), 1e-6
-    for _ in range(MAX_JOINT_STEPS):
-        normal = jacobian.T @ jacobian
-        normal[np.diag_indices_from(normal)] *= 1.0 + damping
-        step = np.asarray(-np.linalg.solve(normal, jacobian.T @ residual), dtype=np.float64).reshape(-1, 6)
-        trial = _moved(motion, step[0]), _moved(boards, step[1:])
-        trial_residual, trial_jacobian = _evaluate(images, *trial)
-        trial_cost = float(trial_residual @ trial_residual)
-        if trial_cost < cost:
-            settled = cost - trial_cost <= tolerance * cost
-            (motion, boards), residual, jacobian, cost = trial, trial_residual, trial_jacobian, trial_cost
-            damping = max(damping * 0.1, 1e-9)
-            if settled:
-                break
-        else:
-            damping = max(damping * 10.0, 1e-4)
-            if damping > 1e4:
-                break
+
+    def linearise(poses: tuple[FloatArray, FloatArray]) -> DenseProblem:
+        return DenseProblem(*_evaluate(images, *poses))
+
+    def moved(poses: tuple[FloatArray, FloatArray], step: DenseStep) -> tuple[FloatArray, FloatArray]:
+        change = step.change.reshape(-1, 6)
+        return _moved(poses[0], change[0]), _moved(poses[1], change[1:])
+
+    start = cam2_from_cam1.copy(), cam1_from_board.copy()
+    end = minimise(start, linearise, moved, DAMPING, Stop(steps=MAX_JOINT_STEPS, gain=tolerance))
+    motion, boards = end.state
+    residual = end.problem.residual
     split = np.split(residual.reshape(-1, 2), [len(images[0].rays)])
     chi2, squared = np.zeros((len(boards), 2)), np.zeros((len(boards), 2))
     for k, (image, part) in enumerate(zip(images, split, strict=True)):

@@ -1,0 +1,87 @@
+"""Levenberg-Marquardt for many small problems at once, each with a damping of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.optim.damping import Damping, Stop
+
+__all__ = ["BatchedProblem", "minimise_each"]
+
+State = tuple[FloatArray, ...]
+"""Arrays whose first axis is that of the problems."""
+
+
+class BatchedProblem(NamedTuple):
+    """K problems around their states.
+
+    Attributes
+    ----------
+    normal, descent : (K, U, U) and (K, U), J^T J and -J^T r.
+    cost : (K,) sums of squared residuals.
+    """
+
+    normal: FloatArray
+    descent: FloatArray
+    cost: FloatArray
+
+
+def minimise_each(
+    state: State,
+    linearise: Callable[[State], BatchedProblem],
+    moved: Callable[[State, FloatArray], State],
+    damping: Damping,
+    stop: Stop,
+    *,
+    small: Callable[[State, FloatArray], BoolArray] | None = None,
+    until_all: bool = False,
+) -> tuple[State, FloatArray]:
+    """Return states each at its own minimum, and their costs (K,).
+
+    Parameters
+    ----------
+    moved : gives the states after steps (K, U).
+    damping : `by_gain`, `acceleration` and `refused_floor` are not for a batch.
+    stop : `gain_ratio` and `cost` are not for a batch.
+    small : says which steps (K, U) are too short to matter: their problems are done.
+    until_all : problems that are done go on while others are not, with steps that are computed anyhow; otherwise they
+        stay where they are, and what a problem finds does not depend on the others.
+    """
+    here = linearise(state)
+    level = np.full(len(here.cost), damping.start)
+    active = np.full(len(level), True) if until_all else here.cost > 0.0
+    for _ in range(stop.steps):
+        if not active.any():
+            break
+        diagonal = np.einsum("kii->ki", here.normal)
+        diagonal = np.where(diagonal > 0.0, diagonal, 1.0)
+        added = level[:, None] * diagonal
+        unknowns = np.arange(diagonal.shape[1])
+        damped = here.normal.copy()
+        damped[:, unknowns, unknowns] += added
+        step: FloatArray = np.asarray(np.linalg.solve(damped, here.descent[..., None])[..., 0], dtype=np.float64)
+        predicted = (step * (added * step + here.descent)).sum(axis=-1)
+        trial = moved(state, step)
+        there = linearise(trial)
+        better = there.cost < here.cost
+        if not until_all:
+            better &= active
+        gain = np.where(better, here.cost - there.cost, 0.0)
+        done = np.where(better, gain <= stop.gain * here.cost, level > damping.ceiling)
+        done |= predicted <= stop.promise * here.cost
+        if small is not None:
+            done |= small(state, step)
+        state = tuple(_chosen(better, new, old) for new, old in zip(trial, state, strict=True))
+        here = BatchedProblem(*(_chosen(better, new, old) for new, old in zip(there, here, strict=True)))
+        level = np.where(better, np.maximum(damping.shrink * level, damping.floor), damping.growth * level)
+        active = ~done if until_all else active & ~done
+    return state, here.cost
+
+
+def _chosen(which: BoolArray, new: FloatArray, old: FloatArray) -> FloatArray:
+    """Return rows of `new` where `which`, of `old` elsewhere."""
+    return np.where(which.reshape(-1, *[1] * (new.ndim - 1)), new, old)

@@ -1,0 +1,14 @@
+"""From medians to standard deviations: the factors that hold for Gaussian noise, in one home."""
+
+from __future__ import annotations
+
+__all__ = ["MEDIAN_OF_CHI_SQUARE_3", "MEDIAN_OF_NORMAL", "MEDIAN_OF_RAYLEIGH", "SIGMA_OF_MEDIAN"]
+
+MEDIAN_OF_NORMAL = 0.6745
+"""Median of |x| of a Gaussian x of standard deviation 1, to four digits."""
+SIGMA_OF_MEDIAN = 1.4826
+"""Standard deviation of a Gaussian whose |x| has the median 1, to five digits: one over the above."""
+MEDIAN_OF_RAYLEIGH = 1.17741
+"""Median of |r| of a two-dimensional Gaussian of standard deviation 1 per coordinate: sqrt(2 log 2)."""
+MEDIAN_OF_CHI_SQUARE_3 = 2.366
+"""Median of |r|^2 of a three-dimensional Gaussian of standard deviation 1 per coordinate."""
