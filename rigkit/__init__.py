@@ -12,8 +12,8 @@ Layers, each importing only rows below it (tests/test_architecture.py reads the 
      5  affine | relative_pose | calibration | synthetic | interop
      4  rectification    perspective, stereo and panoramic views
      3  cameras          protocol, one file a model, registry
-     2  geometry | optim
-     1  core             errors, arrays, boards, detections, matches, clouds, measured truth
+     2  geometry         rigid motions, rotations, planes, triangulation
+     1  core | optim     errors, arrays, boards, detections, matches, clouds, truth | least squares, robust scale
      0  kernels          compiled loops
 
 Conventions: `b_from_a` maps a to b, `x_in_a` lives in a, touching names match; camera x right, y down, z forward; pixel

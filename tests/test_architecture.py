@@ -16,8 +16,8 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("kernels",),
-    ("core",),
-    ("geometry", "optim"),
+    ("core", "optim"),
+    ("geometry",),
     ("cameras",),
     ("rectification",),
     ("affine", "relative_pose", "calibration", "synthetic", "interop"),
