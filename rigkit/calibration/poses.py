@@ -14,6 +14,8 @@ from rigkit.calibration.radial_alignment import align
 from rigkit.calibration.state import State
 from rigkit.core.arrays import FloatArray, Mat3, Points
 from rigkit.geometry.rotation import exp_so3, nearest_rotation
+from rigkit.optim.batched import BatchedProblem, minimise_each
+from rigkit.optim.damping import Damping, Stop
 
 __all__ = ["find_poses", "refine_each", "refine_poses"]
 
@@ -22,10 +24,8 @@ TOLERANCE = 1e-10
 """Stop where a step promises less than this part of a view's cost,"""
 START_TOLERANCE = 1e-5
 """or this, of a pose that is only where a solve begins: a robust loss takes dozens of steps for the last digits."""
-DAMPING_START = 1e-6
-MAX_DAMPING = 1e10
-MIN_DAMPING = 1e-12
-"""A view of which hardly a corner projects does not determine its pose: less than this would leave it singular."""
+DAMPING = Damping(start=1e-6, floor=1e-12, ceiling=1e10)
+"""A view of which hardly a corner projects does not determine its pose: less than the floor would leave it singular."""
 
 
 def refine_poses(
@@ -56,28 +56,17 @@ def refine_each(
 ) -> tuple[Mat3, Points, FloatArray]:
     """Return poses (N, 3, 3), (N, 3) each at its own minimum and their costs (N,): Levenberg-Marquardt with a damping
     of its own for each. `linearise` returns the normal equations at given poses."""
-    normal = linearise(rotation, translation_mm)
-    pp, p, cost = normal.pp, normal.p, normal.costs
-    damping = np.full(len(cost), DAMPING_START)
-    active = cost > 0.0
-    for _ in range(MAX_ITERATIONS):
-        if not active.any():
-            break
-        diagonal = np.diagonal(pp, axis1=-2, axis2=-1)
-        diagonal = np.where(diagonal > 0.0, diagonal, 1.0)
-        damped = pp + (damping[:, None] * diagonal)[..., None] * np.eye(6)
-        step: FloatArray = np.asarray(np.linalg.solve(damped, p[..., None])[..., 0] * active[:, None], float)
-        predicted = (step * (damping[:, None] * diagonal * step + p)).sum(axis=-1)
-        turned, shifted = exp_so3(step[:, :3]) @ rotation, translation_mm + step[:, 3:]
-        there = linearise(turned, shifted)
-        better = active & (there.costs < cost)
-        rotation = np.where(better[:, None, None], turned, rotation)
-        translation_mm = np.where(better[:, None], shifted, translation_mm)
-        active &= (predicted > tolerance * cost) & (damping < MAX_DAMPING)
-        pp, p = np.where(better[:, None, None], there.pp, pp), np.where(better[:, None], there.p, p)
-        cost = np.where(better, there.costs, cost)
-        damping = np.where(better, np.maximum(0.1 * damping, MIN_DAMPING), 10.0 * damping)
-    return rotation, translation_mm, cost
+
+    def around(poses: tuple[FloatArray, ...]) -> BatchedProblem:
+        normal = linearise(*poses)
+        return BatchedProblem(normal.pp, normal.p, normal.costs)
+
+    def moved(poses: tuple[FloatArray, ...], step: FloatArray) -> tuple[FloatArray, ...]:
+        return exp_so3(step[:, :3]) @ poses[0], poses[1] + step[:, 3:]
+
+    stop = Stop(steps=MAX_ITERATIONS, promise=tolerance)
+    found, cost = minimise_each((rotation, translation_mm), around, moved, DAMPING, stop)
+    return found[0], found[1], cost
 
 
 def find_poses(observations: Observations, state: State, weight: FloatArray, loss_px: float | None) -> State:

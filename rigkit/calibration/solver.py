@@ -14,8 +14,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
-import numpy as np
-
 from rigkit.calibration.linearise import normal_equations
 from rigkit.calibration.normal_equations import NormalEquations, Step
 from rigkit.calibration.observations import Observations
@@ -24,6 +22,9 @@ from rigkit.calibration.state import State
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import RigkitError
 from rigkit.geometry.rotation import exp_so3
+from rigkit.optim import levenberg_marquardt
+from rigkit.optim.damping import Damping, Stop, StopReason
+from rigkit.optim.levenberg_marquardt import LinearisedProblem
 
 __all__ = ["CameraSolution", "Linearised", "minimise", "solve", "with_priors"]
 
@@ -33,21 +34,29 @@ MAX_ITERATIONS = 60
 COST_TOLERANCE = 1e-11
 """Stop when the quadratic model promises less than this part of the cost: Gauss-Newton converges quadratically here, so
 the optimum is then known to about 1e-10 in cost."""
-DAMPING_START = 1e-13
+MIN_GAIN_RATIO = 0.5
+"""A step that gains little, and less than this share of what it promised, was too far: the next one may gain more."""
+DAMPING = Damping(start=1e-13, shrink=0.01, growth=4.0, acceleration=2.0, ceiling=1e12, by_gain=True)
 """Monomials of a polynomial are nearly dependent (eigenvalues down to 1e-12 of the scaled system at degree 6): more
-would hold their combinations back. A step that goes too far is refused and the damping grows quickly."""
-DAMPING_SHRINK = 0.01
-"""For the same reason; with Nielsen's 1/3 it would be dozens of steps."""
-DAMPING_GROWTH = 4.0
-MAX_DAMPING = 1e12
+than 1e-13 would hold their combinations back, and with a shrink of 1/3 it would be dozens of steps. A step that goes
+too far is refused and the damping grows quickly."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Linearised:
+class Linearised(LinearisedProblem):
     """The problem around a state: the normal equations of the corners, and those with all priors added."""
 
     data: NormalEquations
     normal: NormalEquations
+
+    @property
+    def cost(self) -> float:
+        """The cost, priors included."""
+        return self.normal.cost
+
+    def step(self, damping: float) -> Step | None:
+        """Return the damped step of the normal equations with priors."""
+        return self.normal.step(damping)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -125,31 +134,11 @@ def minimise(
     `moved` returns the state after a step, None where there is no such state. `here` is the problem around the start,
     where it is known.
     """
-    here = linearise(state) if here is None else here
-    damping, growth = DAMPING_START, DAMPING_GROWTH
-    for iteration in range(1, max_iterations + 1):
-        step = here.normal.step(damping)
-        if step is None:
-            damping, growth = damping * growth, growth * 2.0
-            if damping > MAX_DAMPING:
-                return state, here, Convergence(iteration, False, "the normal equations are singular")
-            continue
-        if step.predicted <= tolerance * here.normal.cost:
-            return state, here, Convergence(iteration, True, "cost stationary")
-        trial = moved(state, step)
-        there = None if trial is None else linearise(trial)
-        gain = -np.inf if there is None else (here.normal.cost - there.normal.cost) / step.predicted
-        if trial is not None and there is not None and gain > 0.0:
-            stationary = here.normal.cost - there.normal.cost <= tolerance * here.normal.cost and gain > 0.5
-            state, here = trial, there
-            if stationary:
-                return state, here, Convergence(iteration, True, "cost stationary")
-            damping, growth = damping * max(DAMPING_SHRINK, 1.0 - (2.0 * gain - 1.0) ** 3), DAMPING_GROWTH
-        else:
-            damping, growth = damping * growth, growth * 2.0
-            if damping > MAX_DAMPING:
-                return state, here, Convergence(iteration, True, "no smaller cost nearby")
-    return state, here, Convergence(max_iterations, False, f"stopped after {max_iterations} iterations")
+    stop = Stop(steps=max_iterations, gain=tolerance, gain_ratio=MIN_GAIN_RATIO, promise=tolerance)
+    end = levenberg_marquardt.minimise(state, linearise, moved, DAMPING, stop, here=here)
+    stopped = f"stopped after {max_iterations} iterations"
+    reason = stopped if end.reason == StopReason.STEPS else str(end.reason)
+    return end.state, end.problem, Convergence(end.steps, end.converged, reason)
 
 
 def _moved(state: State, step: Step) -> State | None:
