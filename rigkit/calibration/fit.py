@@ -17,6 +17,7 @@ from rigkit.calibration.state import State, evaluate
 from rigkit.cameras.base import Camera, image_center
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.errors import DegenerateError
+from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
 __all__ = ["OUTLIER_SIGMAS", "Fit", "fit_kept", "fit_model", "heldout_squares", "inliers", "robust_sigma", "sigma_of"]
 
@@ -28,8 +29,6 @@ RINGS, RING_CORNERS = 8, 50
 the ring around the middle that a corner lies in, of so many with as many corners each, but no fewer than 50."""
 RING_FACTOR = 4.0
 """No ring scatters more than this many times as much as all corners: beyond it the corners in it are bad ones."""
-RAYLEIGH_MEDIAN = 1.17741
-"""Median of |r| of a 2-D Gaussian with unit standard deviation per coordinate."""
 CAUCHY_SIGMAS = 2.5
 COARSE = 5e-2
 FINE = 1e-5
@@ -79,7 +78,7 @@ class Fit:
 def sigma_of(norm: FloatArray, used: BoolArray | IntArray) -> float:
     """Return the robust standard deviation per coordinate, median |r| / 1.177, of the corners `used`."""
     chosen = norm[used]
-    return max(median_of(chosen) / RAYLEIGH_MEDIAN, SIGMA_FLOOR_PX) if chosen.size else SIGMA_FLOOR_PX
+    return max(median_of(chosen) / MEDIAN_OF_RAYLEIGH, SIGMA_FLOOR_PX) if chosen.size else SIGMA_FLOOR_PX
 
 
 def robust_sigma(fit: Fit, observations: Observations) -> float:
@@ -169,7 +168,7 @@ def _robust(observations: Observations, state: State, start_sigma: float) -> _Fo
         return _Found(state, norm, sigma)  # nothing for a robust loss to do
     # Padding is left out of the medians by standing beyond all corners.
     ordered = np.sort(np.where(present, norm, np.inf), axis=1)
-    of_view = ordered[np.arange(len(norm)), np.maximum(present.sum(axis=1) - 1, 0) // 2] / RAYLEIGH_MEDIAN
+    of_view = ordered[np.arange(len(norm)), np.maximum(present.sum(axis=1) - 1, 0) // 2] / MEDIAN_OF_RAYLEIGH
     bad = np.flatnonzero(of_view > BAD_VIEW * sigma)
     if bad.size:
         part = observations.subset(bad)

@@ -18,12 +18,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from rigkit.calibration.observations import Observations, median_of
-from rigkit.calibration.radial_alignment import MAD_TO_SIGMA, TURN_SIGMAS, Alignment, align, distortion_centre
+from rigkit.calibration.radial_alignment import TURN_SIGMAS, Alignment, align, distortion_centre
 from rigkit.calibration.state import State, evaluate
 from rigkit.cameras.base import Camera, RadialCurve, image_center
 from rigkit.core.arrays import FloatArray, Mat3, Points
 from rigkit.core.errors import InputError
 from rigkit.geometry.rotation import nearest_rotation
+from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 
 __all__ = ["initialise", "start_error"]
 
@@ -172,7 +173,7 @@ class _Depths:
             z = (a @ self._rows[:, which[:-1]]) + (self._middle[:, which[:-1]] @ a)[:, None]
             slope = s / np.maximum(s * s + z * z, TINY)
             residual = np.abs(z - t3[:, None] - sign[:, None] * depth) * slope
-            scale = TURN_SIGMAS * MAD_TO_SIGMA * median_of(residual[self._used]) + NOTHING
+            scale = TURN_SIGMAS * SIGMA_OF_MEDIAN * median_of(residual[self._used]) + NOTHING
             weight = np.where(self._used, self._weight * slope / (1.0 + (residual / scale) ** 2), 0.0)
             a, sign, t3 = self._joint(which, weight, sign)
         radius = np.linspace(0.0, 1.0, SAMPLES)

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.core.arrays import FloatArray
+from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 
 __all__ = ["Alignment", "align", "distortion_centre"]
 
@@ -29,7 +30,6 @@ SHIFT = 1e-13
 """Of the trace, keeps the normal matrix of exact corners invertible."""
 TURN_SIGMAS = 2.5
 """Residuals of so many robust sigmas count half."""
-MAD_TO_SIGMA = 1.4826
 MIN_SIGMA_PX = 1e-6
 """Exact corners scatter by rounding alone, far below any noise; weights are one over it."""
 ON_AXIS = 1e-3
@@ -157,7 +157,7 @@ def _sigma(residual: FloatArray, used: np.ndarray) -> FloatArray:
     middle = np.maximum(used.sum(axis=1) - 1, 0) // 2
     ordered = np.partition(np.where(used, residual, np.inf), np.unique(middle), axis=1)
     median = ordered[np.arange(len(used)), middle]
-    return np.maximum(MAD_TO_SIGMA * np.where(np.isfinite(median), median, 0.0), MIN_SIGMA_PX)
+    return np.maximum(SIGMA_OF_MEDIAN * np.where(np.isfinite(median), median, 0.0), MIN_SIGMA_PX)
 
 
 def _best_subset(offset: FloatArray, local: FloatArray, used: np.ndarray) -> FloatArray:

@@ -15,6 +15,7 @@ from rigkit.core.arrays import FloatArray, IntArray, Points
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import exp_so3, nearest_rotation, skew
+from rigkit.optim.robust_scale import MEDIAN_OF_CHI_SQUARE_3
 
 __all__ = ["board_scales", "metric_scale", "scale_and_gradient"]
 
@@ -148,8 +149,7 @@ def _similarity_scale(
         residual = np.einsum("nij,nj->ni", whiten, points - k * turned - c)
         square = np.sum(residual**2, axis=1)
         if covariances is None:
-            # Three components of a point; the median of their sum of squares is 2.37 variances.
-            noise = max(float(np.median(square)) / 2.366, 1e-300)
+            noise = max(float(np.median(square)) / MEDIAN_OF_CHI_SQUARE_3, 1e-300)
         w = np.minimum(1.0, noise * OUTLYING / np.maximum(square, 1e-300)) ** 2
         J = np.concatenate([turned[:, :, None], -k * skew(turned), np.broadcast_to(np.eye(3), whiten.shape)], axis=2)
         J = whiten @ J

@@ -24,6 +24,7 @@ from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.sampson import sampson_distances
+from rigkit.optim.robust_scale import MEDIAN_OF_NORMAL, MEDIAN_OF_RAYLEIGH
 from rigkit.reconstruction.geometry import decide_pose_type
 from rigkit.reconstruction.metric import triangulate_matches
 from rigkit.reconstruction.reconstruct import Reconstruction, colours_at, oriented_cloud
@@ -46,8 +47,6 @@ GATE = 3.3
 """In standard deviations: one good point in a thousand is lost."""
 AFFINITY_GATE = 3.7
 """The same for the length of two residuals."""
-MEDIAN_OF_NORMAL = 0.6745
-MEDIAN_OF_RAYLEIGH = 1.1774
 ROUNDS = 4
 MAX_FALSE_ALARMS = 1e-2
 MAX_RANGE_SIGMA = 0.3

@@ -19,6 +19,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Normals, Points, as_
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import angle_between
 from rigkit.interop.open3d import mean_and_covariance, plane_inliers
+from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 
 __all__ = ["NormalErrors", "Plane", "angle_jacobian", "face_angle", "fit_moved", "fit_plane", "normal_errors"]
 
@@ -32,8 +33,6 @@ that."""
 VAGUE = 8.0
 """A point this many times as uncertain as the middle one of its board has a sixty-fourth of its say. Nothing is lost
 without it, and beside an epipole errors are so large that they are no longer linear: nobody knows its true variance."""
-TO_SIGMA = 1.4826
-"""From the median of absolute values to the standard deviation of a Gaussian."""
 ROUNDING = 1e-9
 """Of the distance: exact points have no scatter to judge by."""
 RANSAC_ROUNDS = 2
@@ -276,14 +275,14 @@ def _judged(points: Points, covariance: FloatArray, common: FloatArray) -> tuple
     floor = ROUNDING * float(np.linalg.norm(centroid))
     for _ in range(RANSAC_ROUNDS):
         off = np.abs((points - centroid) @ axes[:, 0])
-        near = 2.0 * TO_SIGMA * float(np.median(off)) + floor
+        near = 2.0 * SIGMA_OF_MEDIAN * float(np.median(off)) + floor
         shared = plane_inliers(points, near, iterations=RANSAC_ITERATIONS)
         weights = np.zeros(len(points))
         weights[shared], _ = _weights(points[shared], covariance[shared], common[:, shared])
         centroid, axes = _principal(points, weights)
     seen = _Across.of(points, covariance, common, centroid, axes)
     off = np.abs(seen.residuals)
-    scatter = TO_SIGMA * float(np.median(off / np.sqrt(seen.variance)))
+    scatter = SIGMA_OF_MEDIAN * float(np.median(off / np.sqrt(seen.variance)))
     expected = np.sqrt(scatter**2 * seen.variance + np.sum(seen.bending(weights) ** 2, axis=1))
     return np.asarray(off <= GROSS * expected + floor), np.asarray(expected <= VAGUE * np.median(expected))
 

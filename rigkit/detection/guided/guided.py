@@ -25,6 +25,7 @@ from rigkit.detection.saddles.response import GreyImage, grey_image
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
 from rigkit.detection.subpixel.edge_model import NEAR_PX, NEAR_SIGMAS, Geometry, ends_of
 from rigkit.detection.subpixel.scatter import UNEXPLAINED
+from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
 __all__ = ["complete_boards", "fit_corners"]
 
@@ -62,8 +63,6 @@ own standard deviation together, is covered in part."""
 SCATTER_FLOOR_PX = 0.01
 """No camera and no printed board is truer than this."""
 
-MEDIAN_OF_RAYLEIGH = 1.1774
-"""Median distance from the mean of a normal point in the plane, in standard deviations per axis."""
 
 MIN_ADDED_CONTRAST = 0.15
 """Contrast relative to the found corners' around: a glint takes most of it, but not all."""

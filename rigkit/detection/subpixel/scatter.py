@@ -10,6 +10,7 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray
 from rigkit.kernels import lattice as native
+from rigkit.optim.robust_scale import MEDIAN_OF_NORMAL
 
 __all__ = ["UNEXPLAINED", "excess_scatter"]
 
@@ -19,9 +20,6 @@ MIN_SCATTER_CORNERS, MIN_DIFFERENCES = 12, 16
 
 UNEXPLAINED = 1.25
 """A scatter about the lattice less than this times the expected one is what chance makes of fifty corners."""
-
-MEDIAN_OF_NORMAL = 0.6745
-"""Median of the absolute value of a standard normal variable."""
 
 
 def excess_scatter(pixels: FloatArray, sigma_px: FloatArray, parts: Sequence[tuple[slice, slice]]) -> FloatArray:

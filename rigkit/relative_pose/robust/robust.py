@@ -19,6 +19,7 @@ from rigkit.core.errors import DegenerateError, InputError, RigkitError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.optim.robust_scale import MEDIAN_OF_NORMAL
 from rigkit.relative_pose.refinement.local import SampsonRows
 from rigkit.relative_pose.refinement.marginal import QUANTILE, MarginalLoss, marginal_quality
 from rigkit.relative_pose.refinement.refine import SIGNIFICANT, RefinedPose, refine_pose
@@ -35,7 +36,6 @@ __all__ = ["RobustPose", "Sample", "robust_pose"]
 Sample = Literal["points", "affine", "mixed"]
 """What minimal samples consist of: points only; affine correspondences only; one affine correspondence and points."""
 
-MEDIAN_OF_NORMAL = 0.6745
 BATCH = 96
 """Samples at a time: a little more than 40 % of wrong matches ask for."""
 WIDE = 4.0

@@ -18,6 +18,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, Mat3
 from rigkit.core.errors import InputError
 from rigkit.core.matches import Matches
 from rigkit.geometry.sampson import epipolar_normals
+from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 
 __all__ = [
     "LEAST_SIGMA_A",
@@ -36,7 +37,6 @@ WeightRule = Literal["noise", "auto", "equal", "points"]
 """noise: from the sigmas of the matches (affinities without a sigma_A are ignored); auto: sigma_A estimated from the
 data; equal: every row counts the same in normalised coordinates; points: affinities ignored."""
 
-MAD_TO_SIGMA = 1.4826
 START_SIGMA_A = 0.05
 """Where nothing is known of the affinities, the estimate starts from here; it is replaced by what the data say."""
 LEAST_SIGMA_A = 1e-6
@@ -151,7 +151,7 @@ def estimate_sigma_A(matches: Matches, E21: Mat3) -> float:
     """
     residual = affinity_residuals(matches, E21)
     residual = residual[np.isfinite(residual)]
-    return float(MAD_TO_SIGMA * np.median(np.abs(residual))) if residual.size else float("nan")
+    return float(SIGMA_OF_MEDIAN * np.median(np.abs(residual))) if residual.size else float("nan")
 
 
 def _weights(
