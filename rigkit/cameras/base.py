@@ -19,6 +19,13 @@ from rigkit.core.errors import InputError
 __all__ = ["Camera", "RadialCurve", "image_center"]
 
 
+MAX_SIDE_PX = 2**20
+"""Some sixty times the longest line sensor: a larger image is a mistyped number."""
+MAX_PARAMETER = 1e15
+"""A double of this size has no digits left for tenths, and products of much larger ones overflow; what lenses need is
+below it (the k3 that bends the rim of a lens of one degree: 1e12)."""
+
+
 def image_center(size_px: tuple[int, int]) -> FloatArray:
     """Return the centre of the image, px: (width - 1) / 2, (height - 1) / 2, because (0, 0) is a pixel's centre."""
     return np.array([(size_px[0] - 1) / 2.0, (size_px[1] - 1) / 2.0])
@@ -94,16 +101,26 @@ class Camera(ABC):
     """The sizes that a model of several sizes can have: Brown's numbers of distortion terms, Scaramuzza's degrees."""
 
     def __post_init__(self) -> None:
+        _require_numbers(self.size_px, "camera size")
         size = as_array(self.size_px, (2,), "camera size")
-        if (size < 1.0).any() or (size != np.round(size)).any():
-            raise InputError(f"camera size {self.size_px}: width and height must be positive whole numbers")
+        if (size < 1.0).any() or (size > MAX_SIDE_PX).any() or (size != np.round(size)).any():
+            raise InputError(
+                f"camera size {self.size_px}: width and height must be positive whole numbers, at most {MAX_SIDE_PX}"
+            )
         object.__setattr__(self, "size_px", (int(size[0]), int(size[1])))
+        _require_numbers(self.parameters, f"{self.model} parameters")
         array = as_array(self.parameters, (None,), f"{self.model} parameters")
         object.__setattr__(self, "parameters", array)
         names = self.parameter_names()
         if len(names) != array.size:
             raise InputError(
                 f"{self.model} camera: {len(names)} parameters expected ({', '.join(names)}), got {array.size}"
+            )
+        if array.size and np.abs(array).max() > MAX_PARAMETER:
+            worst = int(np.argmax(np.abs(array)))
+            raise InputError(
+                f"{self.model} camera: {names[worst]} = {array[worst]:g} is beyond +-{MAX_PARAMETER:g}, no lens's; "
+                "check the number and its unit"
             )
         with np.errstate(all="ignore"):
             self._prepare()
@@ -255,6 +272,7 @@ class Camera(ABC):
 
         Raises InputError where they are outside of what the model is defined for; a solver takes that as a failed step.
         """
+        _require_numbers(parameters, f"{self.model} parameters")
         return type(self)(self.size_px, np.asarray(parameters, dtype=np.float64))
 
     def on_image(self, pixels: Pixels) -> BoolArray:
@@ -269,6 +287,14 @@ class Camera(ABC):
         """Pixels per radian on the optical axis: the scale of an angular error, whatever the model."""
         _, _, d_pixels_d_point, _ = self.project_with_jacobians(np.array([0.0, 0.0, 1.0]))
         return float(np.sqrt(abs(np.linalg.det(d_pixels_d_point[:, :2]))))
+
+
+def _require_numbers(values: object, what: str) -> None:
+    """Raise InputError for texts and truth values, which numpy would take for numbers."""
+    entries = () if isinstance(values, np.ndarray) and values.dtype.kind in "iuf" else values
+    for value in entries if isinstance(entries, list | tuple | np.ndarray) else (entries,):
+        if isinstance(value, bool | np.bool_ | str | bytes):
+            raise InputError(f"{what}: {value!r} is a {type(value).__name__}, a number is expected")
 
 
 def _blank(values: FloatArray, valid: BoolArray) -> None:
