@@ -23,7 +23,7 @@ FAR_SQUARES = 1e4
 """Board coordinate given to rays that miss a board's plane."""
 RIM_MARGIN = 0.1
 """Cosine by which the nodes must clear the lens's rim for a whole tile to be lit: they stop short of its edge."""
-LEAST_CELL, MAX_CELL = 1e-6, 2.0
+MIN_CELL, MAX_CELL = 1e-6, 2.0
 """A cell's side, in squares or panel sides: shorter is none; longer, the plane is seen edge on and differences mean
 nothing."""
 SMOOTH_DEPTH_RATIO = 0.5
@@ -291,7 +291,7 @@ class _Cells:
 def _cells(axis: Float32, per_pixel: int) -> _Cells:
     down, right = np.gradient(axis[::per_pixel, ::per_pixel])
     sides = np.abs(np.stack([down, right])) / np.float32(per_pixel)
-    sides = np.clip(sides, LEAST_CELL, MAX_CELL).astype(np.float32)
+    sides = np.clip(sides, MIN_CELL, MAX_CELL).astype(np.float32)
     wide, narrow = sides.max(axis=0), sides.min(axis=0)
     return _Cells(wide, narrow, per_pixel, 0.5 * float((wide + narrow).max()))
 

@@ -194,9 +194,9 @@ def test_no_baseline_and_nonsense_are_refused(rng):
         refine_pose(m.select(np.arange(3)), pose)
 
 
-def test_one_plane_gives_both_poses_or_says_so(rng):
+def test_planar_ambiguity_gives_both_poses_or_says_so(rng):
     """The true pose is among the homography's; a single board in general position is refused where both fit."""
-    from rigkit.relative_pose.solvers.planar_ambiguity import one_plane_poses
+    from rigkit.relative_pose.solvers.planar_ambiguity import ambiguous_poses
 
     refused = solved = 0
     for _ in range(12):
@@ -206,7 +206,7 @@ def test_one_plane_gives_both_poses_or_says_so(rng):
             one = m.select(m.board_index == b)
             if len(one) < 20:
                 continue
-            found = one_plane_poses(replace(one, sigma1_px=np.full(len(one), 0.1), sigma2_px=np.full(len(one), 0.1)))
+            found = ambiguous_poses(replace(one, sigma1_px=np.full(len(one), 0.1), sigma2_px=np.full(len(one), 0.1)))
             assert min(max(pose_errors_deg(p, pose)) for p in found) < 1e-4
             try:
                 end = estimate_pose(replace(one, sigma1_px=np.full(len(one), 0.1), sigma2_px=np.full(len(one), 0.1)))
@@ -219,7 +219,7 @@ def test_one_plane_gives_both_poses_or_says_so(rng):
     assert refused > 0
     assert solved > 0
     three, _ = board_pair(rng, Rigid3(exp_so3([0.05, 0.2, 0.03]), [-290.0, 30.0, 70.0]), 0.1)
-    assert one_plane_poses(three) == ()
+    assert ambiguous_poses(three) == ()
 
 
 @pytest.mark.parametrize("noise_px", [0.05, 0.3])

@@ -21,11 +21,11 @@ from rigkit.geometry.rotation import exp_so3, unit
 from rigkit.geometry.sampson import epipolar_normals, sampson_distances
 from rigkit.relative_pose.refinement.pose_problem import Minimum, PoseProblem, RobustWeights, cauchy_weights
 from rigkit.relative_pose.refinement.residuals import whitened_affinities
-from rigkit.relative_pose.solvers.planar_ambiguity import compare_poses, one_plane_poses
-from rigkit.relative_pose.solvers.pose import behind_sigmas, choose_pose, essential_from_pose, translation_basis
+from rigkit.relative_pose.solvers.planar_ambiguity import ambiguous_poses, compare_poses
+from rigkit.relative_pose.solvers.pose import cheirality_margin, choose_pose, essential_from_pose, translation_basis
 from rigkit.relative_pose.solvers.registry import fundamental_for
 from rigkit.relative_pose.solvers.weights import (
-    LEAST_SIGMA_A,
+    MIN_SIGMA_A,
     RowWeights,
     WeightRule,
     estimate_sigma_A,
@@ -138,7 +138,7 @@ def estimate_pose(
             starts.append(choose_pose(estimate.E21, matches.rays1, matches.rays2, kind))
         except (DegenerateError, InputError) as error:
             failure = failure or error
-    flat = one_plane_poses(matches) if "general" in kinds else ()
+    flat = ambiguous_poses(matches) if "general" in kinds else ()
     starts += flat
     matches = _with_sigma(matches, starts, weights)
     ends: list[RefinedPose] = []
@@ -157,7 +157,7 @@ def estimate_pose(
 
 def _visible_cost(matches: Matches, end: RefinedPose) -> float:
     """Return the cost with what it takes to bring the points that are behind a camera to infinity."""
-    return end.cost + float(np.sum(end.weights * behind_sigmas(matches, end.cam2_from_cam1) ** 2))
+    return end.cost + float(np.sum(end.weights * cheirality_margin(matches, end.cam2_from_cam1) ** 2))
 
 
 def _refuse_ambiguity(matches: Matches, best: RefinedPose, ends: list[RefinedPose]) -> None:
@@ -221,7 +221,7 @@ def _with_sigma(matches: Matches, starts: Sequence[Rigid3], weights: WeightRule 
         return replace(matches, A21=None, sigma_A=None)
     if weights == "auto" and starts:
         least = min(estimate_sigma_A(matches, essential_from_pose(start)) for start in starts)
-        return replace(matches, sigma_A=np.full(len(matches), max(least, LEAST_SIGMA_A)))
+        return replace(matches, sigma_A=np.full(len(matches), max(least, MIN_SIGMA_A)))
     return matches
 
 

@@ -25,8 +25,8 @@ from rigkit.relative_pose.refinement.marginal import QUANTILE, MarginalLoss, mar
 from rigkit.relative_pose.refinement.refine import SIGNIFICANT, RefinedPose, refine_pose
 from rigkit.relative_pose.solvers.minimal import essential_from_five_rows, essential_from_six_rows, planar_from_two_rows
 from rigkit.relative_pose.solvers.planar import solve_planar_batch
-from rigkit.relative_pose.solvers.planar_ambiguity import compare_poses, twin_poses
-from rigkit.relative_pose.solvers.pose import behind_sigmas, choose_pose, essential_from_pose
+from rigkit.relative_pose.solvers.planar_ambiguity import compare_poses, other_ambiguous_poses
+from rigkit.relative_pose.solvers.pose import cheirality_margin, choose_pose, essential_from_pose
 from rigkit.relative_pose.solvers.registry import fundamental_for
 from rigkit.relative_pose.solvers.rows import PLANAR_ENTRIES, affinity_rows, essential_from_planar, point_rows
 from rigkit.relative_pose.solvers.weights import affinity_distances, usable_affinities
@@ -47,7 +47,7 @@ FINALISTS = 4
 """Local optima kept at each of the two noise levels."""
 SAME_QUALITY = 1e-3
 """In matches: optima that differ by less are one, to the precision of the local optimisation."""
-LEAST_NOISE = 1.5
+MIN_NOISE = 1.5
 """Noise level over the noise that the matches show: the loss still sees the tails, and few wrong matches."""
 NOISE_ROUNDS = 3
 """Each leaves out what the noise of the round before does not explain."""
@@ -127,7 +127,7 @@ def robust_pose(
         fitting = np.abs(rows.residuals(finalists[:1])[0])
         fitting = fitting[fitting < QUANTILE * noise]
         shown = float(np.median(fitting)) / MEDIAN_OF_NORMAL if fitting.size else max_noise
-        noise = min(max_noise, max(LEAST_NOISE * shown, LEAST_NOISE))
+        noise = min(max_noise, max(MIN_NOISE * shown, MIN_NOISE))
     finalists = rows.improved(finalists, kind, noise)[0]
     loss = MarginalLoss(noise)
 
@@ -144,9 +144,9 @@ def robust_pose(
             found, qualities = finished(start, plausible)
         except RigkitError:
             continue
-        for twin in twin_poses(matches, found.inliers, noise / LEAST_NOISE, _pose(found)):
+        for alternative in other_ambiguous_poses(matches, found.inliers, noise / MIN_NOISE, _pose(found)):
             try:
-                other, others = finished(twin, _plausible(matches, twin, max_noise))
+                other, others = finished(alternative, _plausible(matches, alternative, max_noise))
             except RigkitError:
                 continue
             if not compare_poses(_pose(found), _pose(other))[1]:
@@ -217,7 +217,7 @@ def _plausible(matches: Matches, pose: Rigid3, max_noise: float) -> BoolArray:
     highest noise level.
     """
     sigmas = QUANTILE * max_noise
-    seen = behind_sigmas(matches, pose) <= sigmas
+    seen = cheirality_margin(matches, pose) <= sigmas
     if matches.sigma_A is None:
         return np.asarray(seen)
     off = affinity_distances(matches, essential_from_pose(pose)) * np.sqrt(0.5)
@@ -264,14 +264,14 @@ class _Search:
 
         Widely first, which forgives a poor start; and at once, which an outlier with leverage cannot lure.
         """
-        widely = self.rows.improved(E21, self.kind, WIDE * self.max_noise, self.max_noise, LEAST_NOISE)[1:]
-        at_once = self.rows.improved(E21, self.kind, self.max_noise, LEAST_NOISE)
+        widely = self.rows.improved(E21, self.kind, WIDE * self.max_noise, self.max_noise, MIN_NOISE)[1:]
+        at_once = self.rows.improved(E21, self.kind, self.max_noise, MIN_NOISE)
         return np.concatenate([*widely, *at_once])
 
     def best(self, E21: Mat3) -> Mat3:
         """Return the best few of `E21` (H, 3, 3) at the highest noise level, the best first, and then at the least."""
         kept = []
-        for quality in self.rows.quality_ahead(E21, QUANTILE * self.max_noise, self.max_noise, LEAST_NOISE):
+        for quality in self.rows.quality_ahead(E21, QUANTILE * self.max_noise, self.max_noise, MIN_NOISE):
             kept.append(_different(quality)[:FINALISTS])
         return np.asarray(E21[np.concatenate(kept)])
 

@@ -14,7 +14,7 @@ from rigkit.core.matches import Matches
 from rigkit.geometry.rotation import nearest_rotation, unit
 from rigkit.geometry.sampson import sampson_distances
 from rigkit.relative_pose.solvers.weights import (
-    LEAST_SIGMA_A,
+    MIN_SIGMA_A,
     RowWeights,
     WeightRule,
     assumed_sigma_A,
@@ -86,7 +86,7 @@ def reweighted(
     E21 = solve(row_weights)
     for _ in range(REWEIGHTINGS):
         if rule == "auto":
-            sigma_A = np.where(usable_affinities(matches), max(estimate_sigma_A(matches, E21), LEAST_SIGMA_A), np.nan)
+            sigma_A = np.where(usable_affinities(matches), max(estimate_sigma_A(matches, E21), MIN_SIGMA_A), np.nan)
         row_weights = noise_weights(matches, E21, sigma_A)
         E21 = solve(row_weights)
     return E21, row_weights

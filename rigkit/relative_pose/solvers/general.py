@@ -8,7 +8,7 @@ from rigkit.core.arrays import Mat3
 from rigkit.core.matches import Matches
 from rigkit.relative_pose.solvers.eight_point import NormalisedRows, essential_nearest, linear_epipolar
 from rigkit.relative_pose.solvers.estimate import EpipolarEstimate, check_baseline, check_count, finish, reweighted
-from rigkit.relative_pose.solvers.planar_ambiguity import refuse_one_plane
+from rigkit.relative_pose.solvers.planar_ambiguity import refuse_planar_ambiguity
 from rigkit.relative_pose.solvers.weights import RowWeights, WeightRule
 
 __all__ = ["GeneralSolver"]
@@ -33,5 +33,5 @@ class GeneralSolver:
             return linear_epipolar(rows, row_weights)
 
         matrix, used = reweighted(matches, weights, linear)
-        refuse_one_plane(matches, used)
+        refuse_planar_ambiguity(matches, used)
         return finish(matches, essential_nearest(matrix), matrix, used)

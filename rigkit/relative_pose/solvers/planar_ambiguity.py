@@ -22,17 +22,17 @@ from rigkit.relative_pose.solvers.rows import right_singular
 from rigkit.relative_pose.solvers.weights import RowWeights
 
 __all__ = [
+    "ambiguous_poses",
     "compare_poses",
     "decompose_homography",
     "homography_of_rays",
-    "one_plane_poses",
-    "refuse_one_plane",
-    "twin_poses",
+    "other_ambiguous_poses",
+    "refuse_planar_ambiguity",
 ]
 
 SAME_POSE = 5e-3
 """Two poses nearer than this (rad, and share of the baseline) mislead nobody."""
-ONE_PLANE_SIGMAS = 3.0
+ONE_PLANE_MAX_SIGMAS = 3.0
 """Points whose homography transfers them within so many sigmas (rms) may lie on one plane."""
 AT_REST_SIGMAS = 3.3
 """A parallax, or one off a plane's, is noise below: one good point in a thousand has more."""
@@ -78,7 +78,7 @@ def decompose_homography(H21: Mat3) -> tuple[tuple[Rigid3, FloatArray], ...]:
     return tuple(out)
 
 
-def refuse_one_plane(matches: Matches, weights: RowWeights) -> None:
+def refuse_planar_ambiguity(matches: Matches, weights: RowWeights) -> None:
     """Raise DegenerateError if one plane explains what `weights` let count, points and affinities, to within the noise.
 
     Affinities of other planes through the same points determine what the points leave open; where they count without a
@@ -118,7 +118,7 @@ def _affinities_of(matches: Matches, H21: Mat3) -> FloatArray:
     return np.asarray(np.linalg.solve(B @ matches.jacobians2, B @ across))
 
 
-def one_plane_poses(matches: Matches) -> tuple[Rigid3, ...]:
+def ambiguous_poses(matches: Matches) -> tuple[Rigid3, ...]:
     """Return the poses (unit baseline) of the plane that all points may lie on; nothing if they do not lie on one.
 
     Only poses with all points on the visible side of the plane's half-space, d > 0, are returned: at most two. Raises
@@ -128,13 +128,13 @@ def one_plane_poses(matches: Matches) -> tuple[Rigid3, ...]:
         return ()
     H21 = homography_of_rays(matches)
     square = np.sum(transfer_error(matches, H21) ** 2, axis=1) / (matches.sigma1_px**2 + matches.sigma2_px**2)
-    if np.mean(square) > 2.0 * ONE_PLANE_SIGMAS**2:
+    if np.mean(square) > 2.0 * ONE_PLANE_MAX_SIGMAS**2:
         return ()
     check_baseline(matches)
     return _visible(matches.rays1, H21)
 
 
-def twin_poses(matches: Matches, among: BoolArray, noise: float, pose: Rigid3) -> tuple[Rigid3, ...]:
+def other_ambiguous_poses(matches: Matches, among: BoolArray, noise: float, pose: Rigid3) -> tuple[Rigid3, ...]:
     """Return the other poses (unit baseline) of the plane on which most points lie under `pose`; nothing without one.
 
     Parameters
@@ -168,8 +168,8 @@ def twin_poses(matches: Matches, among: BoolArray, noise: float, pose: Rigid3) -
             return ()
         weights, before = 1.0 / (1.0 + (off / max(1.0, middle)) ** 2), middle
     H21 = pose.rotation + np.outer(t, normal)
-    twins = _visible(rays1[off < AT_REST_SIGMAS], H21 / np.linalg.svd(H21, compute_uv=False)[1])
-    return tuple(twin for twin in twins if not compare_poses(pose, twin)[1])
+    others = _visible(rays1[off < AT_REST_SIGMAS], H21 / np.linalg.svd(H21, compute_uv=False)[1])
+    return tuple(other for other in others if not compare_poses(pose, other)[1])
 
 
 def compare_poses(first: Rigid3, second: Rigid3) -> tuple[float, bool]:

@@ -14,7 +14,7 @@ from rigkit.geometry.triangulation import ray_ranges
 from rigkit.relative_pose.solvers.eight_point import essential_nearest
 
 __all__ = [
-    "behind_sigmas",
+    "cheirality_margin",
     "choose_pose",
     "decompose_essential",
     "essential_from_pose",
@@ -96,7 +96,7 @@ def choose_pose(E21: Mat3, rays1: Rays, rays2: Rays, pose_type: PoseType | str =
     return poses[order[0]]
 
 
-def behind_sigmas(matches: Matches, cam2_from_cam1: Rigid3) -> FloatArray:
+def cheirality_margin(matches: Matches, cam2_from_cam1: Rigid3) -> FloatArray:
     """Return by how many sigmas of parallax each match (N,) is behind a camera; 0 in front of both.
 
     The nearest point that both cameras can see is then at infinity: that far the pixels would have to move.

@@ -21,7 +21,7 @@ from rigkit.geometry.sampson import epipolar_normals
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 
 __all__ = [
-    "LEAST_SIGMA_A",
+    "MIN_SIGMA_A",
     "RowWeights",
     "WeightRule",
     "affinity_distances",
@@ -39,7 +39,7 @@ data; equal: every row counts the same in normalised coordinates; points: affini
 
 START_SIGMA_A = 0.05
 """Where nothing is known of the affinities, the estimate starts from here; it is replaced by what the data say."""
-LEAST_SIGMA_A = 1e-6
+MIN_SIGMA_A = 1e-6
 """Exact affinities show none at all, and weights are one over it."""
 
 
