@@ -21,6 +21,7 @@ from rigkit.cli.workflow import (
     shifts_of,
     write_results,
 )
+from rigkit.core.errors import ExitCode
 
 if TYPE_CHECKING:
     from rigkit.cli.workflow import LoadedCamera
@@ -28,8 +29,6 @@ if TYPE_CHECKING:
     from rigkit.validation.crosscheck import CrossCheckReport
 
 HELP = "the same pairs through pycolmap, planar PnP and the other chain; exit 1 if they disagree"
-
-EXIT_CHECK_FAILED = 1
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -85,4 +84,4 @@ def run(args: argparse.Namespace) -> int:
     for report in reports:
         for words in report.skipped:
             note(f"{report.pair_id}: {words}")
-    return exit_code_of(failures, 0 if passed else EXIT_CHECK_FAILED)
+    return exit_code_of(failures, 0 if passed else ExitCode.CHECK_FAILED)

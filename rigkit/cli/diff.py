@@ -8,8 +8,6 @@ from typing import Any
 
 HELP = "difference of two calibrations over the image: px map and numbers; same camera or not; or of two rigs"
 
-EXIT_DIFFERENT = 1
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("a", type=Path, metavar="A.json", help="calibration, or a rig")
@@ -21,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import print_json
-    from rigkit.core.errors import InputError
+    from rigkit.core.errors import ExitCode, InputError
     from rigkit.io.files import ensure_writable
     from rigkit.io.rig_file import is_rig_file
 
@@ -31,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
             raise InputError("diff: a map is of two cameras; give the calibrations beside the rigs, rig-CAMERA.json")
         figures = _rigs(args.a, args.b)
         print_json(figures) if args.json else print(_rigs_in_words(figures))
-        return EXIT_DIFFERENT if figures["same"] is False else 0
+        return ExitCode.CHECK_FAILED if figures["same"] is False else 0
     if any(rigs):
         other = args.b if rigs[0] else args.a
         raise InputError(f"diff: a rig and a camera; compare '{other}' with the calibration beside the rig")
@@ -39,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
         ensure_writable(args.output, force=args.force, inputs=(args.a, args.b))
     figures = _cameras(args.a, args.b, args.output, force=args.force)
     print_json(figures) if args.json else print(_camera_in_words(figures))
-    return EXIT_DIFFERENT if figures["same"] is False else 0
+    return ExitCode.CHECK_FAILED if figures["same"] is False else 0
 
 
 def _cameras(a: Path, b: Path, output: Path | None = None, *, force: bool = False) -> dict[str, Any]:

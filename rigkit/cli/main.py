@@ -18,7 +18,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 
-from rigkit.core.errors import RigkitError
+from rigkit.core.errors import ExitCode, RigkitError
 
 __all__ = ["VERBS", "main"]
 
@@ -37,11 +37,6 @@ VERBS: dict[str, tuple[str, str]] = {
     "board": ("rigkit.cli.board", "a board to print, true to scale"),
 }
 """Verb -> (module, one-line help)."""
-
-EXIT_BAD_INPUT = 2
-EXIT_BUG = 70
-SIGNAL_EXIT = 128
-"""A program that a signal ends exits with this plus the signal's number."""
 
 SURROUNDINGS = {
     getattr(errno, name) for name in ("ENOSPC", "EDQUOT", "EROFS", "EACCES", "EPERM", "EIO", "EMFILE", "ENFILE")
@@ -96,15 +91,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as stop:
         number = stop.number if isinstance(stop, _Terminated) else signal.SIGINT
         print("rigkit: interrupted", file=sys.stderr)
-        return SIGNAL_EXIT + number
+        return ExitCode.BY_SIGNAL + number
     except Exception as error:
         if isinstance(error, OSError) and error.errno in SURROUNDINGS:
             where = f"'{error.filename}': " if error.filename else ""
             print(f"rigkit: {where}{error.strerror}; make room or choose another folder", file=sys.stderr)
-            return EXIT_BAD_INPUT
+            return ExitCode.BAD_INPUT
         traceback.print_exc()
         print("rigkit: this is a bug in rigkit; please report the lines above", file=sys.stderr)
-        return EXIT_BUG
+        return ExitCode.BUG
 
 
 @contextmanager

@@ -25,7 +25,7 @@ from rigkit.cli.workflow import (
     shifts_of,
     write_results,
 )
-from rigkit.core.errors import InputError
+from rigkit.core.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
     from rigkit.cli.workflow import LoadedCamera, PairFailure
@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from rigkit.validation.tables import PaperTables, Table
 
 HELP = "the tables against measured truth, report and PLY; exit code 1 if a check fails"
-
-EXIT_CHECK_FAILED = 1
 
 PAPER = "hajder2021"
 """Folder with the paper's tables, beside the data set."""
@@ -272,7 +270,7 @@ def finish(
         words = "all checks passed" if passed else "NOT every pair was validated" if failures else "a check FAILED"
         where = out / ("report.html" if sections else "tables.md")
         print(f"{words}; {where}, {seconds:.1f} s")
-    return exit_code_of(failures, 0 if passed else EXIT_CHECK_FAILED)
+    return exit_code_of(failures, 0 if passed else ExitCode.CHECK_FAILED)
 
 
 def _say_failures(reports: list[ValidationReport], compared: list[CrossCheckReport]) -> None:

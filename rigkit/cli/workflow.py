@@ -138,8 +138,8 @@ def load_cameras(dataset: Dataset, *, recalibrate: bool, progress: Progress) -> 
     A new calibration is kept beside its session where files can be written there. Cameras that no pair uses come along
     where they are calibrated: an image may fit one of them better than the camera that it is said to be from.
     """
-    from rigkit.cli.calibrate_rig import calibrate_camera
     from rigkit.io.calibration_file import save_calibration
+    from rigkit.workflows.calibrate_rig import calibrate_camera
 
     cameras: dict[str, LoadedCamera] = {}
     used = {name for pair in dataset.pairs for name in (pair.camera1.camera_id, pair.camera2.camera_id)}
@@ -157,7 +157,7 @@ def load_cameras(dataset: Dataset, *, recalibrate: bool, progress: Progress) -> 
             )
         if entry.calibration.is_dir():
             raise InputError(f"camera '{entry.camera_id}': '{entry.calibration}' is a folder; correct the manifest")
-        calibration = calibrate_camera(entry.session, progress)
+        calibration = calibrate_camera(entry.session, progress=progress)
         try:
             save_calibration(entry.calibration, calibration, force=True)
         except InputError as error:

@@ -2,34 +2,48 @@
 
 from __future__ import annotations
 
-__all__ = ["CheckFailed", "DegenerateError", "InputError", "InstallationError", "RigkitError"]
+from enum import IntEnum
+
+__all__ = ["CheckFailed", "DegenerateError", "ExitCode", "InputError", "InstallationError", "RigkitError"]
+
+
+class ExitCode(IntEnum):
+    """What the command line returns."""
+
+    WELL = 0
+    CHECK_FAILED = 1
+    BAD_INPUT = 2
+    DEGENERATE = 3
+    BUG = 70
+    BY_SIGNAL = 128
+    """Plus the number of the signal that ended the program."""
 
 
 class RigkitError(Exception):
     """Base of every error that rigkit raises on purpose; `exit_code` is what the command line returns for it."""
 
-    exit_code: int = 2
+    exit_code: ExitCode = ExitCode.BAD_INPUT
 
 
 class CheckFailed(RigkitError):
     """A measured check did not hold."""
 
-    exit_code = 1
+    exit_code = ExitCode.CHECK_FAILED
 
 
 class InputError(RigkitError):
     """What was handed in cannot be used: a file, an option, an array."""
 
-    exit_code = 2
+    exit_code = ExitCode.BAD_INPUT
 
 
 class InstallationError(RigkitError):
     """A part of rigkit itself is missing or does not fit: the message says what to type."""
 
-    exit_code = 2
+    exit_code = ExitCode.BAD_INPUT
 
 
 class DegenerateError(RigkitError):
     """The geometry does not determine what was asked for (no baseline, one flat board only, parallel directions)."""
 
-    exit_code = 3
+    exit_code = ExitCode.DEGENERATE

@@ -15,7 +15,6 @@ from helpers.data import REPOSITORY
 
 from rigkit.cameras.brown import Brown
 from rigkit.cameras.kannala_brandt import KannalaBrandt
-from rigkit.cli.calibrate import first_camera
 from rigkit.cli.main import main
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
@@ -28,6 +27,7 @@ from rigkit.io.session import load_session
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.placing import place_board, sees_paper
 from rigkit.synthetic.render import Optics, render
+from rigkit.workflows.corners import first_camera
 
 IMAGES = REPOSITORY / "datasets" / "lab-a" / "calibration" / "fisheye"
 SESSION = 'schema = "rigkit.session/1"\nimages = "*.jpg"\nboard = "board.toml"\nmodel = "kannala_brandt"\n'

@@ -11,7 +11,6 @@ from calibration.test_rig import Views, mounts, rig_views
 from helpers.board_rig_scenes import ALIKE, corner_of_a_room, target_views
 from helpers.calibration_scenes import lens
 
-from rigkit.cli.calibrate_rig import calibrate_camera
 from rigkit.cli.main import main
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
@@ -20,6 +19,7 @@ from rigkit.io.calibration_file import load_calibration
 from rigkit.io.corner_cache import CornerCache, FoundCorners
 from rigkit.io.rig_file import load_board_rigs, load_rig
 from rigkit.io.rig_session import load_rig_session
+from rigkit.workflows.calibrate_rig import calibrate_camera
 
 NAMES = ("reg", "wide")
 SIGMAS = 4.0

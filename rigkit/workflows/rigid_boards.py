@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from dataclasses import replace
 
-if TYPE_CHECKING:
-    from rigkit.calibration.rig.result import RigCalibration
-    from rigkit.core.boards import Board
-    from rigkit.core.detections import BoardDetection
-    from rigkit.io.corner_cache import FoundCorners
-    from rigkit.io.rig_session import RigSession
+from rigkit.calibration.rig.board_names import renamed
+from rigkit.calibration.rig.result import RigCalibration
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
+from rigkit.core.errors import InputError
+from rigkit.identification.board_ids import LocatedBoard, assign_board_ids
+from rigkit.identification.placements import board_kinds
+from rigkit.io.corner_cache import FoundCorners
+from rigkit.io.rig_session import RigSession
 
 __all__ = ["named_as_listed", "named_by_rule", "require_distinct"]
 
 
 def require_distinct(session: RigSession) -> None:
     """Raise InputError where a rig of cameras has boards that nothing tells apart: alike, and not on one mount."""
-    from rigkit.core.errors import InputError
-    from rigkit.identification.placements import board_kinds
 
     if len(session.cameras) < 2:
         return
@@ -33,8 +34,6 @@ def require_distinct(session: RigSession) -> None:
 def named_as_listed(session: RigSession, found: Mapping[str, FoundCorners]) -> dict[str, FoundCorners]:
     """Return the corners with a name for every whole board of a group that has none: which of those that look alike is
     which, the solution finds out from how they stand to each other."""
-    from dataclasses import replace
-
     boards = {b.board_id: b for own in session.cameras.values() for b in own.boards}
     groups = [[boards[name] for name in group.boards] for group in session.rigid_boards]
     if not groups:
@@ -71,10 +70,6 @@ def named_by_rule(session: RigSession, rig: RigCalibration) -> RigCalibration:
 
     It looks at the first image that shows the most of them, and follows the session's layout or the order listed.
     """
-    from rigkit.calibration.rig.board_names import renamed
-    from rigkit.identification.board_ids import LocatedBoard, assign_board_ids
-    from rigkit.identification.placements import board_kinds
-
     boards = {b.board_id: b for own in session.cameras.values() for b in own.boards}
     names: dict[str, str] = {}
     for group in session.rigid_boards:

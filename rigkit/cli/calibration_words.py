@@ -1,0 +1,53 @@
+"""What `rigkit calibrate` says of one camera: for programs and for a person."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rigkit.calibration.result import Calibration
+
+__all__ = ["describe", "summary"]
+
+
+def summary(calibration: Calibration) -> dict[str, Any]:
+    """Return the figures for programs."""
+    camera = calibration.camera
+    return {
+        "model": camera.model,
+        "size_px": list(camera.size_px),
+        "parameters": dict(zip(camera.parameter_names(), camera.parameters.tolist(), strict=True)),
+        "heldout_rms_px": calibration.heldout_rms_px,
+        "rms_px": calibration.rms_px,
+        "sigma_px": calibration.sigma_px,
+        "views": [{"image": v.image, "board": v.board_id, "rms_px": v.rms_px} for v in calibration.views],
+        "dropped": [{"image": image, "reason": reason} for image, reason in calibration.dropped],
+        "outliers": len(calibration.outliers),
+        "verdicts": [str(finding) for finding in calibration.verdicts],
+    }
+
+
+def describe(calibration: Calibration) -> str:
+    """Return the result for a person: the headline first."""
+    camera = calibration.camera
+    held = calibration.heldout_rms_px
+    headline = "held-out RMS not available (too few images)" if held is None else f"held-out RMS {held:.4f} px"
+    lines = [
+        f"{camera.model}, {camera.size_px[0]}x{camera.size_px[1]} px: {headline}",
+        f"training RMS {calibration.rms_px:.4f} px (2-D per corner, {calibration.corner_count} corners in "
+        f"{len(calibration.views)} views), {len(calibration.outliers)} outliers, {len(calibration.dropped)} images "
+        "dropped",
+    ]
+    sigmas = calibration.parameter_sigmas
+    for name, value, sigma in zip(camera.parameter_names(), camera.parameters, sigmas, strict=True):
+        lines.append(f"  {name:>4} = {value:.9g} +- {sigma:.2g}")
+    lines += [f"dropped {image}: {reason}" for image, reason in calibration.dropped]
+    lines += [
+        f"tried {c.name}: held-out {'-' if c.heldout_rms_px is None else format(c.heldout_rms_px, '.4f')} px, "
+        f"training {c.rms_px:.4f} px{f' (chosen: {c.reason})' if c.chosen else ''}"
+        for c in calibration.candidates
+        if math.isfinite(c.rms_px)
+    ]
+    lines += [f"{c.name}: {c.reason}" for c in calibration.candidates if not math.isfinite(c.rms_px)]
+    return "\n".join([*lines, *map(str, calibration.verdicts)])

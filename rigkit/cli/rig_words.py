@@ -1,0 +1,109 @@
+"""What `rigkit calibrate` says of a rig: for programs and for a person."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+from typing import TYPE_CHECKING, Any
+
+from rigkit.cli import calibration_words
+
+if TYPE_CHECKING:
+    from rigkit.calibration.rig.result import RigCalibration
+    from rigkit.validation.checks import Check
+
+__all__ = ["describe", "summary"]
+
+
+def summary(rig: RigCalibration, checks: Sequence[Check]) -> dict[str, Any]:
+    """Return the figures for programs."""
+    from dataclasses import asdict
+
+    return {
+        "heldout_rms_px": rig.heldout_rms_px,
+        "rms_px": rig.rms_px,
+        "sigma_px": rig.sigma_px,
+        "overdispersion": rig.overdispersion,
+        "verdicts": [str(finding) for finding in rig.verdicts],
+        "cameras": [
+            {
+                "name": camera.name,
+                "heldout_rms_px": camera.calibration.heldout_rms_px,
+                "rms_px": camera.rms_px,
+                "cam_from_rig": camera.cam_from_rig.matrix()[:3].tolist(),
+                "parameters": dict(
+                    zip(camera.camera.parameter_names(), camera.camera.parameters.tolist(), strict=True)
+                ),
+                "sigmas": dict(
+                    zip(camera.camera.parameter_names(), camera.calibration.parameter_sigmas.tolist(), strict=True)
+                ),
+                "alone": calibration_words.summary(alone),
+            }
+            for camera, alone in zip(rig.cameras, rig.single, strict=True)
+        ],
+        "baselines": [
+            {"from": a, "to": b, "value_mm": value, "sigma_mm": sigma} for a, b, value, sigma in baselines(rig)
+        ],
+        "transfers": [{"from": a, "to": b, "median_px": m, "worst_px": w} for a, b, m, w in transfers(rig)],
+        "angles": [{"a": a, "b": b, "value_deg": value, "sigma_deg": sigma} for a, b, value, sigma in angles(rig)],
+        "left_out": [{"frame": frame, "board": board, "reason": reason} for frame, board, reason in rig.left_out],
+        "checks": [asdict(c) for c in checks],
+    }
+
+
+def baselines(rig: RigCalibration) -> list[tuple[str, str, float, float]]:
+    """Return (from, to, mm, sigma mm) of every two cameras."""
+    names = [c.name for c in rig.cameras]
+    return [(a, b, *rig.baseline_mm(a, b)) for a, b in combinations(names, 2)]
+
+
+def angles(rig: RigCalibration) -> list[tuple[str, str, float, float]]:
+    """Return (board, board, deg, sigma deg) of every two boards on one mount."""
+    return [(a, b, *t.angle_deg(a, b)) for t in rig.board_rigs for a, b in combinations(t.names, 2)]
+
+
+def transfers(rig: RigCalibration) -> list[tuple[str, str, float, float]]:
+    """Return (from, to, px at the middle corner, px at the worst) of every two cameras that see the same places."""
+    from rigkit.calibration.rig.uncertainty import transfer_uncertainty
+
+    found = [transfer_uncertainty(rig, a, b) for a, b in combinations([c.name for c in rig.cameras], 2)]
+    return [(t.a, t.b, t.median_px, t.worst_px) for t in found if t is not None]
+
+
+def describe(rig: RigCalibration, checks: Sequence[Check]) -> str:
+    """Return the result for a person: the headline first."""
+    import numpy as np
+
+    from rigkit.geometry.rotation import log_so3
+
+    held = "held-out RMS not available" if rig.heldout_rms_px is None else f"held-out RMS {rig.heldout_rms_px:.4f} px"
+    count = len(rig.cameras)
+    lines = [
+        f"{count} camera{'s' if count > 1 else ''}, {rig.shared_count} poses shared by several views: {held}, training "
+        f"RMS {rig.rms_px:.4f} px; frames scatter {rig.overdispersion:.2f} times as independent corners would"
+    ]
+    for camera, alone in zip(rig.cameras, rig.single, strict=True):
+        held = "not available" if alone.heldout_rms_px is None else f"{alone.heldout_rms_px:.4f} px"
+        x, y, z = camera.cam_from_rig.inverse().translation_mm
+        turned = np.degrees(np.linalg.norm(log_so3(camera.cam_from_rig.rotation)))
+        lines.append(
+            f"{camera.name}: {camera.camera.model}, alone held-out RMS {held}, training RMS {alone.rms_px:.4f}; in the "
+            f"rig {camera.rms_px:.4f} px; at ({x:.2f}, {y:.2f}, {z:.2f}) mm, turned by {turned:.3f} deg"
+        )
+    lines += [f"baseline {a} to {b}: {value:.3f} +- {sigma:.3f} mm" for a, b, value, sigma in baselines(rig)]
+    lines += [
+        f"a point seen by {a} appears in {b} within {middle:.3f} px (one standard deviation; {worst:.3f} at worst)"
+        for a, b, middle, worst in transfers(rig)
+    ]
+    lines += [f"angle {a} to {b}: {value:.3f} +- {sigma:.3f} deg" for a, b, value, sigma in angles(rig)]
+    for c in checks:
+        verdict = "as measured" if c.passed else "NOT as measured"
+        lines.append(
+            f"{c.name} {verdict}: {c.ours:.3f} {c.unit}, measured {c.measured:g} +- {c.measured_sigma:g} {c.unit} "
+            f"({c.how}), off by {c.k:.1f} combined sigmas"
+        )
+    lines += [f"frame {frame}, board '{board}' left out: {reason}" for frame, board, reason in rig.left_out]
+    for camera, alone in zip(rig.cameras, rig.single, strict=True):
+        lines += [f"{camera.name}: dropped {image}: {reason}" for image, reason in alone.dropped]
+        lines += [f"{camera.name} alone: {verdict}" for verdict in alone.verdicts]
+    return "\n".join([*lines, *map(str, rig.verdicts)])

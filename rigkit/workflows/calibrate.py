@@ -1,0 +1,95 @@
+"""From a session of one camera to its calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.rig.board_ties import suggest_ties
+from rigkit.calibration.verdicts import judge_session
+from rigkit.core.progress import Progress, silent
+from rigkit.io.calibration_file import calibration_text
+from rigkit.io.files import ensure_writable, write_together
+from rigkit.io.session import Session, load_session
+from rigkit.workflows.corners import session_corners, session_views
+from rigkit.workflows.session_page import session_page
+
+__all__ = ["CalibrateOptions", "SessionCalibration", "calibrate_session", "calibration_of"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrateOptions:
+    """Where the results of a calibration go."""
+
+    output: Path | None = None
+    """File for the calibration (of a rig: for the mount, with the cameras' files beside it); None: nothing is
+    written."""
+    report: Path | None = None
+    """File for a page to look at; None: no page."""
+    force: bool = False
+    """Replace files that exist; what the calibration reads is never replaced."""
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class SessionCalibration:
+    """What a session came to.
+
+    Attributes
+    ----------
+    session : what was calibrated.
+    calibration : the camera, how sure it is, and what to think of it.
+    written : the files that were written: the calibration, then the page.
+    """
+
+    session: Session
+    calibration: Calibration
+    written: tuple[Path, ...]
+
+
+def calibrate_session(
+    session: Session | str | Path, options: CalibrateOptions | None = None, *, progress: Progress = silent
+) -> SessionCalibration:
+    """Calibrate the camera of a session, given its file or the session as loaded, and write what `options` ask for.
+
+    Raises
+    ------
+    InputError
+        No image shows a board of the session, or a file cannot be written (said before the work).
+    DegenerateError
+        The views do not determine the camera.
+    """
+    options = options or CalibrateOptions()
+    if not isinstance(session, Session):
+        session = load_session(session)
+    targets = [path for path in (options.output, options.report) if path is not None]
+    ensure_writable(targets, force=options.force, inputs=[session.path, *session.images])
+    calibration = calibration_of(session, progress=progress)
+    files: dict[Path, str] = {}
+    if options.output is not None:
+        files[options.output] = calibration_text(calibration)
+    if options.report is not None:
+        files[options.report] = session_page(session, calibration, files)
+    if files:
+        write_together(files, force=options.force)
+    return SessionCalibration(session=session, calibration=calibration, written=tuple(files))
+
+
+def calibration_of(session: Session, *, progress: Progress = silent) -> Calibration:
+    """Return the calibration of a session: images -> corners (kept beside the session) -> calibration.
+
+    Raises InputError where no image shows a board of the session, DegenerateError where the views do not determine the
+    camera.
+    """
+    views, size_px, dropped = session_views(session, session_corners(session, progress=progress))
+    result = calibrate(
+        views,
+        size_px,
+        model=session.model,
+        degree=session.degree,
+        board=session.board_shape,
+        progress=progress,
+    )
+    verdicts = judge_session(result, dropped, suggest_ties(views, result))
+    return replace(result, dropped=(*dropped, *result.dropped), verdicts=verdicts)

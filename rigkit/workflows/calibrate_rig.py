@@ -1,0 +1,188 @@
+"""From a session of several cameras, or of boards on one mount, to the rig and what was measured of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.rig.board_ties import suggest_ties
+from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.result import RigCalibration
+from rigkit.calibration.verdicts import judge
+from rigkit.core.progress import Progress, silent
+from rigkit.io.calibration_file import calibration_text
+from rigkit.io.files import ensure_writable, write_together
+from rigkit.io.rig_file import board_rigs_text, rig_text
+from rigkit.io.rig_session import RigSession, frames_of_images, is_rig_session, load_rig_session
+from rigkit.io.session import load_session
+from rigkit.validation.checks import COVERAGE, Check
+from rigkit.validation.checks import judge as judge_measured
+from rigkit.workflows.calibrate import CalibrateOptions, calibration_of
+from rigkit.workflows.corners import session_corners, session_views
+from rigkit.workflows.rigid_boards import named_as_listed, named_by_rule, require_distinct
+from rigkit.workflows.session_page import rig_page
+
+__all__ = ["RigSessionCalibration", "calibrate_camera", "calibrate_rig_session", "measured_checks", "rig_of"]
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class RigSessionCalibration:
+    """What a rig's session came to.
+
+    Attributes
+    ----------
+    session : what was calibrated.
+    rig : the cameras, how they stand, and what to think of it.
+    checks : what a person measured beside what came out.
+    written : the files that were written.
+    """
+
+    session: RigSession
+    rig: RigCalibration
+    checks: tuple[Check, ...]
+    written: tuple[Path, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether everything that was measured agrees."""
+        return all(check.passed for check in self.checks)
+
+
+def calibrate_rig_session(
+    session: RigSession | str | Path, options: CalibrateOptions | None = None, *, progress: Progress = silent
+) -> RigSessionCalibration:
+    """Calibrate the rig of a session, given its file or the session as loaded, and write what `options` ask for.
+
+    Raises
+    ------
+    InputError
+        A camera's images show no board, nothing says which were taken together, boards cannot be told apart, or a file
+        cannot be written (said before the work).
+    DegenerateError
+        The views do not determine a camera.
+    """
+    options = options or CalibrateOptions()
+    if not isinstance(session, RigSession):
+        session = load_rig_session(session)
+    targets = _targets(session, options)
+    inputs = [session.path, *(image for own in session.cameras.values() for image in own.images)]
+    ensure_writable(targets, force=options.force, inputs=inputs)
+    rig = rig_of(session, progress=progress)
+    checks = measured_checks(session, rig)
+    files: dict[Path, str] = {}
+    if options.output is not None:
+        if len(session.cameras) > 1:
+            files[options.output] = rig_text(rig)
+        for camera in rig.cameras:
+            files[_beside(session, options.output, camera.name)] = calibration_text(judged(camera.calibration))
+        if session.rigid_boards:
+            files[_boards_file(options.output)] = board_rigs_text(rig.board_rigs)
+    if options.report is not None:
+        # One camera is shown as its boards on one mount have it: that is what its file says.
+        alone = dict(zip(session.cameras, rig.single, strict=True))
+        if len(rig.cameras) == 1:
+            alone = dict.fromkeys(session.cameras, judged(rig.cameras[0].calibration))
+        files[options.report] = rig_page(session, rig, alone, checks, files)
+    if files:
+        write_together(files, force=options.force)
+    return RigSessionCalibration(session=session, rig=rig, checks=tuple(checks), written=tuple(files))
+
+
+def _targets(session: RigSession, options: CalibrateOptions) -> list[Path]:
+    """Return the files that will be written."""
+    out = []
+    if options.output is not None:
+        out += [options.output] if len(session.cameras) > 1 else []
+        out += [_beside(session, options.output, name) for name in session.cameras]
+        out += [_boards_file(options.output)] if session.rigid_boards else []
+    return out if options.report is None else [*out, options.report]
+
+
+def _beside(session: RigSession, target: Path, name: str) -> Path:
+    """Return where the calibration of one camera goes."""
+    return target.with_name(f"{target.stem}-{name}.json") if len(session.cameras) > 1 else target
+
+
+def _boards_file(target: Path) -> Path:
+    return target.with_name(f"{target.stem}-boards.json")
+
+
+def calibrate_camera(path: Path, *, progress: Progress = silent) -> Calibration:
+    """Return the calibration of one camera from its session, with boards on one mount or without.
+
+    Raises InputError for a session of several cameras, and as `calibrate_rig_session`.
+    """
+    session = load_rig_session(path) if is_rig_session(path) else None
+    if session is None or len(session.cameras) > 1:
+        return calibration_of(load_session(path), progress=progress)
+    return judged(rig_of(session, progress=progress).cameras[0].calibration)
+
+
+def judged(calibration: Calibration) -> Calibration:
+    """Return a camera's calibration with the verdicts on it as it is in the rig: there it has another held-out error
+    than alone, and is surer."""
+    return replace(calibration, verdicts=judge(calibration))
+
+
+def rig_of(session: RigSession, *, progress: Progress = silent) -> RigCalibration:
+    """Return the calibration of a rig's session: images -> corners (kept beside the session) -> rig.
+
+    Raises InputError where a camera's images show no board, nothing says which were taken together, or boards cannot be
+    told apart; DegenerateError where the views do not determine a camera.
+    """
+    require_distinct(session)
+    found = {
+        name: named_as_listed(session, session_corners(own, progress=progress)) for name, own in session.cameras.items()
+    }
+    frames = {name: {image: image for image in own} for name, own in found.items()}
+    if len(found) > 1:
+        frames = frames_of_images({name: list(own) for name, own in found.items()}, session.frames)
+    views, sizes, dropped = {}, {}, {}
+    for name, own in session.cameras.items():
+        seen, sizes[name], dropped[name] = session_views(own, found[name])
+        views[name] = [(frames[name][view.image], view) for view in seen]
+    rig = calibrate_rig(
+        views,
+        sizes,
+        model={name: own.model for name, own in session.cameras.items()},
+        degree={name: own.degree for name, own in session.cameras.items()},
+        board=next(iter(session.cameras.values())).board_shape,
+        rigid_boards=[group.boards for group in session.rigid_boards],
+        progress=progress,
+    )
+    rig = named_by_rule(session, rig)
+    if not session.rigid_boards:
+        said = [
+            s
+            for (_, own), c in zip(views.items(), rig.single, strict=True)
+            for s in suggest_ties([v for _, v in own], c)
+        ]
+        rig = replace(rig, verdicts=(*rig.verdicts, *dict.fromkeys(said)))
+    single = [replace(c, dropped=(*dropped[n], *c.dropped)) for n, c in zip(session.cameras, rig.single, strict=True)]
+    cameras = [
+        replace(c, calibration=replace(c.calibration, dropped=alone.dropped))
+        for c, alone in zip(rig.cameras, single, strict=True)
+    ]
+    return replace(rig, single=tuple(single), cameras=tuple(cameras))
+
+
+def measured_checks(session: RigSession, rig: RigCalibration) -> list[Check]:
+    """Return what a person measured beside what came out: baselines, angles and distances of boards on one mount."""
+    out = []
+    for b in session.baselines:
+        known = (b.length.value_mm, b.length.sigma_mm, b.length.how)
+        ours = rig.baseline_mm(b.a, b.b)
+        out.append(judge_measured(f"baseline {b.a}-{b.b}", "baseline", "mm", known, ours, COVERAGE, rig.corner_count))
+    for group, solved in zip(session.rigid_boards, rig.board_rigs, strict=True):
+        count = sum(b.board.corner_count for b in solved.boards)
+        for angle in group.truth.angles:
+            known = (angle.value_deg, angle.sigma_deg, angle.how)
+            ours = solved.angle_deg(angle.a, angle.b)
+            out.append(judge_measured(f"angle {angle.a}-{angle.b}", "angle", "deg", known, ours, COVERAGE, count))
+        for distance in group.truth.distances:
+            known = (distance.value_mm, distance.sigma_mm, distance.how)
+            ours = solved.distance_mm(distance.a, distance.b)
+            name = f"distance {distance.a} to {distance.b}"
+            out.append(judge_measured(name, "distance", "mm", known, ours, COVERAGE, count))
+    return out

@@ -1,0 +1,37 @@
+"""What somebody needs to know to get the same page again: versions, the time, hashes of the files."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+
+__all__ = ["digest_line", "digest_of_many", "software_facts"]
+
+PACKAGES = ("numpy", "opencv-contrib-python-headless")
+"""Whose versions every result depends on."""
+
+
+def software_facts(*packages: str) -> dict[str, str]:
+    """Return the time, and the versions of rigkit, Python, and the packages in use (`packages` beside the usual)."""
+    facts = {"rigkit": version("rigkit"), "Python": platform.python_version()}
+    facts |= {name: version(name) for name in (*PACKAGES, *packages)}
+    return facts | {"written": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")}
+
+
+def digest_line(source: Path | str | bytes) -> str:
+    """Return the SHA-256 of a file, of a text as UTF-8, or of bytes, in words."""
+    if isinstance(source, Path):
+        source = source.read_bytes()
+    data = source.encode() if isinstance(source, str) else source
+    return f"SHA-256 {hashlib.sha256(data).hexdigest()}"
+
+
+def digest_of_many(hashes: Mapping[str, str] | Sequence[tuple[str, str]]) -> str:
+    """Return one SHA-256 of several files, given (name, SHA-256) of each, in words that say how to compute it."""
+    pairs = list(hashes.items()) if isinstance(hashes, Mapping) else list(hashes)
+    digest = hashlib.sha256("".join(f"{own}  {name}\n" for name, own in pairs).encode()).hexdigest()
+    return f"{len(pairs)} files; SHA-256 of what `sha256sum` prints of them: {digest}"

@@ -1,0 +1,83 @@
+"""The page of a session's calibration: what it needs from the disk is thumbnails of the images, and hashes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from rigkit.calibration.result import Calibration, ViewResult
+from rigkit.calibration.rig.result import RigCalibration
+from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
+from rigkit.io.corner_cache import image_hash
+from rigkit.io.images import read_image
+from rigkit.io.rig_session import RigSession
+from rigkit.io.session import Session
+from rigkit.report.calibration_page import CalibrationSection, build_calibration_page, thumbnail_jpeg
+from rigkit.report.rig_tables import rig_tables
+from rigkit.validation.checks import Check
+from rigkit.workflows.corners import image_names
+from rigkit.workflows.provenance import digest_line, digest_of_many, software_facts
+
+__all__ = ["rig_page", "session_page"]
+
+
+def session_page(session: Session, calibration: Calibration, files: Mapping[Path, str]) -> str:
+    """Return the page of a session's calibration, which is written to `files` (path -> content) beside it."""
+    name = session.path.resolve().parent.name
+    section = CalibrationSection(name, calibration, _thumbnails(session, calibration))
+    lead = f"{session.path.name} with {_boards_in_words(session.boards)}"
+    facts = _facts(session.path, files, {"images": session.images})
+    return build_calibration_page(f"rigkit calibration: {name}", lead, [section], facts)
+
+
+def rig_page(
+    session: RigSession,
+    rig: RigCalibration,
+    shown: Mapping[str, Calibration],
+    checks: Sequence[Check],
+    files: Mapping[Path, str],
+) -> str:
+    """Return the page of a rig, which is written to `files` (path -> content) beside it: what the cameras share, then
+    each camera as `shown`."""
+    name = session.path.resolve().parent.name
+    sections = [CalibrationSection(own, c, _thumbnails(session.cameras[own], c)) for own, c in shown.items()]
+    boards = _boards_in_words(next(iter(session.cameras.values())).boards)
+    then = "then every camera as calibrated alone" if len(rig.cameras) > 1 else "then the camera"
+    lead = f"{session.path.name} with {boards}: the rig first, {then}"
+    facts = _facts(session.path, files, {f"images of {own}": s.images for own, s in session.cameras.items()})
+    return build_calibration_page(f"rigkit rig calibration: {name}", lead, sections, facts, rig_tables(rig, checks))
+
+
+def _boards_in_words(boards: Sequence[Board]) -> str:
+    return ("board " if len(boards) == 1 else "boards ") + ", ".join(
+        f"'{b.board_id}' ({b.columns} x {b.rows} corners, {b.square_x_mm:g} x {b.square_y_mm:g} mm)" for b in boards
+    )
+
+
+def _thumbnails(session: Session, calibration: Calibration) -> dict[str, bytes]:
+    """Return a small picture of every image that is there, used or left out, with the corners found in it."""
+    views: dict[str, list[ViewResult]] = {image: [] for image, _ in calibration.dropped}
+    for view in calibration.views:
+        views.setdefault(view.image, []).append(view)
+    out = {}
+    for path, name in zip(session.images, image_names(session), strict=True):
+        if name in views:
+            try:
+                out[name] = thumbnail_jpeg(read_image(path), views[name])
+            except InputError:
+                # Corners are kept beside the session: the image itself may have gone bad since.
+                continue
+    return out
+
+
+def _facts(session: Path, files: Mapping[Path, str], images: Mapping[str, Sequence[Path]]) -> dict[str, str]:
+    """Return what somebody needs to know to get the same page again."""
+    facts = software_facts() | {session.name: digest_line(session)}
+    facts |= {path.name: digest_line(text) for path, text in files.items()}
+    for name, paths in images.items():
+        if paths:
+            facts[name] = digest_of_many([(p.name, image_hash(p)) for p in paths])
+        else:
+            facts[name] = "gone; the corners kept beside the session were used"
+    return facts
