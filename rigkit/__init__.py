@@ -29,6 +29,7 @@ inside, degrees in files and reports.
 from __future__ import annotations
 
 import importlib
+import logging
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -210,6 +211,8 @@ _NAMES_OF = {
     ),
 }
 """Module -> the public names in it, as imported above for type checkers."""
+
+logging.getLogger(__name__).addHandler(logging.NullHandler())
 
 _HOMES = {name: module for module, names in _NAMES_OF.items() for name in names}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import sys
 import time
 from typing import Any
@@ -41,8 +42,8 @@ def progress_on_stderr() -> Progress:
 
 
 def note(text: str) -> None:
-    """Print a line for the person at the terminal; results go to stdout, this goes to stderr."""
-    print(text, file=sys.stderr)
+    """Tell the person at the terminal: through the log, which goes to stderr; results go to stdout."""
+    logging.getLogger("rigkit.cli").info("%s", text)
 
 
 def print_json(value: Any) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import errno
 import importlib
+import logging
 import os
 import signal
 import sys
@@ -18,6 +19,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 
+from rigkit.cli.log import add_log_arguments, logging_to
 from rigkit.core.errors import ExitCode, RigkitError
 
 __all__ = ["VERBS", "main"]
@@ -68,6 +70,7 @@ def build_parser(verb: str | None) -> argparse.ArgumentParser:
         if name == verb:
             module = importlib.import_module(module_name)
             module.add_arguments(sub)
+            add_log_arguments(sub)
             sub.set_defaults(run=module.run)
     return parser
 
@@ -81,7 +84,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with _signals_interrupt():
             args = build_parser(verb).parse_args(arguments)
-            return int(args.run(args))
+            with logging_to(verbose=args.verbose, log_file=args.log_file):
+                return _logged_run(args)
     except RigkitError as error:
         print(f"rigkit: {error}", file=sys.stderr)
         return error.exit_code
@@ -100,6 +104,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         traceback.print_exc()
         print("rigkit: this is a bug in rigkit; please report the lines above", file=sys.stderr)
         return ExitCode.BUG
+
+
+def _logged_run(args: argparse.Namespace) -> int:
+    log = logging.getLogger(__name__)
+    log.debug("rigkit %s: %s", args.verb, {k: v for k, v in vars(args).items() if k not in ("verb", "run")})
+    try:
+        return int(args.run(args))
+    except BaseException:
+        log.debug("ended by", exc_info=True)
+        raise
 
 
 @contextmanager

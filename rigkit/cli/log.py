@@ -1,0 +1,60 @@
+"""Where the library's log goes: notes to stderr, with -v the details too, with --log-file everything into a file."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rigkit.core.errors import InputError
+
+__all__ = ["add_log_arguments", "logging_to"]
+
+
+def add_log_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what every verb takes."""
+    group = parser.add_argument_group("log")
+    group.add_argument("-v", "--verbose", action="store_true", help="say on stderr what is being done, and with what")
+    group.add_argument("--log-file", type=Path, metavar="FILE", help="append all of that, with times, to a file")
+
+
+class _OnStderr(logging.Handler):
+    """Writes to what `sys.stderr` is at that moment; a stderr that is closed loses notes, not results."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        try:
+            print(self.format(record), file=sys.stderr)
+        except (OSError, ValueError):
+            return
+
+
+@contextmanager
+def logging_to(*, verbose: bool, log_file: Path | None) -> Iterator[None]:
+    """Let the log of the package go to stderr (details if `verbose`) and to `log_file` within the block.
+
+    Raises InputError where the file cannot be written.
+    """
+    root = logging.getLogger("rigkit")
+    terminal = _OnStderr(logging.DEBUG if verbose else logging.INFO)
+    handlers: list[logging.Handler] = [terminal]
+    if log_file is not None:
+        try:
+            kept = logging.FileHandler(log_file, encoding="utf-8", errors="backslashreplace")
+        except OSError as error:
+            raise InputError(f"--log-file '{log_file}': {error.strerror}; choose another file") from error
+        kept.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        handlers.append(kept)
+    before = root.level
+    root.setLevel(logging.DEBUG if verbose or log_file is not None else logging.INFO)
+    for handler in handlers:
+        root.addHandler(handler)
+    try:
+        yield
+    finally:
+        root.setLevel(before)
+        for handler in handlers:
+            root.removeHandler(handler)
+            handler.close()
