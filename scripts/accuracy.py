@@ -19,14 +19,16 @@ import numpy as np
 from rigkit.affine.registry import AFFINE_METHODS
 from rigkit.cameras.base import Camera
 from rigkit.cli.console import progress_on_stderr
-from rigkit.cli.workflow import load_cameras, match_images, over_pairs, reconstruct_with
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, nearest_rotation, rotation_angle
 from rigkit.io.manifest import Pair, load_dataset
 from rigkit.io.paper_tables import load_paper_tables
 from rigkit.reconstruction.pairing import MatchedPair
+from rigkit.reconstruction.reconstruct import reconstruct_from
 from rigkit.validation.planes import fit_plane, normal_errors
 from rigkit.validation.tables import best_of
+from rigkit.workflows.datasets import load_cameras, over_pairs
+from rigkit.workflows.pairs import geometry_of, match_images
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -80,8 +82,9 @@ def measure_pair(job: PairJob) -> dict[str, Any]:
     true_pose = Rigid3.from_matrix(truth["cam2_from_cam1"])
     matched, _, _ = match_images(pair, camera1, camera2, chain)
     out: dict[str, Any] = {"pair": pair.pair_id, **corner_figures(matched, truth), "methods": {}}
+    geometry = geometry_of(matched, pair)
     for method in AFFINE_METHODS:
-        r = reconstruct_with(matched, pair, method)
+        r = reconstruct_from(geometry, affine_method=method)
         planes = [fit_plane(r.cloud.points_mm[r.cloud.on_board(name)]) for name in r.cloud.board_ids]
         angles = [np.rad2deg(angle_between(a.normal, b.normal)) for a, b in combinations(planes, 2)]
         normals = [
@@ -133,12 +136,16 @@ def measure(folder: Path, *, pairs: Sequence[str] = (), chain: str = "raw", jobs
     """Measure all pairs and both calibrations of datasets/lab-a against the truth under `folder`."""
     progress = progress_on_stderr()
     dataset = load_dataset(ROOT / "datasets" / "lab-a").select(pairs)
-    cameras = {k: v.camera for k, v in load_cameras(dataset, recalibrate=False, progress=progress).items()}
-    work = [
-        PairJob(p, cameras[p.camera1.camera_id], cameras[p.camera2.camera_id], folder / "captures" / p.pair_id, chain)
-        for p in dataset.pairs
-    ]
-    results, failures = over_pairs(measure_pair, work, jobs, "pairs against truth", progress)
+    loaded = load_cameras(dataset, progress=progress)
+    cameras = {name: camera.camera for name, camera in loaded.known.items()}
+
+    def job_of(pair: Pair) -> PairJob:
+        camera1, camera2 = loaded.of(pair)
+        return PairJob(pair, camera1.camera, camera2.camera, folder / "captures" / pair.pair_id, chain)
+
+    results, failures = over_pairs(
+        measure_pair, dataset.pairs, job_of, jobs=jobs, what="pairs against truth", progress=progress
+    )
     if failures:
         raise failures[0].error
     lenses = {}

@@ -22,6 +22,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE.html",
         help="write a page to look at; without a name beside the output",
     )
+    parser.add_argument(
+        "--no-cache", action="store_true", help="find all corners anew, and keep none beside the session"
+    )
     parser.add_argument("--force", action="store_true", help="replace existing results")
     parser.add_argument("--json", action="store_true", help="print the result for programs")
 
@@ -34,11 +37,13 @@ def run(args: argparse.Namespace) -> int:
     from rigkit.io.session import load_session
     from rigkit.workflows.calibrate import CalibrateOptions, calibrate_session
     from rigkit.workflows.calibrate_rig import calibrate_rig_session
+    from rigkit.workflows.corners import Cache
 
     def options(default: Path) -> CalibrateOptions:
         target = args.output or default
         page = None if args.report is None else Path(args.report) if args.report else target.with_suffix(".html")
-        return CalibrateOptions(output=target, report=page, force=args.force)
+        cache = Cache.OFF if args.no_cache else Cache.UPDATE
+        return CalibrateOptions(output=target, report=page, force=args.force, cache=cache)
 
     started = time.monotonic()
     progress = progress_on_stderr()
@@ -46,13 +51,17 @@ def run(args: argparse.Namespace) -> int:
     if is_rig_session(args.session):
         mount = load_rig_session(args.session)
         done = calibrate_rig_session(mount, options(mount.rig_path), progress=progress)
-        written, passed = done.written, done.passed
+        written, unreadable, passed = done.written, done.unreadable, done.passed
         result = rig_words.summary(done.rig, done.checks) if args.json else rig_words.describe(done.rig, done.checks)
     else:
         session = load_session(args.session)
         one = calibrate_session(session, options(session.calibration_path), progress=progress)
-        written, words = one.written, calibration_words
+        written, unreadable, words = one.written, one.unreadable, calibration_words
         result = words.summary(one.calibration) if args.json else words.describe(one.calibration)
     note(f"{', '.join(str(p) for p in written)} written, {time.monotonic() - started:.1f} s")
     print_json(result) if args.json else print(result)
+    for reason in unreadable.values():
+        note(f"left out: {reason}")
+    if unreadable:
+        return ExitCode.BAD_INPUT
     return ExitCode.WELL if passed else ExitCode.CHECK_FAILED

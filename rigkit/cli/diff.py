@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from rigkit.core.errors import ExitCode
+
+if TYPE_CHECKING:
+    from rigkit.workflows.diff import CameraPair, RigPair
 
 HELP = "difference of two calibrations over the image: px map and numbers; same camera or not; or of two rigs"
 
@@ -19,51 +25,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import print_json
-    from rigkit.core.errors import ExitCode, InputError
-    from rigkit.io.files import ensure_writable
-    from rigkit.io.rig_file import is_rig_file
+    from rigkit.workflows.diff import DiffOptions, RigPair, diff
 
-    rigs = [is_rig_file(path) for path in (args.a, args.b)]
-    if all(rigs):
-        if args.output is not None:
-            raise InputError("diff: a map is of two cameras; give the calibrations beside the rigs, rig-CAMERA.json")
-        figures = _rigs(args.a, args.b)
-        print_json(figures) if args.json else print(_rigs_in_words(figures))
-        return ExitCode.CHECK_FAILED if figures["same"] is False else 0
-    if any(rigs):
-        other = args.b if rigs[0] else args.a
-        raise InputError(f"diff: a rig and a camera; compare '{other}' with the calibration beside the rig")
-    if args.output is not None:
-        ensure_writable(args.output, force=args.force, inputs=(args.a, args.b))
-    figures = _cameras(args.a, args.b, args.output, force=args.force)
-    print_json(figures) if args.json else print(_camera_in_words(figures))
-    return ExitCode.CHECK_FAILED if figures["same"] is False else 0
+    done = diff(args.a, args.b, DiffOptions(output=args.output, force=args.force))
+    figures = _rig_figures(done) if isinstance(done, RigPair) else _camera_figures(done)
+    if args.json:
+        print_json(figures)
+    else:
+        print(_rigs_in_words(figures) if isinstance(done, RigPair) else _camera_in_words(figures))
+    return ExitCode.CHECK_FAILED if done.same is False else ExitCode.WELL
 
 
-def _cameras(a: Path, b: Path, output: Path | None = None, *, force: bool = False) -> dict[str, Any]:
-    """Return the difference of two cameras; `same` is None where a file has no covariance."""
-    from rigkit.calibration.compare import compare_calibrations
-    from rigkit.cameras.compare import compare_cameras
-    from rigkit.io.calibration_file import is_calibration, load_calibration, load_camera
-    from rigkit.io.files import write_atomic
-    from rigkit.report.figures import difference_png
-
-    cameras = load_camera(a), load_camera(b)
-    # A camera from another tool comes without covariance: then there is a difference but no verdict.
-    known = all(is_calibration(path) for path in (a, b))
-    result = compare_calibrations(load_calibration(a), load_calibration(b)) if known else None
-    difference = compare_cameras(*cameras) if result is None else result.difference
-    if output is not None:
-        write_atomic(output, difference_png(difference), force=force)
+def _camera_figures(pair: CameraPair) -> dict[str, Any]:
+    """Return the figures for programs; `same` is None where a file has no covariance."""
+    judged, difference = pair.judged, pair.difference
     return {
         "rms_px": difference.rms_px,
         "max_px": difference.max_px,
         "rotation_deg": difference.rotation_deg,
         "coverage": difference.coverage,
-        "ratio": None if result is None else result.ratio,
-        "chance": None if result is None else result.chance,
-        "same": None if result is None else result.same,
-        "same_model": None if result is None else result.same_model,
+        "ratio": None if judged is None else judged.ratio,
+        "chance": None if judged is None else judged.chance,
+        "same": pair.same,
+        "same_model": None if judged is None else judged.same_model,
     }
 
 
@@ -81,36 +65,13 @@ def _camera_in_words(figures: dict[str, Any]) -> str:
     )
 
 
-def _rigs(a: Path, b: Path) -> dict[str, Any]:
-    """Return the differences of the mounts, and of the cameras where their calibrations lie beside the rigs."""
-    from dataclasses import asdict
-
-    from rigkit.calibration.rig.compare import compare_mounts
-    from rigkit.core.errors import InputError
-    from rigkit.io.rig_file import load_saved_rig
-
-    first, second = load_saved_rig(a), load_saved_rig(b)
-    names = list(first.cameras)
-    if names != list(second.cameras):
-        raise InputError(f"diff: '{a}' has the cameras {', '.join(names)}, '{b}' {', '.join(second.cameras)}")
-    mounts = compare_mounts(
-        names,
-        [first.cameras[name][1] for name in names],
-        [second.cameras[name][1] for name in names],
-        first.mount_covariance,
-        second.mount_covariance,
-    )
-    cameras = {}
-    for name in names:
-        beside = [path.with_name(f"{path.stem}-{name}.json") for path in (a, b)]
-        if all(path.is_file() for path in beside):
-            cameras[name] = _cameras(*beside)
-    known = [s for s in (mounts.same, *(c["same"] for c in cameras.values())) if s is not None]
+def _rig_figures(pair: RigPair) -> dict[str, Any]:
+    """Return the figures of the mounts, and of the cameras."""
     return {
-        "mounts": [asdict(m) for m in mounts.mounts],
-        "chance": mounts.chance,
-        "cameras": cameras,
-        "same": all(known) if known else None,
+        "mounts": [asdict(m) for m in pair.mounts.mounts],
+        "chance": pair.mounts.chance,
+        "cameras": {name: _camera_figures(own) for name, own in pair.cameras.items()},
+        "same": pair.same,
     }
 
 

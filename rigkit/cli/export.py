@@ -151,43 +151,12 @@ def _written(camera: Camera, kind: str) -> tuple[str, float, str]:
 
 def _export_cloud(args: argparse.Namespace) -> int:
     from rigkit.cli.console import progress_on_stderr
-    from rigkit.cli.workflow import load_cameras, match_images, reconstruct_with, write_results
-    from rigkit.interop.colmap_model import colmap_model
-    from rigkit.io.files import ensure_writable
-    from rigkit.io.manifest import load_dataset
-    from rigkit.io.npz import cloud_npz
-    from rigkit.io.ply import ply_bytes
+    from rigkit.workflows.export_cloud import ExportCloudOptions, export_cloud
 
-    dataset = load_dataset(args.source)
     kind = args.to or args.output.suffix.lstrip(".") or "colmap"
     if kind not in CLOUD_FORMATS:
         raise InputError(f"export: a cloud is written as {', '.join(CLOUD_FORMATS)}, not as '{kind}'; use --to")
-    if args.pair is None and len(dataset.pairs) != 1:
-        raise InputError(f"export: say which pair with --pair: {', '.join(p.pair_id for p in dataset.pairs)}")
-    pair = dataset.pair(args.pair) if args.pair else dataset.pairs[0]
-    if kind != "colmap":
-        ensure_writable(args.output, force=args.force, inputs=dataset.inputs)
-    pair.require_images()
-    cameras = load_cameras(dataset.select([pair.pair_id]), recalibrate=False, progress=progress_on_stderr())
-    camera1, camera2 = cameras[pair.camera1.camera_id].camera, cameras[pair.camera2.camera_id].camera
-    matched, image1, _ = match_images(pair, camera1, camera2, "raw")
-    reconstruction = reconstruct_with(matched, pair, args.method, image1)
-    files: dict[str, str | bytes] = {}
-    if kind == "colmap":
-        model, notes = colmap_model(
-            (reconstruction.camera1, reconstruction.camera2),
-            reconstruction.cam2_from_cam1,
-            (reconstruction.pixels1, reconstruction.pixels2),
-            reconstruction.cloud,
-            (pair.image1, pair.image2),
-            error_px=reconstruction.sampson_rms_px,
-        )
-        files |= model
-        for words in notes:
-            note(words)
-        write_results(args.output, files, force=args.force, inputs=dataset.inputs)
-    else:
-        data = ply_bytes(reconstruction.cloud) if kind == "ply" else cloud_npz(reconstruction)
-        write_results(args.output.parent, {args.output.name: data}, force=args.force)
-    print(f"{args.output}: {len(reconstruction.cloud)} points of pair '{pair.pair_id}'")
+    options = ExportCloudOptions(output=args.output, kind=kind, pair=args.pair, method=args.method, force=args.force)
+    r = export_cloud(args.source, options, progress=progress_on_stderr())
+    print(f"{args.output}: {len(r.cloud)} points of pair '{r.pair_id}'")
     return 0

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-__all__ = ["CheckFailed", "DegenerateError", "ExitCode", "InputError", "InstallationError", "RigkitError"]
+__all__ = [
+    "CheckFailed",
+    "DegenerateError",
+    "ExitCode",
+    "InputError",
+    "InstallationError",
+    "InternalError",
+    "RigkitError",
+]
 
 
 class ExitCode(IntEnum):
@@ -47,3 +55,9 @@ class DegenerateError(RigkitError):
     """The geometry does not determine what was asked for (no baseline, one flat board only, parallel directions)."""
 
     exit_code = ExitCode.DEGENERATE
+
+
+class InternalError(RigkitError):
+    """A fault of rigkit itself in one part of the work, where the rest of the work goes on."""
+
+    exit_code = ExitCode.BUG

@@ -1,14 +1,16 @@
 """Corners found before, beside the session, so that calibrating again needs no images.
 
-An entry holds as long as the image (by its hash), the detector (by the hash of its source) and the sizes of the boards
-are the same; where the images are gone, those of an earlier detector are better than none.
+A cache changes the time that a result takes, never the result. An entry holds as long as the image (by its hash), the
+code (by its hash) and the sizes of the boards are the same. Corners placed through a lens are kept
+beside those found without one, under a key for everything that the lens was calibrated from: they hold for that lens
+alone. Where the images are gone, corners of an earlier detector are better than none.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,9 +23,9 @@ from rigkit.core.errors import InputError
 from rigkit.io.files import write_atomic
 from rigkit.io.sources import source_hash
 
-__all__ = ["CornerCache", "FoundCorners", "image_hash"]
+__all__ = ["CornerCache", "FoundCorners", "image_hash", "lens_key"]
 
-SCHEMA = "rigkit.corners/1"
+SCHEMA = "rigkit.corners/2"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -34,32 +36,35 @@ class FoundCorners:
     ----------
     size_px : (width, height).
     detections : the boards.
-    through_camera : whether they were placed with the help of a first calibration of the camera.
     """
 
     size_px: tuple[int, int]
     detections: tuple[BoardDetection, ...]
-    through_camera: bool = False
 
 
 class CornerCache:
-    """The corners of a session's images. `get` what is known, `put` what is new, `save` at the end."""
+    """The corners of a session's images. `get` what is known, `put` what is new, `save` at the end.
 
-    def __init__(self, path: Path, boards: Sequence[Board]) -> None:
+    Without a path nothing is known at first, and nothing is kept.
+    """
+
+    def __init__(self, path: Path | None, boards: Sequence[Board]) -> None:
         self.path = path
         targets = " ".join(_target(b) for b in boards)
-        self.detector = f"{source_hash('corners', 'native')} {targets}"
+        self.detector = f"{source_hash()} {targets}"
         self.current = True
         """Whether the entries are of this detector."""
         self._entries: dict[str, dict[str, Any]] = {}
         self._changed = False
+        if path is None:
+            return
         try:
             data = json.loads(path.read_text(encoding="utf-8"))
             if isinstance(data, dict) and data.get("schema") == SCHEMA:
                 if data["detector"].partition(" ")[2] != targets:
                     return
                 for entry in data["images"].values():
-                    str(entry["sha256"]), _found_in(entry)
+                    str(entry["sha256"]), _found_in(entry), _found_through(entry)
                 self._entries, self.current = data["images"], data["detector"] == self.detector
         except (OSError, ValueError, TypeError, KeyError, AttributeError, InputError):
             # A cache that cannot be read is as good as none: it is written anew.
@@ -70,21 +75,34 @@ class CornerCache:
         """Names of the images whose corners are known."""
         return sorted(self._entries)
 
-    def get(self, name: str, digest: str | None) -> FoundCorners | None:
+    def digest(self, name: str) -> str:
+        """Return the hash that image `name` had when its corners were found."""
+        return str(self._entries[name]["sha256"])
+
+    def get(self, name: str, digest: str | None, lens: str | None = None) -> FoundCorners | None:
         """Return the corners of image `name` if its hash is `digest`; None as digest takes what is there (the image is
-        gone)."""
+        gone). With the key of a `lens` those placed through that lens, else those found without one."""
         entry = self._entries.get(name)
         if entry is None or (digest is not None and (entry["sha256"] != digest or not self.current)):
             return None
+        if lens is not None:
+            return _found_through(entry) if entry["lens"] and entry["lens"]["key"] == lens else None
         return _found_in(entry)
 
-    def put(self, name: str, digest: str, found: FoundCorners) -> None:
-        """Remember the corners of an image."""
+    def put(self, name: str, digest: str, found: FoundCorners, lens: str | None = None) -> None:
+        """Remember the corners of an image; those placed through a `lens` beside those that are known without one."""
         boards = [_detection_out(d) for d in found.detections]
         if not self.current:
             self._entries, self.current = {}, True
-        entry = {"sha256": digest, "size_px": list(found.size_px), "through_camera": found.through_camera}
-        self._entries[name] = entry | {"boards": boards}
+        if lens is None:
+            self._entries[name] = {
+                "sha256": digest,
+                "size_px": list(found.size_px),
+                "boards": boards,
+                "lens": None,
+            }
+        else:
+            self._entries[name]["lens"] = {"key": lens, "boards": boards}
         self._changed = True
 
     def keep(self, names: Collection[str]) -> None:
@@ -95,7 +113,7 @@ class CornerCache:
 
     def save(self) -> None:
         """Write the file if anything is new."""
-        if self._changed:
+        if self._changed and self.path is not None:
             data = {"schema": SCHEMA, "detector": self.detector, "images": self._entries}
             write_atomic(self.path, json.dumps(data, allow_nan=False) + "\n", force=True)
 
@@ -105,6 +123,12 @@ def _target(board: Board) -> str:
     size = f"{board.columns}x{board.rows}"
     m = board.markers
     return size if m is None else f"{board.board_id}:{size}:{m.dictionary}:{m.first_id}:{m.legacy_pattern}"
+
+
+def lens_key(images: Mapping[str, str], boards: Sequence[Board], *options: object) -> str:
+    """Return a key for the lens that a first calibration gives: its images (name -> hash), boards, and options."""
+    known = [*images.items(), *map(repr, boards), *map(str, options), source_hash()]
+    return hashlib.sha256(json.dumps(known).encode()).hexdigest()
 
 
 def image_hash(path: Path) -> str:
@@ -125,8 +149,11 @@ def _detection_out(d: BoardDetection) -> dict[str, Any]:
 
 def _found_in(entry: dict[str, Any]) -> FoundCorners:
     width, height = entry["size_px"]
-    through_camera = entry.get("through_camera", False) is True
-    return FoundCorners((int(width), int(height)), tuple(_detection_in(v) for v in entry["boards"]), through_camera)
+    return FoundCorners((int(width), int(height)), tuple(_detection_in(v) for v in entry["boards"]))
+
+
+def _found_through(entry: dict[str, Any]) -> FoundCorners | None:
+    return None if entry["lens"] is None else _found_in(entry | {"boards": entry["lens"]["boards"]})
 
 
 def _detection_in(data: dict[str, Any]) -> BoardDetection:

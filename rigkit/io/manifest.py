@@ -97,6 +97,11 @@ class Dataset:
         """The files that a person made, which no result may be written over."""
         return (self.manifest, *(image for pair in self.pairs for image in (pair.image1, pair.image2)))
 
+    @property
+    def used_cameras(self) -> frozenset[str]:
+        """The ids of the cameras that a pair was taken with."""
+        return frozenset(e.camera_id for pair in self.pairs for e in (pair.camera1, pair.camera2))
+
     def pair(self, pair_id: str) -> Pair:
         """Return the pair of that name; raises InputError that lists the known ones."""
         return _named(pair_id, {p.pair_id: p for p in self.pairs}, f"{self.manifest}: pair")

@@ -13,10 +13,12 @@ SUFFIXES = {".py", ".c", ".h"}
 
 
 def source_hash(*packages: str) -> str:
-    """Return a hash of the sources of subpackages of rigkit, such as "corners"; of all of it where none is named."""
+    """Return a hash of the sources of subpackages of rigkit, such as "detection"; of all of it where none is named."""
     root = Path(rigkit.__path__[0])
     digest = hashlib.sha256()
     for folder in [root / name for name in packages] or [root]:
+        if not folder.is_dir():
+            raise ValueError(f"rigkit has no part '{folder.name}'")
         for path in sorted(p for p in folder.rglob("*") if p.suffix in SUFFIXES):
             digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]

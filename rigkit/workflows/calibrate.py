@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,10 +14,10 @@ from rigkit.core.progress import Progress, silent
 from rigkit.io.calibration_file import calibration_text
 from rigkit.io.files import ensure_writable, write_together
 from rigkit.io.session import Session, load_session
-from rigkit.workflows.corners import session_corners, session_views
+from rigkit.workflows.corners import Cache, SessionCorners, session_corners, session_views
 from rigkit.workflows.session_page import session_page
 
-__all__ = ["CalibrateOptions", "SessionCalibration", "calibrate_session", "calibration_of"]
+__all__ = ["CalibrateOptions", "SessionCalibration", "calibrate_session", "calibration_from"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,6 +31,8 @@ class CalibrateOptions:
     """File for a page to look at; None: no page."""
     force: bool = False
     """Replace files that exist; what the calibration reads is never replaced."""
+    cache: Cache = Cache.READ
+    """What becomes of the corners kept beside the session."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -40,11 +43,13 @@ class SessionCalibration:
     ----------
     session : what was calibrated.
     calibration : the camera, how sure it is, and what to think of it.
+    unreadable : by name of the image, why it was left out where it cannot be read.
     written : the files that were written: the calibration, then the page.
     """
 
     session: Session
     calibration: Calibration
+    unreadable: Mapping[str, str]
     written: tuple[Path, ...]
 
 
@@ -65,24 +70,27 @@ def calibrate_session(
         session = load_session(session)
     targets = [path for path in (options.output, options.report) if path is not None]
     ensure_writable(targets, force=options.force, inputs=[session.path, *session.images])
-    calibration = calibration_of(session, progress=progress)
+    corners = session_corners(session, cache=options.cache, progress=progress)
+    calibration = calibration_from(session, corners, progress=progress)
     files: dict[Path, str] = {}
     if options.output is not None:
         files[options.output] = calibration_text(calibration)
     if options.report is not None:
-        files[options.report] = session_page(session, calibration, files)
+        files[options.report] = session_page(session, calibration, corners, files)
     if files:
         write_together(files, force=options.force)
-    return SessionCalibration(session=session, calibration=calibration, written=tuple(files))
+    return SessionCalibration(
+        session=session, calibration=calibration, unreadable=corners.unreadable, written=tuple(files)
+    )
 
 
-def calibration_of(session: Session, *, progress: Progress = silent) -> Calibration:
-    """Return the calibration of a session: images -> corners (kept beside the session) -> calibration.
+def calibration_from(session: Session, corners: SessionCorners, *, progress: Progress = silent) -> Calibration:
+    """Return the calibration of a session from its corners.
 
     Raises InputError where no image shows a board of the session, DegenerateError where the views do not determine the
     camera.
     """
-    views, size_px, dropped = session_views(session, session_corners(session, progress=progress))
+    views, size_px, dropped = session_views(session, corners)
     result = calibrate(
         views,
         size_px,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,12 +19,19 @@ from rigkit.io.rig_session import RigSession, frames_of_images, is_rig_session, 
 from rigkit.io.session import load_session
 from rigkit.validation.checks import COVERAGE, Check
 from rigkit.validation.checks import judge as judge_measured
-from rigkit.workflows.calibrate import CalibrateOptions, calibration_of
-from rigkit.workflows.corners import session_corners, session_views
+from rigkit.workflows.calibrate import CalibrateOptions, calibration_from
+from rigkit.workflows.corners import Cache, SessionCorners, session_corners, session_views
 from rigkit.workflows.rigid_boards import named_as_listed, named_by_rule, require_distinct
 from rigkit.workflows.session_page import rig_page
 
-__all__ = ["RigSessionCalibration", "calibrate_camera", "calibrate_rig_session", "measured_checks", "rig_of"]
+__all__ = [
+    "RigSessionCalibration",
+    "calibrate_camera",
+    "calibrate_rig_session",
+    "measured_checks",
+    "rig_corners",
+    "rig_from",
+]
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -35,12 +43,14 @@ class RigSessionCalibration:
     session : what was calibrated.
     rig : the cameras, how they stand, and what to think of it.
     checks : what a person measured beside what came out.
+    unreadable : by name of the image, why it was left out where it cannot be read.
     written : the files that were written.
     """
 
     session: RigSession
     rig: RigCalibration
     checks: tuple[Check, ...]
+    unreadable: Mapping[str, str]
     written: tuple[Path, ...]
 
     @property
@@ -68,7 +78,8 @@ def calibrate_rig_session(
     targets = _targets(session, options)
     inputs = [session.path, *(image for own in session.cameras.values() for image in own.images)]
     ensure_writable(targets, force=options.force, inputs=inputs)
-    rig = rig_of(session, progress=progress)
+    corners = rig_corners(session, cache=options.cache, progress=progress)
+    rig = rig_from(session, corners, progress=progress)
     checks = measured_checks(session, rig)
     files: dict[Path, str] = {}
     if options.output is not None:
@@ -83,10 +94,13 @@ def calibrate_rig_session(
         alone = dict(zip(session.cameras, rig.single, strict=True))
         if len(rig.cameras) == 1:
             alone = dict.fromkeys(session.cameras, judged(rig.cameras[0].calibration))
-        files[options.report] = rig_page(session, rig, alone, checks, files)
+        files[options.report] = rig_page(session, rig, alone, checks, corners, files)
     if files:
         write_together(files, force=options.force)
-    return RigSessionCalibration(session=session, rig=rig, checks=tuple(checks), written=tuple(files))
+    unreadable = {image: reason for own in corners.values() for image, reason in own.unreadable.items()}
+    return RigSessionCalibration(
+        session=session, rig=rig, checks=tuple(checks), unreadable=unreadable, written=tuple(files)
+    )
 
 
 def _targets(session: RigSession, options: CalibrateOptions) -> list[Path]:
@@ -108,15 +122,18 @@ def _boards_file(target: Path) -> Path:
     return target.with_name(f"{target.stem}-boards.json")
 
 
-def calibrate_camera(path: Path, *, progress: Progress = silent) -> Calibration:
-    """Return the calibration of one camera from its session, with boards on one mount or without.
+def calibrate_camera(path: Path, *, cache: Cache = Cache.READ, progress: Progress = silent) -> Calibration:
+    """Return the calibration of one camera from its session, with boards on one mount or without; nothing is written
+    but what `cache` says.
 
     Raises InputError for a session of several cameras, and as `calibrate_rig_session`.
     """
     session = load_rig_session(path) if is_rig_session(path) else None
     if session is None or len(session.cameras) > 1:
-        return calibration_of(load_session(path), progress=progress)
-    return judged(rig_of(session, progress=progress).cameras[0].calibration)
+        own = load_session(path)
+        return calibration_from(own, session_corners(own, cache=cache, progress=progress), progress=progress)
+    corners = rig_corners(session, cache=cache, progress=progress)
+    return judged(rig_from(session, corners, progress=progress).cameras[0].calibration)
 
 
 def judged(calibration: Calibration) -> Calibration:
@@ -125,22 +142,30 @@ def judged(calibration: Calibration) -> Calibration:
     return replace(calibration, verdicts=judge(calibration))
 
 
-def rig_of(session: RigSession, *, progress: Progress = silent) -> RigCalibration:
-    """Return the calibration of a rig's session: images -> corners (kept beside the session) -> rig.
-
-    Raises InputError where a camera's images show no board, nothing says which were taken together, or boards cannot be
-    told apart; DegenerateError where the views do not determine a camera.
-    """
+def rig_corners(
+    session: RigSession, *, cache: Cache = Cache.READ, progress: Progress = silent
+) -> dict[str, SessionCorners]:
+    """Return the corners of every camera of a rig; raises InputError where its boards cannot be told apart."""
     require_distinct(session)
-    found = {
-        name: named_as_listed(session, session_corners(own, progress=progress)) for name, own in session.cameras.items()
-    }
+    return {name: session_corners(own, cache=cache, progress=progress) for name, own in session.cameras.items()}
+
+
+def rig_from(
+    session: RigSession, corners: Mapping[str, SessionCorners], *, progress: Progress = silent
+) -> RigCalibration:
+    """Return the calibration of a rig's session from the corners of its cameras.
+
+    Raises InputError where a camera's images show no board or nothing says which were taken together, DegenerateError
+    where the views do not determine a camera.
+    """
+    corners = {name: replace(own, found=named_as_listed(session, own.found)) for name, own in corners.items()}
+    found = {name: own.found for name, own in corners.items()}
     frames = {name: {image: image for image in own} for name, own in found.items()}
     if len(found) > 1:
         frames = frames_of_images({name: list(own) for name, own in found.items()}, session.frames)
     views, sizes, dropped = {}, {}, {}
     for name, own in session.cameras.items():
-        seen, sizes[name], dropped[name] = session_views(own, found[name])
+        seen, sizes[name], dropped[name] = session_views(own, corners[name])
         views[name] = [(frames[name][view.image], view) for view in seen]
     rig = calibrate_rig(
         views,

@@ -6,6 +6,8 @@ import logging
 import os
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 from statistics import median
 
@@ -16,11 +18,11 @@ from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError, RigkitError
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
-from rigkit.io.corner_cache import CornerCache, FoundCorners, image_hash
+from rigkit.io.corner_cache import CornerCache, FoundCorners, image_hash, lens_key
 from rigkit.io.images import read_image
 from rigkit.io.session import Session
 
-__all__ = ["first_camera", "image_names", "session_corners", "session_views"]
+__all__ = ["Cache", "SessionCorners", "first_camera", "image_names", "session_corners", "session_views"]
 
 ODD_SIZES = 3
 """A few images of another size are left out; where they are this part of all, which of the sizes is meant?"""
@@ -30,15 +32,43 @@ LOOSE = 1.5
 _log = logging.getLogger(__name__)
 
 
+class Cache(StrEnum):
+    """What becomes of the corners kept beside a session; they change the time that a result takes, never the result."""
+
+    OFF = "off"
+    """They are neither used nor written."""
+    READ = "read"
+    """They are used where they hold."""
+    UPDATE = "update"
+    """They are used where they hold, and new ones are kept."""
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class SessionCorners:
+    """The corners of a session's images.
+
+    Attributes
+    ----------
+    found : by name of the image, as finely as they could be placed.
+    unreadable : by name of the image, why others cannot be read.
+    source : where they come from, in words.
+    """
+
+    found: Mapping[str, FoundCorners]
+    unreadable: Mapping[str, str]
+    source: str
+
+
 def session_views(
-    session: Session, found: Mapping[str, FoundCorners]
+    session: Session, corners: SessionCorners
 ) -> tuple[list[BoardView], tuple[int, int], list[tuple[str, str]]]:
     """Return the views that the corners found give, the images' size, and (image, reason) of those that give none.
 
     Raises InputError where there is no view, or the boards clearly have another size than stated.
     """
+    found = corners.found
     size_px = _common_size(session, found)
-    views, dropped = [], []
+    views, dropped = [], list(corners.unreadable.items())
     for name, item in found.items():
         if item.size_px != size_px:
             width, height = item.size_px
@@ -74,70 +104,91 @@ def _common_size(session: Session, found: Mapping[str, FoundCorners]) -> tuple[i
     return counts[0][0]
 
 
-def session_corners(session: Session, *, progress: Progress = silent) -> dict[str, FoundCorners]:
-    """Return the corners of every image by name, from the images or from the cache.
+def session_corners(session: Session, *, cache: Cache = Cache.READ, progress: Progress = silent) -> SessionCorners:
+    """Return the corners of every image by name, from the images or from what is kept beside the session.
 
     They are found twice: a first calibration, from the corners of the first time, says how lines bend at every corner,
-    which few large squares through a wide lens do not, and what is covered.
+    which few large squares through a wide lens do not, and what is covered. An image that cannot be read does not end
+    the rest; its error is raised where there is no other image.
     """
-    cache = CornerCache(session.corners_path, session.boards)
-    found: dict[str, FoundCorners] = {}
+    kept = CornerCache(None if cache is Cache.OFF else session.corners_path, session.boards)
     if not session.images:
-        found = {name: item for name in cache.images if (item := cache.get(name, None)) is not None}
-        if not found:
-            whose = "" if session.camera is None else f" of camera '{session.camera}'"
-            raise InputError(f"{session.path}: no image matches 'images'{whose}, and no corners are kept beside it")
-        _log.info(
-            f"{session.path}: no image matches 'images'; the corners of {len(found)} images kept in "
-            f"{session.corners_path.name} are used" + ("" if cache.current else ", found by another version of rigkit")
-        )
-    hashes = {name: image_hash(path) for path, name in zip(session.images, image_names(session), strict=True)}
-    paths = dict(zip(hashes, session.images, strict=True))
-    for name, digest in hashes.items():
-        item = cache.get(name, digest)
-        if item is not None:
-            found[name] = item
+        return _kept_alone(session, kept)
+    paths = dict(zip(image_names(session), session.images, strict=True))
+    hashes = {name: image_hash(path) for name, path in paths.items()}
+    first = {name: item for name, digest in hashes.items() if (item := kept.get(name, digest)) is not None}
+    fresh = [name for name in paths if name not in first]
+    unreadable: dict[str, str] = {}
 
-    def look(names: list[str], camera: Camera | None) -> None:
+    def look(names: list[str], camera: Camera | None, lens: str | None) -> dict[str, FoundCorners]:
         """Find the corners in the images of these names and remember them."""
         words = ("corners", "through the lens")[: 1 if camera is None else 2]
         what = " ".join(words if session.camera is None else (*words, "of", session.camera))
+        out = {}
         for i, name in enumerate(names):
             progress(what, i, len(names))
-            found[name] = _found_in(paths[name], session, camera)
-            cache.put(name, hashes[name], found[name])
+            try:
+                out[name] = _found_in(paths[name], session, camera)
+            except InputError as error:
+                unreadable[name] = str(error)
+                if len(unreadable) == len(paths):
+                    raise
+                continue
+            kept.put(name, hashes[name], out[name], lens)
         progress(what, len(names), len(names))
+        return out
 
-    look([name for name in paths if name not in found], None)
+    first |= look(fresh, None, None)
+    first = {name: first[name] for name in paths if name in first}
     # An image of another size is of no use: it must not count as new time and again.
-    size_px = Counter(item.size_px for item in found.values()).most_common(1)[0][0]
-    usable = [name for name in paths if found[name].size_px == size_px]
+    size_px = Counter(item.size_px for item in first.values()).most_common(1)[0][0]
+    usable = [name for name in first if first[name].size_px == size_px]
+    lens = _lens_of(session, {name: hashes[name] for name in first})
     # All of them, or the corners would depend on which images were added when.
-    new = not all(found[name].through_camera for name in usable)
-    camera = first_camera(session, found) if new else None
-    if camera is not None:
-        look(usable, camera)
-    found = {name: found[name] for name in paths or found}
-    if paths:
-        cache.keep(paths)
-    try:
-        cache.save()
-    except InputError as error:
-        _log.info(f"{error}; the corners are used, but not kept")
-    return found
+    through = {name: item for name in usable if (item := kept.get(name, hashes[name], lens)) is not None}
+    if len(through) < len(usable):
+        camera = first_camera(session, first)
+        through = {} if camera is None else look(usable, camera, lens)
+    if cache is Cache.UPDATE:
+        kept.keep(first)
+        try:
+            kept.save()
+        except InputError as error:
+            _log.info(f"{error}; the corners are used, but not kept")
+    old = len(first) - len([name for name in fresh if name in first])
+    source = f"found in {len(first) - old} images" + (f", kept in {session.corners_path.name} of {old}" if old else "")
+    return SessionCorners(found=first | through, unreadable=unreadable, source=source)
+
+
+def _lens_of(session: Session, hashes: Mapping[str, str]) -> str:
+    """Return the key of the first calibration of these images."""
+    return lens_key(hashes, session.boards, session.model, session.degree)
+
+
+def _kept_alone(session: Session, kept: CornerCache) -> SessionCorners:
+    """Return the corners kept beside a session whose images are gone."""
+    first = {name: item for name in kept.images if (item := kept.get(name, None)) is not None}
+    if not first:
+        whose = "" if session.camera is None else f" of camera '{session.camera}'"
+        raise InputError(f"{session.path}: no image matches 'images'{whose}, and no corners are kept beside it")
+    lens = _lens_of(session, {name: kept.digest(name) for name in first})
+    through = {name: item for name in first if (item := kept.get(name, None, lens)) is not None}
+    source = f"the corners of {len(first)} images kept in {session.corners_path.name} are used"
+    source += "" if kept.current else ", found by another version of rigkit"
+    _log.info(f"{session.path}: no image matches 'images'; {source}")
+    return SessionCorners(found=first | through, unreadable={}, source=source)
 
 
 def _found_in(path: Path, session: Session, camera: Camera | None) -> FoundCorners:
-
     image = read_image(path)
-    detections = detect_boards(image, session.boards, camera=camera)
-    return FoundCorners((image.shape[1], image.shape[0]), detections, camera is not None)
+    return FoundCorners((image.shape[1], image.shape[0]), detect_boards(image, session.boards, camera=camera))
 
 
 def first_camera(session: Session, found: Mapping[str, FoundCorners]) -> Camera | None:
     """Return a camera calibrated quickly from `found`; None where it cannot be: the calibration proper says why."""
     try:
-        views, size_px, _ = session_views(session, found)
+        corners = SessionCorners(found=found, unreadable={}, source="")
+        views, size_px, _ = session_views(session, corners)
         # Scaramuzza's model takes any lens; what it does not follow closely, another may.
         model = "scaramuzza" if session.model == "auto" else session.model
         first = calibrate(views, size_px, model=model, degree=session.degree, board="flat")

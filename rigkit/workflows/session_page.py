@@ -16,18 +16,18 @@ from rigkit.io.session import Session
 from rigkit.report.calibration_page import CalibrationSection, build_calibration_page, thumbnail_jpeg
 from rigkit.report.rig_tables import rig_tables
 from rigkit.validation.checks import Check
-from rigkit.workflows.corners import image_names
+from rigkit.workflows.corners import SessionCorners, image_names
 from rigkit.workflows.provenance import digest_line, digest_of_many, software_facts
 
 __all__ = ["rig_page", "session_page"]
 
 
-def session_page(session: Session, calibration: Calibration, files: Mapping[Path, str]) -> str:
+def session_page(session: Session, calibration: Calibration, corners: SessionCorners, files: Mapping[Path, str]) -> str:
     """Return the page of a session's calibration, which is written to `files` (path -> content) beside it."""
     name = session.path.resolve().parent.name
     section = CalibrationSection(name, calibration, _thumbnails(session, calibration))
     lead = f"{session.path.name} with {_boards_in_words(session.boards)}"
-    facts = _facts(session.path, files, {"images": session.images})
+    facts = _facts(session.path, files, {"images": session.images}, {"corners": corners.source})
     return build_calibration_page(f"rigkit calibration: {name}", lead, [section], facts)
 
 
@@ -36,6 +36,7 @@ def rig_page(
     rig: RigCalibration,
     shown: Mapping[str, Calibration],
     checks: Sequence[Check],
+    corners: Mapping[str, SessionCorners],
     files: Mapping[Path, str],
 ) -> str:
     """Return the page of a rig, which is written to `files` (path -> content) beside it: what the cameras share, then
@@ -45,7 +46,9 @@ def rig_page(
     boards = _boards_in_words(next(iter(session.cameras.values())).boards)
     then = "then every camera as calibrated alone" if len(rig.cameras) > 1 else "then the camera"
     lead = f"{session.path.name} with {boards}: the rig first, {then}"
-    facts = _facts(session.path, files, {f"images of {own}": s.images for own, s in session.cameras.items()})
+    images = {f"images of {own}": s.images for own, s in session.cameras.items()}
+    sources = {f"corners of {own}": found.source for own, found in corners.items()}
+    facts = _facts(session.path, files, images, sources)
     return build_calibration_page(f"rigkit rig calibration: {name}", lead, sections, facts, rig_tables(rig, checks))
 
 
@@ -71,7 +74,9 @@ def _thumbnails(session: Session, calibration: Calibration) -> dict[str, bytes]:
     return out
 
 
-def _facts(session: Path, files: Mapping[Path, str], images: Mapping[str, Sequence[Path]]) -> dict[str, str]:
+def _facts(
+    session: Path, files: Mapping[Path, str], images: Mapping[str, Sequence[Path]], corners: Mapping[str, str]
+) -> dict[str, str]:
     """Return what somebody needs to know to get the same page again."""
     facts = software_facts() | {session.name: digest_line(session)}
     facts |= {path.name: digest_line(text) for path, text in files.items()}
@@ -80,4 +85,4 @@ def _facts(session: Path, files: Mapping[Path, str], images: Mapping[str, Sequen
             facts[name] = digest_of_many([(p.name, image_hash(p)) for p in paths])
         else:
             facts[name] = "gone; the corners kept beside the session were used"
-    return facts
+    return facts | dict(corners)

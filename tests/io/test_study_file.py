@@ -10,8 +10,8 @@ import pytest
 from rigkit.core.errors import InputError
 from rigkit.core.posetype import PoseType
 from rigkit.io.study_file import load_study
-from rigkit.io.study_run import run_study, study_key
 from rigkit.synthetic.noise import NoisyImages
+from rigkit.workflows.study import run_study, study_key
 
 ROOT = Path(__file__).resolve().parents[2]
 MINIMAL = """
@@ -133,7 +133,7 @@ def test_the_key_depends_on_everything_that_matters(tmp_path: Path, monkeypatch:
     renamed = MINIMAL.replace('"small"', '"other"') + '[[claims]]\ntext = "x"\nsmaller = {}\nlarger = {}\n'
     assert study_key(load_study(write(tmp_path, renamed))) == study_key(study)
     # What other code left half done is not mixed with what this code computes.
-    monkeypatch.setattr("rigkit.io.study_run.source_hash", lambda: "other code")
+    monkeypatch.setattr("rigkit.workflows.study.source_hash", lambda: "other code")
     assert study_key(study) not in keys
 
 

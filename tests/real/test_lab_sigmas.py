@@ -10,14 +10,14 @@ import pytest
 from helpers.data import REPOSITORY, shared_data
 
 from rigkit.cameras.base import Camera
-from rigkit.cli.workflow import load_cameras, match_found, reconstruct_with
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
-from rigkit.core.progress import silent
 from rigkit.core.truth import MeasuredAngle, MeasuredLength, PairTruth
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.manifest import load_dataset
 from rigkit.validation.checks import validate
+from rigkit.workflows.datasets import load_cameras
+from rigkit.workflows.pairs import match_found, reconstruct_with
 
 SIGMA_PX = 0.03
 DRAWS_A_PAIR = 25
@@ -57,7 +57,7 @@ def seen(
 def test_measured_quantities_fall_within_the_predicted_sigmas(rng: np.random.Generator) -> None:
     folder: Path = shared_data("lab-a")
     dataset = load_dataset(REPOSITORY / "datasets" / "lab-a")
-    cameras = load_cameras(dataset, recalibrate=False, progress=silent)
+    cameras = load_cameras(dataset).known
     angles, baselines = [], []
     for pair in dataset.pairs:
         truth = json.loads((folder / "captures" / pair.pair_id / "truth.json").read_text())

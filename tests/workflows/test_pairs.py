@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 
 from rigkit.cameras.kannala_brandt import KannalaBrandt
-from rigkit.cli.workflow import find_boards
 from rigkit.core.boards import Board
 from rigkit.core.posetype import PoseType
 from rigkit.core.truth import PairTruth
@@ -19,6 +18,7 @@ from rigkit.synthetic.pairs import trihedral_pair
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import Panel
+from rigkit.workflows.pairs import find_boards
 
 CAMERA = KannalaBrandt((800, 600), np.array([400.0, 400.0, 405.0, 295.0, -0.02, 0.002, 0.0, 0.0]))
 BOARDS = tuple(Board(name, 11, 8, 30.0, 30.0) for name in ("plane1", "plane2", "plane3"))

@@ -1,4 +1,4 @@
-"""Running a study: in one process, several, or on a Dask cluster; an interrupted run goes on where it stopped."""
+"""Synthetic studies: in one process, several, or on a Dask cluster; an interrupted run goes on where it stopped."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ import importlib
 import io
 import json
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import as_completed
 from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +21,83 @@ from numpy.typing import NDArray
 from rigkit.core.errors import InputError
 from rigkit.core.processes import worker_pool
 from rigkit.core.progress import Progress, silent
-from rigkit.io.files import write_atomic
+from rigkit.io.files import ensure_writable, write_atomic, write_together
 from rigkit.io.sources import source_hash
+from rigkit.io.study_file import load_study
+from rigkit.report.study_figure import study_figure
 from rigkit.study.study import Study, chunk_count, run_chunk
+from rigkit.study.table import StudyTable, tabulate
 
-__all__ = ["run_study", "study_key"]
+__all__ = ["StudyOptions", "StudyResult", "run_studies", "run_study", "study_key"]
 
 Errors = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StudyOptions:
+    """How to run studies, and where their tables and figures go."""
+
+    output: Path | None = None
+    """Folder for tables, figures and the parts of a run that was interrupted; None: nothing is written."""
+    trials: int | None = None
+    """Instead of the number in the file."""
+    jobs: int = 1
+    """Processes; the numbers stay the same."""
+    dask: str | None = None
+    """Address of a Dask scheduler to use instead of processes."""
+    figure: Literal["png", "pdf", "svg"] = "png"
+    """Format of the figures."""
+    force: bool = False
+    """Replace files that exist; the studies themselves are never replaced."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class StudyResult:
+    """A study, its table, and the files that were written."""
+
+    study: Study
+    table: StudyTable
+    written: tuple[Path, ...]
+
+
+def run_studies(
+    paths: Sequence[str | Path], options: StudyOptions | None = None, *, progress: Progress = silent
+) -> Iterator[StudyResult]:
+    """Yield the result of every study file, each written as soon as it is there.
+
+    Raises InputError before the work where a file cannot be read or written, or two studies have the same name.
+    """
+    options = options or StudyOptions()
+    if options.jobs < 1:
+        raise InputError(f"simulate: --jobs must be at least 1, got {options.jobs}")
+    studies = [load_study(path) for path in paths]
+    if options.trials is not None:
+        studies = [replace(study, trials=options.trials) for study in studies]
+    names = [study.name for study in studies]
+    if len(set(names)) < len(names):
+        raise InputError(f"simulate: two studies have the same name ({', '.join(sorted(names))}); rename one")
+    for study in studies:
+        ensure_writable(_files_of(study, options).values(), force=options.force, inputs=paths)
+    for study in studies:
+        parts = None if options.output is None else options.output / f".{study.name}.parts"
+        table = tabulate(study, run_study(study, jobs=options.jobs, dask=options.dask, parts=parts, progress=progress))
+        places = _files_of(study, options)
+        if places:
+            contents: dict[str, str | bytes] = {
+                "csv": table.to_csv(),
+                "json": json.dumps(table.to_dict(), indent=1, allow_nan=False) + "\n",
+                "md": table.to_markdown(),
+                options.figure: study_figure(table, options.figure),
+            }
+            write_together({path: contents[suffix] for suffix, path in places.items()}, force=options.force)
+        yield StudyResult(study, table, tuple(places.values()))
+
+
+def _files_of(study: Study, options: StudyOptions) -> dict[str, Path]:
+    """Return where the files of a study go, by their ending."""
+    if options.output is None:
+        return {}
+    return {suffix: options.output / f"{study.name}.{suffix}" for suffix in ("csv", "json", "md", options.figure)}
 
 
 def study_key(study: Study) -> str:

@@ -1,0 +1,63 @@
+"""What the verbs on a data set share: their arguments, the folder of results, and what came to nothing."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rigkit.cli.console import note
+
+if TYPE_CHECKING:
+    from rigkit.workflows.datasets import PairFailure
+
+__all__ = ["add_dataset_arguments", "dataset_options", "exit_code_of", "failed_pairs", "results_folder"]
+
+
+def add_dataset_arguments(parser: argparse.ArgumentParser, *, optional: bool = False) -> None:
+    """Add what every verb on a data set takes; `optional`: the verb also works on something else."""
+    number = "?" if optional else None
+    parser.add_argument(
+        "dataset", metavar="DATASET", nargs=number, help="folder with a dataset.toml, or the file itself"
+    )
+    parser.add_argument("-p", "--pair", action="append", default=[], metavar="ID", help="only this pair (repeatable)")
+    parser.add_argument("-o", "--output", metavar="DIR", help="folder for results (default: a new one, out/<data set>)")
+    parser.add_argument("--force", action="store_true", help="replace existing results")
+    parser.add_argument("--recalibrate", action="store_true", help="calibrate from the images even if that was done")
+    parser.add_argument(
+        "--chain", choices=("raw", "rectified"), default="raw", help="captured pixels or perspective views"
+    )
+    parser.add_argument("-j", "--jobs", type=int, metavar="N", help="processes (default: one a core)")
+    parser.add_argument("--json", action="store_true", help="print the result for programs")
+
+
+def results_folder(args: argparse.Namespace, name: str) -> Path:
+    """Return the folder asked for, or a new one of that name."""
+    from rigkit.workflows.results import free_folder
+
+    return Path(args.output) if args.output else free_folder(name, force=args.force)
+
+
+def dataset_options(args: argparse.Namespace, name: str) -> dict[str, Any]:
+    """Return the fields of `DatasetOptions` that the arguments tell, for the data set of that name."""
+    return {
+        "pairs": tuple(args.pair),
+        "output": results_folder(args, name),
+        "force": args.force,
+        "recalibrate": args.recalibrate,
+        "chain": args.chain,
+        "jobs": args.jobs,
+    }
+
+
+def failed_pairs(failures: Sequence[PairFailure]) -> dict[str, dict[str, str]]:
+    """Return what a program needs to know of `failures`; nothing where there are none."""
+    return {"failed": {failure.pair_id: str(failure.error) for failure in failures}} if failures else {}
+
+
+def exit_code_of(failures: Sequence[PairFailure], otherwise: int) -> int:
+    """Say which pairs came to nothing; return the exit code that the first of them asks for, else `otherwise`."""
+    for failure in failures:
+        note(str(failure))
+    return failures[0].error.exit_code if failures else otherwise

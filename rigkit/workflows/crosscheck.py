@@ -1,0 +1,96 @@
+"""The pairs of a data set through pycolmap, planar PnP and the other chain."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from rigkit.core.progress import Progress, silent
+from rigkit.io.manifest import Dataset, Pair
+from rigkit.report.tables import tables_to_json, tables_to_markdown
+from rigkit.report.validation_page import crosscheck_table
+from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
+from rigkit.validation.tables import Table
+from rigkit.workflows.datasets import (
+    DatasetOptions,
+    LoadedCamera,
+    PairFailure,
+    load_cameras,
+    over_pairs,
+    ready_dataset,
+)
+from rigkit.workflows.pairs import match_images, reconstruct_other_chain, reconstruct_with, shifts_of
+from rigkit.workflows.results import require_folder, write_results
+
+__all__ = ["DatasetCrossCheck", "crosscheck_dataset"]
+
+MARKDOWN, JSON = "crosscheck.md", "crosscheck.json"
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class DatasetCrossCheck:
+    """What the independent methods say of the pairs of a data set.
+
+    Attributes
+    ----------
+    reports : one a pair that could be reconstructed.
+    failures : the other pairs.
+    table : all comparisons.
+    files : relative path -> content of everything, whether it was written or not.
+    """
+
+    reports: tuple[CrossCheckReport, ...]
+    failures: tuple[PairFailure, ...]
+    table: Table
+    files: Mapping[str, str | bytes]
+
+    @property
+    def passed(self) -> bool:
+        """Whether every pair could be compared, and everything agrees."""
+        return not self.failures and all(report.passed for report in self.reports)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Job:
+    """What one process needs to know of one pair."""
+
+    pair: Pair
+    camera1: LoadedCamera
+    camera2: LoadedCamera
+    chain: str
+
+
+def crosscheck_dataset(
+    dataset: Dataset | str | Path, options: DatasetOptions | None = None, *, progress: Progress = silent
+) -> DatasetCrossCheck:
+    """Compare the pairs of a data set, given its folder or the data set as loaded, with independent methods.
+
+    A pair that cannot be reconstructed is among the failures; its error is raised where there is no other pair.
+    """
+    options = options or DatasetOptions()
+    known = ready_dataset(dataset, options, reserved=(MARKDOWN, JSON))
+    if options.output is not None:
+        require_folder(options.output, force=options.force)
+    cameras = load_cameras(known, recalibrate=options.recalibrate, progress=progress)
+    reports, failures = over_pairs(
+        _crosscheck,
+        known.pairs,
+        lambda pair: _Job(pair, *cameras.of(pair), options.chain),
+        jobs=options.jobs,
+        what="cross-checking pairs",
+        progress=progress,
+    )
+    table = crosscheck_table(reports)
+    files = {**cameras.files, MARKDOWN: tables_to_markdown([table]), JSON: tables_to_json([table])}
+    if options.output is not None:
+        write_results(options.output, files, force=options.force, inputs=known.inputs)
+    return DatasetCrossCheck(reports=tuple(reports), failures=failures, table=table, files=files)
+
+
+def _crosscheck(job: _Job) -> CrossCheckReport:
+    """Reconstruct one pair and compare it with every independent method."""
+    matched, _, _ = match_images(job.pair, job.camera1.camera, job.camera2.camera, job.chain)
+    other = reconstruct_other_chain(matched, job.pair)
+    ours = reconstruct_with(matched, job.pair, "3SDIR")
+    return crosscheck(ours, other_chain=other, shifts=shifts_of(ours, job.camera1, job.camera2))

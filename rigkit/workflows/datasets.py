@@ -1,0 +1,257 @@
+"""Data sets at work: the options that every verb on one takes, its cameras, and each pair for itself.
+
+Cameras are calibrated first where a calibration file is missing; pairs are independent and run in several processes. A
+camera or a pair that comes to nothing does not take the others with it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import logging
+import os
+import re
+import traceback
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, TypeVar
+
+from rigkit.calibration.result import Calibration
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import FloatArray
+from rigkit.core.errors import InputError, InternalError, RigkitError
+from rigkit.core.processes import worker_pool
+from rigkit.core.progress import Progress, silent
+from rigkit.io.calibration_file import calibration_text, is_calibration, load_calibration, load_camera
+from rigkit.io.manifest import CameraEntry, Dataset, Pair, load_dataset
+from rigkit.workflows.calibrate_rig import calibrate_camera
+
+__all__ = [
+    "DatasetOptions",
+    "LoadedCamera",
+    "LoadedCameras",
+    "PairFailure",
+    "load_cameras",
+    "over_pairs",
+    "ready_dataset",
+]
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+MAX_NAME_BYTES = 200
+"""Names of folders have at most 255 bytes, and temporary files need some of them."""
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DatasetOptions:
+    """What every workflow on a data set takes."""
+
+    pairs: tuple[str, ...] = ()
+    """Only these pairs; all of them where none is named."""
+    output: Path | None = None
+    """Folder for the results; None: nothing is written."""
+    force: bool = False
+    """Replace results that are there; what was read is never replaced."""
+    recalibrate: bool = False
+    """Calibrate the cameras from their sessions even where the manifest names a calibration that is there."""
+    chain: Literal["raw", "rectified"] = "raw"
+    """Captured pixels, or perspective views of them."""
+    jobs: int | None = None
+    """Processes; None: one a core."""
+
+
+def ready_dataset(dataset: Dataset | str | Path, options: DatasetOptions, reserved: Iterable[str] = ()) -> Dataset:
+    """Return the pairs asked for of a data set, given its folder or manifest or the data set as loaded.
+
+    Raises InputError for what can be known before the work: no such pair, no image of any pair, fewer than one process,
+    a pair's name that cannot be a folder beside the files called `reserved`.
+    """
+    if options.jobs is not None and options.jobs < 1:
+        raise InputError(f"--jobs {options.jobs}: at least one process is needed")
+    known = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
+    known = known.select(options.pairs)
+    missing = []
+    for pair in known.pairs:
+        if pair.pair_id in {*reserved, CALIBRATIONS}:
+            raise InputError(f"{known.manifest}: pair '{pair.pair_id}': a file of results has that name; rename it")
+        if len(os.fsencode(pair.pair_id)) > MAX_NAME_BYTES:
+            raise InputError(
+                f"{known.manifest}: the name of pair '{pair.pair_id[:20]}...' has more than {MAX_NAME_BYTES} bytes; "
+                "its results need a folder of that name: shorten it"
+            )
+        try:
+            pair.require_images()
+        except InputError as error:
+            missing.append(error)
+    if missing and len(missing) == len(known.pairs):
+        raise missing[0]
+    return known
+
+
+CALIBRATIONS = "calibrations"
+"""Folder of results for cameras that were calibrated on the way."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class LoadedCamera:
+    """A camera, and its whole calibration; None where the file does not say more (another tool's camera)."""
+
+    camera: Camera
+    calibration: Calibration | None
+
+    @property
+    def covariance(self) -> FloatArray | None:
+        """The covariance of the camera's parameters, where it is known."""
+        return None if self.calibration is None else self.calibration.covariance
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class LoadedCameras:
+    """The cameras of a data set.
+
+    Attributes
+    ----------
+    known : by id, those that can be used; also some that no pair names.
+    failed : by id, why others cannot be used.
+    files : relative path -> content of the calibrations that were made now, for the folder of results.
+    sources : by id, what a camera was read from: its file, or the text of a new calibration.
+    """
+
+    known: Mapping[str, LoadedCamera]
+    failed: Mapping[str, RigkitError]
+    files: Mapping[str, str]
+    sources: Mapping[str, Path | str]
+
+    def of(self, pair: Pair) -> tuple[LoadedCamera, LoadedCamera]:
+        """Return the two cameras of a pair; raises why they cannot be used."""
+        for entry in (pair.camera1, pair.camera2):
+            if entry.camera_id in self.failed:
+                raise self.failed[entry.camera_id]
+        return self.known[pair.camera1.camera_id], self.known[pair.camera2.camera_id]
+
+
+def load_cameras(dataset: Dataset, *, recalibrate: bool = False, progress: Progress = silent) -> LoadedCameras:
+    """Return the cameras of a data set, calibrating those in use from their sessions where that was not done yet.
+
+    Nothing is written: a manifest does not say where files go. Cameras that no pair uses come along where they are
+    calibrated: an image may fit one of them better than the camera that it is said to be from. Raises the first error
+    where no pair has both its cameras.
+    """
+    known: dict[str, LoadedCamera] = {}
+    failed: dict[str, RigkitError] = {}
+    files: dict[str, str] = {}
+    sources: dict[str, Path | str] = {}
+    used = dataset.used_cameras
+    for index, entry in enumerate(dataset.cameras):
+        name = entry.camera_id
+        try:
+            if entry.calibration.is_file() and (name not in used or not recalibrate):
+                known[name], sources[name] = _load(entry.calibration), entry.calibration
+            elif name in used:
+                calibration = _calibrate(dataset, entry, progress)
+                known[name] = LoadedCamera(calibration.camera, calibration)
+                sources[name] = files[_file_of(name, index)] = calibration_text(calibration)
+                _log.info(
+                    f"camera '{name}' was calibrated from '{entry.session}', for these results alone; "
+                    "`rigkit calibrate` keeps a calibration beside its session"
+                )
+        except RigkitError as error:
+            failed[name] = error
+            if name not in used:
+                _log.info(f"camera '{name}', which no pair uses, is left aside: {error}")
+    out = LoadedCameras(known=known, failed=failed, files=files, sources=sources)
+    if not any({p.camera1.camera_id, p.camera2.camera_id} <= set(known) for p in dataset.pairs):
+        raise next(error for name, error in failed.items() if name in used)
+    return out
+
+
+def _calibrate(dataset: Dataset, entry: CameraEntry, progress: Progress) -> Calibration:
+    if entry.session is None:
+        raise InputError(
+            f"{dataset.manifest}: camera '{entry.camera_id}' has no session to calibrate from; "
+            'add session = "session.toml" to its table'
+        )
+    if entry.calibration.is_dir():
+        raise InputError(f"camera '{entry.camera_id}': '{entry.calibration}' is a folder; correct the manifest")
+    return calibrate_camera(entry.session, progress=progress)
+
+
+def _file_of(camera_id: str, index: int) -> str:
+    """Return where a new calibration goes among the results, whatever characters the camera's id has."""
+    safe = re.sub(r"[^\w-]", "_", camera_id)[:40]
+    return f"{CALIBRATIONS}/{safe if safe == camera_id else f'{safe}-{index + 1}'}.json"
+
+
+def _load(path: Path) -> LoadedCamera:
+    if not is_calibration(path):
+        return LoadedCamera(load_camera(path), None)
+    calibration = load_calibration(path)
+    return LoadedCamera(calibration.camera, calibration)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PairFailure:
+    """A pair that came to nothing, and why."""
+
+    pair_id: str
+    error: RigkitError
+
+    def __str__(self) -> str:
+        words = str(self.error)
+        return words if f"'{self.pair_id}'" in words else f"pair '{self.pair_id}': {words}"
+
+
+def over_pairs(
+    work: Callable[[Job], Result],
+    pairs: Sequence[Pair],
+    job_of: Callable[[Pair], Job],
+    *,
+    jobs: int | None = None,
+    what: str = "pairs",
+    progress: Progress = silent,
+) -> tuple[list[Result], tuple[PairFailure, ...]]:
+    """Return `work(job_of(pair))` of every pair, in their order, and the pairs that came to nothing.
+
+    Several processes work where that helps; `work` is a function of a module. A pair that cannot be done does not take
+    the others with it; only if there is no result at all is the first pair's error raised.
+    """
+    outcomes: dict[str, Result | RigkitError] = {}
+    waiting: dict[str, Job] = {}
+    for pair in pairs:
+        try:
+            pair.require_images()
+            waiting[pair.pair_id] = job_of(pair)
+        except RigkitError as error:
+            outcomes[pair.pair_id] = error
+    count = min(len(waiting), jobs or os.cpu_count() or 1)
+    progress(what, 0, len(waiting))
+    with contextlib.ExitStack() as stack:
+        attempt = functools.partial(_attempt, work)
+        each = map if count <= 1 else stack.enter_context(worker_pool(count)).map
+        results: Iterable[Result | RigkitError] = each(attempt, waiting.values())
+        for done, (name, outcome) in enumerate(zip(waiting, results, strict=True), start=1):
+            progress(what, done, len(waiting))
+            outcomes[name] = outcome
+    ordered = [(pair.pair_id, outcomes[pair.pair_id]) for pair in pairs]
+    failures = tuple(PairFailure(name, outcome) for name, outcome in ordered if isinstance(outcome, RigkitError))
+    if failures and len(failures) == len(pairs):
+        for failure in failures[1:]:
+            _log.info(f"{failure}")
+        raise failures[0].error
+    return [outcome for _, outcome in ordered if not isinstance(outcome, RigkitError)], failures
+
+
+def _attempt(work: Callable[[Job], Result], job: Job) -> Result | RigkitError:
+    try:
+        return work(job)
+    except RigkitError as error:
+        return error
+    except Exception as error:
+        # A fault of ours in one pair must not lose the others' results; the traceback says where it is.
+        return InternalError(
+            f"{traceback.format_exc()}this is a bug in rigkit ({error!r}); please report the lines above"
+        )

@@ -1,0 +1,194 @@
+"""Every chessboard of every image, with pictures of what was found."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.cameras.base import Camera
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
+from rigkit.core.errors import CheckFailed, InputError
+from rigkit.core.processes import worker_pool
+from rigkit.core.progress import Progress, silent
+from rigkit.detection.detect import MIN_BOARD_CORNERS, detect_boards
+from rigkit.io.board_file import load_board
+from rigkit.io.calibration_file import load_camera
+from rigkit.io.corners_file import write_corners
+from rigkit.io.files import ensure_writable, write_atomic
+from rigkit.io.images import read_image
+from rigkit.report.overlay import draw_boards
+
+__all__ = ["DetectOptions", "DetectionResult", "detect_in_images"]
+
+IMAGE_ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DetectOptions:
+    """What may be in the images, and where the results go."""
+
+    boards: tuple[Path, ...] = ()
+    """Files of the boards that may be there; without any, boards of every size are looked for."""
+    camera: Path | None = None
+    """Calibration of the camera of all images: finds corners that were missed on `boards`, places all more finely."""
+    min_corners: int = 12
+    """Fewest corners of a board whose size is not given."""
+    output: Path | None = None
+    """Corners file to write; None: none."""
+    overlay: Path | None = None
+    """Folder for a picture of each image with its corners; None: no pictures."""
+    force: bool = False
+    """Replace files that exist; what was read is never replaced."""
+    jobs: int | None = None
+    """Processes; None: one a core."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class DetectionResult:
+    """What was found, by image, in the order given; and by image why others could not be looked at."""
+
+    found: Mapping[str, tuple[BoardDetection, ...]]
+    failures: Mapping[str, InputError]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Job:
+    """What one process needs to know of one image."""
+
+    image: Path
+    overlay: Path | None
+    boards: tuple[Board, ...]
+    camera: Camera | None
+    min_corners: int
+    force: bool
+
+
+def detect_in_images(
+    paths: Sequence[str | Path], options: DetectOptions | None = None, *, progress: Progress = silent
+) -> DetectionResult:
+    """Detect the boards of images, or of folders of images, and write what `options` ask for.
+
+    An image that cannot be read is among the failures and does not end the rest; its error is raised where there is no
+    other image.
+
+    Raises
+    ------
+    InputError
+        No such file, no image in a folder, or a file that cannot be written: said before the work.
+    CheckFailed
+        No image shows a board.
+    """
+    options = options or DetectOptions()
+    if options.min_corners < MIN_BOARD_CORNERS:
+        raise InputError(
+            f"--min-corners {options.min_corners}: a chessboard of less than 3x3 corners cannot be told apart"
+        )
+    if options.jobs is not None and options.jobs < 1:
+        raise InputError(f"--jobs {options.jobs}: at least one process is needed")
+    images = list(_images([Path(path) for path in paths]))
+    boards = tuple(load_board(path) for path in options.boards)
+    if options.camera is not None and not boards:
+        raise InputError("--camera helps to find boards of known size only; give them, such as --board a9x6.toml")
+    camera = None if options.camera is None else load_camera(options.camera)
+    overlays = _overlay_paths(images, options.overlay)
+    outputs = [path for path in (options.output, *overlays) if path is not None]
+    read = [*images, *options.boards, *([options.camera] if options.camera else [])]
+    ensure_writable(outputs, force=options.force, inputs=read)
+    tasks = [
+        _Job(image, overlay, boards, camera, options.min_corners, options.force)
+        for image, overlay in zip(images, overlays, strict=True)
+    ]
+    outcomes = _over_images(tasks, options.jobs, progress)
+    failures = {name: outcome for name, outcome in outcomes.items() if isinstance(outcome, InputError)}
+    found = {name: outcome for name, outcome in outcomes.items() if not isinstance(outcome, InputError)}
+    if failures and not found:
+        raise next(iter(failures.values()))
+    if not any(found.values()) and not failures:
+        raise CheckFailed(f"no chessboard found in {len(images)} images; check focus and exposure, or --min-corners")
+    if options.output is not None and any(found.values()):
+        write_corners(options.output, found, force=options.force)
+    return DetectionResult(found, failures)
+
+
+def _images(paths: Sequence[Path]) -> Iterator[Path]:
+    seen: set[Path] = set()
+    for path in paths:
+        inside = [path]
+        if path.is_dir():
+            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in IMAGE_ENDINGS)
+            if not inside:
+                raise InputError(f"folder '{path}' has no images ({' '.join(sorted(IMAGE_ENDINGS))}); give another")
+        elif not path.exists():
+            raise InputError(f"image '{path}' does not exist; check the path")
+        for image in inside:
+            if image not in seen:
+                seen.add(image)
+                yield image
+
+
+def _overlay_paths(images: Sequence[Path], folder: Path | None) -> list[Path | None]:
+    """Return where each overlay goes; images of one name in several folders get their folder's name as well."""
+    if folder is None:
+        return [None] * len(images)
+    common = Counter(image.stem for image in images)
+    names = [image.stem if common[image.stem] == 1 else "_".join(image.with_suffix("").parts[-3:]) for image in images]
+    if len(set(names)) < len(names):
+        raise InputError("--overlay: several images would get the same picture name; run the folders one by one")
+    return [folder / f"{name}.png" for name in names]
+
+
+Outcome: TypeAlias = tuple[BoardDetection, ...] | InputError
+
+
+def _over_images(tasks: Sequence[_Job], processes: int | None, progress: Progress) -> dict[str, Outcome]:
+    """Return the detections per image in their order, whatever the number of processes."""
+    jobs = min(processes or os.cpu_count() or 1, len(tasks))
+    found: dict[str, Outcome] = {}
+
+    def collect(results: Any) -> None:
+        for task, result in zip(tasks, results, strict=True):
+            found[str(task.image)] = result
+            progress("detecting", len(found), len(tasks))
+
+    if jobs == 1:
+        collect(map(_detect, tasks))
+    else:
+        with worker_pool(jobs) as pool:
+            collect(pool.map(_detect, tasks, chunksize=max(1, min(8, len(tasks) // (4 * jobs)))))
+    return found
+
+
+def _detect(job: _Job) -> Outcome:
+    """Detect the boards of one image and write its overlay; return the error where the image is of no use."""
+    cv2.setNumThreads(1)
+    try:
+        image = read_image(job.image)
+        found = _boards_in(image, job)
+    except InputError as error:
+        return error
+    if job.overlay is not None:
+        picture = cv2.cvtColor(draw_boards(image, found), cv2.COLOR_RGB2BGR)
+        write_atomic(job.overlay, np.asarray(cv2.imencode(".png", picture)[1]).tobytes(), force=job.force)
+    return found
+
+
+def _boards_in(image: NDArray[Any], job: _Job) -> tuple[BoardDetection, ...]:
+    size = (image.shape[1], image.shape[0])
+    if job.camera is not None and size != job.camera.size_px:
+        raise InputError(
+            f"image '{job.image}' is {size[0]}x{size[1]} px but the calibration is for {job.camera.size_px[0]}x"
+            f"{job.camera.size_px[1]}; use that camera's images, or leave --camera out"
+        )
+    try:
+        return detect_boards(image, job.boards, min_corners=job.min_corners, camera=job.camera)
+    except InputError as error:
+        raise InputError(f"'{job.image}': {error}") from error

@@ -1,0 +1,106 @@
+"""Two calibrations, or two rigs, against what their uncertainties predict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from rigkit.calibration.compare import CalibrationComparison, compare_calibrations
+from rigkit.calibration.rig.compare import RigDifference, compare_mounts
+from rigkit.cameras.compare import CameraDifference, compare_cameras
+from rigkit.core.errors import InputError
+from rigkit.io.calibration_file import is_calibration, load_calibration, load_camera
+from rigkit.io.files import ensure_writable, write_atomic
+from rigkit.io.rig_file import is_rig_file, load_saved_rig
+from rigkit.report.figures import difference_png
+
+__all__ = ["CameraPair", "DiffOptions", "RigPair", "diff"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DiffOptions:
+    """Where the map of the difference of two cameras goes."""
+
+    output: Path | None = None
+    """File for the map; None: no map."""
+    force: bool = False
+    """Replace a map that exists."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CameraPair:
+    """The difference of two cameras, and what their covariances say of it; None where a file has none (another tool's
+    camera)."""
+
+    difference: CameraDifference
+    judged: CalibrationComparison | None
+
+    @property
+    def same(self) -> bool | None:
+        """Whether it is the same camera; None: nobody can tell."""
+        return None if self.judged is None else self.judged.same
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RigPair:
+    """The differences of two rigs' mounts, and by name of the cameras whose calibrations lie beside the rigs."""
+
+    mounts: RigDifference
+    cameras: Mapping[str, CameraPair]
+
+    @property
+    def same(self) -> bool | None:
+        """Whether it is the same rig; None: nobody can tell."""
+        known = [s for s in (self.mounts.same, *(c.same for c in self.cameras.values())) if s is not None]
+        return all(known) if known else None
+
+
+def diff(a: Path, b: Path, options: DiffOptions | None = None) -> CameraPair | RigPair:
+    """Compare two calibration files, or two files of rigs.
+
+    Raises InputError for a rig and a camera, rigs of other cameras, or a map that cannot be written.
+    """
+    options = options or DiffOptions()
+    rigs = [is_rig_file(path) for path in (a, b)]
+    if all(rigs):
+        if options.output is not None:
+            raise InputError("diff: a map is of two cameras; give the calibrations beside the rigs, rig-CAMERA.json")
+        return _rigs(a, b)
+    if any(rigs):
+        other = b if rigs[0] else a
+        raise InputError(f"diff: a rig and a camera; compare '{other}' with the calibration beside the rig")
+    if options.output is not None:
+        ensure_writable(options.output, force=options.force, inputs=(a, b))
+    pair = _cameras(a, b)
+    if options.output is not None:
+        write_atomic(options.output, difference_png(pair.difference), force=options.force)
+    return pair
+
+
+def _cameras(a: Path, b: Path) -> CameraPair:
+    cameras = load_camera(a), load_camera(b)
+    if not all(is_calibration(path) for path in (a, b)):
+        return CameraPair(compare_cameras(*cameras), None)
+    judged = compare_calibrations(load_calibration(a), load_calibration(b))
+    return CameraPair(judged.difference, judged)
+
+
+def _rigs(a: Path, b: Path) -> RigPair:
+    first, second = load_saved_rig(a), load_saved_rig(b)
+    names = list(first.cameras)
+    if names != list(second.cameras):
+        raise InputError(f"diff: '{a}' has the cameras {', '.join(names)}, '{b}' {', '.join(second.cameras)}")
+    mounts = compare_mounts(
+        names,
+        [first.cameras[name][1] for name in names],
+        [second.cameras[name][1] for name in names],
+        first.mount_covariance,
+        second.mount_covariance,
+    )
+    cameras = {}
+    for name in names:
+        beside = [path.with_name(f"{path.stem}-{name}.json") for path in (a, b)]
+        if all(path.is_file() for path in beside):
+            cameras[name] = _cameras(*beside)
+    return RigPair(mounts, cameras)

@@ -1,0 +1,81 @@
+"""The oriented cloud of one pair in a format of other tools."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+from rigkit.core.errors import InputError
+from rigkit.core.progress import Progress, silent
+from rigkit.interop.colmap_model import colmap_model
+from rigkit.io.files import ensure_writable
+from rigkit.io.manifest import Dataset, load_dataset
+from rigkit.io.npz import cloud_npz
+from rigkit.io.ply import ply_bytes
+from rigkit.reconstruction.reconstruct import Reconstruction
+from rigkit.workflows.datasets import load_cameras
+from rigkit.workflows.pairs import match_images, reconstruct_with
+from rigkit.workflows.results import write_results
+
+__all__ = ["ExportCloudOptions", "export_cloud"]
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExportCloudOptions:
+    """Which cloud goes where."""
+
+    output: Path
+    """File to write; a folder for a COLMAP model."""
+    kind: str
+    """Format: ply, npz or colmap."""
+    pair: str | None = None
+    """Name of the pair; None: the only one."""
+    method: str = "3SDIR"
+    """Affine estimator of the normals."""
+    force: bool = False
+    """Replace files that exist; what was read is never replaced."""
+
+
+def export_cloud(
+    dataset: Dataset | str | Path, options: ExportCloudOptions, *, progress: Progress = silent
+) -> Reconstruction:
+    """Reconstruct one pair of a data set, write its cloud, and return the reconstruction.
+
+    Raises
+    ------
+    InputError
+        No such pair, or none named of several; a file that cannot be read or written.
+    DegenerateError
+        The corners do not determine the pose.
+    """
+    known = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
+    if options.pair is None and len(known.pairs) != 1:
+        raise InputError(f"export: say which pair with --pair: {', '.join(p.pair_id for p in known.pairs)}")
+    pair = known.pair(options.pair) if options.pair else known.pairs[0]
+    if options.kind != "colmap":
+        ensure_writable(options.output, force=options.force, inputs=known.inputs)
+    pair.require_images()
+    camera1, camera2 = load_cameras(known.select([pair.pair_id]), progress=progress).of(pair)
+    matched, image1, _ = match_images(pair, camera1.camera, camera2.camera, "raw")
+    r = reconstruct_with(matched, pair, options.method, image1)
+    folder, files = options.output, dict[str, str | bytes]()
+    if options.kind == "colmap":
+        model, notes = colmap_model(
+            (r.camera1, r.camera2),
+            r.cam2_from_cam1,
+            (r.pixels1, r.pixels2),
+            r.cloud,
+            (pair.image1, pair.image2),
+            error_px=r.sampson_rms_px,
+        )
+        files |= model
+        for words in notes:
+            _log.info(words)
+    else:
+        folder = options.output.parent
+        files[options.output.name] = ply_bytes(r.cloud) if options.kind == "ply" else cloud_npz(r)
+    write_results(folder, files, force=options.force, inputs=known.inputs)
+    return r

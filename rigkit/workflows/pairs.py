@@ -1,0 +1,128 @@
+"""One pair of a data set: boards found, matched and reconstructed as the manifest declares it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.cameras.base import Camera
+from rigkit.core.detections import BoardDetection
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.detection.detect import detect_boards
+from rigkit.io.images import read_image, to_grey
+from rigkit.io.manifest import Pair
+from rigkit.reconstruction.geometry import PairGeometry, pair_geometry
+from rigkit.reconstruction.pairing import MatchedPair, match_pair
+from rigkit.reconstruction.reconstruct import Reconstruction, reconstruct_from
+from rigkit.validation.intrinsics import CalibrationShifts, calibration_shifts
+from rigkit.workflows.datasets import LoadedCamera
+
+__all__ = [
+    "find_boards",
+    "geometry_of",
+    "match_found",
+    "match_images",
+    "read_for",
+    "reconstruct_other_chain",
+    "reconstruct_with",
+    "shifts_of",
+]
+
+Detections: TypeAlias = tuple[BoardDetection, ...]
+Image: TypeAlias = NDArray[Any]
+
+
+def find_boards(pair: Pair, camera1: Camera, camera2: Camera) -> tuple[Detections, Detections, Image, Image]:
+    """Return the boards found in either image of a pair, and the images; raises InputError where there are none.
+
+    The cameras show where corners were missed, which parts are of one board, what is covered, and how lines bend; a
+    camera that no pose of a board fits is left aside.
+    """
+    images = []
+    found: list[Detections] = []
+    for path, camera, entry in ((pair.image1, camera1, pair.camera1), (pair.image2, camera2, pair.camera2)):
+        image = read_for(camera, path, f"pair '{pair.pair_id}', camera '{entry.camera_id}'")
+        detections = detect_boards(to_grey(image), pair.boards, camera=camera)
+        if not detections:
+            sizes = ", ".join(sorted({f"{b.columns}x{b.rows}" for b in pair.boards}))
+            raise InputError(
+                f"pair '{pair.pair_id}': no board ({sizes}) found in '{path}'; check the image and the boards"
+            )
+        images.append(image)
+        found.append(detections)
+    return found[0], found[1], images[0], images[1]
+
+
+def read_for(camera: Camera, path: str | Path, whose: str) -> Image:
+    """Return an image; raises InputError also where it is of another size than the camera was calibrated at."""
+    image = read_image(path)
+    size = (image.shape[1], image.shape[0])
+    if size != camera.size_px:
+        raise InputError(
+            f"{whose}: image '{path}' is {size[0]}x{size[1]} px but the calibration is for "
+            f"{camera.size_px[0]}x{camera.size_px[1]}; use images of that size, or recalibrate"
+        )
+    return image
+
+
+def match_images(pair: Pair, camera1: Camera, camera2: Camera, chain: str) -> tuple[MatchedPair, Image, Image]:
+    """Return the matched corners of a pair, and its two images."""
+    found1, found2, image1, image2 = find_boards(pair, camera1, camera2)
+    return match_found(pair, camera1, camera2, found1, found2, chain), image1, image2
+
+
+def match_found(
+    pair: Pair,
+    camera1: Camera,
+    camera2: Camera,
+    detections1: Sequence[BoardDetection],
+    detections2: Sequence[BoardDetection],
+    chain: str,
+) -> MatchedPair:
+    """Match the boards found in the two images of a pair as the manifest declares it."""
+    return match_pair(
+        pair.pair_id,
+        camera1,
+        camera2,
+        detections1,
+        detections2,
+        pair.boards,
+        layout=pair.layout or None,
+        angles=pair.truth.angles,
+        chain="rectified" if chain == "rectified" else "raw",
+    )
+
+
+def geometry_of(matched: MatchedPair, pair: Pair) -> PairGeometry:
+    """Return pose and points of matched corners as the manifest declares the pair."""
+    level = None if pair.level_sigma_deg is None else float(np.deg2rad(pair.level_sigma_deg))
+    return pair_geometry(matched, pose_type=pair.pose_type, level_sigma_rad=level)
+
+
+def reconstruct_with(matched: MatchedPair, pair: Pair, method: str, image1: Image | None = None) -> Reconstruction:
+    """Reconstruct matched corners as the manifest declares the pair."""
+    return reconstruct_from(geometry_of(matched, pair), affine_method=method, image1=image1)
+
+
+def shifts_of(reconstruction: Reconstruction, camera1: LoadedCamera, camera2: LoadedCamera) -> CalibrationShifts | None:
+    """Return what the calibrations' uncertainty does to a reconstruction; None where a camera has no covariance."""
+    if camera1.covariance is None or camera2.covariance is None:
+        return None
+    return calibration_shifts(
+        reconstruction,
+        camera1.covariance,
+        None if camera1 is camera2 else camera2.covariance,
+        level_sigma_rad=reconstruction.level_sigma_rad,
+    )
+
+
+def reconstruct_other_chain(matched: MatchedPair, pair: Pair) -> Reconstruction | None:
+    """Reconstruct the same corners in the other pixels (raw or rectified); None where they do not fit."""
+    try:
+        return reconstruct_with(matched.in_chain("rectified" if matched.chain == "raw" else "raw"), pair, "3SDIR")
+    except DegenerateError:
+        return None

@@ -1,0 +1,106 @@
+"""Oriented clouds of every pair of a data set; needs no measured truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from rigkit.cameras.base import Camera
+from rigkit.core.progress import Progress, silent
+from rigkit.io.manifest import Dataset, Pair
+from rigkit.io.ply import ply_bytes
+from rigkit.reconstruction.reconstruct import Reconstruction
+from rigkit.report.figures import cloud_png, corners_png, epipolar_png
+from rigkit.workflows.datasets import DatasetOptions, PairFailure, load_cameras, over_pairs, ready_dataset
+from rigkit.workflows.pairs import match_images, reconstruct_with
+from rigkit.workflows.results import require_folder, write_results
+
+__all__ = ["DatasetReconstruction", "PairReconstruction", "ReconstructOptions", "reconstruct_dataset"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReconstructOptions(DatasetOptions):
+    """How to reconstruct the pairs of a data set."""
+
+    method: str = "3SDIR"
+    """Affine estimator of the normals."""
+    pictures: bool = True
+    """Draw corners, epipolar curves and the cloud."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PairReconstruction:
+    """One pair: the reconstruction, the name of its cloud's file, and all its files (relative path -> content)."""
+
+    reconstruction: Reconstruction
+    ply: str
+    files: Mapping[str, bytes]
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class DatasetReconstruction:
+    """What the pairs of a data set came to.
+
+    Attributes
+    ----------
+    pairs : those that could be reconstructed.
+    failures : the others.
+    files : relative path -> content of everything, whether it was written or not.
+    """
+
+    pairs: tuple[PairReconstruction, ...]
+    failures: tuple[PairFailure, ...]
+    files: Mapping[str, str | bytes]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Job:
+    """What one process needs to know of one pair."""
+
+    pair: Pair
+    camera1: Camera
+    camera2: Camera
+    options: ReconstructOptions
+
+
+def reconstruct_dataset(
+    dataset: Dataset | str | Path, options: ReconstructOptions | None = None, *, progress: Progress = silent
+) -> DatasetReconstruction:
+    """Reconstruct the pairs of a data set, given its folder or as loaded, and write what `options` ask for.
+
+    A pair that cannot be reconstructed is among the failures; its error is raised where there is no other pair.
+    """
+    options = options or ReconstructOptions()
+    known = ready_dataset(dataset, options)
+    if options.output is not None:
+        require_folder(options.output, force=options.force)
+    cameras = load_cameras(known, recalibrate=options.recalibrate, progress=progress)
+
+    def job_of(pair: Pair) -> _Job:
+        first, second = cameras.of(pair)
+        return _Job(pair, first.camera, second.camera, options)
+
+    outcomes, failures = over_pairs(
+        _reconstruct, known.pairs, job_of, jobs=options.jobs, what="reconstructing pairs", progress=progress
+    )
+    files: dict[str, str | bytes] = dict(cameras.files)
+    for outcome in outcomes:
+        files |= outcome.files
+    if options.output is not None:
+        write_results(options.output, files, force=options.force, inputs=known.inputs)
+    return DatasetReconstruction(pairs=tuple(outcomes), failures=failures, files=files)
+
+
+def _reconstruct(job: _Job) -> PairReconstruction:
+    """Reconstruct one pair and render its files."""
+    pair, options = job.pair, job.options
+    matched, image1, image2 = match_images(pair, job.camera1, job.camera2, options.chain)
+    r = reconstruct_with(matched, pair, options.method, image1)
+    ply = f"{pair.pair_id}/{options.method}.ply"
+    files = {ply: ply_bytes(r.cloud)}
+    if options.pictures:
+        files[f"{pair.pair_id}/corners.png"] = corners_png(r, image1, image2)
+        files[f"{pair.pair_id}/epipolar.png"] = epipolar_png(r, image1, image2)
+        files[f"{pair.pair_id}/cloud.png"] = cloud_png(r)
+    return PairReconstruction(r, ply, files)

@@ -1,0 +1,156 @@
+"""A pair of views of any scene, without boards: matched here, or from a file of correspondences."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.affine.correspondences import Correspondences
+from rigkit.affine.features import match_affine_features
+from rigkit.core.errors import InputError
+from rigkit.core.progress import Progress, silent
+from rigkit.io.calibration_file import load_camera
+from rigkit.io.correspondences import correspondences_text, read_correspondences
+from rigkit.io.ply import ply_bytes
+from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene
+from rigkit.report.figures import cloud_png, epipolar_png
+from rigkit.report.scene_figure import normals_png
+from rigkit.workflows.pairs import read_for
+from rigkit.workflows.results import require_folder, write_results
+
+__all__ = ["CLOUD", "SceneOptions", "SceneResult", "reconstruct_views"]
+
+CLOUD = "scene.ply"
+
+Images: TypeAlias = tuple[NDArray[Any], NDArray[Any]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SceneOptions:
+    """What is there of a scene, and how to reconstruct it."""
+
+    camera: Path
+    """Calibration of the camera (of the first image)."""
+    camera2: Path | None = None
+    """Calibration of the second image's camera; None: the same."""
+    images: tuple[Path, Path] | None = None
+    """The two images: their features are matched; with `correspondences` they colour the cloud."""
+    correspondences: Path | None = None
+    """Correspondences with affinities or directions (CSV, NPZ or AffineExtractor's text)."""
+    baseline_mm: float | None = None
+    """Measured baseline; None: it is the unit of the result."""
+    pose_type: str = "general"
+    """Of the two views: general, planar, standard, forward or auto."""
+    level_sigma_deg: float | None = None
+    """How well that pose type holds."""
+    output: Path | None = None
+    """Folder for the results; None: nothing is written."""
+    force: bool = False
+    """Replace results that are there; what was read is never replaced."""
+    pictures: bool = True
+    """Draw the cloud, the epipolar curves and the normals."""
+
+    @property
+    def name(self) -> str:
+        """What the scene is called: as the file that it comes from."""
+        source = self.correspondences or (self.images[0] if self.images else None)
+        if source is None:
+            raise InputError("a scene needs two images, or a file of correspondences")
+        return source.stem
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class SceneResult:
+    """What a scene came to.
+
+    Attributes
+    ----------
+    name : of the scene.
+    scene : the reconstruction, and which correspondences agree.
+    correspondences : all of them.
+    files : relative path -> content of everything, whether it was written or not.
+    """
+
+    name: str
+    scene: SceneReconstruction
+    correspondences: Correspondences
+    files: Mapping[str, str | bytes]
+
+    @property
+    def unit(self) -> str:
+        """The unit of lengths: "mm", or "baselines" where none was measured."""
+        return "mm" if self.scene.metric else "baselines"
+
+
+def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> SceneResult:
+    """Reconstruct two views of a scene and write what `options` ask for.
+
+    Raises
+    ------
+    InputError
+        A file cannot be read or written, an image is of another size than its camera's, both images are the same.
+    DegenerateError
+        The correspondences do not determine the pose.
+    """
+    name = options.name
+    if options.output is not None:
+        require_folder(options.output, force=options.force)
+    camera1 = load_camera(options.camera)
+    camera2 = load_camera(options.camera2) if options.camera2 else camera1
+    images = None
+    if options.images:
+        a, b = options.images
+        images = (read_for(camera1, a, "image A"), read_for(camera2, b, "image B"))
+        if np.array_equal(*images):
+            raise InputError(
+                f"images A '{a}' and B '{b}' are the same picture to the last pixel: no baseline; give two images "
+                "taken from different places"
+            )
+    found = _correspondences(options, images, progress)
+    scene = reconstruct_scene(
+        found,
+        camera1,
+        camera2,
+        pair_id=name,
+        pose_type=options.pose_type,
+        level_sigma_rad=None if options.level_sigma_deg is None else float(np.deg2rad(options.level_sigma_deg)),
+        baseline_mm=options.baseline_mm,
+        image1=images[0] if images else None,
+    )
+    files = _files(options, scene, found, images)
+    if options.output is not None:
+        read = (*(options.images or ()), options.correspondences, options.camera, options.camera2)
+        write_results(options.output, files, force=options.force, inputs=[path for path in read if path])
+    return SceneResult(name=name, scene=scene, correspondences=found, files=files)
+
+
+def _correspondences(options: SceneOptions, images: Images | None, progress: Progress) -> Correspondences:
+    if options.correspondences:
+        return read_correspondences(options.correspondences)
+    assert images is not None
+    progress("matching affine features", 0, 1)
+    found = match_affine_features(*images)
+    progress("matching affine features", 1, 1)
+    return found
+
+
+def _files(
+    options: SceneOptions, scene: SceneReconstruction, found: Correspondences, images: Images | None
+) -> dict[str, str | bytes]:
+    r = scene.reconstruction
+    unit = "mm" if scene.metric else "baselines"
+    files: dict[str, str | bytes] = {CLOUD: ply_bytes(r.cloud, unit=unit)}
+    if not options.correspondences:
+        files["correspondences.csv"] = correspondences_text(found)
+    if not options.pictures:
+        return files
+    files["cloud.png"] = cloud_png(r, unit=unit)
+    if images:
+        files["epipolar.png"] = epipolar_png(r, *images, every=max(1, len(r.cloud) // 40))
+        files["normals.png"] = normals_png(scene, found, *images)
+    return files

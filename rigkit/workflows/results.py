@@ -1,0 +1,52 @@
+"""Folders of results: which one, and files written into it all together or not at all."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from rigkit.core.errors import InputError
+from rigkit.io.files import ensure_folder_writable, ensure_writable, write_together
+
+__all__ = ["free_folder", "require_folder", "write_results"]
+
+
+def free_folder(name: str, *, force: bool) -> Path:
+    """Return the first of out/NAME, out/NAME-2, ... that is not there yet; out/NAME itself with `force`."""
+    base = Path("out") / name
+    if force:
+        return base
+    names = itertools.chain([base], (base.with_name(f"{base.name}-{number}") for number in itertools.count(2)))
+    return next(folder for folder in names if not folder.exists())
+
+
+def require_folder(folder: Path, *, force: bool) -> None:
+    """Raise InputError, before the work, where `folder` holds results and `force` is not given, or files could not be
+    written there."""
+    if folder.is_dir() and any(folder.iterdir()) and not force:
+        raise InputError(f"folder '{folder}' is not empty; use --force to replace results in it, or another folder")
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"'{folder}' is a file, not a folder; give another name with -o")
+    ensure_folder_writable(folder)
+
+
+def write_results(
+    folder: Path, files: Mapping[str, str | bytes], *, force: bool, inputs: Iterable[str | Path] = ()
+) -> tuple[Path, ...]:
+    """Write all files (relative path -> content) into `folder`, or none, and return where they are.
+
+    Raises InputError where one would replace one of `inputs`, or would lie outside of `folder` because something in it
+    is a link.
+    """
+    placed = {folder / name: data for name, data in files.items()}
+    whole = folder.resolve()
+    for path in placed:
+        if not path.parent.resolve().is_relative_to(whole):
+            raise InputError(
+                f"cannot write '{path}': a link in '{folder}' leads out of it, to '{path.parent.resolve()}'; remove "
+                "the link, or give another folder"
+            )
+    ensure_writable(placed, force=force, inputs=inputs)
+    write_together(placed, force=force)
+    return tuple(placed)

@@ -1,0 +1,260 @@
+"""Every pair of a data set and every affine estimator against what a person measured."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from rigkit.affine.registry import AFFINE_METHODS
+from rigkit.core.errors import InputError, RigkitError
+from rigkit.core.findings import Finding, Severity
+from rigkit.core.progress import Progress, silent
+from rigkit.io.manifest import Dataset, Pair
+from rigkit.io.paper_tables import load_paper_tables
+from rigkit.io.ply import ply_bytes
+from rigkit.reconstruction.pairing import MatchedPair
+from rigkit.reconstruction.reconstruct import Reconstruction, reconstruct_from
+from rigkit.report.drawings import normal_errors_svg, residuals_svg
+from rigkit.report.figures import as_jpeg, as_pdf, as_png, cloud_figure, corners_figure, epipolar_figure
+from rigkit.report.page import PairSection
+from rigkit.report.validation_page import crosscheck_table, pair_section
+from rigkit.validation.checks import ValidationReport, validate_each
+from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
+from rigkit.validation.diagnose import camera_suspects, suspects
+from rigkit.validation.intrinsics import CalibrationShifts
+from rigkit.validation.tables import PaperTables, best_report
+from rigkit.workflows.datasets import (
+    DatasetOptions,
+    LoadedCameras,
+    PairFailure,
+    load_cameras,
+    over_pairs,
+    ready_dataset,
+)
+from rigkit.workflows.pairs import find_boards, geometry_of, match_found, reconstruct_other_chain, shifts_of
+from rigkit.workflows.results import require_folder, write_results
+from rigkit.workflows.validation_files import RESERVED, PairValidation, validation_files
+
+__all__ = ["DatasetValidation", "PairValidation", "ValidateOptions", "validate_dataset"]
+
+PAPER = "hajder2021"
+"""Folder with the paper's tables, beside the data set."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ValidateOptions(DatasetOptions):
+    """How to validate a data set."""
+
+    pictures: bool = True
+    """Draw each pair, and make the page."""
+    pdf: bool = False
+    """The pictures as vectors too, for a paper."""
+    crosscheck: bool = True
+    """Compare with independent methods."""
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class DatasetValidation:
+    """What a data set came to.
+
+    Attributes
+    ----------
+    pairs : those that could be reconstructed.
+    failures : the others.
+    causes : what explains checks that fail, gravest where one does fail.
+    files : relative path -> content of everything, whether it was written or not.
+    seconds : how long it took.
+    """
+
+    pairs: tuple[PairValidation, ...]
+    failures: tuple[PairFailure, ...]
+    causes: tuple[Finding, ...]
+    files: Mapping[str, str | bytes]
+    seconds: float
+
+    @property
+    def reports(self) -> tuple[ValidationReport, ...]:
+        """Every estimator of every pair."""
+        return tuple(report for pair in self.pairs for report in pair.reports)
+
+    @property
+    def crosschecks(self) -> tuple[CrossCheckReport, ...]:
+        """The comparisons with independent methods."""
+        return tuple(pair.crosscheck for pair in self.pairs if pair.crosscheck is not None)
+
+    @property
+    def passed(self) -> bool:
+        """Whether every pair was validated, and every check holds."""
+        checked = all(r.passed for r in self.reports) and all(r.passed for r in self.crosschecks)
+        return checked and not self.failures
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Job:
+    """What one process needs to know of one pair."""
+
+    pair: Pair
+    cameras: LoadedCameras
+    options: ValidateOptions
+
+
+def validate_dataset(
+    dataset: Dataset | str | Path, options: ValidateOptions | None = None, *, progress: Progress = silent
+) -> DatasetValidation:
+    """Validate the pairs of a data set, given its folder or the data set as loaded, and write what `options` ask for.
+
+    Raises
+    ------
+    InputError
+        Nothing was measured, or something asked for cannot be: all said before the work.
+    RigkitError
+        No pair could be reconstructed; a pair that could not is else among the failures.
+    """
+    started = time.monotonic()
+    options = options or ValidateOptions()
+    known = ready_dataset(dataset, options, reserved=RESERVED)
+    if options.output is not None:
+        require_folder(options.output, force=options.force)
+    if not any(pair.truth.count for pair in known.pairs):
+        raise InputError(
+            f"{known.manifest}: nothing was measured of these pairs; add a baseline or angles under [pairs.truth]"
+        )
+    paper = _paper_tables(known)
+    cameras = load_cameras(known, recalibrate=options.recalibrate, progress=progress)
+
+    def job_of(pair: Pair) -> _Job:
+        cameras.of(pair)
+        return _Job(pair, cameras, options)
+
+    pairs, failures = over_pairs(
+        _validate, known.pairs, job_of, jobs=options.jobs, what="reconstructing and validating pairs", progress=progress
+    )
+    compared = [pair.crosscheck for pair in pairs if pair.crosscheck is not None]
+    passed = not failures and all(r.passed for pair in pairs for r in pair.reports) and all(r.passed for r in compared)
+    causes = [cause for pair in pairs for cause in pair.causes]
+    causes += suspects([pair.best for pair in pairs])
+    causes += [f"pair '{report.pair_id}': {words}" for report in compared for words in report.suspects]
+    # Where everything passed they explain nothing, but a person should know.
+    severity = Severity.LOOK if passed else Severity.BAD
+    seconds = time.monotonic() - started
+    files = validation_files(
+        known, cameras, pairs, failures, paper, passed=passed, chain=options.chain, seconds=seconds
+    )
+    if options.output is not None:
+        write_results(options.output, files, force=options.force, inputs=known.inputs)
+    return DatasetValidation(
+        pairs=tuple(pairs),
+        failures=failures,
+        causes=tuple(Finding(severity=severity, message=cause) for cause in causes),
+        files=files,
+        seconds=time.monotonic() - started,
+    )
+
+
+def _paper_tables(dataset: Dataset) -> PaperTables | None:
+    """Return the paper's tables where they lie beside the data set."""
+    folder = dataset.root.parent / PAPER
+    return load_paper_tables(folder) if folder.is_dir() else None
+
+
+def _validate(job: _Job) -> PairValidation:
+    """Reconstruct one pair with every estimator and judge each."""
+    pair = job.pair
+    names = (pair.camera1.camera_id, pair.camera2.camera_id)
+    camera1, camera2 = (loaded.camera for loaded in job.cameras.of(pair))
+    found1, found2, image1, image2 = find_boards(pair, camera1, camera2)
+    known = {name: loaded.camera for name, loaded in job.cameras.known.items()}
+    causes = camera_suspects(pair.pair_id, names, (found1, found2), pair.boards, known)
+    try:
+        matched = match_found(pair, camera1, camera2, found1, found2, job.options.chain)
+        return _judge(job, matched, image1, image2, causes)
+    except RigkitError as error:
+        if not causes:
+            raise
+        raise type(error)(f"{error}; probable cause: {'; '.join(causes)}") from error
+
+
+def _judge(
+    job: _Job, matched: MatchedPair, image1: NDArray[Any], image2: NDArray[Any], causes: tuple[str, ...]
+) -> PairValidation:
+    pair = job.pair
+    geometry = geometry_of(matched, pair)
+    reconstructions = {m: reconstruct_from(geometry, affine_method=m, image1=image1) for m in AFFINE_METHODS}
+    shifts = _shifts(reconstructions, job)
+    reports = validate_each(list(reconstructions.values()), pair.truth, [shifts[m] for m in reconstructions])
+    best = best_report(reports)
+    files: dict[str, bytes] = {
+        f"{pair.pair_id}/{method}.ply": ply_bytes(r.cloud) for method, r in reconstructions.items()
+    }
+    shown = reconstructions[best.affine_method]
+    compared = None
+    if job.options.crosscheck:
+        other = reconstruct_other_chain(matched, pair)
+        compared = crosscheck(shown, other_chain=other, shifts=shifts[best.affine_method])
+    section = None
+    if job.options.pictures:
+        drawn = _pictures(shown, image1, image2, pdf=job.options.pdf)
+        files |= drawn
+        section = _section(reconstructions, shown, reports, compared, drawn)
+    return PairValidation(
+        pair_id=pair.pair_id,
+        reports=reports,
+        best=best,
+        crosscheck=compared,
+        causes=causes,
+        files=files,
+        section=section,
+    )
+
+
+def _shifts(reconstructions: Mapping[str, Reconstruction], job: _Job) -> dict[str, CalibrationShifts | None]:
+    """Return what the calibrations' uncertainty does to each reconstruction, by estimator.
+
+    The likelihood sees the corners, not the affinities: estimators that kept the same corners share the answer.
+    """
+    cameras = job.cameras.of(job.pair)
+    known: list[tuple[Reconstruction, CalibrationShifts | None]] = []
+    out: dict[str, CalibrationShifts | None] = {}
+    for method, reconstruction in reconstructions.items():
+        same = [shifts for first, shifts in known if first.same_points(reconstruction)]
+        out[method] = same[0] if same else shifts_of(reconstruction, *cameras)
+        if not same:
+            known.append((reconstruction, out[method]))
+    return out
+
+
+def _pictures(r: Reconstruction, image1: NDArray[Any], image2: NDArray[Any], *, pdf: bool) -> dict[str, bytes]:
+    """Return the pictures of a pair by relative path, as vectors too with `pdf`."""
+    figures = {
+        "corners": corners_figure(r, image1, image2),
+        "epipolar": epipolar_figure(r, image1, image2),
+        "cloud": cloud_figure(r),
+    }
+    files: dict[str, bytes] = {}
+    for name, figure in figures.items():
+        files[f"{r.pair_id}/{name}.png"] = as_png(figure)
+        if pdf:
+            files[f"{r.pair_id}/{name}.pdf"] = as_pdf(figure)
+    return files
+
+
+def _section(
+    reconstructions: Mapping[str, Reconstruction],
+    shown: Reconstruction,
+    reports: tuple[ValidationReport, ...],
+    compared: CrossCheckReport | None,
+    drawn: Mapping[str, bytes],
+) -> PairSection:
+    """Return the pair's section of the page, with the pictures `drawn` as JPEG."""
+    pictures = [
+        ("Corners as found and matched", "image/jpeg", as_jpeg(drawn[f"{shown.pair_id}/corners.png"])),
+        ("Epipolar curves of every seventh corner", "image/jpeg", as_jpeg(drawn[f"{shown.pair_id}/epipolar.png"])),
+        ("What the corners leave over", "image/svg+xml", residuals_svg(shown).encode()),
+        ("Normal errors of the estimators", "image/svg+xml", normal_errors_svg(reconstructions, reports).encode()),
+    ]
+    return pair_section(shown, reports, pictures, [] if compared is None else [crosscheck_table([compared])])

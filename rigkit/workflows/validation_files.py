@@ -1,0 +1,106 @@
+"""The tables and the page of a validation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from rigkit.io.manifest import Dataset
+from rigkit.report.page import PairSection, build_page
+from rigkit.report.tables import tables_to_csv, tables_to_json, tables_to_latex, tables_to_markdown
+from rigkit.report.validation_page import camera_table, crosscheck_table, summary_table
+from rigkit.validation.checks import ValidationReport
+from rigkit.validation.crosscheck import CrossCheckReport
+from rigkit.validation.tables import PaperTables, Table, build_tables
+from rigkit.workflows.datasets import LoadedCameras, PairFailure
+from rigkit.workflows.provenance import digest_line, software_facts
+
+__all__ = ["RESERVED", "PairValidation", "validation_files"]
+
+PAGE = "report.html"
+RESERVED = ("tables.md", "tables.csv", "tables.tex", "tables.json", PAGE)
+"""Names of files of results, which no pair can have."""
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class PairValidation:
+    """What one pair came to.
+
+    Attributes
+    ----------
+    pair_id : its name.
+    reports : one an estimator, in the order of the registry.
+    best : that of the estimator shown.
+    crosscheck : what independent methods say of that one, if they were asked.
+    causes : what may be wrong with the capture, seen before the reconstruction.
+    files : relative path -> content of clouds and pictures.
+    section : of the page, where there are pictures.
+    """
+
+    pair_id: str
+    reports: tuple[ValidationReport, ...]
+    best: ValidationReport
+    crosscheck: CrossCheckReport | None
+    causes: tuple[str, ...]
+    files: Mapping[str, bytes]
+    section: PairSection | None
+
+
+def validation_files(
+    dataset: Dataset,
+    cameras: LoadedCameras,
+    pairs: Sequence[PairValidation],
+    failures: Sequence[PairFailure],
+    paper: PaperTables | None,
+    *,
+    passed: bool,
+    chain: str,
+    seconds: float,
+) -> dict[str, str | bytes]:
+    """Return everything that a validation came to, relative path -> content; the page where there are pictures."""
+    reports = [report for pair in pairs for report in pair.reports]
+    compared = [pair.crosscheck for pair in pairs if pair.crosscheck is not None]
+    tables = [summary_table([pair.best for pair in pairs]), *build_tables(reports, paper)]
+    if compared:
+        tables.insert(-2, crosscheck_table(compared))
+    files: dict[str, str | bytes] = {
+        "tables.md": tables_to_markdown(tables),
+        "tables.csv": tables_to_csv(tables),
+        "tables.tex": tables_to_latex(tables),
+        "tables.json": tables_to_json(tables),
+    }
+    files |= cameras.files
+    for pair in pairs:
+        files |= pair.files
+    sections = [pair.section for pair in pairs if pair.section is not None]
+    if sections:
+        lead = f"pairs: {len(pairs)}; reconstructions: {len(reports)}; {seconds:.0f} s"
+        lead += "".join(f"; not validated: {failure}" for failure in failures)
+        shown = [table for table in tables if table.key not in ("checks", "estimators")]
+        shown += _calibrations(dataset, cameras)
+        title = f"rigkit validation: {dataset.name}"
+        files[PAGE] = build_page(title, lead, passed, shown, sections, _facts(dataset, cameras, chain))
+    return files
+
+
+def _calibrations(dataset: Dataset, cameras: LoadedCameras) -> list[Table]:
+    """Return the table of the cameras in use; none where their files say no more than the camera."""
+    known = {
+        name: loaded.calibration
+        for name, loaded in cameras.known.items()
+        if name in dataset.used_cameras and loaded.calibration is not None
+    }
+    return [camera_table(known)] if known else []
+
+
+def _facts(dataset: Dataset, cameras: LoadedCameras, chain: str) -> dict[str, str]:
+    """Return what somebody needs to know to get the same page again."""
+    facts = software_facts("open3d", "pycolmap") | {"chain": chain}
+    facts["manifest"] = f"{dataset.manifest.name}, {digest_line(dataset.manifest)}"
+    for name, source in cameras.sources.items():
+        label = "calibrated from its session" if isinstance(source, str) else source.name
+        facts[f"camera {name}"] = f"{label}, {digest_line(source)}"
+    for pair in dataset.pairs:
+        there = [path for path in (pair.image1, pair.image2) if path.is_file()]
+        facts[f"pair {pair.pair_id}"] = "; ".join(f"{path.name}, {digest_line(path)}" for path in there)
+    return facts
