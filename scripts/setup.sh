@@ -41,6 +41,16 @@ find_python() {
     return 1
 }
 
+# Whether a C program can be compiled and linked with what setup.py will use.
+compiles() {
+    folder=$(mktemp -d)
+    printf '#include <math.h>\n#include <stdlib.h>\nint main(void) { return (int)sqrt(0.0); }\n' >"$folder/a.c"
+    ${CC:-$(command -v gcc || command -v cc || echo cc)} "$folder/a.c" -o "$folder/a" -lm 2>/dev/null
+    result=$?
+    rm -rf "$folder"
+    return $result
+}
+
 # set_up EXTRAS: a virtual environment with the package and its extras ('' or '[dev]').
 set_up() {
     root=$1
@@ -62,12 +72,10 @@ set_up() {
     stamp="$venv/.rigkit-installed"
     # The tests' set-up contains the plain one.
     if ! { [ -x "$venv/bin/rigkit" ] && grep -qxF -e "$wanted" -e "[dev] ${wanted#* }" "$stamp" 2>/dev/null; }; then
-        if ! command -v gcc >/dev/null 2>&1 && ! command -v cc >/dev/null 2>&1; then
-            (system_packages gcc libc6-dev) || say "going on without a C compiler: detection will be several times slower"
-        fi
+        compiles || { say "a C compiler builds the kernels"; system_packages gcc libc6-dev; }
         say "installing Python packages (about 600 MB the first time)"
         "$venv/bin/python" -m pip install --quiet --disable-pip-version-check -e "$root$extras" >&2 ||
-            { say "pip could not install the packages; see above"; exit 2; }
+            { say "pip could not install the packages; see above (the kernels need a C compiler: gcc or clang)"; exit 2; }
         printf '%s\n' "$wanted" >"$stamp"
     fi
     missing=$("$venv/bin/python" - <<'PY'

@@ -41,8 +41,8 @@ VERBS: dict[str, tuple[str, str]] = {
 """Verb -> (module, one-line help)."""
 
 SURROUNDINGS = {
-    getattr(errno, name) for name in ("ENOSPC", "EDQUOT", "EROFS", "EACCES", "EPERM", "EIO", "EMFILE", "ENFILE")
-}
+    getattr(errno, name, None) for name in ("ENOSPC", "EDQUOT", "EROFS", "EACCES", "EPERM", "EIO", "EMFILE", "ENFILE")
+} - {None}
 """Errors of the system that are nobody's bug: a full disk, a folder that may not be written, too many open files."""
 
 
@@ -54,16 +54,31 @@ class _Terminated(KeyboardInterrupt):
         self.number = number
 
 
+class _Version(argparse.Action):
+    """Shows what is installed; the kernels are looked at only when asked for."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, help: str | None = None) -> None:
+        super().__init__(option_strings, argparse.SUPPRESS, nargs=0, help=help)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        import platform
+
+        from rigkit import __version__
+        from rigkit.kernels import about
+
+        print(f"rigkit {__version__}\nkernels {about()}")
+        print(f"{platform.system()} {platform.machine()}, Python {platform.python_version()}")
+        parser.exit()
+
+
 def build_parser(verb: str | None) -> argparse.ArgumentParser:
     """Return the parser; only the module of `verb` is imported, all others show their one-line help."""
-    from rigkit import __version__
-
     parser = argparse.ArgumentParser(
         prog="rigkit",
         description="Calibrate lab cameras, reconstruct oriented point clouds, validate them against measured truth.",
         epilog="Exit codes: 0 well; 1 a check failed; 2 bad input; 3 degenerate geometry; 70 a bug in rigkit.",
     )
-    parser.add_argument("--version", action="version", version=f"rigkit {__version__}")
+    parser.add_argument("--version", action=_Version, help="show version, compiled kernels and platform, and exit")
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
     for name, (module_name, summary) in VERBS.items():
         sub = verbs.add_parser(name, help=summary, description=summary)
@@ -125,7 +140,9 @@ def _signals_interrupt() -> Iterator[None]:
 
     taken = []
     if threading.current_thread() is threading.main_thread():
-        taken = [n for n in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) is signal.SIG_DFL]
+        # Windows has no SIGHUP.
+        known = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+        taken = [n for n in known if signal.getsignal(n) is signal.SIG_DFL]
     for number in taken:
         signal.signal(number, stop)
     try:

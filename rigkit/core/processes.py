@@ -26,6 +26,10 @@ def _terminal_silent() -> Iterator[None]:
 
     They inherit the mask; handlers of their own would come after a second of imports.
     """
+    if not hasattr(signal, "pthread_sigmask"):
+        # Windows has neither signal masks nor a signal for a closed terminal.
+        yield
+        return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
     try:
         yield

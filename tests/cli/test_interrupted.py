@@ -99,3 +99,26 @@ def _ends(_: int) -> None:
 def test_a_worker_that_is_killed_is_told_in_words() -> None:
     with pytest.raises(InputError, match="-j 1"), worker_pool(1) as pool:
         list(pool.map(_ends, [0]))
+
+
+def _twice(number: int) -> int:
+    return 2 * number
+
+
+def test_a_system_without_these_signals_serves_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows has no SIGHUP and no signal masks."""
+    monkeypatch.delattr(signal, "SIGHUP")
+    monkeypatch.delattr(signal, "pthread_sigmask")
+    assert main(["board", "5x4", "--square-mm", "30", "-o", str(tmp_path / "board")]) == 0
+    with worker_pool(1) as pool:
+        assert list(pool.map(_twice, [1, 2])) == [2, 4]
+
+
+def test_the_version_says_what_is_installed(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["--version"])
+    assert stop.value.code == 0
+    first, second, third = capsys.readouterr().out.splitlines()
+    assert first.startswith("rigkit ")
+    assert second.split()[0] == "kernels" and len(second.split()[1].rstrip(",")) == 16
+    assert "Python 3." in third

@@ -15,7 +15,7 @@ from rigkit.core.arrays import FloatArray
 __all__ = ["QUANTILE", "MarginalLoss", "marginal_quality", "marginal_weights"]
 
 QUANTILE = 2.576
-"""Of |r| for a normal r: 99 %. As in native/pose.c."""
+"""Of |r| for a normal r: 99 %. As in kernels/pose.c."""
 
 
 def marginal_quality(r: FloatArray, max_noise: FloatArray | float) -> FloatArray:
