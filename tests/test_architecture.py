@@ -36,6 +36,116 @@ FOR_ALL = {"rigkit.core.arrays", "rigkit.core.errors"}
 
 MAX_LINES = 400
 
+MAX_FUNCTION_LINES = 60
+MAX_POSITIONAL_FIELDS = 6
+"""Nobody remembers the order of more: classes of more fields take keywords."""
+
+LONG_FUNCTIONS = {
+    "affine/geometry_noise.py:geometry_covariance",
+    "affine/mixed.py:affines_from_mixed_directions",
+    "affine/registry.py:affines_from_directions",
+    "calibration/calibrate.py:calibrate",
+    "calibration/rig/assemble.py:assemble_rig",
+    "calibration/rig/board_places.py:board_places",
+    "calibration/rig/calibrate.py:calibrate_rig",
+    "detection/subpixel/edge_fit.py:fit_edges",
+    "io/manifest_writer.py:manifest_text",
+    "reconstruction/reconstruct.py:reconstruct_from",
+    "reconstruction/scene.py:reconstruct_scene",
+    "relative_pose/robust/robust.py:robust_pose",
+}
+"""Still longer: this list only gets shorter."""
+POSITIONAL_CLASSES = {
+    "benchmark/score.py:Score",
+    "core/boards.py:Board",
+    "core/cloud.py:OrientedCloud",
+    "core/matches.py:DirectionPairs",
+    "core/matches.py:Matches",
+    "detection/subpixel/edge_fit.py:EdgeFit",
+    "identification/board_matches.py:BoardMatch",
+    "identification/pair_identity.py:PairIdentity",
+    "io/manifest.py:Pair",
+    "io/session.py:Session",
+    "reconstruction/pairing.py:MatchedPair",
+    "relative_pose/refinement/pose_problem.py:Minimum",
+    "relative_pose/refinement/refine.py:RefinedPose",
+    "relative_pose/refinement/select.py:TypeEvidence",
+    "study/study.py:Study",
+    "study/table.py:Cell",
+    "synthetic/pairs.py:StereoScene",
+    "synthetic/photometry.py:Photometry",
+    "synthetic/raycast.py:Surface",
+    "validation/boards.py:BoardResult",
+    "validation/checks.py:Check",
+    "validation/checks.py:ValidationReport",
+    "validation/crosscheck.py:OtherWay",
+    "validation/planes.py:Plane",
+    "validation/pnp.py:PnpResult",
+}
+"""Classes of many fields that still take them by place: this list only gets shorter."""
+NAMES_OF_SEVERAL_CLASSES = {
+    "Cell",
+    "Lattice",
+    "Minimum",
+    "Step",
+    "_Corners",
+    "_Entry",
+    "_Fit",
+    "_Job",
+}
+"""This list only gets shorter."""
+PER_MODULE = {"HELP"}
+"""Constants that every module of a kind has: the one-line help of a verb."""
+NAMES_OF_SEVERAL_CONSTANTS = {
+    "ACCEPTED",
+    "BAD_VIEW",
+    "BLOCK",
+    "CAMERA_KEYS",
+    "COARSE",
+    "COLOURS",
+    "CURVE_SAMPLES",
+    "DAMPING",
+    "FIT_STEPS",
+    "GRID",
+    "JPEG_QUALITY",
+    "KEYS",
+    "MAX_ITERATIONS",
+    "MAX_STEPS",
+    "MIN_CORNERS",
+    "MIN_IMAGES",
+    "MIN_INCIDENCE",
+    "MIN_SIGMA_PX",
+    "NAMES",
+    "NEWTON_STEPS",
+    "NORMAL",
+    "OUTLIER_SIGMAS",
+    "OUTLYING",
+    "PARAMETERS",
+    "PLANES",
+    "POINTS",
+    "POSE_TYPES",
+    "PYRAMID_DEPTH",
+    "RESIDUAL_LENGTH",
+    "RIDGE",
+    "ROTATION_TOLERANCE",
+    "ROUNDS",
+    "SAMPLES",
+    "SCHEMA",
+    "SETTLED",
+    "SETTLED_RAD",
+    "SHIFT",
+    "SIGMAS",
+    "STARTS",
+    "STEPS",
+    "STEP_REL",
+    "STEP_TOLERANCE",
+    "SUFFIXES",
+    "TOLERANCE",
+    "TRIES",
+    "TYPES",
+}
+"""Constants of one name with several values: this list only gets shorter."""
+
 HEAVY_HOMES = {
     "open3d": {"interop/open3d.py"},
     "pycolmap": {"interop/colmap.py"},
@@ -137,6 +247,63 @@ def test_one_camera_knows_nothing_of_rigs() -> None:
 def test_module_size(path: Path) -> None:
     lines = len(path.read_text().splitlines())
     assert lines <= MAX_LINES, f"{path.relative_to(PACKAGE)} has {lines} lines: split it"
+
+
+def place_of(path: Path, name: str) -> str:
+    return f"{path.relative_to(PACKAGE).as_posix()}:{name}"
+
+
+@functools.cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+def test_function_size() -> None:
+    long = {
+        place_of(path, node.name)
+        for path in MODULES
+        for node in ast.walk(tree_of(path))
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))
+        and (node.end_lineno or node.lineno) - node.lineno >= MAX_FUNCTION_LINES
+    }
+    assert long <= LONG_FUNCTIONS, f"more than {MAX_FUNCTION_LINES} lines: {sorted(long - LONG_FUNCTIONS)}"
+
+
+def test_classes_of_many_fields_take_keywords() -> None:
+    positional = set()
+    for path in MODULES:
+        for node in ast.walk(tree_of(path)):
+            decorator = next((d for d in getattr(node, "decorator_list", ()) if "dataclass" in ast.unparse(d)), None)
+            if not isinstance(node, ast.ClassDef) or decorator is None or "kw_only=True" in ast.unparse(decorator):
+                continue
+            fields = [n for n in node.body if isinstance(n, ast.AnnAssign) and "ClassVar" not in ast.unparse(n)]
+            if len(fields) > MAX_POSITIONAL_FIELDS:
+                positional.add(place_of(path, node.name))
+    assert positional <= POSITIONAL_CLASSES, f"need kw_only=True: {sorted(positional - POSITIONAL_CLASSES)}"
+
+
+def test_a_class_name_means_one_thing() -> None:
+    homes: dict[str, list[str]] = {}
+    for path in MODULES:
+        for node in tree_of(path).body:
+            if isinstance(node, ast.ClassDef):
+                homes.setdefault(node.name, []).append(place_of(path, node.name))
+    several = {name for name, places in homes.items() if len(places) > 1}
+    new = several - NAMES_OF_SEVERAL_CLASSES
+    assert not new, {name: homes[name] for name in new}
+
+
+def test_a_constant_has_one_value() -> None:
+    values: dict[str, dict[str, str]] = {}
+    for path in MODULES:
+        for node in tree_of(path).body:
+            if isinstance(node, (ast.Assign, ast.AnnAssign)) and node.value is not None:
+                for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
+                    if isinstance(target, ast.Name) and target.id.isupper() and not target.id.startswith("_"):
+                        values.setdefault(target.id, {})[place_of(path, target.id)] = ast.unparse(node.value)
+    several = {name for name, known in values.items() if len(set(known.values())) > 1}
+    new = several - NAMES_OF_SEVERAL_CONSTANTS - PER_MODULE
+    assert not new, {name: values[name] for name in new}
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))

@@ -14,7 +14,7 @@ import numpy as np
 from rigkit.core.boards import Board, marker_rectangles
 from rigkit.core.errors import InputError
 
-__all__ = ["PAPERS", "Sheet", "board_sheet", "pdf_bytes", "svg_text"]
+__all__ = ["PAPERS", "PrintedSheet", "board_sheet", "pdf_bytes", "svg_text"]
 
 PAPERS = {
     "a4": (210.0, 297.0),
@@ -38,8 +38,8 @@ TEXT_MM = 3.0
 POINTS_PER_MM = 72.0 / 25.4
 
 
-@dataclass(frozen=True, slots=True)
-class Sheet:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PrintedSheet:
     """Shapes in mm: black rectangles (x, y, w, h), lines (x1, y1, x2, y2) and texts (x, y, degrees, words)."""
 
     width_mm: float
@@ -52,7 +52,7 @@ class Sheet:
     ruler_y_mm: float
 
 
-def board_sheet(board: Board, paper: str) -> Sheet:
+def board_sheet(board: Board, paper: str) -> PrintedSheet:
     """Lay out the board's (columns + 1) x (rows + 1) squares and two rulers on a sheet of `paper`.
 
     The top-left square is black (on a ChArUco board as its pattern says). Around the squares one margin of at least
@@ -92,10 +92,19 @@ def board_sheet(board: Board, paper: str) -> Sheet:
         (x0, bottom + 4.5, 0.0, f"rigkit: {name}. Print at 100 %. This ruler should be {ruler_x:g} mm; measure it."),
         (right + 2.0, y0, 90.0, f"This ruler should be {ruler_y:g} mm."),
     )
-    return Sheet(*size, name, tuple(rectangles), tuple(lines), texts, float(ruler_x), float(ruler_y))
+    return PrintedSheet(
+        width_mm=size[0],
+        height_mm=size[1],
+        title=name,
+        rectangles=tuple(rectangles),
+        lines=tuple(lines),
+        texts=texts,
+        ruler_x_mm=float(ruler_x),
+        ruler_y_mm=float(ruler_y),
+    )
 
 
-def svg_text(sheet: Sheet) -> str:
+def svg_text(sheet: PrintedSheet) -> str:
     """Return the sheet as SVG with its size in mm."""
     out = [
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{sheet.width_mm:g}mm" height="{sheet.height_mm:g}mm" '
@@ -120,7 +129,7 @@ def svg_text(sheet: Sheet) -> str:
     return "\n".join([*out, "</svg>\n"])
 
 
-def pdf_bytes(sheet: Sheet) -> bytes:
+def pdf_bytes(sheet: PrintedSheet) -> bytes:
     """Return the sheet as a one-page PDF of exactly its size."""
 
     def at(x: float, y: float) -> str:
