@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import importlib
 import sys
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,9 @@ def kernels() -> Kernels:
     if wrong is not None:
         raise InstallationError(f"the compiled kernels {wrong} ({path}); {_remedy()}")
     # Every wrapper declares its structures, which the functions name.
-    from rigkit.kernels import edges, front, growth, lattice, minimal, pose  # noqa: F401
+    # By name: these modules import this one.
+    for name in ("edges", "front", "growth", "lattice", "minimal", "pose"):
+        importlib.import_module(f"rigkit.kernels.{name}")
 
     try:
         return Kernels(path)
