@@ -73,7 +73,7 @@ def _by_frame(observations: RigObservations, state: RigState, frame: IntArray) -
     information, score = np.zeros((int(frame.max()) + 1, n, n)), np.zeros((int(frame.max()) + 1, n))
     for c, own in enumerate(observations.cameras):
         alone = state.of_camera(c, observations)
-        product = view_products(own, alone, observations.weights[c])
+        product = view_products(own, alone.with_boards_held(), observations.weights[c])
         p = alone.camera.parameters.size
         by = pose_jacobians(observations, state, c, alone.translation_mm)
         at = frame[observations.frame[c]]
