@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.compare import CalibrationComparison, Verdict, compare_calibrations
+from rigkit.calibration.compare import CalibrationComparison, CameraVerdict, compare_calibrations
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import projection_design
 from rigkit.calibration.usable import views_of_image
@@ -209,7 +209,7 @@ def main() -> None:
     for name, found in everything.items():
         if found:
             ratio = float(np.exp(np.mean([np.log(c.ratio) for c in found])))
-            other = sum(c.verdict is Verdict.OTHER for c in found)
+            other = sum(c.verdict is CameraVerdict.OTHER for c in found)
             print(f"{name}: geometric mean ratio {ratio:.2f}; another camera in {other} of {len(found)}")
 
 

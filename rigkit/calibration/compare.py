@@ -20,7 +20,7 @@ from rigkit.cameras.compare import CameraDifference, compare_cameras, grid_pixel
 from rigkit.cameras.convert import refit_camera
 from rigkit.core.arrays import FloatArray, Pixels
 
-__all__ = ["CalibrationComparison", "Verdict", "compare_calibrations"]
+__all__ = ["CalibrationComparison", "CameraVerdict", "compare_calibrations"]
 
 SAMPLES = 4000
 """Draws of the null distribution: the chance is then known to 0.002 near 0.01."""
@@ -32,7 +32,7 @@ IMPORTANT_PX = 0.1
 """What is smaller is of no importance, however surely it is there: corners of real images are hardly better."""
 
 
-class Verdict(StrEnum):
+class CameraVerdict(StrEnum):
     """What a difference means."""
 
     SAME = "no contradiction"
@@ -65,15 +65,15 @@ class CalibrationComparison:
         return self.difference.rms_px / max(self.predicted_px, np.finfo(float).tiny)
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> CameraVerdict:
         if self.chance >= SAME_CHANCE:
-            return Verdict.SAME
-        return Verdict.UNIMPORTANT if self.difference.rms_px < IMPORTANT_PX else Verdict.OTHER
+            return CameraVerdict.SAME
+        return CameraVerdict.UNIMPORTANT if self.difference.rms_px < IMPORTANT_PX else CameraVerdict.OTHER
 
     @property
     def same(self) -> bool:
         """Nothing says that these are two cameras, or that the lens moved by anything of importance."""
-        return self.verdict is not Verdict.OTHER
+        return self.verdict is not CameraVerdict.OTHER
 
 
 def compare_calibrations(

@@ -54,7 +54,7 @@ def _camera_figures(pair: CameraPair) -> dict[str, Any]:
 
 
 def _camera_in_words(figures: dict[str, Any]) -> str:
-    from rigkit.calibration.compare import Verdict
+    from rigkit.calibration.compare import CameraVerdict
 
     known = figures["same"] is not None
     line = (
@@ -64,7 +64,7 @@ def _camera_in_words(figures: dict[str, Any]) -> str:
     )
     if not known:
         return line + "no verdict: a file has no covariance"
-    at = f" at {figures['rms_px']:.2g} px" if figures["verdict"] == Verdict.UNIMPORTANT else ""
+    at = f" at {figures['rms_px']:.2g} px" if figures["verdict"] == CameraVerdict.UNIMPORTANT else ""
     return line + (
         f"expected of one camera {figures['predicted_px']:.4f} px, {figures['ratio']:.2f} times as much is found "
         f"(chance {figures['chance']:.3g}): {figures['verdict']}{at}"

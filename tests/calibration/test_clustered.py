@@ -12,7 +12,7 @@ from helpers.calibration_scenes import BOARD, REACH_DEG, lens, random_views
 from rigkit.calibration.assemble import assemble
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.clustered import clustered_covariance, with_block
-from rigkit.calibration.compare import Verdict, compare_calibrations
+from rigkit.calibration.compare import CameraVerdict, compare_calibrations
 from rigkit.calibration.fit import fit_kept
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration
@@ -69,11 +69,11 @@ def test_power_and_false_alarms() -> None:
     ]
     results = [calibrate(views, camera.size_px, model="kannala_brandt", board="flat") for views in pixels_of]
     for a, b in itertools.pairwise(results):
-        assert compare_calibrations(a, b).verdict is not Verdict.OTHER
+        assert compare_calibrations(a, b).verdict is not CameraVerdict.OTHER
     longer = np.array(results[1].camera.parameters)
     longer[:2] *= 1.001
     touched = replace(results[1], camera=results[1].camera.with_parameters(longer))
-    assert compare_calibrations(results[0], touched).verdict is Verdict.OTHER
+    assert compare_calibrations(results[0], touched).verdict is CameraVerdict.OTHER
 
 
 def test_few_clusters_say_nothing() -> None:
