@@ -30,13 +30,13 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray, IntArray
 
-__all__ = ["MIN_CLUSTERS", "Clustered", "clustered_covariance", "reduced_by_cluster", "with_block"]
+__all__ = ["MIN_CLUSTERS", "RANK", "Clustered", "clustered_covariance", "reduced_by_cluster", "with_block"]
 
 MIN_CLUSTERS = 4
 """Fewer images (or frames) say nothing about how they differ."""
 MIN_LEFT = 0.05
 """What is left of an image's pull in a direction that it alone determines: less is rounding."""
-RANK = 1e-13
+RANK = 1e-12
 """Combinations with less than this part of the largest information are not determined."""
 
 

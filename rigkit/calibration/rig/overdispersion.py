@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from rigkit.calibration.clustered import RANK
 from rigkit.calibration.linearise import view_products
 from rigkit.calibration.normal_equations import NormalEquations
 from rigkit.calibration.rig.solver import pose_jacobians
@@ -29,8 +30,6 @@ __all__ = ["MIN_FRAMES", "frame_overdispersion"]
 
 MIN_FRAMES = 4
 """Fewer frames say nothing about how they differ."""
-RANK = 1e-12
-"""Combinations of globals with less than this part of the largest information are not determined."""
 
 
 def frame_overdispersion(
