@@ -36,7 +36,7 @@ from rigkit.detection.lattice.links import find_links
 from rigkit.detection.lattice.origin import quarter_turns
 from rigkit.detection.lattice.split import join_parts, split_at_turns, split_necks
 from rigkit.detection.saddles.bad_pixels import without_bad_pixels
-from rigkit.detection.saddles.local_contrast import equalised
+from rigkit.detection.saddles.local_contrast import equalised, stretched
 from rigkit.detection.saddles.nearby import near_any
 from rigkit.detection.saddles.response import GreyImage, Level, grey_image, pyramid
 from rigkit.detection.saddles.saddle import find_corners
@@ -162,9 +162,10 @@ def detect_boards(
     lattices = find_lattices(grey, fewest, only)
     if not lattices and grey.dtype != np.uint8:
         # Beyond 8 bits the squares of a board may be a hundredth of the range of brightness.
-        even = equalised(grey)
-        lattices = find_lattices(even, fewest, only)
-        grey = even if lattices else grey
+        seen = [item.lattice for item in find_lattices(equalised(grey), fewest, only)]
+        # What is hot beside a board moves corners of the equalised image: they are placed on one that is only brighter.
+        grey = stretched(grey, [lattice.pixels for lattice in seen])
+        lattices = _fitted(grey, seen, fewest, only)
     marked: list[BoardDetection] = []
     if len(plain) < len(known):
         from rigkit.detection.charuco import charuco_boards
