@@ -166,9 +166,8 @@ def main() -> None:
         "\n| score | image | corners | sigma, cells | scatter | unexplained | spacing change |\n|--:|:--|--:|--:|--:|--:|--:|"
     )
     for board in (True, False):
-        ranked = sorted(
-            (c for c in found if c.board is board), key=lambda c: c.evidence.score if board else -c.evidence.score
-        )
+        mine = [c for c in found if c.board is board]
+        ranked = sorted(mine, key=lambda c: c.evidence.score, reverse=not board)
         for c in ranked[:SHOWN]:
             print(
                 f"| {c.evidence.score:.2f} | {c.image} | {c.corners} |", " | ".join(f"{v:.4f}" for v in c.evidence), "|"
