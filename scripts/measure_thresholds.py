@@ -162,9 +162,8 @@ def main() -> None:
     *weights, offset = fitted_weights(found)
     print("fitted:  ", ", ".join(f"{n} {w:.2f}" for n, w in zip(SCORE, weights, strict=True)), f"offset {offset:.2f}")
     print("in use:  ", ", ".join(f"{n} {w:.2f}" for n, w in SCORE.items()), f"offset {OFFSET:.2f}")
-    print(
-        "\n| score | image | corners | sigma, cells | scatter | unexplained | spacing change |\n|--:|:--|--:|--:|--:|--:|--:|"
-    )
+    print("\n| score | image | corners | sigma, cells | scatter | unexplained | spacing change |")
+    print("|--:|:--|--:|--:|--:|--:|--:|")
     for board in (True, False):
         mine = [c for c in found if c.board is board]
         ranked = sorted(mine, key=lambda c: c.evidence.score, reverse=not board)
