@@ -64,12 +64,13 @@ class Candidate:
 
     def measures(self) -> list[float]:
         """Return the logarithms that are weighed."""
-        sigma_cells, scatter, unexplained, change = self.evidence
+        sigma_cells, scatter, unexplained, change, raggedness = self.evidence
         return [
             float(np.log(sigma_cells)),
             float(np.log(scatter)),
             float(np.log(max(unexplained, MIN_UNEXPLAINED))),
             float(np.log(max(change, MIN_SPACING_CHANGE))),
+            float(np.log(raggedness)),
         ]
 
 
@@ -162,8 +163,8 @@ def main() -> None:
     *weights, offset = fitted_weights(found)
     print("fitted:  ", ", ".join(f"{n} {w:.2f}" for n, w in zip(SCORE, weights, strict=True)), f"offset {offset:.2f}")
     print("in use:  ", ", ".join(f"{n} {w:.2f}" for n, w in SCORE.items()), f"offset {OFFSET:.2f}")
-    print("\n| score | image | corners | sigma, cells | scatter | unexplained | spacing change |")
-    print("|--:|:--|--:|--:|--:|--:|--:|")
+    print("\n| score | image | corners | sigma, cells | scatter | unexplained | spacing change | raggedness |")
+    print("|--:|:--|--:|--:|--:|--:|--:|--:|")
     for board in (True, False):
         mine = [c for c in found if c.board is board]
         ranked = sorted(mine, key=lambda c: c.evidence.score, reverse=not board)
