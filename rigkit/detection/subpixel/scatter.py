@@ -57,7 +57,7 @@ def scatter_factors(pixels: FloatArray, sigma_px: FloatArray, parts: Sequence[tu
     together are asked as well, and the calmest is right.
     """
     factors = excess_scatter(pixels, sigma_px, parts)
-    for k in np.flatnonzero(factors > UNEXPLAINED):
+    for k in np.flatnonzero(factors > UNEXPLAINED).tolist():
         part = parts[k]
         if any(change.every > STRONG_BEND for change in spacing_changes(pixels[part])):
             calmest = np.fmin.reduce([_mixed_roughness(pixels[part], sigma_px[part], *orders) for orders in MIXED])
