@@ -29,6 +29,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "detect": ("rigkit.cli.detect", "corners of every chessboard in the images"),
     "calibrate": ("rigkit.cli.calibrate", "calibrate a camera from images of chessboards"),
     "diff": ("rigkit.cli.diff", "difference of two calibrations over the image; same camera or not"),
+    "certify": ("rigkit.cli.certify", "how wrong a length, depth, plane or angle may be that is measured with them"),
     "rectify": ("rigkit.cli.rectify", "perspective, cylindrical, equirectangular or stereo images from any camera's"),
     "reconstruct": ("rigkit.cli.reconstruct", "oriented clouds (PLY) and pictures of every pair"),
     "validate": ("rigkit.cli.validate", "the tables against measured truth, report and PLY; exit 1 if a check fails"),

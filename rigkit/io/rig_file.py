@@ -38,11 +38,14 @@ BOARD_KEYS = {"board_id", "size", "square_mm", "square_sigma_mm", "points_mm", "
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SavedRig:
-    """What a rig file says: cameras and cam_from_rig by name, and the covariance of all intrinsics and of the mounts of
-    all cameras but the first; None in a file that does not say (another tool's rig)."""
+    """What a rig file says: cameras and cam_from_rig by name, the covariance of all intrinsics and of the mounts of all
+    cameras but the first, and the corners' sigma; None in a file that does not say (another tool's rig). `scale_sigma`
+    is how well all lengths are known from the boards' squares, relative; 0 where nobody stated it."""
 
     cameras: dict[str, tuple[Camera, Rigid3]]
     covariance: FloatArray | None
+    sigma_px: float | None = None
+    scale_sigma: float = 0.0
 
     @property
     def mount_covariance(self) -> FloatArray | None:
@@ -101,7 +104,9 @@ def load_saved_rig(path: str | Path) -> SavedRig:
         covariance = None
         if "covariance" in data:
             covariance = as_array(data["covariance"], (size, size), "covariance")
-    return SavedRig(cameras, covariance)
+        sigma_px = None if "sigma_px" not in data else float(data["sigma_px"])
+        scale_sigma = float(data.get("scale_sigma", 0.0))
+    return SavedRig(cameras, covariance, sigma_px, scale_sigma)
 
 
 def is_rig_file(path: str | Path) -> bool:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import importlib
 import sys
 from pathlib import Path
 from typing import Any
@@ -45,11 +44,6 @@ def kernels() -> Kernels:
     wrong = mismatch(path)
     if wrong is not None:
         raise InstallationError(f"the compiled kernels {wrong} ({path}); {_remedy()}")
-    # Every wrapper declares its structures, which the functions name.
-    # By name: these modules import this one.
-    for name in ("edges", "front", "growth", "lattice", "minimal", "pose"):
-        importlib.import_module(f"rigkit.kernels.{name}")
-
     try:
         return Kernels(path)
     except OSError as error:

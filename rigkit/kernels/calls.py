@@ -125,19 +125,23 @@ class Kernel:
 
     def __init__(self, name: str, library: ctypes.CDLL) -> None:
         self.name = name
-        parameters = header().functions[name]
         self._function = getattr(library, name)
+        self._names = tuple(one.name for one in header().functions[name])
+        self._checks: _Checks | None = None
+
+    def _declare(self) -> _Checks:
+        """Declare the arguments, at the first call: by then the caller has declared the structures among them."""
+        parameters, result = header().functions[self.name], header().results[self.name]
         self._function.argtypes = [_ctype(one) for one in parameters]
-        result = header().results[name]
         self._function.restype = None if result.type == "void" else _ctype(result)
-        self._names = tuple(one.name for one in parameters)
-        self._checks = _Checks(name, parameters)
+        self._checks = _Checks(self.name, parameters)
+        return self._checks
 
     def __call__(self, *arguments: Any) -> Any:
         """Call it; raises TypeError where an argument is missing or an array is not as declared."""
         if len(arguments) != len(self._names):
             raise TypeError(f"{self.name}: wants {', '.join(self._names)}; was given {len(arguments)}")
-        given = list(arguments)
-        for place, at in self._checks.addresses(dict(zip(self._names, arguments, strict=True))):
+        checks, given = self._checks or self._declare(), list(arguments)
+        for place, at in checks.addresses(dict(zip(self._names, arguments, strict=True))):
             given[place] = at
         return self._function(*given)

@@ -1,0 +1,154 @@
+"""The certificate: the bound on the error of a measurement over the image, its causes, and what would halve it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from scipy.special import ndtri
+
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.findings import Finding, Severity
+from rigkit.validation.certificate.contracts import Certificate, Instrument, Quantity, Task
+from rigkit.validation.certificate.propagation import (
+    CORNERS,
+    DISTANCE,
+    LENSES,
+    MOUNTS,
+    SCALE,
+    gradients,
+    measured_points,
+    variances,
+)
+
+__all__ = ["certify"]
+
+MAP_CELLS = (33, 25)
+"""Columns and rows of places at which the bound is evaluated."""
+COARSE = 0.1
+"""A bound beyond this part of what is measured (of a radian, for angles), or points as uncertain: what is derived to
+first order is then too small."""
+
+
+def certify(instrument: Instrument, task: Task, *, cells: tuple[int, int] = MAP_CELLS) -> Certificate:
+    """Return the bound on the error of `task` over the image of the first camera.
+
+    Raises
+    ------
+    InputError
+        A depth, plane or angle with one camera.
+    DegenerateError
+        Nowhere do all cameras see what is measured.
+    """
+    if not instrument.is_rig and task.quantity is not Quantity.LENGTH:
+        raise InputError(
+            f"certificate: one camera measures no {task.quantity}; give a rig, or a length at a known distance"
+        )
+    first = instrument.cameras[0]
+    width, height = first.size_px
+    u, v = np.meshgrid(np.linspace(0.0, width - 1.0, cells[0]), np.linspace(0.0, height - 1.0, cells[1]))
+    pixels = np.stack([u, v], axis=-1)
+    rays, valid = first.unproject(pixels.reshape(-1, 2))
+    points, weights = measured_points(np.where(valid[:, None], rays, [0.0, 0.0, 1.0]), task, instrument.is_rig)
+    by_corner, by_calibration, farthest, seen = gradients(instrument, points, weights)
+    seen &= valid
+    if not seen.any():
+        raise DegenerateError(
+            f"certificate: nowhere is a {task.quantity} of {task.size_mm:g} mm at {task.distance_mm:g} mm in view of "
+            f"{' and '.join(instrument.names)}; give a shorter length or another distance"
+        )
+    variance = variances(instrument, task, by_corner, by_calibration)
+    # Of several ways to hold the same thing the worst counts.
+    worst = np.argmax(sum(variance.values()), axis=1)
+    chosen = np.arange(len(worst))
+    # Radians become degrees only here.
+    factor = np.rad2deg(1.0) if task.quantity is Quantity.ANGLE else 1.0
+    sigma = {
+        cause: np.where(seen, factor * np.sqrt(value[chosen, worst]), np.nan).reshape(u.shape)
+        for cause, value in variance.items()
+    }
+    quantile = float(ndtri(0.5 + 0.5 * task.confidence))
+    bound = quantile * np.sqrt(sum(s**2 for s in sigma.values()))
+    whole = factor * (1.0 if task.quantity is Quantity.ANGLE else task.size_mm)
+    uncertain = (quantile * instrument.sigma_px * farthest > COARSE * task.size_mm).reshape(u.shape)
+    in_view = seen.reshape(u.shape)
+    certificate = Certificate(
+        task=task,
+        instrument=instrument,
+        pixels=pixels,
+        in_view=in_view,
+        bound=bound,
+        sigma=sigma,
+        coarse=in_view & (uncertain | (bound > COARSE * whole)),
+    )
+    return replace(certificate, findings=tuple(_findings(certificate)))
+
+
+def _findings(certificate: Certificate) -> list[Finding]:
+    """Return what is not counted in, and what would halve the worst bound."""
+    instrument, task = certificate.instrument, certificate.task
+    found = []
+    coarse = float(np.mean(certificate.coarse[certificate.in_view]))
+    if coarse > 0.0:
+        found.append(
+            Finding(
+                severity=Severity.LOOK,
+                message=f"in {100.0 * coarse:.0f} % of the view the bound is but a lower one: the lines of sight "
+                "hardly cross there, and points are uncertain by more than a tenth of what is measured",
+                remedy="measure elsewhere in the image, nearer, or move the cameras apart",
+            )
+        )
+    if instrument.is_rig and instrument.scale_sigma == 0.0 and SCALE in certificate.sigma:
+        found.append(
+            Finding(
+                severity=Severity.LOOK,
+                message="nobody stated how well the boards' squares were measured, so their scale counts as exact",
+                remedy="give square_sigma_mm in the board's file and calibrate again",
+            )
+        )
+    if not instrument.is_rig and task.distance_sigma_mm == 0.0:
+        found.append(
+            Finding(
+                severity=Severity.LOOK,
+                message="the distance counts as exact",
+                remedy="say with --distance-sigma how well it is known",
+            )
+        )
+    found.append(
+        Finding(
+            severity=Severity.GOOD,
+            message=f"to halve the worst error: {_how_to_halve(certificate.shares(), certificate)}",
+        )
+    )
+    return found
+
+
+def _how_to_halve(shares: Mapping[str, float], certificate: Certificate) -> str:
+    """Return what to do, cause by cause, the largest first, until a quarter of the variance is left."""
+    scale = 100.0 * certificate.instrument.scale_sigma
+    steps: list[str] = []
+    left, target = 1.0, 0.25
+    for cause, share in sorted(shares.items(), key=lambda item: -item[1]):
+        if left <= target or share <= 0.0:
+            break
+        # This cause alone must shrink to what the others leave of the target, or to nothing much (a ninth).
+        allowed = max(target - (left - share), share / 9.0)
+        factor = share / allowed
+        left -= share - allowed
+        steps.append(_remedy(cause, factor, share, scale))
+    return "; ".join(steps)
+
+
+def _remedy(cause: str, factor: float, share: float, scale_percent: float) -> str:
+    part = f"{cause} make {100.0 * share:.0f} % of the variance"
+    times = f"{int(np.ceil(factor)):d} times"
+    root = f"{np.sqrt(factor):.1f} times"
+    remedies: dict[str, str] = {
+        CORNERS: f"repeat the measurement {times} and average, or come nearer, or move the cameras apart",
+        LENSES: f"calibrate with {times} as many pictures, boards also where the bound is worst",
+        MOUNTS: f"calibrate with {times} as many pictures of boards that both cameras see",
+        SCALE: f"measure the squares {root} better than the {scale_percent:.3g} % stated, over the whole board",
+        DISTANCE: f"measure the distance {root} better",
+    }
+    return f"{part}: {remedies[cause]}"

@@ -1,0 +1,136 @@
+"""How noise and calibration move a length, a depth, a plane or an angle.
+
+A quantity g of points X_i, which pixels q_i in the cameras see, moves to first order with the noise of the pixels and
+with the calibration theta (intrinsics and mounts) as
+
+    dg = sum_i c_i . dX_i,      dX = A (dq - D dtheta),      A = (J^T J)^-1 J^T,
+
+where J = d q / d X and D = d q / d theta stack both cameras (the points are triangulated by least squares). One camera
+sees directions only: its points lie at the stated distance, and A = r d ray / d pixel moves them across the ray.
+Every corner's noise is its own, the calibration is common to all points of one measurement, the scale of the boards to
+all lengths. The bound is the normal quantile of the confidence times the root of the sum.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.core.arrays import BoolArray, FloatArray, Points, Rays
+from rigkit.geometry.rotation import skew
+from rigkit.validation.certificate.contracts import Instrument, Quantity, Task
+
+__all__ = ["CORNERS", "DISTANCE", "LENSES", "MOUNTS", "SCALE", "gradients", "measured_points", "variances"]
+
+PLANE_POINTS = 5
+"""A plane is measured at so many points along either side."""
+CORNERS, LENSES, MOUNTS, SCALE, DISTANCE = "corners", "lenses", "mounts", "board scale", "distance"
+"""Causes of error."""
+
+
+def measured_points(rays: Rays, task: Task, is_rig: bool) -> tuple[Points, FloatArray]:
+    """Return points (N, K, 3) of what is measured in the middle of N `rays`, in the first camera's frame, and the
+    gradients (N, M, K, 3) of M quantities by these points."""
+    level = np.cross(np.broadcast_to([0.0, 1.0, 0.0], rays.shape), rays)
+    steep = np.linalg.norm(level, axis=-1, keepdims=True) < 1e-6
+    level = np.where(steep, [1.0, 0.0, 0.0], level)
+    level -= np.sum(level * rays, axis=-1, keepdims=True) * rays
+    level /= np.linalg.norm(level, axis=-1, keepdims=True)
+    upright = np.cross(rays, level)
+    middle, half = task.distance_mm * rays, 0.5 * task.size_mm
+    zero = np.zeros_like(rays)
+    if task.quantity is Quantity.DEPTH:
+        points = np.stack([middle - half * rays, middle + half * rays], axis=1)
+        return points, np.stack([-rays, rays], axis=1)[:, None]
+    if task.quantity is Quantity.ANGLE:
+        points = np.stack([middle, middle + task.size_mm * level, middle + task.size_mm * upright], axis=1)
+        # cos = a . b with unit edges a and b: at a right angle d angle = -(da . b + db . a).
+        turned = -np.stack([-(upright + level), upright, level], axis=1) / task.size_mm
+        return points, turned[:, None]
+    if task.quantity is Quantity.PLANE:
+        steps = np.linspace(-half, half, PLANE_POINTS)
+        x, y = (side.ravel() for side in np.meshgrid(steps, steps))
+        points = middle[:, None] + x[:, None] * level[:, None] + y[:, None] * upright[:, None]
+        basis = np.stack([np.ones_like(x), x, y], axis=1)
+        left_over = np.eye(len(x)) - basis @ np.linalg.pinv(basis)
+        return points, left_over[None, :, :, None] * rays[:, None, None, :]
+    points = np.stack([middle + sign * half * way for way in (level, upright) for sign in (-1.0, 1.0)], axis=1)
+    if is_rig:
+        ends = np.stack([-level, level, zero, zero], axis=1), np.stack([zero, zero, -upright, upright], axis=1)
+    else:
+        # length = 2 D tan(angle / 2): an end that moves across its ray by s opens the angle by s / range.
+        opening = task.distance_mm * (1.0 + (half / task.distance_mm) ** 2) / np.hypot(task.distance_mm, half)
+        across = []
+        for way, pair in ((level, points[:, :2]), (upright, points[:, 2:])):
+            away = np.stack([-way, way], axis=1)
+            sight = pair / np.linalg.norm(pair, axis=-1, keepdims=True)
+            away = away - np.sum(away * sight, axis=-1, keepdims=True) * sight
+            across.append(opening * away / np.linalg.norm(away, axis=-1, keepdims=True))
+        ends = (
+            np.concatenate([across[0], np.zeros_like(across[0])], axis=1),
+            np.concatenate([np.zeros_like(across[1]), across[1]], axis=1),
+        )
+    return points, np.stack(ends, axis=1)
+
+
+def gradients(
+    instrument: Instrument, points: Points, weights: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """Return d quantity / d pixel (N, M, K, 2 C) of C cameras, d quantity / d calibration (N, M, P), how far a pixel's
+    error moves the point that suffers most (N,) mm/px, and which of the N places all cameras see."""
+    size = len(instrument.covariance)
+    rig_from_first = instrument.cam_from_rig[0].inverse()
+    in_rig = rig_from_first.apply(points)
+    jacobians, designs, first = [], [], 0
+    seen = np.ones(len(points), dtype=bool)
+    for k, (camera, pose) in enumerate(zip(instrument.cameras, instrument.cam_from_rig, strict=True)):
+        in_cam = pose.apply(in_rig)
+        pixels, valid, d_pixels_d_point, d_pixels_d_parameters = camera.project_with_jacobians(in_cam)
+        seen &= (valid & camera.on_image(pixels)).all(axis=1)
+        design = np.zeros((*points.shape[:2], 2, size))
+        design[..., first : first + camera.parameters.size] = d_pixels_d_parameters
+        first += camera.parameters.size
+        if instrument.is_rig:
+            run = instrument.intrinsic_count + 6 * k
+            design[..., run : run + 3] = d_pixels_d_point @ -skew(in_cam - pose.translation_mm)
+            design[..., run + 3 : run + 6] = d_pixels_d_point
+        jacobians.append(d_pixels_d_point @ (pose.rotation @ rig_from_first.rotation))
+        designs.append(design)
+    J, D = (np.where(seen[:, None, None, None], np.concatenate(part, axis=2), 0.0) for part in (jacobians, designs))
+    if instrument.is_rig:
+        normal = np.swapaxes(J, -1, -2) @ J
+        # Out of view anything that can be inverted will do.
+        normal[~seen] = np.eye(3)
+        by_pixel = np.linalg.solve(normal, np.swapaxes(J, -1, -2))
+    else:
+        # The pseudo-inverse of a 2x3 Jacobian moves a point across its ray alone.
+        by_pixel = np.linalg.pinv(J)
+    by_corner = np.einsum("nmkx,nkxp->nmkp", weights, by_pixel)
+    farthest = np.linalg.norm(by_pixel, ord=2, axis=(-2, -1)).max(axis=1)
+    return by_corner, -np.einsum("nmkp,nkpt->nmt", by_corner, D), farthest, seen
+
+
+def variances(
+    instrument: Instrument, task: Task, by_corner: FloatArray, by_calibration: FloatArray
+) -> dict[str, FloatArray]:
+    """Return the variance (N, M) that each cause adds.
+
+    What the mounts share with the lenses they were estimated with is the lenses': dm = C_ml C_ll^-1 dl + rest.
+    """
+    split = instrument.intrinsic_count
+    covariance = instrument.covariance
+    lens, mount = by_calibration[..., :split], by_calibration[..., split:]
+    own = covariance[:split, :split]
+    follows = covariance[split:, :split] @ np.linalg.pinv(own, hermitian=True)
+    with_lens = lens + mount @ follows
+    variance = {
+        CORNERS: instrument.sigma_px**2 * np.sum(by_corner**2, axis=(-1, -2)),
+        LENSES: np.einsum("nmi,ij,nmj->nm", with_lens, own, with_lens),
+    }
+    if instrument.is_rig:
+        rest = covariance[split:, split:] - follows @ covariance[:split, split:]
+        variance[MOUNTS] = np.einsum("nmi,ij,nmj->nm", mount, rest, mount)
+    if task.quantity in (Quantity.LENGTH, Quantity.DEPTH):
+        relative = instrument.scale_sigma if instrument.is_rig else task.distance_sigma_mm / task.distance_mm
+        cause = SCALE if instrument.is_rig else DISTANCE
+        variance[cause] = np.full(by_calibration.shape[:2], (relative * task.size_mm) ** 2)
+    return {cause: np.maximum(value, 0.0) for cause, value in variance.items()}

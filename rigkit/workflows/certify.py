@@ -1,0 +1,110 @@
+"""From a calibration's file to a certificate of what can be measured with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rigkit.core.errors import InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.io.calibration_file import load_calibration
+from rigkit.io.files import ensure_writable, write_together
+from rigkit.io.rig_file import is_rig_file, load_saved_rig
+from rigkit.report.certificate_page import CertificateWords, certificate_page, certificate_pdf, in_words
+from rigkit.validation.certificate.certify import certify
+from rigkit.validation.certificate.contracts import Certificate, Instrument, Task, instrument_of_rig
+from rigkit.workflows.provenance import digest_line, software_facts
+
+__all__ = ["CertifiedFile", "CertifyOptions", "certify_file", "load_instrument"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CertifyOptions:
+    """What a certificate is held against, and where it goes."""
+
+    limit: float | None = None
+    """Largest error allowed, in the unit of the task."""
+    sigma_px: float | None = None
+    """Standard deviation of the corners to be measured, per coordinate; None: that of the calibration's corners."""
+    cameras: tuple[str, str] | None = None
+    """Two cameras of a rig; None: its first two."""
+    report: Path | None = None
+    """File for a page to look at; None: no page."""
+    pdf: Path | None = None
+    """File for a sheet of A4 to sign; None: no sheet."""
+    force: bool = False
+    """Replace files that exist; the calibration is never replaced."""
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class CertifiedFile:
+    """What was certified: the bound over the image, what it states in words, and the files that were written."""
+
+    certificate: Certificate
+    words: CertificateWords
+    written: tuple[Path, ...]
+
+
+def certify_file(path: str | Path, task: Task, options: CertifyOptions | None = None) -> CertifiedFile:
+    """Certify what a calibration, or a rig, measures `task` to, and write what `options` ask for.
+
+    Raises
+    ------
+    InputError
+        No calibration, one without a covariance, a camera that the rig does not have, or a file that cannot be written.
+    DegenerateError
+        Nowhere do all cameras see what is measured.
+    """
+    options = options or CertifyOptions()
+    targets = [target for target in (options.report, options.pdf) if target is not None]
+    ensure_writable(targets, force=options.force, inputs=[path])
+    if options.limit is not None and not (np.isfinite(options.limit) and options.limit > 0.0):
+        raise InputError(f"certificate: the limit must be positive, got {options.limit}")
+    certificate = certify(load_instrument(path, options.cameras, options.sigma_px), task)
+    title = f"Certificate: {task.quantity} with {Path(path).name}"
+    facts = {Path(path).name: digest_line(Path(path)), **software_facts()}
+    files: dict[Path, str | bytes] = {}
+    if options.report is not None:
+        files[options.report] = certificate_page(certificate, title, facts, options.limit)
+    if options.pdf is not None:
+        files[options.pdf] = certificate_pdf(certificate, title, facts, options.limit)
+    if files:
+        write_together(files, force=options.force)
+    return CertifiedFile(certificate=certificate, words=in_words(certificate, options.limit), written=tuple(files))
+
+
+def load_instrument(
+    path: str | Path, cameras: tuple[str, str] | None = None, sigma_px: float | None = None
+) -> Instrument:
+    """Return the camera of a calibration's file, or two cameras of a rig's, with what is known of their errors.
+
+    Raises InputError for another file, or one that does not say how sure it is.
+    """
+    if not is_rig_file(path):
+        if cameras is not None:
+            raise InputError(f"'{path}': --cameras names two cameras of a rig, and this is not a rig's file")
+        calibration = load_calibration(path)
+        return Instrument(
+            names=(Path(path).stem,),
+            cameras=(calibration.camera,),
+            cam_from_rig=(Rigid3.identity(),),
+            covariance=calibration.covariance,
+            sigma_px=sigma_px or calibration.sigma_px,
+        )
+    saved = load_saved_rig(path)
+    if saved.covariance is None or saved.sigma_px is None:
+        raise InputError(f"'{path}': the file does not say how sure the rig is; calibrate it with rigkit")
+    names = list(saved.cameras)
+    if len(names) < 2:
+        raise InputError(f"'{path}': a rig of one camera; give that camera's calibration")
+    return instrument_of_rig(
+        names,
+        [camera for camera, _ in saved.cameras.values()],
+        [pose for _, pose in saved.cameras.values()],
+        saved.covariance,
+        cameras or (names[0], names[1]),
+        sigma_px=sigma_px or saved.sigma_px,
+        scale_sigma=saved.scale_sigma,
+    )

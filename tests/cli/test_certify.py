@@ -1,0 +1,97 @@
+"""`rigkit certify`: statement, exit code, page, sheet and JSON."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rigkit.cameras.registry import camera_model
+from rigkit.cli.main import main
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
+from rigkit.io.calibration_file import camera_to_json
+
+SIGMAS = [0.3, 0.3, 0.3, 0.3, 1e-4, 1e-4, 1e-4, 1e-4]
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Path:
+    camera = camera_model("kannala_brandt")((1280, 960), np.array([390.0, 391.0, 641.0, 478.0, 0.02, 0.0, 0.0, 0.0]))
+    poses = {"left": Rigid3.identity(), "right": Rigid3(exp_so3(np.array([0.0, -0.1, 0.0])), [-200.0, 0.0, 0.0])}
+    covariance = np.diag([*SIGMAS, *SIGMAS, 1e-4, 1e-4, 1e-4, 0.1, 0.1, 0.1]) ** 2
+    data: dict[str, Any] = {
+        "schema": "rigkit.rig/1",
+        "sigma_px": 0.05,
+        "scale_sigma": 1e-4,
+        "cameras": [
+            {
+                "name": name,
+                "camera": camera_to_json(camera),
+                "cam_from_rig": pose.matrix()[:3].tolist(),
+                "rms_px": 0.07,
+            }
+            for name, pose in poses.items()
+        ],
+        "covariance": covariance.tolist(),
+    }
+    path = tmp_path / "rig.json"
+    path.write_text(json.dumps(data))
+    return path
+
+
+def test_a_length_with_page_sheet_and_limit(rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page, sheet = rig.with_name("c.html"), rig.with_name("c.pdf")
+    asked = ["certify", str(rig), "--length", "300", "--distance", "1200", "--report", str(page), "--pdf", str(sheet)]
+    assert main([*asked, "--limit", "1000"]) == 0
+    words = capsys.readouterr().out
+    assert "A length of 300 mm across the line of sight, 1200 mm away: 95 % of errors within" in words
+    assert "To halve the worst error: " in words
+    assert "within the limit" in page.read_text()
+    assert sheet.read_bytes().startswith(b"%PDF")
+    assert main([*asked, "--limit", "0.001", "--force"]) == 1
+    assert "beyond the limit" in page.read_text()
+
+
+def test_the_result_for_programs(rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["certify", str(rig), "--depth", "50", "--distance", "900", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["quantity"] == "depth"
+    assert told["cameras"] == ["left", "right"]
+    assert told["passed"] is None
+    bounds = [value for row in told["bound"] for value in row if value is not None]
+    assert max(bounds) == told["worst"]
+    assert main(["certify", str(rig), "--depth", "50", "--distance", "900", "--json", "--sigma-px", "0.5"]) == 0
+    assert json.loads(capsys.readouterr().out)["median"] > told["median"]
+
+
+@pytest.mark.parametrize(
+    "more, words",
+    [
+        (["--length", "-3", "--distance", "900"], "the size must be positive"),
+        (["--length", "3", "--distance", "900", "--sigma-px", "0"], "--sigma-px 0.0: it must be positive"),
+        (["--length", "3", "--distance", "900", "--limit", "nan"], "the limit must be positive"),
+        (["--length", "3", "--distance", "900", "--confidence", "100"], "the confidence lies between 0 and 1"),
+        (["--length", "3", "--distance", "900", "--cameras", "left", "top"], "two different cameras of left, right"),
+        (["--length", "3", "--distance", "900", "--report", "rig.json", "--force"], "rig.json"),
+    ],
+)
+def test_bad_input(
+    rig: Path, more: list[str], words: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(rig.parent)
+    before = rig.read_bytes()
+    assert main(["certify", "rig.json", *more]) == 2
+    assert words in capsys.readouterr().err
+    assert rig.read_bytes() == before
+
+
+def test_a_rig_that_does_not_say_how_sure_it_is(rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = json.loads(rig.read_text())
+    del data["covariance"]
+    rig.write_text(json.dumps(data))
+    assert main(["certify", str(rig), "--length", "300", "--distance", "1200"]) == 2
+    assert "does not say how sure the rig is" in capsys.readouterr().err

@@ -1,0 +1,211 @@
+"""Certificates against Monte Carlo: a rig and a camera that are wrong by their own covariance measure what they see."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.cameras import PARAMETERS, SIZE_PX
+
+from rigkit.cameras.base import Camera
+from rigkit.cameras.registry import camera_model
+from rigkit.core.arrays import FloatArray
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.findings import Severity
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
+from rigkit.geometry.triangulation import triangulate_rays
+from rigkit.validation.certificate.certify import certify
+from rigkit.validation.certificate.contracts import Certificate, Instrument, Quantity, Task, instrument_of_rig
+from rigkit.validation.certificate.propagation import measured_points
+
+TRIALS = 800
+COVERAGE = (0.93, 0.97)
+"""Of a 95 % bound, on average over the places."""
+COVERAGE_AT_A_PLACE = (0.919, 0.981)
+"""Four standard deviations of a share that is counted in 800 trials."""
+PLACES = 4
+SECOND = Rigid3(exp_so3(np.array([0.02, -0.15, 0.01])), [-250.0, 4.0, 20.0])
+
+
+def lens(name: str) -> Camera:
+    return camera_model(name)(SIZE_PX, np.array(PARAMETERS[name]))
+
+
+def covariance_of(camera: Camera, rng: np.random.Generator) -> FloatArray:
+    """With correlations; about 0.3 px in focal lengths and centre, and so little in distortion that the bound, which is
+    linear, is not asked for more than it says: at 100 degrees off the axis k4 stands beside the 9th power."""
+    sigma = np.where(np.arange(camera.parameters.size) < 4, 0.3, 1e-4 if camera.model == "brown" else 5e-6)
+    mixing = np.eye(sigma.size) + 0.4 * rng.normal(size=(sigma.size, sigma.size))
+    return np.asarray(sigma[:, None] * (mixing @ mixing.T) / 2.0 * sigma)
+
+
+def rig_covariance(camera: Camera, rng: np.random.Generator) -> FloatArray:
+    """Of two such lenses and the second one's mount, part of which follows the lenses as in a joint solution."""
+    p = camera.parameters.size
+    joint = np.zeros((2 * p + 6, 2 * p + 6))
+    joint[:p, :p], joint[p : 2 * p, p : 2 * p] = covariance_of(camera, rng), covariance_of(camera, rng)
+    lenses = joint[: 2 * p, : 2 * p]
+    follows = rng.normal(size=(6, 2 * p)) * np.array([2e-4, 2e-4, 2e-4, 0.1, 0.1, 0.1])[:, None]
+    follows /= np.sqrt(np.diag(lenses) * 2 * p)
+    joint[2 * p :, : 2 * p] = follows @ lenses
+    joint[: 2 * p, 2 * p :] = joint[2 * p :, : 2 * p].T
+    joint[2 * p :, 2 * p :] = follows @ lenses @ follows.T + np.diag([2e-4, 3e-4, 1e-4, 0.2, 0.1, 0.3]) ** 2
+    return joint
+
+
+def rig_of(name: str, joint: FloatArray, *, scale_sigma: float = 4e-4) -> Instrument:
+    names, poses = ("left", "right"), (Rigid3.identity(), SECOND)
+    cameras = (lens(name), lens(name))
+    return instrument_of_rig(names, cameras, poses, joint, names, sigma_px=0.08, scale_sigma=scale_sigma)
+
+
+def places_of(certificate: Certificate, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """Rays and bounds of some places in view where the bound is no coarse one."""
+    rows, columns = np.nonzero(certificate.in_view & ~certificate.coarse)
+    assert len(rows) >= PLACES
+    some = rng.choice(len(rows), PLACES, replace=False)
+    pixels = certificate.pixels[rows[some], columns[some]]
+    return certificate.instrument.cameras[0].unproject(pixels)[0], certificate.bound[rows[some], columns[some]]
+
+
+def read_off(quantity: Quantity, points: FloatArray) -> FloatArray:
+    """What points (N, K, 3) measure, (N, ways), by the definition of the quantity."""
+    if quantity is Quantity.ANGLE:
+        a, b = points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]
+        cosine = np.sum(a * b, axis=1) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
+        return np.asarray(np.rad2deg(np.arccos(cosine)))[:, None]
+    if quantity is Quantity.PLANE:
+        centred = points - points.mean(axis=1, keepdims=True)
+        normals = np.linalg.svd(centred)[2][:, 2]
+        normals *= np.sign(np.sum(normals * points.mean(axis=1), axis=1))[:, None]
+        return np.asarray(np.einsum("nkx,nx->nk", centred, normals))
+    ends = points.reshape(len(points), -1, 2, 3)
+    return np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)
+
+
+def holds(inside: FloatArray) -> None:
+    """Assert that the bound of the way that is harder to measure holds as often as it says; `inside` (places, ways)."""
+    share = (inside / TRIALS).min(axis=1)
+    assert COVERAGE[0] <= share.mean() <= COVERAGE[1], share
+    assert (share >= COVERAGE_AT_A_PLACE[0]).all(), share
+    assert (share <= COVERAGE_AT_A_PLACE[1]).all(), share
+
+
+@pytest.mark.parametrize(
+    "quantity, name",
+    [
+        (Quantity.LENGTH, "brown"),
+        (Quantity.DEPTH, "kannala_brandt"),
+        (Quantity.PLANE, "brown"),
+        (Quantity.ANGLE, "kannala_brandt"),
+    ],
+)
+def test_bounds_of_a_rig_hold_as_often_as_they_say(quantity: Quantity, name: str, rng: np.random.Generator) -> None:
+    joint = rig_covariance(lens(name), rng)
+    rig = rig_of(name, joint)
+    task = Task(quantity=quantity, size_mm=150.0, distance_mm=1500.0)
+    rays, bounds = places_of(certify(rig, task, cells=(9, 7)), rng)
+    points, _ = measured_points(rays, task, True)
+    exact = read_off(quantity, points)
+    seen = [c.project(pose.apply(points))[0] for c, pose in zip(rig.cameras, rig.cam_from_rig, strict=True)]
+    p, factor = rig.cameras[0].parameters.size, np.linalg.cholesky(joint)
+    inside = np.zeros(exact.shape)
+    for _ in range(TRIALS):
+        wrong = factor @ rng.normal(size=len(joint))
+        cameras = [c.with_parameters(c.parameters + wrong[k * p :][:p]) for k, c in enumerate(rig.cameras)]
+        pose = Rigid3(exp_so3(wrong[2 * p : 2 * p + 3]) @ SECOND.rotation, SECOND.translation_mm + wrong[2 * p + 3 :])
+        pixels = [q + rig.sigma_px * rng.normal(size=q.shape) for q in seen]
+        sight = [c.unproject(q)[0] for c, q in zip(cameras, pixels, strict=True)]
+        slopes = [c.ray_jacobian(q) for c, q in zip(cameras, pixels, strict=True)]
+        found, valid = triangulate_rays(*sight, pose, jacobians1=slopes[0], jacobians2=slopes[1])
+        assert valid.all()
+        found *= 1.0 + rig.scale_sigma * rng.normal()
+        inside += np.abs(read_off(quantity, found) - exact) <= bounds[:, None]
+    holds(inside)
+
+
+def test_bounds_of_one_camera_hold_as_often_as_they_say(rng: np.random.Generator) -> None:
+    camera = lens("kannala_brandt")
+    covariance = covariance_of(camera, rng)
+    alone = Instrument(
+        names=("cam",),
+        cameras=(camera,),
+        cam_from_rig=(Rigid3.identity(),),
+        covariance=covariance,
+        sigma_px=0.08,
+    )
+    task = Task(quantity=Quantity.LENGTH, size_mm=400.0, distance_mm=1000.0, distance_sigma_mm=0.5)
+    rays, bounds = places_of(certify(alone, task, cells=(9, 7)), rng)
+    points, _ = measured_points(rays, task, False)
+    seen, factor = camera.project(points)[0], np.linalg.cholesky(covariance)
+    inside = np.zeros((PLACES, 2))
+    for _ in range(TRIALS):
+        wrong = camera.with_parameters(camera.parameters + factor @ rng.normal(size=len(factor)))
+        sight, _ = wrong.unproject(seen + alone.sigma_px * rng.normal(size=seen.shape))
+        a, b = sight[:, 0::2], sight[:, 1::2]
+        distance = task.distance_mm + task.distance_sigma_mm * rng.normal()
+        length = 2.0 * distance * np.tan(0.5 * np.arccos(np.sum(a * b, axis=-1)))
+        inside += np.abs(length - task.size_mm) <= bounds[:, None]
+    holds(inside)
+
+
+def test_the_causes_add_up_and_the_worst_is_named_first(rng: np.random.Generator) -> None:
+    rig = rig_of("brown", rig_covariance(lens("brown"), rng), scale_sigma=0.01)
+    certificate = certify(rig, Task(quantity=Quantity.LENGTH, size_mm=200.0, distance_mm=1200.0), cells=(9, 7))
+    assert sum(certificate.shares().values()) == pytest.approx(1.0)
+    assert max(certificate.shares(), key=lambda cause: certificate.shares()[cause]) == "board scale"
+    advice = certificate.findings[-1]
+    assert "to halve the worst error: board scale make" in advice.message
+    assert 0.0 < certificate.share_within(certificate.median) < certificate.share_within(certificate.worst) == 1.0
+
+
+def test_what_is_not_counted_in_is_said(rng: np.random.Generator) -> None:
+    rig = rig_of("brown", rig_covariance(lens("brown"), rng), scale_sigma=0.0)
+    certificate = certify(rig, Task(quantity=Quantity.DEPTH, size_mm=100.0, distance_mm=900.0), cells=(5, 4))
+    assert any("square_sigma_mm" in str(f) for f in certificate.findings if f.severity is Severity.LOOK)
+
+
+def test_the_first_camera_may_be_any_of_the_rig(rng: np.random.Generator) -> None:
+    """A rig's frame is no camera's affair: seen from the other side the same length is as uncertain."""
+    joint = rig_covariance(lens("brown"), rng)
+    forth = rig_of("brown", joint)
+    back = instrument_of_rig(
+        ("left", "right"),
+        forth.cameras,
+        forth.cam_from_rig,
+        joint,
+        ("right", "left"),
+        sigma_px=0.08,
+        scale_sigma=4e-4,
+    )
+    task = Task(quantity=Quantity.DEPTH, size_mm=1.0, distance_mm=1500.0)
+    one, other = certify(forth, task, cells=(21, 17)), certify(back, task, cells=(21, 17))
+    # Not the same lines of sight, but over the whole field much the same.
+    assert one.median == pytest.approx(other.median, rel=0.2)
+
+
+def test_refusals(rng: np.random.Generator) -> None:
+    camera = lens("brown")
+    alone = Instrument(
+        names=("cam",),
+        cameras=(camera,),
+        cam_from_rig=(Rigid3.identity(),),
+        covariance=covariance_of(camera, rng),
+        sigma_px=0.1,
+    )
+    with pytest.raises(InputError, match="one camera measures no depth"):
+        certify(alone, Task(quantity=Quantity.DEPTH, size_mm=10.0, distance_mm=1000.0))
+    with pytest.raises(DegenerateError, match="nowhere is a length of 90000 mm"):
+        certify(alone, Task(quantity=Quantity.LENGTH, size_mm=90000.0, distance_mm=1000.0))
+    with pytest.raises(InputError, match="size must be positive"):
+        Task(quantity=Quantity.LENGTH, size_mm=0.0, distance_mm=1000.0)
+    with pytest.raises(InputError, match="two different cameras of left, right"):
+        instrument_of_rig(
+            ("left", "right"),
+            (camera, camera),
+            (Rigid3.identity(), SECOND),
+            rig_covariance(camera, rng),
+            ("left", "left"),
+            sigma_px=0.1,
+            scale_sigma=0.0,
+        )
