@@ -38,7 +38,7 @@ class Correspondences:
     sigma_A: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        n = len(np.asarray(self.pixels1))
+        n = len(np.atleast_1d(self.pixels1))
         object.__setattr__(self, "pixels1", as_array(self.pixels1, (n, 2), "correspondences, pixels1"))
         object.__setattr__(self, "pixels2", as_array(self.pixels2, (n, 2), "correspondences, pixels2"))
         shapes: dict[str, tuple[int | None, ...]] = {"A21": (n, 2, 2), "sigma_px": (n,), "sigma_A": (n,)}

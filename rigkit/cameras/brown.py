@@ -31,8 +31,8 @@ class Brown(Camera):
     """With (x, y) = (X/Z, Y/Z) and t = x^2 + y^2:  m = L(t) (x, y) + tangential,  u = fx m_x + cx, v = fy m_y + cy.
 
     L = (1 + k1 t + k2 t^2 + k3 t^3) / (1 + k4 t + k5 t^2 + k6 t^3); tangential =
-    (2 p1 x y + p2 (t + 2 x^2), p1 (t + 2 y^2) + 2 p2 x y). Parameters are fx, fy, cx, cy, k1, k2, p1, p2, k3 and, in
-    the rational form, k4, k5, k6.
+    (2 p1 x y + p2 (t + 2 x^2), p1 (t + 2 y^2) + 2 p2 x y). Parameters are fx, fy, cx, cy, k1, k2, p1, p2 (four terms:
+    Kalibr's radtan, plumb_bob without k3), then k3 (five), then k4, k5, k6 (eight: the rational form).
 
     Notes
     -----
@@ -51,7 +51,7 @@ class Brown(Camera):
     def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
         count = 5 if order is None else order
         if count not in cls.orders:
-            raise InputError(f"brown camera: {count} distortion terms; choose 4 (k3 stays 0), 5 or 8")
+            raise InputError(f"brown camera: {count} distortion terms; choose 4 (without k3), 5 or 8")
         theta, radius = curve.below(np.pi / 2, cls.model)
         r = np.tan(theta)
         # A curve with noise may be fitted best by a polynomial that turns down just outside it: then fewer terms.
@@ -68,7 +68,7 @@ class Brown(Camera):
             a = np.linalg.lstsq(columns / size, radius, rcond=None)[0] / size
             k = np.zeros(6)
             k[:top], k[3 : 3 + bottom] = a[1 : top + 1] / a[0], a[top + 1 :]
-            shape = np.array([k[0], k[1], 0.0, 0.0, *k[2:]])[: max(count, 5)]
+            shape = np.array([k[0], k[1], 0.0, 0.0, *k[2:]])[:count]
             camera = cls(size_px, np.array([a[0], a[0], *curve.centre_px, *shape]))
             if a[0] > 0.0 and camera.max_angle_rad > theta[-1]:
                 return camera
@@ -80,11 +80,14 @@ class Brown(Camera):
 
     def parameter_names(self) -> tuple[str, ...]:
         names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+        if self.parameters.size == 8:
+            return names[:8]
         return (*names, "k4", "k5", "k6") if self.parameters.size > 9 else names
 
     def _polynomials(self) -> tuple[FloatArray, FloatArray]:
         """Numerator and denominator of L as polynomials in t."""
-        k1, k2, _, _, k3 = self.parameters[4:9]
+        k1, k2 = self.parameters[4:6].tolist()
+        k3 = float(self.parameters[8]) if self.parameters.size > 8 else 0.0
         return np.array([1.0, k1, k2, k3]), np.concatenate([[1.0], self.parameters[9:]])
 
     def _prepare(self) -> None:
@@ -234,7 +237,8 @@ def _fill_radial(
         np.multiply(out[10], t, out=out[11])
     np.multiply(ray, t, out=out[4])
     np.multiply(out[4], t, out=out[5])
-    np.multiply(out[5], t, out=out[8])
+    if len(out) > 8:
+        np.multiply(out[5], t, out=out[8])
 
 
 def _product(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -97,7 +97,7 @@ def _read_camera(path: Path, kind: str) -> Camera:
     from rigkit.interop.opencv import read_opencv
     from rigkit.interop.ros import read_camera_info
     from rigkit.io.calibration_file import load_camera
-    from rigkit.io.text import read_text
+    from rigkit.io.reading import read_text
 
     if kind == "rigkit":
         return load_camera(path)

@@ -25,6 +25,7 @@ __all__ = [
     "RayJacobians",
     "Rays",
     "as_array",
+    "as_covariance",
     "as_indices",
     "in_8_bits",
     "upper_median",
@@ -33,6 +34,13 @@ __all__ = [
 
 BRIGHT_SHARE = 0.999
 """Of the pixels; the rest may be brighter than the image's bits: hot, or a glint."""
+
+NOT_NUMBERS = "bSUmMV"
+"""Kinds of arrays that numpy would turn into numbers, and that are none: truth values, words, dates."""
+MAX_ASYMMETRY = 1e-6
+"""Of a covariance, in units of the two sigmas: solving leaves 1e-12 of a well-posed problem."""
+MIN_EIGENVALUE = -1e-6
+"""Of a correlation matrix, for each row that it has: rounding of an inverse makes a zero slightly negative."""
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -66,8 +74,11 @@ def as_array(value: ArrayLike, shape: tuple[int | None, ...], name: str, *, fini
         Wrong shape, not numeric, or not finite.
     """
     try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+        raw = np.asarray(value)
+        if raw.dtype.kind in NOT_NUMBERS and raw.size:
+            raise TypeError(f"of {raw.dtype.name}")
+        array = np.array(raw, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{name}: not an array of numbers ({error})") from error
     _check_shape(array, shape, name)
     if finite and not np.isfinite(array).all():
@@ -75,6 +86,32 @@ def as_array(value: ArrayLike, shape: tuple[int | None, ...], name: str, *, fini
         raise InputError(f"{name}: {bad} of {array.size} values are NaN or infinite; remove them first")
     array.flags.writeable = False
     return array
+
+
+def as_covariance(value: ArrayLike, name: str, size: int) -> FloatArray:
+    """Return a read-only copy of a covariance (`size`, `size`).
+
+    Raises
+    ------
+    InputError
+        Another shape, not finite, not symmetric, or with a negative variance in some direction: beyond what rounding
+        leaves of the correlations, `MAX_ASYMMETRY` and `MIN_EIGENVALUE`.
+    """
+    covariance = as_array(value if size else np.zeros((0, 0)), (size, size), name)
+    variance = np.diag(covariance)
+    if (variance < 0.0).any():
+        raise InputError(f"{name}: a variance is negative ({variance.min():.3g}); the numbers were changed or damaged")
+    sigma = np.sqrt(variance)
+    # What has no variance has no covariance either.
+    scale = np.outer(sigma, sigma)
+    if (np.abs(covariance - covariance.T) > MAX_ASYMMETRY * scale).any():
+        raise InputError(f"{name}: it is not symmetric, as covariances are; the numbers were changed or damaged")
+    if (np.abs(covariance) > (1.0 - MIN_EIGENVALUE) * scale).any():
+        raise InputError(f"{name}: a correlation is beyond 1; the numbers were changed or damaged")
+    correlation = np.divide(covariance, scale, out=np.zeros_like(covariance), where=scale > 0.0)
+    if size and float(np.linalg.eigvalsh(correlation + correlation.T)[0]) < 2.0 * MIN_EIGENVALUE * size:
+        raise InputError(f"{name}: it has a negative variance in some direction; the numbers were changed or damaged")
+    return covariance
 
 
 def as_indices(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> IntArray:

@@ -8,6 +8,7 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray, IntArray, Points
 from rigkit.core.errors import InputError
+from rigkit.core.identifiers import check_identifier
 
 __all__ = ["Board", "Markers", "marker_rectangles"]
 
@@ -60,6 +61,7 @@ class Board:
     markers: Markers | None = None
 
     def __post_init__(self) -> None:
+        check_identifier(self.board_id, "board")
         if not all(isinstance(count, int | np.integer) for count in (self.columns, self.rows)):
             raise InputError(
                 f"board '{self.board_id}': columns and rows are whole numbers, got {self.columns!r} and {self.rows!r}"

@@ -7,21 +7,22 @@ from collections.abc import Mapping
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.cameras.registry import camera_model
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 from rigkit.interop.colmap import HALF_PIXEL
-from rigkit.interop.exchange import Accepted, Written, best_accepted
+from rigkit.interop.exchange import Accepted, Written, best_accepted, camera_of, image_size
 
 __all__ = ["read_colmap_cameras", "write_colmap_cameras"]
 
 ACCEPTED = (
     Accepted("pinhole"),
+    Accepted("brown", 4),
     Accepted("brown", 5),
     Accepted("brown", 8),
     Accepted("kannala_brandt"),
     Accepted("eucm"),
 )
+MAX_COLMAP_DIGITS = 9
 BEHIND = "COLMAP projects no point at or beyond 90 degrees"
 
 # COLMAP's model -> our model, and where its parameters go in ours; f1 stands for one focal length used twice.
@@ -52,7 +53,7 @@ def write_colmap_cameras(cameras: Mapping[int, Camera]) -> tuple[str, dict[int, 
         c = chosen.camera
         name = {"pinhole": "PINHOLE", "kannala_brandt": "OPENCV_FISHEYE", "eucm": "EUCM"}.get(c.model)
         if name is None:
-            name = "FULL_OPENCV" if c.parameters[8:].any() else "OPENCV"
+            name = "OPENCV" if c.parameters.size == 8 else "FULL_OPENCV"
         ours = dict(zip(c.parameter_names(), c.parameters.tolist(), strict=True))
         ours["cx"] += HALF_PIXEL
         ours["cy"] += HALF_PIXEL
@@ -83,29 +84,37 @@ def read_colmap_cameras(text: str, name: str = "cameras.txt") -> dict[int, Camer
             raise InputError(f"{where}: camera model '{model}' is unknown; known: {', '.join(LAYOUTS)}")
         model, keys = LAYOUTS[words[1]]
         try:
-            camera_id, width, height = int(words[0]), int(words[2]), int(words[3])
-            values = [float(w) for w in words[4:]]
+            camera_id, *size, values = (*(_whole(words[i]) for i in (0, 2, 3)), [float(w) for w in words[4:]])
         except ValueError as error:
-            raise InputError(f"{where}: not a camera ({error})") from error
+            raise InputError(f"{where}: not a camera ({error}); correct the line") from error
+        if camera_id in cameras:
+            raise InputError(f"{where}: camera {camera_id} is there twice; leave one")
         if len(values) != len(keys):
             raise InputError(f"{where}: {words[1]} has {len(keys)} parameters, found {len(values)}")
-        cameras[camera_id] = camera_model(model)(
-            (width, height), _parameters(model, dict(zip(keys, values, strict=True)))
-        )
+        parameters = _parameters(model, dict(zip(keys, values, strict=True)))
+        cameras[camera_id] = camera_of(model, image_size(size, where.strip("'"), "size"), parameters, where.strip("'"))
     if not cameras:
         raise InputError(f"'{name}': no camera in it; is it COLMAP's cameras.txt?")
     return cameras
 
 
+def _whole(word: str) -> int:
+    if not word.isascii() or not word.isdigit() or len(word) > MAX_COLMAP_DIGITS:
+        raise ValueError(f"'{word[:40]}' is no whole number")
+    return int(word)
+
+
 def _parameters(model: str, theirs: dict[str, float]) -> FloatArray:
     names = {
         "pinhole": ("fx", "fy", "cx", "cy"),
-        "brown": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"),
+        "brown": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
         "kannala_brandt": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
         "eucm": ("fx", "fy", "cx", "cy", "alpha", "beta"),
     }[model]
-    if any(theirs.get(k, 0.0) != 0.0 for k in ("k4", "k5", "k6")) and model == "brown":
-        names = (*names, "k4", "k5", "k6")
+    if model == "brown" and any(theirs.get(k, 0.0) != 0.0 for k in ("k4", "k5", "k6")):
+        names = (*names, "k3", "k4", "k5", "k6")
+    elif model == "brown" and "k3" in theirs:
+        names = (*names, "k3")
     if "f" in theirs:
         theirs = {"fx": theirs["f"], "fy": theirs["f"], **theirs}
     theirs = {**theirs, "cx": theirs["cx"] - HALF_PIXEL, "cy": theirs["cy"] - HALF_PIXEL}

@@ -8,13 +8,24 @@ from typing import Any
 
 import numpy as np
 
-from rigkit.cameras.base import Camera
+from rigkit.cameras.base import MAX_SIDE_PX, Camera
 from rigkit.cameras.convert import convert_camera
+from rigkit.cameras.registry import camera_model
 from rigkit.cameras.ucm import UCM
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 
-__all__ = ["Accepted", "Written", "best_accepted", "field", "numbers", "unified_from_xi", "unified_with_xi"]
+__all__ = [
+    "Accepted",
+    "Written",
+    "best_accepted",
+    "camera_of",
+    "field",
+    "image_size",
+    "numbers",
+    "unified_from_xi",
+    "unified_with_xi",
+]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -30,7 +41,7 @@ class Accepted:
         if camera.model != self.model:
             return False
         names = camera.parameter_names()
-        if self.order is not None and camera.model == "brown" and len(names) - 4 != max(self.order, 5):
+        if self.order is not None and camera.model == "brown" and len(names) - 4 != self.order:
             return False
         return all(camera.parameters[names.index(name)] == 0.0 for name in self.zero)
 
@@ -109,13 +120,34 @@ def field(data: dict[str, Any], key: str, name: str) -> Any:
 def numbers(value: Any, name: str, key: str, count: int | None = None) -> FloatArray:
     """Return `value` as finite numbers (N,); raises InputError that names file and key."""
     try:
-        array = np.asarray(value, dtype=np.float64).reshape(-1)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"'{name}': '{key}' is not a list of numbers") from error
+        raw = np.asarray(value)
+        words = isinstance(value, list) and any(isinstance(one, bool) for one in value)
+        if words or (raw.size and raw.dtype.kind not in "iuf"):
+            raise TypeError
+        array = raw.astype(np.float64).reshape(-1)
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise InputError(f"'{name}': '{key}' is not a list of numbers; is the file whole?") from error
     if not np.isfinite(array).all() or (count is not None and array.size != count):
         wanted = "finite numbers" if count is None else f"{count} finite numbers"
-        raise InputError(f"'{name}': '{key}' should have {wanted}, has {array.size}")
+        raise InputError(f"'{name}': '{key}' should have {wanted}, has {array.size}; is the file whole?")
     return array
+
+
+def image_size(value: Any, name: str, key: str) -> tuple[int, int]:
+    """Return (width, height); raises InputError that names file and key for what is no pair of whole numbers."""
+    width, height = numbers(value, name, key, 2).tolist()
+    for side in (width, height):
+        if side != np.floor(side) or not 1.0 <= side <= MAX_SIDE_PX:
+            raise InputError(f"'{name}': '{key}' has {side:g}, which is no number of pixels; correct it")
+    return int(width), int(height)
+
+
+def camera_of(model: str, size_px: tuple[int, int], parameters: FloatArray, name: str) -> Camera:
+    """Return the camera; raises InputError that names the file where the values make none."""
+    try:
+        return camera_model(model)(size_px, parameters)
+    except InputError as error:
+        raise InputError(f"'{name}': {error}; is it the calibration of this format?") from error
 
 
 def unified_with_xi(camera: Camera) -> tuple[float, FloatArray]:
@@ -130,6 +162,11 @@ def unified_with_xi(camera: Camera) -> tuple[float, FloatArray]:
     return xi, np.array([core[0] * (1.0 + xi), core[1] * (1.0 + xi), core[2], core[3]])
 
 
-def unified_from_xi(size_px: tuple[int, int], xi: float, core: FloatArray) -> Camera:
-    """Return the unified camera of xi and gamma_x, gamma_y, cx, cy; the reverse of `unified_with_xi`."""
+def unified_from_xi(size_px: tuple[int, int], xi: float, core: FloatArray, name: str) -> Camera:
+    """Return the unified camera of xi and gamma_x, gamma_y, cx, cy; the reverse of `unified_with_xi`.
+
+    Raises InputError that names the file for a negative xi: its sphere would be seen from behind.
+    """
+    if not xi >= 0.0:
+        raise InputError(f"'{name}': xi = {xi:g}, which is never negative; calibrate again")
     return UCM(size_px, np.array([*(core[:2] / (1.0 + xi)), *core[2:], xi / (1.0 + xi)]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.cameras.registry import camera_model
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
@@ -17,7 +17,9 @@ from rigkit.interop.exchange import (
     Accepted,
     Written,
     best_accepted,
+    camera_of,
     field,
+    image_size,
     numbers,
     unified_from_xi,
     unified_with_xi,
@@ -28,13 +30,14 @@ __all__ = ["KalibrChain", "read_kalibr", "write_kalibr"]
 
 ACCEPTED = (
     Accepted("pinhole"),
-    Accepted("brown", 4, ("k3",)),
+    Accepted("brown", 4),
     Accepted("kannala_brandt"),
     Accepted("ucm"),
     Accepted("eucm"),
     Accepted("double_sphere"),
 )
 MM_PER_M = 1000.0
+CAMERA = re.compile(r"cam[0-9]{1,3}")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -86,7 +89,7 @@ def read_kalibr(text: str, name: str = "camchain") -> tuple[tuple[Camera, ...], 
     "omni" with distortion) and for damaged files.
     """
     data = parse_yaml(text, name)
-    keys = sorted((k for k in data if k.startswith("cam") and k[3:].isdigit()), key=lambda k: int(k[3:]))
+    keys = sorted((k for k in data if CAMERA.fullmatch(k)), key=lambda k: int(k[3:]))
     if not keys:
         raise InputError(f"'{name}': no cam0; is it a camchain of Kalibr?")
     cameras, poses = [], [Rigid3.identity()]
@@ -117,10 +120,9 @@ def _described(camera: Camera) -> tuple[str, FloatArray, str, FloatArray]:
 
 
 def _camera(block: Any, name: str) -> Camera:
-    model = field(block, "camera_model", name)
+    model = str(field(block, "camera_model", name))
     distortion_model = str(block.get("distortion_model", "none"))
-    size_px = tuple(int(v) for v in numbers(field(block, "resolution", name), name, "resolution", 2))
-    size = (size_px[0], size_px[1])
+    size = image_size(field(block, "resolution", name), name, "resolution")
     intrinsics = numbers(field(block, "intrinsics", name), name, "intrinsics")
     distortion = numbers(block.get("distortion_coeffs") or [], name, "distortion_coeffs")
     expected = {"pinhole": 4, "omni": 5, "eucm": 6, "ds": 6}
@@ -129,17 +131,17 @@ def _camera(block: Any, name: str) -> Camera:
     if intrinsics.size != expected[model]:
         raise InputError(f"'{name}': {model} has {expected[model]} intrinsics, found {intrinsics.size}")
     if model == "pinhole" and distortion_model == "equidistant":
-        return camera_model("kannala_brandt")(size, np.concatenate([intrinsics, distortion]))
+        return camera_of("kannala_brandt", size, np.concatenate([intrinsics, distortion]), name)
     if model == "pinhole" and distortion_model == "radtan" and distortion.any():
-        return camera_model("brown")(size, np.concatenate([intrinsics, distortion, [0.0]]))
+        return camera_of("brown", size, np.concatenate([intrinsics, distortion]), name)
     if distortion.any():
         raise InputError(
             f"'{name}': {model} with distortion_model '{distortion_model}' is not supported; calibrate with radtan or "
             "equidistant on a pinhole, or without distortion"
         )
     if model == "pinhole":
-        return camera_model("pinhole")(size, intrinsics)
+        return camera_of("pinhole", size, intrinsics, name)
     if model == "omni":
-        return unified_from_xi(size, float(intrinsics[0]), intrinsics[1:])
+        return unified_from_xi(size, float(intrinsics[0]), intrinsics[1:], name)
     ours = {"eucm": "eucm", "ds": "double_sphere"}[model]
-    return camera_model(ours)(size, np.concatenate([intrinsics[2:], intrinsics[:2]]))
+    return camera_of(ours, size, np.concatenate([intrinsics[2:], intrinsics[:2]]), name)

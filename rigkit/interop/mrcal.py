@@ -20,13 +20,13 @@ from rigkit.core.arrays import BoolArray, FloatArray, Pixels, Rays
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
-from rigkit.interop.exchange import Accepted, Written, best_accepted, field, numbers
+from rigkit.interop.exchange import Accepted, Written, best_accepted, camera_of, field, image_size, numbers
 
 __all__ = ["read_cameramodel", "write_cameramodel"]
 
-ACCEPTED = (Accepted("pinhole"), Accepted("brown", 5), Accepted("brown", 8))
+ACCEPTED = (Accepted("pinhole"), Accepted("brown", 4), Accepted("brown", 5), Accepted("brown", 8))
 SPLINED = re.compile(
-    r"^LENSMODEL_SPLINED_STEREOGRAPHIC_(?:spline_)?order=(?P<order>\d)_Nx=(?P<nx>\d+)_Ny=(?P<ny>\d+)_fov_x_deg=(?P<fov>\d+)$"
+    r"^LENSMODEL_SPLINED_STEREOGRAPHIC_(?:spline_)?order=(?P<order>\d)_Nx=(?P<nx>\d{1,4})_Ny=(?P<ny>\d{1,4})_fov_x_deg=(?P<fov>\d{1,3})$"
 )
 MM_PER_M = 1000.0
 KNOTS_X = 40
@@ -38,6 +38,11 @@ CHECK_GRID = (233, 187)
 """Pixels at which its error is measured: others."""
 SPLINE_DEGREE = 10
 """Of the polynomial camera in whose form a spline is read: the highest, there is no noise to follow."""
+SPLINE_MODELS = ("scaramuzza", "kannala_brandt", "double_sphere", "eucm", "ucm", "brown")
+"""Tried in this order for a spline; the last ones have few terms, and are what some other program's lens was."""
+EXACT_PX = 0.01
+"""A spline is off by as much from the lens that it was made of: no other model needs to be tried."""
+MIN_SEEN = 0.99
 CLOSE_ENOUGH_PX = 0.1
 """A parametric model that is off by less is preferred to the spline: other programs can read it."""
 
@@ -51,7 +56,7 @@ def write_cameramodel(camera: Camera, cam_from_ref: Rigid3 | None = None) -> Wri
         chosen = None
     if chosen is not None and chosen.covered == 1.0 and chosen.max_error_px < CLOSE_ENOUGH_PX:
         p = chosen.camera.parameters
-        lens = {4: "PINHOLE", 9: "OPENCV5", 12: "OPENCV8"}[p.size]
+        lens = {4: "PINHOLE", 8: "OPENCV4", 9: "OPENCV5", 12: "OPENCV8"}[p.size]
         return chosen.written(_text(f"LENSMODEL_{lens}", p, camera.size_px, pose))
     lens, intrinsics = _spline_of(camera)
     pixels, rays = _samples(camera, CHECK_GRID)
@@ -63,19 +68,21 @@ def write_cameramodel(camera: Camera, cam_from_ref: Rigid3 | None = None) -> Wri
 
 
 def read_cameramodel(
-    text: str, name: str = "cameramodel", *, spline_as: str = "scaramuzza"
+    text: str, name: str = "cameramodel", *, spline_as: str | None = None
 ) -> tuple[Camera, Rigid3, float]:
-    """Return the camera, cam_from_ref and the largest error, px: 0 unless a spline was refitted as `spline_as`.
+    """Return the camera, cam_from_ref and the largest error, px: 0 unless a spline was refitted, as `spline_as` or
+    else as the model that follows it best: a lens that was written as a spline comes back as what it was.
 
     Raises InputError for damaged files and for lens models that are not here (CAHVOR, panoramas).
     """
     try:
         data = ast.literal_eval(text[text.index("{") :])
-    except (ValueError, SyntaxError, MemoryError, RecursionError) as error:
-        raise InputError(f"'{name}': not a .cameramodel of mrcal ({error.__class__.__name__})") from error
+    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
+        data = None
+    if not isinstance(data, dict):
+        raise InputError(f"'{name}': not a .cameramodel of mrcal, a dictionary of Python; is the file whole?")
     lens = str(data.get("lensmodel", data.get("lens_model", "")))
-    size_px = numbers(field(data, "imagersize", name), name, "imagersize", 2)
-    size = (int(size_px[0]), int(size_px[1]))
+    size = image_size(field(data, "imagersize", name), name, "imagersize")
     intrinsics = numbers(field(data, "intrinsics", name), name, "intrinsics")
     pose_key = "rt_cam_ref" if "rt_cam_ref" in data else "extrinsics"
     rt = numbers(field(data, pose_key, name), name, pose_key, 6)
@@ -86,9 +93,8 @@ def read_cameramodel(
         if intrinsics.size != counts[kind]:
             raise InputError(f"'{name}': {lens} has {counts[kind]} intrinsics, found {intrinsics.size}")
         if kind == "PINHOLE":
-            return camera_model("pinhole")(size, intrinsics), pose, 0.0
-        padded = np.append(intrinsics, 0.0) if kind == "OPENCV4" else intrinsics
-        return camera_model("brown")(size, padded), pose, 0.0
+            return camera_of("pinhole", size, intrinsics, name), pose, 0.0
+        return camera_of("brown", size, intrinsics, name), pose, 0.0
     if SPLINED.match(lens) is None:
         raise InputError(f"'{name}': lens model '{lens}' is not supported; known: {', '.join(counts)}, splined (cubic)")
     camera, error_px = _from_spline(lens, intrinsics, size, spline_as, name)
@@ -185,9 +191,9 @@ def _basis(u: FloatArray, lens: str) -> tuple[Any, BoolArray]:
 
 
 def _from_spline(
-    lens: str, intrinsics: FloatArray, size_px: tuple[int, int], model: str, name: str
+    lens: str, intrinsics: FloatArray, size_px: tuple[int, int], model: str | None, name: str
 ) -> tuple[Camera, float]:
-    """Return the camera of `model` nearest to the spline over the image, and its largest error, px."""
+    """Return the camera of `model` (None: of any) nearest to the spline over the image, and its largest error, px."""
     match = SPLINED.match(lens)
     assert match is not None
     if intrinsics.size != 4 + 2 * int(match["nx"]) * int(match["ny"]):
@@ -196,12 +202,25 @@ def _from_spline(
     if len(rays) < GRID[0]:
         raise InputError(f"'{name}': the spline shows next to nothing on the image; is the file whole?")
     centre = _spline_project(np.array([[0.0, 0.0, 1.0]]), lens, intrinsics)[0][0]
-    camera = fit_camera(
-        camera_model(model), size_px, rays, pixels, centre, order=SPLINE_DEGREE if model == "scaramuzza" else None
-    )
-    rays, pixels = _spline_samples(lens, intrinsics, size_px, 3 * GRID[0])
-    projected, seen = camera.project(rays)
-    return camera, float(np.linalg.norm((projected - pixels)[seen], axis=-1).max())
+    checked = _spline_samples(lens, intrinsics, size_px, 3 * GRID[0])
+    best: tuple[Camera, float] | None = None
+    for kind in (model,) if model else SPLINE_MODELS:
+        try:
+            order = SPLINE_DEGREE if kind == "scaramuzza" else None
+            camera = fit_camera(camera_model(kind), size_px, rays, pixels, centre, order=order)
+        except (InputError, np.linalg.LinAlgError):
+            continue
+        projected, seen = camera.project(checked[0])
+        error = np.linalg.norm((projected - checked[1])[seen], axis=-1)
+        # What the camera cannot see it does not follow.
+        worst = float(error.max()) if seen.mean() > MIN_SEEN else np.inf
+        if best is None or worst < best[1]:
+            best = camera, worst
+        if worst < EXACT_PX:
+            break
+    if best is None or not np.isfinite(best[1]):
+        raise InputError(f"'{name}': no model here follows this spline; export it from mrcal as a parametric model")
+    return best
 
 
 def _spline_samples(lens: str, intrinsics: FloatArray, size_px: tuple[int, int], count: int) -> tuple[Rays, Pixels]:

@@ -15,7 +15,7 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.scaramuzza import DEGREES, Scaramuzza
 from rigkit.core.arrays import FloatArray, Mat3
 from rigkit.core.errors import InputError
-from rigkit.interop.exchange import Accepted, Chosen, Written, best_accepted, numbers
+from rigkit.interop.exchange import Accepted, Chosen, Written, best_accepted, image_size, numbers
 
 __all__ = ["read_ocamcalib", "read_py_ocamcalib", "write_ocamcalib"]
 
@@ -71,13 +71,22 @@ def read_ocamcalib(text: str, name: str = "calib_results.txt") -> tuple[Scaramuz
     rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if len(rows) < 5:
         raise InputError(f"'{name}': {len(rows)} lines of numbers, expected 5; is it OCamCalib's calib_results.txt?")
-    ss_row = numbers(rows[0], name, "polynomial")
-    ss = numbers(rows[0][1:], name, "polynomial", int(ss_row[0]))
-    row, column = numbers(rows[2], name, "center", 2)
-    c, d, e = numbers(rows[3], name, "affine parameters", 3)
-    height, width = (int(v) for v in numbers(rows[4], name, "image size", 2))
+    ss_row = _line(rows[0], name, "polynomial")
+    if ss_row[0] != ss_row.size - 1:
+        raise InputError(f"'{name}': {ss_row[0]:g} terms of the polynomial announced, {ss_row.size - 1} given")
+    row, column = _line(rows[2], name, "center", 2)
+    c, d, e = _line(rows[3], name, "affine parameters", 3)
+    height, width = image_size(_line(rows[4], name, "image size", 2), name, "image size")
     affine = np.array([[c, d], [e, 1.0]])
-    return _from_ocam((width, height), -ss, np.array([column, row]), affine[::-1, ::-1], name)
+    return _from_ocam((width, height), -ss_row[1:], np.array([column, row]), affine[::-1, ::-1], name)
+
+
+def _line(words: list[str], name: str, key: str, count: int | None = None) -> FloatArray:
+    """Return the numbers of a line."""
+    try:
+        return numbers([float(word) for word in words], name, key, count)
+    except ValueError as error:
+        raise InputError(f"'{name}': {key}: {error}; is the file whole?") from error
 
 
 def read_py_ocamcalib(text: str, size_px: tuple[int, int], name: str = "calibration.json") -> tuple[Scaramuzza, Mat3]:
@@ -90,8 +99,8 @@ def read_py_ocamcalib(text: str, size_px: tuple[int, int], name: str = "calibrat
         polynomial = numbers(data["taylor_coefficient"], name, "taylor_coefficient")
         centre = numbers(data["distortion_center"], name, "distortion_center", 2)
         stretch = numbers(data["stretch_matrix"], name, "stretch_matrix", 4).reshape(2, 2)
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"'{name}': not a calibration of py-OCamCalib ({error})") from error
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(f"'{name}': not a calibration of py-OCamCalib ({error}); is the file whole?") from error
     camera, turn = _from_ocam(size_px, polynomial, centre, stretch, name)
     return camera, turn @ np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 

@@ -10,16 +10,26 @@ from typing import Any
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.cameras.registry import camera_model
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
-from rigkit.interop.exchange import Accepted, Written, best_accepted, field, numbers, unified_from_xi, unified_with_xi
+from rigkit.interop.exchange import (
+    Accepted,
+    Written,
+    best_accepted,
+    camera_of,
+    field,
+    image_size,
+    numbers,
+    unified_from_xi,
+    unified_with_xi,
+)
 from rigkit.interop.yaml_text import parse_yaml
 
 __all__ = ["read_opencv", "write_opencv"]
 
 ACCEPTED = (
     Accepted("pinhole"),
+    Accepted("brown", 4),
     Accepted("brown", 5),
     Accepted("brown", 8),
     Accepted("kannala_brandt"),
@@ -56,7 +66,8 @@ def read_opencv(text: str, name: str = "OpenCV YAML") -> Camera:
     on top of omnidir's sphere).
     """
     data = parse_yaml(text, name)
-    size = (int(field(data, "image_width", name)), int(field(data, "image_height", name)))
+    sides = [field(data, key, name) for key in ("image_width", "image_height")]
+    size = image_size(sides, name, "image_width, image_height")
     K = _read_matrix(field(data, "camera_matrix", name), name, "camera_matrix")
     if K.size != 9 or K[1] != 0.0:
         raise InputError(f"'{name}': camera_matrix must be 3x3 without skew")
@@ -64,18 +75,18 @@ def read_opencv(text: str, name: str = "OpenCV YAML") -> Camera:
     key = next((k for k in ("distortion_coefficients", "dist_coeffs", "distCoeffs", "D") if k in data), None)
     d = np.zeros(0) if key is None else _read_matrix(data[key], name, key)
     if "xi" in data:
-        xi = float(_read_matrix(data["xi"], name, "xi")[0])
+        xi = float(numbers(data["xi"]["data"] if _is_matrix(data["xi"]) else data["xi"], name, "xi", 1)[0])
         if d.any():
             raise InputError(f"'{name}': distortion on top of the unified model (xi) is not supported; recalibrate")
-        return unified_from_xi(size, xi, core)
+        return unified_from_xi(size, xi, core, name)
     if data.get("fisheye_model"):
-        return camera_model("kannala_brandt")(size, np.concatenate([core, d if d.size else np.zeros(4)]))
+        return camera_of("kannala_brandt", size, np.concatenate([core, d if d.size else np.zeros(4)]), name)
     if d.size > 8 and d[8:].any():
         raise InputError(f"'{name}': thin prism and tilt terms (more than 8) are not supported; calibrate without them")
     d = d[:8]
     if not d.any():
-        return camera_model("pinhole")(size, core)
-    return camera_model("brown")(size, np.concatenate([core, d, np.zeros(max(5 - d.size, 0))]))
+        return camera_of("pinhole", size, core, name)
+    return camera_of("brown", size, np.concatenate([core, d]), name)
 
 
 def _matrix(array: FloatArray) -> str:
@@ -85,4 +96,8 @@ def _matrix(array: FloatArray) -> str:
 
 
 def _read_matrix(value: Any, name: str, key: str) -> FloatArray:
-    return numbers(value["data"] if isinstance(value, dict) and "data" in value else value, name, key)
+    return numbers(value["data"] if _is_matrix(value) else value, name, key)
+
+
+def _is_matrix(value: Any) -> bool:
+    return isinstance(value, dict) and "data" in value

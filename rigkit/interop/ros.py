@@ -8,15 +8,20 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.cameras.registry import camera_model
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
-from rigkit.interop.exchange import Accepted, Written, best_accepted, field, numbers
+from rigkit.interop.exchange import Accepted, Written, best_accepted, camera_of, field, image_size, numbers
 from rigkit.interop.yaml_text import flow, parse_yaml
 
 __all__ = ["read_camera_info", "write_camera_info"]
 
-ACCEPTED = (Accepted("pinhole"), Accepted("brown", 5), Accepted("brown", 8), Accepted("kannala_brandt"))
+ACCEPTED = (
+    Accepted("pinhole"),
+    Accepted("brown", 4),
+    Accepted("brown", 5),
+    Accepted("brown", 8),
+    Accepted("kannala_brandt"),
+)
 
 
 def write_camera_info(camera: Camera, camera_name: str = "camera") -> Written:
@@ -28,6 +33,9 @@ def write_camera_info(camera: Camera, camera_name: str = "camera") -> Written:
     p = c.parameters
     fx, fy, cx, cy = p[:4].tolist()
     distortion = p[4:] if p.size > 4 else np.zeros(5)
+    if c.model == "brown" and distortion.size == 4:
+        # plumb_bob has five numbers; without k3 the last one is 0.
+        distortion = np.append(distortion, 0.0)
     model = {4: "equidistant", 5: "plumb_bob", 8: "rational_polynomial"}[distortion.size]
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     text = (
@@ -44,7 +52,8 @@ def write_camera_info(camera: Camera, camera_name: str = "camera") -> Written:
 def read_camera_info(text: str, name: str = "camera_info") -> Camera:
     """Return the camera of a camera_info file; raises InputError for other distortion models and damaged files."""
     data = parse_yaml(text, name)
-    size = (int(field(data, "image_width", name)), int(field(data, "image_height", name)))
+    sides = [field(data, key, name) for key in ("image_width", "image_height")]
+    size = image_size(sides, name, "image_width, image_height")
     K = numbers(field(field(data, "camera_matrix", name), "data", name), name, "camera_matrix", 9)
     if K[1] != 0.0:
         raise InputError(f"'{name}': camera_matrix has skew {K[1]:g}, which no model here has")
@@ -55,7 +64,7 @@ def read_camera_info(text: str, name: str = "camera_info") -> Camera:
         "plumb_bob": ("brown", 5),
         "rational_polynomial": ("brown", 8),
         "equidistant": ("kannala_brandt", 4),
-    }.get(model, ("", 0))
+    }.get(str(model), ("", 0))
     if not ours:
         raise InputError(
             f"'{name}': distortion_model '{model}' is unknown; known: plumb_bob, rational_polynomial, equidistant"
@@ -64,8 +73,8 @@ def read_camera_info(text: str, name: str = "camera_info") -> Camera:
         raise InputError(f"'{name}': {model} has {count} coefficients, found {distortion.size}")
     distortion = np.concatenate([distortion[:count], np.zeros(max(count - distortion.size, 0))])
     if ours == "brown" and not distortion.any():
-        return camera_model("pinhole")(size, core)
-    return camera_model(ours)(size, np.concatenate([core, distortion]))
+        return camera_of("pinhole", size, core, name)
+    return camera_of(ours, size, np.concatenate([core, distortion]), name)
 
 
 def _matrix(array: FloatArray) -> str:

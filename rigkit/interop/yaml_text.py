@@ -18,14 +18,14 @@ __all__ = ["flow", "parse_yaml"]
 MAX_CHARACTERS = 1_000_000
 """A camchain has two thousand; OpenCV's own samples write all corners of all views into the file."""
 MAX_DEPTH = 20
-MAX_DIGITS = 40
+MAX_YAML_DIGITS = 40
 """Of a whole number; longer ones are damage."""
 
 NULL, BOOL, INT, FLOAT = (f"tag:yaml.org,2002:{kind}" for kind in ("null", "bool", "int", "float"))
 RESOLVED = (
     (NULL, re.compile(r"^(?:~|null|Null|NULL|)$"), ["~", "n", "N", ""]),
     (BOOL, re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), list("tTfF")),
-    (INT, re.compile(rf"^[-+]?[0-9]{{1,{MAX_DIGITS}}}$"), list("-+0123456789")),
+    (INT, re.compile(rf"^[-+]?[0-9]{{1,{MAX_YAML_DIGITS}}}$"), list("-+0123456789")),
     (
         FLOAT,
         re.compile(

@@ -25,6 +25,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from rigkit.core.boards import Board, Markers, marker_rectangles
+from rigkit.core.errors import InputError
 from rigkit.io.toml_reader import TomlTable, read_toml
 
 __all__ = ["SCHEMA", "board_from_table", "load_board", "load_layout", "with_squares"]
@@ -75,7 +76,7 @@ def _printed(table: TomlTable) -> tuple[float, float] | None:
 
 def board_from_table(table: TomlTable, default_id: str) -> Board:
     """Return the board that a table of any file describes by the keys above; the caller calls `table.done()`."""
-    board_id = table.text("id", hint='id = "plane1"') if table.has("id") else default_id
+    board_id = table.identifier("id", hint='id = "plane1"') if table.has("id") else default_id
     columns = table.integer("columns", hint="columns = 9 (inner corners along x)", at_least=2)
     rows = table.integer("rows", hint="rows = 6 (inner corners along y)", at_least=2)
     for key, count in (("columns", columns), ("rows", rows)):
@@ -94,8 +95,11 @@ def board_from_table(table: TomlTable, default_id: str) -> Board:
     sigma = None
     if table.has("square_sigma_mm"):
         sigma = table.number("square_sigma_mm", hint="square_sigma_mm = 0.05")
-    board = Board(board_id, columns, rows, x, y, sigma, _markers(table))
-    marker_rectangles(board)
+    try:
+        board = Board(board_id, columns, rows, x, y, sigma, _markers(table))
+        marker_rectangles(board)
+    except InputError as error:
+        raise error if str(table.path) in str(error) else table.error(f"{error}; correct the board") from error
     return board
 
 

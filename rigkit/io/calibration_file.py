@@ -19,12 +19,13 @@ import numpy as np
 from rigkit.calibration.result import BoardShape, Calibration, Candidate, Convergence, Outlier, ViewResult
 from rigkit.cameras.base import Camera
 from rigkit.cameras.registry import camera_model
-from rigkit.core.arrays import FloatArray, without_nan
+from rigkit.core.arrays import FloatArray, as_covariance, without_nan
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding, Severity
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.files import write_atomic
-from rigkit.io.text import read_text
+from rigkit.io.json_reader import read_json, real, whole
+from rigkit.io.reading import usable_path
 
 __all__ = [
     "SCHEMA",
@@ -112,13 +113,15 @@ def load_calibration(path: str | Path) -> Calibration:
     if missing:
         raise InputError(f"'{path}': no {', '.join(missing)}: a camera without its calibration; calibrate again")
     with damage_named(path):
+        camera = camera_from_json(data["camera"], path)
+        size = camera.parameters.size
         return Calibration(
-            camera=camera_from_json(data["camera"], path),
-            rms_px=float(data["rms_px"]),
-            heldout_rms_px=None if data["heldout_rms_px"] is None else float(data["heldout_rms_px"]),
-            covariance=_array(data["covariance"]),
-            frame_covariance=_array(data["frame_covariance"]),
-            sigma_px=float(data["sigma_px"]),
+            camera=camera,
+            rms_px=real(data["rms_px"]),
+            heldout_rms_px=None if data["heldout_rms_px"] is None else real(data["heldout_rms_px"]),
+            covariance=as_covariance(data["covariance"], "covariance", size),
+            frame_covariance=as_covariance(data["frame_covariance"], "frame_covariance", size + 6),
+            sigma_px=real(data["sigma_px"]),
             views=tuple(_view_in(v) for v in data["views"]),
             dropped=tuple((str(image), str(reason)) for image, reason in data["dropped"]),
             outliers=tuple(Outlier(**_finite(v)) for v in data["outliers"]),
@@ -135,25 +138,21 @@ def damage_named(path: str | Path) -> Iterator[None]:
     try:
         yield
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, InputError) as error:
-        words = str(error)
+        words = " ".join(str(error).split())[:200]
         raise InputError(words if str(path) in words else f"'{path}': damaged ({words}); calibrate again") from error
 
 
 def _read(path: str | Path) -> dict[str, Any]:
-    source = Path(path)
+    source = usable_path(path)
     if not source.exists():
         raise InputError(f"calibration '{source}' does not exist; run `rigkit calibrate` first")
-    try:
-        data = json.loads(read_text(source, "calibration"))
-    except ValueError as error:
-        raise InputError(f"'{source}': not a calibration file ({error}); calibrate again") from error
-    found = data.get("schema") if isinstance(data, dict) else None
-    if found != SCHEMA:
-        raise InputError(f"'{source}': schema is {found!r}, but a file with schema '{SCHEMA}' is needed here")
-    unknown = sorted(set(data) - KEYS)
-    if unknown:
-        raise InputError(f"'{source}': unknown key '{unknown[0]}'; known: {', '.join(sorted(KEYS))}")
-    return dict(data)
+    return read_json(
+        source,
+        SCHEMA,
+        KEYS,
+        "calibration file",
+        remedy="calibrate again, or bring another program's camera in with `rigkit export FILE -o camera.json`",
+    )
 
 
 def _field(data: dict[str, Any], key: str, path: str | Path) -> Any:
@@ -173,8 +172,8 @@ def camera_from_json(data: Any, path: str | Path) -> Camera:
     if not isinstance(data, dict) or set(data) != CAMERA_KEYS or not isinstance(data["parameters"], dict):
         raise InputError(f"'{path}': 'camera' must have the keys {', '.join(sorted(CAMERA_KEYS))}, and no others")
     try:
-        width, height = (int(v) for v in data["size_px"])
-        values = np.array([float(v) for v in data["parameters"].values()])
+        width, height = (whole(v) for v in data["size_px"])
+        values = np.array([real(v) for v in data["parameters"].values()])
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"'{path}': camera: {error}; size_px is [width, height], parameters are numbers") from error
     try:

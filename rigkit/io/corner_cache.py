@@ -21,9 +21,11 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
 from rigkit.io.files import write_atomic
+from rigkit.io.json_reader import parse_json
+from rigkit.io.reading import read_bytes, read_text
 from rigkit.io.sources import source_hash
 
-__all__ = ["CornerCache", "FoundCorners", "image_hash", "lens_key"]
+__all__ = ["CornerCache", "FoundCorners", "image_hash", "kept_corners", "lens_key"]
 
 SCHEMA = "rigkit.corners/2"
 
@@ -59,14 +61,14 @@ class CornerCache:
         if path is None:
             return
         try:
-            data = json.loads(path.read_text(encoding="utf-8"))
+            data = parse_json(read_text(path))
             if isinstance(data, dict) and data.get("schema") == SCHEMA:
                 if data["detector"].partition(" ")[2] != targets:
                     return
                 for entry in data["images"].values():
                     str(entry["sha256"]), _found_in(entry), _found_through(entry)
                 self._entries, self.current = data["images"], data["detector"] == self.detector
-        except (OSError, ValueError, TypeError, KeyError, AttributeError, InputError):
+        except (OSError, ValueError, TypeError, KeyError, AttributeError, OverflowError, InputError):
             # A cache that cannot be read is as good as none: it is written anew.
             return
 
@@ -118,6 +120,13 @@ class CornerCache:
             write_atomic(self.path, json.dumps(data, allow_nan=False) + "\n", force=True)
 
 
+def kept_corners(data: Any) -> dict[str, FoundCorners]:
+    """Return what a file of kept corners has of each image; raises whatever damage leads to."""
+    if data["schema"] != SCHEMA:
+        raise InputError(f"its schema is not '{SCHEMA}'")
+    return {str(image): _found_in(entry) for image, entry in data["images"].items()}
+
+
 def _target(board: Board) -> str:
     """Return what the detector looks for of a board."""
     size = f"{board.columns}x{board.rows}"
@@ -133,7 +142,7 @@ def lens_key(images: Mapping[str, str], boards: Sequence[Board], *options: objec
 
 def image_hash(path: Path) -> str:
     """Return the SHA-256 of the file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    return hashlib.sha256(read_bytes(path, "image")).hexdigest()
 
 
 def _detection_out(d: BoardDetection) -> dict[str, Any]:

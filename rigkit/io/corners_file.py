@@ -1,13 +1,16 @@
 """Corners on disk: CSV with the columns image, board, column, row, u_px, v_px, sigma_px, one corner a line.
 
 A board without a name is written as `?NUMBER:COLUMNSxROWS`, counted from 1 in each image, so that reading gives back
-what was found.
+what was found. Read are also the `corners.json` that calibrations keep, and the `corners.vnl` of mrgingham and mrcal:
+a line `# filename x y level`, then all corners of the one board in each image, row by row; '-' for what was not found.
+The level is that of the image pyramid: each one doubles the standard deviation (mrgingham's manual).
 """
 
 from __future__ import annotations
 
 import csv
 import io
+import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,12 +20,19 @@ import numpy as np
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
+from rigkit.io.corner_cache import kept_corners
 from rigkit.io.files import write_atomic
-from rigkit.io.text import read_text
+from rigkit.io.json_reader import parse_json
+from rigkit.io.reading import read_text
 
 __all__ = ["COLUMNS", "corners_text", "read_corners", "write_corners"]
 
 COLUMNS = ("image", "board", "column", "row", "u_px", "v_px", "sigma_px")
+
+LEVEL_0_SIGMA_PX = 0.1
+"""Standard deviation of a .vnl file's corner at level 0; a calibration measures the scale of its corners itself."""
+MAX_LEVEL = 10
+VNL_COLUMNS = {"filename", "x", "y"}
 
 UNNAMED = re.compile(r"^\?\d+:(\d+)x(\d+)$")
 
@@ -46,9 +56,10 @@ def write_corners(path: str | Path, detections: Mapping[str, Sequence[BoardDetec
 
 
 def read_corners(path: str | Path, boards: Sequence[Board] = ()) -> dict[str, tuple[BoardDetection, ...]]:
-    """Return the detections of each image, in the order of the file.
+    """Return the detections of each image, in the order of the file; images without any board have none.
 
-    The size of a named board is that of `boards`; where the name is not among them, the largest column and row read.
+    The size of a named board is that of `boards`; where the name is not among them, the largest column and row read. A
+    .vnl file needs its board: it names none.
 
     Raises
     ------
@@ -56,7 +67,12 @@ def read_corners(path: str | Path, boards: Sequence[Board] = ()) -> dict[str, tu
         No such file, other columns, or a line that cannot be understood; names the line.
     """
     source = Path(path)
-    lines = csv.reader(io.StringIO(read_text(source, "corners file")))
+    text = read_text(source, "corners file")
+    if text.lstrip().startswith("{"):
+        return _from_json(source, text)
+    if text.startswith("#"):
+        return _from_vnl(source, text, boards)
+    lines = csv.reader(io.StringIO(text))
     if tuple(next(lines, ())) != COLUMNS:
         raise InputError(f"corners file '{source}': the first line must be {','.join(COLUMNS)}")
     rows: dict[str, dict[str, list[tuple[float, ...]]]] = {}
@@ -82,6 +98,72 @@ def read_corners(path: str | Path, boards: Sequence[Board] = ()) -> dict[str, tu
         }
     except (InputError, OverflowError) as error:
         raise InputError(f"corners file '{source}': {error}") from error
+
+
+def _from_json(source: Path, text: str) -> dict[str, tuple[BoardDetection, ...]]:
+    """Return what a calibration keeps of its images."""
+    try:
+        return {image: found.detections for image, found in kept_corners(parse_json(text)).items()}
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, InputError) as error:
+        words = " ".join(str(error).split())[:200]
+        raise InputError(f"corners file '{source}': damaged ({words}); detect the corners again") from error
+
+
+def _from_vnl(source: Path, text: str, boards: Sequence[Board]) -> dict[str, tuple[BoardDetection, ...]]:
+    """Return the detections of mrgingham's or mrcal's file, which is about one board."""
+    if len(boards) != 1:
+        raise InputError(f"corners file '{source}' is about one board, and {len(boards)} are given; give that one")
+    names: list[str] = []
+    corners: dict[str, list[tuple[float, float, float]]] = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.split()
+        if line.startswith("#") or not words:
+            if not names and not line.startswith(("##", "#!")):
+                names = line.lstrip("#").split()
+                if not set(names) >= VNL_COLUMNS:
+                    raise InputError(f"corners file '{source}', line {number}: the columns must be filename x y level")
+            continue
+        cells = dict(zip(names, words, strict=False))
+        try:
+            corners.setdefault(cells["filename"], []).append(_vnl_corner(cells))
+        except (ValueError, KeyError) as error:
+            raise InputError(
+                f"corners file '{source}', line {number}: {error}; expected {' '.join(names)}, '-' for what is absent"
+            ) from error
+    return {image: _vnl_detections(source, image, found, boards[0]) for image, found in corners.items()}
+
+
+def _vnl_corner(cells: Mapping[str, str]) -> tuple[float, float, float]:
+    """Return u, v, sigma of a line; NaN where there is no corner."""
+    absent = (math.nan, math.nan, math.nan)
+    if "-" in (cells["x"], cells["y"], cells.get("level"), cells.get("weight")):
+        return absent
+    u, v, scale = float(cells["x"]), float(cells["y"]), 2.0 ** min(float(cells.get("level", "0")), MAX_LEVEL + 1)
+    if "weight" in cells:
+        weight = float(cells["weight"])
+        if weight <= 0.0:
+            return absent
+        scale = 1.0 / weight
+    if not (math.isfinite(u + v) and 2.0**-MAX_LEVEL <= scale <= 2.0**MAX_LEVEL):
+        raise ValueError("a value is NaN, infinite or no level")
+    return (u, v, LEVEL_0_SIGMA_PX * scale)
+
+
+def _vnl_detections(
+    source: Path, image: str, corners: list[tuple[float, float, float]], board: Board
+) -> tuple[BoardDetection, ...]:
+    """Return the board's detection, none where not one corner was found."""
+    table = np.array(corners)
+    found = ~np.isnan(table[:, 0])
+    if not found.any():
+        return ()
+    if len(table) != board.corner_count:
+        raise InputError(
+            f"corners file '{source}': image '{image}' has {len(table)} lines, board '{board.board_id}' of "
+            f"{board.columns}x{board.rows} has {board.corner_count} corners; give the board that was detected"
+        )
+    grid = board.grid()[found]
+    return (BoardDetection(board.board_id, board.columns, board.rows, grid, table[found, :2], table[found, 2]),)
 
 
 def _detection(name: str, values: list[tuple[float, ...]], sizes: Mapping[str, tuple[int, int]]) -> BoardDetection:

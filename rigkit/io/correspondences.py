@@ -13,8 +13,11 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import re
+import struct
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +27,8 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
 from rigkit.io.files import write_atomic
+from rigkit.io.numbers import MAX_NUMBER
+from rigkit.io.reading import read_bytes
 
 __all__ = ["correspondences_text", "read_correspondences", "write_correspondences"]
 
@@ -33,6 +38,8 @@ SIGMAS = ("sigma_px", "sigma_A")
 DIRECTION = re.compile(r"^(du1|dv1|du2|dv2)_([1-9]\d*)$")
 ARRAYS = ("pixels1", "pixels2", "A21", "directions1", "directions2", *SIGMAS)
 
+MAX_ARRAY_BYTES = 500_000_000
+"""Of one array of an NPZ, unpacked."""
 EXTRACTOR_COLUMNS = "a11 a21 a12 a22 tx ty x1 y1 x2 y2"
 MAX_REFINEMENT_PX = 30.0
 """AffineExtractor refines within patches of this half width: a point further from its match means other columns."""
@@ -47,12 +54,9 @@ def read_correspondences(path: str | Path) -> Correspondences:
         The file cannot be read or understood; says where and what was expected.
     """
     source = Path(path)
-    try:
-        payload = source.read_bytes()
-    except OSError as error:
-        raise InputError(f"correspondences '{source}' cannot be read ({error.strerror}); check the path") from error
+    payload = read_bytes(source, "correspondences")
     if payload[:2] == b"PK":
-        return _from_npz(source)
+        return _from_npz(source, payload)
     try:
         text = payload.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -108,7 +112,9 @@ def _from_csv(source: Path, text: str) -> Correspondences:
         try:
             rows.append([float(field) if field.strip() else np.nan for field in line])
         except ValueError as error:
-            raise InputError(f"correspondences '{source}', line {lines.line_num}: {error}") from error
+            raise InputError(
+                f"correspondences '{source}', line {lines.line_num}: {error}; write a number, or nothing"
+            ) from error
         if len(line) != len(header):
             raise InputError(
                 f"correspondences '{source}', line {lines.line_num}: {len(line)} fields for {len(header)} columns"
@@ -146,7 +152,9 @@ def _from_extractor(source: Path, lines: list[str]) -> Correspondences:
         try:
             rows.append([float(field) for field in re.split(r"[\s,;]+", line.strip()) if field])
         except ValueError as error:
-            raise InputError(f"correspondences '{source}', line {number}: {error}") from error
+            raise InputError(
+                f"correspondences '{source}', line {number}: {error}; expected on each line: {EXTRACTOR_COLUMNS}"
+            ) from error
         if len(rows[-1]) != 10:
             raise InputError(
                 f"correspondences '{source}', line {number}: {len(rows[-1])} numbers; without a header line ten are "
@@ -166,15 +174,18 @@ def _from_extractor(source: Path, lines: list[str]) -> Correspondences:
     return _built(source, pixels1[good], pixels2[good], A21[good], None, {})
 
 
-def _from_npz(source: Path) -> Correspondences:
+def _from_npz(source: Path, payload: bytes) -> Correspondences:
     try:
-        with np.load(source, allow_pickle=False) as archive:
-            table = {name: np.asarray(archive[name], dtype=np.float64) for name in archive.files}
-    except (ValueError, OSError, KeyError, zipfile.BadZipFile) as error:
-        raise InputError(f"correspondences '{source}': damaged NPZ, or not of numbers ({error})") from error
+        table = _arrays(payload)
+    except (ValueError, TypeError, OSError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError,
+            RuntimeError, SyntaxError, struct.error) as error:  # fmt: skip
+        words = " ".join(str(error).split())[:200]
+        raise InputError(
+            f"correspondences '{source}': damaged NPZ, or not of numbers ({words}); write it again"
+        ) from error
     unknown = [name for name in table if name not in ARRAYS]
     if unknown:
-        raise InputError(f"correspondences '{source}': unknown array '{unknown[0]}'; known: {', '.join(ARRAYS)}")
+        raise InputError(f"correspondences '{source}': unknown array {unknown[0]!r}; known: {', '.join(ARRAYS)}")
     needed = ["pixels1", "pixels2"]
     if "directions1" in table or "directions2" in table:
         needed += ["directions1", "directions2"]
@@ -185,6 +196,29 @@ def _from_npz(source: Path) -> Correspondences:
     return _built(source, table["pixels1"], table["pixels2"], table.get("A21"), directions, table)
 
 
+def _arrays(payload: bytes) -> dict[str, FloatArray]:
+    """Return the arrays of an NPZ by name; the size that each states is checked before memory is taken for it."""
+    table: dict[str, FloatArray] = {}
+    with zipfile.ZipFile(io.BytesIO(payload)) as archive:
+        for info in archive.infolist():
+            name = info.filename.removesuffix(".npy")
+            if name in table:
+                raise ValueError(f"array {name[:40]!r} is there twice")
+            if info.file_size > MAX_ARRAY_BYTES:
+                raise ValueError(f"array {name[:40]!r} has {info.file_size} bytes, more than {MAX_ARRAY_BYTES}")
+            with archive.open(info) as member:
+                version = np.lib.format.read_magic(member)
+                read = np.lib.format.read_array_header_1_0 if version[0] == 1 else np.lib.format.read_array_header_2_0
+                shape, _, kind = read(member)
+            if kind.kind not in "iuf":
+                raise ValueError(f"array {name[:40]!r} is of {kind}")
+            if math.prod(shape) * kind.itemsize > info.file_size:
+                raise ValueError(f"array {name[:40]!r} states more values than it has")
+            with archive.open(info) as member:
+                table[name] = np.asarray(np.lib.format.read_array(member, allow_pickle=False), dtype=np.float64)
+    return table
+
+
 def _built(
     source: Path,
     pixels1: FloatArray,
@@ -193,6 +227,9 @@ def _built(
     directions: tuple[FloatArray, FloatArray] | None,
     table: dict[str, FloatArray],
 ) -> Correspondences:
+    for values in (pixels1, pixels2, A21, *(directions or ()), *table.values()):
+        if values is not None and (np.abs(values) > MAX_NUMBER).any():
+            raise InputError(f"correspondences '{source}': a number is beyond {MAX_NUMBER:g}; check the columns")
     try:
         pairs = None
         if directions is not None:

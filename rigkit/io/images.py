@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.errors import InputError
+from rigkit.io.animation import frame_count
+from rigkit.io.reading import read_bytes
 from rigkit.io.tiff import as_stored, page_count
 
 __all__ = ["Image", "read_image", "to_grey"]
@@ -47,19 +49,14 @@ def read_image(path: str | Path) -> Image:
         No such file, not an image, several in one file, cut off or damaged, or a pixel type other than 8 or 16 bit.
     """
     source = Path(path)
-    if source.is_dir():
-        raise InputError(f"image '{source}' is a folder; give a file")
-    try:
-        data = source.read_bytes()
-    except FileNotFoundError as error:
-        raise InputError(f"image '{source}' does not exist; check the path in the manifest or session") from error
-    except OSError as error:
-        raise InputError(f"image '{source}' cannot be read: {error.strerror}; check permissions") from error
+    data = read_bytes(source, "image")
     fault = _fault(data)
     if fault:
         raise InputError(f"image '{source}' is {fault}; copy it again from the camera")
     if (pages := page_count(data)) > 1:
         raise InputError(f"image '{source}' holds {pages} pages; save each as a file of its own")
+    if (frames := frame_count(data)) > 1:
+        raise InputError(f"image '{source}' is an animation of {frames} frames; save each as a file of its own")
     try:
         with _quiet_opencv():
             raw = cv2.imdecode(np.frombuffer(as_stored(data), np.uint8), cv2.IMREAD_UNCHANGED)

@@ -13,6 +13,7 @@ from rigkit.core.posetype import PoseType
 from rigkit.core.truth import PairTruth
 from rigkit.identification.board_ids import BOARD_SIDES
 from rigkit.io.board_file import board_from_table, load_board
+from rigkit.io.reading import usable_path
 from rigkit.io.toml_reader import TomlTable, read_toml
 from rigkit.io.truth_csv import load_truth_csv
 from rigkit.io.truth_file import truth_from_table
@@ -125,15 +126,14 @@ def load_dataset(path: str | Path) -> Dataset:
         No manifest, unknown keys, a missing fact (no square size, pose type or name has a default), a reference to
         something that is not declared, two things of one name, a camera with neither calibration nor session.
     """
-    given = Path(path)
+    given = usable_path(path)
     source = given / MANIFEST if given.is_dir() else given
     if not source.is_file():
         what = f"folder '{given}' has no {MANIFEST}" if given.is_dir() else f"data set '{given}' does not exist"
         raise InputError(f"{what}; write one, or let `rigkit init` start it")
     source = source.resolve()
     top = read_toml(source, SCHEMA)
-    name = top.text("name", hint='name = "my-lab"')
-    _refuse_no_folder(top, "name", name)
+    name = top.identifier("name", hint='name = "my-lab"')
     boards = tuple(_board(t) for t in top.tables("boards", hint='[[boards]] with id = "plane1" and file or sizes'))
     cameras = tuple(_camera(t) for t in top.tables("cameras", hint='[[cameras]] with id = "left" and calibration'))
     _refuse_twice(top, "boards", [b.board_id for b in boards])
@@ -147,7 +147,7 @@ def load_dataset(path: str | Path) -> Dataset:
 
 
 def _board(table: TomlTable) -> Board:
-    board_id = table.text("id", hint='id = "plane1"')
+    board_id = table.identifier("id", hint='id = "plane1"')
     if table.has("file"):
         board = replace(load_board(table.path_to("file", hint='file = "board.toml"')), board_id=board_id)
     else:
@@ -157,7 +157,7 @@ def _board(table: TomlTable) -> Board:
 
 
 def _camera(table: TomlTable) -> CameraEntry:
-    camera_id = table.text("id", hint='id = "left"')
+    camera_id = table.identifier("id", hint='id = "left"')
     calibration = table.path_to("calibration", hint='calibration = "calibration.json"')
     session: Path | None = calibration.with_name(SESSION)
     if table.has("session"):
@@ -175,8 +175,7 @@ def _camera(table: TomlTable) -> CameraEntry:
 
 
 def _pair(table: TomlTable, boards: Sequence[Board], cameras: Sequence[CameraEntry]) -> Pair:
-    pair_id = table.text("id", hint='id = "left-right"')
-    _refuse_no_folder(table, "id", pair_id)
+    pair_id = table.identifier("id", hint='id = "left-right"')
     by_camera = {c.camera_id: c for c in cameras}
     by_board = {b.board_id: b for b in boards}
     place = f"{table.path}: {table.where}"
@@ -228,12 +227,6 @@ def _named(name: str, known: Mapping[str, Entry], where: str) -> Entry:
     if name not in known:
         raise InputError(f"{where} '{name}' is not declared; known: {', '.join(known)}")
     return known[name]
-
-
-def _refuse_no_folder(table: TomlTable, key: str, value: str) -> None:
-    """Refuse what cannot be one folder of results: it would be written elsewhere."""
-    if Path(value).name != value or value == "..":
-        raise table.error(f"'{key}' names a folder of results: use letters, digits, '-' and '_'")
 
 
 def _refuse_twice(table: TomlTable, what: str, names: Sequence[str]) -> None:

@@ -7,7 +7,7 @@ import io
 from pathlib import Path
 
 from rigkit.core.errors import InputError
-from rigkit.io.text import read_text
+from rigkit.io.reading import read_text
 from rigkit.validation.tables import PaperTables
 
 __all__ = ["load_paper_tables"]

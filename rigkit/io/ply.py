@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import InputError
 from rigkit.io.files import write_atomic
+from rigkit.io.reading import read_bytes
 
 __all__ = ["ply_bytes", "read_ply", "write_ply"]
 
@@ -88,11 +89,16 @@ def ply_bytes(
     for name, _, values in columns:
         table[name] = values
     notes = ["rigkit oriented point cloud", f"units {unit}", "frame camera 1: x right, y down, z forward"]
-    notes += [f"{BOARD_COMMENT}{i} {board_id}" for i, board_id in enumerate(cloud.board_ids)]
-    notes += [" ".join(str(line).split()) for line in comments]
+    notes += [f"{BOARD_COMMENT}{i} {_one_line(board_id)}" for i, board_id in enumerate(cloud.board_ids)]
+    notes += [_one_line(line) for line in comments]
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in notes)]
     header += [f"element vertex {len(cloud)}", *(f"property {kind} {name}" for name, kind, _ in columns), "end_header"]
     return ("\n".join(header) + "\n").encode("utf-8") + table.tobytes()
+
+
+def _one_line(text: str) -> str:
+    """Return the text as a header can have it: blanks for what would end the line, '?' for other control characters."""
+    return "".join(c if c.isprintable() else "?" for c in " ".join(str(text).split()))
 
 
 def read_ply(path: str | Path) -> OrientedCloud:
@@ -106,10 +112,7 @@ def read_ply(path: str | Path) -> OrientedCloud:
         No such file, not such a PLY, no normals, or cut off.
     """
     source = Path(path)
-    try:
-        data = source.read_bytes()
-    except OSError as error:
-        raise InputError(f"point cloud '{source}' cannot be read: {error.strerror}; check the path") from error
+    data = read_bytes(source, "point cloud")
     count, fields, board_ids, start = _header(data, source)
     kinds = np.dtype(fields)
     if len(data) < start + count * kinds.itemsize:
@@ -138,8 +141,8 @@ def read_ply(path: str | Path) -> OrientedCloud:
 
 def _header(data: bytes, source: Path) -> tuple[int, list[tuple[str, str]], tuple[str, ...], int]:
     """Return the number of points, their fields, the board names, and where the points start."""
-    end = data.find(b"end_header\n")
-    if not data.startswith(b"ply") or end < 0:
+    end = data.find(b"\nend_header\n") + 1
+    if not data.startswith(b"ply") or end <= 0:
         raise InputError(f"'{source}' is not a PLY file, or its header is cut off; give a file written by rigkit")
     lines = data[:end].decode("utf-8", errors="replace").splitlines()
     if "format binary_little_endian 1.0" not in lines:
@@ -171,5 +174,7 @@ def _declared(lines: list[str], source: Path) -> tuple[int, list[tuple[str, str]
         elif words[:1] == ["property"]:
             if words[1] not in TYPES:
                 raise InputError(f"'{source}': a point has a property of type '{words[1]}', which is not read")
+            if words[2] in dict(fields):
+                raise InputError(f"'{source}': property '{words[2]}' is declared twice; write or copy the file again")
             fields.append((words[2], TYPES[words[1]]))
     return count, fields, boards

@@ -15,11 +15,13 @@ import numpy as np
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray, as_array
+from rigkit.core.arrays import FloatArray, as_covariance
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
+from rigkit.core.identifiers import check_identifier
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibration_file import camera_from_json, camera_to_json, damage_named, findings_to_json
+from rigkit.io.json_reader import json_schema, read_json, real, whole
 
 __all__ = ["BOARDS_SCHEMA", "SCHEMA", "SavedRig", "board_rigs_text", "is_rig_file", "load_board_rigs", "load_rig"]
 __all__ += ["load_saved_rig", "rig_text"]
@@ -99,23 +101,24 @@ def load_saved_rig(path: str | Path) -> SavedRig:
             if set(entry) != CAMERA_KEYS:
                 raise InputError(f"'{path}': a camera must have the keys {', '.join(sorted(CAMERA_KEYS))}, no others")
             camera = camera_from_json(entry["camera"], path)
-            cameras[str(entry["name"])] = (camera, Rigid3.from_matrix(entry["cam_from_rig"]))
+            name = check_identifier(entry["name"], "camera")
+            if name in cameras:
+                raise InputError(f"'{path}': two cameras are called '{name}'; calibrate again")
+            cameras[name] = (camera, Rigid3.from_matrix(entry["cam_from_rig"]))
+        if not cameras:
+            raise InputError(f"'{path}': no camera in it; calibrate again")
         size = sum(camera.parameters.size for camera, _ in cameras.values()) + 6 * (len(cameras) - 1)
         covariance = None
         if "covariance" in data:
-            covariance = as_array(data["covariance"], (size, size), "covariance")
-        sigma_px = None if "sigma_px" not in data else float(data["sigma_px"])
-        scale_sigma = float(data.get("scale_sigma", 0.0))
+            covariance = as_covariance(data["covariance"], "covariance", size)
+        sigma_px = None if "sigma_px" not in data else real(data["sigma_px"])
+        scale_sigma = real(data.get("scale_sigma", 0.0))
     return SavedRig(cameras, covariance, sigma_px, scale_sigma)
 
 
 def is_rig_file(path: str | Path) -> bool:
     """Say whether the file is a rig's; False for anything that cannot be read."""
-    try:
-        data = json.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError):
-        return False
-    return isinstance(data, dict) and data.get("schema") == SCHEMA
+    return json_schema(path) == SCHEMA
 
 
 def board_rigs_text(rigs: Sequence[BoardRig]) -> str:
@@ -157,9 +160,9 @@ def load_board_rigs(path: str | Path) -> tuple[BoardRig, ...]:
         return tuple(
             BoardRig(
                 tuple(_placed(entry, path) for entry in rig["boards"]),
-                np.array(rig["covariance"], dtype=np.float64).reshape(-1, 6 * (len(rig["boards"]) - 1)),
-                int(rig["image_count"]),
-                float(rig["scale_sigma"]),
+                as_covariance(rig["covariance"], "covariance", 6 * (len(rig["boards"]) - 1)),
+                whole(rig["image_count"]),
+                real(rig["scale_sigma"]),
             )
             for rig in data["rigs"]
         )
@@ -169,21 +172,10 @@ def _placed(entry: dict[str, Any], path: str | Path) -> MountedBoard:
     if set(entry) != BOARD_KEYS:
         raise InputError(f"'{path}': a board must have the keys {', '.join(sorted(BOARD_KEYS))}, and no others")
     (columns, rows), (along_x, along_y), sigma = entry["size"], entry["square_mm"], entry["square_sigma_mm"]
-    known = None if sigma is None else float(sigma)
-    board = Board(str(entry["board_id"]), int(columns), int(rows), float(along_x), float(along_y), known)
+    known = None if sigma is None else real(sigma)
+    board = Board(str(entry["board_id"]), whole(columns), whole(rows), real(along_x), real(along_y), known)
     return MountedBoard(board, np.array(entry["points_mm"]), Rigid3.from_matrix(entry["target_from_board"]))
 
 
 def _read(path: str | Path, schema: str, keys: set[str]) -> dict[str, Any]:
-    try:
-        data: Any = json.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except FileNotFoundError as error:
-        raise InputError(f"rig file '{path}' does not exist; check the path") from error
-    except (OSError, ValueError) as error:
-        raise InputError(f"'{path}': not a rig file ({error}); calibrate again") from error
-    if not isinstance(data, dict) or data.get("schema") != schema:
-        raise InputError(f"'{path}': a file with schema '{schema}' is needed here")
-    unknown = sorted(set(data) - keys)
-    if unknown:
-        raise InputError(f"'{path}': unknown key '{unknown[0]}'; known: {', '.join(sorted(keys))}")
-    return dict(data)
+    return read_json(path, schema, keys, "rig file", remedy="calibrate again")

@@ -140,9 +140,9 @@ def load_rig_session(path: str | Path) -> RigSession:
         frames = table.text("frames", hint='frames = "number"', choices=FRAMES)
     cameras: dict[str, Session] = {}
     for entry in table.tables("cameras", hint='[[cameras]] with id = "left" and images = "left*.jpg"'):
-        name = entry.text("id", hint=HINT_ID)
-        if name in cameras or re.search(r"[/\\]", name):
-            raise entry.error("its id must be its own and without slashes; give it another")
+        name = entry.identifier("id", hint=HINT_ID)
+        if name in cameras:
+            raise entry.error("its id must be its own; give it another")
         own, own_degree = model, degree
         if entry.has("model"):
             own, own_degree, _ = options_of(entry)

@@ -103,6 +103,7 @@ def images_of(table: TomlTable) -> tuple[Path, ...]:
     found: dict[Path, Path] = {}
     absent = []
     for pattern in patterns:
+        table.beside(pattern)
         # Only what the person wrote is a pattern, and no file's own name: both may have brackets in them.
         root = table.path.parent
         matches = [root / m for m in sorted(glob.glob(pattern, root_dir=root))]
@@ -124,7 +125,7 @@ def boards_of(table: TomlTable) -> tuple[Board, ...]:
     if table.has("boards"):
         if table.has("board"):
             raise table.error("'board' and 'boards'; keep one of the two")
-        boards = tuple(load_board(table.path.parent / name) for name in table.texts("boards", hint=hint))
+        boards = tuple(load_board(table.beside(name)) for name in table.texts("boards", hint=hint))
     else:
         boards = (load_board(table.path_to("board", hint=hint)),)
     ids = [board.board_id for board in boards]

@@ -28,7 +28,7 @@ def load_study(path: str | Path) -> Study:
     """
     source = Path(path)
     top = read_toml(source, SCHEMA)
-    name = top.text("name", hint='name = "general-motion"')
+    name = top.identifier("name", hint='name = "general-motion"')
     options: dict[str, Any] = {
         "title": top.text("title", hint='title = "..."') if top.has("title") else name,
         "trials": top.integer("trials", hint="trials = 100", at_least=1),

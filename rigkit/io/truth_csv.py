@@ -19,12 +19,11 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.truth import MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
-from rigkit.io.text import read_text
+from rigkit.io.numbers import fault_of_number
+from rigkit.io.reading import read_text
 from rigkit.io.truth_file import make_angle, make_distance
 
 __all__ = ["load_truth_csv"]
@@ -154,8 +153,9 @@ def _measured(row: Row, units: Units, kind: str) -> tuple[float, float, str]:
         except ValueError as error:
             fault = f"'{text}' is no number" if text else "is empty"
             raise InputError(f"'{column[0]}' {fault}; write it with a decimal point and without unit") from error
-        if not np.isfinite(number):
-            raise InputError(f"'{column[0]}' is {text}; write a number")
+        wrong = fault_of_number(number)
+        if wrong:
+            raise InputError(f"'{column[0]}' must be {wrong}, got {text[:40]}; write what was measured")
         numbers.append(number * column[1])
     if not row.get("how"):
         raise InputError("'how' is empty; say by what it was measured")

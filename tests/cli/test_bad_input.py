@@ -195,7 +195,7 @@ def test_name_that_is_no_folder(write: Write, capsys: pytest.CaptureFixture[str]
     folder = write()
     manifest = folder / "dataset.toml"
     manifest.write_text(manifest.read_text().replace('name = "bad"', 'name = "../../elsewhere"'))
-    check(*run(folder, capsys), 2, "dataset.toml", "'name'", "folder of results")
+    check(*run(folder, capsys), 2, "dataset.toml", "'name'", "is no name")
 
 
 def test_no_process(write: Write, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,6 +10,7 @@ import pytest
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
+from rigkit.io.corner_cache import CornerCache, FoundCorners
 from rigkit.io.corners_file import COLUMNS, read_corners, write_corners
 
 WRITTEN_PX = 1e-5
@@ -77,3 +78,73 @@ def test_corners_that_are_none_of_a_board_name_the_file(tmp_path: Path) -> None:
         path.write_text(f"{','.join(COLUMNS)}\na.png,a,0,0,1.0,2.0,0.1\na.png,a,{grid},5.0,2.0,{sigma}\n")
         with pytest.raises(InputError, match=r"corners\.csv"):
             read_corners(path)
+
+
+VNL = """## produced by a detector
+# filename x y level
+a.jpg 10.5 20.25 0
+a.jpg 30 20 1
+a.jpg - - -
+a.jpg 10 40 0
+a.jpg 30 40 -
+a.jpg 50 40 2
+b.jpg - - -
+"""
+
+
+def test_corners_of_other_detectors(tmp_path: Path) -> None:
+    """mrgingham's table: corners row by row, each level of the pyramid twice as uncertain."""
+    path = tmp_path / "corners.vnl"
+    path.write_text(VNL)
+    board = Board("a", 3, 2, 30.0, 30.0)
+    found = read_corners(path, [board])
+    assert list(found) == ["a.jpg", "b.jpg"] and found["b.jpg"] == ()
+    (one,) = found["a.jpg"]
+    assert one.board_id == "a" and one.grid.tolist() == [[0, 0], [1, 0], [0, 1], [2, 1]]
+    assert one.pixels.tolist() == [[10.5, 20.25], [30.0, 20.0], [10.0, 40.0], [50.0, 40.0]]
+    assert (one.sigma_px / one.sigma_px[0]).tolist() == [1.0, 2.0, 1.0, 4.0]
+    path.write_text(
+        VNL.replace(" level", " weight").replace(" 2\n", " 0.25\n").replace("20 1", "20 0.5").replace(" 0\n", " 1\n")
+    )
+    again = read_corners(path, [board])["a.jpg"][0]
+    assert again.sigma_px.tolist() == one.sigma_px.tolist()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("a.jpg 10 40 0\n", "", "5 lines"),
+        ("filename x", "file x", "columns must be"),
+        ("30 20 1", "30 x 1", "line 4"),
+        ("30 20 1", "30 20 900", "line 4"),
+        ("30 20 1", "nan 20 1", "line 4"),
+        ("a.jpg 30 20 1", "a.jpg", "line 4"),
+    ],
+)
+def test_damaged_corners_of_other_detectors(tmp_path: Path, old: str, new: str, words: str) -> None:
+    path = tmp_path / "corners.vnl"
+    path.write_text(VNL.replace(old, new))
+    with pytest.raises(InputError, match=words):
+        read_corners(path, [Board("a", 3, 2, 30.0, 30.0)])
+    with pytest.raises(InputError, match="about one board"):
+        read_corners(path)
+
+
+def test_kept_corners_of_a_calibration(tmp_path: Path) -> None:
+    path = tmp_path / "corners.json"
+    board = Board("a", 3, 2, 30.0, 30.0)
+    detection = BoardDetection("a", 3, 2, board.grid(), np.arange(12.0).reshape(-1, 2), np.full(6, 0.1))
+    cache = CornerCache(path, [board])
+    cache.put("x.png", "0", FoundCorners((640, 480), (detection,)))
+    cache.save()
+    (back,) = read_corners(path)["x.png"]
+    assert back.pixels.tolist() == detection.pixels.tolist() and back.board_id == "a"
+    for old, new in (
+        ('"grid": [[', '"grid": [[1e999, '),
+        ('"pixels": ', '"pixels": ' + "[" * 9000),
+        ("rigkit.corners/2", "x"),
+    ):
+        text = path.read_text()
+        path.with_name("d.json").write_text(text.replace(old, new))
+        with pytest.raises(InputError, match=r"d\.json"):
+            read_corners(path.with_name("d.json"))

@@ -62,7 +62,7 @@ WRONG = [
     (",300,2,", ",300 mm,2,", "line 2: .*'300 mm' is no number"),
     (",300,2,", ',"300,5",2,', "decimal point"),
     (",300,2,", ",300,,", "line 2: .*'sigma .mm.' is empty"),
-    (",300,2,", ",300,0,", "sigma must be positive"),
+    (",300,2,", ",300,0,", "must be positive"),
     (",300,2,", ",nan,2,", "nan"),
     (",,90,0.3,", ",90,90,0.3,", "leave it empty"),
     ("set square", "", "line 3: 'how' is empty"),

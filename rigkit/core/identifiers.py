@@ -1,0 +1,27 @@
+"""What boards, cameras, pairs and data sets may be called: names go into folders, tables, pages and files' headers."""
+
+from __future__ import annotations
+
+import re
+
+from rigkit.core.errors import InputError
+
+__all__ = ["MAX_IDENTIFIER", "check_identifier"]
+
+MAX_IDENTIFIER = 60
+"""Characters; file systems take 255 bytes, of which a letter may need four."""
+IDENTIFIER = re.compile(r"\w([\w .+()-]*[\w.+()-])?")
+
+
+def check_identifier(name: str, what: str) -> str:
+    """Return `name`; raises InputError, which calls it `what`, where it is not one.
+
+    Letters and digits of any script, '_', '-', '.', '+', parentheses and blanks inside; a letter, digit or '_' first.
+    """
+    if len(name) <= MAX_IDENTIFIER and IDENTIFIER.fullmatch(name) and ".." not in name:
+        return name
+    shown = ascii(name if len(name) <= MAX_IDENTIFIER else name[:MAX_IDENTIFIER] + "...")
+    raise InputError(
+        f"{what} {shown} is no name, which has no slashes: use at most {MAX_IDENTIFIER} letters, digits, '_', "
+        "'-' and '.', with a letter or digit first"
+    )

@@ -1,0 +1,103 @@
+"""A strict reader for the JSON files that the program writes: no key twice, no number without end, no bare NaN."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+from rigkit.core.errors import InputError
+from rigkit.io.numbers import MAX_NUMBER
+from rigkit.io.reading import read_text
+
+__all__ = ["json_schema", "parse_json", "read_json", "real", "whole"]
+
+MAX_JSON_DIGITS = 18
+"""Of a whole number: what 64 bits hold."""
+
+
+def parse_json(text: str) -> Any:
+    """Return what the text says; raises ValueError (in words) for what is not JSON as the program writes it."""
+    try:
+        return json.loads(
+            text, object_pairs_hook=_once, parse_constant=_no_constant, parse_float=_finite, parse_int=_short
+        )
+    except RecursionError as error:
+        raise ValueError("nested too deep") from error
+
+
+def json_schema(path: str | Path) -> str | None:
+    """Return the schema that the file states; None for a file that is no JSON, states none or cannot be read."""
+    try:
+        data = parse_json(read_text(path))
+    except (InputError, ValueError):
+        return None
+    schema = data.get("schema") if isinstance(data, dict) else None
+    return schema if isinstance(schema, str) else None
+
+
+def read_json(path: str | Path, schema: str, keys: Collection[str], what: str, *, remedy: str) -> dict[str, Any]:
+    """Return the outermost object of the file of `schema`.
+
+    Raises InputError for a file that `what` is not: not there, no JSON, another schema, a key not in `keys`; `remedy`
+    says what to do.
+    """
+    try:
+        data = parse_json(read_text(path, what))
+    except ValueError as error:
+        raise InputError(f"'{path}': not a {what} ({error}); {remedy}") from error
+    found = data.get("schema") if isinstance(data, dict) else None
+    if found != schema:
+        has = f"schema is {str(found)[:60]!r}" if found is not None else "it states no schema"
+        raise InputError(f"'{path}': {has}, but a file with schema '{schema}' is needed here; {remedy}")
+    unknown = sorted(set(data) - set(keys))
+    if unknown:
+        raise InputError(f"'{path}': unknown key {unknown[0][:60]!r}; known: {', '.join(sorted(keys))}")
+    return dict(data)
+
+
+def real(value: Any) -> float:
+    """Return a number; raises ValueError for a word, true or false, and what no measurement is."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{str(value)[:40]!r} is not a number")
+    if not abs(value) <= MAX_NUMBER:
+        raise ValueError(f"{value:g} is larger than anything measured")
+    return float(value)
+
+
+def whole(value: Any) -> int:
+    """Return a whole number; raises ValueError for anything else, 640.5 and true among it."""
+    number = real(value)
+    if number != math.floor(number):
+        raise ValueError(f"{value} is not a whole number")
+    return int(number)
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    out = dict(pairs)
+    if len(out) < len(pairs):
+        seen: set[str] = set()
+        for key, _ in pairs:
+            if key in seen:
+                raise ValueError(f"key {key[:60]!r} is there twice")
+            seen.add(key)
+    return out
+
+
+def _no_constant(word: str) -> float:
+    raise ValueError(f"{word} is no number of JSON")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text[:40]} is too large")
+    return value
+
+
+def _short(text: str) -> int:
+    if len(text) > MAX_JSON_DIGITS:
+        raise ValueError(f"a number of {len(text)} digits")
+    return int(text)

@@ -1,0 +1,72 @@
+"""Reading files: regular ones, of a size that they may have, in words that say what is wrong with any other."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+from rigkit.core.errors import InputError
+
+__all__ = ["MAX_BINARY_BYTES", "MAX_TEXT_BYTES", "read_bytes", "read_text", "usable_path"]
+
+MAX_TEXT_BYTES = 64_000_000
+"""The corners of ten thousand images."""
+MAX_BINARY_BYTES = 1_000_000_000
+"""An image of 160 megapixels in 16 bits, a cloud of ten million points."""
+MAX_NAME_BYTES, MAX_PATH_BYTES = 255, 4095
+"""What file systems take of one name, and the system of a whole path."""
+
+
+def usable_path(path: str | Path) -> Path:
+    """Return the path; raises InputError where no system could open it: a NUL character, names too long, links that
+    lead to each other."""
+    text = str(path)
+    shown = ascii(text if len(text) < 80 else text[:80] + "...")
+    if "\0" in text:
+        raise InputError(f"{shown} has a NUL character, which no path has; correct the path")
+    names = [len(os.fsencode(part)) for part in Path(text).parts]
+    if max(names, default=0) > MAX_NAME_BYTES or len(os.fsencode(text)) > MAX_PATH_BYTES:
+        raise InputError(f"{shown}: a name is longer than {MAX_NAME_BYTES} bytes; give a shorter path")
+    try:
+        Path(text).resolve()
+    except (RuntimeError, OSError) as error:
+        raise InputError(f"{shown} cannot be followed: its links lead to each other; correct the path") from error
+    return Path(text)
+
+
+def read_bytes(path: str | Path, what: str = "", *, max_bytes: int = MAX_BINARY_BYTES) -> bytes:
+    """Return the content of a regular file.
+
+    `what` the file is comes before its name in the InputError for one that is not there, cannot be read, is a folder, a
+    pipe or a device, or has more than `max_bytes`.
+    """
+    source = usable_path(path)
+    name = f"{what} '{source}'" if what else f"'{source}'"
+    try:
+        status = source.stat()
+        if stat.S_ISDIR(status.st_mode):
+            raise InputError(f"{name} is a folder; give a file")
+        if not stat.S_ISREG(status.st_mode):
+            raise InputError(f"{name} is a pipe or a device; save its content as a file and give that")
+        if status.st_size > max_bytes:
+            raise InputError(f"{name} has {status.st_size} bytes, more than {max_bytes}; is it the right one?")
+        return source.read_bytes()
+    except FileNotFoundError as error:
+        raise InputError(f"{name} does not exist; check the path") from error
+    except OSError as error:
+        raise InputError(f"{name} cannot be read: {error.strerror}; check the path and permissions") from error
+
+
+def read_text(path: str | Path, what: str = "", *, max_bytes: int = MAX_TEXT_BYTES) -> str:
+    """Return the text of a UTF-8 file, without the byte order mark that spreadsheets and editors may put in front.
+
+    Raises InputError as `read_bytes` does, and for what is no text.
+    """
+    data = read_bytes(path, what, max_bytes=max_bytes)
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        name = f"{what} '{path}'" if what else f"'{path}'"
+        raise InputError(f"{name} cannot be read: not UTF-8 text; save it as UTF-8") from error
+    return text.replace("\r\n", "\n").replace("\r", "\n")
