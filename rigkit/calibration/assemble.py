@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from rigkit.calibration.clustered import Clustered, clustered_covariance, reduced_by_cluster, with_block
 from rigkit.calibration.fit import Fit
+from rigkit.calibration.linearise import view_products
 from rigkit.calibration.normal_equations import NormalEquations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import BoardShape, Calibration, Candidate, Outlier, ViewResult
 from rigkit.calibration.shape import ShapeModel
 from rigkit.calibration.solver import with_priors
 from rigkit.calibration.state import State
-from rigkit.core.arrays import FloatArray, Points
+from rigkit.core.arrays import FloatArray, IntArray, Points
 from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
@@ -33,7 +35,7 @@ def assemble(
 ) -> Calibration:
     """Return the result, without verdicts."""
     state, sigma = fit.state, fit.sigma_px
-    covariance = frame_covariance(solution_normal(fit), state)
+    covariance, clustered = _covariance(observations, fit)
     px = np.where(fit.residuals.valid[..., None], fit.residuals.px, np.nan)
     poses = Rigid3.stack(state.rotation, state.translation_mm)
     p = state.camera.parameters.size
@@ -41,8 +43,10 @@ def assemble(
         camera=state.camera,
         rms_px=fit.rms_px,
         heldout_rms_px=heldout_px,
-        covariance=covariance[:p, :p] * sigma**2,
-        frame_covariance=covariance * sigma**2,
+        covariance=covariance[:p, :p],
+        frame_covariance=covariance,
+        overdispersion=clustered.overdispersion,
+        freedom=clustered.freedom,
         sigma_px=sigma,
         views=ViewResult.of_views(observations.views, poses, px, fit.kept),
         dropped=dropped,
@@ -51,6 +55,29 @@ def assemble(
         convergence=fit.convergence,
         boards=board_shapes(observations, state.shape, state.unknowns),
     )
+
+
+def _covariance(observations: Observations, fit: Fit) -> tuple[FloatArray, Clustered]:
+    """Return the covariance of the parameters and of the mean motion of the boards, (P + 6, P + 6), with the images as
+    the independent units, and what the images said."""
+    normal = solution_normal(fit)
+    p = fit.state.camera.parameters.size
+    # A warp may hide in the lens: an aspect ratio of the board in that of the pixels.
+    n = p + fit.state.shape.basis.shape[-1]
+    unit = frame_covariance(normal, fit.state, n)
+    products = view_products(observations, fit.state, fit.weight(observations))
+    information, score = reduced_by_cluster(products, n, image_numbers(observations))
+    prior = (normal.gg - fit.data.gg)[:n, :n]
+    clustered = clustered_covariance(unit[:n, :n], information, score, prior, fit.sigma_px)
+    covariance = with_block(unit * fit.sigma_px**2, clustered.covariance, clustered.overdispersion**2)
+    chosen = np.concatenate([np.arange(p), np.arange(n, n + 6)])
+    return covariance[np.ix_(chosen, chosen)], clustered
+
+
+def image_numbers(observations: Observations) -> IntArray:
+    """Return the number of the image of each view (V,)."""
+    place = {name: i for i, name in enumerate(dict.fromkeys(observations.images))}
+    return np.array([place[name] for name in observations.images], dtype=np.int64)
 
 
 def _outliers(observations: Observations, fit: Fit) -> tuple[Outlier, ...]:
@@ -82,12 +109,13 @@ def motion_of_world(translation_mm: Points) -> FloatArray:
     return lever
 
 
-def frame_covariance(normal: NormalEquations, state: State) -> FloatArray:
-    """Return the covariance, for unit residuals, of the P parameters and of the mean motion of the boards (w, t).
+def frame_covariance(normal: NormalEquations, state: State, count: int) -> FloatArray:
+    """Return the covariance, for unit residuals, of the first `count` globals and of the mean motion of the boards
+    (w, t).
 
     The boards on average move a point x in the camera frame by W x x + T, W and T the means of `motion_of_world`.
     """
-    p = state.camera.parameters.size
+    p = count
     globals_, back, own = normal.covariance()
     used = normal.pp.trace(axis1=-2, axis2=-1) > 0.0
     lever = motion_of_world(state.translation_mm[used]) / max(int(used.sum()), 1)
@@ -104,8 +132,9 @@ def frame_covariance(normal: NormalEquations, state: State) -> FloatArray:
 
 def require_determined(result: Calibration, at_corners_px: FloatArray) -> None:
     """Raise DegenerateError where the views leave the lens open, even at the corners that they have: `at_corners_px` is
-    the uncertainty there."""
+    the uncertainty there. How much a wrong model makes the images disagree says nothing about that."""
     sigma = float(np.nanmedian(at_corners_px)) if np.isfinite(at_corners_px).any() else np.inf
+    sigma /= result.overdispersion
     if result.sigma_px > 0.0:
         sigma *= max(result.sigma_px, MIN_SIGMA_PX) / result.sigma_px
     if not sigma < UNKNOWN_SHARE * result.camera.size_px[0]:

@@ -1,26 +1,43 @@
-"""Two calibrations: is their difference what their uncertainties predict, or are these two cameras?"""
+"""Two calibrations: is their difference what their uncertainties predict, or are these two cameras?
+
+A camera calibrated from boards alone has a free rotation, which the boards' poses take up. So the difference is taken
+after the best rotation, over the pixels where both had boards, and what is predicted for it from the two covariances is
+taken over the same pixels, with the same three rotations projected out.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 
+from rigkit.calibration.coverage import covered_by_boards
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.uncertainty import projection_design, projection_uncertainty
+from rigkit.calibration.uncertainty import projection_design
 from rigkit.cameras.base import Camera
-from rigkit.cameras.compare import CameraDifference, compare_cameras
+from rigkit.cameras.compare import CameraDifference, compare_cameras, grid_pixels
 from rigkit.cameras.convert import refit_camera
 from rigkit.core.arrays import FloatArray, Pixels
 
-__all__ = ["CalibrationComparison", "compare_calibrations"]
+__all__ = ["CalibrationComparison", "CameraVerdict", "compare_calibrations"]
 
-SAMPLES = 2000
-"""Draws of the null distribution: the chance is then known to 0.005 near 0.05."""
+SAMPLES = 4000
+"""Draws of the null distribution: the chance is then known to 0.002 near 0.01."""
 REFIT_SIGMA = 0.5
 """What the models make of one lens is known from a refit to about half: poses and noise had their part in the fits."""
 SAME_CHANCE = 0.01
-"""A difference this unlikely for one and the same camera makes it two."""
+"""A difference this unlikely for one and the same camera is no chance."""
+IMPORTANT_PX = 0.1
+"""What is smaller is of no importance, however surely it is there: corners of real images are hardly better."""
+
+
+class CameraVerdict(StrEnum):
+    """What a difference means."""
+
+    SAME = "no contradiction"
+    UNIMPORTANT = "differs by more than chance, of no importance"
+    OTHER = "another camera or a moved lens"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -29,23 +46,34 @@ class CalibrationComparison:
 
     Attributes
     ----------
-    difference : over the image, after the best rotation.
-    predicted_px : (rows, columns) predicted rms difference of two calibrations of one camera, NaN where not covered.
-    ratio : rms over the image of difference / predicted: about 1 for one and the same camera in one model.
-    chance : probability of a ratio at least this large if both were calibrations of the same, unchanged camera, each in
-        its own model.
+    difference : where both had boards, after the best rotation.
+    predicted_px : the rms difference that two calibrations of one camera would have on average, there and after the
+        best rotation.
+    chance : probability of a difference at least this large if both were calibrations of the same, unchanged camera,
+        each in its own model.
     same_model : both are of one model and size.
     """
 
     difference: CameraDifference
-    predicted_px: FloatArray
-    ratio: float
+    predicted_px: float
     chance: float
     same_model: bool
 
     @property
+    def ratio(self) -> float:
+        """The rms difference over the one predicted: about 1 for one and the same camera."""
+        return self.difference.rms_px / max(self.predicted_px, np.finfo(float).tiny)
+
+    @property
+    def verdict(self) -> CameraVerdict:
+        if self.chance >= SAME_CHANCE:
+            return CameraVerdict.SAME
+        return CameraVerdict.UNIMPORTANT if self.difference.rms_px < IMPORTANT_PX else CameraVerdict.OTHER
+
+    @property
     def same(self) -> bool:
-        return self.chance >= SAME_CHANCE
+        """Nothing says that these are two cameras, or that the lens moved by anything of importance."""
+        return self.verdict is not CameraVerdict.OTHER
 
 
 def compare_calibrations(
@@ -53,41 +81,37 @@ def compare_calibrations(
 ) -> CalibrationComparison:
     """Compare two calibrations over the image of `a`.
 
-    Raises InputError or DegenerateError where the images differ in size or the cameras share no view.
+    Raises InputError or DegenerateError where the images differ in size, or the boards of the two had too little of it
+    in common.
 
     Notes
     -----
-    The null distribution of the ratio is sampled: both calibrations' errors are drawn from their covariances, turned
-    into differences over the image by the projection's derivatives, and the best rotation is taken out of each with the
-    same weights as it is taken out of the difference found. Models of different kinds or sizes show one lens
-    differently, which no covariance knows: that difference, from each camera refitted as the other is modelled, is a
-    part of the null.
+    The null distribution of the mean squared difference is sampled: both calibrations' errors are drawn from their
+    covariances (Student's t with the degrees of freedom that these have) and turned into differences by the
+    projection's derivatives. Models of different kinds or sizes show one lens differently, which no covariance knows:
+    that difference, from each camera refitted as the other is modelled, is a part of the null.
     """
-    difference = compare_cameras(a.camera, b.camera, grid=grid)
-    # The rotation is fitted where both calibrations know what they say: extrapolated corners must not turn it.
-    weights = np.zeros(difference.covered.shape)
-    weights[difference.covered] = 1.0 / _variance(a, b, difference)[0]
-    difference = compare_cameras(a.camera, b.camera, grid=grid, weights=weights)
-    covered = difference.covered
-    pixels = difference.pixels[covered]
-    variance, seen = _variance(a, b, difference)
-    found = float(np.mean((difference.difference_px[covered] ** 2).sum(axis=-1) / variance))
+    pixels = grid_pixels(a.camera.size_px, grid)
+    both = covered_by_boards(a, pixels) & covered_by_boards(b, pixels)
+    difference = compare_cameras(a.camera, b.camera, grid=grid, mask=both)
+    pixels = difference.pixels[difference.covered]
+    rays = a.camera.unproject(pixels)[0]
+    designs = [_design(a, rays), _design(b, rays @ difference.b_from_a.T)]
     # The rotation that the comparison fits, at first order. In two calibrations of one camera both are the same.
-    root = np.repeat(1.0 / np.sqrt(variance), 2)[:, None]
-    designs = _design(a, pixels), _design(b, seen)
-    turn = root * np.concatenate([design[:, -3:] for design in designs], axis=1)
+    turn = np.linalg.qr(designs[0][:, -3:])[0]
+    by_model = _by_model(a, b, difference)[:, None]
+    columns = [design[:, :-3] for design in designs] + [by_model]
+    together = np.concatenate([column - turn @ (turn.T @ column) for column in columns], axis=1)
+    gram = together.T @ together / len(pixels)
     rng = np.random.default_rng(seed)
-    drawn = root * (_draw(a, designs[0], rng) - _draw(b, designs[1], rng))
-    by_model = root * _by_model(a, b, difference)[:, None]
-    if by_model.any():
-        drawn += by_model * (1.0 + REFIT_SIGMA * rng.normal(size=SAMPLES))
-    drawn = drawn - turn @ np.linalg.lstsq(turn, drawn, rcond=None)[0]
-    null = (drawn.reshape(len(pixels), 2, SAMPLES) ** 2).sum(axis=1).mean(axis=0)
-    predicted = np.full(covered.shape, np.nan)
-    predicted[covered] = np.sqrt(variance)
-    chance = float((1 + np.count_nonzero(null >= found)) / (SAMPLES + 1))
+    drawn = np.concatenate([_draw(a, rng), -_draw(b, rng), 1.0 + REFIT_SIGMA * rng.normal(size=(1, SAMPLES))])
+    null = np.einsum("kn,kn->n", drawn, gram @ drawn)
+    chance = float((1 + np.count_nonzero(null >= difference.rms_px**2)) / (SAMPLES + 1))
+    p = a.camera.parameters.size
+    expected = float(np.sum(gram[:p, :p] * a.covariance) + np.sum(gram[p:-1, p:-1] * b.covariance))
+    expected += (1.0 + REFIT_SIGMA**2) * float(gram[-1, -1])
     return CalibrationComparison(
-        difference, predicted, float(np.sqrt(found)), chance, _kind(a.camera) == _kind(b.camera)
+        difference, float(np.sqrt(max(expected, 0.0))), chance, _kind(a.camera) == _kind(b.camera)
     )
 
 
@@ -102,8 +126,9 @@ def _by_model(a: Calibration, b: Calibration, difference: CameraDifference) -> F
         at = np.concatenate([view.pixels for view in like.views])
         rays, valid = lens.camera.unproject(at)
         refitted = refit_camera(like.camera, rays[valid] @ like_from_lens.T, at[valid])
-        projected, valid = refitted.project(_rays(lens, pixels) @ like_from_lens.T)
+        projected, valid = refitted.project(lens.camera.unproject(pixels)[0] @ like_from_lens.T)
         out += sign * np.where(valid[:, None], projected - pixels, 0.0)
+    # What one model cannot follow of the other shows in one of the two refits.
     return out.reshape(-1)
 
 
@@ -111,31 +136,21 @@ def _kind(camera: Camera) -> tuple[str, int]:
     return camera.model, camera.parameters.size
 
 
-def _variance(a: Calibration, b: Calibration, difference: CameraDifference) -> tuple[FloatArray, Pixels]:
-    """Return the predicted variance (M,) of the difference at the covered pixels, and the pixels in `b`."""
-    pixels = difference.pixels[difference.covered]
-    seen, _ = b.camera.project(_rays(a, pixels) @ difference.b_from_a.T)
-    covariance = projection_uncertainty(a, pixels).covariance + projection_uncertainty(b, seen).covariance
-    return np.trace(covariance, axis1=-2, axis2=-1), seen
-
-
-def _rays(calibration: Calibration, pixels: Pixels) -> FloatArray:
-    return calibration.camera.unproject(pixels)[0]
-
-
-def _design(calibration: Calibration, pixels: Pixels) -> FloatArray:
+def _design(calibration: Calibration, rays: Pixels) -> FloatArray:
     """Return d pixel / d (parameters, turn of the rays), (2 N, P + 3)."""
-    design = projection_design(calibration.camera, _rays(calibration, pixels))
-    return design.transpose(2, 0, 1).reshape(2 * len(pixels), -1)
+    design = projection_design(calibration.camera, rays)
+    return design.transpose(2, 0, 1).reshape(2 * len(rays), -1)
 
 
-def _draw(calibration: Calibration, design: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return errors of the projection (2 N, SAMPLES), drawn from the calibration's covariance."""
-    count = design.shape[1]
-    covariance = calibration.frame_covariance[:count, :count]
+def _draw(calibration: Calibration, rng: np.random.Generator) -> FloatArray:
+    """Return errors of the parameters (P, SAMPLES), drawn from the calibration's covariance."""
+    covariance = calibration.covariance
     # Scaled to correlations first: parameters differ by twenty orders of magnitude.
     sigma = np.sqrt(np.diag(covariance))
     safe = np.where(sigma > 0.0, sigma, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
     root = safe[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-    return np.asarray(design @ root @ rng.normal(size=(count, SAMPLES)))
+    drawn = root @ rng.normal(size=(len(sigma), SAMPLES))
+    if np.isfinite(calibration.freedom):
+        drawn /= np.sqrt(rng.chisquare(calibration.freedom, SAMPLES) / calibration.freedom)
+    return np.asarray(drawn)

@@ -60,13 +60,14 @@ def normal_equations(
 
 
 def view_products(observations: Observations, state: State, weight: FloatArray) -> FloatArray:
-    """Return of every view the sums of the products of its weighted rows, (V, P + 7, P + 7): derivatives by the P
-    parameters of the camera and by the pose (w, t), and last the residual. The boards keep their shape."""
+    """Return of every view the sums of the products of its weighted rows, (V, K, K): derivatives by the parameters of
+    the camera, by the warps of the boards and by the pose (w, t), and last the residual. Released corners are held."""
     views, corners = weight.shape
     residuals, costs = Residuals(np.empty((views, corners, 2)), np.empty((views, corners), dtype=bool)), np.empty(views)
-    count = state.camera.parameters.size + 7
+    state = state.with_corners_held()
+    count = state.camera.parameters.size + state.shape.basis.shape[-1] + 7
     out = np.empty((views, count, count))
-    for block, rows in _blocks(observations, state.with_boards_held(), weight, None, residuals, costs):
+    for block, rows in _blocks(observations, state, weight, None, residuals, costs):
         each = np.moveaxis(rows, (1, 2), (0, 1))
         out[block] = (each @ np.swapaxes(each, -1, -2)).sum(axis=0)
     return out

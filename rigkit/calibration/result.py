@@ -176,6 +176,9 @@ class Calibration:
     frame_covariance : (P + 6, P + 6) of the parameters together with the mean motion of the boards, (rad, mm): what
         `uncertainty` needs to tell a moved camera from another lens.
     sigma_px : standard deviation per coordinate of a corner of median quality, from the residuals.
+    overdispersion : by how much more the images disagree than independent corners would, as a ratio of standard
+        deviations. The covariances count it in: they rest on what repeats from image to image.
+    freedom : degrees of freedom of the covariances; infinite where there are too few images to know.
     views : the views used, in the order given.
     dropped : (image, reason) of what was not used.
     outliers : corners left out of views that were used.
@@ -198,6 +201,8 @@ class Calibration:
     convergence: Convergence
     boards: tuple[BoardShape, ...]
     verdicts: tuple[Finding, ...] = ()
+    overdispersion: float = 1.0
+    freedom: float = float("inf")
 
     def __post_init__(self) -> None:
         p = self.camera.parameters.size

@@ -80,6 +80,12 @@ class ShapeModel:
         """Return the shape with nothing left to solve for: boards as the unknowns have them."""
         return _rigid(self.points(unknowns))
 
+    def with_corners_held(self, unknowns: FloatArray) -> ShapeModel:
+        """Return the shape with released corners held where the unknowns have them, on boards that still warp."""
+        count = self.basis.shape[-1]
+        flat = self.points(unknowns) - self.basis @ unknowns[:count]
+        return ShapeModel("warp", flat, self.basis, self.sigma[:count], NONE)
+
 
 def _rigid(points: Points) -> ShapeModel:
     return ShapeModel("flat", points, np.zeros((len(points), 3, 0)), np.zeros(0), NONE)

@@ -38,6 +38,13 @@ class State:
         """Return the state with nothing of the boards' shape left to solve for."""
         return replace(self, shape=self.shape.held(self.unknowns), unknowns=np.zeros(0))
 
+    def with_corners_held(self) -> State:
+        """Return the state with released corners held where they are, and the boards' warps left to solve for."""
+        count = self.shape.basis.shape[-1]
+        if not count:
+            return self.with_boards_held()
+        return replace(self, shape=self.shape.with_corners_held(self.unknowns), unknowns=self.unknowns[:count])
+
     def points_in_cam(self, observations: Observations) -> tuple[Points, Points]:
         """Return the corners in the camera frame and their lever arms R X, both (V, C, 3) mm, coordinates first in
         memory."""

@@ -1,14 +1,20 @@
 """How far a calibrated projection may be off, over the image, in pixels.
 
 The covariance of the parameters alone says too much: a changed principal point and a turned camera are the same image
-of the world. What counts is where a point that is fixed to the boards appears. The boards' solved motions, averaged,
-are the motion of the world (W, T) that goes with a change dk of the parameters, and
+of the world, and a camera calibrated from boards alone has a free rotation. At infinity a change dk of the parameters
+goes with the rotation W that hides it best where the boards were,
+
+    dq = (Q - R (R^T R)^-1 R^T Q) dk,      Q = d q / d k,      R = d q / d W,
+
+sums over the corners used. Of points at a known distance what counts is where a point that is fixed to the boards
+appears: the boards' solved motions, averaged, are the motion of the world (W, T) that goes with dk, and
 
     dq = d q / d k  dk + d q / d x (W x x + T)
 
 has the covariance M F M^T, with F the joint covariance of (k, W, T) (`Calibration.frame_covariance`).
 
-Reference: D. Kogan, mrcal, "Projection uncertainty" (the mean over the frames is the same; here in closed form).
+Reference: D. Kogan, mrcal, "Projection uncertainty" and "Projection differences" (the mean over the frames and the
+rotation that is taken out are the same; here in closed form).
 """
 
 from __future__ import annotations
@@ -50,11 +56,14 @@ class Uncertainty:
 
 
 def projection_uncertainty(calibration: Calibration, pixels: Pixels, *, range_mm: float = np.inf) -> Uncertainty:
-    """Return the uncertainty of the projection at `pixels` (..., 2) of points `range_mm` away (infinity by default)."""
+    """Return the uncertainty of the projection at `pixels` (..., 2) of points `range_mm` away: at infinity (default)
+    after the rotation that boards leave open, nearer relative to the boards."""
     pixels = np.asarray(pixels, dtype=np.float64)
     rays, valid = calibration.camera.unproject(pixels)
     flat = np.where(valid[..., None], rays, [0.0, 0.0, 1.0]).reshape(-1, 3)
-    covariance = _covariance(calibration, flat, range_mm).reshape(*valid.shape, 2, 2)
+    far = bool(np.isinf(range_mm))
+    found = _far_covariance(calibration, flat, _corner_rays(calibration)) if far else _near(calibration, flat, range_mm)
+    covariance = found.reshape(*valid.shape, 2, 2)
     return Uncertainty(pixels, np.where(valid[..., None, None], covariance, np.nan), valid)
 
 
@@ -64,12 +73,36 @@ def worst_direction(covariance: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(0.5 * (a + c) + np.hypot(0.5 * (a - c), b)))
 
 
-def _covariance(calibration: Calibration, rays: FloatArray, range_mm: float) -> FloatArray:
-    """Return the covariance (M, 2, 2) of the projection along rays (M, 3); unit rays, unless the range is infinite."""
-    design = projection_design(calibration.camera, rays, range_mm)
-    count = design.shape[1]
-    moved = calibration.frame_covariance[:count, :count] @ design
-    covariance = np.empty((len(rays), 2, 2))
+def _far_covariance(calibration: Calibration, rays: FloatArray, corners: FloatArray) -> FloatArray:
+    """Return the covariance (M, 2, 2) of the projection along rays (M, 3) at infinity, after the rotation that hides a
+    change of the parameters best along the rays `corners` (N, 3)."""
+    p = calibration.camera.parameters.size
+    # Parameters have units of their own: in standard deviations they can be compared.
+    scale = np.sqrt(np.maximum(np.diag(calibration.covariance), 0.0))
+    there = projection_design(calibration.camera, corners).transpose(1, 0, 2).reshape(p + 3, -1)
+    hides = np.linalg.lstsq(there[p:].T, (scale[:, None] * there[:p]).T, rcond=None)[0]
+    here = projection_design(calibration.camera, rays)
+    design = scale[:, None] * here[:, :p] - np.einsum("wp,iwm->ipm", hides, here[:, p:])
+    safe = np.where(scale > 0.0, scale, 1.0)
+    return _propagated(calibration.covariance / np.outer(safe, safe), design)
+
+
+def _near(calibration: Calibration, rays: FloatArray, range_mm: float) -> FloatArray:
+    """Return the covariance (M, 2, 2) of the projection of points `range_mm` away along unit rays (M, 3)."""
+    return _propagated(calibration.frame_covariance, projection_design(calibration.camera, rays, range_mm))
+
+
+def _corner_rays(calibration: Calibration) -> FloatArray:
+    """Return the rays of up to 400 of the corners used."""
+    pixels = np.concatenate([view.pixels[view.kept] for view in calibration.views])
+    rays, valid = calibration.camera.unproject(pixels[_spread(len(pixels))])
+    return np.asarray(rays[valid])
+
+
+def _propagated(parameters: FloatArray, design: FloatArray) -> FloatArray:
+    """Return the covariances (M, 2, 2) of what has the derivatives `design` (2, K, M) by K unknowns."""
+    moved = parameters @ design
+    covariance = np.empty((design.shape[-1], 2, 2))
     for i, j in ((0, 0), (0, 1), (1, 1)):
         covariance[:, i, j] = covariance[:, j, i] = np.einsum("kn,kn->n", design[i], moved[j])
     return covariance
@@ -93,7 +126,7 @@ def projection_design(camera: Camera, rays: FloatArray, range_mm: float = np.inf
 
 
 def uncertainty_at_corners(calibration: Calibration, points_in_cam: Points | None = None) -> FloatArray:
-    """Return the standard deviation in the worst direction, (M,) px, at up to 400 of the corners used.
+    """Return the standard deviation in the worst direction, (M,) px, at up to 400 of the corners used, at infinity.
 
     `points_in_cam` (N, 3) are the board's corners in the camera frame, of the corners used, where they are known: it
     saves the way back from the pixels.
@@ -102,7 +135,9 @@ def uncertainty_at_corners(calibration: Calibration, points_in_cam: Points | Non
         kept = np.concatenate([view.kept for view in calibration.views])
         pixels = np.concatenate([view.pixels for view in calibration.views])[kept]
         return projection_uncertainty(calibration, pixels[_spread(len(pixels))]).worst_px
-    return worst_direction(_covariance(calibration, points_in_cam[_spread(len(points_in_cam))], np.inf))
+    points = points_in_cam[_spread(len(points_in_cam))]
+    rays = points / np.linalg.norm(points, axis=-1, keepdims=True)
+    return worst_direction(_far_covariance(calibration, rays, rays))
 
 
 def _spread(count: int) -> IntArray:

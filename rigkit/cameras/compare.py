@@ -15,7 +15,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Pixels
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import exp_so3, nearest_rotation, rotation_angle, skew
 
-__all__ = ["CameraDifference", "compare_cameras"]
+__all__ = ["CameraDifference", "compare_cameras", "grid_pixels"]
 
 STEPS = 20
 SETTLED_RAD = 1e-12
@@ -101,8 +101,7 @@ def compare_cameras(
     if a.size_px != b.size_px:
         raise InputError(f"cameras of {a.size_px} and {b.size_px} px cannot be compared; calibrate at one image size")
     columns, rows = grid
-    u, v = np.linspace(0.0, a.size_px[0] - 1.0, columns), np.linspace(0.0, a.size_px[1] - 1.0, rows)
-    pixels = np.stack(np.meshgrid(u, v), axis=-1)
+    pixels = grid_pixels(a.size_px, grid)
     for name, array in (("mask", mask), ("weights", weights)):
         if array is not None and np.shape(array) != (rows, columns):
             raise InputError(f"{name}: expected shape {rows}x{columns} as the grid, got {np.shape(array)}")
@@ -119,6 +118,12 @@ def compare_cameras(
         raise DegenerateError(f"the cameras share {covered.sum()} of {covered.size} pixels; they look elsewhere")
     difference = np.where(covered[..., None], projected - pixels, np.nan)
     return CameraDifference(pixels, difference, covered, b_from_a)
+
+
+def grid_pixels(size_px: tuple[int, int], grid: tuple[int, int]) -> Pixels:
+    """Return (columns, rows) pixels spread evenly from corner pixel to corner pixel, (rows, columns, 2)."""
+    u, v = (np.linspace(0.0, size - 1.0, count) for size, count in zip(size_px, grid, strict=True))
+    return np.stack(np.meshgrid(u, v), axis=-1)
 
 
 def _best_rotation(rays: FloatArray, pixels: FloatArray, weight: FloatArray, b: Camera) -> Mat3:

@@ -44,23 +44,30 @@ def _camera_figures(pair: CameraPair) -> dict[str, Any]:
         "max_px": difference.max_px,
         "rotation_deg": difference.rotation_deg,
         "coverage": difference.coverage,
+        "predicted_px": None if judged is None else judged.predicted_px,
         "ratio": None if judged is None else judged.ratio,
         "chance": None if judged is None else judged.chance,
+        "verdict": None if judged is None else str(judged.verdict),
         "same": pair.same,
         "same_model": None if judged is None else judged.same_model,
     }
 
 
 def _camera_in_words(figures: dict[str, Any]) -> str:
+    from rigkit.calibration.compare import CameraVerdict
+
+    known = figures["same"] is not None
     line = (
         f"difference {figures['rms_px']:.4f} px rms, {figures['max_px']:.4f} px at most, over "
-        f"{100 * figures['coverage']:.0f} % of the image, after a rotation of {figures['rotation_deg']:.4f} deg\n"
+        f"{100 * figures['coverage']:.0f} % of the image{', where both had boards' if known else ''}, after a rotation "
+        f"of {figures['rotation_deg']:.4f} deg\n"
     )
-    if figures["same"] is None:
+    if not known:
         return line + "no verdict: a file has no covariance"
-    verdict = "the same camera" if figures["same"] else "NOT the same camera, or a moved lens"
+    at = f" at {figures['rms_px']:.2g} px" if figures["verdict"] == CameraVerdict.UNIMPORTANT else ""
     return line + (
-        f"{figures['ratio']:.2f} times what the uncertainties predict (chance {figures['chance']:.3g}): {verdict}"
+        f"expected of one camera {figures['predicted_px']:.4f} px, {figures['ratio']:.2f} times as much is found "
+        f"(chance {figures['chance']:.3g}): {figures['verdict']}{at}"
         + ("" if figures["same_model"] else "; the chance allows for what their different models make of one lens")
     )
 

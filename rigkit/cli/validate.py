@@ -82,7 +82,7 @@ def _say_failures(reports: Iterable[ValidationReport], compared: Iterable[CrossC
         for words in report.unchecked:
             failed.setdefault(("NOT CHECKED", report.pair_id, words), []).append(report.affine_method)
     for (what, pair_id, words), methods in failed.items():
-        print(f"{what} {pair_id} {', '.join(methods)} {words}")
+        print(f"{what} {pair_id} {','.join(methods)} {words}")
     for other in compared:
         for c in other.checks:
             if not c.passed:

@@ -6,7 +6,7 @@ No size need be known, no number of boards, no lens.
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,7 @@ from rigkit.detection.lattice.links import find_links
 from rigkit.detection.lattice.origin import quarter_turns
 from rigkit.detection.lattice.split import join_parts, split_at_turns, split_necks
 from rigkit.detection.saddles.bad_pixels import without_bad_pixels
+from rigkit.detection.saddles.local_contrast import equalised, stretched
 from rigkit.detection.saddles.nearby import near_any
 from rigkit.detection.saddles.response import GreyImage, Level, grey_image, pyramid
 from rigkit.detection.saddles.saddle import find_corners
@@ -62,19 +63,29 @@ def find_lattices(
     """
     grey = grey_image(image)
     size_px = (grey.shape[1], grey.shape[0])
+    found = _fitted(grey, candidates(grey, min_corners, _promising), min_corners, sizes)
+    return [item for item in found if min_corners < MIN_BOARD_CORNERS or compact(item.lattice, size_px)]
+
+
+def candidates(
+    grey: GreyImage, min_corners: int, promising: Callable[[GreyImage, Level, Lattice], bool]
+) -> list[Lattice]:
+    """Return the lattices of `grey` that may be boards, before the sub-pixel fit.
+
+    `promising` says of a lattice, on the image and the finest level of its pyramid, whether it is worth growing.
+    """
+    size_px = (grey.shape[1], grey.shape[0])
     levels = pyramid(grey)
     corners, saddles = find_corners(levels)
     lattices = build_lattices(corners, find_links(corners, levels[0]))
     index = SaddleIndex(saddles)
-    grown = grow_all(lattices, index, levels[0], functools.partial(_promising, grey, levels[0]))
+    grown = grow_all(lattices, index, levels[0], functools.partial(promising, grey, levels[0]))
     grown = [item for item in grown if item.count >= MIN_PART_CORNERS]
     if not any(item.solid or min_corners < MIN_BOARD_CORNERS for item in grown):
         return []
     boards = [board for item in grown for part in split_at_turns(item) for board in split_necks(part)]
     parts = separate([tidy(board, size_px) for board in boards], MIN_PART_CORNERS)
-    boards = [board for board in join_parts(parts) if large(board, min_corners)]
-    found = _fitted(grey, boards, min_corners, sizes)
-    return [item for item in found if min_corners < MIN_BOARD_CORNERS or compact(item.lattice, size_px)]
+    return [board for board in join_parts(parts) if large(board, min_corners)]
 
 
 def _fitted(
@@ -147,7 +158,14 @@ def detect_boards(
     sizes = tuple(dict.fromkeys(board.size for board in plain))
     grey = without_bad_pixels(grey_image(image))
     fewest = min([min_corners, *(max(columns * rows, MIN_BOARD_CORNERS) for columns, rows in sizes)])
-    lattices = find_lattices(grey, fewest, sizes if len(plain) == len(known) else ())
+    only = sizes if len(plain) == len(known) else ()
+    lattices = find_lattices(grey, fewest, only)
+    if not lattices and grey.dtype != np.uint8:
+        # Beyond 8 bits the squares of a board may be a hundredth of the range of brightness.
+        seen = [item.lattice for item in find_lattices(equalised(grey), fewest, only)]
+        # What is hot beside a board moves corners of the equalised image: they are placed on one that is only brighter.
+        grey = stretched(grey, [lattice.pixels for lattice in seen])
+        lattices = _fitted(grey, seen, fewest, only)
     marked: list[BoardDetection] = []
     if len(plain) < len(known):
         from rigkit.detection.charuco import charuco_boards

@@ -47,8 +47,10 @@ SCHEMA = "rigkit.calibration/1"
 CAMERA_KEYS = {"model", "size_px", "parameters"}
 KEYS = {
     "schema", "camera", "rms_px", "heldout_rms_px", "sigma_px", "covariance", "frame_covariance", "verdicts",
-    "candidates", "convergence", "dropped", "outliers", "boards", "views",
+    "candidates", "convergence", "dropped", "outliers", "boards", "views", "overdispersion", "freedom",
 }  # fmt: skip
+LATER_KEYS = {"overdispersion", "freedom"}
+"""Former files do not have them."""
 
 
 def save_calibration(path: str | Path, calibration: Calibration, *, force: bool = False) -> None:
@@ -70,6 +72,8 @@ def calibration_text(calibration: Calibration) -> str:
         "convergence": asdict(c.convergence),
         "dropped": [list(v) for v in c.dropped],
         "outliers": [asdict(v) for v in c.outliers],
+        "overdispersion": c.overdispersion,
+        "freedom": c.freedom if math.isfinite(c.freedom) else None,
         "covariance": c.covariance.tolist(),
         "frame_covariance": c.frame_covariance.tolist(),
         "boards": [
@@ -109,7 +113,7 @@ def is_calibration(path: str | Path) -> bool:
 def load_calibration(path: str | Path) -> Calibration:
     """Return the whole calibration; raises InputError like `load_camera`, also where the file has the camera alone."""
     data = _read(path)
-    missing = sorted(KEYS - set(data))
+    missing = sorted(KEYS - LATER_KEYS - set(data))
     if missing:
         raise InputError(f"'{path}': no {', '.join(missing)}: a camera without its calibration; calibrate again")
     with damage_named(path):
@@ -129,6 +133,8 @@ def load_calibration(path: str | Path) -> Calibration:
             convergence=Convergence(**data["convergence"]),
             boards=tuple(BoardShape(**v) for v in data["boards"]),
             verdicts=findings_from_json(data["verdicts"]),
+            overdispersion=float(data.get("overdispersion", 1.0)),
+            freedom=float(data.get("freedom") or math.inf),
         )
 
 

@@ -16,6 +16,7 @@ from rigkit.core.errors import DegenerateError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.reconstruction.metric import MetricPose, TriangulatedPoints, metric_pose, triangulate_matches
+from rigkit.reconstruction.noise_level import variance_factor
 from rigkit.relative_pose.refinement.refine import RefinedPose, refine_pose, rules_out
 from rigkit.relative_pose.refinement.select import DEFAULT_LEVEL_RAD, PoseTypeEvidence, pose_type_evidence
 from rigkit.relative_pose.solvers.pose import choose_pose, essential_from_pose
@@ -31,6 +32,9 @@ MAX_BASELINE_SIGMA = 0.2
 
 NOTABLE_SCATTER = 2.0
 """Corners that scatter this many times more than predicted are worth a word: blur, JPEG, a bad calibration."""
+
+POSE_FREEDOM = 5
+"""Degrees of freedom of a relative pose without its length."""
 
 SAME_COST = 1e-9
 """Costs that differ by less than this part are one minimum, reached from two sides."""
@@ -68,6 +72,7 @@ class PairGeometry:
     metric : the pose in mm, with its covariance.
     E21 : (3, 3) essential matrix of that pose, unit Frobenius norm.
     points : every corner, triangulated, mm in the frame of camera 1.
+    scatter : factor of the corners' stated sigmas that their residuals show; `pair` has it in its sigmas.
     notes : what was dropped, assumed or contradicted, in words.
     """
 
@@ -77,6 +82,7 @@ class PairGeometry:
     metric: MetricPose
     E21: Mat3
     points: TriangulatedPoints
+    scatter: float
     notes: tuple[str, ...]
 
     @property
@@ -163,11 +169,11 @@ def _likeliest_pose(pair: MatchedPair, decision: PoseTypeDecision) -> RefinedPos
 def _in_mm(pair: MatchedPair, decision: PoseTypeDecision, refined: RefinedPose) -> PairGeometry:
     """Return the geometry of a pair with the scale of its squares, and sigmas that fit what is seen."""
     notes = [*pair.notes, *decision.notes]
-    scatter = float(np.sqrt(refined.variance_factor))
-    if scatter > 1.0:
-        # The corners miss the epipolar geometry by more than their sigmas promise: believe what is seen.
-        pair = pair.noisier(scatter)
-        refined = refine_pose(pair.captured, refined.cam2_from_cam1, decision.pose_type, decision.level_sigma_rad)
+    freedom = len(pair.captured) - POSE_FREEDOM
+    scatter = float(np.sqrt(variance_factor(refined.variance_factor * freedom, freedom)))
+    # The corners miss the epipolar geometry by more than their sigmas promise, or by less: believe what is seen.
+    pair = pair.noisier(scatter)
+    refined = refine_pose(pair.captured, refined.cam2_from_cam1, decision.pose_type, decision.level_sigma_rad)
     if scatter > NOTABLE_SCATTER:
         notes.append(f"corners scatter {scatter:.1f} times as much as predicted; all sigmas were enlarged to match")
     metric = metric_pose(pair.captured, refined.cam2_from_cam1, refined.covariance, pair.boards)
@@ -183,5 +189,6 @@ def _in_mm(pair: MatchedPair, decision: PoseTypeDecision, refined: RefinedPose) 
         metric=metric,
         E21=essential_from_pose(metric.cam2_from_cam1),
         points=triangulate_matches(pair.captured, metric.cam2_from_cam1, metric.covariance),
+        scatter=scatter,
         notes=tuple(notes),
     )

@@ -16,6 +16,7 @@ import numpy as np
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.matches import Matches
+from rigkit.geometry.principal_axes import principal_axes
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.metric import triangulate_matches
 from rigkit.reconstruction.reconstruct import Reconstruction
@@ -23,9 +24,6 @@ from rigkit.reconstruction.scale import metric_scale
 from rigkit.relative_pose.refinement.refine import refine_pose
 
 __all__ = ["CalibrationShifts", "calibration_shifts"]
-
-NEGLIGIBLE = 1e-12
-"""Principal axes with less than this part of the largest variance (parameters scaled to one sigma) are left out."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -88,15 +86,6 @@ def calibration_shifts(
     again = [_again(reconstruction, *both, level_sigma_rad, seen) for both in cameras]
     base, *moved = (estimated for estimated, _ in again)
     return CalibrationShifts(base, tuple(moved), np.logical_and.reduce([found for _, found in again]))
-
-
-def principal_axes(covariance: FloatArray) -> FloatArray:
-    """Return rows (K, P) with sum of outer products equal to `covariance`: independent moves of one sigma each."""
-    sigma = np.sqrt(np.diag(covariance))
-    safe = np.where(sigma > 0.0, sigma, 1.0)
-    values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
-    kept = values > NEGLIGIBLE * values[-1]
-    return np.asarray((vectors[:, kept] * np.sqrt(values[kept])).T * sigma)
 
 
 def _again(

@@ -16,12 +16,13 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray, Points
 from rigkit.core.truth import MeasuredDistance
+from rigkit.geometry.principal_axes import principal_axes
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.triangulation import point_covariances, triangulate_rays
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.validation.boards import BoardResult, Placed, measure_board, place_moved
-from rigkit.validation.intrinsics import CalibrationShifts, principal_axes
+from rigkit.validation.intrinsics import CalibrationShifts
 from rigkit.validation.planes import angle_jacobian, face_angle, normal_errors
 
 __all__ = ["Measured", "measure", "points_by_pose"]

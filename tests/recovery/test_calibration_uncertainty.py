@@ -17,6 +17,7 @@ from rigkit.calibration.solver import solve
 from rigkit.calibration.state import State
 from rigkit.calibration.uncertainty import projection_uncertainty, uncertainty_map
 from rigkit.cameras.registry import MODELS
+from rigkit.geometry.rotation import exp_so3
 
 NOISE_PX = 0.2
 RUNS, MANY_RUNS = 60, 300
@@ -39,30 +40,44 @@ def observed_over_predicted(
     points, valid = truth.camera.unproject(pixels)
     assert valid.all()
     points = points * (1e9 if np.isinf(range_mm) else range_mm)
-    moved, predicted = [], None
+    moved, predicted = [], []
     for _ in range(runs):
         noisy = replace(exact, pixels=exact.pixels + NOISE_PX * rng.normal(size=exact.pixels.shape))
         fit = fit_kept(noisy, truth, exact.present)
-        moved.append(fit.state.camera.project(_carried(points, truth, fit.state, np.isinf(range_mm)))[0] - pixels)
-        if predicted is None:
-            result = assemble(noisy, fit, None, (), ())
-            result = replace(result, frame_covariance=result.frame_covariance * (NOISE_PX / result.sigma_px) ** 2)
-            predicted = projection_uncertainty(result, pixels, range_mm=range_mm)
-    assert predicted is not None
+        result = assemble(noisy, fit, None, (), ())
+        if np.isinf(range_mm):
+            there, known = truth.camera.unproject(exact.pixels[exact.present])
+            carried = points @ _best_turn(fit.state, there[known], exact.pixels[exact.present][known]).T
+        else:
+            carried = _carried(points, truth, fit.state)
+        moved.append(fit.state.camera.project(carried)[0] - pixels)
+        # Twenty views know their own disagreement to a fifth: what they say on average is what must be right.
+        predicted.append(projection_uncertainty(result, pixels, range_mm=range_mm).covariance)
     scatter = np.array(moved)
     second = np.einsum("rni,rnj->nij", scatter, scatter) / runs
-    ratio = np.sqrt(np.linalg.eigvalsh(second)[:, 1]) / predicted.worst_px
-    mahalanobis = np.einsum("rni,nij,rnj->rn", scatter, np.linalg.inv(predicted.covariance), scatter)
+    covariance = np.mean(predicted, axis=0)
+    ratio = np.sqrt(np.linalg.eigvalsh(second)[:, 1] / np.linalg.eigvalsh(covariance)[:, 1])
+    mahalanobis = np.einsum("rni,nij,rnj->rn", scatter, np.linalg.inv(covariance), scatter)
     return float(ratio.mean()), float(mahalanobis.mean() / 2.0)
 
 
-def _carried(points: np.ndarray, before: State, after: State, far: bool) -> np.ndarray:
+def _best_turn(state: State, rays: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Return the rotation of the rays after which the camera of `state` projects them nearest to the pixels."""
+    turn = np.eye(3)
+    for _ in range(3):
+        found, valid, by_point, _ = state.camera.project_with_jacobians(rays @ turn.T)
+        design = np.cross((rays @ turn.T)[:, None], by_point)[valid].reshape(-1, 3)
+        turn = exp_so3(np.linalg.lstsq(design, (pixels - found)[valid].reshape(-1), rcond=None)[0]) @ turn
+    return turn
+
+
+def _carried(points: np.ndarray, before: State, after: State) -> np.ndarray:
     """Return the points carried along by each board from its pose before to its pose after, averaged over boards."""
     moved = []
     for r0, t0, r1, t1 in zip(
         before.rotation, before.translation_mm, after.rotation, after.translation_mm, strict=True
     ):
-        moved.append((points - (0.0 if far else t0)) @ r0 @ r1.T + (0.0 if far else t1))
+        moved.append((points - t0) @ r0 @ r1.T + t1)
     return np.mean(moved, axis=0)
 
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from rigkit.calibration.clustered import RANK
 from rigkit.calibration.linearise import view_products
 from rigkit.calibration.normal_equations import NormalEquations
 from rigkit.calibration.rig.solver import pose_jacobians
@@ -29,8 +30,6 @@ __all__ = ["MIN_FRAMES", "frame_overdispersion"]
 
 MIN_FRAMES = 4
 """Fewer frames say nothing about how they differ."""
-RANK = 1e-12
-"""Combinations of globals with less than this part of the largest information are not determined."""
 
 
 def frame_overdispersion(
@@ -73,7 +72,7 @@ def _by_frame(observations: RigObservations, state: RigState, frame: IntArray) -
     information, score = np.zeros((int(frame.max()) + 1, n, n)), np.zeros((int(frame.max()) + 1, n))
     for c, own in enumerate(observations.cameras):
         alone = state.of_camera(c, observations)
-        product = view_products(own, alone, observations.weights[c])
+        product = view_products(own, alone.with_boards_held(), observations.weights[c])
         p = alone.camera.parameters.size
         by = pose_jacobians(observations, state, c, alone.translation_mm)
         at = frame[observations.frame[c]]

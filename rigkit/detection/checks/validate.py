@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from rigkit.core.arrays import BoolArray, FloatArray, upper_median
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.detection.checks.evidence import Evidence
 from rigkit.detection.lattice.lattice import MANY, Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
-from rigkit.detection.lattice.spacing import spacing_changes
 from rigkit.detection.saddles.nearby import near_any
 from rigkit.detection.saddles.response import Level, sample
 from rigkit.detection.subpixel.subpixel import RefinedLattice
@@ -38,14 +38,9 @@ FRAME_CELLS = 0.5
 SHARED_PX = 2.0
 """Corners of two lattices nearer than this are the same."""
 
-MAX_RELATIVE_SIGMA = 0.011
-"""Corners more uncertain than this, in cells, make no board: keys, letters, weave."""
-
-MAX_RESIDUAL = 0.25
-MAX_UNEXPLAINED, FORGIVEN_NOISE = 0.185, 10.0
-"""Largest typical residual of the edge model, relative to the contrast, and the part of it that noise (of so many grey
-levels) does not explain. Dots in rows have saddles between them, too, and show 0.2; boards 0.03 to 0.07 with motion,
-saturation or compression, 0.13 where a camera sharpens strongly, 0.175 in black and white without any grey."""
+MAX_SHARED = 0.25
+"""Largest part of a lattice's corners that larger ones may have, too: of what grows over a seam, the row on it and the
+one beyond; of a board found twice, on two levels of the pyramid, nearly all."""
 
 MAX_LOST = 0.4
 """Largest part of a lattice's corners that the sub-pixel fit may refuse: beside what covers a board there are many."""
@@ -56,10 +51,6 @@ rows and columns."""
 
 MIN_ROWS = 3
 """Rows and columns of the smallest board."""
-
-MAX_SPACING_CHANGE = 0.5
-"""Typical difference of neighbouring steps, relative to the shorter: boards show at most 0.35, near the rim of a strong
-fisheye; the crossings of a cloth's stripes 0.7."""
 
 STEPS_ACROSS, MAX_EDGES = 16, 256
 """Between two corners the edge runs straight. It is looked for in so many steps across, of so many edges."""
@@ -125,22 +116,39 @@ def large(lattice: Lattice, least: int) -> bool:
 
 
 def separate(lattices: Sequence[Lattice], least: int) -> list[Lattice]:
-    """Return those of `lattices` that are `large` enough and share no corners with a larger one."""
+    """Return those of `lattices` that are `large` enough, without the corners that they share with larger ones.
+
+    What has most of its corners in common with larger ones is the same board again, and left out. A lattice that grew
+    over the seam to another board keeps its own corners.
+    """
     candidates = sorted((item for item in lattices if large(item, least)), key=lambda item: -item.count)
     corners = [item.pixels[item.known] for item in candidates]
     low = np.array([mine.min(axis=0) for mine in corners]) - SHARED_PX
     high = np.array([mine.max(axis=0) for mine in corners])
-    kept: list[int] = []
-    for k, mine in enumerate(corners):
+    kept: list[Lattice] = []
+    for k, (item, mine) in enumerate(zip(candidates, corners, strict=True)):
         touching = ((low[:k] < high[k]) & (low[k] < high[:k])).all(axis=1)
-        if not any(_overlap(mine, corners[j]) for j in kept if touching[j]):
-            kept.append(k)
-    return [candidates[k] for k in kept]
+        shared = np.zeros(len(mine), np.bool_)
+        for other in np.flatnonzero(touching):
+            again = near_any(mine, corners[other], SHARED_PX)
+            # A single corner may belong to both: two boards that touch there.
+            if np.count_nonzero(again) > 1:
+                shared |= again
+        rest = _without_shared(item, shared)
+        if rest is not None and large(rest, least):
+            kept.append(rest)
+    return kept
 
 
-def _overlap(mine: FloatArray, theirs: FloatArray) -> bool:
-    """Return whether more than one of the corners `mine` (N, 2) is among `theirs` (M, 2)."""
-    return bool(np.count_nonzero(near_any(mine, theirs, SHARED_PX)) > 1)
+def _without_shared(lattice: Lattice, shared: BoolArray) -> Lattice | None:
+    """Return `lattice` without those of its corners (N,) that are `shared`; None where most are."""
+    if not shared.any():
+        return lattice
+    if np.count_nonzero(shared) > MAX_SHARED * len(shared):
+        return None
+    drop = lattice.known.copy()
+    drop[lattice.known] = shared
+    return lattice.without(drop).trimmed()
 
 
 def sample_of(lattice: Lattice) -> Lattice | None:
@@ -221,21 +229,7 @@ def trustworthy(refined: RefinedLattice, before: int, least: int) -> bool:
     lattice = refined.lattice
     if lattice.count < max(least, (1.0 - MAX_LOST) * before) or min(lattice.size) < MIN_ROWS:
         return False
-    known = lattice.known
-    relative = refined.residual[known] / lattice.contrast[known]
-    unexplained = relative**2 - (FORGIVEN_NOISE / lattice.contrast[known]) ** 2
-    if upper_median(relative) > MAX_RESIDUAL or upper_median(unexplained) > MAX_UNEXPLAINED**2:
-        return False
-    if _irregular(lattice):
-        return False
-    shape = fit_cells(lattice.pixels, known, degree=1)
-    in_cells = refined.worst_sigma_px[known] / np.sqrt(np.maximum(shape.areas(), 1e-6))
-    return upper_median(in_cells) < MAX_RELATIVE_SIGMA
-
-
-def _irregular(lattice: Lattice) -> bool:
-    """Return whether rows and columns follow each other at steps as different as no lens and no view makes them."""
-    return any(line.every > MAX_SPACING_CHANGE for line in spacing_changes(lattice.pixels))
+    return Evidence.of(refined).score > 0.0
 
 
 def too_large(lattice: Lattice, sizes: Sequence[tuple[int, int]]) -> bool:

@@ -9,10 +9,11 @@ from math import comb
 import numpy as np
 
 from rigkit.core.arrays import FloatArray
+from rigkit.detection.lattice.spacing import spacing_changes
 from rigkit.kernels import lattice as native
 from rigkit.optim.robust_scale import MEDIAN_OF_NORMAL
 
-__all__ = ["UNEXPLAINED", "excess_scatter"]
+__all__ = ["UNEXPLAINED", "excess_scatter", "scatter_factors"]
 
 DIFFERENCES = (5, 6)
 MIN_SCATTER_CORNERS, MIN_DIFFERENCES = 12, 16
@@ -20,6 +21,15 @@ MIN_SCATTER_CORNERS, MIN_DIFFERENCES = 12, 16
 
 UNEXPLAINED = 1.25
 """A scatter about the lattice less than this times the expected one is what chance makes of fifty corners."""
+
+STRONG_BEND = 0.25
+"""Neighbouring steps that differ by more than this, relative to the shorter, are a lens's: a difference of order 6 of
+what turns, or grows, by that much a cell is some hundredths of a pixel in cells of 50 px, as much as good corners
+scatter."""
+
+MIXED = ((3, 3), (3, 4), (4, 3), (4, 4))
+"""Orders of the differences along columns and then along rows. What a lens does to a corner it does nearly so to the
+corners beside it, so these shrink the bend twice over; scatter they leave as it is."""
 
 
 def excess_scatter(pixels: FloatArray, sigma_px: FloatArray, parts: Sequence[tuple[slice, slice]]) -> FloatArray:
@@ -38,6 +48,33 @@ def excess_scatter(pixels: FloatArray, sigma_px: FloatArray, parts: Sequence[tup
     if library is not None:
         return native.excess_scatter(pixels, sigma_px, parts, _rules())
     return np.array([_excess(pixels[part], sigma_px[part]) for part in parts])
+
+
+def scatter_factors(pixels: FloatArray, sigma_px: FloatArray, parts: Sequence[tuple[slice, slice]]) -> FloatArray:
+    """Return by how much the sigmas of each part are to be raised, (P,): `excess_scatter` for any lens.
+
+    Strong lenses bend rows by more than the differences along them take away; there those along rows and columns
+    together are asked as well, and the calmest is right.
+    """
+    factors = excess_scatter(pixels, sigma_px, parts)
+    for k in np.flatnonzero(factors > UNEXPLAINED).tolist():
+        part = parts[k]
+        if any(change.every > STRONG_BEND for change in spacing_changes(pixels[part])):
+            calmest = np.fmin.reduce([_mixed_roughness(pixels[part], sigma_px[part], *orders) for orders in MIXED])
+            factors[k] = max(np.fmin(factors[k], calmest), 1.0)
+    return factors
+
+
+def _mixed_roughness(pixels: FloatArray, sigma_px: FloatArray, down: int, along: int) -> float:
+    """Return the typical mixed difference of `pixels` (R, C, 2) over the expected one, NaN where there are few."""
+    if pixels.shape[0] <= down or pixels.shape[1] <= along:
+        return np.nan
+    weights = [np.array([float(comb(order, k)) ** 2 for k in range(order + 1)]) for order in (down, along)]
+    windows = np.lib.stride_tricks.sliding_window_view(sigma_px**2, (down + 1, along + 1))
+    variance = np.einsum("rcij,i,j->rc", windows, *weights)
+    ratio = np.abs(np.diff(np.diff(pixels, down, axis=0), along, axis=1)) / np.sqrt(variance)[..., None]
+    seen = ratio[np.isfinite(ratio)]
+    return float(np.median(seen)) / MEDIAN_OF_NORMAL if len(seen) >= MIN_DIFFERENCES else np.nan
 
 
 @functools.cache

@@ -6,7 +6,7 @@ corners are, and so gives a better lattice for a second pass, which also tries t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -20,7 +20,7 @@ from rigkit.detection.subpixel.correlation import sigma_factors
 from rigkit.detection.subpixel.edge_curvature import line_curvature
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
 from rigkit.detection.subpixel.edge_model import WINDOW_REACH, Geometry, ends_of
-from rigkit.detection.subpixel.scatter import excess_scatter
+from rigkit.detection.subpixel.scatter import scatter_factors
 
 __all__ = ["RefinedLattice", "refine"]
 
@@ -73,6 +73,8 @@ class RefinedLattice:
     lattice : the corners.
     sigma_px, blur_px : predicted standard deviation, width of the edges.
     residual, noise : RMS of what the fit leaves and of the part of it that is noise, grey levels.
+    scatter : factor by which `sigma_px` was raised, because the corners scatter about the lattice by so much more than
+        the noise in the image explains.
     """
 
     lattice: Lattice
@@ -80,6 +82,7 @@ class RefinedLattice:
     blur_px: FloatArray
     residual: FloatArray
     noise: FloatArray
+    scatter: float = 1.0
 
     @property
     def worst_sigma_px(self) -> FloatArray:
@@ -91,31 +94,39 @@ class RefinedLattice:
     def without(self, drop: BoolArray) -> RefinedLattice:
         """Return this with the corners `drop` (R, C) forgotten."""
         rest = (np.where(drop, np.nan, values) for values in self._values())
-        return RefinedLattice(self.lattice.without(drop), *rest)
+        return _refined(self.lattice.without(drop), rest, self.scatter)
 
     def cut(self, rows: slice, columns: slice) -> RefinedLattice:
         """Return the part of `rows` and `columns`."""
         rest = (values[rows, columns] for values in self._values())
-        return RefinedLattice(self.lattice.cut(rows, columns), *rest)
+        return _refined(self.lattice.cut(rows, columns), rest, self.scatter)
 
     def padded(self, rows: tuple[int, int], columns: tuple[int, int]) -> RefinedLattice:
         """Return this with so many empty rows and columns before and after."""
         rest = (padded(values, rows, columns) for values in self._values())
-        return RefinedLattice(self.lattice.padded(rows, columns), *rest)
+        return _refined(self.lattice.padded(rows, columns), rest, self.scatter)
 
     def turned(self, quarter_turns: int) -> RefinedLattice:
         """Return this counted from another corner, as `Lattice.turned`."""
         rest = (np.rot90(values, -quarter_turns) for values in self._values())
-        return RefinedLattice(self.lattice.turned(quarter_turns), *rest)
+        return _refined(self.lattice.turned(quarter_turns), rest, self.scatter)
 
     def filled(self, other: RefinedLattice) -> RefinedLattice:
         """Return this with the corners of `other`, of the same size, where it has none."""
         known = self.lattice.known
         pairs = zip(self._values(), other._values(), strict=True)
-        return RefinedLattice(self.lattice.filled(other.lattice), *(np.where(known, *pair) for pair in pairs))
+        scatter = max(self.scatter, other.scatter)
+        rest = (np.where(known, *pair) for pair in pairs)
+        return _refined(self.lattice.filled(other.lattice), rest, scatter)
 
     def _values(self) -> tuple[FloatArray, ...]:
         return (self.sigma_px, self.blur_px, self.residual, self.noise)
+
+
+def _refined(lattice: Lattice, values: Iterable[FloatArray], scatter: float) -> RefinedLattice:
+    """Return the refined `lattice` of `values` as `RefinedLattice._values`."""
+    sigma_px, blur_px, residual, noise = values
+    return RefinedLattice(lattice, sigma_px, blur_px, residual, noise, scatter)
 
 
 def refine(image: GreyImage, lattices: Sequence[Lattice]) -> list[RefinedLattice]:
@@ -137,7 +148,7 @@ def refine(image: GreyImage, lattices: Sequence[Lattice]) -> list[RefinedLattice
     checked = _checked(last, sheet.parts)
     # Where corners scatter about the lattice by more than the noise in the image explains (JPEG blocks, aliasing, wavy
     # paper), the sigmas of the board are raised to what is seen.
-    scatter = excess_scatter(checked.lattice.pixels, checked.sigma_px, sheet.parts)
+    scatter = scatter_factors(checked.lattice.pixels, checked.sigma_px, sheet.parts)
     return [
         _part_of(checked, part, item.rising, float(raised))
         for part, item, raised in zip(sheet.parts, lattices, scatter, strict=True)
@@ -148,7 +159,9 @@ def _part_of(sheet: RefinedLattice, part: Part, rising: bool, raised: float) -> 
     """Return the lattice at `part` of the sheet, its sigmas `raised` by a factor."""
     lattice = Lattice(sheet.lattice.pixels[part], sheet.lattice.contrast[part], rising)
     sigma_px = sheet.sigma_px[part] * raised
-    return RefinedLattice(lattice, sigma_px, sheet.blur_px[part], sheet.residual[part], sheet.noise[part])
+    return RefinedLattice(
+        lattice, sigma_px, sheet.blur_px[part], sheet.residual[part], sheet.noise[part], scatter=raised
+    )
 
 
 def _typical_blur(item: RefinedLattice, parts: Sequence[Part]) -> FloatArray:

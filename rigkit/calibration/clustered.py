@@ -1,0 +1,132 @@
+"""Covariances from what repeats: the image is the unit that is independent, not the corner.
+
+Residuals of one view share causes (a lens or a board that is not quite its model, blur, light, a board that bends), so
+50 to 300 corners count like a few. With H_v and s_v what image v contributes to information and score of the shared
+unknowns after its own poses are eliminated, and K = (sum H_v + prior)^-1, the sandwich
+
+    K (sum_v s_v s_v^T) K
+
+holds whatever happens inside an image. Whitened by K, M_v = K^1/2 H_v K^1/2 is the leverage of an image: it has pulled
+the solution to itself, and z_v = K^1/2 s_v is too small. (I - M_v)^-1/2 z_v is not: its second moments sum to those of
+independent corners where corners are independent ("CR2").
+
+So few images know the size of the second moments, and hardly their shape in ten or twenty directions. They are shrunk
+towards a multiple of what independent corners would have, by as much as their own noise asks ("oracle approximating
+shrinkage"): with few images one number scales the covariance of independent corners, with many each direction has its
+own. What they say has as many degrees of freedom as there are images but one, or fewer where some images weigh more
+than others: quantiles are Student's.
+
+References: R. M. Bell, D. F. McCaffrey, "Bias reduction in standard errors for linear regression with multi-stage
+samples", Survey Methodology 28, 2002. J. G. MacKinnon, M. D. Webb, "Cluster-robust inference: a guide to empirical
+practice", Journal of Econometrics 232, 2023. Y. Chen, A. Wiesel, Y. C. Eldar, A. O. Hero, "Shrinkage algorithms for
+MMSE covariance estimation", IEEE Trans. Signal Processing 58, 2010, eq. 23.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.core.arrays import FloatArray, IntArray
+
+__all__ = ["MIN_CLUSTERS", "RANK", "Clustered", "clustered_covariance", "reduced_by_cluster", "with_block"]
+
+MIN_CLUSTERS = 4
+"""Fewer images (or frames) say nothing about how they differ."""
+MIN_LEFT = 0.05
+"""What is left of an image's pull in a direction that it alone determines: less is rounding."""
+RANK = 1e-12
+"""Combinations with less than this part of the largest information are not determined."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Clustered:
+    """Covariance (n, n) of shared unknowns; `overdispersion`, by how much more (as a ratio of standard deviations) the
+    clusters disagree than independent corners would; `freedom`, the degrees of freedom of the covariance (infinite
+    where it rests on the scatter of corners, with too few clusters to know better)."""
+
+    covariance: FloatArray
+    overdispersion: float
+    freedom: float
+
+
+def reduced_by_cluster(products: FloatArray, count: int, cluster: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return information (N, P, P) and score (N, P) of every cluster of views after their poses are eliminated.
+
+    `products` (V, P + 7, P + 7) are those of `view_products`, `count` is P, `cluster` (V,) numbers the clusters.
+    """
+    coupling, pose = products[:, :count, count : count + 6], products[:, count : count + 6, count : count + 6]
+    back = coupling @ np.linalg.pinv(pose, hermitian=True)
+    total = int(cluster.max()) + 1
+    information, score = np.zeros((total, count, count)), np.zeros((total, count))
+    np.add.at(information, cluster, products[:, :count, :count] - back @ np.swapaxes(coupling, -1, -2))
+    own = products[:, :count, -1] - (back @ products[:, count : count + 6, -1:])[..., 0]
+    np.add.at(score, cluster, own)
+    return information, score
+
+
+def clustered_covariance(
+    unit: FloatArray, information: FloatArray, score: FloatArray, prior: FloatArray, sigma_px: float
+) -> Clustered:
+    """Return the covariance of n shared unknowns from N clusters.
+
+    Parameters
+    ----------
+    unit : (n, n) their covariance for independent corners of unit variance, all other unknowns free.
+    information, score : (N, n, n) and (N, n), of each cluster, its poses eliminated, released corners held: they are
+        many, mostly their priors hold them, and what they add to `unit` is scaled as a whole.
+    prior : (n, n) information of the priors.
+    sigma_px : standard deviation of a corner, from all residuals.
+    """
+    if len(score) < MIN_CLUSTERS or not sigma_px > 0.0:
+        return Clustered(unit * sigma_px**2, 1.0, float("inf"))
+    data = information.sum(axis=0)
+    # Scaled to a unit diagonal: parameters differ by many powers of ten.
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(data + prior), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh((data + prior) * scale[:, None] * scale)
+    known = values > RANK * values[-1]
+    root = scale[:, None] * vectors[:, known] / np.sqrt(values[known])
+    leverage = root.T @ information @ root
+    left, axes = np.linalg.eigh(np.eye(root.shape[1]) - leverage)
+    pull = np.swapaxes(axes, -1, -2) @ (score @ root / sigma_px)[..., None]
+    pull = (axes @ (pull / np.sqrt(np.maximum(left, MIN_LEFT))[..., None]))[..., 0]
+    expected = root.T @ data @ root
+    # Images of much leverage count for several.
+    share = np.einsum("vii->v", leverage)
+    freedom = max(float(share.sum() ** 2 / (share**2).sum()) - 1.0, 1.0)
+    found = _shrunk(pull.T @ pull, expected, freedom)
+    factor = float(np.trace(found) / np.trace(expected))
+    covariance = root @ (found + np.eye(len(found)) - expected) @ root.T
+    covariance += factor * (unit - root @ root.T)
+    covariance *= sigma_px**2
+    return Clustered(0.5 * (covariance + covariance.T), float(np.sqrt(factor)), freedom)
+
+
+def _shrunk(moments: FloatArray, expected: FloatArray, freedom: float) -> FloatArray:
+    """Return the second moments shrunk towards a multiple of those expected."""
+    count = len(moments)
+    size = float(np.trace(moments))
+    squared = float((moments**2).sum())
+    # Chen et al., eq. 23.
+    above = (1.0 - 2.0 / count) * squared + size**2
+    below = (freedom + 1.0 - 2.0 / count) * (squared - size**2 / count)
+    shrinkage = min(1.0, above / below) if below > 0.0 else 1.0
+    return (1.0 - shrinkage) * moments + shrinkage * size / float(np.trace(expected)) * expected
+
+
+def with_block(covariance: FloatArray, block: FloatArray, factor: float) -> FloatArray:
+    """Return a covariance (N, N) in which the first n unknowns have the covariance `block` (n, n): the others follow
+    them as before, and what is their own is multiplied by `factor`."""
+    n = len(block)
+    before = covariance[:n, :n]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(before), np.finfo(float).tiny))
+    inverse = np.linalg.pinv(before * scale[:, None] * scale, rcond=RANK, hermitian=True) * scale[:, None] * scale
+    follow = covariance[n:, :n] @ inverse
+    out = np.empty_like(covariance)
+    out[:n, :n] = block
+    out[n:, :n] = follow @ block
+    out[:n, n:] = out[n:, :n].T
+    own = covariance[n:, n:] - follow @ before @ follow.T
+    out[n:, n:] = factor * own + follow @ block @ follow.T
+    return np.asarray(0.5 * (out + out.T))

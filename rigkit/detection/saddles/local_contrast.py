@@ -1,0 +1,55 @@
+"""Images whose parts differ in brightness by far more than a board's squares do: heat images, scenes against the light.
+
+Of 16 bits a person in front of a board takes most in a heat image, and the squares of the board a hundredth. Such an
+image is searched once more with its local mean taken away and its local deviation made the same everywhere; where
+boards are then known, the image is stretched to their brightness.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from rigkit.core.arrays import FloatArray
+from rigkit.detection.saddles.response import FloatImage, GreyImage, sample
+
+__all__ = ["equalised", "stretched"]
+
+WINDOW_PART = 1.0 / 16.0
+"""Standard deviation of the window, as a part of the image's shorter side: boards with squares of a fortieth to a sixth
+of it keep their contrast."""
+
+MIN_DEVIATION = 0.02
+"""Smallest local deviation that is made up for, as a part of the largest: below is the noise of empty walls."""
+
+MIDDLE, GAIN = 127.5, 50.0
+"""Grey levels of the local mean, and of one local deviation."""
+
+DARK, BRIGHT = 25.0, 205.0
+"""Grey levels that the dark and the bright squares are stretched to."""
+
+
+def equalised(grey: GreyImage) -> FloatImage:
+    """Return `grey` with equal mean and deviation everywhere, in grey levels 0..255."""
+    values = grey.astype(np.float32)
+    window = WINDOW_PART * min(values.shape)
+    off = values - cv2.GaussianBlur(values, (0, 0), window)
+    deviation = np.sqrt(cv2.GaussianBlur(off * off, (0, 0), window))
+    least = max(MIN_DEVIATION * float(deviation.max()), 1e-6)
+    return np.asarray(np.clip(MIDDLE + GAIN * off / np.maximum(deviation, least), 0.0, 255.0), np.float32)
+
+
+def stretched(grey: GreyImage, boards: list[FloatArray]) -> GreyImage:
+    """Return `grey` linear in brightness, 0..255, with the squares of `boards` between DARK and BRIGHT.
+
+    `boards` : (R, C, 2) pixels of the corners each, NaN where unknown; without any the image comes back as it is.
+    """
+    corners = [(b[:-1, :-1] + b[:-1, 1:] + b[1:, :-1] + b[1:, 1:]).reshape(-1, 2) for b in boards]
+    middles = 0.25 * np.concatenate([*corners, np.zeros((0, 2))])
+    middles = middles[np.isfinite(middles).all(axis=1)]
+    if not len(middles):
+        return grey
+    low, high = np.quantile(sample(grey, middles), (0.1, 0.9))
+    gain = (BRIGHT - DARK) / max(float(high - low), 1e-6)
+    values = (grey.astype(np.float32) - np.float32(low)) * np.float32(gain) + np.float32(DARK)
+    return np.asarray(np.clip(values, 0.0, 255.0), np.float32)

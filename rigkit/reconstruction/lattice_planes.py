@@ -1,0 +1,374 @@
+"""The boards' planes from their known lattice: joint maximum likelihood over relative pose and boards' poses.
+
+All corners of both views take part, also those that only one view shows. A free plane is known along the lines of
+sight no better than its triangulated points; the lattice fixes its tilt by perspective in each view as well, and the
+relative pose ties both views together: the planes are several times more certain, most of all where the baseline is
+short or points at the boards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Points, Rays
+from rigkit.core.boards import Board
+from rigkit.core.errors import DegenerateError
+from rigkit.geometry.board_pose import point_residuals
+from rigkit.geometry.principal_axes import principal_axes
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import angle_between, exp_so3, skew
+from rigkit.reconstruction.noise_level import variance_factor
+
+if TYPE_CHECKING:
+    from rigkit.reconstruction.geometry import PairGeometry
+    from rigkit.reconstruction.pairing import MatchedPair
+
+__all__ = ["LatticePlanes", "lattice_planes"]
+
+MIN_CORNERS = 8
+"""A board with fewer corners in a view has no pose there worth the name."""
+GROSS = 8.0
+"""A corner this many standard deviations off is no corner of the lattice: something stands in front of it."""
+OUTLIER_ROUNDS = 3
+MAX_STEPS = 40
+STEP_TOLERANCE = 1e-10
+"""Largest step in standard deviations of a parameter at which the minimisation ends: nothing of it shows."""
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """The corners of one board in one view.
+
+    Attributes
+    ----------
+    board, second : which board, and whether it is the second view.
+    pixels, sigma_px, points : (N, 2), (N,), and on the lattice (N, 3).
+    rays, bases : (N, 3), and rows (N, 2, 3) perpendicular to them that make residuals in sigmas.
+    """
+
+    board: int
+    second: bool
+    pixels: FloatArray
+    sigma_px: FloatArray
+    points: Points
+    rays: Rays
+    bases: FloatArray
+
+    @classmethod
+    def of(
+        cls, camera: Camera, board: int, second: bool, pixels: FloatArray, sigma_px: FloatArray, points: Points
+    ) -> _View:
+        """Return the corners as a camera sees them."""
+        bases = np.linalg.pinv(camera.ray_jacobian(pixels)) / sigma_px[:, None, None]
+        return cls(board, second, pixels, sigma_px, points, camera.unproject(pixels)[0], np.asarray(bases))
+
+    def by(self, camera: Camera) -> _View:
+        """Return the same corners by another camera."""
+        return _View.of(camera, self.board, self.second, self.pixels, self.sigma_px, self.points)
+
+    def select(self, which: BoolArray) -> _View:
+        of = (self.pixels, self.sigma_px, self.points, self.rays, self.bases)
+        return _View(self.board, self.second, *(array[which] for array in of))
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """cam2_from_cam1, the boards' poses in camera 1, and the logarithms (K,) of their sizes over the declared ones."""
+
+    pose: Rigid3
+    boards: tuple[Rigid3, ...]
+    log_sizes: FloatArray
+
+    def moved(self, step: FloatArray) -> _State:
+        count = len(self.boards)
+        by_pose, *by_board = step[: 6 * (count + 1)].reshape(-1, 6)
+        boards = tuple(_moved(board, part) for board, part in zip(self.boards, by_board, strict=True))
+        return _State(_moved(self.pose, by_pose), boards, self.log_sizes + step[6 * (count + 1) :])
+
+
+@dataclass(frozen=True, eq=False)
+class LatticePlanes:
+    """Relative pose and boards' poses of maximum likelihood, with the boards' lattices known.
+
+    Attributes
+    ----------
+    board_ids : in the order of the parameters.
+    cam2_from_cam1 : relative pose, mm.
+    cam1_from_board : by id, mm.
+    covariance : (P, P) of the parameters from the corners' noise: (rotation rad, translation mm) of the relative pose,
+        then of every board, each as a left perturbation; then the logarithms of the boards' sizes.
+    calibration_moves : (A, P) what one standard deviation along each principal axis of the calibrations' covariance
+        changes in the parameters; A = 0 where that is not known.
+    variance_factor : observed over stated variance of the corners, as used in `covariance`.
+    rms_sigmas : root mean square residual of the corners per axis, in their stated sigmas.
+    count, gross : corners of both views that take part, and that were left out as gross outliers.
+    """
+
+    board_ids: tuple[str, ...]
+    cam2_from_cam1: Rigid3
+    cam1_from_board: Mapping[str, Rigid3]
+    covariance: FloatArray
+    calibration_moves: FloatArray
+    variance_factor: float
+    rms_sigmas: float
+    count: int
+    gross: int
+
+    @cached_property
+    def full_covariance(self) -> FloatArray:
+        """(P, P), with the calibrations' share."""
+        return np.asarray(self.covariance + self.calibration_moves.T @ self.calibration_moves)
+
+    def normal(self, board_id: str) -> FloatArray:
+        """Return the unit normal (3,) of a board, facing camera 1."""
+        pose = self.cam1_from_board[board_id]
+        normal = pose.rotation[:, 2]
+        return np.asarray(-np.sign(normal @ pose.translation_mm) * normal)
+
+    def offset_mm(self, board_id: str) -> float:
+        """Return n . x of the board's points."""
+        return float(self.normal(board_id) @ self.cam1_from_board[board_id].translation_mm)
+
+    def normal_covariance(self, board_id: str) -> Mat3:
+        """Return the covariance (3, 3) of a board's normal, rad^2, the calibrations' share included."""
+        by_turn = np.zeros((3, len(self.covariance)))
+        by_turn[:, self._rotation_of(board_id)] = -skew(self.normal(board_id))
+        return np.asarray(by_turn @ self.full_covariance @ by_turn.T)
+
+    def angle_deg(self, a: str, b: str) -> tuple[float, float]:
+        """Return the angle between two faces as a protractor across them shows it, and its sigma, degrees."""
+        one, two = self.normal(a), self.normal(b)
+        sine = float(np.linalg.norm(np.cross(one, two)))
+        # d angle / d turn of a: along the axis that both normals turn about; parallel faces have no such axis.
+        axis = np.cross(one, two) / sine if sine > 1e-12 else np.zeros(3)
+        row = np.zeros(len(self.covariance))
+        row[self._rotation_of(a)], row[self._rotation_of(b)] = axis, -axis
+        sigma = float(np.sqrt(row @ self.full_covariance @ row))
+        return 180.0 - float(np.rad2deg(angle_between(one, two))), float(np.rad2deg(sigma))
+
+    def baseline_mm(self) -> tuple[float, float]:
+        """Return the length of the baseline and its sigma, mm."""
+        t = self.cam2_from_cam1.translation_mm
+        length = float(np.linalg.norm(t))
+        row = np.zeros(len(self.covariance))
+        row[3:6] = t / length
+        return length, float(np.sqrt(row @ self.full_covariance @ row))
+
+    def points(self, board: Board, grid: FloatArray) -> tuple[Points, FloatArray]:
+        """Return the lattice points at `grid` (N, 2) in camera 1, mm, and their covariances (N, 3, 3)."""
+        pose = self.cam1_from_board[board.board_id]
+        turned = board.points(np.asarray(grid, dtype=np.int64)) @ pose.rotation.T
+        by = np.zeros((len(turned), 3, len(self.covariance)))
+        start = self._rotation_of(board.board_id).start
+        by[:, :, start : start + 3], by[:, :, start + 3 : start + 6] = -skew(turned), np.eye(3)
+        by[:, :, 6 * (len(self.board_ids) + 1) + self.board_ids.index(board.board_id)] = turned
+        return turned + pose.translation_mm, by @ self.full_covariance @ np.swapaxes(by, 1, 2)
+
+    def _rotation_of(self, board_id: str) -> slice:
+        start = 6 * (1 + self.board_ids.index(board_id))
+        return slice(start, start + 3)
+
+
+def lattice_planes(
+    geometry: PairGeometry,
+    covariance1: FloatArray | None = None,
+    covariance2: FloatArray | None = None,
+    *,
+    one_camera: bool = False,
+) -> LatticePlanes:
+    """Return the boards' planes of maximum likelihood with their lattices known.
+
+    Parameters
+    ----------
+    geometry : of the pair; boards need eight corners in each view.
+    covariance1, covariance2 : of the cameras' parameters, or None: the intrinsics are exact.
+    one_camera : both images are of one camera, whose errors they share; `covariance2` is not used then.
+
+    Raises
+    ------
+    DegenerateError
+        No board has enough corners in both views, or they leave the poses open.
+
+    Notes
+    -----
+    Residuals are pixels over the corners' sigmas; a board whose `square_sigma_mm` is stated has its size as a further
+    unknown with that prior, else it is exact. The calibrations' share is linear: moving the cameras along a principal
+    axis changes the residuals by dr and the parameters by -(J^T J)^-1 J^T dr.
+    """
+    pair = geometry.pair
+    moved = _moved_cameras(pair, covariance1, covariance2, one_camera)
+    views, boards = _views(geometry, moved)
+    if not boards:
+        raise DegenerateError(
+            f"pair '{pair.pair_id}': no board has {MIN_CORNERS} corners in each view for its own plane"
+        )
+    sigma = np.array([(b.square_sigma_mm or 0.0) / np.sqrt(b.square_x_mm * b.square_y_mm) for b in boards])
+    identity = pair.identity
+    placed = tuple(identity.cam1_from_board[b.board_id] for b in boards)
+    state = _State(identity.cam2_from_cam1, placed, np.zeros(len(boards)))
+    total = sum(len(v.rays) for v in views)
+    for _ in range(OUTLIER_ROUNDS):
+        state = _minimum(views, state, sigma)
+        near = _near(views, state)
+        if all(which.all() for which in near):
+            break
+        views = [view.select(which) for view, which in zip(views, near, strict=True)]
+    r, J = _residuals(views, state, sigma)
+    free = _free(sigma)
+    count, priors = sum(len(v.rays) for v in views), int((sigma > 0.0).sum())
+    data = r[: len(r) - priors]
+    factor = variance_factor(float(data @ data), 2 * count - 6 * (len(boards) + 1))
+    # The sizes' prior is no noise of the corners: its variance stays what a person said.
+    scaled = J[:, free] / np.sqrt(np.where(np.arange(len(J)) < len(data), factor, 1.0))[:, None]
+    information = _inverse(scaled.T @ scaled, pair.pair_id)
+    covariance = np.zeros((J.shape[1], J.shape[1]))
+    covariance[np.ix_(free, free)] = information
+    moves = np.zeros((len(moved), J.shape[1]))
+    moves[:, free] = -_residual_changes(views, state, moved) @ J[: len(data), free] @ information / factor
+    return LatticePlanes(
+        tuple(b.board_id for b in boards),
+        state.pose,
+        {b.board_id: pose for b, pose in zip(boards, state.boards, strict=True)},
+        covariance,
+        moves,
+        factor,
+        float(np.sqrt(np.mean(data**2))),
+        count,
+        total - count,
+    )
+
+
+def _views(geometry: PairGeometry, moved: list[tuple[Camera, Camera]]) -> tuple[list[_View], list[Board]]:
+    """Return the corners of every board that has enough of them in both views, and these boards.
+
+    Corners at the rim of the field that one of the moved cameras does not see take no part.
+    """
+    pair = geometry.pair
+    views: list[_View] = []
+    boards: list[Board] = []
+    found = [{d.board_id: d for d in one} for one in (pair.identity.detections1, pair.identity.detections2)]
+    for board in pair.boards:
+        both = []
+        for second in (False, True):
+            corners, cameras = (
+                found[second][board.board_id],
+                [m[second] for m in ((pair.camera1, pair.camera2), *moved)],
+            )
+            seen = np.logical_and.reduce([camera.unproject(corners.pixels)[1] for camera in cameras])
+            # What the matched corners show of their noise holds as well for those that one view alone has.
+            sigma_px, points = geometry.scatter * corners.sigma_px[seen], board.points(corners.grid[seen])
+            both.append(_View.of(cameras[0], len(boards), second, corners.pixels[seen], sigma_px, points))
+        if all(len(view.rays) >= MIN_CORNERS for view in both):
+            views += both
+            boards.append(board)
+    return views, boards
+
+
+def _moved(pose: Rigid3, step: FloatArray) -> Rigid3:
+    return Rigid3(exp_so3(step[:3]) @ pose.rotation, pose.translation_mm + step[3:])
+
+
+def _free(sigma: FloatArray) -> BoolArray:
+    """Return which parameters are unknown: a board's size only where a sigma of it is stated."""
+    return np.concatenate([np.ones(6 * (len(sigma) + 1), dtype=bool), sigma > 0.0])
+
+
+def _of_view(view: _View, state: _State) -> tuple[FloatArray, FloatArray]:
+    """Return residuals (N, 2) of one board in one view, and their derivatives (N, 2, P)."""
+    k, count = view.board, len(state.boards)
+    turned = np.exp(state.log_sizes[k]) * view.points @ state.boards[k].rotation.T
+    x = turned + state.boards[k].translation_mm
+    jacobian = np.zeros((len(x), 2, 7 * count + 6))
+    if view.second:
+        around = x @ state.pose.rotation.T
+        residual, by_x2 = point_residuals(view.rays, view.bases, around + state.pose.translation_mm)
+        jacobian[:, :, :3], jacobian[:, :, 3:6] = -by_x2 @ skew(around), by_x2
+        by_x = by_x2 @ state.pose.rotation
+    else:
+        residual, by_x = point_residuals(view.rays, view.bases, x)
+    start = 6 * (k + 1)
+    jacobian[:, :, start : start + 3], jacobian[:, :, start + 3 : start + 6] = -by_x @ skew(turned), by_x
+    jacobian[:, :, 6 * (count + 1) + k] = (by_x @ turned[:, :, None])[..., 0]
+    return residual, jacobian
+
+
+def _residuals(views: list[_View], state: _State, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return all residuals in sigmas, those of the sizes' prior last, and their derivatives."""
+    parts = [_of_view(view, state) for view in views]
+    stated = sigma > 0.0
+    prior = np.zeros((int(stated.sum()), 7 * len(sigma) + 6))
+    prior[:, 6 * (len(sigma) + 1) :] = np.diag(1.0 / np.where(stated, sigma, 1.0))[stated]
+    r = np.concatenate([*(r.ravel() for r, _ in parts), state.log_sizes[stated] / sigma[stated]])
+    return r, np.concatenate([*(J.reshape(-1, J.shape[-1]) for _, J in parts), prior])
+
+
+def _minimum(views: list[_View], state: _State, sigma: FloatArray) -> _State:
+    """Return the nearest minimum of the sum of squares (Levenberg-Marquardt)."""
+    free, damping = _free(sigma), 1e-6
+    r, J = _residuals(views, state, sigma)
+    for _ in range(MAX_STEPS):
+        gram = J[:, free].T @ J[:, free]
+        scale = np.sqrt(np.maximum(np.diag(gram), 1e-30))
+        step = np.zeros(J.shape[1])
+        unit_step = np.linalg.solve(
+            gram / np.outer(scale, scale) + damping * np.eye(len(gram)), -(J[:, free].T @ r) / scale
+        )
+        step[free] = unit_step / scale
+        trial = state.moved(step)
+        r_trial, J_trial = _residuals(views, trial, sigma)
+        if r_trial @ r_trial <= r @ r:
+            state, r, J, damping = trial, r_trial, J_trial, max(0.1 * damping, 1e-12)
+            if np.abs(unit_step).max() < STEP_TOLERANCE * np.sqrt(len(r)):
+                break
+        else:
+            damping = max(10.0 * damping, 1e-9)
+            if damping > 1e6:
+                break
+    return state
+
+
+def _near(views: list[_View], state: _State) -> list[BoolArray]:
+    """Return which corners of each view are no gross outliers, by the median of all residuals."""
+    off = [np.linalg.norm(_of_view(view, state)[0], axis=1) for view in views]
+    # The median length of two normal residuals is 1.1774 of their sigma.
+    sigma = max(float(np.median(np.concatenate(off))) / 1.1774, 1e-9)
+    near = [np.asarray(one <= GROSS * sigma) for one in off]
+    enough = all(which.sum() >= MIN_CORNERS for which in near)
+    return near if enough else [np.ones(len(one), dtype=bool) for one in off]
+
+
+def _inverse(gram: FloatArray, pair_id: str) -> FloatArray:
+    scale = np.sqrt(np.diag(gram))
+    values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
+    if not values[0] > 1e-14:
+        raise DegenerateError(f"pair '{pair_id}': the corners leave the boards' poses open; more of them must be seen")
+    return np.asarray((vectors / values) @ vectors.T / np.outer(scale, scale))
+
+
+def _moved_cameras(
+    pair: MatchedPair, covariance1: FloatArray | None, covariance2: FloatArray | None, one_camera: bool
+) -> list[tuple[Camera, Camera]]:
+    """Return the cameras moved by one sigma along each principal axis of the calibrations; none where one is exact."""
+    one, two = pair.camera1, pair.camera2
+    if covariance1 is None or (covariance2 is None and not one_camera):
+        return []
+    out = []
+    for axis in principal_axes(covariance1):
+        moved = one.with_parameters(one.parameters + axis)
+        out.append((moved, moved if one_camera else two))
+    if covariance2 is not None and not one_camera:
+        out += [(one, two.with_parameters(two.parameters + axis)) for axis in principal_axes(covariance2)]
+    return out
+
+
+def _residual_changes(views: list[_View], state: _State, moved: list[tuple[Camera, Camera]]) -> FloatArray:
+    """Return the change (A, R) of the residuals for each of the moved cameras."""
+    base = np.concatenate([_of_view(view, state)[0].ravel() for view in views])
+    rows = [[_of_view(view.by(cameras[view.second]), state)[0].ravel() for view in views] for cameras in moved]
+    return np.array([np.concatenate(row) - base for row in rows]).reshape(len(moved), len(base))

@@ -1,0 +1,217 @@
+"""Do the stated uncertainties of real calibrations hold? Halves of one camera's images, calibrated apart.
+
+The images of every set are split at random into halves. Two calibrations of one and the same camera must differ, after
+the rotation that none of them knows and where both had boards, by what they say that they may: the ratio of the
+observed difference and the predicted one is 1 over many splits. And a test that never alarms is worthless: other
+cameras, and slightly moved lenses, must be found.
+
+    python scripts/split_halves.py [SET ...] [--data DIR] [--splits 6] [--cache DIR] [--power] [--model MODEL]
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.compare import CalibrationComparison, CameraVerdict, compare_calibrations
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.uncertainty import projection_design
+from rigkit.calibration.usable import views_of_image
+from rigkit.cameras.base import Camera
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import RigkitError
+from rigkit.detection.detect import detect_boards
+from rigkit.io.images import read_image
+
+Views = dict[str, list[BoardView]]
+"""What each image shows, by its name."""
+
+
+@dataclass(frozen=True, slots=True)
+class Capture:
+    """Images of one unchanged camera: where they are, and the board on them."""
+
+    folder: str
+    pattern: str
+    board: Board
+    rendered: bool = False
+
+
+CAPTURES = {
+    "bouguet-left": Capture("real/bouguet-stereo", "left*.jpg", Board("b", 9, 6, 30.0, 30.0)),
+    "bouguet-right": Capture("real/bouguet-stereo", "right*.jpg", Board("b", 9, 6, 30.0, 30.0)),
+    "camodocal": Capture("real/camodocal-fisheye", "*.png", Board("b", 9, 6, 30.0, 30.0)),
+    "ocam": Capture("real/ocam-fisheye1", "*.jpg", Board("b", 8, 6, 32.5, 32.5)),
+    "ov-plane": Capture("real/ov-plane/corners", "*/*.orpc", Board("ov", 22, 22, 7.5, 7.5)),
+    "caliper": Capture("public/caliper-board", "*.png", Board("b", 16, 10, 15.0, 15.0)),
+    "fisheye-chess": Capture("public/fisheye-chess", "*.jpg", Board("b", 4, 6, 30.0, 30.0)),
+    "cylinder": Capture("public/cylinder/201", "*", Board("b", 19, 14, 10.0, 10.0)),
+    "bumblebee-left": Capture("public/bumblebee2", "left*.jpg", Board("b", 4, 6, 30.0, 30.0)),
+    "bumblebee-right": Capture("public/bumblebee2", "right*.jpg", Board("b", 4, 6, 30.0, 30.0)),
+    "lab-regular": Capture("lab-a/calibration/regular", "*.jpg", Board("b", 9, 6, 30.0, 30.0), True),
+    "lab-fisheye": Capture("lab-a/calibration/fisheye", "*.jpg", Board("b", 9, 6, 30.0, 30.0), True),
+}
+
+
+OTHERS = [("bouguet-left", "bouguet-right"), ("bumblebee-left", "bumblebee-right"), ("lab-regular", "lab-fisheye")]
+"""Different cameras with images of one size."""
+
+
+def published_corners(path: Path, board: Board) -> tuple[list[BoardView], tuple[int, int]]:
+    """Return the view of a file of published corners (*.orpc) and the image's size, 1280x800 px."""
+    lines = path.read_text().splitlines()
+    start = next(i for i, line in enumerate(lines) if line.startswith("encoding")) + 1
+    table = np.array([[float(x) for x in line.split(",")] for line in lines[start:] if line.strip()])
+    row, column = np.divmod(table[:, 1].astype(np.int64), board.columns)
+    view = BoardView(path.name, board, np.stack([column, row], -1), table[:, 3:5], np.full(len(table), 0.1))
+    return [view], (1280, 800)
+
+
+def views_of(path: Path, board: Board, cache: Path) -> tuple[list[BoardView], tuple[int, int]]:
+    """Return what an image shows and its size, from the images or from the cache."""
+    if path.suffix == ".orpc":
+        return published_corners(path, board)
+    digest = hashlib.sha256(path.read_bytes() + repr(board).encode()).hexdigest()[:20]
+    kept = cache / f"{digest}.npz"
+    if not kept.is_file():
+        image = read_image(path)
+        views, _ = views_of_image(path.name, detect_boards(image, [board]), [board])
+        arrays: dict[str, np.ndarray] = {"size": np.array([image.shape[1], image.shape[0]])}
+        for k, view in enumerate(views[:1]):
+            part = view.board
+            about = json.dumps([part.board_id, part.columns, part.rows, part.square_x_mm, part.square_y_mm])
+            arrays |= {f"board{k}": np.array(about), f"grid{k}": view.grid}
+            arrays |= {f"pixels{k}": view.pixels, f"sigma{k}": view.sigma_px}
+        np.savez(kept, **arrays)  # type: ignore[arg-type]
+    with np.load(kept) as data:
+        width, height = data["size"].tolist()
+        views = []
+        if "grid0" in data:
+            part = Board(*json.loads(str(data["board0"])))
+            views = [BoardView(path.name, part, data["grid0"], data["pixels0"], data["sigma0"])]
+    return views, (width, height)
+
+
+def load(name: str, data: Path, cache: Path) -> tuple[Views, tuple[int, int]]:
+    """Return what the images of a set show, and their size."""
+    capture = CAPTURES[name]
+    found: Views = {}
+    size = (0, 0)
+    for path in sorted((data / capture.folder).glob(capture.pattern)):
+        views, size = views_of(path, capture.board, cache)
+        if views:
+            found[path.name] = views
+    return found, size
+
+
+def halves(views: Views, rng: np.random.Generator) -> tuple[Views, Views]:
+    """Return the images, split at random."""
+    names = rng.permutation(sorted(views)).tolist()
+    return tuple({name: views[name] for name in sorted(part)} for part in (names[::2], names[1::2]))  # type: ignore[return-value]
+
+
+def calibrated(views: Views, size_px: tuple[int, int], model: str) -> Calibration:
+    return calibrate([view for own in views.values() for view in own], size_px, model=model)
+
+
+def in_words(what: str, found: CalibrationComparison) -> str:
+    return (
+        f"{what}: {found.difference.rms_px:.4f} px, expected {found.predicted_px:.4f} px, ratio {found.ratio:.2f}, "
+        f"chance {found.chance:.4f}: {found.verdict}"
+    )
+
+
+def split(name: str, loaded: tuple[Views, tuple[int, int]], splits: int, model: str) -> list[CalibrationComparison]:
+    """Print and return the comparisons of random halves of a set."""
+    rng = np.random.default_rng(len(name))
+    found = []
+    for k in range(splits):
+        try:
+            a, b = (calibrated(part, loaded[1], model) for part in halves(loaded[0], rng))
+            found.append(compare_calibrations(a, b))
+        except RigkitError as error:
+            print(f"{name} split {k}: {error}", flush=True)
+            continue
+        about = " ".join(
+            f"[{c.camera.model} {c.camera.parameters.size}, {c.boards[0].kind}, x{c.overdispersion:.2f}]"
+            for c in (a, b)
+        )
+        print(in_words(f"{name} split {k} {about}", found[-1]), flush=True)
+    return found
+
+
+def changed(views: Views, move: Callable[[np.ndarray], np.ndarray], size_px: tuple[int, int]) -> Views:
+    """Return the views as another lens shows them: their corners moved."""
+    limit = np.array(size_px) - 0.5
+    moved = {}
+    for name, own in views.items():
+        moved[name] = [replace(view, pixels=np.clip(move(view.pixels), -0.5, limit)) for view in own]
+    return moved
+
+
+def shift_px(camera: Camera, pixels: np.ndarray, remaining_px: float) -> np.ndarray:
+    """Return by how much the principal point must move for `remaining_px` rms to remain after the best rotation."""
+    rays, valid = camera.unproject(pixels)
+    along = np.array([1.0, 0.5])
+    design = projection_design(camera, rays[valid])[:, -3:].transpose(2, 0, 1).reshape(-1, 3)
+    all_moved = np.tile(along, int(valid.sum()))
+    left = all_moved - design @ np.linalg.lstsq(design, all_moved, rcond=None)[0]
+    return remaining_px / max(float(np.sqrt(2.0 * (left**2).mean())), 1e-9) * along
+
+
+def power(name: str, loaded: tuple[Views, tuple[int, int]], model: str) -> list[CalibrationComparison]:
+    """Print and return the comparisons of one half with the other half behind a lens that was touched."""
+    views, size = loaded
+    a_views, b_views = halves(views, np.random.default_rng(0))
+    a = calibrated(a_views, size, model)
+    centre = a.camera.project(np.array([0.0, 0.0, 1.0]))[0]
+    pixels = np.concatenate([view.pixels[view.kept] for view in a.views])
+    shift = shift_px(a.camera, pixels[:: max(1, len(pixels) // 500)], 0.2)
+    found = []
+    for what, move in (
+        ("focal length + 0.1 %", lambda p: centre + 1.001 * (p - centre)),
+        (f"principal point moved by {np.linalg.norm(shift):.1f} px", lambda p: p + shift),
+    ):
+        found.append(compare_calibrations(a, calibrated(changed(b_views, move, size), size, model)))
+        print(in_words(f"{name}, {what}", found[-1]), flush=True)
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("sets", nargs="*", metavar="SET", help=f"of {', '.join(CAPTURES)}; default all")
+    parser.add_argument("--data", type=Path, default=Path(__file__).parents[1] / "../shared/data")
+    parser.add_argument("--splits", type=int, default=6)
+    parser.add_argument("--cache", type=Path, default=Path("/tmp/split_halves_cache"), help="of corners")
+    parser.add_argument("--model", default="scaramuzza")
+    parser.add_argument("--power", action="store_true", help="find other cameras and moved lenses")
+    args = parser.parse_args()
+    args.cache.mkdir(parents=True, exist_ok=True)
+    everything: dict[str, list[CalibrationComparison]] = {}
+    for name in args.sets or CAPTURES:
+        loaded = load(name, args.data, args.cache)
+        if args.power:
+            power(name, loaded, args.model)
+        else:
+            everything[name] = split(name, loaded, args.splits, args.model)
+    pairs = [(a, b) for a, b in OTHERS if args.power and (not args.sets or {a, b} <= set(args.sets))]
+    for a, b in pairs:
+        first, second = (calibrated(*load(name, args.data, args.cache), args.model) for name in (a, b))
+        print(in_words(f"{a} against {b}", compare_calibrations(first, second)))
+    for name, found in everything.items():
+        if found:
+            ratio = float(np.exp(np.mean([np.log(c.ratio) for c in found])))
+            other = sum(c.verdict is CameraVerdict.OTHER for c in found)
+            print(f"{name}: geometric mean ratio {ratio:.2f}; another camera in {other} of {len(found)}")
+
+
+if __name__ == "__main__":
+    main()

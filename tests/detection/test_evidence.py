@@ -1,0 +1,104 @@
+"""Boards that are hard to see and are boards; what resembles boards and is none; what a lens adds to the scatter."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from rigkit.benchmark.scenes import CONDITIONS, one_board
+from rigkit.core.boards import Board
+from rigkit.detection.checks.evidence import Evidence
+from rigkit.detection.checks.validate import separate
+from rigkit.detection.detect import detect_boards
+from rigkit.detection.lattice.lattice import Lattice
+from rigkit.detection.subpixel.scatter import excess_scatter, scatter_factors
+
+BOARD = Board("board", 9, 6, 30.0, 30.0)
+CORNERS = BOARD.corner_count
+
+FAR_FACTOR = 1.6
+"""Estimates of the scatter of some fifty corners lie within this factor of the truth."""
+
+HEAT_ERROR_PX = 0.1
+"""RMS error of corners in the rendered heat image: its noise, relative to the board's contrast, is 0.05."""
+
+
+def rendered(seed: int, **options: float) -> np.ndarray:
+    scene = one_board(
+        np.random.default_rng(seed), board=BOARD, max_tilt_deg=30.0, square_px=options.pop("square_px", 40)
+    )
+    photometry = replace(CONDITIONS["plain"][1], **{k: v for k, v in options.items() if k != "blur_px"})
+    image = scene.render(rng=np.random.default_rng(seed), blur_px=options.get("blur_px", 0.7), photometry=photometry)
+    return np.asarray(image)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"square_px": 9.0, "noise_levels": 4.0, "blur_px": 1.2},
+        {"sharpen": 4.0, "noise_levels": 2.0, "blur_px": 1.5},
+        {"blur_px": 5.0, "noise_levels": 3.0},
+    ],
+    ids=["small", "sharpened", "blurred"],
+)
+def test_boards_seen_badly_are_found(options: dict[str, float]) -> None:
+    found = [detect_boards(rendered(seed, **options)) for seed in range(3)]
+    assert [[len(item.grid) for item in boards] for boards in found] == [[CORNERS]] * 3
+
+
+def test_each_measure_has_a_say_and_none_decides_alone() -> None:
+    board = Evidence(0.002, 1.5, 0.05, 0.05)
+    assert board.score > 0.0
+    for name in Evidence._fields:
+        worse = board._replace(**{name: 2.0 * getattr(board, name)})
+        assert worse.score < board.score
+        assert worse.score > 0.0
+    assert Evidence(*(4.0 * np.array(board))).score < 0.0
+
+
+def test_a_heat_image_with_a_faint_board_beside_something_hot() -> None:
+    scene = one_board(np.random.default_rng(3), board=BOARD, max_tilt_deg=30.0, square_px=30)
+    grey = scene.render(blur_px=1.0).astype(np.float64)
+    rng = np.random.default_rng(4)
+    # Of the range of 16 bits the board has a fiftieth.
+    heat = 3000.0 + 6.0 * grey + 30.0 * rng.standard_normal(grey.shape)
+    heat[:, :120] = 52000.0
+    image = np.clip(cv2.GaussianBlur(heat, (0, 0), 0.7), 0, 65535).astype(np.uint16)
+    (found,) = detect_boards(image)
+    (truth,) = scene.truth()
+    nearest = np.linalg.norm(found.pixels[:, None] - truth.pixels, axis=2).min(axis=1)
+    assert len(found.grid) == CORNERS
+    assert np.sqrt(np.mean(nearest**2)) < HEAT_ERROR_PX
+
+
+def grid(rows: int, columns: int, first_px: tuple[float, float]) -> Lattice:
+    v, u = np.mgrid[:rows, :columns] * 20.0
+    return Lattice(np.stack([u, v], axis=-1) + first_px, np.full((rows, columns), 100.0), True)
+
+
+def test_a_grid_that_grew_over_a_seam_keeps_its_own_corners() -> None:
+    large, grown, again = grid(8, 8, (0.0, 0.0)), grid(7, 8, (0.0, 140.0)), grid(6, 7, (20.0, 20.0))
+    kept = separate([again, grown, large], 9)
+    assert [item.size for item in kept] == [(8, 8), (8, 6)]
+    assert not np.isclose(kept[1].pixels[..., 1], 140.0).any()
+
+
+def strong_bend(noise_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (6, 7, 2) as a mirror sees them, 0.8 radians a cell apart, and their noise (6, 7)."""
+    row, column = np.mgrid[:6, :7].astype(np.float64)
+    azimuth, radius = 0.8 * column, 120.0 * np.exp(0.5 * row)
+    pixels = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth)], axis=-1)
+    return pixels + noise_px * np.random.default_rng(5).standard_normal(pixels.shape), np.full((6, 7), 0.05)
+
+
+def test_what_a_lens_bends_is_no_scatter() -> None:
+    everything = [(slice(0, 6), slice(0, 7))]
+    pixels, sigma_px = strong_bend(0.05)
+    along, both = excess_scatter(pixels, sigma_px, everything)[0], scatter_factors(pixels, sigma_px, everything)[0]
+    assert along > 5.0
+    assert both < 0.5 * along
+    pixels, sigma_px = strong_bend(2.0)
+    assert scatter_factors(pixels, sigma_px, everything)[0] == pytest.approx(2.0 / 0.05, rel=FAR_FACTOR - 1.0)
