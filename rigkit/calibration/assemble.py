@@ -9,6 +9,7 @@ from rigkit.calibration.fit import Fit
 from rigkit.calibration.linearise import view_products
 from rigkit.calibration.normal_equations import NormalEquations
 from rigkit.calibration.observations import Observations
+from rigkit.calibration.repeats import cluster_numbers
 from rigkit.calibration.result import BoardShape, Calibration, Candidate, Outlier, ViewResult
 from rigkit.calibration.shape import ShapeModel
 from rigkit.calibration.solver import with_priors
@@ -66,7 +67,7 @@ def _covariance(observations: Observations, fit: Fit) -> tuple[FloatArray, Clust
     n = p + fit.state.shape.basis.shape[-1]
     unit = frame_covariance(normal, fit.state, n)
     products = view_products(observations, fit.state, fit.weight(observations))
-    information, score = reduced_by_cluster(products, n, image_numbers(observations))
+    information, score = reduced_by_cluster(products, n, _clusters(observations))
     prior = (normal.gg - fit.data.gg)[:n, :n]
     clustered = clustered_covariance(unit[:n, :n], information, score, prior, fit.sigma_px)
     covariance = with_block(unit * fit.sigma_px**2, clustered.covariance, clustered.overdispersion**2)
@@ -74,10 +75,10 @@ def _covariance(observations: Observations, fit: Fit) -> tuple[FloatArray, Clust
     return covariance[np.ix_(chosen, chosen)], clustered
 
 
-def image_numbers(observations: Observations) -> IntArray:
-    """Return the number of the image of each view (V,)."""
-    place = {name: i for i, name in enumerate(dict.fromkeys(observations.images))}
-    return np.array([place[name] for name in observations.images], dtype=np.int64)
+def _clusters(observations: Observations) -> IntArray:
+    """Return the number of the image of each view (V,), images that repeat others taken as one."""
+    boards = [view.board.board_id for view in observations.views]
+    return cluster_numbers(observations.images, boards, [view.pixels for view in observations.views])
 
 
 def _outliers(observations: Observations, fit: Fit) -> tuple[Outlier, ...]:

@@ -152,6 +152,18 @@ class NormalEquations:
         points = (inverse @ (self.g[p:] - coupling.T @ step).reshape(count, 3, 1)).reshape(-1)
         return np.concatenate([step[:p], points]), step[p:].reshape(views, 6)
 
+    @property
+    def identifiable(self) -> bool:
+        """Whether the equations tell every global from the others at all: combinations of which they say less than the
+        arithmetic can resolve have no inverse, and no covariance."""
+        variance = np.diag(self.covariance()[0])
+        back = _inverse(self.pp) @ np.swapaxes(self.gp, -1, -2)
+        # Against what it would be if all other globals were known.
+        alone = np.diag(self.gg) - np.einsum("vgi,vig->g", self.gp, back)
+        inflated = variance * alone
+        limit = 1.0 / (len(inflated) * np.finfo(float).eps)
+        return bool((np.isfinite(inflated) & (inflated > 0.0) & (inflated < limit)).all())
+
     def covariance(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return S^-1 (G, G), W = pp^-1 gp^T (V, 6, G) and pp^-1 (V, 6, 6): the covariance of globals g and poses p
         for unit residuals is cov(g) = S^-1, cov(p_v, g) = -W_v S^-1, cov(p_v, p_u) = W_v S^-1 W_u^T + [v = u] pp_v^-1.

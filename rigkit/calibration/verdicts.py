@@ -11,9 +11,12 @@ from typing import Protocol
 
 import numpy as np
 
+from rigkit.calibration.coverage import covered_by_boards
+from rigkit.calibration.repeats import cluster_numbers
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import uncertainty_at_corners
 from rigkit.cameras.base import image_center
+from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.findings import Finding, Severity
 
@@ -42,6 +45,10 @@ PATTERN = 0.35
 """Correlation of residuals of neighbouring corners: noise has 0 (a fitted pose makes it slightly negative)."""
 OVERFIT = 1.25
 """Held-out over training RMS."""
+NEARLY_ALL = 0.9
+"""Of the image, to speak of all of it."""
+ONE_DISTANCE = 1.15
+"""Corners from near to far within this factor are at one distance."""
 UNSURE_PX = 1.0
 """Worst-direction standard deviation of a projection, in the covered part of the image."""
 ASPECT = 2e-3
@@ -66,16 +73,20 @@ def judge(
 ) -> tuple[Finding, ...]:
     """Return the verdicts, the headline first; `also` are verdicts found elsewhere, `at_corners_px` is what
     `uncertainty_at_corners` returns, where it is known already."""
+    at_corners = uncertainty_at_corners(calibration) if at_corners_px is None else at_corners_px
+    # What says that nobody knows how good the rest is: then it is not good.
+    doubts = [*_images(calibration), *_unsure(calibration, at_corners)]
     found = [
         *also,
         *_left_out(calibration.dropped),
         *_tilts(calibration),
-        *_images(calibration),
+        *doubts,
+        *_repeated(calibration),
+        *_distances(calibration),
         *_coverage(calibration),
         *_views(calibration),
         *_pattern(calibration),
         *_overfit(calibration),
-        *_unsure(calibration, uncertainty_at_corners(calibration) if at_corners_px is None else at_corners_px),
         *_boards(calibration),
         *_outliers(calibration),
     ]
@@ -87,7 +98,7 @@ def judge(
                 'try model = "auto", or add views with the board tilted',
             ),
         )
-    return (headline(calibration, found), *found)
+    return (headline(calibration, found, doubtful=bool(doubts), where=_where(calibration)), *found)
 
 
 def judge_session(
@@ -95,18 +106,22 @@ def judge_session(
 ) -> tuple[Finding, ...]:
     """Return the verdicts of the calibration together with those on images that gave no view at all, and others."""
     found = [*_left_out(dropped), *calibration.verdicts[1:], *also]
-    return (headline(calibration, found), *found)
+    doubtful = bool(calibration.verdicts) and calibration.verdicts[0].severity is Severity.LOOK
+    return (headline(calibration, found, doubtful=doubtful, where=_where(calibration)), *found)
 
 
-def headline(result: Judged, found: Sequence[Finding]) -> Finding:
-    """Return the first verdict, from all others."""
+def headline(result: Judged, found: Sequence[Finding], *, doubtful: bool = False, where: str = "") -> Finding:
+    """Return the first verdict, from all others; `doubtful` where one of them says that the result may be worse than
+    its error, `where` says of which part of the image the error is."""
     held = result.heldout_rms_px
     error = f"training RMS {result.rms_px:.3f} px" if held is None else f"held-out RMS {held:.3f} px"
     bad = sum(finding.severity is Severity.BAD for finding in found)
     if bad:
         return _bad(f"{error}, but {bad} of the remarks below must be dealt with first")
     remarks = {0: "", 1: "; 1 remark below"}.get(len(found), f"; {len(found)} remarks below")
-    return Finding(severity=Severity.GOOD, message=f"{error}{remarks}")
+    if doubtful:
+        return _look(f"{error}{where}, but how good the lens is elsewhere is not known well{remarks}")
+    return Finding(severity=Severity.GOOD, message=f"{error}{where}{remarks}")
 
 
 def _look(message: str, remedy: str | None = None, image: str | None = None) -> Finding:
@@ -153,6 +168,45 @@ def _images(c: Calibration) -> list[Finding]:
     images = f"{count} images" if count > 1 else "1 image"
     remedy = f"take at least {FEW_IMAGES}, better 15, to know how good the calibration is elsewhere"
     return [_look(f"{images} only", remedy)]
+
+
+def _repeated(c: Calibration) -> list[Finding]:
+    """Say which images show the boards where another one does."""
+    images = [view.image for view in c.views]
+    number = cluster_numbers(images, [view.board_id for view in c.views], [view.pixels for view in c.views])
+    first = {int(n): image for n, image in reversed(list(zip(number, images, strict=True)))}
+    again = {image: first[int(n)] for n, image in zip(number, images, strict=True) if first[int(n)] != image}
+    if not again:
+        return []
+    one, other = next(iter(again.items()))
+    what = f"image '{one}' shows" if len(again) == 1 else f"{len(again)} images, '{one}' the first, show"
+    return [
+        _look(
+            f"{what} the board where another one does ('{other}'): they count as one",
+            "move the board from image to image",
+        )
+    ]
+
+
+def _distances(c: Calibration) -> list[Finding]:
+    """Say where all boards were equally far away: then depth was seen on their tilts alone."""
+    if len(c.views) < 2:
+        return []
+    shapes = {board.board_id: board.points_mm for board in c.boards}
+    depth = [v.cam_from_board.apply(shapes[v.board_id]) for v in c.views]
+    far = np.concatenate([np.linalg.norm(points, axis=1) for points in depth])
+    if np.quantile(far, 0.95) > ONE_DISTANCE * np.quantile(far, 0.05):
+        return []
+    return [_look("all boards were at one distance", "hold some at half and some at double of it")]
+
+
+def _where(c: Calibration) -> str:
+    """Return in words of which part of the image the calibration speaks, empty where of nearly all."""
+    pixels = grid_pixels(c.camera.size_px, (4 * CELLS[0], 4 * CELLS[1]))
+    rays, valid = c.camera.unproject(pixels)
+    asked = valid & (np.where(valid, rays[..., 2], -1.0) > np.cos(np.radians(ASKED_DEG)))
+    share = float(covered_by_boards(c, pixels)[asked].mean()) if asked.any() else 0.0
+    return "" if share >= NEARLY_ALL else f" over the {100.0 * share:.0f} % of the image where boards were"
 
 
 def _coverage(c: Calibration) -> list[Finding]:
@@ -272,7 +326,17 @@ def _overfit(c: Calibration) -> list[Finding]:
 def _unsure(c: Calibration, inside: FloatArray) -> list[Finding]:
     worst = float(np.nanmax(inside)) if np.isfinite(inside).any() else np.inf
     if worst <= UNSURE_PX:
-        return []
+        usual = float(np.sqrt(np.nanmean(inside**2)))
+        error = c.rms_px if c.heldout_rms_px is None else c.heldout_rms_px
+        if usual <= max(error, SMALL_PX):
+            return []
+        return [
+            _look(
+                f"the projection is uncertain by {usual:.2f} px (one standard deviation) where the boards were, more "
+                f"than the error of {error:.2f} px that the images show",
+                "take more views, with the board tilted",
+            )
+        ]
     what = f"the projection is uncertain by up to {worst:.1f} px (one standard deviation) where the boards were"
     if not np.isfinite(worst):
         return [_bad(what, "take more views, with the board tilted")]

@@ -5,12 +5,20 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.linearise import normal_equations
+from rigkit.calibration.normal_equations import NormalEquations
+from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration
+from rigkit.calibration.solver import with_priors
+from rigkit.calibration.state import State
 from rigkit.calibration.verdicts import judge_session
+from rigkit.cameras.eucm import EUCM
 from rigkit.core.boards import Board
+from rigkit.core.errors import DegenerateError
 from rigkit.core.findings import Severity, worst
 
 
@@ -126,3 +134,48 @@ def test_hundredths_of_a_pixel_are_no_reason_to_retake(rng: np.random.Generator)
         views[i] = replace(views[i], pixels=np.clip(rough, 0.0, np.array(SIZE) - 1.0))
     result = calibrate(views, SIZE, model="brown", board="flat")
     assert len(result.outliers) > 10 and not said(result, "retake") and not said(result, "outliers")
+
+
+def test_repeated_images_count_as_one(rng: np.random.Generator) -> None:
+    views, _, _ = random_views(lens("reg"), 10, rng, reach_deg=33.0, noise_px=0.1)
+    noisy = [replace(v, image=f"again {v.image}", pixels=v.pixels + 0.02 * rng.normal(size=(54, 2))) for v in views]
+    once = calibrate(views, SIZE, model="brown", board="flat")
+    twice = calibrate([*views, *noisy], SIZE, model="brown", board="flat")
+    assert said(twice, "show the board where another one does") and not said(once, "where another one does")
+    # The same images again say nothing new: independent corners would promise a factor of 0.7.
+    assert np.median(twice.parameter_sigmas / once.parameter_sigmas) > 0.85
+
+
+def test_two_images_are_not_good(rng: np.random.Generator) -> None:
+    views, _, _ = random_views(lens("reg"), 3, rng, reach_deg=33.0)
+    result = calibrate(views, SIZE, model="brown", board="flat")
+    assert result.verdicts[0].severity is not Severity.GOOD
+    assert judge_session(result, [])[0].severity is not Severity.GOOD
+
+
+def test_the_part_of_the_image_is_named(rng: np.random.Generator) -> None:
+    views, _, _ = random_views(lens("reg"), 15, rng, reach_deg=15.0)
+    result = calibrate(views, SIZE, model="brown", board="flat")
+    assert "% of the image where boards were" in result.verdicts[0].message
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.4])
+def test_numbers_that_no_image_tells(alpha: float, rng: np.random.Generator) -> None:
+    """Without any bend (alpha is zero) nothing in an image depends on EUCM's beta."""
+    camera = EUCM(SIZE, np.array([1364.0, 1365.0, 808.0, 615.0, alpha, 1.0]))
+    views, rotation, translation = random_views(camera, 15, rng, reach_deg=33.0, noise_px=0.0)
+    observations = Observations.from_views(views)
+    state = State.start(camera, rotation, translation, observations)
+    normal = with_priors(normal_equations(observations, state), state, 0.1)
+    assert normal.identifiable == (alpha > 0.0)
+
+
+def test_a_model_that_is_not_identifiable_is_not_taken(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    views, _, _ = random_views(lens("reg"), 12, rng, reach_deg=33.0)
+    monkeypatch.setattr(NormalEquations, "identifiable", property(lambda normal: len(normal.g) != 6))
+    with pytest.raises(DegenerateError, match="not identifiable"):
+        calibrate(views, SIZE, model="eucm", board="flat")
+    result = calibrate(views, SIZE, model="auto", board="flat", folds=0)
+    assert any(c.name == "eucm" and "not identifiable" in c.reason for c in result.candidates)
