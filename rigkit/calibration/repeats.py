@@ -10,7 +10,7 @@ from rigkit.core.arrays import IntArray, Pixels
 
 __all__ = ["cluster_numbers"]
 
-SAME_PX = 0.5
+REPEATED_PX = 0.5
 """Boards whose corners have, in two images, the same centre and the same extents within this were not moved between."""
 
 
@@ -44,6 +44,6 @@ def _place(corners: Pixels) -> tuple[float, ...]:
 
 def _alike(one: list[tuple[str, tuple[float, ...]]], other: list[tuple[str, tuple[float, ...]]]) -> bool:
     return len(one) == len(other) and all(
-        a == b and max(abs(x - y) for x, y in zip(p, q, strict=True)) <= SAME_PX
+        a == b and max(abs(x - y) for x, y in zip(p, q, strict=True)) <= REPEATED_PX
         for (a, p), (b, q) in zip(one, other, strict=True)
     )
