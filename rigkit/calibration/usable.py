@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections import Counter
 from collections.abc import Sequence
 
@@ -11,6 +12,7 @@ from rigkit.core.arrays import FloatArray, IntArray, Pixels
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection, BoardView
 from rigkit.core.errors import InputError
+from rigkit.core.identifiers import IDENTIFIER, MAX_IDENTIFIER
 
 __all__ = ["MIN_CORNERS", "other_size", "usable_views", "views_of_image"]
 
@@ -100,7 +102,7 @@ def views_of_image(
     """Return the views that an image gives, or why it gives none.
 
     A detection that could be several boards, or part of one, still is a flat grid of known squares: it becomes a view
-    of a board of its own, called "<board>, part of <image>".
+    of a board of its own, called "<board> part of <image>".
     """
     views: list[BoardView] = []
     other: list[str] = []
@@ -112,13 +114,21 @@ def views_of_image(
         if parent is None:
             other.append(f"{found.columns}x{found.rows}")
             continue
-        name = f"{parent.board_id}, part of {image}" + (f" ({k + 1})" if len(detections) > 1 else "")
+        name = _part_name(parent.board_id, image, k + 1 if len(detections) > 1 else None)
         part = Board(name, turned.columns, turned.rows, parent.square_x_mm, parent.square_y_mm, parent.square_sigma_mm)
         views.append(BoardView(image, part, turned.grid, turned.pixels, turned.sigma_px))
     if views:
         return views, None
     sizes = ", ".join(f"{b.columns}x{b.rows}" for b in boards)
     return [], f"found only {', '.join(other)} corners, the board has {sizes}" if other else "no board found"
+
+
+def _part_name(board_id: str, image: str, number: int | None) -> str:
+    """Return a name for a part of a board, its own for every image, whatever the image is called."""
+    name = f"{board_id} part of {image}" + (f" ({number})" if number else "")
+    if len(name) <= MAX_IDENTIFIER and IDENTIFIER.fullmatch(name) and ".." not in name:
+        return name
+    return f"{board_id[: MAX_IDENTIFIER - 20]} part {zlib.crc32(name.encode()):08x}"
 
 
 def _parent(found: BoardDetection, boards: Sequence[Board]) -> tuple[Board | None, BoardDetection]:
