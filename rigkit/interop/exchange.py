@@ -89,9 +89,10 @@ def best_accepted(camera: Camera, accepted: Sequence[Accepted], format_name: str
     Nearest: the one that covers most of the image, then the one with the smallest largest error.
     Raises InputError where none can follow the lens.
     """
-    for kind in accepted:
-        if kind.holds(camera):
-            return Chosen(camera, kind)
+    for same in (camera, *_without_zero_terms(camera)):
+        for kind in accepted:
+            if kind.holds(same):
+                return Chosen(same, kind)
     found: list[Chosen] = []
     for kind in accepted:
         try:
@@ -108,6 +109,15 @@ def best_accepted(camera: Camera, accepted: Sequence[Accepted], format_name: str
         raise InputError(f"{format_name}: none of its models can follow this {camera.model} camera")
     widest = max(c.covered for c in found)
     return min((c for c in found if c.covered >= widest - 0.01), key=lambda c: c.max_error_px)
+
+
+def _without_zero_terms(camera: Camera) -> list[Camera]:
+    """Return the same Brown camera with fewer terms, as far as those left out are zero."""
+    if camera.model != "brown":
+        return []
+    p = camera.parameters
+    counts = [4 + count for count in sorted(type(camera).orders, reverse=True) if 4 + count < p.size]
+    return [camera.with_parameters(p[:n]) for n in counts if not p[n:].any()]
 
 
 def field(data: dict[str, Any], key: str, name: str) -> Any:

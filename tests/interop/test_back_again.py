@@ -56,6 +56,13 @@ def test_radtan_of_four_numbers_is_one_camera_everywhere() -> None:
     assert largest_difference_px(RADTAN, read_camera_info(write_camera_info(RADTAN).text)) < 1e-9
 
 
+def test_a_term_that_is_zero_is_left_out() -> None:
+    longer = camera_model("brown")(RADTAN.size_px, np.append(RADTAN.parameters, 0.0))
+    written = write_kalibr([longer]).cameras[0]
+    assert written.max_error_px == 0.0 and not written.note
+    assert read_kalibr(written.text)[0][0].parameters.tolist() == RADTAN.parameters.tolist()
+
+
 @pytest.mark.parametrize(
     "text",
     [
