@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.epipolar_scenes import FISHEYE, REGULAR, pair, plane_in_sight, pose_errors_deg
+from helpers.epipolar_scenes import FISHEYE, REGULAR, plane_in_sight, pose_errors_deg
+from helpers.epipolar_scenes import pair as pair_of_type
 from tolerances import EXACT_REL
 
 from rigkit.core.errors import DegenerateError, InputError
@@ -16,7 +17,21 @@ from rigkit.relative_pose.solvers.registry import SOLVERS, fundamental_for
 
 CAMERAS = {"pinhole": REGULAR, "fisheye": FISHEYE}
 KINDS = sorted(SOLVERS)
-SAMPLE = {"general": 12, "planar": 8, "translation": 6, "standard": 5, "forward": 5}
+SAMPLE = {
+    "general": 12,
+    "planar": 8,
+    "translation": 6,
+    "standard": 5,
+    "forward": 5,
+    "standard-rows": 5,
+    "forward-roll": 5,
+}
+SCENE = {"standard-rows": "standard", "forward-roll": "forward"}
+"""Pose type of the pairs for motions that are none."""
+
+
+def pair(rng, count, kind="general", **options):
+    return pair_of_type(rng, count, SCENE.get(kind, kind), **options)
 
 
 def same_up_to_sign(a, b):
@@ -40,7 +55,10 @@ def test_exact_data_give_the_exact_geometry(rng, kind, camera, weights):
     assert same_up_to_sign(estimate.E21, essential_from_pose(pose)) < EXACT_REL
     assert np.linalg.norm(estimate.E21) == pytest.approx(1.0)
     assert np.abs(estimate.residuals_px).max() < 1e-6
-    assert max(pose_errors_deg(choose_pose(estimate.E21, matches.rays1, matches.rays2, kind), pose)) < 1e-6
+    assert (
+        max(pose_errors_deg(choose_pose(estimate.E21, matches.rays1, matches.rays2, SCENE.get(kind, kind)), pose))
+        < 1e-6
+    )
     if camera is FISHEYE:
         assert estimate.F21 is None
     else:
@@ -65,8 +83,9 @@ def test_affinities_obey_the_estimated_geometry(rng, kind):
 def test_degrees_of_freedom(rng, kind):
     """The rank of dE over random members of the solver's set is its number of degrees of freedom."""
     freedom = fundamental_for(kind).degrees_of_freedom
-    if kind == "general":
-        assert freedom == 7  # F; the essential projection has five
+    if kind in ("general", "standard-rows"):
+        # Of F; the essential matrices among them have five, and none: with one camera rows are what they are.
+        assert freedom == {"general": 7, "standard-rows": 2}[kind]
         return
     _, pose, _ = pair(rng, 3, kind)
     e0 = essential_from_pose(pose)
@@ -79,6 +98,8 @@ def test_degrees_of_freedom(rng, kind):
             R, t = exp_so3(step * a * y) @ R, exp_so3(step * b * y) @ t
         elif kind == "translation":
             t = t + step * v
+        elif kind == "forward-roll":
+            R = exp_so3(step * a * np.array([0.0, 0.0, 1.0])) @ R
         moved = essential_from_pose(Rigid3(R, t))
         matches, _, _ = pair(rng, 12, kind, pose=Rigid3(R, 300.0 * unit(t)))
         # The solver's set contains the moved geometry: it recovers it exactly.

@@ -1,8 +1,11 @@
-"""Standard stereo of perspective views whose vertical intrinsics are not known: which rows of both images are one row.
+"""Standard stereo whose vertical intrinsics are not known: which rows of both images are one row.
 
-F = [[0, 0, 0], [0, 0, a], [0, b, c]] is estimated from the rows [v2, v1, 1] of points and [a3, 0, 0], [a4, 1, 0] of
-affinities (A = [[a1, a2], [a3, a4]]): two degrees of freedom. Where the cameras are known nothing is left to estimate:
-`fixed.FixedSolver`.
+F = [[0, 0, 0], [0, 0, a], [0, b, c]]: the vertical coordinates of the normalised images obey a y2 + b y1 + c = 0. The
+rows on (a, b, c) are [y2, y1, 1] of a point and [a3, 0, 0], [a4, 1, 0] of an affinity A = [[a1, a2], [a3, a4]]: two
+degrees of freedom. For any central camera the affinity's rows are [g2 A, g1, 0] with g = d y / d pixel. Where the
+cameras are known nothing is left to estimate: `fixed.FixedSolver`.
+
+Reference: L. Hajder, "Affine Correspondences in Stereo Vision", standard stereo.
 """
 
 from __future__ import annotations
@@ -11,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.core.arrays import FloatArray, Mat3
-from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.arrays import BoolArray, FloatArray, Mat3, RayJacobians, Rays
+from rigkit.core.errors import DegenerateError
 from rigkit.core.matches import Matches
 from rigkit.relative_pose.solvers.eight_point import essential_nearest
 from rigkit.relative_pose.solvers.estimate import EpipolarEstimate, check_baseline, check_count, finish, reweighted
@@ -21,54 +24,97 @@ from rigkit.relative_pose.solvers.weights import RowWeights, WeightRule
 
 __all__ = ["RowsSolver"]
 
-ONE_ROW_PX = 1e-9
+ONE_ROW_RAD = 1e-12
 """Rows that scatter by less are one row, and its rounding."""
 UNDETERMINED = 1e-12
 """Second singular value over the first: what is below is rounding."""
+MIN_AHEAD = 0.05
+"""Rays 87 degrees off the axis and more have no place in a perspective image: they are left out."""
 
 
 @dataclass(frozen=True, slots=True)
 class RowsSolver:
-    """F21 of two images whose rows are parallel, the second's an affine function of the first's."""
+    """E21 of two images whose rows are parallel, the second's an affine function of the first's."""
 
     degrees_of_freedom: int = 2
 
     def solve(self, matches: Matches, weights: WeightRule | RowWeights | None = None) -> EpipolarEstimate:
         """Return the epipolar geometry of standard stereo with free rows; see FundamentalSolver.
 
-        InputError where the pixels are not those of perspective views.
+        F21 obeys the relation of the rows; E21, which cannot have another focal length, is the nearest to it.
+
+        Raises DegenerateError where all points lie on one row.
         """
-        if matches.K1 is None or matches.K2 is None:
-            raise InputError("standard stereo with free rows needs perspective views; rectify the images first")
-        K1, K2 = matches.K1, matches.K2
+        rows = _Rows.of(matches)
 
         def best(row_weights: RowWeights) -> Mat3:
             check_count(matches, row_weights, self.degrees_of_freedom, "standard stereo with free rows")
-            return np.asarray(K2.T @ _relation(matches, row_weights) @ K1)
+            return rows.relation(row_weights)
 
         check_baseline(matches)
         on_rays, used = reweighted(matches, weights, best)
         return finish(matches, essential_nearest(on_rays), on_rays, used)
 
 
-def _relation(matches: Matches, weights: RowWeights) -> Mat3:
-    v1, v2 = matches.pixels1[:, 1], matches.pixels2[:, 1]
-    shift1, shift2 = v1.mean(), v2.mean()
-    spread = float(np.std(v1))
-    scale = 1.0 / spread if spread > ONE_ROW_PX else 1.0
-    # Residuals are differences of rows times the scale: one over their noise. An affinity's second row has sigma_A.
-    known = bool(np.isfinite(weights.sigma_A[weights.affinities > 0.0]).all())
-    noise = np.hypot(matches.sigma1_px, matches.sigma2_px) * scale if known else np.ones(len(v1))
-    system: FloatArray = np.stack([(v2 - shift2) * scale, (v1 - shift1) * scale, np.ones(len(v1))], axis=1)
-    system = system / noise[:, None]
-    if matches.A21 is not None:
-        used = weights.affinities > 0.0
-        sigma = weights.sigma_A[used] if known else np.ones(int(used.sum()))
-        a3, a4 = matches.A21[used, 1, 0] / sigma, matches.A21[used, 1, 1] / sigma
-        zero = np.zeros_like(a3)
-        system = np.concatenate([system, np.stack([a3, zero, zero], axis=1), np.stack([a4, 1.0 / sigma, zero], axis=1)])
-    s, vt = right_singular(system)
-    if s[1] < UNDETERMINED * s[0]:
-        raise DegenerateError("the relation between the images' rows is not determined: all points lie on one row")
-    a, b, c = vt[2] * [scale, scale, 1.0]
-    return np.array([[0.0, 0.0, 0.0], [0.0, 0.0, a], [0.0, b, c - a * shift2 - b * shift1]])
+@dataclass(frozen=True, eq=False, slots=True)
+class _Rows:
+    """Vertical coordinates (N,) of normalised images, and what affinities say of them.
+
+    Attributes
+    ----------
+    y1, y2 : vertical coordinates; `ahead` says where they exist.
+    sigma : (N,) standard deviation of a difference of the two.
+    by1, by2 : (N, 2) derivatives of y1, and of y2 through the affinity, by the pixel of image 1; NaN without one.
+    across : (N,) how much y2 changes per pixel of image 2.
+    """
+
+    y1: FloatArray
+    y2: FloatArray
+    ahead: BoolArray
+    sigma: FloatArray
+    by1: FloatArray
+    by2: FloatArray
+    across: FloatArray
+
+    @classmethod
+    def of(cls, m: Matches) -> _Rows:
+        y1, g1, ahead1 = _vertical(m.rays1, m.jacobians1)
+        y2, g2, ahead2 = _vertical(m.rays2, m.jacobians2)
+        size1, size2 = (np.linalg.norm(g, axis=1) for g in (g1, g2))
+        sigma = np.hypot(m.sigma1_px * size1, m.sigma2_px * size2)
+        by2 = np.full((len(m), 2), np.nan) if m.A21 is None else np.einsum("ni,nij->nj", g2, m.A21)
+        return cls(y1, y2, ahead1 & ahead2, sigma, g1, by2, size2)
+
+    def relation(self, weights: RowWeights) -> Mat3:
+        """Return E (3, 3) on rays with the least squares (a, b, c)."""
+        point = self.ahead & (weights.points > 0.0)
+        affine = self.ahead & (weights.affinities > 0.0)
+        if not (point.any() or affine.any()):
+            raise DegenerateError("the relation between the images' rows is not determined: no point lies ahead")
+        some = point if point.any() else affine
+        shift1, shift2 = float(self.y1[some].mean()), float(self.y2[some].mean())
+        spread = float(np.std(self.y1[some]))
+        scale = 1.0 / spread if spread > ONE_ROW_RAD else 1.0 / float(self.across[some].mean())
+        # Equal weights: a row a point in units of the spread, two an affinity in pixels of image 1.
+        known = bool(np.isfinite(weights.sigma_A[affine]).all())
+        pixel = 1.0 / float(np.linalg.norm(self.by1[some], axis=1).mean())
+        noise = self.sigma[point] * scale if known else np.ones(int(point.sum()))
+        noise_A = weights.sigma_A[affine] * self.across[affine] * pixel if known else np.ones(int(affine.sum()))
+        ones = np.ones(int(point.sum()))
+        of_points = np.stack([(self.y2 - shift2)[point] * scale, (self.y1 - shift1)[point] * scale, ones], axis=1)
+        of_affinities = np.zeros((int(affine.sum()), 2, 3))
+        of_affinities[..., 0], of_affinities[..., 1] = self.by2[affine] * pixel, self.by1[affine] * pixel
+        weighted = (of_affinities / noise_A[:, None, None]).reshape(-1, 3)
+        s, vt = right_singular(np.concatenate([of_points / noise[:, None], weighted]))
+        if s[1] < UNDETERMINED * s[0]:
+            raise DegenerateError("the relation between the images' rows is not determined: all points lie on one row")
+        a, b, c = vt[2] * [scale, scale, 1.0]
+        return np.array([[0.0, 0.0, 0.0], [0.0, 0.0, a], [0.0, b, c - a * shift2 - b * shift1]])
+
+
+def _vertical(rays: Rays, jacobians: RayJacobians) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return y / z (N,) of rays, its derivative (N, 2) by the pixel, and where it exists."""
+    ahead = rays[:, 2] > MIN_AHEAD
+    z = np.where(ahead, rays[:, 2], 1.0)
+    y = rays[:, 1] / z
+    return y, (jacobians[:, 1] - y[:, None] * jacobians[:, 2]) / z[:, None], np.asarray(ahead)
