@@ -14,7 +14,16 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.matches import DirectionPairs
 
-__all__ = ["PlanarDirections", "blocks", "finite", "first_of", "smallest_singular", "solve_each", "unit_weights"]
+__all__ = [
+    "PlanarDirections",
+    "blocks",
+    "finite",
+    "first_of",
+    "last_of",
+    "smallest_singular",
+    "solve_each",
+    "unit_weights",
+]
 
 BLOCK = 8192
 """Corners worked on at a time: about fifty rows of this length fit a second-level cache."""
@@ -68,6 +77,11 @@ def first_of(use: BoolArray, count: int) -> BoolArray:
     if use.shape[0] <= count:
         return use
     return np.asarray(use & (np.cumsum(use, axis=0) <= count))
+
+
+def last_of(use: BoolArray) -> BoolArray:
+    """Return the last direction in use of every corner, (K, n)."""
+    return np.asarray(use & (np.cumsum(use[::-1], axis=0)[::-1] == 1))
 
 
 def unit_weights(directions: PlanarDirections) -> tuple[FloatArray, FloatArray]:

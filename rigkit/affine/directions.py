@@ -11,7 +11,7 @@ are first-order wrong under perspective; harmonic means, or a projective fit, ar
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -21,9 +21,10 @@ from rigkit.core.detections import BoardDetection, common_corners
 from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
 
-__all__ = ["DirectionField", "Support", "board_directions", "direction_field"]
+__all__ = ["SUPPORTS", "DirectionField", "Support", "board_directions", "direction_field"]
 
-Support = Literal["neighbours", "line", "patch"]
+Support = Literal["chord", "neighbours", "line", "patch"]
+SUPPORTS: tuple[Support, ...] = get_args(Support)
 
 MIN_COSINE = 0.2
 """Corners further than 78 degrees from a corner say nothing about its own surroundings."""
@@ -98,12 +99,14 @@ def direction_field(
     Parameters
     ----------
     support : what a direction is estimated from.
+        "chord": the chord to the next corner, at the far border from the one before (the paper's directions): the
+        angle is exact, the length is not.
         "neighbours": the chord through the two neighbours, its length their harmonic mean; at a border the next two
-        corners (the paper's directions, with exact lengths).
+        corners: exact lengths.
         "line": a projective fit x(s) = (p + s v) / (1 + g s) to the nearest 2 `window` + 1 corners of the line.
         "patch": a homography through the nearest (2 `window` + 1)^2 corners; the more corners, the less noise, the
         more it relies on a flat board and a true camera.
-    window : half width in squares; None takes the whole line or board. Ignored by "neighbours".
+    window : half width in squares; None takes the whole line or board. Ignored by "chord" and "neighbours".
 
     Raises
     ------
@@ -121,6 +124,8 @@ def direction_field(
     if window is not None and window < 1:
         raise InputError(f"directions: the window must be at least 1 square, got {window}")
     tangent = _Tangent.build(detection, view)
+    if support == "chord":
+        return _next_chords(tangent, detection)
     if support == "neighbours":
         return _along_both(*(_chords(tangent, detection, axis) for axis in (0, 1)))
     if support == "line":
@@ -128,7 +133,7 @@ def direction_field(
         return _along_both(*fits)
     if support == "patch":
         return _patch_fit(tangent, detection, window)
-    raise InputError(f"directions: support '{support}' is unknown; known: neighbours, line, patch")
+    raise InputError(f"directions: support '{support}' is unknown; known: {', '.join(SUPPORTS)}")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -196,6 +201,32 @@ def _along_both(horizontal: tuple[FloatArray, FloatArray], vertical: tuple[Float
     vectors = np.stack([horizontal[0], vertical[0], horizontal[0] + vertical[0]], axis=1)
     covariance = np.stack([horizontal[1], vertical[1], horizontal[1] + vertical[1]], axis=1)
     return DirectionField(vectors, _finite(vectors), covariance, np.zeros((len(vectors), 2, 2)))
+
+
+def _next_chords(tangent: _Tangent, detection: BoardDetection) -> DirectionField:
+    """Return the chords to the next corner along row, column and diagonal, or from the one before where it is last.
+
+    The corners without a diagonal neighbour have the sum of their other two exact derivatives.
+    """
+    padded = np.pad(_index_map(detection), 1, constant_values=-1)
+    column, row = detection.grid[:, 0] + 1, detection.grid[:, 1] + 1
+    own = tangent.sigma_px**2
+    chords, variances, ways = [], [], []
+    for right, down in ((1, 0), (0, 1), (1, 1)):
+        index = np.stack([padded[row + way * down, column + way * right] for way in (1, -1)], axis=1)
+        position, usable, _ = tangent.positions(index)
+        ahead = usable[:, 0]
+        chords.append(np.where(ahead[:, None], position[:, 0], -position[:, 1]))
+        other = np.where(ahead, index[:, 0], index[:, 1])
+        variances.append(np.where(usable.any(axis=1), tangent.sigma_px[other] ** 2 + own, np.nan))
+        ways.append(np.where(ahead, 1.0, -1.0))
+    lone = ~_finite(chords[2])
+    exact = [_chords(tangent, detection, axis) for axis in (0, 1)]
+    chords[2] = np.where(lone[:, None], exact[0][0] + exact[1][0], chords[2])
+    variances[2] = np.where(lone, sum(0.5 * np.trace(c, axis1=1, axis2=2) for _, c in exact), variances[2])
+    vectors, eye = np.stack(chords, axis=1), np.eye(2)
+    shared = (ways[0] * ways[1] * own)[:, None, None] * eye
+    return DirectionField(vectors, _finite(vectors), np.stack(variances, axis=1)[..., None, None] * eye, shared)
 
 
 def _chords(tangent: _Tangent, detection: BoardDetection, axis: int) -> tuple[FloatArray, FloatArray]:

@@ -56,7 +56,7 @@ def affines_from_directions(
         the diagonal of a board steps in for an edge that is parallel to the baseline.
     F21 : for F2UDIR and F3UDIR in perspective images: the fundamental matrix; `directions` must have pixels then.
     epipolar : the same for any central camera: epipolar normals in the same pixels as the directions.
-    scale : for DET3UDIR: "area" (exact, default), "ls" (exact) or "sqmean" (the paper's; biased).
+    scale : for DET3UDIR: "area" (exact, default), "ls" (exact), "sqmean" (the paper's) or "diagonal" (both biased).
     noise : of the directions; then each affinity has a covariance.
     determinant : (N,) for DET3UDIR: det A where it is known otherwise; then lengths are not used.
     epipolar_rows : "hard", or "soft": the epipolar equations stacked with the directions in least squares, as in the

@@ -11,14 +11,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigkit.affine.components import PlanarDirections, first_of, solve_each, unit_weights
+from rigkit.affine.components import PlanarDirections, first_of, last_of, solve_each, unit_weights
 from rigkit.core.arrays import Affines, BoolArray, FloatArray
 from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
 
 __all__ = ["SCALES", "determinant_block", "determinant_from_lengths", "determinant_sensitivity", "shape_block"]
 
-SCALES = ("area", "ls", "sqmean")
+SCALES = ("area", "ls", "sqmean", "diagonal")
 
 NEWTON_STEPS = 40
 """Newton converges monotonically and quadratically, usually in 4 to 6 steps; only near-singular sets take more."""
@@ -188,7 +188,7 @@ def determinant_from_lengths(directions: PlanarDirections, shape: FloatArray, sc
 
     "area": ratio of the signed areas that the first two directions span; exact. "ls": the scale of `shape`
     (determinant 1) that fits the lengths best; exact. "sqmean": squared mean of the scales |d2|/|d1|, as the paper
-    has it; biased unless A is a similarity, for replication.
+    has it; biased unless A is a similarity, for replication. "diagonal": the same of the last direction alone.
     """
     if scale == "area":
         pair = first_of(directions.use, 2)
@@ -211,6 +211,10 @@ def determinant_from_lengths(directions: PlanarDirections, shape: FloatArray, sc
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.where(directions.use, length2 / length1, 0.0).sum(0) / directions.use.sum(0)
         return np.asarray(ratio**2)
+    if scale == "diagonal":
+        last = last_of(directions.use)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray((np.where(last, length2, 0.0).sum(0) / np.where(last, length1, 0.0).sum(0)) ** 2)
     raise InputError(f"affine scale '{scale}' is unknown; known: {', '.join(SCALES)}")
 
 
@@ -263,8 +267,9 @@ def determinant_sensitivity(
         right2[:, 4] = d2
         right1[:, 4] = -np.einsum("nki,nij->nkj", d2, A21)
     else:
-        ratio = np.where(use, length2 / length1, 0.0)
-        gain = (2.0 * ratio.sum(1) / use.sum(1) ** 2)[:, None]
+        counted = use if scale == "sqmean" else last_of(use.T).T
+        ratio = np.where(counted, length2 / length1, 0.0)
+        gain = np.where(counted, (2.0 * ratio.sum(1) / counted.sum(1) ** 2)[:, None], 0.0)
         right2[:, 4] = (gain / (length1 * length2))[..., None] * d2
         right1[:, 4] = -(gain * ratio / length1**2)[..., None] * d1
     system = np.zeros((n, 5, 5))

@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING
 
 from rigkit.cli.console import note, print_json, progress_on_stderr
 from rigkit.cli.dataset_arguments import add_dataset_arguments, dataset_options, exit_code_of, failed_pairs
-from rigkit.core.errors import ExitCode
+from rigkit.core.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from rigkit.io.manifest import Dataset
     from rigkit.validation.checks import ValidationReport
     from rigkit.validation.crosscheck import CrossCheckReport
+    from rigkit.workflows.paper import PaperOptions
     from rigkit.workflows.validate import DatasetValidation
 
 HELP = "the tables against measured truth, report and PLY; exit code 1 if a check fails"
@@ -27,18 +29,49 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--figures", choices=("png", "pdf"), default="png", help="pdf: the pictures for a paper as well (vectors)"
     )
     parser.add_argument("--no-crosscheck", action="store_true", help="leave out the comparison with pycolmap")
+    parser.add_argument(
+        "--paper",
+        action="store_true",
+        help="the paper's own pipeline instead (chords, equal weights, linear solvers, no refinement): its tables "
+        "beside the printed ones, and its claims judged",
+    )
+    parser.add_argument(
+        "--own-solvers",
+        action="store_true",
+        help="with --paper: standard and forward pairs by their own constrained solvers, not by the planar one",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.io.manifest import load_dataset
+    from rigkit.workflows.paper import PaperOptions
     from rigkit.workflows.validate import ValidateOptions, validate_dataset
 
     dataset = load_dataset(args.dataset)
     common = dataset_options(args, dataset.name)
+    if args.paper:
+        return _as_paper(dataset, PaperOptions(**common, own_solvers=args.own_solvers), json=args.json)
+    if args.own_solvers:
+        raise InputError("--own-solvers is about --paper; add that, or leave it out")
     options = ValidateOptions(
         **common, pictures=not args.no_pictures, pdf=args.figures == "pdf", crosscheck=not args.no_crosscheck
     )
     return show(validate_dataset(dataset, options, progress=progress_on_stderr()), common["output"], json=args.json)
+
+
+def _as_paper(dataset: Dataset, options: PaperOptions, *, json: bool) -> int:
+    """Repeat the paper and print its tables; return the exit code. What it claims passes or fails no check of ours."""
+    from rigkit.report.tables import tables_to_text
+    from rigkit.workflows.paper import validate_as_paper
+
+    done = validate_as_paper(dataset, options, progress=progress_on_stderr())
+    if json:
+        result = {"output": str(options.output), "reports": [report.to_dict() for report in done.reports]}
+        print_json(result | failed_pairs(done.failures))
+    else:
+        print(tables_to_text([table for table in done.tables if table.key != "estimators"]))
+        print(f"{options.output}")
+    return exit_code_of(done.failures, ExitCode.WELL)
 
 
 def show(done: DatasetValidation, out: Path, *, json: bool) -> int:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from rigkit.core.boards import Board
 from rigkit.core.posetype import PoseType
 from rigkit.io.toml_reader import TomlTable, read_toml
-from rigkit.study.study import NOISE_KINDS, Claim, Study
+from rigkit.study.study import NOISE_KINDS, Claim, Study, Variant
 from rigkit.study.table import CELL_KEYS
 from rigkit.synthetic.noise import NoisyImages
 
@@ -16,6 +17,9 @@ __all__ = ["SCHEMA", "load_study"]
 
 SCHEMA = "rigkit.study/1"
 POSE_TYPES = tuple(str(p) for p in PoseType if p is not PoseType.AUTO)
+
+DEFAULTS = {f.name: f.default for f in fields(Study) if f.name in ("support", "det_scale")}
+"""What a study that says nothing of them works with: the paper's."""
 
 
 def load_study(path: str | Path) -> Study:
@@ -43,6 +47,10 @@ def load_study(path: str | Path) -> Study:
     options |= _noise(top.table("noise", hint='[noise] with on = "directions" and sigma_deg = [0, 3, 10]'))
     if top.has("estimation"):
         options |= _estimation(top.table("estimation", hint="[estimation]"))
+    if top.has("variants"):
+        defaults = {key: options.get(key, DEFAULTS[key]) for key in ("support", "det_scale")}
+        variants = top.tables("variants", hint='[[variants]] with name = "3SDIR, patch"')
+        options["variants"] = tuple(_variant(table, defaults) for table in variants)
     if top.has("scene"):
         options |= _scene(top.table("scene", hint="[scene]"))
     if top.has("claims"):
@@ -64,7 +72,7 @@ def _noise(table: TomlTable) -> dict[str, Any]:
 
 def _estimation(table: TomlTable) -> dict[str, Any]:
     out: dict[str, Any] = {}
-    for key in ("lengths", "det_scale", "epipolar"):
+    for key in ("support", "det_scale", "epipolar"):
         if table.has(key):
             out[key] = table.text(key, hint=f'{key} = "..."')
     if table.has("min_conditioning"):
@@ -97,21 +105,41 @@ def _scene(table: TomlTable) -> dict[str, Any]:
     return out
 
 
+def _variant(table: TomlTable, defaults: dict[str, str]) -> Variant:
+    name = table.text("name", hint='name = "3SDIR, patch"')
+    method = table.text("method", hint='method = "3SDIR"')
+    chosen = dict(defaults)
+    for key in defaults:
+        if table.has(key):
+            chosen[key] = table.text(key, hint=f'{key} = "..."')
+    table.done()
+    return Variant(name, method, **chosen)
+
+
 def _claim(table: TomlTable) -> Claim:
     text = table.text("text", hint='text = "3SDIR is better than F2UDIR"')
-    sides = []
-    for side in ("smaller", "larger"):
-        inner = table.table(side, hint=f'{side} = {{ method = "3SDIR" }}')
-        which: dict[str, Any] = {}
-        for key in CELL_KEYS:
-            if inner.has(key):
-                if key == "plane":
-                    which[key] = inner.integer(key, hint="plane = 1", at_least=1)
-                elif key == "sigma":
-                    which[key] = inner.number(key, hint="sigma = 3.0", positive=False)
-                else:
-                    which[key] = inner.text(key, hint=f'{key} = "..."')
-        inner.done()
-        sides.append(which)
+    smaller = _cells(table.table("smaller", hint='smaller = { method = "3SDIR" }'))
+    larger, limit = None, None
+    if table.has("at_most_deg"):
+        limit = table.number("at_most_deg", hint="at_most_deg = 20.0")
+    if table.has("larger") or limit is None:
+        larger = _cells(table.table("larger", hint='larger = { method = "F2UDIR" }, or at_most_deg = 20.0'))
     table.done()
-    return Claim(text, sides[0], sides[1])
+    return Claim(text, smaller, larger, limit)
+
+
+def _cells(table: TomlTable) -> dict[str, Any]:
+    """Return a selection of cells; the noise may be one level or a list of them."""
+    which: dict[str, Any] = {}
+    for key in CELL_KEYS:
+        if table.has(key):
+            if key == "plane":
+                which[key] = table.integer(key, hint="plane = 1", at_least=1)
+            elif key == "sigma":
+                hint = "sigma = 3.0, or [1.0, 2.0, 3.0]"
+                several = table.is_list(key)
+                which[key] = table.numbers(key, hint=hint) if several else table.number(key, hint=hint, positive=False)
+            else:
+                which[key] = table.text(key, hint=f'{key} = "..."')
+    table.done()
+    return which

@@ -75,6 +75,10 @@ class TomlTable:
             self._known.append(key)
         return key in self._values
 
+    def is_list(self, key: str) -> bool:
+        """Say whether there is a list, for what may be one value or several."""
+        return isinstance(self._values.get(key), list)
+
     def text(self, key: str, *, hint: str, choices: Sequence[str] = ()) -> str:
         """Return a required string; `hint` is what the error tells the person to add, written as in the file."""
         value = self._required(key, hint)

@@ -7,18 +7,21 @@ Hajder, "Affine Correspondences in Stereo Vision: Theory, Practice, and Limitati
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.affine.affinities import EpipolarNormals
+from rigkit.affine.directions import SUPPORTS, direction_field
 from rigkit.affine.normal import normals_from_affines
 from rigkit.affine.registry import AFFINE_METHODS, affines_from_directions, needs_epipolar
 from rigkit.affine.unscaled import SCALES
+from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.arrays import FloatArray, Mat3, Pixels
 from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
 from rigkit.core.posetype import PoseType
@@ -27,7 +30,7 @@ from rigkit.synthetic.lattice import chord_directions, harmonic_directions
 from rigkit.synthetic.noise import NoisyImages, corner_noise, rotate_directions
 from rigkit.synthetic.poses import PairBatch, general_pairs, special_pairs
 
-__all__ = ["CHUNK_TRIALS", "PLANES", "Claim", "Study", "chunk_count", "run_chunk"]
+__all__ = ["CHUNK_TRIALS", "PLANES", "Claim", "Study", "Variant", "chunk_count", "run_chunk"]
 
 CHUNK_TRIALS = 50
 """Trials that share a random generator. Changing it changes the numbers of every study."""
@@ -35,23 +38,38 @@ PLANES = 3
 BOARD = Board("study", 6, 8, 40.0, 40.0)
 """The paper's synthetic boards."""
 NOISE_KINDS = {"directions": "deg", "corners": "px"}
-LENGTHS = ("chord", "harmonic")
 
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """A statement about medians: each cell of `smaller` is below each cell of `larger`.
+    """A statement about medians: each cell of `smaller` is below each cell of `larger`, or at most a limit.
 
     Attributes
     ----------
     text : the statement in words.
-    smaller, larger : selections of cells: any of method, pose_type, plane, sigma; cells that agree in all that neither
-        side names are compared with each other.
+    smaller, larger : selections of cells: any of method, pose_type, plane, sigma, each a value or several; cells that
+        agree in all that neither side names are compared with each other.
+    at_most_deg : instead of `larger`: what no cell of `smaller` exceeds.
     """
 
     text: str
     smaller: dict[str, Any]
-    larger: dict[str, Any]
+    larger: dict[str, Any] | None = None
+    at_most_deg: float | None = None
+
+    def __post_init__(self) -> None:
+        if (self.larger is None) == (self.at_most_deg is None):
+            raise InputError(f"claim '{self.text}': give either what is larger or a limit (at_most_deg)")
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """An affine estimator under a name of its own, with the directions and the scale that it works from."""
+
+    name: str
+    method: str
+    support: str
+    det_scale: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,12 +82,13 @@ class Study:
     seed : of all random numbers.
     trials : pairs of views per pose type.
     pose_types : without AUTO.
-    methods : affine estimators.
+    methods : affine estimators, or names of `variants`.
     noise : "directions" (sigmas in degrees, lengths kept) or "corners" (sigmas in px, everything computed from them).
     sigmas : noise levels.
     images : which image is noisy.
-    lengths : "chord" (one-sided, as in the paper) or "harmonic" (exact).
-    det_scale : scale of DET3UDIR, "sqmean" as in the paper, "area" or "ls".
+    support : what directions are estimated from, see `direction_field`; "chord" as in the paper.
+    det_scale : scale of DET3UDIR, see `affines_from_directions`; "sqmean" as in the paper.
+    variants : estimators with another support or scale than the study's, for comparison.
     epipolar : "truth", or "estimated" from the noisy corners by the eight-point method (corner noise only).
     board, focal_px, centre_px : target and camera.
     parallax_deg : of general pairs. baseline_mm, in_plane_deg : of the others.
@@ -86,8 +105,9 @@ class Study:
     noise: str
     sigmas: tuple[float, ...]
     images: NoisyImages = NoisyImages.BOTH
-    lengths: str = "chord"
+    support: str = "chord"
     det_scale: str = "sqmean"
+    variants: tuple[Variant, ...] = ()
     epipolar: str = "truth"
     board: Board = BOARD
     focal_px: float = 1350.0
@@ -101,10 +121,10 @@ class Study:
     def __post_init__(self) -> None:
         for value, known, what in (
             (self.noise, tuple(NOISE_KINDS), "noise"),
-            (self.lengths, LENGTHS, "lengths"),
-            (self.det_scale, SCALES, "det_scale"),
             (self.epipolar, ("truth", "estimated"), "epipolar"),
-            *((m, AFFINE_METHODS, "method") for m in self.methods),
+            *((v.support, SUPPORTS, "support") for v in self.estimators),
+            *((v.det_scale, SCALES, "det_scale") for v in self.estimators),
+            *((v.method, AFFINE_METHODS, "method") for v in self.estimators),
         ):
             if value not in known:
                 raise InputError(f"study '{self.name}': {what} '{value}' is unknown; known: {', '.join(known)}")
@@ -120,6 +140,12 @@ class Study:
             raise InputError(f"study '{self.name}': the board needs 3x3 inner corners at least")
 
     @property
+    def estimators(self) -> tuple[Variant, ...]:
+        """What `methods` name."""
+        named = {variant.name: variant for variant in self.variants}
+        return tuple(named.get(m, Variant(m, m, self.support, self.det_scale)) for m in self.methods)
+
+    @property
     def unit(self) -> str:
         """Unit of the noise levels."""
         return NOISE_KINDS[self.noise]
@@ -128,6 +154,7 @@ class Study:
         """Return everything that determines the numbers, for provenance and for recognising earlier results."""
         out = {name: getattr(self, name) for name in self.__slots__ if name != "claims"}
         out["board"] = {"columns": self.board.columns, "rows": self.board.rows, "square_mm": self.board.square_x_mm}
+        out["variants"] = [asdict(variant) for variant in self.variants]
         return {key: [str(v) for v in value] if key == "pose_types" else value for key, value in out.items()}
 
 
@@ -177,35 +204,51 @@ class _Scene:
         inverse = np.linalg.inv(k)
         self.F21 = inverse.T @ pairs.essential() @ inverse
         self.normals = pairs.normals[:, pairs.board_index].reshape(-1, 3)
-        self.clean = self._directions(self.pixels1, self.pixels2)
+        self.supports = tuple(dict.fromkeys(variant.support for variant in study.estimators))
+        self.clean = {support: self._directions(self.pixels1, self.pixels2, support) for support in self.supports}
         self.normals_of_lines = _epipolar_normals(self.F21, self.pixels1, self.pixels2)
 
-    def _directions(self, pixels1: Pixels, pixels2: Pixels) -> DirectionPairs:
+    def _directions(self, pixels1: Pixels, pixels2: Pixels, support: str) -> DirectionPairs:
         board, trials = self.study.board, self.shape[0]
-        build = chord_directions if self.study.lengths == "chord" else harmonic_directions
-        both = [
-            build(p.reshape(trials, PLANES, board.rows, board.columns, 2)).reshape(-1, 3, 2) for p in (pixels1, pixels2)
-        ]
-        return DirectionPairs(both[0], both[1], np.ones(both[0].shape[:2], dtype=bool))
+        lattices = [p.reshape(trials, PLANES, board.rows, board.columns, 2) for p in (pixels1, pixels2)]
+        both = [self._along(lattice, support).reshape(-1, 3, 2) for lattice in lattices]
+        return DirectionPairs(both[0], both[1], np.asarray(np.isfinite(np.stack(both)).all(axis=(0, -1))))
+
+    def _along(self, lattices: Pixels, support: str) -> FloatArray:
+        """Return the directions of all lattices (trials, planes, rows, columns, 2) at once where a formula does it."""
+        if support == "chord":
+            return chord_directions(lattices)
+        if support == "neighbours":
+            return harmonic_directions(lattices)
+        study, board = self.study, self.study.board
+        view = Pinhole((1, 1), np.array([study.focal_px, study.focal_px, *study.centre_px]))
+        grid, sigma = board.grid(), np.ones(board.corner_count)
+        out = np.empty((*lattices.shape[:-1], 3, 2))
+        flat = out.reshape(-1, board.corner_count, 3, 2)
+        for index, pixels in enumerate(lattices.reshape(-1, board.corner_count, 2)):
+            seen = BoardDetection(board.board_id, board.columns, board.rows, grid, pixels, sigma)
+            flat[index] = direction_field(seen, view, support="line" if support == "line" else "patch").vectors
+        return out
 
     def errors(self, sigma: float, rng: np.random.Generator) -> FloatArray:
         """Return the angular errors, degrees, (methods, trials, corners)."""
         study = self.study
         lines = self.normals_of_lines
         if study.noise == "directions":
-            directions = rotate_directions(self.clean, np.radians(sigma), rng, images=study.images)
+            angle = np.radians(sigma)
+            noisy = {s: rotate_directions(d, angle, rng, images=study.images) for s, d in self.clean.items()}
         else:
             pixels1, pixels2 = corner_noise(self.pixels1, self.pixels2, sigma, rng, images=study.images)
-            directions = self._directions(pixels1, pixels2)
+            noisy = {support: self._directions(pixels1, pixels2, support) for support in self.supports}
             F21 = _eight_point(pixels1, pixels2) if study.epipolar == "estimated" else self.F21
             lines = _epipolar_normals(F21, pixels1, pixels2)
         out = []
-        for method in study.methods:
+        for variant in study.estimators:
             affinities = affines_from_directions(
-                directions,
-                method,
-                epipolar=lines if needs_epipolar(method) else None,
-                scale=study.det_scale,
+                noisy[variant.support],
+                variant.method,
+                epipolar=lines if needs_epipolar(variant.method) else None,
+                scale=variant.det_scale,
                 min_conditioning=study.min_conditioning,
             )
             normals, _ = normals_from_affines(self.jacobian1, self.jacobian2, affinities.A21)

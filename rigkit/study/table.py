@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rigkit.core.claims import Comparison, Verdict, judge_claim
 from rigkit.core.errors import InputError
 from rigkit.study.study import PLANES, Claim, Study
 
-__all__ = ["ALL_PLANES", "CELL_KEYS", "Cell", "StudyTable", "Verdict", "tabulate"]
+__all__ = ["ALL_PLANES", "CELL_KEYS", "Cell", "StudyTable", "tabulate"]
 
 ALL_PLANES = 0
 """`Cell.plane` of the cell over all planes together."""
@@ -47,24 +48,6 @@ class Cell:
     whisker_low_deg: float
     whisker_high_deg: float
     mean_deg: float
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """In how many of all comparisons a claim holds, and the worst one that contradicts it."""
-
-    text: str
-    holds_in: int
-    comparisons: int
-    against: str
-
-    @property
-    def words(self) -> str:
-        if self.holds_in == self.comparisons:
-            return f"holds (in all {self.comparisons} comparisons)"
-        if self.holds_in == 0:
-            return f"does not hold (in none of {self.comparisons} comparisons); {self.against}"
-        return f"holds in {self.holds_in} of {self.comparisons} comparisons only; {self.against}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,33 +148,40 @@ def _box(values: NDArray[np.float32]) -> tuple[Any, ...]:
     return (good.size, missing, *(float(v) for v in (median, q25, q75, low, high, good.mean())))
 
 
-def _select(cells: Sequence[Cell], which: dict[str, Any]) -> list[Cell]:
-    return [c for c in cells if all(getattr(c, key) == value for key, value in which.items())]
+def _select(cells: Sequence[Cell], which: Mapping[str, Any]) -> list[Cell]:
+    """Return the cells with these keys; a list of values stands for any of them."""
+
+    def fits(cell: Cell) -> bool:
+        return all(
+            getattr(cell, key) in value if isinstance(value, tuple | list) else getattr(cell, key) == value
+            for key, value in which.items()
+        )
+
+    return [cell for cell in cells if fits(cell)]
 
 
 def _judge(claim: Claim, cells: Sequence[Cell]) -> Verdict:
-    """Compare each cell of one side with each of the other that agrees in what neither side names."""
-    free = [key for key in CELL_KEYS if key not in claim.smaller and key not in claim.larger]
+    verdict = judge_claim(claim.text, _comparisons(claim, cells))
+    if verdict is None:
+        raise InputError(f"claim '{claim.text}': no two cells of this study can be compared; check its keys and values")
+    return verdict
+
+
+def _comparisons(claim: Claim, cells: Sequence[Cell]) -> Iterator[Comparison]:
+    """Yield each cell of one side with each of the other that agrees in what neither side names, or with the limit."""
+    larger = claim.larger or {}
+    free = [key for key in CELL_KEYS if key not in claim.smaller and key not in larger]
     default = {"plane": ALL_PLANES} if "plane" in free else {}
-    holds, total, against, excess = 0, 0, "", -np.inf
     for small in _select(cells, claim.smaller | default):
-        for large in _select(cells, claim.larger | default):
+        if claim.at_most_deg is not None:
+            yield Comparison(small.median_deg, _name(small), claim.at_most_deg, "the limit", or_equal=True)
+            continue
+        for large in _select(cells, larger | default):
             if any(getattr(small, key) != getattr(large, key) for key in free):
                 continue
             if max(small.median_deg, large.median_deg) < EXACT_DEG:
                 continue
-            total += 1
-            difference = small.median_deg - large.median_deg
-            if difference < 0.0:
-                holds += 1
-            elif not difference <= excess:
-                excess = difference
-                against = (
-                    f"against it: {_name(small)} {small.median_deg:.2f} deg, {_name(large)} {large.median_deg:.2f} deg"
-                )
-    if not total:
-        raise InputError(f"claim '{claim.text}': no two cells of this study can be compared; check its keys and values")
-    return Verdict(claim.text, holds, total, against)
+            yield Comparison(small.median_deg, _name(small), large.median_deg, _name(large))
 
 
 def _name(cell: Cell) -> str:

@@ -167,6 +167,7 @@ def validate(
     *,
     shifts: CalibrationShifts | None = None,
     coverage: float = COVERAGE,
+    weighted: bool = True,
 ) -> ValidationReport:
     """Judge a reconstruction against measured truth.
 
@@ -176,6 +177,7 @@ def validate(
     truth : what a person measured of that pair.
     shifts : from `calibration_shifts`: what the calibrations' uncertainty adds to every sigma; None: exact intrinsics.
     coverage : largest |difference| / combined sigma that passes.
+    weighted : planes by what is known of each point's noise; else by principal components of the points, all alike.
 
     Raises
     ------
@@ -184,7 +186,7 @@ def validate(
     DegenerateError
         A board has too few points for a plane.
     """
-    return _report(reconstruction, measure(reconstruction, shifts), truth, shifts, coverage)
+    return _report(reconstruction, measure(reconstruction, shifts, weighted=weighted), truth, shifts, coverage)
 
 
 def validate_each(

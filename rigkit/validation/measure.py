@@ -98,8 +98,12 @@ class Measured:
         return variance + float(np.sum((shifted[1:] - shifted[:1]) ** 2))
 
 
-def measure(reconstruction: Reconstruction, shifts: CalibrationShifts | None = None) -> Measured:
+def measure(
+    reconstruction: Reconstruction, shifts: CalibrationShifts | None = None, *, weighted: bool = True
+) -> Measured:
     """Fit plane and lattice of every board, again for each small step of the pose, and of the calibrations if given.
+
+    Without `weighted` the planes are the principal ones of the points, all alike and none left out.
 
     Raises DegenerateError where a board has too few points.
     """
@@ -115,7 +119,7 @@ def measure(reconstruction: Reconstruction, shifts: CalibrationShifts | None = N
         reconstruction.camera1.ray_jacobian(reconstruction.pixels1),
         reconstruction.camera2.ray_jacobian(reconstruction.pixels2),
     )
-    usable = bool(np.isfinite(covariance).all())
+    usable = weighted and bool(np.isfinite(covariance).all())
     by_pose = () if reconstruction.pose_covariance is None else points_by_pose(reconstruction)
     common = _common_moves(reconstruction, by_pose, shifts)
 

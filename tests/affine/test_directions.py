@@ -10,10 +10,12 @@ from helpers.board_scenes import Scene, detection, fisheye_camera, regular_camer
 from rigkit.affine.directions import board_directions, direction_field
 from rigkit.cameras.base import Camera
 from rigkit.cameras.kannala_brandt import KannalaBrandt
+from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
+from rigkit.synthetic.lattice import chord_directions
 
 EXACT_REL = 1e-9
 """Noise-free corners of a flat board: the estimate is the derivative itself; measured 1e-14."""
@@ -148,6 +150,21 @@ def test_missing_corners(support: str, window: int | None, rng: np.random.Genera
     assert found.valid.mean() > (0.7 if (support, window) == ("line", 1) else 0.85)
     assert error.max() < 1e-7 * np.abs(truth).max()
     assert np.isnan(found.vectors[~found.valid]).all()
+
+
+def test_chords_are_the_papers(rng: np.random.Generator) -> None:
+    """Those of the synthetic study in perspective images, border and all; in angle they are exact."""
+    camera = Pinhole((1624, 1240), np.array([1350.0, 1350.0, 805.0, 622.0]))
+    scene = trihedral_scene(rng, (BOARD,), camera)
+    pixels = scene.pixels1["a"]
+    found = direction_field(detection(BOARD, pixels), camera, support="chord")
+    expected = chord_directions(pixels.reshape(BOARD.rows, BOARD.columns, 2)).reshape(-1, 3, 2)
+    assert found.valid.all()
+    assert found.vectors == pytest.approx(expected, rel=1e-7, abs=1e-7)
+    truth = true_directions(scene, BOARD, 1)
+    assert angle_errors(found.vectors, truth).max() < 1e-6
+    length = np.linalg.norm(found.vectors, axis=-1) / np.linalg.norm(truth, axis=-1)
+    assert np.abs(length - 1.0).max() > 0.01
 
 
 def test_two_rows_have_no_vertical_length() -> None:

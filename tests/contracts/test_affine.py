@@ -166,7 +166,8 @@ def test_input_is_not_changed(method: str, corners: Corners) -> None:
 
 
 @pytest.mark.parametrize(
-    ("method", "scale"), [*((m, "area") for m in AFFINE_METHODS), ("DET3UDIR", "ls"), ("DET3UDIR", "sqmean")]
+    ("method", "scale"),
+    [*((m, "area") for m in AFFINE_METHODS), ("DET3UDIR", "ls"), ("DET3UDIR", "sqmean"), ("DET3UDIR", "diagonal")],
 )
 def test_predicted_covariance_agrees_with_monte_carlo(
     method: str, scale: str, corners: Corners, rng: np.random.Generator
@@ -174,9 +175,9 @@ def test_predicted_covariance_agrees_with_monte_carlo(
     """Directions with unequal, correlated noise, the diagonal being the sum of the edges, as on a chessboard."""
     trials = 4000
     found = affines_from_directions(corners.directions(), method, epipolar=corners.epipolar)
-    # sqmean is biased; its covariance is about its own answer, so it is tried where it is right: nearly a similarity.
+    # Biased scales have covariances about their own answers: they are tried where they are right, nearly a similarity.
     spread = np.linalg.cond(corners.A21)
-    pick = int(np.argmin(spread)) if scale == "sqmean" else int(np.nanargmax(found.conditioning))
+    pick = int(np.argmin(spread)) if scale in ("sqmean", "diagonal") else int(np.nanargmax(found.conditioning))
     chosen = np.full(trials, pick)
     halves = 0.1 * np.array([[[1.0, 0.0], [0.3, 0.5]], [[0.7, 0.2], [0.0, 0.9]]])
     joint = np.concatenate(

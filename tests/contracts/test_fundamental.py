@@ -232,7 +232,7 @@ def test_planar_solver_on_standard_and_forward(rng):
 
 
 def test_unknown_names_are_refused():
-    with pytest.raises(InputError, match="known: forward, general"):
+    with pytest.raises(InputError, match="known: forward, forward-roll, general"):
         fundamental_for("circular")
     with pytest.raises(InputError, match="pose_type_evidence"):
         fundamental_for("auto")

@@ -30,7 +30,7 @@ FULL = (
     MINIMAL.replace("sigma_deg = [0, 2.5]", 'sigma_px = [0.1]\nimages = "2"').replace('"directions"', '"corners"')
     + """
 [estimation]
-lengths = "harmonic"
+support = "neighbours"
 det_scale = "ls"
 epipolar = "estimated"
 min_conditioning = 0.1
@@ -61,8 +61,8 @@ def test_everything_is_read(tmp_path: Path) -> None:
     study = load_study(write(tmp_path, FULL))
     assert study.pose_types == (PoseType.GENERAL, PoseType.FORWARD)
     assert (study.noise, study.sigmas, study.images) == ("corners", (0.1,), NoisyImages.SECOND)
-    assert (study.lengths, study.det_scale, study.epipolar, study.min_conditioning) == (
-        "harmonic",
+    assert (study.support, study.det_scale, study.epipolar, study.min_conditioning) == (
+        "neighbours",
         "ls",
         "estimated",
         0.1,

@@ -67,7 +67,7 @@ def test_order_of_the_estimators() -> None:
         assert abs(at[3.0][method] / want - 1.0) < MEDIAN_REL
     # Chords are one-sided: scaled estimators are off without any noise; exact lengths are not.
     assert at[0.0]["2SDIR"] > 0.5
-    exact = run(replace(GENERAL, methods=METHODS, sigmas=(0.0,), lengths="harmonic", det_scale="area"))
+    exact = run(replace(GENERAL, methods=METHODS, sigmas=(0.0,), support="neighbours", det_scale="area"))
     assert max(exact.cell(method=m).whisker_high_deg for m in METHODS) < 1e-3
 
 
@@ -103,7 +103,7 @@ def test_corner_noise_with_estimated_epipolar_geometry() -> None:
         assert abs(chord[method] / want - 1.0) < MEDIAN_REL
     assert max(chord, key=lambda m: chord[m]) == "DET3UDIR"
     assert max(chord.values()) < 2.0
-    exact = run(replace(study, lengths="harmonic", det_scale="area"))
+    exact = run(replace(study, support="neighbours", det_scale="area"))
     assert exact.cell(method="3SDIR").median_deg < 0.5 * chord["3SDIR"]
     known = run(replace(study, epipolar="truth")).cell(method="F3UDIR").median_deg
     assert known <= chord["F3UDIR"] * 1.02

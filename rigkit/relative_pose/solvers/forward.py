@@ -26,7 +26,7 @@ __all__ = ["ForwardRollSolver"]
 
 BASIS = np.array([[1.0, 0, 0, 0, 1, 0, 0, 0, 0], [0, 1.0, 0, -1, 0, 0, 0, 0, 0]])
 """vec(E) = (a, b) BASIS, row-major."""
-ON_AXIS = 1e-12
+MIN_OFF_AXIS = 1e-12
 """Rows smaller than this, rays being of unit length, are rounding: the points lie on the axis."""
 
 
@@ -53,7 +53,7 @@ class ForwardRollSolver:
             more = affinities * row_weights.affinities[:, None, None]
             system = np.concatenate([points * row_weights.points[:, None], more.reshape(-1, 2)])
             s, vt = right_singular(system)
-            if s[0] < ON_AXIS * np.abs(row_weights.points).max():
+            if s[0] < MIN_OFF_AXIS * np.abs(row_weights.points).max():
                 raise DegenerateError("the roll is not determined: all points lie on the optical axis")
             return np.asarray((vt[-1] @ BASIS).reshape(3, 3))
 

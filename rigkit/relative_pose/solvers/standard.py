@@ -56,7 +56,7 @@ class RowsSolver:
         return finish(matches, essential_nearest(on_rays), on_rays, used)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class _Rows:
     """Vertical coordinates (N,) of normalised images, and what affinities say of them.
 
@@ -83,7 +83,7 @@ class _Rows:
         size1, size2 = (np.linalg.norm(g, axis=1) for g in (g1, g2))
         sigma = np.hypot(m.sigma1_px * size1, m.sigma2_px * size2)
         by2 = np.full((len(m), 2), np.nan) if m.A21 is None else np.einsum("ni,nij->nj", g2, m.A21)
-        return cls(y1, y2, ahead1 & ahead2, sigma, g1, by2, size2)
+        return cls(y1=y1, y2=y2, ahead=ahead1 & ahead2, sigma=sigma, by1=g1, by2=by2, across=size2)
 
     def relation(self, weights: RowWeights) -> Mat3:
         """Return E (3, 3) on rays with the least squares (a, b, c)."""

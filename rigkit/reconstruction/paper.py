@@ -1,0 +1,143 @@
+"""The paper's own pipeline, beside the one that rigkit uses: for comparison with what was published.
+
+L. Hajder, "Affine Correspondences in Stereo Vision: Theory, Practice, and Limitations". Points give F; chords to the
+neighbouring corners and F give an affinity at every corner; points and affinities, all rows with equal weights, give F
+again by a linear solver that the pose type constrains; rays are intersected and the squares give the scale. There is no
+refinement, no weight by noise and no predicted uncertainty. Formulas are the corrected ones (`Erratum:` where they
+stand).
+
+The paper runs the planar solver on standard and forward pairs too (`MOTIONS`); `OWN_MOTIONS` has those pose types'
+own constrained solvers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from rigkit.affine.affinities import Affinities, EpipolarNormals
+from rigkit.affine.registry import affines_from_directions, needs_epipolar
+from rigkit.core.arrays import BoolArray
+from rigkit.core.cloud import OrientedCloud
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.matches import Matches
+from rigkit.core.posetype import PoseType
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.reconstruction.metric import triangulate_matches
+from rigkit.reconstruction.pairing import MatchedPair
+from rigkit.reconstruction.reconstruct import Reconstruction, colours_at, oriented_cloud
+from rigkit.reconstruction.scale import metric_scale
+from rigkit.relative_pose.solvers.pose import choose_pose
+from rigkit.relative_pose.solvers.registry import fundamental_for
+
+__all__ = ["MOTIONS", "OWN_MOTIONS", "reconstruct_as_paper"]
+
+MOTIONS: Mapping[PoseType, str] = {
+    PoseType.GENERAL: "general",
+    PoseType.PLANAR: "planar",
+    PoseType.STANDARD: "planar",
+    PoseType.FORWARD: "planar",
+}
+"""Solver by pose type, as in the paper."""
+OWN_MOTIONS: Mapping[PoseType, str] = {**MOTIONS, PoseType.STANDARD: "standard-rows", PoseType.FORWARD: "forward-roll"}
+"""Solver by pose type, each constrained as far as the type goes."""
+SCALE = "sqmean"
+"""The paper's scale of DET3UDIR."""
+
+
+def reconstruct_as_paper(
+    pair: MatchedPair, *, pose_type: PoseType | str, affine_method: str, motions: Mapping[PoseType, str] = MOTIONS
+) -> Reconstruction:
+    """Return what the paper's pipeline makes of a pair with one affine estimator.
+
+    Parameters
+    ----------
+    pair : matched corners; their directions are taken anew, as chords to the neighbours.
+    pose_type : as declared; the paper has no way to choose one.
+    affine_method : see `rigkit.affine.registry.AFFINE_METHODS`.
+    motions : which solver re-estimates the epipolar geometry, by pose type.
+
+    Raises
+    ------
+    InputError
+        Pose type AUTO.
+    DegenerateError
+        The geometry does not determine the pose, or no corner has both a point and a normal.
+
+    """
+    kind = PoseType(pose_type)
+    if kind not in motions:
+        raise InputError(f"pair '{pair.pair_id}': the paper's pipeline needs a declared pose type, not '{kind}'")
+    chords = pair.in_chain(pair.chain, support="chord")
+    m = chords.matches
+    try:
+        affinities = _affinities(chords, affine_method)
+        with_affinities = m.with_affinities(affinities.A21, None)
+        estimate = fundamental_for(kind, motion=motions[kind]).solve(with_affinities, "equal")
+        allowed = PoseType.PLANAR if motions[kind] == "planar" else kind
+        pose = choose_pose(estimate.E21, m.rays1, m.rays2, allowed)
+        metric = _in_mm(pair, pose)
+        cloud, kept = _cloud(pair, m, metric, affinities)
+    except DegenerateError as error:
+        raise DegenerateError(f"pair '{pair.pair_id}', {affine_method}: {error}") from error
+    return Reconstruction(
+        pair_id=pair.pair_id,
+        pose_type=kind,
+        affine_method=affine_method,
+        camera1=pair.camera1,
+        camera2=pair.camera2,
+        boards=pair.boards,
+        matches=with_affinities.select(kept),
+        pixels1=pair.captured.pixels1[kept],
+        pixels2=pair.captured.pixels2[kept],
+        cam2_from_cam1=metric,
+        pose_covariance=None,
+        E21=estimate.E21,
+        cloud=cloud,
+        baseline_mm=float(np.linalg.norm(metric.translation_mm)),
+        baseline_sigma_mm=float("nan"),
+        sampson_rms_px=float(np.sqrt(np.mean(estimate.residuals_px**2))),
+        notes=pair.notes,
+    )
+
+
+def _cloud(
+    pair: MatchedPair, matches: Matches, pose: Rigid3, affinities: Affinities
+) -> tuple[OrientedCloud, BoolArray]:
+    """Return points and normals; their sigmas are the corners' alone, for the pipeline predicts none of the pose."""
+    return oriented_cloud(
+        triangulate_matches(pair.captured, pose),
+        matches,
+        pose,
+        np.zeros((6, 6)),
+        affinities,
+        colours=colours_at(None, pair.captured.pixels1),
+        board_ids=tuple(board.board_id for board in pair.boards),
+    )
+
+
+def _in_mm(pair: MatchedPair, pose: Rigid3) -> Rigid3:
+    """Return a pose of unit baseline with the scale of the boards' squares, all corners alike."""
+    points = triangulate_matches(pair.captured, pose).points
+    scale, _ = metric_scale(points, pair.captured.board_index, pair.captured.grid, pair.boards)
+    return Rigid3(pose.rotation, scale * pose.translation_mm)
+
+
+def _affinities(chords: MatchedPair, method: str) -> Affinities:
+    """Return the affinities at the corners; no direction is left out for lying along its epipolar line.
+
+    Notes
+    -----
+    The first F is of general motion whatever the pose type. F2UDIR and F3UDIR fulfil the geometry that they were made
+    with, so that re-estimation with the same solver would give it back: circular, whatever the paper hopes of it.
+    F3UDIR stacks its epipolar rows with the directions in least squares, as printed.
+    """
+    m = chords.matches
+    epipolar = None
+    if needs_epipolar(method):
+        E21 = fundamental_for("general").solve(m, "equal").E21
+        epipolar = EpipolarNormals.from_rays(m.rays1, m.jacobians1, m.rays2, m.jacobians2, E21)
+    return affines_from_directions(
+        chords.directions, method, epipolar=epipolar, scale=SCALE, epipolar_rows="soft", min_conditioning=0.0
+    )

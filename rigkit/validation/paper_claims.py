@@ -1,0 +1,173 @@
+"""What the paper says of its estimators and pose types, judged on our figures and on the ones that it printed.
+
+L. Hajder, "Affine Correspondences in Stereo Vision: Theory, Practice, and Limitations". Figures are mean angles between
+the normals at the corners and the normal of the plane through the points; the paper prints them by plane and capture
+without saying by which estimator, and estimators only by the baselines that they lead to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from rigkit.core.claims import Comparison, Verdict, judge_claim
+from rigkit.core.posetype import PoseType
+from rigkit.validation.checks import ValidationReport
+from rigkit.validation.tables import Cell, Column, PaperTables, Table, mean_normal_error
+
+__all__ = ["claim_table", "estimator_order_table"]
+
+SCALED = ("2SDIR", "3SDIR")
+UNSCALED = ("F2UDIR", "F3UDIR", "DET3UDIR")
+WORST = "DET3UDIR"
+CLAIMS = (
+    "Scaled directions are the best: 2SDIR and 3SDIR are better than the other three",
+    "DET3UDIR is the worst of the five",
+    "Plane 1 is the worst where the motion is special",
+    "Forward motion is the worst of the motions of a lens",
+    "Standard stereo is the most accurate of the motions of a lens",
+)
+
+
+class Capture(NamedTuple):
+    """A pair by name, by its lens ("regular" of "regular forward") and by how it was taken."""
+
+    name: str
+    lens: str
+    motion: str
+
+    @classmethod
+    def of(cls, pair_id: str, motion: str | None = None) -> Capture:
+        """Take the lens, and the motion where it is not given, from the name."""
+        name = pair_id.replace("-", " ")
+        head, _, tail = name.rpartition(" ")
+        return cls(name, head, tail if motion is None else motion)
+
+
+Errors = Mapping[Capture, Mapping[int, float]]
+"""Number of the plane, from 1 -> degrees."""
+
+
+def claim_table(reports: Sequence[ValidationReport], method: str, printed: PaperTables) -> Table:
+    """Return the paper's claims with the verdict of our figures on each, and that of the paper's own.
+
+    Parameters
+    ----------
+    reports : pairs x estimators. The lens of a pair is its name up to the last word ("regular" of "regular-forward").
+    method : estimator whose figures stand for planes and pose types.
+    printed : the paper's tables.
+    """
+    by_baseline = dict(_baseline_errors(printed))
+    ours = (
+        judge_claim(CLAIMS[0], _better(_by_estimator(reports), SCALED, UNSCALED, "deg")),
+        judge_claim(CLAIMS[1], _better(_by_estimator(reports), (*UNSCALED[:2], *SCALED), (WORST,), "deg")),
+        *_of_planes({Capture.of(r.pair_id, r.pose_type): _by_plane(r) for r in reports if r.affine_method == method}),
+    )
+    theirs = (
+        judge_claim(CLAIMS[0], _better(by_baseline, SCALED, UNSCALED, "mm")),
+        judge_claim(CLAIMS[1], _better(by_baseline, (*UNSCALED[:2], *SCALED), (WORST,), "mm")),
+        *_of_planes(_printed_planes(printed)),
+    )
+    rows = [
+        (Cell(text), Cell(_words(own), failed=own is not None and not own.holds), Cell(_words(other)))
+        for text, own, other in zip(CLAIMS, ours, theirs, strict=True)
+    ]
+    note = (
+        f"Planes and motions by mean normal errors with {method}; estimators by mean normal errors in our figures, by "
+        "errors of the baseline in the printed ones."
+    )
+    head = (Column("the paper says"), Column("our figures"), Column("the printed figures"))
+    return Table("claims", "What the paper says, judged", head, tuple(rows), note)
+
+
+def estimator_order_table(reports: Sequence[ValidationReport], printed: PaperTables) -> Table:
+    """Return one row an estimator: mean normal error, mean baseline error, and that of the printed baselines."""
+    methods = list(dict.fromkeys(r.affine_method for r in reports))
+    theirs = dict(_baseline_errors(printed))
+    rows = []
+    for method in methods:
+        of_method = [r for r in reports if r.affine_method == method]
+        baselines = [abs(c.difference) for r in of_method for c in r.checks if c.kind == "baseline"]
+        paper = [errors[method] for errors in theirs.values() if method in errors]
+        cells = (mean_normal_error(of_method), _mean(baselines), _mean(paper))
+        rows.append((Cell(method), *(Cell(value) for value in cells)))
+    head = (
+        Column("estimator"),
+        Column("mean normal error", "deg", 4),
+        Column("mean baseline error", "mm", 3),
+        Column("printed baseline error", "mm", 3),
+    )
+    return Table("order", "The five estimators, over all pairs", head, tuple(rows))
+
+
+def _of_planes(errors: Errors) -> tuple[Verdict | None, ...]:
+    """Return the verdicts on planes and motions."""
+    first = (
+        Comparison(planes[number], f"{capture.name} plane {number}", planes[1], "plane 1")
+        for capture, planes in errors.items()
+        for number in sorted(planes)
+        if capture.motion != PoseType.GENERAL and number != 1 and 1 in planes
+    )
+    return (
+        judge_claim(CLAIMS[2], first),
+        judge_claim(CLAIMS[3], _between(errors, lambda one, other: other == PoseType.FORWARD)),
+        judge_claim(CLAIMS[4], _between(errors, lambda one, other: one == PoseType.STANDARD)),
+    )
+
+
+def _between(errors: Errors, claimed: Callable[[str, str], bool]) -> Iterator[Comparison]:
+    """Yield the captures of one lens whose motions (of the smaller, of the larger) a claim is about."""
+    mean = {capture: float(np.mean(list(planes.values()))) for capture, planes in errors.items() if planes}
+    for one, other in product(mean, mean):
+        if one != other and one.lens == other.lens and claimed(one.motion, other.motion):
+            yield Comparison(mean[one], one.name, mean[other], other.name)
+
+
+def _better(
+    errors: Mapping[str, Mapping[str, float]], good: Sequence[str], bad: Sequence[str], unit: str
+) -> Iterator[Comparison]:
+    """Yield every good estimator against every bad one, capture by capture."""
+    for name, of in errors.items():
+        for one, other in product(good, bad):
+            if one in of and other in of:
+                yield Comparison(of[one], f"{name} {one}", of[other], other, unit)
+
+
+def _by_estimator(reports: Sequence[ValidationReport]) -> dict[str, dict[str, float]]:
+    out: dict[str, dict[str, float]] = {}
+    for report in reports:
+        out.setdefault(Capture.of(report.pair_id).name, {})[report.affine_method] = mean_normal_error([report])
+    return out
+
+
+def _by_plane(report: ValidationReport) -> dict[int, float]:
+    """Return the mean normal error by the number of the plane, from 1, in the order of the names."""
+    found = sorted((board.board.board_id, board.normal_errors.mean_deg) for board in report.boards)
+    return {number: error for number, (_, error) in enumerate(found, start=1)}
+
+
+def _printed_planes(printed: PaperTables) -> Errors:
+    out: dict[Capture, dict[int, float]] = {}
+    for row, cells in printed.planes.items():
+        kind, _, number = row.rpartition(" ")
+        if kind == "mean normal error":
+            for name, value in cells.items():
+                out.setdefault(Capture.of(name), {})[int(number)] = float(value)
+    return out
+
+
+def _baseline_errors(printed: PaperTables) -> Iterator[tuple[str, dict[str, float]]]:
+    for name, cells in printed.baselines.items():
+        known = float(cells["measured"])
+        yield name, {m: abs(float(v) - known) for m, v in cells.items() if m != "measured"}
+
+
+def _words(verdict: Verdict | None) -> str:
+    return "nothing to compare" if verdict is None else verdict.words
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return float(np.mean(values)) if values else None

@@ -1,0 +1,156 @@
+"""Every pair of a data set through the paper's own pipeline: its tables with the printed numbers, its claims judged."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rigkit.affine.registry import AFFINE_METHODS
+from rigkit.core.errors import InputError, RigkitError
+from rigkit.core.progress import Progress, silent
+from rigkit.io.manifest import Dataset, Pair
+from rigkit.io.paper_tables import load_paper_tables
+from rigkit.reconstruction.paper import MOTIONS, OWN_MOTIONS, reconstruct_as_paper
+from rigkit.report.tables import tables_to_csv, tables_to_json, tables_to_latex, tables_to_markdown
+from rigkit.validation.checks import ValidationReport, validate
+from rigkit.validation.paper_claims import claim_table, estimator_order_table
+from rigkit.validation.tables import (
+    PaperTables,
+    Table,
+    average_table,
+    baseline_table,
+    best_method,
+    estimator_table,
+    plane_table,
+)
+from rigkit.workflows.datasets import (
+    DatasetOptions,
+    LoadedCameras,
+    PairFailure,
+    load_cameras,
+    over_pairs,
+    ready_dataset,
+)
+from rigkit.workflows.pairs import match_images
+from rigkit.workflows.results import require_folder, write_results
+
+__all__ = ["PaperOptions", "PaperValidation", "validate_as_paper"]
+
+PAPER = "hajder2021"
+"""Folder with the paper's tables, beside the data set."""
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PaperOptions(DatasetOptions):
+    """How to repeat the paper on a data set."""
+
+    own_solvers: bool = False
+    """Standard and forward pairs by their own constrained solvers; else by the planar one, as in the paper."""
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class PaperValidation:
+    """What the paper's pipeline made of a data set.
+
+    Attributes
+    ----------
+    reports : pairs x estimators. Their sigmas are those of the points' scatter: the pipeline predicts none.
+    tables : in the layout of the paper's, with the printed numbers, and the claims.
+    failures : pairs that came to nothing.
+    files : relative path -> content of everything, whether it was written or not.
+    """
+
+    reports: tuple[ValidationReport, ...]
+    tables: tuple[Table, ...]
+    failures: tuple[PairFailure, ...]
+    files: Mapping[str, str]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _PaperJob:
+    """What one process needs to know of one pair."""
+
+    pair: Pair
+    cameras: LoadedCameras
+    options: PaperOptions
+
+
+def validate_as_paper(
+    dataset: Dataset | str | Path, options: PaperOptions | None = None, *, progress: Progress = silent
+) -> PaperValidation:
+    """Repeat the paper's comparison on the pairs of a data set, and write what `options` ask for.
+
+    Raises
+    ------
+    InputError
+        Nothing was measured, or something asked for cannot be: all said before the work.
+    RigkitError
+        No pair could be reconstructed; a pair that could not is else among the failures.
+    """
+    options = options or PaperOptions()
+    known = ready_dataset(dataset, options)
+    if options.output is not None:
+        require_folder(options.output, force=options.force)
+    if not any(pair.truth.count for pair in known.pairs):
+        raise InputError(
+            f"{known.manifest}: nothing was measured of these pairs; add a baseline or angles under [pairs.truth]"
+        )
+    folder = known.root.parent / PAPER
+    printed = load_paper_tables(folder) if folder.is_dir() else PaperTables()
+    cameras = load_cameras(known, recalibrate=options.recalibrate, progress=progress)
+
+    def job_of(pair: Pair) -> _PaperJob:
+        cameras.of(pair)
+        return _PaperJob(pair, cameras, options)
+
+    found, failures = over_pairs(
+        _repeat, known.pairs, job_of, jobs=options.jobs, what="repeating the paper on pairs", progress=progress
+    )
+    reports = tuple(report for of_pair in found for report in of_pair)
+    tables = _tables(reports, printed)
+    files = {
+        "tables.md": tables_to_markdown(tables),
+        "tables.csv": tables_to_csv(tables),
+        "tables.tex": tables_to_latex(tables),
+        "tables.json": tables_to_json(tables),
+    }
+    files |= cameras.files
+    if options.output is not None:
+        write_results(options.output, files, force=options.force, inputs=known.inputs)
+    return PaperValidation(reports=reports, tables=tables, failures=failures, files=files)
+
+
+def _repeat(job: _PaperJob) -> tuple[ValidationReport, ...]:
+    """Return the reports of one pair, an estimator that fails on it left out and said."""
+    pair = job.pair
+    camera1, camera2 = (loaded.camera for loaded in job.cameras.of(pair))
+    matched, _, _ = match_images(pair, camera1, camera2, job.options.chain)
+    motions = OWN_MOTIONS if job.options.own_solvers else MOTIONS
+    reports, errors = [], []
+    for method in AFFINE_METHODS:
+        try:
+            made = reconstruct_as_paper(matched, pose_type=pair.pose_type, affine_method=method, motions=motions)
+            reports.append(validate(made, pair.truth, weighted=False))
+        except RigkitError as error:
+            errors.append(error)
+    if not reports:
+        raise errors[0]
+    for lost in errors:
+        _log.warning(f"{lost}")
+    return tuple(reports)
+
+
+def _tables(reports: Sequence[ValidationReport], printed: PaperTables) -> tuple[Table, ...]:
+    method = best_method(reports)
+    tables = [plane_table(reports, method, printed)]
+    if any(check.kind == "baseline" for report in reports for check in report.checks):
+        tables.append(baseline_table(reports, printed))
+    averages = average_table(reports, method, printed)
+    if averages is not None:
+        tables.append(averages)
+    tables += [estimator_order_table(reports, printed), claim_table(reports, method, printed), estimator_table(reports)]
+    return tuple(tables)
