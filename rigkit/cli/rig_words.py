@@ -10,7 +10,7 @@ from rigkit.cli import calibration_words
 
 if TYPE_CHECKING:
     from rigkit.calibration.rig.result import RigCalibration
-    from rigkit.validation.checks import Check
+    from rigkit.validation.check import Check
 
 __all__ = ["describe", "summary"]
 

@@ -12,7 +12,7 @@ from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.uncertainty import transfer_uncertainty
 from rigkit.core.truth import Feature
 from rigkit.geometry.rotation import log_so3
-from rigkit.validation.checks import Check
+from rigkit.validation.check import Check
 from rigkit.validation.tables import Cell, Column, Table
 
 __all__ = ["rig_tables"]

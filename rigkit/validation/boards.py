@@ -151,7 +151,7 @@ def measure_board(
         board,
         plane,
         lattice,
-        normal_errors(normals, plane),
+        normal_errors(normals, plane.normal),
         x / board.square_x_mm,
         y / board.square_y_mm,
         float(np.rad2deg(np.arcsin(np.clip(abs(along @ down) / (x * y), 0.0, 1.0)))),

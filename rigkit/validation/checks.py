@@ -8,8 +8,8 @@ sigma is honest, and fewer where people state theirs generously.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from itertools import combinations
 from typing import Any
 
@@ -18,17 +18,19 @@ import numpy as np
 from rigkit.core.arrays import without_nan
 from rigkit.core.errors import InputError
 from rigkit.core.truth import PairTruth
+from rigkit.reconstruction.lattice_planes import LatticePlanes
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.validation.boards import BoardResult
+from rigkit.validation.check import Check, compare
+from rigkit.validation.declarations import DECLARED, declaration_checks
 from rigkit.validation.intrinsics import CalibrationShifts
 from rigkit.validation.measure import Measured, measure
+from rigkit.validation.planes import NormalErrors, normal_errors
 
 __all__ = [
     "COVERAGE",
     "AngleResult",
-    "Check",
     "ValidationReport",
-    "judge",
     "validate",
     "validate_each",
 ]
@@ -37,54 +39,32 @@ COVERAGE = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
-    """One measured quantity beside ours.
-
-    Attributes
-    ----------
-    name : "baseline", "angle plane1-plane2", "distance plane1.centre to plane2".
-    kind : "baseline", "angle" or "distance".
-    unit : "mm" or "deg", of all values.
-    measured, measured_sigma, how : what a person wrote down.
-    ours, our_sigma : what was reconstructed, with the predicted standard deviation.
-    difference : ours - measured.
-    combined_sigma : root of the sum of both variances.
-    k : |difference| / combined_sigma.
-    limit_k : the largest k that passes.
-    passed : the verdict.
-    count : how many points stand behind ours.
-    """
-
-    name: str
-    kind: str
-    unit: str
-    measured: float
-    measured_sigma: float
-    how: str
-    ours: float
-    our_sigma: float
-    difference: float
-    combined_sigma: float
-    k: float
-    limit_k: float
-    passed: bool
-    count: int
-
-
-@dataclass(frozen=True, slots=True)
 class AngleResult:
-    """The angle between two boards' faces, degrees, its sigma, and the measured angle where there is one."""
+    """The angle between two boards' faces, degrees, its sigma, and the measured angle where there is one.
+
+    `angle_deg` is that of planes through the triangulated points; `lattice_deg` and `lattice_sigma_deg` of the planes
+    that the boards' known lattices give, where they were computed.
+    """
 
     a: str
     b: str
     angle_deg: float
     sigma_deg: float
     measured_deg: float | None
+    lattice_deg: float | None = None
+    lattice_sigma_deg: float | None = None
 
     @property
     def error_deg(self) -> float | None:
         """|angle - measured|: the orthogonality error where a right angle was measured; None where nothing was."""
         return None if self.measured_deg is None else abs(self.angle_deg - self.measured_deg)
+
+    @property
+    def lattice_error_deg(self) -> float | None:
+        """|lattice angle - measured|; None where one of them is not known."""
+        if self.measured_deg is None or self.lattice_deg is None:
+            return None
+        return abs(self.lattice_deg - self.measured_deg)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -100,6 +80,7 @@ class ValidationReport:
     angles : between each two boards.
     baseline_mm, baseline_sigma_mm, sampson_rms_px, count : of the reconstruction.
     notes : the reconstruction's notes, and boards with gross outliers.
+    lattice_normal_errors : of the estimated normals against the planes of the boards' known lattices, by board.
     """
 
     pair_id: str
@@ -114,9 +95,10 @@ class ValidationReport:
     sampson_rms_px: float
     count: int
     notes: tuple[str, ...] = ()
+    lattice_normal_errors: Mapping[str, NormalErrors] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not self.checks:
+        if all(check.kind in DECLARED for check in self.checks):
             why = f" ({'; '.join(self.unchecked)})" if self.unchecked else ""
             raise InputError(
                 f"pair '{self.pair_id}': nothing measured can be checked{why}; "
@@ -149,8 +131,11 @@ class ValidationReport:
             "sampson_rms_px": self.sampson_rms_px,
             "checks": [asdict(check) for check in self.checks],
             "unchecked": list(self.unchecked),
-            "angles": [asdict(angle) | {"error_deg": angle.error_deg} for angle in self.angles],
-            "boards": [_board_dict(board) for board in self.boards],
+            "angles": [
+                asdict(angle) | {"error_deg": angle.error_deg, "lattice_error_deg": angle.lattice_error_deg}
+                for angle in self.angles
+            ],
+            "boards": [_board_dict(board, self.lattice_normal_errors) for board in self.boards],
             "notes": list(self.notes),
         }
         cleaned: dict[str, Any] = without_nan(out)
@@ -166,6 +151,7 @@ def validate(
     truth: PairTruth,
     *,
     shifts: CalibrationShifts | None = None,
+    lattice: LatticePlanes | None = None,
     coverage: float = COVERAGE,
     weighted: bool = True,
 ) -> ValidationReport:
@@ -176,6 +162,7 @@ def validate(
     reconstruction : of one pair.
     truth : what a person measured of that pair.
     shifts : from `calibration_shifts`: what the calibrations' uncertainty adds to every sigma; None: exact intrinsics.
+    lattice : the boards' planes by their known lattices, to stand beside those of the points.
     coverage : largest |difference| / combined sigma that passes.
     weighted : planes by what is known of each point's noise; else by principal components of the points, all alike.
 
@@ -186,11 +173,15 @@ def validate(
     DegenerateError
         A board has too few points for a plane.
     """
-    return _report(reconstruction, measure(reconstruction, shifts, weighted=weighted), truth, shifts, coverage)
+    measured = measure(reconstruction, shifts, weighted=weighted)
+    return _report(reconstruction, measured, truth, shifts, lattice, coverage)
 
 
 def validate_each(
-    reconstructions: Sequence[Reconstruction], truth: PairTruth, shifts: Sequence[CalibrationShifts | None]
+    reconstructions: Sequence[Reconstruction],
+    truth: PairTruth,
+    shifts: Sequence[CalibrationShifts | None],
+    lattice: LatticePlanes | None = None,
 ) -> tuple[ValidationReport, ...]:
     """Return `validate` of reconstructions of one pair by several estimators, each with its shifts.
 
@@ -203,7 +194,7 @@ def validate_each(
         if measured is None:
             measured = measure(reconstruction, moved)
             known.append((reconstruction, moved, measured))
-        reports.append(_report(reconstruction, measured.with_normals(reconstruction), truth, moved, COVERAGE))
+        reports.append(_report(reconstruction, measured.with_normals(reconstruction), truth, moved, lattice, COVERAGE))
     return tuple(reports)
 
 
@@ -212,6 +203,7 @@ def _report(
     measured: Measured,
     truth: PairTruth,
     shifts: CalibrationShifts | None,
+    lattice: LatticePlanes | None,
     coverage: float,
 ) -> ValidationReport:
     baseline_sigma_mm = reconstruction.baseline_sigma_mm
@@ -220,10 +212,11 @@ def _report(
     cloud = reconstruction.cloud
     checks: list[Check] = []
     unchecked: list[str] = []
+    held, unheld = declaration_checks(reconstruction)
     if truth.baseline is not None:
         known = (truth.baseline.value_mm, truth.baseline.sigma_mm, truth.baseline.how)
         ours = (reconstruction.baseline_mm, baseline_sigma_mm)
-        checks.append(judge("baseline", "baseline", "mm", known, ours, coverage, len(cloud)))
+        checks.append(compare("baseline", "baseline", "mm", known, ours, coverage, len(cloud)))
     angles = {frozenset(two): measured.angle_deg(*two) for two in combinations(measured.boards, 2)}
     for angle in truth.angles:
         name, both = f"angle {angle.a}-{angle.b}", (angle.a, angle.b)
@@ -231,7 +224,7 @@ def _report(
             unchecked.append(f"{name}: {measured.absent(*both)}")
             continue
         known = (angle.value_deg, angle.sigma_deg, angle.how)
-        checks.append(judge(name, "angle", "deg", known, angles[frozenset(both)], coverage, measured.count(*both)))
+        checks.append(compare(name, "angle", "deg", known, angles[frozenset(both)], coverage, measured.count(*both)))
     for distance in truth.distances:
         name, ends = f"distance {distance.a} to {distance.b}", (distance.a.board_id, distance.b.board_id)
         if measured.absent(*ends):
@@ -239,8 +232,10 @@ def _report(
             continue
         known = (distance.value_mm, distance.sigma_mm, distance.how)
         checks.append(
-            judge(name, "distance", "mm", known, measured.distance_mm(distance), coverage, measured.count(*ends))
+            compare(name, "distance", "mm", known, measured.distance_mm(distance), coverage, measured.count(*ends))
         )
+    checks += held
+    unchecked += unheld
     stated = {frozenset((angle.a, angle.b)): angle.value_deg for angle in truth.angles}
     return ValidationReport(
         reconstruction.pair_id,
@@ -250,7 +245,7 @@ def _report(
         tuple(unchecked),
         tuple(measured.boards.values()),
         tuple(
-            AngleResult(a, b, *angles[frozenset((a, b))], stated.get(frozenset((a, b))))
+            AngleResult(a, b, *angles[frozenset((a, b))], stated.get(frozenset((a, b))), *_lattice_angle(lattice, a, b))
             for a, b in combinations(measured.boards, 2)
         ),
         reconstruction.baseline_mm,
@@ -258,7 +253,20 @@ def _report(
         reconstruction.sampson_rms_px,
         len(cloud),
         (*reconstruction.notes, *_outlier_notes(measured.boards.values())),
+        {} if lattice is None else _lattice_normal_errors(reconstruction, lattice),
     )
+
+
+def _lattice_angle(lattice: LatticePlanes | None, a: str, b: str) -> tuple[float, float] | tuple[None, None]:
+    if lattice is None or not {a, b} <= set(lattice.board_ids):
+        return None, None
+    return lattice.angle_deg(a, b)
+
+
+def _lattice_normal_errors(reconstruction: Reconstruction, lattice: LatticePlanes) -> dict[str, NormalErrors]:
+    cloud = reconstruction.cloud
+    of = {board.board_id: cloud.normals[cloud.board_index == n] for n, board in enumerate(reconstruction.boards)}
+    return {name: normal_errors(of[name], lattice.normal(name)) for name in lattice.board_ids if len(of.get(name, ()))}
 
 
 def _outlier_notes(boards: Iterable[BoardResult]) -> list[str]:
@@ -270,46 +278,10 @@ def _outlier_notes(boards: Iterable[BoardResult]) -> list[str]:
     ]
 
 
-def judge(
-    name: str,
-    kind: str,
-    unit: str,
-    known: tuple[float, float, str],
-    ours: tuple[float, float],
-    coverage: float,
-    count: int,
-) -> Check:
-    """Return the check of `ours` (value, sigma) against `known` (value, sigma, how).
-
-    A sigma that is NaN (not predicted) counts as zero on our side: that makes the check stricter, never laxer.
-    """
-    value, sigma, how = known
-    our_sigma = ours[1] if np.isfinite(ours[1]) else 0.0
-    difference = ours[0] - value
-    combined = float(np.hypot(sigma, our_sigma))
-    k = abs(difference) / combined
-    return Check(
-        name,
-        kind,
-        unit,
-        value,
-        sigma,
-        how,
-        float(ours[0]),
-        float(ours[1]),
-        float(difference),
-        combined,
-        float(k),
-        coverage,
-        bool(k <= coverage),
-        count,
-    )
-
-
-def _board_dict(result: BoardResult) -> dict[str, Any]:
-    plane = result.plane
+def _board_dict(result: BoardResult, by_lattice: Mapping[str, NormalErrors]) -> dict[str, Any]:
+    plane, board_id = result.plane, result.board.board_id
     return {
-        "board": result.board.board_id,
+        "board": board_id,
         "points": plane.count,
         "normal": plane.normal.tolist(),
         "offset_mm": plane.offset_mm,
@@ -317,6 +289,7 @@ def _board_dict(result: BoardResult) -> dict[str, Any]:
         "flatness_rms_mm": plane.rms_mm,
         "flatness_peak_mm": plane.peak_mm,
         "normal_errors": asdict(result.normal_errors),
+        "lattice_normal_errors": asdict(by_lattice[board_id]) if board_id in by_lattice else None,
         "square_x_ratio": result.square_x_ratio,
         "square_y_ratio": result.square_y_ratio,
         "skew_deg": result.skew_deg,

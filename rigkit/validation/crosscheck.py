@@ -2,7 +2,7 @@
 
 pycolmap: two-view geometry, triangulation and bundle adjustment; scale from the squares. Planar PnP: every board's own
 pose, no epipolar geometry at all. Another chain: the same pair reconstructed in other pixels (raw or rectified).
-A difference beyond the combined sigmas is a failed check; which ways agree among each other says what to suspect.
+A difference beyond its own sigma is a failed check; which ways agree among each other says what to suspect.
 """
 
 from __future__ import annotations
@@ -20,16 +20,18 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, log_so3, rotation_angle, unit
 from rigkit.interop.colmap import colmap_pair, solve_pair
+from rigkit.reconstruction.geometry import POSE_FREEDOM
 from rigkit.reconstruction.reconstruct import Reconstruction
-from rigkit.validation.checks import Check, judge
+from rigkit.validation.check import Check, compare
 from rigkit.validation.colmap_method import colmap_reconstruction
 from rigkit.validation.intrinsics import CalibrationShifts
 from rigkit.validation.measure import Measured, measure
 from rigkit.validation.planes import face_angle, fit_moved
 from rigkit.validation.pnp import AnglesDeg, moved_pnp, planar_pnp
 
-__all__ = ["CrossCheckReport", "OtherWay", "compare_chains", "crosscheck"]
+__all__ = ["CrossCheckReport", "OtherWay", "compare_chains", "crosscheck", "sigma_of_difference"]
 
+TWO_VIEW = "pycolmap two-view"
 ADJUSTED = "pycolmap bundle adjustment"
 PNP = "planar PnP"
 OTHER_CHAIN = "other chain"
@@ -152,7 +154,7 @@ def crosscheck(
     reconstruction : of one pair.
     other_chain : the same pair reconstructed in other pixels (rectified where this one is raw, or the reverse).
     shifts : from `calibration_shifts`: a wrong calibration moves the ways apart; None: exact intrinsics.
-    coverage : largest |difference| / combined sigma that passes.
+    coverage : largest |difference| / its sigma that passes.
     seed : of COLMAP's RANSAC.
 
     Raises InputError where none of the ways could be gone.
@@ -168,11 +170,14 @@ def crosscheck(
             ways += attempt()
         except DegenerateError as error:
             skipped.append(f"{name}: {error}")
+    if any(way.name == TWO_VIEW and np.isnan(way.covariance).all() for way in ways):
+        skipped.append(
+            f"{TWO_VIEW}: its own bundle adjustment moves it by more than it is uncertain; it is no result yet"
+        )
     if other_chain is not None:
         ways.append(compare_chains(reconstruction, other_chain, OTHER_CHAIN))
-    own = _with_observed_corners(reconstruction, ways)
-    measured = measure(own)
-    checks = [check for way in ways for check in _checks(own, measured, way, coverage, shifts)]
+    measured = measure(reconstruction)
+    checks = [check for way in ways for check in _checks(reconstruction, measured, way, coverage, shifts)]
     return CrossCheckReport(
         reconstruction.pair_id,
         reconstruction.affine_method,
@@ -205,14 +210,32 @@ def _colmap_ways(reconstruction: Reconstruction, seed: int) -> list[OtherWay]:
     baseline = adjusted.baseline_mm
     two_view = Rigid3(result.two_view.rotation, result.two_view.translation_mm * baseline)
     unknown = np.full((6, 6), np.nan)
-    found = (adjusted.cam2_from_cam1, adjusted.pose_covariance)
-    covariance = unknown if found[1] is None else found[1]
+    covariance = unknown if adjusted.pose_covariance is None else adjusted.pose_covariance
+    # What the adjustment leaves in place is as certain as its end, but for a length that it never had.
+    own_sigma = np.array(_pose_sigmas(adjusted.cam2_from_cam1, covariance)[:2])
+    own = adjusted.cam2_from_cam1
+    moved = np.rad2deg(
+        [
+            rotation_angle(own.rotation @ two_view.rotation.T),
+            angle_between(own.translation_mm, two_view.translation_mm),
+        ]
+    )
+    settled = bool((moved <= CROSS_COVERAGE * own_sigma).all())
     return [
-        _way("pycolmap two-view", reconstruction, two_view, unknown, {}, np.nan, result.inliers, excluded),
+        _way(
+            TWO_VIEW,
+            reconstruction,
+            two_view,
+            covariance if settled else unknown,
+            {},
+            np.nan,
+            result.inliers,
+            excluded,
+        ),
         _way(
             ADJUSTED,
             reconstruction,
-            found[0],
+            own,
             covariance,
             _angles(measure(adjusted)),
             result.rms_px,
@@ -230,19 +253,17 @@ def _pnp_way(reconstruction: Reconstruction) -> OtherWay:
     return replace(way, variance_factor=found.variance_factor)
 
 
-def _with_observed_corners(reconstruction: Reconstruction, ways: Sequence[OtherWay]) -> Reconstruction:
-    """Return the reconstruction with its pose's covariance for the corner errors that the boards' shapes show.
+def sigma_of_difference(ours: float, theirs: float, freedom: int) -> float:
+    """Return the standard deviation of the difference of two estimates from the same corners, from those of both.
 
-    It is never made smaller: errors that all corners share do not show in a board's shape.
+    Notes
+    -----
+    The more certain estimate uses what the corners say in full, so that the error of the other one is its error and an
+    independent part: Var(a - b) = |Var a - Var b| (Hausman, Econometrica 46, 1978). Each variance is estimated from
+    residuals, to the share sqrt(2 / freedom) of itself; as much of the larger one is added.
     """
-    factor = max([1.0, *(way.variance_factor for way in ways if np.isfinite(way.variance_factor))])
-    if reconstruction.pose_covariance is None:
-        return reconstruction
-    return replace(
-        reconstruction,
-        pose_covariance=factor * reconstruction.pose_covariance,
-        baseline_sigma_mm=float(np.sqrt(factor)) * reconstruction.baseline_sigma_mm,
-    )
+    a, b = ours**2, theirs**2
+    return float(np.sqrt(abs(a - b) + np.sqrt(2.0 / max(freedom, 2)) * max(a, b)))
 
 
 def _way(
@@ -273,11 +294,12 @@ def _checks(
     coverage: float,
     shifts: CalibrationShifts | None,
 ) -> list[Check]:
-    """Return the checks of one way; none for what that way gives without uncertainty.
+    """Return the checks of one way, by the sigma of the difference: both saw the same corners.
 
-    Epipolar ways take the same calibration in the same manner; only the boards' own poses move apart from ours.
+    There are none for what that way gives without uncertainty. Epipolar ways take the same calibration in the same
+    manner; only the boards' own poses move apart from ours.
     """
-    checks = []
+    rows_of: list[tuple[str, str, str, tuple[float, float], tuple[float, float]]] = []
     ours = _angles(measured)
     apart = _apart(measured, shifts) if shifts is not None and way.name == PNP else {}
     sigma = _pose_sigmas(way.cam2_from_cam1, way.covariance)
@@ -291,15 +313,16 @@ def _checks(
             ("baseline", "mm", way.baseline_mm, reconstruction.baseline_mm),
         )
         for (name, unit, other, value), theirs, mine in zip(rows, sigma, own, strict=True):
-            known = (other, theirs, way.name)
-            sigma_ours = float(np.hypot(mine, apart.get(name, 0.0)))
-            checks.append(judge(name, name, unit, known, (value, sigma_ours), coverage, way.used))
+            rows_of.append((name, name, unit, (other, theirs), (value, mine)))
     for (a, b), (angle, angle_sigma) in way.angles_deg.items():
         if (a, b) in ours:
-            known = (angle, angle_sigma, way.name)
-            name = f"angle {a}-{b}"
-            mine_and_shift = (ours[a, b][0], float(np.hypot(ours[a, b][1], apart.get(name, 0.0))))
-            checks.append(judge(name, "angle", "deg", known, mine_and_shift, coverage, way.used))
+            rows_of.append((f"angle {a}-{b}", "angle", "deg", (angle, angle_sigma), ours[a, b]))
+    checks = []
+    for name, kind, unit, (other, theirs), (value, mine) in rows_of:
+        both = [sigma if np.isfinite(sigma) else 0.0 for sigma in (mine, theirs)]
+        combined = float(np.hypot(sigma_of_difference(*both, way.used - POSE_FREEDOM), apart.get(name, 0.0)))
+        known = (other, theirs, way.name)
+        checks.append(compare(name, kind, unit, known, (value, mine), coverage, way.used, combined_sigma=combined))
     return checks
 
 

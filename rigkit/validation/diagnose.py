@@ -12,7 +12,8 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.board_pose import board_pose
-from rigkit.validation.checks import Check, ValidationReport
+from rigkit.validation.check import Check
+from rigkit.validation.checks import ValidationReport
 
 __all__ = ["camera_fit", "camera_suspects", "suspects"]
 

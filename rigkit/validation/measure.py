@@ -58,7 +58,7 @@ class Measured:
         cloud = reconstruction.cloud
         of = {board.board_id: cloud.normals[cloud.board_index == n] for n, board in enumerate(reconstruction.boards)}
         boards = {
-            name: replace(found, normal_errors=normal_errors(of[name], found.plane))
+            name: replace(found, normal_errors=normal_errors(of[name], found.plane.normal))
             for name, found in self.boards.items()
         }
         return replace(self, boards=boards)

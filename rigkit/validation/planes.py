@@ -100,7 +100,7 @@ class Plane:
 
 @dataclass(frozen=True, slots=True)
 class NormalErrors:
-    """Angles between estimated normals and the normal of the plane fitted to the points, degrees."""
+    """Angles between estimated normals and the normal of a plane, degrees."""
 
     mean_deg: float
     median_deg: float
@@ -334,12 +334,15 @@ def angle_jacobian(normal_a: FloatArray, normal_b: FloatArray) -> tuple[FloatArr
     return (normal_b - cosine * normal_a) / sine, (normal_a - cosine * normal_b) / sine
 
 
-def normal_errors(normals: Normals, plane: Plane) -> NormalErrors:
-    """Return statistics of the angles between normals (N, 3) and the plane's; raises DegenerateError for none."""
+def normal_errors(normals: Normals, plane_normal: FloatArray) -> NormalErrors:
+    """Return statistics of the angles between normals (N, 3) and that of their plane (3,).
+
+    Raises DegenerateError where there are no normals.
+    """
     array = as_array(normals, (None, 3), "normals")
     if len(array) == 0:
         raise DegenerateError("normal errors: no normals to judge")
-    errors = np.rad2deg(angle_between(array, plane.normal))
+    errors = np.rad2deg(angle_between(array, plane_normal))
     lower, median, upper = np.quantile(errors, [0.25, 0.5, 0.75])
     return NormalErrors(
         float(errors.mean()), float(median), float(lower), float(upper), float(errors.max()), len(array)

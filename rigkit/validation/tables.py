@@ -20,6 +20,7 @@ __all__ = [
     "Column",
     "PaperTables",
     "Table",
+    "angle_table",
     "average_table",
     "baseline_table",
     "best_method",
@@ -117,11 +118,14 @@ def build_tables(reports: Sequence[ValidationReport], paper: PaperTables | None 
     printed = paper or PaperTables()
     method = best_method(reports)
     tables = [plane_table(reports, method, printed), check_table(reports), estimator_table(reports)]
+    angles = angle_table([report for report in reports if report.affine_method == method])
+    if angles is not None:
+        tables.insert(1, angles)
     if any(_measured_baseline(report) is not None for report in reports):
-        tables.insert(1, baseline_table(reports, printed))
+        tables.insert(-2, baseline_table(reports, printed))
     averages = average_table(reports, method, printed)
     if averages is not None:
-        tables.insert(2, averages)
+        tables.insert(-2, averages)
     return tuple(tables)
 
 
@@ -176,6 +180,42 @@ def plane_table(reports: Sequence[ValidationReport], method: str, paper: PaperTa
             rows.append((Cell(f"{kind} normal error {board_id}"), *cells))
     columns = (Column("deg"), *(Column(pair_id, "", 4) for pair_id in chosen))
     return Table("planes", f"Angles between planes and normal errors, {method}", columns, tuple(rows))
+
+
+def angle_table(reports: Sequence[ValidationReport]) -> Table | None:
+    """Return the angles between boards by planes through the points and by known lattices, one report a pair.
+
+    None where no lattice planes were computed.
+    """
+    rows: list[tuple[Cell, ...]] = []
+    for report in reports:
+        for angle in report.angles:
+            if angle.lattice_deg is None:
+                continue
+            free = (Cell(angle.angle_deg, sigma=angle.sigma_deg), Cell(angle.error_deg))
+            lattice = (Cell(angle.lattice_deg, sigma=angle.lattice_sigma_deg), Cell(angle.lattice_error_deg))
+            normals = [report.lattice_normal_errors.get(name) for name in (angle.a, angle.b)]
+            means = [Cell(None if errors is None else errors.mean_deg) for errors in normals]
+            head = (Cell(report.pair_id), Cell(f"{angle.a}, {angle.b}"), Cell(angle.measured_deg))
+            rows.append((*head, *free, *lattice, *means))
+    if not rows:
+        return None
+    columns = (
+        Column("pair"),
+        Column("boards"),
+        Column("measured", "deg", 2),
+        Column("points' planes", "deg", 4),
+        Column("error", "deg", 4),
+        Column("lattice planes", "deg", 4),
+        Column("error, lattice", "deg", 4),
+        Column("mean normal error to lattice, first", "deg", 4),
+        Column("second", "deg", 4),
+    )
+    note = (
+        "Points' planes: fitted to the triangulated corners. Lattice planes: maximum likelihood of relative pose and "
+        "boards' poses from all corners of both views, the boards' squares known; sigmas include the calibrations."
+    )
+    return Table("angles", "Angles between boards by free and by lattice planes", columns, tuple(rows), note)
 
 
 def baseline_table(reports: Sequence[ValidationReport], paper: PaperTables) -> Table:

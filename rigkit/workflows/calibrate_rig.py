@@ -17,8 +17,8 @@ from rigkit.io.files import ensure_writable, write_together
 from rigkit.io.rig_file import board_rigs_text, rig_text
 from rigkit.io.rig_session import RigSession, frames_of_images, is_rig_session, load_rig_session
 from rigkit.io.session import load_session
-from rigkit.validation.checks import COVERAGE, Check
-from rigkit.validation.checks import judge as judge_measured
+from rigkit.validation.check import Check, compare
+from rigkit.validation.checks import COVERAGE
 from rigkit.workflows.calibrate import CalibrateOptions, calibration_from
 from rigkit.workflows.corners import Cache, SessionCorners, session_corners, session_views
 from rigkit.workflows.rigid_boards import named_as_listed, named_by_rule, require_distinct
@@ -198,16 +198,16 @@ def measured_checks(session: RigSession, rig: RigCalibration) -> list[Check]:
     for b in session.baselines:
         known = (b.length.value_mm, b.length.sigma_mm, b.length.how)
         ours = rig.baseline_mm(b.a, b.b)
-        out.append(judge_measured(f"baseline {b.a}-{b.b}", "baseline", "mm", known, ours, COVERAGE, rig.corner_count))
+        out.append(compare(f"baseline {b.a}-{b.b}", "baseline", "mm", known, ours, COVERAGE, rig.corner_count))
     for group, solved in zip(session.rigid_boards, rig.board_rigs, strict=True):
         count = sum(b.board.corner_count for b in solved.boards)
         for angle in group.truth.angles:
             known = (angle.value_deg, angle.sigma_deg, angle.how)
             ours = solved.angle_deg(angle.a, angle.b)
-            out.append(judge_measured(f"angle {angle.a}-{angle.b}", "angle", "deg", known, ours, COVERAGE, count))
+            out.append(compare(f"angle {angle.a}-{angle.b}", "angle", "deg", known, ours, COVERAGE, count))
         for distance in group.truth.distances:
             known = (distance.value_mm, distance.sigma_mm, distance.how)
             ours = solved.distance_mm(distance.a, distance.b)
             name = f"distance {distance.a} to {distance.b}"
-            out.append(judge_measured(name, "distance", "mm", known, ours, COVERAGE, count))
+            out.append(compare(name, "distance", "mm", known, ours, COVERAGE, count))
     return out

@@ -16,6 +16,7 @@ from rigkit.detection.detect import detect_boards
 from rigkit.io.images import read_image, to_grey
 from rigkit.io.manifest import Pair
 from rigkit.reconstruction.geometry import PairGeometry, pair_geometry
+from rigkit.reconstruction.lattice_planes import LatticePlanes, lattice_planes
 from rigkit.reconstruction.pairing import MatchedPair, match_pair
 from rigkit.reconstruction.reconstruct import Reconstruction, reconstruct_from
 from rigkit.validation.intrinsics import CalibrationShifts, calibration_shifts
@@ -24,6 +25,7 @@ from rigkit.workflows.datasets import LoadedCamera
 __all__ = [
     "find_boards",
     "geometry_of",
+    "lattice_of",
     "match_found",
     "match_images",
     "read_for",
@@ -118,6 +120,14 @@ def shifts_of(reconstruction: Reconstruction, camera1: LoadedCamera, camera2: Lo
         None if camera1 is camera2 else camera2.covariance,
         level_sigma_rad=reconstruction.level_sigma_rad,
     )
+
+
+def lattice_of(geometry: PairGeometry, camera1: LoadedCamera, camera2: LoadedCamera) -> LatticePlanes | None:
+    """Return the boards' planes by their known lattices; None where too few corners are seen."""
+    try:
+        return lattice_planes(geometry, camera1.covariance, camera2.covariance, one_camera=camera1 is camera2)
+    except DegenerateError:
+        return None
 
 
 def reconstruct_other_chain(matched: MatchedPair, pair: Pair) -> Reconstruction | None:

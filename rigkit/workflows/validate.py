@@ -36,7 +36,14 @@ from rigkit.workflows.datasets import (
     over_pairs,
     ready_dataset,
 )
-from rigkit.workflows.pairs import find_boards, geometry_of, match_found, reconstruct_other_chain, shifts_of
+from rigkit.workflows.pairs import (
+    find_boards,
+    geometry_of,
+    lattice_of,
+    match_found,
+    reconstruct_other_chain,
+    shifts_of,
+)
 from rigkit.workflows.results import require_folder, write_results
 from rigkit.workflows.validation_files import RESERVED, PairValidation, validation_files
 
@@ -186,7 +193,8 @@ def _judge(
     geometry = geometry_of(matched, pair)
     reconstructions = {m: reconstruct_from(geometry, affine_method=m, image1=image1) for m in AFFINE_METHODS}
     shifts = _shifts(reconstructions, job)
-    reports = validate_each(list(reconstructions.values()), pair.truth, [shifts[m] for m in reconstructions])
+    lattice = lattice_of(geometry, job.cameras[pair.camera1.camera_id], job.cameras[pair.camera2.camera_id])
+    reports = validate_each(list(reconstructions.values()), pair.truth, [shifts[m] for m in reconstructions], lattice)
     best = best_report(reports)
     files: dict[str, bytes] = {
         f"{pair.pair_id}/{method}.ply": ply_bytes(r.cloud) for method, r in reconstructions.items()

@@ -15,7 +15,8 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.triangulation import triangulate_rays
 from rigkit.reconstruction.reconstruct import Reconstruction
-from rigkit.validation.checks import judge, validate, validate_each
+from rigkit.validation.check import compare
+from rigkit.validation.checks import validate, validate_each
 from rigkit.validation.measure import Measured, measure
 
 BASELINE_MM = float(np.linalg.norm(CAM2_FROM_CAM1.translation_mm))
@@ -73,13 +74,13 @@ def test_a_wrong_stated_baseline_fails_the_baseline_only(factor: float) -> None:
 
 def test_the_verdict_is_k_combined_sigmas() -> None:
     known = (100.0, 0.6, "rule")
-    check = judge("x", "distance", "mm", known, (101.9, 0.8), 2.0, 10)
+    check = compare("x", "distance", "mm", known, (101.9, 0.8), 2.0, 10)
     assert (check.combined_sigma, check.k, check.passed) == (pytest.approx(1.0), pytest.approx(1.9), True)
-    assert not judge("x", "distance", "mm", known, (97.9, 0.8), 2.0, 10).passed
-    assert judge("x", "distance", "mm", known, (97.9, 0.8), 3.0, 10).passed
+    assert not compare("x", "distance", "mm", known, (97.9, 0.8), 2.0, 10).passed
+    assert compare("x", "distance", "mm", known, (97.9, 0.8), 3.0, 10).passed
     # What we could not predict never makes it easier.
-    assert judge("x", "distance", "mm", known, (101.0, np.nan), 2.0, 10).combined_sigma == 0.6
-    assert not judge("x", "distance", "mm", known, (np.nan, 0.8), 2.0, 10).passed
+    assert compare("x", "distance", "mm", known, (101.0, np.nan), 2.0, 10).combined_sigma == 0.6
+    assert not compare("x", "distance", "mm", known, (np.nan, 0.8), 2.0, 10).passed
 
 
 def test_missing_board_is_said_and_does_not_pass() -> None:

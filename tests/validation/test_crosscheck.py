@@ -19,7 +19,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
 from rigkit.interop.colmap import colmap_pair, solve_pair
 from rigkit.reconstruction.reconstruct import Reconstruction
-from rigkit.validation.crosscheck import ADJUSTED, PNP, crosscheck
+from rigkit.validation.crosscheck import ADJUSTED, PNP, crosscheck, sigma_of_difference
 from rigkit.validation.intrinsics import calibration_shifts
 from rigkit.validation.measure import measure
 from rigkit.validation.pnp import planar_pnp
@@ -56,7 +56,7 @@ def test_every_way_finds_the_exact_geometry(name: str) -> None:
     report = crosscheck(made(CAMERAS[name]))
     assert report.passed
     assert not report.skipped
-    assert len(report.checks) == 12
+    assert len(report.checks) == 15
     for way in report.ways:
         assert way.used == 144
         assert np.deg2rad(way.rotation_difference_deg) < EXACT_RAD
@@ -162,11 +162,23 @@ def test_another_chain_is_compared(rng: np.random.Generator) -> None:
     exact = made(regular_camera())
     report = crosscheck(exact, other_chain=exact)
     assert report.passed
-    assert len(report.checks) == 18
+    assert len(report.checks) == 21
     moved = replace(exact, cam2_from_cam1=Rigid3(CAM2_FROM_CAM1.rotation, CAM2_FROM_CAM1.translation_mm * 1.01))
     report = crosscheck(exact, other_chain=moved)
     assert not report.passed
     assert "rectification" in report.suspects[-1]
+
+
+def test_the_sigma_of_a_difference_is_that_of_estimates_from_the_same_data(rng: np.random.Generator) -> None:
+    """The mean, which is efficient, and the median of the same numbers differ by less than independent ones would."""
+    count, draws = 101, 4000
+    numbers = rng.normal(size=(draws, count))
+    mean, median = numbers.mean(axis=1), np.median(numbers, axis=1)
+    predicted = sigma_of_difference(float(mean.std()), float(median.std()), 10**9)
+    assert np.std(median - mean) == pytest.approx(predicted, rel=0.08)
+    assert predicted < 0.6 * np.hypot(mean.std(), median.std())
+    # Variances from few residuals are not known well enough to call equal sigmas no difference at all.
+    assert sigma_of_difference(1.0, 1.0, 50) == pytest.approx(0.2**0.5)
 
 
 def test_no_way_at_all_is_an_error() -> None:

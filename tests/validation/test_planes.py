@@ -101,7 +101,7 @@ def test_quartiles_are_those_of_the_angles() -> None:
     plane = fit_plane(board_points()[0])
     across = np.cross(plane.normal, [1.0, 0.0, 0.0])
     across /= np.linalg.norm(across)
-    errors = normal_errors(np.cos(tilts)[:, None] * plane.normal + np.sin(tilts)[:, None] * across, plane)
+    errors = normal_errors(np.cos(tilts)[:, None] * plane.normal + np.sin(tilts)[:, None] * across, plane.normal)
     assert (errors.lower_quartile_deg, errors.median_deg, errors.upper_quartile_deg) == pytest.approx((2.0, 3.0, 4.0))
 
 
@@ -112,7 +112,7 @@ def test_too_few_or_collinear_points_do_not_make_a_plane() -> None:
     with pytest.raises(DegenerateError, match="line"):
         fit_plane(points[:8])
     with pytest.raises(DegenerateError, match="no normals"):
-        normal_errors(np.zeros((0, 3)), fit_plane(points))
+        normal_errors(np.zeros((0, 3)), fit_plane(points).normal)
     with pytest.raises(InputError, match="covariance"):
         fit_plane(points, np.zeros((48, 3, 3)))
 

@@ -17,11 +17,20 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import DegenerateError, InputError, RigkitError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import rotation_angle, unit
 from rigkit.relative_pose.refinement.refine import RefinedPose, estimate_pose, refine_pose
 from rigkit.relative_pose.refinement.residuals import level_terms
 from rigkit.relative_pose.solvers.pose import translation_basis
 
-__all__ = ["DEFAULT_LEVEL_RAD", "PoseTypeEvidence", "TypeEvidence", "pose_type_evidence"]
+__all__ = [
+    "CONTRADICTION_P",
+    "DEFAULT_LEVEL_RAD",
+    "PoseTypeEvidence",
+    "TypeEvidence",
+    "pose_type_evidence",
+    "type_deviation_rad",
+]
 
 DEFAULT_LEVEL_RAD = float(np.radians(0.2))
 """What a carefully set spirit level on a tripod holds to, where nobody says."""
@@ -45,8 +54,7 @@ class TypeEvidence:
     log_evidence : log marginal likelihood, relative to the best type (so 0 for the best, negative for the others).
     probability : posterior probability if all four types were equally likely beforehand.
     chi2, residuals : sum of squared residuals of the points in sigmas (stated ones) and their number.
-    deviation_rad : largest deviation of the general fit from the type: an angle out of the vertical axis, of the
-        rotation, or of the translation's direction. Zero for the general type.
+    deviation_rad : largest angle of the general fit off the type, see `type_deviation_rad`. Zero for the general type.
     p_value : chance of deviations at least this large from noise and level, if the type were true.
     refined : the pose under this type (soft level).
     """
@@ -200,4 +208,20 @@ def _deviation(general: RefinedPose | None, kind: PoseType, level: float, noise2
     values, jacobian, covariance = _level_parts(general, kind)
     spread = noise2 * jacobian @ covariance @ jacobian.T + level**2 * np.eye(len(values))
     distance2 = float(values @ np.linalg.solve(spread, values))
-    return float(np.abs(values).max()), float(gammaincc(0.5 * len(values), 0.5 * distance2))
+    return type_deviation_rad(general.cam2_from_cam1, kind), float(gammaincc(0.5 * len(values), 0.5 * distance2))
+
+
+def type_deviation_rad(pose: Rigid3, kind: PoseType) -> float:
+    """Return the largest angle by which a pose is off its type, rad; zero for the general type.
+
+    Planar: the tilt of the vertical axis, and of the translation out of the horizontal plane. Standard and forward: the
+    rotation, and the translation against the x or the z axis, either way along it.
+    """
+    R, t = pose.rotation, unit(pose.translation_mm)
+    if kind == PoseType.PLANAR:
+        tilt = np.arctan2(np.hypot(R[0, 1], R[2, 1]), R[1, 1])
+        return float(max(tilt, np.arctan2(abs(t[1]), np.hypot(t[0], t[2]))))
+    if kind in (PoseType.STANDARD, PoseType.FORWARD):
+        along, across = (0, [1, 2]) if kind == PoseType.STANDARD else (2, [0, 1])
+        return float(max(rotation_angle(R), np.arctan2(np.linalg.norm(t[across]), abs(t[along]))))
+    return 0.0

@@ -1,0 +1,86 @@
+"""One quantity beside ours: both uncertainties and a verdict.
+
+A check passes where |ours - measured| <= k sqrt(sigma_ours^2 + sigma_measured^2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+__all__ = ["Check", "compare"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Check:
+    """One measured quantity beside ours.
+
+    Attributes
+    ----------
+    name : "baseline", "angle plane1-plane2", "distance plane1.centre to plane2", "pose type planar", "level".
+    kind : "baseline", "angle", "distance", "pose type" or "level".
+    unit : "mm" or "deg", of all values.
+    measured, measured_sigma, how : what a person wrote down.
+    ours, our_sigma : what was reconstructed, with the predicted standard deviation.
+    difference : ours - measured.
+    combined_sigma : root of the sum of both variances.
+    k : |difference| / combined_sigma.
+    limit_k : the largest k that passes.
+    passed : the verdict.
+    count : how many points stand behind ours.
+    """
+
+    name: str
+    kind: str
+    unit: str
+    measured: float
+    measured_sigma: float
+    how: str
+    ours: float
+    our_sigma: float
+    difference: float
+    combined_sigma: float
+    k: float
+    limit_k: float
+    passed: bool
+    count: int
+
+
+def compare(
+    name: str,
+    kind: str,
+    unit: str,
+    known: tuple[float, float, str],
+    ours: tuple[float, float],
+    coverage: float,
+    count: int,
+    *,
+    combined_sigma: float | None = None,
+) -> Check:
+    """Return the check of `ours` (value, sigma) against `known` (value, sigma, how).
+
+    A sigma that is NaN (not predicted) counts as zero on our side: that makes the check stricter, never laxer.
+    `combined_sigma` is that of the difference where the two are not independent; by default they are.
+    """
+    value, sigma, how = known
+    our_sigma = ours[1] if np.isfinite(ours[1]) else 0.0
+    difference = ours[0] - value
+    combined = float(np.hypot(sigma, our_sigma)) if combined_sigma is None else combined_sigma
+    k = abs(difference) / combined
+    return Check(
+        name=name,
+        kind=kind,
+        unit=unit,
+        measured=value,
+        measured_sigma=sigma,
+        how=how,
+        ours=float(ours[0]),
+        our_sigma=float(ours[1]),
+        difference=float(difference),
+        combined_sigma=combined,
+        k=float(k),
+        limit_k=coverage,
+        passed=bool(k <= coverage),
+        count=count,
+    )

@@ -1,0 +1,64 @@
+"""A pose type or level that was declared and does not hold fails a check of its own, with the true angle."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.board_scenes import detection, regular_camera
+from helpers.reconstructions import BOARDS
+
+from rigkit.core.posetype import PoseType
+from rigkit.core.truth import MeasuredAngle, PairTruth
+from rigkit.reconstruction.pairing import match_pair
+from rigkit.reconstruction.reconstruct import Reconstruction, reconstruct_pair
+from rigkit.synthetic.pairs import trihedral_pair
+from rigkit.validation.checks import validate
+
+TRUTH = PairTruth(None, (MeasuredAngle("plane1", "plane2", 90.0, 0.3, "set square"),))
+
+
+def declared(true: PoseType, said: PoseType, rng: np.random.Generator, level_deg: float = 0.2) -> Reconstruction:
+    """Return a reconstruction of a pair of one pose type that was declared another."""
+    scene = trihedral_pair(
+        BOARDS, regular_camera(), true, rng, level_sigma_deg=level_deg, distance=(0.9, 1.3), walls=False
+    )
+    found = [
+        [detection(b, np.array(d.pixels), rng, 0.03) for b, d in zip(BOARDS, exact, strict=True)]
+        for exact in scene.detections()
+    ]
+    pair = match_pair("made", scene.camera1, scene.camera2, *found, BOARDS)
+    return reconstruct_pair(pair, pose_type=said, level_sigma_rad=np.deg2rad(0.2))
+
+
+@pytest.mark.parametrize("pose_type", [PoseType.PLANAR, PoseType.STANDARD, PoseType.FORWARD])
+def test_what_holds_passes(rng: np.random.Generator, pose_type: PoseType) -> None:
+    report = validate(declared(pose_type, pose_type, rng), TRUTH)
+    assert report.check(f"pose type {pose_type}").passed
+    assert report.check("level").passed
+    assert report.passed
+
+
+@pytest.mark.parametrize(
+    ("true", "said"), [(PoseType.FORWARD, PoseType.STANDARD), (PoseType.STANDARD, PoseType.FORWARD)]
+)
+def test_another_pose_type_fails_by_a_right_angle(rng: np.random.Generator, true: PoseType, said: PoseType) -> None:
+    report = validate(declared(true, said, rng), TRUTH)
+    row = report.check(f"pose type {said}")
+    assert not row.passed
+    assert not report.passed
+    assert row.ours == pytest.approx(90.0, abs=1.0)
+    assert report.check("level").passed
+
+
+def test_a_level_that_was_off_fails_with_its_angle(rng: np.random.Generator) -> None:
+    report = validate(declared(PoseType.GENERAL, PoseType.PLANAR, rng), TRUTH)
+    row = report.check("level")
+    assert not row.passed
+    assert row.ours > 5.0
+    assert row.k > row.limit_k
+
+
+def test_nothing_declared_is_nothing_to_check(rng: np.random.Generator) -> None:
+    for said in (PoseType.GENERAL, PoseType.AUTO):
+        report = validate(declared(PoseType.STANDARD, said, rng), TRUTH)
+        assert {check.kind for check in report.checks} == {"angle"}
