@@ -9,7 +9,7 @@ short or points at the boards.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -41,7 +41,7 @@ STEP_TOLERANCE = 1e-10
 """Largest step in standard deviations of a parameter at which the minimisation ends: nothing of it shows."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class _View:
     """The corners of one board in one view.
 
@@ -66,15 +66,23 @@ class _View:
     ) -> _View:
         """Return the corners as a camera sees them."""
         bases = np.linalg.pinv(camera.ray_jacobian(pixels)) / sigma_px[:, None, None]
-        return cls(board, second, pixels, sigma_px, points, camera.unproject(pixels)[0], np.asarray(bases))
+        return cls(
+            board=board,
+            second=second,
+            pixels=pixels,
+            sigma_px=sigma_px,
+            points=points,
+            rays=camera.unproject(pixels)[0],
+            bases=np.asarray(bases),
+        )
 
     def by(self, camera: Camera) -> _View:
         """Return the same corners by another camera."""
         return _View.of(camera, self.board, self.second, self.pixels, self.sigma_px, self.points)
 
     def select(self, which: BoolArray) -> _View:
-        of = (self.pixels, self.sigma_px, self.points, self.rays, self.bases)
-        return _View(self.board, self.second, *(array[which] for array in of))
+        names = ("pixels", "sigma_px", "points", "rays", "bases")
+        return replace(self, **{name: getattr(self, name)[which] for name in names})
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +100,7 @@ class _State:
         return _State(_moved(self.pose, by_pose), boards, self.log_sizes + step[6 * (count + 1) :])
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class LatticePlanes:
     """Relative pose and boards' poses of maximum likelihood, with the boards' lattices known.
 
@@ -213,12 +221,20 @@ def lattice_planes(
     placed = tuple(identity.cam1_from_board[b.board_id] for b in boards)
     state = _State(identity.cam2_from_cam1, placed, np.zeros(len(boards)))
     total = sum(len(v.rays) for v in views)
-    for _ in range(OUTLIER_ROUNDS):
-        state = _minimum(views, state, sigma)
-        near = _near(views, state)
-        if all(which.all() for which in near):
-            break
-        views = [view.select(which) for view, which in zip(views, near, strict=True)]
+    views, state = _without_outliers(views, state, sigma)
+    return _result(pair.pair_id, boards, views, state, sigma, moved, total)
+
+
+def _result(
+    pair_id: str,
+    boards: list[Board],
+    views: list[_View],
+    state: _State,
+    sigma: FloatArray,
+    moved: list[tuple[Camera, Camera]],
+    total: int,
+) -> LatticePlanes:
+    """Return the planes at a minimum, with the covariance that the residuals and the moved cameras show."""
     r, J = _residuals(views, state, sigma)
     free = _free(sigma)
     count, priors = sum(len(v.rays) for v in views), int((sigma > 0.0).sum())
@@ -226,21 +242,21 @@ def lattice_planes(
     factor = variance_factor(float(data @ data), 2 * count - 6 * (len(boards) + 1))
     # The sizes' prior is no noise of the corners: its variance stays what a person said.
     scaled = J[:, free] / np.sqrt(np.where(np.arange(len(J)) < len(data), factor, 1.0))[:, None]
-    information = _inverse(scaled.T @ scaled, pair.pair_id)
+    information = _inverse(scaled.T @ scaled, pair_id)
     covariance = np.zeros((J.shape[1], J.shape[1]))
     covariance[np.ix_(free, free)] = information
     moves = np.zeros((len(moved), J.shape[1]))
     moves[:, free] = -_residual_changes(views, state, moved) @ J[: len(data), free] @ information / factor
     return LatticePlanes(
-        tuple(b.board_id for b in boards),
-        state.pose,
-        {b.board_id: pose for b, pose in zip(boards, state.boards, strict=True)},
-        covariance,
-        moves,
-        factor,
-        float(np.sqrt(np.mean(data**2))),
-        count,
-        total - count,
+        board_ids=tuple(b.board_id for b in boards),
+        cam2_from_cam1=state.pose,
+        cam1_from_board={b.board_id: pose for b, pose in zip(boards, state.boards, strict=True)},
+        covariance=covariance,
+        calibration_moves=moves,
+        variance_factor=factor,
+        rms_sigmas=float(np.sqrt(np.mean(data**2))),
+        count=count,
+        gross=total - count,
     )
 
 
@@ -331,6 +347,17 @@ def _minimum(views: list[_View], state: _State, sigma: FloatArray) -> _State:
             if damping > 1e6:
                 break
     return state
+
+
+def _without_outliers(views: list[_View], state: _State, sigma: FloatArray) -> tuple[list[_View], _State]:
+    """Return the views without gross outliers, and the minimum for what is left."""
+    for _ in range(OUTLIER_ROUNDS):
+        state = _minimum(views, state, sigma)
+        near = _near(views, state)
+        if all(which.all() for which in near):
+            break
+        views = [view.select(which) for view, which in zip(views, near, strict=True)]
+    return views, state
 
 
 def _near(views: list[_View], state: _State) -> list[BoolArray]:

@@ -38,7 +38,7 @@ __all__ = [
 COVERAGE = 2.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class AngleResult:
     """The angle between two boards' faces, degrees, its sigma, and the measured angle where there is one.
 
@@ -245,7 +245,7 @@ def _report(
         tuple(unchecked),
         tuple(measured.boards.values()),
         tuple(
-            AngleResult(a, b, *angles[frozenset((a, b))], stated.get(frozenset((a, b))), *_lattice_angle(lattice, a, b))
+            _angle_result(a, b, angles[frozenset((a, b))], stated.get(frozenset((a, b))), lattice)
             for a, b in combinations(measured.boards, 2)
         ),
         reconstruction.baseline_mm,
@@ -257,10 +257,20 @@ def _report(
     )
 
 
-def _lattice_angle(lattice: LatticePlanes | None, a: str, b: str) -> tuple[float, float] | tuple[None, None]:
-    if lattice is None or not {a, b} <= set(lattice.board_ids):
-        return None, None
-    return lattice.angle_deg(a, b)
+def _angle_result(
+    a: str, b: str, found: tuple[float, float], stated: float | None, lattice: LatticePlanes | None
+) -> AngleResult:
+    known = lattice is not None and {a, b} <= set(lattice.board_ids)
+    by_lattice = lattice.angle_deg(a, b) if known and lattice is not None else (None, None)
+    return AngleResult(
+        a=a,
+        b=b,
+        angle_deg=found[0],
+        sigma_deg=found[1],
+        measured_deg=stated,
+        lattice_deg=by_lattice[0],
+        lattice_sigma_deg=by_lattice[1],
+    )
 
 
 def _lattice_normal_errors(reconstruction: Reconstruction, lattice: LatticePlanes) -> dict[str, NormalErrors]:
