@@ -193,7 +193,7 @@ def _judge(
     geometry = geometry_of(matched, pair)
     reconstructions = {m: reconstruct_from(geometry, affine_method=m, image1=image1) for m in AFFINE_METHODS}
     shifts = _shifts(reconstructions, job)
-    lattice = lattice_of(geometry, job.cameras[pair.camera1.camera_id], job.cameras[pair.camera2.camera_id])
+    lattice = lattice_of(geometry, *job.cameras.of(pair))
     reports = validate_each(list(reconstructions.values()), pair.truth, [shifts[m] for m in reconstructions], lattice)
     best = best_report(reports)
     files: dict[str, bytes] = {
