@@ -319,8 +319,9 @@ def _checks(
             rows_of.append((f"angle {a}-{b}", "angle", "deg", (angle, angle_sigma), ours[a, b]))
     checks = []
     for name, kind, unit, (other, theirs), (value, mine) in rows_of:
-        both = [sigma if np.isfinite(sigma) else 0.0 for sigma in (mine, theirs)]
-        combined = float(np.hypot(sigma_of_difference(*both, way.used - POSE_FREEDOM), apart.get(name, 0.0)))
+        ours_sigma, their_sigma = (sigma if np.isfinite(sigma) else 0.0 for sigma in (mine, theirs))
+        of_corners = sigma_of_difference(ours_sigma, their_sigma, way.used - POSE_FREEDOM)
+        combined = float(np.hypot(of_corners, apart.get(name, 0.0)))
         known = (other, theirs, way.name)
         checks.append(compare(name, kind, unit, known, (value, mine), coverage, way.used, combined_sigma=combined))
     return checks

@@ -226,7 +226,7 @@ def test_calibrations_move_only_the_boards_own_poses_apart(rng: np.random.Genera
     plain, honest = (crosscheck(exact, shifts=s) for s in (None, calibration_shifts(exact, axes**2)))
     share: dict[str, float] = {}
     for before, after in zip(plain.checks, honest.checks, strict=True):
-        added = after.our_sigma**2 - before.our_sigma**2
+        added = after.combined_sigma**2 - before.combined_sigma**2
         assert added > 0.0 if before.how == PNP else added == 0.0
         if before.how == PNP and before.kind == "angle":
             share[before.name] = np.sqrt(added)

@@ -91,7 +91,7 @@ def test_a_corner_that_opens_wider_than_a_right_angle_is_more_than_90_degrees() 
 def test_normal_errors_are_angles_to_the_plane() -> None:
     reconstruction = make_reconstruction(normal_tilt_rad=np.deg2rad(2.0))
     on = reconstruction.cloud.on_board("plane2")
-    errors = normal_errors(reconstruction.cloud.normals[on], fit_plane(reconstruction.cloud.points_mm[on]))
+    errors = normal_errors(reconstruction.cloud.normals[on], fit_plane(reconstruction.cloud.points_mm[on]).normal)
     assert (errors.mean_deg, errors.median_deg, errors.max_deg) == pytest.approx((2.0, 2.0, 2.0), abs=1e-9)
     assert errors.count == 48
 
