@@ -9,20 +9,28 @@ short or points at the boards.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Points, Rays
+from rigkit.core.arrays import FloatArray, Mat3, Points
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
-from rigkit.geometry.board_pose import point_residuals
 from rigkit.geometry.principal_axes import principal_axes
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import angle_between, exp_so3, skew
+from rigkit.geometry.rotation import angle_between, skew
+from rigkit.reconstruction.lattice_problem import (
+    MIN_CORNERS,
+    LatticeView,
+    PlacedLattices,
+    all_residuals,
+    fit_without_outliers,
+    free_parameters,
+    residuals_of,
+)
 from rigkit.reconstruction.noise_level import variance_factor
 
 if TYPE_CHECKING:
@@ -30,74 +38,6 @@ if TYPE_CHECKING:
     from rigkit.reconstruction.pairing import MatchedPair
 
 __all__ = ["LatticePlanes", "lattice_planes"]
-
-MIN_CORNERS = 8
-"""A board with fewer corners in a view has no pose there worth the name."""
-GROSS = 8.0
-"""A corner this many standard deviations off is no corner of the lattice: something stands in front of it."""
-OUTLIER_ROUNDS = 3
-MAX_STEPS = 40
-STEP_TOLERANCE = 1e-10
-"""Largest step in standard deviations of a parameter at which the minimisation ends: nothing of it shows."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _View:
-    """The corners of one board in one view.
-
-    Attributes
-    ----------
-    board, second : which board, and whether it is the second view.
-    pixels, sigma_px, points : (N, 2), (N,), and on the lattice (N, 3).
-    rays, bases : (N, 3), and rows (N, 2, 3) perpendicular to them that make residuals in sigmas.
-    """
-
-    board: int
-    second: bool
-    pixels: FloatArray
-    sigma_px: FloatArray
-    points: Points
-    rays: Rays
-    bases: FloatArray
-
-    @classmethod
-    def of(
-        cls, camera: Camera, board: int, second: bool, pixels: FloatArray, sigma_px: FloatArray, points: Points
-    ) -> _View:
-        """Return the corners as a camera sees them."""
-        bases = np.linalg.pinv(camera.ray_jacobian(pixels)) / sigma_px[:, None, None]
-        return cls(
-            board=board,
-            second=second,
-            pixels=pixels,
-            sigma_px=sigma_px,
-            points=points,
-            rays=camera.unproject(pixels)[0],
-            bases=np.asarray(bases),
-        )
-
-    def by(self, camera: Camera) -> _View:
-        """Return the same corners by another camera."""
-        return _View.of(camera, self.board, self.second, self.pixels, self.sigma_px, self.points)
-
-    def select(self, which: BoolArray) -> _View:
-        names = ("pixels", "sigma_px", "points", "rays", "bases")
-        return replace(self, **{name: getattr(self, name)[which] for name in names})
-
-
-@dataclass(frozen=True, eq=False)
-class _State:
-    """cam2_from_cam1, the boards' poses in camera 1, and the logarithms (K,) of their sizes over the declared ones."""
-
-    pose: Rigid3
-    boards: tuple[Rigid3, ...]
-    log_sizes: FloatArray
-
-    def moved(self, step: FloatArray) -> _State:
-        count = len(self.boards)
-        by_pose, *by_board = step[: 6 * (count + 1)].reshape(-1, 6)
-        boards = tuple(_moved(board, part) for board, part in zip(self.boards, by_board, strict=True))
-        return _State(_moved(self.pose, by_pose), boards, self.log_sizes + step[6 * (count + 1) :])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -219,24 +159,24 @@ def lattice_planes(
     sigma = np.array([(b.square_sigma_mm or 0.0) / np.sqrt(b.square_x_mm * b.square_y_mm) for b in boards])
     identity = pair.identity
     placed = tuple(identity.cam1_from_board[b.board_id] for b in boards)
-    state = _State(identity.cam2_from_cam1, placed, np.zeros(len(boards)))
+    state = PlacedLattices(identity.cam2_from_cam1, placed, np.zeros(len(boards)))
     total = sum(len(v.rays) for v in views)
-    views, state = _without_outliers(views, state, sigma)
+    views, state = fit_without_outliers(views, state, sigma)
     return _result(pair.pair_id, boards, views, state, sigma, moved, total)
 
 
 def _result(
     pair_id: str,
     boards: list[Board],
-    views: list[_View],
-    state: _State,
+    views: list[LatticeView],
+    state: PlacedLattices,
     sigma: FloatArray,
     moved: list[tuple[Camera, Camera]],
     total: int,
 ) -> LatticePlanes:
     """Return the planes at a minimum, with the covariance that the residuals and the moved cameras show."""
-    r, J = _residuals(views, state, sigma)
-    free = _free(sigma)
+    r, J = all_residuals(views, state, sigma)
+    free = free_parameters(sigma)
     count, priors = sum(len(v.rays) for v in views), int((sigma > 0.0).sum())
     data = r[: len(r) - priors]
     factor = variance_factor(float(data @ data), 2 * count - 6 * (len(boards) + 1))
@@ -260,13 +200,13 @@ def _result(
     )
 
 
-def _views(geometry: PairGeometry, moved: list[tuple[Camera, Camera]]) -> tuple[list[_View], list[Board]]:
+def _views(geometry: PairGeometry, moved: list[tuple[Camera, Camera]]) -> tuple[list[LatticeView], list[Board]]:
     """Return the corners of every board that has enough of them in both views, and these boards.
 
     Corners at the rim of the field that one of the moved cameras does not see take no part.
     """
     pair = geometry.pair
-    views: list[_View] = []
+    views: list[LatticeView] = []
     boards: list[Board] = []
     found = [{d.board_id: d for d in one} for one in (pair.identity.detections1, pair.identity.detections2)]
     for board in pair.boards:
@@ -279,95 +219,11 @@ def _views(geometry: PairGeometry, moved: list[tuple[Camera, Camera]]) -> tuple[
             seen = np.logical_and.reduce([camera.unproject(corners.pixels)[1] for camera in cameras])
             # What the matched corners show of their noise holds as well for those that one view alone has.
             sigma_px, points = geometry.scatter * corners.sigma_px[seen], board.points(corners.grid[seen])
-            both.append(_View.of(cameras[0], len(boards), second, corners.pixels[seen], sigma_px, points))
+            both.append(LatticeView.of(cameras[0], len(boards), second, corners.pixels[seen], sigma_px, points))
         if all(len(view.rays) >= MIN_CORNERS for view in both):
             views += both
             boards.append(board)
     return views, boards
-
-
-def _moved(pose: Rigid3, step: FloatArray) -> Rigid3:
-    return Rigid3(exp_so3(step[:3]) @ pose.rotation, pose.translation_mm + step[3:])
-
-
-def _free(sigma: FloatArray) -> BoolArray:
-    """Return which parameters are unknown: a board's size only where a sigma of it is stated."""
-    return np.concatenate([np.ones(6 * (len(sigma) + 1), dtype=bool), sigma > 0.0])
-
-
-def _of_view(view: _View, state: _State) -> tuple[FloatArray, FloatArray]:
-    """Return residuals (N, 2) of one board in one view, and their derivatives (N, 2, P)."""
-    k, count = view.board, len(state.boards)
-    turned = np.exp(state.log_sizes[k]) * view.points @ state.boards[k].rotation.T
-    x = turned + state.boards[k].translation_mm
-    jacobian = np.zeros((len(x), 2, 7 * count + 6))
-    if view.second:
-        around = x @ state.pose.rotation.T
-        residual, by_x2 = point_residuals(view.rays, view.bases, around + state.pose.translation_mm)
-        jacobian[:, :, :3], jacobian[:, :, 3:6] = -by_x2 @ skew(around), by_x2
-        by_x = by_x2 @ state.pose.rotation
-    else:
-        residual, by_x = point_residuals(view.rays, view.bases, x)
-    start = 6 * (k + 1)
-    jacobian[:, :, start : start + 3], jacobian[:, :, start + 3 : start + 6] = -by_x @ skew(turned), by_x
-    jacobian[:, :, 6 * (count + 1) + k] = (by_x @ turned[:, :, None])[..., 0]
-    return residual, jacobian
-
-
-def _residuals(views: list[_View], state: _State, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return all residuals in sigmas, those of the sizes' prior last, and their derivatives."""
-    parts = [_of_view(view, state) for view in views]
-    stated = sigma > 0.0
-    prior = np.zeros((int(stated.sum()), 7 * len(sigma) + 6))
-    prior[:, 6 * (len(sigma) + 1) :] = np.diag(1.0 / np.where(stated, sigma, 1.0))[stated]
-    r = np.concatenate([*(r.ravel() for r, _ in parts), state.log_sizes[stated] / sigma[stated]])
-    return r, np.concatenate([*(J.reshape(-1, J.shape[-1]) for _, J in parts), prior])
-
-
-def _minimum(views: list[_View], state: _State, sigma: FloatArray) -> _State:
-    """Return the nearest minimum of the sum of squares (Levenberg-Marquardt)."""
-    free, damping = _free(sigma), 1e-6
-    r, J = _residuals(views, state, sigma)
-    for _ in range(MAX_STEPS):
-        gram = J[:, free].T @ J[:, free]
-        scale = np.sqrt(np.maximum(np.diag(gram), 1e-30))
-        step = np.zeros(J.shape[1])
-        unit_step = np.linalg.solve(
-            gram / np.outer(scale, scale) + damping * np.eye(len(gram)), -(J[:, free].T @ r) / scale
-        )
-        step[free] = unit_step / scale
-        trial = state.moved(step)
-        r_trial, J_trial = _residuals(views, trial, sigma)
-        if r_trial @ r_trial <= r @ r:
-            state, r, J, damping = trial, r_trial, J_trial, max(0.1 * damping, 1e-12)
-            if np.abs(unit_step).max() < STEP_TOLERANCE * np.sqrt(len(r)):
-                break
-        else:
-            damping = max(10.0 * damping, 1e-9)
-            if damping > 1e6:
-                break
-    return state
-
-
-def _without_outliers(views: list[_View], state: _State, sigma: FloatArray) -> tuple[list[_View], _State]:
-    """Return the views without gross outliers, and the minimum for what is left."""
-    for _ in range(OUTLIER_ROUNDS):
-        state = _minimum(views, state, sigma)
-        near = _near(views, state)
-        if all(which.all() for which in near):
-            break
-        views = [view.select(which) for view, which in zip(views, near, strict=True)]
-    return views, state
-
-
-def _near(views: list[_View], state: _State) -> list[BoolArray]:
-    """Return which corners of each view are no gross outliers, by the median of all residuals."""
-    off = [np.linalg.norm(_of_view(view, state)[0], axis=1) for view in views]
-    # The median length of two normal residuals is 1.1774 of their sigma.
-    sigma = max(float(np.median(np.concatenate(off))) / 1.1774, 1e-9)
-    near = [np.asarray(one <= GROSS * sigma) for one in off]
-    enough = all(which.sum() >= MIN_CORNERS for which in near)
-    return near if enough else [np.ones(len(one), dtype=bool) for one in off]
 
 
 def _inverse(gram: FloatArray, pair_id: str) -> FloatArray:
@@ -394,8 +250,10 @@ def _moved_cameras(
     return out
 
 
-def _residual_changes(views: list[_View], state: _State, moved: list[tuple[Camera, Camera]]) -> FloatArray:
+def _residual_changes(
+    views: list[LatticeView], state: PlacedLattices, moved: list[tuple[Camera, Camera]]
+) -> FloatArray:
     """Return the change (A, R) of the residuals for each of the moved cameras."""
-    base = np.concatenate([_of_view(view, state)[0].ravel() for view in views])
-    rows = [[_of_view(view.by(cameras[view.second]), state)[0].ravel() for view in views] for cameras in moved]
+    base = np.concatenate([residuals_of(view, state)[0].ravel() for view in views])
+    rows = [[residuals_of(view.by(cameras[view.second]), state)[0].ravel() for view in views] for cameras in moved]
     return np.array([np.concatenate(row) - base for row in rows]).reshape(len(moved), len(base))
