@@ -10,11 +10,9 @@ from typing import TYPE_CHECKING, Any
 from rigkit.core.errors import InputError
 
 if TYPE_CHECKING:
-    from rigkit.rectification.rectify import RectifyMap
+    from rigkit.workflows.rectify import RectifiedImage
 
 HELP = "perspective, cylindrical or equirectangular image from any camera's image, or a stereo pair"
-
-EIGHT_BIT = (".jpg", ".jpeg", ".bmp", ".webp")
 
 IMAGE_SIZE = re.compile(r"^(\d+)[xX](\d+)$")
 
@@ -49,92 +47,58 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    if args.image2 is not None or args.rig is not None:
-        return _run_stereo(args)
-    import numpy as np
+    from rigkit.cli.console import print_json
+    from rigkit.workflows.rectify import RectifyOptions, rectify_image, rectify_stereo_images
 
-    from rigkit.io.calibration_file import load_camera
-    from rigkit.io.files import ensure_writable
-    from rigkit.rectification.rectify import rectify_map, rotation_from_view_angles
-    from rigkit.rectification.targets import target_camera
-
-    if args.camera is None:
-        raise InputError("rectify: --camera is missing; give the camera's calibration.json")
-    _ensure_kind(args.output)
-    ensure_writable(args.output, force=args.force, inputs=(args.image, args.camera))
-    camera = load_camera(args.camera)
-    target = target_camera(
-        camera,
-        args.projection,
-        hfov_rad=None if args.hfov_deg is None else np.radians(args.hfov_deg),
+    options = RectifyOptions(
+        output=Path(args.output),
+        projection=args.projection,
+        hfov_deg=args.hfov_deg,
+        angles_deg=(args.yaw_deg, args.pitch_deg, args.roll_deg),
         size_px=_size(args.size),
+        interpolation=args.interpolation,
+        force=args.force,
     )
-    rotation = rotation_from_view_angles(*np.radians([args.yaw_deg, args.pitch_deg, args.roll_deg]))
-    return _report(args, [_write(args, args.image, rectify_map(camera, target, target_from_cam=rotation), args.output)])
-
-
-def _run_stereo(args: argparse.Namespace) -> int:
-    from rigkit.io.files import ensure_writable
-    from rigkit.io.rig_file import load_rig
-    from rigkit.rectification.stereo import rectify_pair
-
+    if args.image2 is None and args.rig is None:
+        if args.camera is None:
+            raise InputError("rectify: --camera is missing; give the camera's calibration.json")
+        one = rectify_image(args.image, args.camera, options)
+        print_json(_summary(one, args.projection)) if args.json else print(_words(one, args.projection))
+        return 0
     if args.image2 is None or args.rig is None:
         raise InputError("rectify: a stereo pair needs two images and --rig RIG.json")
-    _ensure_kind(args.output)
-    if args.hfov_deg is not None or args.size is not None or args.yaw_deg or args.pitch_deg or args.roll_deg:
-        raise InputError("rectify: the baseline decides the view of a stereo pair; leave out its angles and its size")
-    rig = load_rig(args.rig)
-    names = list(args.names or list(rig)[:2])
-    missing = [name for name in names if name not in rig]
-    if missing or len(names) != 2:
-        raise InputError(f"'{args.rig}': no camera '{', '.join(missing)}'; there are {', '.join(rig)}")
-    (camera1, cam1_from_rig), (camera2, cam2_from_rig) = (rig[name] for name in names)
-    out = Path(args.output)
-    outputs = [str(out.with_name(f"{out.stem}-{i}{out.suffix}")) for i in (1, 2)]
-    ensure_writable(outputs, force=args.force, inputs=(args.image, args.image2, args.rig))
-    pair = rectify_pair(camera1, camera2, cam2_from_rig @ cam1_from_rig.inverse(), projection=args.projection)
-    images, maps = (args.image, args.image2), (pair.map1, pair.map2)
-    done = [_write(args, image, remap, o) for image, remap, o in zip(images, maps, outputs, strict=True)]
-    return _report(args, done, {"rect2_from_rect1_mm": pair.rect2_from_rect1.translation_mm.tolist()})
+    names = None if args.names is None else tuple(args.names)
+    done, pair = rectify_stereo_images((args.image, args.image2), args.rig, options, names)
+    baseline = pair.rect2_from_rect1.translation_mm.tolist()
+    if args.json:
+        print_json({"images": [_summary(one, args.projection) for one in done], "rect2_from_rect1_mm": baseline})
+        return 0
+    for one in done:
+        print(_words(one, args.projection))
+    print(f"baseline {abs(baseline[0]):.3f} mm along the rows")
+    return 0
 
 
-def _write(args: argparse.Namespace, image: str, remap: RectifyMap, output: str) -> dict[str, Any]:
-    """Resample, write, and return what to say of it."""
-    from rigkit.io.files import write_atomic
-    from rigkit.io.images import read_image
-
-    covered = float(remap.coverage().mean())
-    if covered == 0.0:
-        raise InputError("rectify: the camera sees nothing of this view; change --yaw-deg, --pitch-deg or --hfov-deg")
-    pixels = remap.image(read_image(image), interpolation=args.interpolation)
-    write_atomic(output, _encoded(pixels, output), force=args.force)
-    target = remap.target
+def _summary(one: RectifiedImage, projection: str) -> dict[str, Any]:
+    target = one.map.target
     return {
-        "image": output,
-        "projection": args.projection,
+        "image": str(one.path),
+        "projection": projection,
         "model": target.model,
         "size_px": list(target.size_px),
         "parameters": dict(zip(target.parameter_names(), target.parameters.tolist(), strict=True)),
-        "target_from_cam": remap.target_from_cam.tolist(),
-        "covered": covered,
+        "target_from_cam": one.map.target_from_cam.tolist(),
+        "covered": one.covered,
     }
 
 
-def _report(args: argparse.Namespace, done: list[dict[str, Any]], stereo: dict[str, Any] | None = None) -> int:
-    from rigkit.cli.console import print_json
-
-    if args.json:
-        print_json(done[0] if stereo is None else {"images": done, **stereo})
-        return 0
-    for one in done:
-        (width, height), focal = one["size_px"], one["parameters"]["fx"]
-        print(
-            f"{one['image']}: {one['projection']}, {width} x {height} px, focal length {focal:.2f} px, "
-            f"{100.0 * one['covered']:.1f} % of it seen by the camera"
-        )
-    if stereo is not None:
-        print(f"baseline {abs(stereo['rect2_from_rect1_mm'][0]):.3f} mm along the rows")
-    return 0
+def _words(one: RectifiedImage, projection: str) -> str:
+    target = one.map.target
+    (width, height), focal = target.size_px, target.parameters[target.parameter_names().index("fx")]
+    return (
+        f"{one.path}: {projection}, {width} x {height} px, focal length {focal:.2f} px, "
+        f"{100.0 * one.covered:.1f} % of it seen by the camera"
+    )
 
 
 def _size(text: str | None) -> tuple[int, int] | None:
@@ -144,24 +108,3 @@ def _size(text: str | None) -> tuple[int, int] | None:
     if match is None:
         raise InputError(f"--size {text}: give width and height in px, such as --size 1280x960")
     return int(match[1]), int(match[2])
-
-
-def _encoded(image: object, path: str) -> bytes:
-    import cv2
-    import numpy as np
-
-    suffix = Path(path).suffix.lower()
-    pixels = np.asarray(image)
-    if suffix in EIGHT_BIT and pixels.dtype != np.uint8:
-        raise InputError(f"'{path}': a {suffix} file has no 16-bit pixels; write a .png or .tif")
-    _, data = cv2.imencode(suffix, pixels if pixels.ndim == 2 else np.ascontiguousarray(pixels[..., ::-1]))
-    return bytes(data)
-
-
-def _ensure_kind(path: str) -> None:
-    """Refuse a kind of image that cannot be written, before the work."""
-    import cv2
-
-    if not cv2.haveImageWriter(path):
-        kind = Path(path).suffix
-        raise InputError(f"'{path}': images of the kind '{kind}' cannot be written; take .png, .tif or .jpg")
