@@ -66,8 +66,32 @@ if TYPE_CHECKING:
     from rigkit.rectification.rectify import rectify_map
     from rigkit.relative_pose.solvers.registry import fundamental_for
     from rigkit.report.calibration_page import CalibrationSection, build_calibration_page
+    from rigkit.validation.certificate.contracts import Quantity, Task
     from rigkit.validation.checks import ValidationReport, validate
     from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
+    from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration, calibrate_session
+    from rigkit.workflows.calibrate_rig import RigSessionCalibration, calibrate_rig_session
+    from rigkit.workflows.certify import CertifiedFile, CertifyOptions, certify_file
+    from rigkit.workflows.corners import Cache
+    from rigkit.workflows.crosscheck import DatasetCrossCheck, crosscheck_dataset
+    from rigkit.workflows.datasets import DatasetOptions
+    from rigkit.workflows.demo import DemoOptions, run_demo
+    from rigkit.workflows.detect import DetectionResult, DetectOptions, detect_in_images
+    from rigkit.workflows.diff import CameraPair, DiffOptions, RigPair, diff
+    from rigkit.workflows.export_camera import (
+        ExportCameraOptions,
+        ExportedCamera,
+        export_camera,
+        export_rig,
+        import_camera,
+    )
+    from rigkit.workflows.export_cloud import ExportCloudOptions, export_cloud
+    from rigkit.workflows.print_board import MeasuredPrint, PrintOptions, print_board, store_measured_print
+    from rigkit.workflows.reconstruct import DatasetReconstruction, ReconstructOptions, reconstruct_dataset
+    from rigkit.workflows.reconstruct_scene import SceneOptions, SceneResult, reconstruct_views
+    from rigkit.workflows.rectify import RectifiedImage, RectifyOptions, rectify_image, rectify_stereo_images
+    from rigkit.workflows.study import StudyOptions, StudyResult, run_studies, run_study
+    from rigkit.workflows.validate import DatasetValidation, ValidateOptions, validate_dataset
 
     __version__: str
 
@@ -75,39 +99,80 @@ __all__ = [
     "Board",
     "BoardDetection",
     "BoardView",
+    "Cache",
+    "CalibrateOptions",
     "Calibration",
     "CalibrationSection",
     "Camera",
     "CameraDifference",
+    "CameraPair",
+    "CertifiedFile",
+    "CertifyOptions",
     "CrossCheckReport",
     "Dataset",
+    "DatasetCrossCheck",
+    "DatasetOptions",
+    "DatasetReconstruction",
+    "DatasetValidation",
     "DegenerateError",
+    "DemoOptions",
+    "DetectOptions",
+    "DetectionResult",
+    "DiffOptions",
     "DirectionPairs",
+    "ExportCameraOptions",
+    "ExportCloudOptions",
+    "ExportedCamera",
     "InputError",
     "MatchedPair",
     "Matches",
+    "MeasuredPrint",
     "OrientedCloud",
     "PairTruth",
     "PoseType",
+    "PrintOptions",
+    "Quantity",
+    "ReconstructOptions",
     "Reconstruction",
+    "RectifiedImage",
+    "RectifyOptions",
     "RigCalibration",
+    "RigPair",
     "RigSession",
+    "RigSessionCalibration",
     "Rigid3",
     "RigkitError",
+    "SceneOptions",
     "SceneReconstruction",
+    "SceneResult",
     "Session",
+    "SessionCalibration",
+    "StudyOptions",
+    "StudyResult",
+    "Task",
+    "ValidateOptions",
     "ValidationReport",
     "affines_from_directions",
     "build_calibration_page",
     "calibrate",
     "calibrate_rig",
+    "calibrate_rig_session",
+    "calibrate_session",
     "camera_model",
+    "certify_file",
     "compare_cameras",
     "complete_boards",
     "crosscheck",
+    "crosscheck_dataset",
     "detect_boards",
+    "detect_in_images",
+    "diff",
+    "export_camera",
+    "export_cloud",
+    "export_rig",
     "fundamental_for",
     "identify_pair",
+    "import_camera",
     "load_calibration",
     "load_camera",
     "load_dataset",
@@ -116,13 +181,23 @@ __all__ = [
     "load_session",
     "match_pair",
     "normals_from_affines",
+    "print_board",
     "read_image",
     "read_ply",
+    "reconstruct_dataset",
     "reconstruct_pair",
     "reconstruct_scene",
+    "reconstruct_views",
+    "rectify_image",
     "rectify_map",
+    "rectify_stereo_images",
+    "run_demo",
+    "run_studies",
+    "run_study",
     "save_calibration",
+    "store_measured_print",
     "validate",
+    "validate_dataset",
     "write_ply",
 ]
 
@@ -134,81 +209,58 @@ _NAMES_OF = {
     "rigkit.calibration.rig.calibrate": ("calibrate_rig",),
     "rigkit.calibration.rig.result": ("RigCalibration",),
     "rigkit.cameras.base": ("Camera",),
-    "rigkit.cameras.compare": (
-        "CameraDifference",
-        "compare_cameras",
-    ),
+    "rigkit.cameras.compare": ("CameraDifference", "compare_cameras"),
     "rigkit.cameras.registry": ("camera_model",),
     "rigkit.core.boards": ("Board",),
     "rigkit.core.cloud": ("OrientedCloud",),
-    "rigkit.core.detections": (
-        "BoardDetection",
-        "BoardView",
-    ),
-    "rigkit.core.errors": (
-        "DegenerateError",
-        "InputError",
-        "RigkitError",
-    ),
-    "rigkit.core.matches": (
-        "DirectionPairs",
-        "Matches",
-    ),
+    "rigkit.core.detections": ("BoardDetection", "BoardView"),
+    "rigkit.core.errors": ("DegenerateError", "InputError", "RigkitError"),
+    "rigkit.core.matches": ("DirectionPairs", "Matches"),
     "rigkit.core.posetype": ("PoseType",),
     "rigkit.core.truth": ("PairTruth",),
     "rigkit.detection.detect": ("detect_boards",),
     "rigkit.detection.guided.guided": ("complete_boards",),
     "rigkit.geometry.rigid3": ("Rigid3",),
     "rigkit.identification.identify": ("identify_pair",),
-    "rigkit.io.calibration_file": (
-        "load_calibration",
-        "load_camera",
-        "save_calibration",
-    ),
+    "rigkit.io.calibration_file": ("load_calibration", "load_camera", "save_calibration"),
     "rigkit.io.images": ("read_image",),
-    "rigkit.io.manifest": (
-        "Dataset",
-        "load_dataset",
-    ),
-    "rigkit.io.ply": (
-        "read_ply",
-        "write_ply",
-    ),
+    "rigkit.io.manifest": ("Dataset", "load_dataset"),
+    "rigkit.io.ply": ("read_ply", "write_ply"),
     "rigkit.io.rig_file": ("load_rig",),
-    "rigkit.io.rig_session": (
-        "RigSession",
-        "load_rig_session",
-    ),
-    "rigkit.io.session": (
-        "Session",
-        "load_session",
-    ),
-    "rigkit.reconstruction.pairing": (
-        "MatchedPair",
-        "match_pair",
-    ),
-    "rigkit.reconstruction.reconstruct": (
-        "Reconstruction",
-        "reconstruct_pair",
-    ),
-    "rigkit.reconstruction.scene": (
-        "SceneReconstruction",
-        "reconstruct_scene",
-    ),
+    "rigkit.io.rig_session": ("RigSession", "load_rig_session"),
+    "rigkit.io.session": ("Session", "load_session"),
+    "rigkit.reconstruction.pairing": ("MatchedPair", "match_pair"),
+    "rigkit.reconstruction.reconstruct": ("Reconstruction", "reconstruct_pair"),
+    "rigkit.reconstruction.scene": ("SceneReconstruction", "reconstruct_scene"),
     "rigkit.rectification.rectify": ("rectify_map",),
     "rigkit.relative_pose.solvers.registry": ("fundamental_for",),
-    "rigkit.report.calibration_page": (
-        "CalibrationSection",
-        "build_calibration_page",
+    "rigkit.report.calibration_page": ("CalibrationSection", "build_calibration_page"),
+    "rigkit.validation.certificate.contracts": ("Quantity", "Task"),
+    "rigkit.validation.checks": ("ValidationReport", "validate"),
+    "rigkit.validation.crosscheck": ("CrossCheckReport", "crosscheck"),
+    "rigkit.workflows.calibrate": ("CalibrateOptions", "SessionCalibration", "calibrate_session"),
+    "rigkit.workflows.calibrate_rig": ("RigSessionCalibration", "calibrate_rig_session"),
+    "rigkit.workflows.certify": ("CertifiedFile", "CertifyOptions", "certify_file"),
+    "rigkit.workflows.corners": ("Cache",),
+    "rigkit.workflows.crosscheck": ("DatasetCrossCheck", "crosscheck_dataset"),
+    "rigkit.workflows.datasets": ("DatasetOptions",),
+    "rigkit.workflows.demo": ("DemoOptions", "run_demo"),
+    "rigkit.workflows.detect": ("DetectOptions", "DetectionResult", "detect_in_images"),
+    "rigkit.workflows.diff": ("CameraPair", "DiffOptions", "RigPair", "diff"),
+    "rigkit.workflows.export_camera": (
+        "ExportCameraOptions",
+        "ExportedCamera",
+        "export_camera",
+        "export_rig",
+        "import_camera",
     ),
-    "rigkit.validation.checks": (
-        "ValidationReport",
-        "validate",
-    ),
-    "rigkit.validation.crosscheck": (
-        "CrossCheckReport",
-        "crosscheck",
-    ),
+    "rigkit.workflows.export_cloud": ("ExportCloudOptions", "export_cloud"),
+    "rigkit.workflows.print_board": ("MeasuredPrint", "PrintOptions", "print_board", "store_measured_print"),
+    "rigkit.workflows.reconstruct": ("DatasetReconstruction", "ReconstructOptions", "reconstruct_dataset"),
+    "rigkit.workflows.reconstruct_scene": ("SceneOptions", "SceneResult", "reconstruct_views"),
+    "rigkit.workflows.rectify": ("RectifiedImage", "RectifyOptions", "rectify_image", "rectify_stereo_images"),
+    "rigkit.workflows.study": ("StudyOptions", "StudyResult", "run_studies", "run_study"),
+    "rigkit.workflows.validate": ("DatasetValidation", "ValidateOptions", "validate_dataset"),
 }
 """Module -> the public names in it, as imported above for type checkers."""
 

@@ -6,11 +6,9 @@ import argparse
 from pathlib import Path
 
 from rigkit.core.errors import InputError
+from rigkit.workflows.formats import CAMERA_FORMATS, CLOUD_FORMATS
 
 HELP = "cameras in other tools' formats; clouds as PLY, npz or a COLMAP model"
-
-CAMERA_FORMATS = ("rigkit", "opencv", "kalibr", "ros", "colmap", "ocamcalib", "mrcal")
-CLOUD_FORMATS = ("ply", "npz", "colmap")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -20,10 +20,9 @@ from rigkit.io.calibration_file import load_camera, refuse_mirrored, save_camera
 from rigkit.io.files import ensure_writable, write_atomic
 from rigkit.io.reading import read_text
 from rigkit.io.rig_file import load_rig
+from rigkit.workflows.formats import CAMERA_FORMATS, FOREIGN_ENDINGS
 
 __all__ = [
-    "CAMERA_FORMATS",
-    "FOREIGN_ENDINGS",
     "ExportCameraOptions",
     "ExportedCamera",
     "camera_format",
@@ -33,17 +32,6 @@ __all__ = [
     "foreign_paths",
     "import_camera",
 ]
-
-FOREIGN_ENDINGS = {
-    "opencv": ".yaml",
-    "kalibr": ".yaml",
-    "ros": ".yaml",
-    "colmap": ".txt",
-    "ocamcalib": ".txt",
-    "mrcal": ".cameramodel",
-}
-"""Other tools' formats of cameras, and how the names of their files end."""
-CAMERA_FORMATS = ("rigkit", *FOREIGN_ENDINGS)
 
 SIGNS = (
     ("mrcal", re.compile(r"['\"]lens_?model['\"]\s*:")),

@@ -38,8 +38,8 @@ def test_another_print_of_a_measured_board_is_the_same_sheet(board: Path) -> Non
 
 
 def test_a_board_keeps_its_name(board: Path) -> None:
-    name = 'wall "ä"'
-    board.write_text(board.read_text() + "id = 'wall \"ä\"'\n", encoding="utf-8")
+    name = "wall-2.b"
+    board.write_text(board.read_text() + f'id = "{name}"\n', encoding="utf-8")
     assert main(["board", str(board), *READ]) == 0
     assert load_board(board).board_id == name
 

@@ -1,0 +1,17 @@
+"""The formats that cameras and clouds are written in; nothing here is heavy to import."""
+
+from __future__ import annotations
+
+__all__ = ["CAMERA_FORMATS", "CLOUD_FORMATS", "FOREIGN_ENDINGS"]
+
+FOREIGN_ENDINGS = {
+    "opencv": ".yaml",
+    "kalibr": ".yaml",
+    "ros": ".yaml",
+    "colmap": ".txt",
+    "ocamcalib": ".txt",
+    "mrcal": ".cameramodel",
+}
+"""Other tools' formats of cameras, and how the names of their files end."""
+CAMERA_FORMATS = ("rigkit", *FOREIGN_ENDINGS)
+CLOUD_FORMATS = ("ply", "npz", "colmap")
