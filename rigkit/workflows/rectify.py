@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -29,16 +30,16 @@ class RectifyOptions:
 
     output: Path
     """Image to write; of a pair, NAME-1 and NAME-2 beside it."""
-    projection: str = "perspective"
-    """perspective, cylindrical or equirectangular."""
+    projection: Literal["perspective", "cylindrical", "equirectangular"] = "perspective"
+    """Of the view."""
     hfov_deg: float | None = None
     """From the left edge to the right; None: suits the lens."""
     angles_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Yaw (to the right), pitch (up), roll (clockwise) of the view."""
     size_px: tuple[int, int] | None = None
     """Of the result; None: keeps the source's resolution."""
-    interpolation: str = "spline"
-    """spline, lanczos, linear or nearest."""
+    interpolation: Literal["spline", "lanczos", "linear", "nearest"] = "spline"
+    """Between pixels: spline keeps positions to a thousandth of a pixel, linear is quick."""
     force: bool = False
     """Replace files that exist; what was read is never replaced."""
 
@@ -107,7 +108,7 @@ def _write(jobs: list[tuple[str | Path, Path, RectifyMap]], options: RectifyOpti
     return tuple(RectifiedImage(out, remap, share) for (_, out, remap), share in zip(jobs, covered, strict=True))
 
 
-def _encoded(image: NDArray[np.generic], path: Path) -> bytes:
+def _encoded(image: NDArray[Any], path: Path) -> bytes:
     suffix = path.suffix.lower()
     if suffix in EIGHT_BIT and image.dtype != np.uint8:
         raise InputError(f"'{path}': a {suffix} file has no 16-bit pixels; write a .png or .tif")
