@@ -53,10 +53,11 @@ class Pair:
     camera1, camera2 : names of cameras; the same name where one camera was moved.
     image1, image2 : files.
     pose_type : as declared; AUTO lets the data decide.
-    level_sigma_deg : how well the spirit level held, or None: a soft prior.
+    level_sigma_deg : how well the spirit level held: a soft prior; 0: exactly; None: as a carefully set one does.
     boards : the boards that stand there.
     truth : what a person measured.
     layout : board id -> "left", "right", "floor", "ceiling" or "back", as seen from camera 1; empty where not stated.
+    down : which way is down in the frames of camera 1 and 2, for planar motion of cameras that are not level; or None.
     """
 
     pair_id: str
@@ -69,6 +70,7 @@ class Pair:
     boards: tuple[Board, ...]
     truth: PairTruth
     layout: dict[str, str]
+    down: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     @property
     def board_ids(self) -> tuple[str, ...]:
@@ -191,17 +193,36 @@ def _pair(table: TomlTable, boards: Sequence[Board], cameras: Sequence[CameraEnt
     if not names:
         raise table.error("'boards' is empty; name the boards that stand in this pair")
     chosen = tuple(_named(n, by_board, f"{place}: board") for n in names)
-    level = None
-    if table.has("level"):
-        inner = table.table("level", hint="level = { sigma_deg = 0.2 }")
-        level = inner.number("sigma_deg", hint="sigma_deg = 0.2")
-        inner.done()
+    level, down = _level(table, pose_type) if table.has("level") else (None, None)
     truth = PairTruth()
     if table.has("truth"):
         truth = truth_from_table(table.table("truth", hint="[pairs.truth]"), chosen)
     layout = _layout(table, names) if table.has("layout") else {}
     table.done()
-    return Pair(pair_id, camera1, camera2, image1, image2, pose_type, level, chosen, truth, layout)
+    return Pair(pair_id, camera1, camera2, image1, image2, pose_type, level, chosen, truth, layout, down)
+
+
+def _level(
+    table: TomlTable, pose_type: PoseType
+) -> tuple[float | None, tuple[tuple[float, ...], tuple[float, ...]] | None]:
+    """Return how well the level held, and which way is down in either camera where that was said."""
+    inner = table.table("level", hint="level = { sigma_deg = 0.2 }")
+    has_down = [inner.has(key) for key in ("down1", "down2")]
+    sigma, down = None, None
+    if inner.has("sigma_deg") or not any(has_down):
+        sigma = inner.number("sigma_deg", hint="sigma_deg = 0.2", positive=False)
+        if sigma < 0.0:
+            raise inner.error(f"'sigma_deg' must not be negative, got {sigma:g}; 0 means exactly level")
+    if any(has_down):
+        if pose_type is not PoseType.PLANAR:
+            raise inner.error(f"'down1' and 'down2' are for planar motion, not for '{pose_type}'; leave them out")
+        first, second = (inner.numbers(key, hint=f"{key} = [0.0, 0.98, 0.17]") for key in ("down1", "down2"))
+        for key, values in (("down1", first), ("down2", second)):
+            if len(values) != 3 or not any(values):
+                raise inner.error(f"'{key}' must be three numbers, not all zero, got {list(values)}")
+        down = (first, second)
+    inner.done()
+    return sigma, down
 
 
 def _layout(table: TomlTable, names: Sequence[str]) -> dict[str, str]:

@@ -6,17 +6,18 @@ is; the squares give the scale; rays are intersected optimally. Affine estimator
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rigkit.core.arrays import Mat3
-from rigkit.core.errors import DegenerateError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.reconstruction.metric import MetricPose, TriangulatedPoints, metric_pose, triangulate_matches
 from rigkit.reconstruction.noise_level import variance_factor
+from rigkit.relative_pose.refinement.level_frames import LevelFrames
 from rigkit.relative_pose.refinement.refine import RefinedPose, refine_pose, rules_out
 from rigkit.relative_pose.refinement.select import DEFAULT_LEVEL_RAD, PoseTypeEvidence, pose_type_evidence
 from rigkit.relative_pose.solvers.pose import choose_pose, essential_from_pose
@@ -51,6 +52,7 @@ class PoseTypeDecision:
     level_sigma_rad : how well the type is taken to hold; None: exactly, or it is general.
     evidence : for every type; None where the general type was declared, which nothing contradicts.
     notes : the choice under AUTO, or what contradicts the declaration, in words.
+    level_frames : in which the type is meant to hold; None: those of the cameras.
     """
 
     declared: PoseType
@@ -58,6 +60,7 @@ class PoseTypeDecision:
     level_sigma_rad: float | None
     evidence: PoseTypeEvidence | None
     notes: tuple[str, ...]
+    level_frames: LevelFrames | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -92,7 +95,11 @@ class PairGeometry:
 
 
 def pair_geometry(
-    pair: MatchedPair, *, pose_type: PoseType | str, level_sigma_rad: float | None = None
+    pair: MatchedPair,
+    *,
+    pose_type: PoseType | str,
+    level_sigma_rad: float | None = None,
+    level_frames: LevelFrames | None = None,
 ) -> PairGeometry:
     """Return pose, scale and points of one pair.
 
@@ -103,16 +110,22 @@ def pair_geometry(
         contradict is used as told, and `notes` gives the figure.
     level_sigma_rad : how well the spirit level held: the pose type is a soft prior in the refinement. None: as well as
         a carefully set level does (DEFAULT_LEVEL_RAD); 0: the pose type is exact.
+    level_frames : of cameras that are not level themselves but whose mounting is known; planar motion only.
 
     Raises
     ------
+    InputError
+        Level frames of another motion than planar.
     DegenerateError
         No baseline, or geometry that does not determine the pose.
     """
     declared = PoseType(pose_type)
+    if level_frames is not None and declared is not PoseType.PLANAR:
+        raise InputError(f"pair '{pair.pair_id}': the level of each camera is for planar motion, not '{declared}'")
     contradiction: tuple[str, ...] = ()
     try:
-        decision = decide_pose_type(pair.captured, declared, level_sigma_rad)
+        captured = pair.captured if level_frames is None else level_frames.matches(pair.captured)
+        decision = replace(decide_pose_type(captured, declared, level_sigma_rad), level_frames=level_frames)
         contradiction = () if declared is PoseType.AUTO else decision.notes
         return _in_mm(pair, decision, _likeliest_pose(pair, decision))
     except DegenerateError as error:
@@ -144,14 +157,16 @@ def _likeliest_pose(pair: MatchedPair, decision: PoseTypeDecision) -> RefinedPos
     it can land in another valley. The general solution and the pose by which the boards were told apart cannot. Points
     of one plane are explained by two poses: that of the board, whose shape is known, stands unless they rule it out.
     """
-    kind, level, m = decision.pose_type, decision.level_sigma_rad, pair.matches
+    kind, level, frames = decision.pose_type, decision.level_sigma_rad, decision.level_frames
+    m = pair.matches if frames is None else frames.matches(pair.matches)
 
     def end(solver: PoseType | None) -> RefinedPose | DegenerateError:
         try:
             start = pair.identity.cam2_from_cam1
             if solver is not None:
                 start = choose_pose(fundamental_for(solver).solve(m, "points").E21, m.rays1, m.rays2, solver)
-            return refine_pose(pair.captured, start, kind, level)
+                start = start if frames is None else frames.camera_pose(start)
+            return refine_pose(pair.captured, start, kind, level, level_frames=frames)
         except DegenerateError as error:
             return error
 
@@ -173,7 +188,8 @@ def _in_mm(pair: MatchedPair, decision: PoseTypeDecision, refined: RefinedPose) 
     scatter = float(np.sqrt(variance_factor(refined.variance_factor * freedom, freedom)))
     # The corners miss the epipolar geometry by more than their sigmas promise, or by less: believe what is seen.
     pair = pair.noisier(scatter)
-    refined = refine_pose(pair.captured, refined.cam2_from_cam1, decision.pose_type, decision.level_sigma_rad)
+    level, frames = decision.level_sigma_rad, decision.level_frames
+    refined = refine_pose(pair.captured, refined.cam2_from_cam1, decision.pose_type, level, level_frames=frames)
     if scatter > NOTABLE_SCATTER:
         notes.append(f"corners scatter {scatter:.1f} times as much as predicted; all sigmas were enlarged to match")
     metric = metric_pose(pair.captured, refined.cam2_from_cam1, refined.covariance, pair.boards)

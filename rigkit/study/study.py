@@ -48,7 +48,7 @@ class Claim:
     ----------
     text : the statement in words.
     smaller, larger : selections of cells: any of method, pose_type, plane, sigma, each a value or several; cells that
-        agree in all that neither side names are compared with each other.
+        agree in all that not both sides name are compared with each other.
     at_most_deg : instead of `larger`: what no cell of `smaller` exceeds.
     """
 

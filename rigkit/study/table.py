@@ -168,10 +168,10 @@ def _judge(claim: Claim, cells: Sequence[Cell]) -> Verdict:
 
 
 def _comparisons(claim: Claim, cells: Sequence[Cell]) -> Iterator[Comparison]:
-    """Yield each cell of one side with each of the other that agrees in what neither side names, or with the limit."""
+    """Yield each cell of one side with each of the other that agrees in what not both name, or with the limit."""
     larger = claim.larger or {}
-    free = [key for key in CELL_KEYS if key not in claim.smaller and key not in larger]
-    default = {"plane": ALL_PLANES} if "plane" in free else {}
+    free = [key for key in CELL_KEYS if key not in claim.smaller or key not in larger]
+    default = {"plane": ALL_PLANES} if "plane" not in {**claim.smaller, **larger} else {}
     for small in _select(cells, claim.smaller | default):
         if claim.at_most_deg is not None:
             yield Comparison(small.median_deg, _name(small), claim.at_most_deg, "the limit", or_equal=True)

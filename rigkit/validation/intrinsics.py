@@ -108,7 +108,8 @@ def _again(
     )
     pose = reconstruction.cam2_from_cam1
     start = Rigid3(pose.rotation, pose.translation_mm / np.linalg.norm(pose.translation_mm))
-    refined = refine_pose(matches, start, reconstruction.pose_type, level_sigma_rad)
+    frames = None if reconstruction.geometry is None else reconstruction.geometry.decision.level_frames
+    refined = refine_pose(matches, start, reconstruction.pose_type, level_sigma_rad, level_frames=frames)
     points, covariance, valid = triangulate_matches(matches, refined.cam2_from_cam1)
     scale, _ = metric_scale(points, matches.board_index, matches.grid, reconstruction.boards, covariance)
     cloud = reconstruction.cloud

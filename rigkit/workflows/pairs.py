@@ -19,6 +19,7 @@ from rigkit.reconstruction.geometry import PairGeometry, pair_geometry
 from rigkit.reconstruction.lattice_planes import LatticePlanes, lattice_planes
 from rigkit.reconstruction.pairing import MatchedPair, match_pair
 from rigkit.reconstruction.reconstruct import Reconstruction, reconstruct_from
+from rigkit.relative_pose.refinement.level_frames import LevelFrames
 from rigkit.validation.intrinsics import CalibrationShifts, calibration_shifts
 from rigkit.workflows.datasets import LoadedCamera
 
@@ -102,7 +103,8 @@ def match_found(
 def geometry_of(matched: MatchedPair, pair: Pair) -> PairGeometry:
     """Return pose and points of matched corners as the manifest declares the pair."""
     level = None if pair.level_sigma_deg is None else float(np.deg2rad(pair.level_sigma_deg))
-    return pair_geometry(matched, pose_type=pair.pose_type, level_sigma_rad=level)
+    frames = None if pair.down is None else LevelFrames.from_down(*pair.down)
+    return pair_geometry(matched, pose_type=pair.pose_type, level_sigma_rad=level, level_frames=frames)
 
 
 def reconstruct_with(matched: MatchedPair, pair: Pair, method: str, image1: Image | None = None) -> Reconstruction:

@@ -87,7 +87,26 @@ def test_optional_facts_may_be_left_out(tmp_path: Path) -> None:
     assert (pair.level_sigma_deg, pair.layout, pair.truth.count) == (None, {}, 0)
 
 
+def test_the_level_may_be_exact_and_that_of_each_camera_known(tmp_path: Path) -> None:
+    exact = load_dataset(write(tmp_path, TEXT.replace("sigma_deg = 0.2 }", "sigma_deg = 0 }"))).pairs[0]
+    assert (exact.level_sigma_deg, exact.down) == (0.0, None)
+    planar = TEXT.replace('"forward"', '"planar"')
+    down = "level = { down1 = [0.0, 0.98, 0.17], down2 = [0, 1, 0] }"
+    pair = load_dataset(write(tmp_path, planar.replace("level = { sigma_deg = 0.2 }", down))).pairs[0]
+    assert (pair.level_sigma_deg, pair.down) == (None, ((0.0, 0.98, 0.17), (0.0, 1.0, 0.0)))
+    both = planar.replace("sigma_deg = 0.2 }", "sigma_deg = 0.1, down1 = [0, 1, 0], down2 = [0, 1, 0] }")
+    assert load_dataset(write(tmp_path, both)).pairs[0].level_sigma_deg == 0.1
+
+
 WRONG = [
+    ("sigma_deg = 0.2", "sigma_deg = -0.2", ["must not be negative", "0 means exactly level"]),
+    ("sigma_deg = 0.2", "down1 = [0, 1, 0], down2 = [0, 1, 0]", ["for planar motion, not for 'forward'"]),
+    ('forward"\nlevel = { sigma_deg = 0.2', 'planar"\nlevel = { down1 = [0, 1, 0]', ["'down2' is missing"]),
+    (
+        'forward"\nlevel = { sigma_deg = 0.2',
+        'planar"\nlevel = { down1 = [0, 1], down2 = [0, 1, 0]',
+        ["'down1' must be three numbers"],
+    ),
     ('name = "small"', "", ["'name' is missing", 'name = "my-lab"']),
     ('"rigkit.dataset/1"', '"rigkit.dataset/2"', ["another version"]),
     ('"rigkit.dataset/1"', '"rigkit.session/1"', ["rigkit.dataset/1"]),

@@ -11,7 +11,7 @@ import pytest
 
 from rigkit.core.errors import InputError
 from rigkit.core.posetype import PoseType
-from rigkit.study.study import CHUNK_TRIALS, Claim, Study, chunk_count, run_chunk
+from rigkit.study.study import CHUNK_TRIALS, Claim, Study, Variant, chunk_count, run_chunk
 from rigkit.study.table import StudyTable, tabulate
 from rigkit.synthetic.noise import NoisyImages
 
@@ -149,6 +149,37 @@ def test_claims_are_judged() -> None:
     assert "does not hold" in table.to_markdown()
     with pytest.raises(InputError, match="no two cells"):
         run(replace(GENERAL, trials=1, claims=(Claim("?", {"method": "3SDIR"}, {"method": "F2UDIR"}),)))
+
+
+def test_limits_are_judged_both_ways_and_keys_of_one_side_hold_for_both() -> None:
+    claims = (
+        Claim("generous", {"sigma": (1.0, 3.0)}, at_most_deg=30.0),
+        Claim("strict", {"sigma": (1.0, 3.0)}, at_most_deg=4.0),
+        Claim("at 3", {"method": "3SDIR", "sigma": [3.0]}, {"method": "F2UDIR"}),
+    )
+    table = run(replace(GENERAL, trials=20, methods=("F2UDIR", "3SDIR"), sigmas=(0.0, 1.0, 3.0), claims=claims))
+    generous, strict, at_3 = table.verdicts
+    assert generous.holds and generous.comparisons == 4
+    assert (
+        not strict.holds and "F2UDIR general all planes at 3" in strict.against and "the limit 4.00" in strict.against
+    )
+    assert (at_3.holds_in, at_3.comparisons) == (1, 1)
+    with pytest.raises(InputError, match="either"):
+        Claim("both", {}, {}, at_most_deg=1.0)
+    with pytest.raises(InputError, match="either"):
+        Claim("neither", {})
+
+
+def test_variants_have_their_own_support_and_scale() -> None:
+    """Exact corners: chords have no exact lengths, a patch has; and the chord's is the study's own cell of it."""
+    variants = (Variant("patch", "3SDIR", "patch", "area"), Variant("chord", "3SDIR", "chord", "area"))
+    study = replace(GENERAL, trials=2, noise="corners", sigmas=(0.0,), variants=variants)
+    table = run(replace(study, methods=("patch", "chord", "3SDIR")))
+    assert table.cell(method="patch").median_deg < 1e-4
+    assert table.cell(method="chord").median_deg > 0.2
+    assert table.cell(method="chord").median_deg == table.cell(method="3SDIR").median_deg
+    with pytest.raises(InputError, match="known: chord"):
+        replace(study, methods=("star",), variants=(Variant("star", "3SDIR", "star", "area"),))
 
 
 def test_csv_has_every_cell() -> None:

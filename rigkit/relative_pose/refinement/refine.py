@@ -19,6 +19,7 @@ from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit
 from rigkit.geometry.sampson import epipolar_normals, sampson_distances
+from rigkit.relative_pose.refinement.level_frames import LevelFrames
 from rigkit.relative_pose.refinement.pose_problem import Minimum, PoseProblem, RobustWeights, cauchy_weights
 from rigkit.relative_pose.refinement.residuals import whitened_affinities
 from rigkit.relative_pose.solvers.planar_ambiguity import ambiguous_poses, compare_poses
@@ -81,6 +82,7 @@ def refine_pose(
     covariance_A: FloatArray | None = None,
     robust: RobustWeights | None = None,
     point_weights: FloatArray | None = None,
+    level_frames: LevelFrames | None = None,
 ) -> RefinedPose:
     """Return the pose of maximum likelihood near `start`.
 
@@ -94,6 +96,7 @@ def refine_pose(
     covariance_A : (N, 4, 4) covariance of the row-major entries of A21.
     robust : weight function for contaminated matches, `cauchy_weights` for example.
     point_weights : (N,) fixed factors of the squared residuals of each match.
+    level_frames : in which the pose type is meant to hold; None: those of the cameras.
 
     Raises
     ------
@@ -108,10 +111,16 @@ def refine_pose(
         )
     if level_sigma_rad is not None and not level_sigma_rad > 0.0:
         raise InputError(f"level sigma must be positive, got {level_sigma_rad} rad; leave it out for an exact level")
+    if level_frames is not None:
+        matches, start = level_frames.matches(matches), level_frames.level_pose(start)
     exact = level_sigma_rad is None
     problem = PoseProblem(matches, str(pose_type), level_sigma_rad, covariance_A, robust, point_weights)
     R, t = project_to_type(start, pose_type) if exact else _split(start)
-    return _result(problem, problem.minimum(R, t))
+    found = _result(problem, problem.minimum(R, t))
+    if level_frames is None:
+        return found
+    pose = level_frames.camera_pose(found.cam2_from_cam1)
+    return replace(found, cam2_from_cam1=pose, covariance=level_frames.camera_covariance(found.covariance))
 
 
 def estimate_pose(
