@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 
 from rigkit.calibration.result import Calibration, ViewResult
+from rigkit.core.tables import Cell, Column, Table
 from rigkit.io.images import Image
 from rigkit.report.calibration_drawings import coverage_svg, pattern_svg, residuals_svg, uncertainty_svg
 from rigkit.report.render import data_uri, drawing, render, shown_table
-from rigkit.validation.tables import Cell, Column, Table
 
 __all__ = ["CalibrationSection", "build_calibration_page", "thumbnail_jpeg"]
 

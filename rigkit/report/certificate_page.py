@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.core.findings import Severity
+from rigkit.core.tables import Cell, Column, Table
 from rigkit.report.certificate_figure import bound_figure, sheet_pdf
 from rigkit.report.figures import as_png
 from rigkit.report.render import data_uri, render, shown_table
 from rigkit.validation.certificate.contracts import Certificate, Quantity
-from rigkit.validation.tables import Cell, Column, Table
 
 __all__ = ["CertificateWords", "causes_table", "certificate_page", "certificate_pdf", "in_words"]
 

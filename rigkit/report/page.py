@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from rigkit.core.arrays import FloatArray
+from rigkit.core.tables import Table
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.report.render import data_uri, render, shown_table
-from rigkit.validation.tables import Table
 
 __all__ = ["PairSection", "build_page", "scene_of"]
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rigkit.core.tables import Cell, Column, Table
 from rigkit.report.tables import below, column_label, measured_words
-from rigkit.validation.tables import Cell, Column, Table
 
 if TYPE_CHECKING:
     from jinja2 import Environment

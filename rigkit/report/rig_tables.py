@@ -10,10 +10,10 @@ import numpy as np
 from rigkit.calibration.rig.board_rig import BoardRig
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.uncertainty import transfer_uncertainty
+from rigkit.core.tables import Cell, Column, Table
 from rigkit.core.truth import Feature
 from rigkit.geometry.rotation import log_so3
 from rigkit.validation.check import Check
-from rigkit.validation.tables import Cell, Column, Table
 
 __all__ = ["rig_tables"]
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from rigkit.validation.tables import Cell, Column, Table
+from rigkit.core.tables import Cell, Column, Table
 
 __all__ = [
     "below",

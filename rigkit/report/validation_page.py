@@ -9,12 +9,13 @@ import numpy as np
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import uncertainty_at_corners
 from rigkit.core.findings import Severity
+from rigkit.core.tables import Cell, Column, Table
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.report.page import PairSection, scene_of
 from rigkit.report.tables import measured_words
 from rigkit.validation.checks import ValidationReport
 from rigkit.validation.crosscheck import CrossCheckReport
-from rigkit.validation.tables import Cell, Column, Table, check_table, mean_normal_error
+from rigkit.validation.tables import check_table, mean_normal_error
 
 __all__ = ["camera_table", "crosscheck_table", "pair_section", "summary_table"]
 

@@ -13,13 +13,11 @@ from itertools import combinations
 import numpy as np
 
 from rigkit.core.errors import InputError
+from rigkit.core.tables import Cell, Column, Table
 from rigkit.validation.checks import ValidationReport
 
 __all__ = [
-    "Cell",
-    "Column",
     "PaperTables",
-    "Table",
     "angle_table",
     "average_table",
     "baseline_table",
@@ -60,52 +58,6 @@ class PaperTables:
 
     def baseline(self, pair_id: str, column: str) -> str | None:
         return self.baselines.get(_capture(pair_id), {}).get(column)
-
-
-@dataclass(frozen=True, slots=True)
-class Column:
-    """Head of a column: label, unit and how many decimals its numbers show."""
-
-    label: str
-    unit: str = ""
-    decimals: int = 3
-
-
-@dataclass(frozen=True, slots=True)
-class Cell:
-    """One entry.
-
-    Attributes
-    ----------
-    value : number, text, or None for nothing known.
-    paper : what the paper printed there, or None.
-    sigma : standard deviation of the value, or None.
-    best, failed : how it is marked.
-    """
-
-    value: float | str | None
-    paper: str | None = None
-    sigma: float | None = None
-    best: bool = False
-    failed: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Table:
-    """A table: every row has one cell a column; the first column names the row. It cannot be built without rows."""
-
-    key: str
-    title: str
-    columns: tuple[Column, ...]
-    rows: tuple[tuple[Cell, ...], ...]
-    note: str = ""
-
-    def __post_init__(self) -> None:
-        if not self.rows:
-            raise InputError(f"table '{self.title}': no rows; nothing was validated")
-        for row in self.rows:
-            if len(row) != len(self.columns):
-                raise InputError(f"table '{self.title}': {len(row)} cells in a row of {len(self.columns)} columns")
 
 
 def build_tables(reports: Sequence[ValidationReport], paper: PaperTables | None = None) -> tuple[Table, ...]:

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rigkit.core.progress import Progress, silent
+from rigkit.core.tables import Table
 from rigkit.io.manifest import Dataset, Pair
 from rigkit.report.tables import tables_to_json, tables_to_markdown
 from rigkit.report.validation_page import crosscheck_table
 from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
-from rigkit.validation.tables import Table
 from rigkit.workflows.datasets import (
     DatasetOptions,
     LoadedCamera,

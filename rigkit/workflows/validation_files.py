@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from rigkit.core.tables import Table
 from rigkit.io.manifest import Dataset
 from rigkit.report.page import PairSection, build_page
 from rigkit.report.tables import tables_to_csv, tables_to_json, tables_to_latex, tables_to_markdown
 from rigkit.report.validation_page import camera_table, crosscheck_table, summary_table
 from rigkit.validation.checks import ValidationReport
 from rigkit.validation.crosscheck import CrossCheckReport
-from rigkit.validation.tables import PaperTables, Table, build_tables
+from rigkit.validation.tables import PaperTables, build_tables
 from rigkit.workflows.datasets import LoadedCameras, PairFailure
 from rigkit.workflows.provenance import digest_line, software_facts
 

@@ -10,12 +10,12 @@ from html.parser import HTMLParser
 import pytest
 from helpers.reconstructions import make_reconstruction
 
+from rigkit.core.tables import Cell, Column, Table
 from rigkit.core.truth import MeasuredAngle, PairTruth
 from rigkit.report.page import build_page
 from rigkit.report.tables import tables_to_csv, tables_to_markdown, tables_to_text
 from rigkit.report.validation_page import pair_section, summary_table
 from rigkit.validation.checks import validate
-from rigkit.validation.tables import Cell, Column, Table
 
 NAMES = ("<!--<script>", "</script><script>alert(1)</script>", '"><img src=x>', "a & b", "{{ 7 * 7 }}")
 

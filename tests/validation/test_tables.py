@@ -15,6 +15,7 @@ import pytest
 from helpers.reconstructions import make_reconstruction
 
 from rigkit.core.errors import InputError
+from rigkit.core.tables import Cell, Column, Table
 from rigkit.core.truth import MeasuredAngle, MeasuredLength, PairTruth
 from rigkit.io.paper_tables import load_paper_tables
 from rigkit.report.render import table_html
@@ -27,7 +28,7 @@ from rigkit.report.tables import (
     tables_to_text,
 )
 from rigkit.validation.checks import ValidationReport, validate
-from rigkit.validation.tables import Cell, Column, PaperTables, Table, best_method, best_report, build_tables
+from rigkit.validation.tables import PaperTables, best_method, best_report, build_tables
 
 REPO = Path(__file__).parents[2]
 PAPER = REPO / "datasets" / "hajder2021"
