@@ -42,7 +42,7 @@ class Outline(HTMLParser):
 
 def page_of(name: str) -> str:
     made = make_reconstruction()
-    boards = tuple(replace(board, board_id=f"{name} {k}") for k, board in enumerate(made.boards))
+    boards = tuple(replace(board, board_id=f"board {k}") for k, board in enumerate(made.boards))
     ids = tuple(board.board_id for board in boards)
     reconstruction = replace(made, pair_id=name, boards=boards, cloud=replace(made.cloud, board_ids=ids))
     truth = PairTruth(angles=(MeasuredAngle(ids[0], ids[1], 90.0, 0.3, name),))
