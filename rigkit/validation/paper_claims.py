@@ -15,8 +15,9 @@ import numpy as np
 
 from rigkit.core.claims import Comparison, Verdict, judge_claim
 from rigkit.core.posetype import PoseType
+from rigkit.core.tables import Cell, Column, Table
 from rigkit.validation.checks import ValidationReport
-from rigkit.validation.tables import Cell, Column, PaperTables, Table, mean_normal_error
+from rigkit.validation.tables import PaperTables, mean_normal_error
 
 __all__ = ["claim_table", "estimator_order_table"]
 
