@@ -22,6 +22,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import note, print_json, progress_on_stderr
     from rigkit.core.errors import ExitCode
+    from rigkit.report.study_tables import study_tables
+    from rigkit.report.tables import tables_to_markdown
     from rigkit.workflows.study import StudyOptions, run_studies
 
     options = StudyOptions(
@@ -36,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     for done in run_studies(args.studies, options, progress=progress_on_stderr()):
         results.append(done.table.to_dict())
         if not args.json:
-            print(done.table.to_markdown())
+            print(tables_to_markdown(study_tables(done.table)))
         note(f"{done.study.name}: {', '.join(map(str, done.written))}")
     if args.json:
         print_json(results)

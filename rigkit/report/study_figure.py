@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rigkit.study.study import PLANES
-from rigkit.study.table import ALL_PLANES, Cell, StudyTable
+from rigkit.study.table import ALL_PLANES, StudyCell, StudyTable
 
 __all__ = ["study_figure"]
 
@@ -19,8 +19,8 @@ FORMATS = ("png", "pdf", "svg")
 def study_figure(table: StudyTable, file_format: str = "png") -> bytes:
     """Return the figure as a file: one row of axes a pose type, one column a plane.
 
-    Boxes are grouped by noise level where there are several, one box a method; whiskers as in `Cell`. A study of one
-    pose type and one method shows all planes together.
+    Boxes are grouped by noise level where there are several, one box a method; whiskers as in `StudyCell`.
+    A study of one pose type and one method shows all planes together.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -68,7 +68,7 @@ def _boxes(axis: Any, table: StudyTable, pose_type: str, plane: int) -> None:
                 _box(axis, cell, position, 0.85 * width, COLOURS[m % len(COLOURS)])
 
 
-def _box(axis: Any, cell: Cell, position: float, width: float, colour: str) -> None:
+def _box(axis: Any, cell: StudyCell, position: float, width: float, colour: str) -> None:
     statistics = {
         "med": cell.median_deg,
         "q1": cell.q25_deg,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -15,10 +13,10 @@ from rigkit.core.claims import Comparison, Verdict, judge_claim
 from rigkit.core.errors import InputError
 from rigkit.study.study import PLANES, Claim, Study
 
-__all__ = ["ALL_PLANES", "CELL_KEYS", "Cell", "StudyTable", "tabulate"]
+__all__ = ["ALL_PLANES", "CELL_KEYS", "StudyCell", "StudyTable", "tabulate"]
 
 ALL_PLANES = 0
-"""`Cell.plane` of the cell over all planes together."""
+"""`StudyCell.plane` of the cell over all planes together."""
 WHISKER_IQR = 1.5
 """Whiskers end at the last value within this many interquartile ranges of the box, as in the paper's figures."""
 EXACT_DEG = 1e-5
@@ -27,7 +25,7 @@ CELL_KEYS = ("pose_type", "sigma", "method", "plane")
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
+class StudyCell:
     """Angular errors of normals, degrees, over trials and corners.
 
     Attributes
@@ -55,10 +53,10 @@ class StudyTable:
     """Every cell of a study and the verdicts on its claims."""
 
     study: Study
-    cells: tuple[Cell, ...]
+    cells: tuple[StudyCell, ...]
     verdicts: tuple[Verdict, ...]
 
-    def cell(self, **which: Any) -> Cell:
+    def cell(self, **which: Any) -> StudyCell:
         """Return the one cell with these keys (plane: all unless said); raises InputError if there is not just one."""
         found = _select(self.cells, {"plane": ALL_PLANES, **which})
         if len(found) != 1:
@@ -72,42 +70,6 @@ class StudyTable:
         study = self.study.to_dict() | {"unit": self.study.unit}
         cells = [{key: _number(value) for key, value in asdict(c).items()} for c in self.cells]
         return {"schema": "rigkit.study_result/1", "study": study, "cells": cells, "claims": verdicts}
-
-    def to_csv(self) -> str:
-        text = io.StringIO()
-        names = list(Cell.__slots__)
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow([f"sigma_{self.study.unit}" if name == "sigma" else name for name in names])
-        for cell in self.cells:
-            values = (getattr(cell, name) for name in names)
-            writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in values])
-        return text.getvalue()
-
-    def to_markdown(self) -> str:
-        """Return a table a pose type (rows: noise and plane, columns: methods; median [quartiles]) and the verdicts."""
-        study = self.study
-        lines = [
-            f"# {study.title}",
-            "",
-            f"Angle between estimated and true normal, degrees: median [quartiles]; {_setup(study)}.",
-        ]
-        for pose_type in study.pose_types:
-            lines += ["", f"## {pose_type} motion", ""]
-            lines += [f"| noise, {study.unit} | plane | " + " | ".join(study.methods) + " |"]
-            lines += ["|---|---|" + "---|" * len(study.methods)]
-            for sigma in study.sigmas:
-                for plane in (*range(1, PLANES + 1), ALL_PLANES):
-                    row = [
-                        self.cell(pose_type=str(pose_type), sigma=sigma, method=m, plane=plane) for m in study.methods
-                    ]
-                    text = " | ".join(f"{c.median_deg:.2f} [{c.q25_deg:.2f}, {c.q75_deg:.2f}]" for c in row)
-                    lines.append(f"| {sigma:g} | {plane or 'all'} | {text} |")
-        missing = sum(c.missing for c in self.cells if c.plane == ALL_PLANES)
-        if missing:
-            lines += ["", f"{missing} estimates are missing: their directions do not determine an affinity."]
-        if self.verdicts:
-            lines += ["", "## Statements", ""] + [f"- {v.text}: **{v.words}**" for v in self.verdicts]
-        return "\n".join(lines) + "\n"
 
 
 def _number(value: Any) -> Any:
@@ -124,7 +86,7 @@ def tabulate(study: Study, chunks: Sequence[NDArray[np.float32]]) -> StudyTable:
     return StudyTable(study, cells, tuple(_judge(claim, cells) for claim in study.claims))
 
 
-def _cells(study: Study, errors: NDArray[np.float32]) -> Iterator[Cell]:
+def _cells(study: Study, errors: NDArray[np.float32]) -> Iterator[StudyCell]:
     per_board = study.board.corner_count
     for p, pose_type in enumerate(study.pose_types):
         for s, sigma in enumerate(study.sigmas):
@@ -133,7 +95,7 @@ def _cells(study: Study, errors: NDArray[np.float32]) -> Iterator[Cell]:
                     block = errors[p, s, m]
                     if plane != ALL_PLANES:
                         block = block[:, (plane - 1) * per_board : plane * per_board]
-                    yield Cell(str(pose_type), sigma, method, plane, *_box(block.ravel()))
+                    yield StudyCell(str(pose_type), sigma, method, plane, *_box(block.ravel()))
 
 
 def _box(values: NDArray[np.float32]) -> tuple[Any, ...]:
@@ -148,10 +110,10 @@ def _box(values: NDArray[np.float32]) -> tuple[Any, ...]:
     return (good.size, missing, *(float(v) for v in (median, q25, q75, low, high, good.mean())))
 
 
-def _select(cells: Sequence[Cell], which: Mapping[str, Any]) -> list[Cell]:
+def _select(cells: Sequence[StudyCell], which: Mapping[str, Any]) -> list[StudyCell]:
     """Return the cells with these keys; a list of values stands for any of them."""
 
-    def fits(cell: Cell) -> bool:
+    def fits(cell: StudyCell) -> bool:
         return all(
             getattr(cell, key) in value if isinstance(value, tuple | list) else getattr(cell, key) == value
             for key, value in which.items()
@@ -160,14 +122,14 @@ def _select(cells: Sequence[Cell], which: Mapping[str, Any]) -> list[Cell]:
     return [cell for cell in cells if fits(cell)]
 
 
-def _judge(claim: Claim, cells: Sequence[Cell]) -> Verdict:
+def _judge(claim: Claim, cells: Sequence[StudyCell]) -> Verdict:
     verdict = judge_claim(claim.text, _comparisons(claim, cells))
     if verdict is None:
         raise InputError(f"claim '{claim.text}': no two cells of this study can be compared; check its keys and values")
     return verdict
 
 
-def _comparisons(claim: Claim, cells: Sequence[Cell]) -> Iterator[Comparison]:
+def _comparisons(claim: Claim, cells: Sequence[StudyCell]) -> Iterator[Comparison]:
     """Yield each cell of one side with each of the other that agrees in what not both name, or with the limit."""
     larger = claim.larger or {}
     free = [key for key in CELL_KEYS if key not in claim.smaller or key not in larger]
@@ -184,12 +146,6 @@ def _comparisons(claim: Claim, cells: Sequence[Cell]) -> Iterator[Comparison]:
             yield Comparison(small.median_deg, _name(small), large.median_deg, _name(large))
 
 
-def _name(cell: Cell) -> str:
+def _name(cell: StudyCell) -> str:
     plane = f"plane {cell.plane}" if cell.plane else "all planes"
     return f"{cell.method} {cell.pose_type} {plane} at {cell.sigma:g}"
-
-
-def _setup(study: Study) -> str:
-    images = {"1": "image 1", "2": "image 2", "both": "both images"}[str(study.images)]
-    corners = PLANES * study.board.corner_count
-    return f"noise on {study.noise} of {images}; {study.trials} trials of {corners} corners"

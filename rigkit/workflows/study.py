@@ -25,6 +25,8 @@ from rigkit.io.files import ensure_writable, write_atomic, write_together
 from rigkit.io.sources import source_hash
 from rigkit.io.study_file import load_study
 from rigkit.report.study_figure import study_figure
+from rigkit.report.study_tables import cell_table, study_tables
+from rigkit.report.tables import tables_to_csv, tables_to_markdown
 from rigkit.study.study import Study, chunk_count, run_chunk
 from rigkit.study.table import StudyTable, tabulate
 
@@ -84,9 +86,9 @@ def run_studies(
         places = _files_of(study, options)
         if places:
             contents: dict[str, str | bytes] = {
-                "csv": table.to_csv(),
+                "csv": tables_to_csv([cell_table(table)]),
                 "json": json.dumps(table.to_dict(), indent=1, allow_nan=False) + "\n",
-                "md": table.to_markdown(),
+                "md": tables_to_markdown(study_tables(table)),
                 options.figure: study_figure(table, options.figure),
             }
             write_together({path: contents[suffix] for suffix, path in places.items()}, force=options.force)

@@ -41,7 +41,7 @@ def test_tables_and_figure_are_written(study: Path, tmp_path: Path, capsys: pyte
     assert sorted(p.name for p in out.iterdir()) == ["small.csv", "small.json", "small.md", "small.png"]
     printed = capsys.readouterr()
     assert printed.out.strip() == (out / "small.md").read_text().strip()
-    assert "lengths help: **" in printed.out
+    assert "| lengths help | **" in printed.out
     assert (out / "small.png").read_bytes().startswith(b"\x89PNG")
     result = json.loads((out / "small.json").read_text())
     assert len(result["cells"]) == 2 * 2 * 4

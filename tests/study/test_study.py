@@ -11,6 +11,8 @@ import pytest
 
 from rigkit.core.errors import InputError
 from rigkit.core.posetype import PoseType
+from rigkit.report.study_tables import cell_table, study_tables
+from rigkit.report.tables import tables_to_csv, tables_to_markdown
 from rigkit.study.study import CHUNK_TRIALS, Claim, Study, Variant, chunk_count, run_chunk
 from rigkit.study.table import StudyTable, tabulate
 from rigkit.synthetic.noise import NoisyImages
@@ -146,7 +148,7 @@ def test_claims_are_judged() -> None:
     assert (worse.holds_in, worse.comparisons) == (0, 2)
     assert "at 3" in worse.against
     assert (low.holds_in, low.comparisons) == (2, 2)
-    assert "does not hold" in table.to_markdown()
+    assert "does not hold" in tables_to_markdown(study_tables(table))
     with pytest.raises(InputError, match="no two cells"):
         run(replace(GENERAL, trials=1, claims=(Claim("?", {"method": "3SDIR"}, {"method": "F2UDIR"}),)))
 
@@ -184,10 +186,12 @@ def test_variants_have_their_own_support_and_scale() -> None:
 
 def test_csv_has_every_cell() -> None:
     table = run(replace(GENERAL, trials=2))
-    rows = list(csv.DictReader(io.StringIO(table.to_csv())))
+    title, _, text = tables_to_csv([cell_table(table)]).partition("\n")
+    assert title == "# General motion"
+    rows = list(csv.DictReader(io.StringIO(text)))
     assert len(rows) == 2 * 4
-    assert rows[0]["sigma_deg"] == "0"
-    assert float(rows[-1]["median_deg"]) == pytest.approx(table.cell(sigma=3.0, plane=3).median_deg, rel=1e-5)
+    assert rows[0]["noise [deg]"] == "0"
+    assert float(rows[-1]["median [deg]"]) == table.cell(sigma=3.0, plane=3).median_deg
 
 
 @pytest.mark.parametrize(

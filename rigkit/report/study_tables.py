@@ -1,0 +1,81 @@
+"""The tables of a synthetic study: medians in the layout of the paper's figures, verdicts, and every statistic."""
+
+from __future__ import annotations
+
+from rigkit.core.tables import Cell, Column, Table
+from rigkit.study.study import PLANES, Study
+from rigkit.study.table import ALL_PLANES, StudyCell, StudyTable
+
+__all__ = ["cell_table", "study_tables"]
+
+
+def study_tables(found: StudyTable) -> tuple[Table, ...]:
+    """Return a table a pose type (rows: noise and plane, columns: methods; medians and quartiles) and the verdicts."""
+    study = found.study
+    tables = [_median_table(found, str(pose_type)) for pose_type in study.pose_types]
+    if found.verdicts:
+        columns = (Column("statement"), Column("verdict"))
+        rows = tuple((Cell(v.text), Cell(v.words, best=True)) for v in found.verdicts)
+        tables.append(Table("statements", f"{study.title}: statements", columns, rows))
+    return tuple(tables)
+
+
+def cell_table(found: StudyTable) -> Table:
+    """Return every statistic of every cell, one cell a row."""
+    angle = ("median", "lower quartile", "upper quartile", "lower whisker", "upper whisker", "mean")
+    columns = (
+        Column("pose type"),
+        Column("noise", found.study.unit),
+        Column("method"),
+        Column("plane"),
+        Column("estimates", "", 0),
+        Column("missing", "", 0),
+        *(Column(label, "deg") for label in angle),
+    )
+    rows = tuple(
+        (
+            Cell(cell.pose_type),
+            Cell(cell.sigma),
+            Cell(cell.method),
+            Cell(_plane(cell.plane)),
+            Cell(float(cell.count)),
+            Cell(float(cell.missing)),
+            Cell(cell.median_deg),
+            Cell(cell.q25_deg),
+            Cell(cell.q75_deg),
+            Cell(cell.whisker_low_deg),
+            Cell(cell.whisker_high_deg),
+            Cell(cell.mean_deg),
+        )
+        for cell in found.cells
+    )
+    return Table("cells", found.study.title, columns, rows, _setup(found.study))
+
+
+def _median_table(found: StudyTable, pose_type: str) -> Table:
+    study = found.study
+    rows, missing = [], 0
+    for sigma in study.sigmas:
+        for plane in (*range(1, PLANES + 1), ALL_PLANES):
+            cells = [found.cell(pose_type=pose_type, sigma=sigma, method=m, plane=plane) for m in study.methods]
+            rows.append((Cell(f"{sigma:g}"), Cell(_plane(plane)), *(Cell(_quartiles(cell)) for cell in cells)))
+            missing += sum(cell.missing for cell in cells) if plane == ALL_PLANES else 0
+    columns = (Column("noise", study.unit), Column("plane"), *(Column(method, "deg") for method in study.methods))
+    note = f"Angle between estimated and true normal: median (quartiles); {_setup(study)}."
+    if missing:
+        note += f" {missing} estimates are missing: their directions do not determine an affinity."
+    return Table(f"medians-{pose_type}", f"{study.title}: {pose_type} motion", columns, tuple(rows), note)
+
+
+def _quartiles(cell: StudyCell) -> str | None:
+    return f"{cell.median_deg:.2f} ({cell.q25_deg:.2f} to {cell.q75_deg:.2f})" if cell.count else None
+
+
+def _plane(plane: int) -> str:
+    return "all" if plane == ALL_PLANES else str(plane)
+
+
+def _setup(study: Study) -> str:
+    images = {"1": "image 1", "2": "image 2", "both": "both images"}[str(study.images)]
+    corners = PLANES * study.board.corner_count
+    return f"noise on {study.noise} of {images}; {study.trials} trials of {corners} corners"
