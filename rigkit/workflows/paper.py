@@ -10,6 +10,7 @@ from pathlib import Path
 from rigkit.affine.registry import AFFINE_METHODS
 from rigkit.core.errors import InputError, RigkitError
 from rigkit.core.progress import Progress, silent
+from rigkit.core.tables import Table
 from rigkit.io.manifest import Dataset, Pair
 from rigkit.io.paper_tables import load_paper_tables
 from rigkit.reconstruction.paper import MOTIONS, OWN_MOTIONS, reconstruct_as_paper
@@ -18,7 +19,6 @@ from rigkit.validation.checks import ValidationReport, validate
 from rigkit.validation.paper_claims import claim_table, estimator_order_table
 from rigkit.validation.tables import (
     PaperTables,
-    Table,
     average_table,
     baseline_table,
     best_method,
