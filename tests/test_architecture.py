@@ -74,7 +74,6 @@ POSITIONAL_CLASSES = {
     "relative_pose/refinement/refine.py:RefinedPose",
     "relative_pose/refinement/select.py:TypeEvidence",
     "study/study.py:Study",
-    "study/table.py:Cell",
     "synthetic/pairs.py:StereoScene",
     "synthetic/photometry.py:Photometry",
     "synthetic/raycast.py:Surface",
@@ -87,7 +86,6 @@ POSITIONAL_CLASSES = {
 }
 """Classes of many fields that still take them by place: this list only gets shorter."""
 NAMES_OF_SEVERAL_CLASSES = {
-    "Cell",
     "Lattice",
     "Minimum",
     "Step",
@@ -100,7 +98,6 @@ NAMES_OF_SEVERAL_CLASSES = {
 PER_MODULE = {"HELP"}
 """Constants that every module of a kind has: the one-line help of a verb."""
 NAMES_OF_SEVERAL_CONSTANTS = {
-    "ACCEPTED",
     "BAD_VIEW",
     "BLOCK",
     "CAMERA_KEYS",

@@ -21,10 +21,11 @@ WHISKER_IQR = 1.5
 """Whiskers end at the last value within this many interquartile ranges of the box, as in the paper's figures."""
 EXACT_DEG = 1e-5
 """Below this an estimate is exact (errors are kept in single precision): two exact ones are not compared."""
+STATISTICS = ("median_deg", "q25_deg", "q75_deg", "whisker_low_deg", "whisker_high_deg", "mean_deg")
 CELL_KEYS = ("pose_type", "sigma", "method", "plane")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class StudyCell:
     """Angular errors of normals, degrees, over trials and corners.
 
@@ -95,19 +96,22 @@ def _cells(study: Study, errors: NDArray[np.float32]) -> Iterator[StudyCell]:
                     block = errors[p, s, m]
                     if plane != ALL_PLANES:
                         block = block[:, (plane - 1) * per_board : plane * per_board]
-                    yield StudyCell(str(pose_type), sigma, method, plane, *_box(block.ravel()))
+                    yield StudyCell(
+                        pose_type=str(pose_type), sigma=sigma, method=method, plane=plane, **_statistics(block.ravel())
+                    )
 
 
-def _box(values: NDArray[np.float32]) -> tuple[Any, ...]:
+def _statistics(values: NDArray[np.float32]) -> dict[str, Any]:
+    """Return what `StudyCell` tells of angles, not finite where there is none."""
     good = np.sort(values[np.isfinite(values)].astype(np.float64))
-    missing = values.size - good.size
+    counts = {"count": good.size, "missing": values.size - good.size}
     if not good.size:
-        return (0, missing, *[float("nan")] * 6)
+        return counts | dict.fromkeys(STATISTICS, float("nan"))
     q25, median, q75 = np.percentile(good, [25.0, 50.0, 75.0])
     reach = WHISKER_IQR * (q75 - q25)
     low = good[np.searchsorted(good, q25 - reach, side="left")]
     high = good[np.searchsorted(good, q75 + reach, side="right") - 1]
-    return (good.size, missing, *(float(v) for v in (median, q25, q75, low, high, good.mean())))
+    return counts | dict(zip(STATISTICS, map(float, (median, q25, q75, low, high, good.mean())), strict=True))
 
 
 def _select(cells: Sequence[StudyCell], which: Mapping[str, Any]) -> list[StudyCell]:
