@@ -21,7 +21,7 @@ WHISKER_IQR = 1.5
 """Whiskers end at the last value within this many interquartile ranges of the box, as in the paper's figures."""
 EXACT_DEG = 1e-5
 """Below this an estimate is exact (errors are kept in single precision): two exact ones are not compared."""
-STATISTICS = ("median_deg", "q25_deg", "q75_deg", "whisker_low_deg", "whisker_high_deg", "mean_deg")
+CELL_STATISTICS = ("median_deg", "q25_deg", "q75_deg", "whisker_low_deg", "whisker_high_deg", "mean_deg")
 CELL_KEYS = ("pose_type", "sigma", "method", "plane")
 
 
@@ -106,12 +106,12 @@ def _statistics(values: NDArray[np.float32]) -> dict[str, Any]:
     good = np.sort(values[np.isfinite(values)].astype(np.float64))
     counts = {"count": good.size, "missing": values.size - good.size}
     if not good.size:
-        return counts | dict.fromkeys(STATISTICS, float("nan"))
+        return counts | dict.fromkeys(CELL_STATISTICS, float("nan"))
     q25, median, q75 = np.percentile(good, [25.0, 50.0, 75.0])
     reach = WHISKER_IQR * (q75 - q25)
     low = good[np.searchsorted(good, q25 - reach, side="left")]
     high = good[np.searchsorted(good, q75 + reach, side="right") - 1]
-    return counts | dict(zip(STATISTICS, map(float, (median, q25, q75, low, high, good.mean())), strict=True))
+    return counts | dict(zip(CELL_STATISTICS, map(float, (median, q25, q75, low, high, good.mean())), strict=True))
 
 
 def _select(cells: Sequence[StudyCell], which: Mapping[str, Any]) -> list[StudyCell]:
