@@ -98,6 +98,7 @@ NAMES_OF_SEVERAL_CLASSES = {
 PER_MODULE = {"HELP"}
 """Constants that every module of a kind has: the one-line help of a verb."""
 NAMES_OF_SEVERAL_CONSTANTS = {
+    "ACCEPTED",
     "BAD_VIEW",
     "BLOCK",
     "CAMERA_KEYS",
