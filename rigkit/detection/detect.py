@@ -30,7 +30,7 @@ from rigkit.detection.checks.validate import (
 )
 from rigkit.detection.guided.guided import complete_boards
 from rigkit.detection.guided.rejoin import rejoined
-from rigkit.detection.lattice.grow import SaddleIndex, grow_all
+from rigkit.detection.lattice.grow import grow_all
 from rigkit.detection.lattice.lattice import Lattice, build_lattices
 from rigkit.detection.lattice.links import find_links
 from rigkit.detection.lattice.origin import quarter_turns
@@ -78,8 +78,7 @@ def candidates(
     levels = pyramid(grey)
     corners, saddles = find_corners(levels)
     lattices = build_lattices(corners, find_links(corners, levels[0]))
-    index = SaddleIndex(saddles)
-    grown = grow_all(lattices, index, levels[0], functools.partial(promising, grey, levels[0]))
+    grown = grow_all(lattices, saddles, levels[0], functools.partial(promising, grey, levels[0]))
     grown = [item for item in grown if item.count >= MIN_PART_CORNERS]
     if not any(item.solid or min_corners < MIN_BOARD_CORNERS for item in grown):
         return []

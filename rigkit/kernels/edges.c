@@ -1,5 +1,5 @@
-/* The fit of the edge model to chessboard corners: detection.subpixel.edge_model and detection.subpixel.edge_fit, one corner after the other;
- * at the end, how the lines of a lattice bend: detection.subpixel.edge_curvature.
+/* The fit of the edge model to chessboard corners, one corner after the other; at the end, how the lines of a lattice
+ * bend. The definitions in numpy are in tests/kernels/reference/edges.py, the numbers in rigkit.detection.subpixel.
  *
  * The pixels of a corner are gathered once. Every Gauss-Newton step evaluates the model and its derivatives in float32,
  * a block of pixels at a time, which the compiler vectorises; products are summed in float32 lanes, and the normal
@@ -28,7 +28,7 @@ typedef struct {
 } geometry_t;
 
 /* The pixels of a corner, relative to (centre_u, centre_v), at most `radius` from it both ways. `rows` has room for the
- * rows of edge_model.linearise, a block of pixels after the other, `square`, `turned`, `change` and `paired` for `across`
+ * rows of reference.edges.linearise, a block of pixels after the other, `square`, `turned`, `change` and `paired` for `across`
  * x `across` pixels around the centre. */
 typedef struct {
     float *u, *v, *value, *rows, *square, *turned, *change, *paired;
@@ -37,7 +37,7 @@ typedef struct {
 } window_t;
 
 /* A line through the corner as float32 arithmetic wants it. A sharp edge is two of less `width`, `apart` to either side;
- * `stretch` is s / width (edge_model._edge). */
+ * `stretch` is s / width (reference.edges._edge). */
 typedef struct {
     float cosine, sine, curvature, before, after;
     float blur, width, stretch, apart, kurtosis;
@@ -108,7 +108,7 @@ INLINE void take(window_t *window, const picture_t image, int64_t v, int32_t fir
     window->count += count;
 }
 
-/* Return how far the window reaches towards neighbouring line `k` (edge_model.Geometry.reach). */
+/* Return how far the window reaches towards neighbouring line `k` (reference.edges._reach). */
 INLINE double reach_to(const geometry_t at, int k, double blur, const edge_rules_t *rules)
 {
     if (!at.ends[k])
@@ -117,7 +117,7 @@ INLINE double reach_to(const geometry_t at, int k, double blur, const edge_rules
     return left < rules->least_reach ? rules->least_reach : left < rules->reach ? left : rules->reach;
 }
 
-/* Gather the pixels inside the cell, the radius and the image (edge_model.collect): of every row one or two stretches
+/* Gather the pixels inside the cell, the radius and the image (reference.edges.collect): of every row one or two stretches
  * near the two lines. */
 FOR_EACH_PROCESSOR
 static void collect(
@@ -196,7 +196,7 @@ INLINE float decay(float y)
     return series * power;
 }
 
-/* edge_model._blurred_edge, with the error function of Abramowitz and Stegun 7.1.26, right to 1.5e-7. */
+/* reference.edges._blurred_edge, with the error function of Abramowitz and Stegun 7.1.26, right to 1.5e-7. */
 INLINE void blurred_edge(float x, float kurtosis, float out[5])
 {
     const float square = x * x, gauss = decay(-0.5f * square);
@@ -254,7 +254,7 @@ INLINE void add_gaussian(const line_t line, float shift, float part, edge_t *out
     }
 }
 
-/* edge_model._edge, `shift` back from the line. */
+/* reference.edges._edge, `shift` back from the line. */
 INLINE void add_edge(const line_t line, float shift, float part, edge_t *out)
 {
     if (line.sharp) {
@@ -265,7 +265,7 @@ INLINE void add_edge(const line_t line, float shift, float part, edge_t *out)
     }
 }
 
-/* Evaluate one line over a block of pixels at (u, v) from the window's centre (edge_model._step). */
+/* Evaluate one line over a block of pixels at (u, v) from the window's centre (reference.edges._step). */
 INLINE void along_line(const line_t line, const float *u, const float *v, float x, float y, edge_t *out)
 {
     for (int i = 0; i < BLOCK; i++) {
@@ -288,7 +288,7 @@ INLINE float (*rows_of(const window_t *window, int64_t start))[BLOCK]
     return (float(*)[BLOCK])(window->rows + start * ROWS);
 }
 
-/* edge_model._mixed. */
+/* reference.edges._mixed. */
 INLINE float mixed(const edge_t *one, const edge_t *two, float rho, int i)
 {
     return -(one->value[i] * two->value[i]
@@ -296,7 +296,7 @@ INLINE float mixed(const edge_t *one, const edge_t *two, float rho, int i)
                       + rho * (0.5f * one->bow[i] * two->bow[i] + (1.0f / 6.0f) * rho * one->curl[i] * two->curl[i])));
 }
 
-/* Set the window's rows to the first `parameters` of edge_model.linearise and the last, the residuals, and `products`
+/* Set the window's rows to the first `parameters` of reference.edges.linearise and the last, the residuals, and `products`
  * (rows of ROWS, lower half) to those of these rows over all pixels. */
 INLINE void multiply_rows(
     const int parameters, const double *values, const window_t *window, const geometry_t at, const edge_rules_t *rules,
@@ -382,7 +382,7 @@ static void all_normal_equations(
     multiply_rows(PARAMETERS, values, window, at, rules, products);
 }
 
-/* Set a and b by linear least squares with everything else as it stands (edge_fit._brightness); every second block says
+/* Set a and b by linear least squares with everything else as it stands (reference.edges._brightness); every second block says
  * enough. */
 FOR_EACH_PROCESSOR
 static void brightness(double *values, const window_t *window, const geometry_t at, const edge_rules_t *rules, double sign)
@@ -498,7 +498,7 @@ static double clipped(double value, double low, double high)
     return value < low ? low : value > high ? high : value;
 }
 
-/* Move `values` by `step`, cut where it would leave the region in which the model is nearly linear (edge_fit._limited). */
+/* Move `values` by `step`, cut where it would leave the region in which the model is nearly linear (reference.edges._limited). */
 static void move(double *values, const double *step, int n, const edge_rules_t *rules)
 {
     const double limits[PARAMETERS] = {
@@ -534,7 +534,7 @@ static double leave(window_t *window, const double *step, int parameters)
 }
 
 /* Return the mean square of what the model leaves and mirroring at the corner changes, as that of independent noise, or
- * -1 where few pixels have a mirror image (edge_fit._noise). */
+ * -1 where few pixels have a mirror image (reference.edges._noise). */
 FOR_EACH_PROCESSOR
 static double unmirrored(const double *values, window_t *window, int parameters, const edge_rules_t *rules)
 {
@@ -589,7 +589,7 @@ static double unmirrored(const double *values, window_t *window, int parameters,
 }
 
 /* Set `out` to the sums of the products of what mirroring changes at two pixels that are one of LAGS apart, and behind them
- * to the numbers of such pairs, in the half of the window above `y`: the other half mirrors it (edge_fit._lag_products). */
+ * to the numbers of such pairs, in the half of the window above `y`: the other half mirrors it (reference.edges._lag_products). */
 FOR_EACH_PROCESSOR
 static void lag_products(const window_t *window, double y, double *out)
 {
@@ -628,7 +628,7 @@ static void lag_products(const window_t *window, double y, double *out)
     }
 }
 
-/* Return whether there are pixels on all sides of (x, y) (edge_fit._surrounded). */
+/* Return whether there are pixels on all sides of (x, y) (reference.edges._surrounded). */
 FOR_EACH_PROCESSOR
 static int surrounded(const window_t *window, float x, float y)
 {
@@ -740,7 +740,7 @@ int64_t edges_scratch(const edge_rules_t *rules)
     return (3 + ROWS) * room_of_window(rules->radius_px) + 4 * across * across + CACHE_LINE / (int64_t)sizeof(float);
 }
 
-/* Fit the edge model around `count` corners (edge_fit.fit_edges). pixels (N, 2), sides (N, 2, 2), curvature and its sigma
+/* Fit the edge model around `count` corners (reference.edges.fit_corners). pixels (N, 2), sides (N, 2, 2), curvature and its sigma
  * (N, 2), gaps (N, 2, 2), ends (N, 2, 2), sign, blur and contrast (N), out (N, OUTCOMES); scratch as `edges_scratch` says, zeroed;
  * `grey` is of uint8_t if `bytes`, else of float. */
 void fit_edges(
@@ -856,7 +856,7 @@ INLINE void line_bend(
 }
 
 /* Set `out` (M, 2) to the curvature of row and column at the M wanted cells and `out_sigma` to its standard deviation
- * (detection.subpixel.edge_curvature.line_curvature). */
+ * (reference.edges.line_bends). */
 FOR_EACH_PROCESSOR
 void line_bends(
     const double *pixels, const double *sigma, const uint8_t *wanted, int64_t rows, int64_t columns, int64_t count,

@@ -1,6 +1,6 @@
 /* From an image to linked corners: smoothing, saddle response and its peaks, ring tests, links.
  *
- * The definitions are in rigkit.detection.saddles.response, .saddle, .ring and .links; the numbers come from there. */
+ * The definitions in numpy are in tests/kernels/reference/front.py, the numbers in rigkit.detection: saddles and lattice.links. */
 #include "kernels.h"
 
 /* The means of factor x factor pixels: out (height / factor, width / factor). `sums` (width) is scratch. */
@@ -194,7 +194,7 @@ INLINE int32_t fill_response(const float *restrict from, int64_t width, int64_t 
     return high;
 }
 
-/* detection.saddles.response.peaks: (u, v) and response of the peaks, row by row; returns how many. There is at most one peak in
+/* reference.front.peaks: (u, v) and response of the peaks, row by row; returns how many. There is at most one peak in
  * 3x3 pixels. `scratch` holds 5 * (width + STRIP + 4) floats, `high` 5 * (width / STRIP + 1) bytes. */
 FOR_EACH_PROCESSOR int64_t find_peaks(
     const float *smooth, int64_t height, int64_t width, float threshold, float *scratch, uint8_t *high, int32_t *at,
@@ -239,7 +239,7 @@ FOR_EACH_PROCESSOR int64_t find_peaks(
 }
 
 /* Keep of `count` peaks, in place and in their order, about the `most` strongest beside the strongest one in their square
- * of `side` pixels (detection.saddles.response._strongest): as many bins of this share as are needed, the highest first. `squares`
+ * of `side` pixels (reference.front._strongest): as many bins of this share as are needed, the highest first. `squares`
  * ((height / side + 1) * (width / side + 1)), `bins` (`finest` + 1), both zeroed, and `share` (count) are scratch. Returns
  * how many are left. */
 int64_t keep_strongest(
@@ -276,7 +276,7 @@ int64_t keep_strongest(
     return kept;
 }
 
-/* detection.saddles.saddle.saddle_step for one pixel; whether it is a saddle and near. */
+/* reference.front.saddle_step for one pixel; whether it is a saddle and near. */
 INLINE int saddle_near(const float *smooth, int64_t width, int64_t u, int64_t v, double most_step, double pixel[2])
 {
     const float *at = smooth + v * width + u;
@@ -294,7 +294,7 @@ INLINE int saddle_near(const float *smooth, int64_t width, int64_t u, int64_t v,
 }
 
 /* Return whether every fourth sample of the ring around (u, v) leaves it possible that there is a corner
- * (detection.saddles.ring.may_be_corners). */
+ * (reference.front.may_be_corners). */
 INLINE int may_be_corner(
     const image_t image, const ring_rules_t *rules, float u, float v, float radius, float response)
 {
@@ -483,7 +483,7 @@ INLINE int64_t arm_along(double a, double b)
     return fabs(b) > fabs(a) ? (b < 0.0 ? 3 : 1) : (a < 0.0 ? 2 : 0);
 }
 
-/* Whether the edge from corner i is there (detection.lattice.links._edge_seen). */
+/* Whether the edge from corner i is there (reference.front._edge_seen). */
 INLINE int link_seen(
     const corners_t *corners, const image_t image, double scale, double offset, const link_rules_t *rules, int64_t i,
     const candidate_t *link)
@@ -555,7 +555,7 @@ static double link_length(const double *pixels, int64_t i, int64_t to)
     return sqrt(du * du + dv * dv);
 }
 
-/* detection.lattice.links.find_links: both[4 * i + arm] = 4 * neighbour + its arm, -1 for none. Of the corners, `lines` (count, 4)
+/* reference.front.links: both[4 * i + arm] = 4 * neighbour + its arm, -1 for none. Of the corners, `lines` (count, 4)
  * are the unit vectors of A and B, `least` and `most` bound the contrast of those looked at, `reach` is the most `aside`.
  * `nearest` (count, 4) is scratch. Returns 0 without memory. */
 FOR_EACH_PROCESSOR int64_t find_links(

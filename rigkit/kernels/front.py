@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
-from rigkit.kernels import Kernels, kernels
+from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header
 
-__all__ = ["LinkRules", "RingRules", "corners", "links", "loaded", "near_any", "peaks", "shrunk", "smoothed", "typical"]
+__all__ = ["LinkRules", "RingRules", "corners", "links", "near_any", "peaks", "shrunk", "smoothed", "typical"]
 
 STRIP, HALF = (header().constants[name] for name in ("STRIP", "HALF"))
 
@@ -59,11 +59,6 @@ class ImageOf(Struct):
 @structure("corners_t")
 class _Corners(Struct):
     """The corners that links are sought for."""
-
-
-def loaded() -> Kernels:
-    """Return the kernels()."""
-    return kernels()
 
 
 def shrunk(image: Picture, factor: int) -> Image:

@@ -1,6 +1,6 @@
 /* Lattices of corners: local polynomial fits, rows and columns from links, growth ring by ring.
  *
- * The definitions are in rigkit.detection.lattice.local_fit, .lattice and .grow; the numbers come from there. */
+ * The definitions in numpy are in tests/kernels/reference/growth.py, the numbers in rigkit.detection.lattice. */
 #include "kernels.h"
 
 enum { MOST_TERMS = 10, MOST_DEGREE = 3, MOST_RADIUS = 3, MOST_TRIED = 16 };
@@ -157,7 +157,7 @@ INLINE void fill_bell(const fit_rules_t *rules, double *bell)
         bell[step] = exp(-0.5 * (double)(step * step) / (rules->width * rules->width));
 }
 
-/* detection.lattice.local_fit.fit_cells for the cells marked in `cells` (rows, columns), row by row. */
+/* reference.growth.fit for the cells marked in `cells` (rows, columns), row by row. */
 FOR_EACH_PROCESSOR void fit_cells(
     const double *lattice, int64_t rows, int64_t columns, const uint8_t *cells, const fit_rules_t *rules, int64_t count,
     double *out)
@@ -223,7 +223,7 @@ INLINE int runs_along(double angle, const double *vector, double line_sine)
     return fabs(cross) < line_sine * sqrt(vector[0] * vector[0] + vector[1] * vector[1]);
 }
 
-/* Return whether the saddle at (u, v) can be the corner of the cell, and its contrast (detection.lattice.grow._fits). */
+/* Return whether the saddle at (u, v) can be the corner of the cell, and its contrast (reference.growth._fits). */
 INLINE int fits(
     const sheet_t *sheet, const pyramid_level_t *level, const growth_rules_t *rules, const fit_t *fit, int64_t row,
     int64_t column, double height, const double *pixel, double *contrast)
@@ -321,7 +321,7 @@ static int touches_border(const sheet_t *sheet)
     return 0;
 }
 
-/* Grow one lattice in place by at most `rings` rings (detection.lattice.grow.grow). `fresh` (rows * columns, 3) and `where`
+/* Grow one lattice in place by at most `rings` rings (reference.growth.grown). `fresh` (rows * columns, 3) and `where`
  * (rows * columns) are scratch. Returns the rings that are left, 0 or more, if it needs a wider sheet to grow on; -1 if
  * it has grown all it can. */
 FOR_EACH_PROCESSOR int64_t grow_lattice(
@@ -371,7 +371,7 @@ static int compare(const void *one, const void *two)
     return (a > b) - (a < b);
 }
 
-/* Keep the links that bound a closed square on either side (detection.lattice.links.quads). */
+/* Keep the links that bound a closed square on either side (reference.front.quads). */
 static void keep_quads(int64_t count, int64_t *to, uint8_t *bound)
 {
     memset(bound, 0, (size_t)(4 * count));
@@ -387,7 +387,7 @@ static void keep_quads(int64_t count, int64_t *to, uint8_t *bound)
             to[state] = -1;
 }
 
-/* Give a column and a row to every linked corner, and the arm that points to +column (detection.lattice.lattice._walk). `label` is
+/* Give a column and a row to every linked corner, and the arm that points to +column (reference.growth._walk). `label` is
  * -1 for corners without links; `members` lists the corners of the lattices one lattice after the other. Returns the
  * number of lattices. `queue` (2 * count) is scratch. */
 static int64_t walk(
@@ -459,7 +459,7 @@ static int64_t walk(
     return lattices;
 }
 
-/* detection.lattice.lattice: the lattices of the links `to` (count, 4), which are changed. Returns how many; label, grid (count, 2),
+/* reference.growth.components_of: the lattices of the links `to` (count, 4), which are changed. Returns how many; label, grid (count, 2),
  * turn and members as in `walk`. `queue` (2 * count) and `bound` (4 * count) are scratch. */
 int64_t find_components(
     int64_t count, int64_t *to, int64_t *label, int64_t *grid, int64_t *turn, int64_t *members, int64_t *queue,

@@ -48,7 +48,7 @@ INLINE float brightness_at(const image_t image, float u, float v)
 }
 
 #define PI 3.14159265358979323846
-/* Return the two angles of a corner from the `even` part of its ring (detection.saddles.ring._angles). */
+/* Return the two angles of a corner from the `even` part of its ring (reference.front._angles). */
 INLINE void ring_angles(
     const image_t image, const ring_rules_t *rules, float u, float v, float radius, const float *even, double angles[2])
 {
@@ -89,7 +89,7 @@ INLINE void ring_angles(
 }
 
 /* Return whether the ring around (u, v) is that of a chessboard corner of at least a contrast; if so, its two angles and
- * its contrast (detection.saddles.ring.read_rings). */
+ * its contrast (reference.front.read_rings). */
 INLINE int read_ring(
     const image_t image, const ring_rules_t rules, float u, float v, float radius, double least, double angles[2],
     double *contrast)
@@ -148,7 +148,7 @@ INLINE int read_ring(
 
 /* Return whether at `most` or more of the `places` `along` the edge from (u, v) to (end_u, end_v) the side that should be
  * brighter (sign +1: where angles grow from u to v, seen from the start) is so by more than `weakest`
- * (detection.lattice.links.edge_contrast). */
+ * (reference.front.edge_contrast). */
 INLINE int edge_seen(
     const image_t image, const double *along, int64_t places, int64_t most, double u, double v, double end_u,
     double end_v, double sign, double offset, double weakest)

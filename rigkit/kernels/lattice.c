@@ -1,7 +1,8 @@
 /* What is judged of whole lattices: how evenly their rows run, how much their corners scatter about smooth rows, where
  * the edges between them lie.
  *
- * The definitions are in rigkit.detection.lattice.spacing, .scatter and .validate; the numbers come from there. */
+ * The definitions in numpy are in tests/kernels/reference/lattice.py, the numbers in rigkit.detection: lattice.spacing,
+ * subpixel.scatter, checks.validate. */
 #include "kernels.h"
 
 /* Return what `at` of the `values` are not above and the others not below; the values change places (Hoare's FIND). */
@@ -60,7 +61,7 @@ static double uneven_columns(
 }
 
 /* Set `typical` and `seen` to the above for the inner columns, then for the inner rows, and `every` to the two medians of
- * all (detection.lattice.spacing.unevenness). `scratch` has room for twice as many numbers as there are corners. */
+ * all (reference.lattice.uneven_steps). `scratch` has room for twice as many numbers as there are corners. */
 void uneven_steps(
     const double *pixels, int64_t rows, int64_t columns, double *scratch, int64_t all, double *typical,
     int64_t *seen, double *every)
@@ -79,7 +80,7 @@ typedef struct {
     int64_t rows, columns;
 } part_t;
 
-/* Return the typical difference of `order` over the expected one, NaN for few (detection.subpixel.scatter._roughness). */
+/* Return the typical difference of `order` over the expected one, NaN for few (reference.lattice._roughness). */
 static double roughness(const part_t part, int64_t order, const scatter_rules_t *rules)
 {
     double factor[MOST_ORDER + 1] = {1.0};
@@ -134,7 +135,7 @@ static int solve(double matrix[PLANE][PLANE], double right[PLANE])
     return 1;
 }
 
-/* Take from the corners where those of the best flat board through a pinhole would be (detection.subpixel.scatter._best_plane). */
+/* Take from the corners where those of the best flat board through a pinhole would be (reference.lattice._best_plane). */
 static void flatten(const part_t part)
 {
     const int64_t size = part.rows * part.columns;
@@ -186,7 +187,7 @@ static void flatten(const part_t part)
 }
 
 /* Set `out` to how much more the corners of each of `count` parts of a sheet, `width` corners wide, scatter than their
- * sigmas say (detection.subpixel.scatter.excess_scatter). `parts` are top, left, rows, columns; `scratch` has room for seven numbers
+ * sigmas say (reference.lattice.excess_scatter). `parts` are top, left, rows, columns; `scratch` has room for seven numbers
  * for each corner of a part. */
 void excess_scatter(
     const double *pixels, const double *sigma, int64_t height, int64_t width, const int64_t *parts, int64_t count,
@@ -229,7 +230,7 @@ static int square_of(
 }
 
 /* Set `out` to how far the edges of a lattice lie on the dark side of their corners' line, at `parts` places `along` it
- * (detection.checks.validate._shifts). `sign` is that of the first corner; `sums` has room for parts x (steps + 1). */
+ * (reference.lattice.shifts_of_edges). `sign` is that of the first corner; `sums` has room for parts x (steps + 1). */
 FOR_EACH_PROCESSOR
 void edge_shifts(
     const double *pixels, int64_t rows, int64_t columns, double sign, const image_t image, double scale, double offset,

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.arrays import FloatArray
-from rigkit.kernels import Kernels, kernels
+from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.front import ImageOf
 
-__all__ = ["ScatterRules", "excess_scatter", "loaded", "shifts_of_edges", "uneven_steps"]
+__all__ = ["ScatterRules", "excess_scatter", "shifts_of_edges", "uneven_steps"]
 
 ROOM_FOR_SCATTER = 7
 """Numbers that lattice.c keeps for each corner."""
@@ -23,13 +23,8 @@ class ScatterRules(Struct):
     """The constants of `detection.subpixel.scatter`."""
 
 
-def loaded() -> Kernels:
-    """Return the kernels()."""
-    return kernels()
-
-
 def uneven_steps(pixels: FloatArray) -> tuple[list[float], list[int], tuple[float, float]]:
-    """Return what `detection.lattice.spacing.unevenness` does of `pixels` (R, C, 2).
+    """Return what `detection.lattice.spacing.spacing_changes` does of `pixels` (R, C, 2).
 
     That is `typical` and `seen` of the inner columns and then of the inner rows, and `every` of both.
     """
@@ -71,7 +66,7 @@ def shifts_of_edges(
     steps: int,
     most: int,
 ) -> FloatArray:
-    """Return what `detection.checks.validate._shifts` does of `pixels` (R, C, 2), (K,), from about `most` edges."""
+    """Return how far edges lie aside, (K,), as `detection.checks.validate._edge_offsets`, from about `most` edges."""
     pixels, image = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(image, np.float32)
     places = np.array(along, np.float64)
     rows, columns = pixels.shape[:2]

@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from kernels.reference import edges as reference
 from scipy.spatial import cKDTree
 
 from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, one_board, small_board
@@ -78,7 +79,7 @@ def test_sigma_is_the_scatter(
 ) -> None:
     """`off`: at least so wrong would they be as under independent noise."""
     if not compiled:
-        monkeypatch.setattr(edge_fit, "fit_corners", lambda *_: None)
+        monkeypatch.setattr(edge_fit, "fit_corners", reference.fit_corners)
     fit, truth, sides = fitted(make, rng)
     ratio = np.sqrt(((fit.pixels - truth) ** 2).mean() / (fit.sigma_px**2).mean())
     assert ratio > off if off > 1.0 else ratio < off

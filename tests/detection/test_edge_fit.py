@@ -5,17 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from kernels.reference.edges import PARAMETERS, _edge, collect, linearise, pattern_of
 
 from rigkit.detection.subpixel.edge_fit import fit_edges
-from rigkit.detection.subpixel.edge_model import (
-    PARAMETERS,
-    PIXEL_KURTOSIS,
-    Geometry,
-    _edge,
-    collect,
-    linearise,
-    pattern_of,
-)
+from rigkit.detection.subpixel.edge_model import PIXEL_KURTOSIS, Geometry
 
 DERIVATIVE_REL = 0.01
 """Differences of a float32 model with steps of 1e-3 are good to 1e-4 / 1e-3 grey levels of 60."""

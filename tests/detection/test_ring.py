@@ -10,8 +10,9 @@ from helpers.detection_scenes import single
 from rigkit.core.boards import Board
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import grey_image, pyramid
-from rigkit.detection.saddles.ring import read_rings
-from rigkit.detection.saddles.saddle import RING_RADIUS, find_corners
+from rigkit.detection.saddles.ring import ring_rules
+from rigkit.detection.saddles.saddle import MAX_STEP, RING_RADIUS, find_corners
+from rigkit.kernels import front
 
 DIRECTION_DEG = 3.0
 """Of lines through an ideal corner of 25 degrees: sampled pixels and bilinear reads are no Gaussian. The places
@@ -31,15 +32,19 @@ def ideal_corner(first_deg: float, opening_deg: float, blur_px: float) -> np.nda
     return smooth.reshape(33, FINE, 33, FINE).mean(axis=(1, 3))
 
 
+def corner_at(image: np.ndarray, at: tuple[int, int], radius: float) -> np.ndarray:
+    """Return the angles (N, 2) of the corner next to the pixel `at`, N = 0 for none."""
+    place, response = np.array([at], np.int32), np.zeros(1, np.float32)
+    return front.corners(image, place, response, radius, MAX_STEP, np.inf, ring_rules())[2]
+
+
 @pytest.mark.parametrize("opening", [25.0, 50.0, 90.0, 130.0, 155.0])
 @pytest.mark.parametrize("blur", [1.0, 1.5, 2.0])
 @pytest.mark.parametrize("radius", [RING_RADIUS, 4.6])
 def test_directions_of_blurred_corners(opening: float, blur: float, radius: float) -> None:
     for first in (0.0, 33.0, 100.0, 170.0):
         image = ideal_corner(first, opening, blur).astype(np.float32)
-        rings = read_rings(image, np.array([[16.0, 16.0]]), radius)
-        assert rings.valid.all()
-        rising, falling = np.degrees(rings.angles[0])
+        rising, falling = np.degrees(corner_at(image, (16, 16), radius)[0])
         assert 0.0 <= rising < 180.0
         assert abs((rising - first + 90.0) % 180.0 - 90.0) < DIRECTION_DEG
         assert abs((falling - first - opening + 90.0) % 180.0 - 90.0) < DIRECTION_DEG
@@ -51,9 +56,8 @@ def test_ring_beyond_the_squares_is_refused() -> None:
     fine = (np.arange(40 * FINE) // (5 * FINE))[:, None] + np.arange(40 * FINE) // (5 * FINE)
     image = (fine % 2 * 160.0 + 40.0).reshape(40, FINE, 40, FINE).mean(axis=(1, 3)).astype(np.float32)
     image = cv2.GaussianBlur(image, (0, 0), 1.0)
-    corner = np.array([[19.5, 19.5]])
-    assert read_rings(image, corner, RING_RADIUS).valid.all()
-    assert not read_rings(image, corner, 6.0).valid.any()
+    assert len(corner_at(image, (19, 19), RING_RADIUS)) == 1
+    assert len(corner_at(image, (19, 19), 6.0)) == 0
 
 
 def test_dots_and_noise_have_hardly_any_corners(rng: np.random.Generator) -> None:

@@ -1,4 +1,4 @@
-"""The compiled front of the detector against the numpy one: the same corners and links, to rounding."""
+"""The kernels of the detector's front against numpy and OpenCV: the same corners and links, to rounding."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 import pytest
 from helpers.detection_scenes import corner_scene, fisheye, regular
+from helpers.real_images import real_images
+from kernels.reference import front as reference
 
 from rigkit.detection.lattice import links
 from rigkit.detection.lattice.links import find_links
@@ -38,6 +40,7 @@ def _images() -> dict[str, np.ndarray]:
         "small": (rng.random((17, 16)) * 255).astype(np.uint8),
         "text": text,
         "black": np.zeros((60, 80), np.uint8),
+        **real_images(),
     }
 
 
@@ -45,7 +48,8 @@ def _images() -> dict[str, np.ndarray]:
 def in_numpy(monkeypatch: pytest.MonkeyPatch) -> Callable[..., object]:
     def run(function: Callable[..., object], *args: object) -> object:
         with monkeypatch.context() as patch:
-            patch.setattr(front, "loaded", lambda: None)
+            for name in ("shrunk", "smoothed", "typical", "peaks", "corners", "near_any", "links"):
+                patch.setattr(front, name, getattr(reference, name))
             return function(*args)
 
     return run

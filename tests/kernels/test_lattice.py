@@ -7,12 +7,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from helpers.detection_scenes import corner_scene, regular
+from helpers.real_images import real_images
+from kernels.reference import lattice as reference
 
 from rigkit.detection.checks import validate
 from rigkit.detection.detect import find_lattices
 from rigkit.detection.lattice.spacing import spacing_changes
 from rigkit.detection.saddles.response import grey_image, pyramid
 from rigkit.detection.subpixel.scatter import excess_scatter
+from rigkit.kernels import lattice as native
 
 ROUNDING = 1e-9
 """Relative: differences of fifth and sixth order of pixels lose six digits."""
@@ -36,7 +39,8 @@ def in_numpy(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     """Return what takes the kernels away."""
 
     def take_away() -> None:
-        monkeypatch.setattr("rigkit.kernels.lattice.loaded", lambda: None)
+        for name in ("uneven_steps", "excess_scatter", "shifts_of_edges"):
+            monkeypatch.setattr(native, name, getattr(reference, name))
 
     return take_away
 
@@ -104,3 +108,29 @@ def test_where_edges_lie(holes: float, rng: np.random.Generator, in_numpy: Calla
     for ours, theirs in zip(compiled, plain, strict=True):
         assert np.abs(ours - theirs).max() < SAMPLED_CELLS
         assert np.abs(theirs).max() < validate.MAX_DARK
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("name", list(real_images()))
+def test_real_boards_are_judged_alike(name: str, in_numpy: Callable[[], None]) -> None:
+    grey = grey_image(real_images()[name])
+    level = pyramid(grey)[0]
+    found = find_lattices(grey, 12)
+    assert found
+
+    def judged() -> list[list[float]]:
+        numbers = []
+        for item in found:
+            pixels = item.lattice.pixels
+            changes = [change.every for change in spacing_changes(pixels)]
+            whole = (slice(0, pixels.shape[0]), slice(0, pixels.shape[1]))
+            scatter = excess_scatter(pixels, item.sigma_px, (whole,))
+            shifts = validate._edge_offsets(item.lattice, level, validate.WIDE_STRIPE, validate.OFFSET_PARTS)
+            numbers.append([*changes, *scatter, *shifts])
+        return numbers
+
+    compiled = np.array(judged())
+    in_numpy()
+    plain = np.array(judged())
+    assert np.allclose(compiled[:, :3], plain[:, :3], rtol=ROUNDING)
+    assert np.abs(compiled[:, 3:] - plain[:, 3:]).max() < SAMPLED_CELLS

@@ -12,7 +12,7 @@ from rigkit.detection.checks.evidence import Evidence
 from rigkit.detection.lattice.lattice import MANY, Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.nearby import near_any
-from rigkit.detection.saddles.response import Level, sample
+from rigkit.detection.saddles.response import Level
 from rigkit.detection.subpixel.subpixel import RefinedLattice
 from rigkit.kernels import lattice as native
 
@@ -180,28 +180,8 @@ def _edge_offsets(lattice: Lattice, level: Level, reach: float, along: Sequence[
 
     They are looked for in a stripe of `reach` squares to both sides.
     """
-    library = native.loaded()
-    if library is not None:
-        seen = (level.smooth, level.scale, level.offset)
-        return native.shifts_of_edges(lattice.pixels, lattice.rising, *seen, reach, along, STEPS_ACROSS, MAX_EDGES)
-    pixels, signs = level.to_level(lattice.pixels), lattice.signs()
-    # The edges that squares start with, and how each square goes on from there: boards seen aslant are flat.
-    first, right, below, last = pixels[:-1, :-1], pixels[:-1, 1:], pixels[1:, :-1], pixels[1:, 1:]
-    edges = (
-        (first, right, 0.5 * (below + last - first - right), signs[:-1, :-1]),
-        (first, below, 0.5 * (right + last - first - below), signs[:-1, :-1]),
-    )
-    start, end, across, sign = (np.concatenate([e[k].reshape(-1, *e[k].shape[2:]) for e in edges]) for k in range(4))
-    there = np.flatnonzero(np.isfinite(across[:, 0]))
-    there = there[:: max(len(there) // MAX_EDGES, 1)]
-    start, chord, across = start[there], (end - start)[there], (reach * sign[there])[:, None] * across[there]
-    on_chord = start + np.array(along)[:, None, None] * chord
-    places = on_chord[:, None] + np.linspace(-1.0, 1.0, STEPS_ACROSS + 1)[:, None, None] * across
-    values = sample(level.smooth, places).sum(axis=2, dtype=np.float64)
-    # The mean of a step from dark to bright says where it is, however sharp it is.
-    dark, bright = values[:, 0], values[:, -1]
-    mean = (values.sum(axis=1) - 0.5 * (dark + bright)) / STEPS_ACROSS
-    return np.asarray(2.0 * reach * (mean - 0.5 * (dark + bright)) / np.maximum(bright - dark, 1e-9))
+    seen = (level.smooth, level.scale, level.offset)
+    return native.shifts_of_edges(lattice.pixels, lattice.rising, *seen, reach, along, STEPS_ACROSS, MAX_EDGES)
 
 
 def compact(lattice: Lattice, size_px: tuple[int, int]) -> bool:

@@ -15,15 +15,11 @@ import cv2
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
-from rigkit.detection.lattice.links import Links, quads
+from rigkit.detection.lattice.links import Links
 from rigkit.detection.saddles.saddle import Corners
-from rigkit.kernels import kernels
 from rigkit.kernels.growth import components_of
 
-__all__ = ["GRID_DIRECTIONS", "MANY", "Lattice", "LatticeStack", "build_lattices", "margins", "padded"]
-
-GRID_DIRECTIONS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
-"""(column, row) of the four grid directions."""
+__all__ = ["MANY", "Lattice", "LatticeStack", "build_lattices", "margins", "padded"]
 
 MANY = 200
 """Lattices of so many corners are judged by a part of them before anything else is done with them."""
@@ -200,13 +196,7 @@ class LatticeStack:
 
 def build_lattices(corners: Corners, links: Links) -> Iterator[Lattice]:
     """Return the lattices that closed squares of four linked corners make up, the largest first."""
-    library = kernels()
-    if library is not None:
-        count, label, grid, turn, members = components_of(links.state)
-    else:
-        label, grid, turn = _components(links)
-        count = int(label.max(initial=-1)) + 1
-        members = np.argsort(label, kind="stable")[np.count_nonzero(label < 0) :]
+    count, label, grid, turn, members = components_of(links.state)
     sizes = np.bincount(label[label >= 0], minlength=count)
     ends = np.cumsum(sizes)
     for k in np.argsort(-sizes, kind="stable"):
@@ -234,46 +224,3 @@ def _lattice(corners: Corners, mine: IntArray, cells: IntArray, turn: int) -> La
     rising = (turn + int(cells[0].sum())) % 2 == 0
     whole = Lattice(pixels.reshape(rows, columns, 2), contrast.reshape(rows, columns), rising)
     return whole if single.all() else whole.trimmed()
-
-
-def _components(links: Links) -> tuple[IntArray, IntArray, IntArray]:
-    """Return per corner its lattice (-1 alone), its (column, row), and the arm that points to +column."""
-    bound = quads(links)
-    return _walk(Links(np.where(bound, links.state, -1)))
-
-
-def _walk(links: Links) -> tuple[IntArray, IntArray, IntArray]:
-    """Return per corner its component (-1 alone), its (column, row), and the arm that points to +column."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    count = len(links.corner)
-    start, arm = np.nonzero(links.corner >= 0)
-    end = links.corner[start, arm]
-    graph = coo_matrix((np.ones(len(start), np.int8), (start, end)), shape=(count, count))
-    _, label = connected_components(graph, directed=False)
-    linked = np.asarray((links.corner >= 0).any(axis=1), dtype=np.bool_)
-    _, component = np.unique(np.where(linked, label, -1), return_inverse=True)
-    component = component - (0 if linked.all() else 1)
-    grid, turn = np.zeros((count, 2), np.int64), np.zeros(count, np.int64)
-    degree = (links.corner >= 0).sum(axis=1)
-    order = np.lexsort((-degree, component))
-    order = order[component[order] >= 0]
-    _, first = np.unique(component[order], return_index=True)
-    frontier = order[first]
-    done = ~linked
-    done[frontier] = True
-    while len(frontier):
-        who, arm = np.nonzero(links.corner[frontier] >= 0)
-        start = frontier[who]
-        end, back = links.corner[start, arm], links.arm[start, arm]
-        fresh = ~done[end]
-        start, arm, end, back = start[fresh], arm[fresh], end[fresh], back[fresh]
-        end, first = np.unique(end, return_index=True)
-        start, arm, back = start[first], arm[first], back[first]
-        direction = (arm - turn[start]) % 4
-        grid[end] = grid[start] + GRID_DIRECTIONS[direction]
-        turn[end] = (back - direction - 2) % 4
-        done[end] = True
-        frontier = end
-    return component, grid, turn

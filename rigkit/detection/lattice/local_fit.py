@@ -7,13 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray
-from rigkit.kernels import kernels
 from rigkit.kernels.growth import FitRules, fit
 
 __all__ = ["LocalFit", "fit_cells"]
-
-POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
-TERMS_OF_DEGREE = {1: 3, 2: 6, 3: 10}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -116,41 +112,7 @@ def fit_cells(
         neighbours leave open from running wild.
     leave_out : ignore the corner of the cell itself, to predict it from its neighbours.
     """
-    library = kernels()
-    if library is not None:
-        rules = FitRules(degree, radius, leave_out, width, ridge)
-        return _local_fit(fit(lattice, cells, rules))
-    side = 2 * radius + 1
-    step_r, step_c = (a.ravel() - radius for a in np.divmod(np.arange(side * side), side))
-    powers = POWERS[: TERMS_OF_DEGREE[degree]]
-    design = np.stack([step_c**i * step_r**j for i, j in powers], axis=-1).astype(np.float64)
-    weight = np.exp(-0.5 * (step_c**2 + step_r**2) / width**2)
-    if leave_out:
-        weight[step_c**2 + step_r**2 == 0] = 0.0
-    padded = np.pad(lattice, ((radius, radius), (radius, radius), (0, 0)), constant_values=np.nan)
-    row, column = np.nonzero(cells)
-    near = padded[row[:, None] + step_r + radius, column[:, None] + step_c + radius]
-    known = np.isfinite(near[..., 0]) & (weight > 0.0)
-    weights = np.where(known, weight, 0.0)
-    near = np.where(known[..., None], near, 0.0)
-    total = np.maximum(weights.sum(axis=1), 1e-12)
-    centre = (weights[..., None] * near).sum(axis=1) / total[:, None]
-    size = len(powers)
-    products = (design[:, :, None] * design[:, None, :]).reshape(len(design), -1)
-    normal = (weights @ products).reshape(-1, size, size)
-    pull = np.array([(1e-12, 1e-9, ridge[0], ridge[1])[i + j] for i, j in powers])
-    normal = normal + np.diag(pull)
-    right = np.swapaxes(weights[..., None] * (near - centre[:, None]), 1, 2) @ design
-    constant = np.zeros((len(row), size, 1))
-    constant[:, 0] = 1.0
-    solved = np.linalg.solve(normal, np.concatenate([np.swapaxes(right, 1, 2), constant], axis=2))
-    solution = np.swapaxes(solved[..., :2], 1, 2)
-    gain = np.sqrt(((weights * (solved[..., 2] @ design.T)) ** 2).sum(axis=1))
-    zero = np.zeros((len(row), 2))
-    bend_column, bend_row = (2.0 * solution[..., k] if degree > 1 else zero for k in (3, 5))
-    position = solution[..., 0] + centre
-    single = np.stack([known.sum(axis=1), gain], axis=1)
-    return _local_fit(np.hstack([position, solution[..., 1], solution[..., 2], bend_column, bend_row, single]))
+    return _local_fit(fit(lattice, cells, FitRules(degree, radius, leave_out, width, ridge)))
 
 
 def _local_fit(rows: FloatArray) -> LocalFit:

@@ -14,9 +14,4 @@ def near_any(points: FloatArray, others: FloatArray, reach_px: float) -> BoolArr
     """Return which of `points` (N, 2) lie within `reach_px` of any of `others` (M, 2), in the same pixels."""
     if not len(points) or not len(others):
         return np.zeros(len(points), np.bool_)
-    library = front.loaded()
-    if library is not None:
-        return front.near_any(points, others, reach_px)
-    from scipy.spatial import cKDTree
-
-    return np.asarray(cKDTree(others).query(points)[0] <= reach_px, dtype=np.bool_)
+    return front.near_any(points, others, reach_px)

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 from rigkit.kernels import front
 
@@ -142,7 +142,7 @@ def pyramid(grey: GreyImage) -> list[Level]:
     base, offset = _shrunk(grey, scale), 0.5 * (scale - 1.0)
     levels: list[Level] = []
     while len(levels) < OCTAVES and min(base.shape) >= 16:
-        smooth, base = _smoothed(base)
+        smooth, base = front.smoothed(base, SMOOTH)
         levels.append(Level(smooth, _threshold(smooth), float(scale), offset))
         scale *= 2
     return levels
@@ -152,46 +152,13 @@ def _shrunk(grey: GreyImage, factor: int) -> GreyImage:
     """Return the means of `factor` x `factor` pixels."""
     if factor == 1:
         return grey
-    library = front.loaded()
-    if library is not None:
-        return front.shrunk(grey, factor)
-    height, width = grey.shape[0] // factor, grey.shape[1] // factor
-    whole = grey[: factor * height, : factor * width]
-    mean = cv2.resize(whole.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
-    return np.asarray(mean, np.float32)
-
-
-def _smoothed(image: GreyImage) -> tuple[FloatImage, FloatImage]:
-    """Return `image` smoothed, and every second pixel of every second row of that."""
-    library = front.loaded()
-    if library is not None:
-        return front.smoothed(image, SMOOTH)
-    smooth = np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, SMOOTH, SMOOTH, borderType=cv2.BORDER_REPLICATE), np.float32)
-    return smooth, np.ascontiguousarray(smooth[::2, ::2])
-
-
-def _response(smooth: FloatImage) -> FloatImage:
-    """Return D of the inner pixels of `smooth` (H, W), (H - 2, W - 2)."""
-    second = np.array([1.0, -2.0, 1.0], np.float32)
-    first = np.array([-0.5, 0.0, 0.5], np.float32)
-    lxx = cv2.filter2D(smooth, cv2.CV_32F, second[None])
-    lyy = cv2.filter2D(smooth, cv2.CV_32F, second[:, None])
-    lxy = cv2.sepFilter2D(smooth, cv2.CV_32F, first, first)
-    # In place: fresh pages of memory cost as much as the arithmetic.
-    cv2.multiply(lxx, lyy, dst=lxx)
-    cv2.multiply(lxy, lxy, dst=lxy)
-    return np.asarray(cv2.subtract(lxy, lxx, dst=lxy), np.float32)[1:-1, 1:-1]
+    return front.shrunk(grey, factor)
 
 
 def _threshold(smooth: FloatImage) -> float:
     """Return the smallest D of a peak."""
     step = max(1, int(np.sqrt(smooth.size / TYPICAL)))
-    library = front.loaded()
-    if library is not None:
-        response, brightness = front.typical(smooth, step)
-    else:
-        response = np.abs(_response(smooth)[::step, ::step]).ravel()
-        brightness = smooth[1:-1:step, 1:-1:step].ravel()
+    response, brightness = front.typical(smooth, step)
     few = int(EXTREME * len(brightness))
     span = _ranked(brightness, len(brightness) - 1 - few) - _ranked(brightness, few)
     contrast = (max(span, MIN_SPAN) / 200.0) ** 2
@@ -209,44 +176,7 @@ def _ranked(values: FloatImage, at: int) -> float:
 def peaks(level: Level) -> tuple[NDArray[np.signedinteger], FloatImage]:
     """Return the local maxima of the response above the threshold, (N, 2) as (u, v) of the level, row by row, and D."""
     most = max(MAX_PEAKS, level.smooth.size // PIXELS_A_PEAK)
-    library = front.loaded()
-    if library is not None:
-        return front.peaks(level.smooth, level.threshold, most, PEAK_SQUARE_PX, SHARES)
-    response = _response(level.smooth)
-    highest = cv2.dilate(response, np.ones((5, 5), np.uint8))
-    mask = (response >= highest) & (response > level.threshold)
-    mask[:2] = mask[-2:] = False
-    mask[:, :2] = mask[:, -2:] = False
-    flat = np.flatnonzero(mask)
-    flat = flat[~_repeated(response.ravel(), flat, response.shape[1])]
-    v, u = np.divmod(flat, response.shape[1])
-    places, heights = np.stack([u, v], axis=-1) + 1, response.ravel()[flat]
-    kept = _strongest(places, heights, most) if len(places) > most else slice(None)
-    return places[kept], heights[kept]
-
-
-def _strongest(at: IntArray, height: FloatImage, most: int) -> BoolArray:
-    """Return which of the peaks `at` (N, 2) of `height` (N,) are the `most` strongest in their surroundings.
-
-    More where the last ones are equally strong.
-    """
-    column, row = (at // PEAK_SQUARE_PX).T
-    square = row * (int(column.max()) + 1) + column
-    strongest = np.zeros(int(square.max()) + 1, np.float32)
-    np.maximum.at(strongest, square, height)
-    # Beyond what float32 holds one is as strong as the other.
-    share = (np.float32(SHARES) * np.nan_to_num(height / strongest[square], nan=1.0)).astype(np.int64)
-    at_least = np.cumsum(np.bincount(share, minlength=SHARES + 1)[::-1])[::-1]
-    return np.asarray(share >= np.flatnonzero(at_least >= most)[-1], np.bool_)
-
-
-def _repeated(response: FloatImage, flat: IntArray, width: int) -> NDArray[np.bool_]:
-    """Return which peaks have an equal one before them in their neighbourhood: a corner between pixels makes two."""
-    value = response[flat]
-    repeated = np.zeros(len(flat), bool)
-    for dv, du in ((0, -1), (0, -2), *((dv, du) for dv in (-1, -2) for du in (-2, -1, 0, 1, 2))):
-        repeated |= response[flat + dv * width + du] == value
-    return repeated
+    return front.peaks(level.smooth, level.threshold, most, PEAK_SQUARE_PX, SHARES)
 
 
 def sample(image: GreyImage, pixels: NDArray[np.floating]) -> FloatImage:

@@ -18,15 +18,13 @@ harmonics 2 and 4 of the ring the angle, and the phase of harmonic 2 where the m
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray
-from rigkit.detection.saddles.response import FloatImage, sample
+from rigkit.core.arrays import FloatArray
 from rigkit.kernels.front import HALF, RingRules
 
-__all__ = ["Rings", "arm_vectors", "may_be_corners", "read_rings", "ring_rules"]
+__all__ = ["arm_vectors", "ring_rules"]
 
 CIRCLE = np.stack([f(np.arange(2 * HALF) * (np.pi / HALF)) for f in (np.cos, np.sin)], axis=-1).astype(np.float32)
 """Where they lie on a ring of radius 1, (2 HALF, 2)."""
@@ -39,11 +37,11 @@ MAX_CENTRE = 0.16
 """Largest difference of the centre from the mean of the ring, relative to the contrast. Rings inside the four squares
 show less than 0.06; more where they reach beyond, which spoils the directions as well, and between dots or letters."""
 
-QUICK, QUICK_ODD, QUICK_CENTRE, QUICK_SHARP = 4, 0.5, 0.6, 1.12
-"""Every so many samples tell most of what is no corner, at a quarter of the cost: the energy of the odd part relative
-to that of the even part, the centre off the mean relative to its deviation, the response relative to its variance. Of
-29157 rings that pass the other tests, in rendered and real images, two are lost; of those of noise and texture two in
-three need not be read."""
+QUICK_ODD, QUICK_CENTRE, QUICK_SHARP = 0.5, 0.6, 1.12
+"""Every fourth of the samples tells most of what is no corner, at a quarter of the cost: the energy of the odd part
+relative to that of the even part, the centre off the mean relative to its deviation, the response relative to its
+variance. Of 29157 rings that pass the other tests, in rendered and real images, two are lost; of those of noise and
+texture two in three need not be read."""
 
 LARGEST_GAIN = 8.0
 """Largest R_2 / R_4 that is made up for: beyond it, in the middle of a strong blur, harmonic 4 is only noise."""
@@ -53,80 +51,6 @@ MAX_COSINE = 0.99
 
 GAINS = 64
 """Entries of the table of R_2(r / s) / R_4(r / s) over R_2(r / 2 s) / R_2(r / s), which goes from 1/4 to 1."""
-
-HARMONICS = [np.exp(-1j * m * np.arange(HALF) * (np.pi / HALF)).astype(np.complex64) for m in (2, 4)]
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Rings:
-    """What the rings around N points say.
-
-    Attributes
-    ----------
-    angles : (N, 2) rad. Line A (dark to bright with growing angle) in [0, pi), line B (bright to dark) in (A, A + pi).
-    contrast : (N,) bright minus dark, grey levels.
-    valid : (N,) looks like a chessboard corner; the other values are undefined elsewhere.
-    """
-
-    angles: FloatArray
-    contrast: FloatArray
-    valid: BoolArray
-
-
-def may_be_corners(image: FloatImage, pixels: FloatArray, radius_px: float, response: FloatImage) -> BoolArray:
-    """Return which of `pixels` (N, 2), where the saddle response is `response` (N,), are worth to be read a ring of."""
-    places = pixels.astype(np.float32)
-    values = sample(image, places[:, None, :] + np.float32(radius_px) * CIRCLE[::QUICK])
-    one, other = np.split(values, 2, axis=1)
-    even = 0.5 * (one + other)
-    mean = even.mean(axis=1)
-    variance = even.var(axis=1)
-    odd = 0.25 * ((one - other) ** 2).mean(axis=1)
-    off = np.abs(sample(image, places) - mean)
-    possible = (
-        (odd < QUICK_ODD * variance) & (off**2 < QUICK_CENTRE**2 * variance) & (response < QUICK_SHARP * variance)
-    )
-    return np.asarray(possible, dtype=np.bool_)
-
-
-def read_rings(
-    image: FloatImage,
-    pixels: FloatArray,
-    radius_px: FloatArray | float,
-    max_odd: float = MAX_ODD,
-    max_centre: float = MAX_CENTRE,
-) -> Rings:
-    """Return what rings of `radius_px` (scalar or (N,)) around `pixels` (N, 2) of `image` look like."""
-    radius = np.broadcast_to(np.asarray(radius_px, np.float32), pixels.shape[:1])
-    values = sample(image, pixels[:, None, :].astype(np.float32) + radius[:, None, None] * CIRCLE)
-    even = 0.5 * (values[:, :HALF] + values[:, HALF:])
-    odd = 0.5 * (values[:, :HALF] - values[:, HALF:])
-    low, high = even.min(axis=1), even.max(axis=1)
-    contrast = (high - low).astype(np.float64)
-    middle = 0.5 * (low + high)
-    mean = even.mean(axis=1)
-    spread = even - mean[:, None]
-    symmetric = (odd**2).sum(axis=1) < max_odd * (spread**2).sum(axis=1)
-    balanced = np.abs(sample(image, pixels) - mean) < max_centre * (high - low)
-    above = even > middle[:, None]
-    valid = symmetric & balanced & (np.count_nonzero(~above & np.roll(above, -1, axis=1), axis=1) == 1)
-    angles = np.zeros((len(pixels), 2))
-    angles[valid] = _angles(image, pixels[valid], radius[valid], even[valid])
-    return Rings(angles, contrast, valid)
-
-
-def _angles(image: FloatImage, pixels: FloatArray, radius: FloatImage, even: FloatImage) -> FloatArray:
-    """Return the angles of lines A and B (N, 2) from the `even` parts (N, HALF) of rings of `radius` (N,)."""
-    second, fourth = (even @ wave for wave in HARMONICS)
-    inner = sample(image, pixels[:, None, :].astype(np.float32) + 0.5 * radius[:, None, None] * CIRCLE[::2])
-    size = np.maximum(np.abs(second), 1e-20)
-    phase = second / size
-    nearer = (0.5 * (inner[:, : HALF // 2] + inner[:, HALF // 2 :])) @ HARMONICS[0][::2]
-    gain = np.interp(2.0 * (nearer * phase.conj()).real / size, np.linspace(0.25, 1.0, GAINS), _gains())
-    cosine = gain * (fourth * phase.conj() ** 2).real / size
-    half = 0.5 * np.arccos(np.clip(cosine, -MAX_COSINE, MAX_COSINE))
-    first = (-0.5 * np.angle(phase) - half) % np.pi
-    return np.stack([first, first + 2.0 * half], axis=-1)
 
 
 @functools.cache

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.detection.saddles.nearby import near_any
-from rigkit.detection.saddles.response import FloatImage, Level, peaks
-from rigkit.detection.saddles.ring import may_be_corners, read_rings, ring_rules
+from rigkit.detection.saddles.response import Level, peaks
+from rigkit.detection.saddles.ring import ring_rules
 from rigkit.kernels import front
 
-__all__ = ["Corners", "Saddles", "find_corners", "saddle_step"]
+__all__ = ["Corners", "Saddles", "find_corners"]
 
 RING_RADIUS = 2.6
 """Of the ring, in pixels of the level: fits squares of 6 px, and 5 where they are seen straight on."""
@@ -43,7 +43,7 @@ class Corners:
     Attributes
     ----------
     pixels : (N, 2) full resolution, a few tenths of a pixel good.
-    angles : (N, 2) rad, lines A and B as in `Rings`.
+    angles : (N, 2) rad. Line A (dark to bright with growing angle) in [0, pi), line B (bright to dark) in (A, A + pi).
     contrast : (N,) grey levels.
     scale : (N,) of the level on which the corner was found.
     """
@@ -55,21 +55,6 @@ class Corners:
 
     def __len__(self) -> int:
         return len(self.pixels)
-
-
-def saddle_step(smooth: FloatImage, at: IntArray) -> tuple[FloatArray, BoolArray]:
-    """Return the stationary point next to each of the pixels `at` (N, 2), and whether it is a saddle and near."""
-    u, v = at[:, 0], at[:, 1]
-    patch = {(i, j): smooth[v + j, u + i].astype(np.float64) for i in (-1, 0, 1) for j in (-1, 0, 1)}
-    gu, gv = 0.5 * (patch[1, 0] - patch[-1, 0]), 0.5 * (patch[0, 1] - patch[0, -1])
-    huu = patch[1, 0] + patch[-1, 0] - 2.0 * patch[0, 0]
-    hvv = patch[0, 1] + patch[0, -1] - 2.0 * patch[0, 0]
-    huv = 0.25 * (patch[1, 1] + patch[-1, -1] - patch[1, -1] - patch[-1, 1])
-    det = huu * hvv - huv**2
-    safe = np.where(det < 0.0, det, -1.0)
-    step = np.stack([(huv * gv - hvv * gu) / safe, (huv * gu - huu * gv) / safe], axis=-1)
-    near = (det < 0.0) & (np.abs(step).max(axis=1) <= MAX_STEP)
-    return at + step, near
 
 
 def find_corners(levels: list[Level]) -> tuple[Corners, Saddles]:
@@ -88,15 +73,7 @@ def find_corners(levels: list[Level]) -> tuple[Corners, Saddles]:
 def _corners_of(level: Level) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
     """Return the saddles of `level` in its own pixels, and of those that are corners: which, angles, contrast."""
     at, response = peaks(level)
-    library = front.loaded()
-    if library is not None:
-        return front.corners(level.smooth, at, response, RING_RADIUS, MAX_STEP, MAX_SHARPNESS, ring_rules())
-    found, near = saddle_step(level.smooth, at)
-    found, response = found[near], response[near]
-    which = np.flatnonzero(may_be_corners(level.smooth, found, RING_RADIUS, response))
-    rings = read_rings(level.smooth, found[which], RING_RADIUS)
-    good = rings.valid & (response[which] <= MAX_SHARPNESS * rings.contrast**2)
-    return found, which[good], rings.angles[good], rings.contrast[good]
+    return front.corners(level.smooth, at, response, RING_RADIUS, MAX_STEP, MAX_SHARPNESS, ring_rules())
 
 
 def _without_known(fresh: Corners, known: list[Corners]) -> Corners:

@@ -10,8 +10,6 @@ of low degree would miss. Where few corners leave the curvature open, its standa
 
 from __future__ import annotations
 
-import numpy as np
-
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.detection.lattice.lattice import LatticeStack
 from rigkit.kernels.edges import BendRules, line_bends
@@ -26,9 +24,6 @@ BENT_RAD = 0.06
 
 LINE_REACH = LatticeStack.GAP
 """Corners so many cells away are used: on a sheet, further ones may be another board's."""
-
-COEFFICIENTS = 6
-"""Coefficients of order 0 to 5."""
 
 MIN_CORNER_SIGMA_PX = 1e-3
 """No corner is taken to be better than this."""
@@ -52,45 +47,4 @@ def line_curvature(
     sides_px : (M, 2) lengths of the cell's sides along row and column.
     """
     rules = BendRules(DECAY, MIN_CORNER_SIGMA_PX, FREE, BENT_RAD, LINE_REACH)
-    compiled = line_bends(pixels, sigma_px, cells, sides_px, rules)
-    if compiled is not None:
-        return compiled
-    steps = np.arange(-LINE_REACH, LINE_REACH + 1)
-    design = steps[:, None].astype(np.float64) ** np.arange(COEFFICIENTS)
-    products = (design[:, :, None] * design[:, None, :]).reshape(len(steps), -1)
-    decay = DECAY ** np.arange(COEFFICIENTS)
-    known = np.isfinite(sigma_px) & np.isfinite(pixels[..., 0])
-    weight = np.where(known, np.maximum(sigma_px, MIN_CORNER_SIGMA_PX) ** -2.0, 0.0)
-    row, column = np.nonzero(cells)
-    out, out_sigma = np.empty((2, len(row), 2))
-    for line, (along_row, along_column) in enumerate(((0, 1), (1, 0))):
-        r, c = row[:, None] + along_row * steps, column[:, None] + along_column * steps
-        inside = (r >= 0) & (r < pixels.shape[0]) & (c >= 0) & (c < pixels.shape[1])
-        r, c = np.where(inside, r, row[:, None]), np.where(inside, c, column[:, None])
-        side = sides_px[:, line, None]
-        weights = np.where(inside, weight[r, c], 0.0) * side**2
-        off = np.where((weights > 0.0)[..., None], pixels[r, c] - pixels[row, column][:, None], 0.0) / side[..., None]
-        normal = (weights @ products).reshape(-1, COEFFICIENTS, COEFFICIENTS)
-        right = design.T @ (weights[..., None] * off)
-        found, sigma = _most_probable(normal, right, np.broadcast_to(decay, (len(row), COEFFICIENTS)))
-        size = np.linalg.norm(found, axis=2)
-        turn = np.maximum(2.0 * size[:, 2], np.sqrt(2.0 * size[:, 3]))
-        bent = turn > BENT_RAD
-        if bent.any():
-            expected: FloatArray = np.repeat(decay[None], np.count_nonzero(bent), axis=0)
-            expected[:, 2:] = np.maximum(decay[2:], 0.5 * turn[bent, None] ** np.arange(1, COEFFICIENTS - 1))
-            found[bent], sigma[bent] = _most_probable(normal[bent], right[bent], expected)
-        first, second = found[:, 1], 2.0 * found[:, 2]
-        cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
-        square = np.maximum((first**2).sum(axis=1), 1e-12)
-        out[:, line] = cross / (square**1.5 * sides_px[:, line])
-        out_sigma[:, line] = 2.0 * sigma / (square * sides_px[:, line])
-    return out, out_sigma
-
-
-def _most_probable(normal: FloatArray, right: FloatArray, expected: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the coefficients (M, K, 2) that are `expected` (M, K) in size, and the second's sigma (M,)."""
-    prior = np.diag([FREE, FREE, *[1.0] * (COEFFICIENTS - 2)])
-    inverse = np.linalg.inv(normal * expected[:, :, None] * expected[:, None, :] + prior)
-    found = expected[..., None] * (inverse @ (expected[..., None] * right))
-    return found, expected[:, 2] * np.sqrt(inverse[:, 2, 2])
+    return line_bends(pixels, sigma_px, cells, sides_px, rules)

@@ -44,10 +44,7 @@ def excess_scatter(pixels: FloatArray, sigma_px: FloatArray, parts: Sequence[tup
     sigma_px : (R, C), NaN likewise.
     parts : the rows and columns of each board.
     """
-    library = native.loaded()
-    if library is not None:
-        return native.excess_scatter(pixels, sigma_px, parts, _rules())
-    return np.array([_excess(pixels[part], sigma_px[part]) for part in parts])
+    return native.excess_scatter(pixels, sigma_px, parts, _rules())
 
 
 def scatter_factors(pixels: FloatArray, sigma_px: FloatArray, parts: Sequence[tuple[slice, slice]]) -> FloatArray:
@@ -87,60 +84,3 @@ def _rules() -> native.ScatterRules:
         first_order=DIFFERENCES[0],
         last_order=DIFFERENCES[-1],
     )
-
-
-def _excess(pixels: FloatArray, sigma_px: FloatArray) -> float:
-    if np.count_nonzero(np.isfinite(pixels[..., 0])) < MIN_SCATTER_CORNERS:
-        return 1.0
-    calmest = np.inf
-    for flatten in (False, True):
-        values = pixels - _best_plane(pixels) if flatten else pixels
-        for order in DIFFERENCES:
-            calmest = float(np.fmin(calmest, _roughness(values, sigma_px, order)))
-            if calmest <= UNEXPLAINED:
-                return 1.0
-    return calmest if np.isfinite(calmest) else 1.0
-
-
-def _best_plane(pixels: FloatArray) -> FloatArray:
-    """Return (R, C, 2) where the corners of the best flat board through a pinhole would be; NaN where unknown.
-
-    Best in the linear sense, all coordinates between -1 and 1: what this misses is smooth, and no difference sees it.
-    """
-    row, column = np.nonzero(np.isfinite(pixels[..., 0]))
-    known = pixels[row, column]
-    mean = known.mean(axis=0)
-    unit = np.abs(known - mean).sum() / len(known)
-    p = (known - mean) / unit
-    size = np.array(pixels.shape[1::-1])
-    x, y = (2.0 * np.stack([column, row], axis=-1) / size - 1.0).T
-    one, none = np.ones(len(x)), np.zeros(len(x))
-    design = np.concatenate(
-        [
-            np.stack([x, y, one, none, none, none, -p[:, 0] * x, -p[:, 0] * y], axis=-1),
-            np.stack([none, none, none, x, y, one, -p[:, 1] * x, -p[:, 1] * y], axis=-1),
-        ]
-    )
-    h, _, rank, _ = np.linalg.lstsq(design, p.T.ravel(), rcond=None)
-    flat = np.full(pixels.shape, np.nan)
-    if rank == len(h):
-        depth = h[6] * x + h[7] * y + 1.0
-        plane = np.stack([h[0] * x + h[1] * y + h[2], h[3] * x + h[4] * y + h[5]], axis=-1)
-        flat[row, column] = plane / depth[:, None] * unit + mean
-    return flat
-
-
-def _roughness(values: FloatArray, sigma_px: FloatArray, order: int) -> float:
-    """Return the typical difference of `order` of `values` (R, C, 2) over the expected one, NaN where there are few."""
-    factors = [float(comb(order, k)) ** 2 for k in range(order + 1)]
-    found: list[FloatArray] = []
-    for along in (0, 1):
-        moved, square = values.swapaxes(0, along), sigma_px.swapaxes(0, along) ** 2
-        count = len(square) - order
-        if count <= 0:
-            continue
-        variance = sum(factor * square[k : k + count] for k, factor in enumerate(factors))
-        ratio = np.abs(np.diff(moved, order, axis=0)) / np.sqrt(variance)[..., None]
-        found.append(ratio[np.isfinite(ratio)])
-    every = np.concatenate(found) if found else np.zeros(0)
-    return float(np.median(every)) / MEDIAN_OF_NORMAL if len(every) >= MIN_DIFFERENCES else np.nan

@@ -1,0 +1,23 @@
+"""A few images of real boards, where the captures outside the repository are there."""
+
+from __future__ import annotations
+
+import functools
+
+import cv2
+import numpy as np
+
+from helpers.data import CAPTURES
+
+CHOSEN = {
+    "webcam": "real/bouguet-stereo/left10.jpg",
+    "strong fisheye": "real/camodocal-fisheye/img42.png",
+    "three boards": "real/multi-board/e2.png",
+}
+
+
+@functools.cache
+def real_images() -> dict[str, np.ndarray]:
+    """Return those images that are there, grey, by their names."""
+    found = {name: CAPTURES / path for name, path in CHOSEN.items()}
+    return {name: cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for name, path in found.items() if path.is_file()}

@@ -1,0 +1,364 @@
+"""What the detector asks the kernels of front.c for, in numpy and OpenCV; arguments as those of `rigkit.kernels.front`.
+
+The tolerances are those of the detector, whatever the rules say.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree
+
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.detection.lattice.links import (
+    ARM_COSINE,
+    ASIDE,
+    CONTRAST_RATIO,
+    EDGE_PLACES,
+    LENGTH_RATIO,
+    MAX_ASIDE_PX,
+    MIN_ASIDE_PX,
+    MIN_EDGE_PLACES,
+    NEIGHBOURS,
+    Links,
+    _bounds,
+)
+from rigkit.detection.saddles.response import FloatImage, GreyImage, Level, sample
+from rigkit.detection.saddles.ring import (
+    CIRCLE,
+    GAINS,
+    MAX_CENTRE,
+    MAX_COSINE,
+    MAX_ODD,
+    QUICK_CENTRE,
+    QUICK_ODD,
+    QUICK_SHARP,
+    _gains,
+    arm_vectors,
+)
+from rigkit.detection.saddles.saddle import MAX_STEP, Corners
+from rigkit.kernels.front import HALF, LinkRules, RingRules
+
+QUICK = 4
+"""Every so many samples of a ring are looked at before it is read."""
+
+
+def shrunk(image: GreyImage, factor: int) -> FloatImage:
+    height, width = image.shape[0] // factor, image.shape[1] // factor
+    whole = image[: factor * height, : factor * width]
+    mean = cv2.resize(whole.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(mean, np.float32)
+
+
+def smoothed(image: GreyImage, kernel: FloatImage) -> tuple[FloatImage, FloatImage]:
+    smooth = np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REPLICATE), np.float32)
+    return smooth, np.ascontiguousarray(smooth[::2, ::2])
+
+
+def typical(smooth: FloatImage, step: int) -> tuple[FloatImage, FloatImage]:
+    return np.abs(_response(smooth)[::step, ::step]).ravel(), smooth[1:-1:step, 1:-1:step].ravel()
+
+
+def peaks(smooth: FloatImage, threshold: float, limit: int, side: int, finest: int) -> tuple[IntArray, FloatImage]:
+    response = _response(smooth)
+    highest = cv2.dilate(response, np.ones((5, 5), np.uint8))
+    mask = (response >= highest) & (response > threshold)
+    mask[:2] = mask[-2:] = False
+    mask[:, :2] = mask[:, -2:] = False
+    flat = np.flatnonzero(mask)
+    flat = flat[~_repeated(response.ravel(), flat, response.shape[1])]
+    v, u = np.divmod(flat, response.shape[1])
+    places, heights = np.stack([u, v], axis=-1) + 1, response.ravel()[flat]
+    kept = _strongest(places, heights, limit, side, finest) if len(places) > limit else slice(None)
+    return places[kept], heights[kept]
+
+
+def corners(
+    smooth: FloatImage,
+    at: IntArray,
+    response: FloatImage,
+    radius: float,
+    most_step: float,
+    most_sharp: float,
+    rules: RingRules,
+) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
+    assert most_step == MAX_STEP and rules.most_odd == MAX_ODD
+    found, near = saddle_step(smooth, at)
+    found, response = found[near], response[near]
+    which = np.flatnonzero(may_be_corners(smooth, found, radius, response))
+    rings = read_rings(smooth, found[which], radius)
+    good = rings.valid & (response[which] <= most_sharp * rings.contrast**2)
+    return found, which[good], rings.angles[good], rings.contrast[good]
+
+
+def near_any(fresh: FloatArray, known: FloatArray, reach: float) -> BoolArray:
+    return np.asarray(cKDTree(known).query(fresh)[0] <= reach, dtype=np.bool_)
+
+
+def links(
+    pixels: FloatArray,
+    lines: FloatArray,
+    contrast: FloatArray,
+    bounds: tuple[FloatArray, FloatArray],
+    reach: FloatArray,
+    image: FloatImage,
+    scale: float,
+    offset: float,
+    rules: LinkRules,
+) -> IntArray:
+    assert np.array_equal(bounds, _bounds(contrast)) and rules.neighbours == NEIGHBOURS
+    angles = np.arctan2(lines[..., 1], lines[..., 0])
+    given = Corners(pixels, angles, contrast, reach * scale / MAX_ASIDE_PX)
+    return _without_long(_mutual(given, Level(image, 0.0, scale, offset)), pixels).reshape(-1, 4)
+
+
+def _response(smooth: FloatImage) -> FloatImage:
+    """Return D of the inner pixels of `smooth` (H, W), (H - 2, W - 2)."""
+    second = np.array([1.0, -2.0, 1.0], np.float32)
+    first = np.array([-0.5, 0.0, 0.5], np.float32)
+    lxx = cv2.filter2D(smooth, cv2.CV_32F, second[None])
+    lyy = cv2.filter2D(smooth, cv2.CV_32F, second[:, None])
+    lxy = cv2.sepFilter2D(smooth, cv2.CV_32F, first, first)
+    # In place: fresh pages of memory cost as much as the arithmetic.
+    cv2.multiply(lxx, lyy, dst=lxx)
+    cv2.multiply(lxy, lxy, dst=lxy)
+    return np.asarray(cv2.subtract(lxy, lxx, dst=lxy), np.float32)[1:-1, 1:-1]
+
+
+def _strongest(at: IntArray, height: FloatImage, most: int, side: int, shares: int) -> BoolArray:
+    """Return which of the peaks `at` (N, 2) of `height` (N,) are the `most` strongest in their surroundings.
+
+    More where the last ones are equally strong.
+    """
+    column, row = (at // side).T
+    square = row * (int(column.max()) + 1) + column
+    strongest = np.zeros(int(square.max()) + 1, np.float32)
+    np.maximum.at(strongest, square, height)
+    # Beyond what float32 holds one is as strong as the other.
+    share = (np.float32(shares) * np.nan_to_num(height / strongest[square], nan=1.0)).astype(np.int64)
+    at_least = np.cumsum(np.bincount(share, minlength=shares + 1)[::-1])[::-1]
+    return np.asarray(share >= np.flatnonzero(at_least >= most)[-1], np.bool_)
+
+
+def _repeated(response: FloatImage, flat: IntArray, width: int) -> BoolArray:
+    """Return which peaks have an equal one before them in their neighbourhood: a corner between pixels makes two."""
+    value = response[flat]
+    repeated = np.zeros(len(flat), bool)
+    for dv, du in ((0, -1), (0, -2), *((dv, du) for dv in (-1, -2) for du in (-2, -1, 0, 1, 2))):
+        repeated |= response[flat + dv * width + du] == value
+    return repeated
+
+
+def saddle_step(smooth: FloatImage, at: IntArray) -> tuple[FloatArray, BoolArray]:
+    """Return the stationary point next to each of the pixels `at` (N, 2), and whether it is a saddle and near."""
+    u, v = at[:, 0], at[:, 1]
+    patch = {(i, j): smooth[v + j, u + i].astype(np.float64) for i in (-1, 0, 1) for j in (-1, 0, 1)}
+    gu, gv = 0.5 * (patch[1, 0] - patch[-1, 0]), 0.5 * (patch[0, 1] - patch[0, -1])
+    huu = patch[1, 0] + patch[-1, 0] - 2.0 * patch[0, 0]
+    hvv = patch[0, 1] + patch[0, -1] - 2.0 * patch[0, 0]
+    huv = 0.25 * (patch[1, 1] + patch[-1, -1] - patch[1, -1] - patch[-1, 1])
+    det = huu * hvv - huv**2
+    safe = np.where(det < 0.0, det, -1.0)
+    step = np.stack([(huv * gv - hvv * gu) / safe, (huv * gu - huu * gv) / safe], axis=-1)
+    near = (det < 0.0) & (np.abs(step).max(axis=1) <= MAX_STEP)
+    return at + step, near
+
+
+HARMONICS = [np.exp(-1j * m * np.arange(HALF) * (np.pi / HALF)).astype(np.complex64) for m in (2, 4)]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Rings:
+    """What the rings around N points say.
+
+    Attributes
+    ----------
+    angles : (N, 2) rad, lines A and B as in `Corners`.
+    contrast : (N,) bright minus dark, grey levels.
+    valid : (N,) looks like a chessboard corner; the other values are undefined elsewhere.
+    """
+
+    angles: FloatArray
+    contrast: FloatArray
+    valid: BoolArray
+
+
+def may_be_corners(image: FloatImage, pixels: FloatArray, radius_px: float, response: FloatImage) -> BoolArray:
+    """Return which of `pixels` (N, 2), where the saddle response is `response` (N,), are worth to be read a ring of."""
+    places = pixels.astype(np.float32)
+    values = sample(image, places[:, None, :] + np.float32(radius_px) * CIRCLE[::QUICK])
+    one, other = np.split(values, 2, axis=1)
+    even = 0.5 * (one + other)
+    mean = even.mean(axis=1)
+    variance = even.var(axis=1)
+    odd = 0.25 * ((one - other) ** 2).mean(axis=1)
+    off = np.abs(sample(image, places) - mean)
+    possible = (
+        (odd < QUICK_ODD * variance) & (off**2 < QUICK_CENTRE**2 * variance) & (response < QUICK_SHARP * variance)
+    )
+    return np.asarray(possible, dtype=np.bool_)
+
+
+def read_rings(
+    image: FloatImage,
+    pixels: FloatArray,
+    radius_px: FloatArray | float,
+    max_odd: float = MAX_ODD,
+    max_centre: float = MAX_CENTRE,
+) -> Rings:
+    """Return what rings of `radius_px` (scalar or (N,)) around `pixels` (N, 2) of `image` look like."""
+    radius = np.broadcast_to(np.asarray(radius_px, np.float32), pixels.shape[:1])
+    values = sample(image, pixels[:, None, :].astype(np.float32) + radius[:, None, None] * CIRCLE)
+    even = 0.5 * (values[:, :HALF] + values[:, HALF:])
+    odd = 0.5 * (values[:, :HALF] - values[:, HALF:])
+    low, high = even.min(axis=1), even.max(axis=1)
+    contrast = (high - low).astype(np.float64)
+    middle = 0.5 * (low + high)
+    mean = even.mean(axis=1)
+    spread = even - mean[:, None]
+    symmetric = (odd**2).sum(axis=1) < max_odd * (spread**2).sum(axis=1)
+    balanced = np.abs(sample(image, pixels) - mean) < max_centre * (high - low)
+    above = even > middle[:, None]
+    valid = symmetric & balanced & (np.count_nonzero(~above & np.roll(above, -1, axis=1), axis=1) == 1)
+    angles = np.zeros((len(pixels), 2))
+    angles[valid] = _angles(image, pixels[valid], radius[valid], even[valid])
+    return Rings(angles, contrast, valid)
+
+
+def _angles(image: FloatImage, pixels: FloatArray, radius: FloatImage, even: FloatImage) -> FloatArray:
+    """Return the angles of lines A and B (N, 2) from the `even` parts (N, HALF) of rings of `radius` (N,)."""
+    second, fourth = (even @ wave for wave in HARMONICS)
+    inner = sample(image, pixels[:, None, :].astype(np.float32) + 0.5 * radius[:, None, None] * CIRCLE[::2])
+    size = np.maximum(np.abs(second), 1e-20)
+    phase = second / size
+    nearer = (0.5 * (inner[:, : HALF // 2] + inner[:, HALF // 2 :])) @ HARMONICS[0][::2]
+    gain = np.interp(2.0 * (nearer * phase.conj()).real / size, np.linspace(0.25, 1.0, GAINS), _gains())
+    cosine = gain * (fourth * phase.conj() ** 2).real / size
+    half = 0.5 * np.arccos(np.clip(cosine, -MAX_COSINE, MAX_COSINE))
+    first = (-0.5 * np.angle(phase) - half) % np.pi
+    return np.stack([first, first + 2.0 * half], axis=-1)
+
+
+def edge_contrast(
+    image: FloatImage, start: FloatArray, end: FloatArray, sign: FloatArray, offset_px: FloatArray
+) -> FloatArray:
+    """Return how much brighter the expected side of the edges `start` -> `end` (M, 2) is, (M, 5) at EDGE_PLACES.
+
+    `sign` is +1 where brightness grows with the angle (from u to v) around the start; `offset_px` (M,) is how far from
+    the chord both sides are sampled.
+    """
+    chord = end - start
+    length = np.maximum(np.linalg.norm(chord, axis=1), 1e-9)
+    normal = np.stack([-chord[:, 1], chord[:, 0]], axis=1) / length[:, None]
+    along = start[:, None] + EDGE_PLACES[:, None] * chord[:, None]
+    aside = (sign * offset_px)[:, None, None] * normal[:, None]
+    return np.asarray(sample(image, along + aside) - sample(image, along - aside), dtype=np.float64)
+
+
+def _mutual(corners: Corners, level: Level) -> IntArray:
+    """Return the mutual links, 4 * the neighbour + its arm, before the long ones are dropped; flat."""
+    count = len(corners)
+    start, arm, end, back, distance = _candidates(corners)
+    seen = _edge_seen(corners, level, start, arm, end)
+    start, arm, end, back, distance = start[seen], arm[seen], end[seen], back[seen], distance[seen]
+    state = 4 * start + arm
+    order = np.lexsort((distance, state))
+    state, first = np.unique(state[order], return_index=True)
+    chosen = order[first]
+    to = np.full(4 * count, -1)
+    to[state] = 4 * end[chosen] + back[chosen]
+    linked = np.flatnonzero(to >= 0)
+    mutual = linked[to[to[linked]] == linked]
+    both = np.full(4 * count, -1)
+    both[mutual] = to[mutual]
+    return both
+
+
+def _candidates(corners: Corners) -> tuple[IntArray, IntArray, IntArray, IntArray, FloatArray]:
+    """Return (start, its arm, end, its arm, distance) of the pairs whose arms point at each other."""
+    pixels = corners.pixels
+    length, other = _nearest_alike(pixels, corners.contrast)
+    chord_u = (pixels[other, 0] - pixels[:, :1]) / length
+    chord_v = (pixels[other, 1] - pixels[:, 1:]) / length
+    lines = arm_vectors(corners.angles)[:, :2]
+    along = [chord_u * lines[:, k, :1] + chord_v * lines[:, k, 1:] for k in (0, 1)]
+    ratio = corners.contrast[:, None] / corners.contrast[other]
+    alike = (ratio > CONTRAST_RATIO) & (ratio < 1.0 / CONTRAST_RATIO) & (other != np.arange(len(pixels))[:, None])
+    start, slot = np.nonzero(alike & ((np.abs(along[0]) > ARM_COSINE) | (np.abs(along[1]) > ARM_COSINE)))
+    end, distance = other[start, slot], length[start, slot]
+    arm = _arm(along[0][start, slot], along[1][start, slot])
+    chord = np.stack([chord_u[start, slot], chord_v[start, slot]], axis=-1)
+    home = -(lines[end] * chord[:, None]).sum(axis=2)
+    back = _arm(home[:, 0], home[:, 1])
+    good = (np.abs(home).max(axis=1) > ARM_COSINE) & ((arm + back) % 2 == 1)
+    return start[good], arm[good], end[good], back[good], distance[good]
+
+
+def _nearest_alike(pixels: FloatArray, contrast: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Return distance and index of the NEIGHBOURS nearest corners of like contrast, (N, K); the corner itself fills up.
+
+    Noise makes hundreds of faint corners: they must not crowd out the neighbours of the clear ones. So each half octave
+    of contrast is looked up among those that it may be linked with.
+    """
+    near = min(NEIGHBOURS + 1, len(pixels))
+    length = np.ones((len(pixels), near))
+    other = np.repeat(np.arange(len(pixels))[:, None], near, axis=1)
+    least, most = _bounds(contrast)
+    for low in np.unique(least):
+        mine = np.flatnonzero(least == low)
+        pool = np.flatnonzero((contrast > low) & (contrast < most[mine[0]]))
+        distance, found = cKDTree(pixels[pool]).query(pixels[mine], k=np.arange(1, near + 1))
+        there = np.isfinite(distance)
+        length[mine] = np.where(there, np.maximum(distance, 1e-6), 1.0)
+        other[mine] = np.where(there, pool[np.where(there, found, 0)], mine[:, None])
+    return length, other
+
+
+def _arm(along_a: FloatArray, along_b: FloatArray) -> IntArray:
+    """Return the arm (A, B, -A, -B) that points most along, given the cosines to A and B."""
+    second = np.abs(along_b) > np.abs(along_a)
+    backwards = np.where(second, along_b, along_a) < 0.0
+    return second.astype(np.int64) + 2 * backwards.astype(np.int64)
+
+
+def _edge_seen(corners: Corners, level: Level, start: IntArray, arm: IntArray, end: IntArray) -> BoolArray:
+    """Return whether the edge between the corners is there, with the polarity of the arm."""
+    first, last = level.to_level(corners.pixels[start]), level.to_level(corners.pixels[end])
+    length = np.linalg.norm(last - first, axis=1)
+    offset = np.clip(ASIDE * length, MIN_ASIDE_PX, MAX_ASIDE_PX * corners.scale[start] / level.scale)
+    sign = np.where(arm % 2 == 0, 1.0, -1.0)
+    difference = edge_contrast(level.smooth, first, last, sign, offset)
+    weakest = CONTRAST_RATIO * np.minimum(corners.contrast[start], corners.contrast[end])
+    return np.asarray((difference > weakest[:, None]).sum(axis=1) >= MIN_EDGE_PLACES, dtype=np.bool_)
+
+
+def _without_long(to: IntArray, pixels: FloatArray) -> IntArray:
+    """Drop links more than LENGTH_RATIO times as long as the link of the opposite arm."""
+    there = to >= 0
+    length = np.where(
+        there, np.linalg.norm(pixels[np.where(there, to, 0) // 4] - np.repeat(pixels, 4, axis=0), axis=1), 0
+    )
+    opposite = np.roll(length.reshape(-1, 4), 2, axis=1).ravel()
+    drop = there & (opposite > 0) & (length > LENGTH_RATIO * opposite)
+    out = to.copy()
+    out[to[drop]] = -1
+    out[drop] = -1
+    return out
+
+
+def quads(links: Links) -> BoolArray:
+    """Return which links (N, 4) bound a closed square of four corners, on either side."""
+    count = len(links.state)
+    there = links.state >= 0
+    state = links.state.ravel()
+    turned = np.where(there, 4 * links.corner + (links.arm - 1) % 4, -1).ravel()
+    start = np.arange(4 * count)
+    walk = start
+    for _ in range(4):
+        walk = np.where(walk >= 0, turned[walk], -1)
+    closed = (walk == start) & there.ravel()
+    other = np.zeros_like(closed)
+    other[state[closed]] = True
+    return np.asarray((closed | other).reshape(-1, 4), dtype=np.bool_)
