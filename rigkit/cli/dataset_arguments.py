@@ -12,7 +12,15 @@ from rigkit.cli.console import note
 if TYPE_CHECKING:
     from rigkit.workflows.datasets import PairFailure
 
-__all__ = ["add_dataset_arguments", "dataset_options", "exit_code_of", "failed_pairs", "results_folder"]
+__all__ = [
+    "add_dataset_arguments",
+    "add_direction_arguments",
+    "dataset_options",
+    "direction_options",
+    "exit_code_of",
+    "failed_pairs",
+    "results_folder",
+]
 
 
 def add_dataset_arguments(parser: argparse.ArgumentParser, *, optional: bool = False) -> None:
@@ -32,6 +40,20 @@ def add_dataset_arguments(parser: argparse.ArgumentParser, *, optional: bool = F
     parser.add_argument("--json", action="store_true", help="print the result for programs")
 
 
+def add_direction_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what normals are computed from."""
+    parser.add_argument(
+        "--directions",
+        choices=("chord", "neighbours", "line", "patch"),
+        help="from the next corner, both neighbours, five corners of a line, or a patch of 5x5 (default)",
+    )
+    parser.add_argument(
+        "--det-scale",
+        choices=("area", "ls", "sqmean", "diagonal"),
+        help="scale of DET3UDIR: signed area (default), least squares, the paper's squared mean, diagonal",
+    )
+
+
 def results_folder(args: argparse.Namespace, name: str) -> Path:
     """Return the folder asked for, or a new one of that name."""
     from rigkit.workflows.results import free_folder
@@ -49,6 +71,12 @@ def dataset_options(args: argparse.Namespace, name: str) -> dict[str, Any]:
         "chain": args.chain,
         "jobs": args.jobs,
     }
+
+
+def direction_options(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the fields of `DatasetOptions` about directions that were given."""
+    given = {"support": args.directions, "det_scale": args.det_scale}
+    return {name: value for name, value in given.items() if value is not None}
 
 
 def failed_pairs(failures: Sequence[PairFailure]) -> dict[str, dict[str, str]]:

@@ -6,9 +6,16 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from rigkit.cli.console import note, print_json, progress_on_stderr
-from rigkit.cli.dataset_arguments import add_dataset_arguments, dataset_options, exit_code_of, failed_pairs
+from rigkit.cli.dataset_arguments import (
+    add_dataset_arguments,
+    add_direction_arguments,
+    dataset_options,
+    direction_options,
+    exit_code_of,
+    failed_pairs,
+)
 from rigkit.cli.reconstruct_scene import add_scene_arguments, is_scene, run_scene
-from rigkit.core.errors import ExitCode
+from rigkit.core.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
     from rigkit.workflows.reconstruct import PairReconstruction
@@ -20,6 +27,7 @@ METHODS = ("F2UDIR", "F3UDIR", "DET3UDIR", "2SDIR", "3SDIR")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_dataset_arguments(parser, optional=True)
+    add_direction_arguments(parser)
     add_scene_arguments(parser)
     parser.add_argument("--method", choices=METHODS, default="3SDIR", help="affine estimator (default 3SDIR)")
     parser.add_argument("--no-pictures", action="store_true", help="leave out PNG pictures")
@@ -27,13 +35,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     if is_scene(args):
+        if direction_options(args):
+            raise InputError("reconstruct: --directions and --det-scale are about boards, and a scene has none")
         return run_scene(args)
     from rigkit.io.manifest import load_dataset
     from rigkit.workflows.reconstruct import ReconstructOptions, reconstruct_dataset
 
     dataset = load_dataset(args.dataset)
     common = dataset_options(args, dataset.name)
-    options = ReconstructOptions(**common, method=args.method, pictures=not args.no_pictures)
+    options = ReconstructOptions(**common, **direction_options(args), method=args.method, pictures=not args.no_pictures)
     done = reconstruct_dataset(dataset, options, progress=progress_on_stderr())
     results = [_summary(pair) for pair in done.pairs]
     for r in results:

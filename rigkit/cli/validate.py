@@ -7,7 +7,14 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from rigkit.cli.console import note, print_json, progress_on_stderr
-from rigkit.cli.dataset_arguments import add_dataset_arguments, dataset_options, exit_code_of, failed_pairs
+from rigkit.cli.dataset_arguments import (
+    add_dataset_arguments,
+    add_direction_arguments,
+    dataset_options,
+    direction_options,
+    exit_code_of,
+    failed_pairs,
+)
 from rigkit.core.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
@@ -24,6 +31,7 @@ HELP = "the tables against measured truth, report and PLY; exit code 1 if a chec
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_dataset_arguments(parser)
+    add_direction_arguments(parser)
     parser.add_argument("--no-pictures", action="store_true", help="leave out PNG pictures and the HTML report")
     parser.add_argument(
         "--figures", choices=("png", "pdf"), default="png", help="pdf: the pictures for a paper as well (vectors)"
@@ -49,12 +57,18 @@ def run(args: argparse.Namespace) -> int:
 
     dataset = load_dataset(args.dataset)
     common = dataset_options(args, dataset.name)
+    if args.paper and direction_options(args):
+        raise InputError("--paper has directions and a scale of its own; leave --directions and --det-scale out")
     if args.paper:
         return _as_paper(dataset, PaperOptions(**common, own_solvers=args.own_solvers), json=args.json)
     if args.own_solvers:
         raise InputError("--own-solvers is about --paper; add that, or leave it out")
     options = ValidateOptions(
-        **common, pictures=not args.no_pictures, pdf=args.figures == "pdf", crosscheck=not args.no_crosscheck
+        **common,
+        **direction_options(args),
+        pictures=not args.no_pictures,
+        pdf=args.figures == "pdf",
+        crosscheck=not args.no_crosscheck,
     )
     return show(validate_dataset(dataset, options, progress=progress_on_stderr()), common["output"], json=args.json)
 

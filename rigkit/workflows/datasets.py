@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeVar
 
+from rigkit.affine.directions import Support
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
@@ -60,6 +61,10 @@ class DatasetOptions:
     """Calibrate the cameras from their sessions even where the manifest names a calibration that is there."""
     chain: Literal["raw", "rectified"] = "raw"
     """Captured pixels, or perspective views of them."""
+    support: Support = "patch"
+    """What directions are estimated from, see `direction_field`."""
+    det_scale: str = "area"
+    """Scale of DET3UDIR, see `affines_from_directions`."""
     jobs: int | None = None
     """Processes; None: one a core."""
 

@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from rigkit.affine.directions import Support
 from rigkit.cameras.base import Camera
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import DegenerateError, InputError
@@ -72,10 +73,12 @@ def read_for(camera: Camera, path: str | Path, whose: str) -> Image:
     return image
 
 
-def match_images(pair: Pair, camera1: Camera, camera2: Camera, chain: str) -> tuple[MatchedPair, Image, Image]:
+def match_images(
+    pair: Pair, camera1: Camera, camera2: Camera, chain: str, support: Support = "patch"
+) -> tuple[MatchedPair, Image, Image]:
     """Return the matched corners of a pair, and its two images."""
     found1, found2, image1, image2 = find_boards(pair, camera1, camera2)
-    return match_found(pair, camera1, camera2, found1, found2, chain), image1, image2
+    return match_found(pair, camera1, camera2, found1, found2, chain, support), image1, image2
 
 
 def match_found(
@@ -85,6 +88,7 @@ def match_found(
     detections1: Sequence[BoardDetection],
     detections2: Sequence[BoardDetection],
     chain: str,
+    support: Support = "patch",
 ) -> MatchedPair:
     """Match the boards found in the two images of a pair as the manifest declares it."""
     return match_pair(
@@ -97,6 +101,7 @@ def match_found(
         layout=pair.layout or None,
         angles=pair.truth.angles,
         chain="rectified" if chain == "rectified" else "raw",
+        support=support,
     )
 
 
@@ -107,9 +112,11 @@ def geometry_of(matched: MatchedPair, pair: Pair) -> PairGeometry:
     return pair_geometry(matched, pose_type=pair.pose_type, level_sigma_rad=level, level_frames=frames)
 
 
-def reconstruct_with(matched: MatchedPair, pair: Pair, method: str, image1: Image | None = None) -> Reconstruction:
+def reconstruct_with(
+    matched: MatchedPair, pair: Pair, method: str, image1: Image | None = None, *, det_scale: str = "area"
+) -> Reconstruction:
     """Reconstruct matched corners as the manifest declares the pair."""
-    return reconstruct_from(geometry_of(matched, pair), affine_method=method, image1=image1)
+    return reconstruct_from(geometry_of(matched, pair), affine_method=method, scale=det_scale, image1=image1)
 
 
 def shifts_of(reconstruction: Reconstruction, camera1: LoadedCamera, camera2: LoadedCamera) -> CalibrationShifts | None:

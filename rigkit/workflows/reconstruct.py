@@ -95,8 +95,8 @@ def reconstruct_dataset(
 def _reconstruct(job: _Job) -> PairReconstruction:
     """Reconstruct one pair and render its files."""
     pair, options = job.pair, job.options
-    matched, image1, image2 = match_images(pair, job.camera1, job.camera2, options.chain)
-    r = reconstruct_with(matched, pair, options.method, image1)
+    matched, image1, image2 = match_images(pair, job.camera1, job.camera2, options.chain, options.support)
+    r = reconstruct_with(matched, pair, options.method, image1, det_scale=options.det_scale)
     ply = f"{pair.pair_id}/{options.method}.ply"
     files = {ply: ply_bytes(r.cloud)}
     if options.pictures:

@@ -149,9 +149,7 @@ def validate_dataset(
     # Where everything passed they explain nothing, but a person should know.
     severity = Severity.LOOK if passed else Severity.BAD
     seconds = time.monotonic() - started
-    files = validation_files(
-        known, cameras, pairs, failures, paper, passed=passed, chain=options.chain, seconds=seconds
-    )
+    files = validation_files(known, cameras, pairs, failures, paper, passed=passed, options=options, seconds=seconds)
     if options.output is not None:
         write_results(options.output, files, force=options.force, inputs=known.inputs)
     return DatasetValidation(
@@ -178,7 +176,7 @@ def _validate(job: _Job) -> PairValidation:
     known = {name: loaded.camera for name, loaded in job.cameras.known.items()}
     causes = camera_suspects(pair.pair_id, names, (found1, found2), pair.boards, known)
     try:
-        matched = match_found(pair, camera1, camera2, found1, found2, job.options.chain)
+        matched = match_found(pair, camera1, camera2, found1, found2, job.options.chain, job.options.support)
         return _judge(job, matched, image1, image2, causes)
     except RigkitError as error:
         if not causes:
@@ -191,7 +189,10 @@ def _judge(
 ) -> PairValidation:
     pair = job.pair
     geometry = geometry_of(matched, pair)
-    reconstructions = {m: reconstruct_from(geometry, affine_method=m, image1=image1) for m in AFFINE_METHODS}
+    scale = job.options.det_scale
+    reconstructions = {
+        m: reconstruct_from(geometry, affine_method=m, scale=scale, image1=image1) for m in AFFINE_METHODS
+    }
     shifts = _shifts(reconstructions, job)
     lattice = lattice_of(geometry, *job.cameras.of(pair))
     reports = validate_each(list(reconstructions.values()), pair.truth, [shifts[m] for m in reconstructions], lattice)

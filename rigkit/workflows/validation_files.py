@@ -13,7 +13,7 @@ from rigkit.report.validation_page import camera_table, crosscheck_table, summar
 from rigkit.validation.checks import ValidationReport
 from rigkit.validation.crosscheck import CrossCheckReport
 from rigkit.validation.tables import PaperTables, build_tables
-from rigkit.workflows.datasets import LoadedCameras, PairFailure
+from rigkit.workflows.datasets import DatasetOptions, LoadedCameras, PairFailure
 from rigkit.workflows.provenance import digest_line, software_facts
 
 __all__ = ["RESERVED", "PairValidation", "validation_files"]
@@ -55,7 +55,7 @@ def validation_files(
     paper: PaperTables | None,
     *,
     passed: bool,
-    chain: str,
+    options: DatasetOptions,
     seconds: float,
 ) -> dict[str, str | bytes]:
     """Return everything that a validation came to, relative path -> content; the page where there are pictures."""
@@ -80,7 +80,7 @@ def validation_files(
         shown = [table for table in tables if table.key not in ("checks", "estimators")]
         shown += _calibrations(dataset, cameras)
         title = f"rigkit validation: {dataset.name}"
-        files[PAGE] = build_page(title, lead, passed, shown, sections, _facts(dataset, cameras, chain))
+        files[PAGE] = build_page(title, lead, passed, shown, sections, _facts(dataset, cameras, options))
     return files
 
 
@@ -94,9 +94,10 @@ def _calibrations(dataset: Dataset, cameras: LoadedCameras) -> list[Table]:
     return [camera_table(known)] if known else []
 
 
-def _facts(dataset: Dataset, cameras: LoadedCameras, chain: str) -> dict[str, str]:
+def _facts(dataset: Dataset, cameras: LoadedCameras, options: DatasetOptions) -> dict[str, str]:
     """Return what somebody needs to know to get the same page again."""
-    facts = software_facts("open3d", "pycolmap") | {"chain": chain}
+    facts = software_facts("open3d", "pycolmap") | {"chain": options.chain}
+    facts["directions"] = f"{options.support}; scale of DET3UDIR: {options.det_scale}"
     facts["manifest"] = f"{dataset.manifest.name}, {digest_line(dataset.manifest)}"
     for name, source in cameras.sources.items():
         label = "calibrated from its session" if isinstance(source, str) else source.name
