@@ -70,6 +70,7 @@ if TYPE_CHECKING:
     from rigkit.validation.checks import ValidationReport, validate
     from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
     from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration, calibrate_session
+    from rigkit.workflows.calibrate_any import FolderOptions, calibrate_folders, calibrate_session_file
     from rigkit.workflows.calibrate_rig import RigSessionCalibration, calibrate_rig_session
     from rigkit.workflows.certify import CertifiedFile, CertifyOptions, certify_file
     from rigkit.workflows.corners import Cache
@@ -123,6 +124,7 @@ __all__ = [
     "ExportCameraOptions",
     "ExportCloudOptions",
     "ExportedCamera",
+    "FolderOptions",
     "InputError",
     "MatchedPair",
     "Matches",
@@ -155,9 +157,11 @@ __all__ = [
     "affines_from_directions",
     "build_calibration_page",
     "calibrate",
+    "calibrate_folders",
     "calibrate_rig",
     "calibrate_rig_session",
     "calibrate_session",
+    "calibrate_session_file",
     "camera_model",
     "certify_file",
     "compare_cameras",
@@ -239,6 +243,7 @@ _NAMES_OF = {
     "rigkit.validation.checks": ("ValidationReport", "validate"),
     "rigkit.validation.crosscheck": ("CrossCheckReport", "crosscheck"),
     "rigkit.workflows.calibrate": ("CalibrateOptions", "SessionCalibration", "calibrate_session"),
+    "rigkit.workflows.calibrate_any": ("FolderOptions", "calibrate_folders", "calibrate_session_file"),
     "rigkit.workflows.calibrate_rig": ("RigSessionCalibration", "calibrate_rig_session"),
     "rigkit.workflows.certify": ("CertifiedFile", "CertifyOptions", "certify_file"),
     "rigkit.workflows.corners": ("Cache",),

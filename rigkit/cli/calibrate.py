@@ -1,18 +1,38 @@
-"""`rigkit calibrate SESSION.toml`: from a folder of images to calibration.json, or from several to rig.json."""
+"""`rigkit calibrate`: from a session, or folders of images, to calibration.json, or of several cameras to rig.json."""
 
 from __future__ import annotations
 
 import argparse
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rigkit.core.errors import ExitCode, InputError
+from rigkit.workflows.formats import FOREIGN_ENDINGS
+
+if TYPE_CHECKING:
+    from rigkit.workflows.calibrate import SessionCalibration
+    from rigkit.workflows.calibrate_rig import RigSessionCalibration
 
 __all__ = ["HELP", "add_arguments", "run"]
 
 HELP = "calibrate a camera, or several on one mount, from images of chessboards"
+SESSION_NAME = "session.toml"
+
+EXAMPLES = """examples:
+  rigkit calibrate photos --board 9x6x25 -r          one camera; 9x6 inner corners, squares of 25 mm; with a page
+  rigkit calibrate left right --board board.toml     a rig, one folder a camera; so is a folder of left01, right01, ...
+  rigkit calibrate photos --board 9x6x25 --export opencv ros
+  rigkit calibrate session.toml --force              again, from the session written the first time
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("session", type=Path, metavar="SESSION.toml", help="what to calibrate (rigkit.session/1)")
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = EXAMPLES
+    parser.add_argument(
+        "source", nargs="+", type=Path, metavar="SESSION.toml|FOLDER", help="a session, or folders of images"
+    )
     parser.add_argument("-o", "--output", type=Path, help="default: calibration.json (rig.json) beside the session")
     parser.add_argument(
         "-r",
@@ -23,45 +43,68 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write a page to look at; without a name beside the output",
     )
     parser.add_argument(
+        "--export", nargs="+", default=[], choices=sorted(FOREIGN_ENDINGS), help="also in these formats, beside it"
+    )
+    parser.add_argument("--corners", type=Path, metavar="FILE", help="use these: corners.csv, corners.json, .vnl")
+    parser.add_argument(
         "--no-cache", action="store_true", help="find all corners anew, and keep none beside the session"
     )
     parser.add_argument("--force", action="store_true", help="replace existing results")
     parser.add_argument("--json", action="store_true", help="print the result for programs")
+    folders = parser.add_argument_group("folders", f"the session used is kept as {SESSION_NAME} for the next time")
+    folders.add_argument(
+        "--board", action="append", default=[], metavar="CxRxMM|BOARD.toml", help="such as 9x6x25 (repeatable)"
+    )
+    folders.add_argument("--model", help="camera model (default: auto, the one that predicts best)")
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.cli import calibration_words, rig_words
-    from rigkit.cli.console import note, print_json, progress_on_stderr
-    from rigkit.core.errors import ExitCode
-    from rigkit.io.rig_session import is_rig_session, load_rig_session
-    from rigkit.io.session import load_session
-    from rigkit.workflows.calibrate import CalibrateOptions, calibrate_session
-    from rigkit.workflows.calibrate_rig import calibrate_rig_session
-    from rigkit.workflows.corners import Cache
-
-    def options(default: Path) -> CalibrateOptions:
-        target = args.output or default
-        page = None if args.report is None else Path(args.report) if args.report else target.with_suffix(".html")
-        cache = Cache.OFF if args.no_cache else Cache.UPDATE
-        return CalibrateOptions(output=target, report=page, force=args.force, cache=cache)
+    from rigkit.cli.console import note, print_json
 
     started = time.monotonic()
-    progress = progress_on_stderr()
-    passed = True
-    if is_rig_session(args.session):
-        mount = load_rig_session(args.session)
-        done = calibrate_rig_session(mount, options(mount.rig_path), progress=progress)
-        written, unreadable, passed = done.written, done.unreadable, done.passed
-        result = rig_words.summary(done.rig, done.checks) if args.json else rig_words.describe(done.rig, done.checks)
-    else:
-        session = load_session(args.session)
-        one = calibrate_session(session, options(session.calibration_path), progress=progress)
-        written, unreadable, words = one.written, one.unreadable, calibration_words
-        result = words.summary(one.calibration) if args.json else words.describe(one.calibration)
-    note(f"{', '.join(str(p) for p in written)} written, {time.monotonic() - started:.1f} s")
-    print_json(result) if args.json else print(result)
-    for reason in unreadable.values():
+    done = _calibrated(args)
+    summary, words, passed = _said(done)
+    note(f"{', '.join(str(p) for p in done.written)} written, {time.monotonic() - started:.1f} s")
+    print_json(summary) if args.json else print(words)
+    for reason in done.unreadable.values():
         note(f"left out: {reason}")
-    if unreadable:
+    if done.unreadable:
         return ExitCode.BAD_INPUT
     return ExitCode.WELL if passed else ExitCode.CHECK_FAILED
+
+
+def _calibrated(args: argparse.Namespace) -> SessionCalibration | RigSessionCalibration:
+    from rigkit.cli.console import progress_on_stderr
+    from rigkit.workflows.calibrate import CalibrateOptions
+    from rigkit.workflows.calibrate_any import FolderOptions, calibrate_folders, calibrate_session_file
+    from rigkit.workflows.corners import Cache
+
+    options = CalibrateOptions(
+        output=args.output,
+        report=None if args.report is None else Path(args.report),
+        force=args.force,
+        cache=Cache.OFF if args.no_cache else Cache.UPDATE,
+        corners=args.corners,
+        exports=tuple(dict.fromkeys(args.export)),
+    )
+    progress = progress_on_stderr()
+    first: Path = args.source[0]
+    told = bool(args.board or args.model)
+    if len(args.source) == 1 and first.is_dir() and not told and (first / SESSION_NAME).is_file():
+        first = first / SESSION_NAME
+    if len(args.source) > 1 or first.is_dir():
+        about = FolderOptions(boards=tuple(args.board), model=args.model or "auto")
+        return calibrate_folders(args.source, about, options, progress=progress)
+    if told:
+        raise InputError(f"calibrate: '{first}' says itself what board and model it has; leave out --board and --model")
+    return calibrate_session_file(first, options, progress=progress)
+
+
+def _said(done: SessionCalibration | RigSessionCalibration) -> tuple[dict[str, Any], str, bool]:
+    """Return the figures for programs, the words for a person, and whether everything measured agrees."""
+    from rigkit.cli import calibration_words, rig_words
+    from rigkit.workflows.calibrate import SessionCalibration
+
+    if isinstance(done, SessionCalibration):
+        return calibration_words.summary(done.calibration), calibration_words.describe(done.calibration), True
+    return rig_words.summary(done.rig, done.checks), rig_words.describe(done.rig, done.checks), done.passed

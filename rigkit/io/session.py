@@ -5,7 +5,7 @@
     schema = "rigkit.session/1"
     images = "images/*.jpg"              # or a list of files and patterns, relative to this file
     board = "../../boards/a9x6_30.toml"  # or boards = ["a.toml", "b.toml"]
-    model = "scaramuzza"                 # a camera model, or "auto"
+    model = "scaramuzza"                 # optional: a camera model, or "auto" (the default: chosen by held-out error)
     degree = 6                           # optional: of the polynomial; by default chosen by held-out error
     board_shape = "auto"                 # optional: flat, warp, released, or auto (chosen by held-out error)
 
@@ -25,9 +25,10 @@ from rigkit.core.errors import InputError
 from rigkit.io.board_file import load_board
 from rigkit.io.toml_reader import TomlTable, named_path, read_toml
 
-__all__ = ["SCHEMA", "Session", "boards_of", "images_of", "load_session", "options_of"]
+__all__ = ["SCHEMA", "Session", "boards_of", "files_of_session", "images_of", "load_session", "options_of"]
 
 SCHEMA = "rigkit.session/1"
+HINT_BOARD = 'board = "board.toml" (or boards = ["a.toml", "b.toml"])'
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -80,7 +81,9 @@ def load_session(path: str | Path) -> Session:
 
 def options_of(table: TomlTable) -> tuple[str, int | None, str]:
     """Return model, degree and board shape that a table asks for."""
-    model = table.text("model", hint='model = "scaramuzza"', choices=("auto", *MODELS))
+    model = "auto"
+    if table.has("model"):
+        model = table.text("model", hint='model = "scaramuzza"', choices=("auto", *MODELS))
     degree = table.integer("degree", hint="degree = 6", at_least=1) if table.has("degree") else None
     if degree is not None:
         try:
@@ -119,15 +122,32 @@ def images_of(table: TomlTable) -> tuple[Path, ...]:
     return tuple(found.values())
 
 
+def files_of_session(path: str | Path) -> tuple[Path, ...]:
+    """Return every file that a calibration of this session, or rig's session, reads: itself, boards, images, and the
+    corners kept beside it, whether they are there or not.
+
+    Raises InputError like `load_session`.
+    """
+    source = Path(path)
+    table = read_toml(source, SCHEMA)
+    boards = table.texts("boards", hint=HINT_BOARD) if table.has("boards") else (table.text("board", hint=HINT_BOARD),)
+    out = [source, *map(table.beside, boards)]
+    entries = table.tables("cameras", hint="[[cameras]]") if table.has("cameras") else (table,)
+    for entry in entries:
+        out += images_of(entry)
+        name = f"-{entry.text('id', hint='id')}" if entry is not table else ""
+        out.append(source.parent / f"corners{name}.json")
+    return tuple(out)
+
+
 def boards_of(table: TomlTable) -> tuple[Board, ...]:
     """Return the boards that a table lists by file."""
-    hint = 'board = "board.toml" (or boards = ["a.toml", "b.toml"])'
     if table.has("boards"):
         if table.has("board"):
             raise table.error("'board' and 'boards'; keep one of the two")
-        boards = tuple(load_board(table.beside(name)) for name in table.texts("boards", hint=hint))
+        boards = tuple(load_board(table.beside(name)) for name in table.texts("boards", hint=HINT_BOARD))
     else:
-        boards = (load_board(table.path_to("board", hint=hint)),)
+        boards = (load_board(table.path_to("board", hint=HINT_BOARD)),)
     ids = [board.board_id for board in boards]
     if len(set(ids)) < len(ids):
         raise table.error("two boards have the same id; give one of the files another 'id'")

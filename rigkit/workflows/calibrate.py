@@ -13,11 +13,21 @@ from rigkit.calibration.verdicts import judge_session
 from rigkit.core.progress import Progress, silent
 from rigkit.io.calibration_file import calibration_text
 from rigkit.io.files import ensure_writable, write_together
-from rigkit.io.session import Session, load_session
+from rigkit.io.rig_session import RigSession
+from rigkit.io.session import Session, files_of_session, load_session
 from rigkit.workflows.corners import Cache, SessionCorners, session_corners, session_views
+from rigkit.workflows.export_camera import foreign_files, foreign_paths
+from rigkit.workflows.given_corners import given_corners
 from rigkit.workflows.session_page import session_page
 
-__all__ = ["CalibrateOptions", "SessionCalibration", "calibrate_session", "calibration_from"]
+__all__ = [
+    "CalibrateOptions",
+    "SessionCalibration",
+    "calibrate_session",
+    "calibration_from",
+    "corners_of",
+    "session_inputs",
+]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,6 +43,10 @@ class CalibrateOptions:
     """Replace files that exist; what the calibration reads is never replaced."""
     cache: Cache = Cache.READ
     """What becomes of the corners kept beside the session."""
+    corners: Path | None = None
+    """File of corners (ours, or another detector's) to use instead of looking for them; None: they are looked for."""
+    exports: tuple[str, ...] = ()
+    """Other tools' formats to write the camera in, beside `output` (`rigkit.workflows.formats`)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -69,12 +83,15 @@ def calibrate_session(
     if not isinstance(session, Session):
         session = load_session(session)
     targets = [path for path in (options.output, options.report) if path is not None]
-    ensure_writable(targets, force=options.force, inputs=[session.path, *session.images])
-    corners = session_corners(session, cache=options.cache, progress=progress)
+    if options.output is not None:
+        targets += foreign_paths(options.output, options.exports)
+    ensure_writable(targets, force=options.force, inputs=session_inputs(session, options))
+    corners = corners_of(session, options, progress=progress)
     calibration = calibration_from(session, corners, progress=progress)
     files: dict[Path, str] = {}
     if options.output is not None:
         files[options.output] = calibration_text(calibration)
+        files |= foreign_files(calibration.camera, options.output, options.exports)
     if options.report is not None:
         files[options.report] = session_page(session, calibration, corners, files)
     if files:
@@ -82,6 +99,22 @@ def calibrate_session(
     return SessionCalibration(
         session=session, calibration=calibration, unreadable=corners.unreadable, written=tuple(files)
     )
+
+
+def corners_of(session: Session, options: CalibrateOptions, *, progress: Progress = silent) -> SessionCorners:
+    """Return the corners of a camera's images: from the file that `options` name, or found."""
+    if options.corners is not None:
+        return given_corners(session, options.corners)
+    return session_corners(session, cache=options.cache, progress=progress)
+
+
+def session_inputs(session: Session | RigSession, options: CalibrateOptions) -> list[Path]:
+    """Return every file that a calibration reads, and that its results never replace."""
+    cameras = session.cameras.values() if isinstance(session, RigSession) else [session]
+    out = [path for own in cameras for path in (*own.images, own.corners_path)]
+    # A session made in Python need not have a file.
+    out += files_of_session(session.path) if session.path.is_file() else [session.path]
+    return out if options.corners is None else [*out, options.corners]
 
 
 def calibration_from(session: Session, corners: SessionCorners, *, progress: Progress = silent) -> Calibration:

@@ -19,8 +19,9 @@ from rigkit.io.rig_session import RigSession, frames_of_images, is_rig_session, 
 from rigkit.io.session import load_session
 from rigkit.validation.check import Check, compare
 from rigkit.validation.checks import COVERAGE
-from rigkit.workflows.calibrate import CalibrateOptions, calibration_from
+from rigkit.workflows.calibrate import CalibrateOptions, calibration_from, corners_of, session_inputs
 from rigkit.workflows.corners import Cache, SessionCorners, session_corners, session_views
+from rigkit.workflows.export_camera import foreign_files, foreign_paths
 from rigkit.workflows.rigid_boards import named_as_listed, named_by_rule, require_distinct
 from rigkit.workflows.session_page import rig_page
 
@@ -76,9 +77,9 @@ def calibrate_rig_session(
     if not isinstance(session, RigSession):
         session = load_rig_session(session)
     targets = _targets(session, options)
-    inputs = [session.path, *(image for own in session.cameras.values() for image in own.images)]
-    ensure_writable(targets, force=options.force, inputs=inputs)
-    corners = rig_corners(session, cache=options.cache, progress=progress)
+    ensure_writable(targets, force=options.force, inputs=session_inputs(session, options))
+    require_distinct(session)
+    corners = {name: corners_of(own, options, progress=progress) for name, own in session.cameras.items()}
     rig = rig_from(session, corners, progress=progress)
     checks = measured_checks(session, rig)
     files: dict[Path, str] = {}
@@ -86,7 +87,9 @@ def calibrate_rig_session(
         if len(session.cameras) > 1:
             files[options.output] = rig_text(rig)
         for camera in rig.cameras:
-            files[_beside(session, options.output, camera.name)] = calibration_text(judged(camera.calibration))
+            own = _beside(session, options.output, camera.name)
+            files[own] = calibration_text(judged(camera.calibration))
+            files |= foreign_files(camera.camera, own, options.exports)
         if session.rigid_boards:
             files[_boards_file(options.output)] = board_rigs_text(rig.board_rigs)
     if options.report is not None:
@@ -97,7 +100,7 @@ def calibrate_rig_session(
         files[options.report] = rig_page(session, rig, alone, checks, corners, files)
     if files:
         write_together(files, force=options.force)
-    unreadable = {image: reason for own in corners.values() for image, reason in own.unreadable.items()}
+    unreadable = {image: reason for one in corners.values() for image, reason in one.unreadable.items()}
     return RigSessionCalibration(
         session=session, rig=rig, checks=tuple(checks), unreadable=unreadable, written=tuple(files)
     )
@@ -108,7 +111,8 @@ def _targets(session: RigSession, options: CalibrateOptions) -> list[Path]:
     out = []
     if options.output is not None:
         out += [options.output] if len(session.cameras) > 1 else []
-        out += [_beside(session, options.output, name) for name in session.cameras]
+        own = [_beside(session, options.output, name) for name in session.cameras]
+        out += [*own, *(path for one in own for path in foreign_paths(one, options.exports))]
         out += [_boards_file(options.output)] if session.rigid_boards else []
     return out if options.report is None else [*out, options.report]
 

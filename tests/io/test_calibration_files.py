@@ -122,7 +122,6 @@ def test_session_file(tmp_path: Path) -> None:
     for wrong, message in (
         (text + "degre = 6\n", "did you mean 'degree'"),
         (text.replace("scaramuzza", "thin"), "unknown; known"),
-        (text.replace('model = "scaramuzza"\n', ""), "'model' is missing"),
         (text + 'boards = ["board.toml"]\n', "keep one of the two"),
     ):
         path.write_text(wrong)

@@ -1,0 +1,106 @@
+"""From a session, of one camera or several, or from folders of images, to the calibration."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from rigkit.core.errors import InputError
+from rigkit.core.progress import Progress, silent
+from rigkit.io.files import ensure_writable, write_together
+from rigkit.io.reading import read_bytes
+from rigkit.io.rig_session import RigSession, is_rig_session, load_rig_session
+from rigkit.io.session import Session, load_session
+from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration, calibrate_session
+from rigkit.workflows.calibrate_rig import RigSessionCalibration, calibrate_rig_session
+from rigkit.workflows.folder_session import session_of_folders
+
+__all__ = ["FolderOptions", "calibrate_folders", "calibrate_session_file", "default_output"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FolderOptions:
+    """What folders of images do not tell of themselves."""
+
+    boards: tuple[str, ...]
+    """COLUMNSxROWSxMM (inner corners along and across, mm a square), or files of boards."""
+    model: str = "auto"
+    """A camera model, or "auto"."""
+
+
+def calibrate_session_file(
+    path: str | Path, options: CalibrateOptions, *, progress: Progress = silent
+) -> SessionCalibration | RigSessionCalibration:
+    """Calibrate what a session's file lists, one camera or a rig; `options.output` None: beside the session; a report
+    of no name, Path(""): beside the output.
+
+    Raises as `calibrate_session` and `calibrate_rig_session` do.
+    """
+    session = load_rig_session(path) if is_rig_session(path) else load_session(path)
+    output = options.output or default_output(session)
+    report = output.with_suffix(".html") if options.report == Path() else options.report
+    options = replace(options, output=output, report=report)
+    if isinstance(session, RigSession):
+        return calibrate_rig_session(session, options, progress=progress)
+    return calibrate_session(session, options, progress=progress)
+
+
+def default_output(session: Session | RigSession) -> Path:
+    """Return where the result goes unless somebody says otherwise: beside the session."""
+    return session.rig_path if isinstance(session, RigSession) else session.calibration_path
+
+
+def calibrate_folders(
+    folders: Sequence[str | Path],
+    folder_options: FolderOptions,
+    options: CalibrateOptions,
+    *,
+    progress: Progress = silent,
+) -> SessionCalibration | RigSessionCalibration:
+    """Calibrate the camera, or cameras, whose images lie in folders, and write the session that says so, for the next
+    time: beside `options.output`, or in the one folder that holds all of them.
+
+    A session that is there is kept where it says the same, refused where it says something else, and replaced with
+    `options.force`. Where nothing comes out, no session is left.
+
+    Raises
+    ------
+    InputError
+        No board told, no images, a file that cannot be written, and as `calibrate_session_file`.
+    DegenerateError
+        The views do not determine a camera.
+    """
+    places = [Path(folder) for folder in folders]
+    place = places[0] if len(places) == 1 else Path(os.path.commonpath([p.absolute() for p in places]))
+    place = place if options.output is None else options.output.parent
+    wanted = session_of_folders(places, folder_options.boards, place, model=folder_options.model)
+    new = {path: text for path, text in wanted.files.items() if not _says(path, text)}
+    results = [path for path in (options.output, options.report) if path not in (None, Path())]
+    ensure_writable([*new, *results], force=options.force, inputs=set(wanted.files) - set(new))
+    there = {path for path in new if path.exists()}
+    if new:
+        write_together(dict(new), force=options.force)
+    try:
+        return calibrate_session_file(wanted.path, options, progress=progress)
+    except BaseException:
+        for path in set(new) - there:
+            with suppress(OSError):
+                path.unlink()
+        raise
+
+
+def _says(path: Path, text: str) -> bool:
+    """Say whether the file is there and says this, whatever its comments are."""
+    if not path.is_file():
+        return False
+    try:
+        return _stripped(read_bytes(path, "session").decode()) == _stripped(text)
+    except (InputError, UnicodeDecodeError):
+        return False
+
+
+def _stripped(text: str) -> list[str]:
+    return [line.strip() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]

@@ -1,0 +1,203 @@
+"""From folders of images to the session that calibrates them: one camera, or several on one mount."""
+
+from __future__ import annotations
+
+import glob
+import json
+import os
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
+from rigkit.core.identifiers import check_identifier
+from rigkit.io.board_file import load_board
+from rigkit.io.session import SCHEMA
+from rigkit.workflows.detect import IMAGE_ENDINGS
+from rigkit.workflows.print_board import board_text
+
+__all__ = ["FolderSession", "cameras_in", "session_of_folders"]
+
+BOARD_WORDS = re.compile(r"^(\d{1,4})[xX](\d{1,4})[xX](\d{1,4}(?:\.\d{1,4})?)$")
+SIDE = r"left|right|cam(?:era)?[_-]?\d{1,3}"
+"""How people call the cameras of a rig."""
+NAMED_FIRST = re.compile(rf"(?P<side>{SIDE})(?P<gap>[_-]?)(?P<number>\d+)", re.IGNORECASE)
+NAMED_LAST = re.compile(r"\d+(?P<gap>[_-]?)(?P<side>left|right)", re.IGNORECASE)
+SIDE_FOLDER = re.compile(rf"(.*[ _-])?({SIDE})", re.IGNORECASE)
+
+
+@dataclass(frozen=True, slots=True)
+class FolderSession:
+    """The session's file, and the content of all files (path -> text) that it needs: itself, and boards."""
+
+    path: Path
+    files: Mapping[Path, str]
+
+
+def session_of_folders(
+    folders: Sequence[Path], boards: Sequence[str], place: Path, *, model: str = "auto"
+) -> FolderSession:
+    """Return the session of one folder, or of several that hold a camera's images each, to be kept in folder `place`.
+
+    Parameters
+    ----------
+    folders : of images; see `cameras_in`.
+    boards : files of boards, or COLUMNSxROWSxMM: inner corners along and across, side of a square.
+    place : folder of the session, to which its paths are relative.
+    model : of all cameras.
+
+    Raises
+    ------
+    InputError
+        No board, a folder without images, or names that a session cannot hold.
+    """
+    if not boards:
+        raise InputError(
+            "calibrate: images cannot tell how large the squares are; give the board, such as --board 9x6x25 (inner "
+            "corners along and across, mm a square) or --board board.toml"
+        )
+    cameras = cameras_in(folders)
+    files: dict[Path, str] = {}
+    names = [_board_file(words, place, files) for words in boards]
+    shown = " ".join([*map(str, folders), *(f"--board {words}" for words in boards)])
+    lines = [
+        "# " + " ".join(f"Written by rigkit calibrate {shown}".split()),
+        "# Calibrate again with: rigkit calibrate session.toml --force",
+        f'schema = "{SCHEMA}"',
+        "",
+        "# The board in the images; a rule over many of its squares tells their true size.",
+        f"board = {_quoted(names[0])}" if len(names) == 1 else f"boards = [{', '.join(map(_quoted, names))}]",
+        "",
+        '# A camera model, or "auto": the one that predicts images best that it was not fitted to.',
+        f"model = {_quoted(model)}",
+        "",
+        "# Images, relative to this file: names, or patterns such as *.jpg.",
+    ]
+    if len(cameras) == 1:
+        lines.append(f"images = {_listed(cameras[''], place)}")
+    else:
+        lines += ["# Those of one moment have the same name, or the same number at its end.", ""]
+        for name, patterns in cameras.items():
+            lines += ["[[cameras]]", f"id = {_quoted(name)}", f"images = {_listed(patterns, place)}", ""]
+        lines += [
+            "# What a rule says of the distance of two cameras is compared with the result:",
+            "# [[baselines]]",
+            f"# a = {_quoted(next(iter(cameras)))}",
+            f"# b = {_quoted(list(cameras)[1])}",
+            "# value_mm = 100.0",
+            "# sigma_mm = 1.0",
+            '# how = "steel rule"',
+        ]
+    path = place / "session.toml"
+    files[path] = "\n".join(lines).rstrip() + "\n"
+    return FolderSession(path, files)
+
+
+def cameras_in(folders: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
+    """Return the images of every camera as (folder, pattern), by its name; of one camera by "".
+
+    Several folders are as many cameras. One folder holds several where all its images are called left01, right01 (or
+    cam0_01, 01_left), or where it has no images but folders left and right (or cam0, cam1).
+
+    Raises InputError for a folder without images, or folders of one name.
+    """
+    if len(folders) > 1:
+        return _one_each(folders)
+    folder = folders[0]
+    images = _images(folder)
+    if images:
+        return _by_names(folder, images)
+    inside = [p for p in folder.iterdir() if p.is_dir() and SIDE_FOLDER.fullmatch(p.name) and _images(p)]
+    if len(inside) < 2:
+        raise InputError(
+            f"folder '{folder}' has no images ({' '.join(sorted(IMAGE_ENDINGS))}), nor folders left and right with "
+            "some; give the folder of a camera's images, or one folder a camera"
+        )
+    return _one_each(sorted(inside, key=lambda p: _natural(p.name)))
+
+
+def _images(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        raise InputError(f"'{folder}' is not a folder; give folders of images, or one session file")
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_ENDINGS and p.is_file())
+
+
+def _one_each(folders: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
+    out: dict[str, list[tuple[Path, str]]] = {}
+    for folder in folders:
+        name = check_identifier(folder.resolve().name, f"folder '{folder}', the name of a camera,")
+        if name in out:
+            raise InputError(f"two folders are called '{name}', which names a camera; rename one")
+        images = _images(folder)
+        if not images:
+            raise InputError(f"folder '{folder}' has no images ({' '.join(sorted(IMAGE_ENDINGS))}); give another")
+        out[name] = [(folder, f"*{suffix}") for suffix in _suffixes(images)]
+    return out
+
+
+def _by_names(folder: Path, images: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
+    """Return the cameras that the images' names tell: more than one only where every image has a side."""
+    sides: dict[str, dict[str, None]] = {}
+    for image in images:
+        first, last = NAMED_FIRST.fullmatch(image.stem), NAMED_LAST.fullmatch(image.stem)
+        if first is not None:
+            side, pattern = first["side"], f"{first['side']}{first['gap']}[0-9]*{image.suffix}"
+        elif last is not None:
+            side, pattern = last["side"], f"*[0-9]{last['gap']}{last['side']}{image.suffix}"
+        else:
+            sides = {}
+            break
+        sides.setdefault(side.lower(), {})[pattern] = None
+    if len(sides) < 2:
+        return {"": [(folder, f"*{suffix}") for suffix in _suffixes(images)]}
+    return {side: [(folder, pattern) for pattern in sides[side]] for side in sorted(sides, key=_natural)}
+
+
+def _suffixes(images: Iterable[Path]) -> list[str]:
+    return sorted({image.suffix for image in images})
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    return [(int(part) if part.isdigit() else -1, part) for part in re.split(r"(\d+)", name.lower())]
+
+
+def _board_file(words: str, place: Path, files: dict[Path, str]) -> str:
+    """Return a board's file as the session names it; a new one is added to `files`."""
+    match = BOARD_WORDS.match(words)
+    if match is None:
+        if not words.endswith(".toml"):
+            raise InputError(f"--board {words}: write inner corners and mm a square, such as 9x6x25, or a board file")
+        load_board(words)
+        return _relative(Path(words), place)
+    columns, rows, side = int(match[1]), int(match[2]), float(match[3])
+    path = place / f"board-{columns}x{rows}x{side:g}.toml"
+    board = Board(path.stem, columns, rows, side, side)
+    files[path] = board_text(board, f"as told by --board {words}; squares are best measured over many", path)
+    return path.name
+
+
+def _listed(patterns: Sequence[tuple[Path, str]], place: Path) -> str:
+    texts = []
+    for folder, pattern in patterns:
+        inside = _relative(folder, place)
+        texts.append(_quoted(pattern if inside == "." else f"{glob.escape(inside)}/{pattern}"))
+    return texts[0] if len(texts) == 1 else f"[{', '.join(texts)}]"
+
+
+def _relative(path: Path, place: Path) -> str:
+    try:
+        return Path(os.path.relpath(path.resolve(), place.resolve())).as_posix()
+    except ValueError:
+        # On another drive.
+        return path.resolve().as_posix()
+
+
+def _quoted(text: str) -> str:
+    """Return a basic string of TOML, which has the escapes of JSON."""
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise InputError(f"{text!r}: a session is UTF-8, which cannot hold this name; rename the file") from error
+    return json.dumps(text, ensure_ascii=False)

@@ -1,0 +1,234 @@
+"""A newcomer's way: folders of pictures and the size of the board, one command, nothing written by hand."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rigkit.cameras.base import Camera
+from rigkit.cameras.brown import Brown
+from rigkit.cli.main import main
+from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3, nearest_rotation
+from rigkit.interop.opencv import read_opencv
+from rigkit.interop.ros import read_camera_info
+from rigkit.io.calibration_file import load_calibration
+from rigkit.io.corners_file import read_corners
+from rigkit.io.rig_file import load_rig, load_saved_rig
+from rigkit.io.rig_session import load_rig_session
+from rigkit.io.session import load_session
+from rigkit.synthetic.photometry import Photometry
+from rigkit.synthetic.placing import place_board, sees_paper
+from rigkit.synthetic.render import Optics, render
+from rigkit.workflows.calibrate import CalibrateOptions
+from rigkit.workflows.calibrate_any import calibrate_session_file
+from rigkit.workflows.folder_session import cameras_in, session_of_folders
+
+CAMERA = Brown((640, 480), np.array([520.0, 521.0, 322.3, 236.1, -0.21, 0.06, 4e-4, -3e-4, 0.0]))
+RIGHT_FROM_LEFT = Rigid3(exp_so3(np.array([0.01, -0.04, 0.02])), [-90.0, 1.0, 2.0])
+BOARD = Board("board", 9, 6, 30.0, 30.0)
+FRAMES = 9
+SAME_LENS_PX = 0.1
+"""Projections of the camera found against the true one, where boards were: corners of JPEGs to about 0.03 px, 9 images;
+a board of another size, or another format's convention, gives a pixel at least."""
+SIGMAS = 4.0
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """left01.jpg, right01.jpg, ... of a rig, ray-traced."""
+    folder = tmp_path_factory.mktemp("pictures")
+    rng = np.random.default_rng(11)
+    optics, photometry = Optics(0.7, supersample=2), Photometry(noise_levels=2.0)
+    count = 0
+    while count < FRAMES:
+        spot = np.array([320.0, 240.0]) + rng.uniform(-1.0, 1.0, 2) * np.array([90.0, 60.0])
+        placed = place_board(BOARD, CAMERA, spot, rng.uniform(26.0, 34.0), 40.0, rng)
+        poses = {"left": Rigid3.identity(), "right": RIGHT_FROM_LEFT}
+        if placed is None or not sees_paper(placed, CAMERA, (0.0, 0.0), CAMERA.size_px):
+            continue
+        if not all(placed.see(CAMERA, pose)[1].all() for pose in poses.values()):
+            continue
+        count += 1
+        for name, pose in poses.items():
+            image = render([placed], CAMERA, pose, optics=optics, photometry=photometry, rng=rng)
+            cv2.imwrite(str(folder / f"{name}{count:02d}.jpg"), image, [cv2.IMWRITE_JPEG_QUALITY, 97])
+    return folder
+
+
+def of_one_camera(pictures: Path, folder: Path) -> Path:
+    """Return a folder with the pictures of one camera, as cameras name them."""
+    folder.mkdir(parents=True)
+    for k, path in enumerate(sorted(pictures.glob("left*.jpg"))):
+        shutil.copy(path, folder / f"DSC_{k:04d}.JPG")
+    return folder
+
+
+def worst_px(camera: Camera) -> float:
+    """Return how far the projections are off in the middle of the image, but for a rotation of the camera."""
+    u, v = np.meshgrid(np.linspace(150.0, 490.0, 18), np.linspace(120.0, 360.0, 13))
+    pixels = np.stack([u.ravel(), v.ravel()], axis=1)
+    rays, ours = CAMERA.unproject(pixels)[0], camera.unproject(pixels)[0]
+    projected, valid = camera.project(rays @ nearest_rotation(ours.T @ rays).T)
+    assert valid.all()
+    return float(np.abs(projected - pixels).max())
+
+
+def test_from_pictures_to_a_page_and_two_formats_in_one_command(
+    pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = of_one_camera(pictures, tmp_path / "my [photos]")
+    command = ["calibrate", str(folder), "--board", "9x6x30", "-r", "--export", "opencv", "ros"]
+    assert main(command) == 0
+    assert "held-out RMS" in capsys.readouterr().out
+    cameras = [
+        load_calibration(folder / "calibration.json").camera,
+        read_opencv((folder / "calibration-opencv.yaml").read_text(), ""),
+        read_camera_info((folder / "calibration-ros.yaml").read_text(), ""),
+    ]
+    assert max(map(worst_px, cameras)) < SAME_LENS_PX
+    assert (folder / "calibration.html").read_text().count("data:image/jpeg") == FRAMES
+    # What was used stands there, and gives the same again.
+    session = load_session(folder / "session.toml")
+    assert len(session.images) == FRAMES and session.model == "auto"
+    assert session.boards[0].size == (9, 6) and session.boards[0].square_x_mm == 30.0
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    assert main(command) == 2
+    assert "calibration.json' exists" in capsys.readouterr().err
+    for again in ([str(folder / "session.toml")], [str(folder)]):
+        assert main(["calibrate", *again, "--force"]) == 0
+        assert (folder / "calibration.json").read_bytes() == before[folder / "calibration.json"]
+    assert {path.name for path in folder.iterdir()} == {path.name for path in before} | {"corners.json"}
+
+
+def test_a_session_of_a_person_is_not_replaced(
+    pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = of_one_camera(pictures, tmp_path / "photos")
+    session = folder / "session.toml"
+    session.write_text("# mine\n")
+    assert main(["calibrate", str(folder), "--board", "9x6x30"]) == 2
+    assert "session.toml' exists" in capsys.readouterr().err
+    assert session.read_text() == "# mine\n" and not (folder / "board-9x6x30.toml").exists()
+    session.unlink()
+    # Nothing comes out, nothing is left.
+    assert main(["calibrate", str(folder), "--board", "7x5x30"]) == 2
+    assert "columns and rows" in capsys.readouterr().err
+    assert sorted({path.suffix for path in folder.iterdir()} - {".json"}) == [".JPG"]
+    assert main(["calibrate", str(folder)]) == 2
+    assert "--board 9x6x25" in capsys.readouterr().err
+    assert main(["calibrate", str(folder), "--board", "9x6"]) == 2
+    assert "mm a square" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("layout", ["names", "folders", "two folders"])
+def test_pictures_of_two_cameras_are_a_rig(pictures: Path, tmp_path: Path, layout: str) -> None:
+    folder = tmp_path / "rig"
+    sources = [folder]
+    shutil.copytree(pictures, folder)
+    if layout != "names":
+        for side in ("left", "right"):
+            (folder / side).mkdir()
+            for path in folder.glob(f"{side}*.jpg"):
+                path.rename(folder / side / path.name.replace(side, "IMG"))
+        sources = [folder] if layout == "folders" else [folder / "left", folder / "right"]
+    command = ["calibrate", *map(str, sources), "--board", "9x6x30", "--model", "brown", "--export", "opencv"]
+    assert main(command) == 0
+    rig = load_rig(folder / "rig.json")
+    assert list(rig) == list(load_rig_session(folder / "session.toml").cameras) == ["left", "right"]
+    found = rig["right"][1] @ rig["left"][1].inverse()
+    sigma = np.sqrt(np.diag(load_saved_rig(folder / "rig.json").mount_covariance)[-3:])
+    assert np.all(np.abs(found.translation_mm - RIGHT_FROM_LEFT.translation_mm) < SIGMAS * sigma + 0.05)
+    assert np.linalg.norm(sigma) < 1.0
+    for name in rig:
+        camera = read_opencv((folder / f"rig-{name}-opencv.yaml").read_text(), "")
+        assert worst_px(camera) < SAME_LENS_PX
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["left01.jpg", "right01.jpg"], {"left": ["left[0-9]*.jpg"], "right": ["right[0-9]*.jpg"]}),
+        (["01_left.png", "01_right.png"], {"left": ["*[0-9]_left.png"], "right": ["*[0-9]_right.png"]}),
+        (["cam2_1.png", "cam10_1.png"], {"cam2": ["cam2_[0-9]*.png"], "cam10": ["cam10_[0-9]*.png"]}),
+        # One that belongs to neither side, or one side alone: one camera.
+        (["left01.jpg", "right01.jpg", "upright.jpg"], {"": ["*.jpg"]}),
+        (["left01.jpg", "left02.JPG"], {"": ["*.JPG", "*.jpg"]}),
+        (["a/1.jpg", "b/1.jpg"], None),
+        (["cam0/1.jpg", "cam1/1.jpg", "other/1.jpg"], {"cam0": ["*.jpg"], "cam1": ["*.jpg"]}),
+    ],
+)
+def test_what_names_tell_of_cameras(tmp_path: Path, names: list[str], expected: dict[str, list[str]] | None) -> None:
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    if expected is None:
+        with pytest.raises(InputError, match="left and right"):
+            cameras_in([tmp_path])
+        return
+    assert {name: [pattern for _, pattern in own] for name, own in cameras_in([tmp_path]).items()} == expected
+
+
+def test_a_name_that_a_session_cannot_hold(tmp_path: Path) -> None:
+    folder = tmp_path / "ph\udcffotos"
+    folder.mkdir()
+    (folder / "1.jpg").touch()
+    with pytest.raises(InputError, match="rename"):
+        session_of_folders([folder], ["9x6x25"], tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["csv", "vnl", "json"])
+def test_corners_from_a_file(
+    pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = of_one_camera(pictures, tmp_path / "photos")
+    assert main(["calibrate", str(folder), "--board", "9x6x30", "--model", "brown"]) == 0
+    plain = load_calibration(folder / "calibration.json")
+    corners = tmp_path / f"corners.{kind}"
+    if kind == "json":
+        shutil.copy(folder / "corners.json", corners)
+    else:
+        csv = tmp_path / "corners.csv"
+        assert main(["detect", str(folder), "-o", str(csv), "-j", "1"]) == 0
+        if kind == "vnl":
+            write_vnl(csv, corners)
+    (folder / "corners.json").unlink()
+    capsys.readouterr()
+    monkeypatch.setattr("rigkit.workflows.corners.detect_boards", lambda *_, **__: pytest.fail("looked for corners"))
+    arguments = ["calibrate", str(folder / "session.toml"), "--corners", str(corners), "-o", str(tmp_path / "new.json")]
+    assert main(arguments) == 0
+    found = load_calibration(tmp_path / "new.json")
+    assert found.corner_count == plain.corner_count == FRAMES * 54
+    assert worst_px(found.camera) < SAME_LENS_PX
+    assert not (folder / "corners.json").exists()
+    assert main([*arguments[:-1], str(corners), "--force"]) == 2
+    assert "it would be lost" in capsys.readouterr().err
+    for path in folder.glob("*.JPG"):
+        path.rename(path.with_name(f"x{path.name}"))
+    assert main([*arguments, "--force"]) == 2
+    assert "names none of the 9 images" in capsys.readouterr().err
+
+
+def write_vnl(csv: Path, vnl: Path) -> None:
+    """Write the corners of a whole 9x6 board in each image as mrgingham does, row by row."""
+    lines = ["# filename x y level"]
+    for image, (found,) in read_corners(csv).items():
+        assert (found.columns, found.rows) == (9, 6)
+        for k in np.lexsort((found.grid[:, 0], found.grid[:, 1])):
+            lines.append(f"{Path(image).name} {found.pixels[k, 0]:.5f} {found.pixels[k, 1]:.5f} 0")
+    vnl.write_text("\n".join(lines) + "\n")
+
+
+def test_a_session_file_from_python_too(pictures: Path, tmp_path: Path) -> None:
+    (tmp_path / "board.toml").write_text('schema = "rigkit.board/1"\ncolumns = 9\nrows = 6\nsquare_mm = 30.0\n')
+    (tmp_path / "session.toml").write_text(
+        f'schema = "rigkit.session/1"\nimages = "{pictures}/left*.jpg"\nboard = "board.toml"\n'
+    )
+    done = calibrate_session_file(tmp_path / "session.toml", CalibrateOptions())
+    assert done.written == (tmp_path / "calibration.json",)
