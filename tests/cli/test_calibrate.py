@@ -285,7 +285,7 @@ def test_degrees_that_no_model_has(
     [
         ("columns = 9000", "'columns' is 9000, more than 1000"),
         ("square_mm = 0.03", "write mm"),
-        ("square_mm = inf", "must be a number"),
+        ("square_mm = inf", "must be a finite number"),
         ("rows = 1", "must be at least 2"),
     ],
 )
