@@ -70,7 +70,6 @@ POSITIONAL_CLASSES = {
     "reconstruction/lattice_planes.py:LatticePlanes",
     "reconstruction/lattice_planes.py:_View",
     "reconstruction/pairing.py:MatchedPair",
-    "relative_pose/refinement/pose_problem.py:Minimum",
     "relative_pose/refinement/refine.py:RefinedPose",
     "relative_pose/refinement/select.py:TypeEvidence",
     "study/study.py:Study",
@@ -87,7 +86,6 @@ POSITIONAL_CLASSES = {
 """Classes of many fields that still take them by place: this list only gets shorter."""
 NAMES_OF_SEVERAL_CLASSES = {
     "Lattice",
-    "Minimum",
     "Step",
     "_Corners",
     "_Entry",

@@ -203,7 +203,7 @@ def _fit(matches: Matches, declared: PoseType, level_sigma_rad: float | None, rn
         pose = refined.cam2_from_cam1
         inliers = _agreeing(matches, pose)
         _require(inliers)
-    _refuse_chance(matches, pose, inliers, fundamental_for(pose_type).degrees_of_freedom)
+    _a_contrario_test(matches, pose, inliers, fundamental_for(pose_type).degrees_of_freedom)
     return _Fit(matches, refined, inliers, pose_type, level_sigma_rad, tuple(notes))
 
 
@@ -241,8 +241,8 @@ def _require(inliers: BoolArray) -> None:
         )
 
 
-def _refuse_chance(matches: Matches, pose: Rigid3, inliers: BoolArray, freedom: int) -> None:
-    """Raise DegenerateError where as many of so many wrong matches would be expected to agree with some pose."""
+def _a_contrario_test(matches: Matches, pose: Rigid3, inliers: BoolArray, freedom: int) -> None:
+    """Raise DegenerateError unless the a-contrario test rejects chance: as many wrong matches agreeing with some pose."""
     affinity = _affinity_in_sigmas(matches, pose)
     # A match without an affinity always passes that test.
     fits = ~(np.nan_to_num(affinity) >= AFFINITY_GATE)

@@ -13,15 +13,19 @@ from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rotation import exp_so3, unit
 from rigkit.kernels import pose as kernel
+from rigkit.optim.damping import Damping, Stop
+from rigkit.optim.levenberg_marquardt import DenseStep, LinearisedProblem, minimise
 from rigkit.relative_pose.refinement.local import SampsonRows
 from rigkit.relative_pose.refinement.marginal import MarginalLoss
 from rigkit.relative_pose.refinement.residuals import affinity_terms, level_terms, point_terms, whitened_affinities
 from rigkit.relative_pose.solvers.pose import free_directions, translation_basis
 
-__all__ = ["Minimum", "PoseProblem", "RobustWeights", "cauchy_weights"]
+__all__ = ["PoseMinimum", "PoseProblem", "RobustWeights", "cauchy_weights"]
 
 MAX_ITERATIONS = 60
 STEP_TOLERANCE = 1e-10
+DAMPING_OF_POSE = Damping(start=1e-6, ceiling=1e8, floor=1e-12)
+ROUNDING_OF_COST = 1e-14
 CAUCHY_SCALE = 2.385
 """In standard deviations: 95 % efficient for Gaussian noise."""
 
@@ -34,8 +38,8 @@ def cauchy_weights(residuals: FloatArray) -> FloatArray:
     return np.asarray(1.0 / (1.0 + (residuals / CAUCHY_SCALE) ** 2))
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Minimum:
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class PoseMinimum:
     """Where the minimisation ended.
 
     Attributes
@@ -57,6 +61,51 @@ class Minimum:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class _WeightedRows(LinearisedProblem):
+    """Residuals (M,) around a pose with their derivatives (M, 5), their weights and matches (M,), and what may move."""
+
+    residuals: FloatArray
+    jacobian: FloatArray
+    weights: FloatArray
+    of: IntArray
+    free: IntArray
+
+    @property
+    def cost(self) -> float:
+        """Weighted sum of squared residuals."""
+        return float(np.sum(self.weights * self.residuals**2))
+
+    def step(self, damping: float) -> DenseStep | None:
+        """Return the damped step, (5,), zero where nothing may move."""
+        J, w = self.jacobian[:, self.free], self.weights
+        gram, gradient = (J.T * w) @ J, (J.T * w) @ self.residuals
+        scale = np.diag(gram) + 1e-12 * np.trace(gram) + 1e-300
+        try:
+            move = np.linalg.solve(gram + damping * np.diag(scale), -gradient)
+        except np.linalg.LinAlgError:
+            return None
+        change = np.zeros(5)
+        change[self.free] = move
+        return DenseStep(change, float(move @ (damping * scale * move - gradient)))
+
+    def decrease(self, there: _WeightedRows) -> float:
+        """Return by how much the cost is less there, both under the weights here; equal within rounding is less.
+
+        A step that lowers this sum lowers the robust loss as well.
+        """
+        return self.cost * (1.0 + ROUNDING_OF_COST) - float(np.sum(self.weights * there.residuals**2))
+
+
+def _moved(state: tuple[FloatArray, FloatArray], step: DenseStep) -> tuple[FloatArray, FloatArray]:
+    R, t = state
+    return exp_so3(step.change[:3]) @ R, unit(t + step.change[3:] @ translation_basis(t))
+
+
+def _small(step: DenseStep) -> bool:
+    return bool(np.abs(step.change).max() < STEP_TOLERANCE)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class PoseProblem:
     """What a pose is refined on; the attributes are the arguments of `refine_pose`."""
 
@@ -71,7 +120,7 @@ class PoseProblem:
         """Return which of (w, b), the first of b horizontal, may move."""
         return free_directions(PoseType.GENERAL if self.level_sigma_rad is not None else self.kind)
 
-    def minimum(self, R: FloatArray, t: FloatArray) -> Minimum:
+    def minimum(self, R: FloatArray, t: FloatArray) -> PoseMinimum:
         """Return the minimum near a pose; raises InputError where the residuals are too few."""
         loss = self._loss()
         plain = self.level_sigma_rad is None and self.covariance_A is None
@@ -80,35 +129,42 @@ class PoseProblem:
             self._require(len(self.matches) + 2 * len(which))
             packed, limits = SampsonRows.of(self.matches).packed, (MAX_ITERATIONS, STEP_TOLERANCE)
             given = (packed, affine, which, self._own_weights())
-            end = kernel.minimise(*given, loss, self.free(), R, t, *limits)
-            return Minimum(*end[:5], 0, *end[5:])
-        return self._minimum(R, t)
+            turned, moved, r, jacobian, w, count, settled = kernel.minimise(*given, loss, self.free(), R, t, *limits)
+            return PoseMinimum(
+                R=turned,
+                t=moved,
+                residuals=r,
+                jacobian=jacobian,
+                weights=w,
+                priors=0,
+                iterations=count,
+                converged=settled,
+            )
+        return self._descend(R, t)
 
-    def _minimum(self, R: FloatArray, t: FloatArray) -> Minimum:
-        free = self.free()
-        r, jacobian, of = self._residuals(R, t)
-        self._require(len(r))
-        w = self._weights(r, of)
-        damping, converged, iterations = 1e-6, not len(free), 0
-        while not converged and iterations < MAX_ITERATIONS:
-            iterations += 1
-            J = jacobian[:, free]
-            gram, gradient = (J.T * w) @ J, (J.T * w) @ r
-            scale = np.diag(gram) + 1e-12 * np.trace(gram) + 1e-300
-            step = np.zeros(5)
-            step[free] = np.linalg.solve(gram + damping * np.diag(scale), -gradient)
-            new_R, new_t = exp_so3(step[:3]) @ R, unit(t + step[3:] @ translation_basis(t))
-            new_r, new_jacobian, _ = self._residuals(new_R, new_t)
-            converged = bool(np.abs(step).max() < STEP_TOLERANCE)
-            # Both poses under the old weights: a step that lowers this sum lowers the robust loss as well.
-            if np.sum(w * new_r**2) <= np.sum(w * r**2) * (1.0 + 1e-14):
-                R, t, r, jacobian = new_R, new_t, new_r, new_jacobian
-                w = self._weights(r, of)
-                damping = max(damping * 0.1, 1e-12)
-            else:
-                converged = converged or damping > 1e8
-                damping *= 10.0
-        return Minimum(R, t, r, jacobian, w, int(np.sum(of < 0)), iterations, converged)
+    def _descend(self, R: FloatArray, t: FloatArray) -> PoseMinimum:
+        """Return the minimum near a pose where there are priors or covariances of affinities, which no kernel takes."""
+        start = self._linearise((R, t))
+        self._require(len(start.residuals))
+        iterations, converged, state, here = 0, True, (R, t), start
+        if len(self.free()):
+            stop = Stop(steps=MAX_ITERATIONS)
+            end = minimise((R, t), self._linearise, _moved, DAMPING_OF_POSE, stop, here=start, small=_small)
+            iterations, converged, state, here = end.steps, end.converged, end.state, end.problem
+        return PoseMinimum(
+            R=state[0],
+            t=state[1],
+            residuals=here.residuals,
+            jacobian=here.jacobian,
+            weights=here.weights,
+            priors=int(np.sum(here.of < 0)),
+            iterations=iterations,
+            converged=converged,
+        )
+
+    def _linearise(self, state: tuple[FloatArray, FloatArray]) -> _WeightedRows:
+        residuals, jacobian, of = self._residuals(*state)
+        return _WeightedRows(residuals, jacobian, self._weights(residuals, of), of, self.free())
 
     def _require(self, count: int) -> None:
         if count < len(self.free()):

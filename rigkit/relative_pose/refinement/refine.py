@@ -20,7 +20,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit
 from rigkit.geometry.sampson import epipolar_normals, sampson_distances
 from rigkit.relative_pose.refinement.level_frames import LevelFrames
-from rigkit.relative_pose.refinement.pose_problem import Minimum, PoseProblem, RobustWeights, cauchy_weights
+from rigkit.relative_pose.refinement.pose_problem import PoseMinimum, PoseProblem, RobustWeights, cauchy_weights
 from rigkit.relative_pose.refinement.residuals import whitened_affinities
 from rigkit.relative_pose.solvers.planar_ambiguity import ambiguous_poses, compare_poses
 from rigkit.relative_pose.solvers.pose import cheirality_margin, choose_pose, essential_from_pose, translation_basis
@@ -234,7 +234,7 @@ def _with_sigma(matches: Matches, starts: Sequence[Rigid3], weights: WeightRule 
     return matches
 
 
-def _result(problem: PoseProblem, end: Minimum) -> RefinedPose:
+def _result(problem: PoseProblem, end: PoseMinimum) -> RefinedPose:
     matches, root, freedom = problem.matches, np.sqrt(end.weights), len(problem.free())
     r, J = end.residuals * root, end.jacobian[:, problem.free()] * root[:, None]
     gram = J.T @ J
