@@ -53,7 +53,6 @@ LONG_FUNCTIONS = {
     "reconstruction/lattice_planes.py:lattice_planes",
     "reconstruction/reconstruct.py:reconstruct_from",
     "reconstruction/scene.py:reconstruct_scene",
-    "relative_pose/robust/robust.py:robust_pose",
 }
 """Still longer: this list only gets shorter."""
 POSITIONAL_CLASSES = {

@@ -242,7 +242,7 @@ def _require(inliers: BoolArray) -> None:
 
 
 def _a_contrario_test(matches: Matches, pose: Rigid3, inliers: BoolArray, freedom: int) -> None:
-    """Raise DegenerateError unless the a-contrario test rejects chance: as many wrong matches agreeing with some pose."""
+    """Raise DegenerateError where as many of so many wrong matches would be expected to agree with some pose."""
     affinity = _affinity_in_sigmas(matches, pose)
     # A match without an affinity always passes that test.
     fits = ~(np.nan_to_num(affinity) >= AFFINITY_GATE)

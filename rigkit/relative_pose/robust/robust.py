@@ -104,30 +104,11 @@ def robust_pose(
     DegenerateError
         No sample gave a pose; the matches that fit leave another one open, all on one plane, or have no baseline.
     """
-    if not (np.isfinite(max_noise) and max_noise > 1.0):
-        raise InputError(f"robust estimation: max_noise is in sigmas of the matches and above 1, got {max_noise}")
-    if not 0.0 < confidence < 1.0:
-        raise InputError(f"robust estimation: confidence must be between 0 and 1, got {confidence}")
-    if max_trials < 1:
-        raise InputError(f"robust estimation: max_trials must be 1 at least, got {max_trials}")
+    _check_options(max_noise, confidence, max_trials)
     kind = str(pose_type)
     rows = SampsonRows.of(matches)
-    if kind in (PoseType.STANDARD, PoseType.FORWARD):
-        finalists, trials = fundamental_for(kind).solve(matches, "points").E21[None], 0
-    else:
-        size = _sample_size(matches, kind, sample)
-        search = _Search(matches, rows, kind, sample, size, max_noise)
-        finalists, trials = search.run(rng, confidence, max_trials)
-    if not len(finalists):
-        raise DegenerateError(f"no pose in {trials} samples of {len(matches)} matches; check how they were matched")
-    # The search allowed for much noise; what the matches that fit show is the noise there is. At that level the local
-    # optima, nearly equal before, part company.
-    noise = max_noise
-    for _ in range(NOISE_ROUNDS):
-        fitting = np.abs(rows.residuals(finalists[:1])[0])
-        fitting = fitting[fitting < QUANTILE * noise]
-        shown = float(np.median(fitting)) / MEDIAN_OF_NORMAL if fitting.size else max_noise
-        noise = min(max_noise, max(MIN_NOISE * shown, MIN_NOISE))
+    finalists, trials = _finalists(matches, rows, rng, kind, sample, max_noise, confidence, max_trials)
+    noise = _shown_noise(rows, finalists, max_noise)
     finalists = rows.improved(finalists, kind, noise)[0]
     loss = MarginalLoss(noise)
 
@@ -153,6 +134,52 @@ def robust_pose(
                 found, qualities = _preferred((found, qualities), (other, others))
         return found
     raise DegenerateError(f"no pose that enough matches agree with, from in front of both cameras, in {trials} samples")
+
+
+def _check_options(max_noise: float, confidence: float, max_trials: int) -> None:
+    if not (np.isfinite(max_noise) and max_noise > 1.0):
+        raise InputError(f"robust estimation: max_noise is in sigmas of the matches and above 1, got {max_noise}")
+    if not 0.0 < confidence < 1.0:
+        raise InputError(f"robust estimation: confidence must be between 0 and 1, got {confidence}")
+    if max_trials < 1:
+        raise InputError(f"robust estimation: max_trials must be 1 at least, got {max_trials}")
+
+
+def _finalists(
+    matches: Matches,
+    rows: SampsonRows,
+    rng: np.random.Generator,
+    kind: str,
+    sample: Sample,
+    max_noise: float,
+    confidence: float,
+    max_trials: int,
+) -> tuple[Mat3, int]:
+    """Return the best essential matrices (H, 3, 3) of the samples, and how many were drawn; options of `robust_pose`.
+
+    Raises DegenerateError where there are none.
+    """
+    if kind in (PoseType.STANDARD, PoseType.FORWARD):
+        return fundamental_for(kind).solve(matches, "points").E21[None], 0
+    size = _sample_size(matches, kind, sample)
+    finalists, trials = _Search(matches, rows, kind, sample, size, max_noise).run(rng, confidence, max_trials)
+    if not len(finalists):
+        raise DegenerateError(f"no pose in {trials} samples of {len(matches)} matches; check how they were matched")
+    return finalists, trials
+
+
+def _shown_noise(rows: SampsonRows, finalists: Mat3, max_noise: float) -> float:
+    """Return the noise, in sigmas, that the matches show which fit the best of the finalists.
+
+    The search allowed for much noise; at the level that there is the local optima, nearly equal before, part company.
+    """
+    noise = max_noise
+    for _ in range(NOISE_ROUNDS):
+        fitting = np.abs(rows.residuals(finalists[:1])[0])
+        fitting = fitting[fitting < QUANTILE * noise]
+        shown = float(np.median(fitting)) / MEDIAN_OF_NORMAL if fitting.size else max_noise
+        noise = min(max_noise, max(MIN_NOISE * shown, MIN_NOISE))
+    return noise
 
 
 def _pose(found: RobustPose) -> Rigid3:
