@@ -33,6 +33,9 @@ import logging
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from rigkit.affine.affinities import EpipolarNormals
+    from rigkit.affine.homography import affines_from_homography, homography_from_affines, homography_from_plane
+    from rigkit.affine.mixed import affines_from_mixed_directions
     from rigkit.affine.normal import normals_from_affines
     from rigkit.affine.registry import affines_from_directions
     from rigkit.calibration.calibrate import calibrate
@@ -121,6 +124,7 @@ __all__ = [
     "DetectionResult",
     "DiffOptions",
     "DirectionPairs",
+    "EpipolarNormals",
     "ExportCameraOptions",
     "ExportCloudOptions",
     "ExportedCamera",
@@ -155,6 +159,8 @@ __all__ = [
     "ValidateOptions",
     "ValidationReport",
     "affines_from_directions",
+    "affines_from_homography",
+    "affines_from_mixed_directions",
     "build_calibration_page",
     "calibrate",
     "calibrate_folders",
@@ -175,6 +181,8 @@ __all__ = [
     "export_cloud",
     "export_rig",
     "fundamental_for",
+    "homography_from_affines",
+    "homography_from_plane",
     "identify_pair",
     "import_camera",
     "load_calibration",
@@ -206,6 +214,9 @@ __all__ = [
 ]
 
 _NAMES_OF = {
+    "rigkit.affine.affinities": ("EpipolarNormals",),
+    "rigkit.affine.homography": ("affines_from_homography", "homography_from_affines", "homography_from_plane"),
+    "rigkit.affine.mixed": ("affines_from_mixed_directions",),
     "rigkit.affine.normal": ("normals_from_affines",),
     "rigkit.affine.registry": ("affines_from_directions",),
     "rigkit.calibration.calibrate": ("calibrate",),

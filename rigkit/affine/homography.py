@@ -1,18 +1,15 @@
-"""Affinities and homographies: A from H, H from a plane, H from affinities, H from one affinity and F."""
+"""Affinities and homographies: A from H, H from a plane, H from affinities."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from rigkit.affine.components import finite
-from rigkit.core.arrays import Affines, BoolArray, FloatArray, Mat3, Normals, Pixels
+from rigkit.core.arrays import Affines, BoolArray, Mat3, Normals, Pixels
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import skew
 
 __all__ = [
     "affines_from_homography",
-    "homographies_from_affines_and_F",
     "homography_from_affines",
     "homography_from_plane",
 ]
@@ -98,57 +95,6 @@ def homography_from_affines(pixels1: Pixels, pixels2: Pixels, A21: Affines, *, a
     H21 = np.linalg.inv(T2) @ vt[-1].reshape(3, 3) @ T1
     H21 /= np.linalg.norm(H21)
     return np.asarray(H21 if np.median(H21[2] @ np.concatenate([q1, np.ones((n, 1))], 1).T) > 0.0 else -H21)
-
-
-def homographies_from_affines_and_F(
-    F21: Mat3, pixels1: Pixels, pixels2: Pixels, A21: Affines
-) -> tuple[FloatArray, BoolArray]:
-    """Return the homography (N, 3, 3), unit Frobenius norm, of each point's tangent plane, and where it is defined.
-
-    Parameters
-    ----------
-    F21 : (3, 3) fundamental matrix, rank 2.
-    pixels1, pixels2 : (N, 2), on each other's epipolar lines (correct them first).
-    A21 : (N, 2, 2)
-
-    Notes
-    -----
-    Every homography of the scene is [e2]x F + e2 v^T with the epipole e2; the equations of one point and one affinity
-    are linear in the three entries of v. Undefined at the epipole.
-    """
-    q1, q2, A = (np.asarray(v, dtype=np.float64) for v in (pixels1, pixels2, A21))
-    n = len(q1)
-    T1, T2 = _normalisation(q1), _normalisation(q2)
-    F = np.linalg.inv(T2).T @ np.asarray(F21, dtype=np.float64) @ np.linalg.inv(T1)
-    F /= np.linalg.norm(F)
-    epipole = np.linalg.svd(F)[0][:, 2]
-    base = skew(epipole) @ F
-    x1 = np.concatenate([q1 * T1[0, 0] + T1[:2, 2], np.ones((n, 1))], axis=1)
-    x2 = q2 * T2[0, 0] + T2[:2, 2]
-    a = A * (T2[0, 0] / T1[0, 0])
-    # w_r = e_r - q2_r e_3: the row (w_r^T H) x1 = 0 of the point and w_r^T H[:, c] = a_rc H[2] x1 of the affinity.
-    w = np.zeros((n, 2, 3))
-    w[:, 0, 0] = w[:, 1, 1] = 1.0
-    w[:, :, 2] = -x2
-    we, wb = w @ epipole, w @ base
-    rows = np.empty((n, 2, 3, 3))
-    right = np.empty((n, 2, 3))
-    rows[:, :, 2] = we[:, :, None] * x1[:, None, :]
-    right[:, :, 2] = -np.einsum("nri,ni->nr", wb, x1)
-    depth = x1 @ base[2]
-    for c in range(2):
-        rows[:, :, c] = we[:, :, None] * np.eye(3)[c] - a[:, :, c, None] * epipole[2] * x1[:, None, :]
-        right[:, :, c] = a[:, :, c] * depth[:, None] - wb[:, :, c]
-    system, target = rows.reshape(n, 6, 3), right.reshape(n, 6)
-    solvable = finite(system) & finite(target)
-    v = np.full((n, 3), np.nan)
-    v[solvable] = np.einsum("nij,nj->ni", np.linalg.pinv(system[solvable]), target[solvable])
-    H21 = np.linalg.inv(T2) @ (base + epipole[:, None] * v[:, None, :]) @ T1
-    with np.errstate(divide="ignore", invalid="ignore"):
-        H21 /= np.linalg.norm(H21, axis=(1, 2), keepdims=True)
-    H21 *= np.sign(np.einsum("ni,ni->n", H21[:, 2], np.concatenate([q1, np.ones((n, 1))], axis=1)))[:, None, None]
-    valid = finite(H21)
-    return np.where(valid[:, None, None], H21, np.nan), valid
 
 
 DEGENERATE = 1e-10

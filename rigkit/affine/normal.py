@@ -7,7 +7,6 @@ optimal normal.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +23,6 @@ __all__ = [
     "estimate_normals",
     "normal_covariance",
     "normals_from_affines",
-    "normals_from_views",
 ]
 
 NORMAL_METHODS = ("optimal", "fne", "nullvector")
@@ -164,43 +162,6 @@ def _rms_angle(J1: FloatArray, normals: Normals, spread_y: FloatArray) -> FloatA
         step = np.sqrt(2.0) * (J1[:, 0] * a[:, None] + J1[:, 1] * b[:, None])
         total += angle_between(gauge, gauge + step) ** 2 + angle_between(gauge, gauge - step) ** 2
     return np.asarray(np.sqrt(total / 4.0))
-
-
-def normals_from_views(
-    J1: FloatArray, J_others: Sequence[FloatArray], affines: Sequence[Affines], sigmas: Sequence[float] | None = None
-) -> tuple[Normals, BoolArray]:
-    """Return the normals (N, 3) that fit the affinities from view 1 to several other views best, and where valid.
-
-    Parameters
-    ----------
-    J1 : (N, 2, 3) d pixel / d point of the reference view.
-    J_others : one (N, 2, 3) a view, in the same frame.
-    affines : one (N, 2, 2) a view, view from view 1; NaN where a view does not see the point.
-    sigmas : standard deviation of the entries of each view's affinities; equal by default.
-
-    Notes
-    -----
-    y = sum_k w_k (G_k - A_k)^T h_k / sum_k w_k h_k . h_k with w = 1 / sigma^2: the global minimum of
-    sum_k w_k |A_k(n) - A_k|_F^2, because the gauge n . d = 1 belongs to view 1 alone.
-    """
-    if not (len(J_others) == len(affines) > 0) or (sigmas is not None and len(sigmas) != len(affines)):
-        raise InputError("normals from views: one Jacobian, one affinity (and one sigma) a view, one view at least")
-    n = len(J1)
-    above, below = np.zeros((n, 2)), np.zeros(n)
-    for k, (J2, A21) in enumerate(zip(J_others, affines, strict=True)):
-        G, h, _ = linear_gauge(J1, J2)
-        seen = finite(A21) & finite(h)
-        weight = np.where(seen, 1.0 if sigmas is None else 1.0 / sigmas[k] ** 2, 0.0)
-        residual = np.where(seen[:, None, None], G - A21, 0.0)
-        step = np.where(seen[:, None], h, 0.0)
-        above += weight[:, None] * np.einsum("nij,ni->nj", residual, step)
-        below += weight * np.sum(step * step, axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        y = above / below[:, None]
-    out = _from_gauge(J1, linear_gauge(J1, J1).d, y)
-    valid = finite(out)
-    out[~valid] = np.nan
-    return out, valid
 
 
 def _optimal(J1: FloatArray, J2: FloatArray, A21: Affines, covariance: FloatArray | None) -> Normals:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -46,10 +46,6 @@ class DirectionPairs:
     kinds : K names, here ("horizontal", "vertical", "diagonal").
     pixels1, pixels2 : (N, 2) where the directions are, or None.
     """
-
-    HORIZONTAL: ClassVar[int] = 0
-    VERTICAL: ClassVar[int] = 1
-    DIAGONAL: ClassVar[int] = 2
 
     image1: FloatArray
     image2: FloatArray

@@ -10,13 +10,12 @@ from tolerances import EXACT_REL
 
 from rigkit.affine.homography import (
     affines_from_homography,
-    homographies_from_affines_and_F,
     homography_from_affines,
     homography_from_plane,
 )
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3, skew
+from rigkit.geometry.rotation import exp_so3
 
 FINITE_DIFFERENCE = 1e-7
 TWO_AFFINITIES = 1e-7
@@ -89,15 +88,6 @@ def test_homography_from_affinities_refuses(corners: Corners) -> None:
         homography_from_affines(twice.pixels1, twice.pixels2, twice.A21)
 
 
-def test_homography_from_one_affinity_and_F(corners: Corners, H21: np.ndarray) -> None:
-    K_inv = np.linalg.inv(REGULAR.K)
-    F21 = K_inv.T @ skew(POSE.translation_mm) @ POSE.rotation @ K_inv
-    found, valid = homographies_from_affines_and_F(F21, corners.pixels1, corners.pixels2, corners.A21)
-    assert valid.all()
-    sign = np.sign(found[:, 2, 2] * H21[2, 2])[:, None, None]
-    np.testing.assert_allclose(sign * found, np.broadcast_to(H21, found.shape), atol=1e-9 * np.abs(H21).max())
-
-
 @pytest.mark.parametrize("name", ["pixels1", "pixels2", "A21"])
 def test_a_homography_of_unknown_numbers_is_refused(name):
     given = {"pixels1": np.eye(2), "pixels2": np.eye(2), "A21": np.tile(np.eye(2), (2, 1, 1))}
@@ -114,10 +104,3 @@ def test_a_homography_of_many_points_needs_little_memory(rng):
     q2 = np.concatenate([q1, np.ones((10_000, 1))], axis=1) @ H.T
     found = homography_from_affines(q1, q2[:, :2] / q2[:, 2:], A21)
     assert found == pytest.approx(H / np.linalg.norm(H), abs=EXACT_REL)
-
-
-def test_no_points_have_no_homographies(corners):
-    none = np.zeros((0, 2))
-    H21, valid = homographies_from_affines_and_F(np.eye(3), none, none, np.zeros((0, 2, 2)))
-    assert H21.shape == (0, 3, 3)
-    assert valid.shape == (0,)

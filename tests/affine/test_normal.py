@@ -12,7 +12,6 @@ from rigkit.affine.normal import (
     estimate_normals,
     normal_covariance,
     normals_from_affines,
-    normals_from_views,
 )
 from rigkit.affine.registry import affines_from_directions
 from rigkit.affine.surface import affines_from_normals
@@ -139,63 +138,6 @@ def test_undefined_at_the_epipole_and_without_affinity(corners: Corners) -> None
 def test_unknown_method() -> None:
     with pytest.raises(InputError, match="known: optimal, fne, nullvector"):
         normals_from_affines(np.zeros((1, 2, 3)), np.zeros((1, 2, 3)), np.zeros((1, 2, 2)), method="best")
-
-
-class TestManyViews:
-    MOTIONS = (POSE, Rigid3(exp_so3(np.array([-0.2, 0.1, 0.0])), [100.0, -220.0, 40.0]), SIDEWAYS)
-
-    def views(self) -> list[Corners]:
-        board = Rigid3(exp_so3(np.array([0.5, -0.4, 0.3])), [-100.0, -140.0, 900.0])
-        out = [see(REGULAR, REGULAR, motion, [board]) for motion in self.MOTIONS]
-        return [v for v in out if v is not None]
-
-    def test_exact(self) -> None:
-        views = self.views()
-        assert len(views) == 3
-        normals, valid = normals_from_views(views[0].J1, [v.J2 for v in views], [v.A21 for v in views])
-        assert valid.all()
-        assert angles_deg(normals, views[0].normals).max() < 1e-9
-
-    def test_is_the_weighted_minimum(self, rng: np.random.Generator) -> None:
-        views, sigmas = self.views(), [0.02, 0.1, 0.05]
-        noisy = [v.A21 + s * rng.normal(size=v.A21.shape) for v, s in zip(views, sigmas, strict=True)]
-        normals, _ = normals_from_views(views[0].J1, [v.J2 for v in views], noisy, sigmas)
-
-        def cost(n: np.ndarray) -> np.ndarray:
-            terms = [
-                np.sum((affines_from_normals(v.J1, v.J2, n)[0] - A) ** 2, axis=(1, 2)) / s**2
-                for v, A, s in zip(views, noisy, sigmas, strict=True)
-            ]
-            return np.sum(terms, axis=0)
-
-        best = cost(normals)
-        for size in (1e-4, 1e-2, 0.3):
-            for _ in range(15):
-                assert (cost(unit(normals + size * rng.normal(size=normals.shape))) >= best * (1.0 - 1e-12)).all()
-
-    def test_more_views_are_better_and_a_missing_view_is_left_out(self, rng: np.random.Generator) -> None:
-        views = self.views()
-        noisy = [v.A21 + 0.02 * rng.normal(size=v.A21.shape) for v in views]
-        noisy[2][:10] = np.nan
-        J_others = [v.J2 for v in views]
-        both, valid = normals_from_views(views[0].J1, J_others, noisy)
-        assert valid.all()
-        two, _ = normals_from_views(views[0].J1, J_others[:2], noisy[:2])
-        one, _ = normals_from_affines(views[0].J1, J_others[0], noisy[0])
-        np.testing.assert_allclose(both[:10], two[:10], atol=1e-12)
-        truth = views[0].normals
-        assert np.median(angles_deg(both, truth)) < np.median(angles_deg(one, truth))
-
-    def test_one_view_is_the_two_view_answer(self, rng: np.random.Generator) -> None:
-        view = self.views()[0]
-        noisy = view.A21 + 0.02 * rng.normal(size=view.A21.shape)
-        many, _ = normals_from_views(view.J1, [view.J2], [noisy])
-        two, _ = normals_from_affines(view.J1, view.J2, noisy)
-        np.testing.assert_allclose(many, two, atol=1e-12)
-
-    def test_numbers_must_agree(self) -> None:
-        with pytest.raises(InputError, match="one Jacobian, one affinity"):
-            normals_from_views(np.zeros((1, 2, 3)), [], [])
 
 
 class TestPredictedSigma:

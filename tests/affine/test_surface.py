@@ -7,7 +7,7 @@ import pytest
 from helpers.affine_scenes import FISHEYE, REGULAR, Corners, see
 from tolerances import EXACT_REL, ROUNDING
 
-from rigkit.affine.correct import epipolar_residuals
+from rigkit.affine.affinities import EpipolarNormals
 from rigkit.affine.surface import affines_from_normals, affines_from_normals_by_minors, linear_gauge
 from rigkit.cameras.base import Camera
 from rigkit.geometry.rigid3 import Rigid3
@@ -78,6 +78,12 @@ def test_the_fisheye_scene_goes_beyond_90_degrees() -> None:
 def test_minors_and_gauge_agree(camera: Camera) -> None:
     c = scene(camera)
     np.testing.assert_allclose(affines_from_normals_by_minors(c.J1, c.J2, -3.0 * c.normals), c.A21, rtol=EXACT_REL)
+
+
+def epipolar_residuals(A21: np.ndarray, epipolar: EpipolarNormals) -> np.ndarray:
+    """Return (A21^T n2 + n1) / |n2|, (N, 2)."""
+    raw = np.einsum("nij,ni->nj", A21, epipolar.n2) + epipolar.n1
+    return np.asarray(raw / np.linalg.norm(epipolar.n2, axis=-1, keepdims=True))
 
 
 @CAMERAS
