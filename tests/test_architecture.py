@@ -48,7 +48,6 @@ LONG_FUNCTIONS = {
     "calibration/rig/assemble.py:assemble_rig",
     "calibration/rig/board_places.py:board_places",
     "calibration/rig/calibrate.py:calibrate_rig",
-    "detection/subpixel/edge_fit.py:fit_edges",
     "io/manifest_writer.py:manifest_text",
     "reconstruction/lattice_planes.py:lattice_planes",
     "reconstruction/reconstruct.py:reconstruct_from",
@@ -56,14 +55,10 @@ LONG_FUNCTIONS = {
 }
 """Still longer: this list only gets shorter."""
 POSITIONAL_CLASSES = {
-    "benchmark/score.py:Score",
     "core/boards.py:Board",
     "core/cloud.py:OrientedCloud",
     "core/matches.py:DirectionPairs",
     "core/matches.py:Matches",
-    "detection/subpixel/edge_fit.py:EdgeFit",
-    "identification/board_matches.py:BoardMatch",
-    "identification/pair_identity.py:PairIdentity",
     "io/manifest.py:Pair",
     "io/session.py:Session",
     "reconstruction/lattice_planes.py:LatticePlanes",
@@ -116,7 +111,6 @@ NAMES_OF_SEVERAL_CONSTANTS = {
     "NAMES",
     "NEWTON_STEPS",
     "NORMAL",
-    "OUTLIER_SIGMAS",
     "OUTLYING",
     "PLANES",
     "POINTS",

@@ -17,11 +17,10 @@ import numpy as np
 
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
-from rigkit.core.detections import BoardDetection, common_corners
+from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
-from rigkit.core.matches import DirectionPairs
 
-__all__ = ["SUPPORTS", "DirectionField", "Support", "board_directions", "direction_field"]
+__all__ = ["SUPPORTS", "DirectionField", "Support", "direction_field"]
 
 Support = Literal["chord", "neighbours", "line", "patch"]
 SUPPORTS: tuple[Support, ...] = get_args(Support)
@@ -58,37 +57,6 @@ class DirectionField:
         across = np.stack([-along[..., 1], along[..., 0]], axis=-1)
         variance = np.einsum("...i,...ij,...j->...", across, self.covariance, across)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)) / length2)
-
-
-def board_directions(
-    detection1: BoardDetection,
-    detection2: BoardDetection,
-    view1: Camera,
-    view2: Camera,
-    *,
-    support: Support = "patch",
-    window: int | None = 2,
-) -> tuple[DirectionPairs, BoolArray]:
-    """Return corresponding directions at the corners that both detections share, row by row (see `common_corners`).
-
-    Parameters
-    ----------
-    detection1, detection2 : one board in two images, oriented alike (`identify_pair`).
-    view1, view2 : the cameras in whose pixels the corners are given, raw or rectified.
-    support, window : as `direction_field`.
-
-    Returns
-    -------
-    directions : `DirectionPairs` (N, 3, 2), lengths exact.
-    valid : (N,) bool, all three directions known in both images.
-    """
-    _, first, second = common_corners(detection1, detection2)
-    field1 = direction_field(detection1, view1, support=support, window=window)
-    field2 = direction_field(detection2, view2, support=support, window=window)
-    pairs = DirectionPairs(
-        field1.vectors[first], field2.vectors[second], field1.valid[first] & field2.valid[second], scaled=True
-    )
-    return pairs, np.asarray(pairs.valid.all(axis=1))
 
 
 def direction_field(

@@ -30,8 +30,8 @@ EQUAL_BOARDS = tuple(Board(name, 8, 6, 40.0, 40.0) for name in ("plane1", "plane
 """Columns + rows is even: each looks the same turned by 180 degrees."""
 SAME_PX = 1.0
 """A corner is the true corner within this distance; neighbours are at least ten times as far."""
-POSE_TYPES = (PoseType.GENERAL, PoseType.PLANAR, PoseType.STANDARD, PoseType.FORWARD)
-TRIES = 50
+BENCH_POSE_TYPES = (PoseType.GENERAL, PoseType.PLANAR, PoseType.STANDARD, PoseType.FORWARD)
+PAIR_TRIES = 50
 RIGHT_ANGLES = (90.0, 90.0, 90.0)
 CLEAR_MM, AWAY_MM = 8.0, 160.0
 """Boards that do not stand in the corner of the room are away from it by this much along both walls."""
@@ -67,7 +67,7 @@ def equal_boards_pair(seed: int, *, size_px: tuple[int, int] = (800, 600)) -> tu
         pair = _random_pair(lambda: _cyclic_boards(off_mm, rng), camera, rng)
         return f"{lens}, {off_mm:g} mm from symmetric", pair
     if seed // 2 % 2 == 0:
-        pose_type = POSE_TYPES[seed // 4 % 4]
+        pose_type = BENCH_POSE_TYPES[seed // 4 % 4]
         pair = trihedral_pair(EQUAL_BOARDS, camera, pose_type, rng, baseline_mm=200.0)
         return f"{lens}, in the corner, {pose_type}", pair
     walls = wall_axes(RIGHT_ANGLES)
@@ -79,7 +79,7 @@ def equal_boards_pair(seed: int, *, size_px: tuple[int, int] = (800, 600)) -> tu
 
 
 def _random_pair(boards: Callable[[], Sequence[PlacedBoard]], camera: Camera, rng: np.random.Generator) -> StereoScene:
-    for _ in range(TRIES):
+    for _ in range(PAIR_TRIES):
         try:
             return random_pair(
                 boards(),
@@ -91,7 +91,7 @@ def _random_pair(boards: Callable[[], Sequence[PlacedBoard]], camera: Camera, rn
             )
         except DegenerateError:
             continue
-    raise DegenerateError(f"equal boards: no two views of {TRIES} arrangements saw all boards")
+    raise DegenerateError(f"equal boards: no two views of {PAIR_TRIES} arrangements saw all boards")
 
 
 def _cyclic_boards(off_mm: float, rng: np.random.Generator) -> list[PlacedBoard]:

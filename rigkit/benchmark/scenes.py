@@ -66,7 +66,7 @@ CONDITIONS: dict[str, tuple[Optics, Photometry]] = {
     "16 bit": (Optics(0.7), replace(BENCH_PHOTOMETRY, bits=16, noise_levels=2.0)),
 }
 """Light, lens and sensor by name, for `BenchScene.render(optics=, photometry=)`."""
-TRIES = 500
+SCENE_TRIES = 500
 CLEAR_SQUARES = 0.6
 """A corner is clear of what covers the board if it lies this far from it: then all of its cell is seen."""
 
@@ -164,7 +164,7 @@ def one_board(
     """
     camera = bench_camera(lens, size_px)
     board = board or Board("board", 10, 10, 30.0, 30.0)
-    for _ in range(TRIES):
+    for _ in range(SCENE_TRIES):
         target = rng.uniform(0.3, 0.7, 2) * size_px
         share = square_px or 0.66 * min(size_px) / (max(board.size) + 2)
         placed = place_board(board, camera, target, share, max_tilt_deg, rng)
@@ -232,7 +232,7 @@ def partial_board(
     """Return a board cut by the frame, a third to nine tenths of its corners visible."""
     camera = bench_camera(lens, size_px)
     board = board or Board("board", 11, 8, 30.0, 30.0)
-    for _ in range(TRIES):
+    for _ in range(SCENE_TRIES):
         target = rng.uniform(0.0, 1.0, 2) * size_px
         placed = place_board(board, camera, target, 0.07 * min(size_px) * rng.uniform(0.8, 1.4), 45.0, rng)
         if placed is None:
@@ -309,9 +309,9 @@ def _place_in_cell(
     board: Board, camera: Camera, low: FloatArray, high: FloatArray, rng: np.random.Generator
 ) -> PlacedBoard:
     """Return the board somewhere in a part of the image, smaller the longer it takes to fit."""
-    for attempt in range(TRIES):
+    for attempt in range(SCENE_TRIES):
         target = low + (high - low) * rng.uniform(0.4, 0.6, 2)
-        share = float((high - low).min()) / (max(board.size) + 1.5) * (1.0 - 0.6 * attempt / TRIES)
+        share = float((high - low).min()) / (max(board.size) + 1.5) * (1.0 - 0.6 * attempt / SCENE_TRIES)
         placed = place_board(board, camera, target, share, 45.0, rng)
         if placed is not None and sees_paper(placed, camera, low, high):
             return placed

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -44,7 +44,7 @@ class FoundBoard:
         return cls(detection.pixels, detection.grid, detection.sigma_px)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Score:
     """Counts and errors, of one image or of many added up.
 
@@ -108,7 +108,17 @@ class Score:
         )
 
 
-_EMPTY = Score(0, 0, 0, 0, 0, 0, 0, np.zeros((0, 2)), np.zeros(0))
+_EMPTY = Score(
+    corners=0,
+    found=0,
+    boards=0,
+    complete=0,
+    split=0,
+    false_boards=0,
+    wrong_indices=0,
+    errors_px=np.zeros((0, 2)),
+    sigma_px=np.zeros(0),
+)
 
 
 def score(scene: BenchScene, found: Sequence[FoundBoard]) -> Score:
@@ -119,7 +129,7 @@ def score(scene: BenchScene, found: Sequence[FoundBoard]) -> Score:
     """
     truth = scene.truth()
     if not truth:
-        return Score(0, 0, 0, 0, 0, len(found), 0, np.zeros((0, 2)), np.zeros(0))
+        return replace(_EMPTY, false_boards=len(found))
     pixels = np.concatenate([t.pixels for t in truth])
     grid = np.concatenate([t.grid for t in truth])
     owner = np.repeat(np.arange(len(truth)), [len(t.grid) for t in truth])
@@ -151,15 +161,15 @@ def score(scene: BenchScene, found: Sequence[FoundBoard]) -> Score:
     every = np.any([h for _, h in hits], axis=0) if hits else np.zeros(len(pixels), bool)
     complete = [any(h[due & (owner == k)].all() for _, h in hits) for k in range(len(truth))]
     return Score(
-        int(due.sum()),
-        int((every & due).sum()),
-        len(truth),
-        sum(complete),
-        int((pieces > 1).sum()),
-        false_boards,
-        wrong,
-        np.concatenate([np.zeros((0, 2)), *errors]),
-        np.concatenate([np.zeros(0), *sigmas]),
+        corners=int(due.sum()),
+        found=int((every & due).sum()),
+        boards=len(truth),
+        complete=sum(complete),
+        split=int((pieces > 1).sum()),
+        false_boards=false_boards,
+        wrong_indices=wrong,
+        errors_px=np.concatenate([np.zeros((0, 2)), *errors]),
+        sigma_px=np.concatenate([np.zeros(0), *sigmas]),
     )
 
 

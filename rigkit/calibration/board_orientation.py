@@ -24,9 +24,10 @@ from rigkit.calibration.shape import often_seen, released_sigma
 from rigkit.calibration.state import State
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3
 from rigkit.core.boards import Board
+from rigkit.core.detections import grid_turned
 from rigkit.geometry.rigid3 import Rigid3
 
-__all__ = ["board_turn", "grid_turned", "same_looks", "turned_views", "with_views_turned"]
+__all__ = ["board_turn", "same_looks", "turned_views", "with_views_turned"]
 
 SURE = 10.0
 """Log odds from which a view is turned: 20000 to 1, as most views are counted alike to begin with. Measured on boards
@@ -41,15 +42,6 @@ def same_looks(board: Board) -> tuple[int, ...]:
         return (0,)
     square = board.columns == board.rows and board.columns % 2 == 0 and board.square_x_mm == board.square_y_mm
     return (0, 1, 2, 3) if square else (0, 2)
-
-
-def grid_turned(grid: IntArray, size: tuple[int, int], quarter_turns: int) -> IntArray:
-    """Return (column, row) (N, 2) of corners, on a board of `size`, when they are counted from another corner."""
-    (column, row), (columns, rows) = grid.T, size
-    for _ in range(quarter_turns):
-        column, row = rows - 1 - row, column
-        columns, rows = rows, columns
-    return np.stack([column, row], axis=-1)
 
 
 @lru_cache(maxsize=256)

@@ -11,7 +11,23 @@ from rigkit.core.arrays import FloatArray, IntArray, Pixels, Points, as_array, a
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 
-__all__ = ["BoardDetection", "BoardView", "common_corners"]
+__all__ = ["BoardDetection", "BoardView", "common_corners", "grid_turned"]
+
+
+def grid_turned(grid: IntArray, size: tuple[int, int], quarter_turns: int) -> IntArray:
+    """Return (column, row) (N, 2) of corners counted from the corner that lies `quarter_turns` x 90 degrees further.
+
+    One turn makes (column, row) into (rows - 1 - row, column), right-handed as before. `size` : (columns, rows) of the
+    grid before the turn.
+
+    >>> grid_turned(np.array([[0, 0], [2, 1]]), (3, 2), 1).tolist()
+    [[1, 0], [0, 2]]
+    """
+    (column, row), (columns, rows) = grid.T, size
+    for _ in range(quarter_turns % 4):
+        column, row = rows - 1 - row, column
+        columns, rows = rows, columns
+    return np.stack([column, row], axis=-1)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -50,20 +66,11 @@ class BoardDetection:
 
     def turned(self, quarter_turns: int) -> BoardDetection:
         """Return the same corners with the first corner moved by `quarter_turns` x 90 degrees (still right-handed)."""
-        column, row = self.grid[:, 0], self.grid[:, 1]
-        columns, rows = self.columns, self.rows
-        for _ in range(quarter_turns % 4):
-            column, row = rows - 1 - row, column
-            columns, rows = rows, columns
-        order = np.lexsort((column, row))
-        return BoardDetection(
-            self.board_id,
-            columns,
-            rows,
-            np.stack([column, row], axis=-1)[order],
-            self.pixels[order],
-            self.sigma_px[order],
-        )
+        size = (self.columns, self.rows)
+        grid = grid_turned(self.grid, size, quarter_turns)
+        order = np.lexsort(grid.T)
+        columns, rows = size if quarter_turns % 2 == 0 else size[::-1]
+        return BoardDetection(self.board_id, columns, rows, grid[order], self.pixels[order], self.sigma_px[order])
 
     def named(self, board_id: str) -> BoardDetection:
         return replace(self, board_id=board_id)

@@ -31,7 +31,7 @@ TILT_RMS_PX = 0.5
 """The reversed tilt of a board is tried too where its rms is within this ratio, or this many px, of the better one."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class BoardMatch:
     """Detection `first` of image 1 and `second` of image 2 taken for one board of a kind.
 
@@ -193,5 +193,16 @@ def _matches_of_pair(i: int, j: int, k: int, kind: BoardKind, poses1: GridPoses,
             against = square and kind.board.columns % 2 == 1 and odd
             for pose1, _ in poses1.placed(i, kind, placement1):
                 for pose2, _ in poses2.placed(j, kind, placement2):
-                    matches.append(BoardMatch(i, j, k, key, placement1, placement2, pose1, pose2, against))
+                    match = BoardMatch(
+                        first=i,
+                        second=j,
+                        kind=k,
+                        key=key,
+                        placement1=placement1,
+                        placement2=placement2,
+                        cam1_from_board=pose1,
+                        cam2_from_board=pose2,
+                        against_colour=against,
+                    )
+                    matches.append(match)
     return matches

@@ -23,9 +23,9 @@ from rigkit.identification.board_ids import LocatedBoard, assign_board_ids, firs
 from rigkit.identification.board_matches import BoardMatch, GridPoses, ImageObservations, matches_between
 from rigkit.identification.joint_pose import BoardObservation, JointPose, refine_joint
 from rigkit.identification.pair_identity import PairIdentity
-from rigkit.identification.placements import BoardKind, Placement, board_kinds, describe, placements, possible_kinds
+from rigkit.identification.placements import BoardKind, Placement, board_kinds, describe, placements
 
-__all__ = ["PairIdentity", "common_corners", "identify_pair", "identify_single"]
+__all__ = ["PairIdentity", "common_corners", "identify_pair"]
 
 LOG_ODDS = float(np.log(1000.0))
 """Odds of a thousand to one decide between two assignments; below, the geometry leaves a tie."""
@@ -84,41 +84,6 @@ def identify_pair(
     rivals = [s for s in ranked if s.differs_from(winner)]
     runner_up_px = _runner_up_px(winner, rivals, matches, views, kinds)
     return _result(winner, runner_up_px, tied, views, kinds, boards, layout)
-
-
-def identify_single(detections: Sequence[BoardDetection], boards: Sequence[Board]) -> tuple[BoardDetection, ...]:
-    """Return the detections of one image (a calibration image) that are listed boards, named, on the board's grid.
-
-    Of several whole detections of one board the one with the most corners is kept. A part of a grid counts where only
-    one board not seen whole can hold it; it takes the first position that fits, its pose takes up the difference. What
-    fits no board is left out.
-
-    Raises
-    ------
-    InputError
-        No boards, or a detection without a name that may be any of several boards of one size.
-    """
-    kinds = _checked_kinds(boards)
-    by_id = {b.board_id: BoardKind((b,)) for b in boards}
-    out: dict[str, BoardDetection] = {}
-
-    def whole(detection: BoardDetection) -> bool:
-        return any(sorted(k.board.size) == sorted((detection.columns, detection.rows)) for k in kinds)
-
-    candidates = list(zip(detections, possible_kinds(detections, kinds), strict=True))
-    for detection, possible in sorted(candidates, key=lambda c: (not whole(c[0]), -len(c[0].grid))):
-        ids = [i for k in possible for i in kinds[k].ids]
-        if detection.board_id in ids:
-            ids = [str(detection.board_id)]
-        elif possible and whole(detection) and len(kinds[possible[0]].ids) > 1:
-            raise InputError(
-                f"boards {', '.join(ids)} look alike: one image cannot tell them apart; list only the one that it shows"
-            )
-        vacant = [i for i in (ids[:1] if whole(detection) else ids) if i not in out]
-        if len(vacant) == 1:
-            kind = by_id[vacant[0]]
-            out[vacant[0]] = placements(detection, kind)[0].apply(detection, kind.board).named(vacant[0])
-    return tuple(out[b.board_id] for b in boards if b.board_id in out)
 
 
 def _checked_kinds(boards: Sequence[Board]) -> tuple[BoardKind, ...]:
@@ -258,16 +223,16 @@ def _result(
     lost = [_why_left_over(v, views[v], n) for v, n in left_over]
     ordered = [[*both, *(b.board_id for b in boards if b.board_id in d and b.board_id not in both)] for d in detections]
     return PairIdentity(
-        tuple(detections[0][i] for i in ordered[0]),
-        tuple(detections[1][i] for i in ordered[1]),
-        Rigid3.from_matrix(pose.cam2_from_cam1),
-        {i: Rigid3.from_matrix(m) for i, m in start.items()},
-        float(np.sqrt(pose.squared_px.sum() / corners.sum())),
-        runner_up_px,
-        dict(zip(both, per_board.tolist(), strict=True)),
-        bool(contradicting),
-        _missing(boards, detections, both),
-        (
+        detections1=tuple(detections[0][i] for i in ordered[0]),
+        detections2=tuple(detections[1][i] for i in ordered[1]),
+        cam2_from_cam1=Rigid3.from_matrix(pose.cam2_from_cam1),
+        cam1_from_board={i: Rigid3.from_matrix(m) for i, m in start.items()},
+        residual_px=float(np.sqrt(pose.squared_px.sum() / corners.sum())),
+        runner_up_px=runner_up_px,
+        board_residual_px=dict(zip(both, per_board.tolist(), strict=True)),
+        ambiguous=bool(contradicting),
+        missing=_missing(boards, detections, both),
+        notes=(
             *views[0].notes,
             *views[1].notes,
             *notes,

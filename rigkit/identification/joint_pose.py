@@ -18,7 +18,7 @@ from rigkit.optim.levenberg_marquardt import DenseProblem, DenseStep, minimise
 __all__ = ["BoardObservation", "JointPose", "refine_joint"]
 
 MAX_JOINT_STEPS = 30
-DAMPING = Damping(start=1e-6, floor=1e-9, refused_floor=1e-4, ceiling=1e4)
+JOINT_DAMPING = Damping(start=1e-6, floor=1e-9, refused_floor=1e-4, ceiling=1e4)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -111,7 +111,7 @@ def refine_joint(
         return _moved(poses[0], change[0]), _moved(poses[1], change[1:])
 
     start = cam2_from_cam1.copy(), cam1_from_board.copy()
-    end = minimise(start, linearise, moved, DAMPING, Stop(steps=MAX_JOINT_STEPS, gain=tolerance))
+    end = minimise(start, linearise, moved, JOINT_DAMPING, Stop(steps=MAX_JOINT_STEPS, gain=tolerance))
     motion, boards = end.state
     residual = end.problem.residual
     split = np.split(residual.reshape(-1, 2), [len(images[0].rays)])

@@ -11,7 +11,7 @@ from rigkit.geometry.rigid3 import Rigid3
 __all__ = ["PairIdentity"]
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class PairIdentity:
     """Boards of two images, named and turned so that one physical corner has one grid index in both.
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.boards import Board
-from rigkit.core.detections import BoardDetection
+from rigkit.core.detections import BoardDetection, grid_turned
 
 __all__ = ["BoardKind", "Placement", "board_kinds", "describe", "placements", "possible_kinds"]
 
@@ -68,22 +68,12 @@ class Placement:
         size = (detection1.columns, detection1.rows)
         turned_size = size if first.quarter_turns % 2 == 0 else size[::-1]
         shifted = on_board - np.array([first.columns, first.rows])
-        back = _turn(shifted, turned_size, -first.quarter_turns % 4)
+        back = grid_turned(shifted, turned_size, -first.quarter_turns)
         return tuple(int(v) for v in back.ravel())
 
     def _place(self, grid: IntArray, detection: BoardDetection) -> IntArray:
-        turned = _turn(grid, (detection.columns, detection.rows), self.quarter_turns)
+        turned = grid_turned(grid, (detection.columns, detection.rows), self.quarter_turns)
         return np.asarray(turned + np.array([self.columns, self.rows]), dtype=np.int64)
-
-
-def _turn(grid: IntArray, size: tuple[int, int], quarter_turns: int) -> IntArray:
-    """Return grid positions (N, 2) of a columns x rows grid after `quarter_turns`, as `BoardDetection.turned`."""
-    column, row = grid[:, 0], grid[:, 1]
-    columns, rows = size
-    for _ in range(quarter_turns):
-        column, row = rows - 1 - row, column
-        columns, rows = rows, columns
-    return np.stack([column, row], axis=-1)
 
 
 def board_kinds(boards: Sequence[Board]) -> tuple[BoardKind, ...]:

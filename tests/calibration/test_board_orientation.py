@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from helpers.calibration_scenes import REACH_DEG, SIZE, lens, projection_difference, random_views
 
-from rigkit.calibration.board_orientation import board_turn, grid_turned, same_looks, with_views_turned
+from rigkit.calibration.board_orientation import board_turn, same_looks, with_views_turned
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.state import State, evaluate
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.boards import Board
-from rigkit.core.detections import BoardView
+from rigkit.core.detections import BoardView, grid_turned
 
 OBLONG, SQUARE = Board("8x6", 8, 6, 30.0, 30.0), Board("6x6", 6, 6, 30.0, 30.0)
 NOISE_PX = 0.1

@@ -28,7 +28,7 @@ from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, rotation_angle
-from rigkit.identification.identify import PairIdentity, common_corners, identify_pair, identify_single
+from rigkit.identification.identify import PairIdentity, common_corners, identify_pair
 
 POSE_RAD = 2e-3
 """0.05 px at 1356 px over three boards gives about 1e-4 rad; a wrong assignment is off by tens of degrees."""
@@ -339,15 +339,3 @@ def test_nothing_in_common_and_bad_lists(rng: np.random.Generator) -> None:
         identify_pair(one, two, [], scene.camera1, scene.camera2)
     with pytest.raises(InputError, match="twice"):
         identify_pair(one, two, [EQUAL[0], EQUAL[0]], scene.camera1, scene.camera2)
-
-
-def test_single_image() -> None:
-    wide, small = Board("wide", 9, 6, 30.0, 30.0), Board("small", 7, 5, 20.0, 20.0)
-    seen = detection(wide, wide.points()[:, :2] + 200.0)
-    part = cut(detection(small, small.points()[:, :2] + 700.0), slice(0, 6), slice(0, 5))
-    found = identify_single([part, seen, cut(seen, slice(0, 4), slice(0, 4))], [wide, small])
-    assert [(d.board_id, d.columns, d.rows, len(d.grid)) for d in found] == [("wide", 9, 6, 54), ("small", 7, 5, 30)]
-    assert np.array_equal(found[0].pixels, seen.pixels)
-    with pytest.raises(InputError, match="look alike"):
-        identify_single([seen], [wide, Board("twin", 9, 6, 30.0, 30.0)])
-    assert identify_single([], [wide]) == ()

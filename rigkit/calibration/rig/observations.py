@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.board_orientation import board_turn, grid_turned, same_looks
+from rigkit.calibration.board_orientation import board_turn, same_looks
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.state import Key
 from rigkit.core.arrays import BoolArray, FloatArray, Points
 from rigkit.core.boards import Board
-from rigkit.core.detections import BoardView
+from rigkit.core.detections import BoardView, grid_turned
 from rigkit.geometry.rigid3 import Rigid3
 
 __all__ = ["FrameObservations", "Observation", "Places", "frame_observations", "outer_corners", "turns_of"]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, upper_median
 from rigkit.detection.checks.validate import stray_row
-from rigkit.detection.lattice.local_fit import fit_cells
+from rigkit.detection.lattice.local_fit import PLIANT, STIFF, fit_cells
 from rigkit.detection.subpixel.subpixel import RefinedLattice
 
 __all__ = ["may_be_discontinuous", "split_at_discontinuities", "without_outliers"]
@@ -40,9 +40,6 @@ MIN_SUSPECT_RESIDUAL = 0.02
 
 MIN_JUDGES = 8
 """Corners behind a prediction that convicts."""
-
-PREDICTIONS = ((2, (0.02, 1.0)), (3, (1e-3, 1e-2)))
-"""Degrees and ridges of the predictions, which must agree: one is steady, the other follows the rim of a fisheye."""
 
 UNUSUAL, MIN_UNUSUAL = 1.3, 3
 """A seam shows: so many corners have residuals beyond this times the typical one."""
@@ -137,7 +134,8 @@ def _judged(item: RefinedLattice, suspect: BoolArray, expected: float) -> tuple[
     pixels = item.lattice.without(suspect).pixels
     astray, in_place = np.zeros((2, *suspect.shape), np.bool_)
     astray[suspect] = True
-    for degree, ridge in PREDICTIONS:
+    # Both must agree.
+    for degree, ridge in (STIFF, PLIANT):
         shape = fit_cells(pixels, suspect, degree=degree, ridge=ridge)
         off = np.hypot(*(shape.pixels - item.lattice.pixels[suspect]).T)
         good = expected * np.hypot(1.0, shape.gain) * shape.cell_px()

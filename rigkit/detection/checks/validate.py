@@ -10,7 +10,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.detection.checks.evidence import Evidence
 from rigkit.detection.lattice.lattice import MANY, Lattice
-from rigkit.detection.lattice.local_fit import fit_cells
+from rigkit.detection.lattice.local_fit import STIFF, fit_cells
 from rigkit.detection.saddles.nearby import near_any
 from rigkit.detection.saddles.response import Level
 from rigkit.detection.subpixel.subpixel import RefinedLattice
@@ -101,7 +101,7 @@ def stray_row(lattice: Lattice, size_px: tuple[int, int]) -> BoolArray | None:
         row[outer] = True
         rest = lattice.without(row)
         missing = row & ~known
-        shape = fit_cells(rest.pixels, missing, degree=2, radius=3, ridge=(0.02, 1.0))
+        shape = fit_cells(rest.pixels, missing, radius=3, degree=STIFF.degree, ridge=STIFF.ridge)
         side = np.abs(shape.along_column) + np.abs(shape.along_row)
         margin = FRAME_CELLS * side
         inside = (shape.pixels > margin) & (shape.pixels < np.array(size_px) - 1.0 - margin)

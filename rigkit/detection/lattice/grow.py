@@ -21,6 +21,7 @@ from rigkit.detection.lattice.links import (
     MIN_ASIDE_PX,
     MIN_EDGE_PLACES,
 )
+from rigkit.detection.lattice.local_fit import PLIANT, STIFF
 from rigkit.detection.saddles.nearby import near_any
 from rigkit.detection.saddles.response import Level
 from rigkit.detection.saddles.ring import ring_rules
@@ -34,10 +35,6 @@ MAX_RINGS = 60
 
 ROOM = 6
 """Empty rows and columns around a lattice for it to grow into, before it is given more."""
-
-STIFF = (2, (0.02, 1.0))
-PLIANT = (3, (1e-3, 1e-2))
-"""Degree and ridge of the prediction: one is steady with few neighbours, the other follows the rim of a fisheye."""
 
 FIT_WIDTH, FIT_RADIUS = 1.3, 3
 """Standard deviation of the weight and reach of the predictions, cells."""

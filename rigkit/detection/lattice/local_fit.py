@@ -3,13 +3,31 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.kernels.growth import FitRules, fit
 
-__all__ = ["LocalFit", "fit_cells"]
+__all__ = ["PLIANT", "STIFF", "LocalFit", "Prediction", "fit_cells"]
+
+
+class Prediction(NamedTuple):
+    """How a corner is foretold from those around it.
+
+    Attributes
+    ----------
+    degree : of the polynomial.
+    ridge : as of `fit_cells`.
+    """
+
+    degree: int
+    ridge: tuple[float, float]
+
+
+STIFF, PLIANT = Prediction(2, (0.02, 1.0)), Prediction(3, (1e-3, 1e-2))
+"""One is steady with few neighbours, the other follows the rim of a fisheye."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -16,7 +16,7 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.lattice.lattice import Lattice, margins
-from rigkit.detection.lattice.local_fit import fit_cells
+from rigkit.detection.lattice.local_fit import PLIANT, STIFF, fit_cells
 from rigkit.detection.lattice.spacing import SpacingChange, spacing_changes
 
 __all__ = ["join_parts", "split_at_turns", "split_necks"]
@@ -99,7 +99,7 @@ def _continues(lattice: Lattice, part: slice, at: int) -> bool:
     pixels[:, part] = lattice.pixels[:, part]
     cells = np.zeros(lattice.known.shape, bool)
     cells[:, at] = lattice.known[:, at]
-    shape = fit_cells(pixels, cells, degree=2, ridge=(0.02, 1.0))
+    shape = fit_cells(pixels, cells, degree=STIFF.degree, ridge=STIFF.ridge)
     side = np.minimum(np.linalg.norm(shape.along_column, axis=1), np.linalg.norm(shape.along_row, axis=1))
     off = np.linalg.norm(shape.pixels - lattice.pixels[cells], axis=1)
     return bool(np.median(off / np.maximum(side, 1e-9)) < CONTINUES_CELLS)
@@ -157,7 +157,7 @@ def _absorb(lattice: Lattice, groups: list[BoolArray]) -> None:
     while loose.any():
         off = np.full((len(groups), *loose.shape), np.inf)
         for number, group in enumerate(groups):
-            fit = fit_cells(lattice.without(~group).pixels, loose, degree=2, width=1.3, ridge=(0.02, 1.0))
+            fit = fit_cells(lattice.without(~group).pixels, loose, width=1.3, degree=STIFF.degree, ridge=STIFF.ridge)
             side = np.minimum(np.hypot(*fit.along_column.T), np.hypot(*fit.along_row.T))
             distance = np.hypot(*(fit.pixels - lattice.pixels[loose]).T)
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -279,7 +279,7 @@ def _agree(pixels: FloatArray, one: BoolArray, two: BoolArray) -> bool:
     """
     reach = np.ones((2 * GAP + 1, 2 * GAP + 1), np.uint8)
     between = (cv2.dilate(one.astype(np.uint8), reach) > 0) & (cv2.dilate(two.astype(np.uint8), reach) > 0)
-    for degree, ridge in ((2, (0.02, 1.0)), (3, (1e-3, 1e-2))):
+    for degree, ridge in (STIFF, PLIANT):
         mine, theirs = (
             fit_cells(np.where(part[..., None], pixels, np.nan), between, degree=degree, width=1.3, ridge=ridge)
             for part in (one, two)

@@ -63,7 +63,7 @@ VALID_MOVE_PX, VALID_MOVE_CELLS = 1.5, 0.2
 """A fit that ends further from its start, in px or in sides of its cell, has found something else."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class EdgeFit:
     """The fitted corners.
 
@@ -137,8 +137,18 @@ def fit_edges(
         _rules(radius_px, iterations, converged_px, mirrored, least),
     )
     _, _, sigma_px, width, contrast, residual, noise, valid, used = fitted[:, : -2 * len(LAGS)].T
-    products, pairs = fitted[:, -2 * len(LAGS) : -len(LAGS)], fitted[:, -len(LAGS) :]
-    return EdgeFit(fitted[:, :2], sigma_px, width, contrast, residual, noise, used, products, pairs, valid > 0.5)
+    return EdgeFit(
+        pixels=fitted[:, :2],
+        sigma_px=sigma_px,
+        blur=width,
+        contrast=contrast,
+        residual=residual,
+        noise=noise,
+        used=used,
+        products=fitted[:, -2 * len(LAGS) : -len(LAGS)],
+        pairs=fitted[:, -len(LAGS) :],
+        valid=valid > 0.5,
+    )
 
 
 @functools.cache

@@ -52,8 +52,8 @@ HOLE_SIGMA = 3.0
 """What a corner in an empty cell must show: how far from its prediction (cells); contrast, relative residual and sigma
 relative to the corners around it."""
 
-OUTLIER_CELLS = 0.06
-OUTLIER_SIGMAS = 8.0
+DISPLACED_CELLS = 0.06
+DISPLACED_SIGMAS = 8.0
 """A corner further than this from where its neighbours say (in cells; and times the board's typical deviation; and
 times the standard deviation expected of it) is something else: a finger, a glint, the end of a ruler."""
 
@@ -311,7 +311,7 @@ def _checked(item: RefinedLattice, parts: Sequence[Part]) -> RefinedLattice:
             continue
         typical = upper_median(cells[part][sure])
         usual = upper_median(relative[part][here])
-        astray = (cells[part] > max(OUTLIER_CELLS, OUTLIER_SIGMAS * typical)) & (excess[part] > OUTLIER_SIGMAS)
+        astray = (cells[part] > max(DISPLACED_CELLS, DISPLACED_SIGMAS * typical)) & (excess[part] > DISPLACED_SIGMAS)
         covered = relative[part] > max(COVERED_NOISE, COVERED_FACTOR * usual)
         drop[part] = sure & (astray | (covered & (cells[part] > COVERED_OFF * typical)))
     return item.without(drop) if drop.any() else item

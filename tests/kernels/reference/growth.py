@@ -26,9 +26,7 @@ from rigkit.detection.lattice.grow import (
     MIN_FORETELLING,
     MIN_RING_PX,
     ODD,
-    PLIANT,
     RING,
-    STIFF,
 )
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.links import (
@@ -39,7 +37,7 @@ from rigkit.detection.lattice.links import (
     MIN_EDGE_PLACES,
     Links,
 )
-from rigkit.detection.lattice.local_fit import LocalFit, _local_fit
+from rigkit.detection.lattice.local_fit import PLIANT, STIFF, LocalFit, _local_fit
 from rigkit.detection.saddles.response import Level
 from rigkit.kernels.growth import FitRules, GrowthRules, Squares
 
