@@ -35,6 +35,7 @@ from rigkit.detection.checks.evidence import MIN_SPACING_CHANGE, MIN_UNEXPLAINED
 from rigkit.detection.checks.validate import compact, has_edge_offset
 from rigkit.detection.detect import candidates
 from rigkit.detection.lattice.lattice import Lattice
+from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.bad_pixels import without_bad_pixels
 from rigkit.detection.saddles.response import GreyImage, Level, grey_image
 from rigkit.detection.subpixel.subpixel import refine
@@ -46,6 +47,8 @@ MIN_BOARD = 24
 """Smaller grids in images of boards may be parts of other things."""
 BLURS_PX, NOISE_LEVELS = (1.5, 2.5, 3.5), 5.0
 SQUARES_PX = (8.0, 12.0)
+MIN_CELL_PX = 6.0
+"""Boards of smaller squares, pictures of boards in the background among them, are listed apart."""
 CHANCE = ("codes", "mosaic")
 RIDGE = 1e-3
 SHOWN = 10
@@ -60,6 +63,7 @@ class Candidate:
     image: str
     board: bool
     corners: int
+    cell_px: float
     evidence: Evidence
 
     def measures(self) -> list[float]:
@@ -131,7 +135,14 @@ def judged(kind: str, image: str, board: bool, pixels: NDArray[np.generic]) -> l
     size_px = (grey.shape[1], grey.shape[0])
     fitted = refine(grey, candidates(grey, MIN_CORNERS, promising))
     kept = [item for item in fitted if item.lattice.count >= least and compact(item.lattice, size_px)]
-    return [Candidate(kind, image, board, item.lattice.count, Evidence.of(item)) for item in kept]
+    return [
+        Candidate(kind, image, board, item.lattice.count, _cell_px(item.lattice), Evidence.of(item)) for item in kept
+    ]
+
+
+def _cell_px(lattice: Lattice) -> float:
+    """Return the median side of the cells, px."""
+    return float(np.median(fit_cells(lattice.pixels, lattice.known, degree=1).cell_px()))
 
 
 def fitted_weights(found: list[Candidate]) -> NDArray[np.float64]:
@@ -158,6 +169,9 @@ def main() -> None:
     args = parser.parse_args()
     images = (*rendered(args.seeds), *real(args.boards, True), *real(args.without, False))
     found = [candidate for image in images for candidate in judged(*image)]
+    tiny = sorted(c.evidence.score for c in found if c.board and c.cell_px < MIN_CELL_PX)
+    found = [c for c in found if not c.board or c.cell_px >= MIN_CELL_PX]
+    print(f"boards with squares under {MIN_CELL_PX:g} px: {len(tiny)}, scores", ", ".join(f"{s:.1f}" for s in tiny))
     for board, what in ((True, "boards"), (False, "other patterns")):
         print(f"{what}: {sum(c.board is board for c in found)} lattices reach the judgement")
     *weights, offset = fitted_weights(found)
