@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rigkit.cli.console import note, progress_on_stderr
 from rigkit.core.errors import InputError
+from rigkit.core.identifiers import MAX_IDENTIFIER
 
 if TYPE_CHECKING:
     from rigkit.io.manifest_writer import FoundPair
@@ -49,6 +51,7 @@ def run(args: argparse.Namespace) -> int:
     target = args.output or root / "dataset.toml"
     images = find_images(root)
     ensure_writable(target, force=args.force, inputs=images)
+    _require_told(args)
     progress = progress_on_stderr()
     sightings = []
     for done, path in enumerate(images, start=1):
@@ -59,11 +62,17 @@ def run(args: argparse.Namespace) -> int:
     pairs = group_pairs(sightings, root)
     for pair in pairs:
         note(f"pair '{pair.name}': {pair.first.image.name}, {pair.second.image.name}")
-    square_mm = args.square_mm or _length("--square-mm", _ask("side of a square, mm", "--square-mm"))
-    calibration = args.calibration or _ask("path of calibration.json (relative to the manifest)", "--calibration")
-    poses = {p.name: args.pose_type or _ask(f"pose type of '{p.name}'", "--pose-type", POSE_TYPES) for p in pairs}
+    square_mm = args.square_mm or _length("--square-mm", _ask("side of a square, mm"))
+    calibration = args.calibration or _ask("path of calibration.json (relative to the manifest)")
+    poses = {p.name: args.pose_type or _ask(f"pose type of '{p.name}'", POSE_TYPES) for p in pairs}
     text = manifest_text(
-        args.name or root.name, target.parent.resolve(), pairs, square_mm, calibration, poses, _baselines(args, pairs)
+        args.name or _name_of(root),
+        target.parent.resolve(),
+        pairs,
+        square_mm,
+        calibration,
+        poses,
+        _baselines(args, pairs),
     )
     write_atomic(target, text, force=args.force)
     print(target)
@@ -74,10 +83,26 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _ask(question: str, option: str, choices: tuple[str, ...] = ()) -> str:
-    """Ask at the terminal; where there is none, say which option tells it."""
-    if not sys.stdin.isatty():
-        raise InputError(f"init: images cannot tell the {question}; say it with {option}")
+def _require_told(args: argparse.Namespace) -> None:
+    """Raise InputError that names everything that nobody has said and that, without a terminal, nobody can be asked."""
+    needed = {
+        "--square-mm": ("side of a square, mm", args.square_mm),
+        "--calibration": ("camera's calibration.json", args.calibration),
+        "--pose-type": (f"pose type of the pairs ({', '.join(POSE_TYPES)})", args.pose_type),
+    }
+    missing = {option: question for option, (question, value) in needed.items() if value is None}
+    if missing and not sys.stdin.isatty():
+        said = "; ".join(f"the {question}: {option}" for option, question in missing.items())
+        raise InputError(f"init: images cannot tell everything; say {said}")
+
+
+def _name_of(folder: Path) -> str:
+    """Return the folder's name without the letters that no data set's name has."""
+    return re.sub(r"[^\w .+()-]|^\W+|\.(?=\.)", "", folder.name)[:MAX_IDENTIFIER].strip() or "data"
+
+
+def _ask(question: str, choices: tuple[str, ...] = ()) -> str:
+    """Ask at the terminal until there is an answer."""
     hint = f" ({', '.join(choices)})" if choices else ""
     while True:
         print(f"{question}{hint}: ", end="", file=sys.stderr, flush=True)

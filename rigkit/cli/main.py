@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import errno
 import importlib
+import io
 import logging
 import os
 import signal
@@ -97,6 +98,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     arguments = list(sys.argv[1:] if argv is None else argv)
     verb = next((a for a in arguments if not a.startswith("-")), None)
+    _open_streams()
     try:
         with _signals_interrupt():
             args = build_parser(verb).parse_args(arguments)
@@ -120,6 +122,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         traceback.print_exc()
         print("rigkit: this is a bug in rigkit; please report the lines above", file=sys.stderr)
         return ExitCode.BUG
+
+
+def _open_streams() -> None:
+    """Let results be printed whatever the terminal's letters are, and nothing end because nobody listens to stderr."""
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - for the rest of the process
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _logged_run(args: argparse.Namespace) -> int:

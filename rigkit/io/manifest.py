@@ -14,6 +14,7 @@ from rigkit.core.truth import PairTruth
 from rigkit.identification.board_ids import BOARD_SIDES
 from rigkit.io.board_file import board_from_table, load_board
 from rigkit.io.reading import usable_path
+from rigkit.io.session import files_of_session
 from rigkit.io.toml_reader import TomlTable, read_toml
 from rigkit.io.truth_csv import load_truth_csv
 from rigkit.io.truth_file import truth_from_table
@@ -84,9 +85,9 @@ class Pair:
                 raise InputError(f"pair '{self.pair_id}': image{number} '{path}' {what}; correct the manifest")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Dataset:
-    """A manifest as read; every path is absolute."""
+    """A manifest as read; every path is absolute; `sources` are the files of boards and truth that it names."""
 
     name: str
     root: Path
@@ -94,11 +95,16 @@ class Dataset:
     boards: tuple[Board, ...]
     cameras: tuple[CameraEntry, ...]
     pairs: tuple[Pair, ...]
+    sources: tuple[Path, ...] = ()
 
     @property
     def inputs(self) -> tuple[Path, ...]:
-        """The files that a person made, which no result may be written over."""
-        return (self.manifest, *(image for pair in self.pairs for image in (pair.image1, pair.image2)))
+        """The files that work on this data set may read, which no result may be written over."""
+        images = (image for pair in self.pairs for image in (pair.image1, pair.image2))
+        calibrations = (camera.calibration for camera in self.cameras if camera.calibration.is_file())
+        sessions = (camera.session for camera in self.cameras if camera.session is not None)
+        read = (path for session in sessions for path in _files_of(session))
+        return (self.manifest, *self.sources, *images, *calibrations, *read)
 
     @property
     def used_cameras(self) -> frozenset[str]:
@@ -145,7 +151,26 @@ def load_dataset(path: str | Path) -> Dataset:
     if top.has("truth_table"):
         pairs = _with_table(top, pairs)
     top.done()
-    return Dataset(name, source.parent, source, boards, cameras, pairs)
+    named = [table.path_to("file", hint="") for table in top.tables("boards", hint="") if table.has("file")]
+    if top.has("truth_table"):
+        named.append(top.path_to("truth_table", hint=""))
+    return Dataset(
+        name=name,
+        root=source.parent,
+        manifest=source,
+        boards=boards,
+        cameras=cameras,
+        pairs=pairs,
+        sources=tuple(named),
+    )
+
+
+def _files_of(session: Path) -> tuple[Path, ...]:
+    """Return what a calibration from the session reads; of a damaged one itself: that is said where it is needed."""
+    try:
+        return files_of_session(session)
+    except InputError:
+        return (session,)
 
 
 def _board(table: TomlTable) -> Board:

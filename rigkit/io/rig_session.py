@@ -47,7 +47,7 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.truth import MeasuredLength, PairTruth
 from rigkit.identification.board_ids import BOARD_SIDES
-from rigkit.io.session import SCHEMA, Session, boards_of, images_of, options_of
+from rigkit.io.session import SCHEMA, Session, beside_session, boards_of, images_of, options_of
 from rigkit.io.toml_reader import TomlTable, read_toml
 from rigkit.io.truth_file import truth_from_table
 
@@ -109,7 +109,7 @@ class RigSession:
     @property
     def rig_path(self) -> Path:
         """Where the result goes, beside the session: that of one camera is a calibration like any other."""
-        return self.path.parent / ("rig.json" if len(self.cameras) > 1 else "calibration.json")
+        return beside_session(self.path, "rig.json" if len(self.cameras) > 1 else "calibration.json")
 
 
 def is_rig_session(path: str | Path) -> bool:

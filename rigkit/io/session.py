@@ -25,7 +25,16 @@ from rigkit.core.errors import InputError
 from rigkit.io.board_file import load_board
 from rigkit.io.toml_reader import TomlTable, named_path, read_toml
 
-__all__ = ["SCHEMA", "Session", "boards_of", "files_of_session", "images_of", "load_session", "options_of"]
+__all__ = [
+    "SCHEMA",
+    "Session",
+    "beside_session",
+    "boards_of",
+    "files_of_session",
+    "images_of",
+    "load_session",
+    "options_of",
+]
 
 SCHEMA = "rigkit.session/1"
 HINT_BOARD = 'board = "board.toml" (or boards = ["a.toml", "b.toml"])'
@@ -56,14 +65,20 @@ class Session:
 
     @property
     def calibration_path(self) -> Path:
-        """Where the calibration goes: beside the session."""
-        return self.path.parent / "calibration.json"
+        """Where the calibration goes: beside the session, see `beside_session`."""
+        return beside_session(self.path, "calibration.json")
 
     @property
     def corners_path(self) -> Path:
         """Where the corners found are kept, so that calibrating again needs no images."""
         name = "corners.json" if self.camera is None else f"corners-{self.camera}.json"
-        return self.path.parent / name
+        return beside_session(self.path, name)
+
+
+def beside_session(session: Path, name: str) -> Path:
+    """Return where a result of that name goes: of a session that is not called session.toml after the session's name,
+    so that those of two sessions in one folder do not meet."""
+    return session.parent / (name if session.stem == "session" else f"{session.stem}-{name}")
 
 
 def load_session(path: str | Path) -> Session:
@@ -136,7 +151,7 @@ def files_of_session(path: str | Path) -> tuple[Path, ...]:
     for entry in entries:
         out += images_of(entry)
         name = f"-{entry.text('id', hint='id')}" if entry is not table else ""
-        out.append(source.parent / f"corners{name}.json")
+        out.append(beside_session(source, f"corners{name}.json"))
     return tuple(out)
 
 

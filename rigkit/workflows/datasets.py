@@ -27,6 +27,7 @@ from rigkit.core.progress import Progress, silent
 from rigkit.io.calibration_file import calibration_text, is_calibration, load_calibration, load_camera
 from rigkit.io.manifest import CameraEntry, Dataset, Pair, load_dataset
 from rigkit.workflows.calibrate_rig import calibrate_camera
+from rigkit.workflows.results import CALIBRATIONS
 
 __all__ = [
     "DatasetOptions",
@@ -95,10 +96,6 @@ def ready_dataset(dataset: Dataset | str | Path, options: DatasetOptions, reserv
     if missing and len(missing) == len(known.pairs):
         raise missing[0]
     return known
-
-
-CALIBRATIONS = "calibrations"
-"""Folder of results for cameras that were calibrated on the way."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -9,7 +9,10 @@ from pathlib import Path
 from rigkit.core.errors import InputError
 from rigkit.io.files import ensure_folder_writable, ensure_writable, write_together
 
-__all__ = ["free_folder", "require_folder", "write_results"]
+__all__ = ["CALIBRATIONS", "free_folder", "require_folder", "write_results"]
+
+CALIBRATIONS = "calibrations"
+"""Folder of results for cameras that were calibrated on the way."""
 
 
 def free_folder(name: str, *, force: bool) -> Path:
@@ -47,6 +50,8 @@ def write_results(
                 f"cannot write '{path}': a link in '{folder}' leads out of it, to '{path.parent.resolve()}'; remove "
                 "the link, or give another folder"
             )
-    ensure_writable(placed, force=force, inputs=inputs)
+    # A calibration made anew was not read before: with `force` it takes the place of the one that the manifest names.
+    new = {path.resolve() for path in placed if path.relative_to(folder).parts[0] == CALIBRATIONS}
+    ensure_writable(placed, force=force, inputs=[path for path in inputs if Path(path).resolve() not in new])
     write_together(placed, force=force)
     return tuple(placed)

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import os
+import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from helpers.data import REPOSITORY
 
 from rigkit.cli.main import main
+from rigkit.io.manifest import load_dataset
+from rigkit.io.session import files_of_session, load_session
 
 LAB = REPOSITORY / "datasets" / "lab-a"
 LENS = REPOSITORY / "calib" / "cameras" / "mvca020_r61" / "calibration.json"
@@ -70,3 +78,47 @@ def test_no_image_of_a_data_set_is_lost(folder: Path, capsys: pytest.CaptureFixt
     assert main(["reconstruct", ".", "-p", "regular-general", "-o", ".", "--force", "-j", "1"]) == 2
     assert "it would be lost" in capsys.readouterr().err
     assert image.read_bytes() == before
+
+
+def test_no_board_truth_or_session_of_a_data_set_is_lost(folder: Path) -> None:
+    """Whatever a manifest leads to is an input: its boards, its table of truth, sessions, and what these lead to."""
+    (folder / "truth.csv").write_text("pair,quantity,value,sigma,how\n")
+    text = (folder / "dataset.toml").read_text()
+    rest = text[text.index("[[cameras]]") :]
+    rest = rest[rest.index("[[pairs]]") :]
+    text = text[: text.index("[[boards]]")]
+    boards = "".join(f'[[boards]]\nid = "plane{k}"\nfile = "board.toml"\n' for k in (1, 2, 3))
+    cameras = "".join(
+        f'[[cameras]]\nid = "{name}"\ncalibration = "camera.json"\nsession = "session.toml"\n'
+        for name in dict.fromkeys(re.findall(r'camera[12] = "([^"]+)"', rest))
+    )
+    (folder / "dataset.toml").write_text(text + boards + cameras + rest)
+    read = {path.name for path in load_dataset(folder).inputs}
+    assert read >= {"dataset.toml", "board.toml", "session.toml", "camera.json", "corners.json", "view1.png"}
+
+
+def test_two_sessions_in_one_folder_do_not_meet(folder: Path) -> None:
+    shutil.copy(folder / "session.toml", folder / "night.toml")
+    day, night = load_session(folder / "session.toml"), load_session(folder / "night.toml")
+    assert day.calibration_path.name == "calibration.json" and day.corners_path.name == "corners.json"
+    assert night.calibration_path.name == "night-calibration.json"
+    assert night.corners_path.name == "night-corners.json"
+    assert night.corners_path in files_of_session(night.path)
+
+
+@pytest.mark.parametrize("closed", [False, True], ids=["ascii", "stderr closed"])
+def test_streams_that_cannot_take_every_letter(tmp_path: Path, closed: bool) -> None:
+    """Results in ASCII, a file's name that is not UTF-8, nobody who listens to notes: none of it is a bug of ours."""
+    name = os.fsdecode(b"ph\xffoto.png")
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((60, 80), 200, dtype=np.uint8))
+    shutil.copy(LAB / "images" / "regular-general" / "view1.jpg", tmp_path / name)
+    code = "import sys; from rigkit.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    done = subprocess.run(
+        ["sh", "-c", '"$@" 2>&-' if closed else '"$@"', "sh", sys.executable, "-c", code, "detect", name, "-j", "1"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONIOENCODING": "ascii", "PYTHONPATH": str(REPOSITORY)},
+        capture_output=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert b"\\udcff" in done.stdout and b"3 boards in 1 of 1 images" in done.stdout
