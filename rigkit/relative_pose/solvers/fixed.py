@@ -1,5 +1,9 @@
 """Standard stereo and forward motion: no rotation, translation along x or z. With known cameras nothing is left to
-estimate but the scale, and the sign is left to cheirality."""
+estimate but the scale, and the sign is left to cheirality.
+
+Reference: L. Hajder, "Affine Correspondences in Stereo Vision", standard stereo and forward motion. What the printed
+forms leave open, other vertical intrinsics and a roll, `standard.RowsSolver` and `forward.ForwardRollSolver` estimate.
+"""
 
 from __future__ import annotations
 

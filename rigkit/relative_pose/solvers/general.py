@@ -1,4 +1,8 @@
-"""General motion: F by the normalised eight-point method on points and noise-weighted affinities, E by projection."""
+"""General motion: F by the normalised eight-point method on points and noise-weighted affinities, E by projection.
+
+Reference: R. Hartley, "In defense of the eight-point algorithm" (1997); L. Hajder, "Affine Correspondences in Stereo
+Vision", F from points and affinities: one row a point, two an affinity.
+"""
 
 from __future__ import annotations
 

@@ -1,10 +1,13 @@
 """Planar motion: rotation about the vertical axis, translation in the horizontal plane; the global optimum.
 
 E = [[0, e1, 0], [e2, 0, e3], [0, e4, 0]] with e = (-cos phi, cos(phi - theta), -sin(phi - theta), sin phi), that is
-e1^2 + e4^2 = e2^2 + e3^2 = 1. The least squares problem min e^T G e under these two constraints has no duality gap
-(Brickman 1961): min = 2 max_mu lambda_min(G + mu J), J = diag(1, -1, -1, 1), a concave problem in one unknown. It
-replaces the polynomial solvers of Hajder and Barath ("Relative planar motion for vehicle-mounted cameras from a
-single affine correspondence", 2020) and of Guan et al., takes any number of rows, and is batched.
+e1^2 + e4^2 = e2^2 + e3^2 = 1. Rows in normalised coordinates are [x2 y1, y2 x1, y2, y1] of a point and [a1 y1,
+y2 + a3 x1, a3, 0], [x2 + a2 y1, a4 x1, a4, 1] of an affinity [[a1, a2], [a3, a4]].
+
+The least squares problem min e^T G e under these two constraints has no duality gap (Brickman 1961): min = 2 max_mu
+lambda_min(G + mu J), J = diag(1, -1, -1, 1), a concave problem in one unknown. It replaces the polynomial solvers of
+Hajder and Barath ("Relative planar motion for vehicle-mounted cameras from a single affine correspondence", 2020) and
+of Guan et al., takes any number of rows, and is batched.
 """
 
 from __future__ import annotations

@@ -7,9 +7,11 @@ With rays f, ray Jacobians B and the affinity A of a match, on the row-major vec
 
 The affinity's rows are the derivative of the point's row along the surface, in the pixel units of image 1: therefore
 their noise is sigma_A |n2|, far from an epipole, where that of the point's row is sqrt(sigma1^2 |n1|^2 + sigma2^2
-|n2|^2). Homogeneous pixels (u, v, 1) with the Jacobian [I; 0] give the equations on F. Reference: Barath and Hajder;
-Eichhardt and Barath, "Optimal multi-view correction of local affine frames" (central cameras); Hajder, "Affine
-Correspondences in Stereo Vision".
+|n2|^2). Homogeneous pixels (u, v, 1) with the Jacobian [I; 0] give the equations on F.
+
+Reference: D. Barath, L. Hajder, "Efficient recovery of essential matrix from two affine correspondences" (2018), A^T n2
+= -n1; I. Eichhardt, D. Barath, "Optimal multi-view correction of local affine frames" (2019), central cameras; L.
+Hajder, "Affine Correspondences in Stereo Vision", estimation of F from points and affinities.
 """
 
 from __future__ import annotations

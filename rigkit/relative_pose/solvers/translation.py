@@ -1,6 +1,7 @@
 """Pure translation: no rotation, the direction of the translation unknown.
 
-Rows on t: a point gives f1 x f2, an affinity (B1 e_j) x f2 + f1 x (B2 A e_j).
+E = [t]x. Rows on t: a point gives f1 x f2, an affinity (B1 e_j) x f2 + f1 x (B2 A e_j), the derivative of the point's
+row along the surface.
 """
 
 from __future__ import annotations

@@ -2,9 +2,11 @@
 
 A linear solver sees the residual of a row multiplied by its weight. The residual of a point's row has the standard
 deviation sqrt(sigma1^2 |n1|^2 + sigma2^2 |n2|^2), that of an affinity's rows sigma_A |n2|, and what the pixels add
-(n1, n2: gradients of the epipolar constraint by the pixels). Weights are one over these. Equal weights in normalised
-coordinates, which the literature uses, make the pose worse than points alone as soon as there are more than a few
-points; they are kept as the rule "equal" for replication.
+(n1, n2: gradients of the epipolar constraint by the pixels). Weights are one over these.
+
+Erratum: L. Hajder, "Affine Correspondences in Stereo Vision", expects affinities to improve F, with equal weights in
+normalised coordinates. With more than a few points these make the pose worse than points alone; they are kept as the
+rule "equal" for replication.
 """
 
 from __future__ import annotations
