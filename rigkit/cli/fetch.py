@@ -1,0 +1,60 @@
+"""`rigkit fetch NAME`: a public capture with measured truth."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+__all__ = ["HELP", "add_arguments", "run"]
+
+HELP = "public captures with measured truth: list them, or fetch one"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("names", nargs="*", metavar="NAME", help="of public captures; none: list them all")
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        metavar="DIR",
+        help="folder of captures (default: RIGKIT_DATA, or this user's cache)",
+    )
+    parser.add_argument(
+        "--catalogue", type=Path, metavar="DIR", help="folder with their descriptions (default: datasets/public)"
+    )
+    parser.add_argument("--json", action="store_true", help="print the result for programs")
+
+
+def run(args: argparse.Namespace) -> int:
+    from rigkit.cli.console import note, print_json, progress_on_stderr
+    from rigkit.core.errors import ExitCode, InputError
+    from rigkit.workflows.truth import fetch_public_set, public_sets
+
+    known = public_sets(args.catalogue)
+    for name in args.names:
+        if name not in known:
+            raise InputError(f"no public capture is called '{name}'; there are {', '.join(known)}")
+    if not args.names:
+        listed = {
+            name: {"about": one.about, "licence": one.licence, "source": one.source, "fetchable": len(one.urls)}
+            for name, one in known.items()
+        }
+        if args.json:
+            print_json(listed)
+        for name, one in known.items() if not args.json else ():
+            print(f"{name}: {one.about} ({one.licence}; {len(one.urls)} of {len(one.sha256)} files fetchable)")
+        return ExitCode.WELL
+    done = [fetch_public_set(known[name], args.output, progress=progress_on_stderr()) for name in args.names]
+    if args.json:
+        print_json(
+            {d.described.name: {"folder": str(d.folder), "present": len(d.present), "missing": d.missing} for d in done}
+        )
+    for one in done:
+        if not args.json:
+            print(f"{one.described.name}: {len(one.present)} files in {one.folder}, {len(one.fetched)} of them new")
+        if one.missing:
+            note(
+                f"{one.described.name}: {len(one.missing)} files are not fetchable yet, such as '{one.missing[0]}'; "
+                f"get them from {one.described.source}"
+            )
+    return ExitCode.CHECK_FAILED if any(one.missing for one in done) else ExitCode.WELL
