@@ -49,12 +49,12 @@ def run(args: argparse.Namespace) -> int:
         print_json(
             {d.described.name: {"folder": str(d.folder), "present": len(d.present), "missing": d.missing} for d in done}
         )
-    for one in done:
+    for d in done:
         if not args.json:
-            print(f"{one.described.name}: {len(one.present)} files in {one.folder}, {len(one.fetched)} of them new")
-        if one.missing:
+            print(f"{d.described.name}: {len(d.present)} files in {d.folder}, {len(d.fetched)} of them new")
+        if d.missing:
             note(
-                f"{one.described.name}: {len(one.missing)} files are not fetchable yet, such as '{one.missing[0]}'; "
-                f"get them from {one.described.source}"
+                f"{d.described.name}: {len(d.missing)} files are not fetchable yet, such as '{d.missing[0]}'; "
+                f"get them from {d.described.source}"
             )
-    return ExitCode.CHECK_FAILED if any(one.missing for one in done) else ExitCode.WELL
+    return ExitCode.CHECK_FAILED if any(d.missing for d in done) else ExitCode.WELL

@@ -102,10 +102,10 @@ def load_public_set(path: str | Path) -> PublicSet:
     """Return the description of a public capture; raises InputError for a missing or unknown key, a path that leaves
     the set, something that is no hash or address, or an address of a file that is not listed."""
     table = read_toml(path, SCHEMA)
-    boards = ()
+    boards: tuple[Board, ...] = ()
     if table.has("boards"):
         boards = tuple(_board(entry) for entry in table.tables("boards", hint="[[boards]] with id, columns, rows"))
-    measured = ()
+    measured: tuple[PublicMeasurement, ...] = ()
     if table.has("measured"):
         entries = table.tables("measured", hint="[[measured]] with id, value, unit and how")
         measured = tuple(_measurement(entry) for entry in entries)
