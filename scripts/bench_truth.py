@@ -15,7 +15,7 @@ import importlib.util
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -95,6 +95,8 @@ class Bench:
     found: FetchedSet
     work: Path
     model: str
+    most: int | None = None
+    """Most images of boards a camera, spread evenly; None: all."""
 
     @property
     def name(self) -> str:
@@ -104,10 +106,17 @@ class Bench:
     def board(self) -> Board:
         return self.found.described.boards[0]
 
+    def images(self, pattern: str) -> tuple[Path, ...]:
+        """Return the images of boards, at most as many as asked for."""
+        found = self.found.files(pattern)
+        if self.most is None or len(found) <= self.most:
+            return found
+        return tuple(found[k] for k in np.linspace(0, len(found) - 1, self.most).astype(int))
+
     def session(self, pattern: str, camera: str | None = None) -> Session:
         path = self.work / f"{self.name}.toml"
         boards = self.found.described.boards
-        return Session(path, self.found.files(pattern), boards, self.model, None, "auto", camera)
+        return Session(path, self.images(pattern), boards, self.model, None, "auto", camera)
 
     def alone(self, pattern: str, camera: str | None = None) -> SessionCalibration:
         output = self.work / f"{self.name}-{camera or 'camera'}.json"
@@ -148,7 +157,7 @@ def caliper_board(bench: Bench) -> Iterator[Row]:
     found = bench.alone("*.png").calibration
     yield from caliper_rows(bench, f"{RIGKIT} ({found.boards[0].kind})", found.boards[0].points_mm)
     yield bench.row("held-out rms", RIGKIT, found.heldout_rms_px or np.nan)
-    views, size_px = peers.opencv_views(bench.found.files("*.png"), bench.board)
+    views, size_px = peers.opencv_views(bench.images("*.png"), bench.board)
     rms, points = peers.opencv_released(views, size_px)
     yield from caliper_rows(bench, "OpenCV (calibrateCameraRO)", points)
     yield bench.row("rms of the fit", "OpenCV (calibrateCameraRO)", rms)
@@ -160,8 +169,8 @@ def stereo_rows(bench: Bench, left: str, right: str, lengths: Sequence[str]) -> 
     for what in lengths:
         yield bench.against(what, RIGKIT, length, sigma)
     yield bench.row("held-out rms", RIGKIT, rig.heldout_rms_px or np.nan)
-    views1, size_px = peers.opencv_views(bench.found.files(left), bench.board)
-    views2, _ = peers.opencv_views(bench.found.files(right), bench.board)
+    views1, size_px = peers.opencv_views(bench.images(left), bench.board)
+    views2, _ = peers.opencv_views(bench.images(right), bench.board)
     rms, _, pose = peers.opencv_stereo(views1, views2, size_px)
     for what in lengths:
         yield bench.against(what, "OpenCV (stereoCalibrate)", float(np.linalg.norm(pose.translation_mm)))
@@ -184,7 +193,7 @@ def simplestereo(bench: Bench) -> Iterator[Row]:
         found = calibrate_session(camera, CalibrateOptions(cache=Cache.UPDATE)).calibration
         sigma = float(found.parameter_sigmas[0])
         yield bench.against("focal length", f"{RIGKIT} (brown), {side}", float(found.camera.parameters[0]), sigma)
-        views, size_px = peers.opencv_views(bench.found.files(f"calib/*_{side}.png"), bench.board)
+        views, size_px = peers.opencv_views(bench.images(f"calib/*_{side}.png"), bench.board)
         _, other = peers.opencv_camera(views, size_px, False)
         yield bench.against("focal length", f"OpenCV, {side}", float(other.parameters[0]))
 
@@ -241,7 +250,7 @@ def one_camera(pattern: str, fisheye: bool, whole: str | None) -> Callable[[Benc
         published = None if whole is None else bench.found.described.measurement(whole)
         fits = {RIGKIT: found.rms_px}
         if bench.board.markers is None:
-            views, size_px = peers.opencv_views(bench.found.files(pattern), bench.board)
+            views, size_px = peers.opencv_views(bench.images(pattern), bench.board)
             try:
                 fits[f"OpenCV ({len(views)} images)"] = peers.opencv_camera(views, size_px, fisheye)[0]
             except peers.cv2.error as error:
@@ -283,10 +292,11 @@ def cylinder(bench: Bench) -> Iterator[Row]:
     cameras = []
     for name, start in CYLINDER_SEEN.items():
         found = bench.alone(f"{name}/*.jpg", name).calibration
-        yield bench.row(f"held-out rms, camera {name}", RIGKIT, found.heldout_rms_px or np.nan)
+        of = f"{len(bench.images(f'{name}/*.jpg'))} of {len(bench.found.files(f'{name}/*.jpg'))} images of boards"
+        yield bench.row(f"held-out rms, camera {name}", RIGKIT, found.heldout_rms_px or np.nan, how=of)
         image = read_image(bench.found.files(f"{name}.jpg")[0])
         marks.append(mark_lattice(image, np.array(start), CYLINDER_ROWS))
-        views, size_px = peers.opencv_views(bench.found.files(f"{name}/*.jpg"), bench.board)
+        views, size_px = peers.opencv_views(bench.images(f"{name}/*.jpg"), bench.board)
         cameras.append(peers.opencv_camera(views, size_px, False)[1])
     keys, pixels1, pixels2, A21 = lattice_affinities(marks[0], marks[1])
     path = bench.work / "cylinder-marks.npz"
@@ -385,6 +395,16 @@ def as_json(rows: Sequence[Row]) -> list[dict[str, Any]]:
     return [asdict(row) | {"error": row.error, "in_sigmas": row.in_sigmas} for row in rows]
 
 
+def merged(path: Path, rows: Sequence[Row]) -> list[Row]:
+    """Return the rows with those that a file has of other sets, in the order of the sets."""
+    new = {row.set for row in rows}
+    names = [field.name for field in fields(Row)]
+    kept = (
+        [Row(**{name: one[name] for name in names}) for one in json.loads(path.read_text())] if path.is_file() else []
+    )
+    return sorted([*rows, *(row for row in kept if row.set not in new)], key=lambda row: list(BENCHES).index(row.set))
+
+
 def with_table(page: str, table: str) -> str:
     """Return the page with the table in place of the one between its marks."""
     begin, end = "<!-- table: begin -->\n", "<!-- table: end -->"
@@ -397,7 +417,8 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=None, help="folder of captures; default: RIGKIT_DATA or the cache")
     parser.add_argument("--work", type=Path, default=Path("/tmp/rigkit-bench-truth"), help="corners and calibrations")
     parser.add_argument("--model", default="scaramuzza", help="rigkit's, of all sets")
-    parser.add_argument("--json", type=Path, help="write the table for programs")
+    parser.add_argument("--most", type=int, help="images of boards a camera, spread evenly; default: all")
+    parser.add_argument("--json", type=Path, help="put the rows of these sets into this file; it keeps other sets'")
     parser.add_argument("--markdown", type=Path, help="write the table between the marks of this page")
     args = parser.parse_args()
     args.work.mkdir(parents=True, exist_ok=True)
@@ -411,13 +432,14 @@ def main() -> None:
             continue
         own = list[Row]()
         try:
-            for row in BENCHES[name](Bench(found, args.work, args.model)):
+            for row in BENCHES[name](Bench(found, args.work, args.model, args.most)):
                 own.append(row)
         except RigkitError as error:
             print(f"{name}: {error}")
         print(markdown(own), flush=True)
         rows += own
     if args.json:
+        rows = merged(args.json, rows)
         args.json.write_text(json.dumps(as_json(rows), indent=1) + "\n")
     if args.markdown:
         args.markdown.write_text(with_table(args.markdown.read_text(), markdown(rows)))
