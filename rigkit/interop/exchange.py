@@ -11,7 +11,6 @@ import numpy as np
 from rigkit.cameras.base import MAX_SIDE_PX, Camera
 from rigkit.cameras.convert import convert_camera
 from rigkit.cameras.registry import camera_model
-from rigkit.cameras.ucm import UCM
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 
@@ -179,4 +178,4 @@ def unified_from_xi(size_px: tuple[int, int], xi: float, core: FloatArray, name:
     """
     if not xi >= 0.0:
         raise InputError(f"'{name}': xi = {xi:g}, which is never negative; calibrate again")
-    return UCM(size_px, np.array([*(core[:2] / (1.0 + xi)), *core[2:], xi / (1.0 + xi)]))
+    return camera_of("ucm", size_px, np.array([*(core[:2] / (1.0 + xi)), *core[2:], xi / (1.0 + xi)]), name)

@@ -114,6 +114,8 @@ def _from_ocam(
         raise InputError(f"'{name}': a polynomial of degree {polynomial.size - 1}; rigkit takes {degrees}")
     if polynomial[0] <= 0.0 or polynomial[1] != 0.0:
         raise InputError(f"'{name}': the polynomial must look forward and have no linear term; is it OCamCalib's?")
+    if not abs(np.linalg.det(affine)) > 0.0:
+        raise InputError(f"'{name}': the affine parameters put all pixels on one line; is the file whole?")
     # affine = [[c, d], [0, 1]] scale rotation: the last row of the triangle is (0, scale).
     scale = float(np.linalg.norm(affine[1]))
     cosine, sine = affine[1, 1] / scale, -affine[1, 0] / scale
@@ -124,7 +126,10 @@ def _from_ocam(
     cam_from_ocam = np.zeros((3, 3))
     cam_from_ocam[:2, :2] = rotation @ np.array([[0.0, 1.0], [1.0, 0.0]])
     cam_from_ocam[2, 2] = -1.0
-    return Scaramuzza(size_px, parameters), cam_from_ocam
+    try:
+        return Scaramuzza(size_px, parameters), cam_from_ocam
+    except InputError as error:
+        raise InputError(f"'{name}': {error}; is the file whole?") from error
 
 
 def _scaramuzza(camera: Camera) -> Chosen:

@@ -176,7 +176,9 @@ def _files_of(session: Path) -> tuple[Path, ...]:
 def _board(table: TomlTable) -> Board:
     board_id = table.identifier("id", hint='id = "plane1"')
     if table.has("file"):
-        board = replace(load_board(table.path_to("file", hint='file = "board.toml"')), board_id=board_id)
+        path = table.path_to("file", hint='file = "board.toml"')
+        with table.located():
+            board = replace(load_board(path), board_id=board_id)
     else:
         board = board_from_table(table, board_id)
     table.done()

@@ -42,7 +42,7 @@ def read_bytes(path: str | Path, what: str = "", *, max_bytes: int = MAX_BINARY_
     pipe or a device, or has more than `max_bytes`.
     """
     source = usable_path(path)
-    name = f"{what} '{source}'" if what else f"'{source}'"
+    name = _named(source, what)
     try:
         status = source.stat()
         if stat.S_ISDIR(status.st_mode):
@@ -67,6 +67,11 @@ def read_text(path: str | Path, what: str = "", *, max_bytes: int = MAX_TEXT_BYT
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        name = f"{what} '{path}'" if what else f"'{path}'"
-        raise InputError(f"{name} cannot be read: not UTF-8 text; save it as UTF-8") from error
+        raise InputError(f"{_named(path, what)} cannot be read: not UTF-8 text; save it as UTF-8") from error
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def _named(path: str | Path, what: str) -> str:
+    """Return what the file is and its name, in one line whatever characters the name has."""
+    shown = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(path))
+    return f"{what} '{shown}'" if what else f"'{shown}'"

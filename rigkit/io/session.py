@@ -160,9 +160,11 @@ def boards_of(table: TomlTable) -> tuple[Board, ...]:
     if table.has("boards"):
         if table.has("board"):
             raise table.error("'board' and 'boards'; keep one of the two")
-        boards = tuple(load_board(table.beside(name)) for name in table.texts("boards", hint=HINT_BOARD))
+        paths = [table.beside(name) for name in table.texts("boards", hint=HINT_BOARD)]
     else:
-        boards = (load_board(table.path_to("board", hint=HINT_BOARD)),)
+        paths = [table.path_to("board", hint=HINT_BOARD)]
+    with table.located():
+        boards = tuple(load_board(path) for path in paths)
     ids = [board.board_id for board in boards]
     if len(set(ids)) < len(ids):
         raise table.error("two boards have the same id; give one of the files another 'id'")

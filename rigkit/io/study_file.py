@@ -56,7 +56,8 @@ def load_study(path: str | Path) -> Study:
     if top.has("claims"):
         options["claims"] = tuple(_claim(t) for t in top.tables("claims", hint='[[claims]] with text = "..."'))
     top.done()
-    return Study(name=name, **options)
+    with top.located():
+        return Study(name=name, **options)
 
 
 def _noise(table: TomlTable) -> dict[str, Any]:

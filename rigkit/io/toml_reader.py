@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import difflib
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +69,14 @@ class TomlTable:
         """Return an error that starts with the file and the table."""
         place = f"{self.path}: {self.where}: " if self.where else f"{self.path}: "
         return InputError(place + message)
+
+    @contextmanager
+    def located(self) -> Iterator[None]:
+        """Let complaints of the block start with the file and the table."""
+        try:
+            yield
+        except InputError as error:
+            raise self.error(str(error)) from error
 
     def has(self, key: str) -> bool:
         """Say whether the key is there, and make it a known one."""

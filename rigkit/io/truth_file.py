@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
@@ -26,7 +25,7 @@ def truth_from_table(table: TomlTable, boards: Sequence[Board]) -> PairTruth:
         inner = table.table("baseline", hint=HINT_BASELINE)
         measured = _value(inner, "mm")
         inner.done()
-        with _located(inner):
+        with inner.located():
             baseline = MeasuredLength(*measured)
     angles = []
     if table.has("angles"):
@@ -34,7 +33,7 @@ def truth_from_table(table: TomlTable, boards: Sequence[Board]) -> PairTruth:
             a, b = (inner.text(key, hint=f'{key} = "{boards[0].board_id}"') for key in "ab")
             measured = _value(inner, "deg")
             inner.done()
-            with _located(inner):
+            with inner.located():
                 angles.append(make_angle(a, b, *measured, boards))
     distances = []
     if table.has("distances"):
@@ -42,7 +41,7 @@ def truth_from_table(table: TomlTable, boards: Sequence[Board]) -> PairTruth:
             a, b = (inner.text(key, hint=f'{key} = "{boards[0].board_id}.centre"') for key in "ab")
             measured = _value(inner, "mm")
             inner.done()
-            with _located(inner):
+            with inner.located():
                 distances.append(make_distance(a, b, *measured, boards))
     table.done()
     return PairTruth(baseline, tuple(angles), tuple(distances))
@@ -90,12 +89,3 @@ def _value(table: TomlTable, unit: str) -> tuple[float, float, str]:
     value = table.number(f"value_{unit}", hint=f"value_{unit} = 90.0" if unit == "deg" else f"value_{unit} = 300.0")
     sigma = table.number(f"sigma_{unit}", hint=f"sigma_{unit} = 0.5: how far off the measurement may well be")
     return value, sigma, table.text("how", hint='how = "steel rule": by what it was measured')
-
-
-@contextmanager
-def _located(table: TomlTable) -> Iterator[None]:
-    """Say where in the file a complaint belongs."""
-    try:
-        yield
-    except InputError as error:
-        raise table.error(str(error)) from error

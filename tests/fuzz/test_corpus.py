@@ -1,0 +1,75 @@
+"""Every damaged input that once ended badly ends well, and the harness that finds them would say so if it did not."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "scripts"))
+
+import fuzz  # noqa: E402
+import fuzz_seeds  # noqa: E402
+
+CORPUS = ROOT / "tests" / "corpus"
+CASES = sorted(path for path in CORPUS.rglob("*") if path.is_file())
+
+
+@pytest.fixture(scope="module")
+def seeds(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("fuzz") / "seeds"
+    fuzz_seeds.write_seeds(folder)
+    return folder
+
+
+@pytest.mark.parametrize("damaged", CASES, ids=lambda path: str(path.relative_to(CORPUS)))
+def test_what_once_ended_badly(damaged: Path, seeds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing but a result, or one line that names the file, comes of it in any of its readers."""
+    shutil.copytree(seeds, tmp_path / "place")
+    (tmp_path / "place" / "out").mkdir()
+    monkeypatch.chdir(tmp_path / "place")
+    case = f"case{damaged.suffix}"
+    shutil.copy(damaged, case)
+    for reader in fuzz.KINDS[damaged.parent.name].readers:
+        words = [word.replace("{case}", case).replace("{out}", "out") for word in reader]
+        assert fuzz.fault_of(words, case, sound=False) is None, words
+
+
+def test_cases_depend_on_seed_class_and_number_alone(seeds: Path, tmp_path: Path) -> None:
+    kind = fuzz.KINDS["board"]
+    words = [fuzz.case_of(kind, "board", 7, 40, seeds, tmp_path / name) for name in ("a", "b", "c")]
+    texts = [(tmp_path / name / "case.toml").read_bytes() for name in ("a", "b")]
+    assert words[0] == words[1] and texts[0] == texts[1]
+    assert texts[0] != (seeds / "board.toml").read_bytes()
+
+
+def test_faults_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An exception of another kind, a message without the file's name, and an exit code for bugs."""
+
+    def raising(error: Exception) -> object:
+        def reader(*_: object) -> None:
+            raise error
+
+        return reader
+
+    import fuzz_api
+
+    from rigkit.cli import main as cli
+    from rigkit.core.errors import InputError
+
+    call = ["fuzz_api:read_vnl", "case.toml"]
+    for error, said in (
+        (ValueError("bad"), "ValueError: bad"),
+        (InputError("no name"), "does not name"),
+        (InputError("case.toml: two\nlines"), "several lines"),
+    ):
+        monkeypatch.setattr(fuzz_api, "read_vnl", raising(error))
+        assert said in str(fuzz.fault_of(call, "case.toml", sound=False))
+    monkeypatch.setattr(fuzz_api, "read_vnl", raising(InputError("case.toml: one line")))
+    assert fuzz.fault_of(call, "case.toml", sound=False) is None
+    assert "though sound" in str(fuzz.fault_of(call, "case.toml", sound=True))
+    monkeypatch.setattr(cli, "build_parser", raising(ValueError("bad")))
+    assert "exit 70" in str(fuzz.fault_of(["export"], None, sound=False))
