@@ -81,7 +81,7 @@ def _calls() -> list[Call]:
         (rigkit.detect_boards, {"image": image, "boards": [SMALL], "min_corners": 12}),
         (rigkit.complete_boards, {"image": image, "detections": [d], "boards": [SMALL]}),
         (rigkit.rectify_map, {"camera": cameras[1], "target": cameras[0], "target_from_cam": np.eye(3)}),
-        (rigkit.DirectionPairs, {"directions1": directions, "directions2": directions}),
+        (rigkit.DirectionPairs, {"directions1": directions, "directions2": directions, "valid": np.ones((n, 2), bool)}),
         (rigkit.normals_from_affines, {"J1": np.ones((n, 2, 3)), "J2": np.ones((n, 2, 3)), "A21": directions}),
     ]
     return calls

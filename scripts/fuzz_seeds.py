@@ -175,6 +175,8 @@ def _write_calibrations(folder: Path) -> None:
         # f(rho) / a0 stays the same function of rho / a0.
         power = 1 if name in ("a0", "cx", "cy") else 1 - int(name[1:]) if name[1:].isdigit() else 0
         values[name] *= scale**power
+    for view in data["views"]:
+        view["pixels"] = [[scale * u, scale * v] for u, v in view["pixels"]]
     (folder / "calibration.json").write_text(json.dumps(data))
     pinhole = {"fx": 150.0, "fy": 150.0, "cx": 79.5, "cy": 59.5}
     model = {"model": "pinhole", "size_px": list(SIZE_PX), "parameters": pinhole}

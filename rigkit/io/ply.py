@@ -127,16 +127,19 @@ def read_ply(path: str | Path) -> OrientedCloud:
     def column(name: str, default: float) -> NDArray[np.generic]:
         return np.asarray(table[name]) if name in names else np.full(count, default)
 
-    return OrientedCloud(
-        np.stack([table[name] for name in POINT], axis=-1).astype(np.float64),
-        np.stack([table[name] for name in NORMAL], axis=-1).astype(np.float64),
-        np.stack([column(name, 128) for name in COLOUR], axis=-1).astype(np.uint8),
-        column("board", -1).astype(np.int64),
-        np.stack([column("column", 0), column("row", 0)], axis=-1).astype(np.int64),
-        column("sigma_mm", np.nan).astype(np.float64),
-        np.deg2rad(column("normal_sigma_deg", np.nan).astype(np.float64)),
-        board_ids,
-    )
+    try:
+        return OrientedCloud(
+            np.stack([table[name] for name in POINT], axis=-1).astype(np.float64),
+            np.stack([table[name] for name in NORMAL], axis=-1).astype(np.float64),
+            np.stack([column(name, 128) for name in COLOUR], axis=-1).astype(np.uint8),
+            column("board", -1).astype(np.int64),
+            np.stack([column("column", 0), column("row", 0)], axis=-1).astype(np.int64),
+            column("sigma_mm", np.nan).astype(np.float64),
+            np.deg2rad(column("normal_sigma_deg", np.nan).astype(np.float64)),
+            board_ids,
+        )
+    except InputError as error:
+        raise InputError(f"point cloud '{source}': {error}") from error
 
 
 def _header(data: bytes, source: Path) -> tuple[int, list[tuple[str, str]], tuple[str, ...], int]:
