@@ -152,6 +152,11 @@ def test_missing_corners(support: str, window: int | None, rng: np.random.Genera
     assert np.isnan(found.vectors[~found.valid]).all()
 
 
+TANGENT_CHORD_REL = 0.05
+"""Chords are taken in the tangent plane at each corner; in the image plane of a perspective view they are longer or
+shorter by what the plane is turned within a square."""
+
+
 def test_chords_are_the_papers(rng: np.random.Generator) -> None:
     """Those of the synthetic study in perspective images, border and all; in angle they are exact."""
     camera = Pinhole((1624, 1240), np.array([1350.0, 1350.0, 805.0, 622.0]))
@@ -160,7 +165,10 @@ def test_chords_are_the_papers(rng: np.random.Generator) -> None:
     found = direction_field(detection(BOARD, pixels), camera, support="chord")
     expected = chord_directions(pixels.reshape(BOARD.rows, BOARD.columns, 2)).reshape(-1, 3, 2)
     assert found.valid.all()
-    assert found.vectors == pytest.approx(expected, rel=1e-7, abs=1e-7)
+    assert angle_errors(found.vectors, expected).max() < 1e-6
+    assert np.linalg.norm(found.vectors, axis=-1) == pytest.approx(
+        np.linalg.norm(expected, axis=-1), rel=TANGENT_CHORD_REL
+    )
     truth = true_directions(scene, BOARD, 1)
     assert angle_errors(found.vectors, truth).max() < 1e-6
     length = np.linalg.norm(found.vectors, axis=-1) / np.linalg.norm(truth, axis=-1)

@@ -102,7 +102,7 @@ def test_a_wrongly_declared_pose_type_is_named(monkeypatch: pytest.MonkeyPatch) 
 
     (note,) = reconstruct_pair(pair, pose_type="forward").notes[:1]
     assert re.search(words.replace("standard", "forward"), note)
-    monkeypatch.setattr("rigkit.reconstruction.reconstruct.metric_pose", no_scale)
+    monkeypatch.setattr("rigkit.reconstruction.geometry.metric_pose", no_scale)
     with pytest.raises(DegenerateError, match=f"no scale.*{words}"):
         reconstruct_pair(pair, pose_type="standard", level_sigma_rad=np.radians(0.2))
 
