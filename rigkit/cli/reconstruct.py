@@ -30,11 +30,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_direction_arguments(parser)
     add_scene_arguments(parser)
     parser.add_argument("--method", choices=METHODS, default="3SDIR", help="affine estimator (default 3SDIR)")
+    parser.add_argument(
+        "--planes",
+        choices=("free", "lattice"),
+        default="free",
+        help="each point and normal by itself (default), or on the boards' known lattices, fitted to both images",
+    )
     parser.add_argument("--no-pictures", action="store_true", help="leave out PNG pictures")
 
 
 def run(args: argparse.Namespace) -> int:
     if is_scene(args):
+        if args.planes != "free":
+            raise InputError("reconstruct: --planes is about boards, and a scene has none")
         if direction_options(args):
             raise InputError("reconstruct: --directions and --det-scale are about boards, and a scene has none")
         return run_scene(args)
@@ -43,7 +51,13 @@ def run(args: argparse.Namespace) -> int:
 
     dataset = load_dataset(args.dataset)
     common = dataset_options(args, dataset.name)
-    options = ReconstructOptions(**common, **direction_options(args), method=args.method, pictures=not args.no_pictures)
+    options = ReconstructOptions(
+        **common,
+        **direction_options(args),
+        method=args.method,
+        planes=args.planes,
+        pictures=not args.no_pictures,
+    )
     done = reconstruct_dataset(dataset, options, progress=progress_on_stderr())
     results = [_summary(pair) for pair in done.pairs]
     for r in results:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.core.arrays import FloatArray, IntArray, Normals, Points, as_array, as_indices
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Normals, Points, as_array, as_indices
 from rigkit.core.errors import InputError
 
 __all__ = ["OrientedCloud"]
@@ -27,6 +27,8 @@ class OrientedCloud:
     sigma_mm : (N,) predicted standard deviation of the point (root of the covariance's largest eigenvalue).
     normal_sigma_rad : (N,) predicted rms angle of the normal.
     board_ids : names of the boards.
+    calibration_in_sigmas : whether the sigmas include the uncertainty of the cameras' calibrations; else the cameras
+        count as exact, and the corners' noise and the relative pose are all that is in them.
     """
 
     points_mm: Points
@@ -37,6 +39,7 @@ class OrientedCloud:
     sigma_mm: FloatArray
     normal_sigma_rad: FloatArray
     board_ids: tuple[str, ...]
+    calibration_in_sigmas: bool = False
 
     def __post_init__(self) -> None:
         n = len(np.asarray(self.points_mm))
@@ -55,6 +58,11 @@ class OrientedCloud:
 
     def __len__(self) -> int:
         return len(self.points_mm)
+
+    def select(self, mask: BoolArray) -> OrientedCloud:
+        """Return the points at a mask (N,)."""
+        rows = ("points_mm", "normals", "colours", "board_index", "grid", "sigma_mm", "normal_sigma_rad")
+        return replace(self, **{name: getattr(self, name)[mask] for name in rows})
 
     def on_board(self, board_id: str) -> NDArray[np.bool_]:
         """Return the mask of the points on one board."""

@@ -41,6 +41,12 @@ POINT = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")
 COLOUR = ("red", "green", "blue")
 BOARD_COMMENT = "board "
+SIGMAS = "sigmas: noise of the corners and of the relative pose"
+SIGMAS_COMMENT = {
+    True: f"{SIGMAS}, and the covariance of the calibrations",
+    False: f"{SIGMAS}; the calibrations count as exact",
+}
+"""What the sigmas include, by `OrientedCloud.calibration_in_sigmas`."""
 
 
 def write_ply(
@@ -89,6 +95,7 @@ def ply_bytes(
     for name, _, values in columns:
         table[name] = values
     notes = ["rigkit oriented point cloud", f"units {unit}", "frame camera 1: x right, y down, z forward"]
+    notes.append(SIGMAS_COMMENT[cloud.calibration_in_sigmas])
     notes += [f"{BOARD_COMMENT}{i} {_one_line(board_id)}" for i, board_id in enumerate(cloud.board_ids)]
     notes += [_one_line(line) for line in comments]
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in notes)]
@@ -137,6 +144,7 @@ def read_ply(path: str | Path) -> OrientedCloud:
             column("sigma_mm", np.nan).astype(np.float64),
             np.deg2rad(column("normal_sigma_deg", np.nan).astype(np.float64)),
             board_ids,
+            f"\ncomment {SIGMAS_COMMENT[True]}\n".encode() in data[:start],
         )
     except InputError as error:
         raise InputError(f"point cloud '{source}': {error}") from error

@@ -7,8 +7,8 @@ corner; affinities and epipolar geometry give normals.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,20 +21,35 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import Affines, BoolArray, FloatArray, Mat3, Pixels, in_8_bits
 from rigkit.core.boards import Board
 from rigkit.core.cloud import OrientedCloud
-from rigkit.core.errors import DegenerateError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.sampson import sampson_distances
 from rigkit.reconstruction.geometry import PairGeometry, pair_geometry
+from rigkit.reconstruction.lattice_planes import LatticePlanes, lattice_planes
 from rigkit.reconstruction.metric import TriangulatedPoints
+from rigkit.relative_pose.solvers.pose import essential_from_pose
 
 if TYPE_CHECKING:
     from rigkit.reconstruction.pairing import MatchedPair
 
-__all__ = ["Reconstruction", "colours_at", "oriented_cloud", "reconstruct_from", "reconstruct_pair"]
+__all__ = [
+    "PLANES",
+    "Planes",
+    "Reconstruction",
+    "colours_at",
+    "on_lattice",
+    "oriented_cloud",
+    "reconstruct_from",
+    "reconstruct_pair",
+]
 
 GREY = 160
+Planes = Literal["free", "lattice"]
+"""What points and normals of a cloud are: each by itself, or those of the boards' known lattices."""
+PLANES: tuple[Planes, ...] = get_args(Planes)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -98,13 +113,18 @@ def reconstruct_pair(
     level_sigma_rad: float | None = None,
     scale: str = "area",
     image1: NDArray[np.generic] | None = None,
+    planes: Planes = "free",
 ) -> Reconstruction:
     """Reconstruct one pair with one affine estimator: `pair_geometry`, then `reconstruct_from`.
 
-    Parameters, errors : of those two. For several estimators compute the geometry once.
+    Parameters, errors : of those two. For several estimators compute the geometry once. With `planes` "lattice" the
+    points and normals are those of the boards' known lattices (`on_lattice`), the intrinsics exact.
     """
+    if planes not in PLANES:
+        raise InputError(f"planes: '{planes}' is unknown; known: {', '.join(PLANES)}")
     geometry = pair_geometry(pair, pose_type=pose_type, level_sigma_rad=level_sigma_rad)
-    return reconstruct_from(geometry, affine_method=affine_method, scale=scale, image1=image1)
+    free = reconstruct_from(geometry, affine_method=affine_method, scale=scale, image1=image1)
+    return free if planes == "free" else on_lattice(free, lattice_planes(geometry))
 
 
 def reconstruct_from(
@@ -176,6 +196,70 @@ def reconstruct_from(
         geometry=geometry,
         kept=kept,
     )
+
+
+def on_lattice(reconstruction: Reconstruction, planes: LatticePlanes) -> Reconstruction:
+    """Return the reconstruction with the points, normals and pose that the boards' lattices give.
+
+    Points of one board share the errors of its pose: their sigmas are each point's own, and planes fitted to them look
+    more certain than they are. `planes` says how certain the boards' planes are. Points of boards that are not in
+    `planes` are left out, and a note says so.
+
+    Raises
+    ------
+    DegenerateError
+        No point is on a board of `planes`.
+    """
+    cloud, names = reconstruction.cloud, reconstruction.cloud.board_ids
+    known = np.array([name in planes.board_ids for name in names])
+    placed = (cloud.board_index >= 0) & known[cloud.board_index]
+    if not placed.any():
+        raise DegenerateError(f"pair '{reconstruction.pair_id}': no point is on a board whose lattice was fitted")
+    baseline_mm, baseline_sigma_mm = planes.baseline_mm()
+    lost = [name for name, fitted in zip(names, known, strict=True) if not fitted]
+    told = f"left out, for their lattices could not be fitted: {', '.join(lost)}"
+    pixels1, pixels2 = reconstruction.pixels1[placed], reconstruction.pixels2[placed]
+    m = Matches.from_cameras(reconstruction.camera1, reconstruction.camera2, pixels1, pixels2)
+    E21 = essential_from_pose(planes.cam2_from_cam1)
+    distances = sampson_distances(E21, m.rays1, m.rays2, m.jacobians1, m.jacobians2)
+    return replace(
+        reconstruction,
+        matches=reconstruction.matches.select(placed),
+        pixels1=pixels1,
+        pixels2=pixels2,
+        cam2_from_cam1=planes.cam2_from_cam1,
+        pose_covariance=planes.full_covariance[:6, :6],
+        E21=E21,
+        sampson_rms_px=float(np.sqrt(np.mean(distances**2))),
+        cloud=_cloud_on_lattice(reconstruction, planes, placed),
+        baseline_mm=baseline_mm,
+        baseline_sigma_mm=baseline_sigma_mm,
+        notes=(*reconstruction.notes, told) if lost else reconstruction.notes,
+        kept=None,
+    )
+
+
+def _cloud_on_lattice(reconstruction: Reconstruction, planes: LatticePlanes, placed: BoolArray) -> OrientedCloud:
+    """Return the points `placed` (N,) as the boards' lattices have them."""
+    cloud = reconstruction.cloud
+    points_mm, normals = np.array(cloud.points_mm), np.array(cloud.normals)
+    sigma_mm, normal_sigma_rad = np.array(cloud.sigma_mm), np.array(cloud.normal_sigma_rad)
+    for k, board in enumerate(reconstruction.boards):
+        rows = placed & (cloud.board_index == k)
+        if rows.any():
+            points_mm[rows], covariance = planes.points(board, cloud.grid[rows])
+            sigma_mm[rows] = np.sqrt(np.linalg.eigvalsh(covariance)[:, -1])
+            normals[rows] = planes.normal(board.board_id)
+            normal_sigma_rad[rows] = np.sqrt(np.trace(planes.normal_covariance(board.board_id)))
+    moved = replace(
+        cloud,
+        points_mm=points_mm,
+        normals=normals,
+        sigma_mm=sigma_mm,
+        normal_sigma_rad=normal_sigma_rad,
+        calibration_in_sigmas=len(planes.calibration_moves) > 0,
+    )
+    return moved.select(placed)
 
 
 def _affinities(pair: MatchedPair, method: str, E21: Mat3, scale: str) -> Affinities:

@@ -12,11 +12,11 @@ from rigkit.core.errors import DegenerateError
 from rigkit.core.truth import Feature
 from rigkit.validation.planes import NormalErrors, Plane, fit_moved, fit_plane, normal_errors
 
-__all__ = ["BoardResult", "Lattice", "Placed", "fit_lattice", "measure_board", "place_moved"]
+__all__ = ["BoardGrid", "BoardResult", "Placed", "fit_lattice", "measure_board", "place_moved"]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Lattice:
+class BoardGrid:
     """x = origin + column * step_x + row * step_y, fitted to the corners by least squares.
 
     Attributes
@@ -76,7 +76,7 @@ class BoardResult:
 
     board: Board
     plane: Plane
-    lattice: Lattice
+    lattice: BoardGrid
     normal_errors: NormalErrors
     square_x_ratio: float
     square_y_ratio: float
@@ -99,7 +99,7 @@ class BoardResult:
         return np.array([self.board.columns - 1, self.board.rows - 1]) / 2.0
 
 
-def fit_lattice(points_mm: Points, grid: IntArray) -> Lattice:
+def fit_lattice(points_mm: Points, grid: IntArray) -> BoardGrid:
     """Fit the lattice to points (N, 3) with (column, row) `grid` (N, 2).
 
     Raises DegenerateError where the corners lie in one row or column, or are fewer than four.
@@ -110,7 +110,7 @@ def fit_lattice(points_mm: Points, grid: IntArray) -> Lattice:
     steps, *_ = np.linalg.lstsq(design, points_mm, rcond=None)
     residuals = points_mm - design @ steps
     scatter = np.asarray(residuals.T @ residuals / (len(grid) - 3))
-    return Lattice(np.asarray(steps), scatter, np.asarray(np.linalg.inv(design.T @ design)))
+    return BoardGrid(np.asarray(steps), scatter, np.asarray(np.linalg.inv(design.T @ design)))
 
 
 def _design(grid: IntArray) -> FloatArray:

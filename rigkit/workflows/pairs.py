@@ -19,7 +19,7 @@ from rigkit.io.manifest import Pair
 from rigkit.reconstruction.geometry import PairGeometry, pair_geometry
 from rigkit.reconstruction.lattice_planes import LatticePlanes, lattice_planes
 from rigkit.reconstruction.pairing import MatchedPair, match_pair
-from rigkit.reconstruction.reconstruct import Reconstruction, reconstruct_from
+from rigkit.reconstruction.reconstruct import Reconstruction, on_lattice, reconstruct_from
 from rigkit.relative_pose.refinement.level_frames import LevelFrames
 from rigkit.validation.intrinsics import CalibrationShifts, calibration_shifts
 from rigkit.workflows.datasets import LoadedCamera
@@ -31,6 +31,7 @@ __all__ = [
     "match_found",
     "match_images",
     "read_for",
+    "reconstruct_on_lattice",
     "reconstruct_other_chain",
     "reconstruct_with",
     "shifts_of",
@@ -137,6 +138,20 @@ def lattice_of(geometry: PairGeometry, camera1: LoadedCamera, camera2: LoadedCam
         return lattice_planes(geometry, camera1.covariance, camera2.covariance, one_camera=camera1 is camera2)
     except DegenerateError:
         return None
+
+
+def reconstruct_on_lattice(
+    reconstruction: Reconstruction, camera1: LoadedCamera, camera2: LoadedCamera
+) -> Reconstruction:
+    """Return a pair's reconstruction on the boards' known lattices, with the calibrations' share in its sigmas.
+
+    Raises DegenerateError where too few corners are seen.
+    """
+    if reconstruction.geometry is None:
+        raise InputError(f"pair '{reconstruction.pair_id}': lattices are fitted to boards, and there are none")
+    covariances = (camera1.covariance, camera2.covariance)
+    planes = lattice_planes(reconstruction.geometry, *covariances, one_camera=camera1 is camera2)
+    return on_lattice(reconstruction, planes)
 
 
 def reconstruct_other_chain(matched: MatchedPair, pair: Pair) -> Reconstruction | None:

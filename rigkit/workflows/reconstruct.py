@@ -6,14 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from rigkit.cameras.base import Camera
 from rigkit.core.progress import Progress, silent
 from rigkit.io.manifest import Dataset, Pair
 from rigkit.io.ply import ply_bytes
-from rigkit.reconstruction.reconstruct import Reconstruction
+from rigkit.reconstruction.reconstruct import Planes, Reconstruction
 from rigkit.report.figures import cloud_png, corners_png, epipolar_png
-from rigkit.workflows.datasets import DatasetOptions, PairFailure, load_cameras, over_pairs, ready_dataset
-from rigkit.workflows.pairs import match_images, reconstruct_with
+from rigkit.workflows.datasets import DatasetOptions, LoadedCamera, PairFailure, load_cameras, over_pairs, ready_dataset
+from rigkit.workflows.pairs import match_images, reconstruct_on_lattice, reconstruct_with
 from rigkit.workflows.results import require_folder, write_results
 
 __all__ = ["DatasetReconstruction", "PairReconstruction", "ReconstructOptions", "reconstruct_dataset"]
@@ -25,6 +24,8 @@ class ReconstructOptions(DatasetOptions):
 
     method: str = "3SDIR"
     """Affine estimator of the normals."""
+    planes: Planes = "free"
+    """Points and normals: each by itself, or on the boards' known lattices (then whatever the estimator)."""
     pictures: bool = True
     """Draw corners, epipolar curves and the cloud."""
 
@@ -59,8 +60,8 @@ class _Job:
     """What one process needs to know of one pair."""
 
     pair: Pair
-    camera1: Camera
-    camera2: Camera
+    camera1: LoadedCamera
+    camera2: LoadedCamera
     options: ReconstructOptions
 
 
@@ -78,8 +79,7 @@ def reconstruct_dataset(
     cameras = load_cameras(known, recalibrate=options.recalibrate, progress=progress)
 
     def job_of(pair: Pair) -> _Job:
-        first, second = cameras.of(pair)
-        return _Job(pair, first.camera, second.camera, options)
+        return _Job(pair, *cameras.of(pair), options)
 
     outcomes, failures = over_pairs(
         _reconstruct, known.pairs, job_of, jobs=options.jobs, what="reconstructing pairs", progress=progress
@@ -95,9 +95,11 @@ def reconstruct_dataset(
 def _reconstruct(job: _Job) -> PairReconstruction:
     """Reconstruct one pair and render its files."""
     pair, options = job.pair, job.options
-    matched, image1, image2 = match_images(pair, job.camera1, job.camera2, options.chain, options.support)
+    matched, image1, image2 = match_images(pair, job.camera1.camera, job.camera2.camera, options.chain, options.support)
     r = reconstruct_with(matched, pair, options.method, image1, det_scale=options.det_scale)
-    ply = f"{pair.pair_id}/{options.method}.ply"
+    if options.planes == "lattice":
+        r = reconstruct_on_lattice(r, job.camera1, job.camera2)
+    ply = f"{pair.pair_id}/{options.method if options.planes == 'free' else options.planes}.ply"
     files = {ply: ply_bytes(r.cloud)}
     if options.pictures:
         files[f"{pair.pair_id}/corners.png"] = corners_png(r, image1, image2)
