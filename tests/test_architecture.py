@@ -73,7 +73,7 @@ POSITIONAL_CLASSES = {
     "validation/boards.py:BoardResult",
     "validation/checks.py:Check",
     "validation/checks.py:ValidationReport",
-    "validation/crosscheck.py:OtherWay",
+    "validation/crosscheck.py:IndependentMethod",
     "validation/planes.py:Plane",
     "validation/pnp.py:PnpResult",
 }

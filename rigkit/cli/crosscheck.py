@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(tables_to_text([done.table]))
         for report in done.reports:
-            for words in report.suspects:
+            for words in report.diagnosis:
                 print(f"{report.pair_id}: suspect {words}")
     for report in done.reports:
         for words in report.skipped:

@@ -118,10 +118,10 @@ def pair_section(
 
 
 def crosscheck_table(reports: Sequence[CrossCheckReport]) -> Table:
-    """Return what every other way found of every pair, and whether it agrees with ours."""
+    """Return what every other method found of every pair, and whether it agrees with ours."""
     columns = (
         Column("pair"),
-        Column("way"),
+        Column("method"),
         Column("rotation difference", "deg", 4),
         Column("direction difference", "deg", 4),
         Column("baseline", "mm", 2),
@@ -132,25 +132,25 @@ def crosscheck_table(reports: Sequence[CrossCheckReport]) -> Table:
     )
     rows = []
     for report in reports:
-        for way in report.ways:
-            failed = [c.name for c in report.checks if c.how == way.name and not c.passed]
-            compared = any(c.how == way.name for c in report.checks)
+        for method in report.methods:
+            failed = [c.name for c in report.checks if c.how == method.name and not c.passed]
+            compared = any(c.how == method.name for c in report.checks)
             rows.append(
                 (
                     Cell(report.pair_id),
-                    Cell(way.name),
-                    Cell(way.rotation_difference_deg),
-                    Cell(way.direction_difference_deg),
-                    Cell(way.baseline_mm),
-                    Cell(way.rms_px),
-                    Cell(float(way.used)),
-                    Cell(float(way.excluded)),
+                    Cell(method.name),
+                    Cell(method.rotation_difference_deg),
+                    Cell(method.direction_difference_deg),
+                    Cell(method.baseline_mm),
+                    Cell(method.rms_px),
+                    Cell(float(method.used)),
+                    Cell(float(method.excluded)),
                     Cell(", ".join(failed) or ("nothing" if compared else "-"), failed=bool(failed)),
                 )
             )
     limits = sorted({c.limit_k for r in reports for c in r.checks})
     note = f"Agreement: within k = {', '.join(f'{k:g}' for k in limits)} combined sigmas."
-    return Table("crosscheck", "The same pairs by other ways", columns, tuple(rows), note)
+    return Table("crosscheck", "The same pairs by other methods", columns, tuple(rows), note)
 
 
 def _by_estimator(reports: Sequence[ValidationReport]) -> Table:

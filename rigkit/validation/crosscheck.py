@@ -1,8 +1,8 @@
-"""The same pair by ways that share nothing with the main path but corners and calibration.
+"""The same pair by methods that share nothing with the main path but corners and calibration.
 
 pycolmap: two-view geometry, triangulation and bundle adjustment; scale from the squares. Planar PnP: every board's own
 pose, no epipolar geometry at all. Another chain: the same pair reconstructed in other pixels (raw or rectified).
-A difference beyond its own sigma is a failed check; which ways agree among each other says what to suspect.
+A difference beyond its own sigma is a failed check; which methods agree among each other says what to suspect.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from rigkit.validation.measure import Measured, measure
 from rigkit.validation.planes import face_angle, fit_moved
 from rigkit.validation.pnp import AnglesDeg, moved_pnp, planar_pnp
 
-__all__ = ["CrossCheckReport", "OtherWay", "compare_chains", "crosscheck", "sigma_of_difference"]
+__all__ = ["CrossCheckReport", "IndependentMethod", "compare_chains", "crosscheck", "sigma_of_difference"]
 
 TWO_VIEW = "pycolmap two-view"
 ADJUSTED = "pycolmap bundle adjustment"
@@ -41,20 +41,20 @@ false alarm, at three every third, at two each."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class OtherWay:
-    """What another way found, beside ours.
+class IndependentMethod:
+    """What another method found, beside ours.
 
     Attributes
     ----------
     name : "pycolmap two-view", "pycolmap bundle adjustment", "planar PnP", "rectified chain".
     cam2_from_cam1 : its relative pose, mm.
-    covariance : (6, 6) of (left rotation perturbation rad, translation mm), NaN where that way has none.
+    covariance : (6, 6) of (left rotation perturbation rad, translation mm), NaN where that method has none.
     rotation_difference_deg, direction_difference_deg : angle between its rotation, translation direction, and ours.
     baseline_mm : its baseline, scaled by the squares.
     angles_deg : (a, b) -> (angle between the faces, sigma).
-    rms_px : its root mean square reprojection error, 2-D per observation; NaN where that way has none.
-    used, excluded : matches that took part; matches beyond what that way can represent.
-    variance_factor : observed over predicted variance of the corners, where that way can tell; else NaN.
+    rms_px : its root mean square reprojection error, 2-D per observation; NaN where that method has none.
+    used, excluded : matches that took part; matches beyond what that method can represent.
+    variance_factor : observed over predicted variance of the corners, where that method can tell; else NaN.
     """
 
     name: str
@@ -72,23 +72,23 @@ class OtherWay:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CrossCheckReport:
-    """All ways of one pair; cannot be built without a check.
+    """All methods of one pair; cannot be built without a check.
 
     Attributes
     ----------
     pair_id, affine_method : of the reconstruction.
-    ways : what each found.
-    checks : differences against combined sigmas; `how` names the way.
-    skipped : ways that could not be gone, and why.
-    suspects : what to look at where a check failed, in words.
+    methods : what each found.
+    checks : differences against combined sigmas; `how` names the method.
+    skipped : methods that could not be used, and why.
+    diagnosis : what to look at where a check failed, in words.
     """
 
     pair_id: str
     affine_method: str
-    ways: tuple[OtherWay, ...]
+    methods: tuple[IndependentMethod, ...]
     checks: tuple[Check, ...]
     skipped: tuple[str, ...]
-    suspects: tuple[str, ...]
+    diagnosis: tuple[str, ...]
 
     def __post_init__(self) -> None:
         if not self.checks:
@@ -98,12 +98,12 @@ class CrossCheckReport:
     def passed(self) -> bool:
         return all(check.passed for check in self.checks)
 
-    def way(self, name: str) -> OtherWay:
-        """Return the way of that name; raises InputError that lists those gone."""
-        for way in self.ways:
-            if way.name == name:
-                return way
-        raise InputError(f"no way is called '{name}'; known: {', '.join(w.name for w in self.ways)}")
+    def method(self, name: str) -> IndependentMethod:
+        """Return the method of that name; raises InputError that lists those used."""
+        for method in self.methods:
+            if method.name == name:
+                return method
+        raise InputError(f"no method is called '{name}'; known: {', '.join(w.name for w in self.methods)}")
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers, strings and lists; NaN becomes None."""
@@ -112,26 +112,26 @@ class CrossCheckReport:
             "pair": self.pair_id,
             "affine_method": self.affine_method,
             "passed": self.passed,
-            "ways": [
+            "methods": [
                 {
-                    "name": way.name,
-                    "rotation_difference_deg": way.rotation_difference_deg,
-                    "direction_difference_deg": way.direction_difference_deg,
-                    "baseline_mm": way.baseline_mm,
+                    "name": method.name,
+                    "rotation_difference_deg": method.rotation_difference_deg,
+                    "direction_difference_deg": method.direction_difference_deg,
+                    "baseline_mm": method.baseline_mm,
                     "angles_deg": [
                         {"a": a, "b": b, "angle": angle, "sigma": sigma if np.isfinite(sigma) else None}
-                        for (a, b), (angle, sigma) in way.angles_deg.items()
+                        for (a, b), (angle, sigma) in method.angles_deg.items()
                     ],
-                    "rms_px": way.rms_px if np.isfinite(way.rms_px) else None,
-                    "variance_factor": way.variance_factor if np.isfinite(way.variance_factor) else None,
-                    "used": way.used,
-                    "excluded": way.excluded,
+                    "rms_px": method.rms_px if np.isfinite(method.rms_px) else None,
+                    "variance_factor": method.variance_factor if np.isfinite(method.variance_factor) else None,
+                    "used": method.used,
+                    "excluded": method.excluded,
                 }
-                for way in self.ways
+                for method in self.methods
             ],
             "checks": [without_nan(asdict(check)) for check in self.checks],
             "skipped": list(self.skipped),
-            "suspects": list(self.suspects),
+            "diagnosis": list(self.diagnosis),
         }
 
     def to_json(self) -> str:
@@ -153,50 +153,50 @@ def crosscheck(
     ----------
     reconstruction : of one pair.
     other_chain : the same pair reconstructed in other pixels (rectified where this one is raw, or the reverse).
-    shifts : from `calibration_shifts`: a wrong calibration moves the ways apart; None: exact intrinsics.
+    shifts : from `calibration_shifts`: a wrong calibration moves the methods apart; None: exact intrinsics.
     coverage : largest |difference| / its sigma that passes.
     seed : of COLMAP's RANSAC.
 
-    Raises InputError where none of the ways could be gone.
+    Raises InputError where none of the methods could be used.
     """
-    ways: list[OtherWay] = []
+    methods: list[IndependentMethod] = []
     skipped: list[str] = []
-    attempts: dict[str, Callable[[], list[OtherWay]]] = {
-        "pycolmap": lambda: _colmap_ways(reconstruction, seed),
-        "planar PnP": lambda: [_pnp_way(reconstruction)],
+    attempts: dict[str, Callable[[], list[IndependentMethod]]] = {
+        "pycolmap": lambda: _colmap_methods(reconstruction, seed),
+        "planar PnP": lambda: [_pnp_method(reconstruction)],
     }
     for name, attempt in attempts.items():
         try:
-            ways += attempt()
+            methods += attempt()
         except DegenerateError as error:
             skipped.append(f"{name}: {error}")
-    if any(way.name == TWO_VIEW and np.isnan(way.covariance).all() for way in ways):
+    if any(method.name == TWO_VIEW and np.isnan(method.covariance).all() for method in methods):
         skipped.append(
             f"{TWO_VIEW}: its own bundle adjustment moves it by more than it is uncertain; it is no result yet"
         )
     if other_chain is not None:
-        ways.append(compare_chains(reconstruction, other_chain, OTHER_CHAIN))
+        methods.append(compare_chains(reconstruction, other_chain, OTHER_CHAIN))
     measured = measure(reconstruction)
-    checks = [check for way in ways for check in _checks(reconstruction, measured, way, coverage, shifts)]
+    checks = [check for method in methods for check in _checks(reconstruction, measured, method, coverage, shifts)]
     return CrossCheckReport(
         reconstruction.pair_id,
         reconstruction.affine_method,
-        tuple(ways),
+        tuple(methods),
         tuple(checks),
         tuple(skipped),
-        _suspects(reconstruction, checks),
+        _diagnosis(reconstruction, checks),
     )
 
 
-def compare_chains(reconstruction: Reconstruction, other: Reconstruction, name: str) -> OtherWay:
-    """Return another reconstruction of the same pair as one of the ways."""
+def compare_chains(reconstruction: Reconstruction, other: Reconstruction, name: str) -> IndependentMethod:
+    """Return another reconstruction of the same pair as one of the methods."""
     covariance = np.full((6, 6), np.nan) if other.pose_covariance is None else other.pose_covariance
     angles = _angles(measure(other))
     rms = other.sampson_rms_px
-    return _way(name, reconstruction, other.cam2_from_cam1, covariance, angles, rms, len(other.cloud), 0)
+    return _method(name, reconstruction, other.cam2_from_cam1, covariance, angles, rms, len(other.cloud), 0)
 
 
-def _colmap_ways(reconstruction: Reconstruction, seed: int) -> list[OtherWay]:
+def _colmap_methods(reconstruction: Reconstruction, seed: int) -> list[IndependentMethod]:
     if len(np.unique(reconstruction.cloud.board_index)) == 1:
         raise DegenerateError(
             "all corners lie on one board, and two poses show one plane alike: pycolmap knows no squares "
@@ -222,7 +222,7 @@ def _colmap_ways(reconstruction: Reconstruction, seed: int) -> list[OtherWay]:
     )
     settled = bool((moved <= CROSS_COVERAGE * own_sigma).all())
     return [
-        _way(
+        _method(
             TWO_VIEW,
             reconstruction,
             two_view,
@@ -232,7 +232,7 @@ def _colmap_ways(reconstruction: Reconstruction, seed: int) -> list[OtherWay]:
             result.inliers,
             excluded,
         ),
-        _way(
+        _method(
             ADJUSTED,
             reconstruction,
             own,
@@ -245,12 +245,12 @@ def _colmap_ways(reconstruction: Reconstruction, seed: int) -> list[OtherWay]:
     ]
 
 
-def _pnp_way(reconstruction: Reconstruction) -> OtherWay:
+def _pnp_method(reconstruction: Reconstruction) -> IndependentMethod:
     found = planar_pnp(reconstruction)
     rms = found.rms_rad * reconstruction.camera1.focal_px
     pose, covariance = found.cam2_from_cam1, found.covariance
-    way = _way(PNP, reconstruction, pose, covariance, found.angles_deg, rms, found.count, 0)
-    return replace(way, variance_factor=found.variance_factor)
+    method = _method(PNP, reconstruction, pose, covariance, found.angles_deg, rms, found.count, 0)
+    return replace(method, variance_factor=found.variance_factor)
 
 
 def sigma_of_difference(ours: float, theirs: float, freedom: int) -> float:
@@ -266,7 +266,7 @@ def sigma_of_difference(ours: float, theirs: float, freedom: int) -> float:
     return float(np.sqrt(abs(a - b) + np.sqrt(2.0 / max(freedom, 2)) * max(a, b)))
 
 
-def _way(
+def _method(
     name: str,
     reconstruction: Reconstruction,
     pose: Rigid3,
@@ -275,12 +275,12 @@ def _way(
     rms_px: float,
     used: int,
     excluded: int,
-) -> OtherWay:
+) -> IndependentMethod:
     ours = reconstruction.cam2_from_cam1
     turn = float(np.rad2deg(rotation_angle(pose.rotation @ ours.rotation.T)))
     direction = float(np.rad2deg(angle_between(pose.translation_mm, ours.translation_mm)))
     baseline = float(np.linalg.norm(pose.translation_mm))
-    return OtherWay(name, pose, covariance, turn, direction, baseline, angles, rms_px, used, excluded)
+    return IndependentMethod(name, pose, covariance, turn, direction, baseline, angles, rms_px, used, excluded)
 
 
 def _angles(measured: Measured) -> AnglesDeg:
@@ -290,40 +290,40 @@ def _angles(measured: Measured) -> AnglesDeg:
 def _checks(
     reconstruction: Reconstruction,
     measured: Measured,
-    way: OtherWay,
+    method: IndependentMethod,
     coverage: float,
     shifts: CalibrationShifts | None,
 ) -> list[Check]:
-    """Return the checks of one way, by the sigma of the difference: both saw the same corners.
+    """Return the checks of one method, by the sigma of the difference: both saw the same corners.
 
-    There are none for what that way gives without uncertainty. Epipolar ways take the same calibration in the same
+    There are none for what a method gives without uncertainty. Epipolar methods take the same calibration in the same
     manner; only the boards' own poses move apart from ours.
     """
     rows_of: list[tuple[str, str, str, tuple[float, float], tuple[float, float]]] = []
     ours = _angles(measured)
-    apart = _apart(measured, shifts) if shifts is not None and way.name == PNP else {}
-    sigma = _pose_sigmas(way.cam2_from_cam1, way.covariance)
+    apart = _apart(measured, shifts) if shifts is not None and method.name == PNP else {}
+    sigma = _pose_sigmas(method.cam2_from_cam1, method.covariance)
     if all(np.isfinite(value) for value in sigma):
         unknown = np.full((6, 6), np.nan)
         covariance = unknown if reconstruction.pose_covariance is None else reconstruction.pose_covariance
         own = _pose_sigmas(reconstruction.cam2_from_cam1, covariance)
         rows = (
-            ("rotation", "deg", 0.0, way.rotation_difference_deg),
-            ("translation direction", "deg", 0.0, way.direction_difference_deg),
-            ("baseline", "mm", way.baseline_mm, reconstruction.baseline_mm),
+            ("rotation", "deg", 0.0, method.rotation_difference_deg),
+            ("translation direction", "deg", 0.0, method.direction_difference_deg),
+            ("baseline", "mm", method.baseline_mm, reconstruction.baseline_mm),
         )
         for (name, unit, other, value), theirs, mine in zip(rows, sigma, own, strict=True):
             rows_of.append((name, name, unit, (other, theirs), (value, mine)))
-    for (a, b), (angle, angle_sigma) in way.angles_deg.items():
+    for (a, b), (angle, angle_sigma) in method.angles_deg.items():
         if (a, b) in ours:
             rows_of.append((f"angle {a}-{b}", "angle", "deg", (angle, angle_sigma), ours[a, b]))
     checks = []
     for name, kind, unit, (other, theirs), (value, mine) in rows_of:
         ours_sigma, their_sigma = (sigma if np.isfinite(sigma) else 0.0 for sigma in (mine, theirs))
-        of_corners = sigma_of_difference(ours_sigma, their_sigma, way.used - POSE_FREEDOM)
+        of_corners = sigma_of_difference(ours_sigma, their_sigma, method.used - POSE_FREEDOM)
         combined = float(np.hypot(of_corners, apart.get(name, 0.0)))
-        known = (other, theirs, way.name)
-        checks.append(compare(name, kind, unit, known, (value, mine), coverage, way.used, combined_sigma=combined))
+        known = (other, theirs, method.name)
+        checks.append(compare(name, kind, unit, known, (value, mine), coverage, method.used, combined_sigma=combined))
     return checks
 
 
@@ -364,10 +364,10 @@ def _pose_sigmas(pose: Rigid3, covariance: FloatArray) -> tuple[float, float, fl
     return float(turn), float(np.rad2deg(np.sqrt(crosswise) / length)), float(np.sqrt(lengthwise))
 
 
-def _suspects(reconstruction: Reconstruction, checks: Sequence[Check]) -> tuple[str, ...]:
-    """Return which stage to look at, from which ways disagree with ours."""
-    failed = {way: {c.kind for c in checks if c.how == way and not c.passed} for way in {c.how for c in checks}}
-    colmap, pnp, chain = (failed.get(way, set()) for way in (ADJUSTED, PNP, OTHER_CHAIN))
+def _diagnosis(reconstruction: Reconstruction, checks: Sequence[Check]) -> tuple[str, ...]:
+    """Return which stage to look at, from which methods disagree with ours."""
+    failed = {name: {c.kind for c in checks if c.how == name and not c.passed} for name in {c.how for c in checks}}
+    colmap, pnp, chain = (failed.get(name, set()) for name in (ADJUSTED, PNP, OTHER_CHAIN))
     out = []
     if colmap and pnp:
         out.append(

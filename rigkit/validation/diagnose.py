@@ -15,7 +15,7 @@ from rigkit.geometry.board_pose import board_pose
 from rigkit.validation.check import Check
 from rigkit.validation.checks import ValidationReport
 
-__all__ = ["camera_fit", "camera_suspects", "suspects"]
+__all__ = ["camera_fit", "diagnose", "diagnose_cameras"]
 
 CLEARLY_BETTER = 4.0
 """Another calibration fits clearly better if it leaves this many times less. Two calibrations of one lens differ by far
@@ -59,7 +59,7 @@ def camera_fit(camera: Camera, detections: Sequence[BoardDetection], boards: Seq
     return float(np.sqrt(square / count)) if count else float("nan")
 
 
-def camera_suspects(
+def diagnose_cameras(
     pair_id: str,
     declared: tuple[str, str],
     detections: tuple[Sequence[BoardDetection], Sequence[BoardDetection]],
@@ -106,19 +106,19 @@ def camera_suspects(
     return tuple(out)
 
 
-def suspects(reports: Sequence[ValidationReport]) -> tuple[str, ...]:
+def diagnose(reports: Sequence[ValidationReport]) -> tuple[str, ...]:
     """Return the probable causes of the checks that failed in a data set; give one report a pair."""
     if all(report.passed for report in reports):
         return ()
     out: list[str] = []
     for report in reports:
-        out += _board_suspects(report)
+        out += _diagnose_boards(report)
     odd = bool(out)
     failed = [(r.pair_id, c) for r in reports for c in r.checks if c.kind in ("baseline", "distance") and not c.passed]
     if failed and not odd:
-        out += _length_suspects(failed, reports)
+        out += _diagnose_lengths(failed, reports)
     for report in reports:
-        out += _angle_suspects(report)
+        out += _diagnose_angles(report)
     return tuple(dict.fromkeys(out))
 
 
@@ -139,7 +139,7 @@ def _clearly_better(fit: Mapping[str, float], declared: str) -> str | None:
     return best if worse and best != declared else None
 
 
-def _board_suspects(report: ValidationReport) -> list[str]:
+def _diagnose_boards(report: ValidationReport) -> list[str]:
     """Return boards whose squares do not agree with those of the others, or that are mirrored."""
     out = []
     ratios = {b.board.board_id: float(np.sqrt(b.square_x_ratio * b.square_y_ratio)) for b in report.boards}
@@ -168,7 +168,7 @@ def _board_suspects(report: ValidationReport) -> list[str]:
     return out
 
 
-def _length_suspects(failed: Sequence[tuple[str, Check]], reports: Sequence[ValidationReport]) -> list[str]:
+def _diagnose_lengths(failed: Sequence[tuple[str, Check]], reports: Sequence[ValidationReport]) -> list[str]:
     """Return whether the squares or the rule are to blame: wrong squares change every length by one factor."""
     ratios = np.array([check.ours / check.measured for _, check in failed])
     lengths = [c for r in reports for c in r.checks if c.kind in ("baseline", "distance")]
@@ -200,7 +200,7 @@ def _ratio_sigma(failed: Sequence[tuple[str, Check]]) -> float:
     return float(max(check.combined_sigma / check.measured for _, check in failed))
 
 
-def _angle_suspects(report: ValidationReport) -> list[str]:
+def _diagnose_angles(report: ValidationReport) -> list[str]:
     failed = [check for check in report.checks if check.kind == "angle" and not check.passed]
     if not failed:
         return []

@@ -25,7 +25,7 @@ from rigkit.report.page import PairSection
 from rigkit.report.validation_page import crosscheck_table, pair_section
 from rigkit.validation.checks import ValidationReport, validate_each
 from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
-from rigkit.validation.diagnose import camera_suspects, suspects
+from rigkit.validation.diagnose import diagnose, diagnose_cameras
 from rigkit.validation.intrinsics import CalibrationShifts
 from rigkit.validation.tables import PaperTables, best_report
 from rigkit.workflows.datasets import (
@@ -144,8 +144,8 @@ def validate_dataset(
     compared = [pair.crosscheck for pair in pairs if pair.crosscheck is not None]
     passed = not failures and all(r.passed for pair in pairs for r in pair.reports) and all(r.passed for r in compared)
     causes = [cause for pair in pairs for cause in pair.causes]
-    causes += suspects([pair.best for pair in pairs])
-    causes += [f"pair '{report.pair_id}': {words}" for report in compared for words in report.suspects]
+    causes += diagnose([pair.best for pair in pairs])
+    causes += [f"pair '{report.pair_id}': {words}" for report in compared for words in report.diagnosis]
     # Where everything passed they explain nothing, but a person should know.
     severity = Severity.LOOK if passed else Severity.BAD
     seconds = time.monotonic() - started
@@ -174,7 +174,7 @@ def _validate(job: _Job) -> PairValidation:
     camera1, camera2 = (loaded.camera for loaded in job.cameras.of(pair))
     found1, found2, image1, image2 = find_boards(pair, camera1, camera2)
     known = {name: loaded.camera for name, loaded in job.cameras.known.items()}
-    causes = camera_suspects(pair.pair_id, names, (found1, found2), pair.boards, known)
+    causes = diagnose_cameras(pair.pair_id, names, (found1, found2), pair.boards, known)
     try:
         matched = match_found(pair, camera1, camera2, found1, found2, job.options.chain, job.options.support)
         return _judge(job, matched, image1, image2, causes)

@@ -1,4 +1,4 @@
-"""The other ways find what the geometry is, agree with a right reconstruction, and contradict a wrong one."""
+"""The other methods find what the geometry is, agree with a right reconstruction, and contradict a wrong one."""
 
 from __future__ import annotations
 
@@ -57,12 +57,12 @@ def test_every_way_finds_the_exact_geometry(name: str) -> None:
     assert report.passed
     assert not report.skipped
     assert len(report.checks) == 15
-    for way in report.ways:
-        assert way.used == 144
-        assert np.deg2rad(way.rotation_difference_deg) < EXACT_RAD
-        assert np.deg2rad(way.direction_difference_deg) < EXACT_RAD
-        assert way.baseline_mm == pytest.approx(np.linalg.norm(CAM2_FROM_CAM1.translation_mm), abs=EXACT_MM)
-        for angle, _ in way.angles_deg.values():
+    for method in report.methods:
+        assert method.used == 144
+        assert np.deg2rad(method.rotation_difference_deg) < EXACT_RAD
+        assert np.deg2rad(method.direction_difference_deg) < EXACT_RAD
+        assert method.baseline_mm == pytest.approx(np.linalg.norm(CAM2_FROM_CAM1.translation_mm), abs=EXACT_MM)
+        for angle, _ in method.angles_deg.values():
             assert angle == pytest.approx(90.0, abs=1e-4)
     assert json.loads(report.to_json())["passed"] is True
 
@@ -98,10 +98,10 @@ def test_rays_beyond_90_degrees_are_left_out_and_counted() -> None:
     )
     report = crosscheck(turned)
     assert report.passed
-    assert behind.sum() <= report.way(ADJUSTED).excluded < 144
-    assert report.way(ADJUSTED).used + report.way(ADJUSTED).excluded == 144
+    assert behind.sum() <= report.method(ADJUSTED).excluded < 144
+    assert report.method(ADJUSTED).used + report.method(ADJUSTED).excluded == 144
     # The boards' own poses need no image plane.
-    assert report.way(PNP).used == 144
+    assert report.method(PNP).used == 144
 
 
 def test_colmap_covariance_is_the_observed_one(rng: np.random.Generator) -> None:
@@ -139,23 +139,23 @@ def test_one_seed_gives_one_answer(rng: np.random.Generator) -> None:
     assert crosscheck(drawn).to_json() == crosscheck(drawn).to_json()
 
 
-def test_a_wrong_pose_is_contradicted_by_both_ways(rng: np.random.Generator) -> None:
+def test_a_wrong_pose_is_contradicted_by_both_methods(rng: np.random.Generator) -> None:
     exact = made(regular_camera())
     wrong = Rigid3(exp_so3(np.array([0.0, 0.002, 0.0])) @ CAM2_FROM_CAM1.rotation, CAM2_FROM_CAM1.translation_mm)
     report = crosscheck(noisy(replace(exact, cam2_from_cam1=wrong), rng))
     failed = {(c.how, c.kind) for c in report.checks if not c.passed}
     assert {(ADJUSTED, "rotation"), (PNP, "rotation")} <= failed
-    assert "relative pose" in report.suspects[0]
+    assert "relative pose" in report.diagnosis[0]
 
 
 def test_a_bent_board_is_contradicted_by_pnp_only(rng: np.random.Generator) -> None:
-    # The epipolar ways measure the faces as they stand; the boards' own poses trust the print.
+    # The epipolar methods measure the faces as they stand; the boards' own poses trust the print.
     exact = made(regular_camera())
     board = replace(BOARDS[1], square_y_mm=BOARDS[1].square_y_mm * 1.01)
     report = crosscheck(noisy(replace(exact, boards=(BOARDS[0], board, BOARDS[2])), rng))
     assert any(c.how == PNP and not c.passed for c in report.checks)
     assert all(c.passed for c in report.checks if c.how == ADJUSTED)
-    assert "calibration or board" in report.suspects[0]
+    assert "calibration or board" in report.diagnosis[0]
 
 
 def test_another_chain_is_compared(rng: np.random.Generator) -> None:
@@ -166,7 +166,7 @@ def test_another_chain_is_compared(rng: np.random.Generator) -> None:
     moved = replace(exact, cam2_from_cam1=Rigid3(CAM2_FROM_CAM1.rotation, CAM2_FROM_CAM1.translation_mm * 1.01))
     report = crosscheck(exact, other_chain=moved)
     assert not report.passed
-    assert "rectification" in report.suspects[-1]
+    assert "rectification" in report.diagnosis[-1]
 
 
 def test_the_sigma_of_a_difference_is_that_of_estimates_from_the_same_data(rng: np.random.Generator) -> None:
@@ -245,5 +245,5 @@ def test_calibrations_move_only_the_boards_own_poses_apart(rng: np.random.Genera
 def test_one_board_is_no_case_for_pycolmap() -> None:
     report = crosscheck(made(CAMERAS["brown"], keep=(2,)))
     assert report.passed
-    assert [way.name for way in report.ways] == [PNP]
+    assert [method.name for method in report.methods] == [PNP]
     assert "one board" in report.skipped[0]

@@ -15,7 +15,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.truth import Feature, MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
 from rigkit.validation.checks import ValidationReport, validate
-from rigkit.validation.diagnose import camera_fit, camera_suspects, suspects
+from rigkit.validation.diagnose import camera_fit, diagnose, diagnose_cameras
 
 BASELINE_MM = float(np.linalg.norm(CAM2_FROM_CAM1.translation_mm))
 CENTRES_MM = 330.0
@@ -56,55 +56,55 @@ def reported(
 def test_nothing_is_suspected_where_all_is_well() -> None:
     report = reported()
     assert report.passed
-    assert suspects([report]) == ()
+    assert diagnose([report]) == ()
 
 
 @pytest.mark.parametrize("scale", [0.97, 1.03])
 def test_wrong_squares_change_all_lengths(scale: float) -> None:
-    found = suspects([reported(scale=scale)])
+    found = diagnose([reported(scale=scale)])
     assert len(found) == 1
     assert "square size" in found[0]
     assert f"{50.0 / scale:.2f} mm instead of 50" in found[0]
 
 
 def test_wrong_squares_show_in_several_pairs() -> None:
-    found = suspects([reported(scale=1.03, distances=False, pair_id=name) for name in ("a", "b")])
+    found = diagnose([reported(scale=1.03, distances=False, pair_id=name) for name in ("a", "b")])
     assert len(found) == 1
     assert "square size: all 2 lengths" in found[0]
 
 
 def test_a_misread_baseline_is_told_by_the_other_lengths() -> None:
-    found = suspects([reported(stated_mm=BASELINE_MM / 1.03)])
+    found = diagnose([reported(stated_mm=BASELINE_MM / 1.03)])
     assert len(found) == 1
     assert "baseline comes out +3.0 %" in found[0]
     assert "misread" in found[0]
-    both = suspects([reported(stated_mm=BASELINE_MM / 1.03, distances=False, pair_id="a"), reported(pair_id="b")])
+    both = diagnose([reported(stated_mm=BASELINE_MM / 1.03, distances=False, pair_id="a"), reported(pair_id="b")])
     assert len(both) == 1
     assert both[0].startswith("pair 'a'")
 
 
 def test_one_length_alone_leaves_both_possible() -> None:
-    found = suspects([reported(stated_mm=BASELINE_MM / 1.03, distances=False)])
+    found = diagnose([reported(stated_mm=BASELINE_MM / 1.03, distances=False)])
     assert len(found) == 1
     assert "misread, or the squares" in found[0]
 
 
 def test_one_board_of_another_size_is_named() -> None:
     wrong = replace(BOARDS[1], square_x_mm=48.0, square_y_mm=48.0)
-    found = suspects([reported(boards=(BOARDS[0], wrong, BOARDS[2]), scale=1.01)])
+    found = diagnose([reported(boards=(BOARDS[0], wrong, BOARDS[2]), scale=1.01)])
     assert len(found) == 1
     assert "board 'plane2'" in found[0]
     assert "50.00 mm would fit" in found[0]
 
 
 def test_a_board_that_stands_otherwise_is_named() -> None:
-    found = suspects([reported(angles=(91.6, 90.0, 88.4), distances=False)])
+    found = diagnose([reported(angles=(91.6, 90.0, 88.4), distances=False)])
     assert len(found) == 1
     assert "'plane2' does not stand as measured" in found[0]
 
 
 def test_a_supplement_is_recognised() -> None:
-    found = suspects([reported(angles=(91.6, 90.0, 90.0), stated_deg=88.4, distances=False)])
+    found = diagnose([reported(angles=(91.6, 90.0, 90.0), stated_deg=88.4, distances=False)])
     assert len(found) == 1
     assert "supplement" in found[0]
 
@@ -129,21 +129,21 @@ def test_the_right_calibration_fits_to_the_noise(rng: np.random.Generator) -> No
 def test_the_other_lens_is_named(rng: np.random.Generator, true: str) -> None:
     one, two = detected(rng, CAMERAS[true])
     wrong = next(name for name in CAMERAS if name != true)
-    assert camera_suspects("p", (true, true), (one, two), BOARDS, CAMERAS) == ()
-    found = camera_suspects("p", (wrong, wrong), (one, two), BOARDS, CAMERAS)
+    assert diagnose_cameras("p", (true, true), (one, two), BOARDS, CAMERAS) == ()
+    found = diagnose_cameras("p", (wrong, wrong), (one, two), BOARDS, CAMERAS)
     assert len(found) == 2
     for number, words in enumerate(found, start=1):
         assert f"image {number} fits camera '{true}'" in words
     # With no other calibration to compare, it still does not fit.
-    alone = camera_suspects("p", (wrong, wrong), (one, two), BOARDS, {wrong: CAMERAS[wrong]})
+    alone = diagnose_cameras("p", (wrong, wrong), (one, two), BOARDS, {wrong: CAMERAS[wrong]})
     assert len(alone) == 2
     assert "does not fit the calibration" in alone[0]
 
 
 def test_swapped_images_or_cameras_are_named(rng: np.random.Generator) -> None:
     one, two = detected(rng, CAMERAS["regular"])[0], detected(rng, CAMERAS["fisheye"])[1]
-    assert camera_suspects("p", ("regular", "fisheye"), (one, two), BOARDS, CAMERAS) == ()
-    found = camera_suspects("p", ("regular", "fisheye"), (two, one), BOARDS, CAMERAS)
+    assert diagnose_cameras("p", ("regular", "fisheye"), (one, two), BOARDS, CAMERAS) == ()
+    found = diagnose_cameras("p", ("regular", "fisheye"), (two, one), BOARDS, CAMERAS)
     assert len(found) == 1
     assert "swapped" in found[0]
 
@@ -153,9 +153,9 @@ def test_cameras_of_two_image_sizes_in_one_pair(rng: np.random.Generator) -> Non
     doubled = Pinhole((2 * small.size_px[0], 2 * small.size_px[1]), np.array([1500.0, 1500.0, 700.0, 500.0]))
     one, two = detected(rng, small)[0], detected(rng, large)[1]
     cameras = CAMERAS | {"large": doubled}
-    assert camera_suspects("p", ("regular", "fisheye"), (one, two), BOARDS, cameras) == ()
+    assert diagnose_cameras("p", ("regular", "fisheye"), (one, two), BOARDS, cameras) == ()
     # What was declared does not fit, and no camera of another image size is proposed for it.
-    found = camera_suspects("p", ("large", "fisheye"), (one, two), BOARDS, cameras)
+    found = diagnose_cameras("p", ("large", "fisheye"), (one, two), BOARDS, cameras)
     assert len(found) == 1
     assert "does not fit the calibration of 'large'" in found[0]
 
@@ -163,22 +163,22 @@ def test_cameras_of_two_image_sizes_in_one_pair(rng: np.random.Generator) -> Non
 def test_no_board_of_known_size_says_nothing(rng: np.random.Generator) -> None:
     found = detected(rng, CAMERAS["regular"])[0]
     assert np.isnan(camera_fit(CAMERAS["regular"], found, [Board("other", 5, 4, 10.0, 10.0)]))
-    assert camera_suspects("p", ("regular", "regular"), (found, []), [Board("x", 5, 4, 1.0, 1.0)], CAMERAS) == ()
+    assert diagnose_cameras("p", ("regular", "regular"), (found, []), [Board("x", 5, 4, 1.0, 1.0)], CAMERAS) == ()
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("m", 1000.0), ("cm", 10.0), ("inches", 25.4)])
 def test_a_length_in_another_unit_is_named(unit: str, factor: float) -> None:
-    one = suspects([reported(stated_mm=BASELINE_MM / factor, distances=False)])
+    one = diagnose([reported(stated_mm=BASELINE_MM / factor, distances=False)])
     assert len(one) == 1
     assert f"written in {unit}?" in one[0]
-    beside = suspects([reported(stated_mm=BASELINE_MM / factor)])
+    beside = diagnose([reported(stated_mm=BASELINE_MM / factor)])
     assert f"written in {unit}?" in beside[0]
-    assert not any("written in" in words for words in suspects([reported(stated_mm=BASELINE_MM / 1.1)]))
+    assert not any("written in" in words for words in diagnose([reported(stated_mm=BASELINE_MM / 1.1)]))
 
 
 def test_corners_of_different_boards_are_not_called_wrong_squares() -> None:
     report = reported()
     odd = replace(report.boards[0], square_x_ratio=18.0, square_y_ratio=1.0)
     failed = replace(report, boards=(odd, *report.boards[1:]), checks=(replace(report.checks[0], passed=False),))
-    assert any("matched" in words and "plane1" in words for words in suspects([failed]))
-    assert not any("measure square_x_mm" in words for words in suspects([failed]))
+    assert any("matched" in words and "plane1" in words for words in diagnose([failed]))
+    assert not any("measure square_x_mm" in words for words in diagnose([failed]))
