@@ -12,6 +12,7 @@ from enum import StrEnum
 
 import numpy as np
 
+from rigkit.calibration.clustered import SAMPLES, drawn_errors
 from rigkit.calibration.coverage import covered_by_boards
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import projection_design
@@ -22,8 +23,6 @@ from rigkit.core.arrays import FloatArray, Pixels
 
 __all__ = ["CalibrationComparison", "CameraVerdict", "compare_calibrations"]
 
-SAMPLES = 4000
-"""Draws of the null distribution: the chance is then known to 0.002 near 0.01."""
 REFIT_SIGMA = 0.5
 """What the models make of one lens is known from a refit to about half: poses and noise had their part in the fits."""
 SAME_CHANCE = 0.01
@@ -104,7 +103,13 @@ def compare_calibrations(
     together = np.concatenate([column - turn @ (turn.T @ column) for column in columns], axis=1)
     gram = together.T @ together / len(pixels)
     rng = np.random.default_rng(seed)
-    drawn = np.concatenate([_draw(a, rng), -_draw(b, rng), 1.0 + REFIT_SIGMA * rng.normal(size=(1, SAMPLES))])
+    drawn = np.concatenate(
+        [
+            drawn_errors(a.covariance, a.freedom, rng),
+            -drawn_errors(b.covariance, b.freedom, rng),
+            1.0 + REFIT_SIGMA * rng.normal(size=(1, SAMPLES)),
+        ]
+    )
     null = np.einsum("kn,kn->n", drawn, gram @ drawn)
     chance = float((1 + np.count_nonzero(null >= difference.rms_px**2)) / (SAMPLES + 1))
     p = a.camera.parameters.size
@@ -140,17 +145,3 @@ def _design(calibration: Calibration, rays: Pixels) -> FloatArray:
     """Return d pixel / d (parameters, turn of the rays), (2 N, P + 3)."""
     design = projection_design(calibration.camera, rays)
     return design.transpose(2, 0, 1).reshape(2 * len(rays), -1)
-
-
-def _draw(calibration: Calibration, rng: np.random.Generator) -> FloatArray:
-    """Return errors of the parameters (P, SAMPLES), drawn from the calibration's covariance."""
-    covariance = calibration.covariance
-    # Scaled to correlations first: parameters differ by twenty orders of magnitude.
-    sigma = np.sqrt(np.diag(covariance))
-    safe = np.where(sigma > 0.0, sigma, 1.0)
-    values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
-    root = safe[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-    drawn = root @ rng.normal(size=(len(sigma), SAMPLES))
-    if np.isfinite(calibration.freedom):
-        drawn /= np.sqrt(rng.chisquare(calibration.freedom, SAMPLES) / calibration.freedom)
-    return np.asarray(drawn)

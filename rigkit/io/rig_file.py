@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -30,7 +31,7 @@ SCHEMA = "rigkit.rig/1"
 BOARDS_SCHEMA = "rigkit.board_rig/1"
 KEYS = {
     "schema", "cameras", "rms_px", "heldout_rms_px", "sigma_px", "overdispersion", "scale_sigma", "covariance",
-    "baselines", "verdicts",
+    "baselines", "verdicts", "freedom",
 }  # fmt: skip
 FORMER_KEYS = {"spread"}
 """What `overdispersion` was called."""
@@ -42,20 +43,14 @@ BOARD_KEYS = {"board_id", "size", "square_mm", "square_sigma_mm", "points_mm", "
 class SavedRig:
     """What a rig file says: cameras and cam_from_rig by name, the covariance of all intrinsics and of the mounts of all
     cameras but the first, and the corners' sigma; None in a file that does not say (another tool's rig). `scale_sigma`
-    is how well all lengths are known from the boards' squares, relative; 0 where nobody stated it."""
+    is how well all lengths are known from the boards' squares, relative; 0 where nobody stated it. `freedom` are the
+    degrees of freedom of the covariance."""
 
     cameras: dict[str, tuple[Camera, Rigid3]]
     covariance: FloatArray | None
     sigma_px: float | None = None
     scale_sigma: float = 0.0
-
-    @property
-    def mount_covariance(self) -> FloatArray | None:
-        """Of the mounts alone, (6 (n - 1), 6 (n - 1))."""
-        if self.covariance is None:
-            return None
-        first = len(self.covariance) - 6 * (len(self.cameras) - 1)
-        return np.asarray(self.covariance[first:, first:])
+    freedom: float = math.inf
 
 
 def rig_text(rig: RigCalibration) -> str:
@@ -67,6 +62,7 @@ def rig_text(rig: RigCalibration) -> str:
         "rms_px": rig.rms_px,
         "sigma_px": rig.sigma_px,
         "overdispersion": rig.overdispersion,
+        "freedom": rig.freedom if math.isfinite(rig.freedom) else None,
         "scale_sigma": rig.scale_sigma,
         "verdicts": findings_to_json(rig.verdicts),
         "baselines": [{"from": a, "to": b, "value_mm": v, "sigma_mm": s} for a, b, v, s in pairs],
@@ -113,7 +109,8 @@ def load_saved_rig(path: str | Path) -> SavedRig:
             covariance = as_covariance(data["covariance"], "covariance", size)
         sigma_px = None if "sigma_px" not in data else real(data["sigma_px"])
         scale_sigma = real(data.get("scale_sigma", 0.0))
-    return SavedRig(cameras, covariance, sigma_px, scale_sigma)
+        freedom = math.inf if data.get("freedom") is None else real(data["freedom"])
+    return SavedRig(cameras, covariance, sigma_px, scale_sigma, freedom)
 
 
 def is_rig_file(path: str | Path) -> bool:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rigkit.calibration.compare import CalibrationComparison, compare_calibrations
-from rigkit.calibration.rig.compare import RigDifference, compare_mounts
+from rigkit.calibration.rig.compare import Mounted, RigDifference, compare_mounts
 from rigkit.cameras.compare import CameraDifference, compare_cameras
 from rigkit.core.errors import InputError
 from rigkit.io.calibration_file import is_calibration, load_calibration, load_camera
@@ -91,13 +91,7 @@ def _rigs(a: Path, b: Path) -> RigPair:
     names = list(first.cameras)
     if names != list(second.cameras):
         raise InputError(f"diff: '{a}' has the cameras {', '.join(names)}, '{b}' {', '.join(second.cameras)}")
-    mounts = compare_mounts(
-        names,
-        [first.cameras[name][1] for name in names],
-        [second.cameras[name][1] for name in names],
-        first.mount_covariance,
-        second.mount_covariance,
-    )
+    mounts = compare_mounts(*(Mounted(rig.cameras, rig.covariance, rig.freedom) for rig in (first, second)))
     cameras = {}
     for name in names:
         beside = [path.with_name(f"{path.stem}-{name}.json") for path in (a, b)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +12,8 @@ from rigkit.calibration.camera_prior import camera_prior
 from rigkit.calibration.normal_equations import Step
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.rig.calibrate import calibrate_rig
-from rigkit.calibration.rig.overdispersion import frame_overdispersion
+from rigkit.calibration.rig.compare import Mounted, compare_mounts
+from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.solver import rig_normal
 from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.calibration.rig.uncertainty import transfer_covariance, transfer_uncertainty
@@ -29,6 +29,8 @@ from rigkit.geometry.rotation import exp_so3, log_so3
 NOISE_PX = 0.2
 SIGMAS = 4.0
 """A mount further than this from the truth, in its own standard deviations, is wrong: 1 in 16000 by chance."""
+MOVED_MM = 1.0
+RIGS = 12
 MODELS = {"reg": "brown", "wide": "kannala_brandt", "fish": "kannala_brandt"}
 
 Views = dict[str, list[tuple[str, BoardView]]]
@@ -270,18 +272,12 @@ def test_transfer_is_as_sure_as_it_says() -> None:
     assert transfer is not None and 0.0 < transfer.median_px < transfer.worst_px
 
 
-def test_overdispersion_has_no_bias_with_few_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_overdispersion_has_no_bias_with_few_frames() -> None:
     """Six frames hold the solution fast: what each has pulled it by is counted."""
     squared = []
-
-    def recorded(*args: Any) -> float:
-        squared.append(frame_overdispersion(*args) ** 2)
-        return 1.0
-
-    monkeypatch.setattr("rigkit.calibration.rig.calibrate.frame_overdispersion", recorded)
     for seed in range(16):
         views = {n: own for n, own in rig_views(np.random.default_rng(seed), 6).items() if n != "fish"}
-        calibrate_rig(views, sizes(), model=MODELS, folds=0)
+        squared.append(calibrate_rig(views, sizes(), model=MODELS, folds=0).overdispersion ** 2)
     # One run scatters by 0.24 (0.12 of the standard deviation): 16 by 0.06.
     assert np.mean(squared) == pytest.approx(1.0, abs=0.2)
 
@@ -303,3 +299,53 @@ def test_overdispersion_is_one_for_noise_and_more_for_errors_in_common() -> None
         z.append((length - np.linalg.norm(mounts()["wide"][1].translation_mm)) / sigma)
     assert np.mean(clean) < 1.1 and np.mean(bumpy) > 1.15
     assert np.sqrt(np.mean(np.square(z))) < 1.6
+
+
+def mounted(rig: RigCalibration) -> Mounted:
+    cameras = {c.name: (c.camera, c.cam_from_rig) for c in rig.cameras}
+    return Mounted(cameras, rig.covariance, rig.freedom)
+
+
+@pytest.fixture(scope="module")
+def rigs() -> list[Mounted]:
+    found = []
+    for seed in range(RIGS):
+        views = {n: own for n, own in rig_views(np.random.default_rng(seed), 12).items() if n != "fish"}
+        found.append(mounted(calibrate_rig(views, sizes(), model=MODELS, folds=0)))
+    return found
+
+
+def moved(rig: Mounted, name: str, by: Rigid3) -> Mounted:
+    cameras = {n: (c, by @ m if n == name else m) for n, (c, m) in rig.cameras.items()}
+    return Mounted(cameras, rig.covariance, rig.freedom)
+
+
+def test_rigs_that_did_not_change_are_the_same(rigs: list[Mounted]) -> None:
+    """Chances of one and the same rig are uniform, and what was moved is found."""
+    chances = [compare_mounts(a, b).chance for a, b in zip(rigs[::2], rigs[1::2], strict=True)]
+    assert min(chances) > 0.01 and 0.15 < np.mean(chances) < 0.9
+    turned = Rigid3(exp_so3(np.array([0.0, 0.004, 0.0])), [MOVED_MM, 0.0, 0.0])
+    found = compare_mounts(rigs[0], moved(rigs[1], "wide", turned))
+    assert found.same is False and found.mounts[0].rotation_deg > 0.15
+
+
+def test_a_turn_of_the_lens_that_the_mount_takes_up_is_no_motion(rigs: list[Mounted]) -> None:
+    """A moved principal point and a mount turned back by what it looks like: the same rig. The mount alone, turned by
+    as much: another one."""
+    rig = rigs[0]
+    camera, mount = rig.cameras["wide"]
+    shifted = camera.parameters.copy()
+    # Kannala-Brandt: fx, fy, cx, cy, ...
+    shifted[2] += 2.0
+    other = camera.with_parameters(shifted)
+    turn = Rigid3(exp_so3(np.array([0.0, -2.0 / shifted[0], 0.0])), np.zeros(3))
+    both = dict(rig.cameras) | {"wide": (other, turn @ mount)}
+    hidden = compare_mounts(rig, Mounted(both, rig.covariance, rig.freedom))
+    plain = compare_mounts(rig, moved(rig, "wide", turn))
+    assert hidden.mounts[0].rotation_deg < 0.3 * plain.mounts[0].rotation_deg
+    assert hidden.chance > plain.chance
+
+
+def test_mounts_of_a_rig_that_does_not_say_how_sure_it_is_have_no_chance(rigs: list[Mounted]) -> None:
+    found = compare_mounts(rigs[0], Mounted(rigs[1].cameras, None))
+    assert found.chance is None and found.same is None and found.mounts[0].shift_mm > 0.0

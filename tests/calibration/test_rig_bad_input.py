@@ -11,7 +11,7 @@ from helpers.board_rig_scenes import ALIKE, corner_of_a_room, target_views
 from helpers.calibration_scenes import BOARD, lens
 
 from rigkit.calibration.rig.calibrate import calibrate_rig
-from rigkit.calibration.rig.compare import compare_mounts
+from rigkit.calibration.rig.compare import Mounted, compare_mounts
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
@@ -137,5 +137,6 @@ def test_a_mount_that_one_fold_alone_tells_has_no_held_out_error(rng: np.random.
 
 
 def test_one_camera_has_no_mount_to_compare() -> None:
-    found = compare_mounts(["only"], [Rigid3.identity()], [Rigid3.identity()], np.zeros((0, 0)), np.zeros((0, 0)))
+    only = Mounted({"only": (lens("reg"), Rigid3.identity())}, np.zeros((lens("reg").parameters.size,) * 2))
+    found = compare_mounts(only, only)
     assert found.mounts == () and found.same

@@ -61,7 +61,7 @@ def test_stereo_session(stereo: Path, capsys: pytest.CaptureFixture[str]) -> Non
     told = told_of(session, SESSION.format(value=BASELINE_MM[0], shape="auto"), capsys, "-r")
     baseline = told["baselines"][0]
     assert abs(baseline["value_mm"] - BASELINE_MM[0]) < BASELINE_MM[1]
-    assert 0.02 < baseline["sigma_mm"] < 0.1
+    assert 0.02 < baseline["sigma_mm"] < 0.2
     assert told["checks"][0]["passed"]
     assert told["heldout_rms_px"] < 0.1
     rig = load_rig(stereo / "rig.json")

@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.calibration.assemble import board_shapes, motion_of_world
+from rigkit.calibration.clustered import with_block
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
+from rigkit.calibration.rig.clustered import clustered_by_frame
 from rigkit.calibration.rig.flatness import shape_error
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.observations import Places
@@ -30,10 +32,8 @@ def assemble_rig(
     joint: JointRig,
     places: Places,
     heldout: tuple[float | None, tuple[float | None, ...]],
-    overdispersion: float,
 ) -> RigCalibration:
-    """Return the rig; `heldout` is the error of frames that took no part, over all cameras and of each, and
-    `overdispersion` by how much more the frames disagree than the corners' scatter explains.
+    """Return the rig; `heldout` is the error of frames that took no part, over all cameras and of each.
 
     Raises DegenerateError where there are fewer corners than unknowns.
     """
@@ -41,10 +41,12 @@ def assemble_rig(
     layout = state.layout(observations)
     sigma = residual_sigma(joint)
     unit, back, own = normal.covariance()
+    clustered = clustered_by_frame(observations, state, normal, unit, joint.frames, sigma)
+    overdispersion = clustered.overdispersion
+    covariance = with_block(unit * sigma**2, clustered.covariance, overdispersion**2)
     off = shape_error(observations, state, sigma * overdispersion)
-    if off.any():
-        unit[: len(off), : len(off)] += np.outer(off, off) / (sigma * overdispersion) ** 2
-    covariance = unit * (sigma * overdispersion) ** 2
+    covariance[: len(off), : len(off)] += np.outer(off, off)
+    own *= (sigma * overdispersion) ** 2
     boards = observations.cameras[0].boards
     points = observations.shape.points(state.unknowns)
     first_row = observations.cameras[0].first_row
@@ -58,7 +60,7 @@ def assemble_rig(
         px = np.where(residuals.valid[..., None], residuals.px, np.nan)
         poses = Rigid3.stack(alone.rotation, alone.translation_mm)
         views = ViewResult.of_views(observations.cameras[c].views, poses, px, kept)
-        frame = _frame_covariance(observations, joint, layout, c, unit, back, own) * (sigma * overdispersion) ** 2
+        frame = _frame_covariance(observations, joint, layout, c, covariance, back, own)
         p = alone.camera.parameters.size
         of_camera = replace(
             single[c],
@@ -67,6 +69,8 @@ def assemble_rig(
             heldout_rms_px=heldout[1][c],
             covariance=frame[:p, :p],
             frame_covariance=frame,
+            overdispersion=overdispersion,
+            freedom=clustered.freedom,
             views=views,
             convergence=joint.solution.convergence,
             boards=board_shapes(observations.cameras[c], observations.shape, state.unknowns),
@@ -84,6 +88,7 @@ def assemble_rig(
         covariance=covariance[: last.stop, : last.stop],
         sigma_px=sigma,
         overdispersion=overdispersion,
+        freedom=clustered.freedom,
         single=single,
         convergence=joint.solution.convergence,
         corner_count=everything.size,
@@ -118,12 +123,13 @@ def _frame_covariance(
     joint: JointRig,
     layout: Layout,
     c: int,
-    unit: FloatArray,
+    covariance: FloatArray,
     back: FloatArray,
     own: FloatArray,
 ) -> FloatArray:
-    """Return the covariance, for unit residuals, of the P parameters of camera `c` and of the mean motion of the boards
-    before it, (P + 6, P + 6), as `rigkit.calibration.assemble` has it for a camera alone."""
+    """Return the covariance of the P parameters of camera `c` and of the mean motion of the boards before it,
+    (P + 6, P + 6), as `rigkit.calibration.assemble` has it for a camera alone; from that of all globals and `own`
+    (F, 6, 6), what is the poses' own."""
     state = joint.solution.state
     translation = state.of_camera(c, observations).translation_mm
     f = observations.frame[c]
@@ -141,10 +147,10 @@ def _frame_covariance(
                 mean[:, run] += (lever[views] @ by.place[views]).sum(axis=0)
     each = np.zeros((len(observations.keys), 6, 6))
     np.add.at(each, f, through_target)
-    design = np.zeros((len(unit[layout.cameras[c]]) + 6, layout.count))
+    design = np.zeros((len(covariance[layout.cameras[c]]) + 6, layout.count))
     design[:-6, layout.cameras[c]] = np.eye(len(design) - 6)
     design[-6:] = mean
-    out = design @ unit @ design.T
+    out = design @ covariance @ design.T
     out[-6:, -6:] += np.einsum("fij,fjk,flk->il", each, own, each)
     return np.asarray(0.5 * (out + out.T))
 

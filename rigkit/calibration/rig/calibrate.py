@@ -13,12 +13,11 @@ from dataclasses import dataclass, replace
 
 from rigkit.calibration.calibrate import FOLDS, calibrate
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.rig.assemble import assemble_rig, residual_sigma
+from rigkit.calibration.rig.assemble import assemble_rig
 from rigkit.calibration.rig.board_places import board_places
 from rigkit.calibration.rig.heldout import heldout_rms
 from rigkit.calibration.rig.joint import solve_jointly
 from rigkit.calibration.rig.observations import FrameObservations, Places, frame_observations
-from rigkit.calibration.rig.overdispersion import frame_overdispersion
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.verdicts import judge_rig
 from rigkit.core.boards import Board
@@ -88,12 +87,8 @@ def calibrate_rig(
             named, places, notes = board_places(rigid_boards, again, boards)
         seen = named
     joint = solve_jointly(list(views), seen, single, places, progress)
-    solution = joint.solution
-    overdispersion = frame_overdispersion(
-        joint.observations, solution.state, solution.normal, joint.frames, residual_sigma(joint)
-    )
     heldout = heldout_rms(joint, folds)
-    rig = assemble_rig(list(views), single, joint, places, heldout, max(1.0, overdispersion))
+    rig = assemble_rig(list(views), single, joint, places, heldout)
     return replace(rig, verdicts=judge_rig(rig, (*notes, *joint.notes)))
 
 

@@ -1,21 +1,58 @@
-"""Two calibrations of a rig: have its cameras moved against each other?"""
+"""Two calibrations of a rig: have its cameras moved against each other?
+
+Boards alone leave open how a lens is turned in its camera: a moved principal point and a turned camera are the same
+image, and the mount takes the turn up. So mounts are compared as the lenses of the first rig have their axes. With W_k
+the rotation that hides a change dk_k of the lens k best (first order: W_k = G_k dk_k), the mount's perturbation
+(w, dt) at (R, t) becomes
+
+    w' = w - W_k + R W_0,      dt' = dt - W_k x t,
+
+whose covariance is that of intrinsics and mounts together.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import exp
+from itertools import pairwise
 
 import numpy as np
 
+from rigkit.calibration.clustered import drawn_errors
+from rigkit.calibration.uncertainty import projection_design
+from rigkit.cameras.base import Camera
+from rigkit.cameras.compare import compare_cameras, grid_pixels
 from rigkit.core.arrays import FloatArray
+from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import log_so3
+from rigkit.geometry.rotation import log_so3, skew
 
-__all__ = ["MountDifference", "RigDifference", "compare_mounts"]
+__all__ = ["MountDifference", "Mounted", "RigDifference", "compare_mounts"]
 
 SAME_CHANCE = 0.01
 """Mounts this unlikely to be one and the same rig's are another rig's, or a rig's that was bent."""
+GRID = (24, 18)
+"""Pixels (columns, rows) at which the lenses are compared."""
+FLOOR_PX = 1e-6
+"""No projection is surer than this: weights stay finite without noise."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Mounted:
+    """The cameras of a rig by name, each with its cam_from_rig, the first the identity; the covariance of all
+    intrinsics and then of the mounts of all but the first (left perturbations, rad and mm), None where that is not
+    known, and its degrees of freedom. An error of the squares' size is the same in two rigs where the boards are: it is
+    not in the covariance."""
+
+    cameras: dict[str, tuple[Camera, Rigid3]]
+    covariance: FloatArray | None
+    freedom: float = float("inf")
+
+    @property
+    def runs(self) -> list[slice]:
+        """Where the parameters of each camera stand in the covariance."""
+        ends = np.cumsum([0, *(camera.parameters.size for camera, _ in self.cameras.values())]).tolist()
+        return [slice(a, b) for a, b in pairwise(ends)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,30 +78,38 @@ class RigDifference:
         return None if self.chance is None else self.chance >= SAME_CHANCE
 
 
-def compare_mounts(
-    names: Sequence[str],
-    a: Sequence[Rigid3],
-    b: Sequence[Rigid3],
-    covariance_a: FloatArray | None,
-    covariance_b: FloatArray | None,
-) -> RigDifference:
-    """Compare cam_from_rig of n cameras, the first the identity in both; of one camera alone nothing can differ.
+def compare_mounts(a: Mounted, b: Mounted, *, seed: int = 0) -> RigDifference:
+    """Compare the mounts of two rigs after the rotations of their lenses; of one camera alone nothing can differ.
 
-    Parameters
-    ----------
-    covariance_a, covariance_b : (6 (n - 1), 6 (n - 1)) of the mounts of all but the first: left perturbations, rad and
-        mm; None where that is not known. An error of the squares' size is the same in both where the boards are: it is
-        not among them.
+    Raises InputError where the rigs have other cameras, or cameras of other image sizes; DegenerateError where two
+    cameras look elsewhere.
     """
-    both = None if covariance_a is None or covariance_b is None else covariance_a + covariance_b
-    off = np.concatenate([np.zeros(0), *(_off(first, second) for first, second in zip(a[1:], b[1:], strict=True))])
+    if list(a.cameras) != list(b.cameras):
+        raise InputError(f"rigs of other cameras: {', '.join(a.cameras)} and {', '.join(b.cameras)}")
+    turns = []
+    weights = [_weights(a, k) * _weights(b, k) for k in range(len(a.cameras))]
+    for (first, _), (second, _), weight in zip(a.cameras.values(), b.cameras.values(), weights, strict=True):
+        turns.append(compare_cameras(first, second, grid=GRID, weights=weight).b_from_a)
+    sits, sat = ([mount for _, mount in rig.cameras.values()] for rig in (a, b))
+    off = [np.zeros(0)]
+    for turn, here, there in list(zip(turns, sits, sat, strict=True))[1:]:
+        # As the axes of the first rig's lenses have it.
+        moved = Rigid3(turn.T @ there.rotation @ turns[0], turn.T @ there.translation_mm)
+        off.append(_off(here, moved))
+    apart = np.concatenate(off)
+    known = None
+    if a.covariance is not None and b.covariance is not None:
+        rng = np.random.default_rng(seed)
+        parts = [_moved(a, a.covariance, weights), _moved(b, b.covariance, weights)]
+        drawn = drawn_errors(parts[0], a.freedom, rng) - drawn_errors(parts[1], b.freedom, rng)
+        known = parts[0] + parts[1], drawn
     mounts = []
-    for k, name in enumerate(names[1:]):
+    for k, name in enumerate(list(a.cameras)[1:]):
         own = slice(6 * k, 6 * k + 6)
-        angle, shift = np.degrees(np.linalg.norm(off[own][:3])), np.linalg.norm(off[own][3:])
-        chance = None if both is None else _chance(off[own], both[own, own])
+        angle, shift = np.degrees(np.linalg.norm(apart[own][:3])), np.linalg.norm(apart[own][3:])
+        chance = None if known is None else _chance(apart[own], known[0][own, own], known[1][own])
         mounts.append(MountDifference(name, float(angle), float(shift), chance))
-    return RigDifference(tuple(mounts), None if both is None else _chance(off, both))
+    return RigDifference(tuple(mounts), None if known is None else _chance(apart, *known))
 
 
 def _off(first: Rigid3, second: Rigid3) -> FloatArray:
@@ -73,13 +118,56 @@ def _off(first: Rigid3, second: Rigid3) -> FloatArray:
     return np.concatenate([turn, first.translation_mm - second.translation_mm])
 
 
-def _chance(off: FloatArray, covariance: FloatArray) -> float:
-    """Return the probability of a chi-square, of as many degrees of freedom as `off` has numbers (even), this large."""
+def _weights(rig: Mounted, k: int) -> FloatArray:
+    """Return the weights (rows, columns) of the pixels of camera `k`: what the lens knows there, by its variance."""
+    camera = list(rig.cameras.values())[k][0]
+    pixels = grid_pixels(camera.size_px, GRID)
+    if rig.covariance is None:
+        return np.ones(pixels.shape[:2])
+    out = np.zeros(pixels.shape[:2])
+    rays, valid = camera.unproject(pixels)
+    p = camera.parameters.size
+    design = projection_design(camera, rays[valid])[:, :p]
+    own = rig.covariance[rig.runs[k], rig.runs[k]]
+    variance = np.einsum("ipm,pq,iqm->m", design, own, design)
+    out[valid] = 1.0 / np.maximum(np.sqrt(np.maximum(variance, 0.0)), FLOOR_PX)
+    return np.asarray(out / out.max())
+
+
+def _moved(rig: Mounted, covariance: FloatArray, weights: Sequence[FloatArray]) -> FloatArray:
+    """Return the covariance (6 (n - 1), 6 (n - 1)) of the mounts as the lenses have their axes."""
+    design = _design(rig, weights)
+    return design @ covariance @ design.T
+
+
+def _design(rig: Mounted, weights: Sequence[FloatArray]) -> FloatArray:
+    """Return d (w', dt') of all mounts / d (intrinsics, mounts), (6 (n - 1), K)."""
+    turns = []
+    for (camera, _), weight in zip(rig.cameras.values(), weights, strict=True):
+        rays, valid = camera.unproject(grid_pixels(camera.size_px, GRID))
+        p = camera.parameters.size
+        both = projection_design(camera, rays[valid]) * np.sqrt(weight[valid])
+        rows = both.transpose(1, 0, 2).reshape(p + 3, -1)
+        turns.append(-np.linalg.lstsq(rows[p:].T, rows[:p].T, rcond=None)[0])
+    runs, first = rig.runs, rig.runs[-1].stop
+    out = np.zeros((6 * (len(turns) - 1), first + 6 * (len(turns) - 1)))
+    for k, (_, mount) in enumerate(rig.cameras.values()):
+        if k == 0:
+            continue
+        turn, shift = slice(6 * k - 6, 6 * k - 3), slice(6 * k - 3, 6 * k)
+        out[turn, runs[0]] += mount.rotation @ turns[0]
+        out[turn, runs[k]] -= turns[k]
+        out[shift, runs[k]] += skew(mount.translation_mm) @ turns[k]
+        out[6 * k - 6 : 6 * k, first + 6 * k - 6 : first + 6 * k] = np.eye(6)
+    return out
+
+
+def _chance(off: FloatArray, covariance: FloatArray, errors: FloatArray) -> float:
+    """Return the probability that errors like those drawn, (n, N), are as large as `off` (n,), by the covariance."""
+    if not len(off):
+        return 1.0
     scale = 1.0 / np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
-    scaled = np.linalg.pinv(covariance * scale[:, None] * scale, hermitian=True)
-    half = 0.5 * float((off * scale) @ scaled @ (off * scale))
-    term = total = 1.0
-    for k in range(1, len(off) // 2):
-        term *= half / k
-        total += term
-    return float(min(exp(-half) * total, 1.0)) if half < 700.0 else 0.0
+    inverse = np.linalg.pinv(covariance * scale[:, None] * scale, hermitian=True)
+    size, drawn = off * scale, errors * scale[:, None]
+    null = np.einsum("in,in->n", drawn, inverse @ drawn)
+    return float((1 + np.count_nonzero(null >= size @ inverse @ size)) / (len(null) + 1))

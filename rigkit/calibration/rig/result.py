@@ -50,8 +50,9 @@ class RigCalibration:
         (rad) and translation (mm), six each.
     sigma_px : standard deviation of a corner per coordinate, of median quality.
     overdispersion : by how much more the frames disagree than the corners' scatter alone explains, as a ratio of
-        standard deviations: 1 where the errors of a frame's corners are independent. All covariances count it in, and
-        by how much cameras and mounts would move if the boards' corners were free.
+        standard deviations: 1 where the errors of a frame's corners are independent. All covariances rest on the
+        frames, and count in by how much cameras and mounts would move if the boards' corners were free.
+    freedom : degrees of freedom of the covariances; infinite where there are too few frames to know.
     single : each camera calibrated alone, with its own verdicts.
     convergence : of the joint solve.
     corner_count : corners used.
@@ -71,6 +72,7 @@ class RigCalibration:
     overdispersion: float
     single: tuple[Calibration, ...]
     convergence: Convergence
+    freedom: float = float("inf")
     corner_count: int = 0
     shared_count: int = 0
     left_out: tuple[tuple[str, str, str], ...] = ()
