@@ -27,6 +27,8 @@ REFIT_SIGMA = 0.5
 """What the models make of one lens is known from a refit to about half: poses and noise had their part in the fits."""
 SAME_CHANCE = 0.01
 """A difference this unlikely for one and the same camera is no chance."""
+FLOOR_PX = 0.05
+"""Of no combination of the parameters does a covariance from images know that it moves the projection by less."""
 IMPORTANT_PX = 0.1
 """What is smaller is of no importance, however surely it is there: corners of real images are hardly better."""
 
@@ -85,10 +87,11 @@ def compare_calibrations(
 
     Notes
     -----
-    The null distribution of the mean squared difference is sampled: both calibrations' errors are drawn from their
-    covariances (Student's t with the degrees of freedom that these have) and turned into differences by the
-    projection's derivatives. Models of different kinds or sizes show one lens differently, which no covariance knows:
-    that difference, from each camera refitted as the other is modelled, is a part of the null.
+    The difference is measured in units of what is expected of it (Mahalanobis), and the null distribution of that is
+    sampled: both calibrations' errors are drawn from their covariances (Student's t with the degrees of freedom that
+    these have) and turned into differences by the projection's derivatives. Models of different kinds or sizes show one
+    lens differently, which no covariance knows: that difference, from each camera refitted as the other is modelled, is
+    a part of the null.
     """
     pixels = grid_pixels(a.camera.size_px, grid)
     both = covered_by_boards(a, pixels) & covered_by_boards(b, pixels)
@@ -98,7 +101,7 @@ def compare_calibrations(
     designs = [_design(a, rays), _design(b, rays @ difference.b_from_a.T)]
     # The rotation that the comparison fits, at first order. In two calibrations of one camera both are the same.
     turn = np.linalg.qr(designs[0][:, -3:])[0]
-    by_model = _by_model(a, b, difference)[:, None]
+    by_model = _by_model(a, b, difference, turn)[:, None]
     columns = [design[:, :-3] for design in designs] + [by_model]
     together = np.concatenate([column - turn @ (turn.T @ column) for column in columns], axis=1)
     gram = together.T @ together / len(pixels)
@@ -110,31 +113,60 @@ def compare_calibrations(
             1.0 + REFIT_SIGMA * rng.normal(size=(1, SAMPLES)),
         ]
     )
-    null = np.einsum("kn,kn->n", drawn, gram @ drawn)
-    chance = float((1 + np.count_nonzero(null >= difference.rms_px**2)) / (SAMPLES + 1))
+    expected_by = np.zeros((len(gram), len(gram)))
     p = a.camera.parameters.size
-    expected = float(np.sum(gram[:p, :p] * a.covariance) + np.sum(gram[p:-1, p:-1] * b.covariance))
-    expected += (1.0 + REFIT_SIGMA**2) * float(gram[-1, -1])
+    expected_by[:p, :p], expected_by[p:-1, p:-1] = a.covariance, b.covariance
+    expected_by[-1, -1] = 1.0 + REFIT_SIGMA**2
+    found = difference.difference_px[difference.covered].reshape(-1)
+    chance = _chance(found - turn @ (turn.T @ found), together, expected_by, drawn)
+    expected = float(np.sum(gram * expected_by))
     return CalibrationComparison(
         difference, float(np.sqrt(max(expected, 0.0))), chance, _kind(a.camera) == _kind(b.camera)
     )
 
 
-def _by_model(a: Calibration, b: Calibration, difference: CameraDifference) -> FloatArray:
-    """Return the difference (2 M,), px at the covered pixels, that the two models alone make of one lens."""
+def _chance(found: FloatArray, design: FloatArray, covariance: FloatArray, drawn: FloatArray) -> float:
+    """Return the probability of a difference as large as `found` (2 N,), from draws (K, SAMPLES) of the errors of K
+    unknowns, their derivatives `design` (2 N, K) and covariance.
+
+    Each way in which two calibrations may differ is judged by how far it may: a focal length changed by a thousandth is
+    small beside what a principal point may do, and plain beside what a focal length may. What they know better than
+    FLOOR_PX is taken for known to so much: of the surest combinations a covariance from some images says least.
+    """
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    safe = np.where(sigma > 0.0, sigma, 1.0)
+    basis, how = np.linalg.qr(design * safe / np.sqrt(len(found) / 2.0))
+    spread, axes = np.linalg.eigh(how @ (covariance / np.outer(safe, safe)) @ how.T)
+    known = (np.maximum(spread, 0.0) + FLOOR_PX**2)[:, None]
+    scaled = found[:, None] / np.sqrt(len(found) / 2.0)
+    seen = axes.T @ (basis.T @ scaled)
+    beyond = max(float((scaled**2).sum() - (seen**2).sum()), 0.0)
+    size = float((seen**2 / known).sum()) + beyond / FLOOR_PX**2
+    null = ((axes.T @ (how @ (drawn / safe[:, None]))) ** 2 / known).sum(axis=0)
+    return float((1 + np.count_nonzero(null >= size)) / (SAMPLES + 1))
+
+
+def _by_model(a: Calibration, b: Calibration, difference: CameraDifference, turn: FloatArray) -> FloatArray:
+    """Return the difference (2 M,), px at the covered pixels, that the two models alone make of one lens, after the
+    rotation `turn` (2 M, 3)."""
     pixels = difference.pixels[difference.covered]
-    out = np.zeros((len(pixels), 2))
+    out = np.zeros(2 * len(pixels))
     if _kind(a.camera) == _kind(b.camera):
-        return out.reshape(-1)
+        return out
     for sign, lens, like, like_from_lens in ((1.0, a, b, difference.b_from_a), (-1.0, b, a, difference.b_from_a.T)):
         # The lens in the other's model, fitted as that was: where that had its corners.
         at = np.concatenate([view.pixels for view in like.views])
         rays, valid = lens.camera.unproject(at)
-        refitted = refit_camera(like.camera, rays[valid] @ like_from_lens.T, at[valid])
-        projected, valid = refitted.project(lens.camera.unproject(pixels)[0] @ like_from_lens.T)
-        out += sign * np.where(valid[:, None], projected - pixels, 0.0)
+        tried = []
+        # A model may ask for its own axis: turned as a moved lens is, none follows what one did of the other.
+        for how in (np.eye(3), like_from_lens):
+            refitted = refit_camera(like.camera, rays[valid] @ how.T, at[valid])
+            projected, seen = refitted.project(lens.camera.unproject(pixels)[0] @ how.T)
+            off = np.where(seen[:, None], projected - pixels, 0.0).reshape(-1)
+            tried.append(off - turn @ (turn.T @ off))
+        out += sign * min(tried, key=lambda off: float(off @ off))
     # What one model cannot follow of the other shows in one of the two refits.
-    return out.reshape(-1)
+    return out
 
 
 def _kind(camera: Camera) -> tuple[str, int]:
