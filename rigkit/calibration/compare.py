@@ -87,7 +87,7 @@ def compare_calibrations(
 
     Notes
     -----
-    The difference is measured in units of what is expected of it (Mahalanobis), and the null distribution of that is
+    The null distribution of the difference, of its size and of its size in units of what is expected of it, is
     sampled: both calibrations' errors are drawn from their covariances (Student's t with the degrees of freedom that
     these have) and turned into differences by the projection's derivatives. Models of different kinds or sizes show one
     lens differently, which no covariance knows: that difference, from each camera refitted as the other is modelled, is
@@ -129,21 +129,32 @@ def _chance(found: FloatArray, design: FloatArray, covariance: FloatArray, drawn
     """Return the probability of a difference as large as `found` (2 N,), from draws (K, SAMPLES) of the errors of K
     unknowns, their derivatives `design` (2 N, K) and covariance.
 
-    Each way in which two calibrations may differ is judged by how far it may: a focal length changed by a thousandth is
-    small beside what a principal point may do, and plain beside what a focal length may. What they know better than
-    FLOOR_PX is taken for known to so much: of the surest combinations a covariance from some images says least.
+    Two sizes count, and the one that says more is compared with what it would say by chance (Tippett's combination):
+    the mean square, which large differences in few ways show best, and the difference in units of what is expected
+    (Mahalanobis), in which each way to differ is judged by how far it may: a part of a pixel is small beside what a
+    principal point may do, and plain beside what a focal length may. What is known better than FLOOR_PX is taken for
+    known to so much: of the surest combinations a covariance from some images says least.
     """
+    pixels = len(found) / 2.0
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     safe = np.where(sigma > 0.0, sigma, 1.0)
-    basis, how = np.linalg.qr(design * safe / np.sqrt(len(found) / 2.0))
+    basis, how = np.linalg.qr(design * safe / np.sqrt(pixels))
     spread, axes = np.linalg.eigh(how @ (covariance / np.outer(safe, safe)) @ how.T)
-    known = (np.maximum(spread, 0.0) + FLOOR_PX**2)[:, None]
-    scaled = found[:, None] / np.sqrt(len(found) / 2.0)
-    seen = axes.T @ (basis.T @ scaled)
-    beyond = max(float((scaled**2).sum() - (seen**2).sum()), 0.0)
-    size = float((seen**2 / known).sum()) + beyond / FLOOR_PX**2
-    null = ((axes.T @ (how @ (drawn / safe[:, None]))) ** 2 / known).sum(axis=0)
-    return float((1 + np.count_nonzero(null >= size)) / (SAMPLES + 1))
+    known = np.maximum(spread, 0.0) + FLOOR_PX**2
+    total = float(found @ found) / pixels
+    seen = (axes.T @ (basis.T @ found)) ** 2 / pixels
+    beyond = max(total - float(seen.sum()), 0.0)
+    null = (axes.T @ (how @ (drawn / safe[:, None]))) ** 2
+    weighted = float((seen / known).sum()) + beyond / FLOOR_PX**2
+    likely = np.minimum(_exceeded(total, null.sum(axis=0)), _exceeded(weighted, (null / known[:, None]).sum(axis=0)))
+    return float(np.count_nonzero(likely <= likely[0]) / len(likely))
+
+
+def _exceeded(size: float, null: FloatArray) -> FloatArray:
+    """Return for `size` and then for each of `null` (N,) by which part of all of them it is reached, (N + 1,)."""
+    everything = np.concatenate([[size], null])
+    order = np.argsort(np.argsort(-everything, kind="stable"), kind="stable")
+    return np.asarray((order + 1.0) / len(everything))
 
 
 def _by_model(a: Calibration, b: Calibration, difference: CameraDifference, turn: FloatArray) -> FloatArray:

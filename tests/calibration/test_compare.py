@@ -76,7 +76,11 @@ def test_one_camera_in_two_models_is_one_camera(in_other_models: dict[str, list[
 def test_what_models_make_of_one_lens_is_allowed_for(
     in_other_models: dict[str, list[Calibration]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pair = in_other_models["kannala_brandt"][0], in_other_models["scaramuzza 5"][0]
+    # Surer than the models are alike.
+    pair = [
+        replace(c, covariance=1e-2 * c.covariance, frame_covariance=1e-2 * c.frame_covariance)
+        for c in (in_other_models["kannala_brandt"][0], in_other_models["scaramuzza 5"][0])
+    ]
     allowed = compare_calibrations(*pair)
     monkeypatch.setattr(
         compare, "_by_model", lambda a, b, difference, turn: np.zeros(2 * int(difference.covered.sum()))
@@ -92,7 +96,7 @@ def test_a_moved_lens_is_another_camera_in_another_model_too(in_other_models: di
             assert not compare_calibrations(replace(first, camera=first.camera.with_parameters(grown)), second).same
 
 
-def test_a_moved_principal_point_is_found_in_models_of_either_kind(in_other_models: dict[str, list[Calibration]]) -> None:
+def test_a_moved_principal_point_is_found_in_either_model(in_other_models: dict[str, list[Calibration]]) -> None:
     """Most of it is a rotation of the lens: a part of the pixel remains, in a direction that all views know well."""
     for name in ("kannala_brandt", "scaramuzza 5", "scaramuzza 6"):
         first, second = in_other_models["kannala_brandt"][0], in_other_models[name][1]
