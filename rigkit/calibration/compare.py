@@ -27,7 +27,7 @@ REFIT_SIGMA = 0.5
 """What the models make of one lens is known from a refit to about half: poses and noise had their part in the fits."""
 SAME_CHANCE = 0.01
 """A difference this unlikely for one and the same camera is no chance."""
-FLOOR_PX = 0.05
+COVARIANCE_FLOOR_PX = 0.05
 """Of no combination of the parameters does a covariance from images know that it moves the projection by less."""
 IMPORTANT_PX = 0.1
 """What is smaller is of no importance, however surely it is there: corners of real images are hardly better."""
@@ -132,20 +132,20 @@ def _chance(found: FloatArray, design: FloatArray, covariance: FloatArray, drawn
     Two sizes count, and the one that says more is compared with what it would say by chance (Tippett's combination):
     the mean square, which large differences in few ways show best, and the difference in units of what is expected
     (Mahalanobis), in which each way to differ is judged by how far it may: a part of a pixel is small beside what a
-    principal point may do, and plain beside what a focal length may. What is known better than FLOOR_PX is taken for
-    known to so much: of the surest combinations a covariance from some images says least.
+    principal point may do, and plain beside what a focal length may. What is known better than COVARIANCE_FLOOR_PX is
+    taken for known to so much: of the surest combinations a covariance from some images says least.
     """
     pixels = len(found) / 2.0
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     safe = np.where(sigma > 0.0, sigma, 1.0)
     basis, how = np.linalg.qr(design * safe / np.sqrt(pixels))
     spread, axes = np.linalg.eigh(how @ (covariance / np.outer(safe, safe)) @ how.T)
-    known = np.maximum(spread, 0.0) + FLOOR_PX**2
+    known = np.maximum(spread, 0.0) + COVARIANCE_FLOOR_PX**2
     total = float(found @ found) / pixels
     seen = (axes.T @ (basis.T @ found)) ** 2 / pixels
     beyond = max(total - float(seen.sum()), 0.0)
     null = (axes.T @ (how @ (drawn / safe[:, None]))) ** 2
-    weighted = float((seen / known).sum()) + beyond / FLOOR_PX**2
+    weighted = float((seen / known).sum()) + beyond / COVARIANCE_FLOOR_PX**2
     likely = np.minimum(_exceeded(total, null.sum(axis=0)), _exceeded(weighted, (null / known[:, None]).sum(axis=0)))
     return float(np.count_nonzero(likely <= likely[0]) / len(likely))
 

@@ -33,7 +33,7 @@ SAME_CHANCE = 0.01
 """Mounts this unlikely to be one and the same rig's are another rig's, or a rig's that was bent."""
 GRID = (24, 18)
 """Pixels (columns, rows) at which the lenses are compared."""
-FLOOR_PX = 1e-6
+WEIGHT_FLOOR_PX = 1e-6
 """No projection is surer than this: weights stay finite without noise."""
 
 
@@ -130,7 +130,7 @@ def _weights(rig: Mounted, k: int) -> FloatArray:
     design = projection_design(camera, rays[valid])[:, :p]
     own = rig.covariance[rig.runs[k], rig.runs[k]]
     variance = np.einsum("ipm,pq,iqm->m", design, own, design)
-    out[valid] = 1.0 / np.maximum(np.sqrt(np.maximum(variance, 0.0)), FLOOR_PX)
+    out[valid] = 1.0 / np.maximum(np.sqrt(np.maximum(variance, 0.0)), WEIGHT_FLOOR_PX)
     return np.asarray(out / out.max())
 
 
