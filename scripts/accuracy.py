@@ -88,7 +88,7 @@ def measure_pair(job: PairJob) -> dict[str, Any]:
         planes = [fit_plane(r.cloud.points_mm[r.cloud.on_board(name)]) for name in r.cloud.board_ids]
         angles = [np.rad2deg(angle_between(a.normal, b.normal)) for a, b in combinations(planes, 2)]
         normals = [
-            normal_errors(r.cloud.normals[r.cloud.on_board(n)], p)
+            normal_errors(r.cloud.normals[r.cloud.on_board(n)], p.normal)
             for n, p in zip(r.cloud.board_ids, planes, strict=True)
         ]
         out["methods"][method] = {

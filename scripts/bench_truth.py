@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import bench_truth_peers as peers
+import cv2
 import numpy as np
 from benchmark_calibration_peers import Mrcal
 
@@ -116,7 +117,15 @@ class Bench:
     def session(self, pattern: str, camera: str | None = None) -> Session:
         path = self.work / f"{self.name}.toml"
         boards = self.found.described.boards
-        return Session(path, self.images(pattern), boards, self.model, None, "auto", camera)
+        return Session(
+            path=path,
+            images=self.images(pattern),
+            boards=boards,
+            model=self.model,
+            degree=None,
+            board_shape="auto",
+            camera=camera,
+        )
 
     def alone(self, pattern: str, camera: str | None = None) -> SessionCalibration:
         output = self.work / f"{self.name}-{camera or 'camera'}.json"
@@ -140,8 +149,9 @@ def caliper_rows(bench: Bench, tool: str, points: np.ndarray) -> Iterator[Row]:
     of the calipers alone: none of the tools states how sure a board's released corners are."""
     columns = bench.board.columns
     at = {name: points[row * columns + column] for name, (column, row) in CALIPER_CORNERS.items()}
-    names = [a + b for a, b in combinations(at, 2)]
-    lengths = np.array([np.linalg.norm(at[a] - at[b]) for a, b in names])
+    pairs = list(combinations(sorted(at), 2))
+    names = [a + b for a, b in pairs]
+    lengths = np.array([np.linalg.norm(at[a] - at[b]) for a, b in pairs])
     measured = [bench.found.described.measurement(name) for name in names]
     truth = np.array([m.value for m in measured])
     lengths *= (truth @ lengths) / (lengths @ lengths)
@@ -189,7 +199,15 @@ def simplestereo(bench: Bench) -> Iterator[Row]:
     """Yield the focal length by rigkit's brown model and OpenCV's, which call it the same: both cameras alone."""
     for side in "LR":
         session = bench.session(f"calib/*_{side}.png", side)
-        camera = Session(session.path, session.images, session.boards, "brown", None, "auto", side)
+        camera = Session(
+            path=session.path,
+            images=session.images,
+            boards=session.boards,
+            model="brown",
+            degree=None,
+            board_shape="auto",
+            camera=side,
+        )
         found = calibrate_session(camera, CalibrateOptions(cache=Cache.UPDATE)).calibration
         sigma = float(found.parameter_sigmas[0])
         yield bench.against("focal length", f"{RIGKIT} (brown), {side}", float(found.camera.parameters[0]), sigma)
@@ -213,7 +231,7 @@ def held_out(camera: Camera, views: Sequence[BoardView]) -> tuple[float, int]:
     squares, count = 0.0, 0
     for view in views:
         rays, valid = camera.unproject(view.pixels)
-        bases = np.linalg.pinv(camera.ray_jacobian(view.pixels[valid]))
+        bases = np.linalg.pinv(camera.ray_jacobian(view.pixels[valid])).astype(np.float64)
         points = view.points()[valid]
         pose = board_poses(rays[valid], points, bases=bases)[0].cam_from_board
         pixels, seen = camera.project(pose.apply(points))
@@ -236,7 +254,7 @@ def ov_plane(bench: Bench) -> Iterator[Row]:
     ):
         try:
             rms, count = held_out(fitted(), test)
-        except (RigkitError, peers.cv2.error) as error:
+        except (RigkitError, cv2.error) as error:
             print(f"{bench.name}: {tool} fails: {str(error).splitlines()[-1]}")
             continue
         yield bench.row("rms on the published test images", tool, rms, how=f"{count} of {total} corners")
@@ -253,7 +271,7 @@ def one_camera(pattern: str, fisheye: bool, whole: str | None) -> Callable[[Benc
             views, size_px = peers.opencv_views(bench.images(pattern), bench.board)
             try:
                 fits[f"OpenCV ({len(views)} images)"] = peers.opencv_camera(views, size_px, fisheye)[0]
-            except peers.cv2.error as error:
+            except cv2.error as error:
                 print(f"{bench.name}: OpenCV fails: {str(error).splitlines()[-1]}")
         for tool, rms in fits.items():
             yield bench.row("rms of the fit", tool, rms)

@@ -146,7 +146,9 @@ def noisy_directions(rng: np.random.Generator, A21: np.ndarray, count: int) -> D
     turn = DIRECTION_NOISE_RAD * rng.normal(size=angle.shape)
     c, s = np.cos(turn), np.sin(turn)
     d2 = np.stack([c * d2[..., 0] - s * d2[..., 1], s * d2[..., 0] + c * d2[..., 1]], axis=-1)
-    return DirectionPairs(d1, d2, np.ones(angle.shape, dtype=bool), kinds=tuple(map(str, range(count))))
+    return DirectionPairs(
+        image1=d1, image2=d2, valid=np.ones(angle.shape, dtype=bool), kinds=tuple(map(str, range(count)))
+    )
 
 
 def affine_rows(corners: int) -> Iterator[Row]:

@@ -205,8 +205,10 @@ def _write_calibrations(folder: Path) -> None:
 
 def _write_cameras(folder: Path) -> None:
     """Cameras of every foreign format, by our own writers."""
-    brown = camera_model("brown")((640, 480), [420.0, 421.0, 320.0, 240.0, -0.28, 0.07, 2e-4, 1.7e-5])
-    fisheye = camera_model("kannala_brandt")((640, 480), [190.0, 190.0, 320.0, 240.0, 0.01, -0.005, 0.001, 0.0])
+    brown = camera_model("brown")((640, 480), np.array([420.0, 421.0, 320.0, 240.0, -0.28, 0.07, 2e-4, 1.7e-5]))
+    fisheye = camera_model("kannala_brandt")(
+        (640, 480), np.array([190.0, 190.0, 320.0, 240.0, 0.01, -0.005, 0.001, 0.0])
+    )
     turned = Rigid3(np.eye(3), np.array([-100.0, 0.0, 0.0]))
     texts = {
         "opencv.yaml": write_opencv(fisheye).text,
@@ -243,7 +245,16 @@ def small_cloud() -> OrientedCloud:
     points = np.column_stack([30.0 * d.grid, np.full(n, 900.0)])
     colours = np.full((n, 3), 128, dtype=np.uint8)
     normals = np.tile([0.0, 0.0, -1.0], (n, 1))
-    return OrientedCloud(points, normals, colours, np.zeros(n, int), d.grid, np.ones(n), np.full(n, 0.01), ("small",))
+    return OrientedCloud(
+        points_mm=points,
+        normals=normals,
+        colours=colours,
+        board_index=np.zeros(n, int),
+        grid=d.grid,
+        sigma_mm=np.ones(n),
+        normal_sigma_rad=np.full(n, 0.01),
+        board_ids=("small",),
+    )
 
 
 def _write_tables(folder: Path) -> None:

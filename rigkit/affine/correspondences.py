@@ -58,7 +58,9 @@ class Correspondences:
         """Return those picked by a mask or by indices."""
         d = self.directions
         if d is not None:
-            d = DirectionPairs(d.image1[which], d.image2[which], d.valid[which], d.scaled, d.kinds)
+            d = DirectionPairs(
+                image1=d.image1[which], image2=d.image2[which], valid=d.valid[which], scaled=d.scaled, kinds=d.kinds
+            )
         A21, sigma_px, sigma_A = (None if v is None else v[which] for v in (self.A21, self.sigma_px, self.sigma_A))
         return Correspondences(self.pixels1[which], self.pixels2[which], A21, d, sigma_px, sigma_A)
 

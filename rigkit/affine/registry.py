@@ -123,11 +123,11 @@ def _covariance(
     n, k = directions.valid.shape
     out = np.full((n, 4, 4), np.nan)
     some = DirectionPairs(
-        directions.image1[valid],
-        directions.image2[valid],
-        directions.valid[valid],
-        directions.scaled,
-        directions.kinds,
+        image1=directions.image1[valid],
+        image2=directions.image2[valid],
+        valid=directions.valid[valid],
+        scaled=directions.scaled,
+        kinds=directions.kinds,
     )
     if epipolar is not None and needs_epipolar(method):
         normals = EpipolarNormals(epipolar.n1[valid], epipolar.n2[valid])

@@ -13,7 +13,7 @@ from rigkit.core.errors import InputError
 __all__ = ["OrientedCloud"]
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class OrientedCloud:
     """Points with normals, in the frame of camera 1.
 

@@ -34,7 +34,7 @@ class CentralCamera(Protocol):
         """Return d ray / d pixel, (..., 3, 2)."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class DirectionPairs:
     """Corresponding image directions at N points, K directions each.
 
@@ -76,7 +76,7 @@ class DirectionPairs:
                 object.__setattr__(self, name, as_array(getattr(self, name), (n, 2), f"directions' {name}"))
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Matches:
     """N corresponding points of two images, with all that the geometry needs to know of the two cameras there.
 
@@ -164,20 +164,20 @@ class Matches:
             raise InputError(f"matches: {lost} of {n} points lie outside a camera's field of view; remove them first")
         ones = np.ones(n)
         return cls(
-            pixels1,
-            pixels2,
-            rays1,
-            rays2,
-            camera1.ray_jacobian(pixels1),
-            camera2.ray_jacobian(pixels2),
-            ones if sigma1_px is None else sigma1_px,
-            ones if sigma2_px is None else sigma2_px,
-            np.full(n, -1) if board_index is None else board_index,
-            np.zeros((n, 2), dtype=np.int64) if grid is None else grid,
-            getattr(camera1, "K", None),
-            getattr(camera2, "K", None),
-            A21,
-            sigma_A,
+            pixels1=pixels1,
+            pixels2=pixels2,
+            rays1=rays1,
+            rays2=rays2,
+            jacobians1=camera1.ray_jacobian(pixels1),
+            jacobians2=camera2.ray_jacobian(pixels2),
+            sigma1_px=ones if sigma1_px is None else sigma1_px,
+            sigma2_px=ones if sigma2_px is None else sigma2_px,
+            board_index=np.full(n, -1) if board_index is None else board_index,
+            grid=np.zeros((n, 2), dtype=np.int64) if grid is None else grid,
+            K1=getattr(camera1, "K", None),
+            K2=getattr(camera2, "K", None),
+            A21=A21,
+            sigma_A=sigma_A,
         )
 
     def with_affinities(self, A21: Affines, sigma_A: FloatArray | None = None) -> Matches:
@@ -191,18 +191,18 @@ class Matches:
             return None if array is None else array[which]
 
         return Matches(
-            self.pixels1[which],
-            self.pixels2[which],
-            self.rays1[which],
-            self.rays2[which],
-            self.jacobians1[which],
-            self.jacobians2[which],
-            self.sigma1_px[which],
-            self.sigma2_px[which],
-            self.board_index[which],
-            self.grid[which],
-            self.K1,
-            self.K2,
-            pick(self.A21),
-            pick(self.sigma_A),
+            pixels1=self.pixels1[which],
+            pixels2=self.pixels2[which],
+            rays1=self.rays1[which],
+            rays2=self.rays2[which],
+            jacobians1=self.jacobians1[which],
+            jacobians2=self.jacobians2[which],
+            sigma1_px=self.sigma1_px[which],
+            sigma2_px=self.sigma2_px[which],
+            board_index=self.board_index[which],
+            grid=self.grid[which],
+            K1=self.K1,
+            K2=self.K2,
+            A21=pick(self.A21),
+            sigma_A=pick(self.sigma_A),
         )

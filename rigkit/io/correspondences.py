@@ -237,7 +237,9 @@ def _built(
             if first.ndim != 3:
                 raise InputError(f"directions: expected shape NxKx2, got {first.shape}")
             kinds = tuple(f"direction {k + 1}" for k in range(first.shape[1]))
-            pairs = DirectionPairs(first, second, np.ones(first.shape[:2], dtype=bool), False, kinds)
+            pairs = DirectionPairs(
+                image1=first, image2=second, valid=np.ones(first.shape[:2], dtype=bool), scaled=False, kinds=kinds
+            )
         return Correspondences(pixels1, pixels2, A21, pairs, table.get("sigma_px"), table.get("sigma_A"))
     except InputError as error:
         raise InputError(f"correspondences '{source}': {error}") from error

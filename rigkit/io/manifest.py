@@ -44,7 +44,7 @@ class CameraEntry:
     session: Path | None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Pair:
     """Two images of the same boards.
 
@@ -226,7 +226,19 @@ def _pair(table: TomlTable, boards: Sequence[Board], cameras: Sequence[CameraEnt
         truth = truth_from_table(table.table("truth", hint="[pairs.truth]"), chosen)
     layout = _layout(table, names) if table.has("layout") else {}
     table.done()
-    return Pair(pair_id, camera1, camera2, image1, image2, pose_type, level, chosen, truth, layout, down)
+    return Pair(
+        pair_id=pair_id,
+        camera1=camera1,
+        camera2=camera2,
+        image1=image1,
+        image2=image2,
+        pose_type=pose_type,
+        level_sigma_deg=level,
+        boards=chosen,
+        truth=truth,
+        layout=layout,
+        down=down,
+    )
 
 
 def _level(

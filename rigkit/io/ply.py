@@ -136,15 +136,15 @@ def read_ply(path: str | Path) -> OrientedCloud:
 
     try:
         return OrientedCloud(
-            np.stack([table[name] for name in POINT], axis=-1).astype(np.float64),
-            np.stack([table[name] for name in NORMAL], axis=-1).astype(np.float64),
-            np.stack([column(name, 128) for name in COLOUR], axis=-1).astype(np.uint8),
-            column("board", -1).astype(np.int64),
-            np.stack([column("column", 0), column("row", 0)], axis=-1).astype(np.int64),
-            column("sigma_mm", np.nan).astype(np.float64),
-            np.deg2rad(column("normal_sigma_deg", np.nan).astype(np.float64)),
-            board_ids,
-            f"\ncomment {SIGMAS_COMMENT[True]}\n".encode() in data[:start],
+            points_mm=np.stack([table[name] for name in POINT], axis=-1).astype(np.float64),
+            normals=np.stack([table[name] for name in NORMAL], axis=-1).astype(np.float64),
+            colours=np.stack([column(name, 128) for name in COLOUR], axis=-1).astype(np.uint8),
+            board_index=column("board", -1).astype(np.int64),
+            grid=np.stack([column("column", 0), column("row", 0)], axis=-1).astype(np.int64),
+            sigma_mm=column("sigma_mm", np.nan).astype(np.float64),
+            normal_sigma_rad=np.deg2rad(column("normal_sigma_deg", np.nan).astype(np.float64)),
+            board_ids=board_ids,
+            calibration_in_sigmas=f"\ncomment {SIGMAS_COMMENT[True]}\n".encode() in data[:start],
         )
     except InputError as error:
         raise InputError(f"point cloud '{source}': {error}") from error

@@ -130,7 +130,9 @@ def load_rig_session(path: str | Path) -> RigSession:
     model, degree, shape = options_of(table)
     rigid = _rigid_boards(table, boards)
     if rigid and not table.has("cameras"):
-        one = Session(source, images_of(table), boards, model, degree, shape)
+        one = Session(
+            path=source, images=images_of(table), boards=boards, model=model, degree=degree, board_shape=shape
+        )
         table.done()
         return RigSession(source, {ONE: one}, None, (), rigid)
     if table.has("images"):
@@ -148,7 +150,9 @@ def load_rig_session(path: str | Path) -> RigSession:
             own, own_degree, _ = options_of(entry)
         images = images_of(entry)
         entry.done()
-        cameras[name] = Session(source, images, boards, own, own_degree, shape, name)
+        cameras[name] = Session(
+            path=source, images=images, boards=boards, model=own, degree=own_degree, board_shape=shape, camera=name
+        )
     if len(cameras) < 2:
         raise table.error("a rig has at least two [[cameras]]; for one, write its `images` without [[cameras]]")
     baselines = _baselines(table, tuple(cameras))

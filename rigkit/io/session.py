@@ -40,7 +40,7 @@ SCHEMA = "rigkit.session/1"
 HINT_BOARD = 'board = "board.toml" (or boards = ["a.toml", "b.toml"])'
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Session:
     """What to calibrate and how.
 
@@ -91,7 +91,7 @@ def load_session(path: str | Path) -> Session:
     boards = boards_of(table)
     model, degree, shape = options_of(table)
     table.done()
-    return Session(source, images, boards, model, degree, shape)
+    return Session(path=source, images=images, boards=boards, model=model, degree=degree, board_shape=shape)
 
 
 def options_of(table: TomlTable) -> tuple[str, int | None, str]:

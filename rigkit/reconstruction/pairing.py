@@ -32,7 +32,7 @@ MAX_RECTIFIED_RAD = np.deg2rad(75.0)
 only sensible one."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class MatchedPair:
     """Two images of the same boards, corner by corner.
 
@@ -157,17 +157,17 @@ def _matched(
     if unseen:
         notes.append(f"{unseen} corners lie outside the calibrated field of view and were left out")
     return MatchedPair(
-        pair_id,
-        camera1,
-        camera2,
-        used,
-        identity,
-        chain,
-        captured,
-        matches,
-        directions,
-        noise,
-        (*notes, *identity.notes),
+        pair_id=pair_id,
+        camera1=camera1,
+        camera2=camera2,
+        boards=used,
+        identity=identity,
+        chain=chain,
+        captured=captured,
+        matches=matches,
+        directions=directions,
+        noise=noise,
+        notes=(*notes, *identity.notes),
     )
 
 
@@ -244,9 +244,9 @@ def _directions(
             shared[k].append(field.shared[index])
         valid.append(field1.valid[i] & field2.valid[j])
     directions = DirectionPairs(
-        np.concatenate(vectors[0]),
-        np.concatenate(vectors[1]),
-        np.concatenate(valid),
+        image1=np.concatenate(vectors[0]),
+        image2=np.concatenate(vectors[1]),
+        valid=np.concatenate(valid),
         pixels1=matches.pixels1,
         pixels2=matches.pixels2,
     )

@@ -316,14 +316,14 @@ def oriented_cloud(
     if not kept.any():
         raise DegenerateError("no match has both a point and a normal; check affinities and baseline")
     cloud = OrientedCloud(
-        points[kept],
-        normals.normals[kept],
-        colours[kept],
-        m.board_index[kept],
-        m.grid[kept],
-        np.sqrt(np.linalg.eigvalsh(covariance[kept])[:, -1]),
-        normals.sigma_rad[kept],
-        board_ids,
+        points_mm=points[kept],
+        normals=normals.normals[kept],
+        colours=colours[kept],
+        board_index=m.board_index[kept],
+        grid=m.grid[kept],
+        sigma_mm=np.sqrt(np.linalg.eigvalsh(covariance[kept])[:, -1]),
+        normal_sigma_rad=normals.sigma_rad[kept],
+        board_ids=board_ids,
     )
     return cloud, kept
 

@@ -353,14 +353,14 @@ def _cloud(
 
 def _select(cloud: OrientedCloud, which: BoolArray) -> OrientedCloud:
     return OrientedCloud(
-        cloud.points_mm[which],
-        cloud.normals[which],
-        cloud.colours[which],
-        cloud.board_index[which],
-        cloud.grid[which],
-        cloud.sigma_mm[which],
-        cloud.normal_sigma_rad[which],
-        cloud.board_ids,
+        points_mm=cloud.points_mm[which],
+        normals=cloud.normals[which],
+        colours=cloud.colours[which],
+        board_index=cloud.board_index[which],
+        grid=cloud.grid[which],
+        sigma_mm=cloud.sigma_mm[which],
+        normal_sigma_rad=cloud.normal_sigma_rad[which],
+        board_ids=cloud.board_ids,
     )
 
 

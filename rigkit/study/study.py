@@ -72,7 +72,7 @@ class Variant:
     det_scale: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Study:
     """What is simulated.
 
@@ -212,7 +212,9 @@ class _Scene:
         board, trials = self.study.board, self.shape[0]
         lattices = [p.reshape(trials, PLANES, board.rows, board.columns, 2) for p in (pixels1, pixels2)]
         both = [self._along(lattice, support).reshape(-1, 3, 2) for lattice in lattices]
-        return DirectionPairs(both[0], both[1], np.asarray(np.isfinite(np.stack(both)).all(axis=(0, -1))))
+        return DirectionPairs(
+            image1=both[0], image2=both[1], valid=np.asarray(np.isfinite(np.stack(both)).all(axis=(0, -1)))
+        )
 
     def _along(self, lattices: Pixels, support: str) -> FloatArray:
         """Return the directions of all lattices (trials, planes, rows, columns, 2) at once where a formula does it."""

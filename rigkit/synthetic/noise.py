@@ -48,7 +48,9 @@ def rotate_directions(
     for k, noisy in enumerate(images.which):
         if noisy and sigma_rad > 0.0:
             out[k] = turn(out[k], sigma_rad * rng.standard_normal(shape))
-    return DirectionPairs(out[0], out[1], directions.valid, directions.scaled, directions.kinds)
+    return DirectionPairs(
+        image1=out[0], image2=out[1], valid=directions.valid, scaled=directions.scaled, kinds=directions.kinds
+    )
 
 
 def corner_noise(

@@ -33,7 +33,7 @@ PLANAR_YAW_DEG = 10.0
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class StereoScene:
     """Boards, what stands behind them, and two cameras.
 
@@ -196,7 +196,15 @@ def random_pair(
             second = relative_pose(pose_type, baseline_mm, rng, level_sigma_deg=level_sigma_deg) @ first
             fits = True
         if fits and _sees_all(placed, second_camera, second):
-            return StereoScene(tuple(placed), behind, camera, second_camera, first, second, pose_type)
+            return StereoScene(
+                boards=tuple(placed),
+                panels=behind,
+                camera1=camera,
+                camera2=second_camera,
+                cam1_from_world=first,
+                cam2_from_world=second,
+                pose_type=pose_type,
+            )
     raise DegenerateError(
         f"random pair: in {TRIES} random views no {pose_type} pair saw all corners; "
         "use a wider lens, a shorter baseline or a larger distance"

@@ -35,7 +35,7 @@ class Shadow:
     factor: float = 0.35
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Photometry:
     """Light and sensor.
 

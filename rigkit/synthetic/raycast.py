@@ -30,7 +30,7 @@ SMOOTH_DEPTH_RATIO = 0.5
 """Depth ratio over a tile above which x and y are fitted themselves: the fit's error is below 6 ** -NODES = 1e-7."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Surface:
     """A rectangle in the camera frame: `plane_from_ray` maps a ray to (x, y, 1) / range in squares."""
 
@@ -56,15 +56,15 @@ def board_surface(placed: PlacedBoard, cam_from_world: Rigid3) -> Surface:
     front = float(cam_from_board.rotation[:, 2] @ cam_from_board.translation_mm) > 0.0
     centre = cam_from_board.apply(board.points()).mean(axis=0)
     return Surface(
-        _plane_from_ray(cam_from_board, scale),
-        low,
-        high,
-        board.size if front else None,
-        placed.white,
-        placed.black,
-        placed.first_black if board.markers is None else board.first_black,
-        float(np.linalg.norm(centre)),
-        marker_rectangles(board) if front and board.markers is not None else None,
+        plane_from_ray=_plane_from_ray(cam_from_board, scale),
+        low=low,
+        high=high,
+        cells=board.size if front else None,
+        white=placed.white,
+        black=placed.black,
+        first_black=placed.first_black if board.markers is None else board.first_black,
+        distance_mm=float(np.linalg.norm(centre)),
+        marks=marker_rectangles(board) if front and board.markers is not None else None,
     )
 
 
@@ -72,7 +72,9 @@ def panel_surface(panel: Panel, cam_from_world: Rigid3) -> Surface:
     half = np.array([0.5, 0.5])
     scale = np.array([panel.width_mm, panel.height_mm])
     matrix = _plane_from_ray(cam_from_world @ panel.world_from_panel, scale)
-    return Surface(matrix, -half, half, None, panel.reflectance, panel.reflectance)
+    return Surface(
+        plane_from_ray=matrix, low=-half, high=half, cells=None, white=panel.reflectance, black=panel.reflectance
+    )
 
 
 def _plane_from_ray(cam_from_plane: Rigid3, scale: FloatArray) -> FloatArray:

@@ -25,7 +25,13 @@ def test_noise_of_a_board_recovers_what_edges_share(rng: np.random.Generator) ->
 
 
 def test_angular_noise_is_across_and_as_long_as_the_direction() -> None:
-    pairs = DirectionPairs(np.array([[[3.0, 4.0]]]), np.array([[[0.0, -2.0]]]), np.ones((1, 1), bool), True, ("h",))
+    pairs = DirectionPairs(
+        image1=np.array([[[3.0, 4.0]]]),
+        image2=np.array([[[0.0, -2.0]]]),
+        valid=np.ones((1, 1), bool),
+        scaled=True,
+        kinds=("h",),
+    )
     noise = DirectionNoise.angular(pairs, 0.1, 0.2)
     np.testing.assert_allclose(noise.covariance1[0], 0.01 * np.array([[16.0, -12.0], [-12.0, 9.0]]))
     np.testing.assert_allclose(noise.covariance2[0], 0.04 * np.array([[4.0, 0.0], [0.0, 0.0]]), atol=1e-18)
@@ -33,7 +39,7 @@ def test_angular_noise_is_across_and_as_long_as_the_direction() -> None:
 
 def test_isotropic_noise_takes_a_sigma_for_each(rng: np.random.Generator) -> None:
     d = rng.normal(size=(4, 3, 2))
-    pairs = DirectionPairs(d, d, np.ones((4, 3), dtype=bool))
+    pairs = DirectionPairs(image1=d, image2=d, valid=np.ones((4, 3), dtype=bool))
     sigma = rng.uniform(0.1, 1.0, (4, 3))
     noise = DirectionNoise.isotropic(pairs, sigma, 0.5)
     np.testing.assert_allclose(np.diagonal(noise.covariance1, axis1=1, axis2=2), np.repeat(sigma**2, 2, axis=1))

@@ -147,7 +147,13 @@ class TestDegenerateDirections:
 
     def test_two_directions_only_are_flagged(self) -> None:
         c = self.scene(STANDARD, 0.0)
-        two = DirectionPairs(c.exact1[:, :2], c.exact2[:, :2], np.ones((len(c), 2), dtype=bool), True, ("h", "v"))
+        two = DirectionPairs(
+            image1=c.exact1[:, :2],
+            image2=c.exact2[:, :2],
+            valid=np.ones((len(c), 2), dtype=bool),
+            scaled=True,
+            kinds=("h", "v"),
+        )
         found = affines_from_directions(two, "F2UDIR", epipolar=c.epipolar)
         assert not found.valid[c.plane <= 1].any()
         assert np.isnan(found.A21[c.plane <= 1]).all()
@@ -180,7 +186,13 @@ class TestDegenerateDirections:
 
     def test_conditioning_is_the_smaller_alignment_of_perpendicular_directions(self) -> None:
         c = self.scene(STANDARD, 25.0)
-        two = DirectionPairs(c.exact1[:, :2], c.exact2[:, :2], np.ones((len(c), 2), dtype=bool), True, ("h", "v"))
+        two = DirectionPairs(
+            image1=c.exact1[:, :2],
+            image2=c.exact2[:, :2],
+            valid=np.ones((len(c), 2), dtype=bool),
+            scaled=True,
+            kinds=("h", "v"),
+        )
         found = affines_from_directions(two, "F2UDIR", epipolar=c.epipolar, min_conditioning=0.0)
         # The board in front: its edges are perpendicular in the image too.
         on = c.plane == 0

@@ -24,7 +24,13 @@ def corners() -> Corners:
 def lengths_lost(directions: DirectionPairs, scaled: list[bool], rng: np.random.Generator) -> DirectionPairs:
     """Stretch the directions whose length shall not count, so that it cannot be used by mistake."""
     factor = np.where(scaled, 1.0, rng.uniform(0.2, 5.0, directions.valid.shape))[..., None]
-    return DirectionPairs(directions.image1, directions.image2 * factor, directions.valid, False, directions.kinds)
+    return DirectionPairs(
+        image1=directions.image1,
+        image2=directions.image2 * factor,
+        valid=directions.valid,
+        scaled=False,
+        kinds=directions.kinds,
+    )
 
 
 @pytest.mark.parametrize(
@@ -48,7 +54,13 @@ def test_exact(scaled: list[bool], with_epipolar: bool, corners: Corners, rng: n
 
 def test_one_direction_with_length_and_the_epipolar_geometry(corners: Corners) -> None:
     """One direction is not enough: along the other axis nothing is known."""
-    one = DirectionPairs(corners.exact1[:, :1], corners.exact2[:, :1], np.ones((len(corners), 1), bool), True, ("h",))
+    one = DirectionPairs(
+        image1=corners.exact1[:, :1],
+        image2=corners.exact2[:, :1],
+        valid=np.ones((len(corners), 1), bool),
+        scaled=True,
+        kinds=("h",),
+    )
     assert not affines_from_mixed_directions(one, np.array(True), epipolar=corners.epipolar).valid.any()
 
 
@@ -62,7 +74,7 @@ def test_too_few_equations(scaled: list[bool], with_epipolar: bool, count: int, 
     valid = directions.valid.copy()
     if any(scaled) or with_epipolar:
         valid[:, 2] = False
-    some = DirectionPairs(directions.image1, directions.image2, valid)
+    some = DirectionPairs(image1=directions.image1, image2=directions.image2, valid=valid)
     epipolar = corners.epipolar if with_epipolar else None
     found = affines_from_mixed_directions(some, np.array(scaled), epipolar=epipolar)
     assert found.valid.any() == (count == 2)
@@ -78,7 +90,9 @@ def test_without_lengths_it_is_f3udir(corners: Corners, rng: np.random.Generator
 
 def test_two_with_lengths_are_2sdir(corners: Corners, rng: np.random.Generator) -> None:
     noisy = turned(corners.directions(), 3.0, rng)
-    two = DirectionPairs(noisy.image1[:, :2], noisy.image2[:, :2], noisy.valid[:, :2], True, ("h", "v"))
+    two = DirectionPairs(
+        image1=noisy.image1[:, :2], image2=noisy.image2[:, :2], valid=noisy.valid[:, :2], scaled=True, kinds=("h", "v")
+    )
     found = affines_from_mixed_directions(two, np.array(True))
     np.testing.assert_allclose(found.A21, affines_from_directions(two, "2SDIR").A21, rtol=1e-8)
 
@@ -94,7 +108,9 @@ def test_predicted_covariance(
     )
     many = corners.select(np.full(4000, 70))
     images = [e + s * rng.normal(size=e.shape) for e, s in ((many.exact1, 0.1), (many.exact2, 0.07))]
-    noisy = lengths_lost(DirectionPairs(*images, np.ones((4000, 3), dtype=bool)), scaled, rng)
+    noisy = lengths_lost(
+        DirectionPairs(image1=images[0], image2=images[1], valid=np.ones((4000, 3), dtype=bool)), scaled, rng
+    )
     sample = affines_from_mixed_directions(
         noisy, np.array(scaled), epipolar=many.epipolar if with_epipolar else None, min_conditioning=0.0
     )

@@ -201,7 +201,9 @@ class TestPredictedSigma:
         assert np.abs(predicted.covariance[0] @ c.normals[0]).max() < 1e-12
         many = c.select(np.zeros(4000, dtype=int))
         images = [e + s * rng.normal(size=e.shape) for e, s in ((many.exact1, 0.05), (many.exact2, 0.08))]
-        found = affines_from_directions(DirectionPairs(*images, np.ones((4000, 3), dtype=bool)), "3SDIR")
+        found = affines_from_directions(
+            DirectionPairs(image1=images[0], image2=images[1], valid=np.ones((4000, 3), dtype=bool)), "3SDIR"
+        )
         normals, _ = normals_from_affines(many.J1, many.J2, found.A21)
         measured = np.cov(normals.T)
         assert np.abs(measured - predicted.covariance[0]).max() < SINGLE_CORNER * np.trace(measured)
@@ -249,7 +251,9 @@ class TestWeighted:
         directions = c.directions()
         noise = DirectionNoise.isotropic(directions, 0.1, 0.1)
         images = [e + 0.1 * rng.normal(size=e.shape) for e in (c.exact1, c.exact2)]
-        found = affines_from_directions(DirectionPairs(*images, directions.valid), "2SDIR", noise=noise)
+        found = affines_from_directions(
+            DirectionPairs(image1=images[0], image2=images[1], valid=directions.valid), "2SDIR", noise=noise
+        )
         rms = {}
         for weighted in (False, True):
             estimate = estimate_normals(c.J1, c.J2, found.A21, covariance=found.covariance, weighted=weighted)

@@ -29,7 +29,7 @@ def random_directions(rng: np.random.Generator, n: int, k: int, noise_rad: float
     c, s = np.cos(turn), np.sin(turn)
     d2 = np.stack([c * d2[..., 0] - s * d2[..., 1], s * d2[..., 0] + c * d2[..., 1]], axis=-1)
     valid = np.ones((n, k), dtype=bool)
-    return DirectionPairs(d1, d2, valid, scaled=False, kinds=tuple(map(str, range(k)))), A21
+    return DirectionPairs(image1=d1, image2=d2, valid=valid, scaled=False, kinds=tuple(map(str, range(k)))), A21
 
 
 def quadratic_form(directions: DirectionPairs, i: int) -> np.ndarray:
@@ -121,7 +121,9 @@ def test_negative_determinants_are_invalid(rng: np.random.Generator) -> None:
     directions, _ = random_directions(rng, 5, 3, 0.0)
     found = affines_from_directions(directions, "DET3UDIR", determinant=np.array([1.0, -1.0, 0.0, np.nan, 2.0]))
     assert not found.valid[1:4].any()
-    mirrored = DirectionPairs(directions.image1, directions.image2 * [1.0, -1.0], directions.valid, True)
+    mirrored = DirectionPairs(
+        image1=directions.image1, image2=directions.image2 * [1.0, -1.0], valid=directions.valid, scaled=True
+    )
     assert not affines_from_directions(mirrored, "DET3UDIR").valid.any()
 
 
@@ -130,7 +132,7 @@ class TestDegenerate:
         directions, A_true = random_directions(rng, 50, 3, 0.0)
         first, second = directions.image1.copy(), directions.image2.copy()
         first[:, 2], second[:, 2] = -first[:, 0], -second[:, 0]
-        parallel = DirectionPairs(first, second, directions.valid, False)
+        parallel = DirectionPairs(image1=first, image2=second, valid=directions.valid, scaled=False)
         found = affines_from_directions(parallel, "DET3UDIR", determinant=np.linalg.det(A_true))
         assert not found.valid.any()
         assert np.nanmax(found.conditioning) < 1e-6
@@ -139,7 +141,7 @@ class TestDegenerate:
         directions, A_true = random_directions(rng, 50, 4, 0.0)
         first, second = directions.image1.copy(), directions.image2.copy()
         first[:, 2], second[:, 2] = -first[:, 0], -second[:, 0]
-        four = DirectionPairs(first, second, directions.valid, False, directions.kinds)
+        four = DirectionPairs(image1=first, image2=second, valid=directions.valid, scaled=False, kinds=directions.kinds)
         found = affines_from_directions(four, "DET3UDIR", determinant=np.linalg.det(A_true), min_conditioning=0.02)
         assert found.valid.mean() > 0.7
         good = found.valid
@@ -174,7 +176,7 @@ class TestScale:
     def test_the_squared_mean_is_exact_for_similarities(self, rng: np.random.Generator) -> None:
         directions, _ = random_directions(rng, 30, 3, 0.0)
         turn = np.array([[0.6, -0.8], [0.8, 0.6]]) * 1.7
-        pairs = DirectionPairs(directions.image1, directions.image1 @ turn.T, directions.valid)
+        pairs = DirectionPairs(image1=directions.image1, image2=directions.image1 @ turn.T, valid=directions.valid)
         found = affines_from_directions(pairs, "DET3UDIR", scale="sqmean", min_conditioning=0.0)
         np.testing.assert_allclose(np.linalg.det(found.A21), 1.7**2, rtol=EXACT_REL)
 

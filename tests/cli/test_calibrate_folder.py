@@ -143,7 +143,9 @@ def test_pictures_of_two_cameras_are_a_rig(pictures: Path, tmp_path: Path, layou
     rig = load_rig(folder / "rig.json")
     assert list(rig) == list(load_rig_session(folder / "session.toml").cameras) == ["left", "right"]
     found = rig["right"][1] @ rig["left"][1].inverse()
-    sigma = np.sqrt(np.diag(load_saved_rig(folder / "rig.json").mount_covariance)[-3:])
+    covariance = load_saved_rig(folder / "rig.json").covariance
+    assert covariance is not None
+    sigma = np.sqrt(np.diag(covariance)[-3:])
     assert np.all(np.abs(found.translation_mm - RIGHT_FROM_LEFT.translation_mm) < SIGMAS * sigma + 0.05)
     assert np.linalg.norm(sigma) < 1.0
     for name in rig:

@@ -46,14 +46,16 @@ def test_one_corner_is_the_same_as_many(method: str, corners: Corners, rng: np.r
     directions = turned(corners.directions(), 2.0, rng)
     many = affines_from_directions(directions, method, epipolar=corners.epipolar)
     for i in (0, 17, len(corners) - 1):
-        one = DirectionPairs(directions.image1[i : i + 1], directions.image2[i : i + 1], directions.valid[i : i + 1])
+        one = DirectionPairs(
+            image1=directions.image1[i : i + 1], image2=directions.image2[i : i + 1], valid=directions.valid[i : i + 1]
+        )
         e = EpipolarNormals(corners.n1[i : i + 1], corners.n2[i : i + 1])
         np.testing.assert_array_equal(affines_from_directions(one, method, epipolar=e).A21[0], many.A21[i])
 
 
 @METHODS
 def test_no_corners(method: str) -> None:
-    empty = DirectionPairs(np.zeros((0, 3, 2)), np.zeros((0, 3, 2)), np.zeros((0, 3), dtype=bool))
+    empty = DirectionPairs(image1=np.zeros((0, 3, 2)), image2=np.zeros((0, 3, 2)), valid=np.zeros((0, 3), dtype=bool))
     found = affines_from_directions(empty, method, epipolar=EpipolarNormals(np.zeros((0, 2)), np.zeros((0, 2))))
     assert found.A21.shape == (0, 2, 2)
 
@@ -64,7 +66,9 @@ def test_blocks_join_seamlessly(method: str, corners: Corners, rng: np.random.Ge
     assert len(repeat) > 20000
     big = corners.select(repeat)
     directions = turned(corners.directions(), 2.0, rng)
-    tiled = DirectionPairs(directions.image1[repeat], directions.image2[repeat], directions.valid[repeat])
+    tiled = DirectionPairs(
+        image1=directions.image1[repeat], image2=directions.image2[repeat], valid=directions.valid[repeat]
+    )
     few = affines_from_directions(directions, method, epipolar=corners.epipolar)
     many = affines_from_directions(tiled, method, epipolar=big.epipolar)
     np.testing.assert_array_equal(many.A21, few.A21[repeat])
@@ -75,7 +79,7 @@ def test_blocks_join_seamlessly(method: str, corners: Corners, rng: np.random.Ge
 def test_lengths_matter_only_where_they_should(method: str, corners: Corners, rng: np.random.Generator) -> None:
     directions = turned(corners.directions(), 2.0, rng)
     factor = rng.uniform(0.3, 3.0, (len(corners), 3, 1))
-    stretched = DirectionPairs(directions.image1, directions.image2 * factor, directions.valid)
+    stretched = DirectionPairs(image1=directions.image1, image2=directions.image2 * factor, valid=directions.valid)
     before = affines_from_directions(directions, method, epipolar=corners.epipolar).A21
     after = affines_from_directions(stretched, method, epipolar=corners.epipolar).A21
     if needs_lengths(method):
@@ -102,7 +106,7 @@ def test_bad_directions_are_left_out(method: str, corners: Corners) -> None:
     valid[2, 0] = False
     valid[3] = False
     first[4, :2] = np.nan
-    directions = DirectionPairs(first, second, valid)
+    directions = DirectionPairs(image1=first, image2=second, valid=valid)
     found = affines_from_directions(directions, method, epipolar=corners.epipolar, min_conditioning=0.0)
     enough = {True: 3, False: 2}[method == "DET3UDIR"]
     assert found.valid[:5].tolist() == [enough == 2] * 3 + [False, False]
@@ -120,7 +124,7 @@ def test_parallel_directions_are_invalid(method: str, corners: Corners) -> None:
         first[7, :1] * np.array([[1.0], [2.0], [-1.0]]),
         second[7, :1] * np.array([[1.0], [2.0], [-1.0]]),
     )
-    directions = DirectionPairs(first, second, np.ones(first.shape[:2], dtype=bool))
+    directions = DirectionPairs(image1=first, image2=second, valid=np.ones(first.shape[:2], dtype=bool))
     found = affines_from_directions(directions, method, epipolar=corners.epipolar)
     assert not found.valid[7]
     assert not found.conditioning[7] > 1e-6
@@ -132,7 +136,7 @@ def test_covariant_under_linear_changes_of_the_pixels(method: str, corners: Corn
     """d1' = L1 d1, d2' = L2 d2, n1' = L1^-T n1, n2' = L2^-T n2 must give L2 A L1^-1, with noisy directions too."""
     L1, L2 = np.eye(2) + 0.4 * rng.normal(size=(2, 2, 2))
     directions = turned(corners.directions(), 3.0, rng)
-    changed = DirectionPairs(directions.image1 @ L1.T, directions.image2 @ L2.T, directions.valid)
+    changed = DirectionPairs(image1=directions.image1 @ L1.T, image2=directions.image2 @ L2.T, valid=directions.valid)
     epipolar = EpipolarNormals(corners.n1 @ np.linalg.inv(L1), corners.n2 @ np.linalg.inv(L2))
     before = affines_from_directions(directions, method, epipolar=corners.epipolar, min_conditioning=0.0).A21
     after = affines_from_directions(changed, method, epipolar=epipolar, min_conditioning=0.0).A21
@@ -148,8 +152,16 @@ def test_least_squares_of_angles_is_not_covariant(method: str, corners: Corners,
     directions = turned(corners.directions(), 3.0, rng)
     if method == "DET3UDIR":
         more = [np.concatenate([d, d[:, :1] - d[:, 1:2]], axis=1) for d in (directions.image1, directions.image2)]
-        directions = DirectionPairs(*more, np.ones((len(corners), 4), dtype=bool), kinds=("h", "v", "d", "e"))
-    changed = DirectionPairs(directions.image1 @ L.T, directions.image2 @ L.T, directions.valid, True, directions.kinds)
+        directions = DirectionPairs(
+            image1=more[0], image2=more[1], valid=np.ones((len(corners), 4), dtype=bool), kinds=("h", "v", "d", "e")
+        )
+    changed = DirectionPairs(
+        image1=directions.image1 @ L.T,
+        image2=directions.image2 @ L.T,
+        valid=directions.valid,
+        scaled=True,
+        kinds=directions.kinds,
+    )
     epipolar = EpipolarNormals(corners.n1 @ np.linalg.inv(L), corners.n2 @ np.linalg.inv(L))
     before = affines_from_directions(directions, method, epipolar=corners.epipolar).A21
     after = affines_from_directions(changed, method, epipolar=epipolar).A21
@@ -195,7 +207,7 @@ def test_predicted_covariance_agrees_with_monte_carlo(
     for exact, factor in ((c.exact1, 1.0), (c.exact2, np.sqrt(0.5))):
         draw = factor * (rng.normal(size=(trials, 4)) @ joint.T).reshape(trials, 2, 2)
         images.append(exact + np.concatenate([draw, draw.sum(axis=1, keepdims=True)], axis=1))
-    noisy = DirectionPairs(*images, np.ones((trials, 3), dtype=bool))
+    noisy = DirectionPairs(image1=images[0], image2=images[1], valid=np.ones((trials, 3), dtype=bool))
     sample = affines_from_directions(noisy, method, epipolar=c.epipolar, scale=scale, min_conditioning=0.0)
     assert sample.valid.all()
     measured = np.cov(sample.A21.reshape(-1, 4).T)
@@ -211,7 +223,7 @@ def test_covariance_is_nan_where_invalid_and_ignores_noise_of_unused_directions(
     valid = directions.valid.copy()
     valid[0] = False
     valid[1, 2] = False
-    some = DirectionPairs(directions.image1, directions.image2, valid)
+    some = DirectionPairs(image1=directions.image1, image2=directions.image2, valid=valid)
     blocks = np.tile(0.01 * np.eye(2), (len(corners), 3, 1, 1))
     blocks[1, 2] = np.nan
     noise = DirectionNoise.independent(blocks, blocks)
@@ -224,8 +236,14 @@ def test_covariance_is_nan_where_invalid_and_ignores_noise_of_unused_directions(
 
 def test_misuse_is_refused_in_words(corners: Corners) -> None:
     directions = corners.directions()
-    unscaled = DirectionPairs(directions.image1, directions.image2, directions.valid, scaled=False)
-    two = DirectionPairs(directions.image1[:, :2], directions.image2[:, :2], directions.valid[:, :2], True, ("h", "v"))
+    unscaled = DirectionPairs(image1=directions.image1, image2=directions.image2, valid=directions.valid, scaled=False)
+    two = DirectionPairs(
+        image1=directions.image1[:, :2],
+        image2=directions.image2[:, :2],
+        valid=directions.valid[:, :2],
+        scaled=True,
+        kinds=("h", "v"),
+    )
     e = corners.epipolar
     cases: list[tuple[DirectionPairs, str, dict[str, object], str]] = [
         (directions, "4SDIR", {}, "unknown; known: F2UDIR"),

@@ -41,9 +41,21 @@ def same_up_to_sign(a, b):
 def swapped(m: Matches) -> Matches:
     """The same pair with the images exchanged."""
     return Matches(
-        m.pixels2, m.pixels1, m.rays2, m.rays1, m.jacobians2, m.jacobians1, m.sigma2_px, m.sigma1_px,
-        m.board_index, m.grid, m.K2, m.K1, None if m.A21 is None else np.linalg.inv(m.A21), m.sigma_A,
-    )  # fmt: skip
+        pixels1=m.pixels2,
+        pixels2=m.pixels1,
+        rays1=m.rays2,
+        rays2=m.rays1,
+        jacobians1=m.jacobians2,
+        jacobians2=m.jacobians1,
+        sigma1_px=m.sigma2_px,
+        sigma2_px=m.sigma1_px,
+        board_index=m.board_index,
+        grid=m.grid,
+        K1=m.K2,
+        K2=m.K1,
+        A21=None if m.A21 is None else np.linalg.inv(m.A21),
+        sigma_A=m.sigma_A,
+    )
 
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)

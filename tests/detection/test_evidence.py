@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,7 +27,7 @@ HEAT_ERROR_PX = 0.1
 """RMS error of corners in the rendered heat image: its noise, relative to the board's contrast, is 0.05."""
 
 
-def rendered(seed: int, **options: float) -> np.ndarray:
+def rendered(seed: int, **options: Any) -> np.ndarray:
     scene = one_board(
         np.random.default_rng(seed), board=BOARD, max_tilt_deg=30.0, square_px=options.pop("square_px", 40)
     )

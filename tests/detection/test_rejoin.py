@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from rigkit.cameras.kannala_brandt import KannalaBrandt
-from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.posetype import PoseType
 from rigkit.detection.detect import detect_boards
@@ -41,8 +40,10 @@ def part(
 
 
 def turned(item: RefinedLattice, turns: int) -> RefinedLattice:
-    rest: list[FloatArray] = [np.rot90(v, -turns) for v in (item.sigma_px, item.blur_px, item.residual, item.noise)]
-    return RefinedLattice(item.lattice.turned(turns), *rest)
+    sigma, blur, residual, noise = (
+        np.rot90(v, -turns) for v in (item.sigma_px, item.blur_px, item.residual, item.noise)
+    )
+    return RefinedLattice(item.lattice.turned(turns), sigma, blur, residual, noise)
 
 
 @pytest.mark.parametrize("turns", range(4))

@@ -56,7 +56,7 @@ def noisy_directions(A21: np.ndarray) -> DirectionPairs:
     d1 = np.array([[1.0, 0.2], [-0.1, 1.0], [0.9, 1.2]])
     d2 = d1 @ A21.T
     d2[0] = np.array([[c, -s], [s, c]]) @ d2[0]
-    return DirectionPairs(d1[None], d2[None], np.ones((1, 3), dtype=bool))
+    return DirectionPairs(image1=d1[None], image2=d2[None], valid=np.ones((1, 3), dtype=bool))
 
 
 def test_geometry(matches: Matches, F21: np.ndarray, epipolar: EpipolarNormals) -> None:

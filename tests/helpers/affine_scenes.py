@@ -51,7 +51,7 @@ class Corners:
     def directions(self, *, chords: bool = False) -> DirectionPairs:
         """Horizontal, vertical, diagonal: exact derivatives, or the paper's chords to the next corner."""
         first, second = (self.chord1, self.chord2) if chords else (self.exact1, self.exact2)
-        return DirectionPairs(first, second, np.ones(first.shape[:2], dtype=bool))
+        return DirectionPairs(image1=first, image2=second, valid=np.ones(first.shape[:2], dtype=bool))
 
     def select(self, which: np.ndarray) -> Corners:
         return Corners(*(getattr(self, f.name)[which] for f in fields(self)))
@@ -168,7 +168,9 @@ def turned(
 
     first = turn(directions.image1) if "1" in images else directions.image1
     second = turn(directions.image2) if "2" in images else directions.image2
-    return DirectionPairs(first, second, directions.valid, directions.scaled, directions.kinds)
+    return DirectionPairs(
+        image1=first, image2=second, valid=directions.valid, scaled=directions.scaled, kinds=directions.kinds
+    )
 
 
 def angles_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -98,10 +98,10 @@ def plane_in_sight(rng: np.random.Generator, noise_px: float = 0.3) -> tuple[Mat
 def joined(first: Matches, second: Matches) -> Matches:
     """All points of both, without affinities."""
     names = ("pixels1", "pixels2", "rays1", "rays2", "jacobians1", "jacobians2", "sigma1_px", "sigma2_px")
-    columns = (
-        np.concatenate([getattr(first, name), getattr(second, name)]) for name in (*names, "board_index", "grid")
-    )
-    return Matches(*columns)
+    columns = {
+        name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in (*names, "board_index", "grid")
+    }
+    return Matches(**columns)
 
 
 BOARDS = (Board("a", 8, 6, 40.0, 40.0), Board("b", 7, 6, 40.0, 41.0), Board("c", 8, 5, 40.0, 40.0))

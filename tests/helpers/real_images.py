@@ -20,4 +20,5 @@ CHOSEN = {
 def real_images() -> dict[str, np.ndarray]:
     """Return those images that are there, grey, by their names."""
     found = {name: CAPTURES / path for name, path in CHOSEN.items()}
-    return {name: cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for name, path in found.items() if path.is_file()}
+    read = {name: cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for name, path in found.items() if path.is_file()}
+    return {name: image for name, image in read.items() if image is not None}

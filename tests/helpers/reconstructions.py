@@ -70,14 +70,14 @@ def make_reconstruction(
         points = points + rng.normal(size=points.shape) * points_noise_mm
     colours = np.arange(3 * n, dtype=np.int64).reshape(n, 3) % 256
     cloud = OrientedCloud(
-        points,
-        normals,
-        colours.astype(np.uint8),
-        index,
-        grid,
-        np.linspace(0.1, 0.3, n),
-        np.linspace(0.001, 0.002, n),
-        tuple(b.board_id for b in kept),
+        points_mm=points,
+        normals=normals,
+        colours=colours.astype(np.uint8),
+        board_index=index,
+        grid=grid,
+        sigma_mm=np.linspace(0.1, 0.3, n),
+        normal_sigma_rad=np.linspace(0.001, 0.002, n),
+        board_ids=tuple(b.board_id for b in kept),
     )
     essential = skew(cam2_from_cam1.translation_mm) @ cam2_from_cam1.rotation
     return Reconstruction(

@@ -91,10 +91,10 @@ def test_damaged_cameras_of_colmap(text: str) -> None:
 )
 def test_damaged_yaml(old: str, new: str) -> None:
     for write, read in ((write_camera_info, read_camera_info), (write_opencv, read_opencv)):
-        text = write(RADTAN).text  # type: ignore[operator]
+        text = write(RADTAN).text
         assert old in text
         with pytest.raises(InputError, match="image_width"):
-            read(text.replace(old, new), "file")  # type: ignore[operator]
+            read(text.replace(old, new), "file")
 
 
 @pytest.mark.parametrize("xi", ["[]", "-1", "-1.5", "[1, 2]", "abc", "{data: abc}"])

@@ -22,7 +22,7 @@ def example(rng: np.random.Generator, n: int = 7) -> Correspondences:
     d1, d2 = rng.normal(size=(2, n, 3, 2))
     valid = np.ones((n, 3), dtype=bool)
     valid[1, 2] = False
-    directions = DirectionPairs(d1, d2, valid, False)
+    directions = DirectionPairs(image1=d1, image2=d2, valid=valid, scaled=False)
     q1, q2 = rng.uniform(0.0, 1000.0, (2, n, 2))
     return Correspondences(q1, q2, A21, directions, rng.uniform(0.1, 1.0, n), rng.uniform(0.01, 0.1, n))
 

@@ -88,5 +88,14 @@ def test_what_is_not_a_whole_cloud_is_refused(cloud_file: Path) -> None:
             read_ply(cloud_file)
     with pytest.raises(InputError, match="no points"):
         ply_bytes(
-            OrientedCloud(*np.zeros((3, 0, 3)), *np.zeros((1, 0), int), np.zeros((0, 2), int), *np.zeros((2, 0)), ())
+            OrientedCloud(
+                points_mm=np.zeros((0, 3)),
+                normals=np.zeros((0, 3)),
+                colours=np.zeros((0, 3), np.uint8),
+                board_index=np.zeros(0, int),
+                grid=np.zeros((0, 2), int),
+                sigma_mm=np.zeros(0),
+                normal_sigma_rad=np.zeros(0),
+                board_ids=(),
+            )
         )

@@ -78,7 +78,7 @@ def test_paths(tmp_path: Path, name: str) -> None:
     readers = (load_board, load_camera, load_rig, load_dataset, read_image, read_ply, read_correspondences, read_text)
     for read in readers:
         with pytest.raises(InputError) as caught:
-            read(path)  # type: ignore[operator]
+            read(path)
         assert ";" in str(caught.value) and "\0" not in str(caught.value)
 
 
@@ -167,9 +167,15 @@ def test_a_name_stays_on_its_line_of_a_header(tmp_path: Path) -> None:
     with pytest.raises(InputError):
         Board("a\nb", 4, 3, 10.0, 10.0)
     cloud = OrientedCloud(
-        np.zeros((1, 3)), np.array([[0.0, 0.0, -1.0]]), np.zeros((1, 3), np.uint8), np.zeros(1, int),
-        np.zeros((1, 2), int), np.ones(1), np.ones(1), ("a\nend_header\n",),
-    )  # fmt: skip
+        points_mm=np.zeros((1, 3)),
+        normals=np.array([[0.0, 0.0, -1.0]]),
+        colours=np.zeros((1, 3), np.uint8),
+        board_index=np.zeros(1, int),
+        grid=np.zeros((1, 2), int),
+        sigma_mm=np.ones(1),
+        normal_sigma_rad=np.ones(1),
+        board_ids=("a\nend_header\n",),
+    )
     (tmp_path / "c.ply").write_bytes(ply_bytes(cloud, comments=["x\ny\x1b"]))
     assert len(read_ply(tmp_path / "c.ply")) == 1
 

@@ -93,7 +93,11 @@ def test_trihedral_stereo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
         for angle in report["angles"]:
             assert abs(angle["angle_deg"] - 90.0) <= ANGLE_DEG
         assert {board["board"]: board["points"] for board in report["boards"]} == {"left": 48, "right": 48, "floor": 42}
-    assert code == 0
+    # Measured truth is met; the boards of wavy paper, seen through published cameras without distortion, are not where
+    # planar PnP puts them, and that is said.
+    assert all(report["passed"] for report in result["reports"])
+    assert code == 1
+    assert any("the boards' own poses disagree where epipolar geometry agrees" in cause for cause in result["causes"])
     cloud = read_ply(tmp_path / "out" / "trihedral" / "3SDIR.ply")
     for name in cloud.board_ids:
         assert fit_plane(cloud.points_mm[cloud.on_board(name)]).rms_mm < PLANE_RMS_MM

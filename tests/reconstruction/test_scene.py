@@ -92,7 +92,9 @@ def test_directions_instead_of_affinities(rng):
     angles = rng.uniform(0.0, np.pi, (60, 1)) + np.array([0.0, 1.0, 2.0])
     d1 = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     d2 = np.einsum("nij,nkj->nki", m.A21, d1) * rng.uniform(0.5, 2.0, (60, 3, 1))
-    pairs = DirectionPairs(d1, d2, np.ones((60, 3), dtype=bool), False, ("a", "b", "c"))
+    pairs = DirectionPairs(
+        image1=d1, image2=d2, valid=np.ones((60, 3), dtype=bool), scaled=False, kinds=("a", "b", "c")
+    )
     by_directions = reconstruct_scene(Correspondences(m.pixels1, m.pixels2, None, pairs), REGULAR, REGULAR)
     by_affinities = reconstruct_scene(Correspondences(m.pixels1, m.pixels2, m.A21), REGULAR, REGULAR)
     assert len(by_directions.kept) > 55

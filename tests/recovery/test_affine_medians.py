@@ -83,7 +83,7 @@ class TestSpecialPoses:
     @staticmethod
     def on_plane(c: Corners, noisy: DirectionPairs, method: str, plane: int) -> float:
         on = c.plane == plane
-        some = DirectionPairs(noisy.image1[on], noisy.image2[on], noisy.valid[on])
+        some = DirectionPairs(image1=noisy.image1[on], image2=noisy.image2[on], valid=noisy.valid[on])
         return median_error(c.select(on), some, method)
 
     @pytest.mark.parametrize("pose", ["standard", "forward", "planar"])
@@ -120,7 +120,9 @@ def errors() -> dict[tuple[str, bool], tuple[np.ndarray, np.ndarray]]:
             noisy = exact + SIGMA_PX * rng.normal(size=exact.shape)
             detection = BoardDetection("b", 6, 8, grid, noisy, np.full(len(grid), SIGMA_PX))
             fields.append(direction_field(detection, REGULAR, support="neighbours"))
-        directions = DirectionPairs(fields[0].vectors, fields[1].vectors, fields[0].valid & fields[1].valid)
+        directions = DirectionPairs(
+            image1=fields[0].vectors, image2=fields[1].vectors, valid=fields[0].valid & fields[1].valid
+        )
         noise = DirectionNoise.of_board(fields[0].covariance, fields[1].covariance)
         for method in AFFINE_METHODS:
             found = affines_from_directions(directions, method, epipolar=c.epipolar, noise=noise)

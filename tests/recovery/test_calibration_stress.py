@@ -47,9 +47,11 @@ for _lens in LENSES:
     }
 
 
-REFUSED = {"reg-brown-1-view": 1}
-"""Refused, and rightly: the only view is tilted by 9 degrees against the image, and with five terms of distortion its
-focal length comes out as 1064 +- 969 px where 1364 is true."""
+REFUSED = {"reg-brown-1-view": 1, "fish200-scaramuzza-1-view": 7, "fish200-scaramuzza-2-views": 1}
+"""Refused, and rightly, in so many of twenty seeds: the only view is tilted by 9 degrees against the image, and with
+five terms of distortion its focal length comes out as 1064 +- 969 px where 1364 is true; one or two views leave the
+coefficients of a polynomial of degree 8 open beyond what arithmetic resolves, so that no covariance can be stated."""
+REFUSALS = ("leave the focal length open", "not identifiable from these images")
 
 
 def failure(case: Case, seed: int) -> str | None:
@@ -78,7 +80,7 @@ def failure(case: Case, seed: int) -> str | None:
 @pytest.mark.parametrize("name", sorted(CASES))
 def test_solved(name: str) -> None:
     failures = {seed: why for seed in range(FEW_SEEDS) if (why := failure(CASES[name], seed))}
-    assert not failures
+    assert not failures or (name in REFUSED and all(any(r in why for r in REFUSALS) for why in failures.values()))
 
 
 @pytest.mark.slow
@@ -86,3 +88,4 @@ def test_solved(name: str) -> None:
 def test_solved_twenty_times(name: str) -> None:
     failures = {seed: why for seed in range(SEEDS) if (why := failure(CASES[name], seed))}
     assert len(failures) <= REFUSED.get(name, 0), failures
+    assert all(any(r in why for r in REFUSALS) for why in failures.values()), failures

@@ -25,8 +25,8 @@ SPECIAL_REL = 0.2
 """60 trials, planar motion drawn at random; exact degeneracies would be off by a factor."""
 
 GENERAL = Study(
-    "general",
-    "General motion",
+    name="general",
+    title="General motion",
     seed=1,
     trials=100,
     pose_types=(PoseType.GENERAL,),

@@ -106,7 +106,7 @@ def test_chords_have_exact_directions_and_point_the_same_way(rng: np.random.Gene
 @pytest.mark.parametrize("images", list(NoisyImages))
 def test_direction_noise_turns_and_keeps_lengths(images: NoisyImages, rng: np.random.Generator) -> None:
     vectors = rng.normal(0.0, 40.0, (2, 1000, 2, 2))
-    clean = DirectionPairs(vectors[0], vectors[1], np.ones((1000, 2), dtype=bool), kinds=("a", "b"))
+    clean = DirectionPairs(image1=vectors[0], image2=vectors[1], valid=np.ones((1000, 2), dtype=bool), kinds=("a", "b"))
     noisy = rotate_directions(clean, 0.05, rng, images=images)
     for changed, before, after in zip(
         images.which, (clean.image1, clean.image2), (noisy.image1, noisy.image2), strict=True

@@ -117,7 +117,7 @@ def test_bounds_of_a_rig_hold_as_often_as_they_say(quantity: Quantity, name: str
         pixels = [q + rig.sigma_px * rng.normal(size=q.shape) for q in seen]
         sight = [c.unproject(q)[0] for c, q in zip(cameras, pixels, strict=True)]
         slopes = [c.ray_jacobian(q) for c, q in zip(cameras, pixels, strict=True)]
-        found, valid = triangulate_rays(*sight, pose, jacobians1=slopes[0], jacobians2=slopes[1])
+        found, valid = triangulate_rays(sight[0], sight[1], pose, jacobians1=slopes[0], jacobians2=slopes[1])
         assert valid.all()
         found *= 1.0 + rig.scale_sigma * rng.normal()
         inside += np.abs(read_off(quantity, found) - exact) <= bounds[:, None]

@@ -22,11 +22,11 @@ def declared(true: PoseType, said: PoseType, rng: np.random.Generator, level_deg
     scene = trihedral_pair(
         BOARDS, regular_camera(), true, rng, level_sigma_deg=level_deg, distance=(0.9, 1.3), walls=False
     )
-    found = [
+    first, second = (
         [detection(b, np.array(d.pixels), rng, 0.03) for b, d in zip(BOARDS, exact, strict=True)]
         for exact in scene.detections()
-    ]
-    pair = match_pair("made", scene.camera1, scene.camera2, *found, BOARDS)
+    )
+    pair = match_pair("made", scene.camera1, scene.camera2, first, second, BOARDS)
     return reconstruct_pair(pair, pose_type=said, level_sigma_rad=np.deg2rad(0.2))
 
 

@@ -44,7 +44,18 @@ def test_boards_behind_a_pole_are_found_as_the_camera_sees_them(tmp_path: Path) 
     path = tmp_path / "view.png"
     cv2.imwrite(str(path), image)
     entry = CameraEntry("camera", tmp_path / "calibration.json", None)
-    pair = Pair("pair", entry, entry, path, path, PoseType.GENERAL, None, BOARDS, PairTruth(), {})
+    pair = Pair(
+        pair_id="pair",
+        camera1=entry,
+        camera2=entry,
+        image1=path,
+        image2=path,
+        pose_type=PoseType.GENERAL,
+        level_sigma_deg=None,
+        boards=BOARDS,
+        truth=PairTruth(),
+        layout={},
+    )
     truth = np.concatenate([b.see(CAMERA, cam)[0] for b in scene.boards])
     found, again, _, _ = find_boards(pair, CAMERA, CAMERA)
     assert [len(d.grid) for d in found] == [len(d.grid) for d in again]

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -62,7 +63,7 @@ def test_own_solvers_find_the_baseline_whatever_the_affinities(repeated) -> None
 
 
 def test_directions_and_scale_are_options(tmp_path: Path) -> None:
-    def errors(**options: str) -> dict[str, float]:
+    def errors(**options: Any) -> dict[str, float]:
         chosen = ValidateOptions(pairs=("regular-general",), jobs=1, pictures=False, crosscheck=False, **options)
         return {r.affine_method: r.boards[0].normal_errors.mean_deg for r in validate_dataset(LAB, chosen).reports}
 

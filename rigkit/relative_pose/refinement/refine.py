@@ -47,7 +47,7 @@ SIGNIFICANT = 3.0
 """Standard deviations by which a pose must explain the matches worse than another one to be ruled out."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class RefinedPose:
     """A refined relative pose.
 
@@ -253,12 +253,12 @@ def _result(problem: PoseProblem, end: PoseMinimum) -> RefinedPose:
     E21 = essential_from_pose(pose)
     px = sampson_distances(E21, matches.rays1, matches.rays2, matches.jacobians1, matches.jacobians2)
     return RefinedPose(
-        pose,
-        covariance,
-        float(np.sqrt(np.mean(px**2))),
-        float(r @ r),
-        float(data @ data) / max(len(r) - freedom, 1),
-        end.weights[:n],
-        end.iterations,
-        end.converged,
+        cam2_from_cam1=pose,
+        covariance=covariance,
+        sampson_rms_px=float(np.sqrt(np.mean(px**2))),
+        cost=float(r @ r),
+        variance_factor=float(data @ data) / max(len(r) - freedom, 1),
+        weights=end.weights[:n],
+        iterations=end.iterations,
+        converged=end.converged,
     )

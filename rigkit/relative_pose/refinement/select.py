@@ -44,7 +44,7 @@ SIGMA_BELIEF = 4.0
 TYPES = (PoseType.GENERAL, PoseType.PLANAR, PoseType.STANDARD, PoseType.FORWARD)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class TypeEvidence:
     """What the matches say about one pose type.
 
@@ -141,7 +141,18 @@ def pose_type_evidence(matches: Matches, level_sigma_rad: float | None = None) -
         deviation, p = _deviation(general, kind, level, noise2)
         chi2 = fit.cost - _prior_cost(fit, kind, level)
         probability = float(np.exp(raw[kind] - top) / total)
-        entries.append(TypeEvidence(kind, raw[kind] - top, probability, chi2, n, deviation, p, fit))
+        entries.append(
+            TypeEvidence(
+                pose_type=kind,
+                log_evidence=raw[kind] - top,
+                probability=probability,
+                chi2=chi2,
+                residuals=n,
+                deviation_rad=deviation,
+                p_value=p,
+                refined=fit,
+            )
+        )
     entries.sort(key=lambda entry: -entry.log_evidence)
     return PoseTypeEvidence(tuple(entries), level, float(np.sqrt(noise2)))
 
