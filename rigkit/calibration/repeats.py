@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from rigkit.core.arrays import IntArray, Pixels
 
@@ -26,12 +27,18 @@ def cluster_numbers(images: Sequence[str], boards: Sequence[str], pixels: Sequen
     shown: dict[str, list[tuple[str, tuple[float, ...]]]] = {}
     for image, board, corners in zip(images, boards, pixels, strict=True):
         shown.setdefault(image, []).append((board, _place(corners)))
-    names = list(shown)
-    own = [sorted(shown[name]) for name in names]
-    number: dict[str, int] = {}
-    for i, name in enumerate(names):
-        again = next((j for j in range(i) if _alike(own[i], own[j])), i)
-        number[name] = number[names[again]] if again < i else i
+    # Only images of the same boards can repeat each other.
+    alike: dict[tuple[str, ...], list[tuple[str, list[float]]]] = {}
+    for image, views in shown.items():
+        ordered = sorted(views)
+        places = [value for _, place in ordered for value in place]
+        alike.setdefault(tuple(board for board, _ in ordered), []).append((image, places))
+    number = {image: i for i, image in enumerate(shown)}
+    for group in alike.values():
+        tree = cKDTree([places for _, places in group])
+        for earlier, later in sorted(tree.query_pairs(REPEATED_PX, p=np.inf), key=lambda pair: pair[::-1]):
+            names = group[earlier][0], group[later][0]
+            number[names[1]] = min(number[names[0]], number[names[1]])
     _, dense = np.unique([number[name] for name in images], return_inverse=True)
     return dense.astype(np.int64)
 
@@ -40,10 +47,3 @@ def _place(corners: Pixels) -> tuple[float, ...]:
     """Return how many corners there are, their centre, and their extents along the image's axes and diagonals, px."""
     along = corners @ np.array([[1.0, 0.0, 1.0, 1.0], [0.0, 1.0, 1.0, -1.0]])
     return (float(len(corners)), *corners.mean(axis=0).tolist(), *np.ptp(along, axis=0).tolist())
-
-
-def _alike(one: list[tuple[str, tuple[float, ...]]], other: list[tuple[str, tuple[float, ...]]]) -> bool:
-    return len(one) == len(other) and all(
-        a == b and max(abs(x - y) for x, y in zip(p, q, strict=True)) <= REPEATED_PX
-        for (a, p), (b, q) in zip(one, other, strict=True)
-    )
