@@ -2,41 +2,50 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from rigkit.calibration.result import Calibration
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels
+from rigkit.calibration.result import Calibration, ViewResult
+from rigkit.core.arrays import BoolArray, FloatArray, Pixels
 
 __all__ = ["covered_by_boards"]
 
 REACH = 1.0
 """A pixel within this many spacings of a corner (of its board in its view) lies on a board: discs of 0.71 would leave
-no gap inside a regular grid."""
-PART = 65536
+no gap inside a regular grid, and perspective makes spacings differ within a view."""
+PART = 1 << 20
 """Distances computed at a time."""
 
 
 def covered_by_boards(calibration: Calibration, pixels: Pixels) -> BoolArray:
     """Say which of `pixels` (..., 2) lie where boards of the calibration were, (...,)."""
-    corners = np.concatenate([view.pixels[view.kept] for view in calibration.views])
-    reach = np.concatenate([_spacing(view.grid[view.kept], view.pixels[view.kept]) for view in calibration.views])
+    views = [view for view in calibration.views if view.kept.any()]
     flat = np.reshape(pixels, (-1, 2))
     found = np.zeros(len(flat), dtype=bool)
-    step = max(1, PART // max(len(corners), 1))
+    if not views:
+        return found.reshape(np.shape(pixels)[:-1])
+    corners = np.concatenate([view.pixels[view.kept] for view in views])
+    # |p - c|^2 <= reach^2 as one matrix product: p . c - (|c|^2 - reach^2) / 2 >= |p|^2 / 2.
+    limit = 0.5 * ((corners**2).sum(axis=1) - _reach_px(views, corners) ** 2)
+    step = max(1, PART // len(corners))
     for first in range(0, len(flat), step):
-        part = slice(first, first + step)
-        squared = ((flat[part, None] - corners) ** 2).sum(axis=-1)
-        found[part] = (squared <= (REACH * reach) ** 2).any(axis=1)
+        part = flat[first : first + step]
+        found[first : first + step] = (part @ corners.T - limit).max(axis=1) >= 0.5 * (part**2).sum(axis=1)
     return found.reshape(np.shape(pixels)[:-1])
 
 
-def _spacing(grid: IntArray, pixels: Pixels) -> FloatArray:
-    """Return the largest distance of each corner (N,) to its neighbours on the grid, where it has any; else the
-    median of the others."""
-    table = np.full((int(grid[:, 0].max(initial=0)) + 3, int(grid[:, 1].max(initial=0)) + 3, 2), np.nan)
-    column, row = grid.T + 1
-    table[column, row] = pixels
-    around = [table[column + i, row + j] for i, j in ((1, 0), (-1, 0), (0, 1), (0, -1))]
-    distance = np.nan_to_num([np.linalg.norm(there - pixels, axis=1) for there in around]).max(axis=0, initial=0.0)
-    usual = float(np.median(distance[distance > 0.0])) if (distance > 0.0).any() else 0.0
-    return np.asarray(np.where(distance > 0.0, distance, usual))
+def _reach_px(views: Sequence[ViewResult], corners: Pixels) -> FloatArray:
+    """Return for each of the `corners` kept in all views (N, 2), view by view, how far its board's squares reach (N,).
+
+    That is the longer side of a square as an affine map of the grid into the image has it, one map a view.
+    """
+    count = np.array([int(view.kept.sum()) for view in views])
+    start = np.cumsum(count) - count
+    grid = np.concatenate([view.grid[view.kept] for view in views]).astype(np.float64)
+    design = np.concatenate([np.ones((len(grid), 1)), grid], axis=1)
+    normal = np.add.reduceat(design[:, :, None] * design[:, None, :], start)
+    moments = np.add.reduceat(design[:, :, None] * corners[:, None, :], start)
+    # A single row or column leaves the other side open, which then counts as zero.
+    sides = np.linalg.norm((np.linalg.pinv(normal, hermitian=True) @ moments)[:, 1:], axis=-1)
+    return np.repeat(REACH * sides.max(axis=1), count)
