@@ -26,8 +26,12 @@ def covered_by_boards(calibration: Calibration, pixels: Pixels) -> BoolArray:
     if not views:
         return found.reshape(np.shape(pixels)[:-1])
     corners = np.concatenate([view.pixels[view.kept] for view in views])
+    reach = _reach_px(views, corners)
+    # From the middle of the image, in single precision: good to a tenth of a pixel, and twice as fast.
+    middle = 0.5 * np.array(calibration.camera.size_px)
+    flat, corners = (flat - middle).astype(np.float32), (corners - middle).astype(np.float32)
     # |p - c|^2 <= reach^2 as one matrix product: p . c - (|c|^2 - reach^2) / 2 >= |p|^2 / 2.
-    limit = 0.5 * ((corners**2).sum(axis=1) - _reach_px(views, corners) ** 2)
+    limit = (0.5 * ((corners**2).sum(axis=1) - reach**2)).astype(np.float32)
     step = max(1, PART // len(corners))
     for first in range(0, len(flat), step):
         part = flat[first : first + step]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rigkit.core.arrays import IntArray, Pixels
+from rigkit.core.arrays import FloatArray, IntArray, Pixels
 
 __all__ = ["cluster_numbers"]
 
@@ -24,9 +24,9 @@ def cluster_numbers(images: Sequence[str], boards: Sequence[str], pixels: Sequen
     images, boards : name of each view's image and of its board.
     pixels : (N, 2) of each view's corners.
     """
-    shown: dict[str, list[tuple[str, tuple[float, ...]]]] = {}
-    for image, board, corners in zip(images, boards, pixels, strict=True):
-        shown.setdefault(image, []).append((board, _place(corners)))
+    shown: dict[str, list[tuple[str, list[float]]]] = {}
+    for image, board, place in zip(images, boards, _places(pixels).tolist(), strict=True):
+        shown.setdefault(image, []).append((board, place))
     # Only images of the same boards can repeat each other.
     alike: dict[tuple[str, ...], list[tuple[str, list[float]]]] = {}
     for image, views in shown.items():
@@ -43,7 +43,13 @@ def cluster_numbers(images: Sequence[str], boards: Sequence[str], pixels: Sequen
     return dense.astype(np.int64)
 
 
-def _place(corners: Pixels) -> tuple[float, ...]:
-    """Return how many corners there are, their centre, and their extents along the image's axes and diagonals, px."""
-    along = corners @ np.array([[1.0, 0.0, 1.0, 1.0], [0.0, 1.0, 1.0, -1.0]])
-    return (float(len(corners)), *corners.mean(axis=0).tolist(), *np.ptp(along, axis=0).tolist())
+def _places(pixels: Sequence[Pixels]) -> FloatArray:
+    """Return for each view how many corners there are, their centre, and their extents along the image's axes and
+    diagonals, px: (V, 7)."""
+    count = np.array([len(corners) for corners in pixels])
+    start = np.cumsum(count) - count
+    every = np.concatenate([np.asarray(corners) for corners in pixels])
+    along = every @ np.array([[1.0, 0.0, 1.0, 1.0], [0.0, 1.0, 1.0, -1.0]])
+    centre = np.add.reduceat(every, start) / count[:, None]
+    extents = np.maximum.reduceat(along, start) - np.minimum.reduceat(along, start)
+    return np.concatenate([count[:, None], centre, extents], axis=1)
