@@ -24,8 +24,8 @@ RATIO = (0.75, 1.3)
 """Observed over predicted standard deviation, root mean square over parameters and runs: 40 runs of 15 views know it to
 about 10 %."""
 CORNERS_PX, IMAGES_PX = 0.05, 0.15
-GOOD_PX = 0.03
-"""Errors in common of a good image: with 20 of 0.05 px, a thousandth of a focal length has a chance of 0.012."""
+GOOD_PX, FAIR_PX = 0.03, 0.05
+"""Errors in common of a good image, and of one with which a thousandth of a focal length is not found any more."""
 
 
 def disturbed(views: list[BoardView], rng: np.random.Generator, images_px: float) -> list[BoardView]:
@@ -62,11 +62,20 @@ def test_sigmas_are_right_whatever_repeats(images_px: float) -> None:
     assert (np.median(overdispersion) > 1.5) == (images_px > 0.0)
 
 
-def test_power_and_false_alarms() -> None:
+@pytest.mark.parametrize(
+    "images_px",
+    [
+        GOOD_PX,
+        pytest.param(
+            FAIR_PX, marks=pytest.mark.xfail(strict=True, reason="chance 0.012, a little over the limit of 0.01")
+        ),
+    ],
+)
+def test_power_and_false_alarms(images_px: float) -> None:
     rng = np.random.default_rng(3)
     camera = lens("fish")
     pixels_of = [
-        disturbed(random_views(camera, 20, rng, reach_deg=REACH_DEG["fish"], noise_px=0.0)[0], rng, GOOD_PX)
+        disturbed(random_views(camera, 20, rng, reach_deg=REACH_DEG["fish"], noise_px=0.0)[0], rng, images_px)
         for _ in range(4)
     ]
     results = [calibrate(views, camera.size_px, model="kannala_brandt", board="flat") for views in pixels_of]
