@@ -263,7 +263,7 @@ def _write_tables(folder: Path) -> None:
     kept = {name: getattr(d, name) for name in ("board_id", "columns", "rows")}
     kept |= {name: getattr(d, name).tolist() for name in ("grid", "pixels", "sigma_px")}
     entry = {"sha256": "0" * 64, "size_px": list(SIZE_PX), "boards": [kept], "lens": {"key": "0", "boards": [kept]}}
-    data = {"schema": corner_cache.SCHEMA, "detector": "0 5x4", "images": {"image.png": entry}}
+    data = {"schema": corner_cache.CORNERS_SCHEMA, "detector": "0 5x4", "images": {"image.png": entry}}
     (folder / "corners.json").write_text(json.dumps(data))
     lines = [f"image.png {u:.3f} {v:.3f} 0" for u, v in d.pixels]
     lines[3] = "image.png - - -"

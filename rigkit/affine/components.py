@@ -25,7 +25,7 @@ __all__ = [
     "unit_weights",
 ]
 
-BLOCK = 8192
+CORNERS_AT_A_TIME = 8192
 """Corners worked on at a time: about fifty rows of this length fit a second-level cache."""
 
 
@@ -63,8 +63,8 @@ class PlanarDirections:
 
 def blocks(n: int) -> Iterator[slice]:
     """Yield slices that cover n corners."""
-    for start in range(0, n, BLOCK):
-        yield slice(start, min(start + BLOCK, n))
+    for start in range(0, n, CORNERS_AT_A_TIME):
+        yield slice(start, min(start + CORNERS_AT_A_TIME, n))
 
 
 def finite(array: FloatArray) -> BoolArray:

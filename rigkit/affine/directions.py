@@ -29,7 +29,7 @@ MIN_COSINE = 0.2
 """Corners further than 78 degrees from a corner say nothing about its own surroundings."""
 MIN_PIVOT = 1e-7
 """A local fit is singular where a pivot is below this part of the largest."""
-FIT_STEPS = 4
+PROJECTIVE_STEPS = 4
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -294,7 +294,7 @@ def _projective_fit(tangent: _Tangent, index: IntArray, steps: FloatArray) -> tu
 
     fitted, w = measured, np.ones((n, m, 1))
     theta = np.zeros((n, 3 * d + 2))
-    for _ in range(FIT_STEPS):
+    for _ in range(PROJECTIVE_STEPS):
         rows = np.zeros((n, m, 2, 3 * d + 2))
         for k in range(2):
             rows[:, :, k, k * d : (k + 1) * d] = steps / w

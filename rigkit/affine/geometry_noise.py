@@ -22,7 +22,7 @@ __all__ = ["geometry_covariance"]
 
 STEP_PX = 1e-3
 STEP_RAD = 1e-7
-STEP_REL = 1e-6
+BASELINE_STEP = 1e-6
 """Steps of the central differences: far above rounding, far below where the second order shows."""
 
 
@@ -79,7 +79,7 @@ def geometry_covariance(
             change = (plus - minus) / (2.0 * STEP_PX) * np.broadcast_to(sigma, (n,))[:, None]
             total += change[:, :, None] * change[:, None, :]
     if pose_covariance is not None:
-        steps = np.repeat([STEP_RAD, STEP_REL * np.linalg.norm(cam2_from_cam1.translation_mm)], 3)
+        steps = np.repeat([STEP_RAD, BASELINE_STEP * np.linalg.norm(cam2_from_cam1.translation_mm)], 3)
         columns = []
         for k, size in enumerate(steps):
             plus, minus = (

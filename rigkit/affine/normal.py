@@ -30,7 +30,7 @@ NORMAL_METHODS = ("optimal", "fne", "nullvector")
 MIN_PARALLAX = 1e-9
 """Smallest |h| / |J2|, about the angle between the two viewing rays in radians: below, it is rounding."""
 
-RIDGE = 1e-2
+RELATIVE_RIDGE = 1e-2
 """Relative variance added across h, where epipolar lines have errors of their own: affinities that fulfil the epipolar
 geometry by construction have no other there, and must not be divided by it."""
 
@@ -215,7 +215,7 @@ def _solution(h: FloatArray, covariance: FloatArray | None) -> FloatArray:
     common = along @ half
     own = across @ half
     trace = np.trace(along @ covariance @ np.swapaxes(along, -1, -2), axis1=-2, axis2=-1)
-    total = own + (RIDGE * trace)[:, None, None] * np.eye(2)
+    total = own + (RELATIVE_RIDGE * trace)[:, None, None] * np.eye(2)
     good = finite(total) & (np.linalg.det(np.nan_to_num(total)) > 0.0)
     out = np.full(along.shape, np.nan)
     gain = np.swapaxes(np.linalg.solve(total[good], np.swapaxes(common[good], -1, -2)), -1, -2)

@@ -13,12 +13,12 @@ __all__ = ["RefinedPatches", "refine_patches"]
 
 Grey = NDArray[np.float32]
 
-STEPS = 20
+PATCH_STEPS = 20
 SETTLED_PX = 1e-3
 """Move of a patch's border at which it is done."""
-SAMPLES = 19
+PATCH_SAMPLES = 19
 """Samples along a patch's side."""
-BLOCK = 1024
+PATCHES_AT_A_TIME = 1024
 """Patches at a time: about 25 MB of samples."""
 MIN_CONTRAST = 2.0
 """Grey levels, standard deviation over a patch: below, there is nothing to align."""
@@ -85,10 +85,8 @@ def refine_patches(
         np.asarray(cv2.Scharr(smooth2, cv2.CV_32F, *order) / 32.0, dtype=np.float32) for order in ((1, 0), (0, 1))
     )
     images = (smooth1, smooth2, (gradient_x, gradient_y))
-    parts = [
-        _refine_block(images, pixels1[i : i + BLOCK], pixels2[i : i + BLOCK], A21[i : i + BLOCK], half_width_px)
-        for i in range(0, len(pixels1), BLOCK)
-    ]
+    blocks = (slice(i, i + PATCHES_AT_A_TIME) for i in range(0, len(pixels1), PATCHES_AT_A_TIME))
+    parts = [_refine_block(images, pixels1[b], pixels2[b], A21[b], half_width_px) for b in blocks]
     if not parts:
         empty = np.zeros(0)
         return RefinedPatches(np.zeros((0, 2, 2)), np.zeros((0, 2)), empty, empty, empty, np.zeros(0, dtype=bool))
@@ -100,14 +98,14 @@ def _refine_block(
 ) -> RefinedPatches:
     image1, image2, gradients = images
     n = len(pixels1)
-    line = np.linspace(-half_width, half_width, SAMPLES)
+    line = np.linspace(-half_width, half_width, PATCH_SAMPLES)
     u = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     grid = _Grid(u, np.exp(-0.25 * np.sum(u * u, axis=1) / (0.6 * half_width) ** 2))
     template, inside1 = _sample(image1, pixels1[:, None, :] + u)
     A, q = A21.copy(), pixels2.copy()
     usable = inside1 & (template.std(axis=1) > MIN_CONTRAST)
     moving = usable.copy()
-    for _ in range(STEPS):
+    for _ in range(PATCH_STEPS):
         which = np.flatnonzero(moving)
         if not which.size:
             break

@@ -20,7 +20,7 @@ __all__ = ["SCALES", "determinant_block", "determinant_from_lengths", "determina
 
 SCALES = ("area", "ls", "sqmean", "diagonal")
 
-NEWTON_STEPS = 40
+MAX_NEWTON_STEPS = 40
 """Newton converges monotonically and quadratically, usually in 4 to 6 steps; only near-singular sets take more."""
 
 NEWTON_TOLERANCE = 4e-16
@@ -84,7 +84,7 @@ def shape_block(directions: PlanarDirections) -> tuple[FloatArray, FloatArray, F
         exact = (count == 3) & (_determinant(*_vector(f, np.zeros_like(f.p11))) > 0.0)
         mu = np.where(exact, 0.0, _smaller_eigenvalue(f.p11, f.p12, f.p22))
         open_ = np.flatnonzero(~exact)
-        for _ in range(NEWTON_STEPS):
+        for _ in range(MAX_NEWTON_STEPS):
             if not open_.size:
                 break
             part = _Form(*(entry[open_] for entry in f))

@@ -23,7 +23,7 @@ __all__ = ["assemble", "board_shapes", "motion_of_world", "require_determined", 
 
 UNKNOWN_SHARE = 0.05
 """A projection that is uncertain by this part of the image's width, where the boards were, is not determined."""
-MIN_SIGMA_PX = 0.02
+MIN_RESULT_SIGMA_PX = 0.02
 """No corner is better than this: keeps data without noise from looking determined by rounding."""
 
 
@@ -137,7 +137,7 @@ def require_determined(result: Calibration, at_corners_px: FloatArray) -> None:
     sigma = float(np.nanmedian(at_corners_px)) if np.isfinite(at_corners_px).any() else np.inf
     sigma /= result.overdispersion
     if result.sigma_px > 0.0:
-        sigma *= max(result.sigma_px, MIN_SIGMA_PX) / result.sigma_px
+        sigma *= max(result.sigma_px, MIN_RESULT_SIGMA_PX) / result.sigma_px
     if not sigma < UNKNOWN_SHARE * result.camera.size_px[0]:
         raise DegenerateError(
             "calibration: the views leave the focal length open (all boards nearly parallel to the image, or too few "

@@ -30,14 +30,14 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray, IntArray
 
-__all__ = ["MIN_CLUSTERS", "SAMPLES", "Clustered", "clustered_covariance", "drawn_errors", "reduced_by_cluster"]
+__all__ = ["MIN_CLUSTERS", "NULL_DRAWS", "Clustered", "clustered_covariance", "drawn_errors", "reduced_by_cluster"]
 __all__ += ["with_block"]
 
 MIN_CLUSTERS = 4
 """Fewer images (or frames) say nothing about how they differ."""
 MIN_LEFT = 0.05
 """What is left of an image's pull in a direction that it alone determines: less is rounding."""
-SAMPLES = 4000
+NULL_DRAWS = 4000
 """Draws of a null distribution: a chance is then known to 0.002 near 0.01."""
 RANK = 1e-12
 """Combinations with less than this part of the largest information are not determined."""
@@ -136,13 +136,13 @@ def with_block(covariance: FloatArray, block: FloatArray, factor: float) -> Floa
 
 
 def drawn_errors(covariance: FloatArray, freedom: float, rng: np.random.Generator) -> FloatArray:
-    """Return errors (n, SAMPLES) of `covariance` (n, n): Student's t with the degrees of freedom that it has."""
+    """Return errors (n, NULL_DRAWS) of `covariance` (n, n): Student's t with the degrees of freedom that it has."""
     # Scaled to correlations first: parameters differ by twenty orders of magnitude.
     sigma = np.sqrt(np.diag(covariance))
     safe = np.where(sigma > 0.0, sigma, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
     root = safe[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-    drawn = root @ rng.normal(size=(len(sigma), SAMPLES))
+    drawn = root @ rng.normal(size=(len(sigma), NULL_DRAWS))
     if np.isfinite(freedom):
-        drawn /= np.sqrt(rng.chisquare(freedom, SAMPLES) / freedom)
+        drawn /= np.sqrt(rng.chisquare(freedom, NULL_DRAWS) / freedom)
     return np.asarray(drawn)

@@ -12,7 +12,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from rigkit.calibration.clustered import SAMPLES, drawn_errors
+from rigkit.calibration.clustered import NULL_DRAWS, drawn_errors
 from rigkit.calibration.coverage import covered_by_boards
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import projection_design
@@ -110,7 +110,7 @@ def compare_calibrations(
         [
             drawn_errors(a.covariance, a.freedom, rng),
             -drawn_errors(b.covariance, b.freedom, rng),
-            1.0 + REFIT_SIGMA * rng.normal(size=(1, SAMPLES)),
+            1.0 + REFIT_SIGMA * rng.normal(size=(1, NULL_DRAWS)),
         ]
     )
     expected_by = np.zeros((len(gram), len(gram)))
@@ -126,7 +126,7 @@ def compare_calibrations(
 
 
 def _chance(found: FloatArray, design: FloatArray, covariance: FloatArray, drawn: FloatArray) -> float:
-    """Return the probability of a difference as large as `found` (2 N,), from draws (K, SAMPLES) of the errors of K
+    """Return the probability of a difference as large as `found` (2 N,), from draws (K, NULL_DRAWS) of the errors of K
     unknowns, their derivatives `design` (2 N, K) and covariance.
 
     Two sizes count, and the one that says more is compared with what it would say by chance (Tippett's combination):

@@ -25,13 +25,13 @@ from rigkit.core.arrays import BoolArray, FloatArray
 
 __all__ = ["fit_shapes"]
 
-ROUNDS = 2
+SIZE_ROUNDS = 2
 """More rounds change the sizes by a few per cent and the lens not at all."""
 STRAY_SIGMAS = 3.0
 """Corners stray where they take this many standard deviations more off the cost than chance does."""
 OPEN = 1e-9
 """A direction of which the views know this part of what they know of the best is open: it is rounding."""
-COARSE = 1e-4
+SIZES_TOLERANCE = 1e-4
 """The rounds stop where a step promises less than this part of the cost: sizes are known to a tenth at best."""
 MIN_SIZE = 1e-4
 """A size falls to no less than this part of the first one in a round: on exact data it would fall to nothing."""
@@ -86,13 +86,13 @@ def _own_blocks(normal: NormalEquations, points: int) -> FloatArray:
 def _evident(observations: Observations, state: State, kept: BoolArray) -> tuple[State, BoolArray]:
     """Return the state, roughly solved, with its priors as wide as the views say, and the corners to keep."""
     norm = evaluate(state, observations).weighted(observations)
-    for _ in range(ROUNDS):
+    for _ in range(SIZE_ROUNDS):
         solution = solve(
             observations,
             state,
             weight=np.where(kept, observations.weight, 0.0),
             prior_sigma_px=sigma_of(norm, kept),
-            cost_tolerance=COARSE,
+            cost_tolerance=SIZES_TOLERANCE,
         )
         state, norm = solution.state, solution.data.residuals[0].weighted(observations)
         sigma = sigma_of(norm, kept)

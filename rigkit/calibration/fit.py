@@ -30,7 +30,7 @@ the ring around the middle that a corner lies in, of so many with as many corner
 RING_FACTOR = 4.0
 """No ring scatters more than this many times as much as all corners: beyond it the corners in it are bad ones."""
 CAUCHY_SIGMAS = 2.5
-COARSE = 5e-2
+COARSE_TOLERANCE = 5e-2
 FINE = 1e-5
 """The robust solves stop where a step promises less than this part of the cost: they only tell outliers from the rest,
 and the least squares that follow begin where they end."""
@@ -41,7 +41,7 @@ GOOD_ENOUGH = 1e-3
 FOLD = 1e-6
 """A fold begins at the solution of all images: a step that promises less of the cost changes no digit shown."""
 SETTLE_ROUNDS = 8
-BAD_VIEW = 2.0
+MAX_SCATTER_OF_VIEW = 2.0
 """A view with this many times the scatter of all gets its pose found anew: perhaps its tilt has the wrong sign."""
 
 
@@ -161,7 +161,7 @@ def _robust(observations: Observations, state: State, start_sigma: float) -> _Fo
     is that of `state`."""
     present = observations.present
     loss = CAUCHY_SIGMAS * start_sigma
-    coarse = solve(observations, state, loss_px=loss, max_iterations=15, cost_tolerance=COARSE)
+    coarse = solve(observations, state, loss_px=loss, max_iterations=15, cost_tolerance=COARSE_TOLERANCE)
     state, norm = coarse.state, coarse.data.residuals[0].weighted(observations)
     sigma = sigma_of(norm, present)
     if not norm.max() > OUTLIER_SIGMAS * sigma:
@@ -169,7 +169,7 @@ def _robust(observations: Observations, state: State, start_sigma: float) -> _Fo
     # Padding is left out of the medians by standing beyond all corners.
     ordered = np.sort(np.where(present, norm, np.inf), axis=1)
     of_view = ordered[np.arange(len(norm)), np.maximum(present.sum(axis=1) - 1, 0) // 2] / MEDIAN_OF_RAYLEIGH
-    bad = np.flatnonzero(of_view > BAD_VIEW * sigma)
+    bad = np.flatnonzero(of_view > MAX_SCATTER_OF_VIEW * sigma)
     if bad.size:
         part = observations.subset(bad)
         found = find_poses(part, state.subset(bad), part.weight, CAUCHY_SIGMAS * sigma)

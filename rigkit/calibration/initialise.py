@@ -30,14 +30,14 @@ __all__ = ["initialise", "start_error"]
 
 EXPONENTS = ((0, 2, 3, 4), (0, 2, 4), (0, 2), (0,))
 """Polynomials tried from rich to poor, until the angle increases with the radius."""
-ROUNDS = 2
+POLYNOMIAL_ROUNDS = 2
 ENUMERATE = 6
 """Up to this many views all patterns of signs are tried."""
 NARROW = 1.45
 """Models that end at 90 degrees are fitted to the curve up to here, rad."""
 FALLBACK_FOV_RAD = (0.7, 1.4, 2.1, 3.1)
 """Fields of view of the equidistant lenses tried where the views do not determine a curve (all boards parallel)."""
-SAMPLES = 96
+RADIUS_SAMPLES = 96
 ORTHONORMAL = 1e-12
 """Departure from a rotation that is rounding."""
 COUNTED = 0.1
@@ -50,7 +50,7 @@ NOTHING_RAD = 1e-6
 """The same of an angle."""
 TINY = 1e-300
 """The same of sums of squares of any scale."""
-RIDGE = 1e-12
+POLYNOMIAL_RIDGE = 1e-12
 """Of the unit diagonal: keeps the normal matrix of views that leave the polynomial open invertible."""
 FLIPS = 10
 """Rounds of the signs at the most; each lowers the residual, and the first that changes nothing is the last."""
@@ -95,8 +95,8 @@ def _starts(
     depths = _Depths(alignment, offset, rho / rho_max, board)
     tried = (depths.curve(exponents) for exponents in EXPONENTS)
     curve = next((c for c in tried if c is not None), None)
-    radius = np.linspace(0.0, rho_max, SAMPLES)
-    fallback = (np.linspace(0.0, 0.5 * fov, SAMPLES) for fov in FALLBACK_FOV_RAD)
+    radius = np.linspace(0.0, rho_max, RADIUS_SAMPLES)
+    fallback = (np.linspace(0.0, 0.5 * fov, RADIUS_SAMPLES) for fov in FALLBACK_FOV_RAD)
     for theta, sign, t3 in map(depths.known, fallback) if curve is None else [curve]:
         camera = _fitted(model, size_px, centre, theta, radius, order)
         if camera is not None:
@@ -161,22 +161,22 @@ class _Depths:
         rows -= self._middle[..., None]
 
     def curve(self, exponents: tuple[int, ...]) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """Return the angles at SAMPLES radii in [0, 1], the signs of the tilts and t3 (V,); None where the angle does
-        not increase."""
+        """Return the angles at RADIUS_SAMPLES radii in [0, 1], the signs of the tilts and t3 (V,); None where the angle
+        does not increase."""
         which = [*(EXPONENTS[0].index(k) for k in exponents), -2]
         s, depth = self._s, self._rows[:, -2] + self._middle[:, -2, None]
         # d rho / d z of the lens turns residuals of z into residuals of rho; at first for a lens of 45 degrees.
         slope = self._safe**2 / (np.maximum(s, NOTHING) * (1.0 + self._safe**2))
         weight = np.where(self._used, self._weight * slope, 0.0)
         a, sign, t3 = self._joint(which, weight, None)
-        for _ in range(ROUNDS - 1):
+        for _ in range(POLYNOMIAL_ROUNDS - 1):
             z = (a @ self._rows[:, which[:-1]]) + (self._middle[:, which[:-1]] @ a)[:, None]
             slope = s / np.maximum(s * s + z * z, TINY)
             residual = np.abs(z - t3[:, None] - sign[:, None] * depth) * slope
             scale = TURN_SIGMAS * SIGMA_OF_MEDIAN * median_of(residual[self._used]) + NOTHING
             weight = np.where(self._used, self._weight * slope / (1.0 + (residual / scale) ** 2), 0.0)
             a, sign, t3 = self._joint(which, weight, sign)
-        radius = np.linspace(0.0, 1.0, SAMPLES)
+        radius = np.linspace(0.0, 1.0, RADIUS_SAMPLES)
         theta = np.arctan2(radius, (radius[:, None] ** np.array(exponents)) @ a)
         if a[0] <= 0.0 or (np.diff(theta) <= 0.0).any():
             return None
@@ -184,7 +184,7 @@ class _Depths:
 
     def known(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return what `curve` does for a curve that is known, with all signs plus."""
-        angle = np.interp(self._rho, np.linspace(0.0, 1.0, SAMPLES), theta)
+        angle = np.interp(self._rho, np.linspace(0.0, 1.0, RADIUS_SAMPLES), theta)
         weight = self._weight * np.sin(angle) ** 2
         z = self._s / np.tan(np.maximum(angle, NOTHING_RAD))
         depth = self._rows[:, -2] + self._middle[:, -2, None]
@@ -205,7 +205,7 @@ class _Depths:
         central = moments[:, which][:, :, which] - total[:, None, None] * mean[:, :, None] * mean[:, None]
         normal = central[:, :-1, :-1].sum(axis=0)
         scale = np.sqrt(np.diag(normal)) + TINY
-        normal = normal / scale[:, None] / scale + RIDGE * np.eye(len(scale))
+        normal = normal / scale[:, None] / scale + POLYNOMIAL_RIDGE * np.eye(len(scale))
         cross = central[:, :-1, -1].T / scale[:, None]
         if sign is None:
             explained = np.asarray(np.linalg.solve(np.linalg.cholesky(normal), cross), dtype=np.float64)

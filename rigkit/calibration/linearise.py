@@ -21,7 +21,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Points
 
 __all__ = ["normal_equations", "view_products"]
 
-BLOCK = 8192
+CORNERS_AT_A_TIME = 8192
 """Corners linearised at a time: their derivatives then stay in the cache, and memory does not grow with the views."""
 
 
@@ -87,7 +87,7 @@ def _blocks(
     table = np.ascontiguousarray(shape.points(state.unknowns).T)
     views, corners = weight.shape
     count = camera.parameters.size + shape.basis.shape[-1] + 7
-    step = max(1, BLOCK // max(corners, 1))
+    step = max(1, CORNERS_AT_A_TIME // max(corners, 1))
     for first in range(0, views, step):
         block = slice(first, min(first + step, views))
         part = _Part(

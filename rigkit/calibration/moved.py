@@ -18,27 +18,27 @@ from rigkit.core.findings import Finding, Severity
 
 __all__ = ["moved_lens"]
 
-MIN_IMAGES = 10
-SIGMAS = 3.0
+MIN_IMAGES_FOR_HALVES = 10
+MIN_HALF_SIGMAS = 3.0
 """Halves this far apart (root of the mean squared distance of the parameters, in standard deviations) may be two
 lenses. Halves of one and the same are 1 apart, at most 2."""
 AGAINST_PLACE = 1.4
 """They are, if no other way to halve the images sets them apart by more than a part of this. Measured: at most 1.2 for
 one lens with flat, bent and wavy boards, 1.5 and more for 2 % of focal length."""
-TOLERANCE = 1e-6
+HALVES_TOLERANCE = 1e-6
 
 
 def moved_lens(observations: Observations, fit: Fit) -> tuple[Finding, ...]:
     """Return a verdict if the two halves of the images, in the order given, have different intrinsics."""
     images = list(dict.fromkeys(observations.images))
-    if len(images) < MIN_IMAGES:
+    if len(images) < MIN_IMAGES_FOR_HALVES:
         return ()
     place = {name: i for i, name in enumerate(images)}
     number = np.array([place[name] for name in observations.images])
     # The shape of the boards stays as it was found: two shapes are not two lenses.
     state = fit.state.with_boards_held()
     distance = _apart(observations, fit, state, number >= len(images) // 2)
-    if not distance > SIGMAS:
+    if not distance > MIN_HALF_SIGMAS:
         return ()
     for values in (*_places(observations, state), number % 2):
         of_image = np.bincount(number, values) / np.bincount(number)
@@ -73,7 +73,7 @@ def _apart(observations: Observations, fit: Fit, state: State, second: BoolArray
     for chosen in (np.flatnonzero(~second), np.flatnonzero(second)):
         part, start = observations.subset(chosen), state.subset(chosen)
         weight = np.where(fit.kept[chosen], part.weight, 0.0)
-        own = solve(part, start, weight=weight, prior_sigma_px=fit.sigma_px, cost_tolerance=TOLERANCE).state
+        own = solve(part, start, weight=weight, prior_sigma_px=fit.sigma_px, cost_tolerance=HALVES_TOLERANCE).state
         whole += _cost(part, start, weight)
         split += _cost(part, own, weight)
         count += 2 * int(fit.kept[chosen].sum()) - 6 * len(chosen)

@@ -12,14 +12,14 @@ from rigkit.calibration.observations import Observations
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray
 
-__all__ = ["NormalEquations", "Residuals", "Step"]
+__all__ = ["NormalEquations", "Residuals", "SchurStep"]
 
 MAX_CONDITION = 1e12
 """A pose whose scaled block is worse has directions that its corners leave open: fewer than three of them."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Step:
+class SchurStep:
     """A proposed step and the decrease of the cost that the quadratic model promises for it."""
 
     globals: FloatArray
@@ -105,7 +105,7 @@ class NormalEquations:
         total = float(self.costs.sum()) + self.prior_cost
         return total if np.isfinite(total) else np.inf
 
-    def step(self, damping: float) -> Step | None:
+    def step(self, damping: float) -> SchurStep | None:
         """Return the damped Gauss-Newton step, None where the damped system is not positive definite."""
         damping_g, damping_p = damping * _diagonal(self.gg), damping * _diagonal(self.pp)
         first = self.points_from
@@ -120,7 +120,7 @@ class NormalEquations:
         # Decrease of the undamped model for the damped step: h^T (mu D h + b).
         predicted = float(step_g @ (damping_g * step_g + self.g))
         predicted += float((step_p * (damping_p * step_p + self.p)).sum())
-        return Step(step_g, step_p, predicted)
+        return SchurStep(step_g, step_p, predicted)
 
     def _eliminate_poses(self, damping_g: FloatArray, damping_p: FloatArray) -> tuple[FloatArray, FloatArray]:
         count = len(self.g)

@@ -19,12 +19,12 @@ from rigkit.optim.damping import Damping, Stop
 
 __all__ = ["find_poses", "refine_each", "refine_poses"]
 
-MAX_ITERATIONS = 40
-TOLERANCE = 1e-10
+MAX_POSE_ITERATIONS = 40
+VIEW_TOLERANCE = 1e-10
 """Stop where a step promises less than this part of a view's cost,"""
 START_TOLERANCE = 1e-5
 """or this, of a pose that is only where a solve begins: a robust loss takes dozens of steps for the last digits."""
-DAMPING = Damping(start=1e-6, floor=1e-12, ceiling=1e10)
+VIEW_DAMPING = Damping(start=1e-6, floor=1e-12, ceiling=1e10)
 """A view of which hardly a corner projects does not determine its pose: less than the floor would leave it singular."""
 
 
@@ -33,7 +33,7 @@ def refine_poses(
     state: State,
     weight: FloatArray,
     loss_px: float | None = None,
-    tolerance: float = TOLERANCE,
+    tolerance: float = VIEW_TOLERANCE,
 ) -> tuple[State, FloatArray]:
     """Return the state with each view's pose at its own minimum, and each view's cost (V,) in px^2. `loss_px` is the
     scale of the Cauchy loss, `tolerance` the part of the cost that a step must promise to be worth another."""
@@ -52,7 +52,7 @@ def refine_each(
     rotation: Mat3,
     translation_mm: Points,
     linearise: Callable[[Mat3, Points], NormalEquations],
-    tolerance: float = TOLERANCE,
+    tolerance: float = VIEW_TOLERANCE,
 ) -> tuple[Mat3, Points, FloatArray]:
     """Return poses (N, 3, 3), (N, 3) each at its own minimum and their costs (N,): Levenberg-Marquardt with a damping
     of its own for each. `linearise` returns the normal equations at given poses."""
@@ -64,8 +64,8 @@ def refine_each(
     def moved(poses: tuple[FloatArray, ...], step: FloatArray) -> tuple[FloatArray, ...]:
         return exp_so3(step[:, :3]) @ poses[0], poses[1] + step[:, 3:]
 
-    stop = Stop(steps=MAX_ITERATIONS, promise=tolerance)
-    found, cost = minimise_each((rotation, translation_mm), around, moved, DAMPING, stop)
+    stop = Stop(steps=MAX_POSE_ITERATIONS, promise=tolerance)
+    found, cost = minimise_each((rotation, translation_mm), around, moved, VIEW_DAMPING, stop)
     return found[0], found[1], cost
 
 

@@ -20,17 +20,17 @@ from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 
 __all__ = ["Alignment", "align", "distortion_centre"]
 
-ROUNDS = 4
+ALIGNMENT_ROUNDS = 4
 SUBSETS = 16
 SUBSET_SIZE = 7
 """With 5 % bad corners 70 % of such subsets are clean; 16 miss once in 10^8 views."""
 SUSPICIOUS = 8.0
 """A largest residual of more than this many robust sigmas sends the view through random subsets."""
-SHIFT = 1e-13
+TRACE_SHIFT = 1e-13
 """Of the trace, keeps the normal matrix of exact corners invertible."""
 TURN_SIGMAS = 2.5
 """Residuals of so many robust sigmas count half."""
-MIN_SIGMA_PX = 1e-6
+MIN_SCATTER_PX = 1e-6
 """Exact corners scatter by rounding alone, far below any noise; weights are one over it."""
 ON_AXIS = 1e-3
 """Of a view's largest radius: nearer to the axis a corner has no direction, and its weight no end."""
@@ -40,7 +40,9 @@ INVERSE_STEPS = 3
 """Each brings the vector nearer by the ratio of the two smallest eigenvalues, the noise against the view's tilt."""
 SQUARE_ROW, SQUARE_COLUMN = np.triu_indices(3)
 """The six different products of two of three numbers."""
-NORMAL = 3 * np.tile([[0, 1, 2], [1, 3, 4], [2, 4, 5]], (2, 2)) + np.kron([[0, 1], [1, 2]], np.ones((3, 3), dtype=int))
+NORMAL_ENTRIES = 3 * np.tile([[0, 1, 2], [1, 3, 4], [2, 4, 5]], (2, 2)) + np.kron(
+    [[0, 1], [1, 2]], np.ones((3, 3), dtype=int)
+)
 """Where each entry of the 6x6 normal matrix lies in the (6, 3) moments: by product of (x, y, 1), by one of (-v, u)."""
 
 
@@ -86,7 +88,7 @@ def align(offset: FloatArray, board: FloatArray, weight: FloatArray) -> Alignmen
         h[bad] = _best_subset(offset[bad], local[bad], used[bad])
         residual, radius = views.residual(h)
     robust = weight
-    for _ in range(ROUNDS):
+    for _ in range(ALIGNMENT_ROUNDS):
         sigma = _sigma(residual, used)
         robust = np.where(used, weight / (1.0 + (residual / (TURN_SIGMAS * sigma[:, None])) ** 2), 0.0)
         h = views.fit(robust / radius, h)
@@ -127,11 +129,11 @@ class _Views:
         """Return the unit h (..., 6) that minimises sum weight^2 (u Y - v X)^2, from a `start` near it if there is one:
         inverse iteration then costs half of all eigenvectors."""
         moments = self._squares @ np.swapaxes(self._direction * (weight * weight)[..., None, :], -1, -2)
-        normal = moments.reshape(*weight.shape[:-1], -1)[..., NORMAL]
+        normal = moments.reshape(*weight.shape[:-1], -1)[..., NORMAL_ENTRIES]
         if start is None:
             return np.asarray(np.linalg.eigh(normal)[1][..., 0])
         trace = np.trace(normal, axis1=-2, axis2=-1)[..., None]
-        inverse = np.linalg.inv(normal + (SHIFT * trace + np.finfo(float).tiny)[..., None] * np.eye(6))
+        inverse = np.linalg.inv(normal + (TRACE_SHIFT * trace + np.finfo(float).tiny)[..., None] * np.eye(6))
         h = start[..., None]
         for _ in range(INVERSE_STEPS):
             h = inverse @ h
@@ -157,7 +159,7 @@ def _sigma(residual: FloatArray, used: np.ndarray) -> FloatArray:
     middle = np.maximum(used.sum(axis=1) - 1, 0) // 2
     ordered = np.partition(np.where(used, residual, np.inf), np.unique(middle), axis=1)
     median = ordered[np.arange(len(used)), middle]
-    return np.maximum(SIGMA_OF_MEDIAN * np.where(np.isfinite(median), median, 0.0), MIN_SIGMA_PX)
+    return np.maximum(SIGMA_OF_MEDIAN * np.where(np.isfinite(median), median, 0.0), MIN_SCATTER_PX)
 
 
 def _best_subset(offset: FloatArray, local: FloatArray, used: np.ndarray) -> FloatArray:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 from rigkit.calibration.linearise import normal_equations
-from rigkit.calibration.normal_equations import NormalEquations, Step
+from rigkit.calibration.normal_equations import NormalEquations, SchurStep
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.state import State
@@ -30,13 +30,13 @@ __all__ = ["CameraSolution", "Linearised", "minimise", "solve", "with_priors"]
 
 S = TypeVar("S")
 
-MAX_ITERATIONS = 60
+MAX_SOLVER_ITERATIONS = 60
 COST_TOLERANCE = 1e-11
 """Stop when the quadratic model promises less than this part of the cost: Gauss-Newton converges quadratically here, so
 the optimum is then known to about 1e-10 in cost."""
 MIN_GAIN_RATIO = 0.5
 """A step that gains little, and less than this share of what it promised, was too far: the next one may gain more."""
-DAMPING = Damping(start=1e-13, shrink=0.01, growth=4.0, acceleration=2.0, ceiling=1e12, by_gain=True)
+SOLVER_DAMPING = Damping(start=1e-13, shrink=0.01, growth=4.0, acceleration=2.0, ceiling=1e12, by_gain=True)
 """Monomials of a polynomial are nearly dependent (eigenvalues down to 1e-12 of the scaled system at degree 6): more
 than 1e-13 would hold their combinations back, and with a shrink of 1/3 it would be dozens of steps. A step that goes
 too far is refused and the damping grows quickly."""
@@ -54,7 +54,7 @@ class Linearised(LinearisedProblem):
         """The cost, priors included."""
         return self.normal.cost
 
-    def step(self, damping: float) -> Step | None:
+    def step(self, damping: float) -> SchurStep | None:
         """Return the damped step of the normal equations with priors."""
         return self.normal.step(damping)
 
@@ -83,7 +83,7 @@ def solve(
     weight: FloatArray | None = None,
     loss_px: float | None = None,
     prior_sigma_px: float = 0.2,
-    max_iterations: int = MAX_ITERATIONS,
+    max_iterations: int = MAX_SOLVER_ITERATIONS,
     cost_tolerance: float = COST_TOLERANCE,
     at_start: NormalEquations | None = None,
 ) -> CameraSolution:
@@ -123,8 +123,8 @@ class _Solver:
 def minimise(
     state: S,
     linearise: Callable[[S], Linearised],
-    moved: Callable[[S, Step], S | None],
-    max_iterations: int = MAX_ITERATIONS,
+    moved: Callable[[S, SchurStep], S | None],
+    max_iterations: int = MAX_SOLVER_ITERATIONS,
     tolerance: float = COST_TOLERANCE,
     here: Linearised | None = None,
 ) -> tuple[S, Linearised, Convergence]:
@@ -135,13 +135,13 @@ def minimise(
     where it is known.
     """
     stop = Stop(steps=max_iterations, gain=tolerance, gain_ratio=MIN_GAIN_RATIO, promise=tolerance)
-    end = levenberg_marquardt.minimise(state, linearise, moved, DAMPING, stop, here=here)
+    end = levenberg_marquardt.minimise(state, linearise, moved, SOLVER_DAMPING, stop, here=here)
     stopped = f"stopped after {max_iterations} iterations"
     reason = stopped if end.reason == StopReason.STEPS else str(end.reason)
     return end.state, end.problem, Convergence(end.steps, end.converged, reason)
 
 
-def _moved(state: State, step: Step) -> State | None:
+def _moved(state: State, step: SchurStep) -> State | None:
     """Return the state after a step, None where the parameters make no camera."""
     p = state.camera.parameters.size
     try:

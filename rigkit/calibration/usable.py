@@ -14,9 +14,9 @@ from rigkit.core.detections import BoardDetection, BoardView
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import IDENTIFIER, MAX_IDENTIFIER
 
-__all__ = ["MIN_CORNERS", "other_size", "usable_views", "views_of_image"]
+__all__ = ["MIN_CORNERS_OF_VIEW", "other_size", "usable_views", "views_of_image"]
 
-MIN_CORNERS = 6
+MIN_CORNERS_OF_VIEW = 6
 """A pose has six numbers: fewer than six corners leave hardly anything to check it by."""
 OFTEN = 3
 """Whole grids of one size: parts of a larger board, as the frame cuts them, come in many sizes."""
@@ -71,8 +71,8 @@ def _on_a_line(points: FloatArray, count: IntArray) -> list[bool]:
 
 
 def _reason(view: BoardView, line_of: str | None) -> str | None:
-    if len(view.grid) < MIN_CORNERS:
-        return f"{len(view.grid)} corners of board '{view.board.board_id}', at least {MIN_CORNERS} are needed"
+    if len(view.grid) < MIN_CORNERS_OF_VIEW:
+        return f"{len(view.grid)} corners of board '{view.board.board_id}', at least {MIN_CORNERS_OF_VIEW} are needed"
     if line_of is not None:
         return f"the corners of board '{view.board.board_id}' lie on one line of the {line_of}"
     return None

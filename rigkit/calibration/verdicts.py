@@ -31,11 +31,11 @@ ASKED_DEG = 95.0
 """Beyond this angle off the axis nobody is asked to hold a board: it would have to be beside the camera."""
 CELL_CORNERS = 5
 """A cell with fewer corners than this is empty."""
-BAD_VIEW = 2.5
+MAX_RATIO_OF_MEDIANS = 2.5
 """A view whose median residual is this many times the usual one, there in the image."""
 RINGS = 4
 """What is usual is asked of so many rings around the middle of the image: towards the rim all corners scatter more."""
-OUTLYING = 0.2
+MAX_OUTLIER_SHARE = 0.2
 """A view with this part of its corners outliers."""
 SMALL_PX = 0.1
 """Corners this near to where they should be are no reason to retake an image, however sure they were said to be."""
@@ -253,19 +253,19 @@ def _views(c: Calibration) -> list[Finding]:
     middle = _medians(residual, lengths)
     usual = max(float(np.median(middle)), np.finfo(float).tiny)
     times = middle / usual
-    if times.max() > BAD_VIEW:
+    if times.max() > MAX_RATIO_OF_MEDIANS:
         away = np.concatenate([v.pixels for v in c.views]) - image_center(c.camera.size_px)
         there = np.full(len(away), usual)
         for ring in np.array_split(np.argsort((away**2).sum(axis=1)), RINGS):
             there[ring] = max(float(np.median(residual[ring])), usual)
         times = _medians(residual / there, lengths)
     found = []
-    for i in np.flatnonzero((times > BAD_VIEW) | (out > OUTLYING * lengths)).tolist():
+    for i in np.flatnonzero((times > MAX_RATIO_OF_MEDIANS) | (out > MAX_OUTLIER_SHARE * lengths)).tolist():
         view = c.views[i]
         far = int((~view.kept & ~(np.linalg.norm(view.residuals_px, axis=1) <= SMALL_PX)).sum())
-        if times[i] > BAD_VIEW and middle[i] > SMALL_PX:
+        if times[i] > MAX_RATIO_OF_MEDIANS and middle[i] > SMALL_PX:
             what = f"has a median residual of {middle[i]:.3f} px, {times[i]:.1f} times the usual one there"
-        elif far > OUTLYING * lengths[i]:
+        elif far > MAX_OUTLIER_SHARE * lengths[i]:
             what = f"has {far} outliers among its {lengths[i]} corners"
         else:
             continue

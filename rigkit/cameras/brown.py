@@ -21,8 +21,8 @@ FARTHEST = 50.0
 """Tangent of 88.9 degrees: no lens of this kind sees further."""
 KNOTS = 129
 """Samples of the radial curve from which its inverse starts."""
-STEPS = 30
-SETTLED = 1e-13
+MAX_INVERSE_STEPS = 30
+NEWTON_SETTLED = 1e-13
 """Newton in the plane stops where the next step would be this small, in units of the focal length."""
 
 
@@ -162,7 +162,7 @@ class Brown(Camera):
         m = np.where(valid, m, 0.0)
         plane = here = self._radial_start(m)
         moving, before = np.arange(valid.size), np.full(valid.size, 1e-300)
-        for _ in range(STEPS):
+        for _ in range(MAX_INVERSE_STEPS):
             squares = _squares(here)
             t = squares[0] + squares[2]
             factor, denominator = self._radial(t)
@@ -175,7 +175,7 @@ class Brown(Camera):
             here *= np.minimum(1.0, self._max_r / length)
             # The next step is (size / before)^2 of this one, for as long as the convergence is quadratic.
             size = np.abs(step[0]) + np.abs(step[1])
-            unsettled = ~(size * np.minimum(size / before, 1.0) ** 2 <= SETTLED * (1.0 + length))
+            unsettled = ~(size * np.minimum(size / before, 1.0) ** 2 <= NEWTON_SETTLED * (1.0 + length))
             before = np.maximum(size, 1e-300)
             plane[:, moving] = here
             if not unsettled.all():

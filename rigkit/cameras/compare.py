@@ -17,8 +17,8 @@ from rigkit.geometry.rotation import exp_so3, nearest_rotation, rotation_angle, 
 
 __all__ = ["CameraDifference", "compare_cameras", "grid_pixels"]
 
-STEPS = 20
-SETTLED_RAD = 1e-12
+MAX_ROTATION_STEPS = 20
+ROTATION_SETTLED_RAD = 1e-12
 """The fit of the rotation stops at steps that move no pixel by a millionth."""
 MIN_PIXELS = 20
 """Fewer common pixels say nothing about the image."""
@@ -131,7 +131,7 @@ def _best_rotation(rays: FloatArray, pixels: FloatArray, weight: FloatArray, b: 
     rays_b, seen = b.unproject(pixels)
     covariance = np.einsum("n,ni,nj->ij", weight[seen], rays_b[seen], rays[seen])
     rotation = nearest_rotation(covariance) if seen.sum() >= 3 else np.eye(3)
-    for _ in range(STEPS):
+    for _ in range(MAX_ROTATION_STEPS):
         turned = rays @ rotation.T
         projected, valid, d_pixels_d_point, _ = b.project_with_jacobians(turned)
         if valid.sum() < 3:
@@ -144,6 +144,6 @@ def _best_rotation(rays: FloatArray, pixels: FloatArray, weight: FloatArray, b: 
         gradient = np.einsum("n,nki,nk->i", w, by_turn, residual)
         step = np.linalg.lstsq(normal, -gradient, rcond=None)[0]
         rotation = exp_so3(step) @ rotation
-        if np.linalg.norm(step) < SETTLED_RAD:
+        if np.linalg.norm(step) < ROTATION_SETTLED_RAD:
             break
     return nearest_rotation(rotation)

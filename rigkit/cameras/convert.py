@@ -16,22 +16,22 @@ from rigkit.optim.levenberg_marquardt import DenseStep, LinearisedProblem, dampe
 
 __all__ = ["Conversion", "convert_camera", "fit_camera", "refit_camera"]
 
-GRID = (64, 48)
+CONVERT_GRID = (64, 48)
 """Pixels of the source at which the two cameras are held against each other."""
-CURVE_SAMPLES = 60
+MIN_COVERED_SAMPLES = 60
 LIMITS_RAD = (np.pi, *np.radians([80.0, 70.0, 60.0, 50.0, 40.0]))
 """Angles from the axis out to which a model is fitted: the widest at which it follows the lens."""
 FOLLOWS_PX = 1.0
 """A model follows the lens where its largest error is below this."""
 WIDE_RAD = np.radians(60.0)
 """Narrower limits are tried for perspective models of lenses that reach beyond this; others are to hold everywhere."""
-STEPS = 60
+MAX_CONVERT_STEPS = 60
 HALVINGS = 8
-SETTLED = 1e-10
+CONVERT_SETTLED = 1e-10
 """The fit stops where a step gains less than this share of the cost,"""
 ROUNDING_PX = 1e-10
 """or where pixels are met this well."""
-DAMPING = Damping(start=1e-6, ceiling=1e6)
+CONVERT_DAMPING = Damping(start=1e-6, ceiling=1e6)
 INSIDE = 0.995
 """Rays within this share of the start's field of view take part: at its edge the derivatives have no end."""
 
@@ -70,14 +70,14 @@ def convert_camera(camera: Camera, model: str, *, order: int | None = None, fixe
     pixels = _grid(camera)
     rays, valid = camera.unproject(pixels)
     pixels, rays = pixels[valid], rays[valid]
-    if len(pixels) < CURVE_SAMPLES:
+    if len(pixels) < MIN_COVERED_SAMPLES:
         raise InputError("camera conversion: the source sees next to nothing of its own image; calibrate it again")
     theta = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
     centre, _ = camera.project(np.array([0.0, 0.0, 1.0]))
     found: Conversion | None = None
     for limit in LIMITS_RAD:
         near = theta <= limit
-        if near.sum() < CURVE_SAMPLES or (found is not None and near.mean() == found.covered):
+        if near.sum() < MIN_COVERED_SAMPLES or (found is not None and near.mean() == found.covered):
             continue
         try:
             fitted = fit_camera(
@@ -136,7 +136,7 @@ def refit_camera(start: Camera, rays: Rays, pixels: Pixels, *, fixed: Sequence[s
 
 
 def _grid(camera: Camera) -> Pixels:
-    u, v = (np.linspace(0.0, size - 1.0, count) for size, count in zip(camera.size_px, GRID, strict=True))
+    u, v = (np.linspace(0.0, size - 1.0, count) for size, count in zip(camera.size_px, CONVERT_GRID, strict=True))
     return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
 
 
@@ -159,11 +159,11 @@ def _start(
 ) -> Camera:
     """Return a first camera from the radial curve: means over rings of equal width in the angle."""
     radius = np.linalg.norm(pixels - centre, axis=-1)
-    edges = np.linspace(0.0, theta.max() * (1.0 + 1e-9), CURVE_SAMPLES + 1)
+    edges = np.linspace(0.0, theta.max() * (1.0 + 1e-9), MIN_COVERED_SAMPLES + 1)
     ring = np.digitize(theta, edges) - 1
-    count = np.bincount(ring, minlength=CURVE_SAMPLES)
+    count = np.bincount(ring, minlength=MIN_COVERED_SAMPLES)
     kept = count > 0
-    mean = [np.bincount(ring, v, CURVE_SAMPLES)[kept] / count[kept] for v in (theta, radius)]
+    mean = [np.bincount(ring, v, MIN_COVERED_SAMPLES)[kept] / count[kept] for v in (theta, radius)]
     rising = np.append(True, np.diff(np.maximum.accumulate(mean[1])) > 0.0)
     try:
         curve = RadialCurve(centre, mean[0][rising], mean[1][rising])
@@ -173,7 +173,7 @@ def _start(
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Fit(LinearisedProblem):
+class _Conversion(LinearisedProblem):
     """A camera against rays and pixels, moved along the columns of `free` (P, F)."""
 
     camera: Camera
@@ -196,8 +196,8 @@ class _Fit(LinearisedProblem):
 def _descend(camera: Camera, rays: Rays, pixels: Pixels, free: FloatArray) -> Camera:
     """Return the camera after a damped descent of the projection error over the free directions."""
 
-    def linearise(state: Camera) -> _Fit:
-        return _Fit(state, rays, pixels, free, _cost(state, rays, pixels))
+    def linearise(state: Camera) -> _Conversion:
+        return _Conversion(state, rays, pixels, free, _cost(state, rays, pixels))
 
     def moved(state: Camera, step: DenseStep) -> Camera | None:
         change = free @ step.change
@@ -208,8 +208,8 @@ def _descend(camera: Camera, rays: Rays, pixels: Pixels, free: FloatArray) -> Ca
                 change = 0.5 * change
         return None
 
-    stop = Stop(steps=STEPS, gain=SETTLED, cost=ROUNDING_PX**2 * pixels.size)
-    return minimise(camera, linearise, moved, DAMPING, stop).state
+    stop = Stop(steps=MAX_CONVERT_STEPS, gain=CONVERT_SETTLED, cost=ROUNDING_PX**2 * pixels.size)
+    return minimise(camera, linearise, moved, CONVERT_DAMPING, stop).state
 
 
 def _cost(camera: Camera, rays: Rays, pixels: Pixels) -> float:

@@ -17,7 +17,7 @@ from rigkit.core.errors import InputError
 
 __all__ = ["DoubleSphere"]
 
-STARTS = ((0.0, 0.1), (0.0, 0.5), (0.0, 0.6), (0.0, 0.7), (-0.2, 0.6), (0.3, 0.6))
+DOUBLE_SPHERE_STARTS = ((0.0, 0.1), (0.0, 0.5), (0.0, 0.6), (0.0, 0.7), (-0.2, 0.6), (0.3, 0.6))
 """(xi, alpha) from a nearly perspective lens to a fisheye."""
 
 
@@ -32,7 +32,7 @@ class DoubleSphere(FocalCamera):
 
     @classmethod
     def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
-        return fit_shape(cls, size_px, curve, STARTS)
+        return fit_shape(cls, size_px, curve, DOUBLE_SPHERE_STARTS)
 
     def parameter_names(self) -> tuple[str, ...]:
         return ("fx", "fy", "cx", "cy", "xi", "alpha")

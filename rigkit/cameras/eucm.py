@@ -18,7 +18,7 @@ from rigkit.core.errors import InputError
 
 __all__ = ["EUCM"]
 
-STARTS = ((0.1, 1.0), (0.5, 1.0), (0.6, 1.0), (0.7, 1.0))
+EUCM_STARTS = ((0.1, 1.0), (0.5, 1.0), (0.6, 1.0), (0.7, 1.0))
 """(alpha, beta) from a nearly perspective lens to a fisheye."""
 
 
@@ -35,7 +35,7 @@ class EUCM(FocalCamera):
     @classmethod
     def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
         count = len(cls.shape_names())
-        return fit_shape(cls, size_px, curve, [start[:count] for start in STARTS])
+        return fit_shape(cls, size_px, curve, [start[:count] for start in EUCM_STARTS])
 
     @classmethod
     def shape_names(cls) -> tuple[str, ...]:

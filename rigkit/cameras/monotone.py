@@ -17,8 +17,8 @@ LAST_STEP_REL = 1e-9
 """Newton doubles the digits at each step: after one this small, as a share of the range, all are right."""
 QUICK_STEPS = 3
 """Newton steps from the table for all points; nearly all are done after two."""
-STEP_REL = 1e-14
-MAX_STEPS = 60
+RELATIVE_STEP = 1e-14
+MAX_BISECTIONS = 60
 """The rest is bracketed: bisection alone reaches double precision in this many steps."""
 CELLS_PER_KNOT = 4
 """The table is looked up in equal cells of the target, found by a division instead of a search."""
@@ -85,7 +85,7 @@ def invert_increasing(
     low, high = np.full(index.size, first), np.full(index.size, last)
     # NaN (a slope of zero) must not be the start.
     x[index] = np.where(np.isfinite(x[index]), x[index], 0.5 * (first + last))
-    for _ in range(MAX_STEPS):
+    for _ in range(MAX_BISECTIONS):
         old = x[index]
         residual, slope = function(old, index)
         above = residual > 0.0
@@ -94,7 +94,7 @@ def invert_increasing(
         new = old - residual / slope
         new = np.where((new >= low) & (new <= high), new, 0.5 * (low + high))
         x[index] = new
-        moving = np.abs(new - old) > STEP_REL * (last - first)
+        moving = np.abs(new - old) > RELATIVE_STEP * (last - first)
         if not moving.any():
             break
         index, low, high = index[moving], low[moving], high[moving]

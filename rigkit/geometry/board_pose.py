@@ -32,10 +32,10 @@ MIN_SPREAD = 1e-6
 """Points are collinear where their second principal extent is below this part of the first."""
 MIN_HOMOGRAPHY_GAP = 1e-9
 """The homography is not unique where the second smallest singular value is below this part of the largest."""
-STEP_TOLERANCE = 1e-12
+POSE_STEP_TOLERANCE = 1e-12
 """Stop when a step gains less than this part of the cost, or moves the pose by less than this part of a radian."""
-STOP = Stop(steps=50, gain=STEP_TOLERANCE)
-DAMPING = Damping(start=1e-4, floor=1e-12, ceiling=1e6)
+STOP = Stop(steps=50, gain=POSE_STEP_TOLERANCE)
+BOARD_DAMPING = Damping(start=1e-4, floor=1e-12, ceiling=1e6)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -252,10 +252,10 @@ def _refine(
 
     def small(poses: tuple[FloatArray, ...], step: FloatArray) -> BoolArray:
         moved_by = np.abs(step[:, 3:]).max(axis=1) / np.linalg.norm(poses[1], axis=1)
-        return np.asarray(np.abs(step[:, :3]).max(axis=1) + moved_by < STEP_TOLERANCE)
+        return np.asarray(np.abs(step[:, :3]).max(axis=1) + moved_by < POSE_STEP_TOLERANCE)
 
     start = (rotation, translation)
-    found, cost = minimise_each(start, linearise, moved, DAMPING, STOP, small=small, until_all=True)
+    found, cost = minimise_each(start, linearise, moved, BOARD_DAMPING, STOP, small=small, until_all=True)
     return found[0], found[1], cost
 
 

@@ -14,7 +14,7 @@ from rigkit.interop.exchange import Accepted, Written, best_accepted, camera_of,
 
 __all__ = ["read_colmap_cameras", "write_colmap_cameras"]
 
-ACCEPTED = (
+COLMAP_ACCEPTS = (
     Accepted("pinhole"),
     Accepted("brown", 4),
     Accepted("brown", 5),
@@ -49,7 +49,7 @@ def write_colmap_cameras(cameras: Mapping[int, Camera]) -> tuple[str, dict[int, 
     """Return cameras.txt of cameras by COLMAP's id (from 1), and per camera what was lost (`text` is its line)."""
     written: dict[int, Written] = {}
     for camera_id, camera in cameras.items():
-        chosen = best_accepted(camera, ACCEPTED, "COLMAP")
+        chosen = best_accepted(camera, COLMAP_ACCEPTS, "COLMAP")
         c = chosen.camera
         name = {"pinhole": "PINHOLE", "kannala_brandt": "OPENCV_FISHEYE", "eucm": "EUCM"}.get(c.model)
         if name is None:

@@ -28,7 +28,7 @@ from rigkit.interop.yaml_text import flow, parse_yaml
 
 __all__ = ["KalibrChain", "read_kalibr", "write_kalibr"]
 
-ACCEPTED = (
+KALIBR_ACCEPTS = (
     Accepted("pinhole"),
     Accepted("brown", 4),
     Accepted("kannala_brandt"),
@@ -63,7 +63,7 @@ def write_kalibr(cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3] | Non
         raise InputError(f"camchain: {len(cameras)} cameras, but {len(cam_from_rig)} poses")
     parts = []
     for i, camera in enumerate(cameras):
-        chosen = best_accepted(camera, ACCEPTED, "Kalibr")
+        chosen = best_accepted(camera, KALIBR_ACCEPTS, "Kalibr")
         model, intrinsics, distortion_model, distortion = _described(chosen.camera)
         lines = [f"cam{i}:"]
         if i and cam_from_rig is not None:

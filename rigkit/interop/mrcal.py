@@ -24,7 +24,7 @@ from rigkit.interop.exchange import Accepted, Written, best_accepted, camera_of,
 
 __all__ = ["read_cameramodel", "write_cameramodel"]
 
-ACCEPTED = (Accepted("pinhole"), Accepted("brown", 4), Accepted("brown", 5), Accepted("brown", 8))
+MRCAL_ACCEPTS = (Accepted("pinhole"), Accepted("brown", 4), Accepted("brown", 5), Accepted("brown", 8))
 SPLINED = re.compile(
     r"^LENSMODEL_SPLINED_STEREOGRAPHIC_(?:spline_)?order=(?P<order>\d)_Nx=(?P<nx>\d{1,4})_Ny=(?P<ny>\d{1,4})_fov_x_deg=(?P<fov>\d{1,3})$"
 )
@@ -32,7 +32,7 @@ MM_PER_M = 1000.0
 KNOTS_X = 40
 SMOOTHING = 1e-6
 """Weight of the second differences of the control points: it carries the surface smoothly over the image's border."""
-GRID = (161, 121)
+SPLINE_GRID = (161, 121)
 """Pixels at which the spline is fitted and read."""
 CHECK_GRID = (233, 187)
 """Pixels at which its error is measured: others."""
@@ -51,7 +51,7 @@ def write_cameramodel(camera: Camera, cam_from_ref: Rigid3 | None = None) -> Wri
     """Return the camera as a .cameramodel file; `cam_from_ref` is its pose, by default the identity."""
     pose = Rigid3.identity() if cam_from_ref is None else cam_from_ref
     try:
-        chosen = best_accepted(camera, ACCEPTED, "mrcal")
+        chosen = best_accepted(camera, MRCAL_ACCEPTS, "mrcal")
     except InputError:
         chosen = None
     if chosen is not None and chosen.covered == 1.0 and chosen.max_error_px < CLOSE_ENOUGH_PX:
@@ -129,7 +129,7 @@ def _stereographic(rays: Rays) -> FloatArray:
 
 def _spline_of(camera: Camera) -> tuple[str, FloatArray]:
     """Return lens model and intrinsics of the spline through the camera's own rays, by linear least squares."""
-    pixels, rays = _samples(camera, GRID)
+    pixels, rays = _samples(camera, SPLINE_GRID)
     u = _stereographic(rays)
     # The spline covers fov_x_deg on the horizontal, and as much as its knots reach on the vertical.
     fov_x = int(np.ceil(np.degrees(4.0 * np.arctan(np.abs(u).max(axis=0)[0] / 2.0)))) + 2
@@ -198,11 +198,11 @@ def _from_spline(
     assert match is not None
     if intrinsics.size != 4 + 2 * int(match["nx"]) * int(match["ny"]):
         raise InputError(f"'{name}': {lens} needs {int(match['nx'])} x {int(match['ny'])} knots; is the file whole?")
-    rays, pixels = _spline_samples(lens, intrinsics, size_px, GRID[0])
-    if len(rays) < GRID[0]:
+    rays, pixels = _spline_samples(lens, intrinsics, size_px, SPLINE_GRID[0])
+    if len(rays) < SPLINE_GRID[0]:
         raise InputError(f"'{name}': the spline shows next to nothing on the image; is the file whole?")
     centre = _spline_project(np.array([[0.0, 0.0, 1.0]]), lens, intrinsics)[0][0]
-    checked = _spline_samples(lens, intrinsics, size_px, 3 * GRID[0])
+    checked = _spline_samples(lens, intrinsics, size_px, 3 * SPLINE_GRID[0])
     best: tuple[Camera, float] | None = None
     for kind in (model,) if model else SPLINE_MODELS:
         try:

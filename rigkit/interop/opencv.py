@@ -27,7 +27,7 @@ from rigkit.interop.yaml_text import parse_yaml
 
 __all__ = ["read_opencv", "write_opencv"]
 
-ACCEPTED = (
+OPENCV_ACCEPTS = (
     Accepted("pinhole"),
     Accepted("brown", 4),
     Accepted("brown", 5),
@@ -39,7 +39,7 @@ ACCEPTED = (
 
 def write_opencv(camera: Camera) -> Written:
     """Return the camera as OpenCV's YAML; `cv2.FileStorage` reads it."""
-    chosen = best_accepted(camera, ACCEPTED, "OpenCV")
+    chosen = best_accepted(camera, OPENCV_ACCEPTS, "OpenCV")
     c = chosen.camera
     p, extra = c.parameters, ""
     fx, fy, cx, cy = p[:4]

@@ -15,7 +15,7 @@ from rigkit.interop.yaml_text import flow, parse_yaml
 
 __all__ = ["read_camera_info", "write_camera_info"]
 
-ACCEPTED = (
+ROS_ACCEPTS = (
     Accepted("pinhole"),
     Accepted("brown", 4),
     Accepted("brown", 5),
@@ -28,7 +28,7 @@ def write_camera_info(camera: Camera, camera_name: str = "camera") -> Written:
     """Return the camera as a camera_info YAML file called `camera_name` inside."""
     if not camera_name or not camera_name.replace("_", "").isalnum():
         raise InputError(f"camera_info: name '{camera_name}'; ROS takes letters, digits and underscores")
-    chosen = best_accepted(camera, ACCEPTED, "ROS")
+    chosen = best_accepted(camera, ROS_ACCEPTS, "ROS")
     c = chosen.camera
     p = c.parameters
     fx, fy, cx, cy = p[:4].tolist()

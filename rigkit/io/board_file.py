@@ -28,9 +28,9 @@ from rigkit.core.boards import Board, Markers, marker_rectangles
 from rigkit.core.errors import InputError
 from rigkit.io.toml_reader import TomlTable, read_toml
 
-__all__ = ["SCHEMA", "board_from_table", "load_board", "load_layout", "with_squares"]
+__all__ = ["BOARD_SCHEMA", "board_from_table", "load_board", "load_layout", "with_squares"]
 
-SCHEMA = "rigkit.board/1"
+BOARD_SCHEMA = "rigkit.board/1"
 MOST_CORNERS = 1000
 """Along one side: no image resolves more."""
 BOTH_PRINTED = "printed_x_mm = 30.0 and printed_y_mm = 30.0"
@@ -43,7 +43,7 @@ def load_board(path: str | Path) -> Board:
 
     Raises InputError for a missing file, an unknown or missing key, or a value that makes no board.
     """
-    table = read_toml(path, SCHEMA)
+    table = read_toml(path, BOARD_SCHEMA)
     board = board_from_table(table, Path(path).stem)
     table.done()
     return board
@@ -54,7 +54,7 @@ def load_layout(path: str | Path) -> Board:
 
     Raises InputError like `load_board`.
     """
-    board, printed = load_board(path), _printed(read_toml(path, SCHEMA))
+    board, printed = load_board(path), _printed(read_toml(path, BOARD_SCHEMA))
     return board if printed is None else with_squares(board, *printed)
 
 

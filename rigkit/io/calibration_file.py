@@ -28,7 +28,7 @@ from rigkit.io.json_reader import read_json, real, whole
 from rigkit.io.reading import usable_path
 
 __all__ = [
-    "SCHEMA",
+    "CALIBRATION_SCHEMA",
     "calibration_text",
     "camera_from_json",
     "camera_to_json",
@@ -43,9 +43,9 @@ __all__ = [
     "save_camera",
 ]
 
-SCHEMA = "rigkit.calibration/1"
+CALIBRATION_SCHEMA = "rigkit.calibration/1"
 CAMERA_KEYS = {"model", "size_px", "parameters"}
-KEYS = {
+CALIBRATION_KEYS = {
     "schema", "camera", "rms_px", "heldout_rms_px", "sigma_px", "covariance", "frame_covariance", "verdicts",
     "candidates", "convergence", "dropped", "outliers", "boards", "views", "overdispersion", "freedom",
 }  # fmt: skip
@@ -62,7 +62,7 @@ def calibration_text(calibration: Calibration) -> str:
     """Return the content of the calibration's file."""
     c = calibration
     data = {
-        "schema": SCHEMA,
+        "schema": CALIBRATION_SCHEMA,
         "camera": camera_to_json(c.camera),
         "rms_px": c.rms_px,
         "heldout_rms_px": c.heldout_rms_px,
@@ -93,7 +93,7 @@ def calibration_text(calibration: Calibration) -> str:
 
 def save_camera(path: str | Path, camera: Camera, *, force: bool = False) -> None:
     """Write a camera without the calibration that it came from."""
-    write_atomic(path, _dumps({"schema": SCHEMA, "camera": camera_to_json(camera)}), force=force)
+    write_atomic(path, _dumps({"schema": CALIBRATION_SCHEMA, "camera": camera_to_json(camera)}), force=force)
 
 
 def load_camera(path: str | Path) -> Camera:
@@ -113,7 +113,7 @@ def is_calibration(path: str | Path) -> bool:
 def load_calibration(path: str | Path) -> Calibration:
     """Return the whole calibration; raises InputError like `load_camera`, also where the file has the camera alone."""
     data = _read(path)
-    missing = sorted(KEYS - LATER_KEYS - set(data))
+    missing = sorted(CALIBRATION_KEYS - LATER_KEYS - set(data))
     if missing:
         raise InputError(f"'{path}': no {', '.join(missing)}: a camera without its calibration; calibrate again")
     with damage_named(path):
@@ -154,8 +154,8 @@ def _read(path: str | Path) -> dict[str, Any]:
         raise InputError(f"calibration '{source}' does not exist; run `rigkit calibrate` first")
     return read_json(
         source,
-        SCHEMA,
-        KEYS,
+        CALIBRATION_SCHEMA,
+        CALIBRATION_KEYS,
         "calibration file",
         remedy="calibrate again, or bring another program's camera in with `rigkit export FILE -o camera.json`",
     )

@@ -27,7 +27,7 @@ from rigkit.io.sources import source_hash
 
 __all__ = ["CornerCache", "FoundCorners", "image_hash", "kept_corners", "lens_key"]
 
-SCHEMA = "rigkit.corners/2"
+CORNERS_SCHEMA = "rigkit.corners/2"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -62,7 +62,7 @@ class CornerCache:
             return
         try:
             data = parse_json(read_text(path))
-            if isinstance(data, dict) and data.get("schema") == SCHEMA:
+            if isinstance(data, dict) and data.get("schema") == CORNERS_SCHEMA:
                 if data["detector"].partition(" ")[2] != targets:
                     return
                 for entry in data["images"].values():
@@ -116,14 +116,14 @@ class CornerCache:
     def save(self) -> None:
         """Write the file if anything is new."""
         if self._changed and self.path is not None:
-            data = {"schema": SCHEMA, "detector": self.detector, "images": self._entries}
+            data = {"schema": CORNERS_SCHEMA, "detector": self.detector, "images": self._entries}
             write_atomic(self.path, json.dumps(data, allow_nan=False) + "\n", force=True)
 
 
 def kept_corners(data: Any) -> dict[str, FoundCorners]:
     """Return what a file of kept corners has of each image; raises whatever damage leads to."""
-    if data["schema"] != SCHEMA:
-        raise InputError(f"its schema is not '{SCHEMA}'")
+    if data["schema"] != CORNERS_SCHEMA:
+        raise InputError(f"its schema is not '{CORNERS_SCHEMA}'")
     return {str(image): _found_in(entry) for image, entry in data["images"].items()}
 
 

@@ -32,11 +32,11 @@ from rigkit.io.reading import read_bytes
 
 __all__ = ["correspondences_text", "read_correspondences", "write_correspondences"]
 
-POINTS = ("u1_px", "v1_px", "u2_px", "v2_px")
+POINT_COLUMNS = ("u1_px", "v1_px", "u2_px", "v2_px")
 AFFINE = ("a11", "a12", "a21", "a22")
-SIGMAS = ("sigma_px", "sigma_A")
+SIGMA_COLUMNS = ("sigma_px", "sigma_A")
 DIRECTION = re.compile(r"^(du1|dv1|du2|dv2)_([1-9]\d*)$")
-ARRAYS = ("pixels1", "pixels2", "A21", "directions1", "directions2", *SIGMAS)
+ARRAYS = ("pixels1", "pixels2", "A21", "directions1", "directions2", *SIGMA_COLUMNS)
 
 MAX_ARRAY_BYTES = 500_000_000
 """Of one array of an NPZ, unpacked."""
@@ -71,7 +71,7 @@ def read_correspondences(path: str | Path) -> Correspondences:
 
 def correspondences_text(found: Correspondences) -> str:
     """Return the CSV text; numbers as exact as needed to read back the same correspondences."""
-    columns: dict[str, FloatArray] = dict(zip(POINTS, np.hstack([found.pixels1, found.pixels2]).T, strict=True))
+    columns: dict[str, FloatArray] = dict(zip(POINT_COLUMNS, np.hstack([found.pixels1, found.pixels2]).T, strict=True))
     if found.A21 is not None:
         columns |= dict(zip(AFFINE, found.A21.reshape(-1, 4).T, strict=True))
     if found.directions is not None:
@@ -80,7 +80,7 @@ def correspondences_text(found: Correspondences) -> str:
                 valid = found.directions.valid[:, k]
                 columns[f"du{image}_{k + 1}"] = np.where(valid, d[:, k, 0], np.nan)
                 columns[f"dv{image}_{k + 1}"] = np.where(valid, d[:, k, 1], np.nan)
-    for name in SIGMAS:
+    for name in SIGMA_COLUMNS:
         if getattr(found, name) is not None:
             columns[name] = getattr(found, name)
     stream = io.StringIO()
@@ -99,12 +99,12 @@ def write_correspondences(path: str | Path, found: Correspondences, *, force: bo
 def _from_csv(source: Path, text: str) -> Correspondences:
     lines = csv.reader(io.StringIO(text))
     header = [name.strip() for name in next(lines)]
-    unknown = [name for name in header if name not in (*POINTS, *AFFINE, *SIGMAS) and not DIRECTION.match(name)]
+    fixed = (*POINT_COLUMNS, *AFFINE, *SIGMA_COLUMNS)
+    unknown = [name for name in header if name not in fixed and not DIRECTION.match(name)]
     if unknown or len(set(header)) != len(header):
         what = f"unknown column '{unknown[0]}'" if unknown else "a column appears twice"
-        raise InputError(
-            f"correspondences '{source}': {what}; known: {', '.join((*POINTS, *AFFINE, 'du1_1', '...', *SIGMAS))}"
-        )
+        known = ", ".join((*POINT_COLUMNS, *AFFINE, "du1_1", "...", *SIGMA_COLUMNS))
+        raise InputError(f"correspondences '{source}': {what}; known: {known}")
     rows = []
     for line in lines:
         if not line or line[0].lstrip().startswith("#"):
@@ -120,11 +120,11 @@ def _from_csv(source: Path, text: str) -> Correspondences:
                 f"correspondences '{source}', line {lines.line_num}: {len(line)} fields for {len(header)} columns"
             )
     table = dict(zip(header, np.array(rows, dtype=np.float64).reshape(-1, len(header)).T, strict=True))
-    for group in (POINTS, AFFINE):
+    for group in (POINT_COLUMNS, AFFINE):
         lacking = [name for name in group if name not in table]
-        if lacking and (group == POINTS or len(lacking) < len(group)):
+        if lacking and (group == POINT_COLUMNS or len(lacking) < len(group)):
             raise InputError(f"correspondences '{source}': column '{lacking[0]}' is missing")
-    points = np.stack([table[name] for name in POINTS], axis=1)
+    points = np.stack([table[name] for name in POINT_COLUMNS], axis=1)
     A21 = np.stack([table[name] for name in AFFINE], axis=1).reshape(-1, 2, 2) if AFFINE[0] in table else None
     return _built(source, points[:, :2], points[:, 2:], A21, _directions(source, table), table)
 

@@ -19,9 +19,9 @@ from rigkit.io.toml_reader import TomlTable, read_toml
 from rigkit.io.truth_csv import load_truth_csv
 from rigkit.io.truth_file import truth_from_table
 
-__all__ = ["SCHEMA", "CameraEntry", "Dataset", "Pair", "load_dataset"]
+__all__ = ["DATASET_SCHEMA", "CameraEntry", "Dataset", "Pair", "load_dataset"]
 
-SCHEMA = "rigkit.dataset/1"
+DATASET_SCHEMA = "rigkit.dataset/1"
 MANIFEST = "dataset.toml"
 SESSION = "session.toml"
 
@@ -140,7 +140,7 @@ def load_dataset(path: str | Path) -> Dataset:
         what = f"folder '{given}' has no {MANIFEST}" if given.is_dir() else f"data set '{given}' does not exist"
         raise InputError(f"{what}; write one, or let `rigkit init` start it")
     source = source.resolve()
-    top = read_toml(source, SCHEMA)
+    top = read_toml(source, DATASET_SCHEMA)
     name = top.identifier("name", hint='name = "my-lab"')
     boards = tuple(_board(t) for t in top.tables("boards", hint='[[boards]] with id = "plane1" and file or sizes'))
     cameras = tuple(_camera(t) for t in top.tables("cameras", hint='[[cameras]] with id = "left" and calibration'))

@@ -12,11 +12,11 @@ from pathlib import Path
 
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
-from rigkit.io.manifest import SCHEMA
+from rigkit.io.manifest import DATASET_SCHEMA
 
 __all__ = ["FoundPair", "Sighting", "board_sizes", "find_images", "group_pairs", "manifest_text"]
 
-SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"}
+IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"}
 
 SIDES = (
     (re.compile(r"(left|_l|-l|view1|cam1|_1|-1|a)$", re.IGNORECASE), 1),
@@ -53,9 +53,9 @@ def find_images(folder: Path) -> list[Path]:
     """Return all images below `folder`, sorted; raises InputError where there are none."""
     if not folder.is_dir():
         raise InputError(f"init: '{folder}' is not a folder; give the folder that holds the images")
-    images = sorted(p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
+    images = sorted(p for p in folder.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
     if not images:
-        raise InputError(f"init: no images ({', '.join(sorted(SUFFIXES))}) under '{folder}'")
+        raise InputError(f"init: no images ({', '.join(sorted(IMAGE_SUFFIXES))}) under '{folder}'")
     return images
 
 
@@ -141,7 +141,10 @@ def manifest_text(
         )
     most = max((s.boards for pair in pairs for s in (pair.first, pair.second)), key=len)
     counts = Counter(most)
-    out = ["# Started by `rigkit init`; what a person measured is for a person to check.", f'schema = "{SCHEMA}"']
+    out = [
+        "# Started by `rigkit init`; what a person measured is for a person to check.",
+        f'schema = "{DATASET_SCHEMA}"',
+    ]
     out += [
         f"name = {_quoted(name)}",
         "",

@@ -12,7 +12,7 @@ from rigkit.validation.tables import PaperTables
 
 __all__ = ["load_paper_tables"]
 
-PLANES = "planes.csv"
+PLANES_FILE = "planes.csv"
 BASELINES = "baselines.csv"
 
 
@@ -21,7 +21,7 @@ def load_paper_tables(folder: str | Path) -> PaperTables:
 
     Raises InputError where one is missing, a row has another number of cells than the head, or a cell is no number.
     """
-    return PaperTables(_read(Path(folder) / PLANES), _read(Path(folder) / BASELINES))
+    return PaperTables(_read(Path(folder) / PLANES_FILE), _read(Path(folder) / BASELINES))
 
 
 def _read(path: Path) -> dict[str, dict[str, str]]:

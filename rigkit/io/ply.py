@@ -19,7 +19,7 @@ from rigkit.io.reading import read_bytes
 
 __all__ = ["ply_bytes", "read_ply", "write_ply"]
 
-TYPES = {
+PLY_TYPES = {
     "char": "i1",
     "int8": "i1",
     "uchar": "u1",
@@ -38,13 +38,13 @@ TYPES = {
     "float64": "<f8",
 }
 POINT = ("x", "y", "z")
-NORMAL = ("nx", "ny", "nz")
+NORMAL_COLUMNS = ("nx", "ny", "nz")
 COLOUR = ("red", "green", "blue")
 BOARD_COMMENT = "board "
-SIGMAS = "sigmas: noise of the corners and of the relative pose"
+SIGMA_COMMENT = "sigmas: noise of the corners and of the relative pose"
 SIGMAS_COMMENT = {
-    True: f"{SIGMAS}, and the covariance of the calibrations",
-    False: f"{SIGMAS}; the calibrations count as exact",
+    True: f"{SIGMA_COMMENT}, and the covariance of the calibrations",
+    False: f"{SIGMA_COMMENT}; the calibrations count as exact",
 }
 """What the sigmas include, by `OrientedCloud.calibration_in_sigmas`."""
 
@@ -83,7 +83,7 @@ def ply_bytes(
     real = "float" if single_precision else "double"
     columns: list[tuple[str, str, NDArray[np.generic]]] = [
         *((name, real, cloud.points_mm[:, i]) for i, name in enumerate(POINT)),
-        *((name, real, cloud.normals[:, i]) for i, name in enumerate(NORMAL)),
+        *((name, real, cloud.normals[:, i]) for i, name in enumerate(NORMAL_COLUMNS)),
         *((name, "uchar", cloud.colours[:, i]) for i, name in enumerate(COLOUR)),
         ("board", "int", cloud.board_index),
         ("column", "int", cloud.grid[:, 0]),
@@ -91,7 +91,7 @@ def ply_bytes(
         ("sigma_mm", real, cloud.sigma_mm),
         ("normal_sigma_deg", real, np.rad2deg(cloud.normal_sigma_rad)),
     ]
-    table = np.empty(len(cloud), dtype=[(name, TYPES[kind]) for name, kind, _ in columns])
+    table = np.empty(len(cloud), dtype=[(name, PLY_TYPES[kind]) for name, kind, _ in columns])
     for name, _, values in columns:
         table[name] = values
     notes = ["rigkit oriented point cloud", f"units {unit}", "frame camera 1: x right, y down, z forward"]
@@ -127,7 +127,7 @@ def read_ply(path: str | Path) -> OrientedCloud:
         raise InputError(f"point cloud '{source}' is cut off: {have} of {count} points; write or copy it again")
     table = np.frombuffer(data, dtype=kinds, count=count, offset=start)
     names = set(kinds.names or ())
-    missing = [name for name in (*POINT, *NORMAL) if name not in names]
+    missing = [name for name in (*POINT, *NORMAL_COLUMNS) if name not in names]
     if missing:
         raise InputError(f"point cloud '{source}' has no {', '.join(missing)}; an oriented cloud needs x y z nx ny nz")
 
@@ -137,7 +137,7 @@ def read_ply(path: str | Path) -> OrientedCloud:
     try:
         return OrientedCloud(
             points_mm=np.stack([table[name] for name in POINT], axis=-1).astype(np.float64),
-            normals=np.stack([table[name] for name in NORMAL], axis=-1).astype(np.float64),
+            normals=np.stack([table[name] for name in NORMAL_COLUMNS], axis=-1).astype(np.float64),
             colours=np.stack([column(name, 128) for name in COLOUR], axis=-1).astype(np.uint8),
             board_index=column("board", -1).astype(np.int64),
             grid=np.stack([column("column", 0), column("row", 0)], axis=-1).astype(np.int64),
@@ -183,9 +183,9 @@ def _declared(lines: list[str], source: Path) -> tuple[int, list[tuple[str, str]
         elif words[:1] == ["element"]:
             break
         elif words[:1] == ["property"]:
-            if words[1] not in TYPES:
+            if words[1] not in PLY_TYPES:
                 raise InputError(f"'{source}': a point has a property of type '{words[1]}', which is not read")
             if words[2] in dict(fields):
                 raise InputError(f"'{source}': property '{words[2]}' is declared twice; write or copy the file again")
-            fields.append((words[2], TYPES[words[1]]))
+            fields.append((words[2], PLY_TYPES[words[1]]))
     return count, fields, boards

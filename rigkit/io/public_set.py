@@ -42,9 +42,9 @@ from rigkit.core.errors import InputError
 from rigkit.io.board_file import board_from_table
 from rigkit.io.toml_reader import TomlTable, read_toml
 
-__all__ = ["SCHEMA", "PublicMeasurement", "PublicSet", "load_public_set"]
+__all__ = ["PUBLIC_SCHEMA", "PublicMeasurement", "PublicSet", "load_public_set"]
 
-SCHEMA = "rigkit.public/1"
+PUBLIC_SCHEMA = "rigkit.public/1"
 MEASURED_UNITS = ("mm", "deg", "px")
 URL = re.compile(r"^(https?|file)://\S+$")
 SHA256 = re.compile(r"^[0-9a-f]{64}$")
@@ -101,7 +101,7 @@ class PublicSet:
 def load_public_set(path: str | Path) -> PublicSet:
     """Return the description of a public capture; raises InputError for a missing or unknown key, a path that leaves
     the set, something that is no hash or address, or an address of a file that is not listed."""
-    table = read_toml(path, SCHEMA)
+    table = read_toml(path, PUBLIC_SCHEMA)
     boards: tuple[Board, ...] = ()
     if table.has("boards"):
         boards = tuple(_board(entry) for entry in table.tables("boards", hint="[[boards]] with id, columns, rows"))

@@ -24,18 +24,18 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibration_file import camera_from_json, camera_to_json, damage_named, findings_to_json
 from rigkit.io.json_reader import json_schema, read_json, real, whole
 
-__all__ = ["BOARDS_SCHEMA", "SCHEMA", "SavedRig", "board_rigs_text", "is_rig_file", "load_board_rigs", "load_rig"]
+__all__ = ["BOARDS_SCHEMA", "RIG_SCHEMA", "SavedRig", "board_rigs_text", "is_rig_file", "load_board_rigs", "load_rig"]
 __all__ += ["load_saved_rig", "rig_text"]
 
-SCHEMA = "rigkit.rig/1"
+RIG_SCHEMA = "rigkit.rig/1"
 BOARDS_SCHEMA = "rigkit.board_rig/1"
-KEYS = {
+RIG_KEYS = {
     "schema", "cameras", "rms_px", "heldout_rms_px", "sigma_px", "overdispersion", "scale_sigma", "covariance",
     "baselines", "verdicts", "freedom",
 }  # fmt: skip
 FORMER_KEYS = {"spread"}
 """What `overdispersion` was called."""
-CAMERA_KEYS = {"name", "camera", "cam_from_rig", "rms_px"}
+RIG_CAMERA_KEYS = {"name", "camera", "cam_from_rig", "rms_px"}
 BOARD_KEYS = {"board_id", "size", "square_mm", "square_sigma_mm", "points_mm", "target_from_board"}
 
 
@@ -57,7 +57,7 @@ def rig_text(rig: RigCalibration) -> str:
     """Return the content of the rig's file."""
     pairs = [(a, b, *rig.baseline_mm(a, b)) for a, b in combinations([c.name for c in rig.cameras], 2)]
     data = {
-        "schema": SCHEMA,
+        "schema": RIG_SCHEMA,
         "heldout_rms_px": rig.heldout_rms_px,
         "rms_px": rig.rms_px,
         "sigma_px": rig.sigma_px,
@@ -90,12 +90,14 @@ def load_saved_rig(path: str | Path) -> SavedRig:
 
     Raises InputError for a missing or damaged file, another schema or an unknown key.
     """
-    data = _read(path, SCHEMA, KEYS | FORMER_KEYS)
+    data = _read(path, RIG_SCHEMA, RIG_KEYS | FORMER_KEYS)
     cameras: dict[str, tuple[Camera, Rigid3]] = {}
     with damage_named(path):
         for entry in data["cameras"]:
-            if set(entry) != CAMERA_KEYS:
-                raise InputError(f"'{path}': a camera must have the keys {', '.join(sorted(CAMERA_KEYS))}, no others")
+            if set(entry) != RIG_CAMERA_KEYS:
+                raise InputError(
+                    f"'{path}': a camera must have the keys {', '.join(sorted(RIG_CAMERA_KEYS))}, no others"
+                )
             camera = camera_from_json(entry["camera"], path)
             name = check_identifier(entry["name"], "camera")
             if name in cameras:
@@ -115,7 +117,7 @@ def load_saved_rig(path: str | Path) -> SavedRig:
 
 def is_rig_file(path: str | Path) -> bool:
     """Say whether the file is a rig's; False for anything that cannot be read."""
-    return json_schema(path) == SCHEMA
+    return json_schema(path) == RIG_SCHEMA
 
 
 def board_rigs_text(rigs: Sequence[BoardRig]) -> str:

@@ -47,7 +47,7 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.truth import MeasuredLength, PairTruth
 from rigkit.identification.board_ids import BOARD_SIDES
-from rigkit.io.session import SCHEMA, Session, beside_session, boards_of, images_of, options_of
+from rigkit.io.session import SESSION_SCHEMA, Session, beside_session, boards_of, images_of, options_of
 from rigkit.io.toml_reader import TomlTable, read_toml
 from rigkit.io.truth_file import truth_from_table
 
@@ -114,7 +114,7 @@ class RigSession:
 
 def is_rig_session(path: str | Path) -> bool:
     """Say whether the session has several cameras or boards on one mount; raises InputError like `load_session`."""
-    table = read_toml(path, SCHEMA)
+    table = read_toml(path, SESSION_SCHEMA)
     return table.has("cameras") or table.has("rigid_boards")
 
 
@@ -125,7 +125,7 @@ def load_rig_session(path: str | Path) -> RigSession:
     between cameras that are not there, and boards on a mount that are not listed or are on two.
     """
     source = Path(path)
-    table = read_toml(source, SCHEMA)
+    table = read_toml(source, SESSION_SCHEMA)
     boards = boards_of(table)
     model, degree, shape = options_of(table)
     rigid = _rigid_boards(table, boards)
@@ -226,7 +226,7 @@ def frames_of_images(images: Mapping[str, Sequence[str]], how: str | None = None
             raise InputError(f'frames = "order" needs as many images of every camera, there are {words}')
         return {name: {image: f"{k:04d}" for k, image in enumerate(own)} for name, own in images.items()}
     for key in (how,) if how else ("name", "number"):
-        frames = {name: {image: KEYS[key](image) for image in own} for name, own in images.items()}
+        frames = {name: {image: FRAME_KEYS[key](image) for image in own} for name, own in images.items()}
         twice = _twice(frames)
         known = sorted(frame for own in frames.values() for frame in set(own.values()))
         if twice is None and any(a == b for a, b in pairwise(known)):
@@ -245,7 +245,7 @@ def _number(image: str) -> str:
     return str(int(numbers[-1])) if numbers else image
 
 
-KEYS: dict[str, Callable[[str], str]] = {"name": lambda image: PurePath(image).stem, "number": _number}
+FRAME_KEYS: dict[str, Callable[[str], str]] = {"name": lambda image: PurePath(image).stem, "number": _number}
 
 
 def _twice(frames: Mapping[str, Mapping[str, str]]) -> str | None:

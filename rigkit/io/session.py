@@ -26,7 +26,7 @@ from rigkit.io.board_file import load_board
 from rigkit.io.toml_reader import TomlTable, named_path, read_toml
 
 __all__ = [
-    "SCHEMA",
+    "SESSION_SCHEMA",
     "Session",
     "beside_session",
     "boards_of",
@@ -36,7 +36,7 @@ __all__ = [
     "options_of",
 ]
 
-SCHEMA = "rigkit.session/1"
+SESSION_SCHEMA = "rigkit.session/1"
 HINT_BOARD = 'board = "board.toml" (or boards = ["a.toml", "b.toml"])'
 
 
@@ -84,7 +84,7 @@ def beside_session(session: Path, name: str) -> Path:
 def load_session(path: str | Path) -> Session:
     """Return the session; raises InputError for a missing file or board, or an unknown key."""
     source = Path(path)
-    table = read_toml(source, SCHEMA)
+    table = read_toml(source, SESSION_SCHEMA)
     if table.has("cameras"):
         raise table.error("has several [[cameras]]; where one camera is asked for, give the session of that one")
     images = images_of(table)
@@ -144,7 +144,7 @@ def files_of_session(path: str | Path) -> tuple[Path, ...]:
     Raises InputError like `load_session`.
     """
     source = Path(path)
-    table = read_toml(source, SCHEMA)
+    table = read_toml(source, SESSION_SCHEMA)
     boards = table.texts("boards", hint=HINT_BOARD) if table.has("boards") else (table.text("board", hint=HINT_BOARD),)
     out = [source, *map(table.beside, boards)]
     entries = table.tables("cameras", hint="[[cameras]]") if table.has("cameras") else (table,)

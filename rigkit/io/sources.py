@@ -9,7 +9,7 @@ import rigkit
 
 __all__ = ["source_hash"]
 
-SUFFIXES = {".py", ".c", ".h"}
+SOURCE_SUFFIXES = {".py", ".c", ".h"}
 
 
 def source_hash(*packages: str) -> str:
@@ -19,6 +19,6 @@ def source_hash(*packages: str) -> str:
     for folder in [root / name for name in packages] or [root]:
         if not folder.is_dir():
             raise ValueError(f"rigkit has no part '{folder.name}'")
-        for path in sorted(p for p in folder.rglob("*") if p.suffix in SUFFIXES):
+        for path in sorted(p for p in folder.rglob("*") if p.suffix in SOURCE_SUFFIXES):
             digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]

@@ -13,10 +13,10 @@ from rigkit.study.study import NOISE_KINDS, Claim, Study, Variant
 from rigkit.study.table import CELL_KEYS
 from rigkit.synthetic.noise import NoisyImages
 
-__all__ = ["SCHEMA", "load_study"]
+__all__ = ["STUDY_SCHEMA", "load_study"]
 
-SCHEMA = "rigkit.study/1"
-POSE_TYPES = tuple(str(p) for p in PoseType if p is not PoseType.AUTO)
+STUDY_SCHEMA = "rigkit.study/1"
+KNOWN_POSE_TYPES = tuple(str(p) for p in PoseType if p is not PoseType.AUTO)
 
 DEFAULTS = {f.name: f.default for f in fields(Study) if f.name in ("support", "det_scale")}
 """What a study that says nothing of them works with: the paper's."""
@@ -31,7 +31,7 @@ def load_study(path: str | Path) -> Study:
         Unknown keys or values, or one of name, trials, seed, pose_types, methods and noise is missing.
     """
     source = Path(path)
-    top = read_toml(source, SCHEMA)
+    top = read_toml(source, STUDY_SCHEMA)
     name = top.identifier("name", hint='name = "general-motion"')
     options: dict[str, Any] = {
         "title": top.text("title", hint='title = "..."') if top.has("title") else name,
@@ -41,8 +41,8 @@ def load_study(path: str | Path) -> Study:
     }
     kinds = top.texts("pose_types", hint='pose_types = ["general"]')
     for kind in kinds:
-        if kind not in POSE_TYPES:
-            raise top.error(f"'pose_types' names '{kind}', which is unknown; known: {', '.join(POSE_TYPES)}")
+        if kind not in KNOWN_POSE_TYPES:
+            raise top.error(f"'pose_types' names '{kind}', which is unknown; known: {', '.join(KNOWN_POSE_TYPES)}")
     options["pose_types"] = tuple(PoseType(kind) for kind in kinds)
     options |= _noise(top.table("noise", hint='[noise] with on = "directions" and sigma_deg = [0, 3, 10]'))
     if top.has("estimation"):

@@ -18,7 +18,7 @@ VALUE_BYTES = {1: 1, 3: 2, 4: 4, 16: 8}
 """Sizes of the integer types."""
 
 
-class _Entry(NamedTuple):
+class _Tag(NamedTuple):
     """The value of an integer entry, and where it stands in the file."""
 
     value: int
@@ -51,7 +51,7 @@ def page_count(data: bytes) -> int:
     return sum(size == sizes[0] for size in sizes) or 1
 
 
-def _value(page: dict[int, _Entry], tag: int) -> int:
+def _value(page: dict[int, _Tag], tag: int) -> int:
     return page[tag].value if tag in page else 0
 
 
@@ -61,7 +61,7 @@ def _byte_order(data: bytes) -> Literal["little", "big"] | None:
     return "big" if data[:4] in (b"MM\0*", b"MM\0+") else None
 
 
-def _pages(data: bytes, order: Literal["little", "big"]) -> list[dict[int, _Entry]]:
+def _pages(data: bytes, order: Literal["little", "big"]) -> list[dict[int, _Tag]]:
     """Return the integer entries of every directory by tag, as far as the file is whole."""
 
     def number(at: int, size: int) -> int:
@@ -70,7 +70,7 @@ def _pages(data: bytes, order: Literal["little", "big"]) -> list[dict[int, _Entr
     big = number(2, 2) == 43
     word, count_bytes, entry_bytes = (8, 8, 20) if big else (4, 2, 12)
     at = number(8 if big else 4, word)
-    pages: list[dict[int, _Entry]] = []
+    pages: list[dict[int, _Tag]] = []
     visited: set[int] = set()
     while at and at + count_bytes <= len(data) and at not in visited:
         visited.add(at)
@@ -82,7 +82,7 @@ def _pages(data: bytes, order: Literal["little", "big"]) -> list[dict[int, _Entr
         for entry in range(first, end, entry_bytes):
             size = VALUE_BYTES.get(number(entry + 2, 2))
             if size is not None and number(entry + 4, word) == 1:
-                page[number(entry, 2)] = _Entry(number(entry + 4 + word, size), entry + 4 + word, size)
+                page[number(entry, 2)] = _Tag(number(entry + 4 + word, size), entry + 4 + word, size)
         pages.append(page)
         at = number(end, word)
     return pages

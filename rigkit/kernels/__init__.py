@@ -25,13 +25,13 @@ class Kernels:
     """The functions of api.h, each a `calls.Kernel`, by their names."""
 
     def __init__(self, path: Path) -> None:
-        from rigkit.kernels.calls import NAMES, Kernel
+        from rigkit.kernels.calls import NAMES_IN_SIZES, Kernel
         from rigkit.kernels.declarations import header
 
         library = ctypes.CDLL(str(path))
         for name in header().functions:
             setattr(self, name, Kernel(name, library))
-        NAMES.update(vars(self))
+        NAMES_IN_SIZES.update(vars(self))
 
     def __getattr__(self, name: str) -> Any:
         raise AttributeError(f"api.h declares no function '{name}'")

@@ -16,7 +16,7 @@ __all__ = ["Kernel", "Struct", "address", "structure"]
 STRUCTURES: dict[str, type[Struct]] = {}
 """By their names in api.h; a structure stands there before those that it is part of."""
 
-NAMES: dict[str, Any] = {"__builtins__": {}, **header().constants}
+NAMES_IN_SIZES: dict[str, Any] = {"__builtins__": {}, **header().constants}
 """What sizes of arrays may be made of, beside other arguments: the constants, and the kernels once they are loaded."""
 
 AnyStruct = TypeVar("AnyStruct", bound="Struct")
@@ -52,7 +52,7 @@ class _Checks:
     def addresses(self, values: dict[str, Any]) -> list[tuple[int, int]]:
         """Return place and address of each of the arrays in `values`; raises TypeError where one is not as declared."""
         out = []
-        for (place, name, dtype), shape in zip(self.arrays, eval(self.shapes, NAMES, values), strict=True):
+        for (place, name, dtype), shape in zip(self.arrays, eval(self.shapes, NAMES_IN_SIZES, values), strict=True):
             array = values[name]
             # Bytes and truth values lie alike in memory.
             if array.shape != shape or (array.dtype != dtype and dtype is not None and not _alike(array.dtype, dtype)):

@@ -57,7 +57,7 @@ class ImageOf(Struct):
 
 
 @structure("corners_t")
-class _Corners(Struct):
+class _CornerArrays(Struct):
     """The corners that links are sought for."""
 
 
@@ -167,7 +167,7 @@ def links(
     """
     arrays = [np.ascontiguousarray(a, np.float64) for a in (pixels, lines, contrast, *bounds, reach)]
     names = ("pixels", "lines", "contrast", "least", "most", "reach")
-    given = _Corners.of(**dict(zip(names, arrays, strict=True)), count=len(pixels))
+    given = _CornerArrays.of(**dict(zip(names, arrays, strict=True)), count=len(pixels))
     nearest, both = np.empty((2, len(pixels), 4), np.int64)
     if not kernels().find_links(given, ImageOf.make(image), scale, offset, rules, nearest, both):
         raise MemoryError

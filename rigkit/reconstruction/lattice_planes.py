@@ -23,7 +23,7 @@ from rigkit.geometry.principal_axes import principal_axes
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, skew
 from rigkit.reconstruction.lattice_problem import (
-    MIN_CORNERS,
+    MIN_CORNERS_OF_BOARD,
     LatticeView,
     PlacedLattices,
     all_residuals,
@@ -154,7 +154,7 @@ def lattice_planes(
     views, boards = _views(geometry, moved)
     if not boards:
         raise DegenerateError(
-            f"pair '{pair.pair_id}': no board has {MIN_CORNERS} corners in each view for its own plane"
+            f"pair '{pair.pair_id}': no board has {MIN_CORNERS_OF_BOARD} corners in each view for its own plane"
         )
     sigma = np.array([(b.square_sigma_mm or 0.0) / np.sqrt(b.square_x_mm * b.square_y_mm) for b in boards])
     identity = pair.identity
@@ -220,7 +220,7 @@ def _views(geometry: PairGeometry, moved: list[tuple[Camera, Camera]]) -> tuple[
             # What the matched corners show of their noise holds as well for those that one view alone has.
             sigma_px, points = geometry.scatter * corners.sigma_px[seen], board.points(corners.grid[seen])
             both.append(LatticeView.of(cameras[0], len(boards), second, corners.pixels[seen], sigma_px, points))
-        if all(len(view.rays) >= MIN_CORNERS for view in both):
+        if all(len(view.rays) >= MIN_CORNERS_OF_BOARD for view in both):
             views += both
             boards.append(board)
     return views, boards

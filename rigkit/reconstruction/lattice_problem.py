@@ -13,7 +13,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, skew
 
 __all__ = [
-    "MIN_CORNERS",
+    "MIN_CORNERS_OF_BOARD",
     "LatticeView",
     "PlacedLattices",
     "all_residuals",
@@ -22,13 +22,13 @@ __all__ = [
     "residuals_of",
 ]
 
-MIN_CORNERS = 8
+MIN_CORNERS_OF_BOARD = 8
 """A board with fewer corners in a view has no pose there worth the name."""
 GROSS = 8.0
 """A corner this many standard deviations off is no corner of the lattice: something stands in front of it."""
 OUTLIER_ROUNDS = 3
-MAX_STEPS = 40
-STEP_TOLERANCE = 1e-10
+MAX_LATTICE_STEPS = 40
+LATTICE_STEP_TOLERANCE = 1e-10
 """Largest step in standard deviations of a parameter at which the minimisation ends: nothing of it shows."""
 
 
@@ -133,7 +133,7 @@ def _minimum(views: list[LatticeView], state: PlacedLattices, sigma: FloatArray)
     """Return the nearest minimum of the sum of squares (Levenberg-Marquardt)."""
     free, damping = free_parameters(sigma), 1e-6
     r, J = all_residuals(views, state, sigma)
-    for _ in range(MAX_STEPS):
+    for _ in range(MAX_LATTICE_STEPS):
         gram = J[:, free].T @ J[:, free]
         scale = np.sqrt(np.maximum(np.diag(gram), 1e-30))
         step = np.zeros(J.shape[1])
@@ -145,7 +145,7 @@ def _minimum(views: list[LatticeView], state: PlacedLattices, sigma: FloatArray)
         r_trial, J_trial = all_residuals(views, trial, sigma)
         if r_trial @ r_trial <= r @ r:
             state, r, J, damping = trial, r_trial, J_trial, max(0.1 * damping, 1e-12)
-            if np.abs(unit_step).max() < STEP_TOLERANCE * np.sqrt(len(r)):
+            if np.abs(unit_step).max() < LATTICE_STEP_TOLERANCE * np.sqrt(len(r)):
                 break
         else:
             damping = max(10.0 * damping, 1e-9)
@@ -173,5 +173,5 @@ def _near(views: list[LatticeView], state: PlacedLattices) -> list[BoolArray]:
     # The median length of two normal residuals is 1.1774 of their sigma.
     sigma = max(float(np.median(np.concatenate(off))) / 1.1774, 1e-9)
     near = [np.asarray(one <= GROSS * sigma) for one in off]
-    enough = all(which.sum() >= MIN_CORNERS for which in near)
+    enough = all(which.sum() >= MIN_CORNERS_OF_BOARD for which in near)
     return near if enough else [np.ones(len(one), dtype=bool) for one in off]

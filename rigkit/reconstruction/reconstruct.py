@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from rigkit.reconstruction.pairing import MatchedPair
 
 __all__ = [
-    "PLANES",
+    "PLANE_CHOICES",
     "Planes",
     "Reconstruction",
     "colours_at",
@@ -49,7 +49,7 @@ __all__ = [
 GREY = 160
 Planes = Literal["free", "lattice"]
 """What points and normals of a cloud are: each by itself, or those of the boards' known lattices."""
-PLANES: tuple[Planes, ...] = get_args(Planes)
+PLANE_CHOICES: tuple[Planes, ...] = get_args(Planes)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -120,8 +120,8 @@ def reconstruct_pair(
     Parameters, errors : of those two. For several estimators compute the geometry once. With `planes` "lattice" the
     points and normals are those of the boards' known lattices (`on_lattice`), the intrinsics exact.
     """
-    if planes not in PLANES:
-        raise InputError(f"planes: '{planes}' is unknown; known: {', '.join(PLANES)}")
+    if planes not in PLANE_CHOICES:
+        raise InputError(f"planes: '{planes}' is unknown; known: {', '.join(PLANE_CHOICES)}")
     geometry = pair_geometry(pair, pose_type=pose_type, level_sigma_rad=level_sigma_rad)
     free = reconstruct_from(geometry, affine_method=affine_method, scale=scale, image1=image1)
     return free if planes == "free" else on_lattice(free, lattice_planes(geometry))

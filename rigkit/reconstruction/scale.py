@@ -19,8 +19,8 @@ from rigkit.optim.robust_scale import MEDIAN_OF_CHI_SQUARE_3
 
 __all__ = ["board_scales", "metric_scale", "scale_and_gradient"]
 
-MIN_CORNERS = 4
-OUTLYING = 14.2
+MIN_CORNERS_FOR_SCALE = 4
+OUTLIER_SQUARE = 14.2
 """Squared distance in sigmas (three components) from which a corner loses weight: one in 400 Gaussian ones does."""
 ITERATIONS = 15
 
@@ -72,7 +72,7 @@ def scale_and_gradient(
     known = np.isfinite(scales)
     if not known.any():
         raise DegenerateError(
-            f"no scale: none of {len(boards)} boards has {MIN_CORNERS} triangulated corners that span it"
+            f"no scale: none of {len(boards)} boards has {MIN_CORNERS_FOR_SCALE} triangulated corners that span it"
         )
     square = [(board.square_sigma_mm or 0.0) / min(board.square_x_mm, board.square_y_mm) for board in boards]
     variance = sigmas**2 + (scales * np.array(square)) ** 2
@@ -117,7 +117,7 @@ def _fit_boards(
     slopes = np.zeros((len(boards), len(points), 3))
     for b, board in enumerate(boards):
         on = finite & (index == b)
-        if on.sum() < MIN_CORNERS:
+        if on.sum() < MIN_CORNERS_FOR_SCALE:
             continue
         model = board.points(cells[on])
         # Corners in a row leave the rotation about it open, but the scale is determined: two spreads are asked all the
@@ -150,7 +150,7 @@ def _similarity_scale(
         square = np.sum(residual**2, axis=1)
         if covariances is None:
             noise = max(float(np.median(square)) / MEDIAN_OF_CHI_SQUARE_3, 1e-300)
-        w = np.minimum(1.0, noise * OUTLYING / np.maximum(square, 1e-300)) ** 2
+        w = np.minimum(1.0, noise * OUTLIER_SQUARE / np.maximum(square, 1e-300)) ** 2
         J = np.concatenate([turned[:, :, None], -k * skew(turned), np.broadcast_to(np.eye(3), whiten.shape)], axis=2)
         J = whiten @ J
         gram = np.einsum("n,nij,nik->jk", w, J, J)

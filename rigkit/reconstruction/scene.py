@@ -47,11 +47,11 @@ GATE = 3.3
 """In standard deviations: one good point in a thousand is lost."""
 AFFINITY_GATE = 3.7
 """The same for the length of two residuals."""
-ROUNDS = 4
+SCENE_ROUNDS = 4
 MAX_FALSE_ALARMS = 1e-2
 MAX_RANGE_SIGMA = 0.3
 """A point whose distance is known no better than this share of it is left out: it could be anywhere along its ray."""
-SAMPLES: tuple[Sample, ...] = ("points", "affine")
+SAMPLE_KINDS: tuple[Sample, ...] = ("points", "affine")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -173,7 +173,7 @@ def _check(correspondences: Correspondences, baseline_mm: float | None, pair_id:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Fit:
+class _ScenePose:
     """The pose of contaminated matches; `matches` are all of them, with the sigmas that the inliers show."""
 
     matches: Matches
@@ -184,14 +184,14 @@ class _Fit:
     notes: tuple[str, ...]
 
 
-def _fit(matches: Matches, declared: PoseType, level_sigma_rad: float | None, rng: np.random.Generator) -> _Fit:
+def _fit(matches: Matches, declared: PoseType, level_sigma_rad: float | None, rng: np.random.Generator) -> _ScenePose:
     """Return the pose that most matches agree with, refined on those by points and affinities."""
     found = _search(matches, PoseType.GENERAL if declared is PoseType.AUTO else declared, rng)
     inliers = found.inliers
     _require(inliers)
     pose, pose_type = found.refined.cam2_from_cam1, declared
     notes: list[str] = []
-    for k in range(ROUNDS):
+    for k in range(SCENE_ROUNDS):
         matches = _with_shown_noise(matches, pose, inliers)
         fitting = matches.select(inliers)
         if k == 0:
@@ -204,7 +204,7 @@ def _fit(matches: Matches, declared: PoseType, level_sigma_rad: float | None, rn
         inliers = _agreeing(matches, pose)
         _require(inliers)
     _a_contrario_test(matches, pose, inliers, fundamental_for(pose_type).degrees_of_freedom)
-    return _Fit(matches, refined, inliers, pose_type, level_sigma_rad, tuple(notes))
+    return _ScenePose(matches, refined, inliers, pose_type, level_sigma_rad, tuple(notes))
 
 
 def _search(matches: Matches, kind: PoseType, rng: np.random.Generator) -> RobustPose:
@@ -214,7 +214,7 @@ def _search(matches: Matches, kind: PoseType, rng: np.random.Generator) -> Robus
     """
     best: tuple[float, RobustPose] | None = None
     failure: RigkitError | None = None
-    for sample in SAMPLES:
+    for sample in SAMPLE_KINDS:
         if sample == "affine" and usable_affinities(matches).sum() < MIN_MATCHES:
             continue
         try:
@@ -311,7 +311,7 @@ def _shown_sigma_A(matches: Matches, pose: Rigid3, inliers: BoolArray) -> FloatA
     return best[1]
 
 
-def _affinities(found: Correspondences, fit: _Fit) -> Affinities:
+def _affinities(found: Correspondences, fit: _ScenePose) -> Affinities:
     """Return the affinities of all matches that fit: given ones, and from directions and the pose where none is.
 
     Those from the pose fulfil the epipolar geometry whatever their error: only given ones have a sigma.
@@ -332,7 +332,7 @@ def _affinities(found: Correspondences, fit: _Fit) -> Affinities:
 
 
 def _cloud(
-    fit: _Fit, affinities: Affinities, baseline_mm: float | None, image1: NDArray[np.generic] | None
+    fit: _ScenePose, affinities: Affinities, baseline_mm: float | None, image1: NDArray[np.generic] | None
 ) -> tuple[OrientedCloud, BoolArray]:
     scale = 1.0 if baseline_mm is None else baseline_mm
     pose, covariance = (

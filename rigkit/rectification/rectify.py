@@ -19,7 +19,7 @@ __all__ = ["Interpolation", "RectifyMap", "rectify_map", "rotation_from_view_ang
 
 Interpolation = Literal["spline", "lanczos", "linear", "nearest"]
 
-ROTATION_TOLERANCE = 1e-6
+ROTATION_INPUT_TOLERANCE = 1e-6
 """A matrix further than this from orthonormal is a mistake, not rounding."""
 CHUNK_PIXELS = 1 << 18
 """Pixels resampled at a time: bounds the memory of large targets."""
@@ -143,7 +143,7 @@ def rectify_map(camera: Camera, target: Camera, *, target_from_cam: ArrayLike | 
     """
     matrix = as_array(np.eye(3) if target_from_cam is None else target_from_cam, (3, 3), "target_from_cam")
     rotation = nearest_rotation(matrix)
-    if np.abs(rotation - matrix).max() > ROTATION_TOLERANCE:
+    if np.abs(rotation - matrix).max() > ROTATION_INPUT_TOLERANCE:
         raise InputError("target_from_cam: not a rotation matrix (orthonormal, determinant +1)")
     return RectifyMap(camera, target, as_array(rotation, (3, 3), "target_from_cam"))
 

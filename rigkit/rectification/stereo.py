@@ -38,7 +38,7 @@ _REACH = {
 """Half extents (along, across the baseline) in the target's own units: beyond them the image is stretched too much."""
 MIN_ANGLE_RAD = np.radians(15.0)
 """Baseline and viewing direction nearer than this: a perspective image perpendicular to the baseline shows neither."""
-SAMPLES = 41
+EXTENT_SAMPLES = 41
 """Pixels a side of each image from which the extent of the targets is found."""
 MAX_ENLARGEMENT = 3.0
 """Width or height of the target against the larger source at the most."""
@@ -142,7 +142,8 @@ def _extent(maps: list[RectifyMap], reach: FloatArray) -> tuple[FloatArray, Floa
     for remap in maps:
         width, height = remap.camera.size_px
         grid = np.stack(
-            np.meshgrid(np.linspace(0.0, width - 1.0, SAMPLES), np.linspace(0.0, height - 1.0, SAMPLES)), axis=-1
+            np.meshgrid(np.linspace(0.0, width - 1.0, EXTENT_SAMPLES), np.linspace(0.0, height - 1.0, EXTENT_SAMPLES)),
+            axis=-1,
         )
         there, valid = remap.pixels(grid)
         valid &= (np.abs(np.where(valid[..., None], there, np.inf)) <= reach).all(axis=-1)

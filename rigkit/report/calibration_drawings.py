@@ -18,7 +18,7 @@ WIDTH = 600.0
 FOOT = 44.0
 MAX_VECTORS = 5000
 """More residuals make the drawing black and the page heavy: of more, every second, third, ... is drawn."""
-RESIDUAL_LENGTH = 0.02
+RMS_LENGTH = 0.02
 """The RMS residual is drawn about as long as this part of the image's width."""
 CELLS_ACROSS = 16
 MIN_IN_CELL = 4
@@ -35,7 +35,7 @@ INK, MARK, BAD, SOFT = "#1f4e8c", "#e6550d", "#b3261e", "#8a94a3"
 def residuals_svg(calibration: Calibration) -> str:
     """Draw how far each corner was measured from where the calibration puts it, magnified; outliers as crosses."""
     pixels, residuals, kept = _corners(calibration)
-    times = _magnification(calibration, RESIDUAL_LENGTH * calibration.camera.size_px[0] / max(calibration.rms_px, 1e-9))
+    times = _magnification(calibration, RMS_LENGTH * calibration.camera.size_px[0] / max(calibration.rms_px, 1e-9))
     step = -(-int(kept.sum()) // MAX_VECTORS)
     q, d = pixels[kept][::step], residuals[kept][::step]
     words = f"{len(q)} residuals, measured minus projected, magnified {times:g} times"

@@ -19,7 +19,7 @@ __all__ = ["CalibrationSection", "build_calibration_page", "thumbnail_jpeg"]
 
 THUMBNAIL_PX = 320
 """Width of the thumbnails: twice what the page shows, for dense screens."""
-JPEG_QUALITY = 70
+PAGE_JPEG_QUALITY = 70
 KEPT_COLOUR, LEFT_OUT_COLOUR = (60, 220, 60), (60, 60, 255)
 """Blue, green, red of the corners in thumbnails."""
 DRAWINGS: tuple[tuple[str, Callable[[Calibration], str]], ...] = (
@@ -75,7 +75,7 @@ def thumbnail_jpeg(image: Image, views: Sequence[ViewResult] = ()) -> bytes:
                 cv2.circle(canvas, place, 24, KEPT_COLOUR, -1, cv2.LINE_AA, 4)
             else:
                 cv2.circle(canvas, place, 72, LEFT_OUT_COLOUR, 2, cv2.LINE_AA, 4)
-    return bytes(cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1])
+    return bytes(cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, PAGE_JPEG_QUALITY])[1])
 
 
 def _shown(section: CalibrationSection) -> dict[str, Any]:

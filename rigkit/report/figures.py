@@ -45,7 +45,7 @@ DPI = 110
 NORMAL_LENGTH_SQUARES = 0.8
 BARE_NORMAL = 0.08
 """Length of a drawn normal where there are no squares, relative to the median distance of the points."""
-PYRAMID_DEPTH = 0.18
+PYRAMID_DEPTH_IN_FIGURE = 0.18
 """Depth of a drawn camera pyramid, relative to the median distance of the points."""
 
 FAR = 4.0
@@ -167,7 +167,7 @@ def cloud_figure(reconstruction: Reconstruction, *, unit: str = "mm") -> Figure:
             axis.quiver(*p.T, *n.T, color=colour, linewidth=0.6, arrow_length_ratio=0.25)
         cameras = ((Rigid3.identity(), "camera 1"), (reconstruction.cam2_from_cam1.inverse(), "camera 2"))
         for cam1_from_cam, name in cameras:
-            _draw_pyramid(axis, cam1_from_cam, reach * PYRAMID_DEPTH, name)
+            _draw_pyramid(axis, cam1_from_cam, reach * PYRAMID_DEPTH_IN_FIGURE, name)
         axis.view_init(elev=elevation, azim=azimuth)
         _fit_equal(axis, reconstruction)
         axis.set_xlabel(f"x {unit}", fontsize=7)

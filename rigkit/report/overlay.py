@@ -12,10 +12,10 @@ from rigkit.core.detections import BoardDetection
 
 __all__ = ["draw_boards"]
 
-COLOURS = ((230, 60, 50), (40, 160, 70), (50, 90, 230), (230, 150, 20), (160, 60, 200), (20, 170, 190))
+OVERLAY_COLOURS = ((230, 60, 50), (40, 160, 70), (50, 90, 230), (230, 150, 20), (160, 60, 200), (20, 170, 190))
 """Red, green, blue of the boards in turn."""
 
-SHIFT = 4
+FRACTION_BITS = 4
 """Binary digits of the fraction of a pixel that OpenCV draws with."""
 
 
@@ -28,14 +28,16 @@ def draw_boards(image: NDArray[np.generic], detections: Sequence[BoardDetection]
     canvas = _canvas(image)
     width = max(1, round(min(canvas.shape[:2]) / 600))
     for number, found in enumerate(detections):
-        colour = COLOURS[number % len(COLOURS)]
+        colour = OVERLAY_COLOURS[number % len(OVERLAY_COLOURS)]
         lattice = found.lattice()
         _segments(canvas, lattice[:, :-1], lattice[:, 1:], colour, width + 1)
         _segments(canvas, lattice[:-1], lattice[1:], colour, width)
         first = found.pixels[0]
-        cv2.circle(canvas, _fixed(first), (6 * width) << SHIFT, colour, width + 1, cv2.LINE_AA, SHIFT)
+        cv2.circle(canvas, _fixed(first), (6 * width) << FRACTION_BITS, colour, width + 1, cv2.LINE_AA, FRACTION_BITS)
         if len(found.pixels) > 1:
-            cv2.arrowedLine(canvas, _fixed(first), _fixed(found.pixels[1]), colour, 2 * width, cv2.LINE_AA, SHIFT, 0.3)
+            cv2.arrowedLine(
+                canvas, _fixed(first), _fixed(found.pixels[1]), colour, 2 * width, cv2.LINE_AA, FRACTION_BITS, 0.3
+            )
         label = f"{found.board_id or number + 1}: {len(found.grid)} of {found.columns}x{found.rows}"
         font = (cv2.FONT_HERSHEY_SIMPLEX, 0.5 * width)
         (length, height), below = cv2.getTextSize(label, *font, width)
@@ -67,9 +69,9 @@ def _segments(
 ) -> None:
     both = np.stack([start.reshape(-1, 2), end.reshape(-1, 2)], axis=1)
     both = both[np.isfinite(both).all(axis=(1, 2))]
-    fixed = np.round(both * (1 << SHIFT)).astype(np.int32)
-    cv2.polylines(canvas, list(fixed), False, colour, width, cv2.LINE_AA, SHIFT)
+    fixed = np.round(both * (1 << FRACTION_BITS)).astype(np.int32)
+    cv2.polylines(canvas, list(fixed), False, colour, width, cv2.LINE_AA, FRACTION_BITS)
 
 
 def _fixed(pixel: NDArray[np.float64]) -> tuple[int, int]:
-    return (round(float(pixel[0]) * (1 << SHIFT)), round(float(pixel[1]) * (1 << SHIFT)))
+    return (round(float(pixel[0]) * (1 << FRACTION_BITS)), round(float(pixel[1]) * (1 << FRACTION_BITS)))

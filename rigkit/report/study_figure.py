@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from rigkit.study.study import PLANES
+from rigkit.study.study import STUDY_PLANES
 from rigkit.study.table import ALL_PLANES, StudyCell, StudyTable
 
 __all__ = ["study_figure"]
 
-COLOURS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee")
+METHOD_COLOURS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee")
 FORMATS = ("png", "pdf", "svg")
 
 
@@ -26,7 +26,7 @@ def study_figure(table: StudyTable, file_format: str = "png") -> bytes:
     from matplotlib.figure import Figure
 
     study = table.study
-    planes = [ALL_PLANES] if len(study.pose_types) == 1 else [*range(1, PLANES + 1)]
+    planes = [ALL_PLANES] if len(study.pose_types) == 1 else [*range(1, STUDY_PLANES + 1)]
     rows, columns = len(study.pose_types), len(planes)
     width = max(4.2, 0.28 * len(study.sigmas) * len(study.methods) + 1.5)
     figure = Figure(figsize=(min(max(width * columns, 6.2), 13.0), 3.0 * rows + 0.8), layout="constrained")
@@ -65,7 +65,7 @@ def _boxes(axis: Any, table: StudyTable, pose_type: str, plane: int) -> None:
                 width = 0.8 / methods
                 position = s + (m - 0.5 * (methods - 1)) * width
             if cell.count:
-                _box(axis, cell, position, 0.85 * width, COLOURS[m % len(COLOURS)])
+                _box(axis, cell, position, 0.85 * width, METHOD_COLOURS[m % len(METHOD_COLOURS)])
 
 
 def _box(axis: Any, cell: StudyCell, position: float, width: float, colour: str) -> None:
@@ -104,4 +104,4 @@ def _label_x(axes: Any, table: StudyTable) -> None:
 def _swatch(index: int) -> Any:
     from matplotlib.patches import Patch
 
-    return Patch(facecolor=COLOURS[index % len(COLOURS)], alpha=0.45)
+    return Patch(facecolor=METHOD_COLOURS[index % len(METHOD_COLOURS)], alpha=0.45)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rigkit.core.tables import Cell, Column, Table
-from rigkit.study.study import PLANES, Study
+from rigkit.study.study import STUDY_PLANES, Study
 from rigkit.study.table import ALL_PLANES, StudyCell, StudyTable
 
 __all__ = ["cell_table", "study_tables"]
@@ -56,7 +56,7 @@ def _median_table(found: StudyTable, pose_type: str) -> Table:
     study = found.study
     rows, missing = [], 0
     for sigma in study.sigmas:
-        for plane in (*range(1, PLANES + 1), ALL_PLANES):
+        for plane in (*range(1, STUDY_PLANES + 1), ALL_PLANES):
             cells = [found.cell(pose_type=pose_type, sigma=sigma, method=m, plane=plane) for m in study.methods]
             rows.append((Cell(f"{sigma:g}"), Cell(_plane(plane)), *(Cell(_quartiles(cell)) for cell in cells)))
             missing += sum(cell.missing for cell in cells) if plane == ALL_PLANES else 0
@@ -77,5 +77,5 @@ def _plane(plane: int) -> str:
 
 def _setup(study: Study) -> str:
     images = {"1": "image 1", "2": "image 2", "both": "both images"}[str(study.images)]
-    corners = PLANES * study.board.corner_count
+    corners = STUDY_PLANES * study.board.corner_count
     return f"noise on {study.noise} of {images}; {study.trials} trials of {corners} corners"

@@ -30,11 +30,11 @@ from rigkit.synthetic.lattice import chord_directions, harmonic_directions
 from rigkit.synthetic.noise import NoisyImages, corner_noise, rotate_directions
 from rigkit.synthetic.poses import PairBatch, general_pairs, special_pairs
 
-__all__ = ["CHUNK_TRIALS", "PLANES", "Claim", "Study", "Variant", "chunk_count", "run_chunk"]
+__all__ = ["CHUNK_TRIALS", "STUDY_PLANES", "Claim", "Study", "Variant", "chunk_count", "run_chunk"]
 
 CHUNK_TRIALS = 50
 """Trials that share a random generator. Changing it changes the numbers of every study."""
-PLANES = 3
+STUDY_PLANES = 3
 BOARD = Board("study", 6, 8, 40.0, 40.0)
 """The paper's synthetic boards."""
 NOISE_KINDS = {"directions": "deg", "corners": "px"}
@@ -170,7 +170,7 @@ def run_chunk(study: Study, index: int) -> NDArray[np.float32]:
     alone.
     """
     trials = min(CHUNK_TRIALS, study.trials - index * CHUNK_TRIALS)
-    corners = PLANES * study.board.corner_count
+    corners = STUDY_PLANES * study.board.corner_count
     shape = (len(study.pose_types), len(study.sigmas), len(study.methods), trials, corners)
     out = np.empty(shape, dtype=np.float32)
     for p, pose_type in enumerate(study.pose_types):
@@ -210,7 +210,7 @@ class _Scene:
 
     def _directions(self, pixels1: Pixels, pixels2: Pixels, support: str) -> DirectionPairs:
         board, trials = self.study.board, self.shape[0]
-        lattices = [p.reshape(trials, PLANES, board.rows, board.columns, 2) for p in (pixels1, pixels2)]
+        lattices = [p.reshape(trials, STUDY_PLANES, board.rows, board.columns, 2) for p in (pixels1, pixels2)]
         both = [self._along(lattice, support).reshape(-1, 3, 2) for lattice in lattices]
         return DirectionPairs(
             image1=both[0], image2=both[1], valid=np.asarray(np.isfinite(np.stack(both)).all(axis=(0, -1)))

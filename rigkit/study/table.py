@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rigkit.core.claims import Comparison, Verdict, judge_claim
 from rigkit.core.errors import InputError
-from rigkit.study.study import PLANES, Claim, Study
+from rigkit.study.study import STUDY_PLANES, Claim, Study
 
 __all__ = ["ALL_PLANES", "CELL_KEYS", "StudyCell", "StudyTable", "tabulate"]
 
@@ -92,7 +92,7 @@ def _cells(study: Study, errors: NDArray[np.float32]) -> Iterator[StudyCell]:
     for p, pose_type in enumerate(study.pose_types):
         for s, sigma in enumerate(study.sigmas):
             for m, method in enumerate(study.methods):
-                for plane in range(PLANES + 1):
+                for plane in range(STUDY_PLANES + 1):
                     block = errors[p, s, m]
                     if plane != ALL_PLANES:
                         block = block[:, (plane - 1) * per_board : plane * per_board]

@@ -33,7 +33,7 @@ __all__ = ["build_demo", "demo_camera"]
 
 SIZE_PX = (960, 720)
 FIELD_DEG = 180.0
-PLANES = (Board("plane1", 8, 6, 50.0, 50.0), Board("plane2", 7, 6, 50.0, 50.0), Board("plane3", 6, 9, 50.0, 50.0))
+DEMO_PLANES = (Board("plane1", 8, 6, 50.0, 50.0), Board("plane2", 7, 6, 50.0, 50.0), Board("plane3", 6, 9, 50.0, 50.0))
 TARGET = Board("target", 9, 6, 30.0, 30.0)
 PAIRS = (("general", PoseType.GENERAL, 0.0), ("standard", PoseType.STANDARD, 300.0))
 """Name, pose type, baseline in mm of the stereo pairs."""
@@ -42,7 +42,7 @@ SQUARE_SIGMA_DEG = 0.3
 VIEW_RADIUS = (0.0, 0.45, 0.62)
 """Where calibration boards are seen: distance from the image's centre, as a share of half its height."""
 VIEWS = 10
-TRIES = 300
+TARGET_TRIES = 300
 OPTICS = Optics(0.6, field_deg=FIELD_DEG)
 PHOTOMETRY = Photometry(exposure=0.95, vignetting=0.3, gradient=(0.1, -0.06), noise_levels=1.5)
 
@@ -91,13 +91,19 @@ def _build(root: Path, rng: np.random.Generator, progress: Progress) -> None:
     scenes = {}
     for n, (name, pose_type, baseline_mm) in enumerate(PAIRS):
         scene = trihedral_pair(
-            PLANES, camera, pose_type, rng, baseline_mm=baseline_mm, distance=(0.55, 0.9), parallax_deg=(20.0, 45.0)
+            DEMO_PLANES,
+            camera,
+            pose_type,
+            rng,
+            baseline_mm=baseline_mm,
+            distance=(0.55, 0.9),
+            parallax_deg=(20.0, 45.0),
         )
         for view, image in enumerate(scene.images(optics=OPTICS, photometry=PHOTOMETRY, rng=rng), start=1):
             _write_png(root / f"images/{name}/view{view}.png", image)
             progress("rendering", VIEWS + 2 * n + view, total)
         scenes[name] = scene
-    for board in (*PLANES, TARGET):
+    for board in (*DEMO_PLANES, TARGET):
         _write_text(root / f"boards/{board.board_id}.toml", _board_toml(board))
     _write_text(root / "cameras/fisheye/session.toml", _session_toml())
     _write_text(root / "truth.json", json.dumps(_truth(camera, targets, scenes), indent=1))
@@ -108,11 +114,11 @@ def _calibration_view(camera: Camera, index: int, rng: np.random.Generator) -> P
     """Return the target for one calibration image: in turn near the centre and towards the rim, all round."""
     width, height = camera.size_px
     centre = np.array([width, height]) / 2.0
-    for attempt in range(TRIES):
+    for attempt in range(TARGET_TRIES):
         radius = 0.5 * height * VIEW_RADIUS[index % len(VIEW_RADIUS)]
         angle = 2.4 * index + rng.normal(0.0, 0.3)
         spot = centre + radius * np.array([1.3 * np.cos(angle), np.sin(angle)])
-        square_px = 0.055 * height * rng.uniform(0.8, 1.2) * (1.0 - 0.5 * attempt / TRIES)
+        square_px = 0.055 * height * rng.uniform(0.8, 1.2) * (1.0 - 0.5 * attempt / TARGET_TRIES)
         placed = place_board(TARGET, camera, spot, square_px, 45.0, rng)
         if placed is not None and sees_paper(placed, camera, (0.0, 0.0), camera.size_px):
             return placed
@@ -145,10 +151,10 @@ def _session_toml() -> str:
 def _manifest_toml(scenes: dict[str, StereoScene]) -> str:
     """Return the manifest, with what a person with a ruler and a set square would have written."""
     out = ['schema = "rigkit.dataset/1"', 'name = "demo"', ""]
-    for board in PLANES:
+    for board in DEMO_PLANES:
         out += ["[[boards]]", f'id = "{board.board_id}"', f'file = "boards/{board.board_id}.toml"', ""]
     out += ["[[cameras]]", 'id = "fisheye"', 'calibration = "cameras/fisheye/calibration.json"', ""]
-    names = ", ".join(f'"{b.board_id}"' for b in PLANES)
+    names = ", ".join(f'"{b.board_id}"' for b in DEMO_PLANES)
     for name, scene in scenes.items():
         out += ["[[pairs]]", f'id = "{name}"', 'camera1 = "fisheye"', 'camera2 = "fisheye"']
         out += [f'image{k} = "images/{name}/view{k}.png"' for k in (1, 2)]
@@ -157,7 +163,7 @@ def _manifest_toml(scenes: dict[str, StereoScene]) -> str:
         out += [f"baseline = {{ value_mm = {scene.baseline_mm:.0f}, sigma_mm = {RULER_SIGMA_MM}, {how} }}"]
         out += ["angles = ["]
         for a, b in ((0, 1), (0, 2), (1, 2)):
-            ids = f'a = "{PLANES[a].board_id}", b = "{PLANES[b].board_id}"'
+            ids = f'a = "{DEMO_PLANES[a].board_id}", b = "{DEMO_PLANES[b].board_id}"'
             out += [f'  {{ {ids}, value_deg = 90.0, sigma_deg = {SQUARE_SIGMA_DEG}, how = "set square" }},']
         out += ["]", ""]
     return "\n".join(out)

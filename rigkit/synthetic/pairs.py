@@ -22,8 +22,8 @@ from rigkit.synthetic.scene import Panel, PlacedBoard, exact_detection, room_wal
 
 __all__ = ["StereoScene", "random_pair", "relative_pose", "trihedral_pair"]
 
-TRIES = 2000
-MIN_INCIDENCE = 0.2
+RANDOM_PAIR_TRIES = 2000
+MIN_PAIR_INCIDENCE = 0.2
 """Smallest |cosine| between viewing ray and board normal, at every corner of every board in both views."""
 BORDER_PX = 8.0
 """Corners keep this distance from the image's border."""
@@ -183,7 +183,7 @@ def random_pair(
     reach = float(np.linalg.norm(corners - middle, axis=1).max())
     behind = panels(reach) if panels is not None else ()
     view = _random_view(middle, reach * _fill_factor(camera), distance, rng)
-    for _ in range(TRIES):
+    for _ in range(RANDOM_PAIR_TRIES):
         first = view()
         if not _sees_all(placed, camera, first):
             continue
@@ -206,7 +206,7 @@ def random_pair(
                 pose_type=pose_type,
             )
     raise DegenerateError(
-        f"random pair: in {TRIES} random views no {pose_type} pair saw all corners; "
+        f"random pair: in {RANDOM_PAIR_TRIES} random views no {pose_type} pair saw all corners; "
         "use a wider lens, a shorter baseline or a larger distance"
     )
 
@@ -240,6 +240,6 @@ def _sees_all(placed: Sequence[PlacedBoard], camera: Camera, cam_from_world: Rig
         if not valid.all() or not ((pixels > BORDER_PX) & (pixels < limit)).all():
             return False
         rays = unit(cam_from_world.apply(board.points()))
-        if not (rays @ (cam_from_world.rotation @ board.normal()) < -MIN_INCIDENCE).all():
+        if not (rays @ (cam_from_world.rotation @ board.normal()) < -MIN_PAIR_INCIDENCE).all():
             return False
     return True

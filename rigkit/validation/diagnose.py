@@ -31,7 +31,7 @@ NO_BOARD = 0.2
 UNITS = {"m": 1000.0, "cm": 10.0, "inches": 25.4}
 UNIT_RATIO = 0.05
 """A length that is off by the factor of a unit, to five percent, was written in that unit."""
-MIN_CORNERS = 12
+MIN_CORNERS_TO_DIAGNOSE = 12
 
 
 def camera_fit(camera: Camera, detections: Sequence[BoardDetection], boards: Sequence[Board]) -> float:
@@ -43,7 +43,7 @@ def camera_fit(camera: Camera, detections: Sequence[BoardDetection], boards: Seq
     square, count = 0.0, 0
     for detection in detections:
         board = _of_that_shape(detection, boards)
-        if board is None or len(detection.grid) < MIN_CORNERS:
+        if board is None or len(detection.grid) < MIN_CORNERS_TO_DIAGNOSE:
             continue
         # A quarter turn where the board's columns are the image's rows; which way round does not matter to its shape.
         seen = detection if board.size == (detection.columns, detection.rows) else detection.turned(1)

@@ -18,7 +18,7 @@ from rigkit.validation.planes import angle_jacobian, face_angle
 
 __all__ = ["AnglesDeg", "PnpResult", "moved_pnp", "planar_pnp"]
 
-MIN_CORNERS = 8
+MIN_CORNERS_FOR_PNP = 8
 
 AnglesDeg = dict[tuple[str, str], tuple[float, float]]
 
@@ -55,7 +55,9 @@ def planar_pnp(reconstruction: Reconstruction) -> PnpResult:
     """
     sights = _sights([reconstruction])
     if not sights:
-        raise DegenerateError(f"pair '{reconstruction.pair_id}': no board has {MIN_CORNERS} corners for its own pose")
+        raise DegenerateError(
+            f"pair '{reconstruction.pair_id}': no board has {MIN_CORNERS_FOR_PNP} corners for its own pose"
+        )
     poses = {b: (board_pose(s.rays1[0], s.points), board_pose(s.rays2[0], s.points)) for b, s in sights.items()}
     counts = {b: len(s.points) for b, s in sights.items()}
     pose, covariance = _mean_pose([_relative(*both) for both in poses.values()], reconstruction.cam2_from_cam1)
@@ -105,7 +107,7 @@ def _sights(reconstructions: Sequence[Reconstruction]) -> dict[str, _Sight]:
     out = {}
     for index, board in enumerate(first.boards):
         on = (first.cloud.board_index == index) & seen
-        if int(on.sum()) >= MIN_CORNERS:
+        if int(on.sum()) >= MIN_CORNERS_FOR_PNP:
             points = board.points(first.cloud.grid[on])
             out[board.board_id] = _Sight(points, np.array(rays1)[:, on], np.array(rays2)[:, on])
     return out

@@ -52,7 +52,7 @@ class DatasetCrossCheck:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Job:
+class _CrosscheckJob:
     """What one process needs to know of one pair."""
 
     pair: Pair
@@ -76,7 +76,7 @@ def crosscheck_dataset(
     reports, failures = over_pairs(
         _crosscheck,
         known.pairs,
-        lambda pair: _Job(pair, *cameras.of(pair), options.chain),
+        lambda pair: _CrosscheckJob(pair, *cameras.of(pair), options.chain),
         jobs=options.jobs,
         what="cross-checking pairs",
         progress=progress,
@@ -88,7 +88,7 @@ def crosscheck_dataset(
     return DatasetCrossCheck(reports=tuple(reports), failures=failures, table=table, files=files)
 
 
-def _crosscheck(job: _Job) -> CrossCheckReport:
+def _crosscheck(job: _CrosscheckJob) -> CrossCheckReport:
     """Reconstruct one pair and compare it with every independent method."""
     matched, _, _ = match_images(job.pair, job.camera1.camera, job.camera2.camera, job.chain)
     other = reconstruct_other_chain(matched, job.pair)

@@ -61,7 +61,7 @@ class DetectionResult:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Job:
+class _DetectJob:
     """What one process needs to know of one image."""
 
     image: Path
@@ -104,7 +104,7 @@ def detect_in_images(
     read = [*images, *options.boards, *([options.camera] if options.camera else [])]
     ensure_writable(outputs, force=options.force, inputs=read)
     tasks = [
-        _Job(image, overlay, boards, camera, options.min_corners, options.force)
+        _DetectJob(image, overlay, boards, camera, options.min_corners, options.force)
         for image, overlay in zip(images, overlays, strict=True)
     ]
     outcomes = _over_images(tasks, options.jobs, progress)
@@ -149,7 +149,7 @@ def _overlay_paths(images: Sequence[Path], folder: Path | None) -> list[Path | N
 Outcome: TypeAlias = tuple[BoardDetection, ...] | InputError
 
 
-def _over_images(tasks: Sequence[_Job], processes: int | None, progress: Progress) -> dict[str, Outcome]:
+def _over_images(tasks: Sequence[_DetectJob], processes: int | None, progress: Progress) -> dict[str, Outcome]:
     """Return the detections per image in their order, whatever the number of processes."""
     jobs = min(processes or os.cpu_count() or 1, len(tasks))
     found: dict[str, Outcome] = {}
@@ -167,7 +167,7 @@ def _over_images(tasks: Sequence[_Job], processes: int | None, progress: Progres
     return found
 
 
-def _detect(job: _Job) -> Outcome:
+def _detect(job: _DetectJob) -> Outcome:
     """Detect the boards of one image and write its overlay; return the error where the image is of no use."""
     cv2.setNumThreads(1)
     try:
@@ -181,7 +181,7 @@ def _detect(job: _Job) -> Outcome:
     return found
 
 
-def _boards_in(image: NDArray[Any], job: _Job) -> tuple[BoardDetection, ...]:
+def _boards_in(image: NDArray[Any], job: _DetectJob) -> tuple[BoardDetection, ...]:
     size = (image.shape[1], image.shape[0])
     if job.camera is not None and size != job.camera.size_px:
         raise InputError(

@@ -14,7 +14,7 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier
 from rigkit.io.board_file import load_board
-from rigkit.io.session import SCHEMA
+from rigkit.io.session import SESSION_SCHEMA
 from rigkit.workflows.detect import IMAGE_ENDINGS
 from rigkit.workflows.print_board import board_text
 
@@ -65,7 +65,7 @@ def session_of_folders(
     lines = [
         "# " + " ".join(f"Written by rigkit calibrate {shown}".split()),
         "# Calibrate again with: rigkit calibrate session.toml --force",
-        f'schema = "{SCHEMA}"',
+        f'schema = "{SESSION_SCHEMA}"',
         "",
         "# The board in the images; a rule over many of its squares tells their true size.",
         f"board = {_quoted(names[0])}" if len(names) == 1 else f"boards = [{', '.join(map(_quoted, names))}]",

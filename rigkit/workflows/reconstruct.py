@@ -56,7 +56,7 @@ class DatasetReconstruction:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Job:
+class _ReconstructJob:
     """What one process needs to know of one pair."""
 
     pair: Pair
@@ -78,8 +78,8 @@ def reconstruct_dataset(
         require_folder(options.output, force=options.force)
     cameras = load_cameras(known, recalibrate=options.recalibrate, progress=progress)
 
-    def job_of(pair: Pair) -> _Job:
-        return _Job(pair, *cameras.of(pair), options)
+    def job_of(pair: Pair) -> _ReconstructJob:
+        return _ReconstructJob(pair, *cameras.of(pair), options)
 
     outcomes, failures = over_pairs(
         _reconstruct, known.pairs, job_of, jobs=options.jobs, what="reconstructing pairs", progress=progress
@@ -92,7 +92,7 @@ def reconstruct_dataset(
     return DatasetReconstruction(pairs=tuple(outcomes), failures=failures, files=files)
 
 
-def _reconstruct(job: _Job) -> PairReconstruction:
+def _reconstruct(job: _ReconstructJob) -> PairReconstruction:
     """Reconstruct one pair and render its files."""
     pair, options = job.pair, job.options
     matched, image1, image2 = match_images(pair, job.camera1.camera, job.camera2.camera, options.chain, options.support)

@@ -18,7 +18,7 @@ MIN_MARK_PX = 6.0
 """Smaller than this along their shorter side marks are specks."""
 MIN_FILLED = 0.6
 """Marks fill this part of their minimal rectangle; digits do not."""
-MAX_STEPS = 1.25
+MAX_STEP_RATIO = 1.25
 """A neighbour is nearer than this many of the last steps in its direction."""
 MAX_BEND_DEG = 15.0
 """By so much the line of marks may turn from one to the next."""
@@ -142,6 +142,6 @@ def _nearest_along(centres: Pixels, at: int, direction: FloatArray) -> int | Non
 def _next(centres: Pixels, at: int, step: FloatArray) -> int | None:
     """Return the centre that follows after a step, None where the line ends."""
     after = _nearest_along(centres, at, step / np.linalg.norm(step))
-    if after is None or np.linalg.norm(centres[after] - centres[at]) > MAX_STEPS * np.linalg.norm(step):
+    if after is None or np.linalg.norm(centres[after] - centres[at]) > MAX_STEP_RATIO * np.linalg.norm(step):
         return None
     return after

@@ -102,7 +102,7 @@ class DatasetValidation:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Job:
+class _ValidateJob:
     """What one process needs to know of one pair."""
 
     pair: Pair
@@ -134,9 +134,9 @@ def validate_dataset(
     paper = _paper_tables(known)
     cameras = load_cameras(known, recalibrate=options.recalibrate, progress=progress)
 
-    def job_of(pair: Pair) -> _Job:
+    def job_of(pair: Pair) -> _ValidateJob:
         cameras.of(pair)
-        return _Job(pair, cameras, options)
+        return _ValidateJob(pair, cameras, options)
 
     pairs, failures = over_pairs(
         _validate, known.pairs, job_of, jobs=options.jobs, what="reconstructing and validating pairs", progress=progress
@@ -167,7 +167,7 @@ def _paper_tables(dataset: Dataset) -> PaperTables | None:
     return load_paper_tables(folder) if folder.is_dir() else None
 
 
-def _validate(job: _Job) -> PairValidation:
+def _validate(job: _ValidateJob) -> PairValidation:
     """Reconstruct one pair with every estimator and judge each."""
     pair = job.pair
     names = (pair.camera1.camera_id, pair.camera2.camera_id)
@@ -185,7 +185,7 @@ def _validate(job: _Job) -> PairValidation:
 
 
 def _judge(
-    job: _Job, matched: MatchedPair, image1: NDArray[Any], image2: NDArray[Any], causes: tuple[str, ...]
+    job: _ValidateJob, matched: MatchedPair, image1: NDArray[Any], image2: NDArray[Any], causes: tuple[str, ...]
 ) -> PairValidation:
     pair = job.pair
     geometry = geometry_of(matched, pair)
@@ -221,7 +221,7 @@ def _judge(
     )
 
 
-def _shifts(reconstructions: Mapping[str, Reconstruction], job: _Job) -> dict[str, CalibrationShifts | None]:
+def _shifts(reconstructions: Mapping[str, Reconstruction], job: _ValidateJob) -> dict[str, CalibrationShifts | None]:
     """Return what the calibrations' uncertainty does to each reconstruction, by estimator.
 
     The likelihood sees the corners, not the affinities: estimators that kept the same corners share the answer.

@@ -9,7 +9,7 @@ import pytest
 from helpers.calibration_scenes import BOARD, lens
 
 from rigkit.calibration.camera_prior import camera_prior
-from rigkit.calibration.normal_equations import Step
+from rigkit.calibration.normal_equations import SchurStep
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.compare import Mounted, compare_mounts
@@ -148,7 +148,7 @@ def test_gradient_and_gauss_newton_matrix(kind: str, tied: bool, rng: np.random.
         scale[run] = 1e-2 * np.maximum(np.abs(camera.parameters), 1e-2)
 
     def residuals(x: np.ndarray) -> np.ndarray:
-        moved = state.moved(Step(x[: layout.count], x[layout.count :].reshape(-1, 6), 0.0), layout)
+        moved = state.moved(SchurStep(x[: layout.count], x[layout.count :].reshape(-1, 6), 0.0), layout)
         assert moved is not None
         return np.concatenate(
             [

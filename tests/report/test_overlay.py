@@ -6,7 +6,7 @@ import numpy as np
 
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
-from rigkit.report.overlay import COLOURS, draw_boards
+from rigkit.report.overlay import OVERLAY_COLOURS, draw_boards
 
 
 def test_rows_are_drawn_through_the_corners() -> None:
@@ -19,7 +19,7 @@ def test_rows_are_drawn_through_the_corners() -> None:
         assert np.array_equal(image, before)
         assert picture.shape == (150, 200, 3)
         middles = (0.5 * (pixels[:-1] + pixels[1:]))[[0, 1, 4, 5, 8, 9]].astype(int)
-        assert all((picture[v, u] == COLOURS[0]).all() for u, v in middles)
+        assert all((picture[v, u] == OVERLAY_COLOURS[0]).all() for u, v in middles)
         assert (picture[145, 5] == picture[145, 195]).all()
 
 
@@ -31,6 +31,6 @@ def test_the_label_stays_inside_the_image() -> None:
         pixels = 10.0 * board.grid() + [column, 100.0]
         found = BoardDetection("a", 4, 3, board.grid(), pixels, np.full(12, 0.01))
         label = draw_boards(np.full((150, 300), 60, np.uint8), [found])[70:93]
-        ink.append(int((label == COLOURS[0]).all(axis=-1).sum()))
+        ink.append(int((label == OVERLAY_COLOURS[0]).all(axis=-1).sum()))
     assert ink[0] > 20
     assert ink[1] == ink[0]

@@ -43,7 +43,7 @@ class _Way:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Entry:
+class _BoardSeen:
     """A board of a scene: its camera, its key there, the ways to read it, and its distance."""
 
     camera: int
@@ -119,7 +119,7 @@ def board_places(
 def _never_read(
     group: Sequence[str],
     known: Mapping[str, Rigid3],
-    scenes: Sequence[list[_Entry]],
+    scenes: Sequence[list[_BoardSeen]],
     readings: Sequence[Reading | None],
 ) -> str | None:
     """Return a board that was seen, but in no scene that tells its place."""
@@ -131,16 +131,16 @@ def _never_read(
     return next((name for name in group if name not in known and not read.get(name, True)), None)
 
 
-def _scenes(seen: Sequence[FrameObservations], members: Sequence[Board]) -> list[list[_Entry]]:
+def _scenes(seen: Sequence[FrameObservations], members: Sequence[Board]) -> list[list[_BoardSeen]]:
     """Return the boards of the group in every image of every camera."""
     names = {b.board_id for b in members}
-    scenes: dict[tuple[int, str], list[_Entry]] = {}
+    scenes: dict[tuple[int, str], list[_BoardSeen]] = {}
     for c, own in enumerate(seen):
         for key, entry in own.items():
             if entry.board_id in names:
                 ways = tuple(_ways(entry, members))
                 distance = float(np.linalg.norm(ways[0].corners.mean(axis=0)))
-                scenes.setdefault((c, entry.frame), []).append(_Entry(c, key, ways, distance))
+                scenes.setdefault((c, entry.frame), []).append(_BoardSeen(c, key, ways, distance))
     return list(scenes.values())
 
 
@@ -166,7 +166,7 @@ Reading = dict[int, Observation]
 
 
 def _best_reference(
-    scenes: Sequence[list[_Entry]], members: Sequence[Board]
+    scenes: Sequence[list[_BoardSeen]], members: Sequence[Board]
 ) -> tuple[dict[str, Rigid3], list[Reading | None]] | None:
     """Return target_from_board of every board found, in the frame of the reference, and how every scene is read; None
     where no scene has two boards."""
@@ -180,7 +180,7 @@ def _best_reference(
 
 
 def _read(
-    reference: list[_Entry], scenes: Sequence[list[_Entry]], members: Sequence[Board]
+    reference: list[_BoardSeen], scenes: Sequence[list[_BoardSeen]], members: Sequence[Board]
 ) -> tuple[dict[str, Rigid3], list[Reading | None], float]:
     """Read all scenes by one of them; the last number is the median misfit, as a part of the distance."""
     far = {b.board_id: outer_corners(b) for b in members}
@@ -209,7 +209,7 @@ def _read(
 
 
 def _named(
-    scene: list[_Entry], known: dict[str, Rigid3], far: Mapping[str, FloatArray]
+    scene: list[_BoardSeen], known: dict[str, Rigid3], far: Mapping[str, FloatArray]
 ) -> tuple[Reading | None, float]:
     """Return how a scene is read, None where nothing tells, and its misfit; boards that were not known are added to
     `known` where the others fix the target."""

@@ -18,12 +18,12 @@ from rigkit.core.progress import silent
 
 __all__ = ["suggest_ties"]
 
-MIN_IMAGES = 3
+MIN_IMAGES_OF_TIE = 3
 """Two images can agree by chance; boards that keep their places in three are mounted."""
 TIED_SIGMAS = 10.0
 """Sharing one pose costs boards on one mount a few sigmas (paper that is not flat: up to 3.5), and boards that moved by
 a millimetre against each other some tens."""
-NAMES = "{0} boards of {1}x{2} corners"
+LIKE_BOARDS = "{0} boards of {1}x{2} corners"
 
 
 def suggest_ties(views: Sequence[BoardView], calibration: Calibration) -> tuple[Finding, ...]:
@@ -32,12 +32,12 @@ def suggest_ties(views: Sequence[BoardView], calibration: Calibration) -> tuple[
     `views` are those of the calibration, with their boards.
     """
     images = Counter(view.image for view in calibration.views)
-    if sum(n > 1 for n in images.values()) < MIN_IMAGES:
+    if sum(n > 1 for n in images.values()) < MIN_IMAGES_OF_TIE:
         return ()
     seen = _by_size([(view.image, view) for view in views], calibration)
     boards = {entry.board_id: entry.view.board for entry in seen.values()}
     often = Counter(board for image, board in seen if images[image] > 1)
-    group = [name for name, count in often.items() if count >= MIN_IMAGES]
+    group = [name for name, count in often.items() if count >= MIN_IMAGES_OF_TIE]
     if len(group) < 2:
         return ()
     # Sharing a shape is for the solution itself to find: here flat boards will do.
@@ -47,11 +47,11 @@ def suggest_ties(views: Sequence[BoardView], calibration: Calibration) -> tuple[
         joint = solve_jointly(["camera"], named, [flat], places, silent)
     except RigkitError:
         return ()
-    if notes or joint.left_out or joint.shared_count < MIN_IMAGES or joint.cost_sigmas > TIED_SIGMAS:
+    if notes or joint.left_out or joint.shared_count < MIN_IMAGES_OF_TIE or joint.cost_sigmas > TIED_SIGMAS:
         return ()
     alike = not {b.board_id for b in calibration.boards}.issuperset(group)
     size = boards[group[0]]
-    words = NAMES.format(len(group), size.columns, size.rows) if alike else f"boards {', '.join(group)}"
+    words = LIKE_BOARDS.format(len(group), size.columns, size.rows) if alike else f"boards {', '.join(group)}"
     how = "give each a board file with an id of its own, and write" if alike else "write"
     listed = ", ".join(f'"{name}"' for name in group) if not alike else "..."
     return (

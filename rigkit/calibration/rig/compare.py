@@ -31,7 +31,7 @@ __all__ = ["MountDifference", "Mounted", "RigDifference", "compare_mounts"]
 
 SAME_CHANCE = 0.01
 """Mounts this unlikely to be one and the same rig's are another rig's, or a rig's that was bent."""
-GRID = (24, 18)
+LENS_GRID = (24, 18)
 """Pixels (columns, rows) at which the lenses are compared."""
 WEIGHT_FLOOR_PX = 1e-6
 """No projection is surer than this: weights stay finite without noise."""
@@ -89,7 +89,7 @@ def compare_mounts(a: Mounted, b: Mounted, *, seed: int = 0) -> RigDifference:
     turns = []
     weights = [_weights(a, k) * _weights(b, k) for k in range(len(a.cameras))]
     for (first, _), (second, _), weight in zip(a.cameras.values(), b.cameras.values(), weights, strict=True):
-        turns.append(compare_cameras(first, second, grid=GRID, weights=weight).b_from_a)
+        turns.append(compare_cameras(first, second, grid=LENS_GRID, weights=weight).b_from_a)
     sits, sat = ([mount for _, mount in rig.cameras.values()] for rig in (a, b))
     off = [np.zeros(0)]
     for turn, here, there in list(zip(turns, sits, sat, strict=True))[1:]:
@@ -121,7 +121,7 @@ def _off(first: Rigid3, second: Rigid3) -> FloatArray:
 def _weights(rig: Mounted, k: int) -> FloatArray:
     """Return the weights (rows, columns) of the pixels of camera `k`: what the lens knows there, by its variance."""
     camera = list(rig.cameras.values())[k][0]
-    pixels = grid_pixels(camera.size_px, GRID)
+    pixels = grid_pixels(camera.size_px, LENS_GRID)
     if rig.covariance is None:
         return np.ones(pixels.shape[:2])
     out = np.zeros(pixels.shape[:2])
@@ -144,7 +144,7 @@ def _design(rig: Mounted, weights: Sequence[FloatArray]) -> FloatArray:
     """Return d (w', dt') of all mounts / d (intrinsics, mounts), (6 (n - 1), K)."""
     turns = []
     for (camera, _), weight in zip(rig.cameras.values(), weights, strict=True):
-        rays, valid = camera.unproject(grid_pixels(camera.size_px, GRID))
+        rays, valid = camera.unproject(grid_pixels(camera.size_px, LENS_GRID))
         p = camera.parameters.size
         both = projection_design(camera, rays[valid]) * np.sqrt(weight[valid])
         rows = both.transpose(1, 0, 2).reshape(p + 3, -1)

@@ -20,7 +20,7 @@ __all__ = ["shape_error"]
 CHANCE_SIGMAS = 3.0
 """Boards depart from their shape where a richer one takes this many standard deviations more off the cost than chance
 does."""
-DAMPING = 1e-12
+STEP_DAMPING = 1e-12
 """Of the one step: keeps what no view determines where it is."""
 
 
@@ -43,7 +43,7 @@ def shape_error(observations: RigObservations, state: RigState, sigma_px: float)
         shape = replace(shape, sigma=np.concatenate([observations.shape.sigma, shape.sigma[known:]]))
         unknowns = np.concatenate([state.unknowns, np.zeros(shape.count - known)])
         normal = rig_normal(replace(observations, shape=shape), replace(state, unknowns=unknowns), sigma_px)
-        step = normal.step(DAMPING)
+        step = normal.step(STEP_DAMPING)
         more = shape.count - known
         if step is None or step.predicted < sigma_px**2 * (more + CHANCE_SIGMAS * np.sqrt(2.0 * more)):
             break

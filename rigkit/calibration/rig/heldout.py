@@ -11,7 +11,7 @@ from rigkit.calibration.state import evaluate
 
 __all__ = ["heldout_rms"]
 
-TOLERANCE = 1e-6
+FOLD_TOLERANCE = 1e-6
 """A fold begins at the solution of all frames: a step that promises less of the cost changes no digit shown."""
 
 
@@ -33,7 +33,7 @@ def heldout_rms(joint: JointRig, folds: int) -> tuple[float | None, tuple[float 
         train = observations.subset(~test)
         if not _hang_together(train):
             return nothing
-        solved = solve_rig(train, state, joint.sigma_px, TOLERANCE).state
+        solved = solve_rig(train, state, joint.sigma_px, FOLD_TOLERANCE).state
         part = observations.subset(test)
         found = refine_frames(part, solved.with_frames(state))
         for c, (own, weight) in enumerate(zip(part.cameras, part.weights, strict=True)):

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.normal_equations import Step
+from rigkit.calibration.normal_equations import SchurStep
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.shape import ShapeModel
 from rigkit.calibration.state import State
@@ -127,7 +127,7 @@ class RigState:
         translation = place @ self.mount_rotation[c].T + self.mount_mm[c]
         return State(self.cameras[c], rotation, translation, observations.shape, self.unknowns)
 
-    def moved(self, step: Step, layout: Layout) -> RigState | None:
+    def moved(self, step: SchurStep, layout: Layout) -> RigState | None:
         """Return the state after a step, None where the parameters make no camera."""
         cameras = []
         for camera, own in zip(self.cameras, layout.cameras, strict=True):

@@ -22,7 +22,7 @@ from rigkit.geometry.rotation import skew
 
 __all__ = ["Transfer", "transfer_covariance", "transfer_uncertainty"]
 
-POINTS = 40
+TRANSFER_POINTS = 40
 """So many corners, spread over all views, are enough to see how sure the transfer is where the boards were."""
 
 
@@ -47,7 +47,7 @@ def transfer_uncertainty(rig: RigCalibration, a: str, b: str) -> Transfer | None
         for view in calibration.views
     ]
     points = np.concatenate(shown)
-    points = points[np.linspace(0, len(points) - 1, min(POINTS, len(points))).astype(np.int64)]
+    points = points[np.linspace(0, len(points) - 1, min(TRANSFER_POINTS, len(points))).astype(np.int64)]
     covariance, seen = transfer_covariance(rig, a, b, points)
     if not seen.any():
         return None

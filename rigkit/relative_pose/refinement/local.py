@@ -19,8 +19,8 @@ from rigkit.relative_pose.solvers.pose import free_directions, rotations_and_dir
 
 __all__ = ["SampsonRows"]
 
-MAX_STEPS = 15
-SETTLED_RAD = 1e-5
+MAX_LOCAL_STEPS = 15
+LOCAL_SETTLED_RAD = 1e-5
 """A shorter step changes no residual by a tenth of its sigma: enough to choose by."""
 
 
@@ -69,7 +69,7 @@ class SampsonRows:
         R, t = _split_essential(E21, kind)
         out = np.empty((len(noise), *R.shape))
         for k, level in enumerate(noise):
-            R, t = kernel.improve(self.packed, R, t, level, free_directions(kind), MAX_STEPS, SETTLED_RAD)
+            R, t = kernel.improve(self.packed, R, t, level, free_directions(kind), MAX_LOCAL_STEPS, LOCAL_SETTLED_RAD)
             out[k] = skew(t) @ R
         return np.asarray(out * np.sqrt(0.5))
 

@@ -22,7 +22,7 @@ from rigkit.relative_pose.solvers.pose import free_directions, translation_basis
 
 __all__ = ["PoseMinimum", "PoseProblem", "RobustWeights", "cauchy_weights"]
 
-MAX_ITERATIONS = 60
+MAX_REFINEMENTS = 60
 STEP_TOLERANCE = 1e-10
 DAMPING_OF_POSE = Damping(start=1e-6, ceiling=1e8, floor=1e-12)
 ROUNDING_OF_COST = 1e-14
@@ -127,7 +127,7 @@ class PoseProblem:
         if plain and loss is not None:
             affine, which = whitened_affinities(self.matches)
             self._require(len(self.matches) + 2 * len(which))
-            packed, limits = SampsonRows.of(self.matches).packed, (MAX_ITERATIONS, STEP_TOLERANCE)
+            packed, limits = SampsonRows.of(self.matches).packed, (MAX_REFINEMENTS, STEP_TOLERANCE)
             given = (packed, affine, which, self._own_weights())
             turned, moved, r, jacobian, w, count, settled = kernel.minimise(*given, loss, self.free(), R, t, *limits)
             return PoseMinimum(
@@ -148,7 +148,7 @@ class PoseProblem:
         self._require(len(start.residuals))
         iterations, converged, state, here = 0, True, (R, t), start
         if len(self.free()):
-            stop = Stop(steps=MAX_ITERATIONS)
+            stop = Stop(steps=MAX_REFINEMENTS)
             end = minimise((R, t), self._linearise, _moved, DAMPING_OF_POSE, stop, here=start, small=_small)
             iterations, converged, state, here = end.steps, end.converged, end.state, end.problem
         return PoseMinimum(

@@ -41,7 +41,7 @@ CONTRADICTION_P = 1e-3
 SIGMA_BELIEF = 4.0
 """The stated sigmas count as much as this many residuals when the noise level is corrected from the fit."""
 
-TYPES = (PoseType.GENERAL, PoseType.PLANAR, PoseType.STANDARD, PoseType.FORWARD)
+SELECTED_TYPES = (PoseType.GENERAL, PoseType.PLANAR, PoseType.STANDARD, PoseType.FORWARD)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -161,7 +161,7 @@ def _fits(matches: Matches, level: float) -> dict[PoseType, RefinedPose]:
     """Return the soft fit of every type that has one."""
     fits: dict[PoseType, RefinedPose] = {}
     failure: RigkitError | None = None
-    for kind in reversed(TYPES):
+    for kind in reversed(SELECTED_TYPES):
         try:
             soft = None if kind == PoseType.GENERAL else level
             fits[kind] = estimate_pose(matches, kind, soft, weights="points")

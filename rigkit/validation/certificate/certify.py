@@ -26,7 +26,7 @@ __all__ = ["certify"]
 
 MAP_CELLS = (33, 25)
 """Columns and rows of places at which the bound is evaluated."""
-COARSE = 0.1
+MAX_SHARE = 0.1
 """A bound beyond this part of what is measured (of a radian, for angles), or points as uncertain: what is derived to
 first order is then too small."""
 
@@ -71,7 +71,7 @@ def certify(instrument: Instrument, task: Task, *, cells: tuple[int, int] = MAP_
     quantile = float(ndtri(0.5 + 0.5 * task.confidence))
     bound = quantile * np.sqrt(sum(s**2 for s in sigma.values()))
     whole = factor * (1.0 if task.quantity is Quantity.ANGLE else task.size_mm)
-    uncertain = (quantile * instrument.sigma_px * farthest > COARSE * task.size_mm).reshape(u.shape)
+    uncertain = (quantile * instrument.sigma_px * farthest > MAX_SHARE * task.size_mm).reshape(u.shape)
     in_view = seen.reshape(u.shape)
     certificate = Certificate(
         task=task,
@@ -80,7 +80,7 @@ def certify(instrument: Instrument, task: Task, *, cells: tuple[int, int] = MAP_
         in_view=in_view,
         bound=bound,
         sigma=sigma,
-        coarse=in_view & (uncertain | (bound > COARSE * whole)),
+        coarse=in_view & (uncertain | (bound > MAX_SHARE * whole)),
     )
     return replace(certificate, findings=tuple(_findings(certificate)))
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray, IntArray, Mat3
 from rigkit.geometry.rotation import cross, exp_so3, skew
-from rigkit.relative_pose.refinement.local import MAX_STEPS, SETTLED_RAD, SampsonRows, _split_essential
+from rigkit.relative_pose.refinement.local import LOCAL_SETTLED_RAD, MAX_LOCAL_STEPS, SampsonRows, _split_essential
 from rigkit.relative_pose.refinement.marginal import marginal_quality, marginal_weights
 from rigkit.relative_pose.solvers.pose import free_directions, rotations_and_direction, translation_basis
 
@@ -59,7 +59,7 @@ def move(packed: FloatArray, R: FloatArray, t: FloatArray, level: float, free: I
     quality, weights = marginal_quality(r, level), marginal_weights(r, level)
     damping = np.full(len(R), 1e-4)
     active = np.arange(len(R))
-    for _ in range(MAX_STEPS):
+    for _ in range(MAX_LOCAL_STEPS):
         basis = translation_basis(t[active])
         J = _derivatives(packed, R[active], t[active], basis)[:, :, free] * inverse[active, :, None]
         JtW = np.swapaxes(J, 1, 2) * weights[active, None]
@@ -79,7 +79,7 @@ def move(packed: FloatArray, R: FloatArray, t: FloatArray, level: float, free: I
         R[took], t[took], r[took], inverse[took] = new_R[better], new_t[better], new_r[better], new_inverse[better]
         quality[took], weights[took] = new_quality[better], marginal_weights(new_r[better], level)
         damping[active] = np.where(better, 0.1 * damping[active], 10.0 * damping[active])
-        moving = (np.abs(step).max(axis=1) > SETTLED_RAD) & (damping[active] < 1e8)
+        moving = (np.abs(step).max(axis=1) > LOCAL_SETTLED_RAD) & (damping[active] < 1e8)
         active = active[moving]
         if not len(active):
             return
