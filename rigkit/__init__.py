@@ -75,6 +75,7 @@ if TYPE_CHECKING:
     from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration, calibrate_session
     from rigkit.workflows.calibrate_any import FolderOptions, calibrate_folders, calibrate_session_file
     from rigkit.workflows.calibrate_rig import RigSessionCalibration, calibrate_rig_session
+    from rigkit.workflows.camera_files import import_camera, import_rig
     from rigkit.workflows.certify import CertifiedFile, CertifyOptions, certify_file
     from rigkit.workflows.corners import Cache
     from rigkit.workflows.crosscheck import DatasetCrossCheck, crosscheck_dataset
@@ -85,9 +86,9 @@ if TYPE_CHECKING:
     from rigkit.workflows.export_camera import (
         ExportCameraOptions,
         ExportedCamera,
+        ExportedRig,
         export_camera,
         export_rig,
-        import_camera,
     )
     from rigkit.workflows.export_cloud import ExportCloudOptions, export_cloud
     from rigkit.workflows.print_board import MeasuredPrint, PrintOptions, print_board, store_measured_print
@@ -128,6 +129,7 @@ __all__ = [
     "ExportCameraOptions",
     "ExportCloudOptions",
     "ExportedCamera",
+    "ExportedRig",
     "FolderOptions",
     "InputError",
     "MatchedPair",
@@ -185,6 +187,7 @@ __all__ = [
     "homography_from_plane",
     "identify_pair",
     "import_camera",
+    "import_rig",
     "load_calibration",
     "load_camera",
     "load_dataset",
@@ -259,6 +262,7 @@ _NAMES_OF = {
     "rigkit.workflows.certify": ("CertifiedFile", "CertifyOptions", "certify_file"),
     "rigkit.workflows.corners": ("Cache",),
     "rigkit.workflows.crosscheck": ("DatasetCrossCheck", "crosscheck_dataset"),
+    "rigkit.workflows.camera_files": ("import_camera", "import_rig"),
     "rigkit.workflows.datasets": ("DatasetOptions",),
     "rigkit.workflows.demo": ("DemoOptions", "run_demo"),
     "rigkit.workflows.detect": ("DetectOptions", "DetectionResult", "detect_in_images"),
@@ -266,9 +270,10 @@ _NAMES_OF = {
     "rigkit.workflows.export_camera": (
         "ExportCameraOptions",
         "ExportedCamera",
+        "ExportedRig",
+        "ExportedRig",
         "export_camera",
         "export_rig",
-        "import_camera",
     ),
     "rigkit.workflows.export_cloud": ("ExportCloudOptions", "export_cloud"),
     "rigkit.workflows.print_board": ("MeasuredPrint", "PrintOptions", "print_board", "store_measured_print"),

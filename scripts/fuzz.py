@@ -103,7 +103,7 @@ KINDS: dict[str, Kind] = {
     "pairs-npz": Kind("pairs.npz", (("rigkit.io.correspondences:read_correspondences", "{case}"),)),
     "ply": Kind("cloud.ply", (("rigkit.io.ply:read_ply", "{case}"),)),
     "opencv": _camera_file("opencv.yaml", ("export", "{case}", "--from", "opencv", "-o", "{out}/new.json")),
-    "kalibr": _camera_file("kalibr.yaml", ("rigkit.workflows.export_camera:import_camera", "{case}")),
+    "kalibr": _camera_file("kalibr.yaml", ("rigkit.workflows.camera_files:import_camera", "{case}")),
     "ros": _camera_file("ros.yaml", ("export", "{case}", "--from", "ros", "-o", "{out}/new.json")),
     "colmap": _camera_file("cameras.txt"),
     "mrcal": _camera_file("lens.cameramodel"),

@@ -12,15 +12,19 @@ HELP = "cameras in other tools' formats; clouds as PLY, npz or a COLMAP model"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "source", type=Path, help="a camera file, a rig (as Kalibr's camchain), or a data set (then --pair)"
-    )
+    parser.add_argument("source", type=Path, help="a camera file, a rig, or a data set (then --pair)")
     parser.add_argument("-o", "--output", type=Path, required=True, help="file to write (a folder for a COLMAP model)")
     parser.add_argument(
         "--to", choices=sorted({*CAMERA_FORMATS, *CLOUD_FORMATS}), help="format (default: by the ending)"
     )
     parser.add_argument(
         "--from", dest="source_format", choices=CAMERA_FORMATS, help="of a camera file (default: told by its content)"
+    )
+    parser.add_argument(
+        "--names",
+        nargs="+",
+        metavar="CAMERA",
+        help="of a rig, in this order (default: all)",
     )
     parser.add_argument("-p", "--pair", help="pair of the data set whose cloud is exported")
     parser.add_argument("--method", default="3SDIR", help="affine estimator of the normals (default 3SDIR)")
@@ -32,14 +36,14 @@ def run(args: argparse.Namespace) -> int:
         return _export_cloud(args)
     import numpy as np
 
-    from rigkit.io.rig_file import is_rig_file
     from rigkit.rectification.targets import field_across
+    from rigkit.workflows.camera_files import is_rig
     from rigkit.workflows.export_camera import ExportCameraOptions, export_camera, export_rig
 
     options = ExportCameraOptions(output=args.output, kind=args.to, source_kind=args.source_format, force=args.force)
-    if is_rig_file(args.source):
-        worst_px = export_rig(args.source, options)
-        print(f"{args.output}: kalibr, at most {worst_px:.4g} px from the rig given")
+    if args.source_format is None and is_rig(args.source):
+        rig = export_rig(args.source, options, tuple(args.names or ()))
+        print(f"{', '.join(map(str, rig.written))}: {rig.kind}, at most {rig.max_error_px:.4g} px from the rig given")
         return 0
     done = export_camera(args.source, options)
     if done.kind == "rigkit":

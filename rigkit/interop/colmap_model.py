@@ -48,7 +48,7 @@ def colmap_model(
     notes = (*(w.note for w in written.values() if w.note), *renamed)
     lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then X Y POINT3D_ID of every corner"]
     for number, pose in ((1, Rigid3.identity()), (2, cam2_from_cam1)):
-        numbers = [*_quaternion(pose.rotation), *pose.translation_mm]
+        numbers = [*quaternion_wxyz(pose.rotation), *pose.translation_mm]
         head = " ".join(f"{v:.17g}" for v in numbers)
         lines += [f"{number} {head} {1 if one else number} {names[number - 1]}", _observations(pixels[number - 1])]
     points = ["# POINT3D_ID X Y Z R G B ERROR TRACK as (IMAGE_ID POINT2D_IDX)"]
@@ -79,7 +79,7 @@ def _observations(pixels: Pixels) -> str:
     return " ".join(f"{u:.9g} {v:.9g} {n + 1}" for n, (u, v) in enumerate(pixels + HALF_PIXEL))
 
 
-def _quaternion(rotation: Mat3) -> FloatArray:
+def quaternion_wxyz(rotation: Mat3) -> FloatArray:
     """Return (w, x, y, z) of a rotation, COLMAP's order."""
     from scipy.spatial.transform import Rotation
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import FloatArray, Mat3
 from rigkit.core.errors import InputError
 from rigkit.interop.exchange import (
     Accepted,
@@ -25,7 +25,14 @@ from rigkit.interop.exchange import (
 )
 from rigkit.interop.yaml_text import parse_yaml
 
-__all__ = ["read_opencv", "write_opencv"]
+__all__ = [
+    "camera_from_arrays",
+    "opencv_arrays",
+    "opencv_matrix",
+    "read_opencv",
+    "read_opencv_matrix",
+    "write_opencv",
+]
 
 OPENCV_ACCEPTS = (
     Accepted("pinhole"),
@@ -41,20 +48,20 @@ def write_opencv(camera: Camera) -> Written:
     """Return the camera as OpenCV's YAML; `cv2.FileStorage` reads it."""
     chosen = best_accepted(camera, OPENCV_ACCEPTS, "OpenCV")
     c = chosen.camera
-    p, extra = c.parameters, ""
-    fx, fy, cx, cy = p[:4]
-    if c.model == "kannala_brandt":
-        distortion, extra = p[4:].reshape(4, 1), "fisheye_model: 1\n"
-    elif c.model == "ucm":
+    extra = "fisheye_model: 1\n" if c.model == "kannala_brandt" else ""
+    if c.model == "ucm":
         xi, (fx, fy, cx, cy) = unified_with_xi(c)
-        distortion, extra = np.zeros((1, 4)), f"xi: {xi!r}\n"
+        K, distortion, extra = (
+            np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
+            np.zeros((1, 4)),
+            f"xi: {xi!r}\n",
+        )
     else:
-        distortion = (p[4:] if p.size > 4 else np.zeros(5)).reshape(1, -1)
-    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        K, distortion = opencv_arrays(c)
     text = (
         "%YAML:1.0\n---\n"
         f"image_width: {c.size_px[0]}\nimage_height: {c.size_px[1]}\n{extra}"
-        f"camera_matrix: {_matrix(K)}distortion_coefficients: {_matrix(distortion)}"
+        f"camera_matrix: {opencv_matrix(K)}distortion_coefficients: {opencv_matrix(distortion)}"
     )
     return chosen.written(text)
 
@@ -68,18 +75,24 @@ def read_opencv(text: str, name: str = "OpenCV YAML") -> Camera:
     data = parse_yaml(text, name)
     sides = [field(data, key, name) for key in ("image_width", "image_height")]
     size = image_size(sides, name, "image_width, image_height")
-    K = _read_matrix(field(data, "camera_matrix", name), name, "camera_matrix")
-    if K.size != 9 or K[1] != 0.0:
-        raise InputError(f"'{name}': camera_matrix must be 3x3 without skew")
-    core = K[[0, 4, 2, 5]]
+    K = read_opencv_matrix(data, "camera_matrix", name)
     key = next((k for k in ("distortion_coefficients", "dist_coeffs", "distCoeffs", "D") if k in data), None)
-    d = np.zeros(0) if key is None else _read_matrix(data[key], name, key)
+    d = np.zeros(0) if key is None else read_opencv_matrix(data, key, name)
     if "xi" in data:
         xi = float(numbers(data["xi"]["data"] if _is_matrix(data["xi"]) else data["xi"], name, "xi", 1)[0])
         if d.any():
             raise InputError(f"'{name}': distortion on top of the unified model (xi) is not supported; recalibrate")
-        return unified_from_xi(size, xi, core, name)
-    if data.get("fisheye_model"):
+        return unified_from_xi(size, xi, _core(K, name), name)
+    return camera_from_arrays(size, K, d, fisheye=bool(data.get("fisheye_model")), name=name)
+
+
+def camera_from_arrays(size: tuple[int, int], K: FloatArray, d: FloatArray, *, fisheye: bool, name: str) -> Camera:
+    """Return the camera of K (9) and distortion (N), as OpenCV has them: the reverse of `opencv_arrays`.
+
+    Raises InputError for skew, and terms that no model here has.
+    """
+    core = _core(K, name)
+    if fisheye:
         return camera_of("kannala_brandt", size, np.concatenate([core, d if d.size else np.zeros(4)]), name)
     if d.size > 8 and d[8:].any():
         raise InputError(f"'{name}': thin prism and tilt terms (more than 8) are not supported; calibrate without them")
@@ -89,14 +102,34 @@ def read_opencv(text: str, name: str = "OpenCV YAML") -> Camera:
     return camera_of("brown", size, np.concatenate([core, d]), name)
 
 
-def _matrix(array: FloatArray) -> str:
+def opencv_arrays(camera: Camera) -> tuple[Mat3, FloatArray]:
+    """Return K and the distortion of a pinhole or Brown camera (1, N), or of a Kannala-Brandt one (4, 1)."""
+    p = camera.parameters
+    fx, fy, cx, cy = p[:4]
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    if camera.model == "kannala_brandt":
+        return K, p[4:].reshape(4, 1)
+    return K, (p[4:] if p.size > 4 else np.zeros(5)).reshape(1, -1)
+
+
+def opencv_matrix(array: FloatArray) -> str:
+    """Return the array (R, C) as OpenCV's storage writes a matrix of doubles."""
     rows, columns = array.shape
     values = ", ".join(repr(float(v)) for v in array.reshape(-1))
     return f"!!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data: [ {values} ]\n"
 
 
-def _read_matrix(value: Any, name: str, key: str) -> FloatArray:
+def read_opencv_matrix(data: dict[str, Any], key: str, name: str) -> FloatArray:
+    """Return data[key] as numbers (N,), written as OpenCV's matrix or as a list."""
+    value = field(data, key, name)
     return numbers(value["data"] if _is_matrix(value) else value, name, key)
+
+
+def _core(K: FloatArray, name: str) -> FloatArray:
+    """Return fx, fy, cx, cy."""
+    if K.size != 9 or K[1] != 0.0:
+        raise InputError(f"'{name}': camera_matrix must be 3x3 without skew")
+    return K[[0, 4, 2, 5]]
 
 
 def _is_matrix(value: Any) -> bool:

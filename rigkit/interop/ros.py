@@ -1,6 +1,7 @@
 """ROS camera_info YAML, as camera_calibration_parsers reads it: plumb_bob, rational_polynomial, equidistant.
 
-Pixels as ours. The rectification matrix is the identity and the projection matrix the camera matrix: a single camera.
+Pixels as ours, lengths in metres. For a camera alone the rectification matrix is the identity and the projection
+matrix the camera matrix.
 """
 
 from __future__ import annotations
@@ -8,12 +9,16 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import FloatArray, Mat3
 from rigkit.core.errors import InputError
 from rigkit.interop.exchange import Accepted, Written, best_accepted, camera_of, field, image_size, numbers
 from rigkit.interop.yaml_text import flow, parse_yaml
 
-__all__ = ["read_camera_info", "write_camera_info"]
+__all__ = ["Rectification", "read_camera_info", "write_camera_info"]
+
+Rectification = tuple[Mat3, FloatArray]
+"""Rotation from the camera into the rectified view (3, 3), and the rectified view's projection matrix (3, 4), whose
+last column is in pixels times metres."""
 
 ROS_ACCEPTS = (
     Accepted("pinhole"),
@@ -24,8 +29,14 @@ ROS_ACCEPTS = (
 )
 
 
-def write_camera_info(camera: Camera, camera_name: str = "camera") -> Written:
-    """Return the camera as a camera_info YAML file called `camera_name` inside."""
+def write_camera_info(
+    camera: Camera, camera_name: str = "camera", *, rectification: Rectification | None = None
+) -> Written:
+    """Return the camera as a camera_info YAML file called `camera_name` inside.
+
+    `rectification` is that of a camera of a stereo pair; by default the camera stands alone. Raises InputError for
+    a name that ROS does not take.
+    """
     if not camera_name or not camera_name.replace("_", "").isalnum():
         raise InputError(f"camera_info: name '{camera_name}'; ROS takes letters, digits and underscores")
     chosen = best_accepted(camera, ROS_ACCEPTS, "ROS")
@@ -38,13 +49,14 @@ def write_camera_info(camera: Camera, camera_name: str = "camera") -> Written:
         distortion = np.append(distortion, 0.0)
     model = {4: "equidistant", 5: "plumb_bob", 8: "rational_polynomial"}[distortion.size]
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    R, P = (np.eye(3), np.hstack([K, np.zeros((3, 1))])) if rectification is None else rectification
     text = (
         f"image_width: {c.size_px[0]}\nimage_height: {c.size_px[1]}\ncamera_name: {camera_name}\n"
         f"camera_matrix:\n{_matrix(K)}"
         f"distortion_model: {model}\n"
         f"distortion_coefficients:\n{_matrix(distortion.reshape(1, -1))}"
-        f"rectification_matrix:\n{_matrix(np.eye(3))}"
-        f"projection_matrix:\n{_matrix(np.hstack([K, np.zeros((3, 1))]))}"
+        f"rectification_matrix:\n{_matrix(R)}"
+        f"projection_matrix:\n{_matrix(P)}"
     )
     return chosen.written(text)
 

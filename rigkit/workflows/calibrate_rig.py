@@ -21,7 +21,7 @@ from rigkit.validation.check import Check, compare
 from rigkit.validation.checks import COVERAGE
 from rigkit.workflows.calibrate import CalibrateOptions, calibration_from, corners_of, session_inputs
 from rigkit.workflows.corners import Cache, SessionCorners, session_corners, session_views
-from rigkit.workflows.export_camera import foreign_files, foreign_paths
+from rigkit.workflows.export_camera import foreign_files, foreign_paths, foreign_rig_files, foreign_rig_paths
 from rigkit.workflows.rigid_boards import named_as_listed, named_by_rule, require_distinct
 from rigkit.workflows.session_page import rig_page
 
@@ -86,6 +86,8 @@ def calibrate_rig_session(
     if options.output is not None:
         if len(session.cameras) > 1:
             files[options.output] = rig_text(rig)
+            mounted = {c.name: (c.camera, c.cam_from_rig) for c in rig.cameras}
+            files |= foreign_rig_files(mounted, options.output, options.exports)
         for camera in rig.cameras:
             own = _beside(session, options.output, camera.name)
             files[own] = calibration_text(judged(camera.calibration))
@@ -113,6 +115,9 @@ def _targets(session: RigSession, options: CalibrateOptions) -> list[Path]:
         out += [options.output] if len(session.cameras) > 1 else []
         own = [_beside(session, options.output, name) for name in session.cameras]
         out += [*own, *(path for one in own for path in foreign_paths(one, options.exports))]
+        if len(session.cameras) > 1:
+            rigs = foreign_rig_paths(list(session.cameras), options.output, options.exports)
+            out += [path for places in rigs.values() for path in places]
         out += [_boards_file(options.output)] if session.rigid_boards else []
     return out if options.report is None else [*out, options.report]
 

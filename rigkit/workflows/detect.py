@@ -21,11 +21,11 @@ from rigkit.core.processes import worker_pool
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import MIN_BOARD_CORNERS, detect_boards
 from rigkit.io.board_file import load_board
-from rigkit.io.calibration_file import load_camera
 from rigkit.io.corners_file import write_corners
 from rigkit.io.files import ensure_writable, write_atomic
 from rigkit.io.images import read_image
 from rigkit.report.overlay import draw_boards
+from rigkit.workflows.camera_files import import_camera
 
 __all__ = ["DetectOptions", "DetectionResult", "detect_in_images"]
 
@@ -98,7 +98,7 @@ def detect_in_images(
     boards = tuple(load_board(path) for path in options.boards)
     if options.camera is not None and not boards:
         raise InputError("--camera helps to find boards of known size only; give them, such as --board a9x6.toml")
-    camera = None if options.camera is None else load_camera(options.camera)
+    camera = None if options.camera is None else import_camera(options.camera)
     overlays = _overlay_paths(images, options.overlay)
     outputs = [path for path in (options.output, *overlays) if path is not None]
     read = [*images, *options.boards, *([options.camera] if options.camera else [])]

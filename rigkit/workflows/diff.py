@@ -10,10 +10,11 @@ from rigkit.calibration.compare import CalibrationComparison, compare_calibratio
 from rigkit.calibration.rig.compare import Mounted, RigDifference, compare_mounts
 from rigkit.cameras.compare import CameraDifference, compare_cameras
 from rigkit.core.errors import InputError
-from rigkit.io.calibration_file import is_calibration, load_calibration, load_camera
+from rigkit.io.calibration_file import is_calibration, load_calibration
 from rigkit.io.files import ensure_writable, write_atomic
-from rigkit.io.rig_file import is_rig_file, load_saved_rig
+from rigkit.io.rig_file import SavedRig, is_rig_file, load_saved_rig
 from rigkit.report.figures import difference_png
+from rigkit.workflows.camera_files import import_camera, import_rig, is_rig
 
 __all__ = ["CameraPair", "DiffOptions", "RigPair", "diff"]
 
@@ -62,7 +63,7 @@ def diff(a: Path, b: Path, options: DiffOptions | None = None) -> CameraPair | R
     Raises InputError for a rig and a camera, rigs of other cameras, or a map that cannot be written.
     """
     options = options or DiffOptions()
-    rigs = [is_rig_file(path) for path in (a, b)]
+    rigs = [is_rig(path) for path in (a, b)]
     if all(rigs):
         if options.output is not None:
             raise InputError("diff: a map is of two cameras; give the calibrations beside the rigs, rig-CAMERA.json")
@@ -79,7 +80,7 @@ def diff(a: Path, b: Path, options: DiffOptions | None = None) -> CameraPair | R
 
 
 def _cameras(a: Path, b: Path) -> CameraPair:
-    cameras = load_camera(a), load_camera(b)
+    cameras = import_camera(a), import_camera(b)
     if not all(is_calibration(path) for path in (a, b)):
         return CameraPair(compare_cameras(*cameras), None)
     judged = compare_calibrations(load_calibration(a), load_calibration(b))
@@ -87,7 +88,7 @@ def _cameras(a: Path, b: Path) -> CameraPair:
 
 
 def _rigs(a: Path, b: Path) -> RigPair:
-    first, second = load_saved_rig(a), load_saved_rig(b)
+    first, second = _saved(a), _saved(b)
     names = list(first.cameras)
     if names != list(second.cameras):
         raise InputError(f"diff: '{a}' has the cameras {', '.join(names)}, '{b}' {', '.join(second.cameras)}")
@@ -98,3 +99,8 @@ def _rigs(a: Path, b: Path) -> RigPair:
         if all(path.is_file() for path in beside):
             cameras[name] = _cameras(*beside)
     return RigPair(mounts, cameras)
+
+
+def _saved(path: Path) -> SavedRig:
+    """Return a rig of ours, or another tool's, which has no covariance."""
+    return load_saved_rig(path) if is_rig_file(path) else SavedRig(import_rig(path), None)

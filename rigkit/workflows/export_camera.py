@@ -1,48 +1,40 @@
-"""Cameras and rigs in other tools' formats, in and out."""
+"""Cameras and rigs in other tools' formats."""
 
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from rigkit.cameras.base import Camera
 from rigkit.core.errors import InputError
-from rigkit.interop.colmap_cameras import read_colmap_cameras, write_colmap_cameras
-from rigkit.interop.kalibr import read_kalibr, write_kalibr
-from rigkit.interop.mrcal import read_cameramodel, write_cameramodel
-from rigkit.interop.ocamcalib import read_ocamcalib, write_ocamcalib
-from rigkit.interop.opencv import read_opencv, write_opencv
-from rigkit.interop.ros import read_camera_info, write_camera_info
-from rigkit.io.calibration_file import load_camera, refuse_mirrored, save_camera
-from rigkit.io.files import ensure_writable, write_atomic
-from rigkit.io.reading import read_text
-from rigkit.io.rig_file import load_rig
+from rigkit.interop.colmap_cameras import write_colmap_cameras
+from rigkit.interop.kalibr import write_kalibr
+from rigkit.interop.mrcal import write_cameramodel
+from rigkit.interop.ocamcalib import write_ocamcalib
+from rigkit.interop.opencv import write_opencv
+from rigkit.interop.rigs import RIG_FORMATS, Rig, write_rig
+from rigkit.interop.ros import write_camera_info
+from rigkit.io.calibration_file import refuse_mirrored, save_camera
+from rigkit.io.files import ensure_writable, write_atomic, write_together
+from rigkit.workflows.camera_files import import_camera, import_rig
 from rigkit.workflows.formats import CAMERA_FORMATS, FOREIGN_ENDINGS
 
 __all__ = [
     "ExportCameraOptions",
     "ExportedCamera",
-    "camera_format",
+    "ExportedRig",
     "export_camera",
     "export_rig",
     "foreign_files",
     "foreign_paths",
-    "import_camera",
+    "foreign_rig_files",
+    "foreign_rig_paths",
 ]
 
-SIGNS = (
-    ("mrcal", re.compile(r"['\"]lens_?model['\"]\s*:")),
-    ("rigkit", re.compile(r'\A\s*\{\s*["}]')),
-    ("ocamcalib", re.compile(r"\A\s*#\s*polynomial coefficients", re.IGNORECASE)),
-    ("kalibr", re.compile(r"^cam\d+\s*:", re.MULTILINE)),
-    ("opencv", re.compile(r"!!opencv-matrix|<opencv_storage>|\A%YAML")),
-    ("ros", re.compile(r"^distortion_model\s*:", re.MULTILINE)),
-    ("colmap", re.compile(r"^\s*\d+\s+[A-Z][A-Z_]+\s+\d+\s+\d+\s+[-+.\d]", re.MULTILINE)),
-)
-"""Format -> what its files have and those of the formats after it in this list have not."""
+RIG_ENDINGS = {"colmap": ".json"}
+"""Where the file of a rig ends otherwise than that of a camera."""
 
 _log = logging.getLogger(__name__)
 
@@ -70,37 +62,13 @@ class ExportedCamera:
     max_error_px: float
 
 
-def import_camera(path: str | Path, kind: str | None = None) -> Camera:
-    """Return the camera of a file, of ours or of another tool's; `kind` is told by the content where it is None.
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class ExportedRig:
+    """What was written of a rig: the format, the largest error of a camera against the one given, in px, the files."""
 
-    Raises InputError for a file that is no camera of that format, holds several, or whose format nobody can tell.
-    """
-    source = Path(path)
-    text, name = read_text(source, "camera file"), str(source)
-    kind = kind or camera_format(text)
-    if kind is None:
-        raise InputError(f"'{name}': none of the known camera formats ({', '.join(CAMERA_FORMATS)}); check the file")
-    if kind not in CAMERA_FORMATS:
-        raise InputError(f"'{kind}' is no camera format; known are {', '.join(CAMERA_FORMATS)}")
-    if kind == "rigkit":
-        return load_camera(source)
-    if kind == "kalibr":
-        return _only(read_kalibr(text, name)[0], name)
-    if kind == "colmap":
-        return _only(tuple(read_colmap_cameras(text, name).values()), name)
-    if kind == "mrcal":
-        camera, _, worst = read_cameramodel(text, name)
-        if worst > 0.0:
-            _log.info(f"the spline was refitted as '{camera.model}', at most {worst:.4g} px away")
-        return camera
-    if kind == "ocamcalib":
-        return read_ocamcalib(text, name)[0]
-    return read_opencv(text, name) if kind == "opencv" else read_camera_info(text, name)
-
-
-def camera_format(text: str) -> str | None:
-    """Return the format of a camera file's content, one of `CAMERA_FORMATS`; None where none of them looks so."""
-    return next((kind for kind, sign in SIGNS if sign.search(text)), None)
+    kind: str
+    max_error_px: float
+    written: tuple[Path, ...]
 
 
 def export_camera(source: str | Path, options: ExportCameraOptions) -> ExportedCamera:
@@ -124,23 +92,63 @@ def export_camera(source: str | Path, options: ExportCameraOptions) -> ExportedC
     return ExportedCamera(camera=camera, kind=kind, max_error_px=worst_px)
 
 
-def export_rig(source: str | Path, options: ExportCameraOptions) -> float:
-    """Write a rig's file as Kalibr's camchain; return its largest error against the rig, in px.
+def export_rig(source: str | Path, options: ExportCameraOptions, names: Sequence[str] = ()) -> ExportedRig:
+    """Write a rig's file (ours, or another tool's) in another format; `names` picks cameras, in their order.
 
-    Raises InputError for no rig, another format, or a file that cannot be written.
+    Formats with a file a camera get OUT-NAME. Raises InputError for no rig, a format without rigs, a camera that is
+    not there, or a file that cannot be written.
     """
-    if options.kind != "kalibr":
+    kind = options.kind
+    if kind is None:
+        raise InputError(f"export: say the rig's format with --to, one of {', '.join(RIG_FORMATS)}")
+    rig = import_rig(source)
+    missing = [name for name in names if name not in rig]
+    if missing or len(set(names)) != len(names):
         raise InputError(
-            f"export: '{source}' is a rig, which goes out with --to kalibr; for other formats export the "
-            f"calibrations of its cameras, beside it: {Path(source).stem}-CAMERA.json"
+            f"'{source}': no camera '{', '.join(missing) or names[0]}' to pick; there are {', '.join(rig)}"
         )
-    ensure_writable(options.output, force=options.force, inputs=[source])
-    rig = load_rig(source)
-    chain = write_kalibr([camera for camera, _ in rig.values()], [pose for _, pose in rig.values()])
-    write_atomic(options.output, chain.text, force=options.force)
-    for k, (name, one) in enumerate(zip(rig, chain.cameras, strict=True)):
-        _log.info(f"cam{k} is '{name}'" + (f"; {one.note}" if one.note else ""))
-    return max(one.max_error_px for one in chain.cameras)
+    rig = {name: rig[name] for name in names or rig}
+    foreign = write_rig(rig, kind)
+    files = {_of_camera(options.output, key): text for key, text in foreign.files.items()}
+    ensure_writable(list(files), force=options.force, inputs=[source])
+    write_together(dict(files), force=options.force)
+    for note in foreign.notes:
+        _log.info(note)
+    return ExportedRig(kind=kind, max_error_px=foreign.max_error_px, written=tuple(files))
+
+
+def foreign_rig_files(rig: Rig, beside: Path, kinds: Sequence[str]) -> dict[Path, str]:
+    """Return the files (path -> content) of a rig in those of the formats that have rigs of so many cameras, named
+    after the rig's file `beside` which they lie; what a user of them should know goes to the log.
+
+    A format that cannot follow this rig is left out, which the log says: the calibration is not lost for it.
+    """
+    files: dict[Path, str] = {}
+    for kind, places in foreign_rig_paths(list(rig), beside, kinds).items():
+        try:
+            foreign = write_rig(rig, kind)
+        except InputError as error:
+            _log.warning(f"no {kind} file of the rig: {error}")
+            continue
+        files |= dict(zip(places, foreign.files.values(), strict=True))
+        _log.info(f"{', '.join(map(str, places))}: {kind}; {'; '.join(foreign.notes)}")
+    return files
+
+
+def foreign_rig_paths(names: Sequence[str], beside: Path, kinds: Sequence[str]) -> dict[str, list[Path]]:
+    """Return by format where `foreign_rig_files` go, for a rig of cameras of these names."""
+    out = {}
+    for kind in kinds:
+        known = RIG_FORMATS.get(kind)
+        if known is not None and not (known.stereo_only and len(names) != 2):
+            whole = beside.with_name(f"{beside.stem}-{kind}{RIG_ENDINGS.get(kind, FOREIGN_ENDINGS[kind])}")
+            out[kind] = [_of_camera(whole, key) for key in known.keys(names)]
+    return out
+
+
+def _of_camera(path: Path, name: str) -> Path:
+    """Return where the file of one camera goes; "" stands for all of them."""
+    return path.with_name(f"{path.stem}-{name}{path.suffix}") if name else path
 
 
 def foreign_files(camera: Camera, beside: Path, kinds: Sequence[str]) -> dict[Path, str]:
@@ -162,12 +170,6 @@ def foreign_paths(beside: Path, kinds: Sequence[str]) -> list[Path]:
     if unknown:
         raise InputError(f"export: '{unknown[0]}' is none of the formats {', '.join(FOREIGN_ENDINGS)}")
     return [beside.with_name(f"{beside.stem}-{kind}{FOREIGN_ENDINGS[kind]}") for kind in kinds]
-
-
-def _only(cameras: tuple[Camera, ...], name: str) -> Camera:
-    if len(cameras) != 1:
-        raise InputError(f"'{name}' holds {len(cameras)} cameras; leave the one that you want in it")
-    return cameras[0]
 
 
 def _foreign(camera: Camera, kind: str) -> tuple[str, float, str]:

@@ -14,12 +14,12 @@ from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.features import match_affine_features
 from rigkit.core.errors import InputError
 from rigkit.core.progress import Progress, silent
-from rigkit.io.calibration_file import load_camera
 from rigkit.io.correspondences import correspondences_text, read_correspondences
 from rigkit.io.ply import ply_bytes
 from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene
 from rigkit.report.figures import cloud_png, epipolar_png
 from rigkit.report.scene_figure import normals_png
+from rigkit.workflows.camera_files import import_camera
 from rigkit.workflows.pairs import read_for
 from rigkit.workflows.results import require_folder, write_results
 
@@ -100,8 +100,8 @@ def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> 
     name = options.name
     if options.output is not None:
         require_folder(options.output, force=options.force)
-    camera1 = load_camera(options.camera)
-    camera2 = load_camera(options.camera2) if options.camera2 else camera1
+    camera1 = import_camera(options.camera)
+    camera2 = import_camera(options.camera2) if options.camera2 else camera1
     images = None
     if options.images:
         a, b = options.images

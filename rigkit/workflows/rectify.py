@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.errors import InputError
-from rigkit.io.calibration_file import load_camera
 from rigkit.io.files import ensure_writable, write_together
 from rigkit.io.images import read_image
-from rigkit.io.rig_file import load_rig
 from rigkit.rectification.rectify import RectifyMap, rectify_map, rotation_from_view_angles
 from rigkit.rectification.stereo import StereoRectification, rectify_pair
 from rigkit.rectification.targets import target_camera
+from rigkit.workflows.camera_files import import_camera, import_rig
 
 __all__ = ["RectifiedImage", "RectifyOptions", "rectify_image", "rectify_stereo_images"]
 
@@ -60,7 +59,7 @@ def rectify_image(image: str | Path, camera: str | Path, options: RectifyOptions
     """
     _ensure_kind(options.output)
     ensure_writable(options.output, force=options.force, inputs=(image, camera))
-    source = load_camera(camera)
+    source = import_camera(camera)
     hfov_rad = None if options.hfov_deg is None else np.radians(options.hfov_deg)
     target = target_camera(source, options.projection, hfov_rad=hfov_rad, size_px=options.size_px)
     rotation = rotation_from_view_angles(*np.radians(options.angles_deg))
@@ -83,7 +82,7 @@ def rectify_stereo_images(
     _ensure_kind(options.output)
     if options.hfov_deg is not None or options.size_px is not None or any(options.angles_deg):
         raise InputError("rectify: the baseline decides the view of a stereo pair; leave out its angles and its size")
-    cameras = load_rig(rig)
+    cameras = import_rig(rig)
     both = list(names or list(cameras)[:2])
     missing = [name for name in both if name not in cameras]
     if missing or len(both) != 2:

@@ -28,6 +28,7 @@ from rigkit.synthetic.placing import place_board, sees_paper
 from rigkit.synthetic.render import Optics, render
 from rigkit.workflows.calibrate import CalibrateOptions
 from rigkit.workflows.calibrate_any import calibrate_session_file
+from rigkit.workflows.camera_files import import_rig
 from rigkit.workflows.folder_session import cameras_in, session_of_folders
 
 CAMERA = Brown((640, 480), np.array([520.0, 521.0, 322.3, 236.1, -0.21, 0.06, 4e-4, -3e-4, 0.0]))
@@ -151,6 +152,8 @@ def test_pictures_of_two_cameras_are_a_rig(pictures: Path, tmp_path: Path, layou
     for name in rig:
         camera = read_opencv((folder / f"rig-{name}-opencv.yaml").read_text(), "")
         assert worst_px(camera) < SAME_LENS_PX
+    pair = import_rig(folder / "rig-opencv.yaml")
+    np.testing.assert_allclose((pair["right"][1] @ pair["left"][1].inverse()).matrix(), found.matrix(), atol=1e-9)
 
 
 @pytest.mark.parametrize(

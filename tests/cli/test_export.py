@@ -2,19 +2,24 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+import yaml
 from helpers.data import REPOSITORY
 
+from rigkit.cameras.base import Camera
 from rigkit.cameras.brown import Brown
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cli.main import main
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3
-from rigkit.interop.kalibr import read_kalibr
+from rigkit.geometry.rotation import exp_so3, skew
+from rigkit.interop.mrcal import read_cameramodel
 from rigkit.io.calibration_file import camera_to_json, load_camera
+from rigkit.workflows.camera_files import import_rig
 
 CALIBRATION = REPOSITORY / "calib" / "cameras" / "mvca020_fe185" / "calibration.json"
 LAB = REPOSITORY / "datasets" / "lab-a"
@@ -57,31 +62,113 @@ def test_a_cloud_as_colmap_model_and_npz(tmp_path: Path, capsys: pytest.CaptureF
     assert main(["export", *source, "-o", str(tmp_path / "cloud.npz")]) == 2
 
 
-def test_a_rig_goes_out_as_a_camchain(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    left = Brown((640, 480), np.array([534.0, 534.2, 341.7, 238.9, -0.28, 0.1, 0.001, 0.0002, 0.0]))
-    right = KannalaBrandt((800, 600), np.array([300.0, 301.0, 398.0, 303.0, -0.02, 0.002, 0.0, 0.0]))
-    # The rig's frame is nobody's: what Kalibr keeps is one camera against the other.
-    poses = (
-        Rigid3(exp_so3(np.array([0.1, 0.0, -0.2])), [5.0, 6.0, 7.0]),
-        Rigid3(exp_so3(np.array([0.0, 0.3, 0.1])), [-250.0, 4.0, 9.0]),
-    )
+def saved_rig(path: Path, cameras: Sequence[Camera], poses: Sequence[Rigid3]) -> Path:
+    """Write a rig's file of cameras called left, right and third."""
     entries = [
         {"name": name, "camera": camera_to_json(camera), "cam_from_rig": pose.matrix()[:3].tolist(), "rms_px": 0.1}
-        for name, camera, pose in zip(("left", "right"), (left, right), poses, strict=True)
+        for name, camera, pose in zip(("left", "right", "third"), cameras, poses, strict=False)
     ]
-    rig, chain = tmp_path / "rig.json", tmp_path / "chain.yaml"
-    rig.write_text(json.dumps({"schema": "rigkit.rig/1", "cameras": entries}))
+    path.write_text(json.dumps({"schema": "rigkit.rig/1", "cameras": entries}))
+    return path
+
+
+LEFT = Brown((640, 480), np.array([534.0, 534.2, 341.7, 238.9, -0.28, 0.1, 0.001, 0.0002, 0.0]))
+RIGHT = Brown((640, 480), np.array([537.0, 536.8, 326.5, 250.1, -0.29, 0.11, -0.0005, 0.0001, 0.0]))
+WIDE = KannalaBrandt((800, 600), np.array([300.0, 301.0, 398.0, 303.0, -0.02, 0.002, 0.0, 0.0]))
+POSES = (
+    Rigid3(exp_so3(np.array([0.1, 0.0, -0.2])), [5.0, 6.0, 7.0]),
+    Rigid3(exp_so3(np.array([0.1, 0.05, -0.18])), [-95.0, 4.0, 9.0]),
+    Rigid3(exp_so3(np.array([0.0, 0.3, 0.1])), [-250.0, 4.0, 9.0]),
+)
+"""The rig's frame is nobody's: what other tools keep is one camera against the other."""
+
+
+def test_a_rig_goes_out_as_a_camchain_and_comes_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = saved_rig(tmp_path / "rig.json", (LEFT, WIDE), (POSES[0], POSES[2]))
+    chain = tmp_path / "chain.yaml"
     assert main(["export", str(rig), "--to", "kalibr", "-o", str(chain)]) == 0
     said = capsys.readouterr()
     assert "at most 0 px" in said.out and "cam0 is 'left'" in said.err and "cam1 is 'right'" in said.err
-    (one, two), (_, cam1_from_cam0) = read_kalibr(chain.read_text())
+    (one, _), (two, cam1_from_cam0) = import_rig(chain).values()
     # Kalibr has no k3, which is zero here.
-    np.testing.assert_allclose(one.parameters, left.parameters[:8], atol=1e-12)
-    assert left.parameters[8] == 0.0
-    np.testing.assert_allclose(two.parameters, right.parameters, atol=1e-12)
-    np.testing.assert_allclose(cam1_from_cam0.matrix(), (poses[1] @ poses[0].inverse()).matrix(), atol=1e-9)
-    assert main(["export", str(rig), "--to", "opencv", "-o", str(tmp_path / "x.yml")]) == 2
-    assert "rig-CAMERA.json" in capsys.readouterr().err
+    np.testing.assert_allclose(one.parameters, LEFT.parameters[:8], atol=1e-12)
+    np.testing.assert_allclose(two.parameters, WIDE.parameters, atol=1e-12)
+    np.testing.assert_allclose(cam1_from_cam0.matrix(), (POSES[2] @ POSES[0].inverse()).matrix(), atol=1e-9)
+    # Another tool's rig is taken wherever ours is.
+    assert main(["diff", str(rig), str(rig)]) == 0
+    assert main(["diff", str(chain), str(chain)]) == 0
+
+
+@pytest.mark.parametrize("wide", [False, True])
+def test_a_stereo_pair_goes_out_as_opencv_and_ros(
+    wide: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cameras = (WIDE, WIDE.with_parameters(WIDE.parameters + 1.0)) if wide else (LEFT, RIGHT)
+    rig = saved_rig(tmp_path / "rig.json", (*cameras, WIDE), POSES)
+    assert main(["export", str(rig), "--to", "opencv", "-o", str(tmp_path / "all.yml")]) == 2
+    assert "3 cameras" in capsys.readouterr().err
+    names = ["--names", "left", "right"]
+    stereo = tmp_path / "stereo.yml"
+    assert main(["export", str(rig), "--to", "opencv", "-o", str(stereo), *names]) == 0
+    assert "at most 0 px" in capsys.readouterr().out
+    storage = cv2.FileStorage(str(stereo), cv2.FILE_STORAGE_READ)
+    K1, D1, K2, D2, R, T, R1, R2, P1, P2, Q, E, F = (
+        storage.getNode(key).mat() for key in ["M1", "D1", "M2", "D2", "R", "T", "R1", "R2", "P1", "P2", "Q", "E", "F"]
+    )
+    # A point that both cameras see, through OpenCV's own functions: the same row after its own rectification, its
+    # depth from the disparity through Q, and the epipolar line of F.
+    in_left = np.random.default_rng(3).uniform([-200, -150, 900], [250, 150, 1500], (40, 3))
+    project = cv2.fisheye.projectPoints if wide else cv2.projectPoints
+    undistort = cv2.fisheye.undistortPoints if wide else cv2.undistortPoints
+    rotation_vector = cv2.Rodrigues(R)[0]
+    one = project(in_left[:, None], np.zeros(3), np.zeros(3), K1, D1)[0]
+    two = project(in_left[:, None], rotation_vector, T, K2, D2)[0]
+    np.testing.assert_allclose(one.reshape(-1, 2), cameras[0].project(in_left)[0], atol=1e-8)
+    in_right = (POSES[1] @ POSES[0].inverse()).apply(in_left)
+    np.testing.assert_allclose(two.reshape(-1, 2), cameras[1].project(in_right)[0], atol=1e-8)
+    a, b = (
+        undistort(p, K, D, R=R_, P=P).reshape(-1, 2)
+        for p, K, D, R_, P in ((one, K1, D1, R1, P1), (two, K2, D2, R2, P2))
+    )
+    np.testing.assert_allclose(a[:, 1], b[:, 1], atol=1e-4)
+    there = cv2.perspectiveTransform(np.column_stack([a, a[:, 0] - b[:, 0]])[:, None], Q)[:, 0]
+    np.testing.assert_allclose(there, in_left @ R1.T, rtol=1e-4)
+    flat = [cv2.convertPointsToHomogeneous(undistort(p, K, D, P=K))[:, 0] for p, K, D in ((one, K1, D1), (two, K2, D2))]
+    assert np.abs(np.einsum("ni,ij,nj->n", flat[1], F, flat[0])).max() < 1e-3 * np.abs(F).max() * 640**2
+    np.testing.assert_allclose(E, np.linalg.norm(T) * skew(T.ravel() / np.linalg.norm(T)) @ R, atol=1e-9)
+    back = import_rig(stereo)
+    np.testing.assert_allclose(back["right"][1].matrix(), (POSES[1] @ POSES[0].inverse()).matrix(), atol=1e-9)
+    assert main(["export", str(rig), "--to", "ros", "-o", str(tmp_path / "info.yaml"), *names]) == 0
+    right = yaml.safe_load((tmp_path / "info-right.yaml").read_text())
+    np.testing.assert_allclose(right["rectification_matrix"]["data"], R2.ravel())
+    np.testing.assert_allclose(np.reshape(right["projection_matrix"]["data"], (3, 4))[:, 3], P2[:, 3] / 1000.0)
+
+
+def test_a_rig_goes_out_to_colmap_and_mrcal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import pycolmap
+
+    rig = saved_rig(tmp_path / "rig.json", (LEFT, RIGHT, WIDE), POSES)
+    assert main(["export", str(rig), "--to", "colmap", "-o", str(tmp_path / "rig_config.json")]) == 0
+    (config,) = pycolmap.read_rig_config(tmp_path / "rig_config.json")
+    assert [c.ref_sensor for c in config.cameras] == [True, False, False]
+    assert [c.image_prefix for c in config.cameras] == ["left/", "right/", "third/"]
+    third = config.cameras[2]
+    assert third.cam_from_rig is not None and third.camera is not None
+    np.testing.assert_allclose(third.cam_from_rig.matrix(), (POSES[2] @ POSES[0].inverse()).matrix()[:3], atol=1e-9)
+    point = np.array([[0.3, -0.2, 1.0]])
+    pixel = np.asarray(third.camera.img_from_cam(point), dtype=np.float64)
+    np.testing.assert_allclose(pixel - 0.5, WIDE.project(point)[0], atol=1e-9)
+    assert (
+        main(["export", str(rig), "--to", "mrcal", "-o", str(tmp_path / "x.cameramodel"), "--names", "left", "right"])
+        == 0
+    )
+    _, pose, _ = read_cameramodel((tmp_path / "x-right.cameramodel").read_text(), "x")
+    np.testing.assert_allclose(pose.matrix(), POSES[1].matrix(), atol=1e-9)
+    capsys.readouterr()
+    assert main(["export", str(rig), "--to", "ocamcalib", "-o", str(tmp_path / "x.txt")]) == 2
+    assert "has no rigs" in capsys.readouterr().err
+    assert main(["export", str(rig), "--to", "kalibr", "-o", str(tmp_path / "x.txt"), "--names", "middle"]) == 2
+    assert "no camera 'middle'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -129,7 +129,7 @@ def test_a_kind_of_image_that_nobody_writes_is_known_before_the_work(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("rigkit.workflows.rectify.load_camera", lambda _: pytest.fail("work was done"))
+    monkeypatch.setattr("rigkit.workflows.rectify.import_camera", lambda _: pytest.fail("work was done"))
     assert main(["rectify", files[0], "--camera", files[1], "-o", str(tmp_path / name)]) == 2
     assert ".png" in capsys.readouterr().err
     assert not (tmp_path / name).exists()
