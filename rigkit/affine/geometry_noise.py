@@ -53,8 +53,7 @@ def geometry_covariance(
     pose_covariance : (6, 6) of (left rotation perturbation rad, translation), or None: the pose is exact.
     covariance : (N, 4, 4) of vec(A21) where the normals are weighted by it.
     """
-    f1, f2 = np.asarray(rays1, dtype=np.float64), np.asarray(rays2, dtype=np.float64)
-    b1, b2 = np.asarray(ray_jacobians1, dtype=np.float64), np.asarray(ray_jacobians2, dtype=np.float64)
+    f1, f2, b1, b2 = (np.asarray(v, dtype=np.float64) for v in (rays1, rays2, ray_jacobians1, ray_jacobians2))
     n = len(f1)
 
     def normals(corner1: FloatArray, corner2: FloatArray, pose: Rigid3) -> FloatArray:
@@ -81,11 +80,9 @@ def geometry_covariance(
     if pose_covariance is not None:
         steps = np.repeat([STEP_RAD, BASELINE_STEP * np.linalg.norm(cam2_from_cam1.translation_mm)], 3)
         columns = []
-        for k, size in enumerate(steps):
-            plus, minus = (
-                normals(still, still, _perturbed(cam2_from_cam1, sign * size * np.eye(6)[k])) for sign in (1.0, -1.0)
-            )
-            columns.append((plus - minus) / (2.0 * size))
+        for step in np.diag(steps):
+            plus, minus = (normals(still, still, _perturbed(cam2_from_cam1, s * step)) for s in (1.0, -1.0))
+            columns.append((plus - minus) / (2.0 * step.sum()))
         by_pose = np.stack(columns, axis=-1)
         total += by_pose @ pose_covariance @ np.swapaxes(by_pose, -1, -2)
     return total

@@ -49,12 +49,7 @@ def affines_from_mixed_directions(
     relative lengths are pure numbers, so they are weighted alike.
     """
     n, k = directions.valid.shape
-    try:
-        counts = np.broadcast_to(scaled, (n, k))
-    except ValueError as error:
-        raise InputError(f"mixed directions: scaled must broadcast to {n}x{k}, got {np.shape(scaled)}") from error
-    if epipolar is not None and len(epipolar) != n:
-        raise InputError(f"mixed directions: {n} corners but epipolar normals of {len(epipolar)}")
+    counts = _checked(n, k, scaled, epipolar)
     length1, length2 = (np.linalg.norm(d, axis=-1) for d in (directions.image1, directions.image2))
     use = directions.valid & (length1 > 0.0) & (length2 > 0.0)
     length1, length2 = np.where(use, length1, 1.0), np.where(use, length2, 1.0)
@@ -80,6 +75,16 @@ def affines_from_mixed_directions(
         covariance = _propagate(free @ gain, by1, by2, use, noise)
         covariance[~valid] = np.nan
     return Affinities(A21, valid, conditioning, covariance)
+
+
+def _checked(n: int, k: int, scaled: BoolArray, epipolar: EpipolarNormals | None) -> BoolArray:
+    """Return `scaled` as (N, K). Raises InputError where that or the epipolar normals do not fit."""
+    if epipolar is not None and len(epipolar) != n:
+        raise InputError(f"mixed directions: {n} corners but epipolar normals of {len(epipolar)}")
+    try:
+        return np.broadcast_to(scaled, (n, k))
+    except ValueError as error:
+        raise InputError(f"mixed directions: scaled must broadcast to {n}x{k}, got {np.shape(scaled)}") from error
 
 
 def _unknowns(n: int, epipolar: EpipolarNormals | None) -> tuple[FloatArray, FloatArray]:

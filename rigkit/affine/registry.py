@@ -76,6 +76,28 @@ def affines_from_directions(
     if F21 is not None and epipolar is None and needs_epipolar(method):
         epipolar = _epipolar_of(directions, F21)
     _check(directions, method, epipolar, scale, determinant, epipolar_rows, noise)
+    A21, conditioning, use = _solved(directions, method, epipolar, scale, determinant, min_conditioning)
+    if epipolar is not None and needs_epipolar(method) and epipolar_rows == "soft":
+        A21 = soft_epipolar(directions, use, epipolar)
+    with np.errstate(invalid="ignore"):
+        valid = (use.sum(axis=1) >= _AT_LEAST[method]) & (conditioning >= min_conditioning)
+    valid &= finite(A21)
+    A21[~valid] = np.nan
+    covariance = None
+    if noise is not None:
+        covariance = _covariance(directions, method, use, valid, A21, epipolar, scale, determinant is not None, noise)
+    return Affinities(A21, valid, conditioning, covariance)
+
+
+def _solved(
+    directions: DirectionPairs,
+    method: str,
+    epipolar: EpipolarNormals | None,
+    scale: str,
+    determinant: FloatArray | None,
+    min_conditioning: float,
+) -> tuple[Affines, FloatArray, BoolArray]:
+    """Return affinities (N, 2, 2), conditioning (N,) and which directions were used (N, K), a block at a time."""
     n = len(directions.valid)
     A21 = np.full((n, 2, 2), np.nan)
     conditioning = np.full(n, np.nan)
@@ -96,16 +118,7 @@ def affines_from_directions(
             a, conditioning[block] = scaled_block(planar)
         use[block] = planar.use.T
         A21[block] = a.T.reshape(-1, 2, 2)
-    if epipolar is not None and needs_epipolar(method) and epipolar_rows == "soft":
-        A21 = soft_epipolar(directions, use, epipolar)
-    with np.errstate(invalid="ignore"):
-        valid = (use.sum(axis=1) >= _AT_LEAST[method]) & (conditioning >= min_conditioning)
-    valid &= finite(A21)
-    A21[~valid] = np.nan
-    covariance = None
-    if noise is not None:
-        covariance = _covariance(directions, method, use, valid, A21, epipolar, scale, determinant is not None, noise)
-    return Affinities(A21, valid, conditioning, covariance)
+    return A21, conditioning, use
 
 
 def _covariance(

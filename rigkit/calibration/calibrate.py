@@ -97,11 +97,7 @@ def calibrate(
     DegenerateError
         The views do not determine the camera.
     """
-    if board not in (*SHAPES, "auto"):
-        raise InputError(f"board shape '{board}' is unknown; known: auto, {', '.join(SHAPES)}")
-    if folds < 0 or folds == 1:
-        raise InputError(f"cross-validation in {folds} folds: give 2 or more, or 0 for none")
-    wanted = _wanted(model, degree)
+    wanted = _wanted(model, degree, board, folds)
     used, dropped = usable_views(views, size_px)
     observations = Observations.from_views(used)
     options, failed = _fit_all(observations, size_px, wanted, progress)
@@ -127,17 +123,25 @@ def calibrate(
         chosen = _choose(observations, shapes)
         candidates += [*(c for c in _described(shapes, chosen) if "board" in c.name), *spared]
     result = assemble(observations, chosen.fit, chosen.heldout_px, dropped, tuple(candidates))
-    points, _ = chosen.fit.state.points_in_cam(observations)
-    at_corners = uncertainty_at_corners(result, points[chosen.fit.kept])
+    also = [] if model == "auto" else _at_the_end(beyond, result)
+    moved = moved_lens(observations, chosen.fit) if folds else ()
+    return _judged(result, observations, chosen.fit, [*moved, *also])
+
+
+def _judged(result: Calibration, observations: Observations, fit: Fit, also: Sequence[Finding]) -> Calibration:
+    """Return the result with its verdicts. Raises DegenerateError where the views do not determine the camera."""
+    points, _ = fit.state.points_in_cam(observations)
+    at_corners = uncertainty_at_corners(result, points[fit.kept])
     require_determined(result, at_corners)
-    also = [
-        *(moved_lens(observations, chosen.fit) if folds else ()),
-        *(_at_the_end(beyond, result) if model != "auto" else ()),
-    ]
     return replace(result, verdicts=judge(result, also, at_corners_px=at_corners))
 
 
-def _wanted(model: str, degree: int | None) -> list[tuple[str, type[Camera], int | None]]:
+def _wanted(model: str, degree: int | None, board: str, folds: int) -> list[tuple[str, type[Camera], int | None]]:
+    """Return name, camera model and size of what is to be fitted. Raises InputError for options without a meaning."""
+    if board not in (*SHAPES, "auto"):
+        raise InputError(f"board shape '{board}' is unknown; known: auto, {', '.join(SHAPES)}")
+    if folds < 0 or folds == 1:
+        raise InputError(f"cross-validation in {folds} folds: give 2 or more, or 0 for none")
     if degree is not None:
         check_order(model, degree)
     names = list(MODELS) if model == "auto" else [model]

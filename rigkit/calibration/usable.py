@@ -115,7 +115,8 @@ def views_of_image(
             other.append(f"{found.columns}x{found.rows}")
             continue
         name = _part_name(parent.board_id, image, k + 1 if len(detections) > 1 else None)
-        part = Board(name, turned.columns, turned.rows, parent.square_x_mm, parent.square_y_mm, parent.square_sigma_mm)
+        sides = parent.square_x_mm, parent.square_y_mm
+        part = Board(name, turned.columns, turned.rows, *sides, square_sigma_mm=parent.square_sigma_mm)
         views.append(BoardView(image, part, turned.grid, turned.pixels, turned.sigma_px))
     if views:
         return views, None

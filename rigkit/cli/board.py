@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
             raise InputError("board: --square-mm is missing; give the side of a square, such as --square-mm 30")
         if measured:
             raise InputError("board: a measured print belongs to a board file; give BOARD.toml instead of a size")
-        board = Board("board", int(size[1]), int(size[2]), args.square_mm, args.square_mm, None, _markers(args))
+        board = Board("board", int(size[1]), int(size[2]), args.square_mm, args.square_mm, markers=_markers(args))
     elif args.charuco or args.marker_mm is not None or args.first_marker or args.legacy:
         raise InputError("board: a board file says itself what markers it has; give a size such as 9x6 with --charuco")
     elif measured:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
 
@@ -57,6 +57,7 @@ class Board:
     rows: int
     square_x_mm: float
     square_y_mm: float
+    _: KW_ONLY
     square_sigma_mm: float | None = None
     markers: Markers | None = None
 

@@ -96,7 +96,7 @@ def board_from_table(table: TomlTable, default_id: str) -> Board:
     if table.has("square_sigma_mm"):
         sigma = table.number("square_sigma_mm", hint="square_sigma_mm = 0.05")
     try:
-        board = Board(board_id, columns, rows, x, y, sigma, _markers(table))
+        board = Board(board_id, columns, rows, x, y, square_sigma_mm=sigma, markers=_markers(table))
         marker_rectangles(board)
     except InputError as error:
         raise error if str(table.path) in str(error) else table.error(f"{error}; correct the board") from error

@@ -164,23 +164,25 @@ def manifest_text(
     ]
     boards = ", ".join(f'"plane{n}"' for n in range(1, len(most) + 1))
     for pair in pairs:
-        seen = " and ".join(_words(s) for s in (pair.first, pair.second))
-        out += [f"# Complete boards found: {seen}.", "[[pairs]]", f'id = "{pair.name}"']
-        out += ['camera1 = "camera"', 'camera2 = "camera"']
-        out += [
-            f"image{i} = {_quoted(_relative(s.image, root))}" for i, s in enumerate((pair.first, pair.second), start=1)
-        ]
-        out += [f'pose_type = "{pose_types[pair.name]}"', f"boards = [{boards}]", "", "[pairs.truth]"]
-        if pair.name in baselines:
-            value, sigma = baselines[pair.name]
-            out.append(f'baseline = {{ value_mm = {value:g}, sigma_mm = {sigma:g}, how = "as told to rigkit init" }}')
-        else:
-            out.append('# baseline = { value_mm = 300.0, sigma_mm = 2.0, how = "steel rule between tripod marks" }')
-        out.append(
-            '# angles = [ { a = "plane1", b = "plane2", value_deg = 90.0, sigma_deg = 0.3, how = "set square" } ]'
-        )
-        out.append("")
+        out += _pair_lines(pair, root, pose_types[pair.name], boards, baselines.get(pair.name))
     return "\n".join(out)
+
+
+def _pair_lines(
+    pair: FoundPair, root: Path, pose_type: str, boards: str, baseline: tuple[float, float] | None
+) -> list[str]:
+    seen = " and ".join(_words(s) for s in (pair.first, pair.second))
+    out = [f"# Complete boards found: {seen}.", "[[pairs]]", f'id = "{pair.name}"']
+    out += ['camera1 = "camera"', 'camera2 = "camera"']
+    out += [f"image{i} = {_quoted(_relative(s.image, root))}" for i, s in enumerate((pair.first, pair.second), start=1)]
+    out += [f'pose_type = "{pose_type}"', f"boards = [{boards}]", "", "[pairs.truth]"]
+    if baseline is not None:
+        value, sigma = baseline
+        out.append(f'baseline = {{ value_mm = {value:g}, sigma_mm = {sigma:g}, how = "as told to rigkit init" }}')
+    else:
+        out.append('# baseline = { value_mm = 300.0, sigma_mm = 2.0, how = "steel rule between tripod marks" }')
+    out.append('# angles = [ { a = "plane1", b = "plane2", value_deg = 90.0, sigma_deg = 0.3, how = "set square" } ]')
+    return [*out, ""]
 
 
 def _quoted(text: str) -> str:

@@ -172,7 +172,8 @@ def _placed(entry: dict[str, Any], path: str | Path) -> MountedBoard:
         raise InputError(f"'{path}': a board must have the keys {', '.join(sorted(BOARD_KEYS))}, and no others")
     (columns, rows), (along_x, along_y), sigma = entry["size"], entry["square_mm"], entry["square_sigma_mm"]
     known = None if sigma is None else real(sigma)
-    board = Board(str(entry["board_id"]), whole(columns), whole(rows), real(along_x), real(along_y), known)
+    size = whole(columns), whole(rows)
+    board = Board(str(entry["board_id"]), *size, real(along_x), real(along_y), square_sigma_mm=known)
     return MountedBoard(board, np.array(entry["points_mm"]), Rigid3.from_matrix(entry["target_from_board"]))
 
 

@@ -151,25 +151,7 @@ def reconstruct_from(
     pair, metric = geometry.pair, geometry.metric
     affinities = _affinities(pair, affine_method, geometry.E21, scale)
     matches = pair.matches.with_affinities(affinities.A21, affinities.sigma_A)
-    affines: Callable[[EpipolarNormals], Affines] | None = None
-    if needs_epipolar(affine_method):
-
-        def affines(epipolar: EpipolarNormals) -> Affines:
-            return affines_from_directions(pair.directions, affine_method, epipolar=epipolar).A21
-
-    try:
-        cloud, kept = oriented_cloud(
-            geometry.points,
-            pair.matches,
-            metric.cam2_from_cam1,
-            metric.covariance,
-            affinities,
-            affines=affines,
-            colours=colours_at(image1, pair.captured.pixels1),
-            board_ids=tuple(board.board_id for board in pair.boards),
-        )
-    except DegenerateError as error:
-        raise DegenerateError(f"pair '{pair.pair_id}': {error}") from error
+    cloud, kept = _cloud(geometry, affinities, affine_method, image1)
     notes = geometry.notes
     if not kept.all():
         lost = int((~kept).sum())
@@ -196,6 +178,32 @@ def reconstruct_from(
         geometry=geometry,
         kept=kept,
     )
+
+
+def _cloud(
+    geometry: PairGeometry, affinities: Affinities, affine_method: str, image1: NDArray[np.generic] | None
+) -> tuple[OrientedCloud, BoolArray]:
+    """Return the oriented cloud and which corners are in it. Raises DegenerateError where it would be empty."""
+    pair = geometry.pair
+    affines: Callable[[EpipolarNormals], Affines] | None = None
+    if needs_epipolar(affine_method):
+
+        def affines(epipolar: EpipolarNormals) -> Affines:
+            return affines_from_directions(pair.directions, affine_method, epipolar=epipolar).A21
+
+    try:
+        return oriented_cloud(
+            geometry.points,
+            pair.matches,
+            geometry.metric.cam2_from_cam1,
+            geometry.metric.covariance,
+            affinities,
+            affines=affines,
+            colours=colours_at(image1, pair.captured.pixels1),
+            board_ids=tuple(board.board_id for board in pair.boards),
+        )
+    except DegenerateError as error:
+        raise DegenerateError(f"pair '{pair.pair_id}': {error}") from error
 
 
 def on_lattice(reconstruction: Reconstruction, planes: LatticePlanes) -> Reconstruction:

@@ -108,29 +108,14 @@ def reconstruct_scene(
     DegenerateError
         Too few of them agree with any pose; no baseline.
     """
-    _check(correspondences, baseline_mm, pair_id)
-    matches, seen = correspondences.matches(camera1, camera2)
-    if len(matches) < MIN_MATCHES:
-        raise InputError(
-            f"'{pair_id}': {len(matches)} of {len(seen)} correspondences lie in both cameras' fields of view; at "
-            f"least {MIN_MATCHES} are needed"
-        )
+    matches, seen = _matches(correspondences, camera1, camera2, baseline_mm, pair_id)
     try:
         fit = _fit(matches, PoseType(pose_type), level_sigma_rad, np.random.default_rng(seed))
         affinities = _affinities(correspondences.select(seen), fit)
-        cloud, kept = _cloud(fit, affinities, baseline_mm, image1)
+        cloud, chosen = _cloud(fit, affinities, baseline_mm, image1)
     except DegenerateError as error:
         raise DegenerateError(f"'{pair_id}': {error}") from error
     scale = 1.0 if baseline_mm is None else baseline_mm
-    notes = list(fit.notes)
-    if not seen.all():
-        notes.append(f"{int((~seen).sum())} correspondences lie outside the calibrated field of view")
-    if baseline_mm is None:
-        notes.append("no baseline is given: lengths are in baselines, not in mm")
-    chosen = np.flatnonzero(kept)
-    inliers = np.zeros(len(seen), dtype=bool)
-    inliers[np.flatnonzero(seen)[fit.inliers]] = True
-    by_affinities = fit.matches.with_affinities(affinities.A21, fit.matches.sigma_A)
     reconstruction = Reconstruction(
         pair_id=pair_id,
         pose_type=fit.pose_type,
@@ -138,7 +123,7 @@ def reconstruct_scene(
         camera1=camera1,
         camera2=camera2,
         boards=(),
-        matches=by_affinities.select(chosen),
+        matches=fit.matches.with_affinities(affinities.A21, fit.matches.sigma_A).select(chosen),
         pixels1=matches.pixels1[chosen],
         pixels2=matches.pixels2[chosen],
         cam2_from_cam1=_scaled(fit.refined.cam2_from_cam1, scale),
@@ -148,18 +133,57 @@ def reconstruct_scene(
         baseline_mm=scale,
         baseline_sigma_mm=0.0,
         sampson_rms_px=fit.refined.sampson_rms_px,
-        notes=tuple(notes),
+        notes=_notes(fit, seen, baseline_mm),
         level_sigma_rad=fit.level_sigma_rad,
     )
+    return _with_scatter(reconstruction, fit, np.flatnonzero(seen), chosen, len(seen), metric=baseline_mm is not None)
+
+
+def _with_scatter(
+    reconstruction: Reconstruction,
+    fit: _ScenePose,
+    seen: NDArray[np.int64],
+    chosen: NDArray[np.int64],
+    count: int,
+    *,
+    metric: bool,
+) -> SceneReconstruction:
+    """Return the reconstruction with what refers to the `count` correspondences: `seen` of them have matches, `chosen`
+    of these are in the cloud."""
+    inliers = np.zeros(count, dtype=bool)
+    inliers[seen[fit.inliers]] = True
     sigma_A = fit.matches.sigma_A
     return SceneReconstruction(
         reconstruction,
-        baseline_mm is not None,
+        metric,
         inliers,
-        np.flatnonzero(seen)[chosen],
+        seen[chosen],
         float(np.median(fit.matches.sigma1_px[fit.inliers])),
         float("nan") if sigma_A is None else float(np.median(sigma_A[fit.inliers])),
     )
+
+
+def _matches(
+    correspondences: Correspondences, camera1: Camera, camera2: Camera, baseline_mm: float | None, pair_id: str
+) -> tuple[Matches, BoolArray]:
+    """Return the matches and which of the correspondences have one. Raises InputError where these cannot be used."""
+    _check(correspondences, baseline_mm, pair_id)
+    matches, seen = correspondences.matches(camera1, camera2)
+    if seen.sum() < MIN_MATCHES:
+        raise InputError(
+            f"'{pair_id}': {int(seen.sum())} of {len(seen)} correspondences lie in both cameras' fields of view; at "
+            f"least {MIN_MATCHES} are needed"
+        )
+    return matches, seen
+
+
+def _notes(fit: _ScenePose, seen: BoolArray, baseline_mm: float | None) -> tuple[str, ...]:
+    notes = list(fit.notes)
+    if not seen.all():
+        notes.append(f"{int((~seen).sum())} correspondences lie outside the calibrated field of view")
+    if baseline_mm is None:
+        notes.append("no baseline is given: lengths are in baselines, not in mm")
+    return tuple(notes)
 
 
 def _check(correspondences: Correspondences, baseline_mm: float | None, pair_id: str) -> None:
@@ -333,22 +357,18 @@ def _affinities(found: Correspondences, fit: _ScenePose) -> Affinities:
 
 def _cloud(
     fit: _ScenePose, affinities: Affinities, baseline_mm: float | None, image1: NDArray[np.generic] | None
-) -> tuple[OrientedCloud, BoolArray]:
+) -> tuple[OrientedCloud, NDArray[np.int64]]:
+    """Return the cloud and which matches are in it."""
     scale = 1.0 if baseline_mm is None else baseline_mm
-    pose, covariance = (
-        _scaled(fit.refined.cam2_from_cam1, scale),
-        _scaled_covariance(fit.refined.covariance, scale),
-    )
+    pose = _scaled(fit.refined.cam2_from_cam1, scale)
+    covariance = _scaled_covariance(fit.refined.covariance, scale)
     points = triangulate_matches(fit.matches, pose, covariance)
     colours = colours_at(image1, fit.matches.pixels1)
     cloud, kept = oriented_cloud(points, fit.matches, pose, covariance, affinities, colours=colours)
     sure = cloud.sigma_mm < MAX_RANGE_SIGMA * np.linalg.norm(cloud.points_mm, axis=1)
     if not sure.any():
         raise DegenerateError("no point's distance is known; the baseline is too short for this scene")
-    which = np.flatnonzero(kept)[sure]
-    kept = np.zeros_like(kept)
-    kept[which] = True
-    return _select(cloud, sure), kept
+    return _select(cloud, sure), np.flatnonzero(kept)[sure]
 
 
 def _select(cloud: OrientedCloud, which: BoolArray) -> OrientedCloud:

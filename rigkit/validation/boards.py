@@ -59,7 +59,7 @@ class Placed:
         return np.asarray(np.sum(points * self.normal, axis=-1) - self.offset_mm)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class BoardResult:
     """What was reconstructed of one board.
 
@@ -148,12 +148,12 @@ def measure_board(
     _, along, down = lattice.steps_mm
     x, y = float(np.linalg.norm(along)), float(np.linalg.norm(down))
     return BoardResult(
-        board,
-        plane,
-        lattice,
-        normal_errors(normals, plane.normal),
-        x / board.square_x_mm,
-        y / board.square_y_mm,
-        float(np.rad2deg(np.arcsin(np.clip(abs(along @ down) / (x * y), 0.0, 1.0)))),
-        bool(np.cross(along, down) @ plane.normal < 0.0),
+        board=board,
+        plane=plane,
+        lattice=lattice,
+        normal_errors=normal_errors(normals, plane.normal),
+        square_x_ratio=x / board.square_x_mm,
+        square_y_ratio=y / board.square_y_mm,
+        skew_deg=float(np.rad2deg(np.arcsin(np.clip(abs(along @ down) / (x * y), 0.0, 1.0)))),
+        right_handed=bool(np.cross(along, down) @ plane.normal < 0.0),
     )

@@ -67,7 +67,7 @@ class AngleResult:
         return abs(self.lattice_deg - self.measured_deg)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class ValidationReport:
     """The verdict on one pair with one affine estimator. It cannot be built without a check.
 
@@ -238,22 +238,22 @@ def _report(
     unchecked += unheld
     stated = {frozenset((angle.a, angle.b)): angle.value_deg for angle in truth.angles}
     return ValidationReport(
-        reconstruction.pair_id,
-        str(reconstruction.pose_type),
-        reconstruction.affine_method,
-        tuple(checks),
-        tuple(unchecked),
-        tuple(measured.boards.values()),
-        tuple(
+        pair_id=reconstruction.pair_id,
+        pose_type=str(reconstruction.pose_type),
+        affine_method=reconstruction.affine_method,
+        checks=tuple(checks),
+        unchecked=tuple(unchecked),
+        boards=tuple(measured.boards.values()),
+        angles=tuple(
             _angle_result(a, b, angles[frozenset((a, b))], stated.get(frozenset((a, b))), lattice)
             for a, b in combinations(measured.boards, 2)
         ),
-        reconstruction.baseline_mm,
-        baseline_sigma_mm,
-        reconstruction.sampson_rms_px,
-        len(cloud),
-        (*reconstruction.notes, *_outlier_notes(measured.boards.values())),
-        {} if lattice is None else _lattice_normal_errors(reconstruction, lattice),
+        baseline_mm=reconstruction.baseline_mm,
+        baseline_sigma_mm=baseline_sigma_mm,
+        sampson_rms_px=reconstruction.sampson_rms_px,
+        count=len(cloud),
+        notes=(*reconstruction.notes, *_outlier_notes(measured.boards.values())),
+        lattice_normal_errors={} if lattice is None else _lattice_normal_errors(reconstruction, lattice),
     )
 
 

@@ -40,7 +40,7 @@ CROSS_COVERAGE = 4.0
 false alarm, at three every third, at two each."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class IndependentMethod:
     """What another method found, beside ours.
 
@@ -277,10 +277,18 @@ def _method(
     excluded: int,
 ) -> IndependentMethod:
     ours = reconstruction.cam2_from_cam1
-    turn = float(np.rad2deg(rotation_angle(pose.rotation @ ours.rotation.T)))
-    direction = float(np.rad2deg(angle_between(pose.translation_mm, ours.translation_mm)))
-    baseline = float(np.linalg.norm(pose.translation_mm))
-    return IndependentMethod(name, pose, covariance, turn, direction, baseline, angles, rms_px, used, excluded)
+    return IndependentMethod(
+        name=name,
+        cam2_from_cam1=pose,
+        covariance=covariance,
+        rotation_difference_deg=float(np.rad2deg(rotation_angle(pose.rotation @ ours.rotation.T))),
+        direction_difference_deg=float(np.rad2deg(angle_between(pose.translation_mm, ours.translation_mm))),
+        baseline_mm=float(np.linalg.norm(pose.translation_mm)),
+        angles_deg=angles,
+        rms_px=rms_px,
+        used=used,
+        excluded=excluded,
+    )
 
 
 def _angles(measured: Measured) -> AnglesDeg:

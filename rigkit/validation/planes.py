@@ -45,7 +45,7 @@ NEWTON_STEPS, NEWTON_TOLERANCE = 100, 1e-10
 """Until it is near, a step doubles the noise's variance at least; then convergence is quadratic."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Plane:
     """The plane of a board.
 
@@ -298,17 +298,17 @@ def _plane(points: Points, weights: FloatArray, noise_mm2: FloatArray | None, us
     design = np.concatenate([np.ones((len(points), 1)), (points - centroid) @ axes[:, 1:]], axis=1)
     operator = np.linalg.solve((design.T * weights) @ design, design.T * weights)
     return Plane(
-        normal,
-        float(normal @ centroid),
-        centroid,
-        float(np.sqrt(np.mean(residuals**2))),
-        float(np.abs(residuals).max()),
-        len(points),
-        axes[:, 1:],
-        operator * noise_mm2 @ operator.T,
-        weights,
-        noise_mm2,
-        used,
+        normal=normal,
+        offset_mm=float(normal @ centroid),
+        centroid_mm=centroid,
+        rms_mm=float(np.sqrt(np.mean(residuals**2))),
+        peak_mm=float(np.abs(residuals).max()),
+        count=len(points),
+        tangents=axes[:, 1:],
+        scatter=operator * noise_mm2 @ operator.T,
+        weights=weights,
+        noise_mm2=noise_mm2,
+        used=used,
     )
 
 

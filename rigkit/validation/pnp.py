@@ -23,7 +23,7 @@ MIN_CORNERS_FOR_PNP = 8
 AnglesDeg = dict[tuple[str, str], tuple[float, float]]
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class PnpResult:
     """What the boards' own poses say.
 
@@ -66,7 +66,15 @@ def planar_pnp(reconstruction: Reconstruction) -> PnpResult:
     # Every pose takes six degrees of freedom from 2N residuals.
     free = 1.0 - 3.0 * len(poses) / total
     factor = square / free / _predicted_square(reconstruction, list(poses))
-    return PnpResult(pose, covariance, _angles(poses), float(np.sqrt(square)), factor, total, len(poses))
+    return PnpResult(
+        cam2_from_cam1=pose,
+        covariance=covariance,
+        angles_deg=_angles(poses),
+        rms_rad=float(np.sqrt(square)),
+        variance_factor=factor,
+        count=total,
+        boards=len(poses),
+    )
 
 
 def moved_pnp(moved: Sequence[Reconstruction]) -> tuple[tuple[Rigid3, AnglesDeg], ...]:

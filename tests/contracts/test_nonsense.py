@@ -46,7 +46,7 @@ def test_no_file_s_camera_has_a_focal_length_that_is_not_positive(
         (lambda: PINHOLE.unproject(np.zeros((2, 5))), r"\(2, 5\)"),
         (lambda: PINHOLE.on_image(np.zeros((4, 3))), r"\(4, 3\)"),
         (lambda: rigkit.Board("b", 9.5, 6, 30.0, 30.0), "whole numbers"),
-        (lambda: rigkit.Board("b", 9, 6, 30.0, 30.0, -1.0), "square_sigma_mm"),
+        (lambda: rigkit.Board("b", 9, 6, 30.0, 30.0, square_sigma_mm=-1.0), "square_sigma_mm"),
         (lambda: rigkit.PoseType("sideways"), "general, planar, standard, forward, auto"),
     ],
 )

@@ -20,7 +20,7 @@ from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics
 from rigkit.synthetic.scene import Panel, PlacedBoard
 
-BOARD = Board("c", 9, 6, 30.0, 30.0, None, Markers("DICT_5X5_100", 21.0))
+BOARD = Board("c", 9, 6, 30.0, 30.0, markers=Markers("DICT_5X5_100", 21.0))
 ROUNDED_LEVELS = 0.51
 """Our image is rounded to whole grey levels, OpenCV's enlarged drawing, averaged, is not."""
 
@@ -33,7 +33,7 @@ def errors(found: BoardDetection, truth: BoardDetection) -> np.ndarray:
 @pytest.mark.parametrize("legacy", [False, True])
 @pytest.mark.parametrize("size", [(6, 5), (6, 4)])
 def test_the_pattern_is_opencvs(size: tuple[int, int], legacy: bool) -> None:
-    board = Board("c", *size, 30.0, 30.0, None, Markers("DICT_4X4_50", 20.0, 3, legacy))
+    board = Board("c", *size, 30.0, 30.0, markers=Markers("DICT_4X4_50", 20.0, 3, legacy))
     camera = bench_camera("regular")
     square_px, border_px = 40, 40
     depth = camera.parameters[0] * 30.0 / square_px
@@ -100,7 +100,7 @@ def test_a_part_keeps_its_numbers(rng: np.random.Generator) -> None:
 def test_two_boards_of_one_size_are_told_apart_by_their_markers(rng: np.random.Generator) -> None:
     """Chessboards of this size would look alike, and the same turned by 180 degrees."""
     names = ("a", "b")
-    boards = [Board(n, 5, 5, 30.0, 30.0, None, Markers("DICT_4X4_100", 21.0, 18 * k)) for k, n in enumerate(names)]
+    boards = [Board(n, 5, 5, 30.0, 30.0, markers=Markers("DICT_4X4_100", 21.0, 18 * k)) for k, n in enumerate(names)]
     camera = bench_camera("regular")
     turn = np.diag([-1.0, -1.0, 1.0])
     left = PlacedBoard(boards[0], Rigid3(turn, np.array([-20.0, 60.0, 500.0])))

@@ -53,30 +53,13 @@ def assemble_rig(
     shapes = {b.board_id: points[first_row[i] : first_row[i + 1]] for i, b in enumerate(boards)}
     cameras, squared = [], []
     for c, name in enumerate(names):
-        alone = state.of_camera(c, observations)
-        residuals = normal.residuals[c]
-        kept = observations.weights[c] > 0.0
-        squared.append((residuals.px**2).sum(axis=-1)[kept])
-        px = np.where(residuals.valid[..., None], residuals.px, np.nan)
-        poses = Rigid3.stack(alone.rotation, alone.translation_mm)
-        views = ViewResult.of_views(observations.cameras[c].views, poses, px, kept)
         frame = _frame_covariance(observations, joint, layout, c, covariance, back, own)
-        p = alone.camera.parameters.size
+        of_camera, of_corners = _of_camera(joint, c, single[c], frame)
+        squared.append(of_corners)
         of_camera = replace(
-            single[c],
-            camera=alone.camera,
-            rms_px=float(np.sqrt(squared[-1].mean())),
-            heldout_rms_px=heldout[1][c],
-            covariance=frame[:p, :p],
-            frame_covariance=frame,
-            overdispersion=overdispersion,
-            freedom=clustered.freedom,
-            views=views,
-            convergence=joint.solution.convergence,
-            boards=board_shapes(observations.cameras[c], observations.shape, state.unknowns),
+            of_camera, heldout_rms_px=heldout[1][c], overdispersion=overdispersion, freedom=clustered.freedom
         )
-        mount = Rigid3(state.mount_rotation[c], state.mount_mm[c])
-        cameras.append(RigCamera(name, mount, of_camera))
+        cameras.append(RigCamera(name, Rigid3(state.mount_rotation[c], state.mount_mm[c]), of_camera))
     everything = np.concatenate(squared)
     last = layout.mounts[-1] or layout.cameras[-1]
     # One ruler has measured all boards: its error does not average out.
@@ -97,6 +80,31 @@ def assemble_rig(
         scale_sigma=scale,
         board_rigs=_board_rigs(joint, layout, places, boards, shapes, covariance, scale),
     )
+
+
+def _of_camera(
+    joint: JointRig, c: int, single: Calibration, frame_covariance: FloatArray
+) -> tuple[Calibration, FloatArray]:
+    """Return the calibration of camera `c` as the rig has it, and the squared residuals of its corners, px^2."""
+    observations, state = joint.observations, joint.solution.state
+    alone = state.of_camera(c, observations)
+    residuals = joint.solution.normal.residuals[c]
+    kept = observations.weights[c] > 0.0
+    squared = (residuals.px**2).sum(axis=-1)[kept]
+    px = np.where(residuals.valid[..., None], residuals.px, np.nan)
+    poses = Rigid3.stack(alone.rotation, alone.translation_mm)
+    p = alone.camera.parameters.size
+    found = replace(
+        single,
+        camera=alone.camera,
+        rms_px=float(np.sqrt(squared.mean())),
+        covariance=frame_covariance[:p, :p],
+        frame_covariance=frame_covariance,
+        views=ViewResult.of_views(observations.cameras[c].views, poses, px, kept),
+        convergence=joint.solution.convergence,
+        boards=board_shapes(observations.cameras[c], observations.shape, state.unknowns),
+    )
+    return found, squared
 
 
 def residual_sigma(joint: JointRig) -> float:

@@ -91,20 +91,9 @@ def board_places(
         origin = known[first].inverse()
         for name, pose in known.items():
             places[name] = (first, origin @ pose)
-        open_scenes = 0
         for scene, reading in zip(scenes, readings, strict=True):
-            open_scenes += reading is None and len(scene) > 1
-            own = out[scene[0].camera]
-            old = [own.pop(entry.key) for entry in scene]
-            for k, (entry, before) in enumerate(zip(scene, old, strict=True)):
-                frame, board_id = before.frame, entry.key[1]
-                way = None if reading is None else reading.get(k)
-                if way is not None:
-                    own[(frame, way.board_id)] = replace(way, key=(frame, first))
-                    continue
-                # Its place on the target is not known: it stays a view of a board of its own.
-                alone = f"{frame}, camera {entry.camera + 1} alone"
-                own[(alone, board_id)] = replace(before, key=(alone, board_id))
+            _rename(out[scene[0].camera], scene, reading, first)
+        open_scenes = sum(r is None and len(s) > 1 for s, r in zip(scenes, readings, strict=True))
         if open_scenes:
             notes.append(
                 Finding(
@@ -114,6 +103,20 @@ def board_places(
                 )
             )
     return out, places, tuple(notes)
+
+
+def _rename(own: FrameObservations, scene: Sequence[_BoardSeen], reading: Reading | None, target: str) -> None:
+    """Give the boards of one scene, in the observations of their camera, their names and the key of their target."""
+    old = [own.pop(entry.key) for entry in scene]
+    for k, (entry, before) in enumerate(zip(scene, old, strict=True)):
+        frame, board_id = before.frame, entry.key[1]
+        way = None if reading is None else reading.get(k)
+        if way is not None:
+            own[(frame, way.board_id)] = replace(way, key=(frame, target))
+            continue
+        # Its place on the target is not known: it stays a view of a board of its own.
+        alone = f"{frame}, camera {entry.camera + 1} alone"
+        own[(alone, board_id)] = replace(before, key=(alone, board_id))
 
 
 def _never_read(

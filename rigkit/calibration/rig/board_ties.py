@@ -76,7 +76,8 @@ def _by_size(views: Sequence[tuple[str, BoardView]], calibration: Calibration) -
             kind = f"{board.columns}x{board.rows}"
             count[entry.frame, kind] += 1
             name = f"{kind} number {count[entry.frame, kind]}"
-            board = Board(name, *board.size, board.square_x_mm, board.square_y_mm, board.square_sigma_mm)
+            sides = board.square_x_mm, board.square_y_mm
+            board = Board(name, *board.size, *sides, square_sigma_mm=board.square_sigma_mm)
         key = (entry.frame, name)
         out[key] = replace(entry, view=replace(entry.view, board=board), key=key)
     return out
