@@ -18,15 +18,20 @@ IMAGE_SIZE = re.compile(r"^(\d+)[xX](\d+)$")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("image", metavar="IMAGE", help="an image as the camera took it")
+    parser.add_argument("image", metavar="IMAGE|FOLDER", help="as the camera took it, or a folder of such images")
     parser.add_argument(
-        "image2", metavar="IMAGE2", nargs="?", help="taken at once by another camera of the rig: stereo"
+        "image2", metavar="IMAGE2|FOLDER2", nargs="?", help="taken at once by another camera of the rig: stereo"
     )
     parser.add_argument("--camera", metavar="CALIB", help="the camera's calibration.json")
-    parser.add_argument("-o", "--output", required=True, metavar="OUT", help="the image to write (.png, .tif, .jpg)")
+    parser.add_argument(
+        "-o", "--output", required=True, metavar="OUT", help="image (.png, .tif, .jpg) or folder to write"
+    )
+    parser.add_argument("--maps", type=Path, metavar="FILE.npz", help="also the geometry: K, P, Q, maps for cv2.remap")
     parser.add_argument("--force", action="store_true", help="replace an existing file")
     parser.add_argument("--json", action="store_true", help="the result for programs, on stdout")
-    stereo = parser.add_argument_group("stereo", "writes OUT-1 and OUT-2, in which a point has the same row")
+    stereo = parser.add_argument_group(
+        "stereo", "writes OUT-1 and OUT-2 (of folders: OUT/ONE/... and OUT/TWO/...), in which a point has the same row"
+    )
     stereo.add_argument("--rig", metavar="RIG", help="the rig's file, instead of --camera")
     stereo.add_argument(
         "--names", nargs=2, metavar=("ONE", "TWO"), help="cameras of the two images (default: the rig's first two)"
@@ -47,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import print_json
+    from rigkit.cli.console import print_json, progress_on_stderr
     from rigkit.workflows.rectify import RectifyOptions, rectify_image, rectify_stereo_images
 
     options = RectifyOptions(
@@ -57,18 +62,26 @@ def run(args: argparse.Namespace) -> int:
         angles_deg=(args.yaw_deg, args.pitch_deg, args.roll_deg),
         size_px=_size(args.size),
         interpolation=args.interpolation,
+        maps=args.maps,
         force=args.force,
     )
     if args.image2 is None and args.rig is None:
         if args.camera is None:
             raise InputError("rectify: --camera is missing; give the camera's calibration.json")
-        one = rectify_image(args.image, args.camera, options)
-        print_json(_summary(one, args.projection)) if args.json else print(_words(one, args.projection))
+        written = rectify_image(args.image, args.camera, options, progress=progress_on_stderr())
+        if args.json:
+            found = [_summary(one, args.projection) for one in written]
+            print_json({"images": found} if Path(args.image).is_dir() else found[0])
+            return 0
+        for one in written:
+            print(_words(one, args.projection))
         return 0
     if args.image2 is None or args.rig is None:
         raise InputError("rectify: a stereo pair needs two images and --rig RIG.json")
     names = None if args.names is None else tuple(args.names)
-    done, pair = rectify_stereo_images((args.image, args.image2), args.rig, options, names)
+    done, pair = rectify_stereo_images(
+        (args.image, args.image2), args.rig, options, names, progress=progress_on_stderr()
+    )
     baseline = pair.rect2_from_rect1.translation_mm.tolist()
     if args.json:
         print_json({"images": [_summary(one, args.projection) for one in done], "rect2_from_rect1_mm": baseline})

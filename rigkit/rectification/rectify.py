@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -23,6 +23,10 @@ ROTATION_INPUT_TOLERANCE = 1e-6
 """A matrix further than this from orthonormal is a mistake, not rounding."""
 CHUNK_PIXELS = 1 << 18
 """Pixels resampled at a time: bounds the memory of large targets."""
+MAX_KEPT_SAMPLES = 8_000_000
+"""Of a map that is used for several images: 24 bytes each."""
+_Band = tuple[NDArray[np.int64], list[tuple[Pixels, BoolArray]]]
+"""Rows of the target, and for each sample of its pixels where the seen ones come from, and which are seen."""
 MAX_SUPERSAMPLING = 8
 """Samples a pixel and axis at the most, where a target shows the source much smaller."""
 
@@ -82,8 +86,61 @@ class RectifyMap:
         antialias : where the target shows the source smaller, average several samples a pixel instead of skipping
             source pixels.
         fill : value where the camera does not see, or has no pixel.
+
+        Raises InputError for an image of another size than the camera's.
         """
-        image = np.asarray(image)
+        bands = self._sampled_bands(self._supersampling() if antialias else 1)
+        return self._resampled(np.asarray(image), interpolation, bands, fill)
+
+    def images(
+        self,
+        images: Iterable[NDArray[Any]],
+        *,
+        interpolation: Interpolation = "spline",
+        antialias: bool = True,
+        fill: float = 0.0,
+    ) -> Iterator[NDArray[Any]]:
+        """Yield each image as `target` sees it, as `image` does; where it fits in memory, the map is computed once."""
+        samples = self._supersampling() if antialias else 1
+        keeps = samples * samples * self.target.size_px[0] * self.target.size_px[1] <= MAX_KEPT_SAMPLES
+        kept: list[_Band] = []
+        for image in images:
+            bands: Iterable[_Band] = kept or self._sampled_bands(samples)
+            if keeps and not kept:
+                bands = kept = list(bands)
+            yield self._resampled(np.asarray(image), interpolation, bands, fill)
+
+    def maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return the columns and rows (h, w) of the camera's image that the target's pixels come from, as cv2.remap
+        takes them; -1 where the camera does not see."""
+        source, seen = self._sources()
+        source = np.where(seen[..., None], source, -1.0).astype(np.float32)
+        return np.ascontiguousarray(source[..., 0]), np.ascontiguousarray(source[..., 1])
+
+    def _sources(self) -> tuple[Pixels, BoolArray]:
+        """Return where each pixel (h, w) of the target comes from, and whether the camera sees it."""
+        columns, rows = self.target.size_px
+        grid = np.stack(np.meshgrid(np.arange(columns, dtype=np.float64), np.arange(rows, dtype=np.float64)), axis=-1)
+        source, valid = self.source_pixels(grid)
+        return source, valid & self.camera.on_image(source)
+
+    def _sampled_bands(self, samples: int) -> Iterator[_Band]:
+        """Yield the rows of each band of the target, and for each of its samples where they come from."""
+        columns, rows = self.target.size_px
+        shifts = (np.arange(samples) + 0.5) / samples - 0.5
+        for band in _bands(rows, columns):
+            grid = np.stack(np.meshgrid(np.arange(columns, dtype=np.float64), band.astype(np.float64)), axis=-1)
+            found = []
+            for dv in shifts:
+                for du in shifts:
+                    source, valid = self.source_pixels(grid + np.array([du, dv]))
+                    valid &= self.camera.on_image(source)
+                    found.append((source[valid], valid))
+            yield band, found
+
+    def _resampled(
+        self, image: NDArray[Any], interpolation: Interpolation, bands: Iterable[_Band], fill: float
+    ) -> NDArray[Any]:
         width, height = self.camera.size_px
         if image.shape[:2] != (height, width) or image.ndim not in (2, 3):
             raise InputError(
@@ -91,22 +148,16 @@ class RectifyMap:
                 f"calibrated at {width} x {height}; take the image size of the calibration"
             )
         sampler = _Sampler(image, interpolation)
-        samples = self._supersampling() if antialias else 1
         columns, rows = self.target.size_px
         out = np.empty((rows, columns, *image.shape[2:]), dtype=np.float64)
-        shifts = (np.arange(samples) + 0.5) / samples - 0.5
-        for band in _bands(rows, columns):
-            grid = np.stack(np.meshgrid(np.arange(columns, dtype=np.float64), band.astype(np.float64)), axis=-1)
-            total = np.zeros((*grid.shape[:2], *image.shape[2:]))
-            weight = np.zeros(grid.shape[:2])
-            for dv in shifts:
-                for du in shifts:
-                    source, valid = self.source_pixels(grid + np.array([du, dv]))
-                    valid &= self.camera.on_image(source)
-                    total[valid] += sampler(source[valid])
-                    weight += valid
+        for band, found in bands:
+            total = np.zeros((len(band), columns, *image.shape[2:]))
+            weight = np.zeros((len(band), columns))
+            for source, valid in found:
+                total[valid] += sampler(source)
+                weight += valid
             # Half of the samples decide whether the pixel is seen: the border neither grows nor frays.
-            seen = weight >= 0.5 * samples * samples
+            seen = weight >= 0.5 * len(found)
             mean = total[seen] / weight[seen].reshape(-1, *(1,) * (image.ndim - 2))
             out[band] = fill
             out[band[0] : band[-1] + 1][seen] = mean
@@ -114,10 +165,7 @@ class RectifyMap:
 
     def coverage(self) -> BoolArray:
         """Say which pixels (h, w) of the target the camera sees."""
-        columns, rows = self.target.size_px
-        grid = np.stack(np.meshgrid(np.arange(columns, dtype=np.float64), np.arange(rows, dtype=np.float64)), axis=-1)
-        source, valid = self.source_pixels(grid)
-        return valid & self.camera.on_image(source)
+        return self._sources()[1]
 
     def _supersampling(self) -> int:
         """Samples a pixel and axis: source pixels per target pixel, where it is large (90 % quantile)."""

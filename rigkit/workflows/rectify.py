@@ -1,7 +1,8 @@
-"""Images as an ideal camera would have taken them: one, or two of a rig whose rows correspond."""
+"""Images as an ideal camera would have taken them: one or a folder, or two of a rig whose rows correspond."""
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -11,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.errors import InputError
-from rigkit.io.files import ensure_writable, write_together
+from rigkit.core.progress import Progress, silent
+from rigkit.io.files import ensure_writable, write_atomic, write_together
 from rigkit.io.images import read_image
 from rigkit.rectification.rectify import RectifyMap, rectify_map, rotation_from_view_angles
 from rigkit.rectification.stereo import StereoRectification, rectify_pair
 from rigkit.rectification.targets import target_camera
 from rigkit.workflows.camera_files import import_camera, import_rig
+from rigkit.workflows.detect import IMAGE_ENDINGS
 
 __all__ = ["RectifiedImage", "RectifyOptions", "rectify_image", "rectify_stereo_images"]
 
@@ -28,7 +31,8 @@ class RectifyOptions:
     """The view, and where it goes; a stereo pair's view is decided by its baseline, but for the projection."""
 
     output: Path
-    """Image to write; of a pair, NAME-1 and NAME-2 beside it."""
+    """Image to write; of a pair, NAME-1 and NAME-2 beside it. Of a folder of images: the folder to write into; of two,
+    each camera's images into a folder of its name there."""
     projection: Literal["perspective", "cylindrical", "equirectangular"] = "perspective"
     """Of the view."""
     hfov_deg: float | None = None
@@ -39,6 +43,8 @@ class RectifyOptions:
     """Of the result; None: keeps the source's resolution."""
     interpolation: Literal["spline", "lanczos", "linear", "nearest"] = "spline"
     """Between pixels: spline keeps positions to a thousandth of a pixel, linear is quick."""
+    maps: Path | None = None
+    """npz file for the geometry: the target's K and rotation, maps for cv2.remap, and of a pair P1, P2 and Q (mm)."""
     force: bool = False
     """Replace files that exist; what was read is never replaced."""
 
@@ -52,19 +58,23 @@ class RectifiedImage:
     covered: float
 
 
-def rectify_image(image: str | Path, camera: str | Path, options: RectifyOptions) -> RectifiedImage:
-    """Write an image as an ideal camera would have taken it; `camera` is the calibration's file.
+def rectify_image(
+    image: str | Path, camera: str | Path, options: RectifyOptions, *, progress: Progress = silent
+) -> tuple[RectifiedImage, ...]:
+    """Write an image, or all of a folder, as an ideal camera would have taken them; `camera` is the calibration's file.
 
     Raises InputError for a view that the camera does not have, a damaged file, or one that cannot be written.
     """
-    _ensure_kind(options.output)
-    ensure_writable(options.output, force=options.force, inputs=(image, camera))
+    jobs = _outputs(Path(image), options.output)
+    _ensure_all([out for _, out in jobs], options, (*(source for source, _ in jobs), camera))
     source = import_camera(camera)
     hfov_rad = None if options.hfov_deg is None else np.radians(options.hfov_deg)
     target = target_camera(source, options.projection, hfov_rad=hfov_rad, size_px=options.size_px)
     rotation = rotation_from_view_angles(*np.radians(options.angles_deg))
     remap = rectify_map(source, target, target_from_cam=rotation)
-    return _write([(image, options.output, remap)], options)[0]
+    done = _write([(jobs, remap)], options, progress)
+    _write_maps([remap], None, options)
+    return done
 
 
 def rectify_stereo_images(
@@ -72,14 +82,16 @@ def rectify_stereo_images(
     rig: str | Path,
     options: RectifyOptions,
     names: tuple[str, str] | None = None,
+    *,
+    progress: Progress = silent,
 ) -> tuple[tuple[RectifiedImage, ...], StereoRectification]:
     """Write two images taken at once by cameras `names` of a rig's file (None: its first two) so that a point has the
-    same row in both; return what was written, and the geometry.
+    same row in both, or two folders of such images in the order of their names; return what was written, and the
+    geometry.
 
-    Raises InputError for cameras that are not there, angles or a size of the view, a damaged file, or one that cannot
-    be written.
+    Raises InputError for cameras that are not there, angles or a size of the view, folders with unlike numbers of
+    images, a damaged file, or one that cannot be written.
     """
-    _ensure_kind(options.output)
     if options.hfov_deg is not None or options.size_px is not None or any(options.angles_deg):
         raise InputError("rectify: the baseline decides the view of a stereo pair; leave out its angles and its size")
     cameras = import_rig(rig)
@@ -89,22 +101,85 @@ def rectify_stereo_images(
         raise InputError(f"'{rig}': no camera '{', '.join(missing)}'; there are {', '.join(cameras)}")
     (camera1, cam1_from_rig), (camera2, cam2_from_rig) = (cameras[name] for name in both)
     out = options.output
-    outputs = [out.with_name(f"{out.stem}-{i}{out.suffix}") for i in (1, 2)]
-    ensure_writable(outputs, force=options.force, inputs=(*images, rig))
+    if all(Path(image).is_dir() for image in images):
+        jobs = [_outputs(Path(image), out / name) for image, name in zip(images, both, strict=True)]
+        if len(jobs[0]) != len(jobs[1]):
+            counts = f"{len(jobs[0])} and {len(jobs[1])} images"
+            raise InputError(f"rectify: '{images[0]}' and '{images[1]}' have {counts}; leave those taken together")
+    else:
+        jobs = [[(Path(one), out.with_name(f"{out.stem}-{i}{out.suffix}"))] for i, one in enumerate(images, start=1)]
+    _ensure_all([to for job in jobs for _, to in job], options, (*(source for job in jobs for source, _ in job), rig))
     pair = rectify_pair(camera1, camera2, cam2_from_rig @ cam1_from_rig.inverse(), projection=options.projection)
-    return _write(list(zip(images, outputs, (pair.map1, pair.map2), strict=True)), options), pair
+    done = _write(list(zip(jobs, (pair.map1, pair.map2), strict=True)), options, progress)
+    _write_maps([pair.map1, pair.map2], pair, options)
+    return done, pair
 
 
-def _write(jobs: list[tuple[str | Path, Path, RectifyMap]], options: RectifyOptions) -> tuple[RectifiedImage, ...]:
-    """Resample all (image, output, map), then write all."""
-    covered = [float(remap.coverage().mean()) for _, _, remap in jobs]
+def _outputs(image: Path, output: Path) -> list[tuple[Path, Path]]:
+    """Return (image, where it goes): one, or those of a folder with their names in another."""
+    if not image.is_dir():
+        return [(image, output)]
+    found = sorted(path for path in image.iterdir() if path.suffix.lower() in IMAGE_ENDINGS)
+    if not found:
+        raise InputError(f"rectify: folder '{image}' has no images ({' '.join(sorted(IMAGE_ENDINGS))}); give another")
+    if output.suffix:
+        raise InputError(f"rectify: '{image}' is a folder, so -o names one too, not '{output.name}'")
+    return [(path, output / (path.name if cv2.haveImageWriter(path.name) else f"{path.stem}.png")) for path in found]
+
+
+def _ensure_all(outputs: list[Path], options: RectifyOptions, inputs: tuple[str | Path, ...]) -> None:
+    """Refuse what cannot be written, before the work."""
+    for path in outputs:
+        if not cv2.haveImageWriter(str(path)):
+            raise InputError(f"'{path}': images of the kind '{path.suffix}' cannot be written; take .png, .tif or .jpg")
+    maps = [] if options.maps is None else [options.maps]
+    ensure_writable([*outputs, *maps], force=options.force, inputs=inputs)
+
+
+def _write(
+    jobs: list[tuple[list[tuple[Path, Path]], RectifyMap]], options: RectifyOptions, progress: Progress
+) -> tuple[RectifiedImage, ...]:
+    """Resample and write the images of each map, one after the other; two images of a pair come together or not."""
+    covered = [float(remap.coverage().mean()) for _, remap in jobs]
     if min(covered) == 0.0:
         raise InputError("rectify: the camera sees nothing of this view; change --yaw-deg, --pitch-deg or --hfov-deg")
-    files: dict[Path, str | bytes] = {}
-    for image, output, remap in jobs:
-        files[output] = _encoded(remap.image(read_image(image), interpolation=options.interpolation), output)
-    write_together(files, force=options.force)
-    return tuple(RectifiedImage(out, remap, share) for (_, out, remap), share in zip(jobs, covered, strict=True))
+    total, done = len(jobs[0][0]), []
+    streams = [
+        remap.images((read_image(source) for source, _ in job), interpolation=options.interpolation)
+        for job, remap in jobs
+    ]
+    for i, seen in enumerate(zip(*streams, strict=True)):
+        files: dict[Path, str | bytes] = {}
+        for image, (job, remap), share in zip(seen, jobs, covered, strict=True):
+            files[job[i][1]] = _encoded(image, job[i][1])
+            done.append(RectifiedImage(job[i][1], remap, share))
+        write_together(files, force=options.force)
+        progress("rectify", i + 1, total)
+    return tuple(done)
+
+
+def _write_maps(maps: list[RectifyMap], pair: StereoRectification | None, options: RectifyOptions) -> None:
+    """Write the geometry as npz, where it is asked for."""
+    if options.maps is None:
+        return
+    target = maps[0].target
+    arrays: dict[str, NDArray[Any]] = {"size_px": np.array(target.size_px), "projection": np.array(options.projection)}
+    fx, fy, cx, cy = target.parameters[:4]
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    for i, remap in enumerate(maps, start=1):
+        end = "" if pair is None else str(i)
+        arrays[f"map_x{end}"], arrays[f"map_y{end}"] = remap.maps()
+        arrays[f"target_from_cam{end}"] = remap.target_from_cam
+    arrays["K"] = K
+    if pair is not None and options.projection == "perspective":
+        along = float(pair.rect2_from_rect1.translation_mm[0])
+        arrays["P1"], arrays["P2"] = np.hstack([K, np.zeros((3, 1))]), np.hstack([K, K @ [[along], [0.0], [0.0]]])
+        arrays["Q"] = np.array(
+            [[1.0, 0, 0, -cx], [0, fx / fy, 0, -cy * fx / fy], [0, 0, 0, fx], [0, 0, -1.0 / along, 0]]
+        )
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+    write_atomic(options.maps, stream.getvalue(), force=options.force)
 
 
 def _encoded(image: NDArray[Any], path: Path) -> bytes:
@@ -113,9 +188,3 @@ def _encoded(image: NDArray[Any], path: Path) -> bytes:
         raise InputError(f"'{path}': a {suffix} file has no 16-bit pixels; write a .png or .tif")
     _, data = cv2.imencode(suffix, image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1]))
     return bytes(data)
-
-
-def _ensure_kind(path: Path) -> None:
-    """Refuse a kind of image that cannot be written, before the work."""
-    if not cv2.haveImageWriter(str(path)):
-        raise InputError(f"'{path}': images of the kind '{path.suffix}' cannot be written; take .png, .tif or .jpg")

@@ -121,6 +121,53 @@ def test_a_pair_gets_the_same_rows(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "--rig" in capsys.readouterr().err
 
 
+def test_folders_of_a_pair_are_rectified_with_their_geometry(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    poses = {"left": Rigid3.identity(), "right": Rigid3(exp_so3(np.array([0.05, -0.1, 0.2])), [-200.0, 20.0, 10.0])}
+    entries = []
+    rng = np.random.default_rng(1)
+    for name, pose in poses.items():
+        (tmp_path / name).mkdir()
+        for k in range(3):
+            cv2.imwrite(str(tmp_path / name / f"{k}.png"), rng.integers(0, 255, (120, 160), dtype=np.uint8))
+        matrix = pose.matrix()[:3].tolist()
+        entries.append({"name": name, "camera": camera_to_json(CAMERA), "cam_from_rig": matrix, "rms_px": 0.1})
+    rig, out, maps = tmp_path / "rig.json", tmp_path / "out", tmp_path / "maps.npz"
+    rig.write_text(json.dumps({"schema": "rigkit.rig/1", "cameras": entries}))
+    both = [str(tmp_path / "left"), str(tmp_path / "right")]
+    command = ["rectify", *both, "--rig", str(rig), "--interpolation", "linear"]
+    assert main([*command, "-o", str(out), "--maps", str(maps)]) == 0
+    assert sorted(str(p.relative_to(out)) for p in out.rglob("*.png")) == [
+        f"{name}/{k}.png" for name in poses for k in range(3)
+    ]
+    # One of the folder is what it is alone.
+    alone = [str(tmp_path / name / "2.png") for name in poses]
+    assert main(["rectify", *alone, "--rig", str(rig), "--interpolation", "linear", "-o", str(tmp_path / "a.png")]) == 0
+    for i, name in enumerate(poses, start=1):
+        one, other = cv2.imread(str(tmp_path / f"a-{i}.png"), 0), cv2.imread(str(out / name / "2.png"), 0)
+        assert one is not None and other is not None
+        np.testing.assert_array_equal(one, other)
+    # The file's P1, P2, Q and maps say of a point what the cameras say.
+    with np.load(maps) as geometry:
+        point = np.array([[150.0, 200.0, 900.0]])
+        seen = []
+        for i, (pose, P) in enumerate(zip(poses.values(), (geometry["P1"], geometry["P2"]), strict=True), start=1):
+            in_rect1 = geometry["target_from_cam1"] @ point[0]
+            u, v, w = P @ [*in_rect1, 1.0]
+            seen.append([u / w, v / w])
+            column, row = np.rint(seen[-1]).astype(int)
+            there = [geometry[f"map_x{i}"][row, column], geometry[f"map_y{i}"][row, column]]
+            np.testing.assert_allclose(there, CAMERA.project(pose.apply(point))[0][0], atol=1.0)
+        assert seen[0][1] == pytest.approx(seen[1][1])
+        back = geometry["Q"] @ [*seen[0], seen[0][0] - seen[1][0], 1.0]
+        np.testing.assert_allclose(back[:3] / back[3], in_rect1, rtol=1e-9)
+    capsys.readouterr()
+    (tmp_path / "right" / "2.png").unlink()
+    assert main([*command, "-o", str(tmp_path / "other")]) == 2
+    assert "3 and 2 images" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", ["out", "out.xyz", "out.json"])
 def test_a_kind_of_image_that_nobody_writes_is_known_before_the_work(
     name: str,
