@@ -267,7 +267,7 @@ def one_camera(pattern: str, fisheye: bool, whole: str | None) -> Callable[[Benc
         yield bench.row("held-out rms", RIGKIT, found.heldout_rms_px or np.nan)
         published = None if whole is None else bench.found.described.measurement(whole)
         fits = {RIGKIT: found.rms_px}
-        if bench.board.markers is None:
+        if not bench.board.identified:
             views, size_px = peers.opencv_views(bench.images(pattern), bench.board)
             try:
                 fits[f"OpenCV ({len(views)} images)"] = peers.opencv_camera(views, size_px, fisheye)[0]

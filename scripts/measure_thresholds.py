@@ -33,9 +33,9 @@ from rigkit.benchmark.blanks import BLANKS, blank
 from rigkit.benchmark.scenes import CONDITIONS, LENSES, one_board
 from rigkit.detection.checks.evidence import MIN_SPACING_CHANGE, MIN_UNEXPLAINED, OFFSET, SCORE, Evidence
 from rigkit.detection.checks.validate import compact, has_edge_offset
-from rigkit.detection.detect import candidates
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
+from rigkit.detection.lattices import candidates
 from rigkit.detection.saddles.bad_pixels import without_bad_pixels
 from rigkit.detection.saddles.response import GreyImage, Level, grey_image
 from rigkit.detection.subpixel.subpixel import refine

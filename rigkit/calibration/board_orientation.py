@@ -38,10 +38,7 @@ KNOWN = 0.5
 
 def same_looks(board: Board) -> tuple[int, ...]:
     """Return the quarter turns after which the board looks as before."""
-    if not board.looks_same_turned:
-        return (0,)
-    square = board.columns == board.rows and board.columns % 2 == 0 and board.square_x_mm == board.square_y_mm
-    return (0, 1, 2, 3) if square else (0, 2)
+    return (0, *board.turns)
 
 
 @lru_cache(maxsize=256)
@@ -49,8 +46,7 @@ def board_turn(board: Board, quarter_turns: int) -> Rigid3:
     """Return counted_from_old: the frame of a board whose corners are counted from another corner, from the old one."""
     angle = 0.5 * np.pi * quarter_turns
     turn = np.rint([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
-    far = (np.array(board.size) - 1) * [board.square_x_mm, board.square_y_mm]
-    corners = np.array([[0.0, 0.0, 0.0], [far[0], far[1], 0.0]])
+    corners = board.points(np.array([[0, 0], [board.columns - 1, board.rows - 1]]))
     # After the turn the grid must again begin at zero.
     return Rigid3(turn, -(corners @ turn.T).min(axis=0))
 
@@ -66,7 +62,7 @@ def with_views_turned(
         view = turned[i]
         grid = grid_turned(view.grid, view.board.size, quarter_turns)
         turned[i] = replace(view, grid=grid)
-        corner[i, : len(grid)] = observations.first_row[observations.board[i]] + grid @ [1, view.board.columns]
+        corner[i, : len(grid)] = observations.first_row[observations.board[i]] + view.board.index(grid)
         back = board_turn(view.board, quarter_turns).inverse()
         translation[i] += rotation[i] @ back.translation_mm
         rotation[i] = rotation[i] @ back.rotation
@@ -100,9 +96,9 @@ class _Turn:
 
     @classmethod
     def of(cls, board: Board, quarter_turns: int) -> _Turn:
-        column, row = grid_turned(board.grid(), board.size, quarter_turns).T
+        place = board.index(grid_turned(board.grid(), board.size, quarter_turns))
         rotation = board_turn(board, quarter_turns).rotation
-        return cls(row * board.columns + column, rotation, 4 // quarter_turns)
+        return cls(place, rotation, 4 // quarter_turns)
 
     def summed(self, values: FloatArray, sign: float) -> FloatArray:
         """Return the part of vectors (..., M, 3) that the turn leaves as it is (`sign` 1) or makes its opposite (-1),

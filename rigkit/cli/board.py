@@ -1,4 +1,4 @@
-"""`rigkit board`: a chessboard or ChArUco board to print, true to scale, and the measured print back into its file."""
+"""`rigkit board`: a board to print, true to scale, and the measured print back into its file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from rigkit.core.errors import InputError
 
 if TYPE_CHECKING:
-    from rigkit.core.boards import Markers
+    from rigkit.core.patterns.base import Pattern
 
 HELP = "a board to print, true to scale (PDF and SVG), and its measured size back into the board file"
 
@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
             raise InputError("board: --square-mm is missing; give the side of a square, such as --square-mm 30")
         if measured:
             raise InputError("board: a measured print belongs to a board file; give BOARD.toml instead of a size")
-        board = Board("board", int(size[1]), int(size[2]), args.square_mm, args.square_mm, markers=_markers(args))
+        board = Board("board", int(size[1]), int(size[2]), args.square_mm, args.square_mm, pattern=_pattern(args))
     elif args.charuco or args.marker_mm is not None or args.first_marker or args.legacy:
         raise InputError("board: a board file says itself what markers it has; give a size such as 9x6 with --charuco")
     elif measured:
@@ -76,12 +76,13 @@ def _store_measured(args: argparse.Namespace) -> int:
     return 0
 
 
-def _markers(args: argparse.Namespace) -> Markers | None:
-    from rigkit.core.boards import Markers
+def _pattern(args: argparse.Namespace) -> Pattern:
+    from rigkit.core.patterns.charuco import Charuco
+    from rigkit.core.patterns.chessboard import Chessboard
 
     if args.charuco is None:
         if args.marker_mm is not None or args.first_marker or args.legacy:
             raise InputError("board: markers need a dictionary; give it, such as --charuco DICT_5X5_100")
-        return None
+        return Chessboard()
     side = args.marker_mm if args.marker_mm is not None else MARKER_SHARE * args.square_mm
-    return Markers(args.charuco, side, args.first_marker, args.legacy)
+    return Charuco(args.charuco, side, args.first_marker, args.legacy)

@@ -1,50 +1,34 @@
-"""Chessboards as a person measured them, and where their corners lie; ChArUco boards have markers in their squares."""
+"""Boards as a person measured them, and where their points lie: chessboards, and whatever else `core.patterns` has."""
 
 from __future__ import annotations
 
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, field, replace
 
 import numpy as np
 
-from rigkit.core.arrays import FloatArray, IntArray, Points
+from rigkit.core.arrays import BoolArray, IntArray, Points
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier
+from rigkit.core.patterns.base import Ink, Pattern
+from rigkit.core.patterns.chessboard import Chessboard
 
-__all__ = ["Board", "Markers", "marker_rectangles"]
-
-
-@dataclass(frozen=True, slots=True)
-class Markers:
-    """The ArUco markers in the white squares of a ChArUco board, numbered row by row.
-
-    Attributes
-    ----------
-    dictionary : name in OpenCV, such as "DICT_5X5_100".
-    side_mm : side of a marker with its black border.
-    first_id : number of the first marker; boards in one image need different ones, or different dictionaries.
-    legacy_pattern : as OpenCV drew boards before 4.6: with an even number of rows of squares the first one is white.
-    """
-
-    dictionary: str
-    side_mm: float
-    first_id: int = 0
-    legacy_pattern: bool = False
+__all__ = ["Board"]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Board:
-    """A chessboard of `columns` x `rows` INNER corners.
+    """A board of `columns` x `rows` points: the INNER corners of a chessboard, the corners of tags, centres of circles.
 
-    Frame: origin at the first inner corner, x along the columns, y along the rows, z into the board (so a camera that
-    looks at the board's face sees x, y, z right-handed like its own axes).
+    Frame: origin at the first point, x along the columns, y along the rows, z into the board (so a camera that looks at
+    the board's face sees x, y, z right-handed like its own axes).
 
     Attributes
     ----------
     board_id : name in manifests, clouds and tables.
-    columns, rows : inner corners along x and y.
-    square_x_mm, square_y_mm : measured side of a square.
+    columns, rows : points along x and y.
+    square_x_mm, square_y_mm : measured side of a square; of a tag on an AprilGrid.
     square_sigma_mm : standard deviation of that measurement, if stated.
-    markers : of a ChArUco board; None for a chessboard, and for a ChArUco board that is to be read as a chessboard.
+    pattern : what is printed.
 
     >>> Board("a", 8, 6, 50.0, 50.0).looks_same_turned
     True
@@ -59,7 +43,7 @@ class Board:
     square_y_mm: float
     _: KW_ONLY
     square_sigma_mm: float | None = None
-    markers: Markers | None = None
+    pattern: Pattern = field(default_factory=Chessboard)
 
     def __post_init__(self) -> None:
         check_identifier(self.board_id, "board")
@@ -68,18 +52,19 @@ class Board:
                 f"board '{self.board_id}': columns and rows are whole numbers, got {self.columns!r} and {self.rows!r}"
             )
         if self.columns < 2 or self.rows < 2:
-            raise InputError(f"board '{self.board_id}': at least 2x2 inner corners, got {self.columns}x{self.rows}")
-        for side in (self.square_x_mm, self.square_y_mm):
+            words = self.pattern.point_word
+            raise InputError(f"board '{self.board_id}': at least 2x2 {words}, got {self.columns}x{self.rows}")
+        for side in self.squares_mm:
             if not (np.isfinite(side) and side > 0.0):
-                raise InputError(f"board '{self.board_id}': the square size must be positive, got {side} mm")
+                word = self.pattern.size_word
+                raise InputError(f"board '{self.board_id}': the {word} size must be positive, got {side} mm")
         sigma = self.square_sigma_mm
         if sigma is not None and not (np.isfinite(sigma) and sigma >= 0.0):
-            raise InputError(f"board '{self.board_id}': square_sigma_mm cannot be {sigma}")
-        if self.markers is not None and not 0.0 < self.markers.side_mm < min(self.square_x_mm, self.square_y_mm):
-            raise InputError(
-                f"board '{self.board_id}': markers of {self.markers.side_mm} mm do not fit into its squares; "
-                "give the side of a marker with its black border"
-            )
+            raise InputError(f"board '{self.board_id}': {self.pattern.size_word}_sigma_mm cannot be {sigma}")
+        try:
+            self.pattern.check(self.columns, self.rows, self.squares_mm)
+        except InputError as error:
+            raise InputError(f"board '{self.board_id}': {error}") from error
 
     @property
     def size(self) -> tuple[int, int]:
@@ -87,69 +72,60 @@ class Board:
         return (self.columns, self.rows)
 
     @property
+    def squares_mm(self) -> tuple[float, float]:
+        """(square_x_mm, square_y_mm)."""
+        return (self.square_x_mm, self.square_y_mm)
+
+    @property
     def corner_count(self) -> int:
+        """Places of the index grid; a pattern may leave some of them empty."""
         return self.columns * self.rows
+
+    @property
+    def identified(self) -> bool:
+        """Whether marks in the image tell which board and which point it is."""
+        return self.pattern.identified
+
+    @property
+    def turns(self) -> tuple[int, ...]:
+        """The quarter turns, of 1, 2 and 3, after which the board looks as before: no single image can tell them."""
+        return self.pattern.turns(self.columns, self.rows, self.square_x_mm == self.square_y_mm)
 
     @property
     def looks_same_turned(self) -> bool:
         """Whether the board looks the same turned by 180 degrees: then no single image can tell its first corner."""
-        return self.markers is None and (self.columns + self.rows) % 2 == 0
-
-    @property
-    def first_black(self) -> bool:
-        """Whether the square before the first inner corner is black, as far as a rule says so: on ChArUco boards."""
-        return self.markers is None or not self.markers.legacy_pattern or self.rows % 2 == 0
+        return 2 in self.turns
 
     def grid(self) -> IntArray:
-        """Return (column, row) of all corners, (columns * rows, 2), row by row."""
+        """Return (column, row) of all places of the index grid, (columns * rows, 2), row by row."""
         row, column = np.divmod(np.arange(self.corner_count), self.columns)
         return np.stack([column, row], axis=-1)
 
+    def exists(self) -> BoolArray:
+        """Say of `grid()` where there is a point, (columns * rows,)."""
+        return self.pattern.exists(self.columns, self.rows).ravel()
+
+    def index(self, grid: IntArray) -> IntArray:
+        """Return the places of points `grid` (N, 2) in `grid()` and `points()`, (N,)."""
+        return np.asarray(grid[:, 1] * self.columns + grid[:, 0], dtype=np.int64)
+
     def points(self, grid: IntArray | None = None) -> Points:
-        """Return the corners `grid` (N, 2; all by default) in the board frame, (N, 3) mm."""
-        chosen = self.grid() if grid is None else np.asarray(grid)
-        scale = np.array([self.square_x_mm, self.square_y_mm])
-        return np.concatenate([chosen * scale, np.zeros((len(chosen), 1))], axis=1)
+        """Return the points `grid` (N, 2; all by default) in the board frame, (N, 3) mm."""
+        chosen = self.pattern.positions(np.asarray(self.grid() if grid is None else grid, dtype=np.float64))
+        return np.concatenate([chosen * np.array(self.squares_mm), np.zeros((len(chosen), 1))], axis=1)
 
+    def ink(self, *, upright: bool = False) -> Ink:
+        """Return what is printed on the board, as `Pattern.ink`; raises InputError where its pattern cannot be."""
+        try:
+            return self.pattern.ink(self.columns, self.rows, self.squares_mm, upright=upright)
+        except InputError as error:
+            raise InputError(f"board '{self.board_id}': {error}") from error
 
-def marker_rectangles(board: Board, *, upright: bool = False) -> FloatArray:
-    """Return the black parts of all markers of a ChArUco board as rectangles (M, 4): x, y, width, height.
+    def describe(self) -> str:
+        """Return the board in words: "9 x 6 inner corners, squares 30 x 30 mm"."""
+        return self.pattern.describe(self.columns, self.rows, self.squares_mm)
 
-    In squares, in the board frame (origin at the first inner corner). Touching modules of a row are one rectangle, or
-    those of a column (`upright`): either way all that is black is covered once.
-
-    Raises InputError where the dictionary is unknown or has too few markers for the board.
-    """
-    markers = board.markers
-    if markers is None:
-        return np.zeros((0, 4))
-    import cv2
-
-    known = getattr(cv2.aruco, markers.dictionary, None)
-    if known is None or not markers.dictionary.startswith("DICT_"):
-        raise InputError(
-            f"board '{board.board_id}': dictionary '{markers.dictionary}' is unknown; give a name of OpenCV's such as "
-            "DICT_4X4_50, DICT_5X5_100 or DICT_APRILTAG_36h11"
-        )
-    dictionary = cv2.aruco.getPredefinedDictionary(known)
-    row, column = np.mgrid[: board.rows + 1, : board.columns + 1]
-    white = np.argwhere((row + column) % 2 == int(board.first_black))
-    available = dictionary.bytesList.shape[0]
-    if markers.first_id < 0 or markers.first_id + len(white) > available:
-        raise InputError(
-            f"board '{board.board_id}': markers {markers.first_id} to {markers.first_id + len(white) - 1} are needed, "
-            f"{markers.dictionary} has 0 to {available - 1}; take a larger dictionary"
-        )
-    modules = int(dictionary.markerSize) + 2
-    side = markers.side_mm / np.array([board.square_x_mm, board.square_y_mm])
-    out = []
-    for marker, (j, i) in enumerate(white, markers.first_id):
-        black = cv2.aruco.generateImageMarker(dictionary, marker, modules, borderBits=1) == 0
-        change = np.diff(np.pad(black.T if upright else black, ((0, 0), (1, 1))).astype(np.int8), axis=1)
-        (line, start), (_, end) = np.nonzero(change == 1), np.nonzero(change == -1)
-        place, extent = np.stack([start, line], axis=-1), np.stack([end - start, np.ones_like(line)], axis=-1)
-        if upright:
-            place, extent = place[:, ::-1], extent[:, ::-1]
-        corner = np.array([i, j]) - 1.0 + 0.5 * (1.0 - side)
-        out.append(np.concatenate([corner + place * side / modules, extent * side / modules], axis=1))
-    return np.concatenate(out)
+    def with_squares(self, x_mm: float, y_mm: float) -> Board:
+        """Return the board with squares of another size, and a pattern that grew with them."""
+        growth = (x_mm / self.square_x_mm + y_mm / self.square_y_mm) / 2.0
+        return replace(self, square_x_mm=x_mm, square_y_mm=y_mm, pattern=self.pattern.scaled(growth))

@@ -95,13 +95,12 @@ def first_corner_turn(item: LocatedBoard, kind: BoardKind, board: Board, others:
 
     Where the board looks the same turned, the first corner is, of those possible, the end of the board nearest to the
     centres of the `others` (3,), mm; without others, the one from which the columns run most nearly to the right in
-    camera 1. Where columns + rows is odd the colours have told the first corner already, on a ChArUco board the
-    markers.
+    camera 1. Where it does not, the colours or the marks have told the first corner already.
     """
     turns: tuple[int, ...] = (0, 2) if kind.board.size == board.size else (1, 3)
     if kind.board.columns == kind.board.rows and kind.board.square_x_mm == kind.board.square_y_mm:
         turns = (0, 2) if kind.board.columns % 2 == 0 else (0, 1, 2, 3)
-    if (board.columns + board.rows) % 2 == 1 or board.markers is not None:
+    if not board.turns:
         return turns[0]
     columns, rows = kind.board.columns - 1, kind.board.rows - 1
     # The corner that `BoardDetection.turned` makes the first, and the direction of the columns from there.

@@ -90,7 +90,7 @@ def board_kinds(boards: Sequence[Board]) -> tuple[BoardKind, ...]:
 
 
 def _alike(a: Board, b: Board) -> bool:
-    if a.markers is not None or b.markers is not None:
+    if a.identified or a.pattern != b.pattern:
         return False
 
     def close(x: float, y: float) -> bool:
@@ -114,8 +114,8 @@ def possible_kinds(detections: Sequence[BoardDetection], kinds: Sequence[BoardKi
         if d.board_id in named:
             out.append([named[d.board_id]])
             continue
-        # A ChArUco board is known by its markers, that is by name, or not at all.
-        plain = [k for k, kind in enumerate(kinds) if kind.board.markers is None]
+        # A board with marks is known by them, that is by name, or not at all.
+        plain = [k for k, kind in enumerate(kinds) if not kind.board.identified]
         whole = [k for k in plain if tuple(sorted(kinds[k].board.size)) == size]
         crowded = sizes.count(size) > sum(len(kinds[k].boards) for k in whole)
         larger = [k for k in plain if k not in whole and placements(d, kinds[k])]
@@ -126,14 +126,15 @@ def possible_kinds(detections: Sequence[BoardDetection], kinds: Sequence[BoardKi
 def placements(detection: BoardDetection, kind: BoardKind) -> list[Placement]:
     """Return the ways to put a detection onto a board of its kind, most likely first; none where it does not fit.
 
-    Where columns + rows is odd the detector's convention (the square outside the first corner is dark) leaves one way
-    to place a whole grid; a square grid may have been turned by 90 degrees against the convention, which comes last.
+    Where a board looks the same in no other way (a chessboard whose columns + rows is odd) the detector's convention
+    leaves one way to place a whole grid; a square grid may have been turned by 90 degrees against the convention, which
+    comes last.
     """
     columns, rows = kind.board.size
-    if kind.board.markers is not None:
+    if kind.board.identified:
         return [Placement(0)]
     whole = sorted((detection.columns, detection.rows)) == sorted((columns, rows))
-    if whole and (columns + rows) % 2 == 1:
+    if whole and not kind.board.turns:
         return [Placement(0 if detection.columns == columns else 1)]
     out = []
     for turn in (0, 2, 1, 3):

@@ -1,17 +1,18 @@
-"""Board files: a chessboard as a person measured it (schema "rigkit.board/1").
+"""Board files: a board as a person measured it (schema "rigkit.board/1").
 
 ::
 
     schema = "rigkit.board/1"
-    columns = 9              # inner corners
+    type = "chessboard"      # optional: of `rigkit.core.patterns.registry`; by default chessboard, with markers charuco
+    columns = 9              # inner corners; of an AprilGrid, tags
     rows = 6
-    square_mm = 30.0         # or square_x_mm and square_y_mm
+    square_mm = 30.0         # or square_x_mm and square_y_mm; of an AprilGrid tag_mm
     square_sigma_mm = 0.05   # optional: how well it was measured
     id = "a9x6_30"           # optional: by default the file's name
     printed_x_mm = 30.0      # optional, both: squares as laid out for printing, which `rigkit board` notes when the
     printed_y_mm = 30.0      # measured print goes into the file
 
-A ChArUco board has four keys more; without them it is read as a chessboard::
+What else there is depends on the type. A ChArUco board::
 
     dictionary = "DICT_5X5_100"  # of its markers, by the name in OpenCV
     marker_mm = 22.0             # side of a marker with its black border
@@ -21,14 +22,18 @@ A ChArUco board has four keys more; without them it is read as a chessboard::
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
 from pathlib import Path
 
-from rigkit.core.boards import Board, Markers, marker_rectangles
+from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
+from rigkit.core.patterns.base import Key, Pattern, Value
+from rigkit.core.patterns.charuco import Charuco
+from rigkit.core.patterns.chessboard import Chessboard
+from rigkit.core.patterns.registry import PATTERNS
 from rigkit.io.toml_reader import TomlTable, read_toml
 
-__all__ = ["BOARD_SCHEMA", "board_from_table", "load_board", "load_layout", "with_squares"]
+__all__ = ["BOARD_SCHEMA", "board_from_table", "board_text", "load_board", "load_layout"]
 
 BOARD_SCHEMA = "rigkit.board/1"
 MOST_CORNERS = 1000
@@ -55,16 +60,7 @@ def load_layout(path: str | Path) -> Board:
     Raises InputError like `load_board`.
     """
     board, printed = load_board(path), _printed(read_toml(path, BOARD_SCHEMA))
-    return board if printed is None else with_squares(board, *printed)
-
-
-def with_squares(board: Board, x_mm: float, y_mm: float) -> Board:
-    """Return the board with squares of another size, and markers that grew with them."""
-    markers = board.markers
-    if markers is not None:
-        growth = (x_mm / board.square_x_mm + y_mm / board.square_y_mm) / 2.0
-        markers = replace(markers, side_mm=markers.side_mm * growth)
-    return replace(board, square_x_mm=x_mm, square_y_mm=y_mm, markers=markers)
+    return board if printed is None else board.with_squares(*printed)
 
 
 def _printed(table: TomlTable) -> tuple[float, float] | None:
@@ -77,40 +73,77 @@ def _printed(table: TomlTable) -> tuple[float, float] | None:
 def board_from_table(table: TomlTable, default_id: str) -> Board:
     """Return the board that a table of any file describes by the keys above; the caller calls `table.done()`."""
     board_id = table.identifier("id", hint='id = "plane1"') if table.has("id") else default_id
-    columns = table.integer("columns", hint="columns = 9 (inner corners along x)", at_least=2)
-    rows = table.integer("rows", hint="rows = 6 (inner corners along y)", at_least=2)
+    kind = _type_of(table)
+    columns = table.integer("columns", hint=f"columns = 9 ({kind.count_word} along x)", at_least=1)
+    rows = table.integer("rows", hint=f"rows = 6 ({kind.count_word} along y)", at_least=1)
     for key, count in (("columns", columns), ("rows", rows)):
         if count > MOST_CORNERS:
-            raise table.error(f"'{key}' is {count}, more than {MOST_CORNERS}; count the inner corners along one side")
-    both = "square_x_mm = 30.0 and square_y_mm = 30.0"
-    if table.has("square_x_mm") or table.has("square_y_mm"):
-        if table.has("square_mm"):
-            raise table.error("'square_mm' together with 'square_x_mm' or 'square_y_mm'; keep one of the two forms")
-        x, y = table.number("square_x_mm", hint=both), table.number("square_y_mm", hint=both)
+            raise table.error(
+                f"'{key}' is {count}, more than {MOST_CORNERS}; count the {kind.count_word} along one side"
+            )
+    word = kind.size_word
+    if table.has(f"{word}_x_mm") or table.has(f"{word}_y_mm"):
+        both = f"{word}_x_mm = 30.0 and {word}_y_mm = 30.0"
+        if table.has(f"{word}_mm"):
+            raise table.error(f"'{word}_mm' together with '{word}_x_mm' or '{word}_y_mm'; keep one of the two forms")
+        x, y = table.number(f"{word}_x_mm", hint=both), table.number(f"{word}_y_mm", hint=both)
     else:
-        x = y = table.number("square_mm", hint="square_mm = 30.0 (measured with a ruler over many squares)")
+        x = y = table.number(f"{word}_mm", hint=f"{word}_mm = 30.0 (measured with a ruler over many {word}s)")
     for side in (x, y, *(_printed(table) or ())):
         if not SQUARES_MM[0] <= side <= SQUARES_MM[1]:
-            raise table.error(f"squares of {side:g} mm are outside {SQUARES_MM[0]:g} to {SQUARES_MM[1]:g} mm; write mm")
+            raise table.error(f"{word}s of {side:g} mm are outside {SQUARES_MM[0]:g} to {SQUARES_MM[1]:g} mm; write mm")
     sigma = None
-    if table.has("square_sigma_mm"):
-        sigma = table.number("square_sigma_mm", hint="square_sigma_mm = 0.05")
+    if table.has(f"{word}_sigma_mm"):
+        sigma = table.number(f"{word}_sigma_mm", hint=f"{word}_sigma_mm = 0.05")
     try:
-        board = Board(board_id, columns, rows, x, y, square_sigma_mm=sigma, markers=_markers(table))
-        marker_rectangles(board)
+        values = {key.name: _value(table, key) for key in kind.keys if key.required or table.has(key.name)}
+        pattern = kind.from_keys(values)
+        per = pattern.points_per_count
+        board = Board(board_id, per * columns, per * rows, x, y, square_sigma_mm=sigma, pattern=pattern)
+        board.ink()
     except InputError as error:
         raise error if str(table.path) in str(error) else table.error(f"{error}; correct the board") from error
     return board
 
 
-def _markers(table: TomlTable) -> Markers | None:
-    if not table.has("dictionary"):
-        for key in ("marker_mm", "first_marker", "legacy_pattern"):
-            if table.has(key):
-                raise table.error(f"'{key}' without 'dictionary'; add dictionary = \"DICT_5X5_100\", or remove it")
-        return None
-    dictionary = table.text("dictionary", hint='dictionary = "DICT_5X5_100"')
-    side = table.number("marker_mm", hint="marker_mm = 22.0 (with the black border)")
-    first = table.integer("first_marker", hint="first_marker = 0", at_least=0) if table.has("first_marker") else 0
-    legacy = table.boolean("legacy_pattern", hint="legacy_pattern = false") if table.has("legacy_pattern") else False
-    return Markers(dictionary, side, first, legacy)
+def _type_of(table: TomlTable) -> type[Pattern]:
+    if table.has("type"):
+        return PATTERNS[table.text("type", hint='type = "chessboard"', choices=tuple(PATTERNS))]
+    if table.has("dictionary"):
+        return Charuco
+    for key in Charuco.keys:
+        if table.has(key.name):
+            raise table.error(f"'{key.name}' without 'dictionary'; add dictionary = \"DICT_5X5_100\", or remove it")
+    return Chessboard
+
+
+def _value(table: TomlTable, key: Key) -> Value:
+    if key.kind is bool:
+        return table.boolean(key.name, hint=key.hint)
+    if key.kind is int:
+        return table.integer(key.name, hint=key.hint)
+    if key.kind is float:
+        return table.number(key.name, hint=key.hint)
+    return table.text(key.name, hint=key.hint)
+
+
+def board_text(board: Board, comment: str, path: Path, *, layout: Board | None = None) -> str:
+    """Return the board's file for `path`; with the `layout` that was printed where the squares are measured ones."""
+    pattern = board.pattern
+    word, per = pattern.size_word, pattern.points_per_count
+    lines = [f"# {comment}", f'schema = "{BOARD_SCHEMA}"']
+    lines += [] if isinstance(pattern, Chessboard) else [f'type = "{pattern.type}"']
+    lines += [f"columns = {board.columns // per}", f"rows = {board.rows // per}"]
+    if board.board_id != path.stem:
+        lines.append(f"id = {_written(board.board_id)}")
+    lines += [f"{word}_x_mm = {board.square_x_mm:.6g}", f"{word}_y_mm = {board.square_y_mm:.6g}"]
+    if layout is not None:
+        lines += [f"printed_x_mm = {layout.square_x_mm:.6g}", f"printed_y_mm = {layout.square_y_mm:.6g}"]
+    if board.square_sigma_mm is not None:
+        lines.append(f"{word}_sigma_mm = {board.square_sigma_mm:.4g}")
+    lines += [f"{name} = {_written(value)}" for name, value in pattern.key_values().items()]
+    return "\n".join(lines) + "\n"
+
+
+def _written(value: Value) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else json.dumps(value, ensure_ascii=False)

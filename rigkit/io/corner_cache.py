@@ -129,9 +129,8 @@ def kept_corners(data: Any) -> dict[str, FoundCorners]:
 
 def _target(board: Board) -> str:
     """Return what the detector looks for of a board."""
-    size = f"{board.columns}x{board.rows}"
-    m = board.markers
-    return size if m is None else f"{board.board_id}:{size}:{m.dictionary}:{m.first_id}:{m.legacy_pattern}"
+    size = f"{board.columns}x{board.rows}:{board.pattern!r}"
+    return f"{board.board_id}:{size}:{board.square_x_mm:g}:{board.square_y_mm:g}" if board.identified else size
 
 
 def lens_key(images: Mapping[str, str], boards: Sequence[Board], *options: object) -> str:

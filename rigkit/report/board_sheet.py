@@ -1,4 +1,4 @@
-"""A chessboard or ChArUco board to print, true to scale, with rulers that show what the printer made of it: SVG, PDF.
+"""A board to print, true to scale, with rulers that show what the printer made of it: SVG, PDF.
 
 The sheet is a list of shapes in mm with the origin at the top left; two small writers turn it into either format.
 """
@@ -11,8 +11,10 @@ from html import escape
 
 import numpy as np
 
-from rigkit.core.boards import Board, marker_rectangles
+from rigkit.core.arrays import FloatArray
+from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
+from rigkit.core.patterns.base import Ink
 
 __all__ = ["PAPERS", "PrintedSheet", "board_sheet", "pdf_bytes", "svg_text"]
 
@@ -53,30 +55,22 @@ class PrintedSheet:
 
 
 def board_sheet(board: Board, paper: str) -> PrintedSheet:
-    """Lay out the board's (columns + 1) x (rows + 1) squares and two rulers on a sheet of `paper`.
+    """Lay out what is printed on the board and two rulers on a sheet of `paper`.
 
-    The top-left square is black (on a ChArUco board as its pattern says). Around the squares one margin of at least
-    half a square stays white, which detectors need.
+    The top-left square of a chessboard is black. Around the pattern a margin stays white, which detectors need.
 
     Raises InputError where the paper is unknown or too small; the message names the paper that would do.
     """
     size = _sheet_size(board, paper)
-    across, down = board.columns + 1, board.rows + 1
-    w, h = across * board.square_x_mm, down * board.square_y_mm
+    low, high = (edge * board.squares_mm for edge in board.pattern.outline(*board.size))
+    w, h = high - low
     x0 = (size[0] - RULER_STRIP_MM - w) / 2.0
     y0 = (size[1] - RULER_STRIP_MM - h) / 2.0
-    rectangles = [
-        (x0 + i * board.square_x_mm, y0 + j * board.square_y_mm, board.square_x_mm, board.square_y_mm)
-        for j in range(down)
-        for i in range(across)
-        if (i + j) % 2 == int(not board.first_black)
-    ]
     # The rows and the columns of each marker's modules, one over the other: no hairline shows where two only touch.
-    squares_mm = np.array([board.square_x_mm, board.square_y_mm])
-    for upright in (False, True):
-        marks = marker_rectangles(board, upright=upright) * np.tile(squares_mm, 2)
-        marks[:, :2] += np.array([x0, y0]) + squares_mm
-        rectangles += [(x, y, width, height) for x, y, width, height in marks.tolist()]
+    inks = [board.ink(upright=upright) for upright in (False, True)]
+    shapes = np.concatenate([_black_squares(board, inks[0]), *(ink.rectangles for ink in inks)])
+    shapes[:, :2] += np.array([x0, y0]) - low
+    rectangles = [(x, y, width, height) for x, y, width, height in shapes.tolist()]
     ruler_x = RULER_STEP_MM * np.floor(w / RULER_STEP_MM)
     ruler_y = RULER_STEP_MM * np.floor(h / RULER_STEP_MM)
     bottom = size[1] - UNPRINTABLE_MM - 7.0
@@ -84,10 +78,7 @@ def board_sheet(board: Board, paper: str) -> PrintedSheet:
     lines = [(x0, bottom, x0 + ruler_x, bottom), (right, y0, right, y0 + ruler_y)]
     lines += [(x0 + t, bottom, x0 + t, bottom - _tick(t)) for t in np.arange(0.0, ruler_x + 1.0, RULER_STEP_MM)]
     lines += [(right, y0 + t, right - _tick(t), y0 + t) for t in np.arange(0.0, ruler_y + 1.0, RULER_STEP_MM)]
-    squares = f"{board.square_x_mm:g} x {board.square_y_mm:g} mm"
-    name = f"{board.columns} x {board.rows} inner corners, squares {squares}"
-    if board.markers is not None:
-        name += f", {board.markers.dictionary} from {board.markers.first_id}, markers {board.markers.side_mm:g} mm"
+    name = board.describe()
     texts = (
         (x0, bottom + 4.5, 0.0, f"rigkit: {name}. Print at 100 %. This ruler should be {ruler_x:g} mm; measure it."),
         (right + 2.0, y0, 90.0, f"This ruler should be {ruler_y:g} mm."),
@@ -102,6 +93,15 @@ def board_sheet(board: Board, paper: str) -> PrintedSheet:
         ruler_x_mm=float(ruler_x),
         ruler_y_mm=float(ruler_y),
     )
+
+
+def _black_squares(board: Board, ink: Ink) -> FloatArray:
+    """Return the black squares of a board that has squares, as rectangles (M, 4) of `Ink`."""
+    if ink.first_black is None:
+        return np.zeros((0, 4))
+    row, column = np.mgrid[: board.rows + 1, : board.columns + 1]
+    place = np.argwhere((row + column) % 2 == int(not ink.first_black))[:, ::-1] - 1.0
+    return np.concatenate([place * board.squares_mm, np.tile(board.squares_mm, (len(place), 1))], axis=1)
 
 
 def svg_text(sheet: PrintedSheet) -> str:
@@ -173,8 +173,8 @@ def pdf_bytes(sheet: PrintedSheet) -> bytes:
 def _sheet_size(board: Board, paper: str) -> tuple[float, float]:
     if paper not in PAPERS:
         raise InputError(f"paper '{paper}' is unknown; known: {', '.join(PAPERS)}")
-    width = (board.columns + 1) * board.square_x_mm + 2.0 * UNPRINTABLE_MM + RULER_STRIP_MM
-    height = (board.rows + 1) * board.square_y_mm + 2.0 * UNPRINTABLE_MM + RULER_STRIP_MM
+    low, high = board.pattern.outline(*board.size)
+    width, height = (high - low) * board.squares_mm + 2.0 * UNPRINTABLE_MM + RULER_STRIP_MM
     landscape = width > height
 
     def fits(size: tuple[float, float]) -> tuple[float, float] | None:

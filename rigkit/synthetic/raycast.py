@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray
-from rigkit.core.boards import marker_rectangles
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.synthetic.scene import Panel, PlacedBoard
 
@@ -51,7 +50,7 @@ def board_surface(placed: PlacedBoard, cam_from_world: Rigid3) -> Surface:
     cam_from_board = cam_from_world @ placed.world_from_board
     board = placed.board
     low, high = placed.edge_squares()
-    scale = np.array([board.square_x_mm, board.square_y_mm])
+    scale, ink = np.array(board.squares_mm), board.ink()
     # Behind the paper there is no pattern.
     front = float(cam_from_board.rotation[:, 2] @ cam_from_board.translation_mm) > 0.0
     centre = cam_from_board.apply(board.points()).mean(axis=0)
@@ -59,12 +58,12 @@ def board_surface(placed: PlacedBoard, cam_from_world: Rigid3) -> Surface:
         plane_from_ray=_plane_from_ray(cam_from_board, scale),
         low=low,
         high=high,
-        cells=board.size if front else None,
+        cells=board.size if front and ink.first_black is not None else None,
         white=placed.white,
         black=placed.black,
-        first_black=placed.first_black if board.markers is None else board.first_black,
+        first_black=bool(ink.first_black) and placed.first_black,
         distance_mm=float(np.linalg.norm(centre)),
-        marks=marker_rectangles(board) if front and board.markers is not None else None,
+        marks=ink.rectangles / np.tile(scale, 2) if front and len(ink.rectangles) else None,
     )
 
 
@@ -193,10 +192,16 @@ def paint(fine: Float32, surface: Surface, chart: Chart, per_pixel: int) -> None
     sheet = [_inside(a, c, surface.low[k], surface.high[k]) for k, (a, c) in enumerate(zip(axes, cells, strict=True))]
     share = sheet[0] * sheet[1]
     target += share * (np.float32(surface.white) - target)
-    if surface.cells is None:
-        return
+    if surface.cells is not None:
+        _paint_squares(target, axes, cells, surface)
+    if surface.marks is not None:
+        _paint_marks(target, axes, cells, surface)
+
+
+def _paint_squares(target: Float32, axes: Float32, cells: list[_Cells], surface: Surface) -> None:
+    """Blacken every other square of a surface with inner corners in `target`."""
     (in_x, wave_x), (in_y, wave_y) = (
-        _squares(a, c, count) for a, c, count in zip(axes, cells, surface.cells, strict=True)
+        _squares(a, c, count) for a, c, count in zip(axes, cells, surface.cells or (0, 0), strict=True)
     )
     # Both waves are -1 on the square before the first inner corner.
     wave_x *= wave_y
@@ -205,8 +210,6 @@ def paint(fine: Float32, surface: Surface, chart: Chart, per_pixel: int) -> None
     wave_x += in_x * in_y
     wave_x *= np.float32(0.5 * (surface.black - surface.white))
     target += wave_x
-    if surface.marks is not None:
-        _paint_marks(target, axes, cells, surface)
 
 
 def _paint_marks(target: Float32, axes: Float32, cells: list[_Cells], surface: Surface) -> None:

@@ -75,8 +75,8 @@ class PlacedBoard:
 
     def edge_squares(self) -> tuple[FloatArray, FloatArray]:
         """Return the lower and the upper edge of the paper along x and y, in squares from the first inner corner."""
-        m = 1.0 + self.margin_squares
-        return np.array([-m, -m]), np.array([self.board.columns - 1 + m, self.board.rows - 1 + m])
+        low, high = self.board.pattern.outline(*self.board.size)
+        return low - self.margin_squares, high + self.margin_squares
 
     def outline(self) -> Points:
         """Return the four corners of the paper in the world, (4, 3) mm."""
@@ -170,10 +170,8 @@ def trihedral(
     along_seam = ((0, 2), (0, 2), (1, 1))
     out = []
     for board, axes, side, (axis, end) in zip(boards, walls, corner_side, along_seam, strict=True):
-        square = np.array([board.square_x_mm, board.square_y_mm])
-        count = np.array([board.columns, board.rows])
-        m = 1.0 + margin_squares
-        far, near = (count - 1 + m) * square + clearance_mm, m * square + clearance_mm
+        low, high = board.pattern.outline(*board.size)
+        far, near = (side * board.squares_mm + clearance_mm for side in (high + margin_squares, margin_squares - low))
         origin = np.where(np.array(side) > 0, -far, near)
         placed = PlacedBoard(board, Rigid3(axes, axes[:, :2] @ origin), margin_squares, first_black=first_black)
         facing = walls[end][:, 2]

@@ -19,7 +19,8 @@ from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import CheckFailed, InputError
 from rigkit.core.processes import worker_pool
 from rigkit.core.progress import Progress, silent
-from rigkit.detection.detect import MIN_BOARD_CORNERS, detect_boards
+from rigkit.detection.detect import detect_boards
+from rigkit.detection.lattices import MIN_BOARD_CORNERS
 from rigkit.io.board_file import load_board
 from rigkit.io.corners_file import write_corners
 from rigkit.io.files import ensure_writable, write_atomic

@@ -13,10 +13,9 @@ from pathlib import Path
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier
-from rigkit.io.board_file import load_board
+from rigkit.io.board_file import board_text, load_board
 from rigkit.io.session import SESSION_SCHEMA
 from rigkit.workflows.detect import IMAGE_ENDINGS
-from rigkit.workflows.print_board import board_text
 
 __all__ = ["FolderSession", "cameras_in", "session_of_folders"]
 

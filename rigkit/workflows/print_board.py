@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
-from rigkit.io.board_file import load_layout, with_squares
+from rigkit.io.board_file import board_text, load_layout
 from rigkit.io.files import write_atomic, write_together
 from rigkit.report.board_sheet import board_sheet, pdf_bytes, svg_text
 
-__all__ = ["MeasuredPrint", "PrintOptions", "board_text", "print_board", "store_measured_print"]
+__all__ = ["MeasuredPrint", "PrintOptions", "print_board", "store_measured_print"]
 
 MAX_UNEVEN = 1.05
 """Ratio of the stretches along and across a sheet: printers are a per cent apart, misread rulers more."""
@@ -91,25 +90,8 @@ def store_measured_print(path: str | Path, measured: MeasuredPrint) -> Board:
     sigma = None
     if measured.sigma_mm is not None:
         sigma = measured.sigma_mm * max(board.square_x_mm / sheet.ruler_x_mm, board.square_y_mm / sheet.ruler_y_mm)
-    printed = with_squares(board, board.square_x_mm * stretch_x, board.square_y_mm * stretch_y)
+    printed = board.with_squares(board.square_x_mm * stretch_x, board.square_y_mm * stretch_y)
     printed = replace(printed, square_sigma_mm=sigma)
     text = board_text(printed, f"measured: {words.format('read')}", Path(path), layout=board)
     write_atomic(path, text, force=True)
     return printed
-
-
-def board_text(board: Board, comment: str, path: Path, *, layout: Board | None = None) -> str:
-    """Return the board's file for `path`; with the `layout` that was printed where the squares are measured ones."""
-    lines = [f"# {comment}", 'schema = "rigkit.board/1"', f"columns = {board.columns}", f"rows = {board.rows}"]
-    if board.board_id != path.stem:
-        lines.append(f"id = {json.dumps(board.board_id, ensure_ascii=False)}")
-    lines += [f"square_x_mm = {board.square_x_mm:.6g}", f"square_y_mm = {board.square_y_mm:.6g}"]
-    if layout is not None:
-        lines += [f"printed_x_mm = {layout.square_x_mm:.6g}", f"printed_y_mm = {layout.square_y_mm:.6g}"]
-    if board.square_sigma_mm is not None:
-        lines.append(f"square_sigma_mm = {board.square_sigma_mm:.4g}")
-    if board.markers is not None:
-        lines += [f'dictionary = "{board.markers.dictionary}"', f"marker_mm = {board.markers.side_mm:.6g}"]
-        lines.append(f"first_marker = {board.markers.first_id}")
-        lines.append(f"legacy_pattern = {str(board.markers.legacy_pattern).lower()}")
-    return "\n".join(lines) + "\n"

@@ -13,6 +13,7 @@ import pytest
 from rigkit.benchmark.scenes import bench_camera, one_board
 from rigkit.cli.main import main
 from rigkit.core.boards import Board
+from rigkit.core.patterns.charuco import Charuco
 from rigkit.io.board_file import load_board
 
 PX_PER_MM = 8.0
@@ -36,12 +37,12 @@ def test_what_is_printed_is_what_opencv_reads(extra: list[str], tmp_path: Path) 
     arguments = ["7x5", "--square-mm", "20", "--charuco", "DICT_5X5_100", *extra]
     assert main(["board", *arguments, "-o", str(name)]) == 0
     board = load_board(name.with_suffix(".toml"))
-    assert board.markers is not None
-    assert board.markers.legacy_pattern == ("--legacy" in extra)
-    ids = np.arange(board.markers.first_id, board.markers.first_id + 24)
+    assert isinstance(board.pattern, Charuco)
+    assert board.pattern.legacy == ("--legacy" in extra)
+    ids = np.arange(board.pattern.first_marker, board.pattern.first_marker + 24)
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
-    target = cv2.aruco.CharucoBoard((8, 6), 20.0, board.markers.side_mm, dictionary, ids)
-    target.setLegacyPattern(board.markers.legacy_pattern)
+    target = cv2.aruco.CharucoBoard((8, 6), 20.0, board.pattern.marker_mm, dictionary, ids)
+    target.setLegacyPattern(board.pattern.legacy)
     corners, numbers, _, found = cv2.aruco.CharucoDetector(target).detectBoard(printed(name.with_suffix(".svg")))
     assert sorted(found.ravel().tolist()) == ids.tolist()
     assert sorted(numbers.ravel().tolist()) == list(range(35))
@@ -59,11 +60,11 @@ def test_the_measured_print_keeps_its_markers(tmp_path: Path) -> None:
     path = str(name.with_suffix(".toml"))
     assert main(["board", path, "--ruler-x-mm", "161.6", "--ruler-y-mm", "121.2"]) == 0
     after = load_board(path)
-    assert before.markers is not None
-    assert after.markers is not None
+    assert isinstance(before.pattern, Charuco)
+    assert isinstance(after.pattern, Charuco)
     assert after.square_x_mm == pytest.approx(20.2, abs=1e-4)
-    assert after.markers.side_mm == pytest.approx(1.01 * before.markers.side_mm, rel=1e-4)
-    assert after.markers.dictionary == "DICT_4X4_50"
+    assert after.pattern.marker_mm == pytest.approx(1.01 * before.pattern.marker_mm, rel=1e-4)
+    assert after.pattern.dictionary == "DICT_4X4_50"
 
 
 @pytest.mark.parametrize(

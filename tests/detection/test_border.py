@@ -11,7 +11,8 @@ from rigkit.benchmark.scenes import BenchScene, bench_camera
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.detection.checks.border import Side, sides
-from rigkit.detection.detect import detect_boards, find_lattices
+from rigkit.detection.detect import detect_boards
+from rigkit.detection.lattices import find_lattices
 from rigkit.detection.saddles.response import grey_image
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3

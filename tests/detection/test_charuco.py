@@ -9,18 +9,19 @@ import numpy as np
 import pytest
 
 from rigkit.benchmark.scenes import BenchScene, bench_camera, one_board
-from rigkit.core.boards import Board, Markers, marker_rectangles
+from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
-from rigkit.detection.charuco import _marked_corners
+from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import grey_image
+from rigkit.detection.targets.charuco import _marked_corners
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics
 from rigkit.synthetic.scene import Panel, PlacedBoard
 
-BOARD = Board("c", 9, 6, 30.0, 30.0, markers=Markers("DICT_5X5_100", 21.0))
+BOARD = Board("c", 9, 6, 30.0, 30.0, pattern=Charuco("DICT_5X5_100", 21.0))
 ROUNDED_LEVELS = 0.51
 """Our image is rounded to whole grey levels, OpenCV's enlarged drawing, averaged, is not."""
 
@@ -33,7 +34,7 @@ def errors(found: BoardDetection, truth: BoardDetection) -> np.ndarray:
 @pytest.mark.parametrize("legacy", [False, True])
 @pytest.mark.parametrize("size", [(6, 5), (6, 4)])
 def test_the_pattern_is_opencvs(size: tuple[int, int], legacy: bool) -> None:
-    board = Board("c", *size, 30.0, 30.0, markers=Markers("DICT_4X4_50", 20.0, 3, legacy))
+    board = Board("c", *size, 30.0, 30.0, pattern=Charuco("DICT_4X4_50", 20.0, 3, legacy))
     camera = bench_camera("regular")
     square_px, border_px = 40, 40
     depth = camera.parameters[0] * 30.0 / square_px
@@ -54,9 +55,9 @@ def test_the_pattern_is_opencvs(size: tuple[int, int], legacy: bool) -> None:
 
 
 def test_rows_and_columns_of_modules_cover_the_same() -> None:
-    areas = [marker_rectangles(BOARD, upright=upright)[:, 2:].prod(axis=1).sum() for upright in (False, True)]
+    areas = [BOARD.ink(upright=upright).rectangles[:, 2:].prod(axis=1).sum() for upright in (False, True)]
     assert areas[0] == pytest.approx(areas[1])
-    assert len(marker_rectangles(Board("p", 9, 6, 30.0, 30.0))) == 0
+    assert len(Board("p", 9, 6, 30.0, 30.0).ink().rectangles) == 0
 
 
 @pytest.mark.parametrize("lens", ["regular", "fisheye"])
@@ -72,8 +73,7 @@ def test_every_corner_has_its_own_number_and_is_finer_than_opencvs(lens: str) ->
         assert len(found.grid) >= 48
         ours.append(errors(found, truth))
         sigmas.append(ours[-1] / found.sigma_px[:, None])
-        assert BOARD.markers is not None
-        grid, pixels = _marked_corners(image, BOARD, BOARD.markers)
+        grid, pixels = _marked_corners(image, BOARD)
         theirs.append(pixels - truth.lattice()[grid[:, 1], grid[:, 0]])
     rms = [float(np.sqrt((np.concatenate(e) ** 2).mean())) for e in (ours, theirs)]
     assert rms[0] < 0.02
@@ -100,7 +100,7 @@ def test_a_part_keeps_its_numbers(rng: np.random.Generator) -> None:
 def test_two_boards_of_one_size_are_told_apart_by_their_markers(rng: np.random.Generator) -> None:
     """Chessboards of this size would look alike, and the same turned by 180 degrees."""
     names = ("a", "b")
-    boards = [Board(n, 5, 5, 30.0, 30.0, markers=Markers("DICT_4X4_100", 21.0, 18 * k)) for k, n in enumerate(names)]
+    boards = [Board(n, 5, 5, 30.0, 30.0, pattern=Charuco("DICT_4X4_100", 21.0, 18 * k)) for k, n in enumerate(names)]
     camera = bench_camera("regular")
     turn = np.diag([-1.0, -1.0, 1.0])
     left = PlacedBoard(boards[0], Rigid3(turn, np.array([-20.0, 60.0, 500.0])))
@@ -129,13 +129,13 @@ def test_a_chessboard_is_no_charuco_board(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize(
-    "markers", [Markers("DICT_4X4_50", 20.0, 30), Markers("DICT_NONE", 20.0), Markers("CORNER_REFINE_NONE", 20.0)]
+    "markers", [Charuco("DICT_4X4_50", 20.0, 30), Charuco("DICT_NONE", 20.0), Charuco("CORNER_REFINE_NONE", 20.0)]
 )
-def test_markers_that_cannot_be_are_refused(markers: Markers) -> None:
+def test_markers_that_cannot_be_are_refused(markers: Charuco) -> None:
     with pytest.raises(InputError, match="board 'c'"):
-        marker_rectangles(replace(BOARD, markers=markers))
+        replace(BOARD, pattern=markers).ink()
     with pytest.raises(InputError, match="do not fit"):
-        replace(BOARD, markers=replace(markers, side_mm=30.0))
+        replace(BOARD, pattern=replace(markers, marker_mm=30.0))
 
 
 def test_grey_values_of_sixteen_bit_images_reach_the_markers() -> None:

@@ -11,8 +11,8 @@ from helpers.real_images import real_images
 from kernels.reference import lattice as reference
 
 from rigkit.detection.checks import validate
-from rigkit.detection.detect import find_lattices
 from rigkit.detection.lattice.spacing import spacing_changes
+from rigkit.detection.lattices import find_lattices
 from rigkit.detection.saddles.response import grey_image, pyramid
 from rigkit.detection.subpixel.scatter import excess_scatter
 from rigkit.kernels import lattice as native

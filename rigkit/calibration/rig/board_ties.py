@@ -10,7 +10,6 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.board_places import board_places
 from rigkit.calibration.rig.joint import solve_jointly
 from rigkit.calibration.rig.observations import FrameObservations, frame_observations
-from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import RigkitError
 from rigkit.core.findings import Finding, Severity
@@ -76,8 +75,7 @@ def _by_size(views: Sequence[tuple[str, BoardView]], calibration: Calibration) -
             kind = f"{board.columns}x{board.rows}"
             count[entry.frame, kind] += 1
             name = f"{kind} number {count[entry.frame, kind]}"
-            sides = board.square_x_mm, board.square_y_mm
-            board = Board(name, *board.size, *sides, square_sigma_mm=board.square_sigma_mm)
+            board = replace(board, board_id=name)
         key = (entry.frame, name)
         out[key] = replace(entry, view=replace(entry.view, board=board), key=key)
     return out

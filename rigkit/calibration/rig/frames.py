@@ -222,7 +222,7 @@ class _Corners:
         entries = list(own.values())
         boards = {e.board_id: e.view.board for e in entries}
         table = {name: board.points() for name, board in boards.items()}
-        rows = [table[e.board_id][e.view.grid[:, 1] * boards[e.board_id].columns + e.view.grid[:, 0]] for e in entries]
+        rows = [table[e.board_id][boards[e.board_id].index(e.view.grid)] for e in entries]
         counts = np.array([len(r) for r in rows], dtype=np.int64)
         pixels, kept = [e.view.pixels for e in entries], [e.kept for e in entries]
         return cls(entries, counts, np.concatenate(rows), np.concatenate(pixels), np.concatenate(kept))

@@ -19,6 +19,8 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
+from rigkit.core.patterns.charuco import Charuco
+from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.detection.guided.board_guide import MIN_GUIDE_CORNERS, UNSOUND, BoardState, Guide
 from rigkit.detection.lattice.local_fit import LocalFit, fit_cells
 from rigkit.detection.saddles.response import GreyImage, grey_image
@@ -27,7 +29,7 @@ from rigkit.detection.subpixel.edge_model import NEAR_PX, NEAR_SIGMAS, Geometry,
 from rigkit.detection.subpixel.scatter import UNEXPLAINED
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
-__all__ = ["complete_boards", "fit_corners"]
+__all__ = ["complete_boards", "completed", "fit_corners"]
 
 RADIUS_PX, FIT_STEPS = 18.0, 8
 """Radius of the window and Gauss-Newton steps, as in the last pass of `rigkit.detection.subpixel.subpixel`."""
@@ -101,20 +103,24 @@ def complete_boards(
         `image` is not an image of a supported type.
     """
     grey = grey_image(image)
-    out = []
-    for found in detections:
-        board = _board_of(found, boards)
-        worth = board is not None and len(found.grid) >= MIN_GUIDE_CORNERS
-        worth &= camera is not None or not found.complete
-        out.append(_completed(grey, found, board, camera) if worth and board is not None else found)
-    return tuple(out)
+    return tuple(completed(grey, found, boards, camera) for found in detections)
+
+
+def completed(grey: GreyImage, found: BoardDetection, boards: Sequence[Board], camera: Camera | None) -> BoardDetection:
+    """Return one detection as `complete_boards` does, from an image in grey levels."""
+    board = _board_of(found, boards)
+    if board is None or len(found.grid) < MIN_GUIDE_CORNERS or (camera is None and found.complete):
+        return found
+    return _completed(grey, found, board, camera)
 
 
 def _board_of(found: BoardDetection, boards: Sequence[Board]) -> Board | None:
     """Return a board of the detection's grid, the one it names if it names one."""
-    fitting = [b for b in boards if b.size == (found.columns, found.rows)]
+    fitting = [
+        b for b in boards if b.size == (found.columns, found.rows) and isinstance(b.pattern, Chessboard | Charuco)
+    ]
     named = [b for b in fitting if b.board_id == found.board_id]
-    return next(iter(named or [b for b in fitting if b.markers is None]), None)
+    return next(iter(named or [b for b in fitting if not b.identified]), None)
 
 
 def fit_corners(
@@ -134,15 +140,15 @@ def fit_corners(
     geometry = Geometry(sides, shape.curvature(), shape.gaps(), ends_of(np.ones_like(cells), cells))
     width = _short_of_markers(board, sides, np.broadcast_to(np.asarray(blur, dtype=np.float64), (len(start),)))
     # What markers leave in the windows is no noise, but makes the corners uncertain all the same.
-    plain = board.markers is None
+    plain = not isinstance(board.pattern, Charuco)
     return fit_edges(image, start, geometry, signs, width, radius_px=RADIUS_PX, iterations=FIT_STEPS, mirrored=plain)
 
 
 def _short_of_markers(board: Board, sides: FloatArray, blur: FloatArray) -> FloatArray:
     """Return the s (M,) to start from, so small that the windows, a few s to either side of a line, are narrow."""
-    if board.markers is not None:
-        squares = np.array([board.square_x_mm, board.square_y_mm])
-        gap = (0.5 * (1.0 - board.markers.side_mm / squares) * np.linalg.norm(sides, axis=2)).min(axis=1)
+    if isinstance(board.pattern, Charuco):
+        white = 0.5 * (1.0 - board.pattern.marker_mm / np.array(board.squares_mm))
+        gap = (white * np.linalg.norm(sides, axis=2)).min(axis=1)
         blur = np.minimum(blur, (gap - MARKER_BLURS * blur - NEAR_PX) / NEAR_SIGMAS)
     return np.clip(blur, *BLUR_RANGE)
 
@@ -275,7 +281,7 @@ def _confirmed(guide: Guide, state: BoardState, shape: LocalFit, side: FloatArra
     good = fit.valid & (moved < limit) & (fit.contrast > MIN_ADDED_CONTRAST * contrast)
     # Noise is the same at any contrast; what the model gets wrong grows with it.
     most = MAX_ADDED_RESIDUAL if guide.camera is not None else MAX_ADDED_RESIDUAL_ALONE
-    most = most if guide.board.markers is None else MAX_ADDED_RESIDUAL_MARKED
+    most = MAX_ADDED_RESIDUAL_MARKED if isinstance(guide.board.pattern, Charuco) else most
     good &= fit.residual < most * residual * np.maximum(1.0, fit.contrast / contrast)
     good &= fit.sigma_px < MAX_SIGMA_CELLS * side
     return np.asarray(good)

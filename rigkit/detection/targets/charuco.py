@@ -14,15 +14,17 @@ import cv2
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
-from rigkit.core.boards import Board, Markers
+from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
-from rigkit.detection.guided.guided import fit_corners
+from rigkit.core.patterns.charuco import Charuco
+from rigkit.detection.guided.guided import completed, fit_corners
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.subpixel import RefinedLattice, refine
+from rigkit.detection.targets.base import Finder, Search
 
-__all__ = ["charuco_boards"]
+__all__ = ["CharucoFinder"]
 
 SAME_CELLS = 0.2
 """A marker's corner and a corner of a lattice are one within so many sides of a cell."""
@@ -34,7 +36,17 @@ SEED_CONTRAST = 100.0
 """Contrast that a corner starts with, grey levels: the fit measures it."""
 
 
-def charuco_boards(
+class CharucoFinder(Finder):
+    """Lattices that markers name; they are no chessboards for anybody else."""
+
+    def find(self, search: Search, boards: Sequence[Board]) -> list[BoardDetection]:
+        lattices = search.lattices
+        found, rest = _charuco_boards(search.grey, lattices, boards, search.min_corners)
+        search.leave(rest)
+        return [completed(search.grey, item, boards, search.camera) for item in found]
+
+
+def _charuco_boards(
     image: GreyImage, found: Sequence[RefinedLattice], boards: Sequence[Board], min_corners: int
 ) -> tuple[list[BoardDetection], list[RefinedLattice]]:
     """Return the ChArUco boards in an image, named and on their own grids, and the lattices that are none.
@@ -50,9 +62,7 @@ def charuco_boards(
     rest = list(found)
     out = []
     for board in boards:
-        if board.markers is None:
-            continue
-        grid, pixels = _marked_corners(eight_bit, board, board.markers)
+        grid, pixels = _marked_corners(eight_bit, board)
         if not len(grid):
             continue
         whole = _empty(board)
@@ -72,14 +82,15 @@ def charuco_boards(
     return out, rest
 
 
-def _marked_corners(image: np.ndarray, board: Board, markers: Markers) -> tuple[IntArray, FloatArray]:
+def _marked_corners(image: np.ndarray, board: Board) -> tuple[IntArray, FloatArray]:
     """Return (column, row) and rough pixels of the corners that OpenCV finds between the markers, (N, 2) each."""
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, markers.dictionary))
-    size = (board.columns + 1, board.rows + 1)
-    ids = np.arange(markers.first_id, markers.first_id + (size[0] * size[1] + int(not board.first_black)) // 2)
+    pattern = board.pattern
+    assert isinstance(pattern, Charuco)
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, pattern.dictionary))
+    ids = pattern.first_marker + np.arange(len(pattern.places(*board.size)))
     side = float(np.sqrt(board.square_x_mm * board.square_y_mm))
-    target = cv2.aruco.CharucoBoard(size, side, markers.side_mm, dictionary, ids)
-    target.setLegacyPattern(markers.legacy_pattern)
+    target = cv2.aruco.CharucoBoard((board.columns + 1, board.rows + 1), side, pattern.marker_mm, dictionary, ids)
+    target.setLegacyPattern(pattern.legacy)
     corners, numbers, _, _ = cv2.aruco.CharucoDetector(target).detectBoard(image)
     if numbers is None or corners is None:
         return np.zeros((0, 2), np.int64), np.zeros((0, 2))
@@ -91,7 +102,7 @@ def _empty(board: Board) -> Lattice:
     shape = (board.rows, board.columns)
     # Across the first edge brightness grows downwards, with the angle, where the square below it is white; that has
     # the colour of the square before the first corner.
-    return Lattice(np.full((*shape, 2), np.nan), np.full(shape, np.nan), not board.first_black)
+    return Lattice(np.full((*shape, 2), np.nan), np.full(shape, np.nan), not board.ink().first_black)
 
 
 def _of(board: Board, grid: IntArray, pixels: FloatArray) -> Lattice:

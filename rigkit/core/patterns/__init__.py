@@ -1,0 +1,1 @@
+"""What is printed on a board: chessboards, ChArUco boards, AprilGrids; one file a pattern, one registry."""

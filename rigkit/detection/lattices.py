@@ -1,0 +1,105 @@
+"""Every lattice of corners in an image that may be a chessboard: loose corners, links, lattices, growth, the sub-pixel
+fit, and what is a board. No size need be known, no number of boards, no lens.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.detection.checks.discontinuity import may_be_discontinuous, split_at_discontinuities, without_outliers
+from rigkit.detection.checks.validate import (
+    compact,
+    has_edge_offset,
+    large,
+    sample_of,
+    separate,
+    tidy,
+    too_large,
+    trustworthy,
+)
+from rigkit.detection.lattice.grow import grow_all
+from rigkit.detection.lattice.lattice import Lattice, build_lattices
+from rigkit.detection.lattice.links import find_links
+from rigkit.detection.lattice.split import join_parts, split_at_turns, split_necks
+from rigkit.detection.saddles.response import GreyImage, Level, grey_image, pyramid
+from rigkit.detection.saddles.saddle import find_corners
+from rigkit.detection.subpixel.subpixel import RefinedLattice, refine
+
+__all__ = ["MIN_BOARD_CORNERS", "candidates", "find_lattices", "fitted"]
+
+MIN_PART_CORNERS = 6
+"""Corners of the smallest part of a board that something lies across."""
+
+MIN_BOARD_CORNERS = 9
+"""Fewer than 3 x 3 corners are too often no board."""
+
+
+def find_lattices(
+    image: NDArray[np.generic], min_corners: int, sizes: Sequence[tuple[int, int]] = ()
+) -> list[RefinedLattice]:
+    """Return the lattices of all boards of `image`, refined, in no particular order and orientation.
+
+    `sizes` : (columns, rows) of all boards that may be in it, if known.
+    """
+    grey = grey_image(image)
+    size_px = (grey.shape[1], grey.shape[0])
+    found = fitted(grey, candidates(grey, min_corners, _promising), min_corners, sizes)
+    return [item for item in found if min_corners < MIN_BOARD_CORNERS or compact(item.lattice, size_px)]
+
+
+def candidates(
+    grey: GreyImage, min_corners: int, promising: Callable[[GreyImage, Level, Lattice], bool]
+) -> list[Lattice]:
+    """Return the lattices of `grey` that may be boards, before the sub-pixel fit.
+
+    `promising` says of a lattice, on the image and the finest level of its pyramid, whether it is worth growing.
+    """
+    size_px = (grey.shape[1], grey.shape[0])
+    levels = pyramid(grey)
+    corners, saddles = find_corners(levels)
+    lattices = build_lattices(corners, find_links(corners, levels[0]))
+    grown = grow_all(lattices, saddles, levels[0], functools.partial(promising, grey, levels[0]))
+    grown = [item for item in grown if item.count >= MIN_PART_CORNERS]
+    if not any(item.solid or min_corners < MIN_BOARD_CORNERS for item in grown):
+        return []
+    boards = [board for item in grown for part in split_at_turns(item) for board in split_necks(part)]
+    parts = separate([tidy(board, size_px) for board in boards], MIN_PART_CORNERS)
+    return [board for board in join_parts(parts) if large(board, min_corners)]
+
+
+def fitted(
+    grey: GreyImage, boards: Sequence[Lattice], min_corners: int, sizes: Sequence[tuple[int, int]]
+) -> list[RefinedLattice]:
+    """Return those of `boards` that the fit confirms, refined, without what belongs to others that they touch."""
+    refined = zip(boards, refine(grey, boards), strict=True)
+    size_px = (grey.shape[1], grey.shape[0])
+    out = []
+    for item in (after for before, after in refined if trustworthy(after, before.count, min_corners)):
+        own = without_outliers(item, size_px)
+        parts = (
+            split_at_discontinuities(own, several=too_large(own.lattice, sizes))
+            if may_be_discontinuous(item, size_px)
+            else [own]
+        )
+        if len(parts) == 1:
+            out += [own] if large(own.lattice, min_corners) else []
+            continue
+        # The edges on the other side of a seam had a say in these corners.
+        alone = [part.lattice.trimmed() for part in parts]
+        out += fitted(grey, [part for part in alone if large(part, min_corners)], min_corners, sizes)
+    return out
+
+
+def _promising(grey: GreyImage, finest: Level, lattice: Lattice) -> bool:
+    """Return whether `lattice` may be a board, as far as a quick look at its edges and a sample of it tell."""
+    if lattice.solid and has_edge_offset(lattice, finest):
+        return False
+    sample = sample_of(lattice)
+    if sample is None:
+        return True
+    (refined,) = refine(grey, [sample])
+    return trustworthy(refined, sample.count, 0)

@@ -1,0 +1,1 @@
+"""How images are searched for each kind of target: one file a pattern, one registry."""

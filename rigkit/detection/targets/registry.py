@@ -1,0 +1,14 @@
+"""How each pattern is searched for. Adding one is one file and one line here."""
+
+from __future__ import annotations
+
+from rigkit.core.patterns.charuco import Charuco
+from rigkit.core.patterns.chessboard import Chessboard
+from rigkit.detection.targets.base import Finder
+from rigkit.detection.targets.charuco import CharucoFinder
+from rigkit.detection.targets.chessboard import ChessboardFinder
+
+__all__ = ["FINDERS"]
+
+FINDERS: dict[str, Finder] = {Charuco.type: CharucoFinder(), Chessboard.type: ChessboardFinder()}
+"""In this order: what is known by its marks first, chessboards, which are what is left, last."""
