@@ -7,7 +7,7 @@ Layers, each importing only rows below it (tests/test_architecture.py reads the 
     10  report           figures, pages, tables in Markdown, CSV and LaTeX
      9  io               manifests, sessions, calibration and corner files, PLY, images
      8  validation | study | benchmark    against what was measured | synthetic studies | what measures detection
-     7  reconstruction   from detections, or correspondences, to an oriented cloud
+     7  reconstruction | planning         from detections, or correspondences, to a cloud | which picture to take next
      6  detection | identification    from an image to grids of corners | which board is which
      5  affine | relative_pose | calibration | synthetic | interop
      4  rectification    perspective, stereo and panoramic views

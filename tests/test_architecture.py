@@ -22,7 +22,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("rectification",),
     ("affine", "relative_pose", "calibration", "synthetic", "interop"),
     ("detection", "identification", "targets"),
-    ("reconstruction",),
+    ("reconstruction", "planning"),
     ("validation", "study", "benchmark"),
     ("io",),
     ("report", "coach"),

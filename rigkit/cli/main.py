@@ -31,6 +31,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "calibrate": ("rigkit.cli.calibrate", "calibrate a camera from images of chessboards"),
     "diff": ("rigkit.cli.diff", "difference of two calibrations over the image; same camera or not"),
     "certify": ("rigkit.cli.certify", "how wrong a length, depth, plane or angle may be that is measured with them"),
+    "plan": ("rigkit.cli.plan", "which pictures to take next; what a lens, a board and so many pictures will reach"),
     "rectify": ("rigkit.cli.rectify", "perspective, cylindrical, equirectangular or stereo images from any camera's"),
     "reconstruct": ("rigkit.cli.reconstruct", "oriented clouds (PLY) and pictures of every pair"),
     "validate": ("rigkit.cli.validate", "the tables against measured truth, report and PLY; exit 1 if a check fails"),

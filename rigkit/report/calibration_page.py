@@ -10,9 +10,12 @@ import cv2
 import numpy as np
 
 from rigkit.calibration.result import Calibration, ViewResult
+from rigkit.core.arrays import Pixels
 from rigkit.core.tables import Cell, Column, Table
 from rigkit.io.images import Image
+from rigkit.planning.plan import Plan
 from rigkit.report.calibration_drawings import coverage_svg, pattern_svg, residuals_svg, uncertainty_svg
+from rigkit.report.plan_page import shown_views
 from rigkit.report.render import data_uri, drawing, render, shown_table
 
 __all__ = ["CalibrationSection", "build_calibration_page", "thumbnail_jpeg"]
@@ -33,11 +36,13 @@ VERDICTS = {"good": "pass", "look": "look", "bad": "fail"}
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CalibrationSection:
-    """One calibrated camera on the page: thumbnails are JPEG by image name; images without one are shown without."""
+    """One calibrated camera on the page: thumbnails are JPEG by image name; images without one are shown without.
+    `plan` are the pictures that would help most next; None shows none."""
 
     name: str
     calibration: Calibration
     thumbnails: Mapping[str, bytes] = field(default_factory=dict)
+    plan: Plan | None = None
 
 
 def build_calibration_page(
@@ -89,10 +94,16 @@ def _shown(section: CalibrationSection) -> dict[str, Any]:
         "basis": _basis(c),
         "findings": _findings(c),
         "drawings": [(name, drawing(draw(c))) for name, draw in DRAWINGS],
+        "next": [] if section.plan is None else shown_views(section.plan, _kept(c)),
+        "next_gain": "" if section.plan is None else f"{100.0 * section.plan.gain:.0f}",
         "tables": [shown_table(table) for table in (_parameters(c), _candidates(c), _boards(c))],
         "views": _views(c, sources),
         "dropped": [(image, reason, sources.get(image)) for image, reason in c.dropped],
     }
+
+
+def _kept(c: Calibration) -> Pixels:
+    return np.concatenate([view.pixels[view.kept] for view in c.views])
 
 
 def _basis(c: Calibration) -> str:

@@ -17,7 +17,7 @@ from rigkit.io.board_file import board_text, load_board
 from rigkit.io.session import SESSION_SCHEMA
 from rigkit.workflows.detect import IMAGE_ENDINGS
 
-__all__ = ["FolderSession", "cameras_in", "session_of_folders"]
+__all__ = ["FolderSession", "board_of_words", "cameras_in", "session_of_folders"]
 
 BOARD_WORDS = re.compile(r"^(\d{1,4})[xX](\d{1,4})[xX](\d{1,4}(?:\.\d{1,4})?)$")
 SIDE = r"left|right|cam(?:era)?[_-]?\d{1,3}"
@@ -164,17 +164,23 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 def _board_file(words: str, place: Path, files: dict[Path, str]) -> str:
     """Return a board's file as the session names it; a new one is added to `files`."""
+    board = board_of_words(words)
+    if BOARD_WORDS.match(words) is None:
+        return _relative(Path(words), place)
+    path = place / f"{board.board_id}.toml"
+    files[path] = board_text(board, f"as told by --board {words}; squares are best measured over many", path)
+    return path.name
+
+
+def board_of_words(words: str) -> Board:
+    """Return the board that `words` tell: COLUMNSxROWSxMM, or a board's file; raises InputError for anything else."""
     match = BOARD_WORDS.match(words)
     if match is None:
         if not words.endswith(".toml"):
             raise InputError(f"--board {words}: write inner corners and mm a square, such as 9x6x25, or a board file")
-        load_board(words)
-        return _relative(Path(words), place)
+        return load_board(words)
     columns, rows, side = int(match[1]), int(match[2]), float(match[3])
-    path = place / f"board-{columns}x{rows}x{side:g}.toml"
-    board = Board(path.stem, columns, rows, side, side)
-    files[path] = board_text(board, f"as told by --board {words}; squares are best measured over many", path)
-    return path.name
+    return Board(f"board-{columns}x{rows}x{side:g}", columns, rows, side, side)
 
 
 def _listed(patterns: Sequence[tuple[Path, str]], place: Path) -> str:

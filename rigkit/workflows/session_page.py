@@ -8,7 +8,7 @@ from pathlib import Path
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.boards import Board
-from rigkit.core.errors import InputError
+from rigkit.core.errors import InputError, RigkitError
 from rigkit.io.corner_cache import image_hash
 from rigkit.io.images import read_image
 from rigkit.io.rig_session import RigSession
@@ -17,6 +17,7 @@ from rigkit.report.calibration_page import CalibrationSection, build_calibration
 from rigkit.report.rig_tables import rig_tables
 from rigkit.validation.check import Check
 from rigkit.workflows.corners import SessionCorners, image_names
+from rigkit.workflows.next_views import next_views
 from rigkit.workflows.provenance import digest_line, digest_of_many, software_facts
 
 __all__ = ["rig_page", "session_page"]
@@ -25,7 +26,7 @@ __all__ = ["rig_page", "session_page"]
 def session_page(session: Session, calibration: Calibration, corners: SessionCorners, files: Mapping[Path, str]) -> str:
     """Return the page of a session's calibration, which is written to `files` (path -> content) beside it."""
     name = session.path.resolve().parent.name
-    section = CalibrationSection(name, calibration, _thumbnails(session, calibration))
+    section = _section(name, session, calibration)
     lead = f"{session.path.name} with {_boards_in_words(session.boards)}"
     facts = _facts(session.path, files, {"images": session.images}, {"corners": corners.source})
     return build_calibration_page(f"rigkit calibration: {name}", lead, [section], facts)
@@ -42,7 +43,7 @@ def rig_page(
     """Return the page of a rig, which is written to `files` (path -> content) beside it: what the cameras share, then
     each camera as `shown`."""
     name = session.path.resolve().parent.name
-    sections = [CalibrationSection(own, c, _thumbnails(session.cameras[own], c)) for own, c in shown.items()]
+    sections = [_section(own, session.cameras[own], c) for own, c in shown.items()]
     boards = _boards_in_words(next(iter(session.cameras.values())).boards)
     then = "then every camera as calibrated alone" if len(rig.cameras) > 1 else "then the camera"
     lead = f"{session.path.name} with {boards}: the rig first, {then}"
@@ -50,6 +51,15 @@ def rig_page(
     sources = {f"corners of {own}": found.source for own, found in corners.items()}
     facts = _facts(session.path, files, images, sources)
     return build_calibration_page(f"rigkit rig calibration: {name}", lead, sections, facts, rig_tables(rig, checks))
+
+
+def _section(name: str, session: Session, calibration: Calibration) -> CalibrationSection:
+    """Return one camera with thumbnails, and with the pictures to take next where there are any to be found."""
+    try:
+        plan = next_views(calibration, session.boards)
+    except RigkitError:
+        plan = None
+    return CalibrationSection(name, calibration, _thumbnails(session, calibration), plan)
 
 
 def _boards_in_words(boards: Sequence[Board]) -> str:

@@ -15,8 +15,12 @@ from report.test_page_in_browser import QUIET, chromium
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import projection_uncertainty
+from rigkit.planning.goal import projection_goal
+from rigkit.planning.information import Knowledge
+from rigkit.planning.plan import plan_views
 from rigkit.report.calibration_drawings import pattern_svg, residuals_svg, uncertainty_svg
 from rigkit.report.calibration_page import CalibrationSection, build_calibration_page, thumbnail_jpeg
+from rigkit.report.plan_page import plan_words
 
 NOISE_PX = 0.2
 IMAGES = 20
@@ -115,3 +119,10 @@ def test_pattern_tells_chance_from_a_lens_that_does_not_fit(calibration: Calibra
     wrong = calibrate(views, camera.size_px, model="ucm", board="flat", folds=0)
     beyond, cells = coloured(wrong)
     assert beyond > 0.3 * cells
+
+
+def test_the_pictures_to_take_next_are_on_the_page(calibration: Calibration) -> None:
+    plan = plan_views(Knowledge.of(calibration), [BOARD], projection_goal(calibration.camera), 2)
+    text = build_calibration_page("t", "l", [CalibrationSection("cam", calibration, {}, plan)], {})
+    assert "Take these 2 next" in text and plan_words(plan)[1] in text
+    assert "Take these" not in build_calibration_page("t", "l", [CalibrationSection("cam", calibration)], {})

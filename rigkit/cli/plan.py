@@ -1,0 +1,117 @@
+"""`rigkit plan`: which pictures to take next, or what a lens, a board and so many pictures will reach."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rigkit.core.errors import ExitCode, InputError
+
+if TYPE_CHECKING:
+    from rigkit.workflows.plan import PlannedSession, PlanOptions
+
+__all__ = ["HELP", "add_arguments", "run"]
+
+HELP = "which pictures to take next, or what a lens, a board and so many pictures will reach"
+
+PLAN_EXAMPLES = """examples:
+  rigkit plan calibration.json -r next.html               the three pictures that would help most, drawn
+  rigkit plan session.toml -n 5 --length 800 --distance 1500
+  rigkit plan --lens 120 --size 1280x960 --board 9x6x30 --views 12
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = PLAN_EXAMPLES
+    parser.add_argument(
+        "source", nargs="?", type=Path, metavar="CALIBRATION|SESSION.toml", help="what there is so far; or give --lens"
+    )
+    parser.add_argument("-n", "--views", type=int, metavar="N", help="pictures to plan (default: 3; with --lens 12)")
+    parser.add_argument("--length", type=float, metavar="MM", help="what matters is a length so long,")
+    parser.add_argument("--distance", type=float, metavar="MM", help="at this distance (default: the whole projection)")
+    parser.add_argument("--near", type=float, default=0.0, metavar="MM", help="the board is not sharp nearer than this")
+    parser.add_argument("--far", type=float, default=float("inf"), metavar="MM", help="nor held farther than this")
+    parser.add_argument("--field", type=float, metavar="DEG", help="the lens sees no more than this full angle")
+    parser.add_argument("-r", "--report", type=Path, metavar="FILE.html", help="write a page to look at")
+    parser.add_argument("--force", action="store_true", help="replace an existing page")
+    parser.add_argument("--json", action="store_true", help="print the result for programs")
+    lens = parser.add_argument_group("before there is a calibration")
+    lens.add_argument("--lens", type=float, metavar="DEG", help="field of view across the width of the image")
+    lens.add_argument("--size", metavar="WxH", help="of the images, px")
+    lens.add_argument(
+        "--board", action="append", default=[], metavar="CxRxMM|BOARD.toml", help="such as 9x6x25 (repeatable)"
+    )
+    lens.add_argument("--model", help="camera model (default: the usual one for such a lens)")
+    lens.add_argument("--sigma-px", type=float, metavar="PX", help="scatter of a corner per coordinate (default: 0.15)")
+
+
+def run(args: argparse.Namespace) -> int:
+    from rigkit.cli.console import note, print_json
+    from rigkit.report.plan_page import plan_to_dict, plan_words
+
+    done = _planned(args)
+    plan = done.plan
+    if args.json:
+        print_json(plan_to_dict(plan))
+    else:
+        print(f"{plan.goal.what}: {plan.error:.3g} {plan.goal.unit} now, {plan.views[-1].error:.3g} then")
+        print("\n".join(f"  {line}" for line in plan_words(plan)))
+        if args.lens is None:
+            more = "1 more picture" if len(plan.views) == 1 else f"{len(plan.views)} more pictures"
+            print(f"{more} would bring {100.0 * plan.gain:.0f} %")
+    for path in done.written:
+        note(f"{path} written")
+    return ExitCode.WELL
+
+
+def _planned(args: argparse.Namespace) -> PlannedSession:
+    from rigkit.cli.console import progress_on_stderr
+    from rigkit.workflows.folder_session import board_of_words
+    from rigkit.workflows.plan import USUAL_SIGMA_PX, LensOptions, plan_lens, plan_session
+
+    if (args.source is None) == (args.lens is None):
+        raise InputError("plan: give a calibration or a session, or describe a lens with --lens, --size and --board")
+    if args.lens is None:
+        told = [name for name in ("size", "board", "model", "sigma_px") if getattr(args, name)]
+        if told:
+            raise InputError(f"plan: --{told[0].replace('_', '-')} goes with --lens; '{args.source}' says it itself")
+        return plan_session(args.source, _options(args, 3), progress=progress_on_stderr())
+    if not (args.size and args.board):
+        raise InputError("plan: --lens needs --size 1280x960 and --board 9x6x25")
+    width, _, height = args.size.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise InputError(f"--size {args.size}: write width and height in pixels, such as 1280x960")
+    sigma = USUAL_SIGMA_PX if args.sigma_px is None else args.sigma_px
+    if not 0.0 < sigma < float("inf"):
+        raise InputError(f"--sigma-px {sigma}: it must be positive")
+    lens = LensOptions(
+        hfov_deg=args.lens,
+        size_px=(int(width), int(height)),
+        boards=tuple(board_of_words(words) for words in args.board),
+        model=args.model,
+        sigma_px=sigma,
+    )
+    return plan_lens(lens, _options(args, 12))
+
+
+def _options(args: argparse.Namespace, count: int) -> PlanOptions:
+    from rigkit.planning.candidates import Reach
+    from rigkit.validation.certificate.contracts import Quantity, Task
+    from rigkit.workflows.plan import PlanOptions
+
+    if (args.length is None) != (args.distance is None):
+        raise InputError("plan: --length and --distance belong together")
+    if args.views is not None and args.views < 1:
+        raise InputError(f"--views {args.views}: at least one")
+    length = None
+    if args.length is not None:
+        length = Task(quantity=Quantity.LENGTH, size_mm=args.length, distance_mm=args.distance)
+    return PlanOptions(
+        count=args.views or count,
+        length=length,
+        reach=Reach(nearest_mm=args.near, farthest_mm=args.far, field_deg=args.field),
+        report=args.report,
+        force=args.force,
+    )

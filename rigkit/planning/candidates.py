@@ -1,0 +1,174 @@
+"""Poses in which a person can hold a board: wholly in view, tilted, at distances at which its squares are plain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.cameras.base import Camera, image_center
+from rigkit.core.arrays import BoolArray, FloatArray, Pixels, Points
+from rigkit.core.boards import Board
+from rigkit.core.errors import DegenerateError
+from rigkit.geometry.rotation import exp_so3, unit
+from rigkit.planning.information import HeldBoards
+
+__all__ = ["Reach", "held_boards", "outline_mm"]
+
+DRAWN = 1200
+"""Poses tried: they fill place, tilt and size evenly."""
+TILT_DEG = (15.0, 60.0)
+"""Flat views do not tell the focal length; beyond, corners are seen too slantingly to be placed well."""
+SIZE_SHARE = (0.35, 1.3)
+"""Diagonal of a board in the image, as a part of the image's height."""
+UPRIGHT_SHARE = 0.3
+"""So many of the poses turn the board by 90 degrees."""
+MIN_SQUARE_PX = 8.0
+"""Smaller squares are not found reliably."""
+BORDER_SHARE = 0.01
+"""The paper stays this part of the image's width away from its border: hands are not that sure."""
+MOVES = 5
+"""Times that a board which sticks out of the image is pushed back into it."""
+INWARD = 0.12
+"""A board that the lens does not see whole goes this part of the way to the middle of the image each time."""
+MAX_SLANT_DEG = 72.0
+"""Of a line of sight to the board's normal, at any of its corners."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reach:
+    """Where boards can be held: between `nearest_mm` and `farthest_mm` from the camera, where it is sharp, and within
+    `field_deg` of the lens where its image does not fill the sensor (None: all that the model sees)."""
+
+    nearest_mm: float = 0.0
+    farthest_mm: float = np.inf
+    field_deg: float | None = None
+
+
+def outline_mm(board: Board) -> Points:
+    """Return the outline of a board's squares, one square beyond its outer corners: the corners of the outline and the
+    middles between them, (8, 3), clockwise as seen."""
+    points = board.points()[:, :2]
+    square = np.array([board.square_x_mm, board.square_y_mm])
+    (left, top), (right, bottom) = points.min(axis=0) - square, points.max(axis=0) + square
+    corners = np.array([[left, top, 0.0], [right, top, 0.0], [right, bottom, 0.0], [left, bottom, 0.0]])
+    between = 0.5 * (corners + np.roll(corners, -1, axis=0))
+    return np.stack([corners, between], axis=1).reshape(8, 3)
+
+
+def held_boards(camera: Camera, board: Board, reach: Reach, points_mm: Points | None = None) -> HeldBoards:
+    """Return poses of `board` that a person can hold before `camera`, spread evenly; always the same ones.
+
+    `points_mm` are its corners (N, 3) as they are known to be, by default as stated. Raises DegenerateError where the
+    board fits nowhere into the image.
+    """
+    u, v, size, tilt, way, upright = _even(DRAWN, 6).T
+    width, height = camera.size_px
+    facing = _tilted(np.radians(TILT_DEG[0] + tilt * (TILT_DEG[1] - TILT_DEG[0])), 2.0 * np.pi * way)
+    facing = facing @ exp_so3(np.where(upright < UPRIGHT_SHARE, 0.5 * np.pi, 0.0)[:, None] * np.array([0.0, 0.0, 1.0]))
+    square_px = (
+        (SIZE_SHARE[0] + size * (SIZE_SHARE[1] - SIZE_SHARE[0])) * height / np.hypot(*(np.array(board.size) + 1))
+    )
+    paper = outline_mm(board)
+    middle = paper.mean(axis=0)
+    spot = np.stack([u * width, v * height], axis=-1) - 0.5
+    for _ in range(MOVES):
+        rotation, translation, seen = _placed(camera, board, spot, facing, square_px, middle)
+        points = _in_cam(paper, rotation, translation)
+        pixels, valid = camera.project(points)
+        spot = spot + _back_inside(camera, pixels, valid & seen[:, None] & _in_field(points, reach.field_deg))
+    rotation, translation, good = _placed(camera, board, spot, facing, square_px, middle)
+    good &= _inside(camera, _in_cam(paper, rotation, translation), reach.field_deg)
+    good &= _plain(camera, board, rotation, translation)
+    distance = np.linalg.norm(rotation @ middle + translation, axis=-1)
+    good &= (distance >= reach.nearest_mm) & (distance <= reach.farthest_mm)
+    if not good.any():
+        raise DegenerateError(
+            f"plan: board '{board.board_id}' ({board.columns}x{board.rows} corners) can be held nowhere wholly in view "
+            "at the distances allowed; take a smaller board, or allow other distances"
+        )
+    points = board.points() if points_mm is None else points_mm
+    return HeldBoards(points, rotation[good], translation[good], np.ones((int(good.sum()), len(points)), dtype=bool))
+
+
+def _even(count: int, dimensions: int) -> FloatArray:
+    """Return `count` places that fill the unit cube evenly: multiples of the powers of the generalised golden ratio.
+
+    Reference: M. Roberts, "The unreasonable effectiveness of quasirandom sequences" (2018).
+    """
+    ratio = 2.0
+    for _ in range(32):
+        ratio = (1.0 + ratio) ** (1.0 / (dimensions + 1))
+    powers = ratio ** -np.arange(1.0, dimensions + 1.0)
+    return np.asarray((0.5 + np.arange(1, count + 1)[:, None] * powers) % 1.0)
+
+
+def _tilted(tilt_rad: FloatArray, way_rad: FloatArray) -> FloatArray:
+    """Return rotations (C, 3, 3) that tilt a facing board so that its side at `way_rad` comes towards the camera."""
+    # A turn about a moves d by a x d: with a = (-d_y, d_x, 0) that is along -z, towards the camera.
+    axis = np.stack([-np.sin(way_rad), np.cos(way_rad), np.zeros_like(way_rad)], axis=-1)
+    return np.asarray(exp_so3(tilt_rad[:, None] * axis))
+
+
+def _placed(
+    camera: Camera, board: Board, spot: Pixels, facing: FloatArray, square_px: FloatArray, middle: FloatArray
+) -> tuple[FloatArray, Points, BoolArray]:
+    """Return the poses in which the middle of the board is seen at `spot` (C, 2) and a facing square is `square_px`
+    wide, and where the lens sees there."""
+    rays, seen = camera.unproject(spot)
+    rays = np.where(seen[:, None], rays, [0.0, 0.0, 1.0])
+    # Radians per pixel, the larger of the two directions: a square is nowhere wider than asked for.
+    scale = np.linalg.norm(np.where(seen[:, None, None], camera.ray_jacobian(spot), 0.0), axis=1).max(axis=-1)
+    distance = min(board.square_x_mm, board.square_y_mm) / np.where(seen, scale * square_px, 1.0)
+    # Upright as the image has it, also where a fisheye sees sideways.
+    down = np.where(np.abs(rays[:, 1:2]) < 0.95, [0.0, 1.0, 0.0], [0.0, 0.0, 1.0])
+    x = unit(np.cross(down, rays))
+    towards = np.stack([x, np.cross(rays, x), rays], axis=-1)
+    rotation = towards @ facing
+    return rotation, rays * distance[:, None] - rotation @ middle, np.asarray(seen & np.isfinite(distance))
+
+
+def _in_cam(points: Points, rotation: FloatArray, translation: Points) -> Points:
+    return np.asarray(points @ np.swapaxes(rotation, -1, -2) + translation[:, None, :])
+
+
+def _back_inside(camera: Camera, pixels: Pixels, valid: BoolArray) -> FloatArray:
+    """Return how far boards with their outlines at `pixels` (C, 8, 2) must be pushed to be in the image, (C, 2); those
+    that the lens does not see whole go towards the middle."""
+    width, height = camera.size_px
+    border = BORDER_SHARE * width
+    whole, any_seen = np.all(valid, axis=1), np.any(valid, axis=1)
+    safe = np.where(whole[:, None, None], pixels, image_center(camera.size_px))
+    low, high = safe.min(axis=1), safe.max(axis=1)
+    push = np.maximum(border - low, 0.0) + np.minimum(np.array([width, height]) - 1.0 - border - high, 0.0)
+    shown = np.where(valid[..., None], pixels, 0.0).sum(axis=1) / np.maximum(valid.sum(axis=1), 1)[:, None]
+    inward = np.where(any_seen[:, None], INWARD * (image_center(camera.size_px) - shown), 0.0)
+    return np.where(whole[:, None], push, inward)
+
+
+def _inside(camera: Camera, paper: Points, field_deg: float | None) -> BoolArray:
+    """Say of which boards the outline (C, 8, 3), in the camera frame, is wholly seen."""
+    pixels, valid = camera.project(paper)
+    inside = valid & camera.on_image(pixels) & _in_field(paper, field_deg)
+    return np.asarray(np.all(inside, axis=1))
+
+
+def _in_field(points: Points, field_deg: float | None) -> BoolArray:
+    """Say which points (..., 3) lie within a field of view."""
+    limit = -2.0 if field_deg is None else np.cos(np.radians(0.5 * field_deg))
+    return np.asarray(points[..., 2] >= limit * np.linalg.norm(points, axis=-1))
+
+
+def _plain(camera: Camera, board: Board, rotation: FloatArray, translation: Points) -> BoolArray:
+    """Say of which boards all squares are large enough, and no line of sight too slanting."""
+    columns, rows = board.size
+    lattice = board.points().reshape(rows, columns, 3)[[0, 0, -1, -1], [0, -1, 0, -1]]
+    step = np.array([board.square_x_mm, board.square_y_mm, 0.0]) * np.eye(3)[:2]
+    ends = np.concatenate([lattice, lattice + step[0], lattice + step[1]])
+    points = _in_cam(ends, rotation, translation)
+    pixels, valid = camera.project(points)
+    sides = np.concatenate([pixels[:, 4:8] - pixels[:, :4], pixels[:, 8:] - pixels[:, :4]], axis=1)
+    with np.errstate(invalid="ignore"):
+        large = (np.linalg.norm(sides, axis=-1) >= MIN_SQUARE_PX).all(axis=1)
+    slant = np.einsum("cnx,cx->cn", unit(points[:, :4]), rotation[..., 2])
+    return np.asarray(large & valid.all(axis=1) & (slant >= np.cos(np.radians(MAX_SLANT_DEG))).all(axis=1))

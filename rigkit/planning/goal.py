@@ -1,0 +1,53 @@
+"""What a calibration is for, as a weight on the errors of the camera's parameters: the mean square of what matters is
+trace(W C), with C their covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.calibration.uncertainty import projection_design
+from rigkit.cameras.base import Camera
+from rigkit.cameras.compare import grid_pixels
+from rigkit.core.arrays import FloatArray, Pixels, Rays
+
+__all__ = ["Goal", "projection_goal", "rays_within"]
+
+GOAL_GRID = (24, 18)
+"""Columns and rows of the pixels that the goal averages over."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Goal:
+    """What is to become small: the root of trace(`weight` C), in `unit`; `what` says it in words."""
+
+    weight: FloatArray
+    unit: str
+    what: str
+
+    def error(self, covariance: FloatArray) -> FloatArray:
+        """Return what covariances (..., P, P) leave, (...,)."""
+        return np.asarray(np.sqrt(np.maximum((self.weight * covariance).sum(axis=(-1, -2)), 0.0)))
+
+
+def projection_goal(camera: Camera, field_deg: float | None = None, pixels: Pixels | None = None) -> Goal:
+    """Return the mean square error of the projection, at infinity and after the rotation that boards leave open: over
+    the image, or the part of it within a field of view of `field_deg`; or at `pixels` (N, 2)."""
+    if pixels is None:
+        pixels = grid_pixels(camera.size_px, GOAL_GRID).reshape(-1, 2)
+    rays = rays_within(camera, pixels, field_deg)
+    p = camera.parameters.size
+    design = projection_design(camera, rays).transpose(2, 0, 1).reshape(-1, p + 3)
+    turn = np.linalg.qr(design[:, p:])[0]
+    left = design[:, :p] - turn @ (turn.T @ design[:, :p])
+    return Goal(left.T @ left / len(rays), "px", "rms error of the projection over the image")
+
+
+def rays_within(camera: Camera, pixels: Pixels, field_deg: float | None) -> Rays:
+    """Return the rays of those of `pixels` (N, 2) that the lens sees."""
+    rays, valid = camera.unproject(pixels)
+    if field_deg is not None:
+        with np.errstate(invalid="ignore"):
+            valid &= rays[:, 2] >= np.cos(np.radians(0.5 * field_deg))
+    return np.asarray(rays[valid])

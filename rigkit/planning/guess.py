@@ -1,0 +1,41 @@
+"""A lens of which somebody only knows how much it sees."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.cameras.base import Camera, RadialCurve, image_center
+from rigkit.cameras.registry import camera_model
+from rigkit.core.errors import InputError
+
+__all__ = ["guessed_camera"]
+
+PERSPECTIVE_DEG = 100.0
+"""Lenses that see less across the image's width mostly draw straight lines straight; wider ones are fisheyes."""
+SAMPLES = 64
+CURVE_END = 1.05
+"""The curve ends this far beyond the corner of the image."""
+MAX_THETA_RAD = 3.0
+
+
+def guessed_camera(hfov_deg: float, size_px: tuple[int, int], model: str | None = None) -> Camera:
+    """Return a camera that sees `hfov_deg` across the width of its image: perspective where that is less than 100
+    degrees, else equidistant; of `model`, by default Brown's or Kannala and Brandt's.
+
+    Raises InputError for an angle that no lens has, or a model that cannot see so much.
+    """
+    if not 0.5 <= hfov_deg <= 300.0:
+        raise InputError(f"a lens of {hfov_deg:g} degrees: give the field of view across the image's width, 0.5 to 300")
+    half_px, half_rad = 0.5 * size_px[0], np.radians(0.5 * hfov_deg)
+    straight = hfov_deg < PERSPECTIVE_DEG
+    corner_px = CURVE_END * 0.5 * float(np.hypot(*size_px))
+    if straight:
+        focal = half_px / np.tan(half_rad)
+        theta = np.linspace(0.0, np.arctan(corner_px / focal), SAMPLES)
+        radius = focal * np.tan(theta)
+    else:
+        focal = half_px / half_rad
+        theta = np.linspace(0.0, min(corner_px / focal, MAX_THETA_RAD), SAMPLES)
+        radius = focal * theta
+    kind = camera_model(model or ("brown" if straight else "kannala_brandt"))
+    return kind.from_radial_curve(size_px, RadialCurve(image_center(size_px), theta, radius))

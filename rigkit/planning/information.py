@@ -1,0 +1,165 @@
+"""What a view of a board tells of the camera, once its own pose is eliminated.
+
+With J_k and J_p the derivatives of a view's corners by camera and pose, it is I = J_k^T J_k - J_k^T J_p (J_p^T J_p)^-1
+J_p^T J_k over the variance of a corner. The corners of one view share causes of error, so n of them count like
+n / (1 + (n - 1) rho) that do not: the design effect of samples that come in clusters.
+
+Reference: L. Kish, "Survey Sampling" (1965), section 5.4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.calibration.camera_prior import camera_prior
+from rigkit.calibration.clustered import reduced_by_cluster
+from rigkit.calibration.linearise import view_products
+from rigkit.calibration.observations import Observations
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.shape import ShapeModel
+from rigkit.calibration.state import State
+from rigkit.calibration.uncertainty import projection_design
+from rigkit.cameras.base import Camera
+from rigkit.cameras.compare import grid_pixels
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
+from rigkit.core.boards import Board
+from rigkit.geometry.rigid3 import Rigid3
+
+__all__ = ["CornerError", "HeldBoards", "Knowledge", "board_of_shape", "lens_prior", "view_information"]
+
+LENS_UNKNOWN = 0.1
+"""A lens that is only guessed shows things this part of half the image's diagonal from where it is thought to."""
+PRIOR_GRID = (12, 9)
+MIN_SIGMA_PX = 0.02
+"""No corner is better than this, as real ones go: exact corners would make every view count for ever."""
+
+
+@dataclass(frozen=True, slots=True)
+class CornerError:
+    """How wrong a corner is: its standard deviation per coordinate, px, and the part `rho` of its variance that it has
+    in common with the other corners of its view."""
+
+    sigma_px: float
+    rho: float = 0.0
+
+    @classmethod
+    def of(cls, calibration: Calibration) -> CornerError:
+        """Return what the views of a calibration show: they disagree more than independent corners would."""
+        corners = np.array([int(view.kept.sum()) for view in calibration.views])
+        usual = float(corners[corners > 0].mean())
+        excess = calibration.overdispersion**2 - 1.0
+        rho = float(np.clip(excess / (usual - 1.0), 0.0, 1.0)) if usual > 1.0 else 0.0
+        return cls(max(calibration.sigma_px, MIN_SIGMA_PX), rho)
+
+    def variance(self, corners: FloatArray) -> FloatArray:
+        """Return the variance that each of so many corners of a view counts with, px^2."""
+        return np.asarray(self.sigma_px**2 * (1.0 + np.maximum(corners - 1.0, 0.0) * self.rho))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class HeldBoards:
+    """One board in C poses: cam_from_board as `rotation` (C, 3, 3) and `translation_mm` (C, 3), and which of its N
+    corners are `seen` (C, N)."""
+
+    points_mm: Points
+    rotation: FloatArray
+    translation_mm: Points
+    seen: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.rotation)
+
+    def pose(self, index: int) -> Rigid3:
+        """Return cam_from_board of one of them."""
+        return Rigid3(self.rotation[index], self.translation_mm[index])
+
+    def chosen(self, index: IntArray | BoolArray) -> HeldBoards:
+        """Return some of them."""
+        return HeldBoards(self.points_mm, self.rotation[index], self.translation_mm[index], self.seen[index])
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Knowledge:
+    """What is known of a camera: its estimate, the information (P, P) on its parameters, and how wrong corners are."""
+
+    camera: Camera
+    information: FloatArray
+    error: CornerError
+
+    @classmethod
+    def guessed(cls, camera: Camera, error: CornerError) -> Knowledge:
+        """Return what is known of a lens of which somebody only said roughly what it is."""
+        return cls(camera, lens_prior(camera), error)
+
+    @classmethod
+    def of(cls, calibration: Calibration) -> Knowledge:
+        """Return what a calibration's views say."""
+        error, camera = CornerError.of(calibration), calibration.camera
+        known = lens_prior(camera)
+        for shape in calibration.boards:
+            views = [v for v in calibration.views if v.board_id == shape.board_id and v.kept.any()]
+            columns = board_of_shape(shape.board_id, shape.points_mm).columns
+            seen = np.zeros((len(views), len(shape.points_mm)), dtype=bool)
+            for row, view in zip(seen, views, strict=True):
+                row[(view.grid[:, 1] * columns + view.grid[:, 0])[view.kept]] = True
+            poses = [view.cam_from_board for view in views]
+            held = HeldBoards(
+                shape.points_mm,
+                np.array([pose.rotation for pose in poses]).reshape(-1, 3, 3),
+                np.array([pose.translation_mm for pose in poses]).reshape(-1, 3),
+                seen,
+            )
+            known = known + view_information(camera, held, error).sum(axis=0)
+        return cls(camera, known, error)
+
+    def with_views(self, held: HeldBoards) -> Knowledge:
+        """Return what is known once these views are taken."""
+        more = view_information(self.camera, held, self.error).sum(axis=0)
+        return Knowledge(self.camera, self.information + more, self.error)
+
+
+def board_of_shape(board_id: str, points_mm: Points) -> Board:
+    """Return the flat board nearest to corners (N, 3) that stand row by row, as a calibration's file has them."""
+    back = np.flatnonzero(np.diff(points_mm[:, 0]) < 0.0)
+    columns = int(back[0]) + 1 if len(back) else len(points_mm)
+    rows = len(points_mm) // columns
+    lattice = points_mm.reshape(rows, columns, 3)
+    across = float(np.linalg.norm(np.diff(lattice, axis=1), axis=-1).mean())
+    down = float(np.linalg.norm(np.diff(lattice, axis=0), axis=-1).mean())
+    return Board(board_id, columns, rows, across, down)
+
+
+def view_information(camera: Camera, held: HeldBoards, error: CornerError) -> FloatArray:
+    """Return what each view of a board in C poses tells of the camera's parameters, (C, P, P)."""
+    views, corners = held.seen.shape
+    observations = Observations(
+        views=(),
+        pixels=np.zeros((views, corners, 2)),
+        corner=np.broadcast_to(np.arange(corners), held.seen.shape),
+        sigma_px=np.ones(held.seen.shape),
+        weight=held.seen.astype(np.float64),
+        present=held.seen,
+        boards=(),
+        first_row=np.array([0, corners]),
+        board=np.zeros(views, dtype=np.int64),
+    )
+    rigid = ShapeModel("flat", held.points_mm, np.zeros((corners, 3, 0)), np.zeros(0), np.zeros(0, dtype=np.int64))
+    state = State(camera, held.rotation, held.translation_mm, rigid, np.zeros(0))
+    weight = held.seen / np.sqrt(error.variance(held.seen.sum(axis=1, dtype=np.float64)))[:, None]
+    products = view_products(observations, state, weight)
+    return reduced_by_cluster(products, camera.parameters.size, np.arange(views))[0]
+
+
+def lens_prior(camera: Camera) -> FloatArray:
+    """Return the information (P, P) of what is known of every lens: square pixels, an axis roughly in the middle, and
+    a projection that is a tenth of the image off at the most. The views of a session do not feel it."""
+    rays, valid = camera.unproject(grid_pixels(camera.size_px, PRIOR_GRID).reshape(-1, 2))
+    p = camera.parameters.size
+    design = projection_design(camera, rays[valid])[:, :p]
+    sigma = LENS_UNKNOWN * 0.5 * float(np.hypot(*camera.size_px))
+    # All pixels together say no more than one for each parameter.
+    whole = np.einsum("ipm,iqm->pq", design, design) * p / (design[0, 0].size * sigma**2)
+    rows, _ = camera_prior(camera)
+    return np.asarray(whole + rows.T @ rows)

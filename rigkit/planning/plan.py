@@ -1,0 +1,165 @@
+"""Choosing views greedily: the one that lowers the error of the goal most, then the next."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.core.arrays import FloatArray
+from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.planning.candidates import Reach, held_boards
+from rigkit.planning.goal import Goal
+from rigkit.planning.information import Knowledge, view_information
+
+__all__ = ["Plan", "Proposal", "choose_views", "covariance_of", "exchanged_views", "plan_views"]
+
+NEARLY = 0.03
+"""Of views whose gain is within this part of the best one's, the one nearest to the last pose is taken."""
+
+MAX_EXCHANGES = 50
+WORTH = 1e-3
+"""An exchange of views that gains less than this part of the error is none."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Proposal:
+    """A view to take: where to hold the board, and the error of the goal once it is taken."""
+
+    board: Board
+    cam_from_board: Rigid3
+    error: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Plan:
+    """Views to take, in this order, what the goal's error is before them, and what is known of the camera."""
+
+    knowledge: Knowledge
+    goal: Goal
+    error: float
+    views: tuple[Proposal, ...]
+
+    @property
+    def gain(self) -> float:
+        """The part of the error that all views together take away."""
+        return 1.0 - self.views[-1].error / self.error if self.views else 0.0
+
+
+def covariance_of(information: FloatArray) -> FloatArray:
+    """Return the inverses of information matrices (..., P, P), each scaled to a unit diagonal first: parameters differ
+    by many powers of ten."""
+    scale = 1.0 / np.sqrt(np.einsum("...pp->...p", information))
+    unit = information * scale[..., :, None] * scale[..., None, :]
+    return np.asarray(np.linalg.inv(unit) * scale[..., :, None] * scale[..., None, :])
+
+
+def choose_views(
+    information: FloatArray,
+    views: FloatArray,
+    goal: Goal,
+    count: int,
+    *,
+    effort: Callable[[int], FloatArray] | None = None,
+) -> tuple[list[int], list[float]]:
+    """Return which `count` of C views to take, in order, and the error of the goal after each.
+
+    Parameters
+    ----------
+    information : (P, P) what is known before.
+    views : (C, P, P) what each view adds; each is taken once.
+    effort : returns how far all views (C,) are from view j, or (-1) from the last one taken before: of views nearly as
+        good the nearest is taken. None: the best is.
+    """
+    left, taken, errors = np.arange(len(views)), [], []
+    last = -1
+    for _ in range(min(count, len(views))):
+        before = float(goal.error(covariance_of(information)))
+        after = goal.error(covariance_of(information + views[left]))
+        if effort is None:
+            pick = int(np.argmin(after))
+        else:
+            good = np.flatnonzero(before - after >= (1.0 - NEARLY) * (before - after.min()))
+            pick = int(good[np.argmin(effort(last)[left[good]])])
+        last = int(left[pick])
+        information = information + views[last]
+        taken.append(last)
+        errors.append(float(after[pick]))
+        left = np.delete(left, pick)
+    return taken, errors
+
+
+def exchanged_views(information: FloatArray, views: FloatArray, goal: Goal, taken: Sequence[int]) -> list[int]:
+    """Return as many views as `taken`, better ones of C: one after the other is put back where another helps more,
+    until none does.
+
+    Reference: V. V. Fedorov, "Theory of Optimal Experiments" (1972), the exchange algorithm.
+    """
+    chosen = list(taken)
+    whole = information + views[chosen].sum(axis=0)
+    for _ in range(MAX_EXCHANGES):
+        error = float(goal.error(covariance_of(whole)))
+        left = np.setdiff1d(np.arange(len(views)), chosen)
+        # Every taken view against every one left.
+        without = whole - views[chosen]
+        after = goal.error(covariance_of(without[:, None] + views[left])) if len(left) else np.full((1, 1), np.inf)
+        out, into = np.unravel_index(int(np.argmin(after)), after.shape)
+        if not after[out, into] < (1.0 - WORTH) * error:
+            break
+        whole = without[out] + views[left[into]]
+        chosen[out] = int(left[into])
+    return chosen
+
+
+def plan_views(
+    knowledge: Knowledge,
+    boards: Sequence[Board],
+    goal: Goal,
+    count: int,
+    *,
+    reach: Reach | None = None,
+    last: Rigid3 | None = None,
+) -> Plan:
+    """Return the next `count` views to take of `boards`, one board a view, the first near the pose `last` where several
+    are as good.
+
+    Raises
+    ------
+    InputError
+        No board, or no view asked for.
+    DegenerateError
+        No board fits into the image at the distances allowed.
+    """
+    if not boards or count < 1:
+        raise InputError("plan: at least one board and one view are needed")
+    held = [held_boards(knowledge.camera, board, reach or Reach()) for board in boards]
+    views = np.concatenate([view_information(knowledge.camera, h, knowledge.error) for h in held])
+    rotation = np.concatenate([h.rotation for h in held])
+    middle = np.concatenate([h.rotation @ h.points_mm.mean(axis=0) + h.translation_mm for h in held])
+    start = last or Rigid3(np.eye(3), np.array([0.0, 0.0, float(np.median(np.linalg.norm(middle, axis=-1)))]))
+
+    def effort(view: int) -> FloatArray:
+        rows = (rotation[view], middle[view]) if view >= 0 else (start.rotation, start.translation_mm)
+        return _effort(rotation, middle, *rows)
+
+    taken, errors = choose_views(knowledge.information, views, goal, count, effort=effort)
+    owner = np.repeat(np.arange(len(boards)), [len(h) for h in held])
+    translation = np.concatenate([h.translation_mm for h in held])
+    proposals = [
+        Proposal(boards[owner[i]], Rigid3(rotation[i], translation[i]), error)
+        for i, error in zip(taken, errors, strict=True)
+    ]
+    return Plan(knowledge, goal, float(goal.error(covariance_of(knowledge.information))), tuple(proposals))
+
+
+def _effort(rotation: FloatArray, middle: FloatArray, last_rotation: FloatArray, last_middle: FloatArray) -> FloatArray:
+    """Return how far poses (C, ...) are from the last: the angles of the turn and between the lines of sight, and the
+    logarithm of the ratio of the distances."""
+    distance, last_distance = np.linalg.norm(middle, axis=-1), float(np.linalg.norm(last_middle))
+    turned = np.einsum("cij,ij->c", rotation, last_rotation)
+    seen = middle @ last_middle / (distance * last_distance)
+    angle = np.arccos(np.clip(0.5 * (turned - 1.0), -1.0, 1.0)) + np.arccos(np.clip(seen, -1.0, 1.0))
+    return np.asarray(angle + np.abs(np.log(distance / last_distance)))

@@ -1,0 +1,74 @@
+"""The views that would improve a calibration most, for what it is to be used for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rigkit.calibration.result import Calibration
+from rigkit.cameras.base import Camera
+from rigkit.core.boards import Board
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.planning.candidates import Reach
+from rigkit.planning.goal import Goal, projection_goal
+from rigkit.planning.information import Knowledge
+from rigkit.planning.plan import Plan, plan_views
+from rigkit.validation.certificate.contracts import Instrument, Quantity, Task
+from rigkit.validation.certificate.propagation import gradients, measured_points
+
+__all__ = ["NEXT_VIEWS", "goal_of", "next_views"]
+
+NEXT_VIEWS = 3
+TASK_CELLS = (13, 10)
+"""Columns and rows of the places at which a length is measured."""
+
+
+def next_views(
+    calibration: Calibration,
+    boards: Sequence[Board],
+    count: int = NEXT_VIEWS,
+    *,
+    length: Task | None = None,
+    reach: Reach | None = None,
+) -> Plan:
+    """Return the views of `boards` that would improve a calibration most, the first near the last one taken.
+
+    Raises as `plan_views` and `goal_of`.
+    """
+    reach = reach or Reach()
+    goal = goal_of(calibration.camera, reach, length)
+    last = calibration.views[-1].cam_from_board
+    return plan_views(Knowledge.of(calibration), boards, goal, count, reach=reach, last=last)
+
+
+def goal_of(camera: Camera, reach: Reach, task: Task | None) -> Goal:
+    """Return what the views are to improve: a length at a distance, or the whole projection.
+
+    Raises InputError for a task that is no length, DegenerateError where the length is nowhere in view.
+    """
+    if task is None:
+        return projection_goal(camera, reach.field_deg)
+    if task.quantity is not Quantity.LENGTH:
+        raise InputError(f"plan: one camera measures no {task.quantity}; give a length at a distance")
+    p = camera.parameters.size
+    instrument = Instrument(
+        names=("camera",),
+        cameras=(camera,),
+        cam_from_rig=(Rigid3.identity(),),
+        covariance=np.zeros((p, p)),
+        sigma_px=1.0,
+    )
+    width, height = camera.size_px
+    u, v = np.meshgrid(*(np.linspace(0.0, side - 1.0, n) for side, n in zip((width, height), TASK_CELLS, strict=True)))
+    rays, valid = camera.unproject(np.stack([u, v], axis=-1).reshape(-1, 2))
+    _, by_calibration, _, seen = gradients(instrument, *measured_points(rays[valid], task, is_rig=False))
+    if not seen.any():
+        raise DegenerateError(
+            f"plan: nowhere is a length of {task.size_mm:g} mm at {task.distance_mm:g} mm in view; give a shorter "
+            "length or another distance"
+        )
+    rows = by_calibration[seen].reshape(-1, p)
+    what = f"standard error of a length of {task.size_mm:g} mm at {task.distance_mm:g} mm"
+    return Goal(rows.T @ rows / len(rows), "mm", what)

@@ -1,0 +1,137 @@
+"""Which pictures to take next, for a session or a calibration, or before there is a camera at all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from rigkit.core.arrays import Pixels
+from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
+from rigkit.core.progress import Progress, silent
+from rigkit.io.calibration_file import load_calibration
+from rigkit.io.files import ensure_writable, write_atomic
+from rigkit.io.rig_file import is_rig_file
+from rigkit.io.rig_session import is_rig_session
+from rigkit.io.session import load_session
+from rigkit.planning.candidates import Reach
+from rigkit.planning.guess import guessed_camera
+from rigkit.planning.information import CornerError, Knowledge, board_of_shape
+from rigkit.planning.plan import Plan, plan_views
+from rigkit.report.plan_page import plan_page
+from rigkit.validation.certificate.contracts import Task
+from rigkit.workflows.calibrate import CalibrateOptions, calibrate_session, session_inputs
+from rigkit.workflows.corners import Cache
+from rigkit.workflows.next_views import NEXT_VIEWS, goal_of, next_views
+from rigkit.workflows.provenance import digest_line, software_facts
+
+__all__ = ["LensOptions", "PlanOptions", "PlannedSession", "plan_lens", "plan_session"]
+
+USUAL_SIGMA_PX = 0.15
+USUAL_RHO = 0.05
+"""What corners of real boards have: so much scatter, and this part of its variance in common in a view (50 corners then
+count like 15)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanOptions:
+    """What is wanted, and where it goes."""
+
+    count: int = NEXT_VIEWS
+    """Views to propose."""
+    length: Task | None = None
+    """A length at a distance that is to be measured well; None: the projection over the image."""
+    reach: Reach = field(default_factory=Reach)
+    """Where boards can be held."""
+    report: Path | None = None
+    """File for a page to look at; None: no page."""
+    force: bool = False
+    """Replace a page that exists."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LensOptions:
+    """A lens that nobody has calibrated yet."""
+
+    hfov_deg: float
+    """What it sees across the width of the image."""
+    size_px: tuple[int, int]
+    boards: tuple[Board, ...]
+    model: str | None = None
+    """Camera model; None: the usual one for such a lens."""
+    sigma_px: float = USUAL_SIGMA_PX
+    """Standard deviation of a corner."""
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class PlannedSession:
+    """The plan, the corners (N, 2) taken so far, and the files that were written."""
+
+    plan: Plan
+    taken: Pixels
+    written: tuple[Path, ...]
+
+
+def plan_session(
+    path: str | Path, options: PlanOptions | None = None, *, progress: Progress = silent
+) -> PlannedSession:
+    """Return the views that would improve a calibration most, given its file or the session that it comes from.
+
+    Raises
+    ------
+    InputError
+        A rig (its cameras are planned one by one), a file that is neither, or a page that cannot be written.
+    DegenerateError
+        The views so far do not determine the camera, or no board can be held in view.
+    """
+    options, source = options or PlanOptions(), Path(path)
+    rig = is_rig_session(source) if source.suffix == ".toml" else is_rig_file(source)
+    if rig:
+        raise InputError(
+            f"plan: '{source}' is of a rig; give the calibration of the camera that is to be improved, rig-CAMERA.json"
+        )
+    inputs: list[Path] = [source]
+    if source.suffix == ".toml":
+        session = load_session(source)
+        calibrating = CalibrateOptions(cache=Cache.UPDATE)
+        inputs += session_inputs(session, calibrating)
+        if options.report is not None:
+            ensure_writable([options.report], force=options.force, inputs=inputs)
+        calibration = calibrate_session(session, calibrating, progress=progress).calibration
+        boards = session.boards
+    else:
+        calibration = load_calibration(source)
+        boards = tuple(board_of_shape(shape.board_id, shape.points_mm) for shape in calibration.boards)
+    plan = next_views(calibration, boards, options.count, length=options.length, reach=options.reach)
+    taken = np.concatenate([view.pixels[view.kept] for view in calibration.views])
+    title = f"Next pictures for {source.name}"
+    return PlannedSession(plan=plan, taken=taken, written=_written(plan, options, title, source, inputs, taken))
+
+
+def plan_lens(lens: LensOptions, options: PlanOptions) -> PlannedSession:
+    """Return what `options.count` well-chosen views of a lens that is only guessed will reach.
+
+    Raises as `plan_session`.
+    """
+    camera = guessed_camera(lens.hfov_deg, lens.size_px, lens.model)
+    knowledge = Knowledge.guessed(camera, CornerError(lens.sigma_px, USUAL_RHO))
+    plan = plan_views(
+        knowledge, lens.boards, goal_of(camera, options.reach, options.length), options.count, reach=options.reach
+    )
+    title = f"{options.count} pictures for a lens of {lens.hfov_deg:g} degrees"
+    return PlannedSession(plan=plan, taken=np.zeros((0, 2)), written=_written(plan, options, title, None, [], None))
+
+
+def _written(
+    plan: Plan, options: PlanOptions, title: str, source: Path | None, inputs: list[Path], taken: Pixels | None
+) -> tuple[Path, ...]:
+    if options.report is None:
+        return ()
+    ensure_writable([options.report], force=options.force, inputs=inputs)
+    facts = software_facts() | ({source.name: digest_line(source)} if source is not None else {})
+    lead = f"{plan.goal.what}: {plan.error:.3g} {plan.goal.unit} now, {plan.views[-1].error:.3g} after these pictures."
+    lead = lead[0].upper() + lead[1:]
+    write_atomic(options.report, plan_page(plan, title, lead, facts, taken), force=options.force)
+    return (options.report,)

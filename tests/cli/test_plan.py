@@ -1,0 +1,76 @@
+"""`rigkit plan`: from a calibration, for a lens, what is refused, and what the page shows."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.calibration_scenes import REACH_DEG, lens, random_views
+
+from rigkit.calibration.calibrate import calibrate
+from rigkit.cli.main import main
+from rigkit.io.calibration_file import save_calibration
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    camera = lens("reg")
+    views, _, _ = random_views(camera, 6, np.random.default_rng(3), reach_deg=REACH_DEG["reg"])
+    path = tmp_path_factory.mktemp("plan") / "calibration.json"
+    save_calibration(path, calibrate(views, camera.size_px, model="brown", degree=5, board="flat"))
+    return path
+
+
+def test_next_pictures_of_a_calibration(calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = tmp_path / "next.html"
+    assert main(["plan", str(calibrated), "-n", "2", "-r", str(page), "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    errors = [data["error_now"], *(view["error_then"] for view in data["views"])]
+    assert errors == sorted(errors, reverse=True) and len(errors) == 3
+    outline = np.array(data["views"][0]["outline_px"])
+    assert (outline >= 0.0).all() and (outline <= [1623.0, 1239.0]).all()
+    text = page.read_text()
+    assert data["views"][1]["words"] in text and text.count("<svg") == 2
+    assert main(["plan", str(calibrated), "-r", str(page)]) == 2
+    assert "exists" in capsys.readouterr().err
+
+
+def test_a_length_is_planned_for_in_mm(calibrated: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plan", str(calibrated), "-n", "1", "--length", "300", "--distance", "900"]) == 0
+    out = capsys.readouterr().out
+    assert "standard error of a length of 300 mm at 900 mm" in out and " mm now" in out
+    assert "1 more picture would bring" in out
+
+
+def test_what_a_lens_will_reach(capsys: pytest.CaptureFixture[str]) -> None:
+    errors = {}
+    for views in (4, 12):
+        command = ["plan", "--lens", "120", "--size", "1280x960", "--board", "9x6x30", "--views", str(views), "--json"]
+        assert main(command) == 0
+        errors[views] = json.loads(capsys.readouterr().out)["views"][-1]["error_then"]
+    assert errors[12] < 0.7 * errors[4]
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (["plan"], "give a calibration or a session"),
+        (["plan", "--lens", "90"], "--lens needs --size"),
+        (["plan", "--lens", "90", "--size", "12", "--board", "9x6x30"], "such as 1280x960"),
+        (["plan", "--lens", "0", "--size", "640x480", "--board", "9x6x30"], "0.5 to 300"),
+        (["plan", "x.json", "--board", "9x6x30"], "goes with --lens"),
+        (["plan", "--lens", "90", "--size", "640x480", "--board", "9x6x30", "--length", "3"], "belong together"),
+    ],
+)
+def test_what_is_refused(command: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(command) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_a_rig_is_planned_camera_by_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "rig.json"
+    path.write_text('{"schema": "rigkit.rig/1"}')
+    assert main(["plan", str(path)]) == 2
+    assert "rig-CAMERA.json" in capsys.readouterr().err

@@ -1,0 +1,171 @@
+"""What a view tells before it is taken: predicted errors are those found, poses can be held, words say where."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.calibration_scenes import BOARD, REACH_DEG, lens, random_views
+
+from rigkit.calibration.calibrate import calibrate
+from rigkit.cameras.base import Camera
+from rigkit.cameras.compare import compare_cameras, grid_pixels
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
+from rigkit.planning.candidates import MAX_SLANT_DEG, TILT_DEG, Reach, held_boards, outline_mm
+from rigkit.planning.goal import Goal, projection_goal
+from rigkit.planning.guess import guessed_camera
+from rigkit.planning.information import CornerError, HeldBoards, Knowledge, board_of_shape
+from rigkit.planning.plan import choose_views, covariance_of, exchanged_views, plan_views
+from rigkit.planning.words import placement
+
+NOISE_PX = 0.2
+MONTE_CARLO = 40
+PREDICTED_WITHIN = 0.2
+"""The rms of 40 errors in some eight directions is known to 6 %; three of that."""
+
+
+def _seen(camera: Camera, held: HeldBoards, rng: np.random.Generator) -> list[BoardView]:
+    points = held.points_mm @ np.swapaxes(held.rotation, 1, 2) + held.translation_mm[:, None]
+    pixels, valid = camera.project(points)
+    assert valid.all()
+    noisy = pixels + NOISE_PX * rng.standard_normal(pixels.shape)
+    return [BoardView(f"{k}", BOARD, BOARD.grid(), p, np.full(len(p), NOISE_PX)) for k, p in enumerate(noisy)]
+
+
+@pytest.mark.parametrize("name", ["reg", "fish"])
+def test_the_error_promised_is_the_error_found(name: str, rng: np.random.Generator) -> None:
+    camera, field_deg = lens(name), 2.0 * REACH_DEG[name]
+    held = held_boards(camera, BOARD, Reach(field_deg=field_deg))
+    held = held.chosen(rng.choice(len(held), 10, replace=False))
+    known = Knowledge.guessed(camera, CornerError(NOISE_PX)).with_views(held)
+    promised = projection_goal(camera, field_deg).error(covariance_of(known.information))
+    rays, seen = camera.unproject(grid_pixels(camera.size_px, (24, 18)))
+    seen &= rays[..., 2] >= np.cos(np.radians(REACH_DEG[name]))
+    squared = []
+    for _ in range(MONTE_CARLO):
+        degree = 5 if camera.model == "brown" else None
+        found = calibrate(
+            _seen(camera, held, rng), camera.size_px, model=camera.model, degree=degree, board="flat", folds=0
+        )
+        squared.append(compare_cameras(camera, found.camera, grid=(24, 18), mask=seen).rms_px ** 2)
+    assert np.sqrt(np.mean(squared)) == pytest.approx(promised, rel=PREDICTED_WITHIN)
+
+
+def test_a_calibration_is_known_as_its_own_views_say(rng: np.random.Generator) -> None:
+    camera = lens("wide")
+    views, _, _ = random_views(camera, 12, rng, reach_deg=REACH_DEG["wide"], noise_px=NOISE_PX)
+    calibration = calibrate(views, camera.size_px, model=camera.model, board="flat")
+    known, goal = Knowledge.of(calibration), projection_goal(calibration.camera)
+    # The clustered covariance has a shape of its own; its size is the same.
+    stated, own = goal.error(calibration.covariance), goal.error(covariance_of(known.information))
+    assert own == pytest.approx(float(stated), rel=0.5)
+    (shape,) = calibration.boards
+    board = board_of_shape(shape.board_id, shape.points_mm)
+    assert board.size == BOARD.size
+    assert board.square_x_mm == pytest.approx(30.0) and board.square_y_mm == pytest.approx(30.0)
+
+
+def test_views_that_share_their_errors_count_less() -> None:
+    camera = lens("reg")
+    held = held_boards(camera, BOARD, Reach()).chosen(np.arange(5))
+    alone = Knowledge.guessed(camera, CornerError(0.2)).with_views(held)
+    shared = Knowledge.guessed(camera, CornerError(0.2, rho=0.1)).with_views(held)
+    goal = projection_goal(camera)
+    errors = [float(goal.error(covariance_of(known.information))) for known in (alone, shared)]
+    assert errors[1] > 1.5 * errors[0]
+
+
+@pytest.mark.parametrize("name", ["reg", "wide", "fish"])
+def test_boards_are_held_wholly_in_view_and_as_tilted_as_hands_do(name: str) -> None:
+    camera, reach = lens(name), Reach(nearest_mm=150.0, farthest_mm=900.0, field_deg=2.0 * REACH_DEG[name])
+    held = held_boards(camera, BOARD, reach)
+    assert len(held) > 100
+    paper = outline_mm(BOARD)
+    points = paper @ np.swapaxes(held.rotation, 1, 2) + held.translation_mm[:, None]
+    pixels, valid = camera.project(points)
+    assert valid.all() and camera.on_image(pixels).all()
+    assert (points[..., 2] >= np.cos(np.radians(REACH_DEG[name])) * np.linalg.norm(points, axis=-1) - 1e-9).all()
+    middle = held.rotation @ paper.mean(axis=0) + held.translation_mm
+    distance = np.linalg.norm(middle, axis=1)
+    assert distance.min() >= 150.0 and distance.max() <= 900.0
+    tilt = np.degrees(np.arccos(np.einsum("cx,cx->c", middle / distance[:, None], held.rotation[..., 2])))
+    assert TILT_DEG[0] - 1e-6 <= tilt.min() and tilt.max() <= TILT_DEG[1] + 1e-6 < MAX_SLANT_DEG
+
+
+def test_a_board_too_far_to_be_seen_is_refused() -> None:
+    with pytest.raises(DegenerateError, match="nowhere wholly in view"):
+        held_boards(lens("reg"), BOARD, Reach(nearest_mm=1e5))
+
+
+def test_greedy_takes_the_view_that_helps_most_each_once() -> None:
+    views = np.stack([np.diag([1.0, 0.0]), np.diag([0.0, 9.0]), np.diag([8.0, 0.0])])
+    goal = Goal(np.eye(2), "px", "both")
+    taken, errors = choose_views(np.eye(2), views, goal, 5)
+    assert taken == [1, 2, 0]
+    assert errors == pytest.approx(np.sqrt([1.1, 1 / 9 + 0.1, 1 / 10 + 0.1]))
+
+
+def test_of_views_as_good_the_nearest_is_taken() -> None:
+    views = np.stack([np.diag([8.0, 1.0]), np.diag([8.0, 1.0]), np.diag([0.0, 1.0])])
+    taken, _ = choose_views(
+        np.eye(2), views, Goal(np.diag([1.0, 0.0]), "px", "one"), 1, effort=lambda last: np.array([3.0, 2.0, 1.0])
+    )
+    assert taken == [1]
+
+
+def test_planned_views_beat_views_anyhow(rng: np.random.Generator) -> None:
+    camera, error = lens("reg"), CornerError(NOISE_PX)
+    known, goal = Knowledge.guessed(camera, error), projection_goal(camera)
+    plan = plan_views(known, [BOARD], goal, 6)
+    assert [v.error for v in plan.views] == sorted((v.error for v in plan.views), reverse=True)
+    anyhow = []
+    for _ in range(20):
+        _, rotation, translation = random_views(camera, 6, rng, reach_deg=REACH_DEG["reg"])
+        seen = np.ones((6, BOARD.corner_count), dtype=bool)
+        views = known.with_views(HeldBoards(BOARD.points(), rotation, translation, seen))
+        anyhow.append(float(goal.error(covariance_of(views.information))))
+    assert plan.views[-1].error < 0.6 * np.median(anyhow)
+    with pytest.raises(InputError, match="at least one board"):
+        plan_views(known, [], goal, 1)
+
+
+@pytest.mark.parametrize(("hfov", "model"), [(60.0, "brown"), (90.0, "brown"), (150.0, "kannala_brandt")])
+def test_a_guessed_lens_sees_what_was_said(hfov: float, model: str) -> None:
+    camera = guessed_camera(hfov, (1280, 960))
+    assert camera.model == model
+    (left, right), valid = camera.unproject(np.array([[-0.5, 479.5], [1279.5, 479.5]]))
+    assert valid.all()
+    assert np.degrees(np.arccos(left @ right)) == pytest.approx(hfov, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("at", "turn_deg", "words"),
+    [
+        ((0.0, 0.0, 400.0), (0.0, 0.0, 0.0), "middle, 40 cm away, facing"),
+        ((0.0, 0.0, 400.0), (0.0, 35.0, 0.0), "middle, 40 cm away, tilted 35 degrees, right side nearer"),
+        ((0.0, 0.0, 400.0), (0.0, -35.0, 0.0), "middle, 40 cm away, tilted 35 degrees, left side nearer"),
+        ((0.0, 0.0, 400.0), (30.0, 0.0, 0.0), "middle, 40 cm away, tilted 30 degrees, upper side nearer"),
+        ((0.0, 0.0, 400.0), (-30.0, 0.0, 0.0), "middle, 40 cm away, tilted 30 degrees, lower side nearer"),
+        ((0.0, 0.0, 400.0), (0.0, 0.0, 90.0), "middle, 40 cm away, facing, turned upright"),
+    ],
+)
+def test_words(at: tuple[float, ...], turn_deg: tuple[float, ...], words: str) -> None:
+    board = Board("b", 9, 6, 20.0, 20.0)
+    rotation = exp_so3(np.radians(turn_deg))
+    middle = outline_mm(board).mean(axis=0)
+    assert str(placement(guessed_camera(60.0, (1280, 960)), board, Rigid3(rotation, at - rotation @ middle))) == words
+
+
+def test_words_of_a_corner() -> None:
+    where = placement(guessed_camera(90.0, (1280, 960)), BOARD, Rigid3(np.eye(3), [400.0, -400.0, 600.0]))
+    assert where.place == "top right corner"
+
+
+def test_views_taken_for_want_of_better_ones_are_exchanged() -> None:
+    views = np.stack([np.diag([0.1, 0.0]), np.diag([0.0, 9.0]), np.diag([8.0, 0.0]), np.diag([0.0, 0.1])])
+    goal = Goal(np.eye(2), "px", "both")
+    assert sorted(exchanged_views(np.eye(2), views, goal, [0, 3])) == [1, 2]
+    assert exchanged_views(np.eye(2), views, goal, [2, 1]) == [2, 1]
