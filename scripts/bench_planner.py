@@ -52,6 +52,8 @@ FIRST_FRAMES = 3
 """Before so many there is no calibration: the planner goes by a guess of the lens that is 10 % wrong."""
 HELD_DEG, HELD_DISTANCE, HELD_SIDEWAYS = 5.0, 0.05, 0.02
 GRID = (40, 30)
+EXCHANGES = 2
+"""Rounds, each with the lens as the images taken so far show it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,10 +242,10 @@ def simulate(name: str, seeds: int) -> None:
 
 
 def choose_images(
-    views: list[BoardView], size: tuple[int, int], how: Options, count: int, start: list[int]
+    views: list[BoardView], size: tuple[int, int], how: Options, start: list[int], count: int, covered: np.ndarray
 ) -> list[int]:
-    """Return which images to take: `start`, then what the planner chooses of those at hand, one by one; last those
-    taken before the lens was known are exchanged where others help more."""
+    """Return which images to take: `start`, then what the planner chooses of those at hand, one by one, for the pixels
+    `covered` by any of them; last those taken before the lens was known are exchanged where others help more."""
     taken = list(start)
     while len(taken) < count:
         calibration = of_images(views, taken, size, how)
@@ -253,14 +255,16 @@ def choose_images(
             continue
         knowledge = Knowledge.of(calibration)
         information = np.array([of_image(view, knowledge) for view in (views[i] for i in left)])
-        goal = projection_goal(calibration.camera)
+        goal = projection_goal(calibration.camera, pixels=covered)
         taken.append(left[choose_views(knowledge.information, information, goal, 1)[0][0]])
-    calibration = of_images(views, taken, size, how)
-    if calibration is None:
-        return taken
-    known = Knowledge.guessed(calibration.camera, CornerError.of(calibration))
-    information = np.array([of_image(view, known) for view in views])
-    return exchanged_views(known.information, information, projection_goal(calibration.camera), taken)
+    for _ in range(EXCHANGES):
+        calibration = of_images(views, taken, size, how)
+        if calibration is not None:
+            known = Knowledge.guessed(calibration.camera, CornerError.of(calibration))
+            information = np.array([of_image(view, known) for view in views])
+            goal = projection_goal(calibration.camera, pixels=covered)
+            taken = exchanged_views(known.information, information, goal, taken)
+    return taken
 
 
 def of_image(view: BoardView, knowledge: Knowledge) -> np.ndarray:
@@ -292,6 +296,8 @@ def real(name: str, data: Path, cache: Path, draws: int) -> None:
     how = (camera.model, degree if degree is None or degree in type(camera).orders else None)
     mask = covered_by_boards(full, grid_pixels(size, GRID))
 
+    covered = grid_pixels(size, GRID)[mask]
+
     def error(chosen: list[int]) -> float:
         part = of_images(views, chosen, size, how)
         return np.inf if part is None else compare_cameras(camera, part.camera, grid=GRID, mask=mask).rms_px
@@ -300,7 +306,7 @@ def real(name: str, data: Path, cache: Path, draws: int) -> None:
         rng = np.random.default_rng(count)
         free = np.array([error(rng.choice(len(views), count, replace=False).tolist()) for _ in range(draws)])
         starts = [rng.choice(len(views), 2, replace=False).tolist() for _ in range(max(draws // 4, 4))]
-        own = np.array([error(choose_images(views, size, how, count, start)) for start in starts])
+        own = np.array([error(choose_images(views, size, how, start, count, covered)) for start in starts])
         better = np.mean([np.mean(free > e) for e in own])
         print(
             f"{name:14s} {how} {count:2d} of {len(views)}: planner {np.median(own):.3f} px, random "

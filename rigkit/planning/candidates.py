@@ -88,7 +88,8 @@ def held_boards(camera: Camera, board: Board, reach: Reach, points_mm: Points | 
             "at the distances allowed; take a smaller board, or allow other distances"
         )
     points = board.points() if points_mm is None else points_mm
-    return HeldBoards(points, rotation[good], translation[good], np.ones((int(good.sum()), len(points)), dtype=bool))
+    seen = np.tile(board.exists(), (int(good.sum()), 1))
+    return HeldBoards(points, rotation[good], translation[good], seen)
 
 
 def _even(count: int, dimensions: int) -> FloatArray:

@@ -10,16 +10,19 @@ import numpy as np
 
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import Pixels
+from rigkit.core.boards import Board
 from rigkit.core.tables import Cell, Column, Table
+from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.plan import Plan
 from rigkit.planning.words import placement
 from rigkit.report.render import drawing, render, shown_table
 
-__all__ = ["plan_page", "plan_table", "plan_to_dict", "plan_words", "shown_views", "view_svg"]
+__all__ = ["plan_page", "plan_table", "plan_to_dict", "plan_words", "printed_outlines", "shown_views", "view_svg"]
 
 VIEW_WIDTH = 320.0
 """Width of a drawn view, in units of the drawing."""
 PAPER, SEEN, FRAME = "#e6550d", "#1f4e8c", "#b8c0cc"
+CIRCLE_CORNERS = 12
 MAX_DOTS = 1500
 """More corners taken so far make the drawing black: of more, a part is drawn."""
 
@@ -87,25 +90,36 @@ def view_svg(plan: Plan, index: int, taken: Pixels | None = None) -> str:
         out.append(f'<path d="{path}" stroke="{SEEN}" stroke-opacity="0.35" stroke-width="2" stroke-linecap="round"/>')
     out += [
         f'<path d="{_path(zoom * square)}Z" fill="{PAPER}" fill-opacity="0.75"/>'
-        for square in _black_squares(camera, plan, index)
+        for square in printed_outlines(camera, view.board, view.cam_from_board)
     ]
     outline = placement(camera, view.board, view.cam_from_board).outline_px
     out.append(f'<path d="{_path(zoom * outline)}Z" fill="none" stroke="{PAPER}" stroke-width="2"/></svg>')
     return "".join(out)
 
 
-def _black_squares(camera: Camera, plan: Plan, index: int) -> list[Pixels]:
-    """Return the black squares (4, 2) of a planned view, those that the lens sees whole."""
-    view = plan.views[index]
-    board = view.board
-    row, column = np.mgrid[: board.rows + 1, : board.columns + 1].reshape(2, -1)
-    black = (row + column) % 2 == int(not board.first_black)
-    first = np.stack([column[black], row[black]], axis=-1) - 1.0
-    around = first[:, None] + np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    flat = around * np.array([board.square_x_mm, board.square_y_mm])
-    points = np.concatenate([flat, np.zeros((*flat.shape[:2], 1))], axis=-1)
-    pixels, valid = camera.project(view.cam_from_board.apply(points))
-    return list(pixels[valid.all(axis=1)])
+def printed_outlines(camera: Camera, board: Board, cam_from_board: Rigid3) -> list[Pixels]:
+    """Return the outlines (K, 2) in the image of what is printed on a board, of what the lens sees whole."""
+    ink = board.ink()
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    rectangles = [ink.rectangles]
+    if ink.first_black is not None:
+        row, column = np.mgrid[: board.rows + 1, : board.columns + 1].reshape(2, -1)
+        black = (row + column) % 2 == int(not ink.first_black)
+        side = np.array(board.squares_mm)
+        first = (np.stack([column[black], row[black]], axis=-1) - 1.0) * side
+        rectangles.append(np.concatenate([first, np.broadcast_to(side, first.shape)], axis=1))
+    out = []
+    boxes = np.concatenate(rectangles)
+    turn = np.linspace(0.0, 2.0 * np.pi, CIRCLE_CORNERS, endpoint=False)
+    round_ = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    for flat in (
+        boxes[:, None, :2] + corners * boxes[:, None, 2:],
+        ink.circles[:, None, :2] + round_ * ink.circles[:, None, 2:],
+    ):
+        points = np.concatenate([flat, np.zeros((*flat.shape[:2], 1))], axis=-1)
+        pixels, valid = camera.project(cam_from_board.apply(points))
+        out += list(pixels[valid.all(axis=1)])
+    return out
 
 
 def _path(pixels: Pixels) -> str:
