@@ -156,8 +156,6 @@ def fault_of(words: Sequence[str], names_file: str | None, sound: bool) -> str |
                 return None
             code = main(list(words))
     except RigkitError as error:
-        if "\n" in str(error):
-            return f"message of several lines: {error}"
         return f"refused, though sound: {error}" if sound else _unnamed(str(error), names_file)
     except SystemExit as stop:
         return None if stop.code in (0, 2) else f"SystemExit {stop.code}"

@@ -71,8 +71,10 @@ def normals_from_affines(
     -----
     Optimal: with A(n) = G - h y^T, n ~ J1^T y + d, the minimum of |A(n) - A|_F is y = (G - A)^T h / (h . h).
     Undefined without parallax, h = 0 (the point lies at the epipole, or the cameras coincide): NaN and invalid.
+
+    Raises InputError for arrays of other shapes, or that are no numbers.
     """
-    J1, J2, A21 = (np.asarray(v, dtype=np.float64) for v in (J1, J2, A21))
+    J1, J2, A21 = _matching(J1, J2, A21)
     if method == "optimal":
         out = np.empty((len(A21), 3))
         for block in blocks(len(A21)):
@@ -87,6 +89,21 @@ def normals_from_affines(
     valid = finite(out)
     out[~valid] = np.nan
     return out, valid
+
+
+def _matching(J1: FloatArray, J2: FloatArray, A21: Affines) -> tuple[FloatArray, FloatArray, Affines]:
+    """Return the three as float64; raises InputError where they are not of the same N points."""
+    try:
+        J1, J2, A21 = (np.asarray(v, dtype=np.float64) for v in (J1, J2, A21))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"normals: J1, J2 or A21 is no array of numbers ({error})") from error
+    n = len(J1) if J1.ndim else 0
+    if J1.shape != (n, 2, 3) or J2.shape != (n, 2, 3) or A21.shape != (n, 2, 2):
+        raise InputError(
+            f"normals: J1 and J2 of shape (N, 2, 3) and A21 of (N, 2, 2) are needed, got {J1.shape}, {J2.shape} and "
+            f"{A21.shape}"
+        )
+    return J1, J2, A21
 
 
 def estimate_normals(

@@ -66,6 +66,9 @@ def _covariance(observations: Observations, fit: Fit) -> tuple[FloatArray, Clust
     # A warp may hide in the lens: an aspect ratio of the board in that of the pixels.
     n = p + fit.state.shape.basis.shape[-1]
     unit = frame_covariance(normal, fit.state, n)
+    variance = np.diag(unit)
+    if not (np.isfinite(unit).all() and (variance[:p] > 0.0).all() and (variance >= 0.0).all()):
+        raise not_identifiable(fit.state.camera.model)
     products = view_products(observations, fit.state, fit.weight(observations))
     information, score = reduced_by_cluster(products, n, _clusters(observations))
     prior = (normal.gg - fit.data.gg)[:n, :n]
@@ -129,6 +132,14 @@ def frame_covariance(normal: NormalEquations, state: State, count: int) -> Float
     out[p:, :p] = out[:p, p:].T
     out[p:, p:] = through @ globals_ @ through.T + spread
     return 0.5 * (out + out.T)
+
+
+def not_identifiable(model: str) -> DegenerateError:
+    """Return the error for a model whose parameters the images do not tell from each other."""
+    return DegenerateError(
+        f"calibration: a {model} camera is not identifiable from these images: other numbers show them as well; take a "
+        "simpler model, or views with the board tilted by 20 to 50 degrees in several directions and towards the rim"
+    )
 
 
 def require_determined(result: Calibration, at_corners_px: FloatArray) -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.assemble import assemble, require_determined, solution_normal
+from rigkit.calibration.assemble import assemble, not_identifiable, require_determined, solution_normal
 from rigkit.calibration.board_orientation import turned_views, with_views_turned
 from rigkit.calibration.evidence import fit_shapes
 from rigkit.calibration.fit import Fit, fit_kept, fit_model, heldout_squares, robust_sigma
@@ -192,10 +192,7 @@ def _fit_all(
         try:
             fit = fit_model(observations, size_px, cls, order)
             if not solution_normal(fit).identifiable:
-                raise DegenerateError(
-                    f"calibration: a {name} camera is not identifiable from these images: other numbers show them as "
-                    "well; take a simpler model, or views with the board tilted and towards the rim"
-                )
+                raise not_identifiable(name)
             options.append(_Option(name, fit))
         except (DegenerateError, InputError) as caught:
             error = caught

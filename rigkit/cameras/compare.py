@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Pixels
+from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Pixels, as_array
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import exp_so3, nearest_rotation, rotation_angle, skew
 
@@ -22,6 +22,8 @@ ROTATION_SETTLED_RAD = 1e-12
 """The fit of the rotation stops at steps that move no pixel by a millionth."""
 MIN_PIXELS = 20
 """Fewer common pixels say nothing about the image."""
+MAX_GRID = 10_000
+"""Of a map's columns and rows: more than any image has pixels to show."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -94,13 +96,13 @@ def compare_cameras(
     Raises
     ------
     InputError
-        The sizes differ, or `mask` or `weights` have another shape than the grid.
+        The sizes differ, the grid is no pair of numbers, or `mask` or `weights` have another shape than it.
     DegenerateError
         The cameras have fewer than 20 pixels of the grid in common.
     """
     if a.size_px != b.size_px:
         raise InputError(f"cameras of {a.size_px} and {b.size_px} px cannot be compared; calibrate at one image size")
-    columns, rows = grid
+    columns, rows = grid = _checked_grid(grid)
     pixels = grid_pixels(a.size_px, grid)
     for name, array in (("mask", mask), ("weights", weights)):
         if array is not None and np.shape(array) != (rows, columns):
@@ -118,6 +120,14 @@ def compare_cameras(
         raise DegenerateError(f"the cameras share {covered.sum()} of {covered.size} pixels; they look elsewhere")
     difference = np.where(covered[..., None], projected - pixels, np.nan)
     return CameraDifference(pixels, difference, covered, b_from_a)
+
+
+def _checked_grid(grid: tuple[int, int]) -> tuple[int, int]:
+    """Return (columns, rows) as integers; InputError for what cannot be the counts of a map."""
+    numbers = as_array(grid, (2,), "grid")
+    if not ((numbers == np.rint(numbers)) & (numbers >= 1) & (numbers <= MAX_GRID)).all():
+        raise InputError(f"grid: columns and rows must be whole numbers from 1 to {MAX_GRID}, got {grid}")
+    return int(numbers[0]), int(numbers[1])
 
 
 def grid_pixels(size_px: tuple[int, int], grid: tuple[int, int]) -> Pixels:

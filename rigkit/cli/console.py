@@ -6,6 +6,7 @@ import json
 import logging
 import sys
 import time
+from contextlib import suppress
 from typing import Any
 
 from rigkit.core.progress import Progress
@@ -26,15 +27,17 @@ def progress_on_stderr() -> Progress:
         now = time.monotonic()
         started.setdefault(what, now)
         finished = done >= total
-        if sys.stderr.isatty():
-            if finished or now - drawn >= REDRAW_S:
-                drawn = now
-                filled = BAR_WIDTH * done // max(total, 1)
-                bar = "#" * filled + "." * (BAR_WIDTH - filled)
-                end = f" {now - started[what]:.1f} s\n" if finished else ""
-                print(f"\r{what:<36.36} [{bar}] {done}/{total}{end}", end="", file=sys.stderr, flush=True)
-        elif finished:
-            print(f"{what}: {done} done in {now - started[what]:.1f} s", file=sys.stderr)
+        # A stderr that is closed or full loses the bar, not the work.
+        with suppress(OSError, ValueError):
+            if sys.stderr.isatty():
+                if finished or now - drawn >= REDRAW_S:
+                    drawn = now
+                    filled = BAR_WIDTH * done // max(total, 1)
+                    bar = "#" * filled + "." * (BAR_WIDTH - filled)
+                    end = f" {now - started[what]:.1f} s\n" if finished else ""
+                    print(f"\r{what:<36.36} [{bar}] {done}/{total}{end}", end="", file=sys.stderr, flush=True)
+            elif finished:
+                print(f"{what}: {done} done in {now - started[what]:.1f} s", file=sys.stderr, flush=True)
         if finished:
             started.pop(what, None)
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rigkit.core.errors import ExitCode
+from rigkit.core.errors import ExitCode, printable
 
 if TYPE_CHECKING:
     from rigkit.core.detections import BoardDetection
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
         print_json({image: [_summary(item) for item in items] for image, items in done.found.items()})
     else:
         for image, items in done.found.items():
-            print(f"{image}: " + (", ".join(_words(item) for item in items) or "no board"))
+            print(f"{printable(image)}: " + (", ".join(_words(item) for item in items) or "no board"))
         missing = sum(not items for items in done.found.values())
         total = len(done.found)
         print(f"{sum(map(len, done.found.values()))} boards in {total - missing} of {total} images")

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rigkit.cli.console import note, progress_on_stderr
-from rigkit.core.errors import InputError
+from rigkit.core.errors import ExitCode, InputError
 from rigkit.core.identifiers import MAX_IDENTIFIER
+from rigkit.io.reading import usable_path
 
 if TYPE_CHECKING:
     from rigkit.io.manifest_writer import FoundPair
@@ -47,18 +48,26 @@ def run(args: argparse.Namespace) -> int:
 
     if args.square_mm is not None:
         _length("--square-mm", args.square_mm)
-    root = args.folder.resolve()
+    root = usable_path(args.folder).resolve()
     target = args.output or root / "dataset.toml"
     images = find_images(root)
-    ensure_writable(target, force=args.force, inputs=images)
+    read = [*images, *([target.parent / args.calibration] if args.calibration else [])]
+    ensure_writable(target, force=args.force, inputs=read)
     _require_told(args)
     progress = progress_on_stderr()
     sightings = []
+    unreadable: list[InputError] = []
     for done, path in enumerate(images, start=1):
-        image = read_image(path)
-        sizes = board_sizes(detect_boards(to_grey(image)))
-        sightings.append(Sighting(path, (image.shape[1], image.shape[0]), sizes))
+        try:
+            image = read_image(path)
+            sizes = board_sizes(detect_boards(to_grey(image)))
+            sightings.append(Sighting(path, (image.shape[1], image.shape[0]), sizes))
+        except InputError as error:
+            unreadable.append(error)
+            note(f"left out: {error}")
         progress("looking for boards", done, len(images))
+    if not sightings:
+        raise unreadable[0]
     pairs = group_pairs(sightings, root)
     for pair in pairs:
         note(f"pair '{pair.name}': {pair.first.image.name}, {pair.second.image.name}")
@@ -80,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
         load_dataset(target)
     except InputError as error:
         note(f"to be completed: {error}")
-    return 0
+    return ExitCode.BAD_INPUT if unreadable else ExitCode.WELL
 
 
 def _require_told(args: argparse.Namespace) -> None:
@@ -91,7 +100,7 @@ def _require_told(args: argparse.Namespace) -> None:
         "--pose-type": (f"pose type of the pairs ({', '.join(POSE_TYPES)})", args.pose_type),
     }
     missing = {option: question for option, (question, value) in needed.items() if value is None}
-    if missing and not sys.stdin.isatty():
+    if missing and (sys.stdin is None or not sys.stdin.isatty()):
         said = "; ".join(f"the {question}: {option}" for option, question in missing.items())
         raise InputError(f"init: images cannot tell everything; say {said}")
 
@@ -106,7 +115,10 @@ def _ask(question: str, choices: tuple[str, ...] = ()) -> str:
     hint = f" ({', '.join(choices)})" if choices else ""
     while True:
         print(f"{question}{hint}: ", end="", file=sys.stderr, flush=True)
-        answer = sys.stdin.readline().strip()
+        line = sys.stdin.readline()
+        if not line:
+            raise InputError(f"init: nobody says the {question}; give it as an option, see rigkit init --help")
+        answer = line.strip()
         if answer and (not choices or answer in choices):
             return answer
 

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import argparse
 import logging
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from rigkit.core.errors import InputError
+from rigkit.io.reading import usable_path
 
 __all__ = ["add_log_arguments", "logging_to"]
+
+FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
+LINE = re.compile(rb"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} [A-Z]+ rigkit")
+"""How the first line of a log of ours begins."""
 
 
 def add_log_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,6 +25,24 @@ def add_log_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("log")
     group.add_argument("-v", "--verbose", action="store_true", help="say on stderr what is being done, and with what")
     group.add_argument("--log-file", type=Path, metavar="FILE", help="append all of that, with times, to a file")
+
+
+def _appending(path: Path) -> logging.Handler:
+    """Return a handler that appends to the file; InputError where that is not a log of ours, or cannot be written."""
+    usable_path(path)
+    try:
+        if path.exists() and not path.is_file():
+            raise InputError(f"--log-file '{path}' is no regular file; choose another name")
+        if path.exists():
+            with path.open("rb") as stream:
+                head = stream.read(64)
+            if head and not LINE.match(head):
+                raise InputError(f"--log-file '{path}' is no log of rigkit and stays as it is; choose another name")
+        kept = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
+    except OSError as error:
+        raise InputError(f"--log-file '{path}': {error.strerror}; choose another file") from error
+    kept.setFormatter(logging.Formatter(FORMAT))
+    return kept
 
 
 class _OnStderr(logging.Handler):
@@ -41,12 +65,7 @@ def logging_to(*, verbose: bool, log_file: Path | None) -> Iterator[None]:
     terminal = _OnStderr(logging.DEBUG if verbose else logging.INFO)
     handlers: list[logging.Handler] = [terminal]
     if log_file is not None:
-        try:
-            kept = logging.FileHandler(log_file, encoding="utf-8", errors="backslashreplace")
-        except OSError as error:
-            raise InputError(f"--log-file '{log_file}': {error.strerror}; choose another file") from error
-        kept.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-        handlers.append(kept)
+        handlers.append(_appending(log_file))
     before = root.level
     root.setLevel(logging.DEBUG if verbose or log_file is not None else logging.INFO)
     for handler in handlers:

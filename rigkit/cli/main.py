@@ -7,6 +7,7 @@ A verb is a module in this package with `HELP: str`, `add_arguments(parser)` and
 from __future__ import annotations
 
 import argparse
+import contextlib
 import errno
 import importlib
 import io
@@ -21,7 +22,7 @@ from contextlib import contextmanager
 from types import FrameType
 
 from rigkit.cli.log import add_log_arguments, logging_to
-from rigkit.core.errors import ExitCode, RigkitError
+from rigkit.core.errors import ExitCode, RigkitError, printable
 
 __all__ = ["VERBS", "main"]
 
@@ -107,23 +108,32 @@ def main(argv: Sequence[str] | None = None) -> int:
             with logging_to(verbose=args.verbose, log_file=args.log_file):
                 return _logged_run(args)
     except RigkitError as error:
-        print(f"rigkit: {error}", file=sys.stderr)
+        _say(f"{error}")
         return error.exit_code
     except BrokenPipeError:
         sys.stderr.close()
         return 0
     except KeyboardInterrupt as stop:
         number = stop.number if isinstance(stop, _Terminated) else signal.SIGINT
-        print("rigkit: interrupted", file=sys.stderr)
+        _say("interrupted")
         return ExitCode.BY_SIGNAL + number
     except Exception as error:
+        if isinstance(error, MemoryError) or (type(error).__module__ == "cv2" and "Insufficient memory" in str(error)):
+            reason = printable(str(error)) or "out of memory"
+            _say(f"{reason}; use fewer processes (-j 1), smaller images, or a machine with more memory")
+            return ExitCode.BAD_INPUT
         if isinstance(error, OSError) and error.errno in SURROUNDINGS:
             where = f"'{error.filename}': " if error.filename else ""
-            print(f"rigkit: {where}{error.strerror}; make room or choose another folder", file=sys.stderr)
+            _say(printable(f"{where}{error.strerror}; make room or choose another folder"))
             return ExitCode.BAD_INPUT
-        traceback.print_exc()
-        print("rigkit: this is a bug in rigkit; please report the lines above", file=sys.stderr)
+        _say("this is a bug in rigkit; please report the lines above", before=traceback.format_exc())
         return ExitCode.BUG
+
+
+def _say(words: str, *, before: str = "") -> None:
+    """Print the last line of a run to stderr; the exit code says it too where nobody can read that."""
+    with contextlib.suppress(OSError, ValueError):
+        print(f"{before}rigkit: {words}", file=sys.stderr, flush=True)
 
 
 def _open_streams() -> None:

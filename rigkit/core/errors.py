@@ -12,6 +12,7 @@ __all__ = [
     "InstallationError",
     "InternalError",
     "RigkitError",
+    "printable",
 ]
 
 
@@ -31,6 +32,10 @@ class RigkitError(Exception):
     """Base of every error that rigkit raises on purpose; `exit_code` is what the command line returns for it."""
 
     exit_code: ExitCode = ExitCode.BAD_INPUT
+
+    def __str__(self) -> str:
+        """One line, whatever characters the name of a file or a value in it has."""
+        return printable(super().__str__())
 
 
 class CheckFailed(RigkitError):
@@ -61,3 +66,12 @@ class InternalError(RigkitError):
     """A fault of rigkit itself in one part of the work, where the rest of the work goes on."""
 
     exit_code = ExitCode.BUG
+
+    def __str__(self) -> str:
+        """With the lines that say where it happened."""
+        return Exception.__str__(self)
+
+
+def printable(text: str) -> str:
+    """Return the text with escapes in place of line ends, codes for terminals and characters that no file can hold."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)

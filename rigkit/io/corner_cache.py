@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,8 @@ from rigkit.io.sources import source_hash
 __all__ = ["CornerCache", "FoundCorners", "image_hash", "kept_corners", "lens_key"]
 
 CORNERS_SCHEMA = "rigkit.corners/2"
+MARK = re.compile(rb'^\s*\{\s*"schema":\s*"rigkit\.corners/')
+"""How such a file begins, of any version, even if the rest of it is damaged."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -114,8 +117,11 @@ class CornerCache:
         self._entries = kept
 
     def save(self) -> None:
-        """Write the file if anything is new."""
+        """Write the file if anything is new; raises InputError where it cannot be written, or a file of that name is
+        no file of kept corners."""
         if self._changed and self.path is not None:
+            if self.path.is_file() and not MARK.match(read_bytes(self.path)):
+                raise InputError(f"'{self.path}' is no file of corners kept by rigkit and is left as it is; rename it")
             data = {"schema": CORNERS_SCHEMA, "detector": self.detector, "images": self._entries}
             write_atomic(self.path, json.dumps(data, allow_nan=False) + "\n", force=True)
 

@@ -9,8 +9,12 @@ from contextlib import suppress
 from pathlib import Path
 
 from rigkit.core.errors import InputError
+from rigkit.io.reading import usable_path
 
-__all__ = ["ensure_folder_writable", "ensure_writable", "write_atomic", "write_together"]
+__all__ = ["FORCE", "ensure_folder_writable", "ensure_writable", "write_atomic", "write_together"]
+
+FORCE = "use --force (force=True in Python)"
+"""What replaces files."""
 
 
 def ensure_writable(
@@ -19,12 +23,13 @@ def ensure_writable(
     """Raise InputError if one of `paths` could not be written: call it before work that takes long.
 
     A path that exists is refused without `force`; so is a folder in its place, and a parent that is a file. With force
-    too, no file is written over one of `inputs`, which the work reads, nor two to the same path.
+    too, no file is written over one of `inputs`, which the work reads, nor two to the same path, nor over a pipe or a
+    device.
     """
-    read = {Path(path).resolve() for path in inputs}
+    read = {usable_path(path).resolve() for path in inputs}
     written: set[Path] = set()
     for path in [paths] if isinstance(paths, str | Path) else paths:
-        target = Path(path)
+        target = usable_path(path)
         whole = target.resolve()
         if whole in read:
             raise InputError(f"cannot write '{target}': this command reads it, and it would be lost; give another name")
@@ -33,14 +38,17 @@ def ensure_writable(
         written.add(whole)
         if target.is_dir():
             raise InputError(f"cannot write '{target}': a folder of that name exists; give another name")
-        if target.exists() and not force:
-            raise InputError(f"'{target}' exists and is left as it is; use --force to replace it, or another name")
+        if target.exists() and not target.is_file():
+            raise InputError(f"cannot write '{target}': it is a pipe or a device; give the name of a file")
+        # A link to nothing is somebody's too.
+        if (target.exists() or target.is_symlink()) and not force:
+            raise InputError(f"'{target}' exists and is left as it is; {FORCE} to replace it, or another name")
         _ensure_place(target, target.absolute().parent)
 
 
 def ensure_folder_writable(folder: str | Path) -> None:
     """Raise InputError if files could not be written into `folder`, which need not exist yet."""
-    _ensure_place(Path(folder), Path(folder).absolute())
+    _ensure_place(Path(folder), usable_path(folder).absolute())
 
 
 def _ensure_place(target: Path, folder: Path) -> None:
@@ -124,7 +132,7 @@ def _link_new(temporary: Path, target: Path) -> None:
     try:
         os.link(temporary, target)
     except FileExistsError as error:
-        raise InputError(f"'{target}' appeared while we worked and is left as it is; use --force") from error
+        raise InputError(f"'{target}' appeared while we worked and is left as it is; {FORCE}") from error
     except OSError:
         # Some file systems have no hard links.
         temporary.replace(target)

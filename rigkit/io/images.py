@@ -19,14 +19,17 @@ from numpy.typing import NDArray
 
 from rigkit.core.errors import InputError
 from rigkit.io.animation import frame_count
+from rigkit.io.image_size import announced_size
 from rigkit.io.reading import read_bytes
 from rigkit.io.tiff import as_stored, page_count
 
-__all__ = ["Image", "read_image", "to_grey"]
+__all__ = ["MAX_PIXELS", "Image", "read_image", "require_pixels", "to_grey"]
 
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 """(H, W) grey or (H, W, 3) red green blue."""
 
+MAX_PIXELS = 200_000_000
+"""Of an image: the largest sensors have 150 million; with detection that is 4 GB."""
 JPEG_START = b"\xff\xd8"
 JPEG_END = 0xD9
 JPEG_SCAN = 0xDA
@@ -46,13 +49,16 @@ def read_image(path: str | Path) -> Image:
     Raises
     ------
     InputError
-        No such file, not an image, several in one file, cut off or damaged, or a pixel type other than 8 or 16 bit.
+        No such file, not an image, several in one file, cut off or damaged, of more than `MAX_PIXELS`, or a pixel type
+        other than 8 or 16 bit.
     """
     source = Path(path)
     data = read_bytes(source, "image")
     fault = _fault(data)
     if fault:
         raise InputError(f"image '{source}' is {fault}; copy it again from the camera")
+    if (size := announced_size(data)) is not None:
+        require_pixels(size, f"image '{source}'")
     if (pages := page_count(data)) > 1:
         raise InputError(f"image '{source}' holds {pages} pages; save each as a file of its own")
     if (frames := frame_count(data)) > 1:
@@ -76,6 +82,15 @@ def to_grey(image: Image) -> Image:
     if image.ndim != 3 or image.shape[2] != 3:
         raise InputError(f"image: expected (H, W) or (H, W, 3), got shape {image.shape}")
     return cast(Image, cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+
+
+def require_pixels(size_px: tuple[int, int], what: str) -> None:
+    """Raise InputError, which begins with `what`, for an image that is too large to be worked on."""
+    width, height = size_px
+    if width * height > MAX_PIXELS:
+        raise InputError(
+            f"{what}: {width} x {height} px are more than {MAX_PIXELS // 10**6} million; use a smaller image"
+        )
 
 
 @contextmanager

@@ -72,6 +72,5 @@ def read_text(path: str | Path, what: str = "", *, max_bytes: int = MAX_TEXT_BYT
 
 
 def _named(path: str | Path, what: str) -> str:
-    """Return what the file is and its name, in one line whatever characters the name has."""
-    shown = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(path))
-    return f"{what} '{shown}'" if what else f"'{shown}'"
+    """Return what the file is and its name."""
+    return f"{what} '{path}'" if what else f"'{path}'"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
-__all__ = ["as_stored", "page_count"]
+__all__ = ["as_stored", "page_count", "page_sizes"]
 
 NEW_SUBFILE_TYPE, WIDTH, HEIGHT, ORIENTATION = 254, 256, 257, 274
 REDUCED_OR_MASK = 1 | 4
@@ -43,12 +43,17 @@ def as_stored(data: bytes) -> bytes:
 
 def page_count(data: bytes) -> int:
     """Return how many images as large as the first one a TIFF holds, without previews and masks; 1 for other data."""
+    sizes = page_sizes(data)
+    return sum(size == sizes[0] for size in sizes) or 1
+
+
+def page_sizes(data: bytes) -> list[tuple[int, int]]:
+    """Return the (width, height) of every image in a TIFF, without previews and masks; none for other data."""
     order = _byte_order(data)
     if order is None:
-        return 1
+        return []
     pages = [p for p in _pages(data, order) if not _value(p, NEW_SUBFILE_TYPE) & REDUCED_OR_MASK]
-    sizes = [(_value(p, WIDTH), _value(p, HEIGHT)) for p in pages]
-    return sum(size == sizes[0] for size in sizes) or 1
+    return [(_value(p, WIDTH), _value(p, HEIGHT)) for p in pages]
 
 
 def _value(page: dict[int, _Tag], tag: int) -> int:

@@ -149,7 +149,7 @@ class RectifyMap:
             )
         sampler = _Sampler(image, interpolation)
         columns, rows = self.target.size_px
-        out = np.empty((rows, columns, *image.shape[2:]), dtype=np.float64)
+        out = np.empty((rows, columns, *image.shape[2:]), dtype=image.dtype)
         for band, found in bands:
             total = np.zeros((len(band), columns, *image.shape[2:]))
             weight = np.zeros((len(band), columns))
@@ -159,13 +159,17 @@ class RectifyMap:
             # Half of the samples decide whether the pixel is seen: the border neither grows nor frays.
             seen = weight >= 0.5 * len(found)
             mean = total[seen] / weight[seen].reshape(-1, *(1,) * (image.ndim - 2))
-            out[band] = fill
-            out[band[0] : band[-1] + 1][seen] = mean
-        return _as_dtype(out, image.dtype)
+            out[band] = _as_dtype(np.asarray(fill, dtype=np.float64), image.dtype)
+            out[band[0] : band[-1] + 1][seen] = _as_dtype(mean, image.dtype)
+        return out
 
     def coverage(self) -> BoolArray:
         """Say which pixels (h, w) of the target the camera sees."""
-        return self._sources()[1]
+        columns, rows = self.target.size_px
+        out = np.empty((rows, columns), dtype=bool)
+        for band, ((_, valid),) in self._sampled_bands(1):
+            out[band] = valid
+        return out
 
     def _supersampling(self) -> int:
         """Samples a pixel and axis: source pixels per target pixel, where it is large (90 % quantile)."""

@@ -148,7 +148,7 @@ class ValidationReport:
 
 def validate(
     reconstruction: Reconstruction,
-    truth: PairTruth,
+    truth: PairTruth | None,
     *,
     shifts: CalibrationShifts | None = None,
     lattice: LatticePlanes | None = None,
@@ -160,7 +160,7 @@ def validate(
     Parameters
     ----------
     reconstruction : of one pair.
-    truth : what a person measured of that pair.
+    truth : what a person measured of that pair; None, as of a pair of which nothing was measured, is refused.
     shifts : from `calibration_shifts`: what the calibrations' uncertainty adds to every sigma; None: exact intrinsics.
     lattice : the boards' planes by their known lattices, to stand beside those of the points.
     coverage : largest |difference| / combined sigma that passes.
@@ -173,6 +173,8 @@ def validate(
     DegenerateError
         A board has too few points for a plane.
     """
+    if truth is None:
+        raise InputError("validate: nothing was measured of this pair, so nothing can be checked; give its PairTruth")
     measured = measure(reconstruction, shifts, weighted=weighted)
     return _report(reconstruction, measured, truth, shifts, lattice, coverage)
 

@@ -64,7 +64,7 @@ def calibrate_folders(
     time: beside `options.output`, or in the one folder that holds all of them.
 
     A session that is there is kept where it says the same, refused where it says something else, and replaced with
-    `options.force`. Where nothing comes out, no session is left.
+    `options.force`. Where nothing comes out, all is as before.
 
     Raises
     ------
@@ -80,13 +80,15 @@ def calibrate_folders(
     new = {path: text for path, text in wanted.files.items() if not _says(path, text)}
     results = [path for path in (options.output, options.report) if path not in (None, Path())]
     ensure_writable([*new, *results], force=options.force, inputs=set(wanted.files) - set(new))
-    there = {path for path in new if path.exists()}
+    before = {path: read_bytes(path, "session") for path in new if path.exists()}
     if new:
         write_together(dict(new), force=options.force)
     try:
         return calibrate_session_file(wanted.path, options, progress=progress)
     except BaseException:
-        for path in set(new) - there:
+        if before:
+            write_together(before, force=True)
+        for path in set(new) - set(before):
             with suppress(OSError):
                 path.unlink()
         raise

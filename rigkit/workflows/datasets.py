@@ -252,6 +252,8 @@ def _attempt(work: Callable[[Job], Result], job: Job) -> Result | RigkitError:
         return work(job)
     except RigkitError as error:
         return error
+    except MemoryError as error:
+        return InputError(f"{error or 'out of memory'}; use fewer processes (-j 1), or smaller images")
     except Exception as error:
         # A fault of ours in one pair must not lose the others' results; the traceback says where it is.
         return InternalError(

@@ -176,6 +176,10 @@ def _detect(job: _DetectJob) -> Outcome:
         found = _boards_in(image, job)
     except InputError as error:
         return error
+    except MemoryError as error:
+        return InputError(
+            f"image '{job.image}': {error or 'out of memory'}; use fewer processes (-j 1), or a smaller one"
+        )
     if job.overlay is not None:
         picture = cv2.cvtColor(draw_boards(image, found), cv2.COLOR_RGB2BGR)
         write_atomic(job.overlay, np.asarray(cv2.imencode(".png", picture)[1]).tobytes(), force=job.force)

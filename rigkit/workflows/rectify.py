@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rigkit.core.errors import InputError
 from rigkit.core.progress import Progress, silent
 from rigkit.io.files import ensure_writable, write_atomic, write_together
-from rigkit.io.images import read_image
+from rigkit.io.images import read_image, require_pixels
 from rigkit.rectification.rectify import RectifyMap, rectify_map, rotation_from_view_angles
 from rigkit.rectification.stereo import StereoRectification, rectify_pair
 from rigkit.rectification.targets import target_camera
@@ -140,6 +140,8 @@ def _write(
     jobs: list[tuple[list[tuple[Path, Path]], RectifyMap]], options: RectifyOptions, progress: Progress
 ) -> tuple[RectifiedImage, ...]:
     """Resample and write the images of each map, one after the other; two images of a pair come together or not."""
+    for job, remap in jobs:
+        require_pixels(remap.target.size_px, f"rectified image '{job[0][1]}' (--size)")
     covered = [float(remap.coverage().mean()) for _, remap in jobs]
     if min(covered) == 0.0:
         raise InputError("rectify: the camera sees nothing of this view; change --yaw-deg, --pitch-deg or --hfov-deg")
@@ -186,5 +188,11 @@ def _encoded(image: NDArray[Any], path: Path) -> bytes:
     suffix = path.suffix.lower()
     if suffix in EIGHT_BIT and image.dtype != np.uint8:
         raise InputError(f"'{path}': a {suffix} file has no 16-bit pixels; write a .png or .tif")
-    _, data = cv2.imencode(suffix, image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1]))
+    try:
+        done, data = cv2.imencode(suffix, image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1]))
+    except cv2.error:
+        done = False
+    if not done:
+        size = f"{image.shape[1]} x {image.shape[0]}"
+        raise InputError(f"'{path}': a {suffix} file takes no image of {size} px; write a .png or .tif, or --size")
     return bytes(data)

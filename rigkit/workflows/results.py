@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from rigkit.core.errors import InputError
-from rigkit.io.files import ensure_folder_writable, ensure_writable, write_together
+from rigkit.io.files import FORCE, ensure_folder_writable, ensure_writable, write_together
 
 __all__ = ["CALIBRATIONS", "free_folder", "require_folder", "write_results"]
 
@@ -28,7 +28,7 @@ def require_folder(folder: Path, *, force: bool) -> None:
     """Raise InputError, before the work, where `folder` holds results and `force` is not given, or files could not be
     written there."""
     if folder.is_dir() and any(folder.iterdir()) and not force:
-        raise InputError(f"folder '{folder}' is not empty; use --force to replace results in it, or another folder")
+        raise InputError(f"folder '{folder}' is not empty; {FORCE} to replace results in it, or another folder")
     if folder.exists() and not folder.is_dir():
         raise InputError(f"'{folder}' is a file, not a folder; give another name with -o")
     ensure_folder_writable(folder)

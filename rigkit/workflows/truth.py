@@ -80,6 +80,8 @@ def fetch_public_set(described: PublicSet, root: Path | None = None, *, progress
         A file that is here has another hash, or cannot be downloaded.
     """
     folder = set_folder(described, root)
+    if root is not None and root.exists() and not root.is_dir():
+        raise InputError(f"'{root}' is a file, not a folder; give the folder of captures")
     present, fetched, missing = [], [], []
     for k, (name, expected) in enumerate(described.sha256.items()):
         progress(f"fetch {described.name}", k, len(described.sha256))

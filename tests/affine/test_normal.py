@@ -278,3 +278,13 @@ class TestWeighted:
         assert angles_deg(plain, weighted).max() < 1e-9
         by_weights = normal_covariance(scene.J1, scene.J2, plain, covariance, weighted=True)
         np.testing.assert_allclose(by_weights, normal_covariance(scene.J1, scene.J2, plain, covariance), atol=1e-12)
+
+
+@pytest.mark.parametrize("wrong", [np.ones((4, 3, 2)), np.ones((3, 2, 3)), np.ones((2, 3)), 1.0, [["a"]]])
+@pytest.mark.parametrize("which", [0, 1, 2])
+@pytest.mark.parametrize("method", NORMAL_METHODS)
+def test_arrays_of_other_shapes_are_refused(wrong: object, which: int, method: str) -> None:
+    arrays: list[object] = [np.ones((4, 2, 3)), np.ones((4, 2, 3)), np.ones((4, 2, 2))]
+    arrays[which] = wrong
+    with pytest.raises(InputError, match="J1"):
+        normals_from_affines(*arrays, method=method)  # type: ignore[arg-type]

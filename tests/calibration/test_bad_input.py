@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 
+from rigkit.calibration import assemble
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.shape import shape_model
@@ -98,3 +100,18 @@ def test_parts_of_boards_cost_no_more_than_their_corners(rng: np.random.Generato
     assert np.abs(found["9x6"] - BOARD.points()).max() > 0.1
     for part in parts:
         assert np.array_equal(found[part.board.board_id], BOARD.points())
+
+
+def test_a_covariance_that_is_none_is_no_result(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Equations that were sound while models were compared may have no inverse once corners are left out."""
+    views, _, _ = random_views(lens("reg"), 8, rng, reach_deg=33.0)
+    sound = assemble.frame_covariance
+
+    def singular(*arguments: Any) -> np.ndarray:
+        covariance = sound(*arguments)
+        covariance[0, 0] = -1e10
+        return covariance
+
+    monkeypatch.setattr(assemble, "frame_covariance", singular)
+    with pytest.raises(DegenerateError, match="brown camera is not identifiable"):
+        calibrate(views, SIZE, model="brown", board="flat")

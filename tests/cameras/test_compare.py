@@ -96,3 +96,11 @@ def test_what_cannot_be_compared() -> None:
     narrow: Camera = Pinhole((1280, 960), np.array([1e5, 1e5, 1e6, 1e6]))
     found = compare_cameras(narrow, narrow)
     assert found.max_px < 1e-3
+
+
+@pytest.mark.parametrize(
+    "grid", [(20.5, 15), (0, 15), (-1, -1), (20,), (np.nan, 15), ("a", "b"), (True, True), (10**9, 2), 20]
+)
+def test_a_grid_that_is_none(grid: object) -> None:
+    with pytest.raises(InputError, match="grid"):
+        compare_cameras(CAMERAS["pinhole"], CAMERAS["pinhole"], grid=grid)  # type: ignore[arg-type]

@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from rigkit.cli.main import main
@@ -90,6 +91,19 @@ def test_a_full_disk_is_no_bug_of_ours(monkeypatch: pytest.MonkeyPatch, capsys: 
     monkeypatch.setattr("rigkit.cli.diff.run", full)
     assert main(["diff", "a", "b"]) == 2
     assert "'results/cloud.ply': No space left on device" in capsys.readouterr().err
+
+
+def test_too_little_memory_is_no_bug_of_ours(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def large(args: object) -> int:
+        np.empty((10**9, 10**6))
+        return 0
+
+    monkeypatch.setattr("rigkit.cli.diff.run", large)
+    assert main(["diff", "a", "b"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "Unable to allocate" in line and "-j 1" in line
 
 
 def _ends(_: int) -> None:

@@ -122,3 +122,15 @@ def test_streams_that_cannot_take_every_letter(tmp_path: Path, closed: bool) -> 
     )
     assert done.returncode == 0, done.stderr
     assert b"\\udcff" in done.stdout and b"3 boards in 1 of 1 images" in done.stdout
+
+
+@pytest.mark.parametrize("full", ["2>/dev/full", ">/dev/full 2>/dev/full", ">&- 2>&-", "<&- 2>/dev/full"])
+def test_what_is_refused_is_refused_though_nobody_can_be_told(folder: Path, full: str) -> None:
+    done = subprocess.run(
+        ["sh", "-c", f'"$@" {full}', "sh", sys.executable, "-m", "rigkit", "diff", "camera.json", "nowhere.json"],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
+        capture_output=True,
+        check=False,
+    )
+    assert done.returncode == 2

@@ -180,3 +180,17 @@ def test_a_kind_of_image_that_nobody_writes_is_known_before_the_work(
     assert main(["rectify", files[0], "--camera", files[1], "-o", str(tmp_path / name)]) == 2
     assert ".png" in capsys.readouterr().err
     assert not (tmp_path / name).exists()
+
+
+@pytest.mark.parametrize(
+    ("size", "name", "said"),
+    [("60000x60000", "out.png", "more than 200 million"), ("66000x10", "out.jpg", "takes no image of 66000 x 10 px")],
+)
+def test_an_image_that_is_too_large_is_refused(
+    size: str, name: str, said: str, files: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["rectify", files[0], "--camera", files[1], "-o", str(tmp_path / name), "--size", size]
+    assert main([*arguments, "--interpolation", "nearest"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line and name in line and "--size" in line
+    assert not (tmp_path / name).exists()

@@ -7,6 +7,7 @@ import io
 import json
 import os
 import zipfile
+import zlib
 from pathlib import Path
 
 import cv2
@@ -16,11 +17,12 @@ import pytest
 from rigkit.core.arrays import as_array, as_covariance
 from rigkit.core.boards import Board
 from rigkit.core.cloud import OrientedCloud
-from rigkit.core.errors import InputError
+from rigkit.core.errors import InputError, InternalError
 from rigkit.core.identifiers import MAX_IDENTIFIER, check_identifier
 from rigkit.io.board_file import load_board
 from rigkit.io.calibration_file import load_camera
 from rigkit.io.correspondences import read_correspondences
+from rigkit.io.image_size import announced_size
 from rigkit.io.images import read_image
 from rigkit.io.manifest import load_dataset
 from rigkit.io.ply import ply_bytes, read_ply
@@ -249,3 +251,66 @@ def test_animations(tmp_path: Path, ending: str, rng: np.random.Generator) -> No
         read_image(path)
     cv2.imwrite(str(path), frames[0])
     assert read_image(path).shape[:2] == (40, 60)
+
+
+def test_a_message_is_one_line() -> None:
+    """Whatever a file's name or a value has in it; only a fault of ours comes with its lines."""
+    assert str(InputError("image 'a\nb\x1b[31m\udcff.png' is empty; ü")) == (
+        "image 'a\\nb\\x1b[31m\\udcff.png' is empty; ü"
+    )
+    assert str(InternalError("Traceback:\n here")).count("\n") == 1
+
+
+def _head_of_png(width: int, height: int) -> bytes:
+    head = b"IHDR" + width.to_bytes(4, "big") + height.to_bytes(4, "big") + bytes([8, 0, 0, 0, 0])
+    chunks = [head, b"IDAT" + zlib.compress(bytes(100)), b"IEND"]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        (len(c) - 4).to_bytes(4, "big") + c + zlib.crc32(c).to_bytes(4, "big") for c in chunks
+    )
+
+
+HEADS = {
+    "png": _head_of_png(30_000, 30_000),
+    "bmp": b"BM" + (200).to_bytes(4, "little") + bytes(8) + (40).to_bytes(4, "little")
+    + (30_000).to_bytes(4, "little") + (2**32 - 30_000).to_bytes(4, "little") + bytes(200),
+    "pgm": b"P5\n# a comment\n30000 30000\n255\nabc",
+    "pam": b"P7\nWIDTH 30000\nHEIGHT 30000\nDEPTH 1\nMAXVAL 255\nENDHDR\nabc",
+    "pfm": b"Pf\n30000 30000\n1.0\nabc",
+    "hdr": b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 30000 +X 30000\nabc",
+    "gif": b"GIF89a" + (30_000).to_bytes(2, "little") * 2 + bytes(20),
+    "jp2": b"\0\0\0\x0cjP  \r\n\x87\n" + bytes(20) + b"ihdr" + (30_000).to_bytes(4, "big") * 2,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("ending", sorted(HEADS))
+def test_an_image_of_too_many_pixels(tmp_path: Path, ending: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is refused before a decoder makes room for it."""
+    (tmp_path / f"a.{ending}").write_bytes(HEADS[ending])
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
+    with pytest.raises(InputError, match=rf"a\.{ending}'.*30000 x 30000 px are more than"):
+        read_image(tmp_path / f"a.{ending}")
+
+
+@pytest.mark.parametrize(
+    "ending", ["png", "jpg", "bmp", "pgm", "ppm", "pam", "webp", "tif", "gif", "jp2", "ras", "avif"]
+)
+@pytest.mark.parametrize("colour", [False, True])
+def test_the_size_that_a_file_announces_is_that_of_its_image(ending: str, colour: bool) -> None:
+    image = np.zeros((41, 63, 3) if colour else (41, 63), np.uint8)
+    image[5:20, 7:30] = 255
+    try:
+        done, data = cv2.imencode(f".{ending}", image)
+    except cv2.error:
+        done = False
+    if not done:
+        pytest.skip(f"this OpenCV writes no {ending}")
+    assert announced_size(data.tobytes()) == (63, 41)
+
+
+def test_one_pixel_less_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((40, 60), np.uint8))
+    monkeypatch.setattr("rigkit.io.images.MAX_PIXELS", 40 * 60)
+    assert read_image(tmp_path / "a.png").shape == (40, 60)
+    monkeypatch.setattr("rigkit.io.images.MAX_PIXELS", 40 * 60 - 1)
+    with pytest.raises(InputError, match="60 x 40"):
+        read_image(tmp_path / "a.png")

@@ -196,3 +196,8 @@ def test_scatter_of_the_corners_is_carried_into_angles_and_distances(rng: np.ran
     ratio = np.std(found[..., 0], axis=0) / np.sqrt(np.mean(found[..., 1] ** 2, axis=0))
     assert (ratio > SIGMA_RATIO[0]).all(), ratio
     assert (ratio < SIGMA_RATIO[1]).all(), ratio
+
+
+def test_a_pair_of_which_nothing_was_measured_is_not_checked() -> None:
+    with pytest.raises(InputError, match="nothing was measured"):
+        validate(make_reconstruction(), None)

@@ -1,0 +1,133 @@
+"""Whatever name a result is given, nothing that a command reads is lost, and a name that cannot be written is told."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from rigkit.cli.main import main
+
+CALIBRATE = "calibrate session.toml --no-cache"
+FOLDER = "calibrate pairs --board board.toml --no-cache"
+RIG = "calibrate rig-session.toml --no-cache"
+CERTIFY = "certify calibration.json --length 3 --distance 500"
+INIT = "init pairs --square-mm 30 --calibration calibration.json --pose-type planar"
+IMAGES = ("pairs/view1.png", "pairs/view2.png")
+
+WRITES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
+    ("detect -j 1 image.png --board floor.toml", "-o", ("image.png", "floor.toml")),
+    ("detect -j 1 --board floor.toml --camera calibration.json image.png", "-o", ("calibration.json",)),
+    (CALIBRATE, "-o", ("session.toml", "board.toml", "image.png", "corners.json")),
+    (f"{CALIBRATE} -o new.json", "-r", ("session.toml", "board.toml", "image.png", "corners.json")),
+    (FOLDER, "-o", ("board.toml", *IMAGES)),
+    (f"{FOLDER} -o new.json", "-r", ("board.toml", *IMAGES)),
+    (RIG, "-o", ("rig-session.toml", "board.toml", "floor.toml", "image.png", "image.jpg")),
+    (f"{RIG} -o new.json", "-r", ("rig-session.toml", "board.toml", "floor.toml", "image.png", "image.jpg")),
+    ("diff calibration.json calibration.json", "-o", ("calibration.json",)),
+    (CERTIFY, "-r", ("calibration.json",)),
+    (CERTIFY, "--pdf", ("calibration.json",)),
+    ("rectify image.png --camera calibration.json", "-o", ("image.png",)),
+    ("export calibration.json --to kalibr", "-o", ("calibration.json",)),
+    ("export rig.json --to kalibr", "-o", ("rig.json",)),
+    ("export opencv.yaml --to rigkit", "-o", ("opencv.yaml",)),
+    ("export dataset.toml --to ply --pair first", "-o",
+     ("dataset.toml", "session.toml", "board.toml", "floor.toml", "image.png", "image.jpg", "calibration.json")),
+    (INIT, "-o", ("calibration.json", *IMAGES)),
+)  # fmt: skip
+"""Commands, the option that names what they write, and what they read."""
+COMMANDS = [pytest.param(words, option, id=f"{words.split()[0]} {option}") for words, option, _ in WRITES]
+PLACES = ("loop", "pipe", "folder", "image.bmp/below.json", "x" * 300, "/dev/null")
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def refused(words: str, capsys: pytest.CaptureFixture[str]) -> str:
+    """Run the command, which must be refused in one line; return that."""
+    assert main(words.split()) == 2
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("rigkit: ")]
+    return line
+
+
+@pytest.mark.parametrize(
+    ("words", "option", "read"),
+    [pytest.param(w, o, r, id=f"{w.split()[0]} {o} {r}") for w, o, reads in WRITES for r in reads],
+)
+def test_what_a_command_reads_is_never_written(
+    words: str, option: str, read: str, place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = content(place)
+    assert "it would be lost" in refused(f"{words} {option} {read} --force", capsys)
+    (place / "link.png").symlink_to(read)
+    assert "it would be lost" in refused(f"{words} {option} link.png --force", capsys)
+    (place / "link.png").unlink()
+    assert content(place) == before
+
+
+@pytest.mark.parametrize("name", PLACES)
+@pytest.mark.parametrize(("words", "option"), COMMANDS)
+def test_names_that_cannot_be_written(
+    words: str, option: str, name: str, place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A link to itself, a pipe, a folder, a file as folder, a name too long, and a device, which a rename replaces."""
+    ending = ".png" if words.startswith("rectify") else ""
+    os.mkfifo(place / f"pipe{ending}")
+    (place / f"folder{ending}").mkdir()
+    (place / f"loop{ending}").symlink_to(f"loop{ending}")
+    (place / f"null{ending}").symlink_to("/dev/null")
+    before = content(place)
+    where = f"null{ending}" if name == "/dev/null" else f"{name}{ending}"
+    line = refused(f"{words} {option} {where} --force", capsys)
+    assert where.partition("/below")[0][:40] in line and ";" in line
+    assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
+    assert content(place) == before
+
+
+@pytest.mark.parametrize("name", ["calibration.json", "image.png", "dataset.toml", "pipe", "/dev/null", "folder"])
+def test_a_log_is_added_to_logs_alone(name: str, place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    os.mkfifo(place / "pipe")
+    (place / "folder").mkdir()
+    before = content(place)
+    assert "--log-file" in refused(f"diff calibration.json calibration.json --log-file {name}", capsys)
+    assert content(place) == before
+
+
+def test_a_log_grows(place: Path) -> None:
+    words = "diff calibration.json calibration.json --log-file run.log"
+    assert main(words.split()) == 0
+    once = (place / "run.log").read_bytes()
+    assert main(words.split()) == 0
+    assert (place / "run.log").read_bytes().startswith(once) and (place / "run.log").stat().st_size > len(once)
+
+
+def test_a_session_comes_back_where_the_calibration_fails(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The images of this folder are one view twice: they calibrate nothing."""
+    before = content(place)
+    assert main(["calibrate", "pairs", "--board", "5x4x30", "-o", "new.json", "--force", "--no-cache"]) == 3
+    assert content(place) == before
+
+
+def test_a_file_that_is_no_cache_is_not_replaced_by_one(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (place / "corners.json").write_text('{"mine": 1}')
+    main(["calibrate", "session.toml", "-o", "new.json"])
+    assert (place / "corners.json").read_text() == '{"mine": 1}'
+    assert "left as it is" in capsys.readouterr().err
+    # A damaged one of ours is.
+    (place / "corners.json").write_text('{"schema": "rigkit.corners/1", "ima')
+    main(["calibrate", "session.toml", "-o", "new.json"])
+    assert '"sha256"' in (place / "corners.json").read_text()
+
+
+def test_a_folder_of_captures_that_is_a_file(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "is a file, not a folder" in refused("fetch bumblebee2 -o dataset.toml", capsys)
+
+
+def test_one_unreadable_image_does_not_end_a_manifest(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (place / "pairs" / "view3.png").write_bytes((place / "image.png").read_bytes()[:200])
+    assert main([*INIT.split(), "-o", "new.toml"]) == 2
+    assert (place / "new.toml").is_file()
+    assert "left out: image" in capsys.readouterr().err
