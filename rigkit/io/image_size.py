@@ -25,7 +25,7 @@ NETPBM = re.compile(rb"P[1-6](?:\s|#[^\n]*\n)+(\d{1,10})(?:\s|#[^\n]*\n)+(\d{1,1
 PAM = re.compile(rb"P7\n(?:(?!ENDHDR)[^\n]*\n)*")
 PFM = re.compile(rb"P[Ff]\s+(\d{1,10})\s+(\d{1,10})")
 RADIANCE = re.compile(rb"[-+][XY] (\d{1,10}) [-+][XY] (\d{1,10})")
-HEAD = 65_536
+HEAD_BYTES = 65_536
 """Radiance and PAM have words of any length in front."""
 
 
@@ -86,14 +86,14 @@ def _of_riff(data: bytes) -> Size | None:
 
 def _of_words(*patterns: re.Pattern[bytes]) -> Callable[[bytes], Size | None]:
     def read(data: bytes) -> Size | None:
-        found = next((m for p in patterns if (m := p.search(data[:HEAD])) is not None), None)
+        found = next((m for p in patterns if (m := p.search(data[:HEAD_BYTES])) is not None), None)
         return None if found is None else (int(found[1]), int(found[2]))
 
     return read
 
 
 def _of_pam(data: bytes) -> Size | None:
-    head = PAM.match(data[:HEAD])
+    head = PAM.match(data[:HEAD_BYTES])
     words = dict(re.findall(rb"(WIDTH|HEIGHT) +(\d{1,10})", head[0] if head else b""))
     return (int(words[b"WIDTH"]), int(words[b"HEIGHT"])) if len(words) == 2 else None
 
@@ -113,7 +113,7 @@ def _of_codestream(data: bytes) -> Size:
 
 def _of_boxes(data: bytes) -> Size | None:
     """Return the largest size among the boxes of JPEG 2000 (ihdr) and of AVIF and HEIF (ispe)."""
-    head = data[: 16 * HEAD]
+    head = data[: 16 * HEAD_BYTES]
     sizes = [(_big(head, m.end() + 4), _big(head, m.end())) for m in re.finditer(rb"ihdr", head)]
     sizes += [(_big(head, m.end() + 4), _big(head, m.end() + 8)) for m in re.finditer(rb"ispe", head)]
     return max(sizes, key=lambda size: size[0] * size[1], default=None)
