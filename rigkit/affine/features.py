@@ -18,7 +18,7 @@ from rigkit.affine.refine_patches import refine_patches
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, in_8_bits
 from rigkit.core.errors import DegenerateError, InputError
 
-__all__ = ["match_affine_features"]
+__all__ = ["grey_of", "match_affine_features"]
 
 TILTS = (1.0, np.sqrt(2.0), 2.0)
 """Simulated tilts: together with those of the other image they cover slants of 60 degrees and more."""
@@ -44,7 +44,7 @@ def match_affine_features(
     tilts: Sequence[float] = TILTS,
     features_per_view: int = 600,
     ratio: float = 0.85,
-    half_width_px: float = 12.0,
+    half_width_px: int = 12,
     min_correlation: float = MIN_CORRELATION,
 ) -> Correspondences:
     """Return affine correspondences of two images; contaminated by some wrong ones, as matches are.
@@ -65,7 +65,7 @@ def match_affine_features(
     DegenerateError
         No correspondences: no texture, or images of different scenes.
     """
-    grey1, grey2 = _grey(image1, "image1"), _grey(image2, "image2")
+    grey1, grey2 = grey_of(image1, "image1"), grey_of(image2, "image2")
     first, second = (_features(grey, tilts, features_per_view) for grey in (grey1, grey2))
     i, j, rank = _match(first, second, ratio)
     once = _unrepeated(first.pixels[i], second.pixels[j], rank)
@@ -96,7 +96,8 @@ def match_affine_features(
     )
 
 
-def _grey(image: NDArray[Any], name: str) -> NDArray[np.uint8]:
+def grey_of(image: NDArray[Any], name: str) -> NDArray[np.uint8]:
+    """Return the image in grey, 8 bits; raises InputError where it is none, or too small."""
     import cv2
 
     array = np.asarray(image)

@@ -26,6 +26,7 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--camera2", metavar="CALIB", help="calibration of the camera of image B (default: the same)")
     group.add_argument("--baseline-mm", type=float, metavar="MM", help="measured baseline (default: it is the unit)")
     group.add_argument("--pose-type", choices=POSE_TYPES, default="general", help="of the two views (default general)")
+    group.add_argument("--sparse", action="store_true", help="only the matched features; do not grow a dense cloud")
     group.add_argument("--level-sigma-deg", type=float, metavar="DEG", help="how well that pose type holds")
 
 
@@ -59,6 +60,7 @@ def run_scene(args: argparse.Namespace) -> int:
         output=out,
         force=args.force,
         pictures=not args.no_pictures,
+        grow=not args.sparse,
     )
     done = reconstruct_views(options, progress=progress_on_stderr())
     scene, r = done.scene, done.scene.reconstruction
@@ -76,6 +78,7 @@ def run_scene(args: argparse.Namespace) -> int:
                 "points": len(r.cloud),
                 "unit": done.unit,
                 "cam2_from_cam1": r.cam2_from_cam1.matrix().tolist(),
+                "pose_covariance": None if r.pose_covariance is None else r.pose_covariance.tolist(),
                 "sigma_px": scene.sigma_px,
                 "sigma_A": scene.sigma_A if np.isfinite(scene.sigma_A) else None,
                 "sampson_rms_px": r.sampson_rms_px,

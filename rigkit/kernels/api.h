@@ -259,4 +259,48 @@ EXPORT int64_t minimise(
     ARRAY(double, r, problem.count + 2 * problem.chosen), ARRAY(double, J, problem.count + 2 * problem.chosen, 5),
     ARRAY(double, w, problem.count + 2 * problem.chosen));
 
+/* patches.c */
+
+/* Levels of a pyramid; the largest half side of a patch in samples; what is said of a patch: place in image 2, affinity row
+ * by row, correlation, variance of its brightness, how many levels coarser it was aligned than the images' sharpness asks
+ * for, and the upper triangle of the covariance of place and affinity, row by row. */
+enum { MOST_LEVELS = 8, MOST_HALF = 16, PATCH_COLUMNS = 9 + 21 };
+
+/* An image and its halvings: pixel of level l = pixel of the image / 2^l. */
+typedef struct {
+    image_t levels[MOST_LEVELS];
+    int64_t count;
+} pyramid_t;
+
+/* The constants of affine.refine_patches; `half` is the half side of the patch, its window a Gaussian of `width`, both in
+ * samples. */
+typedef struct {
+    int64_t half, coarsest, most_steps;
+    double width, settled, most_move, least_contrast, least_correlation, most_sigma, least_noise, excess_noise;
+} patch_rules_t;
+
+/* The rays of image 2 every `spacing` pixels, and how well the pairs agree with E21: an infinite sigma is no knowledge. */
+typedef struct {
+    ARRAY(const double, rays2, rows, columns, 3);
+    int64_t rows, columns;
+    double spacing, E21[9], sigma, sigma_A, most_distance;
+} epipolar_t;
+
+/* The nodes that patches grow over: node (r, c) is the pixel `step` * (c, r) of image 1. */
+typedef struct {
+    ARRAY(const double, rays1, rows, columns, 3);
+    ARRAY(const double, jacobians1, rows, columns, 3, 2);
+    ARRAY(double, out, rows, columns, PATCH_COLUMNS);
+    ARRAY(uint8_t, tries, rows, columns);
+    ARRAY(int32_t, heap, rows, columns);
+    int64_t rows, columns, step, most_tries;
+} patch_grid_t;
+
+EXPORT void align_patches(
+    const pyramid_t *first, const pyramid_t *second, const patch_rules_t *rules, ARRAY(const double, starts, count, 8),
+    int64_t count, ARRAY(double, out, count, PATCH_COLUMNS));
+EXPORT int64_t grow_patches(
+    const pyramid_t *first, const pyramid_t *second, const epipolar_t *epipolar, const patch_rules_t *rules,
+    const patch_grid_t *grid, ARRAY(const double, seeds, count, 8), int64_t count);
+
 #endif

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.features import match_affine_features
-from rigkit.core.errors import InputError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.progress import Progress, silent
 from rigkit.io.correspondences import correspondences_text, read_correspondences
 from rigkit.io.ply import ply_bytes
+from rigkit.reconstruction.growing.dense import grow_scene
 from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene
 from rigkit.report.figures import cloud_png, epipolar_png
 from rigkit.report.scene_figure import normals_png
@@ -48,6 +49,8 @@ class SceneOptions:
     """Of the two views: general, planar, standard, forward or auto."""
     level_sigma_deg: float | None = None
     """How well that pose type holds."""
+    grow: bool = True
+    """Where there are images: let the correspondences grow over the surfaces, into a dense cloud."""
     output: Path | None = None
     """Folder for the results; None: nothing is written."""
     force: bool = False
@@ -122,6 +125,8 @@ def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> 
         baseline_mm=options.baseline_mm,
         image1=images[0] if images else None,
     )
+    if images and options.grow:
+        scene, found = _grown(scene, found, images, progress)
     files = _files(options, scene, found, images)
     if options.output is not None:
         read = (*(options.images or ()), options.correspondences, options.camera, options.camera2)
@@ -137,6 +142,21 @@ def _correspondences(options: SceneOptions, images: Images | None, progress: Pro
     found = match_affine_features(*images)
     progress("matching affine features", 1, 1)
     return found
+
+
+def _grown(
+    scene: SceneReconstruction, seeds: Correspondences, images: Images, progress: Progress
+) -> tuple[SceneReconstruction, Correspondences]:
+    """Return the dense scene and its correspondences; where nothing grows, the sparse one that says why."""
+    progress("growing correspondences", 0, 1)
+    try:
+        dense = grow_scene(scene, seeds, *images)
+    except DegenerateError as error:
+        notes = (*scene.reconstruction.notes, f"no dense cloud: {error}")
+        return replace(scene, reconstruction=replace(scene.reconstruction, notes=notes)), seeds
+    finally:
+        progress("growing correspondences", 1, 1)
+    return dense.scene, dense.correspondences
 
 
 def _files(

@@ -1,0 +1,131 @@
+"""Calls of the kernels in patches.c: patches of two images aligned, one by one or grown over a surface."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.core.arrays import Affines, FloatArray, Mat3, Pixels
+from rigkit.kernels import kernels
+from rigkit.kernels.calls import Struct, structure
+from rigkit.kernels.declarations import header
+from rigkit.kernels.front import ImageOf
+
+__all__ = ["EpipolarKnowledge", "PatchRules", "PatchTable", "Pyramid", "aligned", "grown", "starts_of"]
+
+MOST_LEVELS = header().constants["MOST_LEVELS"]
+PATCH_COLUMNS = header().constants["PATCH_COLUMNS"]
+UPPER = np.triu_indices(6)
+
+
+@structure("pyramid_t")
+class Pyramid(Struct):
+    """An image and its halvings, float32."""
+
+    @classmethod
+    def make(cls, levels: Sequence[NDArray[np.float32]]) -> Pyramid:
+        images = [ImageOf.make(np.ascontiguousarray(level, np.float32)) for level in levels[:MOST_LEVELS]]
+        blank = ImageOf.make(np.zeros((1, 1), np.float32))
+        out = cls.of(levels=(ImageOf * MOST_LEVELS)(*images, *[blank] * (MOST_LEVELS - len(images))), count=len(images))
+        out._kept["images"] = images, blank
+        return out
+
+
+@structure("patch_rules_t")
+class PatchRules(Struct):
+    """How patches are aligned, and which are good."""
+
+
+@structure("epipolar_t")
+class EpipolarKnowledge(Struct):
+    """The rays of image 2, and how well pairs are known to agree with an essential matrix."""
+
+    @classmethod
+    def make(
+        cls, rays2: FloatArray, spacing: float, E21: Mat3, *, sigma: float, sigma_A: float, most_distance: float
+    ) -> EpipolarKnowledge:
+        """Return it for the rays (R, C, 3) at the pixels `spacing` * (column, row), NaN where there is none."""
+        entries = np.ascontiguousarray(E21, np.float64).reshape(9)
+        return cls.of(
+            rays2=np.ascontiguousarray(rays2, np.float64),
+            rows=rays2.shape[0],
+            columns=rays2.shape[1],
+            spacing=float(spacing),
+            E21=tuple(entries),
+            sigma=sigma,
+            sigma_A=sigma_A,
+            most_distance=most_distance,
+        )
+
+
+@structure("patch_grid_t")
+class _Grid(Struct):
+    """The nodes that patches grow over."""
+
+
+class PatchTable(NamedTuple):
+    """N patches; NaN where the alignment failed.
+
+    Attributes
+    ----------
+    pixels2 : (N, 2); A21 : (N, 2, 2); correlation : (N,); noise : (N,) variance of the brightness a sample.
+    coarser : (N,) levels by which the patch was aligned more coarsely than the images are sharp.
+    covariance : (N, 6, 6) of (u2, v2, a11, a12, a21, a22).
+    """
+
+    pixels2: Pixels
+    A21: Affines
+    correlation: FloatArray
+    noise: FloatArray
+    coarser: FloatArray
+    covariance: FloatArray
+
+
+def _table(out: FloatArray) -> PatchTable:
+    covariance = np.empty((len(out), 6, 6))
+    covariance[:, UPPER[0], UPPER[1]] = covariance[:, UPPER[1], UPPER[0]] = out[:, 9:]
+    return PatchTable(out[:, :2], out[:, 2:6].reshape(-1, 2, 2), out[:, 6], out[:, 7], out[:, 8], covariance)
+
+
+def starts_of(pixels1: Pixels, pixels2: Pixels, A21: Affines) -> FloatArray:
+    """Return where alignments start, (N, 8)."""
+    return np.ascontiguousarray(np.concatenate([pixels1, pixels2, A21.reshape(-1, 4)], axis=1), np.float64)
+
+
+def aligned(first: Pyramid, second: Pyramid, rules: PatchRules, starts: FloatArray) -> PatchTable:
+    """Return the patches (N,) aligned from `starts` (N, 8)."""
+    out = np.empty((len(starts), PATCH_COLUMNS))
+    kernels().align_patches(first, second, rules, starts, len(starts), out)
+    return _table(out)
+
+
+def grown(
+    first: Pyramid,
+    second: Pyramid,
+    epipolar: EpipolarKnowledge,
+    rules: PatchRules,
+    rays1: FloatArray,
+    jacobians1: FloatArray,
+    step: int,
+    most_tries: int,
+    seeds: FloatArray,
+) -> PatchTable:
+    """Return the patches (R * C,) grown from `seeds` (S, 8) over the nodes of rays (R, C, 3), `step` pixels apart."""
+    rows, columns = rays1.shape[:2]
+    out = np.empty((rows, columns, PATCH_COLUMNS))
+    grid = _Grid.of(
+        rays1=np.ascontiguousarray(rays1, np.float64),
+        jacobians1=np.ascontiguousarray(jacobians1, np.float64),
+        out=out,
+        tries=np.empty((rows, columns), np.uint8),
+        heap=np.empty((rows, columns), np.int32),
+        rows=rows,
+        columns=columns,
+        step=step,
+        most_tries=most_tries,
+    )
+    kernels().grow_patches(first, second, epipolar, rules, grid, seeds, len(seeds))
+    return _table(out.reshape(-1, PATCH_COLUMNS))

@@ -1,0 +1,222 @@
+"""From two images and seeds to a dense oriented cloud: grow, pose again, grow with what the pose says, fit planes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.affine.correspondences import Correspondences
+from rigkit.affine.features import grey_of
+from rigkit.core.arrays import FloatArray
+from rigkit.core.cloud import OrientedCloud
+from rigkit.core.errors import DegenerateError
+from rigkit.core.matches import Matches
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3, rotation_angle, unit
+from rigkit.geometry.sampson import sampson_distances
+from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
+from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKnowledge, grow
+from rigkit.reconstruction.growing.surface import GrownSurface, fit_surface, measure
+from rigkit.reconstruction.reconstruct import Reconstruction, colours_at
+from rigkit.reconstruction.scene import MAX_RANGE_SIGMA, SceneReconstruction, in_unit
+from rigkit.reconstruction.scene_pose import ScenePose, fit_scene_pose
+from rigkit.relative_pose.solvers.pose import essential_from_pose, translation_basis
+from rigkit.relative_pose.solvers.weights import affinity_residuals
+
+__all__ = ["DenseScene", "grow_scene"]
+
+POSE_STEP = 8
+"""Nodes of the pairs that the pose is estimated from, px: spread evenly, unlike features."""
+CLOUD_STEP = 4
+MAX_DISTANCE_PX = 0.7
+"""From the epipolar line, of a pair that is taken; more where the correspondences show more noise."""
+GATE = 3.3
+"""In standard deviations: one good pair in a thousand is lost."""
+MIN_GROWN = 100
+"""Pairs grown, from which on the pose is estimated from them."""
+MOVED_RAD = np.deg2rad(0.5)
+"""Change of the pose by which what was grown with the old one is grown again."""
+MAX_GROWTHS = 3
+POSE_STEP_RAD = 1e-5
+"""For central differences: far above rounding, far below where a plane bends."""
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class DenseScene:
+    """A dense cloud, and the grid that it grew on.
+
+    Attributes
+    ----------
+    scene : as without growing; its correspondences are those of `grown`, row by row.
+    grown : the pairs.
+    surface : the planes at their nodes, in the unit of the scene; row k of the cloud is node `nodes[k]` (row-major).
+    nodes : (K,) indices.
+    """
+
+    scene: SceneReconstruction
+    grown: GrownPatches
+    surface: GrownSurface
+    nodes: NDArray[np.int64]
+
+    @property
+    def correspondences(self) -> Correspondences:
+        """All pairs that were grown."""
+        return self.grown.correspondences()
+
+
+def grow_scene(
+    sparse: SceneReconstruction,
+    seeds: Correspondences,
+    image1: NDArray[np.generic],
+    image2: NDArray[np.generic],
+) -> DenseScene:
+    """Return the dense cloud of two images whose `seeds` gave the reconstruction `sparse`.
+
+    Raises
+    ------
+    DegenerateError
+        Nothing grows from the seeds.
+    """
+    r = sparse.reconstruction
+    view1 = GrowingView.of(grey_of(image1, "image 1"), r.camera1)
+    view2 = GrowingView.of(grey_of(image2, "image 2"), r.camera2)
+    agreeing = seeds.select(sparse.inliers)
+    fit = _pose_from_grown(view1, view2, agreeing, sparse)
+    pose, covariance = in_unit(fit.refined.cam2_from_cam1, fit.refined.covariance, r.baseline_mm)
+    known = _knowledge(fit)
+    grown = grow(view1, view2, agreeing, step=CLOUD_STEP, known=known)
+    if not len(grown):
+        raise DegenerateError(
+            f"no surface grows from {len(agreeing)} correspondences; check that the images are sharp and "
+            "show surfaces with texture"
+        )
+    measured = measure(grown, r.camera1, r.camera2, pose)
+    surface = fit_surface(measured)
+    by_pose, of_pose = _moved_planes(grown, r, pose, covariance)
+    cloud, nodes = _cloud(grown, surface, by_pose, of_pose, image1)
+    matches, _ = grown.correspondences().matches(r.camera1, r.camera2)
+    chosen = np.cumsum(grown.valid.ravel())[nodes] - 1
+    distances = _distances(matches, pose)
+    dense = replace(
+        r,
+        affine_method="grown affinities",
+        matches=matches.select(chosen),
+        pixels1=matches.pixels1[chosen],
+        pixels2=matches.pixels2[chosen],
+        cam2_from_cam1=pose,
+        pose_covariance=covariance,
+        E21=essential_from_pose(pose),
+        cloud=cloud,
+        sampson_rms_px=float(np.sqrt(np.mean(distances[chosen] ** 2))),
+    )
+    inliers = np.zeros(len(matches), dtype=bool)
+    inliers[chosen] = True
+    scene = SceneReconstruction(dense, sparse.metric, inliers, chosen, known.sigma_px, known.sigma_A)
+    return DenseScene(scene=scene, grown=grown, surface=surface, nodes=nodes)
+
+
+def _pose_from_grown(
+    view1: GrowingView, view2: GrowingView, seeds: Correspondences, sparse: SceneReconstruction
+) -> ScenePose:
+    """Return the pose of evenly spread pairs, grown until it does not move any more."""
+    r = sparse.reconstruction
+    pose = Rigid3(r.cam2_from_cam1.rotation, unit(r.cam2_from_cam1.translation_mm))
+    gate = max(MAX_DISTANCE_PX, GATE * sparse.sigma_px)
+    fit = None
+    for _ in range(MAX_GROWTHS):
+        known = LineKnowledge(essential_from_pose(pose), gate)
+        pairs = grow(view1, view2, seeds, step=POSE_STEP, known=known).correspondences()
+        matches, _ = pairs.matches(view1.camera, view2.camera)
+        if len(matches) < MIN_GROWN:
+            raise DegenerateError(
+                f"only {len(matches)} pairs grow from {len(seeds)} correspondences; the surfaces have "
+                "too little texture"
+            )
+        fit = fit_scene_pose(matches, r.pose_type, r.level_sigma_rad, np.random.default_rng(0), start=pose)
+        before, pose = pose, fit.refined.cam2_from_cam1
+        turn = rotation_angle(pose.rotation @ before.rotation.T)
+        swing = np.arccos(np.clip(pose.translation_mm @ before.translation_mm, -1.0, 1.0))
+        gate = MAX_DISTANCE_PX
+        if max(turn, swing) < MOVED_RAD:
+            break
+    assert fit is not None
+    return fit
+
+
+def _distances(matches: Matches, pose: Rigid3) -> FloatArray:
+    m = matches
+    return sampson_distances(essential_from_pose(pose), m.rays1, m.rays2, m.jacobians1, m.jacobians2)
+
+
+def _knowledge(fit: ScenePose) -> LineKnowledge:
+    """Return what the pose says of pairs, as well as the pairs that gave it agree with it."""
+    m, pose = fit.matches, fit.refined.cam2_from_cam1
+    # Sampson's distance is shared by both images; growing moves the place in image 2 alone.
+    sigma = np.sqrt(2.0) * SIGMA_OF_MEDIAN * float(np.median(np.abs(_distances(m, pose)[fit.inliers])))
+    off = affinity_residuals(m, essential_from_pose(pose))[fit.inliers]
+    sigma_A = SIGMA_OF_MEDIAN * float(np.nanmedian(np.abs(off)))
+    return LineKnowledge(essential_from_pose(pose), max(MAX_DISTANCE_PX, GATE * sigma), sigma, sigma_A)
+
+
+def _moved_planes(
+    grown: GrownPatches, r: Reconstruction, pose: Rigid3, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the derivatives (R, C, 3, 5) of the nodes' own planes by the pose, and the pose's covariance (5, 5) so."""
+    length = float(np.linalg.norm(pose.translation_mm))
+    t = pose.translation_mm / length
+    directions = np.zeros((5, 6))
+    directions[:3, :3], directions[3:, 3:] = np.eye(3), translation_basis(t)
+
+    def planes(step: FloatArray) -> FloatArray:
+        there = Rigid3(exp_so3(step[:3]) @ pose.rotation, length * unit(t + step[3:]))
+        own = measure(grown, r.camera1, r.camera2, there)
+        out = np.full(own.z.shape, np.nan)
+        good = np.isfinite(own.z[..., 0])
+        out[good] = np.linalg.solve(own.frame[good], own.z[good][..., None])[..., 0]
+        return out
+
+    each = [(planes(POSE_STEP_RAD * d) - planes(-POSE_STEP_RAD * d)) / (2.0 * POSE_STEP_RAD) for d in directions]
+    to_five = directions / np.array([1.0, 1.0, 1.0, length, length, length])
+    return np.stack(each, axis=-1), np.asarray(to_five @ covariance @ to_five.T)
+
+
+def _cloud(
+    grown: GrownPatches,
+    surface: GrownSurface,
+    by_pose: FloatArray,
+    pose_covariance: FloatArray,
+    image1: NDArray[np.generic],
+) -> tuple[OrientedCloud, NDArray[np.int64]]:
+    """Return the cloud of the planes whose range is known, and their nodes; the pose is (5, 5) as in `by_pose`."""
+    at = np.flatnonzero(surface.valid.ravel())
+
+    def flat(values: FloatArray) -> FloatArray:
+        return values.reshape(-1, *values.shape[2:])[at]
+
+    points, normals, plane, covariance = (
+        flat(v) for v in (surface.points, surface.normals, surface.plane, surface.covariance)
+    )
+    spread = flat(by_pose)
+    covariance = covariance + spread @ pose_covariance @ np.swapaxes(spread, 1, 2)
+    size = np.linalg.norm(points, axis=1)
+    ray = points / size[:, None]
+    sigma_mm = size**2 * np.sqrt(np.einsum("ni,nij,nj->n", ray, covariance, ray))
+    across = np.eye(3) - normals[:, :, None] * normals[:, None, :]
+    of_normal = across @ covariance @ across / np.sum(plane**2, axis=1)[:, None, None]
+    sure = np.isfinite(sigma_mm) & (sigma_mm < MAX_RANGE_SIGMA * size)
+    if not sure.any():
+        raise DegenerateError("no point's distance is known; the baseline is too short for this scene")
+    count = int(sure.sum())
+    cloud = OrientedCloud(
+        points_mm=points[sure],
+        normals=normals[sure],
+        colours=colours_at(image1, flat(grown.pixels1)[sure]),
+        board_index=np.full(count, -1),
+        grid=np.zeros((count, 2), dtype=np.int64),
+        sigma_mm=sigma_mm[sure],
+        normal_sigma_rad=np.sqrt(np.trace(of_normal[sure], axis1=1, axis2=2)),
+        board_ids=(),
+    )
+    return cloud, at[sure]

@@ -1,0 +1,181 @@
+"""Affine correspondences that grow over surfaces: each predicts its neighbours, which the images then correct.
+
+Best first (M. Lhuillier and L. Quan, "Match Propagation for Image-Based Modeling and Rendering", PAMI 2002), here with
+the affinity, so that slanted and turned surfaces are followed: from a pair (q1, q2, A) the neighbour q1 + d is expected
+at q2 + A d, with the same A. The images may be of any central cameras: the epipolar geometry is asked for pixel by
+pixel, and nothing is rectified.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.affine.correspondences import Correspondences
+from rigkit.affine.refine_patches import patch_pyramid, patch_rules
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import Affines, BoolArray, FloatArray, Mat3, Pixels
+from rigkit.kernels.patches import EpipolarKnowledge, Pyramid, grown, starts_of
+
+__all__ = ["GrowingView", "GrownPatches", "LineKnowledge", "grow"]
+
+HALF_WIDTH = 7
+"""Half side of a patch in px: larger ones reach over edges of surfaces, smaller ones have too little texture."""
+COARSEST = 2
+"""Levels up to which patches of little texture grow: of four times the half side."""
+MIN_CORRELATION = 0.9
+MAX_MOVE_PX = 2.0
+"""From where a neighbour predicts a patch."""
+MAX_SIGMA_PX = 0.3
+"""Along the axis of which least is known; beyond, a patch slides along an edge."""
+MAX_TRIES = 3
+"""Of a node, from different neighbours."""
+EXCESS_NOISE = 4.0
+"""Variance of patches over that of independent noise: neighbouring pixels err together, being interpolated."""
+RAY_SPACING_PX = 8.0
+"""Rays are interpolated in between by cubics: to 1e-4 px even for strong fisheyes."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class GrowingView:
+    """An image as growing sees it: the camera, the pyramid, and the rays on a coarse grid."""
+
+    camera: Camera
+    pyramid: Pyramid
+    size_px: tuple[int, int]
+    rays: FloatArray
+
+    @classmethod
+    def of(cls, grey: NDArray[np.generic], camera: Camera) -> GrowingView:
+        """Return the view of an image (H, W), grey levels 0 to 255."""
+        height, width = grey.shape
+        # One node more on every side than the image needs: the interpolation reads four.
+        counts = int(np.ceil(width / RAY_SPACING_PX)) + 2, int(np.ceil(height / RAY_SPACING_PX)) + 2
+        at = np.stack(np.meshgrid(*(RAY_SPACING_PX * np.arange(n) for n in counts)), axis=-1)
+        rays, valid = camera.unproject(at)
+        return cls(camera, patch_pyramid(grey), (width, height), np.where(valid[..., None], rays, np.nan))
+
+    def nodes(self, step: int) -> Pixels:
+        """Return the pixels (R, C, 2) every `step` px."""
+        width, height = self.size_px
+        return np.stack(np.meshgrid(*(np.arange(0.0, n, step) for n in (width, height))), axis=-1)
+
+
+@dataclass(frozen=True, slots=True)
+class LineKnowledge:
+    """What an epipolar geometry says of pairs.
+
+    Attributes
+    ----------
+    E21 : essential matrix.
+    sigma_px, sigma_A : how well places and affinities are known to agree with it; infinite: they are found from the
+        images alone.
+    max_distance_px : from its epipolar line at which a pair is refused.
+    """
+
+    E21: Mat3
+    max_distance_px: float
+    sigma_px: float = np.inf
+    sigma_A: float = np.inf
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class GrownPatches:
+    """Pairs on a grid of nodes in image 1, NaN where there is none.
+
+    Attributes
+    ----------
+    step : px between nodes.
+    pixels1, pixels2 : (R, C, 2); A21 : (R, C, 2, 2).
+    correlation, coarser : (R, C) of the patches; levels by which they were aligned more coarsely for want of texture.
+    covariance : (R, C, 6, 6) of (u2, v2, a11, a12, a21, a22), as the patches alone show it.
+    """
+
+    step: int
+    pixels1: Pixels
+    pixels2: Pixels
+    A21: Affines
+    correlation: FloatArray
+    coarser: FloatArray
+    covariance: FloatArray
+
+    @property
+    def valid(self) -> BoolArray:
+        """Which nodes (R, C) have a pair."""
+        return np.isfinite(self.correlation)
+
+    def __len__(self) -> int:
+        return int(self.valid.sum())
+
+    def only(self, which: BoolArray) -> GrownPatches:
+        """Return the same without the pairs at the nodes (R, C) that are not in `which`."""
+
+        def kept(values: FloatArray) -> FloatArray:
+            mask = which.reshape(*which.shape, *(1,) * (values.ndim - 2))
+            return np.where(mask, values, np.nan)
+
+        return GrownPatches(
+            step=self.step,
+            pixels1=self.pixels1,
+            pixels2=kept(self.pixels2),
+            A21=kept(self.A21),
+            correlation=kept(self.correlation),
+            coarser=kept(self.coarser),
+            covariance=kept(self.covariance),
+        )
+
+    def correspondences(self) -> Correspondences:
+        """Return the pairs in the order of their nodes, row by row."""
+        at = self.valid
+        variances = np.einsum("nii->ni", self.covariance[at])
+        sigma_px, sigma_A = np.sqrt(variances[:, :2].mean(axis=1)), np.sqrt(variances[:, 2:].mean(axis=1))
+        return Correspondences(self.pixels1[at], self.pixels2[at], self.A21[at], None, sigma_px, sigma_A)
+
+
+def grow(
+    view1: GrowingView,
+    view2: GrowingView,
+    seeds: Correspondences,
+    *,
+    step: int,
+    known: LineKnowledge | None = None,
+    min_correlation: float = MIN_CORRELATION,
+) -> GrownPatches:
+    """Return the pairs that grow from `seeds`, which have affinities, on a grid every `step` px of image 1."""
+    at = view1.nodes(step)
+    rays, seen = view1.camera.unproject(at)
+    rays = np.where(seen[..., None], rays, np.nan)
+    jacobians = view1.camera.ray_jacobian(at)
+    line = known if known is not None else LineKnowledge(np.zeros((3, 3)), np.inf)
+    knowledge = EpipolarKnowledge.make(
+        view2.rays,
+        RAY_SPACING_PX,
+        line.E21,
+        sigma=line.sigma_px,
+        sigma_A=line.sigma_A,
+        most_distance=line.max_distance_px,
+    )
+    rules = patch_rules(
+        HALF_WIDTH,
+        coarsest=COARSEST,
+        most_move=MAX_MOVE_PX,
+        least_correlation=min_correlation,
+        most_sigma=MAX_SIGMA_PX,
+        excess_noise=EXCESS_NOISE,
+    )
+    assert seeds.A21 is not None
+    starts = starts_of(seeds.pixels1, seeds.pixels2, seeds.A21)
+    starts = starts[np.isfinite(starts).all(axis=1)]
+    found = grown(view1.pyramid, view2.pyramid, knowledge, rules, rays, jacobians, step, MAX_TRIES, starts)
+    shape = at.shape[:2]
+    return GrownPatches(
+        step=step,
+        pixels1=at,
+        pixels2=found.pixels2.reshape(*shape, 2),
+        A21=found.A21.reshape(*shape, 2, 2),
+        correlation=found.correlation.reshape(shape),
+        coarser=found.coarser.reshape(shape),
+        covariance=found.covariance.reshape(*shape, 6, 6),
+    )

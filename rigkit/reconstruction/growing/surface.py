@@ -1,0 +1,188 @@
+"""Points and normals from grown pairs: local planes through what neighbours say, robust across edges.
+
+Of a plane n . X = d the inverse range 1 / r = m . f with m = n / d is linear in the ray f, for any central camera and
+exactly; so is its gradient by the pixel, m . B with B the ray Jacobian. A pair gives both: the range from its place
+along the epipolar line, the gradient from its affinity (A = G - h y^T, gradient y / r^2; `affine.surface`). The plane
+at a node is fitted to what the pairs around it say, each with the covariance of its patches; neighbours on another
+surface lose their weight.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.affine.surface import linear_gauge
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import BoolArray, FloatArray, Normals, Points
+from rigkit.geometry.projection_jacobian import pair_projection_jacobians
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.triangulation import triangulate_rays
+from rigkit.reconstruction.growing.grow import GrownPatches
+
+__all__ = ["GrownSurface", "NodeMeasurements", "fit_surface", "measure"]
+
+PLANE_REACH = 2
+"""Nodes to either side that a plane is fitted to: 5 x 5."""
+PLANE_ROUNDS = 5
+CAUCHY_TURN = 2.385
+"""In standard deviations: where Cauchy's loss turns; 95 % efficient for Gaussian noise."""
+MIN_SUPPORT = 5.0
+"""Neighbours, in sum of weights, that a plane needs."""
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class NodeMeasurements:
+    """What each node says by itself, on its grid (R, C); NaN where nothing.
+
+    Attributes
+    ----------
+    z : (R, C, 3) inverse range, and its gradient by the pixel.
+    covariance : (R, C, 3, 3) of z, from the noise along the epipolar line alone.
+    frame : (R, C, 3, 3) ray and columns of the ray Jacobian in rows: z = frame m for the plane m . X = 1.
+    slope : (R, C) px along the epipolar line by which the place moves with the inverse range.
+    """
+
+    z: FloatArray
+    covariance: FloatArray
+    frame: FloatArray
+    slope: FloatArray
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class GrownSurface:
+    """Fitted planes on the grid (R, C); NaN where there is none.
+
+    Attributes
+    ----------
+    points : (R, C, 3) in the frame of camera 1, lengths in those of the translation.
+    normals : (R, C, 3) unit, towards camera 1.
+    plane : (R, C, 3) m of the plane m . X = 1; covariance : (R, C, 3, 3) of m.
+    support : (R, C) neighbours that agree, in sum of weights.
+    misfit : (R, C) how far the node's own range is from the plane, px along the epipolar line.
+    """
+
+    points: Points
+    normals: Normals
+    plane: FloatArray
+    covariance: FloatArray
+    support: FloatArray
+    misfit: FloatArray
+
+    @property
+    def valid(self) -> BoolArray:
+        """Which nodes (R, C) have a plane."""
+        return np.isfinite(self.plane[..., 0])
+
+
+def measure(grown: GrownPatches, camera1: Camera, camera2: Camera, cam2_from_cam1: Rigid3) -> NodeMeasurements:
+    """Return what the pairs say of the surface, node by node."""
+    shape, at = grown.valid.shape, np.flatnonzero(grown.valid.ravel())
+
+    def flat(values: FloatArray) -> FloatArray:
+        return values.reshape(-1, *values.shape[2:])[at]
+
+    pixels1, pixels2, A21 = flat(grown.pixels1), flat(grown.pixels2), flat(grown.A21)
+    (rays1, seen1), (rays2, seen2) = camera1.unproject(pixels1), camera2.unproject(pixels2)
+    B1, B2 = camera1.ray_jacobian(pixels1), camera2.ray_jacobian(pixels2)
+    points, valid = triangulate_rays(rays1, rays2, cam2_from_cam1, jacobians1=B1, jacobians2=B2)
+    J1, J2 = pair_projection_jacobians(points, rays1, B1, rays2, B2, cam2_from_cam1)
+    G, h, _ = linear_gauge(J1, J2)
+    length = np.linalg.norm(h, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = 1.0 / np.linalg.norm(points, axis=1)
+        along = h / length[:, None]
+        slope = length / inverse**2
+        y = np.einsum("nij,ni->nj", G - A21, along) / length[:, None]
+        z = np.concatenate([inverse[:, None], inverse[:, None] ** 2 * y], axis=1)
+        # d place = -h d(1/r) r^2, and along h the same for the affinity and the gradient.
+        to_z = np.zeros((len(at), 3, 6))
+        to_z[:, 0, 0:2] = to_z[:, 1, 2::2] = to_z[:, 2, 3::2] = along / slope[:, None]
+    covariance = to_z @ flat(grown.covariance) @ np.swapaxes(to_z, 1, 2)
+    good = valid & seen1 & seen2 & np.isfinite(z).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+    # Ranges are along the node's own ray.
+    frame = np.concatenate([rays1[:, None, :], np.swapaxes(B1, 1, 2)], axis=1)
+
+    def spread(values: FloatArray) -> FloatArray:
+        out = np.full((shape[0] * shape[1], *values.shape[1:]), np.nan)
+        out[at[good]] = values[good]
+        return out.reshape(*shape, *values.shape[1:])
+
+    return NodeMeasurements(z=spread(z), covariance=spread(covariance), frame=spread(frame), slope=spread(slope))
+
+
+def fit_surface(measured: NodeMeasurements, *, reach: int = PLANE_REACH) -> GrownSurface:
+    """Return the planes around all nodes.
+
+    Notes
+    -----
+    Minimises over m sum_j w_ij (z_j - F_j m)^T C_j^-1 (z_j - F_j m), w_ij of Cauchy's loss on the distance of neighbour
+    j's range from the plane, which in the first round is the node's own, as uncertain as that is.
+    """
+    valid = np.isfinite(measured.z[..., 0])
+    F, z = np.nan_to_num(measured.frame), np.nan_to_num(measured.z)
+    C = np.where(valid[..., None, None], measured.covariance, np.eye(3))
+    information = np.linalg.inv(C)
+    Ft = np.swapaxes(F, -1, -2) @ information
+    own_normal, own_right = Ft @ F, (Ft @ z[..., None])[..., 0]
+    own_normal[~valid], own_right[~valid] = 0.0, 0.0
+    variance = np.where(valid, C[..., 0, 0], np.inf)
+    plane, spread = _solved(own_normal, own_right, valid)
+    support = np.zeros(valid.shape)
+    for k in range(PLANE_ROUNDS):
+        normal, right = np.zeros_like(own_normal), np.zeros_like(own_right)
+        support = np.zeros(valid.shape)
+        for dv in range(-reach, reach + 1):
+            for du in range(-reach, reach + 1):
+                here, there = _shifted(valid.shape, dv, du)
+                ray = F[there][..., 0, :]
+                miss = z[there][..., 0] - np.sum(plane[here] * ray, axis=-1)
+                expected = variance[there]
+                if k == 0:
+                    expected = expected + np.einsum("...i,...ij,...j->...", ray, spread[here], ray)
+                with np.errstate(invalid="ignore"):
+                    weight = np.nan_to_num(1.0 / (1.0 + miss**2 / (CAUCHY_TURN**2 * expected)))
+                weight = np.where(valid[there] & valid[here], weight, 0.0)
+                normal[here] += weight[..., None, None] * own_normal[there]
+                right[here] += weight[..., None] * own_right[there]
+                support[here] += weight
+        plane, spread = _solved(normal, right, valid)
+    ray = F[..., 0, :]
+    inverse = np.sum(plane * ray, axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        keep = valid & (inverse > 0.0) & (support >= MIN_SUPPORT)
+        points = ray / inverse[..., None]
+        normals = -plane / np.linalg.norm(plane, axis=-1, keepdims=True)
+        misfit = (z[..., 0] - inverse) * measured.slope
+    return GrownSurface(
+        points=_where(keep, points),
+        normals=_where(keep, normals),
+        plane=_where(keep, plane),
+        covariance=_where(keep, spread),
+        support=_where(keep, support),
+        misfit=_where(keep, misfit),
+    )
+
+
+def _solved(normal: FloatArray, right: FloatArray, valid: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Return the solutions of the systems at the nodes that are `valid`, and the inverses; NaN elsewhere."""
+    plane, spread = np.full(right.shape, np.nan), np.full(normal.shape, np.nan)
+    # Rays are of length one and the gradient's part is not: scaled, the systems are well conditioned.
+    some = normal[valid]
+    scale = 1.0 / np.sqrt(np.einsum("nii->ni", some))
+    inverse = np.linalg.inv(some * scale[:, :, None] * scale[:, None, :]) * scale[:, :, None] * scale[:, None, :]
+    plane[valid], spread[valid] = np.einsum("nij,nj->ni", inverse, right[valid]), inverse
+    return plane, spread
+
+
+def _shifted(shape: tuple[int, ...], dv: int, du: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    """Return the nodes that have a neighbour at (dv, du), and those neighbours."""
+    rows, columns = shape
+    here = slice(max(0, -dv), rows - max(0, dv)), slice(max(0, -du), columns - max(0, du))
+    there = slice(max(0, dv), rows - max(0, -dv)), slice(max(0, du), columns - max(0, -du))
+    return here, there
+
+
+def _where(keep: BoolArray, values: FloatArray) -> FloatArray:
+    return np.where(keep.reshape(*keep.shape, *(1,) * (values.ndim - 2)), values, np.nan)

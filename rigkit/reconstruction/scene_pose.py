@@ -1,0 +1,190 @@
+"""The pose of contaminated correspondences: a robust search, then the likelihood of those that agree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.errors import DegenerateError, RigkitError
+from rigkit.core.matches import Matches
+from rigkit.core.posetype import PoseType
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.sampson import sampson_distances
+from rigkit.optim.robust_scale import MEDIAN_OF_NORMAL, MEDIAN_OF_RAYLEIGH
+from rigkit.reconstruction.geometry import decide_pose_type
+from rigkit.relative_pose.refinement.marginal import QUANTILE, marginal_quality
+from rigkit.relative_pose.refinement.refine import RefinedPose, cauchy_weights, refine_pose
+from rigkit.relative_pose.robust.a_contrario import log_false_alarms
+from rigkit.relative_pose.robust.robust import RobustPose, Sample, robust_pose
+from rigkit.relative_pose.solvers.estimate import check_baseline
+from rigkit.relative_pose.solvers.pose import essential_from_pose
+from rigkit.relative_pose.solvers.registry import fundamental_for
+from rigkit.relative_pose.solvers.weights import affinity_distances, affinity_residuals, usable_affinities
+
+__all__ = ["MIN_MATCHES", "ScenePose", "fit_scene_pose"]
+
+MIN_MATCHES = 8
+"""Fewer that agree are chance among many that do not."""
+MAX_NOISE = 6.0
+"""Noise of points, in their stated sigmas, up to which they can agree with a pose."""
+GATE = 3.3
+"""In standard deviations: one good point in a thousand is lost."""
+AFFINITY_GATE = 3.7
+"""The same for the length of two residuals."""
+SCENE_ROUNDS = 4
+MAX_FALSE_ALARMS = 1e-2
+SAMPLE_KINDS: tuple[Sample, ...] = ("points", "affine")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ScenePose:
+    """The pose of contaminated matches; `matches` are all of them, with the sigmas that the inliers show."""
+
+    matches: Matches
+    refined: RefinedPose
+    inliers: BoolArray
+    pose_type: PoseType
+    level_sigma_rad: float | None
+    notes: tuple[str, ...]
+
+
+def fit_scene_pose(
+    matches: Matches,
+    declared: PoseType,
+    level_sigma_rad: float | None,
+    rng: np.random.Generator,
+    start: Rigid3 | None = None,
+) -> ScenePose:
+    """Return the pose that most matches agree with, refined on those by points and affinities.
+
+    From `start`, where one is known that most of the matches were found with, nothing is searched for.
+    """
+    pose, pose_type = start, declared
+    if pose is None:
+        found = _search(matches, PoseType.GENERAL if declared is PoseType.AUTO else declared, rng)
+        pose, inliers = found.refined.cam2_from_cam1, found.inliers
+    else:
+        inliers = np.abs(_in_sigmas(matches, pose)) < QUANTILE * MAX_NOISE
+    _require(inliers)
+    notes: list[str] = []
+    for k in range(SCENE_ROUNDS):
+        matches = _with_shown_noise(matches, pose, inliers)
+        fitting = matches.select(inliers)
+        if k == 0:
+            check_baseline(fitting)
+            decision = decide_pose_type(fitting, declared, level_sigma_rad)
+            pose_type, level_sigma_rad = decision.pose_type, decision.level_sigma_rad
+            notes += decision.notes
+        refined = refine_pose(fitting, pose, pose_type, level_sigma_rad, robust=cauchy_weights)
+        pose = refined.cam2_from_cam1
+        inliers = _agreeing(matches, pose)
+        _require(inliers)
+    if start is None:
+        _a_contrario_test(matches, pose, inliers, fundamental_for(pose_type).degrees_of_freedom)
+    return ScenePose(matches, refined, inliers, pose_type, level_sigma_rad, tuple(notes))
+
+
+def _search(matches: Matches, kind: PoseType, rng: np.random.Generator) -> RobustPose:
+    """Return the better of the poses found from samples of points and from samples of affine correspondences.
+
+    Points lead to the optimum surely where most matches are right; where few are, the small samples still find it.
+    """
+    best: tuple[float, RobustPose] | None = None
+    failure: RigkitError | None = None
+    for sample in SAMPLE_KINDS:
+        if sample == "affine" and usable_affinities(matches).sum() < MIN_MATCHES:
+            continue
+        try:
+            found = robust_pose(matches, rng, pose_type=kind, sample=sample, max_noise=MAX_NOISE)
+        except RigkitError as error:
+            failure = error
+            continue
+        r = _in_sigmas(matches, found.refined.cam2_from_cam1)
+        quality = float(marginal_quality(r, MAX_NOISE).sum())
+        if best is None or quality > best[0]:
+            best = quality, found
+    if best is None:
+        # Of a camera that did not move at all every sample fails: the reason is worth more than that.
+        check_baseline(matches)
+        raise failure or DegenerateError("no pose found")
+    return best[1]
+
+
+def _require(inliers: BoolArray) -> None:
+    if inliers.sum() < MIN_MATCHES:
+        raise DegenerateError(
+            f"only {int(inliers.sum())} of {len(inliers)} correspondences agree with one pose; check that the images "
+            "show the same scene, and the cameras"
+        )
+
+
+def _a_contrario_test(matches: Matches, pose: Rigid3, inliers: BoolArray, freedom: int) -> None:
+    """Raise DegenerateError where as many of so many wrong matches would be expected to agree with some pose."""
+    affinity = _affinity_in_sigmas(matches, pose)
+    # A match without an affinity always passes that test.
+    fits = ~(np.nan_to_num(affinity) >= AFFINITY_GATE)
+    if log_false_alarms(matches, pose, inliers, fits, freedom, GATE) > np.log(MAX_FALSE_ALARMS):
+        raise DegenerateError(
+            f"{int(inliers.sum())} of {len(inliers)} correspondences agree with one pose, as many as wrong ones might "
+            "by chance; the scene has too little texture, or looks the same in many places"
+        )
+
+
+def _in_sigmas(matches: Matches, pose: Rigid3) -> FloatArray:
+    m = matches
+    E21 = essential_from_pose(pose)
+    return sampson_distances(E21, m.rays1, m.rays2, m.jacobians1, m.jacobians2, m.sigma1_px, m.sigma2_px)
+
+
+def _agreeing(matches: Matches, pose: Rigid3) -> BoolArray:
+    """Return which matches fit by their point, and by their affinity where they have one.
+
+    A wrong partner that lies on the epipolar line by chance can turn the pose; its affinity gives it away.
+    """
+    doubt = _affinity_in_sigmas(matches, pose)
+    good = np.abs(_in_sigmas(matches, pose)) < GATE
+    return np.asarray(good & ~(np.nan_to_num(doubt) >= AFFINITY_GATE))
+
+
+def _affinity_in_sigmas(matches: Matches, pose: Rigid3) -> FloatArray:
+    return affinity_distances(matches, essential_from_pose(pose))
+
+
+def _with_shown_noise(matches: Matches, pose: Rigid3, inliers: BoolArray) -> Matches:
+    """Return the matches with sigmas as large as the residuals of the inliers from `pose` show them to be."""
+    m = matches
+    # The pose's five degrees of freedom were fitted to the residuals.
+    few = np.sqrt(inliers.sum() / (inliers.sum() - 5.0))
+    factor = max(float(np.median(np.abs(_in_sigmas(m, pose)[inliers]))) / MEDIAN_OF_NORMAL * few, 1e-6)
+    return replace(
+        m,
+        sigma1_px=factor * m.sigma1_px,
+        sigma2_px=factor * m.sigma2_px,
+        sigma_A=None if m.A21 is None else _shown_sigma_A(m, pose, inliers),
+    )
+
+
+def _shown_sigma_A(matches: Matches, pose: Rigid3, inliers: BoolArray) -> FloatArray:
+    """Return sigma_A (N,): that which the residuals show, for all the same or in proportion to what was stated.
+
+    The more likely of the two is taken; a stated sigma_A knows the image's noise, but not how flat the surface is.
+    """
+    size = np.linalg.norm(affinity_residuals(matches, essential_from_pose(pose)), axis=1)
+    of = inliers & np.isfinite(size)
+    if not of.any():
+        return np.full(len(matches), np.nan)
+    shapes = [np.ones(len(matches))]
+    stated = matches.sigma_A
+    if stated is not None and (stated[of] > 0.0).all() and np.isfinite(stated[of]).all():
+        shapes += [np.sqrt(stated), np.asarray(stated)]
+    best = None
+    for shape in shapes:
+        with np.errstate(invalid="ignore"):
+            factor = max(float(np.median(size[of] / shape[of])) / MEDIAN_OF_RAYLEIGH, 1e-6)
+        cost = float(np.sum(np.log(factor * shape[of])))
+        if best is None or cost < best[0]:
+            best = cost, factor * shape
+    assert best is not None
+    return best[1]

@@ -1,0 +1,83 @@
+"""Correspondences that grow over textured walls: places, normals and stated errors against the exact surface."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from helpers.epipolar_scenes import pose_errors_deg
+from helpers.textured_scene import Corner
+
+from rigkit.affine.features import match_affine_features
+from rigkit.cameras.kannala_brandt import KannalaBrandt
+from rigkit.cameras.pinhole import Pinhole
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import angle_between, exp_so3
+from rigkit.reconstruction.growing.dense import DenseScene, grow_scene
+from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene
+
+SIZE = (480, 360)
+LENSES = {
+    "pinhole": Pinhole(SIZE, np.array([420.0, 420.0, 239.5, 179.5])),
+    "fisheye": KannalaBrandt(SIZE, np.array([230.0, 230.0, 240.0, 180.0, -0.02, 0.002, 0.0, 0.0])),
+}
+TURN = exp_so3(np.array([0.05, -0.25, 0.1]))
+CAM2_FROM_CAM1 = Rigid3(TURN, -TURN @ [320.0, -60.0, 60.0])
+BASELINE_MM = float(np.linalg.norm(CAM2_FROM_CAM1.translation_mm))
+SEAM_PX = 12.0
+"""Nodes nearer to where two walls meet have them both in their patches."""
+
+
+@cache
+def grown_corner(lens: str) -> tuple[SceneReconstruction, DenseScene, Corner]:
+    rng = np.random.default_rng(5)
+    corner, camera = Corner.random(rng), LENSES[lens]
+    images = [corner.image(camera, pose, rng) for pose in (Rigid3.identity(), CAM2_FROM_CAM1)]
+    seeds = match_affine_features(*images)
+    sparse = reconstruct_scene(seeds, camera, camera, baseline_mm=BASELINE_MM, image1=images[0])
+    return sparse, grow_scene(sparse, seeds, *images), corner
+
+
+def off_the_seams(corner: Corner, lens: str, pixels: np.ndarray) -> np.ndarray:
+    """Which pixels see one wall for SEAM_PX around."""
+    camera, same = LENSES[lens], np.ones(len(pixels), dtype=bool)
+    plane = corner.hit(np.zeros(3), camera.unproject(pixels)[0])[1]
+    for angle in np.arange(0.0, 2.0 * np.pi, np.pi / 8.0):
+        beside = pixels + SEAM_PX * np.array([np.cos(angle), np.sin(angle)])
+        same &= corner.hit(np.zeros(3), camera.unproject(beside)[0])[1] == plane
+    return same
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_a_corner_is_grown_densely_and_its_errors_are_as_stated(lens: str) -> None:
+    sparse, dense, corner = grown_corner(lens)
+    r = dense.scene.reconstruction
+    cloud = r.cloud
+    # Three quarters of the nodes whose patches the second image has too.
+    assert len(cloud) > 10 * len(sparse.reconstruction.cloud)
+    assert len(cloud) == len(r.matches) == len(dense.nodes) == len(dense.scene.kept)
+    assert max(pose_errors_deg(r.cam2_from_cam1, CAM2_FROM_CAM1)) < 0.1
+    same = off_the_seams(corner, lens, r.pixels1)
+    assert same.sum() > 2000
+    points, normals = corner.surface(LENSES[lens], r.pixels1)
+    off = np.abs(np.linalg.norm(cloud.points_mm, axis=1) - np.linalg.norm(points, axis=1))
+    turned = angle_between(cloud.normals, normals)
+    assert np.median(off[same] / np.linalg.norm(points, axis=1)[same]) < 1.0e-3
+    assert np.degrees(np.median(turned[same])) < 1.0
+    np.testing.assert_array_equal(r.pixels1, dense.grown.pixels1.reshape(-1, 2)[dense.nodes])
+    # The grid's own planes are the cloud.
+    np.testing.assert_allclose(dense.surface.points.reshape(-1, 3)[dense.nodes], cloud.points_mm)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_grown_pairs_do_not_cross_to_another_surface(lens: str) -> None:
+    """Pairs are where the exact surface projects to; hardly any is elsewhere."""
+    _, dense, corner = grown_corner(lens)
+    at = dense.grown.valid
+    points, _ = corner.surface(LENSES[lens], dense.grown.pixels1[at])
+    expected, seen = LENSES[lens].project(CAM2_FROM_CAM1.apply(points))
+    off = np.linalg.norm(dense.grown.pixels2[at] - expected, axis=1)
+    assert seen.all()
+    assert np.median(off) < 0.1
+    assert np.mean(off > 1.0) < 0.01
