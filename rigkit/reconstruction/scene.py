@@ -93,11 +93,10 @@ def reconstruct_scene(
     try:
         fit = fit_scene_pose(matches, PoseType(pose_type), level_sigma_rad, np.random.default_rng(seed))
         affinities = _affinities(correspondences.select(seen), fit)
-        cloud, chosen = _cloud(fit, affinities, baseline_mm, image1)
+        pose, covariance = in_unit(fit.refined.cam2_from_cam1, fit.refined.covariance, baseline_mm or 1.0)
+        cloud, chosen = _cloud(fit, affinities, pose, covariance, image1)
     except DegenerateError as error:
         raise DegenerateError(f"'{pair_id}': {error}") from error
-    scale = 1.0 if baseline_mm is None else baseline_mm
-    pose, covariance = in_unit(fit.refined.cam2_from_cam1, fit.refined.covariance, scale)
     reconstruction = Reconstruction(
         pair_id=pair_id,
         pose_type=fit.pose_type,
@@ -112,7 +111,7 @@ def reconstruct_scene(
         pose_covariance=covariance,
         E21=essential_from_pose(fit.refined.cam2_from_cam1),
         cloud=cloud,
-        baseline_mm=scale,
+        baseline_mm=baseline_mm or 1.0,
         baseline_sigma_mm=0.0,
         sampson_rms_px=fit.refined.sampson_rms_px,
         notes=_notes(fit, seen, baseline_mm),
@@ -199,11 +198,13 @@ def _affinities(found: Correspondences, fit: ScenePose) -> Affinities:
 
 
 def _cloud(
-    fit: ScenePose, affinities: Affinities, baseline_mm: float | None, image1: NDArray[np.generic] | None
+    fit: ScenePose,
+    affinities: Affinities,
+    pose: Rigid3,
+    covariance: FloatArray,
+    image1: NDArray[np.generic] | None,
 ) -> tuple[OrientedCloud, NDArray[np.int64]]:
     """Return the cloud and which matches are in it."""
-    scale = 1.0 if baseline_mm is None else baseline_mm
-    pose, covariance = in_unit(fit.refined.cam2_from_cam1, fit.refined.covariance, scale)
     points = triangulate_matches(fit.matches, pose, covariance)
     colours = colours_at(image1, fit.matches.pixels1)
     cloud, kept = oriented_cloud(points, fit.matches, pose, covariance, affinities, colours=colours)
