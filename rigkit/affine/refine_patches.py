@@ -19,7 +19,7 @@ __all__ = ["RefinedPatches", "align", "patch_pyramid", "patch_rules", "refine_pa
 PATCH_STEPS = 20
 SETTLED_PX = 1e-3
 """Move of a patch's border at which it is done."""
-WINDOW = 0.6
+WINDOW_OF_PATCH = 0.6
 """Standard deviation of the window, in half sides of the patch."""
 MIN_CONTRAST = 2.0
 """Grey levels, standard deviation over a patch: below, there is nothing to align."""
@@ -27,7 +27,7 @@ FLOOR_PX = 0.05
 """What noise does not explain: interpolation, and perspective within the patch."""
 BLUR_PX = 0.8
 """Both images are smoothed by this: gradients of raw pixels are not those of what interpolation makes of them."""
-MIN_SIDE_PX = 40
+MIN_LEVEL_SIDE_PX = 40
 """Of the coarsest level of a pyramid: below, no patch fits in."""
 QUANTISATION = 0.3
 """Grey levels: the noise of an image that is rounded to whole ones."""
@@ -58,7 +58,7 @@ def patch_pyramid(grey: NDArray[np.generic]) -> Pyramid:
     import cv2
 
     levels = [np.asarray(cv2.GaussianBlur(np.asarray(grey, np.float32), (0, 0), BLUR_PX), np.float32)]
-    while len(levels) < MOST_LEVELS and min(levels[-1].shape) >= 2 * MIN_SIDE_PX:
+    while len(levels) < MOST_LEVELS and min(levels[-1].shape) >= 2 * MIN_LEVEL_SIDE_PX:
         levels.append(np.asarray(cv2.pyrDown(levels[-1]), np.float32))
     return Pyramid.make(levels)
 
@@ -86,7 +86,7 @@ def patch_rules(
         half=half_width,
         coarsest=coarsest,
         most_steps=PATCH_STEPS,
-        width=WINDOW * half_width,
+        width=WINDOW_OF_PATCH * half_width,
         settled=SETTLED_PX,
         most_move=most_move,
         least_contrast=MIN_CONTRAST,
