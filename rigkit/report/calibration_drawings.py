@@ -26,8 +26,11 @@ MIN_IN_CELL = 4
 CHANCE = 0.01
 """Share of cells whose mean is drawn as beyond chance where there is chance only."""
 MAP_GRID = (40, 30)
-DYNAMIC = 100.0
-"""The colours of the uncertainty map end at this many times its smallest value."""
+MAP_PX = (0.003, 10.0)
+"""Ends of the colours of every uncertainty map, in equal ratios: maps of different calibrations can be compared."""
+CONTOURS_PX = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
+ARROW_HEAD = 3.2
+"""Length of the strokes of an arrow's head, in units of the drawing."""
 VIRIDIS = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], dtype=float)
 INK, MARK, BAD, SOFT = "#1f4e8c", "#e6550d", "#b3261e", "#8a94a3"
 
@@ -35,7 +38,7 @@ INK, MARK, BAD, SOFT = "#1f4e8c", "#e6550d", "#b3261e", "#8a94a3"
 def residuals_svg(calibration: Calibration) -> str:
     """Draw how far each corner was measured from where the calibration puts it, magnified; outliers as crosses."""
     pixels, residuals, kept = _corners(calibration)
-    times = _magnification(calibration, RMS_LENGTH * calibration.camera.size_px[0] / max(calibration.rms_px, 1e-9))
+    times = _magnification(RMS_LENGTH * calibration.camera.size_px[0] / max(calibration.rms_px, 1e-9))
     step = -(-int(kept.sum()) // MAX_VECTORS)
     q, d = pixels[kept][::step], residuals[kept][::step]
     words = f"{len(q)} residuals, measured minus projected, magnified {times:g} times"
@@ -47,6 +50,7 @@ def residuals_svg(calibration: Calibration) -> str:
         f'<path d="{_vectors(zoom * q, zoom * times * d)}" stroke="{INK}" stroke-width="1" fill="none"/>',
         f'<path d="{_dots(zoom * q)}" stroke="{INK}" stroke-width="2.2" stroke-linecap="round"/>',
         f'<path d="{_crosses(zoom * crossed)}" stroke="{BAD}" stroke-width="1.2" fill="none"/>',
+        _scale(calibration, times),
         _foot(
             calibration, words, f"crosses: {len(crossed)} corners left out" if len(crossed) else "no corner left out"
         ),
@@ -77,16 +81,17 @@ def pattern_svg(calibration: Calibration) -> str:
     row, column = np.divmod(np.flatnonzero(enough), CELLS_ACROSS)
     places = (np.stack([column, row], axis=-1) + 0.5) * size
     longest = float(np.linalg.norm(mean, axis=1).max(initial=1e-9))
-    times = _magnification(calibration, 0.9 * size / longest)
+    times = _magnification(0.9 * size / longest)
     words = f"mean residual by part of the image, magnified {times:g} times"
     zoom = _zoom(calibration)
     dots = "".join(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="1.4" fill="{SOFT}"/>' for x, y in zoom * places)
     out = [_open(calibration, words), dots]
     for chosen, colour in ((~beyond, SOFT), (beyond, MARK)):
-        path = _vectors(zoom * places[chosen], zoom * times * mean[chosen])
+        start, by = zoom * places[chosen], zoom * times * mean[chosen]
+        path = _vectors(start, by) + _heads(start, by)
         out.append(f'<path d="{path}" stroke="{colour}" stroke-width="1.6" fill="none"/>')
     expected = f"{int(beyond.sum())} of {len(beyond)} coloured: beyond chance, which makes {CHANCE * len(beyond):.1f}"
-    return "".join([*out, _foot(calibration, words, expected)])
+    return "".join([*out, _scale(calibration, times), _foot(calibration, words, expected)])
 
 
 def coverage_svg(calibration: Calibration) -> str:
@@ -125,23 +130,66 @@ def uncertainty_svg(calibration: Calibration) -> str:
     known = np.isfinite(grid.worst_px)
     if not known.any() or not np.nanmin(grid.worst_px) > 0.0:
         return "".join([_open(calibration, "uncertainty"), _foot(calibration, "the projection has no uncertainty", "")])
-    low = float(np.nanmin(grid.worst_px))
-    high = min(float(np.nanmax(grid.worst_px)), DYNAMIC * low) * (1.0 + 1e-9)
-    level = np.log(np.where(known, grid.worst_px, low) / low) / max(np.log(high / low), 1e-9)
+    low, high = MAP_PX
+    level = np.log(np.where(known, grid.worst_px, low) / low) / np.log(high / low)
     zoom = _zoom(calibration)
     w, h = zoom * width / MAP_GRID[0], zoom * height / MAP_GRID[1]
-    words = f"{low:.3g} px at best, {np.nanmax(grid.worst_px):.3g} px at worst (a point at infinity, worst direction)"
+    best, worst = float(np.nanmin(grid.worst_px)), float(np.nanmax(grid.worst_px))
+    words = f"{best:.3g} px at best, {worst:.3g} px at worst (a point at infinity, worst direction)"
     out = [_open(calibration, "projection uncertainty, px"), '<g shape-rendering="crispEdges">']
     for j, i in np.argwhere(known):
         place = f'x="{i * w:.1f}" y="{j * h:.1f}" width="{w:.1f}" height="{h:.1f}"'
         out.append(f'<rect {place} fill="{_colour(float(level[j, i]))}"/>')
-    out += ["</g>", _colour_bar(zoom * height + 26.0, low, high)]
+    out += ["</g>", _contours(grid.worst_px, w, h), _colour_bar(zoom * height + 26.0, low, high)]
     pixels, _, kept = _corners(calibration)
     hull = cv2.convexHull(pixels[kept].astype(np.float32))[:, 0]
     outline = " ".join(f"{x:.1f},{y:.1f}" for x, y in zoom * hull)
     out.append(f'<polygon points="{outline}" fill="none" stroke="#fff" stroke-width="1.5" stroke-dasharray="6 4"/>')
     out += _numbers(calibration)
     return "".join([*out, _foot(calibration, words, "dashed: around all corners that were seen")])
+
+
+def _contours(worst_px: FloatArray, cell_width: float, cell_height: float) -> str:
+    """Return the lines of equal uncertainty over the map, each with its figure."""
+    from contourpy import contour_generator
+
+    rows, columns = worst_px.shape
+    x, y = (np.arange(columns) + 0.5) * cell_width, (np.arange(rows) + 0.5) * cell_height
+    generator = contour_generator(x, y, np.ma.masked_invalid(np.log(worst_px)))
+    out = []
+    for value in CONTOURS_PX:
+        lines = [np.asarray(line) for line in generator.lines(float(np.log(value)))]
+        for line in lines:
+            path = "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in line)
+            out.append(f'<path d="{path}" fill="none" stroke="#fff" stroke-opacity=".75" stroke-width="1"/>')
+        if lines:
+            a, b = max(lines, key=len)[len(max(lines, key=len)) // 3]
+            out.append(f'<text x="{a:.1f}" y="{b:.1f}" font-size="12.5" fill="#fff">{value:g}</text>')
+    return "".join(out)
+
+
+def _scale(calibration: Calibration, times: float) -> str:
+    """Return a stroke below the drawing as long as a round number of pixels, magnified as the residuals are."""
+    per_px = _zoom(calibration) * times
+    length = _magnification(0.15 * WIDTH / per_px)
+    y, x = _zoom(calibration) * calibration.camera.size_px[1] + 30.0, WIDTH - 4.0
+    return (
+        f'<path d="M{x - length * per_px:.1f} {y:.1f}H{x}m0 -4v8m{-length * per_px:.1f} 0v-8" stroke="#333"/>'
+        f'<text x="{x - length * per_px - 6:.1f}" y="{y + 4:.1f}" text-anchor="end" fill="#333">{length:g} px</text>'
+    )
+
+
+def _heads(start: FloatArray, by: FloatArray) -> str:
+    """Return the heads of arrows, two strokes each; arrows shorter than a head have none."""
+    length = np.linalg.norm(by, axis=-1, keepdims=True)
+    long = length[:, 0] > 1.5 * ARROW_HEAD
+    tip, along = (start + by)[long], (by / np.maximum(length, 1e-12))[long]
+    across = np.stack([-along[:, 1], along[:, 0]], axis=-1)
+    one, two = (ARROW_HEAD * (-along + side * 0.6 * across) for side in (1.0, -1.0))
+    return "".join(
+        f"M{x + a:.1f} {y + b:.1f}L{x:.1f} {y:.1f}l{c:.1f} {d:.1f}"
+        for (x, y), (a, b), (c, d) in zip(tip, one, two, strict=True)
+    )
 
 
 def _colour_bar(y: float, low: float, high: float) -> str:
@@ -186,7 +234,7 @@ def _zoom(calibration: Calibration) -> float:
     return WIDTH / calibration.camera.size_px[0]
 
 
-def _magnification(calibration: Calibration, wanted: float) -> float:
+def _magnification(wanted: float) -> float:
     """Return the next of 1, 2, 5 times a power of ten below `wanted`."""
     power = 10.0 ** np.floor(np.log10(wanted))
     return float(max(m * power for m in (1.0, 2.0, 5.0) if m * power <= wanted))

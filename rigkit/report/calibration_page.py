@@ -9,19 +9,30 @@ from typing import Any
 import cv2
 import numpy as np
 
+from rigkit.calibration.coverage import covered_by_boards
 from rigkit.calibration.result import Calibration, ViewResult
+from rigkit.calibration.rig.result import RigCalibration
+from rigkit.calibration.uncertainty import uncertainty_map
 from rigkit.core.arrays import Pixels
+from rigkit.core.findings import Finding
 from rigkit.core.tables import Cell, Column, Table
 from rigkit.io.images import Image
 from rigkit.planning.plan import Plan
+from rigkit.report.calibration_charts import histogram_svg, images_svg, lens_svg, radius_svg
 from rigkit.report.calibration_drawings import coverage_svg, pattern_svg, residuals_svg, uncertainty_svg
 from rigkit.report.plan_page import shown_views
 from rigkit.report.render import data_uri, drawing, render, shown_table
+from rigkit.report.rig_tables import rig_basis, rig_tables
+from rigkit.report.scene_view import boards_scene, rig_scene
+from rigkit.report.tables import rounded_words
+from rigkit.validation.check import Check
 
 __all__ = ["CalibrationSection", "build_calibration_page", "thumbnail_jpeg"]
 
-THUMBNAIL_PX = 320
-"""Width of the thumbnails: twice what the page shows, for dense screens."""
+THUMBNAILS_PX = (640, 320)
+"""Width of the thumbnails: large ones can be enlarged, small ones are twice what the page shows, for dense screens."""
+MAX_LARGE = 40
+"""More images than this get small thumbnails: the page stays below 5 MB."""
 PAGE_JPEG_QUALITY = 70
 KEPT_COLOUR, LEFT_OUT_COLOUR = (60, 220, 60), (60, 60, 255)
 """Blue, green, red of the corners in thumbnails."""
@@ -30,7 +41,15 @@ DRAWINGS: tuple[tuple[str, Callable[[Calibration], str]], ...] = (
     ("Residuals", residuals_svg),
     ("What the residuals have in common", pattern_svg),
     ("Coverage", coverage_svg),
+    ("RMS by image", images_svg),
+    ("Error by distance from the centre", radius_svg),
+    ("Residuals and chance", histogram_svg),
+    ("The lens", lens_svg),
 )
+IN_PX = ("fx", "fy", "cx", "cy")
+REACH_GRID = (24, 18)
+MAX_RATIO_BEYOND = 3.0
+"""Where the projection is no worse than so many times the worst place that boards reached, all of the image serves."""
 VERDICTS = {"good": "pass", "look": "look", "bad": "fail"}
 
 
@@ -50,24 +69,27 @@ def build_calibration_page(
     lead: str,
     sections: Sequence[CalibrationSection],
     provenance: Mapping[str, str],
-    summary: Sequence[Table] = (),
+    rig: RigCalibration | None = None,
+    checks: Sequence[Check] = (),
 ) -> str:
-    """Return the page as text; everything it needs is inside it. `summary` are tables of what the cameras share."""
+    """Return the page as text; everything it needs is inside it. `rig` is what the cameras share, `checks` what a
+    person measured of it."""
     return render(
         "calibration.html",
         title=title,
         lead=lead,
-        summary=[shown_table(table) for table in summary],
+        shared=None if rig is None else _shared(rig, checks),
         sections=[_shown(section) for section in sections],
         provenance=provenance,
     )
 
 
-def thumbnail_jpeg(image: Image, views: Sequence[ViewResult] = ()) -> bytes:
-    """Return a small picture of `image` ((H, W) or (H, W, 3) RGB) with the corners of its views: used ones as dots,
-    those left out as rings."""
-    zoom = THUMBNAIL_PX / image.shape[1]
-    size = (THUMBNAIL_PX, max(round(image.shape[0] * zoom), 1))
+def thumbnail_jpeg(image: Image, views: Sequence[ViewResult] = (), *, count: int = 1) -> bytes:
+    """Return a small picture of `image` ((H, W) or (H, W, 3) RGB), one of `count` on the page, with the corners of its
+    views: used ones as dots, those left out as rings."""
+    wide = THUMBNAILS_PX[count > MAX_LARGE]
+    zoom = wide / image.shape[1]
+    size = (wide, max(round(image.shape[0] * zoom), 1))
     small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.float64)
     if image.dtype != np.uint8:
         small *= 255.0 / max(float(np.quantile(small, 0.999)), 1.0)
@@ -83,6 +105,18 @@ def thumbnail_jpeg(image: Image, views: Sequence[ViewResult] = ()) -> bytes:
     return bytes(cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, PAGE_JPEG_QUALITY])[1])
 
 
+def _shared(rig: RigCalibration, checks: Sequence[Check]) -> dict[str, Any]:
+    """Return what the cameras share, as the template shows it."""
+    return {
+        "heldout": "not available (too few frames)" if rig.heldout_rms_px is None else f"{rig.heldout_rms_px:.3f} px",
+        "training": f"{rig.rms_px:.3f} px",
+        "findings": _findings(rig.verdicts),
+        "basis": rig_basis(rig),
+        "scene": rig_scene(rig),
+        "tables": [shown_table(table) for table in rig_tables(rig, checks)],
+    }
+
+
 def _shown(section: CalibrationSection) -> dict[str, Any]:
     """Return one camera in words and pictures, as the template shows it."""
     c = section.calibration
@@ -92,7 +126,9 @@ def _shown(section: CalibrationSection) -> dict[str, Any]:
         "heldout": "not available (too few images)" if c.heldout_rms_px is None else f"{c.heldout_rms_px:.3f} px",
         "training": f"{c.rms_px:.3f} px",
         "basis": _basis(c),
-        "findings": _findings(c),
+        "findings": _findings(c.verdicts),
+        "reach": _reach(c),
+        "scene": boards_scene(c.views, c.boards),
         "drawings": [(name, drawing(draw(c))) for name, draw in DRAWINGS],
         "next": [] if section.plan is None else shown_views(section.plan, _kept(c)),
         "next_gain": "" if section.plan is None else f"{100.0 * section.plan.gain:.0f}",
@@ -116,17 +152,41 @@ def _basis(c: Calibration) -> str:
     )
 
 
-def _findings(c: Calibration) -> list[tuple[str, str, str]]:
+def _findings(found: Sequence[Finding]) -> list[tuple[str, str, str]]:
     """Return severity, colour and words of each finding."""
-    return [(str(found.severity), VERDICTS[found.severity], found.text) for found in c.verdicts]
+    return [(str(one.severity), VERDICTS[one.severity], one.text) for one in found]
+
+
+def _reach(c: Calibration) -> str:
+    """Say how sure the projection is where boards were and beyond, in pixels."""
+    grid = uncertainty_map(c, grid=REACH_GRID)
+    known = np.isfinite(grid.worst_px)
+    inside = covered_by_boards(c, grid.pixels) & known
+    if not inside.any():
+        return ""
+    within, beyond = grid.worst_px[inside], grid.worst_px[known & ~inside]
+    words = (
+        f"A far point is projected to ±{np.median(within):.2g} px where boards were (±{within.max():.2g} px at worst; "
+        "one standard deviation)"
+    )
+    if not beyond.size:
+        return words + "."
+    worst = float(beyond.max())
+    if worst < MAX_RATIO_BEYOND * within.max():
+        return words + f", and to ±{worst:.2g} px at worst outside: use the whole image."
+    return words + (
+        f", and to ±{worst:.2g} px at worst outside: use the part inside the dashed line only, or add pictures with "
+        "the board at the border, tilted by 30 degrees."
+    )
 
 
 def _parameters(c: Calibration) -> Table:
     rows = tuple(
-        (Cell(name), Cell(f"{value:.9g}"), Cell(f"{sigma:.2g}"))
+        (Cell(name), Cell(rounded_words(float(value), float(sigma))), Cell("px" if name in IN_PX else ""))
         for name, value, sigma in zip(c.camera.parameter_names(), c.camera.parameters, c.parameter_sigmas, strict=True)
     )
-    return Table("parameters", "Parameters", (Column("name"), Column("value"), Column("standard deviation")), rows)
+    columns = (Column("name"), Column("value and standard deviation"), Column("unit"))
+    return Table("parameters", "Parameters", columns, rows, "The file has every digit.")
 
 
 def _candidates(c: Calibration) -> Table:

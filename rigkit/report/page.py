@@ -13,11 +13,9 @@ from rigkit.core.tables import Table
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.report.render import data_uri, render, shown_table
+from rigkit.report.scene_view import DEPTH, camera_pyramid, rounded
 
 __all__ = ["PairSection", "build_page", "scene_of"]
-
-PYRAMID_DEPTH = 0.15
-"""Depth of a drawn camera pyramid, relative to the median distance of the points."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -67,20 +65,19 @@ def build_page(
 def scene_of(reconstruction: Reconstruction) -> dict[str, Any]:
     """Return the oriented cloud, the cameras and the board planes as the page's 3D view reads them."""
     cloud = reconstruction.cloud
-    depth = PYRAMID_DEPTH * float(np.median(np.linalg.norm(cloud.points_mm, axis=1)))
+    depth = DEPTH * float(np.median(np.linalg.norm(cloud.points_mm, axis=1)))
     frames = ((Rigid3.identity(), "camera 1"), (reconstruction.cam2_from_cam1.inverse(), "camera 2"))
     planes = [
-        {"board": index, "corners": _rounded(_outline(cloud.points_mm[cloud.board_index == index]), 2)}
+        {"board": index, "corners": rounded(_outline(cloud.points_mm[cloud.board_index == index]), 2)}
         for index in range(len(cloud.board_ids))
         if (cloud.board_index == index).sum() >= 3
     ]
-    pyramid = depth * np.array([[0, 0, 0], [-0.6, -0.45, 1], [0.6, -0.45, 1], [0.6, 0.45, 1], [-0.6, 0.45, 1]])
     return {
-        "points": _rounded(cloud.points_mm, 2),
-        "normals": _rounded(cloud.normals, 4),
+        "points": rounded(cloud.points_mm, 2),
+        "normals": rounded(cloud.normals, 4),
         "board": [int(b) for b in cloud.board_index],
         "boards": list(cloud.board_ids),
-        "cameras": [{"name": name, "corners": _rounded(frame.apply(pyramid), 2)} for frame, name in frames],
+        "cameras": [camera_pyramid(name, frame, depth) for frame, name in frames],
         "planes": planes,
         "square_mm": float(np.mean([b.square_x_mm for b in reconstruction.boards])),
     }
@@ -93,7 +90,3 @@ def _outline(points: FloatArray) -> FloatArray:
     local = (points - centre) @ axes.T
     (x0, y0), (x1, y1) = local.min(axis=0), local.max(axis=0)
     return np.asarray(centre + np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]) @ axes)
-
-
-def _rounded(values: FloatArray, digits: int) -> list[list[float]]:
-    return [[round(float(v), digits) for v in row] for row in values]

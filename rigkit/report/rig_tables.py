@@ -13,16 +13,18 @@ from rigkit.calibration.rig.uncertainty import transfer_uncertainty
 from rigkit.core.tables import Cell, Column, Table
 from rigkit.core.truth import Feature
 from rigkit.geometry.rotation import log_so3
+from rigkit.report.tables import rounded_words
 from rigkit.validation.check import Check
 
-__all__ = ["rig_tables"]
+__all__ = ["rig_basis", "rig_tables"]
 
 
 def rig_tables(rig: RigCalibration, checks: Sequence[Check]) -> tuple[Table, ...]:
     """Return the tables that stand first on the page of a rig."""
     tables = [_cameras(rig)]
     if len(rig.cameras) > 1:
-        tables.append(_baselines(rig, checks))
+        tables += [_baselines(rig, checks), _mounts(rig)]
+    tables.append(_intrinsics(rig))
     tables += [_angles(rig, target, checks) for target in rig.board_rigs]
     if rig.left_out:
         columns = (Column("frame"), Column("board"), Column("why"))
@@ -59,14 +61,53 @@ def _cameras(rig: RigCalibration) -> Table:
                 Cell(turned),
             )
         )
-    held = "not available (too few frames)" if rig.heldout_rms_px is None else f"{rig.heldout_rms_px:.3f} px"
-    note = " ".join(f"{verdict.severity.capitalize()}: {verdict.text}." for verdict in rig.verdicts) + (
-        " All intrinsics and mounts solved together. Held-out RMS, over frames that took no part and with one pose for "
-        f"all cameras: {held}; training RMS {rig.rms_px:.3f} px over {rig.corner_count} corners, {rig.shared_count} "
-        f"poses shared by several views. Frames disagree {rig.overdispersion:.2f} times as much as independent corners "
-        "would; all sigmas count that in. The frame is that of the first camera."
+    return Table("rig", "Cameras of the rig", columns, tuple(rows), "The frame is that of the first camera.")
+
+
+def _intrinsics(rig: RigCalibration) -> Table:
+    """Return the intrinsics as the joint solution has them, a column a camera."""
+    sigmas = np.sqrt(np.diag(rig.covariance))
+    columns: list[dict[str, str]] = []
+    start = 0
+    for camera in rig.cameras:
+        names, values = camera.camera.parameter_names(), camera.camera.parameters
+        own = sigmas[start : start + values.size]
+        start += values.size
+        columns.append({name: rounded_words(float(v), float(s)) for name, v, s in zip(names, values, own, strict=True)})
+    rows = tuple(
+        (Cell(name), *(Cell(column.get(name, "–")) for column in columns))
+        for name in dict.fromkeys(name for column in columns for name in column)
     )
-    return Table("rig", "Cameras of the rig", columns, tuple(rows), note)
+    heads = (Column("parameter"), *(Column(f"{c.name} ({c.camera.model})") for c in rig.cameras))
+    note = "As all cameras together have them, with one standard deviation; fx, fy, cx and cy in px."
+    return Table("intrinsics", "Intrinsics in the rig", heads, rows, note)
+
+
+def _mounts(rig: RigCalibration) -> Table:
+    """Return how the cameras stand against the first one."""
+    sigmas = np.sqrt(np.diag(rig.covariance))
+    columns = (Column("camera"), *(Column(f"turned about {a}", "deg") for a in "xyz"))
+    columns += tuple(Column(f"moved along {a}", "mm") for a in "xyz")
+    rows = []
+    for k, camera in enumerate(rig.cameras[1:], start=1):
+        own = sigmas[rig.mount(k)]
+        turned, turned_sigma = np.degrees(log_so3(camera.cam_from_rig.rotation)), np.degrees(own[:3])
+        cells = [Cell(float(v), sigma=float(s)) for v, s in zip(turned, turned_sigma, strict=True)]
+        cells += [
+            Cell(float(v), sigma=float(s)) for v, s in zip(camera.cam_from_rig.translation_mm, own[3:], strict=True)
+        ]
+        rows.append((Cell(camera.name), *cells))
+    note = "cam_from_rig: rotation vector and translation, with one standard deviation."
+    return Table("mounts", "Mounts", columns, tuple(rows), note)
+
+
+def rig_basis(rig: RigCalibration) -> str:
+    """Return what the rig's solution rests on, in words."""
+    return (
+        "All intrinsics and mounts solved together; held out: frames that took no part, with one pose for all cameras. "
+        f"{rig.corner_count} corners, {rig.shared_count} poses shared by several views. Frames disagree "
+        f"{rig.overdispersion:.2f} times as much as independent corners would; all sigmas count that in."
+    )
 
 
 def _baselines(rig: RigCalibration, checks: Sequence[Check]) -> Table:

@@ -17,6 +17,7 @@ __all__ = [
     "below",
     "column_label",
     "measured_words",
+    "rounded_words",
     "tables_to_csv",
     "tables_to_json",
     "tables_to_latex",
@@ -195,6 +196,22 @@ def measured_words(value: float, sigma: float | None, decimals: int) -> str:
     while decimals < MOST_DECIMALS and 0.0 < sigma < 0.5 * 10.0**-decimals:
         decimals += 1
     return f"{value:.{decimals}f} ± {sigma:.{decimals}f}"
+
+
+def rounded_words(value: float, sigma: float) -> str:
+    """Return "value ± sigma" with two digits of the sigma, small ones with a common power of ten.
+
+    >>> rounded_words(534.0337, 0.3412), rounded_words(-1.23456e-10, 4.2e-13), rounded_words(534.0337, 0.0)
+    ('534.03 ± 0.34', '(-1.2346 ± 0.0042)e-10', '534.0337')
+    """
+    if not (np.isfinite(sigma) and sigma > 0.0 and np.isfinite(value)):
+        return f"{value:.9g}"
+    largest = max(abs(value), sigma)
+    power = 0 if largest >= 1e-3 else int(np.floor(np.log10(largest)))
+    value, sigma = value / 10.0**power, sigma / 10.0**power
+    decimals = max(1 - int(np.floor(np.log10(sigma))), 0)
+    words = f"{value:.{decimals}f} ± {sigma:.{decimals}f}"
+    return f"({words})e{power}" if power else words
 
 
 def _left(table: Table) -> list[bool]:

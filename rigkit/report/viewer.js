@@ -1,10 +1,15 @@
-// A small 3D view on a 2D canvas: oriented points, camera pyramids, planes. Drag turns, wheel zooms, double click resets.
+// A small 3D view on a 2D canvas: oriented points, camera pyramids, planes. Drag turns, wheel zooms, double click resets;
+// what lies under the pointer is named; seen from the front, from above or from the side it is orthographic.
 // A scene: {points:[[x,y,z]..], normals:[..], board:[..], boards:[names], cameras:[{name, corners:[tip,a,b,c,d]}],
-// planes:[{board, corners:[a,b,c,d]}], square_mm}. Camera axes: x right, y down, z forward.
+// planes:[{board, corners:[a,b,c,d], name}], square_mm}. Camera axes: x right, y down, z forward.
 "use strict";
 
 const COLOURS = ["#e6550d", "#1f77b4", "#2ca02c", "#9467bd", "#b79a00", "#17becf", "#e377c2", "#7f7f7f"];
-const START = {yaw: -0.45, pitch: 0.45, zoom: 1};
+const START = {yaw: -0.45, pitch: 0.45, zoom: 1, flat: false};
+const FROM = {free: START, front: {yaw: 0, pitch: 0, zoom: 1, flat: true}, top: {yaw: 0, pitch: Math.PI / 2, zoom: 1, flat: true},
+  side: {yaw: Math.PI / 2, pitch: 0, zoom: 1, flat: true}};
+const NEAR_PX = 14;
+const SCALE_PX = 140;
 const TURN_PER_PX = 0.008;
 const DISTANCE = 3.2;
 const FILL = 2.1;
@@ -12,7 +17,8 @@ const FILL = 2.1;
 function viewer(canvas, scene) {
   const show = {normals: true, cameras: true, planes: true};
   let view = {...START};
-  const all = scene.points.concat(...scene.cameras.map((c) => c.corners));
+  let hovered = null;
+  const all = scene.points.concat(...scene.cameras.map((c) => c.corners), ...scene.planes.map((p) => p.corners));
   const middle = [0, 1, 2].map((k) => (Math.min(...all.map((p) => p[k])) + Math.max(...all.map((p) => p[k]))) / 2);
   const reach = Math.max(...all.map((p) => Math.hypot(p[0] - middle[0], p[1] - middle[1], p[2] - middle[2])));
 
@@ -21,15 +27,17 @@ function viewer(canvas, scene) {
     const cy = Math.cos(view.yaw), sy = Math.sin(view.yaw), cp = Math.cos(view.pitch), sp = Math.sin(view.pitch);
     const x1 = cy * x + sy * z, z1 = -sy * x + cy * z;
     const y2 = cp * y + sp * z1, z2 = -sp * y + cp * z1 + DISTANCE;
-    const scale = view.zoom * FILL * Math.min(canvas.width, canvas.height) / z2;
+    const scale = view.zoom * FILL * Math.min(canvas.width, canvas.height) / (view.flat ? DISTANCE : z2);
     return [canvas.width / 2 + scale * x1, canvas.height / 2 + scale * y2, z2];
   }
 
   function draw() {
+    if (!canvas.clientWidth) return;
     const ratio = window.devicePixelRatio || 1;
     canvas.width = canvas.clientWidth * ratio;
     canvas.height = canvas.clientHeight * ratio;
     const pen = canvas.getContext("2d");
+    const wire = getComputedStyle(canvas).getPropertyValue("--wire").trim() || "#333";
     pen.clearRect(0, 0, canvas.width, canvas.height);
     pen.lineWidth = ratio;
     const line = (a, b, colour) => {
@@ -42,11 +50,13 @@ function viewer(canvas, scene) {
     };
     if (show.planes) {
       for (const plane of scene.planes) {
-        pen.fillStyle = COLOURS[plane.board % COLOURS.length] + "22";
+        pen.fillStyle = COLOURS[plane.board % COLOURS.length] + (scene.planes.length > 8 ? "0c" : "22");
         pen.beginPath();
         plane.corners.map(project).forEach((p, i) => (i ? pen.lineTo(p[0], p[1]) : pen.moveTo(p[0], p[1])));
         pen.closePath();
         pen.fill();
+        pen.strokeStyle = COLOURS[plane.board % COLOURS.length] + (plane === hovered ? "ff" : "88");
+        pen.stroke();
       }
     }
     // Far points first, so that near ones lie on top.
@@ -66,16 +76,72 @@ function viewer(canvas, scene) {
       for (const camera of scene.cameras) {
         const [tip, ...base] = camera.corners;
         base.forEach((corner, i) => {
-          line(tip, corner, "#333");
-          line(corner, base[(i + 1) % base.length], "#333");
+          line(tip, corner, wire);
+          line(corner, base[(i + 1) % base.length], wire);
         });
         const p = project(tip);
-        pen.fillStyle = "#333";
+        pen.fillStyle = wire;
         pen.font = `${12 * ratio}px sans-serif`;
         pen.fillText(camera.name, p[0] + 6 * ratio, p[1]);
       }
     }
+    scaleBar(pen, ratio, wire);
+    legend(pen, ratio, wire);
     canvas.dataset.view = `${view.yaw.toFixed(3)} ${view.pitch.toFixed(3)} ${view.zoom.toFixed(3)}`;
+  }
+
+  // A round length that is some SCALE_PX long: true at the middle of the scene.
+  function scaleBar(pen, ratio, wire) {
+    const pxPerMm = view.zoom * FILL * Math.min(canvas.width, canvas.height) / DISTANCE / reach;
+    const rough = SCALE_PX * ratio / pxPerMm, power = 10 ** Math.floor(Math.log10(rough));
+    const length = Math.max(...[1, 2, 5].map((m) => m * power).filter((m) => m <= rough));
+    const x = 14 * ratio, y = canvas.height - 14 * ratio;
+    pen.strokeStyle = pen.fillStyle = wire;
+    pen.lineWidth = 2 * ratio;
+    pen.beginPath();
+    pen.moveTo(x, y);
+    pen.lineTo(x + length * pxPerMm, y);
+    pen.stroke();
+    pen.lineWidth = ratio;
+    pen.font = `${12 * ratio}px sans-serif`;
+    pen.fillText(length >= 1000 ? `${length / 1000} m` : `${length} mm`, x, y - 6 * ratio);
+    // The axes of the first camera beside it.
+    const origin = project(middle), step = 0.12 * reach;
+    [["x", "#c62828"], ["y", "#2e7d32"], ["z", "#1565c0"]].forEach(([name, colour], k) => {
+      const tip = project(middle.map((m, i) => m + (i === k ? step : 0)));
+      const to = [tip[0] - origin[0], tip[1] - origin[1]].map((d) => d / view.zoom);
+      const at = [canvas.width - 60 * ratio, canvas.height - 60 * ratio];
+      pen.strokeStyle = pen.fillStyle = colour;
+      pen.beginPath();
+      pen.moveTo(...at);
+      pen.lineTo(at[0] + to[0], at[1] + to[1]);
+      pen.stroke();
+      pen.fillText(name, at[0] + 1.2 * to[0], at[1] + 1.2 * to[1]);
+    });
+  }
+
+  function legend(pen, ratio, wire) {
+    pen.font = `${12 * ratio}px sans-serif`;
+    scene.boards.slice(0, COLOURS.length).forEach((name, k) => {
+      pen.fillStyle = COLOURS[k];
+      pen.fillRect(14 * ratio, (14 + 18 * k) * ratio, 10 * ratio, 10 * ratio);
+      pen.fillStyle = wire;
+      pen.fillText(name, 30 * ratio, (23 + 18 * k) * ratio);
+    });
+  }
+
+  // The camera or plane whose middle is nearest to the pointer, in words.
+  function under(e) {
+    const box = canvas.getBoundingClientRect(), ratio = window.devicePixelRatio || 1;
+    const at = [(e.clientX - box.left) * ratio, (e.clientY - box.top) * ratio];
+    const mean = (corners) => [0, 1, 2].map((k) => corners.reduce((s, c) => s + c[k], 0) / corners.length);
+    const things = scene.planes.filter((p) => p.name).map((p) => [p, mean(p.corners)]);
+    things.push(...scene.cameras.map((c) => [c, c.corners[0]]));
+    const far = things.map(([thing, p]) => [Math.hypot(project(p)[0] - at[0], project(p)[1] - at[1]), thing, p]);
+    const best = far.sort((a, b) => a[0] - b[0])[0];
+    if (!best || best[0] > 3 * NEAR_PX * ratio) return [null, ""];
+    const where = best[2].map((v) => v.toFixed(0)).join(", ");
+    return [best[1], `${best[1].name} at (${where}) mm`];
   }
 
   let last = null;
@@ -84,7 +150,16 @@ function viewer(canvas, scene) {
     canvas.setPointerCapture(e.pointerId);
   });
   canvas.addEventListener("pointermove", (e) => {
-    if (!last) return;
+    if (!last) {
+      const [thing, words] = under(e);
+      if (thing !== hovered) {
+        hovered = thing;
+        const told = canvas.parentElement.querySelector(".hover");
+        if (told) told.textContent = words;
+        draw();
+      }
+      return;
+    }
     view.yaw -= (e.clientX - last[0]) * TURN_PER_PX;
     view.pitch = Math.max(-1.57, Math.min(1.57, view.pitch + (e.clientY - last[1]) * TURN_PER_PX));
     last = [e.clientX, e.clientY];
@@ -101,6 +176,11 @@ function viewer(canvas, scene) {
     draw();
   });
   canvas.addEventListener("keydown", (e) => {
+    if (e.key === "+" || e.key === "-") {
+      view.zoom *= e.key === "+" ? 1.15 : 1 / 1.15;
+      draw();
+      return;
+    }
     const step = {ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1]}[e.key];
     if (!step) return;
     e.preventDefault();
@@ -114,7 +194,14 @@ function viewer(canvas, scene) {
       draw();
     });
   }
+  for (const press of canvas.parentElement.querySelectorAll("button[data-from]")) {
+    press.addEventListener("click", () => {
+      view = {...FROM[press.dataset.from]};
+      draw();
+    });
+  }
   window.addEventListener("resize", draw);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
   window.addEventListener("beforeprint", draw);
   draw();
 }

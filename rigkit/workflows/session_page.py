@@ -14,7 +14,6 @@ from rigkit.io.images import read_image
 from rigkit.io.rig_session import RigSession
 from rigkit.io.session import Session
 from rigkit.report.calibration_page import CalibrationSection, build_calibration_page, thumbnail_jpeg
-from rigkit.report.rig_tables import rig_tables
 from rigkit.validation.check import Check
 from rigkit.workflows.corners import SessionCorners, image_names
 from rigkit.workflows.next_views import next_views
@@ -50,7 +49,7 @@ def rig_page(
     images = {f"images of {own}": s.images for own, s in session.cameras.items()}
     sources = {f"corners of {own}": found.source for own, found in corners.items()}
     facts = _facts(session.path, files, images, sources)
-    return build_calibration_page(f"rigkit rig calibration: {name}", lead, sections, facts, rig_tables(rig, checks))
+    return build_calibration_page(f"rigkit rig calibration: {name}", lead, sections, facts, rig, checks)
 
 
 def _section(name: str, session: Session, calibration: Calibration) -> CalibrationSection:
@@ -77,7 +76,7 @@ def _thumbnails(session: Session, calibration: Calibration) -> dict[str, bytes]:
     for path, name in zip(session.images, image_names(session), strict=True):
         if name in views:
             try:
-                out[name] = thumbnail_jpeg(read_image(path), views[name])
+                out[name] = thumbnail_jpeg(read_image(path), views[name], count=len(session.images))
             except InputError:
                 # Corners are kept beside the session: the image itself may have gone bad since.
                 continue

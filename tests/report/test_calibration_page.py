@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.calibration_scenes import BOARD, lens, random_views, with_outliers
-from report.test_page_in_browser import QUIET, chromium
+from report.test_page_in_browser import MIN_FONT_PX, QUIET, chromium, measured_at_widths
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration
@@ -69,7 +69,48 @@ def test_works_without_network(calibration: Calibration, tmp_path: Path) -> None
     assert "CONSOLE" not in done.stderr, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
     probe = re.search(r'data-probe="([^"]*)"', done.stdout)
     assert probe is not None
-    assert probe[1] == f"4|true|{IMAGES}|true|true"
+    assert probe[1] == f"8|true|{IMAGES}|true|true"
+
+
+def test_fits_a_phone_a_tablet_and_a_screen(calibration: Calibration, tmp_path: Path) -> None:
+    for width, (wide, small) in measured_at_widths(page(calibration), tmp_path).items():
+        assert wide <= width
+        assert small >= MIN_FONT_PX
+
+
+SORT_PROBE = """<script>
+const table = document.querySelector("table.pictures");
+const cells = (k) => [...table.tBodies[0].rows].map((row) => row.cells[k].textContent.trim());
+const press = (k) => table.tHead.rows[0].cells[k].querySelector("button").click();
+press(3); const up = cells(3).map(parseFloat); press(3); const down = cells(3).map(parseFloat);
+press(1); const names = cells(1);
+document.querySelector("button.enlarge").click();
+const open = document.querySelector("dialog").open;
+const canvas = document.querySelector("canvas[data-scene]");
+document.querySelector("button[data-from=top]").click();
+const ordered = (a) => a.every((v, i) => i === 0 || a[i - 1] <= v);
+const told = [ordered(up), ordered([...down].reverse()), names.join(","), open, canvas.dataset.view];
+document.body.dataset.probe = told.join("|");
+</script></body>"""
+
+
+def test_tables_sort_pictures_enlarge_and_the_view_turns(calibration: Calibration, tmp_path: Path) -> None:
+    path = tmp_path / "calibration.html"
+    path.write_text(page(calibration).replace("</body>", SORT_PROBE), encoding="utf-8")
+    done = subprocess.run(
+        [chromium(), *QUIET, f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", path.as_uri()],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    probe = re.search(r'data-probe="([^"]*)"', done.stdout)
+    assert probe is not None
+    up, down, names, open_, view = probe[1].split("|")
+    assert (up, down, open_) == ("true", "true", "true")
+    images = sorted((v.image for v in calibration.views), key=lambda n: int(re.sub(r"\D", "", n)))
+    assert names.split(",") == images
+    assert view.split()[:2] == ["0.000", "1.571"]
 
 
 def test_says_what_the_calibration_says(calibration: Calibration) -> None:

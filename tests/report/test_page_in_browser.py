@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import re
 import shutil
 import subprocess
@@ -78,3 +79,62 @@ def test_the_page_works_without_network(tmp_path: Path) -> None:
     assert fits == "true"
     first, second = (np.array([float(v) for v in text.split()]) for text in (before, after))
     assert abs(first[0] - second[0]) > 0.1
+
+
+MIN_FONT_PX = 11.0
+"""Smaller words are hard to read on a phone."""
+WIDTHS = (400, 768, 1366)
+FRAMES = """<!doctype html><body><script>
+const page = atob("%PAGE%"), widths = %WIDTHS%;
+const text = new TextDecoder().decode(Uint8Array.from(page, (c) => c.charCodeAt(0)));
+let left = widths.length;
+const told = [];
+for (const width of widths) {
+  const frame = document.createElement("iframe");
+  frame.style = `width: ${width}px; height: 900px; border: 0`;
+  frame.srcdoc = text;
+  frame.addEventListener("load", () => {
+    const page = frame.contentDocument, scale = (e) => {
+      const box = e.ownerSVGElement && e.ownerSVGElement.viewBox.baseVal;
+      return box ? e.ownerSVGElement.getBoundingClientRect().width / box.width : 1;
+    };
+    const words = [...page.querySelectorAll("p, td, th, label, figcaption, svg text, button")]
+      .filter((e) => e.textContent.trim() && e.getBoundingClientRect().width > 0);
+    const size = (e) => parseFloat(frame.contentWindow.getComputedStyle(e).fontSize) * scale(e);
+    const small = Math.min(...words.map(size));
+    told.push([width, page.documentElement.scrollWidth, small.toFixed(2)].join(" "));
+    if (--left === 0) document.body.dataset.probe = told.join("|");
+  });
+  document.body.append(frame);
+}
+</script></body>"""
+
+
+def measured_at_widths(page: str, folder: Path) -> dict[int, tuple[int, float]]:
+    """Return by width of the window how wide the page gets, and its smallest words, px."""
+    path = folder / "frames.html"
+    coded = base64.b64encode(page.encode()).decode()
+    path.write_text(FRAMES.replace("%PAGE%", coded).replace("%WIDTHS%", str(list(WIDTHS))), encoding="utf-8")
+    done = subprocess.run(
+        [chromium(), *QUIET, f"--user-data-dir={folder / 'profile'}", "--dump-dom", path.as_uri()],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    assert "CONSOLE" not in done.stderr, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+    found = re.search(r'data-probe="([^"]*)"', done.stdout)
+    assert found is not None
+    rows = [text.split() for text in found[1].split("|")]
+    return {int(width): (int(wide), float(small)) for width, wide, small in rows}
+
+
+def test_the_page_fits_a_phone_a_tablet_and_a_screen(tmp_path: Path) -> None:
+    reconstruction = make_reconstruction()
+    report = validate(reconstruction, PairTruth(angles=(MeasuredAngle("plane1", "plane2", 90.0, 0.3, "set square"),)))
+    picture = ("The cloud", "image/jpeg", as_jpeg(cloud_png(reconstruction)))
+    section = pair_section(reconstruction, [report], [picture])
+    page = build_page("title", "lead", report.passed, [summary_table([report])], [section], {"rigkit": "x" * 200})
+    for width, (wide, small) in measured_at_widths(page, tmp_path).items():
+        assert wide <= width
+        assert small >= MIN_FONT_PX

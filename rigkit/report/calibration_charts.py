@@ -1,0 +1,215 @@
+"""Charts of a calibration as SVG: error by image and by radius, how residuals are spread, and the lens's curve."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+
+import numpy as np
+
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.uncertainty import projection_uncertainty
+from rigkit.core.arrays import FloatArray
+
+__all__ = ["histogram_svg", "images_svg", "lens_svg", "radius_svg"]
+
+WIDTH, HEIGHT = 600.0, 330.0
+LEFT, RIGHT, TOP, BOTTOM = 58.0, 24.0, 12.0, 46.0
+INK, MARK, SOFT, WORDS, FAINT_WORDS = "#1f4e8c", "#c2410c", "#8a94a3", "#333", "#5b6575"
+MAX_DOTS = 4000
+BARS_NAMED = 24
+"""More images are numbered only: their names would lie over each other."""
+BINS = 41
+IMAGE_RINGS = 12
+"""Rings of equal numbers of corners, each with its own RMS."""
+CURVE_POINTS = 120
+TICKS = (1.0, 2.0, 2.5, 5.0, 10.0)
+
+
+class _Plot:
+    """Axes from data to the drawing."""
+
+    def __init__(self, title: str, x: tuple[float, float], y: tuple[float, float], labels: tuple[str, str]) -> None:
+        self._x, self._y = x, y
+        self.parts = [
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH:g} {HEIGHT:g}" role="img" '
+            f'font-family="sans-serif" font-size="13"><title>{escape(title)}</title>'
+        ]
+        for value in _ticks(*y):
+            at = self.v(value)
+            self.parts.append(f'<path d="M{LEFT} {at:.1f}H{WIDTH - RIGHT}" stroke="#e3e7ee"/>')
+            self.words(LEFT - 6, at + 4, f"{value:g}", "end")
+        self.words(0.5 * (LEFT + WIDTH - RIGHT), HEIGHT - 6, labels[0], "middle")
+        self.parts.append(
+            f'<text transform="translate(13 {0.5 * (TOP + HEIGHT - BOTTOM):.1f}) rotate(-90)" text-anchor="middle" '
+            f'fill="{WORDS}">{escape(labels[1])}</text>'
+        )
+
+    def u(self, x: float) -> float:
+        return LEFT + (x - self._x[0]) / (self._x[1] - self._x[0]) * (WIDTH - LEFT - RIGHT)
+
+    def v(self, y: float) -> float:
+        return HEIGHT - BOTTOM - (y - self._y[0]) / (self._y[1] - self._y[0]) * (HEIGHT - TOP - BOTTOM)
+
+    def words(self, x: float, y: float, text: str, anchor: str = "start", colour: str = WORDS) -> None:
+        self.parts.append(f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="{colour}">{escape(text)}</text>')
+
+    def below(self, values: Sequence[float]) -> None:
+        for value in values:
+            self.words(self.u(value), HEIGHT - BOTTOM + 18, f"{value:g}", "middle")
+
+    def line(self, x: FloatArray, y: FloatArray, colour: str, *, width: float = 1.8, dashes: str = "") -> None:
+        places = " ".join(f"{self.u(float(a)):.1f},{self.v(float(b)):.1f}" for a, b in zip(x, y, strict=True))
+        dashed = f' stroke-dasharray="{dashes}"' if dashes else ""
+        self.parts.append(f'<polyline points="{places}" fill="none" stroke="{colour}" stroke-width="{width}"{dashed}/>')
+
+    def done(self) -> str:
+        frame = f'<path d="M{LEFT} {TOP}V{HEIGHT - BOTTOM}H{WIDTH - RIGHT}" fill="none" stroke="#b8c0cc"/></svg>'
+        return "".join([*self.parts, frame])
+
+
+def images_svg(calibration: Calibration) -> str:
+    """Draw the RMS of every view as a bar, with the RMS of all as a line."""
+    rms = np.array([view.rms_px for view in calibration.views])
+    rms = np.where(np.isfinite(rms), rms, 0.0)
+    top = _round_up(max(float(rms.max(initial=0.0)), 1e-6))
+    plot = _Plot("RMS by image", (-0.5, len(rms) - 0.5), (0.0, top), ("" if _named(len(rms)) else "view", "RMS, px"))
+    wide = max(0.8 * (plot.u(1.0) - plot.u(0.0)), 0.8)
+    for k, (view, value) in enumerate(zip(calibration.views, rms, strict=True)):
+        x, y = plot.u(k) - 0.5 * wide, plot.v(float(value))
+        what = escape(f"{view.image}, {view.board_id}: {value:.3f} px")
+        plot.parts.append(
+            f'<rect x="{x:.1f}" y="{y:.1f}" width="{wide:.1f}" height="{plot.v(0.0) - y:.1f}" fill="{INK}">'
+            f"<title>{what}</title></rect>"
+        )
+        if _named(len(rms)):
+            at = f"translate({plot.u(k) + 4:.1f} {HEIGHT - BOTTOM - 6:.1f}) rotate(-90)"
+            plot.parts.append(
+                f'<text transform="{at}" font-size="12.5" fill="{WORDS}" stroke="#fff" stroke-width="3" '
+                f'paint-order="stroke">{escape(view.image[-28:])}</text>'
+            )
+    if not _named(len(rms)):
+        plot.below(_ticks(0.0, len(rms) - 1.0))
+    plot.line(np.array([-0.5, len(rms) - 0.5]), np.full(2, calibration.rms_px), MARK, dashes="5 4")
+    plot.words(WIDTH - RIGHT, plot.v(calibration.rms_px) - 5, f"all: {calibration.rms_px:.3f} px", "end", MARK)
+    return plot.done()
+
+
+def radius_svg(calibration: Calibration) -> str:
+    """Draw the error of every corner against its distance from the image's centre, and the RMS of rings: a lens that
+    the model does not follow shows in the outer ones."""
+    pixels, residuals = _kept(calibration)
+    centre = 0.5 * (np.array(calibration.camera.size_px) - 1.0)
+    radius, error = np.linalg.norm(pixels - centre, axis=1), np.linalg.norm(residuals, axis=1)
+    top = _round_up(float(np.quantile(error, 0.995)))
+    reach = _round_up(float(np.linalg.norm(centre)), fine=True)
+    plot = _Plot(
+        "error against radius", (0.0, reach), (0.0, top), ("distance from the image's centre, px", "error, px")
+    )
+    step = -(-len(radius) // MAX_DOTS)
+    shown = error[::step] <= top
+    dots = "".join(
+        f"M{plot.u(float(r)):.1f} {plot.v(float(e)):.1f}h0"
+        for r, e in zip(radius[::step][shown], error[::step][shown], strict=True)
+    )
+    plot.parts.append(
+        f'<path d="{dots}" stroke="{INK}" stroke-opacity=".35" stroke-width="2.4" stroke-linecap="round"/>'
+    )
+    order = np.array_split(np.argsort(radius), min(IMAGE_RINGS, max(len(radius) // 20, 1)))
+    rings = np.array([[radius[o].mean(), np.sqrt(np.mean(error[o] ** 2))] for o in order])
+    plot.line(rings[:, 0], rings[:, 1], MARK, width=2.4)
+    plot.words(WIDTH - RIGHT, TOP + 12, "line: RMS of rings", "end", MARK)
+    plot.below(_ticks(0.0, reach))
+    return plot.done()
+
+
+def histogram_svg(calibration: Calibration) -> str:
+    """Draw how often residuals of each size are, u and v together, beside the normal curve of their scatter."""
+    _, residuals = _kept(calibration)
+    values = residuals.reshape(-1)
+    sigma = float(1.4826 * np.median(np.abs(values)))
+    reach = _round_up(max(4.0 * sigma, 1e-6), fine=True)
+    counts, edges = np.histogram(values, BINS, (-reach, reach))
+    step = edges[1] - edges[0]
+    x = np.linspace(-reach, reach, CURVE_POINTS)
+    curve = len(values) * step / (sigma * np.sqrt(2.0 * np.pi)) * np.exp(-0.5 * (x / sigma) ** 2)
+    top = _round_up(float(max(counts.max(), curve.max())))
+    plot = _Plot("residuals", (-reach, reach), (0.0, top), ("residual along u or v, px", "how many"))
+    for count, left in zip(counts, edges, strict=False):
+        y, wide = plot.v(float(count)), plot.u(float(left + step)) - plot.u(float(left))
+        place = f'x="{plot.u(float(left)):.1f}" y="{y:.1f}" width="{wide:.1f}" height="{plot.v(0.0) - y:.1f}"'
+        plot.parts.append(f'<rect {place} fill="{INK}" fill-opacity=".6"/>')
+    plot.line(x, curve, MARK)
+    beyond = int((np.abs(values) > reach).sum())
+    plot.words(WIDTH - RIGHT, TOP + 12, f"line: normal, sigma {sigma:.3g} px; {beyond} lie outside", "end", MARK)
+    plot.below([-reach, -0.5 * reach, 0.0, 0.5 * reach, reach])
+    return plot.done()
+
+
+def lens_svg(calibration: Calibration) -> str:
+    """Draw where the lens puts a ray (px from the principal point) by its angle off the axis, to the right, beside the
+    perspective and the equidistant projection; the band is the uncertainty, magnified."""
+    camera = calibration.camera
+    edge = np.array([[camera.size_px[0] - 1.0, 0.5 * (camera.size_px[1] - 1.0)]])
+    axis, _ = camera.project(np.array([[0.0, 0.0, 1.0]]))
+    u = np.linspace(float(axis[0, 0]), float(edge[0, 0]), CURVE_POINTS)
+    pixels = np.stack([u, np.full(CURVE_POINTS, float(axis[0, 1]))], axis=-1)
+    rays, valid = camera.unproject(pixels)
+    rays, pixels = rays[valid], pixels[valid]
+    angle = np.degrees(np.arctan2(np.linalg.norm(rays[:, :2], axis=1), rays[:, 2]))
+    radius = np.linalg.norm(pixels - axis, axis=1)
+    band = projection_uncertainty(calibration, pixels).worst_px
+    focal = float(np.gradient(radius, np.radians(angle))[1])
+    reach, top = _round_up(float(angle.max()), fine=True), _round_up(float(radius.max()), fine=True)
+    plot = _Plot("the lens", (0.0, reach), (0.0, top), ("angle off the axis, deg", "distance from its centre, px"))
+    theta = np.linspace(0.0, reach, CURVE_POINTS)
+    for curve, dashes in (
+        (focal * np.tan(np.radians(np.minimum(theta, 89.0))), "2 3"),
+        (focal * np.radians(theta), "7 4"),
+    ):
+        inside = curve <= top
+        plot.line(theta[inside], curve[inside], SOFT, width=1.2, dashes=dashes)
+    plot.words(WIDTH - RIGHT, HEIGHT - BOTTOM - 26, "dotted: perspective", "end", FAINT_WORDS)
+    plot.words(WIDTH - RIGHT, HEIGHT - BOTTOM - 10, "dashed: equidistant", "end", FAINT_WORDS)
+    known = np.isfinite(band)
+    times = _round_down(0.1 * top / max(float(np.nanmedian(band)), 1e-9)) if known.any() else 1.0
+    around = np.clip(np.nan_to_num(band) * times, 0.0, 0.5 * top)
+    both = [*zip(angle, radius + around, strict=True), *zip(angle[::-1], (radius - around)[::-1], strict=True)]
+    outline = " ".join(f"{plot.u(a):.1f},{plot.v(float(np.clip(r, 0.0, top))):.1f}" for a, r in both)
+    plot.parts.append(f'<polygon points="{outline}" fill="{INK}" fill-opacity=".18"/>')
+    plot.line(angle, radius, INK, width=2.2)
+    plot.words(
+        LEFT + 10, TOP + 12, f"{focal:.1f} px a radian on the axis; band: one sigma, {times:g} times", colour=INK
+    )
+    plot.below(_ticks(0.0, reach))
+    return plot.done()
+
+
+def _kept(calibration: Calibration) -> tuple[FloatArray, FloatArray]:
+    """Return pixels and residuals of the corners used."""
+    pixels = np.concatenate([view.pixels[view.kept] for view in calibration.views])
+    return pixels, np.concatenate([view.residuals_px[view.kept] for view in calibration.views])
+
+
+def _named(count: int) -> bool:
+    return count <= BARS_NAMED
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """Return round values between `low` and `high`, some five of them."""
+    rough = max(high - low, 1e-12) / 5.0
+    power = 10.0 ** np.floor(np.log10(rough))
+    step = next(m * power for m in TICKS if m * power >= rough)
+    return [float(f"{k * step:.10g}") for k in range(int(np.ceil(low / step)), int(np.floor(high / step + 1e-9)) + 1)]
+
+
+def _round_up(value: float, *, fine: bool = False) -> float:
+    """Return the next round number: 1, 2, 5 times a power of ten, or with `fine` any tenth of the power above."""
+    power = 10.0 ** np.floor(np.log10(max(value, 1e-12)))
+    steps = np.arange(1.0, 10.1, 0.5) if fine else np.array([1.0, 2.0, 5.0, 10.0])
+    return float(power * steps[np.searchsorted(steps * power, value * (1.0 - 1e-12))])
+
+
+def _round_down(value: float) -> float:
+    power = 10.0 ** np.floor(np.log10(max(value, 1e-12)))
+    return float(max(m * power for m in (1.0, 2.0, 5.0) if m * power <= value * (1.0 + 1e-12)))

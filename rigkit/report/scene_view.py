@@ -1,0 +1,89 @@
+"""3D views: cameras as pyramids, boards where they were held, as `viewer.js` reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from rigkit.calibration.result import BoardShape, ViewResult
+from rigkit.calibration.rig.result import RigCalibration
+from rigkit.core.arrays import FloatArray
+from rigkit.geometry.rigid3 import Rigid3
+
+__all__ = ["DEPTH", "boards_scene", "camera_pyramid", "rig_scene", "rounded"]
+
+MAX_BOARDS = 400
+"""More boards hide each other; of more, every second, third, ... is drawn."""
+DEPTH = 0.15
+"""Depth of a drawn camera, relative to the median distance of what it sees."""
+SAME_PLACE = 0.01
+"""Entries of two poses that differ by less, lengths relative to the distance, are of one board seen twice."""
+PYRAMID = np.array([[0.0, 0.0, 0.0], [-0.6, -0.45, 1.0], [0.6, -0.45, 1.0], [0.6, 0.45, 1.0], [-0.6, 0.45, 1.0]])
+
+
+def camera_pyramid(name: str, world_from_cam: Rigid3, depth_mm: float) -> dict[str, Any]:
+    """Return a camera of the view."""
+    return {"name": name, "corners": rounded(world_from_cam.apply(depth_mm * PYRAMID), 2)}
+
+
+def boards_scene(views: Sequence[ViewResult], boards: Sequence[BoardShape]) -> dict[str, Any]:
+    """Return the scene of one camera with every board that it saw."""
+    return _scene({"camera": Rigid3.identity()}, [(view, Rigid3.identity()) for view in views], boards)
+
+
+def rig_scene(rig: RigCalibration) -> dict[str, Any]:
+    """Return the scene of a rig, each board as the first camera that used it has it."""
+    cameras: dict[str, Rigid3] = {}
+    views: list[tuple[ViewResult, Rigid3]] = []
+    places: dict[str, list[FloatArray]] = {}
+    for camera in rig.cameras:
+        rig_from_cam = camera.cam_from_rig.inverse()
+        cameras[camera.name] = rig_from_cam
+        for view in camera.calibration.views:
+            place = (rig_from_cam @ view.cam_from_board).matrix()[:3]
+            known = places.setdefault(view.board_id, [])
+            # Cameras of a rig see one board at one place: it is drawn once.
+            if not any(np.abs(place - other).max() < SAME_PLACE * (1.0 + np.abs(place[:, 3]).max()) for other in known):
+                known.append(place)
+                views.append((view, rig_from_cam))
+    return _scene(cameras, views, rig.cameras[0].calibration.boards)
+
+
+def rounded(values: FloatArray, digits: int) -> list[list[float]]:
+    """Return rows of numbers as JSON has them."""
+    return [[round(float(v), digits) for v in row] for row in values]
+
+
+def _scene(
+    cameras: Mapping[str, Rigid3], views: Sequence[tuple[ViewResult, Rigid3]], boards: Sequence[BoardShape]
+) -> dict[str, Any]:
+    shapes = {board.board_id: board.points_mm for board in boards}
+    names = list(shapes)
+    outlines = {name: _outline(points) for name, points in shapes.items()}
+    planes = []
+    for view, world_from_cam in views[:: -(-len(views) // MAX_BOARDS) or 1]:
+        corners = (world_from_cam @ view.cam_from_board).apply(outlines[view.board_id])
+        name = f"{view.image}, {view.board_id}: {view.rms_px:.3f} px"
+        planes.append({"board": names.index(view.board_id), "corners": rounded(corners, 2), "name": name})
+    far = [
+        float(np.linalg.norm(view.cam_from_board.apply(outlines[view.board_id]), axis=1).mean()) for view, _ in views
+    ]
+    depth = DEPTH * float(np.median(far)) if far else 1.0
+    return {
+        "points": [],
+        "normals": [],
+        "board": [],
+        "boards": names,
+        "cameras": [camera_pyramid(name, frame, depth) for name, frame in cameras.items()],
+        "planes": planes,
+        "square_mm": 1.0,
+    }
+
+
+def _outline(points_mm: FloatArray) -> FloatArray:
+    """Return the four corners (4, 3) of a board's grid of corners, which runs along x and y."""
+    (x0, y0), (x1, y1) = points_mm[:, :2].min(axis=0), points_mm[:, :2].max(axis=0)
+    z = float(points_mm[:, 2].mean())
+    return np.array([[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z]])
