@@ -16,7 +16,7 @@ __all__ = ["histogram_svg", "images_svg", "lens_svg", "radius_svg"]
 WIDTH, HEIGHT = 600.0, 330.0
 LEFT, RIGHT, TOP, BOTTOM = 58.0, 24.0, 12.0, 46.0
 INK, MARK, SOFT, WORDS, FAINT_WORDS = "#1f4e8c", "#c2410c", "#8a94a3", "#333", "#5b6575"
-MAX_DOTS = 4000
+MAX_RESIDUAL_DOTS = 4000
 BARS_NAMED = 24
 """More images are numbered only: their names would lie over each other."""
 BINS = 41
@@ -106,7 +106,7 @@ def radius_svg(calibration: Calibration) -> str:
     plot = _Plot(
         "error against radius", (0.0, reach), (0.0, top), ("distance from the image's centre, px", "error, px")
     )
-    step = -(-len(radius) // MAX_DOTS)
+    step = -(-len(radius) // MAX_RESIDUAL_DOTS)
     shown = error[::step] <= top
     dots = "".join(
         f"M{plot.u(float(r)):.1f} {plot.v(float(e)):.1f}h0"
