@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +20,10 @@ from rigkit.geometry.sampson import sampson_distances
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKnowledge, grow
 from rigkit.reconstruction.growing.surface import GrownSurface, fit_surface, measure
+from rigkit.reconstruction.growing.systematic import SystematicPose, pose_with_field
 from rigkit.reconstruction.reconstruct import Reconstruction, colours_at
 from rigkit.reconstruction.scene import MAX_RANGE_SIGMA, SceneReconstruction, in_unit
-from rigkit.reconstruction.scene_pose import ScenePose, fit_scene_pose
+from rigkit.reconstruction.scene_pose import fit_scene_pose
 from rigkit.relative_pose.solvers.pose import essential_from_pose, translation_basis
 from rigkit.relative_pose.solvers.weights import affinity_residuals
 
@@ -39,6 +41,10 @@ MIN_GROWN = 100
 MOVED_RAD = np.deg2rad(0.5)
 """Change of the pose by which what was grown with the old one is grown again."""
 MAX_GROWTHS = 3
+SHARED_ERROR = 0.5
+"""Of the errors of pairs, in their median: no pair is much better than the others (measured: by likelihood)."""
+OVERLAP = 3.5
+"""Pairs on the nodes of a pose whose windows share their pixels: 4 pi 4.2^2 px^2 of a window to 64 px^2 of a node."""
 POSE_STEP_RAD = 1e-5
 """For central differences: far above rounding, far below where a plane bends."""
 
@@ -83,9 +89,9 @@ def grow_scene(
     view1 = GrowingView.of(grey_of(image1, "image 1"), r.camera1)
     view2 = GrowingView.of(grey_of(image2, "image 2"), r.camera2)
     agreeing = seeds.select(sparse.inliers)
-    fit = _pose_from_grown(view1, view2, agreeing, sparse)
-    pose, covariance = in_unit(fit.refined.cam2_from_cam1, fit.refined.covariance, r.baseline_mm)
-    known = _knowledge(fit)
+    even = _pose_from_grown(view1, view2, agreeing, sparse)
+    pose, covariance = in_unit(even.pose.cam2_from_cam1, even.pose.covariance, r.baseline_mm)
+    known = _knowledge(even.matches, pose)
     grown = grow(view1, view2, agreeing, step=CLOUD_STEP, known=known)
     if not len(grown):
         raise DegenerateError(
@@ -117,32 +123,46 @@ def grow_scene(
     return DenseScene(scene=scene, grown=grown, surface=surface, nodes=nodes)
 
 
+class _EvenPose(NamedTuple):
+    """A pose, and the evenly spread pairs that gave it."""
+
+    pose: SystematicPose
+    matches: Matches
+
+
 def _pose_from_grown(
     view1: GrowingView, view2: GrowingView, seeds: Correspondences, sparse: SceneReconstruction
-) -> ScenePose:
+) -> _EvenPose:
     """Return the pose of evenly spread pairs, grown until it does not move any more."""
     r = sparse.reconstruction
     pose = Rigid3(r.cam2_from_cam1.rotation, unit(r.cam2_from_cam1.translation_mm))
     gate = max(MAX_DISTANCE_PX, GATE * sparse.sigma_px)
-    fit = None
-    for _ in range(MAX_GROWTHS):
+    for k in range(MAX_GROWTHS):
         known = LineKnowledge(essential_from_pose(pose), gate)
         pairs = grow(view1, view2, seeds, step=POSE_STEP, known=known).correspondences()
         matches, _ = pairs.matches(view1.camera, view2.camera)
         if len(matches) < MIN_GROWN:
             raise DegenerateError(
-                f"only {len(matches)} pairs grow from {len(seeds)} correspondences; the surfaces have "
-                "too little texture"
+                f"only {len(matches)} pairs grow from {len(seeds)} correspondences; the surfaces lack texture"
             )
-        fit = fit_scene_pose(matches, r.pose_type, r.level_sigma_rad, np.random.default_rng(0), start=pose)
-        before, pose = pose, fit.refined.cam2_from_cam1
+        fit = fit_scene_pose(_floored(matches), r.pose_type, r.level_sigma_rad, np.random.default_rng(0), start=pose)
+        even = fit.matches.select(fit.inliers)
+        found = pose_with_field(
+            even, fit.refined.cam2_from_cam1, view1.size_px, fit.pose_type, fit.level_sigma_rad, OVERLAP
+        )
+        before, pose = pose, found.cam2_from_cam1
         turn = rotation_angle(pose.rotation @ before.rotation.T)
         swing = np.arccos(np.clip(pose.translation_mm @ before.translation_mm, -1.0, 1.0))
         gate = MAX_DISTANCE_PX
-        if max(turn, swing) < MOVED_RAD:
+        if max(turn, swing) < MOVED_RAD or k == MAX_GROWTHS - 1:
             break
-    assert fit is not None
-    return fit
+    return _EvenPose(found, even)
+
+
+def _floored(matches: Matches) -> Matches:
+    """Return the matches with what images do not tell of a patch's error: half of the usual error in addition."""
+    sigma = np.hypot(matches.sigma1_px, SHARED_ERROR * np.median(matches.sigma1_px))
+    return replace(matches, sigma1_px=sigma, sigma2_px=sigma)
 
 
 def _distances(matches: Matches, pose: Rigid3) -> FloatArray:
@@ -150,13 +170,11 @@ def _distances(matches: Matches, pose: Rigid3) -> FloatArray:
     return sampson_distances(essential_from_pose(pose), m.rays1, m.rays2, m.jacobians1, m.jacobians2)
 
 
-def _knowledge(fit: ScenePose) -> LineKnowledge:
+def _knowledge(matches: Matches, pose: Rigid3) -> LineKnowledge:
     """Return what the pose says of pairs, as well as the pairs that gave it agree with it."""
-    m, pose = fit.matches, fit.refined.cam2_from_cam1
     # Sampson's distance is shared by both images; growing moves the place in image 2 alone.
-    sigma = np.sqrt(2.0) * SIGMA_OF_MEDIAN * float(np.median(np.abs(_distances(m, pose)[fit.inliers])))
-    off = affinity_residuals(m, essential_from_pose(pose))[fit.inliers]
-    sigma_A = SIGMA_OF_MEDIAN * float(np.nanmedian(np.abs(off)))
+    sigma = np.sqrt(2.0) * SIGMA_OF_MEDIAN * float(np.median(np.abs(_distances(matches, pose))))
+    sigma_A = SIGMA_OF_MEDIAN * float(np.nanmedian(np.abs(affinity_residuals(matches, essential_from_pose(pose)))))
     return LineKnowledge(essential_from_pose(pose), max(MAX_DISTANCE_PX, GATE * sigma), sigma, sigma_A)
 
 

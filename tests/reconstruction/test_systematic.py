@@ -1,0 +1,73 @@
+"""Poses of many pairs whose errors are a smooth field besides noise: the error is as stated, and smaller."""
+
+from __future__ import annotations
+
+import numpy as np
+from helpers.epipolar_scenes import REGULAR, pair, pose_errors_deg
+
+from rigkit.core.matches import Matches
+from rigkit.core.posetype import PoseType
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import log_so3, unit
+from rigkit.reconstruction.growing.systematic import pose_with_field
+from rigkit.relative_pose.refinement.refine import cauchy_weights, refine_pose
+from rigkit.relative_pose.solvers.pose import translation_basis
+
+NOISE_PX = 0.1
+TRIALS = 12
+
+
+def distance(estimate: Rigid3, covariance: np.ndarray, truth: Rigid3) -> float:
+    """Root of the Mahalanobis distance per degree of freedom."""
+    t, true = unit(estimate.translation_mm), unit(truth.translation_mm)
+    directions = np.zeros((5, 6))
+    directions[:3, :3], directions[3:, 3:] = np.eye(3), translation_basis(t)
+    off = np.concatenate([log_so3(truth.rotation @ estimate.rotation.T), translation_basis(t) @ (true - t)])
+    return float(np.sqrt(off @ np.linalg.solve(directions @ covariance @ directions.T, off) / 5.0))
+
+
+def with_field(rng: np.random.Generator, m: Matches, amplitude_px: float) -> Matches:
+    """The matches with a few waves added in image 2, across the image."""
+    q, size = m.pixels1, np.array(REGULAR.size_px)
+    field = np.zeros((len(q), 2))
+    for _ in range(4):
+        waves, phase = rng.uniform(0.5, 2.5, 2), rng.uniform(0.0, 2.0 * np.pi)
+        field += rng.normal(size=2) * np.cos(np.pi * (q / size) @ waves + phase)[:, None]
+    shifted = np.array(m.pixels2) + amplitude_px / np.sqrt(2.0) * field
+    sigma = np.full(len(q), NOISE_PX)
+    return Matches.from_cameras(REGULAR, REGULAR, q, shifted, sigma1_px=sigma, sigma2_px=sigma)
+
+
+def errors(rng: np.random.Generator, amplitude_px: float) -> tuple[list[float], list[float], list[float], list[float]]:
+    plain, fitted, plain_error, fitted_error = [], [], [], []
+    for _ in range(TRIALS):
+        m, pose, _ = pair(rng, 1500, noise_px=NOISE_PX)
+        m = with_field(rng, m, amplitude_px)
+        start = refine_pose(m, pose, robust=cauchy_weights)
+        found = pose_with_field(m, start.cam2_from_cam1, REGULAR.size_px, PoseType.GENERAL, None, 1.0)
+        plain.append(distance(start.cam2_from_cam1, start.covariance, pose))
+        fitted.append(distance(found.cam2_from_cam1, found.covariance, pose))
+        plain_error.append(max(pose_errors_deg(start.cam2_from_cam1, pose)))
+        fitted_error.append(max(pose_errors_deg(found.cam2_from_cam1, pose)))
+    return plain, fitted, plain_error, fitted_error
+
+
+def test_a_smooth_field_is_told_from_noise(rng: np.random.Generator) -> None:
+    plain, fitted, plain_error, fitted_error = errors(rng, 0.3)
+    # Twelve times five degrees of freedom: 9 %; the field is not the one of the model.
+    assert 0.5 < np.sqrt(np.mean(np.square(fitted))) < 2.0
+    assert np.sqrt(np.mean(np.square(plain))) > 4.0
+    assert np.median(fitted_error) < 0.7 * np.median(plain_error)
+
+
+def test_without_a_field_nothing_is_lost(rng: np.random.Generator) -> None:
+    _, fitted, plain_error, fitted_error = errors(rng, 0.0)
+    assert 0.7 < np.sqrt(np.mean(np.square(fitted))) < 1.3
+    assert np.median(fitted_error) < 1.15 * np.median(plain_error)
+
+
+def test_a_pose_without_freedom_stays(rng: np.random.Generator) -> None:
+    m, pose, _ = pair(rng, 100, "standard", noise_px=NOISE_PX)
+    found = pose_with_field(m, pose, REGULAR.size_px, PoseType.STANDARD, None, 1.0)
+    assert found.cam2_from_cam1.allclose(Rigid3(pose.rotation, unit(pose.translation_mm)))
+    assert not found.covariance.any()
