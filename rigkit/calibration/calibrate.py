@@ -125,15 +125,21 @@ def calibrate(
     result = assemble(observations, chosen.fit, chosen.heldout_px, dropped, tuple(candidates))
     also = [] if model == "auto" else _at_the_end(beyond, result)
     moved = moved_lens(observations, chosen.fit) if folds else ()
-    return _judged(result, observations, chosen.fit, [*moved, *also])
+    in_force = [name for name, value in (("model", model), ("board_shape", board)) if value == "auto"]
+    return _judged(result, observations, chosen.fit, [*moved, *also], in_force)
 
 
-def _judged(result: Calibration, observations: Observations, fit: Fit, also: Sequence[Finding]) -> Calibration:
-    """Return the result with its verdicts. Raises DegenerateError where the views do not determine the camera."""
+def _judged(
+    result: Calibration, observations: Observations, fit: Fit, also: Sequence[Finding], in_force: Sequence[str]
+) -> Calibration:
+    """Return the result with its verdicts; `also` and `in_force` as for `judge`.
+
+    Raises DegenerateError where the views do not determine the camera.
+    """
     points, _ = fit.state.points_in_cam(observations)
     at_corners = uncertainty_at_corners(result, points[fit.kept])
     require_determined(result, at_corners)
-    return replace(result, verdicts=judge(result, also, at_corners_px=at_corners))
+    return replace(result, verdicts=judge(result, also, at_corners_px=at_corners, in_force=in_force))
 
 
 def _wanted(model: str, degree: int | None, board: str, folds: int) -> list[tuple[str, type[Camera], int | None]]:

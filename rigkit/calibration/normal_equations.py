@@ -99,6 +99,13 @@ class NormalEquations:
             cost += float((weight * unknowns**2).sum())
         return replace(self, gg=gg, g=g, prior_cost=cost)
 
+    def with_quadratic(self, where: slice, off: FloatArray, information: FloatArray) -> NormalEquations:
+        """Add the cost off^T information off of globals that are `off` (n,) from where they are held."""
+        gg, g = self.gg.copy(), self.g.copy()
+        gg[where, where] += information
+        g[where] -= information @ off
+        return replace(self, gg=gg, g=g, prior_cost=self.prior_cost + float(off @ information @ off))
+
     @property
     def cost(self) -> float:
         """The cost, priors included, infinite where the state makes no camera."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -20,6 +20,8 @@ MIN_CORNERS_OF_VIEW = 6
 """A pose has six numbers: fewer than six corners leave hardly anything to check it by."""
 OFTEN = 3
 """Whole grids of one size: parts of a larger board, as the frame cuts them, come in many sizes."""
+MIN_SHARE_LARGER = 0.25
+"""Images that show a whole larger grid instead of a listed board, as a part of all: fewer may be something else."""
 MIN_SPREAD = 1e-6
 """Corners on a line: the determinant of their scatter, as a part of its squared trace, is rounding (of a row of the
 board), or noise (of a board seen edge-on: it is then a thousandth as high as it is wide)."""
@@ -78,22 +80,27 @@ def _reason(view: BoardView, line_of: str | None) -> str | None:
     return None
 
 
-def other_size(detections: Sequence[BoardDetection], boards: Sequence[Board]) -> str | None:
-    """Return in words which size the boards of a session's images have, where it is clearly none of those listed.
+def other_size(detections: Mapping[str, Sequence[BoardDetection]], boards: Sequence[Board]) -> str | None:
+    """Return in words which size the boards of a session's images (name -> detections) have, where it is clearly none
+    of those listed.
 
-    Where no grid is of a listed size, and most are whole grids of one other size, the boards are of that size.
+    Where most of the grids are whole and of one size that is not listed, and none is of a listed size, the boards are
+    of that size; and where images show whole grids that are larger than a listed board, and that board nowhere, part
+    of a larger board was taken for it in the others.
     """
     listed = {frozenset(board.size) for board in boards}
-    if any(frozenset((d.columns, d.rows)) in listed for d in detections):
+    found = [own for own in detections.values() if own]
+    sizes = ", ".join(f"{c} x {r}" for c, r in sorted({board.size for board in boards}))
+    without = [own for own in found if not any(frozenset((d.columns, d.rows)) in listed for d in own)]
+    counts = Counter(max((d.columns, d.rows), (d.rows, d.columns)) for own in without for d in own if d.complete)
+    size, count = counts.most_common(1)[0] if counts else ((0, 0), 0)
+    words = f"{size[0]} x {size[1]} inner corners are seen in {count} of {len(found)} images, {sizes} are declared"
+    if count < OFTEN:
         return None
-    counts = Counter(f"{d.columns}x{d.rows}" for d in detections if d.complete)
-    size, count = counts.most_common(1)[0] if counts else ("", 0)
-    if count < OFTEN or 2 * count <= len(detections):
-        return None
-    sizes = ", ".join(sorted({f"{b.columns}x{b.rows}" for b in boards}))
-    return (
-        f"the boards listed have {sizes} inner corners, but {count} whole grids of {size} were found and none of those"
-    )
+    if len(without) == len(found):
+        return words if 2 * count > sum(len(own) for own in found) else None
+    larger = any(max(board.size) <= size[0] and min(board.size) <= size[1] for board in boards)
+    return words if larger and count >= MIN_SHARE_LARGER * len(found) else None
 
 
 def views_of_image(

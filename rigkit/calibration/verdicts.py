@@ -6,29 +6,23 @@ The limits are constants here; none depends on the result that it judges.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 
-from rigkit.calibration.coverage import covered_by_boards
-from rigkit.calibration.repeats import cluster_numbers
+from rigkit.calibration.captured import ASKED_DEG, NEARLY_ALL, SMALL_PX, Extent, judge_capture
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import uncertainty_at_corners
 from rigkit.cameras.base import image_center
-from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
-from rigkit.core.findings import Finding, Severity
+from rigkit.core.findings import Finding, Severity, worst
 
-__all__ = ["headline", "judge", "judge_session"]
+__all__ = ["judge", "judge_session", "with_headline"]
 
-FEW_IMAGES = 8
-TILTED_DEG = 15.0
-TILTED_VIEWS = 3
 CELLS = (4, 3)
 """The image in columns x rows of cells, for coverage."""
-ASKED_DEG = 95.0
-"""Beyond this angle off the axis nobody is asked to hold a board: it would have to be beside the camera."""
 CELL_CORNERS = 5
 """A cell with fewer corners than this is empty."""
 MAX_RATIO_OF_MEDIANS = 2.5
@@ -37,18 +31,12 @@ RINGS = 4
 """What is usual is asked of so many rings around the middle of the image: towards the rim all corners scatter more."""
 MAX_OUTLIER_SHARE = 0.2
 """A view with this part of its corners outliers."""
-SMALL_PX = 0.1
-"""Corners this near to where they should be are no reason to retake an image, however sure they were said to be."""
 NAMED = 3
 """So many images are named one by one."""
 PATTERN = 0.35
 """Correlation of residuals of neighbouring corners: noise has 0 (a fitted pose makes it slightly negative)."""
 OVERFIT = 1.25
 """Held-out over training RMS."""
-NEARLY_ALL = 0.9
-"""Of the image, to speak of all of it."""
-ONE_DISTANCE = 1.15
-"""Corners from near to far within this factor are at one distance."""
 UNSURE_PX = 1.0
 """Worst-direction standard deviation of a projection, in the covered part of the image."""
 ASPECT = 2e-3
@@ -69,59 +57,66 @@ class Judged(Protocol):
 
 
 def judge(
-    calibration: Calibration, also: Sequence[Finding] = (), *, at_corners_px: FloatArray | None = None
+    calibration: Calibration,
+    also: Sequence[Finding] = (),
+    *,
+    at_corners_px: FloatArray | None = None,
+    in_force: Collection[str] = (),
 ) -> tuple[Finding, ...]:
-    """Return the verdicts, the headline first; `also` are verdicts found elsewhere, `at_corners_px` is what
-    `uncertainty_at_corners` returns, where it is known already."""
+    """Return the verdicts, the headline first.
+
+    Parameters
+    ----------
+    also : verdicts found elsewhere.
+    at_corners_px : what `uncertainty_at_corners` returns, where it is known already.
+    in_force : of "model" and "board_shape" those that are "auto" already: no remedy to offer.
+    """
     at_corners = uncertainty_at_corners(calibration) if at_corners_px is None else at_corners_px
+    extent = Extent.of(calibration)
     # What says that nobody knows how good the rest is: then it is not good.
-    doubts = [*_images(calibration), *_unsure(calibration, at_corners)]
+    causes = [
+        *_not_converged(calibration, in_force),
+        *judge_capture(calibration, extent),
+        *(finding for finding in also if finding.severity is Severity.BAD),
+    ]
     found = [
-        *also,
+        *(finding for finding in also if finding.severity is not Severity.BAD),
         *_left_out(calibration.dropped),
-        *_tilts(calibration),
-        *doubts,
-        *_repeated(calibration),
-        *_distances(calibration),
         *_coverage(calibration),
         *_views(calibration),
-        *_pattern(calibration),
+        *_pattern(calibration, in_force),
         *_overfit(calibration),
         *_boards(calibration),
         *_outliers(calibration),
     ]
-    if not calibration.convergence.converged:
-        found.insert(
-            0,
-            _bad(
-                f"the solver did not converge ({calibration.convergence.reason}): the model may not fit this lens",
-                'try model = "auto", or add views with the board tilted',
-            ),
-        )
-    return (headline(calibration, found, doubtful=bool(doubts), where=_where(calibration)), *found)
+    share = extent.share
+    where = "" if share >= NEARLY_ALL else f" over the {100.0 * share:.0f} % of the image where boards were"
+    return (*with_headline(calibration, causes, _unsure(calibration, at_corners), where), *found)
 
 
 def judge_session(
     calibration: Calibration, dropped: Sequence[tuple[str, str]], also: Sequence[Finding] = ()
 ) -> tuple[Finding, ...]:
     """Return the verdicts of the calibration together with those on images that gave no view at all, and others."""
-    found = [*_left_out(dropped), *calibration.verdicts[1:], *also]
-    doubtful = bool(calibration.verdicts) and calibration.verdicts[0].severity is Severity.LOOK
-    return (headline(calibration, found, doubtful=doubtful, where=_where(calibration)), *found)
+    return (*calibration.verdicts[:1], *_left_out(dropped), *calibration.verdicts[1:], *also)
 
 
-def headline(result: Judged, found: Sequence[Finding], *, doubtful: bool = False, where: str = "") -> Finding:
-    """Return the first verdict, from all others; `doubtful` where one of them says that the result may be worse than
-    its error, `where` says of which part of the image the error is."""
+def with_headline(
+    result: Judged, causes: Sequence[Finding], effects: Sequence[Finding], where: str = ""
+) -> list[Finding]:
+    """Return the first verdict, and those of `causes` and `effects` that it does not say itself.
+
+    It is as grave as the gravest of them and names the first bad cause, or else the first: what is wrong with the
+    images, before what comes of it. `where` says of which part of the image the error is.
+    """
     held = result.heldout_rms_px
     error = f"training RMS {result.rms_px:.3f} px" if held is None else f"held-out RMS {held:.3f} px"
-    bad = sum(finding.severity is Severity.BAD for finding in found)
-    if bad:
-        return _bad(f"{error}, but {bad} of the remarks below must be dealt with first")
-    remarks = {0: "", 1: "; 1 remark below"}.get(len(found), f"; {len(found)} remarks below")
-    if doubtful:
-        return _look(f"{error}{where}, but how good the lens is elsewhere is not known well{remarks}")
-    return Finding(severity=Severity.GOOD, message=f"{error}{where}{remarks}")
+    found = [*causes, *effects]
+    if not found:
+        return [Finding(severity=Severity.GOOD, message=error + where)]
+    first = next((cause for cause in causes if cause.severity is Severity.BAD), found[0])
+    named = replace(first, severity=worst(found), message=f"{error}{where}, but {first.message}")
+    return [named, *(finding for finding in found if finding is not first)]
 
 
 def _look(message: str, remedy: str | None = None, image: str | None = None) -> Finding:
@@ -130,6 +125,18 @@ def _look(message: str, remedy: str | None = None, image: str | None = None) -> 
 
 def _bad(message: str, remedy: str | None = None) -> Finding:
     return Finding(severity=Severity.BAD, message=message, remedy=remedy)
+
+
+def _not_converged(c: Calibration, in_force: Collection[str]) -> list[Finding]:
+    if c.convergence.converged:
+        return []
+    other = "" if "model" in in_force else 'try model = "auto", or '
+    return [
+        _bad(
+            f"the solver did not converge ({c.convergence.reason}): the model may not fit this lens",
+            f"{other}add views with the board tilted",
+        )
+    ]
 
 
 def _left_out(dropped: Sequence[tuple[str, str]]) -> list[Finding]:
@@ -144,69 +151,6 @@ def _left_out(dropped: Sequence[tuple[str, str]]) -> list[Finding]:
         else _look(f"image '{first[reason]}' is left out: {reason}", image=first[reason])
         for reason, count in reasons.most_common(NAMED)
     ]
-
-
-def _tilts(c: Calibration) -> list[Finding]:
-    """Boards parallel to the image plane say nothing about the focal length."""
-    axes = np.array([v.cam_from_board.rotation[2, 2] for v in c.views])
-    tilted = int((np.abs(axes) < np.cos(np.radians(TILTED_DEG))).sum())
-    if tilted >= min(TILTED_VIEWS, len(c.views)):
-        return []
-    return [
-        _bad(
-            f"the board is tilted by more than {TILTED_DEG:.0f} degrees against the image in {tilted} of "
-            f"{len(c.views)} views only",
-            f"take at least {TILTED_VIEWS} with the board tilted by 20 to 50 degrees, about different axes",
-        )
-    ]
-
-
-def _images(c: Calibration) -> list[Finding]:
-    count = len({v.image for v in c.views})
-    if count >= FEW_IMAGES:
-        return []
-    images = f"{count} images" if count > 1 else "1 image"
-    remedy = f"take at least {FEW_IMAGES}, better 15, to know how good the calibration is elsewhere"
-    return [_look(f"{images} only", remedy)]
-
-
-def _repeated(c: Calibration) -> list[Finding]:
-    """Say which images show the boards where another one does."""
-    images = [view.image for view in c.views]
-    number = cluster_numbers(images, [view.board_id for view in c.views], [view.pixels for view in c.views])
-    first = {int(n): image for n, image in reversed(list(zip(number, images, strict=True)))}
-    again = {image: first[int(n)] for n, image in zip(number, images, strict=True) if first[int(n)] != image}
-    if not again:
-        return []
-    one, other = next(iter(again.items()))
-    what = f"image '{one}' shows" if len(again) == 1 else f"{len(again)} images, '{one}' the first, show"
-    return [
-        _look(
-            f"{what} the board where another one does ('{other}'): they count as one",
-            "move the board from image to image",
-        )
-    ]
-
-
-def _distances(c: Calibration) -> list[Finding]:
-    """Say where all boards were equally far away: then depth was seen on their tilts alone."""
-    if len(c.views) < 2:
-        return []
-    shapes = {board.board_id: board.points_mm for board in c.boards}
-    depth = [v.cam_from_board.apply(shapes[v.board_id]) for v in c.views]
-    far = np.concatenate([np.linalg.norm(points, axis=1) for points in depth])
-    if np.quantile(far, 0.95) > ONE_DISTANCE * np.quantile(far, 0.05):
-        return []
-    return [_look("all boards were at one distance", "hold some at half and some at double of it")]
-
-
-def _where(c: Calibration) -> str:
-    """Return in words of which part of the image the calibration speaks, empty where of nearly all."""
-    pixels = grid_pixels(c.camera.size_px, (4 * CELLS[0], 4 * CELLS[1]))
-    rays, valid = c.camera.unproject(pixels)
-    asked = valid & (np.where(valid, rays[..., 2], -1.0) > np.cos(np.radians(ASKED_DEG)))
-    share = float(covered_by_boards(c, pixels)[asked].mean()) if asked.any() else 0.0
-    return "" if share >= NEARLY_ALL else f" over the {100.0 * share:.0f} % of the image where boards were"
 
 
 def _coverage(c: Calibration) -> list[Finding]:
@@ -283,7 +227,7 @@ def _medians(values: FloatArray, count: IntArray) -> FloatArray:
     return np.asarray(0.5 * (padded[row, (count - 1) // 2] + padded[row, count // 2]))
 
 
-def _pattern(c: Calibration) -> list[Finding]:
+def _pattern(c: Calibration, in_force: Collection[str]) -> list[Finding]:
     """Residuals of neighbours agree where a lens or a board is not what the model says."""
     grid = np.concatenate([v.grid for v in c.views])
     kept = np.concatenate([v.kept for v in c.views])
@@ -301,11 +245,10 @@ def _pattern(c: Calibration) -> list[Finding]:
     if not power > 0.0 or products / power < PATTERN:
         return []
     what = f"residuals of neighbouring corners agree (correlation {products / power:.2f}): "
-    lenses = {candidate.name.split()[0] for candidate in c.candidates} - {"board"}
-    if all(board.kind == "flat" for board in c.boards) and not any(t.name == "board released" for t in c.candidates):
-        remedy = 'try board_shape = "auto" or a flatter board'
-        return [_look(what + "the board's shape or the lens model does not fit", remedy)]
-    if len(lenses) < 2:
+    shapes = "board_shape" in in_force or any(board.kind == "released" for board in c.boards)
+    if not shapes:
+        return [_look(what + "the board's shape or the lens model does not fit", 'try board_shape = "auto"')]
+    if "model" not in in_force:
         return [_look(what + "the lens model, or the board's shape, does not quite fit", 'try model = "auto"')]
     what += "neither the lens models nor the boards' shapes follow all of it"
     return [_look(what, "take a board that does not bend")]

@@ -78,6 +78,9 @@ def session_views(
         views += own
         if reason is not None:
             dropped.append((name, reason))
+    wrong = other_size({name: item.detections for name, item in found.items()}, session.boards)
+    if wrong is not None:
+        raise InputError(f"{session.path}: {wrong}; correct columns and rows in the board file")
     if not views:
         reasons = Counter(reason for _, reason in dropped).most_common(1)[0]
         camera = "" if session.camera is None else f" of camera '{session.camera}'"
@@ -85,9 +88,6 @@ def session_views(
             f"{session.path}: no board can be used in {len(found)} images{camera}; {reasons[1]} times: {reasons[0]}; "
             "check columns and rows in the board file"
         )
-    wrong = other_size([d for item in found.values() for d in item.detections], session.boards)
-    if wrong is not None:
-        raise InputError(f"{session.path}: {wrong}; correct columns and rows in the board file")
     return views, size_px, dropped
 
 

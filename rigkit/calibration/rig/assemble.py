@@ -44,6 +44,7 @@ def assemble_rig(
     clustered = clustered_by_frame(observations, state, normal, unit, joint.frames, sigma)
     overdispersion = clustered.overdispersion
     covariance = with_block(unit * sigma**2, clustered.covariance, overdispersion**2)
+    covariance += _error_of_held(observations, layout, single, unit)
     off = shape_error(observations, state, sigma * overdispersion)
     covariance[: len(off), : len(off)] += np.outer(off, off)
     own *= (sigma * overdispersion) ** 2
@@ -105,6 +106,18 @@ def _of_camera(
         boards=board_shapes(observations.cameras[c], observations.shape, state.unknowns),
     )
     return found, squared
+
+
+def _error_of_held(
+    observations: RigObservations, layout: Layout, single: Sequence[Calibration], unit: FloatArray
+) -> FloatArray:
+    """Return what the errors of the solutions near which lenses are held add to the covariance (G, G) of all globals:
+    K W C W K, with the information W by which they are held and each camera's own covariance C."""
+    out = np.zeros_like(unit)
+    for where, alone, (_, information) in zip(layout.cameras, single, observations.held, strict=False):
+        through = unit[:, where] @ information
+        out += through @ alone.covariance @ through.T
+    return out
 
 
 def residual_sigma(joint: JointRig) -> float:

@@ -89,7 +89,9 @@ def calibrate_rig(
     joint = solve_jointly(list(views), seen, single, places, progress)
     heldout = heldout_rms(joint, folds)
     rig = assemble_rig(list(views), single, joint, places, heldout)
-    return replace(rig, verdicts=judge_rig(rig, (*notes, *joint.notes)))
+    models = {model} if isinstance(model, str) else set(model.values())
+    in_force = [name for name, values in (("model", models), ("board_shape", {board})) if values == {"auto"}]
+    return replace(rig, verdicts=judge_rig(rig, (*notes, *joint.notes), in_force=in_force))
 
 
 def _require_one_image(name: str, own: Sequence[tuple[str, BoardView]]) -> None:

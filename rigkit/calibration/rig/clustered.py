@@ -14,7 +14,7 @@ import numpy as np
 from rigkit.calibration.clustered import Clustered, clustered_covariance
 from rigkit.calibration.linearise import view_products
 from rigkit.calibration.normal_equations import NormalEquations
-from rigkit.calibration.rig.solver import pose_jacobians
+from rigkit.calibration.rig.solver import pose_jacobians, with_rig_priors
 from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.core.arrays import FloatArray, IntArray
 
@@ -43,10 +43,8 @@ def clustered_by_frame(
     back = coupling @ np.linalg.pinv(normal.pp, hermitian=True)
     np.subtract.at(information, frame, back @ np.swapaxes(coupling, -1, -2))
     np.subtract.at(score, frame, (back @ normal.p[..., None])[..., 0])
-    layout = state.layout(observations)
     nothing = replace(normal, gg=np.zeros_like(normal.gg), g=np.zeros_like(normal.g))
-    cameras = list(zip(layout.cameras, state.cameras, strict=True))
-    prior = nothing.with_priors(cameras, layout.shape, observations.shape.sigma, state.unknowns, sigma_px).gg[:n, :n]
+    prior = with_rig_priors(nothing, observations, state, sigma_px).gg[:n, :n]
     return clustered_covariance(unit[:n, :n], information, score, prior, sigma_px)
 
 

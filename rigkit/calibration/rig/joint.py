@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from rigkit.calibration.rig.solver import RigSolution, solve_rig
 from rigkit.calibration.rig.state import Key, RigObservations, RigState
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.errors import DegenerateError, InputError
-from rigkit.core.findings import Finding
+from rigkit.core.findings import Finding, Severity
 from rigkit.core.progress import Progress
 from rigkit.geometry.rigid3 import Rigid3
 
@@ -39,6 +39,8 @@ NOTHING_IN_COMMON = 30.0
 MIN_SHARE = 0.5
 """More of the shared targets must agree than disagree."""
 MAX_ROUNDS = 8
+NAMED = 3
+"""So many of the frames that disagree are named."""
 TRIED = 6
 """Of few targets that all look bad, the worst ones are left out for trial, one by one."""
 
@@ -118,6 +120,10 @@ def solve_jointly(
             f"rig: that views share their boards' poses costs {usual_sigmas:.0f} times the corners' noise: they "
             f"disagree on where the boards are; {_advice(seen)}"
         )
+    if usual_sigmas > DISAGREES:
+        observations = replace(observations, held=_held(single, sigma, (usual_sigmas / DISAGREES) ** 2 - 1.0))
+        solution = solve_rig(observations, solution.state, sigma)
+        notes = (_disagreement(cost, sigma, usual_sigmas, several=len(seen) > 1), *notes)
     return JointRig(
         observations=observations,
         solution=solution,
@@ -150,6 +156,38 @@ def _solved(
         unknowns=unknowns,
     )
     return observations, solve_rig(observations, start, sigma)
+
+
+def _disagreement(cost: Mapping[Key, float], sigma: float, usual_sigmas: float, *, several: bool) -> Finding:
+    """Return what to say where sharing poses usually costs more than chance."""
+    worst = sorted(cost, key=lambda key: -cost[key])[:NAMED]
+    times = {frame: np.sqrt(cost[frame, target]) / max(sigma, MIN_PX) for frame, target in worst}
+    frames = ", ".join(f"'{frame}' ({value:.0f})" for frame, value in times.items())
+    what = "the images of a frame are not of one moment, or the rig gives way: that cameras see boards in one place"
+    remedy = "trigger the cameras together, and let boards and rig rest while they do"
+    if not several:
+        what, remedy = "the boards give way against each other: that they keep their places", "fasten the boards"
+    message = (
+        f"{what} costs {usual_sigmas:.1f} times the corners' noise, most in the frames {frames}; the lenses are held "
+        "near what each camera says alone"
+    )
+    return Finding(severity=Severity.LOOK, message=message, remedy=remedy)
+
+
+def _held(single: Sequence[Calibration], sigma: float, weight: float) -> tuple[tuple[FloatArray, FloatArray], ...]:
+    """Return near which parameters each lens is held, and by which information: so many times that of its own corners.
+
+    Where sharing poses usually costs s times what chance allows, what cameras say of each other through shared poses
+    is wrong by s times what they are believed, and would bend the lenses: a camera's own corners count s^2 times.
+    """
+    out = []
+    for alone in single:
+        # Of independent corners, in px^2 of the joint solution.
+        unit = alone.covariance / (sigma * alone.overdispersion) ** 2
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(unit), np.finfo(float).tiny))
+        inverse = np.linalg.pinv(unit * scale[:, None] * scale, hermitian=True)
+        out.append((alone.camera.parameters, weight * inverse * scale[:, None] * scale))
+    return tuple(out)
 
 
 def _one_bad(

@@ -24,7 +24,15 @@ from rigkit.calibration.solver import COST_TOLERANCE, Linearised, minimise
 from rigkit.core.arrays import FloatArray, IntArray, Mat3, Points
 from rigkit.geometry.rotation import skew
 
-__all__ = ["PoseJacobians", "RigSolution", "pose_jacobians", "refine_frames", "rig_normal", "solve_rig"]
+__all__ = [
+    "PoseJacobians",
+    "RigSolution",
+    "pose_jacobians",
+    "refine_frames",
+    "rig_normal",
+    "solve_rig",
+    "with_rig_priors",
+]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -122,8 +130,19 @@ def rig_normal(observations: RigObservations, state: RigState, sigma_px: float =
     if observations.shape.kind == "released":
         released = layout.shape.start + observations.shape.basis.shape[-1]
     normal = NormalEquations(gg=gg, gp=gp, pp=pp, g=g, p=p, costs=costs, residuals=residuals, points_from=released)
+    return with_rig_priors(normal, observations, state, sigma_px)
+
+
+def with_rig_priors(
+    normal: NormalEquations, observations: RigObservations, state: RigState, sigma_px: float
+) -> NormalEquations:
+    """Add what is known of cameras and shape without any corner, and what holds lenses near their own solutions."""
+    layout = state.layout(observations)
     cameras = list(zip(layout.cameras, state.cameras, strict=True))
-    return normal.with_priors(cameras, layout.shape, observations.shape.sigma, state.unknowns, sigma_px)
+    normal = normal.with_priors(cameras, layout.shape, observations.shape.sigma, state.unknowns, sigma_px)
+    for (where, camera), (near, information) in zip(cameras, observations.held, strict=False):
+        normal = normal.with_quadratic(where, camera.parameters - near, information)
+    return normal
 
 
 def _add(total: FloatArray, row: IntArray, values: FloatArray) -> None:

@@ -67,6 +67,8 @@ class RigObservations:
     frame : (V_c,) int of each camera, row of each view's key in `keys`.
     keys : (frame, target) of every pose.
     places : (B,) whether a board has a place to find on its target (the first one of a target is its frame).
+    held : near which parameters (P,) the lens of each camera is held, and by which information (P, P) px^2; empty where
+        none is.
     """
 
     cameras: tuple[Observations, ...]
@@ -75,6 +77,7 @@ class RigObservations:
     frame: tuple[IntArray, ...]
     keys: tuple[Key, ...]
     places: tuple[bool, ...]
+    held: tuple[tuple[FloatArray, FloatArray], ...] = ()
 
     @property
     def tied(self) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.uncertainty import transfer_uncertainty
 from rigkit.calibration.uncertainty import uncertainty_at_corners
-from rigkit.calibration.verdicts import headline
+from rigkit.calibration.verdicts import with_headline
 from rigkit.core.findings import Finding, Severity
 
 __all__ = ["judge_rig"]
@@ -26,12 +26,19 @@ WORSE = 1.5
 MANY_LEFT_OUT = 0.2
 
 
-def judge_rig(rig: RigCalibration, notes: Sequence[Finding] = ()) -> tuple[Finding, ...]:
-    """Return the verdicts, the headline first; `notes` are verdicts found elsewhere."""
-    found = [*notes, *_shared(rig), *_unsure(rig), *_overdispersed(rig), *_worse(rig)]
-    if not rig.convergence.converged:
-        found.insert(0, _bad(f"the joint solution did not converge ({rig.convergence.reason})"))
-    return (headline(rig, found), *found)
+def judge_rig(
+    rig: RigCalibration, notes: Sequence[Finding] = (), *, in_force: Collection[str] = ()
+) -> tuple[Finding, ...]:
+    """Return the verdicts, the headline first; `notes` are verdicts found elsewhere, `in_force` as for `judge`."""
+    causes = [
+        *_not_converged(rig),
+        *notes,
+        *_left_out(rig),
+        *_worse(rig),
+        *_overdispersed(rig, in_force),
+        *_few_shared(rig),
+    ]
+    return tuple(with_headline(rig, causes, _unsure(rig)))
 
 
 def _look(message: str, remedy: str | None = None) -> Finding:
@@ -42,25 +49,34 @@ def _bad(message: str, remedy: str | None = None) -> Finding:
     return Finding(severity=Severity.BAD, message=message, remedy=remedy)
 
 
-def _shared(rig: RigCalibration) -> list[Finding]:
-    out = []
-    if len(rig.cameras) > 1 and rig.shared_count < FEW_SHARED:
-        out.append(
-            _look(
-                f"{rig.shared_count} boards are seen by several cameras at once",
-                f"take at least {FEW_SHARED} frames in which they are",
-            )
-        )
+def _not_converged(rig: RigCalibration) -> list[Finding]:
+    if rig.convergence.converged:
+        return []
+    return [_bad(f"the joint solution did not converge ({rig.convergence.reason})")]
+
+
+def _left_out(rig: RigCalibration) -> list[Finding]:
     total = rig.shared_count + len(rig.left_out)
-    if len(rig.left_out) > MANY_LEFT_OUT * total:
-        out.append(
-            _look(
-                f"{len(rig.left_out)} of {total} boards that several views share were left out because the views "
-                "disagree on them",
-                "fix rig and boards while the images are taken, and trigger the cameras together",
-            )
+    if len(rig.left_out) <= MANY_LEFT_OUT * total:
+        return []
+    return [
+        _look(
+            f"{len(rig.left_out)} of {total} boards that several views share were left out because the views disagree "
+            "on them",
+            "fix rig and boards while the images are taken, and trigger the cameras together",
         )
-    return out
+    ]
+
+
+def _few_shared(rig: RigCalibration) -> list[Finding]:
+    if len(rig.cameras) < 2 or rig.shared_count >= FEW_SHARED:
+        return []
+    return [
+        _look(
+            f"{rig.shared_count} boards are seen by several cameras at once",
+            f"take at least {FEW_SHARED} frames in which they are",
+        )
+    ]
 
 
 def _unsure(rig: RigCalibration) -> list[Finding]:
@@ -88,14 +104,15 @@ def _unsure(rig: RigCalibration) -> list[Finding]:
     return out
 
 
-def _overdispersed(rig: RigCalibration) -> list[Finding]:
+def _overdispersed(rig: RigCalibration, in_force: Collection[str]) -> list[Finding]:
     if rig.overdispersion <= OVERDISPERSED:
         return []
+    automatic = " and ".join(f'{name} = "auto"' for name in ("board_shape", "model") if name not in in_force)
     return [
         _look(
             f"the frames disagree by {rig.overdispersion:.1f} times what the corners' scatter explains; all sigmas "
-            "count it in. Boards or lenses are not quite as the models say, or cameras not quite of one moment: "
-            'board_shape and model "auto" may help, a flatter board does'
+            "count it in. Boards or lenses are not quite as the models say, or cameras not quite of one moment",
+            (f"try {automatic}, or " if automatic else "take ") + "a flatter board",
         )
     ]
 

@@ -1,0 +1,208 @@
+"""What a person should know about how the images were taken: too few, too alike, or not of one camera.
+
+None of this shows in the error of the corners. A calibration that rests on such images is not called good, whatever its
+held-out error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.calibration.coverage import covered_by_boards
+from rigkit.calibration.mixed import two_cameras
+from rigkit.calibration.repeats import cluster_numbers
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.uncertainty import projection_uncertainty
+from rigkit.cameras.compare import grid_pixels
+from rigkit.core.arrays import BoolArray, FloatArray, Pixels
+from rigkit.core.findings import Finding, Severity
+
+__all__ = ["Extent", "judge_capture"]
+
+FEW_IMAGES = 8
+FAR_TOO_FEW = 3
+"""Fewer images show a lens, but nothing by which one could tell that it is wrong."""
+TILTED_DEG = 15.0
+TILTED_VIEWS = 3
+PARALLEL_DEG = 8.0
+"""Root of the mean squared angle of the boards against their middle direction. Hands that tilt have 20 and more."""
+UPRIGHT_DEG = 20.0
+"""Boards turned in the image by no more than this against each other, NEARLY_ALL of them, are the same way up."""
+NEARLY_ALL = 0.9
+ONE_DISTANCE = 1.15
+"""Corners from near to far within this factor are at one distance."""
+ASKED_DEG = 95.0
+"""Beyond this angle off the axis nobody is asked to hold a board: it would have to be beside the camera."""
+GRID = (16, 12)
+"""Pixels (columns, rows) at which it is asked whether boards were there."""
+MIN_SHARE_COVERED = 2.0 / 3.0
+"""Where boards were in less of the image than this, how sure the rest is counts as well,"""
+MAX_TIMES_ERROR = 2.0
+"""which is uncertain by at most so many times the error of the corners,"""
+SMALL_PX = 0.1
+"""or of what is a good corner on real images."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Extent:
+    """Where in the image boards were: `pixels` (N, 2) of a grid at which one is asked to hold one, and whether one was
+    there (N,)."""
+
+    pixels: Pixels
+    covered: BoolArray
+
+    @classmethod
+    def of(cls, calibration: Calibration) -> Extent:
+        pixels = grid_pixels(calibration.camera.size_px, GRID)
+        rays, valid = calibration.camera.unproject(pixels)
+        asked = valid & (np.where(valid, rays[..., 2], -1.0) > np.cos(np.radians(ASKED_DEG)))
+        return cls(pixels[asked], covered_by_boards(calibration, pixels[asked]))
+
+    @property
+    def share(self) -> float:
+        """Part of the image that is asked for in which boards were."""
+        return float(self.covered.mean()) if len(self.covered) else 0.0
+
+
+def judge_capture(calibration: Calibration, extent: Extent) -> list[Finding]:
+    """Return what is wrong with how the images were taken, the gravest first."""
+    return [
+        *two_cameras(calibration),
+        *_repeated(calibration),
+        *_images(calibration),
+        *_tilts(calibration),
+        *_parallel(calibration),
+        *_distances(calibration),
+        *_upright(calibration),
+        *_extrapolated(calibration, extent),
+    ]
+
+
+def _look(message: str, remedy: str) -> Finding:
+    return Finding(severity=Severity.LOOK, message=message, remedy=remedy)
+
+
+def _axes(c: Calibration, axis: int) -> FloatArray:
+    """Return the axis of every board in the camera frame, (V, 3)."""
+    return np.array([v.cam_from_board.rotation[:, axis] for v in c.views])
+
+
+def _tilts(c: Calibration) -> list[Finding]:
+    """Boards parallel to the image plane say nothing about the focal length."""
+    tilted = int((np.abs(_axes(c, 2)[:, 2]) < np.cos(np.radians(TILTED_DEG))).sum())
+    if tilted >= min(TILTED_VIEWS, len(c.views)):
+        return []
+    return [
+        Finding(
+            severity=Severity.BAD,
+            message=f"the board is tilted by more than {TILTED_DEG:.0f} degrees against the image in {tilted} of "
+            f"{len(c.views)} views only",
+            remedy=f"take at least {TILTED_VIEWS} with the board tilted by 20 to 50 degrees, about different axes",
+        )
+    ]
+
+
+def _parallel(c: Calibration) -> list[Finding]:
+    """Boards parallel to each other show one vanishing line, wherever they are."""
+    normals = _axes(c, 2)
+    middle = normals.sum(axis=0)
+    cosines = normals @ middle / np.linalg.norm(middle)
+    spread = float(np.degrees(np.sqrt(np.mean(np.arccos(np.clip(cosines, -1.0, 1.0)) ** 2))))
+    if len(c.views) < 2 or spread > PARALLEL_DEG:
+        return []
+    return [
+        _look(
+            f"all boards are nearly parallel to each other (within {spread:.1f} degrees, rms)",
+            "tilt the board by 20 to 50 degrees, left and right, forward and back",
+        )
+    ]
+
+
+def _upright(c: Calibration) -> list[Finding]:
+    """Pixels that are longer one way, and squares that are longer one way, look alike until the board is turned."""
+    # Half a turn changes nothing: angles are doubled.
+    along = _axes(c, 0) @ np.array([1.0, 1.0j, 0.0])
+    doubled = (along / np.maximum(np.abs(along), np.finfo(float).tiny)) ** 2
+    turned = 0.5 * np.degrees(np.abs(np.angle(doubled * np.conj(doubled.sum()))))
+    if len(c.views) < 2 or float(np.quantile(turned, NEARLY_ALL)) > UPRIGHT_DEG:
+        return []
+    return [
+        _look(
+            "the boards are the same way up in all images: squares that are longer one way than the other hide in fx "
+            "against fy",
+            "turn the board by a quarter of a turn in half of the images",
+        )
+    ]
+
+
+def _numbers(c: Calibration) -> tuple[list[str], list[int]]:
+    """Return the image of every view, and its number: images that repeat others share one."""
+    images = [view.image for view in c.views]
+    number = cluster_numbers(images, [view.board_id for view in c.views], [view.pixels for view in c.views])
+    return images, number.tolist()
+
+
+def _images(c: Calibration) -> list[Finding]:
+    images, number = _numbers(c)
+    count = len(set(number))
+    if count >= FEW_IMAGES:
+        return []
+    words = f"{count} images only" if count > 1 else "1 image only"
+    if len(set(images)) > count:
+        words = f"{len(set(images))} images show the boards at {count} different places only"
+    return [
+        Finding(
+            severity=Severity.BAD if count < FAR_TOO_FEW else Severity.LOOK,
+            message=words,
+            remedy=f"take at least {FEW_IMAGES}, better 15, to know how good the calibration is elsewhere",
+        )
+    ]
+
+
+def _repeated(c: Calibration) -> list[Finding]:
+    """Say which images show the boards where another one does."""
+    images, number = _numbers(c)
+    first = dict(reversed(list(zip(number, images, strict=True))))
+    again = {image: first[n] for n, image in zip(number, images, strict=True) if first[n] != image}
+    if not again:
+        return []
+    one, other = next(iter(again.items()))
+    what = f"image '{one}' shows" if len(again) == 1 else f"{len(again)} images, '{one}' the first, show"
+    return [
+        _look(
+            f"{what} the board where another one does ('{other}'): they count as one",
+            "move the board from image to image",
+        )
+    ]
+
+
+def _distances(c: Calibration) -> list[Finding]:
+    """Say where all boards were equally far away: then depth was seen on their tilts alone."""
+    if len(c.views) < 2:
+        return []
+    shapes = {board.board_id: board.points_mm for board in c.boards}
+    depth = [v.cam_from_board.apply(shapes[v.board_id]) for v in c.views]
+    far = np.concatenate([np.linalg.norm(points, axis=1) for points in depth])
+    if np.quantile(far, 0.95) > ONE_DISTANCE * np.quantile(far, 0.05):
+        return []
+    return [_look("all boards were at one distance", "hold some at half and some at double of it")]
+
+
+def _extrapolated(c: Calibration, extent: Extent) -> list[Finding]:
+    """Say where most of the image is known from elsewhere, and not well."""
+    if extent.share >= MIN_SHARE_COVERED or not len(extent.pixels):
+        return []
+    worst = projection_uncertainty(c, extent.pixels[~extent.covered]).worst_px
+    usual = float(np.sqrt(np.mean(worst**2)))
+    error = c.rms_px if c.heldout_rms_px is None else c.heldout_rms_px
+    if usual <= MAX_TIMES_ERROR * max(error, SMALL_PX):
+        return []
+    return [
+        _look(
+            f"boards were in {100.0 * extent.share:.0f} % of the image only; in the rest the lens is extrapolated, and "
+            f"uncertain by {usual:.2g} px (one standard deviation), {float(np.max(worst)):.2g} at worst",
+            "hold the board there as well, up to the corners of the image",
+        )
+    ]

@@ -1,0 +1,94 @@
+"""Two cameras whose images were mixed: the board before the one, then before the other.
+
+Cameras that stand beside each other see every board from two places, and always the same motion lies between them. Of
+one camera before which a board is held here and there, no motion comes twice; a board that is moved by equal steps
+comes from each place on to the next one, so that the same image is the end of one step and the start of another.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from rigkit.calibration.repeats import cluster_numbers
+from rigkit.calibration.result import Calibration
+from rigkit.core.arrays import FloatArray, IntArray
+from rigkit.core.findings import Finding, Severity
+
+__all__ = ["two_cameras"]
+
+SAME_MOTION = 0.005
+"""Boards that land within this part of their distance were moved alike."""
+MIN_MOTION = 2.0
+"""A motion of less than so many times that is none."""
+MIN_PARTNERS = 4
+"""So many images with a partner at the same motion are no chance: a motion has six numbers."""
+MIN_SHARE_PAIRED = 0.5
+"""Of all images, with their partners, at least this part must hang together so."""
+MAX_SHARE_CHAINED = 0.2
+"""More images than this part that are both start and end: a board moved by equal steps."""
+MAX_STARTS = 24
+"""So many views from which motions are tried."""
+
+
+def two_cameras(calibration: Calibration) -> list[Finding]:
+    """Return a finding if the images are of two cameras that see the board at once."""
+    views = calibration.views
+    images = [view.image for view in views]
+    number = cluster_numbers(images, [view.board_id for view in views], [view.pixels for view in views])
+    _, first = np.unique(number, return_index=True)
+    if len(first) < 2 * MIN_PARTNERS:
+        return []
+    rotation = np.array([view.cam_from_board.rotation for view in views])
+    centre = np.array([view.cam_from_board.translation_mm for view in views])
+    boards = np.unique([view.board_id for view in views], return_inverse=True)[1]
+    start, end = _partners(rotation, centre, boards, number)
+    alike = len(np.unique(number[start]))
+    together = np.unique(np.concatenate([number[start], number[end]]))
+    chained = np.intersect1d(number[start], number[end])
+    enough = len(together) >= MIN_SHARE_PAIRED * len(first)
+    if alike < MIN_PARTNERS or not enough or len(chained) > MAX_SHARE_CHAINED * len(together):
+        return []
+    return [
+        Finding(
+            severity=Severity.BAD,
+            message=f"two cameras are mixed in these images: between '{images[start[0]]}' and '{images[end[0]]}', and "
+            f"{alike - 1} other pairs of images, the board has moved in one and the same way",
+            remedy="calibrate each camera from its own images, or both as a rig with [[cameras]]",
+        )
+    ]
+
+
+def _partners(
+    rotation: FloatArray, centre: FloatArray, boards: IntArray, number: IntArray
+) -> tuple[IntArray, IntArray]:
+    """Return start and end of the views (V,) between which the boards have moved in the one way that is the most
+    common, from poses (V, 3, 3) and (V, 3) mm."""
+    distance = float(np.linalg.norm(centre, axis=1).mean())
+    # A pose as four points: the board's origin, and the ends of axes half as long as it is far away.
+    frame = 0.5 * distance * np.concatenate([np.zeros((1, 3)), np.eye(3)])
+    reach = SAME_MOTION * distance * 2.0
+    points = frame @ np.swapaxes(rotation, -1, -2) + centre[:, None]
+    starts = np.unique(np.linspace(0, len(centre) - 1, min(MAX_STARTS, len(centre))).astype(np.int64))
+    i, j = (axis.ravel() for axis in np.meshgrid(starts, np.arange(len(centre)), indexing="ij"))
+    chosen = (number[i] != number[j]) & (boards[i] == boards[j])
+    i, j = i[chosen], j[chosen]
+    turn = rotation[j] @ np.swapaxes(rotation[i], -1, -2)
+    shift = centre[j] - np.einsum("nij,nj->ni", turn, centre[i])
+    # Where a motion takes a frame that stands where boards usually were.
+    usual = frame + centre.mean(axis=0)
+    ends = np.einsum("nij,pj->npi", turn, usual) + shift[:, None]
+    moved = np.linalg.norm(ends - usual, axis=-1).max(axis=-1) > MIN_MOTION * reach / 2.0
+    if not moved.any():
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    flat = ends.reshape(-1, 12)[moved]
+    tree = cKDTree(flat)
+    near = tree.query_ball_point(flat[int(np.argmax(tree.query_ball_point(flat, reach, return_length=True)))], reach)
+    best = np.flatnonzero(moved)[near]
+    # The motion of the one that lies in the middle of those.
+    middle = best[int(np.argmin(np.linalg.norm(ends[best] - np.median(ends[best], axis=0), axis=(1, 2))))]
+    landed = np.einsum("ij,npj->npi", turn[middle], points) + shift[middle]
+    apart, end = cKDTree(points.reshape(-1, 12)).query(landed.reshape(-1, 12), distance_upper_bound=reach)
+    found = np.flatnonzero(np.isfinite(apart))
+    found = found[(boards[found] == boards[end[found]]) & (number[found] != number[end[found]])]
+    return found, end[found].astype(np.int64)

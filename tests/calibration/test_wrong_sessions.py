@@ -1,0 +1,155 @@
+"""Sessions with one thing wrong: the first verdict names it, and never says "good"."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
+
+from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.cameras.base import Camera
+from rigkit.cameras.compare import compare_cameras
+from rigkit.core.arrays import FloatArray
+from rigkit.core.detections import BoardView
+from rigkit.core.findings import Severity, worst
+from rigkit.geometry.rotation import exp_so3
+
+NOISE_PX = 0.1
+
+
+def seen(camera: Camera, rotation: FloatArray, translation_mm: FloatArray, rng: np.random.Generator) -> list[BoardView]:
+    """Return the views of boards at poses (V, 3, 3) and (V, 3), of those that the image holds."""
+    out = []
+    for k, (turn, shift) in enumerate(zip(rotation, translation_mm, strict=True)):
+        pixels, valid = camera.project(BOARD.points() @ turn.T + shift)
+        if valid.all() and camera.on_image(pixels).all():
+            noisy = np.clip(pixels + NOISE_PX * rng.normal(size=pixels.shape), -0.5, np.array(SIZE) - 0.5)
+            out.append(BoardView(f"{k:03d}.png", BOARD, BOARD.grid(), noisy, np.full(len(noisy), NOISE_PX)))
+    return out
+
+
+def poses(rng: np.random.Generator, count: int, about: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return poses all over the image, turned by the rotation vectors `about` (count, 3)."""
+    depth = rng.uniform(500.0, 1000.0, count)
+    place = np.stack([0.45 * depth * rng.uniform(-1, 1, count), 0.33 * depth * rng.uniform(-1, 1, count), depth], -1)
+    rotation = exp_so3(about)
+    return rotation, place - rotation @ BOARD.points().mean(axis=0)
+
+
+def first(result: Calibration) -> str:
+    assert result.verdicts[0].severity is not Severity.GOOD
+    assert result.verdicts[0].remedy
+    return result.verdicts[0].message
+
+
+def prefixed(views: list[BoardView], prefix: str) -> list[BoardView]:
+    return [replace(view, image=prefix + view.image) for view in views]
+
+
+@pytest.mark.parametrize("order", ["one after the other", "in turns"])
+def test_two_cameras_that_see_the_board_at_once(order: str, rng: np.random.Generator) -> None:
+    left = lens("reg")
+    right = left.with_parameters(np.asarray(left.parameters) + np.array([1.0, 1.0, 4.0, -3.0, *[0.0] * 5]))
+    rotation, translation = poses(rng, 25, 0.4 * rng.normal(size=(25, 3)))
+    beside = exp_so3(np.array([0.0, 0.05, 0.0]))
+    views = prefixed(seen(left, rotation, translation, rng), "a")
+    other = prefixed(seen(right, beside @ rotation, translation @ beside.T - [60.0, 0.0, 0.0], rng), "b")
+    names = {view.image for view in (*views, *other)}
+    both = [*views, *other]
+    if order == "in turns":
+        both.sort(key=lambda view: view.image[1:])
+    result = calibrate(both, SIZE, model="brown", board="flat")
+    assert "two cameras are mixed" in first(result) and len(names) > 20
+    assert worst(result.verdicts) is Severity.BAD
+    assert "mixed" not in str(calibrate(views, SIZE, model="brown", board="flat").verdicts)
+
+
+def test_a_board_moved_by_equal_steps_is_one_camera(rng: np.random.Generator) -> None:
+    steps = np.stack(np.meshgrid(np.arange(5), np.arange(4)), axis=-1).reshape(-1, 2)
+    rotation = exp_so3(np.tile([0.3, 0.2, 0.0], (20, 1)))
+    centre = np.concatenate([110.0 * (steps - [2.0, 1.5]), np.full((20, 1), 900.0)], axis=1)
+    views = seen(lens("reg"), rotation, centre - rotation @ BOARD.points().mean(axis=0), rng)
+    assert "mixed" not in str(calibrate(views, SIZE, model="brown", board="flat").verdicts)
+
+
+def test_boards_parallel_to_each_other(rng: np.random.Generator) -> None:
+    about = np.array([0.5, 0.3, 0.0]) + 0.03 * rng.normal(size=(40, 3))
+    result = calibrate(seen(lens("reg"), *poses(rng, 40, about), rng), SIZE, model="brown", board="flat")
+    assert "nearly parallel to each other" in first(result)
+
+
+def test_boards_the_same_way_up(rng: np.random.Generator) -> None:
+    tilts = np.concatenate([0.4 * rng.normal(size=(90, 2)), 0.02 * rng.normal(size=(90, 1))], axis=1)
+    upright = calibrate(seen(lens("reg"), *poses(rng, 90, tilts), rng), SIZE, model="brown", board="flat")
+    assert "the same way up" in first(upright)
+    tilts[::2, 2] += np.pi / 2.0
+    turned = calibrate(seen(lens("reg"), *poses(rng, 90, tilts), rng), SIZE, model="brown", board="flat")
+    assert turned.verdicts[0].severity is Severity.GOOD
+
+
+def test_boards_at_one_distance(rng: np.random.Generator) -> None:
+    rotation, translation = poses(rng, 60, 0.3 * rng.normal(size=(60, 3)))
+    centre = translation + rotation @ BOARD.points().mean(axis=0)
+    to_one = centre * (1500.0 / np.linalg.norm(centre, axis=1, keepdims=True) - 1.0)
+    result = calibrate(seen(lens("reg"), rotation, translation + to_one, rng), SIZE, model="brown", board="flat")
+    assert "all boards were at one distance" in first(result)
+
+
+def test_repeated_frames(rng: np.random.Generator) -> None:
+    views, _, _ = random_views(lens("reg"), 10, rng, reach_deg=33.0, noise_px=NOISE_PX)
+    again = [replace(v, image=f"again {v.image}", pixels=v.pixels + 0.01 * rng.normal(size=(54, 2))) for v in views]
+    assert "show the board where another one does" in first(calibrate([*views, *again], SIZE, model="brown"))
+    few = calibrate([*views[:4], *again[:4]], SIZE, model="brown", board="flat")
+    assert "where another one does" in first(few)
+    assert any("8 images show the boards at 4 different places only" in str(verdict) for verdict in few.verdicts)
+
+
+def test_corners_of_the_image_without_boards(rng: np.random.Generator) -> None:
+    views, _, _ = random_views(lens("reg"), 20, rng, reach_deg=15.0)
+    result = calibrate(views, SIZE, model="brown", board="flat")
+    assert "of the image only; in the rest the lens is extrapolated" in first(result)
+
+
+def test_few_images_are_the_cause_of_a_large_uncertainty(rng: np.random.Generator) -> None:
+    views, _, _ = random_views(lens("reg"), 2, rng, reach_deg=33.0)
+    result = calibrate(views, SIZE, board="flat")
+    assert "2 images only" in first(result) and "uncertain" in str(result.verdicts[1:])
+
+
+def test_no_remedy_that_is_in_force(rng: np.random.Generator) -> None:
+    x, y = (BOARD.points()[:, :2] / 120.0 - 1.0).T
+    bent = BOARD.points()
+    views = []
+    for k, view in enumerate(random_views(lens("reg"), 14, rng, reach_deg=33.0)[0]):
+        wave = np.stack([np.sin(4.0 * x + k), np.cos(3.0 * y - k)], axis=-1)
+        views.append(replace(view, pixels=np.clip(view.pixels + 0.5 * wave, 0.0, np.array(SIZE) - 1.0)))
+    assert len(bent) == len(views[0].grid)
+    said = str(calibrate(views, SIZE, model="auto", board="auto").verdicts)
+    assert "neighbouring corners agree" in said and '"auto"' not in said
+    assert 'board_shape = "auto"' in str(calibrate(views, SIZE, model="auto", board="flat").verdicts)
+    assert 'model = "auto"' in str(calibrate(views, SIZE, model="brown", board="auto").verdicts)
+
+
+def test_frames_that_are_not_of_one_moment(rng: np.random.Generator) -> None:
+    left, right = lens("reg"), lens("reg", np.array([790.0, 640.0]))
+    rotation, translation = poses(rng, 40, 0.4 * rng.normal(size=(40, 3)))
+    late = exp_so3(0.002 * rng.normal(size=(40, 3)))
+    views = {
+        "left": [(view.image, view) for view in seen(left, rotation, translation, rng)],
+        "right": [
+            (view.image, view)
+            for view in seen(right, late @ rotation, translation + 0.5 * rng.normal(size=(40, 3)) - [80.0, 0, 0], rng)
+        ],
+    }
+    rig = calibrate_rig(views, {"left": SIZE, "right": SIZE}, model="brown")
+    assert rig.verdicts[0].severity is not Severity.GOOD
+    assert "the images of a frame are not of one moment" in rig.verdicts[0].message
+    for camera, alone in zip(rig.cameras, rig.single, strict=True):
+        # Within what the camera alone knows.
+        found = compare_cameras(alone.camera, camera.calibration.camera)
+        assert found.rms_px < 1.0
+        assert (camera.calibration.parameter_sigmas > 0.5 * alone.parameter_sigmas).all()
