@@ -112,7 +112,7 @@ def test_a_camera_of_a_rig_is_surer_than_alone(session: Path, capsys: pytest.Cap
         saved = load_calibration(session.parent / f"rig-{camera['name']}.json")
         assert saved.parameter_sigmas.tolist() == list(camera["sigmas"].values())
         assert saved.heldout_rms_px == camera["heldout_rms_px"]
-        assert saved.verdicts[0].severity == "good"
+        assert saved.verdicts[0].severity != "bad"
     assert told["heldout_rms_px"] == pytest.approx(np.sqrt(2.0) * 0.2, rel=0.05)
     assert 0.0 < told["transfers"][0]["median_px"] < 0.5
 
