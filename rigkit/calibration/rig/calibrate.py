@@ -89,9 +89,7 @@ def calibrate_rig(
     joint = solve_jointly(list(views), seen, single, places, progress)
     heldout = heldout_rms(joint, folds)
     rig = assemble_rig(list(views), single, joint, places, heldout)
-    models = {model} if isinstance(model, str) else set(model.values())
-    in_force = [name for name, values in (("model", models), ("board_shape", {board})) if values == {"auto"}]
-    return replace(rig, verdicts=judge_rig(rig, (*notes, *joint.notes), in_force=in_force))
+    return replace(rig, verdicts=judge_rig(rig, (*notes, *joint.notes), in_force=options.in_force))
 
 
 def _require_one_image(name: str, own: Sequence[tuple[str, BoardView]]) -> None:
@@ -122,6 +120,12 @@ class _Options:
     degree: int | Mapping[str, int | None] | None
     board: str
     folds: int
+
+    @property
+    def in_force(self) -> list[str]:
+        """Which of model and shape of the boards are chosen already: no remedies."""
+        models = {self.model} if isinstance(self.model, str) else set(self.model.values())
+        return [name for name, values in (("model", models), ("board_shape", {self.board})) if values == {"auto"}]
 
     def each_alone(self, views: Views, progress: Progress) -> tuple[Calibration, ...]:
         """Return the calibration of each camera alone; errors name the camera."""
