@@ -128,7 +128,14 @@ def test_gradient_and_gauss_newton_matrix(kind: str, tied: bool, rng: np.random.
     keys = tuple((str(k), "") for k in range(int(frame.max()) + 1))
     weights = [rng.uniform(0.5, 2.0, own.present.shape) * own.present for own in cameras]
     shape = shape_model(kind, everything)
-    observations = RigObservations(tuple(cameras), tuple(weights), shape, (frame, frame), keys, (False, tied))
+    observations = RigObservations(
+        cameras=tuple(cameras),
+        weights=tuple(weights),
+        shape=shape,
+        frame=(frame, frame),
+        keys=keys,
+        places=(False, tied),
+    )
     poses = len(keys)
     state = RigState(
         cameras=tuple(mounts()[name][0] for name in names),

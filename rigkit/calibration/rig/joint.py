@@ -247,7 +247,15 @@ def _observations(
     first_of = {target for target, _ in places.values()}
     free = tuple(b.board_id in places and b.board_id not in first_of for b in everything.boards)
     shape, unknowns = common_shape(everything, single)
-    return RigObservations(tuple(cameras), tuple(weights), shape, tuple(frame), tuple(keys), free), unknowns
+    found = RigObservations(
+        cameras=tuple(cameras),
+        weights=tuple(weights),
+        shape=shape,
+        frame=tuple(frame),
+        keys=tuple(keys),
+        places=free,
+    )
+    return found, unknowns
 
 
 def _board_poses(observations: Observations, places: Places) -> tuple[FloatArray, FloatArray]:

@@ -54,7 +54,7 @@ class Layout:
         return int(self.shape.stop)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class RigObservations:
     """What every camera saw.
 
