@@ -21,9 +21,10 @@ typedef int32_t words_t __attribute__((vector_size(4 * STRETCH)));
 typedef float bright_t __attribute__((vector_size(4 * STRETCH), aligned(4)));
 
 /* What the lattice says of a corner: its cell's sides, the curvature of its lines and how uncertain it is, where their
- * neighbours are, and which of these have no corner of the lattice. */
+ * neighbours are, how far its window goes towards these, in sides of the cell, where that is not by rule, and which of these have
+ * no corner of the lattice. */
 typedef struct {
-    const double *sides, *curvature, *curvature_sigma, *gaps;
+    const double *sides, *curvature, *curvature_sigma, *gaps, *reach;
     const uint8_t *ends;
 } geometry_t;
 
@@ -111,6 +112,8 @@ INLINE void take(window_t *window, const picture_t image, int64_t v, int32_t fir
 /* Return how far the window reaches towards neighbouring line `k` (reference.edges._reach). */
 INLINE double reach_to(const geometry_t at, int k, double blur, const edge_rules_t *rules)
 {
+    if (isfinite(at.reach[k]))
+        return at.reach[k] < rules->reach ? at.reach[k] : rules->reach;
     if (!at.ends[k])
         return rules->reach;
     const double left = 1.0 - rules->end_sigmas * blur / (at.gaps[k] > 1e-9 ? at.gaps[k] : 1e-9);
@@ -741,12 +744,12 @@ int64_t edges_scratch(const edge_rules_t *rules)
 }
 
 /* Fit the edge model around `count` corners (reference.edges.fit_corners). pixels (N, 2), sides (N, 2, 2), curvature and its sigma
- * (N, 2), gaps (N, 2, 2), ends (N, 2, 2), sign, blur and contrast (N), out (N, OUTCOMES); scratch as `edges_scratch` says, zeroed;
+ * (N, 2), gaps, reach and ends (N, 2, 2), sign, blur and contrast (N), out (N, OUTCOMES); scratch as `edges_scratch` says, zeroed;
  * `grey` is of uint8_t if `bytes`, else of float. */
 void fit_edges(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *sides,
-    const double *curvature, const double *curvature_sigma, const double *gaps, const double *sign, const double *blur,
-    const double *contrast, const uint8_t *ends, const edge_rules_t *rules, float *scratch, double *out)
+    const double *curvature, const double *curvature_sigma, const double *gaps, const double *reach, const double *sign,
+    const double *blur, const double *contrast, const uint8_t *ends, const edge_rules_t *rules, float *scratch, double *out)
 {
     const picture_t image = {grey, width, height, bytes};
     const int64_t room = room_of_window(rules->radius_px), across = across_square(rules);
@@ -760,7 +763,7 @@ void fit_edges(
         .radius = (int64_t)floor(rules->radius_px)};
     for (int64_t n = 0; n < count; n++) {
         const geometry_t at = {
-            sides + 4 * n, curvature + 2 * n, curvature_sigma + 2 * n, gaps + 4 * n, ends + 4 * n};
+            sides + 4 * n, curvature + 2 * n, curvature_sigma + 2 * n, gaps + 4 * n, reach + 4 * n, ends + 4 * n};
         collect(&window, image, pixels + 2 * n, at, blur[n], rules);
         fit_corner(&window, pixels + 2 * n, at, sign[n], blur[n], contrast[n], rules, out + OUTCOMES * n);
     }

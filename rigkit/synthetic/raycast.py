@@ -45,6 +45,11 @@ class Surface:
     marks: FloatArray | None = None
     """(M, 4) black rectangles on white squares: x, y, width, height in squares."""
 
+    @property
+    def printed(self) -> bool:
+        """Whether there is a pattern to see."""
+        return self.cells is not None or self.marks is not None
+
 
 def board_surface(placed: PlacedBoard, cam_from_world: Rigid3) -> Surface:
     cam_from_board = cam_from_world @ placed.world_from_board

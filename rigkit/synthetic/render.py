@@ -200,7 +200,7 @@ def _render_tile(
         if cover == FULL:
             # Hides all that was drawn before.
             seen, base = [], surface.white
-        if cover == PART or (cover == FULL and surface.cells is not None):
+        if cover == PART or (cover == FULL and surface.printed):
             seen.append(surface)
     if not seen and chart.lit is None:
         return np.full(shape, base)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from rigkit.core.errors import InputError
+from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.base import Pattern
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
 
 __all__ = ["PATTERNS", "pattern_type"]
 
-PATTERNS: dict[str, type[Pattern]] = {cls.type: cls for cls in (Chessboard, Charuco)}
+PATTERNS: dict[str, type[Pattern]] = {cls.type: cls for cls in (Chessboard, Charuco, AprilGrid)}
 
 
 def pattern_type(name: str) -> type[Pattern]:

@@ -63,8 +63,11 @@ class Links:
         return self.state & 3
 
 
-def find_links(corners: Corners, level: Level) -> Links:
-    """Return the mutual neighbours among `corners`; the brightness is read from `level` (the finest)."""
+def find_links(corners: Corners, level: Level, length_ratio: float = LENGTH_RATIO) -> Links:
+    """Return the mutual neighbours among `corners`; the brightness is read from `level` (the finest).
+
+    `length_ratio` : most that the distances of opposite neighbours differ by.
+    """
     count = len(corners)
     if count < 4:
         return Links(np.full((count, 4), -1))
@@ -77,20 +80,20 @@ def find_links(corners: Corners, level: Level) -> Links:
         level.smooth,
         level.scale,
         level.offset,
-        _link_rules(),
+        _link_rules(length_ratio),
     )
     return Links(to)
 
 
 @functools.cache
-def _link_rules() -> front.LinkRules:
+def _link_rules(length_ratio: float) -> front.LinkRules:
     return front.LinkRules.make(
         NEIGHBOURS,
         EDGE_PLACES,
         MIN_EDGE_PLACES,
         arm_cosine=ARM_COSINE,
         contrast_ratio=CONTRAST_RATIO,
-        length_ratio=LENGTH_RATIO,
+        length_ratio=length_ratio,
         aside=ASIDE,
         least_aside=MIN_ASIDE_PX,
     )

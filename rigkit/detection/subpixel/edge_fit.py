@@ -130,6 +130,7 @@ def fit_edges(
         geometry.curvature,
         loose,
         geometry.gaps,
+        np.full(geometry.gaps.shape, np.nan) if geometry.reach is None else geometry.reach,
         geometry.ends,
         sign,
         blur,

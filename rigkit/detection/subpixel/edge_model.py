@@ -64,12 +64,15 @@ class Geometry:
     curvature : (N, 2) of the two lines, 1/px, positive towards +90 degrees.
     gaps : (N, 2, 2) distance of the neighbouring lines before and after line 1 and line 2 (along +90 degrees), px.
     ends : (N, 2, 2) whether the lattice has no corner on that line beside this one.
+    reach : (N, 2, 2) how far the window goes towards that line, in sides of the cell, at most
+        WINDOW_REACH; None: by rule.
     """
 
     sides: FloatArray
     curvature: FloatArray
     gaps: FloatArray
     ends: BoolArray
+    reach: FloatArray | None = None
 
 
 def ends_of(known: BoolArray, cells: BoolArray) -> BoolArray:

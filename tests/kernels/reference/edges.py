@@ -66,13 +66,14 @@ def fit_corners(
     curvature: FloatArray,
     curvature_sigma: FloatArray,
     gaps: FloatArray,
+    reach: FloatArray,
     ends: BoolArray,
     sign: FloatArray,
     blur: FloatArray,
     contrast: FloatArray,
     rules: Rules,
 ) -> FloatArray:
-    geometry, loose = Geometry(sides, curvature, gaps, ends), curvature_sigma
+    geometry, loose = Geometry(sides, curvature, gaps, ends, reach), curvature_sigma
     window = collect(image, pixels, geometry, blur, rules.radius_px)
     prior_mean, prior = _prior(geometry, loose, blur, window.size)
     kept = np.count_nonzero(loose > 0.0, axis=1) < 2
@@ -155,13 +156,16 @@ def line_bends(
 
 
 def _of(geometry: Geometry, keep: BoolArray) -> Geometry:
-    return Geometry(geometry.sides[keep], geometry.curvature[keep], geometry.gaps[keep], geometry.ends[keep])
+    reach = None if geometry.reach is None else geometry.reach[keep]
+    return Geometry(geometry.sides[keep], geometry.curvature[keep], geometry.gaps[keep], geometry.ends[keep], reach)
 
 
 def _reach(geometry: Geometry, blur: FloatArray) -> FloatArray:
     """Return (N, 2, 2) how far the window reaches, in cells: along both sides, backwards and forwards."""
     left = 1.0 - END_SIGMAS * blur[:, None, None] / np.maximum(geometry.gaps, 1e-9)
     out = np.where(geometry.ends, np.clip(left, MIN_REACH, WINDOW_REACH), WINDOW_REACH)
+    if geometry.reach is not None:
+        out = np.where(np.isfinite(geometry.reach), np.minimum(geometry.reach, WINDOW_REACH), out)
     # +90 degrees from line 1, which runs along the first side, is forwards along the second; from line 2 backwards.
     return np.stack([out[:, 1, ::-1], out[:, 0]], axis=1)
 

@@ -1,0 +1,1 @@
+"""AprilTags: reading their codes, and where their corners are."""

@@ -1,0 +1,123 @@
+"""Reading the code of a tag whose four corners are known.
+
+The brightness at the middle of every module is compared with that of every tag that may be there, in its four
+orientations, by correlation: no threshold, so that slanted light, blur and low contrast cost little. Borders count like
+bits: a black square without a code is no tag.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.patterns.aprilgrid import AprilGrid
+from rigkit.detection.saddles.response import GreyImage, sample
+
+__all__ = ["MIN_LIKENESS", "Codes", "TagCode", "homographies", "read_tags", "transferred"]
+
+MIN_LIKENESS = 0.7
+"""Correlation of a tag with its code at least. Of a code of 36 bits, bits at random reach 0.7 with one of 600 tags once
+in some thousand squares; blur as wide as a module still leaves 0.8."""
+
+MIN_CODE_CONTRAST = 4.0
+"""Standard deviation of the modules' brightness, grey levels: less is paper, or a black square."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Codes:
+    """What the tags that may be there look like.
+
+    Attributes
+    ----------
+    modules : on a side, with the border.
+    numbers : (4 N,) tag of each code.
+    turns : (4 N,) quarter turns, with the angle growing from right to down, by which the code is turned.
+    patterns : (4 N, modules^2) brightness, of mean 0 and length 1.
+    """
+
+    modules: int
+    numbers: IntArray
+    turns: IntArray
+    patterns: FloatArray
+
+    @classmethod
+    def of(cls, pattern: AprilGrid, numbers: IntArray) -> Codes:
+        """Return the codes of the tags of these numbers."""
+        return _codes(pattern.dictionary, pattern.border, pattern.numbering, tuple(numbers.tolist()))
+
+
+@cache
+def _codes(dictionary: str, border: int, numbering: str, numbers: tuple[int, ...]) -> Codes:
+    own = AprilGrid(1.0, dictionary, border, numbering=numbering).modules()[list(numbers)]
+    turned = [np.rot90(own, -turns, axes=(1, 2)) for turns in range(4)]
+    bright = 1.0 - np.stack(turned, axis=1).reshape(4 * len(own), -1).astype(np.float64)
+    bright -= bright.mean(axis=1, keepdims=True)
+    bright /= np.linalg.norm(bright, axis=1, keepdims=True)
+    return Codes(own.shape[1], np.repeat(np.array(numbers), 4), np.tile(np.arange(4), len(own)), bright)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TagCode:
+    """What was read in N quadrilaterals.
+
+    Attributes
+    ----------
+    number : (N,) tag that it is most like.
+    turns : (N,) quarter turns by which the tag is turned against the quadrilateral's first corner.
+    likeness : (N,) correlation, 0 where there is nothing to read.
+    margin : (N,) by which that of the next best tag is less.
+    """
+
+    number: IntArray
+    turns: IntArray
+    likeness: FloatArray
+    margin: FloatArray
+
+    @property
+    def read(self) -> BoolArray:
+        return self.likeness >= MIN_LIKENESS
+
+
+def read_tags(image: GreyImage, quads: FloatArray, codes: Codes) -> TagCode:
+    """Return the codes in the quadrilaterals (N, 4, 2), corners in order of growing angle from u to v."""
+    if not len(quads):
+        return TagCode(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
+    side = codes.modules
+    middle = (np.arange(side) + 0.5) / side
+    places = np.stack(np.meshgrid(middle, middle), axis=-1).reshape(-1, 2)
+    bright = sample(image, transferred(homographies(quads), places)).astype(np.float64)
+    bright -= bright.mean(axis=1, keepdims=True)
+    length = np.linalg.norm(bright, axis=1, keepdims=True)
+    likeness = (bright / np.maximum(length, 1e-9)) @ codes.patterns.T
+    likeness[length[:, 0] < MIN_CODE_CONTRAST * side] = 0.0
+    best = likeness.argmax(axis=1)
+    own = codes.numbers[best]
+    others = np.where(codes.numbers == own[:, None], -1.0, likeness).max(axis=1)
+    most = likeness[np.arange(len(quads)), best]
+    return TagCode(own, codes.turns[best], most, most - others)
+
+
+def homographies(quads: FloatArray) -> FloatArray:
+    """Return the homographies (N, 3, 3) of the unit square, corners (0,0) (1,0) (1,1) (0,1), to the quads (N, 4, 2).
+
+    Heckbert, Fundamentals of Texture Mapping and Image Warping, 1989, section 2.2.3.
+    """
+    p0, p1, p2, p3 = quads.transpose(1, 0, 2)
+    total, d1, d2 = p0 - p1 + p2 - p3, p1 - p2, p3 - p2
+    area = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
+    area = np.where(np.abs(area) < 1e-12, 1e-12, area)
+    g = (total[:, 0] * d2[:, 1] - total[:, 1] * d2[:, 0]) / area
+    h = (d1[:, 0] * total[:, 1] - d1[:, 1] * total[:, 0]) / area
+    out = np.ones((len(quads), 3, 3))
+    out[:, :2, 0], out[:, :2, 1], out[:, :2, 2] = p1 - p0 + g[:, None] * p1, p3 - p0 + h[:, None] * p3, p0
+    out[:, 2, 0], out[:, 2, 1] = g, h
+    return out
+
+
+def transferred(homography: FloatArray, points: FloatArray) -> FloatArray:
+    """Return points (P, 2) under every homography (N, 3, 3), as (N, P, 2)."""
+    image = np.concatenate([points, np.ones((len(points), 1))], axis=1) @ np.swapaxes(homography, 1, 2)
+    return np.asarray(image[..., :2] / image[..., 2:])

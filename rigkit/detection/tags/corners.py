@@ -1,0 +1,256 @@
+"""The corners of a board of tags as finely as those of a chessboard.
+
+Where small squares fill the corners between tags, the corners of tags are saddles like those of chessboards, only that
+their lines are not evenly spaced: a side of a tag to one side, the gap to the next to the other. The edge model is
+fitted in windows that reach half way to the neighbours, and are so narrow that they end before the tag's code.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.detections import BoardDetection
+from rigkit.detection.guided.board_guide import MIN_GUIDE_CORNERS, BoardState, Guide
+from rigkit.detection.guided.guided import (
+    MARGIN_PX,
+    MARKER_BLURS,
+    MAX_ADDED_RESIDUAL_MARKED,
+    MAX_SIGMA_CELLS,
+    MIN_ADDED_CONTRAST,
+    MOVED_CELLS,
+    SCATTER_FLOOR_PX,
+)
+from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.subpixel.correlation import sigma_factors
+from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
+from rigkit.detection.subpixel.edge_model import NEAR_PX, NEAR_SIGMAS, WINDOW_REACH, Geometry
+from rigkit.detection.subpixel.scatter import UNEXPLAINED
+from rigkit.detection.subpixel.subpixel import DISPLACED_CELLS, FIRST_BLUR, FIRST_PASS, LAST_PASS
+from rigkit.detection.tags.placing import TagBoard
+from rigkit.detection.tags.surface import TagSurface, seen_surface, smooth_surface
+from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
+
+__all__ = ["tag_corners"]
+
+MIN_TAG_CORNERS = 4
+"""One tag."""
+
+MIN_FORETELLING_CORNERS = 8
+"""Corners that a missing one can be foretold from: those of two tags."""
+
+MAX_PREDICTED_GAIN = 4.0
+"""Predictions from corners around count up to this standard deviation, for corners of standard deviation 1."""
+
+WIDE_BLUR = 0.15
+"""A missing corner is first sought with edges so wide, in widths of the gap between tags."""
+
+MAX_TAG_ROUNDS = 12
+"""Rounds in which missing corners are added, each foretold by those of the one before."""
+
+TAG_OUTLIER, JUDGING_GAIN = 6.0, 1.5
+"""A corner that lies off where those around have it by more than this, times what is usual and its own standard
+deviation together, is covered in part; where their prediction has no larger gain: at the ends of a board it errs."""
+
+
+def tag_corners(image: GreyImage, tags: TagBoard, pixels: FloatArray, camera: Camera | None) -> BoardDetection | None:
+    """Return the corners of a board whose rough corners are `pixels` (R, C, 2), NaN where unknown; None for too few.
+
+    Corners that the rough ones foretell, or a calibrated `camera`, are added where they are seen.
+    """
+    fitter = _Fitter(image, tags, camera)
+    state = fitter.first(pixels)
+    if np.count_nonzero(state.known) < MIN_TAG_CORNERS:
+        return None
+    for _ in range(MAX_TAG_ROUNDS):
+        more = fitter.added(state)
+        if more is None:
+            break
+        state = more
+    state = fitter.without_outliers(state)
+    row, column = np.nonzero(state.known)
+    if len(row) < MIN_TAG_CORNERS:
+        return None
+    state, factor = fitter.last(state)
+    row, column = np.nonzero(state.known)
+    board = tags.board
+    grid = np.stack([column, row], axis=-1)
+    return BoardDetection(
+        board.board_id, *board.size, grid, state.pixels[row, column], factor * state.sigma_px[row, column]
+    )
+
+
+class _Fitter:
+    """The fit of one board's corners in one image."""
+
+    def __init__(self, image: GreyImage, tags: TagBoard, camera: Camera | None) -> None:
+        self.image, self.tags, self.camera = image, tags, camera
+        board = tags.board
+        self.unit_mm = np.array(board.squares_mm)
+        grid = board.grid()
+        self.places = tags.pattern.positions(grid.astype(np.float64)).reshape(board.rows, board.columns, 2)
+        # To the next corner on either side, in sides of a tag: within the tag, or across the gap.
+        inwards = np.array([tags.pattern.spacing, 1.0])
+        odd = (grid % 2).reshape(board.rows, board.columns, 2)
+        right, below = inwards[1 - odd[..., 0]], inwards[1 - odd[..., 1]]
+        left, above = inwards[odd[..., 0]], inwards[odd[..., 1]]
+        self.steps = np.stack([np.stack([above, below], axis=-1), np.stack([right, left], axis=-1)], axis=2)
+        self.guide: Guide | None = None
+
+    def surface(self, state: BoardState, cells: BoolArray, *, leave_out: bool = False) -> TagSurface:
+        """Return the map at `cells`; `leave_out`: these are the known ones, each foretold by the others."""
+        places, pixels = self.places[state.known], state.pixels[state.known]
+        wanted = self.places[cells]
+        pose = None if self.guide is None or self.guide.camera is None else self.guide.cam_from_board
+        if self.camera is None or pose is None:
+            return smooth_surface(places, pixels, wanted, leave_out=leave_out)
+        seen = seen_surface(self.camera, pose, wanted, self.unit_mm)
+        own = seen_surface(self.camera, pose, places, self.unit_mm).pixels
+        # What the lens model, or a board that is not flat, leaves over changes slowly from corner to corner.
+        valid = np.isfinite(own[:, 0])
+        if leave_out and not valid.all():
+            return seen
+        rest = smooth_surface(places[valid], (pixels - own)[valid], wanted, leave_out=leave_out)
+        near = rest.gain < 1.0
+        moved = seen.pixels + np.where(near[:, None], rest.pixels, 0.0)
+        return replace(seen, pixels=moved, gain=np.where(near, np.hypot(1.0, rest.gain), 1.0))
+
+    def fit(
+        self,
+        cells: BoolArray,
+        surface: TagSurface,
+        start: FloatArray,
+        blur: FloatArray | float,
+        stage: tuple[float, int, float],
+        *,
+        mirrored: bool = True,
+    ) -> EdgeFit:
+        """Fit the edge model at the `cells`; arguments else as of `fit_edges`."""
+        heights, steps = surface.heights(), self.steps[cells]
+        gaps = steps * heights[:, :, None]
+        pattern, side = self.tags.pattern, self.tags.codes.modules
+        border = pattern.border / side * heights.min(axis=1)
+        wide = np.broadcast_to(np.asarray(blur, dtype=np.float64), (len(start),))
+        narrow = np.minimum(wide, (border - MARKER_BLURS * wide - NEAR_PX) / NEAR_SIGMAS)
+        geometry = Geometry(
+            surface.sides,
+            surface.curvature(),
+            gaps,
+            np.zeros(gaps.shape, np.bool_),
+            np.minimum(0.5 * steps, WINDOW_REACH),
+        )
+        signs = np.where(self._odd(cells), 1.0, -1.0)
+        radius_px, iterations, converged_px = stage
+        return fit_edges(
+            self.image,
+            start,
+            geometry,
+            signs,
+            np.clip(narrow, *BLUR_RANGE),
+            radius_px=radius_px,
+            iterations=iterations,
+            converged_px=converged_px,
+            mirrored=mirrored,
+        )
+
+    def _odd(self, cells: BoolArray) -> BoolArray:
+        row, column = np.nonzero(cells)
+        return np.asarray((row + column) % 2 == 1)
+
+    def first(self, pixels: FloatArray) -> BoardState:
+        """Return the rough corners fitted once, those that failed left out."""
+        nothing = np.full(pixels.shape[:2], np.nan)
+        state = BoardState(pixels, nothing, nothing, nothing, nothing, nothing)
+        cells = state.known
+        fit = self.fit(cells, self.surface(state, cells), pixels[cells], FIRST_BLUR, FIRST_PASS, mirrored=False)
+        good = fit.valid & (fit.contrast > 0.0)
+        empty = state.without(np.ones_like(cells))
+        state = empty.with_fit(cells, fit, good)
+        if np.count_nonzero(good) < MIN_TAG_CORNERS:
+            return state
+        return self.again(state)[0]
+
+    def again(self, state: BoardState) -> tuple[BoardState, EdgeFit]:
+        """Return the known corners fitted with lines that bend as the corners have it, and the fit."""
+        cells = state.known
+        if self.camera is not None and np.count_nonzero(cells) >= MIN_GUIDE_CORNERS:
+            self.guide = Guide.of(self.tags.board, self.camera, state)
+        surface = self.surface(state, cells)
+        seen = np.isfinite(surface.pixels[:, 0]) & np.isfinite(surface.sides).all(axis=(1, 2))
+        cells = cells.copy()
+        cells[cells] = seen
+        blur = float(np.nanmedian(state.blur))
+        fit = self.fit(cells, surface.of(seen), state.pixels[cells], blur, LAST_PASS)
+        good = fit.valid & (fit.contrast > 0.0)
+        return state.without(cells).with_fit(cells, fit, good), fit
+
+    def added(self, state: BoardState) -> BoardState | None:
+        """Return the state with those missing corners that can be added now, None where there are none."""
+        missing = ~state.known
+        if not missing.any() or np.count_nonzero(state.known) < MIN_FORETELLING_CORNERS:
+            return None
+        surface = self.surface(state, missing)
+        height, width = self.image.shape
+        with np.errstate(invalid="ignore"):
+            inside = (surface.pixels > MARGIN_PX) & (surface.pixels < np.array([width, height]) - 1.0 - MARGIN_PX)
+            usable = inside.all(axis=1) & (surface.gain < MAX_PREDICTED_GAIN)
+        if not usable.any():
+            return None
+        cells = missing.copy()
+        cells[missing] = usable
+        surface = surface.of(usable)
+        gap = self.tags.pattern.spacing * surface.heights().min(axis=1)
+        blur = float(np.nanmedian(state.blur))
+        rough = self.fit(cells, surface, surface.pixels, np.maximum(blur, WIDE_BLUR * gap), LAST_PASS)
+        start = np.where(rough.valid[:, None], rough.pixels, surface.pixels)
+        fit = self.fit(cells, surface, start, blur, LAST_PASS)
+        moved = np.linalg.norm(fit.pixels - surface.pixels, axis=1)
+        contrast, residual = float(np.nanmedian(state.contrast)), float(np.nanmedian(state.residual))
+        good = fit.valid & (moved < np.maximum(MOVED_CELLS, MOVED_CELLS * surface.gain) * gap)
+        good &= (fit.contrast > MIN_ADDED_CONTRAST * contrast) & (fit.sigma_px < MAX_SIGMA_CELLS * gap)
+        good &= fit.residual < MAX_ADDED_RESIDUAL_MARKED * residual * np.maximum(1.0, fit.contrast / contrast)
+        return state.with_fit(cells, fit, good) if good.any() else None
+
+    def without_outliers(self, state: BoardState) -> BoardState:
+        """Return the state without corners that lie where those around them cannot have them."""
+        for _ in range(MAX_TAG_ROUNDS):
+            cells = state.known
+            if np.count_nonzero(cells) < MIN_GUIDE_CORNERS:
+                return state
+            surface = self.surface(state, cells, leave_out=True)
+            off = np.nan_to_num(np.linalg.norm(state.pixels[cells] - surface.pixels, axis=1)) / surface.gain
+            usual = max(float(np.median(off)), SCATTER_FLOOR_PX)
+            usual_sigma = float(np.median(state.sigma_px[cells]))
+            sigma = np.minimum(state.sigma_px[cells], 3.0 * usual_sigma)
+            gap = self.tags.pattern.spacing * surface.heights().min(axis=1)
+            allowed = np.maximum(TAG_OUTLIER * np.hypot(usual, sigma), DISPLACED_CELLS * gap)
+            excess = np.where(surface.gain < JUDGING_GAIN, off / allowed, 0.0)
+            # Those that contradict the most go first: they may be all that speaks against their neighbours.
+            worst = excess > max(1.0, 0.5 * float(excess.max()))
+            if not worst.any():
+                return state
+            drop = cells.copy()
+            drop[cells] = worst
+            state = state.without(drop)
+        return state
+
+    def last(self, state: BoardState) -> tuple[BoardState, float]:
+        """Return the corners as they finally are, and the factor of their sigmas."""
+        state, fit = self.again(state)
+        good = fit.valid & (fit.contrast > 0.0)
+        cells = state.known
+        sides = self.surface(state, cells).sides
+        every = np.zeros((len(good), 2, 2))
+        every[good] = sides
+        owner = np.zeros(len(good), np.int64)
+        factor = float(sigma_factors(fit, good, every, owner, 1, LAST_PASS[0])[0])
+        if np.count_nonzero(cells) >= MIN_GUIDE_CORNERS:
+            surface = self.surface(state, cells, leave_out=True)
+            off = np.linalg.norm(state.pixels[cells] - surface.pixels, axis=1)
+            expected = factor * state.sigma_px[cells] * np.hypot(1.0, surface.gain)
+            scatter = float(np.nanmedian(off / expected)) / MEDIAN_OF_RAYLEIGH
+            factor *= scatter if scatter > UNEXPLAINED else 1.0
+        return state, factor

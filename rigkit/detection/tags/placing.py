@@ -1,0 +1,101 @@
+"""Lattices of corners on the grids of tag boards: every tag read says where its lattice lies; most of them agree."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.core.arrays import FloatArray, IntArray
+from rigkit.core.boards import Board
+from rigkit.core.detections import grid_turned
+from rigkit.core.patterns.aprilgrid import AprilGrid
+from rigkit.detection.lattice.lattice import Lattice
+from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.tags.codes import Codes, read_tags
+
+__all__ = ["MIN_BITS", "TagBoard", "placed_lattices"]
+
+MIN_BITS = 30
+"""Bits, in all agreeing tags together, that say where a lattice lies: one tag of 36, two of 25 or 16."""
+
+AGREEING_TAGS = 0.4
+"""Part of the squares of a lattice where tags would be in the place that tags give it, which are read as those tags: a
+code by chance stands alone, dirt and glare cover a few."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TagBoard:
+    """A board of tags and what is needed to read it."""
+
+    board: Board
+    pattern: AprilGrid
+    numbers: IntArray
+    codes: Codes
+
+    @classmethod
+    def of(cls, board: Board) -> TagBoard:
+        pattern = board.pattern
+        assert isinstance(pattern, AprilGrid)
+        numbers = pattern.numbers(*board.size)
+        return cls(board, pattern, numbers, Codes.of(pattern, numbers.ravel()))
+
+    def corner_of(self, number: IntArray) -> IntArray:
+        """Return (column, row) of the first corner of tags (N, 2)."""
+        first = np.zeros((int(self.numbers.max()) + 1, 2), np.int64)
+        row, column = np.mgrid[: self.numbers.shape[0], : self.numbers.shape[1]]
+        first[self.numbers] = 2 * np.stack([column, row], axis=-1)
+        return first[number]
+
+
+def placed_lattices(image: GreyImage, lattices: Sequence[Lattice], board: TagBoard) -> tuple[FloatArray, set[int]]:
+    """Return the corners of `board` (R, C, 2), NaN where none is known, and which of the lattices showed them."""
+    columns, rows = board.board.size
+    pixels = np.full((rows, columns, 2), np.nan)
+    found: list[tuple[int, int, IntArray, FloatArray]] = []
+    for n, lattice in enumerate(lattices):
+        place = _place(image, lattice, board)
+        if place is not None:
+            votes, turns, shift = place
+            row, column = np.nonzero(lattice.known)
+            cells = grid_turned(np.stack([column, row], axis=-1), lattice.size, turns) + shift
+            found.append((votes, n, cells, lattice.pixels[row, column]))
+    used = set()
+    # What most tags vouch for comes first; two lattices of one board do not overlap.
+    for _, n, cells, own in sorted(found, key=lambda item: -item[0]):
+        inside = ((cells >= 0) & (cells < [columns, rows])).all(axis=1)
+        cells, own = cells[inside], own[inside]
+        free = np.isnan(pixels[cells[:, 1], cells[:, 0], 0])
+        if 2 * np.count_nonzero(free) <= len(free):
+            continue
+        pixels[cells[free, 1], cells[free, 0]] = own[free]
+        used.add(n)
+    return pixels, used
+
+
+def _place(image: GreyImage, lattice: Lattice, board: TagBoard) -> tuple[int, int, IntArray] | None:
+    """Return how many tags say it, quarter turns and shift (2,) that take the lattice to the board's grid."""
+    corners = lattice.pixels
+    quads = np.stack([corners[:-1, :-1], corners[:-1, 1:], corners[1:, 1:], corners[1:, :-1]], axis=2)
+    # Dark squares: brightness falls with the angle across the edge from their first corner along the row.
+    dark = np.isfinite(quads).all(axis=(2, 3)) & (lattice.signs()[:-1, :-1] < 0.0)
+    row, column = np.nonzero(dark)
+    tags = read_tags(image, quads[row, column], board.codes)
+    sure = np.flatnonzero(tags.read)
+    if not len(sure):
+        return None
+    # A tag that stands upright in the lattice turned back stands on the board.
+    turns, cells = -tags.turns[sure] % 4, np.stack([column, row], axis=-1)[sure]
+    columns, rows = lattice.size
+    turned = np.array([grid_turned(cells, (columns - 1, rows - 1), k) for k in range(4)])[turns, np.arange(len(sure))]
+    shift = board.corner_of(tags.number[sure]) - turned
+    places, votes = np.unique(np.column_stack([turns, shift]), axis=0, return_counts=True)
+    most = int(votes.argmax())
+    bits = (board.codes.modules - 2 * board.pattern.border) ** 2
+    turn, shift_most = int(places[most, 0]), places[most, 1:]
+    every = grid_turned(np.stack([column, row], axis=-1), (columns - 1, rows - 1), turn) + shift_most
+    own = ((every % 2 == 0) & (every >= 0) & (every < board.board.size)).all(axis=1)
+    if votes[most] * bits < MIN_BITS or votes[most] < AGREEING_TAGS * np.count_nonzero(own):
+        return None
+    return int(votes[most]), turn, shift_most

@@ -1,0 +1,181 @@
+"""Where the points of a board whose points are not evenly spaced lie in an image, and how its lines run there.
+
+A smooth map from the board's plane to the image, told by a calibrated camera from the board's pose, corrected by what
+the points around leave over, or by the points around alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.geometry.rigid3 import Rigid3
+
+__all__ = ["TagSurface", "seen_surface", "smooth_surface"]
+
+MOST_DEGREE = 8
+"""Of the polynomial that a lens adds to a perspective: a board that fills a fisheye of 180 degrees takes 7."""
+
+POINTS_A_TERM = 2.5
+"""Points that there must be for each coefficient."""
+
+NEAREST_DEPTH = 0.1
+"""A perspective in which a point of the board is nearer than this part of the mean distance is no camera's: the lens is
+a wide fisheye."""
+
+CHORD = 0.4
+"""Derivatives of a camera's projection are chords of this many sides of a tag to either side."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TagSurface:
+    """The map at M places of the board.
+
+    Attributes
+    ----------
+    pixels : (M, 2)
+    sides : (M, 2, 2) first derivatives along x and along y, px per unit of the board.
+    bends : (M, 2, 2) second derivatives likewise.
+    gain : (M,) standard deviation of `pixels` for points of standard deviation 1.
+    """
+
+    pixels: FloatArray
+    sides: FloatArray
+    bends: FloatArray
+    gain: FloatArray
+
+    def curvature(self) -> FloatArray:
+        """Return the curvature of the lines along x and along y, (M, 2) 1/px, positive towards +90 degrees."""
+        (a, b), (c, d) = self.sides.transpose(2, 1, 0), self.bends.transpose(2, 1, 0)
+        return np.asarray((a * d - b * c).T / np.maximum((self.sides**2).sum(axis=2), 1e-12) ** 1.5)
+
+    def heights(self) -> FloatArray:
+        """Return how far a unit of the board lies from the line along x, and from that along y, (M, 2) px."""
+        area = np.abs(self.sides[:, 0, 0] * self.sides[:, 1, 1] - self.sides[:, 0, 1] * self.sides[:, 1, 0])
+        return np.asarray(area[:, None] / np.maximum(np.linalg.norm(self.sides, axis=2), 1e-9))
+
+    def of(self, which: BoolArray) -> TagSurface:
+        """Return the places `which` (M,)."""
+        return TagSurface(self.pixels[which], self.sides[which], self.bends[which], self.gain[which])
+
+
+def smooth_surface(
+    places: FloatArray, pixels: FloatArray, wanted: FloatArray, *, leave_out: bool = False
+) -> TagSurface:
+    """Return the map at `wanted` (M, 2) as a perspective and a polynomial through points at `places` (N, 2).
+
+    The polynomial has the degree that foretells points best that it was not fitted to. `leave_out` : `wanted` are the
+    places themselves, each foretold by the others.
+    """
+    perspective = _perspective(places, pixels)
+    flat = TagSurface(*(np.zeros((len(wanted), *shape)) for shape in ((2,), (2, 2), (2, 2), ())))
+    rest = pixels
+    if perspective is not None:
+        # What a perspective does is no polynomial; what is left is the lens, and the print.
+        flat, rest = _projected(perspective, wanted), pixels - _projected(perspective, places).pixels
+    left = _polynomial(places, rest, wanted, leave_out, certain=perspective is not None)
+    return TagSurface(flat.pixels + left.pixels, flat.sides + left.sides, flat.bends + left.bends, left.gain)
+
+
+def _perspective(places: FloatArray, pixels: FloatArray) -> FloatArray | None:
+    """Return the homography (3, 3) that fits the points best; None where none with all of them in front does."""
+    normalise = []
+    for points in (places, pixels):
+        middle, size = points.mean(axis=0), max(float(points.std()), 1e-9)
+        normalise.append(
+            np.array([[1.0 / size, 0.0, -middle[0] / size], [0.0, 1.0 / size, -middle[1] / size], [0, 0, 1]])
+        )
+    (x, y), (u, v) = (
+        (points * matrix[0, 0] + matrix[:2, 2]).T for points, matrix in zip((places, pixels), normalise, strict=True)
+    )
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    rows = np.concatenate(
+        [
+            np.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=1),
+            np.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=1),
+        ]
+    )
+    own = np.linalg.eigh(rows.T @ rows)[1][:, 0].reshape(3, 3)
+    matrix = np.linalg.inv(normalise[1]) @ own @ normalise[0]
+    matrix = matrix / (matrix[2] @ [*places.mean(axis=0), 1.0])
+    depth = places @ matrix[2, :2] + matrix[2, 2]
+    return matrix if depth.min() > NEAREST_DEPTH else None
+
+
+def _projected(homography: FloatArray, places: FloatArray) -> TagSurface:
+    """Return the map of a homography at places (M, 2)."""
+    image = np.concatenate([places, np.ones((len(places), 1))], axis=1) @ homography.T
+    depth = image[:, 2:]
+    pixels = image[:, :2] / depth
+    slope, turn = homography[:2, :2].T, homography[2, :2]
+    sides = (slope - turn[:, None] * pixels[:, None]) / depth[:, None]
+    bends = -2.0 * turn[:, None] * sides / depth[:, None]
+    return TagSurface(pixels, sides, bends, np.zeros(len(places)))
+
+
+def _polynomial(
+    places: FloatArray, values: FloatArray, wanted: FloatArray, leave_out: bool, certain: bool
+) -> TagSurface:
+    """Return `values` (N, 2) at `wanted` as a polynomial; `certain`: of degree 1 where points are too few for more."""
+    middle, size = 0.5 * (places.min(axis=0) + places.max(axis=0)), max(0.5 * float(np.ptp(places, axis=0).max()), 1e-9)
+    powers = np.array([(degree - k, k) for degree in range(MOST_DEGREE + 1) for k in range(degree + 1)])
+    powers = powers[: max(int(len(places) / POINTS_A_TERM), 1 if certain else min(3, len(places)))]
+    ends = [end for end in (1, 3, 6, 10, 15, 21, 28, 36, 45) if end <= len(powers)]
+    terms = _terms((places - middle) / size, powers[: ends[-1]])
+    basis, triangle = np.linalg.qr(terms)
+    told = basis.T @ values
+    best: tuple[float, int, FloatArray, FloatArray] | None = None
+    for end in ends:
+        own = basis[:, :end]
+        residual, leverage = values - own @ told[:end], np.minimum((own**2).sum(axis=1), 0.99)
+        foretold = residual / (1.0 - leverage)[:, None]
+        misses = float(np.median(np.linalg.norm(foretold, axis=1)))
+        if best is None or misses < best[0]:
+            best = (misses, end, foretold, leverage)
+    assert best is not None
+    _, end, foretold, leverage = best
+    factors = np.linalg.solve(triangle[:end, :end], told[:end])
+    here = (wanted - middle) / size
+    x, y = (_terms(here, powers[:end], along) @ factors / size for along in ((1, 0), (0, 1)))
+    xx, yy = (_terms(here, powers[:end], along) @ factors / size**2 for along in ((2, 0), (0, 2)))
+    if leave_out:
+        at, gain = values - foretold, np.sqrt(leverage / (1.0 - leverage))
+    else:
+        rows = _terms(here, powers[:end])
+        at, gain = rows @ factors, np.linalg.norm(np.linalg.solve(triangle[:end, :end].T, rows.T), axis=0)
+    return TagSurface(at, np.stack([x, y], axis=1), np.stack([xx, yy], axis=1), gain)
+
+
+def _terms(places: FloatArray, powers: IntArray, along: tuple[int, int] = (0, 0)) -> FloatArray:
+    """Return the terms x^i y^j (N, T) of `powers` (T, 2), differentiated `along` x and y so often."""
+    out = np.ones((len(places), len(powers)))
+    most = int(powers.max(initial=0))
+    for axis, times in enumerate(along):
+        power = powers[:, axis]
+        # Column k is the k-th power: pow() for every entry takes ten times as long.
+        table = np.ones((len(places), most + 1))
+        np.cumprod(np.broadcast_to(places[:, axis, None], (len(places), most)), axis=1, out=table[:, 1:])
+        factor = np.ones(len(power))
+        for k in range(times):
+            factor *= power - k
+        out *= table[:, np.maximum(power - times, 0)] * factor
+    return out
+
+
+def seen_surface(camera: Camera, cam_from_board: Rigid3, wanted: FloatArray, unit_mm: FloatArray) -> TagSurface:
+    """Return the map at `wanted` (M, 2), in units of `unit_mm` (2,), as a camera sees it; NaN where it does not."""
+    h = CHORD
+    offsets = np.array([[0.0, 0.0], [h, 0.0], [-h, 0.0], [0.0, h], [0.0, -h]])
+    places = (wanted + offsets[:, None]) * unit_mm
+    points = np.concatenate([places, np.zeros((*places.shape[:2], 1))], axis=2)
+    pixels, valid = camera.project(cam_from_board.apply(points))
+    here, right, left, below, above = np.where(valid[..., None].all(axis=0), pixels, np.nan)
+    return TagSurface(
+        here,
+        np.stack([right - left, below - above], axis=1) / (2.0 * h),
+        np.stack([right - 2.0 * here + left, below - 2.0 * here + above], axis=1) / h**2,
+        np.ones(len(wanted)),
+    )

@@ -1,0 +1,110 @@
+"""AprilGrids: every tag by its number, its corners as fine as those of chessboards."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from rigkit.benchmark.scenes import BenchScene, bench_camera, one_board
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
+from rigkit.core.errors import InputError
+from rigkit.core.patterns.aprilgrid import TAG_FAMILIES, AprilGrid
+from rigkit.detection.detect import detect_boards
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.synthetic.photometry import Photometry
+from rigkit.synthetic.render import Optics
+from rigkit.synthetic.scene import Panel, PlacedBoard
+
+KALIBR = Board("k", 10, 8, 60.0, 60.0, pattern=AprilGrid(0.3))
+
+OPENCV_PX = 2.0
+"""Contours of markers, in whole pixels; another tag would be off by tens."""
+
+
+def errors(found: BoardDetection, truth: BoardDetection) -> np.ndarray:
+    """Return found minus true pixels by grid position: a board in another place would be off by whole tags."""
+    return found.pixels - truth.lattice()[found.grid[:, 1], found.grid[:, 0]]
+
+
+def facing(board: Board, square_px: float = 50.0) -> BenchScene:
+    """Return a board that faces the camera, a little turned."""
+    camera = bench_camera("regular")
+    depth = camera.parameters[0] * board.square_x_mm / square_px
+    middle = board.points().mean(axis=0)
+    turn = cv2.Rodrigues(np.array([0.1, -0.05, 0.03]))[0]
+    return BenchScene("f", (PlacedBoard(board, Rigid3(turn, [0.0, 0.0, depth] - turn @ middle)),), (), camera)
+
+
+@pytest.mark.parametrize("family", sorted(TAG_FAMILIES))
+def test_what_is_printed_is_what_opencv_reads(family: str) -> None:
+    pattern = AprilGrid(0.4, family, 1, 3, "opencv", corner_squares=False)
+    board = Board("o", 6, 4, 60.0, 60.0, pattern=pattern)
+    image = facing(board).render(optics=Optics(0.5), photometry=Photometry())
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, TAG_FAMILIES[family]))
+    corners, numbers, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(image)
+    assert sorted(numbers.ravel().tolist()) == [3, 4, 5, 6, 7, 8]
+    truth = facing(board).truth()[0].lattice()
+    for number, quad in zip(numbers.ravel(), corners, strict=True):
+        row, column = np.argwhere(pattern.numbers(*board.size) == number)[0] * 2
+        own = truth[[row, row, row + 1, row + 1], [column, column + 1, column + 1, column]]
+        assert np.abs(quad.reshape(4, 2) - own).max() < OPENCV_PX
+
+
+@pytest.mark.parametrize("lens", ["regular", "fisheye"])
+@pytest.mark.parametrize(
+    "pattern",
+    [AprilGrid(0.3), AprilGrid(0.5, "tag25h9", first_tag=7), AprilGrid(0.25, "tag16h5", 1, numbering="opencv")],
+    ids=["kalibr", "25h9", "16h5"],
+)
+def test_every_corner_has_its_own_number(lens: str, pattern: AprilGrid, rng: np.random.Generator) -> None:
+    scene = one_board(rng, lens=lens, board=replace(KALIBR, pattern=pattern))
+    (found,) = detect_boards(scene.render(noise_levels=2.0, rng=rng), [scene.boards[0].board])
+    assert found.board_id == "k"
+    assert len(found.grid) >= 78
+    off = errors(found, scene.truth()[0])
+    assert np.abs(off).max() < 0.3
+    assert 0.7 < np.sqrt(((off / found.sigma_px[:, None]) ** 2).mean()) < 1.3
+
+
+def test_two_boards_are_told_apart_by_their_tags(rng: np.random.Generator) -> None:
+    boards = [Board(n, 6, 6, 60.0, 60.0, pattern=AprilGrid(0.3, first_tag=9 * k)) for k, n in enumerate("ab")]
+    camera = bench_camera("regular")
+    turn = np.diag([-1.0, -1.0, 1.0])
+    left = PlacedBoard(boards[0], Rigid3(turn, np.array([-30.0, 100.0, 800.0])))
+    right = PlacedBoard(boards[1], Rigid3(np.eye(3), np.array([50.0, -100.0, 800.0])))
+    scene = BenchScene("two", (left, right), (), camera)
+    found = {d.board_id: d for d in detect_boards(scene.render(noise_levels=2.0, rng=rng), boards[::-1])}
+    assert set(found) == {"a", "b"}
+    for truth in scene.truth():
+        assert len(found[str(truth.board_id)].grid) == 36
+        assert np.abs(errors(found[str(truth.board_id)], truth)).max() < 0.2
+
+
+def test_a_part_keeps_its_numbers(rng: np.random.Generator) -> None:
+    scene = facing(KALIBR, 75.0)
+    cover = Panel(scene.boards[0].world_from_board @ Rigid3(np.eye(3), np.array([170.0, 90.0, -2.0])), 60.0, 400.0, 0.4)
+    scene = replace(scene, occluders=(cover,))
+    (found,) = detect_boards(scene.render(noise_levels=2.0, rng=rng), [KALIBR])
+    off = np.linalg.norm(errors(found, scene.truth()[0]), axis=1)
+    assert 30 < len(off) < 72
+    assert np.median(off) < 0.05
+    assert off.max() < 0.5
+
+
+def test_tags_of_another_board_are_none(rng: np.random.Generator) -> None:
+    image = facing(KALIBR).render(noise_levels=2.0, rng=rng)
+    others = [AprilGrid(0.3, first_tag=100), AprilGrid(0.3, "tag36h10")]
+    boards = [replace(KALIBR, board_id=f"n{k}", pattern=pattern) for k, pattern in enumerate(others)]
+    assert detect_boards(image, boards) == ()
+
+
+@pytest.mark.parametrize(
+    "pattern", [{"border": 3}, {"first_tag": 580}, {"family": "tag7h1"}, {"numbering": "left"}, {"spacing": 0.0}]
+)
+def test_tags_that_cannot_be_are_refused(pattern: dict[str, object]) -> None:
+    with pytest.raises(InputError, match="board 'k'"):
+        replace(KALIBR, pattern=AprilGrid(**{"spacing": 0.3, **pattern}))  # type: ignore[arg-type]
