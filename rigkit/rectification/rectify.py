@@ -191,7 +191,10 @@ def rectify_map(camera: Camera, target: Camera, *, target_from_cam: ArrayLike | 
     ----------
     target_from_cam : (3, 3) rotation, by default none: x_in_target = target_from_cam @ x_in_cam.
 
-    Raises InputError where `target_from_cam` is not a rotation.
+    Raises
+    ------
+    InputError
+        `target_from_cam` is not a rotation.
     """
     matrix = as_array(np.eye(3) if target_from_cam is None else target_from_cam, (3, 3), "target_from_cam")
     rotation = nearest_rotation(matrix)

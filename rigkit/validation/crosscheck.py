@@ -157,7 +157,10 @@ def crosscheck(
     coverage : largest |difference| / its sigma that passes.
     seed : of COLMAP's RANSAC.
 
-    Raises InputError where none of the methods could be used.
+    Raises
+    ------
+    InputError
+        None of the methods could be used.
     """
     methods: list[IndependentMethod] = []
     skipped: list[str] = []

@@ -21,7 +21,7 @@ from rigkit.io.reading import read_text
 from rigkit.io.rig_file import is_rig_file, load_rig
 from rigkit.workflows.formats import CAMERA_FORMATS
 
-__all__ = ["camera_format", "import_camera", "import_rig", "is_rig"]
+__all__ = ["camera_format", "import_camera", "import_rig", "is_ours", "is_rig"]
 
 SIGNS = (
     ("mrcal", re.compile(r"['\"]lens_?model['\"]\s*:")),
@@ -71,6 +71,11 @@ def import_camera(path: str | Path, kind: str | None = None) -> Camera:
 def camera_format(text: str) -> str | None:
     """Return the format of a camera file's content, one of `CAMERA_FORMATS`; None where none of them looks so."""
     return next((kind for kind, sign in SIGNS if sign.search(text)), None)
+
+
+def is_ours(path: str | Path) -> bool:
+    """Say whether the file is of rigkit's own format; raises InputError for one that cannot be read."""
+    return camera_format(read_text(path, "camera file")) == "rigkit"
 
 
 def is_rig(path: str | Path) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rigkit.calibration.compare import CalibrationComparison, compare_calibrations
@@ -14,7 +14,7 @@ from rigkit.io.calibration_file import is_calibration, load_calibration
 from rigkit.io.files import ensure_writable, write_atomic
 from rigkit.io.rig_file import SavedRig, is_rig_file, load_saved_rig
 from rigkit.report.figures import difference_png
-from rigkit.workflows.camera_files import import_camera, import_rig, is_rig
+from rigkit.workflows.camera_files import import_camera, import_rig, is_ours, is_rig
 
 __all__ = ["CameraPair", "DiffOptions", "RigPair", "diff"]
 
@@ -81,7 +81,7 @@ def diff(a: Path, b: Path, options: DiffOptions | None = None) -> CameraPair | R
 
 def _cameras(a: Path, b: Path) -> CameraPair:
     cameras = import_camera(a), import_camera(b)
-    if not all(is_calibration(path) for path in (a, b)):
+    if not all(is_ours(path) and is_calibration(path) for path in (a, b)):
         return CameraPair(compare_cameras(*cameras), None)
     judged = compare_calibrations(load_calibration(a), load_calibration(b))
     return CameraPair(judged.difference, judged)
@@ -89,6 +89,7 @@ def _cameras(a: Path, b: Path) -> CameraPair:
 
 def _rigs(a: Path, b: Path) -> RigPair:
     first, second = _saved(a), _saved(b)
+    first, second = _named_like(first, second, a), _named_like(second, first, b)
     names = list(first.cameras)
     if names != list(second.cameras):
         raise InputError(f"diff: '{a}' has the cameras {', '.join(names)}, '{b}' {', '.join(second.cameras)}")
@@ -99,6 +100,13 @@ def _rigs(a: Path, b: Path) -> RigPair:
         if all(path.is_file() for path in beside):
             cameras[name] = _cameras(*beside)
     return RigPair(mounts, cameras)
+
+
+def _named_like(rig: SavedRig, other: SavedRig, path: Path) -> SavedRig:
+    """Return another tool's rig, whose cameras have numbers for names, with the names of the other, in their order."""
+    if is_rig_file(path) or len(rig.cameras) != len(other.cameras):
+        return rig
+    return replace(rig, cameras=dict(zip(other.cameras, rig.cameras.values(), strict=True)))
 
 
 def _saved(path: Path) -> SavedRig:

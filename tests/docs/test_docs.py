@@ -1,0 +1,76 @@
+"""The pages of the documentation: every command and every block of Python runs, and every link leads somewhere."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import textwrap
+from pathlib import Path
+
+import pytest
+from cli.test_calibrate_folder import pictures  # noqa: F401 - a fixture
+from helpers.data import REPOSITORY
+
+from rigkit.cli.main import main
+
+PAGES = REPOSITORY / "docs" / "pages"
+MADE_BY_THE_BUILD = ("made/", "api.md")
+BLOCK = re.compile(r"^( *)```(console|python)\n(.*?)^ *```$", re.MULTILINE | re.DOTALL)
+NEEDS = re.compile(r"<!-- with: ([a-z ]+) -->")
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+
+
+def set_up(needs: str, folder: Path, images: Path) -> None:
+    """Lay out what a page starts from: photos of a board by one camera, by two, or the capture of the repository."""
+    for need in needs.split():
+        if need == "photos":
+            (folder / "photos").mkdir()
+            for k, path in enumerate(sorted(images.glob("left*.jpg"))):
+                shutil.copy(path, folder / "photos" / f"{k}.jpg")
+        elif need == "rig":
+            for side in ("left", "right"):
+                (folder / side).mkdir()
+                for path in images.glob(f"{side}*.jpg"):
+                    shutil.copy(path, folder / side / path.name.replace(side, "IMG"))
+        else:
+            assert need == "lab"
+            (folder / "lab-a").symlink_to(REPOSITORY / "datasets" / "lab-a")
+
+
+@pytest.mark.parametrize("page", sorted(p.name for p in PAGES.glob("*.md") if p.name not in MADE_BY_THE_BUILD))
+def test_a_page_does_what_it_says(
+    page: str,
+    pictures: Path,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    text = (PAGES / page).read_text(encoding="utf-8")
+    needs = NEEDS.search(text)
+    set_up(needs[1] if needs else "", tmp_path, pictures)
+    monkeypatch.chdir(tmp_path)
+    known: dict[str, object] = {}
+    for indent, kind, block in BLOCK.findall(text):
+        body = textwrap.dedent(block) if indent else block
+        if kind == "python":
+            exec(compile(body, page, "exec"), known)
+            continue
+        for line in body.splitlines():
+            assert line.startswith("$ rigkit "), line
+            code = main(shlex.split(line)[2:])
+            assert code == 0, (line, capsys.readouterr().err)
+
+
+def test_every_link_leads_somewhere() -> None:
+    for path in [*PAGES.glob("*.md"), REPOSITORY / "README.md"]:
+        text = re.sub(r"```.*?```", "", path.read_text(encoding="utf-8"), flags=re.DOTALL)
+        for target in LINK.findall(text):
+            if target.startswith(("http", "#", *MADE_BY_THE_BUILD)):
+                continue
+            file, _, anchor = target.partition("#")
+            there = path.parent / file
+            assert there.exists(), f"{path.name}: {target}"
+            if anchor:
+                heads = re.findall(r"^#+ (.*)$", there.read_text(encoding="utf-8"), flags=re.MULTILINE)
+                assert anchor in {re.sub(r"[^a-z0-9 -]", "", h.lower()).replace(" ", "-") for h in heads}, target
