@@ -217,6 +217,24 @@ EXPORT void line_bends(
     ARRAY(const double, sides, count, 2), const bend_rules_t *rules, ARRAY(double, out, count, 2),
     ARRAY(double, out_sigma, count, 2));
 
+/* circles.c */
+
+/* What comes out of a circle: u, v, the map (4), covariance of (u, v) at noise of variance 1 (uu, uv, vv), blur, brightness
+ * outside, brightness inside less that, RMS residual, pixels, whether it settled, harmonics 3 to 6 of the edge (8). */
+enum { CIRCLE_OUTCOMES = 23, SPOT = 3 };
+
+/* The constants of detection.circles.fit, under their names there. */
+typedef struct {
+    double near_sigmas, near_px, least_blur, most_blur, most_move_px, most_growth, most_light, converged_px;
+    int64_t iterations, fewest;
+} circle_rules_t;
+
+EXPORT void fit_circles(
+    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t count,
+    ARRAY(const double, pixels, count, 2), ARRAY(const double, maps, count, 2, 2), ARRAY(const double, bends, count, 2, 3),
+    ARRAY(const double, blur, count), ARRAY(const double, reach, count), const circle_rules_t *rules, int64_t most,
+    ARRAY(double, scratch, most, SPOT), ARRAY(double, out, count, CIRCLE_OUTCOMES));
+
 /* minimal.c */
 
 enum { MOST_ROOTS = 10 };

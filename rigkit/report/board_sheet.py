@@ -8,6 +8,7 @@ from __future__ import annotations
 import zlib
 from dataclasses import dataclass
 from html import escape
+from itertools import pairwise
 
 import numpy as np
 
@@ -42,12 +43,15 @@ POINTS_PER_MM = 72.0 / 25.4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PrintedSheet:
-    """Shapes in mm: black rectangles (x, y, w, h), lines (x1, y1, x2, y2) and texts (x, y, degrees, words)."""
+    """Shapes in mm: black rectangles (x, y, w, h), circles on them (x, y, radius), black or `white_circles`, lines
+    (x1, y1, x2, y2) and texts (x, y, degrees, words)."""
 
     width_mm: float
     height_mm: float
     title: str
     rectangles: tuple[tuple[float, float, float, float], ...]
+    circles: tuple[tuple[float, float, float], ...]
+    white_circles: bool
     lines: tuple[tuple[float, float, float, float], ...]
     texts: tuple[tuple[float, float, float, str], ...]
     ruler_x_mm: float
@@ -68,8 +72,11 @@ def board_sheet(board: Board, paper: str) -> PrintedSheet:
     y0 = (size[1] - RULER_STRIP_MM - h) / 2.0
     # The rows and the columns of each marker's modules, one over the other: no hairline shows where two only touch.
     inks = [board.ink(upright=upright) for upright in (False, True)]
-    shapes = np.concatenate([_black_squares(board, inks[0]), *(ink.rectangles for ink in inks)])
+    white_circles = inks[0].inverted and len(inks[0].circles) > 0
+    ground = np.array([[*low, w, h]]) if white_circles else np.zeros((0, 4))
+    shapes = np.concatenate([ground, _black_squares(board, inks[0]), *(ink.rectangles for ink in inks)])
     shapes[:, :2] += np.array([x0, y0]) - low
+    circles = inks[0].circles + np.array([x0 - low[0], y0 - low[1], 0.0])
     rectangles = [(x, y, width, height) for x, y, width, height in shapes.tolist()]
     ruler_x = RULER_STEP_MM * np.floor(w / RULER_STEP_MM)
     ruler_y = RULER_STEP_MM * np.floor(h / RULER_STEP_MM)
@@ -88,6 +95,8 @@ def board_sheet(board: Board, paper: str) -> PrintedSheet:
         height_mm=size[1],
         title=name,
         rectangles=tuple(rectangles),
+        circles=tuple((x, y, radius) for x, y, radius in circles.tolist()),
+        white_circles=white_circles,
         lines=tuple(lines),
         texts=texts,
         ruler_x_mm=float(ruler_x),
@@ -117,6 +126,8 @@ def svg_text(sheet: PrintedSheet) -> str:
         f'<rect x="{x:.6g}" y="{y:.6g}" width="{w:.6g}" height="{h:.6g}" fill="black"/>'
         for x, y, w, h in sheet.rectangles
     ]
+    colour = "white" if sheet.white_circles else "black"
+    out += [f'<circle cx="{x:.6g}" cy="{y:.6g}" r="{r:.6g}" fill="{colour}"/>' for x, y, r in sheet.circles]
     out += [
         f'<line x1="{a:.6g}" y1="{b:.6g}" x2="{c:.6g}" y2="{d:.6g}" stroke="black" stroke-width="0.15"/>'
         for a, b, c, d in sheet.lines
@@ -140,7 +151,9 @@ def pdf_bytes(sheet: PrintedSheet) -> bytes:
 
     drawing = ["0 g"]
     drawing += [f"{at(x, y + h)} {extent(w, h)} re f" for x, y, w, h in sheet.rectangles]
-    drawing += [f"{0.15 * POINTS_PER_MM:.4f} w"]
+    drawing += ["1 g"] if sheet.white_circles else []
+    drawing += [f"{_pdf_circle(x, sheet.height_mm - y, r)} f" for x, y, r in sheet.circles]
+    drawing += ["0 g", f"{0.15 * POINTS_PER_MM:.4f} w"]
     drawing += [f"{at(a, b)} m {at(c, d)} l S" for a, b, c, d in sheet.lines]
     for x, y, turn, words in sheet.texts:
         c, s = np.cos(np.deg2rad(-turn)), np.sin(np.deg2rad(-turn))
@@ -168,6 +181,18 @@ def pdf_bytes(sheet: PrintedSheet) -> bytes:
     out += b"".join(f"{offset:010d} 00000 n \n".encode() for offset in offsets)
     out += f"trailer << /Size {len(objects) + 1} /Root 1 0 R >>\nstartxref\n{start}\n%%EOF\n".encode()
     return bytes(out)
+
+
+def _pdf_circle(x: float, y: float, radius: float) -> str:
+    """Return the path of a circle as four Bezier curves, which depart from it by 0.03 % of the radius at most."""
+    arm = 4.0 / 3.0 * (np.sqrt(2.0) - 1.0)
+    turns = [(1, 0), (0, 1), (-1, 0), (0, -1), (1, 0)]
+    path = [(x + radius, y)]
+    for (a, b), (c, d) in pairwise(turns):
+        path += [(x + radius * (a + arm * c), y + radius * (b + arm * d))]
+        path += [(x + radius * (c + arm * a), y + radius * (d + arm * b)), (x + radius * c, y + radius * d)]
+    words = [f"{u * POINTS_PER_MM:.5f} {v * POINTS_PER_MM:.5f}" for u, v in path]
+    return f"{words[0]} m " + " ".join(f"{' '.join(words[k : k + 3])} c" for k in range(1, len(words), 3))
 
 
 def _sheet_size(board: Board, paper: str) -> tuple[float, float]:

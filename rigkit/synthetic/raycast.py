@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.synthetic.discs import covered_shares
 from rigkit.synthetic.scene import Panel, PlacedBoard
 
 __all__ = ["FULL", "NONE", "PART", "Chart", "Float32", "Surface", "board_surface", "paint", "panel_surface"]
@@ -44,11 +45,16 @@ class Surface:
     distance_mm: float = field(default=0.0)
     marks: FloatArray | None = None
     """(M, 4) black rectangles on white squares: x, y, width, height in squares."""
+    discs: FloatArray | None = None
+    """(K, 3) discs: x, y, radius in mm."""
+    squares_mm: tuple[float, float] = (1.0, 1.0)
+    ground: tuple[FloatArray, FloatArray] | None = None
+    """Lower and upper end, in squares, of the black ground of a print whose discs are white; None: black discs."""
 
     @property
     def printed(self) -> bool:
         """Whether there is a pattern to see."""
-        return self.cells is not None or self.marks is not None
+        return self.cells is not None or self.marks is not None or self.discs is not None
 
 
 def board_surface(placed: PlacedBoard, cam_from_world: Rigid3) -> Surface:
@@ -69,6 +75,9 @@ def board_surface(placed: PlacedBoard, cam_from_world: Rigid3) -> Surface:
         first_black=bool(ink.first_black) and placed.first_black,
         distance_mm=float(np.linalg.norm(centre)),
         marks=ink.rectangles / np.tile(scale, 2) if front and len(ink.rectangles) else None,
+        discs=ink.circles if front and len(ink.circles) else None,
+        squares_mm=board.squares_mm,
+        ground=board.pattern.outline(*board.size) if front and ink.inverted else None,
     )
 
 
@@ -201,6 +210,8 @@ def paint(fine: Float32, surface: Surface, chart: Chart, per_pixel: int) -> None
         _paint_squares(target, axes, cells, surface)
     if surface.marks is not None:
         _paint_marks(target, axes, cells, surface)
+    if surface.discs is not None:
+        _paint_discs(target, axes, cells, surface)
 
 
 def _paint_squares(target: Float32, axes: Float32, cells: list[_Cells], surface: Surface) -> None:
@@ -215,6 +226,18 @@ def _paint_squares(target: Float32, axes: Float32, cells: list[_Cells], surface:
     wave_x += in_x * in_y
     wave_x *= np.float32(0.5 * (surface.black - surface.white))
     target += wave_x
+
+
+def _paint_discs(target: Float32, axes: Float32, cells: list[_Cells], surface: Surface) -> None:
+    """Paint the discs of a surface into `target`, on their ground."""
+    discs = np.zeros((0, 3)) if surface.discs is None else surface.discs
+    change = np.float32(surface.black - surface.white)
+    if surface.ground is not None:
+        low, high = surface.ground
+        ground = [_inside(a, c, low[k], high[k]) for k, (a, c) in enumerate(zip(axes, cells, strict=True))]
+        target += change * ground[0] * ground[1]
+        change = -change
+    target += change * covered_shares(axes, discs, surface.squares_mm)
 
 
 def _paint_marks(target: Float32, axes: Float32, cells: list[_Cells], surface: Surface) -> None:

@@ -7,10 +7,11 @@ from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.base import Pattern
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
+from rigkit.core.patterns.circles import Circles
 
 __all__ = ["PATTERNS", "pattern_type"]
 
-PATTERNS: dict[str, type[Pattern]] = {cls.type: cls for cls in (Chessboard, Charuco, AprilGrid)}
+PATTERNS: dict[str, type[Pattern]] = {cls.type: cls for cls in (Chessboard, Charuco, AprilGrid, Circles)}
 
 
 def pattern_type(name: str) -> type[Pattern]:

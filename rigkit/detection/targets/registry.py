@@ -5,16 +5,19 @@ from __future__ import annotations
 from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
+from rigkit.core.patterns.circles import Circles
 from rigkit.detection.targets.aprilgrid import AprilGridFinder
 from rigkit.detection.targets.base import Finder
 from rigkit.detection.targets.charuco import CharucoFinder
 from rigkit.detection.targets.chessboard import ChessboardFinder
+from rigkit.detection.targets.circles import CirclesFinder
 
 __all__ = ["FINDERS"]
 
 FINDERS: dict[str, Finder] = {
     AprilGrid.type: AprilGridFinder(),
     Charuco.type: CharucoFinder(),
+    Circles.type: CirclesFinder(),
     Chessboard.type: ChessboardFinder(),
 }
 """In this order: what is known by its marks first, chessboards, which are what is left, last."""

@@ -1,0 +1,1 @@
+"""Circle grids: blobs, lattices, the fit of circles, and which board a lattice is."""

@@ -1,0 +1,313 @@
+"""Every grid of circles in an image: blobs, their lattices, the fit of circles, growth, and what is a grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
+
+import numpy as np
+
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.detection.circles.blobs import Blobs, find_blobs
+from rigkit.detection.circles.fit import CircleFit, fit_circles
+from rigkit.detection.circles.lattices import LabelledBlobs, blob_lattices
+from rigkit.detection.circles.local_map import PlaneMap, local_maps
+from rigkit.detection.saddles.response import GreyImage
+
+__all__ = ["CircleGrid", "GridEvidence", "find_grids", "seen_grids"]
+
+Rows = TypeVar("Rows", CircleFit, PlaneMap)
+
+FIRST_EDGE_BLUR = 0.8
+MIN_CIRCLES, MIN_SIDE = 9, 3
+"""Fewer than 3 x 3 circles are too often none."""
+FIRST_SIGMA_PX = 0.1
+"""Of the centroids of blobs."""
+MOST_GROWTH = 0.25
+"""How far a circle's size and slant may differ from what its neighbours say."""
+OFF_PLACE = 0.12
+"""How far a circle may lie from where its neighbours say, in their distance."""
+LEAST_CONTRAST, MOST_CONTRAST = 0.35, 2.5
+"""Contrast of a circle over the grid's typical one: shadows and glare."""
+MOST_RESIDUAL = 3.0
+"""RMS residual over contrast, over the grid's typical one: more, and something lies across the circle."""
+LEAST_TYPICAL = 0.03
+"""Residuals over contrast below this are small anyway."""
+SUPPORT = 5
+"""Neighbours that must foretell a circle which no blob shows."""
+RIM_SIGMAS = 2.5
+"""A circle without a neighbour on some side is fitted to the pixels up to so many sigmas of blur outside of it."""
+MOST_GAIN = 10.0
+"""How much less certain than a circle a place may be that neighbours foretell: a corner of the grid, by its neighbours
+on one side, is five times."""
+SURE_GAIN = 1.5
+"""Of circles in the middle of others: these tell whether a lattice is a smooth image of a plane."""
+MAP_ERROR = 1.0
+"""Error of a centre over that of its circle's size times the radius in distances (`_with_map_error`): (n - 1) / 4 for
+the order n = 5 that follows the polynomial's."""
+FIRST_LENIENCE = 2.0
+"""Before circles are fitted, maps at the rim of a grid, from the middles of blobs, are not good."""
+ROUNDS = 40
+"""Rings of circles that a grid may grow by."""
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class CircleGrid:
+    """Circles of one lattice, sorted by label.
+
+    Attributes
+    ----------
+    label : (N, 2) places in the lattice (`lattices.LabelledBlobs`), from (0, 0) up.
+    pixels, sigma_px : (N, 2) and (N,) images of the centres.
+    maps : (N, 2, 2) px per radius.
+    hexagonal : whether the second direction lies at 60 degrees to the first, not at 90.
+    bright : whether the circles are brighter than what they are printed on.
+    radius : of the circles, in distances of neighbours.
+    empty : (K, 2) places beside these circles that the image shows, and no circle there.
+    evidence : what speaks for a grid.
+    """
+
+    label: IntArray
+    pixels: FloatArray
+    sigma_px: FloatArray
+    maps: FloatArray
+    hexagonal: bool
+    bright: bool
+    radius: float
+    empty: IntArray
+    evidence: GridEvidence
+
+    def __len__(self) -> int:
+        return len(self.label)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GridEvidence:
+    """How well a lattice is one of circles in a plane; medians over its circles.
+
+    Attributes
+    ----------
+    unexplained : RMS residual over contrast.
+    misshapen : how far size and slant differ from those that neighbours foretell, in radii.
+    displaced : distance from the place that neighbours foretell, in distances of neighbours.
+    corners : amplitude in radii of the edge's harmonics 3 to 6, the mean over all circles: squares have 0.15.
+    """
+
+    unexplained: float
+    misshapen: float
+    displaced: float
+    corners: float
+
+    @property
+    def convincing(self) -> bool:
+        return self.unexplained < 0.2 and self.misshapen < 0.08 and self.displaced < 0.04 and self.corners < 0.05
+
+
+def find_grids(grey: GreyImage, min_circles: int = MIN_CIRCLES) -> list[CircleGrid]:
+    """Return the grids of circles in `grey`, the largest first."""
+    found = [grid for grid in seen_grids(grey) if len(grid) >= min_circles and grid.evidence.convincing]
+    return sorted(found, key=lambda grid: -len(grid))
+
+
+def seen_grids(grey: GreyImage) -> list[CircleGrid]:
+    """Return all lattices of `grey` that may be grids, with what speaks for them."""
+    blobs = find_blobs(grey)
+    out = []
+    for found in blob_lattices(blobs):
+        if len(found.index) >= MIN_CIRCLES and _wide(found.label):
+            grid = _grown(grey, blobs, found)
+            if grid is not None:
+                out.append(grid)
+    return out
+
+
+def _wide(label: IntArray) -> bool:
+    """Return whether circles lie in at least MIN_SIDE rows and columns."""
+    return bool((np.ptp(label, axis=0) >= MIN_SIDE - 1).all())
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Draft:
+    """A grid in the making."""
+
+    label: IntArray
+    fit: CircleFit
+    around: PlaneMap
+    radius: float
+    hexagonal: bool
+    bright: bool
+
+    def chosen(self, which: BoolArray) -> _Draft:
+        return replace(self, label=self.label[which], fit=_of(self.fit, which), around=_of(self.around, which))
+
+
+def _grown(grey: GreyImage, blobs: Blobs, found: LabelledBlobs) -> CircleGrid | None:
+    own = blobs.chosen(found.index)
+    around = local_maps(found.label, own.pixels, found.label, hexagonal=found.hexagonal, sigma_px=FIRST_SIGMA_PX)
+    radius = _radius(own.shape, around.first)
+    bright = bool(own.sign[0] > 0)
+    fit = _fitted(grey, own.pixels, around, radius, np.full(len(own), FIRST_EDGE_BLUR))
+    draft = _judged(_Draft(found.label, fit, around, radius, found.hexagonal, bright), FIRST_LENIENCE)
+    if not _enough(draft):
+        return None
+    draft = _again(grey, draft)
+    for _ in range(ROUNDS):
+        if not _enough(draft):
+            return None
+        grown = _larger(grey, draft)
+        if grown is None:
+            break
+        draft = grown
+    draft = _again(grey, draft)
+    if not _enough(draft):
+        return None
+    return _finished(draft, (grey.shape[1], grey.shape[0]))
+
+
+def _enough(draft: _Draft) -> bool:
+    return len(draft.label) >= MIN_CIRCLES and _wide(draft.label)
+
+
+def _radius(maps: FloatArray, first: FloatArray) -> float:
+    """Return the radius in distances of neighbours."""
+    with np.errstate(all="ignore"):
+        ratio = np.sqrt(np.abs(np.linalg.det(maps) / np.linalg.det(first)))
+    return float(np.nanmedian(ratio))
+
+
+def _fitted(grey: GreyImage, pixels: FloatArray, around: PlaneMap, radius: float, blur_px: FloatArray) -> CircleFit:
+    maps = radius * around.first
+    # Half the way to the next circle; where there is none, the sheet may end there.
+    narrow = np.sqrt(np.maximum(np.linalg.eigvalsh(maps @ np.swapaxes(maps, 1, 2))[:, 0], 1.0))
+    reach = np.where(around.surrounded, 0.5 / radius, np.minimum(0.5 / radius, 1.0 + RIM_SIGMAS * blur_px / narrow))
+    return fit_circles(grey, pixels, maps, radius**2 * around.second, blur_px, reach)
+
+
+def _sigma(fit: CircleFit) -> float:
+    return float(np.median(fit.sigma_px)) if len(fit.sigma_px) else FIRST_SIGMA_PX
+
+
+def _judged(draft: _Draft, lenience: float = 1.0) -> _Draft:
+    """Return the draft without what is no circle of it; `lenience` multiplies the limits of shape and residual."""
+    fit = draft.fit
+    good = fit.valid & ((fit.contrast > 0.0) == draft.bright)
+    good &= (np.abs(fit.growth) < lenience * MOST_GROWTH).all(axis=1)
+    if good.sum() < MIN_CIRCLES:
+        return draft.chosen(good)
+    contrast = np.abs(fit.contrast)
+    relative = fit.residual / np.maximum(contrast, 1e-9)
+    usual = max(float(np.median(relative[good])), LEAST_TYPICAL)
+    part = contrast / float(np.median(contrast[good]))
+    good &= (part > LEAST_CONTRAST) & (part < MOST_CONTRAST) & (relative < lenience * MOST_RESIDUAL * usual)
+    if good.sum() < MIN_CIRCLES:
+        return draft.chosen(good)
+    expected = local_maps(
+        draft.label[good],
+        fit.pixels[good],
+        draft.label,
+        hexagonal=draft.hexagonal,
+        sigma_px=_sigma(_of(fit, good)),
+        leave_out=True,
+    )
+    off = np.linalg.norm(fit.pixels - expected.pixels, axis=1) / _spacing(expected)
+    good &= (off < OFF_PLACE) | (expected.gain > MOST_GAIN)
+    return draft.chosen(good)
+
+
+def _spacing(around: PlaneMap) -> FloatArray:
+    """Return the distances (M,) of neighbours, px, in the mean over directions."""
+    return np.asarray(np.sqrt(np.maximum(np.abs(np.linalg.det(around.first)), 1e-9)))
+
+
+def _again(grey: GreyImage, draft: _Draft) -> _Draft:
+    """Return the draft fitted with maps through the circles as they are now."""
+    fit = draft.fit
+    around = local_maps(draft.label, fit.pixels, draft.label, hexagonal=draft.hexagonal, sigma_px=_sigma(fit))
+    radius = _radius(fit.maps, around.first)
+    fresh = _fitted(grey, fit.pixels, around, radius, fit.blur_px)
+    return _judged(replace(draft, fit=fresh, around=around, radius=radius))
+
+
+def _larger(grey: GreyImage, draft: _Draft) -> _Draft | None:
+    """Return the draft with circles found beside its own, or None if there are none."""
+    fit = draft.fit
+    places, around = _beside(draft, (grey.shape[1], grey.shape[0]))
+    if not len(places):
+        return None
+    blur = np.full(len(places), float(np.median(fit.blur_px)))
+    tried = _fitted(grey, around.pixels, around, draft.radius, blur)
+    near = np.linalg.norm(tried.pixels - around.pixels, axis=1) < OFF_PLACE * _spacing(around)
+    joined = replace(
+        draft,
+        label=np.concatenate([draft.label, places[near]]),
+        fit=_joined(fit, _of(tried, near)),
+        around=_joined(draft.around, _of(around, near)),
+    )
+    judged = _judged(joined)
+    return judged if len(judged.label) > len(draft.label) else None
+
+
+def _with_map_error(fit: CircleFit, radius: float) -> FloatArray:
+    """Return standard deviations (N,) of the centres that know how uncertain the curvature of the map is.
+
+    What size and slant of a circle are off (growth e, in radii) shows the error of the map's first derivatives. At the
+    rim, where it is not small, the map is foretold from one side, and what its polynomial leaves of order n in the
+    distance t has second over first derivatives (n - 1) / t. A quarter of that, times the radius, moves the centre.
+    """
+    misshapen = np.sqrt((fit.growth**2).sum(axis=1))
+    size_px = np.sqrt(np.abs(np.linalg.det(fit.maps)))
+    return np.asarray(np.hypot(fit.sigma_px, MAP_ERROR * radius * misshapen * size_px))
+
+
+def _beside(draft: _Draft, size_px: tuple[int, int]) -> tuple[IntArray, PlaneMap]:
+    """Return the places next to circles of the draft that would lie in the image whole, and the maps there."""
+    step = np.array([(1, 0), (-1, 0), (0, 1), (0, -1), *([(1, -1), (-1, 1)] if draft.hexagonal else [])])
+    known = {tuple(label) for label in draft.label.tolist()}
+    beside = {tuple(place) for place in (draft.label[:, None] + step).reshape(-1, 2).tolist()}
+    places = np.array(sorted(beside - known), np.int64).reshape(-1, 2)
+    around = local_maps(draft.label, draft.fit.pixels, places, hexagonal=draft.hexagonal, sigma_px=_sigma(draft.fit))
+    extent = draft.radius * np.sqrt((around.first**2).sum(axis=2))
+    inside = ((around.pixels > extent) & (around.pixels < np.array(size_px) - 1.0 - extent)).all(axis=1)
+    fine = inside & (around.support >= SUPPORT) & (around.gain < MOST_GAIN) & (extent.min(axis=1) > 1.0)
+    return places[fine], _of(around, fine)
+
+
+def _finished(draft: _Draft, size_px: tuple[int, int]) -> CircleGrid | None:
+    fit, label = draft.fit, draft.label
+    expected = local_maps(label, fit.pixels, label, hexagonal=draft.hexagonal, sigma_px=_sigma(fit), leave_out=True)
+    off = np.linalg.norm(fit.pixels - expected.pixels, axis=1) / _spacing(expected)
+    sure = expected.gain < SURE_GAIN
+    evidence = GridEvidence(
+        unexplained=float(np.median(fit.residual / np.abs(fit.contrast))),
+        misshapen=float(np.median(np.sqrt((fit.growth**2).sum(axis=1)))),
+        displaced=float(np.median(off[sure])) if sure.any() else np.inf,
+        corners=float(np.hypot(*fit.harmonics.mean(axis=0).T).max()),
+    )
+    empty, _ = _beside(draft, size_px)
+    first = label.min(axis=0)
+    label, empty = label - first, empty - first
+    order = np.lexsort(label.T)
+    return CircleGrid(
+        label=label[order],
+        pixels=fit.pixels[order],
+        sigma_px=_with_map_error(fit, draft.radius)[order],
+        maps=fit.maps[order],
+        hexagonal=draft.hexagonal,
+        bright=draft.bright,
+        radius=draft.radius,
+        empty=empty,
+        evidence=evidence,
+    )
+
+
+def _of(table: Rows, which: BoolArray) -> Rows:
+    """Return some rows of a class of arrays."""
+    return type(table)(**{name: getattr(table, name)[which] for name in _names(table)})
+
+
+def _joined(one: Rows, two: Rows) -> Rows:
+    return type(one)(**{name: np.concatenate([getattr(one, name), getattr(two, name)]) for name in _names(one)})
+
+
+def _names(table: CircleFit | PlaneMap) -> list[str]:
+    return [field.name for field in fields(table)]

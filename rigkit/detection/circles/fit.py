@@ -1,0 +1,118 @@
+"""The fit of circles to an image: where their centres are, and how certain.
+
+A circle's edge is c + M w + H(w, w) / 2 over the unit circle |w| = 1 of its plane, in radii. c is the image of the
+centre. It differs from the middle of the ellipse seen by H, the curvature of the map from the plane to the image, which
+slant and lens bring about: H comes from the circle's neighbours, c, M, the blur and the light from the pixels
+(circles.c).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.detection.saddles.response import GreyImage
+from rigkit.kernels import circles as kernel
+
+__all__ = ["CircleFit", "fit_circles"]
+
+RULES = kernel.CircleRules.of(
+    near_sigmas=4.0,
+    near_px=3.0,
+    least_blur=0.25,
+    most_blur=12.0,
+    most_move_px=1.0,
+    most_growth=0.2,
+    most_light=1.5,
+    converged_px=1e-4,
+    iterations=25,
+    fewest=16,
+)
+MODEL_SIGMA_PX = 5e-4
+"""What a centre is off without noise, by how the edge model departs from rendered circles: 0.0003 to 0.0007 px."""
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class CircleFit:
+    """N circles as fitted.
+
+    Attributes
+    ----------
+    pixels : (N, 2) images of the centres.
+    maps : (N, 2, 2) px per radius; a turn of the circle in itself is as it was given.
+    growth : (N, 3) symmetric part of how `maps` differ from those given: size, and stretch along and aslant of x.
+    covariance : (N, 2, 2) of `pixels` for white noise, px^2.
+    blur_px, brightness, contrast, residual : (N,) blur of the edge, level around the circle, what the level inside is
+        more, RMS residual in grey levels.
+    count : (N,) pixels.
+    harmonics : (N, 4, 2) cosine and sine of harmonics 3 to 6 of the edge, in radii.
+    valid : (N,)
+    """
+
+    pixels: FloatArray
+    maps: FloatArray
+    growth: FloatArray
+    covariance: FloatArray
+    blur_px: FloatArray
+    brightness: FloatArray
+    contrast: FloatArray
+    residual: FloatArray
+    count: FloatArray
+    harmonics: FloatArray
+    valid: BoolArray
+
+    @property
+    def sigma_px(self) -> FloatArray:
+        """Return the standard deviations (N,) of a coordinate of `pixels`, the mean of both."""
+        return np.asarray(np.sqrt(0.5 * np.trace(self.covariance, axis1=1, axis2=2)))
+
+
+def fit_circles(
+    grey: GreyImage, pixels: FloatArray, maps: FloatArray, bends: FloatArray, blur_px: FloatArray, reach: FloatArray
+) -> CircleFit:
+    """Fit circles to their pixels.
+
+    Parameters
+    ----------
+    pixels : (N, 2) centres, known to a few tenths of the radius.
+    maps : (N, 2, 2) px per radius.
+    bends : (N, 2, 3) second derivatives of the image by the plane, xx, xy and yy, px per radius squared.
+    blur_px : (N,) where to start.
+    reach : (N,) radii to which pixels are the circle's own: half the way to its neighbours.
+    """
+    extent = np.sqrt((maps**2).sum(axis=2)).max(axis=1, initial=1.0)
+    margin = np.abs(bends).sum(axis=(1, 2)) + 1.0
+    own = np.minimum(reach * extent, extent + RULES.near_sigmas * blur_px + RULES.near_px) + margin
+    finite = own[np.isfinite(own)]
+    most = int((2.0 * float(finite.max(initial=1.0)) + 2.0) ** 2)
+    most = min(most, grey.size)
+    rows = kernel.fit_circles(grey, pixels, maps, bends, blur_px, reach, most, RULES)
+    found = rows[:, 2:6].reshape(-1, 2, 2)
+    with np.errstate(all="ignore"):
+        relative = np.linalg.solve(np.where(np.isfinite(maps), maps, 1.0) + 1e-9 * np.eye(2), found)
+    growth = np.stack(
+        [
+            0.5 * (relative[:, 0, 0] + relative[:, 1, 1]) - 1.0,
+            0.5 * (relative[:, 0, 0] - relative[:, 1, 1]),
+            0.5 * (relative[:, 0, 1] + relative[:, 1, 0]),
+        ],
+        axis=1,
+    )
+    covariance = rows[:, [6, 7, 7, 8]].reshape(-1, 2, 2) * (rows[:, 12] ** 2)[:, None, None]
+    covariance = covariance + MODEL_SIGMA_PX**2 * np.eye(2)
+    valid = (rows[:, 14] > 0.5) & (rows[:, 9] > RULES.least_blur) & np.isfinite(rows).all(axis=1)
+    return CircleFit(
+        pixels=rows[:, :2],
+        maps=found,
+        growth=growth,
+        covariance=covariance,
+        blur_px=rows[:, 9],
+        brightness=rows[:, 10],
+        contrast=rows[:, 11],
+        residual=rows[:, 12],
+        count=rows[:, 13],
+        harmonics=rows[:, 15:].reshape(-1, 4, 2),
+        valid=valid,
+    )

@@ -1,0 +1,224 @@
+"""Lattices of blobs: which blobs are neighbours, and the place of each in a square or a hexagonal lattice.
+
+The distance of two blobs is measured in radii, by the mean of their two ellipses. To second order in the distance that
+is free of slant, perspective and lens: over the whole of a grid it is its pitch over its radius, and neither a pitch
+nor a radius in pixels need be known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.detection.circles.blobs import Blobs
+
+__all__ = ["LabelledBlobs", "blob_lattices"]
+
+NEAREST_BLOBS = 16
+"""Nearest blobs that are looked at: at 75 degrees of slant nine others lie nearer than the next one uphill."""
+PITCHES = (2.02, 9.0)
+"""Distances of neighbours, in radii: circles do not touch, and are not lost in their sheet."""
+ALIKE_BLOBS = 2.0
+"""Ratio of the areas of neighbours, and of the axes in which they differ most: between circles a seventh of their
+distance from the camera apart the first is 1.5."""
+EQUAL_STEPS = 1.25
+"""Ratio of the distances of one blob to its neighbours; the next ones of a square lattice have 1.41."""
+MIN_LABELLED = 6
+OFF_STEP = 0.3
+"""How far from a whole number of steps a neighbour may lie, in steps."""
+TRUST = 0.5
+"""Weight of a basis that comes from the neighbours, in links."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class LabelledBlobs:
+    """Blobs in a lattice.
+
+    Attributes
+    ----------
+    index : (N,) which of all blobs.
+    label : (N, 2) whole steps along the two directions of the lattice; the second lies clockwise (from u to v) of the
+        first, by 90 degrees of the sheet, or by 60.
+    hexagonal : whether by 60.
+    """
+
+    index: IntArray
+    label: IntArray
+    hexagonal: bool
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Links:
+    """Directed links between neighbours, each in both directions."""
+
+    source: IntArray
+    target: IntArray
+    vector: FloatArray
+
+
+def blob_lattices(blobs: Blobs) -> list[LabelledBlobs]:
+    """Return the lattices of `blobs`, in no particular order; a blob is in one at most."""
+    if len(blobs) < MIN_LABELLED:
+        return []
+    links = _links(blobs)
+    count, member = connected_components(
+        coo_array((np.ones(len(links.source)), (links.source, links.target)), shape=(len(blobs),) * 2), directed=False
+    )
+    sizes = np.bincount(member, minlength=count)
+    out = []
+    for number in np.flatnonzero(sizes >= MIN_LABELLED):
+        here = member[links.source] == number
+        own = _Links(links.source[here], links.target[here], links.vector[here])
+        found = _labelled(blobs, own)
+        if found is not None:
+            out.append(found)
+    return out
+
+
+def _links(blobs: Blobs) -> _Links:
+    near = min(NEAREST_BLOBS + 1, len(blobs))
+    _, index = cKDTree(blobs.pixels).query(blobs.pixels, k=near)
+    source, target = np.repeat(np.arange(len(blobs)), near - 1), index[:, 1:].ravel()
+    vector = blobs.pixels[target] - blobs.pixels[source]
+    square = blobs.shape @ blobs.shape
+    mean = 0.5 * (square[source] + square[target])
+    distance = np.sqrt(np.einsum("ni,nij,nj->n", vector, np.linalg.inv(mean), vector))
+    # The ratio of the axes' squares in which two ellipses differ most, from the trace and the determinant.
+    between = np.linalg.solve(square[source], square[target])
+    trace, det = np.trace(between, axis1=1, axis2=2), np.linalg.det(between)
+    top = 0.5 * (trace + np.sqrt(np.maximum(trace**2 - 4.0 * det, 0.0)))
+    low = det / np.maximum(top, 1e-12)
+    alike = (
+        (top < ALIKE_BLOBS**2)
+        & (low > ALIKE_BLOBS**-2)
+        & (np.abs(np.log(np.maximum(det, 1e-12))) < 2.0 * np.log(ALIKE_BLOBS))
+    )
+    alike &= blobs.sign[source] == blobs.sign[target]
+    alike &= (distance > PITCHES[0]) & (distance < PITCHES[1])
+    steps = np.where(alike, distance, np.inf).reshape(len(blobs), -1)
+    # The second nearest: a single speck beside a circle must not hide its neighbours.
+    limit = EQUAL_STEPS * np.sort(steps, axis=1)[:, min(1, near - 2)]
+    fair = alike & (distance < limit[source]) & (distance < limit[target])
+    one = coo_array((np.ones(int(fair.sum())), (source[fair], target[fair])), shape=(len(blobs),) * 2).tocsr()
+    both = coo_array(one.multiply(one.T))
+    return _Links(both.row, both.col, blobs.pixels[both.col] - blobs.pixels[both.row])
+
+
+def _labelled(blobs: Blobs, links: _Links) -> LabelledBlobs | None:
+    """Return the blobs of one component with their places, or None where they make no lattice."""
+    index, flat = np.unique(np.concatenate([links.source, links.target]), return_inverse=True)
+    source, target = flat.reshape(2, -1)
+    count = len(index)
+    hexagonal = _triangular(source, target, count)
+    basis0, seed = _seed(blobs.shape[index], source, target, links.vector, count, hexagonal)
+    if basis0 is None:
+        return None
+    label = np.zeros((count, 2), np.int64)
+    basis = np.zeros((count, 2, 2))
+    known = np.zeros(count, bool)
+    basis[seed], known[seed] = basis0, True
+    while True:
+        ahead = np.flatnonzero(known[source] & ~known[target])
+        if not len(ahead):
+            break
+        step, fits = _steps(basis[source[ahead]], links.vector[ahead], hexagonal)
+        ahead, step = ahead[fits], step[fits]
+        if not len(ahead):
+            break
+        reached, first = np.unique(target[ahead], return_index=True)
+        label[reached] = label[source[ahead[first]]] + step[first]
+        basis[reached] = basis[source[ahead[first]]]
+        _refine(basis, reached, source, target, links.vector, hexagonal)
+        known[reached] = True
+    agreed = _agreed(label, known, basis, source, target, links.vector, hexagonal)
+    if agreed.sum() < MIN_LABELLED:
+        return None
+    return LabelledBlobs(index[agreed], label[agreed], hexagonal)
+
+
+def _triangular(source: IntArray, target: IntArray, count: int) -> bool:
+    """Return whether most links are sides of triangles, as in a hexagonal lattice; in a square one none is."""
+    linked = coo_array((np.ones(len(source)), (source, target)), shape=(count, count)).tocsr()
+    sides = (linked @ linked).multiply(linked)
+    return bool(2 * sides.nnz > linked.nnz)
+
+
+def _seed(
+    shape: FloatArray, source: IntArray, target: IntArray, vector: FloatArray, count: int, hexagonal: bool
+) -> tuple[FloatArray | None, int]:
+    """Return the basis (2, 2), steps in its columns, of the blob with the most links, and that blob."""
+    degree = np.bincount(source, minlength=count)
+    # Among those, one whose neighbours have many links themselves lies in the middle.
+    weight = degree + np.bincount(source, degree[target].astype(np.float64), count) / 100.0
+    seed = int(weight.argmax())
+    own = vector[source == seed]
+    level = np.linalg.solve(shape[seed], own.T).T
+    angle = np.arctan2(level[:, 1], level[:, 0])
+    wanted = np.pi / 3.0 if hexagonal else np.pi / 2.0
+    turn = np.mod(angle[None, :] - angle[:, None], 2.0 * np.pi)
+    off = np.abs(turn - wanted)
+    first, second = np.unravel_index(off.argmin(), off.shape)
+    if off[first, second] > 0.35 * wanted:
+        return None, seed
+    return np.stack([own[first], own[second]], axis=1), seed
+
+
+def _steps(basis: FloatArray, vector: FloatArray, hexagonal: bool) -> tuple[IntArray, BoolArray]:
+    """Return the steps (N, 2) that vectors are, and whether each is one to a neighbour."""
+    det = np.linalg.det(basis)
+    fine = np.abs(det) > 1e-9
+    own = np.where(fine[:, None, None], basis, np.eye(2))
+    parts = np.linalg.solve(own, vector[:, :, None])[:, :, 0]
+    step = np.rint(parts)
+    near = (np.abs(parts - step) < OFF_STEP).all(axis=1)
+    total = np.abs(step).sum(axis=1)
+    # Steps of 60 degrees: the third direction is the second less the first.
+    neighbour = (total == 1) | (hexagonal & (total == 2) & (step.sum(axis=1) == 0) & (step[:, 0] != 0))
+    return step.astype(np.int64), fine & near & neighbour
+
+
+def _refine(
+    basis: FloatArray, which: IntArray, source: IntArray, target: IntArray, vector: FloatArray, hexagonal: bool
+) -> None:
+    """Fit the bases of the blobs `which` to their own links, in place."""
+    mine = np.isin(source, which)
+    at = source[mine]
+    step, fits = _steps(basis[at], vector[mine], hexagonal)
+    at, step, own = at[fits], step[fits].astype(np.float64), vector[mine][fits]
+    normal = np.zeros((len(basis), 2, 2))
+    right = np.zeros((len(basis), 2, 2))
+    np.add.at(normal, at, step[:, :, None] * step[:, None, :])
+    np.add.at(right, at, own[:, :, None] * step[:, None, :])
+    normal = normal[which] + TRUST * np.eye(2)
+    right = right[which] + TRUST * basis[which]
+    basis[which] = right @ np.linalg.inv(normal)
+
+
+def _agreed(
+    label: IntArray,
+    known: BoolArray,
+    basis: FloatArray,
+    source: IntArray,
+    target: IntArray,
+    vector: FloatArray,
+    hexagonal: bool,
+) -> BoolArray:
+    """Return which blobs have a place of their own that most of their links agree on."""
+    count = len(label)
+    inside = known[source] & known[target]
+    step, fits = _steps(basis[source], vector, hexagonal)
+    same = inside & fits & (label[source] + step == label[target]).all(axis=1)
+    good, all_links = (np.bincount(source[part], minlength=count) for part in (same, inside))
+    fine = known & (2 * good > all_links)
+    # Of two in one place the one with more links stays.
+    order = np.lexsort((-good, label[:, 1], label[:, 0], ~fine))
+    ranked = label[order]
+    again = np.zeros(count, bool)
+    again[1:] = (ranked[1:] == ranked[:-1]).all(axis=1)
+    fine[order[again]] = False
+    return fine

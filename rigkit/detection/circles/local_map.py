@@ -1,0 +1,142 @@
+"""How the plane of a lattice maps to the image around each of its circles: a polynomial through their neighbours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import factorial
+
+import numpy as np
+
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+
+__all__ = ["HEXAGONAL_BASIS", "SQUARE_BASIS", "PlaneMap", "local_maps", "plane_basis"]
+
+SQUARE_BASIS = np.eye(2)
+HEXAGONAL_BASIS = np.array([[1.0, 0.5], [0.0, np.sqrt(0.75)]])
+"""Steps of a lattice in its plane, in distances of neighbours, as columns."""
+
+MAP_REACH = 3.1
+"""Neighbours up to so many distances away have a say: 36 in a hexagonal lattice, 28 in a square one."""
+NEXT = 1.1
+"""Farther than the nearest, nearer than the next but one."""
+MAP_WIDTH = 1.6
+"""Standard deviation of their Gaussian weight, distances."""
+TYPICAL_DERIVATIVES = (np.inf, np.inf, 0.3, 0.1, 0.03)
+"""How large derivatives of order 0 to 4 are taken to be, in distances of neighbours: each is a third of the one before
+where a lens or slant bends the lattice as strongly as its circles can still be linked. What the scatter of few
+neighbours would make of them beyond that is kept out."""
+LEAST_RIDGE = 1e-9
+"""Keeps the equations solvable where there are fewer neighbours than terms."""
+SLIGHT = 1e-4
+"""Pull on the perspective of a homography, as a part of its neighbours' weight: few neighbours leave it open."""
+POWERS = tuple((order - k, k) for order in range(len(TYPICAL_DERIVATIVES)) for k in range(order + 1))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PlaneMap:
+    """The image as a function of the plane (in distances of neighbours) around M places.
+
+    Attributes
+    ----------
+    pixels : (M, 2) of the places.
+    first : (M, 2, 2) derivatives by the plane's x and y, in columns.
+    second : (M, 2, 3) second derivatives, xx, xy and yy.
+    support : (M,) circles behind the fit, without the one at the place itself.
+    surrounded : (M,) whether there is a circle on every side.
+    gain : (M,) standard deviation of `pixels` for circles of standard deviation 1.
+    """
+
+    pixels: FloatArray
+    first: FloatArray
+    second: FloatArray
+    support: IntArray
+    surrounded: BoolArray
+    gain: FloatArray
+
+
+def plane_basis(hexagonal: bool) -> FloatArray:
+    return HEXAGONAL_BASIS if hexagonal else SQUARE_BASIS
+
+
+def local_maps(
+    label: IntArray,
+    pixels: FloatArray,
+    places: IntArray,
+    *,
+    hexagonal: bool,
+    sigma_px: float,
+    leave_out: bool = False,
+) -> PlaneMap:
+    """Return the maps around the `places` (M, 2) of a lattice, from its circles at `label` (N, 2) and `pixels` (N, 2).
+
+    `sigma_px` : standard deviation of the circles. `leave_out` : without the circles at the places themselves.
+    """
+    step = plane_basis(hexagonal)
+    side = int(np.ceil(MAP_REACH * 1.2)) + 1
+    offset = np.stack(np.meshgrid(np.arange(-side, side + 1), np.arange(-side, side + 1)), axis=-1).reshape(-1, 2)
+    plane = offset @ step.T
+    near = np.hypot(*plane.T) < MAP_REACH
+    offset, plane = offset[near], plane[near]
+    low = np.minimum(label.min(axis=0), places.min(axis=0)) - side
+    size = np.maximum(label.max(axis=0), places.max(axis=0)) + side + 1 - low
+    table = np.full((*size, 2), np.nan)
+    table[tuple((label - low).T)] = pixels
+    around = table[tuple((places[:, None, :] + offset - low).transpose(2, 0, 1))]
+    known: BoolArray = np.isfinite(around[..., 0])
+    centre = (offset == 0).all(axis=1)
+    if leave_out:
+        known = known & ~centre
+    x, y = plane.T
+    terms = np.stack([x**i * y**j / (factorial(i) * factorial(j)) for i, j in POWERS], axis=1)
+    weight = np.where(known, np.exp(-0.5 * (x * x + y * y) / MAP_WIDTH**2), 0.0)
+    # Relative to the place's neighbourhood, or the pull on derivatives would act on coordinates of the image.
+    middle = np.nansum(np.where(known[..., None], around, 0.0), axis=1) / np.maximum(known.sum(axis=1), 1)[:, None]
+    values = np.where(known[..., None], around - middle[:, None], 0.0)
+    pitch = np.sqrt(np.nanmean(np.where(known[..., None], values, np.nan) ** 2) / np.mean(x * x + y * y))
+    ridge = np.array([(sigma_px / (pitch * TYPICAL_DERIVATIVES[i + j])) ** 2 for i, j in POWERS]) + LEAST_RIDGE
+    homography, own = _homographies(plane, values, weight)
+    rest = np.where(known[..., None], values - homography, 0.0)
+    normal = np.einsum("mk,ki,kj->mij", weight, terms, terms, optimize=True) + np.diag(ridge)
+    solved = np.linalg.solve(normal, np.swapaxes(terms[None] * weight[..., None], 1, 2))
+    parts = solved @ rest + np.pad(own, ((0, 0), (0, len(POWERS) - own.shape[1]), (0, 0)))
+    gain = np.sqrt((solved[:, 0] ** 2).sum(axis=1))
+    return PlaneMap(
+        parts[:, 0] + middle,
+        np.swapaxes(parts[:, 1:3], 1, 2),
+        np.swapaxes(parts[:, 3:6], 1, 2),
+        (known & ~centre).sum(axis=1),
+        (known | centre)[:, np.hypot(x, y) < NEXT].all(axis=1),
+        gain,
+    )
+
+
+def _homographies(plane: FloatArray, values: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return M homographies through `values` (M, K, 2) over `plane` (K, 2), at the K places, and their derivatives
+    (M, 6, 2) of order 0 to 2 at the origin.
+
+    Slant bends a lattice as polynomials of low degree cannot follow; what the homography leaves, they can.
+    """
+    count = len(values)
+    x, y = plane.T
+    # x' (1 + g . w) = c + A w is linear in c, A and g.
+    simple = np.stack([np.ones_like(x), x, y], axis=1)
+    each = np.zeros((count, len(plane), 2, 8))
+    each[:, :, 0, 0:3] = each[:, :, 1, 3:6] = simple
+    each[..., 6:] = -values[..., None] * plane[None, :, None, :]
+    rows = each.reshape(count, -1, 8)
+    weighted = rows * np.repeat(weight, 2, axis=1)[..., None]
+    scale = np.maximum((weight[..., None] * values**2).mean(axis=(1, 2)), 1e-9)
+    pull = np.zeros((count, 8))
+    pull[:, :6], pull[:, 6:] = LEAST_RIDGE, (scale * SLIGHT)[:, None]
+    normal = np.swapaxes(weighted, 1, 2) @ rows + pull[:, :, None] * np.eye(8)
+    found = np.linalg.solve(normal, np.swapaxes(weighted, 1, 2) @ values.reshape(count, -1, 1))[..., 0]
+    offset, matrix, bend = found[:, [0, 3]], found[:, [1, 2, 4, 5]].reshape(count, 2, 2), found[:, 6:]
+    below = 1.0 + bend @ plane.T
+    # Where a horizon comes near there is nothing to foretell.
+    below = np.where(below > 0.1, below, 0.1)
+    at = (offset[:, None] + np.einsum("mij,kj->mki", matrix, plane)) / below[..., None]
+    first = matrix - offset[:, :, None] * bend[:, None, :]
+    second = -first[:, :, :, None] * bend[:, None, None, :]
+    second = second + np.swapaxes(second, 2, 3)
+    parts = [offset, first[..., 0], first[..., 1], second[..., 0, 0], second[..., 0, 1], second[..., 1, 1]]
+    return at, np.stack(parts, axis=1)

@@ -1,0 +1,37 @@
+"""Circle grids: every lattice of circles of the image, on the grids of the boards whose circles they can be."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
+from rigkit.detection.circles.find import find_grids
+from rigkit.detection.circles.place import lone_part, placed_on
+from rigkit.detection.targets.base import Finder, Search
+
+__all__ = ["CirclesFinder"]
+
+
+class CirclesFinder(Finder):
+    """Grids with a place in one board are named after it, if no other board and no other grid can be meant."""
+
+    def find(self, search: Search, boards: Sequence[Board]) -> list[BoardDetection]:
+        fewest = min([search.min_corners, *(board.corner_count for board in boards)])
+        out: list[BoardDetection] = []
+        names: list[str | None] = []
+        for grid in find_grids(search.grey, fewest):
+            fits = [(board, placed) for board in boards if (placed := placed_on(grid, board)) is not None]
+            if fits:
+                out.append(fits[0][1])
+                names.append(fits[0][0].board_id if len(fits) == 1 else None)
+                continue
+            parts = [part for board in boards if (part := lone_part(grid, board)) is not None]
+            if parts:
+                out.append(parts[0])
+                names.append(None)
+        often = Counter(names)
+        return [
+            item if name is None or often[name] > 1 else item.named(name) for item, name in zip(out, names, strict=True)
+        ]

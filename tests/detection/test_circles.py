@@ -1,0 +1,132 @@
+"""Circle grids: found, named, and their centres without the bias of slant and lens, as fine as the pixels allow."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rigkit.benchmark.blanks import BLANKS, blank
+from rigkit.benchmark.scenes import BenchScene, bench_camera, bench_field_deg, one_board
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
+from rigkit.core.patterns.circles import Circles
+from rigkit.detection.circles.find import find_grids
+from rigkit.detection.detect import detect_boards
+from rigkit.detection.saddles.response import grey_image
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
+from rigkit.synthetic.scene import Panel, PlacedBoard
+
+REGULAR = Board("r", 10, 8, 25.0, 25.0, pattern=Circles(diameter_mm=15.0))
+ASYMMETRIC = Board("a", 4, 11, 40.0, 40.0, pattern=Circles("asymmetric", diameter_mm=16.0))
+HEXAGONAL = Board("h", 12, 9, 20.0, 20.0, pattern=Circles("hexagonal", diameter_mm=15.0))
+LEFT = Board("l", 12, 8, 20.0, 20.0, pattern=Circles("hexagonal", "left", diameter_mm=15.0))
+WHITE = Board("w", 4, 11, 40.0, 40.0, pattern=Circles("asymmetric", diameter_mm=16.0, inverted=True))
+BOARDS = [REGULAR, ASYMMETRIC, HEXAGONAL, LEFT, WHITE]
+
+MOST_BIAS_PX = 0.01
+"""Of the centres of a slanted grid without noise, in the mean."""
+HONEST = (0.8, 1.25)
+"""RMS error over predicted standard deviation."""
+SINGLE_PX = 0.12
+"""A rim circle of a grid seen by a fisheye at 60 degrees from near by: its neighbours lie on one side."""
+
+
+def errors(found: BoardDetection, truth: BoardDetection) -> np.ndarray:
+    return found.pixels - truth.lattice()[found.grid[:, 1], found.grid[:, 0]]
+
+
+def slanted(board: Board, lens: str, off_deg: float, slant_deg: float, distance_mm: float) -> BenchScene:
+    """Return a scene of one board whose middle lies off the axis and which is slanted to the ray that it lies on."""
+    camera = bench_camera(lens)
+    off = exp_so3(np.radians(off_deg) * np.array([-0.35, 0.94, 0.0]))
+    rotation = off @ exp_so3(np.radians(slant_deg) * np.array([0.6, 0.8, 0.0]))
+    points = board.points()
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    place = Rigid3(rotation, off @ np.array([0.0, 0.0, distance_mm]) - rotation @ middle)
+    return BenchScene(lens, (PlacedBoard(board, place),), (), camera, bench_field_deg(lens))
+
+
+@pytest.mark.parametrize("board", BOARDS, ids=lambda board: board.board_id)
+@pytest.mark.parametrize("lens", ["regular", "fisheye"])
+def test_grids_are_found_whole_and_named_with_honest_sigmas(board: Board, lens: str) -> None:
+    relative = []
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        scene = one_board(rng, lens=lens, board=board)
+        (found,) = detect_boards(scene.render(noise_levels=2.0, rng=rng), [board])
+        truth = scene.truth()[0]
+        assert found.board_id == board.board_id
+        assert found.complete
+        turns = [found, *(found.turned(k) for k in board.turns)]
+        tried = (errors(turn, truth) / turn.sigma_px[:, None] for turn in turns)
+        relative.append(min(tried, key=lambda e: float(np.abs(e).max())))
+    assert HONEST[0] < np.sqrt((np.concatenate(relative) ** 2).mean()) < HONEST[1]
+
+
+@pytest.mark.parametrize(
+    ("lens", "off_deg", "slant_deg", "distance_mm"),
+    [("regular", 20.0, 60.0, 500.0), ("fisheye", 60.0, 0.0, 300.0), ("fisheye", 60.0, 60.0, 350.0)],
+)
+@pytest.mark.parametrize("board", [REGULAR, HEXAGONAL], ids=["regular", "hexagonal"])
+def test_the_centre_is_the_image_of_the_centre(
+    board: Board, lens: str, off_deg: float, slant_deg: float, distance_mm: float
+) -> None:
+    scene = slanted(board, lens, off_deg, slant_deg, distance_mm)
+    (found,) = find_grids(grey_image(scene.render(blur_px=0.7)))
+    truth = scene.truth()[0].pixels
+    nearest = np.linalg.norm(found.pixels[:, None] - truth, axis=2).argmin(axis=1)
+    off = found.pixels - truth[nearest]
+    assert len(found) > 0.7 * len(truth)
+    assert np.abs(off.mean(axis=0)).max() < MOST_BIAS_PX
+    assert np.sqrt(np.median(off**2)) < MOST_BIAS_PX
+    assert np.abs(off).max() < SINGLE_PX
+
+
+def test_a_cut_grid_gets_its_place_where_its_borders_show() -> None:
+    scene = slanted(ASYMMETRIC, "regular", 24.0, 20.0, 520.0)
+    truth = scene.truth()[0]
+    assert len(truth.grid) < ASYMMETRIC.corner_count
+    (found,) = detect_boards(scene.render(), [ASYMMETRIC])
+    assert found.board_id == "a"
+    assert np.abs(errors(found, truth)).max() < SINGLE_PX
+
+
+def test_circles_that_something_covers_are_left_out() -> None:
+    rng = np.random.default_rng(3)
+    scene = one_board(rng, lens="regular", board=HEXAGONAL)
+    place = scene.boards[0].world_from_board
+    middle = HEXAGONAL.points().mean(axis=0) - np.array([0.0, 0.0, 2.0])
+    bar = Panel(Rigid3(place.rotation, place.apply(middle[None])[0]), 50.0, 28.0, 0.4)
+    scene = replace(scene, occluders=(bar,))
+    (found,) = detect_boards(scene.render(noise_levels=2.0, rng=rng), [HEXAGONAL])
+    truth, clear = scene.truth()[0], scene.clear()[0]
+    assert found.board_id == "h"
+    assert clear.sum() - 8 <= len(found.grid) < len(truth.grid)
+    assert np.abs(errors(found, truth)).max() < SINGLE_PX
+
+
+def test_a_grid_of_another_size_is_no_board() -> None:
+    rng = np.random.default_rng(0)
+    scene = one_board(rng, lens="regular", board=REGULAR)
+    image = scene.render(noise_levels=2.0, rng=rng)
+    smaller = replace(REGULAR, board_id="s", columns=9, rows=7)
+    assert detect_boards(image, [smaller]) == ()
+    larger = replace(REGULAR, board_id="m", columns=11, rows=8)
+    assert all(found.board_id is None for found in detect_boards(image, [larger]))
+    assert detect_boards(image, [replace(REGULAR, pattern=Circles(diameter_mm=15.0, inverted=True))]) == ()
+
+
+@pytest.mark.parametrize("name", sorted(set(BLANKS) - {"dots", "staggered"}))
+def test_nothing_is_found_where_no_circles_are(name: str) -> None:
+    for seed in range(3):
+        assert find_grids(blank(name, np.random.default_rng(seed))) == []
+
+
+def test_chessboards_are_no_grids_of_circles() -> None:
+    for blur_px in (0.7, 2.0):
+        rng = np.random.default_rng(5)
+        scene = one_board(rng, lens="regular", board=Board("b", 9, 6, 30.0, 30.0))
+        assert find_grids(grey_image(scene.render(blur_px=blur_px, noise_levels=2.0, rng=rng))) == []
