@@ -48,8 +48,9 @@ class CalibrationComparison:
     Attributes
     ----------
     difference : where both had boards, after the best rotation.
-    predicted_px : the rms difference that two calibrations of one camera would have on average, there and after the
-        best rotation.
+    predicted_px : the usual rms difference of two calibrations of one camera, there and after the best rotation: half
+        of them differ by more. A difference is mostly of one kind (the focal length), and the mean of its square is
+        that of a few large ones.
     chance : probability of a difference at least this large if both were calibrations of the same, unchanged camera,
         each in its own model.
     same_model : both are of one model and size.
@@ -119,10 +120,8 @@ def compare_calibrations(
     expected_by[-1, -1] = 1.0 + REFIT_SIGMA**2
     found = difference.difference_px[difference.covered].reshape(-1)
     chance = _chance(found - turn @ (turn.T @ found), together, expected_by, drawn)
-    expected = float(np.sum(gram * expected_by))
-    return CalibrationComparison(
-        difference, float(np.sqrt(max(expected, 0.0))), chance, _kind(a.camera) == _kind(b.camera)
-    )
+    usual = float(np.sqrt(np.median(np.einsum("kn,kn->n", drawn, gram @ drawn))))
+    return CalibrationComparison(difference, usual, chance, _kind(a.camera) == _kind(b.camera))
 
 
 def _chance(found: FloatArray, design: FloatArray, covariance: FloatArray, drawn: FloatArray) -> float:
