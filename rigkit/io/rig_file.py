@@ -44,13 +44,14 @@ class SavedRig:
     """What a rig file says: cameras and cam_from_rig by name, the covariance of all intrinsics and of the mounts of all
     cameras but the first, and the corners' sigma; None in a file that does not say (another tool's rig). `scale_sigma`
     is how well all lengths are known from the boards' squares, relative; 0 where nobody stated it. `freedom` are the
-    degrees of freedom of the covariance."""
+    degrees of freedom of the covariance, `overdispersion` is by how much more frames disagree than corners."""
 
     cameras: dict[str, tuple[Camera, Rigid3]]
     covariance: FloatArray | None
     sigma_px: float | None = None
     scale_sigma: float = 0.0
     freedom: float = math.inf
+    overdispersion: float = 1.0
 
 
 def rig_text(rig: RigCalibration) -> str:
@@ -112,7 +113,15 @@ def load_saved_rig(path: str | Path) -> SavedRig:
         sigma_px = None if "sigma_px" not in data else real(data["sigma_px"])
         scale_sigma = real(data.get("scale_sigma", 0.0))
         freedom = math.inf if data.get("freedom") is None else real(data["freedom"])
-    return SavedRig(cameras, covariance, sigma_px, scale_sigma, freedom)
+        overdispersion = real(data.get("overdispersion", data.get("spread", 1.0)))
+    return SavedRig(
+        cameras,
+        covariance,
+        sigma_px,
+        scale_sigma=scale_sigma,
+        freedom=freedom,
+        overdispersion=overdispersion,
+    )
 
 
 def is_rig_file(path: str | Path) -> bool:

@@ -15,11 +15,11 @@ from rigkit.planning.information import HeldBoards
 
 __all__ = ["Reach", "held_boards", "outline_mm"]
 
-DRAWN = 1200
-"""Poses tried: they fill place, tilt and size evenly."""
+DRAWN, KEPT = 2400, 900
+"""Poses tried, and so many at the most of those that can be held: both fill place, tilt and size evenly."""
 TILT_DEG = (15.0, 60.0)
 """Flat views do not tell the focal length; beyond, corners are seen too slantingly to be placed well."""
-SIZE_SHARE = (0.35, 1.3)
+SIZE_SHARE = (0.35, 1.6)
 """Diagonal of a board in the image, as a part of the image's height."""
 UPRIGHT_SHARE = 0.3
 """So many of the poses turn the board by 90 degrees."""
@@ -31,7 +31,7 @@ MOVES = 5
 """Times that a board which sticks out of the image is pushed back into it."""
 INWARD = 0.12
 """A board that the lens does not see whole goes this part of the way to the middle of the image each time."""
-MAX_SLANT_DEG = 72.0
+MAX_SLANT_DEG = 76.0
 """Of a line of sight to the board's normal, at any of its corners."""
 
 
@@ -88,8 +88,8 @@ def held_boards(camera: Camera, board: Board, reach: Reach, points_mm: Points | 
             "at the distances allowed; take a smaller board, or allow other distances"
         )
     points = board.points() if points_mm is None else points_mm
-    seen = np.tile(board.exists(), (int(good.sum()), 1))
-    return HeldBoards(points, rotation[good], translation[good], seen)
+    chosen = np.flatnonzero(good)[:KEPT]
+    return HeldBoards(points, rotation[chosen], translation[chosen], np.tile(board.exists(), (len(chosen), 1)))
 
 
 def _even(count: int, dimensions: int) -> FloatArray:

@@ -28,7 +28,7 @@ from rigkit.io.images import read_image
 from rigkit.report.overlay import draw_boards
 from rigkit.workflows.camera_files import import_camera
 
-__all__ = ["DetectOptions", "DetectionResult", "detect_in_images"]
+__all__ = ["DetectOptions", "DetectionResult", "detect_in_images", "images_in"]
 
 IMAGE_ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
 
@@ -95,7 +95,7 @@ def detect_in_images(
         )
     if options.jobs is not None and options.jobs < 1:
         raise InputError(f"--jobs {options.jobs}: at least one process is needed")
-    images = list(_images([Path(path) for path in paths]))
+    images = list(images_in([Path(path) for path in paths]))
     boards = tuple(load_board(path) for path in options.boards)
     if options.camera is not None and not boards:
         raise InputError("--camera helps to find boards of known size only; give them, such as --board a9x6.toml")
@@ -120,7 +120,8 @@ def detect_in_images(
     return DetectionResult(found, failures)
 
 
-def _images(paths: Sequence[Path]) -> Iterator[Path]:
+def images_in(paths: Sequence[Path]) -> Iterator[Path]:
+    """Yield images, and those in folders by name, each once; raises InputError where there is none."""
     seen: set[Path] = set()
     for path in paths:
         inside = [path]

@@ -1,0 +1,103 @@
+"""`rigkit check CALIBRATION IMAGES`: does it still hold, or what moved? Exit code 1 where it does not."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from rigkit.core.errors import ExitCode, InputError
+
+__all__ = ["HELP", "add_arguments", "run"]
+
+HELP = "fresh pictures against a calibration or a rig: still holds, or what moved and by how much"
+
+CHECK_EXAMPLES = """examples:
+  rigkit check calibration.json fresh/*.png                 one to three pictures of the board
+  rigkit check rig.json fresh/left fresh/right --board 9x6x25 --fix rig-fixed.json
+  rigkit check rig.json left1.png right1.png --scene         any textured scene, no board
+  rigkit check calibration.json fresh -r check.html --register calib/history/cam.jsonl --temperature 21.5
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = CHECK_EXAMPLES
+    parser.add_argument("calibration", type=Path, metavar="CALIBRATION|RIG.json")
+    parser.add_argument(
+        "images",
+        nargs="+",
+        type=Path,
+        metavar="IMAGE|FOLDER",
+        help="a rig: a folder a camera, or moment by moment",
+    )
+    parser.add_argument(
+        "--board", action="append", default=[], metavar="CxRxMM|BOARD.toml", help="default: those of the calibration"
+    )
+    parser.add_argument("--scene", action="store_true", help="no board: matches of any textured scene (rigs)")
+    parser.add_argument("--length", type=float, metavar="MM", help="tell what it costs in a length so long,")
+    parser.add_argument("--distance", type=float, metavar="MM", help="at this distance")
+    parser.add_argument("--fix", type=Path, metavar="FILE.json", help="write the calibration with the smallest change")
+    parser.add_argument("-r", "--report", type=Path, metavar="FILE.html", help="write a page to look at")
+    parser.add_argument("--register", type=Path, metavar="FILE.jsonl", help="add the check to this register")
+    parser.add_argument("--temperature", type=float, metavar="C", help="when the pictures were taken, for the register")
+    parser.add_argument("--force", action="store_true", help="replace existing files")
+    parser.add_argument("--json", action="store_true", help="print the result for programs")
+
+
+def run(args: argparse.Namespace) -> int:
+    from rigkit.cli.console import note, print_json, progress_on_stderr
+    from rigkit.report.check_page import check_table
+    from rigkit.report.tables import tables_to_text
+    from rigkit.validation.certificate.contracts import Quantity, Task
+    from rigkit.workflows.check import CheckOptions, check_pictures
+    from rigkit.workflows.folder_session import board_of_words
+
+    if (args.length is None) != (args.distance is None):
+        raise InputError("check: --length and --distance belong together")
+    length = None
+    if args.length is not None:
+        length = Task(quantity=Quantity.LENGTH, size_mm=args.length, distance_mm=args.distance)
+    options = CheckOptions(
+        boards=tuple(board_of_words(words) for words in args.board),
+        scene=args.scene,
+        length=length,
+        fix=args.fix,
+        report=args.report,
+        history=args.register,
+        temperature_c=args.temperature,
+        force=args.force,
+    )
+    done = check_pictures(args.calibration, args.images, options, progress=progress_on_stderr())
+    check = done.check
+    if args.json:
+        change = check.change
+        print_json(
+            {
+                "holds": check.holds,
+                "chance": check.chance,
+                "statement": done.words.headline,
+                "cause": None if change is None else change.cause.kind,
+                "camera": None if change is None else change.cause.camera,
+                "amounts": [] if change is None else change.amounts.tolist(),
+                "sigmas": [] if change is None else change.sigmas.tolist(),
+                "units": [] if change is None else list(change.cause.units),
+                "size_px": None if change is None else change.size_px,
+                "cost": check.cost,
+                "cost_unit": check.cost_unit,
+                "rms_px": check.rms_px,
+                "rms_fixed_px": check.rms_fixed_px,
+                "expected_px": check.expected_px,
+                "left_out": [list(entry) for entry in done.left_out],
+            }
+        )
+    else:
+        print(done.words.headline)
+        for sentence in done.words.sentences:
+            print(f"  {sentence}")
+        if not check.holds:
+            print(tables_to_text([check_table(check)]))
+    for image, reason in done.left_out:
+        note(f"left out: {image}: {reason}")
+    for path in done.written:
+        note(f"{path} written")
+    return ExitCode.WELL if check.holds else ExitCode.CHECK_FAILED

@@ -1,0 +1,207 @@
+"""A check of a calibration in words, as a table and as a page; a register of checks as drift plots."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from html import escape
+
+import numpy as np
+
+from rigkit.cameras.compare import grid_pixels
+from rigkit.core.tables import Cell, Column, Table
+from rigkit.io.history_file import HistoryEntry
+from rigkit.report.render import drawing, render, shown_table
+from rigkit.validation.sentinel.judge import ALARM_CHANCE, SentinelCheck
+
+__all__ = ["CheckWords", "check_page", "check_table", "check_words", "drift_svg", "history_page"]
+
+DRAWN_WIDTH, DRIFT_HEIGHT, MARGIN = 600.0, 190.0, 56.0
+ARROWS = (21, 16)
+ARROW_LENGTH = 0.05
+"""The largest arrow is as long as this part of the image's width."""
+CONTROL_SIGMAS = 3.0
+"""Control limits: what unchanged cameras leave in one of 370 checks."""
+LINE, LIMIT, ALARM, GRID = "#1f4e8c", "#b3261e", "#b3261e", "#e3e7ee"
+
+
+@dataclass(frozen=True, slots=True)
+class CheckWords:
+    """What a check states: the headline, then sentences."""
+
+    headline: str
+    sentences: tuple[str, ...]
+
+
+def check_words(check: SentinelCheck) -> CheckWords:
+    """Return what a check states."""
+    frames = "1 fresh frame" if check.frames == 1 else f"{check.frames} fresh frames"
+    p = f"p = {check.chance:.3g}"
+    sentences = [
+        f"Fresh points lie {check.rms_px:.3f} px rms from where the calibration has them ({check.corners} points in "
+        f"{frames}); {check.expected_px:.3f} px are expected."
+    ]
+    change = check.change
+    if check.holds:
+        headline = f"Still holds ({p}, {frames})"
+        if change is not None and check.chance < ALARM_CHANCE:
+            sentences.append(
+                f"More than chance is there, of no importance: {change}; it moves the projection by "
+                f"{change.size_px:.3f} px."
+            )
+    elif check.unexplained or change is None:
+        headline = f"Does NOT hold ({p}): nothing that moved explains it"
+        sentences.append(
+            f"{check.rms_fixed_px:.2f} px rms are left after the best explanation: another camera, lens or image size, "
+            "or another board; check what was photographed, and calibrate anew."
+        )
+    else:
+        headline = f"Does NOT hold ({p}): {change}"
+        sentences.append(
+            f"It moves the projection by {change.size_px:.3f} px rms; after the correction {check.rms_fixed_px:.3f} px "
+            "are left."
+        )
+    if change is not None:
+        what = "the projection over the image" if check.cost_unit == "px" else "the length"
+        sentences.append(f"In {what} it makes an error of {check.cost:.3g} {check.cost_unit} rms.")
+    return CheckWords(headline, tuple(sentences))
+
+
+def check_table(check: SentinelCheck) -> Table:
+    """Return everything that may have happened, each as if it alone had."""
+    columns = (
+        Column("if this alone happened"),
+        Column("amount"),
+        Column("chance without it"),
+        Column("explains", "", 1),
+    )
+    rows = []
+    for change in check.tried:
+        amounts = ", ".join(
+            f"{a:+.3g} ± {s:.2g} {unit}"
+            for a, s, unit in zip(change.amounts, change.sigmas, change.cause.units, strict=True)
+        )
+        named = check.change is not None and change.cause is check.change.cause
+        rows.append(
+            (Cell(change.cause.words), Cell(amounts), Cell(f"{change.chance:.2g}"), Cell(change.gain, best=named))
+        )
+    none = (Cell("nothing can be told from these pictures"), Cell(""), Cell(""), Cell(None))
+    return Table("causes", "What may have happened", columns, tuple(rows) or (none,))
+
+
+def check_page(check: SentinelCheck, title: str, provenance: Mapping[str, str]) -> str:
+    """Return the check as an HTML page that needs no other file."""
+    words = check_words(check)
+    return render(
+        "check.html",
+        title=title,
+        lead=words.headline,
+        verdict="holds" if check.holds else "does not hold",
+        colour="pass" if check.holds else "fail",
+        sentences=words.sentences,
+        drawings=[(name, drawing(change_svg(check, c))) for c, name in enumerate(check.watched.names)],
+        tables=[shown_table(check_table(check))],
+        provenance=provenance,
+    )
+
+
+def change_svg(check: SentinelCheck, c: int) -> str:
+    """Draw how the best explanation moves the projection of camera `c` of what stays where it is, magnified."""
+    before, after = check.watched.cameras[c], check.fixed.cameras[c]
+    turn = check.fixed.cam_from_rig[c].rotation @ check.watched.cam_from_rig[c].rotation.T
+    pixels = grid_pixels(before.size_px, ARROWS).reshape(-1, 2)
+    rays, valid = before.unproject(pixels)
+    moved, seen = after.project(rays[valid] @ turn.T)
+    start, by = pixels[valid][seen], (moved - pixels[valid])[seen]
+    longest = float(np.linalg.norm(by, axis=1).max(initial=0.0))
+    zoom = DRAWN_WIDTH / before.size_px[0]
+    times = ARROW_LENGTH * before.size_px[0] / longest if longest > 1e-6 else 0.0
+    height = zoom * before.size_px[1]
+    path = "".join(
+        f"M{x:.1f} {y:.1f}l{dx:.1f} {dy:.1f}" for (x, y), (dx, dy) in zip(zoom * start, zoom * times * by, strict=True)
+    )
+    dots = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in zoom * start)
+    words = f"{longest:.3f} px at most, magnified {times:.0f} times" if times else "nothing moves"
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="-1 -1 {DRAWN_WIDTH + 2:g} {height + 26:.1f}" role="img" '
+        f'font-family="sans-serif" font-size="13"><title>{words}</title>'
+        f'<rect width="{DRAWN_WIDTH:g}" height="{height:.1f}" fill="#fbfcfd" stroke="#b8c0cc"/>'
+        f'<path d="{path}" stroke="{LINE}" stroke-width="1.3" fill="none"/>'
+        f'<path d="{dots}" stroke="{LINE}" stroke-width="3" stroke-linecap="round"/>'
+        f'<text x="0" y="{height + 18:.1f}" fill="#333">{words}</text></svg>'
+    )
+
+
+def history_page(entries: Sequence[HistoryEntry], title: str, provenance: Mapping[str, str]) -> str:
+    """Return the register as a page: one drift plot for each thing that may change, then every entry."""
+    names = list(dict.fromkeys(name for entry in entries for name in entry.amounts))
+    alarms = sum(not entry.holds for entry in entries)
+    lead = f"{len(entries)} entries from {entries[0].date[:10]} to {entries[-1].date[:10]}, {alarms} of them alarms."
+    return render(
+        "history.html",
+        title=title,
+        lead=lead,
+        drawings=[(name, drawing(drift_svg(entries, name))) for name in names],
+        tables=[shown_table(_history_table(entries))],
+        provenance=provenance,
+    )
+
+
+def drift_svg(entries: Sequence[HistoryEntry], name: str) -> str:
+    """Draw one amount over time with its standard deviations, zero (as calibrated), and the control limits."""
+    own = [entry for entry in entries if name in entry.amounts]
+    days = np.array([datetime.fromisoformat(entry.date).timestamp() / 86400.0 for entry in own])
+    value, sigma = np.array([entry.amounts[name] for entry in own]).T
+    limit = CONTROL_SIGMAS * float(np.median(sigma))
+    top = 1.1 * max(limit, float((np.abs(value) + sigma).max()))
+    span = max(float(np.ptp(days)), 1e-9)
+    x = MARGIN + (DRAWN_WIDTH - MARGIN - 14.0) * ((days - days[0]) / span if len(own) > 1 else np.full(1, 0.5))
+    middle = 0.5 * (DRIFT_HEIGHT - 24.0)
+    y = middle * (1.0 - value / top)
+    out = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 -6 {DRAWN_WIDTH:g} {DRIFT_HEIGHT + 6:g}" role="img" '
+        f'font-family="sans-serif" font-size="12"><title>{escape(name)}</title>'
+    ]
+    for level, colour, dash in ((0.0, "#8a94a3", ""), (limit, LIMIT, "5 4"), (-limit, LIMIT, "5 4")):
+        height = middle * (1.0 - level / top)
+        out.append(
+            f'<line x1="{MARGIN}" x2="{DRAWN_WIDTH - 6}" y1="{height:.1f}" y2="{height:.1f}" stroke="{colour}" '
+            f'stroke-dasharray="{dash}"/><text x="{MARGIN - 5}" y="{height + 4:.1f}" text-anchor="end" '
+            f'fill="#333">{level:.2g}</text>'
+        )
+    line = "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, y, strict=True))
+    out.append(f'<path d="M{line}" fill="none" stroke="{LINE}" stroke-opacity="0.4"/>')
+    for a, b, s, entry in zip(x, y, middle * sigma / top, own, strict=True):
+        colour = LINE if entry.holds else ALARM
+        out.append(
+            f'<line x1="{a:.1f}" x2="{a:.1f}" y1="{b - s:.1f}" y2="{b + s:.1f}" stroke="{colour}"/>'
+            f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3.4" fill="{colour}">'
+            f"<title>{escape(_of(entry, name))}</title></circle>"
+        )
+    for a, entry, anchor in {0: (x[0], own[0], "start"), 1: (x[-1], own[-1], "end")}.values():
+        out.append(
+            f'<text x="{a:.1f}" y="{DRIFT_HEIGHT - 6:.1f}" text-anchor="{anchor}" fill="#333">{entry.date[:10]}</text>'
+        )
+    return "".join([*out, "</svg>"])
+
+
+def _of(entry: HistoryEntry, name: str) -> str:
+    value, sigma = entry.amounts[name]
+    heat = "" if entry.temperature_c is None else f", {entry.temperature_c:g} °C"
+    return f"{entry.date[:16]}{heat}: {value:+.3g} ± {sigma:.2g}; {entry.verdict}"
+
+
+def _history_table(entries: Sequence[HistoryEntry]) -> Table:
+    columns = (
+        Column("date"), Column("what"), Column("frames", "", 0), Column("rms", "px"), Column("p"),
+        Column("temperature", "°C", 1), Column("verdict"),
+    )  # fmt: skip
+    rows = tuple(
+        (
+            Cell(e.date[:16].replace("T", " ")), Cell(f"{e.kind} of {e.source}"), Cell(float(e.frames)), Cell(e.rms_px),
+            Cell(f"{e.chance:.2g}"), Cell(e.temperature_c), Cell(e.verdict, failed=not e.holds),
+        )
+        for e in entries
+    )  # fmt: skip
+    return Table("entries", "Entries", columns, rows)

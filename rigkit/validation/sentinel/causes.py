@@ -1,0 +1,142 @@
+"""What may have happened to a camera or a rig, each as directions in which everything calibrated would change."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.calibration.uncertainty import projection_design
+from rigkit.cameras.base import Camera, image_center
+from rigkit.cameras.compare import grid_pixels
+from rigkit.core.arrays import FloatArray
+from rigkit.geometry.rotation import skew
+from rigkit.planning.goal import Goal, projection_goal
+from rigkit.validation.sentinel.evidence import Watched
+
+__all__ = ["Cause", "causes_of", "lens_goals"]
+
+FIELD_GRID = (24, 18)
+FIT_RANK = 1e-9
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Cause:
+    """Something that may have happened.
+
+    Attributes
+    ----------
+    kind : "focus", "principal point", "distortion", "rotation", "shift", "moved" (both), "lens" or "scale".
+    camera : name of the camera that it happened to; None for all of the rig.
+    directions : (T, m) of theta.
+    units : of the m amounts.
+    """
+
+    kind: str
+    camera: str | None
+    directions: FloatArray
+    units: tuple[str, ...]
+
+    @property
+    def words(self) -> str:
+        """What happened, in words."""
+        told = {
+            "focus": "the focus of {} changed",
+            "principal point": "the principal point of {} moved",
+            "distortion": "the distortion of {} changed",
+            "lens": "the lens of {} changed in several ways",
+            "rotation": "{} turned on its mount",
+            "shift": "{} was shifted",
+            "moved": "{} was shifted and turned",
+            "scale": "the scale changed: all baselines alike, or the board's squares are not what they were",
+        }
+        return told[self.kind].format("the camera" if self.camera is None else f"camera '{self.camera}'")
+
+
+def causes_of(watched: Watched) -> list[Cause]:
+    """Return what may have happened, the simplest first."""
+    several = len(watched.cameras) > 1
+    lenses, mounts = [], []
+    for c, (name, camera) in enumerate(zip(watched.names, watched.cameras, strict=True)):
+        own = name if several else None
+        whole = np.zeros((watched.size, 6))
+        whole[watched.lens(c)] = _lens_directions(camera)
+        units: tuple[str, ...] = ("%", *("px",) * 5)
+        for kind, part in (
+            ("focus", slice(0, 1)),
+            ("principal point", slice(1, 3)),
+            ("distortion", slice(3, 6)),
+            ("lens", slice(0, 6)),
+        ):
+            lenses.append(Cause(kind, own, whole[:, part], units[part]))
+        if several and (c > 0 or len(watched.cameras) > 2):
+            turn = _mount_directions(watched, c)
+            mounts.append(Cause("rotation", own, turn[:, :3], ("deg",) * 3))
+            mounts.append(Cause("shift", own, turn[:, 3:], ("mm",) * 3))
+            mounts.append(Cause("moved", own, turn, ("deg",) * 3 + ("mm",) * 3))
+    if several:
+        scale = np.zeros((watched.size, 1))
+        for c, pose in enumerate(watched.cam_from_rig[1:], start=1):
+            scale[watched.mount(c)][3:, 0] = 0.01 * pose.translation_mm
+        mounts.append(Cause("scale", None, scale, ("%",)))
+    return sorted([*lenses, *mounts], key=lambda cause: cause.directions.shape[1])
+
+
+def lens_goals(watched: Watched) -> list[Goal]:
+    """Return for each camera the rms change of its projection, after the best rotation, over its image."""
+    out = []
+    for c, camera in enumerate(watched.cameras):
+        goal = projection_goal(camera)
+        weight = np.zeros((watched.size, watched.size))
+        weight[watched.lens(c), watched.lens(c)] = goal.weight
+        out.append(Goal(weight, goal.unit, goal.what))
+    return out
+
+
+def _lens_directions(camera: Camera) -> FloatArray:
+    """Return the changes of the parameters (P, 6) that scale the image by a hundredth, move it by a pixel right and
+    down, and bend it by a pixel at its rim with the third, fifth and seventh power of the radius: as near as the model
+    comes."""
+    pixels = grid_pixels(camera.size_px, FIELD_GRID).reshape(-1, 2)
+    rays, valid = camera.unproject(pixels)
+    axis, seen = camera.project(np.array([0.0, 0.0, 1.0]))
+    offset = pixels[valid] - (axis if seen else image_center(camera.size_px))
+    rim = float(np.linalg.norm(offset, axis=1).max())
+    part = offset / rim
+    squared = (part**2).sum(axis=1, keepdims=True)
+    one = np.ones(len(offset))
+    fields = [
+        0.01 * offset,
+        np.stack([one, 0.0 * one], axis=-1),
+        np.stack([0.0 * one, one], axis=-1),
+        part * squared,
+        part * squared**2,
+        part * squared**3,
+    ]
+    wanted = np.stack([f.reshape(-1) for f in fields], axis=-1)
+    p = camera.parameters.size
+    design = projection_design(camera, rays[valid])[:, :p].transpose(2, 0, 1).reshape(-1, p)
+    scale = np.linalg.norm(design, axis=0)
+    safe = np.where(scale > 0.0, scale, 1.0)
+    return np.asarray(np.linalg.lstsq(design / safe, wanted, rcond=FIT_RANK)[0] / safe[:, None])
+
+
+def _mount_directions(watched: Watched, c: int) -> FloatArray:
+    """Return the change of theta (T, 6) where camera `c` turns by a degree about its own axes or is shifted by a
+    millimetre along them: x in it becomes exp(w) x + v."""
+    out = np.zeros((watched.size, 6))
+    degree = np.radians(1.0)
+    if c > 0:
+        # exp(w) (R x + t) + v: the turn swings t, too.
+        pose = watched.cam_from_rig[c]
+        run = watched.mount(c)
+        out[run.start : run.start + 3, :3] = degree * np.eye(3)
+        out[run.start + 3 : run.stop, :3] = -degree * skew(pose.translation_mm)
+        out[run.start + 3 : run.stop, 3:] = np.eye(3)
+        return out
+    # The first is the frame: when it moves, all others move the other way.
+    for k, pose in enumerate(watched.cam_from_rig[1:], start=1):
+        run = watched.mount(k)
+        out[run.start : run.start + 3, :3] = -degree * pose.rotation
+        out[run.start + 3 : run.stop, 3:] = -pose.rotation
+    return out

@@ -1,0 +1,160 @@
+"""What any textured scene says of a rig: matches that leave the epipolar geometry. No board, and no scale.
+
+Of a pair of cameras every match has a Sampson distance r with derivatives J by theta: a change d moves r by J d, so
+scores -J^T r have the mean J^T J d, as those of boards have. Matches of one part of the image share their errors: by
+how much more the parts disagree than independent matches would, counts against all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rigkit.affine.features import match_affine_features
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels
+from rigkit.core.errors import DegenerateError
+from rigkit.core.progress import Progress, silent
+from rigkit.geometry.rotation import skew
+from rigkit.geometry.sampson import sampson_distances
+from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
+from rigkit.planning.goal import Goal
+from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
+from rigkit.validation.sentinel.judge import SentinelCheck, judge_evidence
+
+__all__ = ["PairMatches", "check_matches", "check_scene"]
+
+FEATURES = 2500
+MIN_FRAME_MATCHES = 40
+"""Fewer matches of a frame may be of one surface, or wrong."""
+PARTS = 4
+"""Columns and rows of the parts of an image that are taken as independent."""
+CAUCHY_SIGMAS = 2.5
+REACH_SIGMAS = 0.2
+"""Derivatives are differences over this part of the standard deviations of theta."""
+NULL_RANK = 1e-9
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PairMatches:
+    """Matches of cameras number `first` and `second` in one frame: pixels (N, 2) in either."""
+
+    first: int
+    second: int
+    pixels1: Pixels
+    pixels2: Pixels
+
+
+def check_scene(
+    watched: Watched, frames: Sequence[Sequence[Any]], cost: Goal | None = None, *, progress: Progress = silent
+) -> SentinelCheck:
+    """Return the verdict on images of a textured scene, one a camera in every frame.
+
+    Raises DegenerateError where too few matches are found.
+    """
+    found = []
+    for k, images in enumerate(frames):
+        progress("matches", k, len(frames))
+        for c in range(1, len(images)):
+            matches = match_affine_features(images[0], images[c], tilts=(1.0,), features_per_view=FEATURES)
+            if len(matches.pixels1) >= MIN_FRAME_MATCHES:
+                found.append(PairMatches(0, c, matches.pixels1, matches.pixels2))
+    progress("matches", len(frames), len(frames))
+    return check_matches(watched, found, cost)
+
+
+def check_matches(watched: Watched, matches: Sequence[PairMatches], cost: Goal | None = None) -> SentinelCheck:
+    """Return the verdict on matches of a rig's cameras.
+
+    Raises DegenerateError where there are too few.
+    """
+    if not matches:
+        raise DegenerateError(
+            f"check: less than {MIN_FRAME_MATCHES} matches in every frame; show the rig a scene with texture and depth"
+        )
+    return judge_evidence(watched, lambda now: _evidence(now, matches), cost)
+
+
+def _evidence(watched: Watched, matches: Sequence[PairMatches]) -> FreshEvidence:
+    n = watched.size
+    information, scores, variances = [], [], []
+    squares, count = 0.0, 0
+    for pair in matches:
+        residual, jacobian, good = _linearised(watched, pair)
+        sigma = float(np.median(np.abs(residual))) * SIGMA_OF_MEDIAN
+        weight = 1.0 / (1.0 + (residual / (CAUCHY_SIGMAS * sigma)) ** 2)
+        by_part = _parts(pair.pixels1[good], watched.cameras[pair.first].size_px)
+        own, score = np.zeros((PARTS**2, n, n)), np.zeros((PARTS**2, n))
+        np.add.at(own, by_part, weight[:, None, None] * jacobian[:, :, None] * jacobian[:, None, :])
+        np.add.at(score, by_part, -(weight * residual)[:, None] * jacobian)
+        information.append(own.sum(axis=0))
+        scores.append(score.sum(axis=0))
+        variances.append(sigma**2 * _disagreement(own / sigma**2, score / sigma**2))
+        squares, count = squares + float((weight * residual**2).sum()), count + len(residual)
+    usual = float(np.median(variances))
+    share = usual / np.array(variances)
+    # Matches have a scatter of their own, which the images themselves show: nothing else is expected of them.
+    rms = float(np.sqrt(squares / count))
+    return FreshEvidence(
+        information=share[:, None, None] * np.array(information),
+        score=share[:, None] * np.array(scores),
+        variance_px2=usual,
+        rms_px=rms,
+        expected_px=rms,
+        corners=count,
+        left_out=0,
+    )
+
+
+def _linearised(watched: Watched, pair: PairMatches) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return the Sampson distances (M,) px of the matches that the cameras see, their derivatives (M, T), and which of
+    N these are."""
+    reach = REACH_SIGMAS * np.sqrt(np.diag(watched.covariance))
+    residual = _distances(watched, pair)
+    jacobian = np.zeros((len(residual), watched.size))
+    for k in np.flatnonzero(reach > 0.0).tolist():
+        step = np.zeros(watched.size)
+        step[k] = reach[k]
+        ahead, behind = _distances(watched.changed(step), pair), _distances(watched.changed(-step), pair)
+        jacobian[:, k] = (ahead - behind) / (2.0 * reach[k])
+    good = np.isfinite(residual) & np.isfinite(jacobian).all(axis=1)
+    return residual[good], jacobian[good], np.asarray(good)
+
+
+def _distances(watched: Watched, pair: PairMatches) -> FloatArray:
+    first, second = (watched.cameras[c] for c in (pair.first, pair.second))
+    motion = watched.cam_from_rig[pair.second] @ watched.cam_from_rig[pair.first].inverse()
+    rays1, seen1 = first.unproject(pair.pixels1)
+    rays2, seen2 = second.unproject(pair.pixels2)
+    found = sampson_distances(
+        skew(motion.translation_mm) @ motion.rotation,
+        rays1,
+        rays2,
+        first.ray_jacobian(pair.pixels1),
+        second.ray_jacobian(pair.pixels2),
+    )
+    return np.where(seen1 & seen2, found, np.nan)
+
+
+def _parts(pixels: Pixels, size_px: tuple[int, int]) -> IntArray:
+    """Return the number of the part of the image in which each of `pixels` (N, 2) lies."""
+    place = np.clip((pixels + 0.5) / np.array(size_px) * PARTS, 0, PARTS - 1).astype(np.int64)
+    return np.asarray(place[:, 1] * PARTS + place[:, 0])
+
+
+def _disagreement(information: FloatArray, score: FloatArray) -> float:
+    """Return by how much more the parts (K, T, T), (K, T) of an image scatter than independent matches would, as a
+    ratio of variances, at least 1; what all have in common is left out."""
+    whole = information.sum(axis=0)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(whole), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(whole * scale[:, None] * scale)
+    seen = values > NULL_RANK * values[-1]
+    root = vectors[:, seen] * scale[:, None] / np.sqrt(values[seen])
+    common = root @ (root.T @ score.sum(axis=0))
+    left = (score - information @ common) @ root
+    used = np.einsum("kii->k", information) > 0.0
+    # The fit takes one part's share of the scatter away.
+    expected = root.shape[1] * (1.0 - 1.0 / max(int(used.sum()), 2))
+    return float(max(1.0, (left**2).sum() / expected))

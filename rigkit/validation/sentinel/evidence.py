@@ -1,0 +1,244 @@
+"""What fresh views of boards say about a camera or a rig: information and score of everything calibrated.
+
+theta are the intrinsics of all cameras, then the mounts of all but the first. Every board in every frame has a pose of
+its own, one for all cameras that see it then, and is eliminated; a change of theta by d leaves scores of mean I d.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from rigkit.calibration.clustered import reduced_by_cluster
+from rigkit.calibration.fit import inliers, sigma_of
+from rigkit.calibration.linearise import view_products
+from rigkit.calibration.observations import Observations
+from rigkit.calibration.poses import refine_poses
+from rigkit.calibration.state import State, evaluate
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import FloatArray, IntArray, Points
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.geometry.board_pose import board_pose
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3, skew
+
+__all__ = ["FreshEvidence", "FreshView", "Watched", "evidence_of"]
+
+MIN_SIGMA_PX = 0.02
+"""No corner is better than this: of exact ones everything would be a change."""
+POSE_ROUNDS = 3
+"""Gauss-Newton steps of a board that several cameras see: the best single view is where they start."""
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Watched:
+    """What is to be checked.
+
+    Attributes
+    ----------
+    names, cameras, cam_from_rig : of one camera or of all of a rig, the first its frame.
+    covariance : (T, T) of theta.
+    sigma_px, overdispersion : of a corner, and by how much more images disagree than independent corners would.
+    freedom : degrees of freedom of the covariance.
+    boards_mm : corners (N, 3) of boards, by name, as the calibration found them; others are as stated.
+    """
+
+    names: tuple[str, ...]
+    cameras: tuple[Camera, ...]
+    cam_from_rig: tuple[Rigid3, ...]
+    covariance: FloatArray
+    sigma_px: float
+    overdispersion: float = 1.0
+    freedom: float = float("inf")
+    boards_mm: Mapping[str, Points] = field(default_factory=dict)
+
+    def lens(self, c: int) -> slice:
+        """Return where the intrinsics of camera `c` stand in theta."""
+        first = sum(camera.parameters.size for camera in self.cameras[:c])
+        return slice(first, first + self.cameras[c].parameters.size)
+
+    def mount(self, c: int) -> slice:
+        """Return where the mount of camera `c` > 0 stands in theta."""
+        first = self.lens(len(self.cameras) - 1).stop + 6 * (c - 1)
+        return slice(first, first + 6)
+
+    @property
+    def size(self) -> int:
+        """How many numbers theta has."""
+        return sum(camera.parameters.size for camera in self.cameras) + 6 * (len(self.cameras) - 1)
+
+    def state(self, c: int, observations: Observations, rotation: FloatArray, translation_mm: Points) -> State:
+        """Return camera `c` before boards in these poses, with the shapes that are known of them."""
+        known = [self.boards_mm.get(board.board_id, board.points()) for board in observations.boards]
+        start = State.start(self.cameras[c], rotation, translation_mm, observations)
+        return replace(start, shape=replace(start.shape, flat=np.concatenate(known)))
+
+    def changed(self, change: FloatArray) -> Watched:
+        """Return cameras and mounts after a change (T,) of theta."""
+        cameras = [c.with_parameters(c.parameters + change[self.lens(k)]) for k, c in enumerate(self.cameras)]
+        mounts = [self.cam_from_rig[0]]
+        for k, pose in enumerate(self.cam_from_rig[1:], start=1):
+            w, v = change[self.mount(k)].reshape(2, 3)
+            mounts.append(Rigid3(exp_so3(w) @ pose.rotation, pose.translation_mm + v))
+        return replace(self, cameras=tuple(cameras), cam_from_rig=tuple(mounts))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FreshView:
+    """A board that camera number `camera` saw in a frame: what all cameras of a rig see at one moment."""
+
+    frame: str
+    camera: int
+    view: BoardView
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class FreshEvidence:
+    """What N frames say: information (N, T, T) and score (N, T) in px^2, the variance (px^2) that each counts with
+    where nothing changed, and what the residuals are like: their rms over the `corners` kept, what it should be
+    (`expected_px`), and how many were `left_out`."""
+
+    information: FloatArray
+    score: FloatArray
+    variance_px2: float
+    rms_px: float
+    expected_px: float
+    corners: int
+    left_out: int
+
+
+def evidence_of(watched: Watched, views: Sequence[FreshView]) -> FreshEvidence:
+    """Return what fresh views say of theta.
+
+    Raises InputError without views, DegenerateError where no view has a pose.
+    """
+    if not views:
+        raise InputError("check: no board was found in the pictures; take sharp ones in which the whole board is seen")
+    found = _Placed.of(watched, views)
+    for _ in range(POSE_ROUNDS):
+        products = found.products(watched)
+        n = watched.size
+        step = np.linalg.solve(products[:, n : n + 6, n : n + 6], products[:, n : n + 6, -1:])[..., 0]
+        found = found.moved(np.asarray(step, dtype=np.float64))
+    information, score = reduced_by_cluster(found.products(watched), watched.size, found.frame)
+    squares, count, left_out = found.residual_squares(watched)
+    sigma = max(watched.sigma_px, MIN_SIGMA_PX) * watched.overdispersion
+    return FreshEvidence(
+        information=information,
+        score=score,
+        variance_px2=sigma**2,
+        rms_px=float(np.sqrt(squares / count)),
+        expected_px=float(np.sqrt(2.0) * sigma),
+        corners=count,
+        left_out=left_out,
+    )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Placed:
+    """Boards in frames (G of them, each with a pose rig_from_board and the number of its frame), and per camera its
+    observations, which board each is of, and its weights without what is no corner."""
+
+    rotation: FloatArray
+    translation_mm: FloatArray
+    frame: IntArray
+    observations: tuple[Observations | None, ...]
+    group: tuple[IntArray, ...]
+    weight: tuple[FloatArray, ...]
+
+    @classmethod
+    def of(cls, watched: Watched, views: Sequence[FreshView]) -> _Placed:
+        keys = list(dict.fromkeys((v.frame, v.view.board.board_id) for v in views))
+        number = {key: k for k, key in enumerate(keys)}
+        frames = {name: k for k, name in enumerate(dict.fromkeys(frame for frame, _ in keys))}
+        rotation, translation = np.tile(np.eye(3), (len(keys), 1, 1)), np.zeros((len(keys), 3))
+        most = np.zeros(len(keys), dtype=np.int64)
+        observations: list[Observations | None] = []
+        groups, weights = [], []
+        for c, pose in enumerate(watched.cam_from_rig):
+            own = [v for v in views if v.camera == c]
+            group = np.array([number[v.frame, v.view.board.board_id] for v in own], dtype=np.int64)
+            groups.append(group)
+            if not own:
+                observations.append(None)
+                weights.append(np.zeros((0, 0)))
+                continue
+            seen = Observations.from_views([v.view for v in own])
+            state, weight = _posed(watched, c, seen)
+            back = pose.inverse()
+            for k, g in enumerate(group.tolist()):
+                if seen.present[k].sum() > most[g]:
+                    most[g] = seen.present[k].sum()
+                    rotation[g] = back.rotation @ state.rotation[k]
+                    translation[g] = back.apply(state.translation_mm[k])
+            observations.append(seen)
+            weights.append(weight)
+        frame = np.array([frames[name] for name, _ in keys], dtype=np.int64)
+        return cls(rotation, translation, frame, tuple(observations), tuple(groups), tuple(weights))
+
+    def state(self, watched: Watched, c: int, observations: Observations) -> State:
+        """Return camera `c` before its boards, as their poses in the rig have them."""
+        pose, group = watched.cam_from_rig[c], self.group[c]
+        rotation = pose.rotation @ self.rotation[group]
+        translation = self.translation_mm[group] @ pose.rotation.T + pose.translation_mm
+        return watched.state(c, observations, rotation, translation)
+
+    def products(self, watched: Watched) -> FloatArray:
+        """Return for each board in a frame the sums of the products of its rows, (G, T + 7, T + 7): derivatives by
+        theta and by its pose in the rig, and the residual."""
+        n = watched.size
+        out = np.zeros((len(self.frame), n + 7, n + 7))
+        for c, seen in enumerate(self.observations):
+            if seen is None:
+                continue
+            own = view_products(seen, self.state(watched, c, seen), self.weight[c])
+            p, turn = watched.cameras[c].parameters.size, watched.cam_from_rig[c].rotation
+            follow = np.zeros((len(own), p + 7, n + 7))
+            follow[:, :p, watched.lens(c)] = np.eye(p)
+            follow[:, p : p + 3, n : n + 3] = follow[:, p + 3 : p + 6, n + 3 : n + 6] = turn
+            follow[:, -1, -1] = 1.0
+            if c > 0:
+                # A mount that turns by w swings the board's origin, R t away, with it.
+                lever = self.translation_mm[self.group[c]] @ turn.T
+                run = watched.mount(c).start
+                follow[:, p : p + 6, run : run + 6] = np.eye(6)
+                follow[:, p + 3 : p + 6, run : run + 3] = -skew(lever)
+            np.add.at(out, self.group[c], np.swapaxes(follow, -1, -2) @ own @ follow)
+        return out
+
+    def moved(self, step: FloatArray) -> _Placed:
+        """Return the boards after steps (G, 6) of their poses."""
+        rotation = exp_so3(step[:, :3]) @ self.rotation
+        return replace(self, rotation=rotation, translation_mm=self.translation_mm + step[:, 3:])
+
+    def residual_squares(self, watched: Watched) -> tuple[float, int, int]:
+        """Return the sum of the squared residuals of the corners kept, px^2, how many these are, and how many not."""
+        total, kept, left = 0.0, 0, 0
+        for c, seen in enumerate(self.observations):
+            if seen is not None:
+                used = self.weight[c] > 0.0
+                total += float((evaluate(self.state(watched, c, seen), seen).px[used] ** 2).sum())
+                kept, left = kept + int(used.sum()), left + int((seen.present & ~used).sum())
+        return total, max(kept, 1), left
+
+
+def _posed(watched: Watched, c: int, observations: Observations) -> tuple[State, FloatArray]:
+    """Return every board where its own view by camera `c` puts it, and the weights of its corners, zero for those that
+    stray."""
+    camera, poses = watched.cameras[c], []
+    for view in observations.views:
+        rays, valid = camera.unproject(view.pixels)
+        if valid.sum() < 4:
+            raise DegenerateError(f"image '{view.image}': the lens does not see where board '{view.board.board_id}' is")
+        poses.append(board_pose(rays[valid], view.points()[valid]).cam_from_board)
+    rotation = np.array([pose.rotation for pose in poses])
+    translation = np.array([pose.translation_mm for pose in poses])
+    state = watched.state(c, observations, rotation, translation)
+    state, _ = refine_poses(observations, state, observations.weight)
+    norm = evaluate(state, observations).weighted(observations)
+    kept = inliers(norm, observations, sigma_of(norm, observations.present), camera.size_px)
+    weight = np.where(kept, observations.weight, 0.0)
+    return refine_poses(observations, state, weight)[0], weight

@@ -1,0 +1,236 @@
+"""Does it still hold, or what happened: the score of fresh frames against the covariance of the calibration.
+
+Scores of frames have, where nothing changed, the covariance A + A C A in units of the frames' own scatter, with A their
+information and C the covariance of theta: the frames scatter, and the calibration was a little off from the start. With
+A = L L^T, w = L^+ score has the covariance I + L^T C L, and a change theta += D a moves it by L^T D a. Every cause D is
+fitted alone; the simplest that explains enough is named (Schwarz's criterion), and the chance that unchanged cameras
+show as much of any cause is Bonferroni's bound over F-tests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+from scipy.stats import f as f_distribution
+
+from rigkit.core.arrays import FloatArray
+from rigkit.planning.goal import Goal
+from rigkit.validation.sentinel.causes import Cause, causes_of, lens_goals
+from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched, evidence_of
+
+__all__ = ["Change", "Look", "SentinelCheck", "check_views", "judge_evidence"]
+
+Look: TypeAlias = Callable[[Watched], FreshEvidence]
+"""What fresh frames say, given cameras and mounts."""
+
+ALARM_CHANCE = 0.005
+"""Fresh pictures that unchanged cameras would show more rarely raise an alarm."""
+ALARM_PX = 0.07
+"""What moves the projection by less is of no importance, however surely it is there."""
+ROUNDS = 3
+"""Times that a change is linearised anew where it was found."""
+WILD = 3.0
+"""Corners that scatter so many times as much as the calibration's after every explanation are explained by none."""
+NULL_RANK = 1e-9
+MAX_SIGMA = 100.0
+"""Percent, pixels, degrees, millimetres: what is known no better is not seen at all."""
+RARE = {"lens": 6.0, "moved": 6.0}
+"""Twice the log odds against several things at once: one time in twenty."""
+RARE_IN_RIGS = {"principal point": 6.0}
+"""Mounts turn, by what looks nearly the same, much more often than the glass moves in its barrel."""
+LARGE_FREEDOM = 1e6
+"""As good as infinite, which the F distribution does not take."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Change:
+    """What a cause would have to be: its amounts in `cause.units` and their covariance, its chance if nothing changed,
+    how large it is (the projection moves by `size_px` rms after the best rotation, or a mount by what shows), and by
+    how much it lowers the squared misfit."""
+
+    cause: Cause
+    amounts: FloatArray
+    covariance: FloatArray
+    chance: float
+    size_px: float
+    gain: float
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """Standard deviations of the amounts."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def __str__(self) -> str:
+        values = ", ".join(
+            f"{a:+.3g} +- {s:.2g} {unit}"
+            for a, s, unit in zip(self.amounts, self.sigmas, self.cause.units, strict=True)
+        )
+        return f"{self.cause.words}: {values}"
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class SentinelCheck:
+    """The verdict on fresh pictures.
+
+    Attributes
+    ----------
+    chance : probability that an unchanged camera or rig shows at least as much.
+    change : what explains the pictures best, alarming or not; None where no cause can be told.
+    watched, fixed : as calibrated, and after `change`.
+    step, covariance : change of theta (T,), and its covariance (T, T).
+    rms_px, rms_fixed_px : of the fresh corners before and after.
+    expected_px : rms that corners should have.
+    frames, corners : how many there were.
+    tried : every cause by itself, the simplest first.
+    cost : error that the change makes in the user's measurement (rms over the image), in `cost_unit`.
+    """
+
+    chance: float
+    change: Change | None
+    watched: Watched
+    fixed: Watched
+    step: FloatArray
+    covariance: FloatArray
+    rms_px: float
+    rms_fixed_px: float
+    expected_px: float
+    frames: int
+    corners: int
+    tried: tuple[Change, ...] = ()
+    cost: float = 0.0
+    cost_unit: str = "px"
+
+    @property
+    def unexplained(self) -> bool:
+        """Nothing that may happen to these cameras explains the pictures: another camera, or another board."""
+        return self.rms_fixed_px > WILD * self.expected_px
+
+    @property
+    def holds(self) -> bool:
+        """Nothing says that the calibration does not hold."""
+        if self.unexplained:
+            return False
+        return self.change is None or self.chance >= ALARM_CHANCE or self.change.size_px < ALARM_PX
+
+
+def check_views(watched: Watched, views: Sequence[FreshView], cost: Goal | None = None) -> SentinelCheck:
+    """Return whether fresh views of boards agree with what is `watched`; `cost` weighs a change of theta by what it
+    does to a measurement, by default to the projection.
+
+    Raises as `evidence_of`.
+    """
+    return judge_evidence(watched, lambda now: evidence_of(now, views), cost)
+
+
+def judge_evidence(watched: Watched, look: Look, cost: Goal | None = None) -> SentinelCheck:
+    """Return the verdict on what `look` finds in fresh frames."""
+    evidence = look(watched)
+    whitened = _Whitened.of(watched, evidence)
+    known = [c for c in (_fitted(whitened, cause) for cause in causes_of(watched)) if c is not None]
+    step, covariance, change, chance = np.zeros(watched.size), watched.covariance, None, 1.0
+    fixed, after = watched, evidence
+    if known:
+        chance = min(1.0, len(known) * min(c.chance for c in known))
+        penalty = float(np.log(max(len(whitened.score), 3)))
+        best = max(known, key=lambda c: _evident(c, penalty))
+        amounts, fixed, after = _refined(watched, look, best)
+        step = best.cause.directions @ amounts
+        covariance = watched.covariance + best.cause.directions @ best.covariance @ best.cause.directions.T
+        change = replace(best, amounts=amounts, size_px=_size_px(watched, evidence, step))
+    goals = [cost] if cost is not None else lens_goals(watched)
+    return SentinelCheck(
+        chance=chance,
+        change=change,
+        watched=watched,
+        fixed=fixed,
+        step=step,
+        covariance=covariance,
+        rms_px=evidence.rms_px,
+        rms_fixed_px=after.rms_px,
+        expected_px=evidence.expected_px,
+        frames=len(evidence.score),
+        corners=evidence.corners,
+        tried=tuple(known),
+        cost=float(np.sqrt(max([0.0, *(float(step @ g.weight @ step) for g in goals)]))),
+        cost_unit=goals[0].unit,
+    )
+
+
+def _evident(change: Change, penalty: float) -> float:
+    """Return twice the log odds of a cause: what it explains, less what its numbers and its rarity cost."""
+    kind = change.cause.kind
+    rare = RARE.get(kind, 0.0) + (RARE_IN_RIGS.get(kind, 0.0) if change.cause.camera is not None else 0.0)
+    return change.gain - change.amounts.size * penalty - rare
+
+
+def _refined(watched: Watched, look: Look, change: Change) -> tuple[FloatArray, Watched, FreshEvidence]:
+    """Return the amounts of a change, what is watched after it, and what the frames say then: linearised anew there, as
+    long as that is possible."""
+    amounts = change.amounts
+    fixed = watched.changed(change.cause.directions @ amounts)
+    after = look(fixed)
+    for _ in range(ROUNDS):
+        again = _fitted(_Whitened.of(fixed, after), change.cause)
+        if again is None:
+            break
+        closer = watched.changed(change.cause.directions @ (amounts + again.amounts))
+        then = look(closer)
+        if then.rms_px > after.rms_px:
+            break
+        amounts, fixed, after = amounts + again.amounts, closer, then
+    return amounts, fixed, after
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Whitened:
+    """Scores w (R,), their covariance (R, R) where nothing changed, and how a change of theta moves them (R, T)."""
+
+    score: FloatArray
+    covariance: FloatArray
+    by_theta: FloatArray
+    freedom: float
+
+    @classmethod
+    def of(cls, watched: Watched, evidence: FreshEvidence) -> _Whitened:
+        information = evidence.information.sum(axis=0) / evidence.variance_px2
+        score = evidence.score.sum(axis=0) / evidence.variance_px2
+        # Scaled to a unit diagonal: parameters differ by many powers of ten.
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+        values, vectors = np.linalg.eigh(information * scale[:, None] * scale)
+        seen = values > NULL_RANK * values[-1]
+        root = np.sqrt(values[seen])
+        left = vectors[:, seen] * root / scale[:, None]
+        own = (vectors[:, seen] * scale[:, None]).T @ score / root
+        covariance = np.eye(len(own)) + left.T @ watched.covariance @ left
+        # How much frames scatter is one number from all directions of all frames of the calibration.
+        return cls(own, covariance, left.T, watched.freedom * len(own))
+
+
+def _fitted(whitened: _Whitened, cause: Cause) -> Change | None:
+    """Return what a cause would have to be; None where the frames do not show it."""
+    by_amount = whitened.by_theta @ cause.directions
+    weighed = np.linalg.solve(whitened.covariance, np.column_stack([by_amount, whitened.score]))
+    normal, right = by_amount.T @ weighed[:, :-1], by_amount.T @ weighed[:, -1]
+    size = np.sqrt(np.maximum(np.diag(normal), np.finfo(float).tiny))
+    if np.linalg.cond(normal / np.outer(size, size)) > 1.0 / NULL_RANK:
+        return None
+    covariance = np.linalg.inv(normal / np.outer(size, size)) / np.outer(size, size)
+    if np.diag(covariance).max() > MAX_SIGMA**2:
+        return None
+    amounts = covariance @ right
+    gain = float(right @ amounts)
+    m = len(amounts)
+    freedom = min(whitened.freedom, LARGE_FREEDOM)
+    chance = float(f_distribution.sf(gain / m, m, freedom))
+    return Change(cause, amounts, covariance, chance, 0.0, gain)
+
+
+def _size_px(watched: Watched, evidence: FreshEvidence, step: FloatArray) -> float:
+    """Return how large a change is: over the image of the camera that suffers most, after the best rotation; or what
+    the corners show of it."""
+    shown = float(step @ evidence.information.sum(axis=0) @ step) / evidence.corners
+    lenses = [float(step @ goal.weight @ step) for goal in lens_goals(watched)]
+    return float(np.sqrt(max([0.0, shown, *lenses])))

@@ -1,0 +1,266 @@
+"""Does a calibration, or a rig, still hold? Fresh pictures of boards, or of any scene, against it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rigkit.calibration.clustered import with_block
+from rigkit.calibration.usable import views_of_image
+from rigkit.cameras.base import Camera
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView, grid_turned
+from rigkit.core.errors import InputError, RigkitError
+from rigkit.core.findings import Finding, Severity
+from rigkit.core.progress import Progress, silent
+from rigkit.detection.detect import detect_boards
+from rigkit.geometry.board_pose import board_pose
+from rigkit.io.calibration_file import camera_to_json, findings_to_json, load_calibration
+from rigkit.io.files import ensure_writable, write_together
+from rigkit.io.history_file import HistoryEntry, history_text
+from rigkit.io.images import read_image
+from rigkit.io.rig_file import is_rig_file, load_saved_rig
+from rigkit.planning.candidates import Reach
+from rigkit.planning.goal import Goal
+from rigkit.planning.information import board_of_shape
+from rigkit.report.check_page import CheckWords, check_page, check_words
+from rigkit.validation.certificate.contracts import Task
+from rigkit.validation.sentinel.epipolar import check_scene
+from rigkit.validation.sentinel.evidence import FreshView, Watched
+from rigkit.validation.sentinel.judge import SentinelCheck, check_views
+from rigkit.validation.sentinel.watch import watched_camera
+from rigkit.workflows.detect import images_in
+from rigkit.workflows.next_views import goal_of
+from rigkit.workflows.provenance import digest_line, software_facts
+
+__all__ = ["CheckOptions", "CheckedPictures", "check_pictures", "load_watched"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CheckOptions:
+    """What is in the pictures, what matters, and where the results go."""
+
+    boards: tuple[Board, ...] = ()
+    """Boards that may be in the pictures; (): those of the calibration."""
+    scene: bool = False
+    """The pictures show any textured scene instead of boards (rigs)."""
+    length: Task | None = None
+    """A length at a distance: what a change costs is told in mm."""
+    fix: Path | None = None
+    """File for the calibration with the smallest change that explains the pictures; None: none is written."""
+    report: Path | None = None
+    """File for a page to look at; None: no page."""
+    history: Path | None = None
+    """Register to which the check is added; None: none."""
+    temperature_c: float | None = None
+    """When the pictures were taken, for the register."""
+    force: bool = False
+    """Replace files that exist; what was read is never replaced, and the register only grows."""
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class CheckedPictures:
+    """The verdict, what it says in words, images without a board by the reason, and the files that were written."""
+
+    check: SentinelCheck
+    words: CheckWords
+    left_out: tuple[tuple[str, str], ...]
+    written: tuple[Path, ...]
+
+
+def check_pictures(
+    path: str | Path,
+    images: Sequence[str | Path],
+    options: CheckOptions | None = None,
+    *,
+    progress: Progress = silent,
+) -> CheckedPictures:
+    """Check a calibration, or a rig, with fresh images (or folders of them).
+
+    Of a rig give one folder a camera, in the rig's order or called as its cameras are, with as many images each, taken
+    together in the order of their names; or the images themselves, moment by moment, each in the rig's order.
+
+    Raises
+    ------
+    InputError
+        No covariance, no images, none with a board, or a file that cannot be written.
+    DegenerateError
+        Pictures that say nothing of the camera.
+    """
+    options, source = options or CheckOptions(), Path(path)
+    watched, known = load_watched(source)
+    frames = _frames(watched, [Path(image) for image in images])
+    inputs = [source, *(image for frame in frames for image in frame)]
+    outputs = [target for target in (options.fix, options.report) if target is not None]
+    ensure_writable(outputs, force=options.force, inputs=inputs)
+    cost = None if options.length is None else _cost(watched, options.length)
+    left_out: list[tuple[str, str]] = []
+    if options.scene:
+        if len(watched.cameras) < 2:
+            raise InputError("check: a scene without boards tells of a rig only; one camera needs pictures of a board")
+        check = check_scene(watched, [_read(watched, frame) for frame in frames], cost, progress=progress)
+    else:
+        boards = options.boards or known
+        if not boards:
+            raise InputError("check: a rig's file does not say what boards there are; give --board 9x6x25")
+        views = _views(watched, frames, boards, left_out, progress)
+        check = check_views(watched, views, cost)
+    words = check_words(check)
+    files: dict[Path, str | bytes] = {}
+    if options.fix is not None and check.change is not None:
+        files[options.fix] = fixed_text(source, check)
+    if options.report is not None:
+        facts = {source.name: digest_line(source), **software_facts()}
+        files[options.report] = check_page(check, f"Check of {source.name}", facts)
+    if files:
+        write_together(files, force=options.force)
+    if options.history is not None:
+        entry = HistoryEntry.of_check(check, source, temperature_c=options.temperature_c)
+        write_together({options.history: history_text(options.history, entry)}, force=True)
+    written = (*files, *([options.history] if options.history is not None else []))
+    return CheckedPictures(check=check, words=words, left_out=tuple(left_out), written=written)
+
+
+def load_watched(source: Path) -> tuple[Watched, tuple[Board, ...]]:
+    """Return what a file of a calibration or a rig says, and the boards it knows.
+
+    Raises InputError for another file, or one that does not say how sure it is.
+    """
+    if not is_rig_file(source):
+        calibration = load_calibration(source)
+        boards = tuple(board_of_shape(shape.board_id, shape.points_mm) for shape in calibration.boards)
+        return watched_camera(calibration, source.stem), boards
+    rig = load_saved_rig(source)
+    if rig.covariance is None or rig.sigma_px is None:
+        raise InputError(f"'{source}': the file does not say how sure the rig is; calibrate it with rigkit")
+    return Watched(
+        names=tuple(rig.cameras),
+        cameras=tuple(camera for camera, _ in rig.cameras.values()),
+        cam_from_rig=tuple(pose for _, pose in rig.cameras.values()),
+        covariance=rig.covariance,
+        sigma_px=rig.sigma_px,
+        overdispersion=rig.overdispersion,
+        freedom=rig.freedom,
+    ), ()
+
+
+def _frames(watched: Watched, sources: Sequence[Path]) -> list[list[Path]]:
+    """Return the images of every moment, one a camera."""
+    count = len(watched.cameras)
+    if not sources:
+        raise InputError("check: give fresh images, or a folder of them")
+    if count == 1:
+        return [[image] for image in images_in(sources)]
+    if all(source.is_dir() for source in sources):
+        if len(sources) != count:
+            names = ", ".join(watched.names)
+            raise InputError(f"check: a rig of {count} cameras ({names}) needs {count} folders, got {len(sources)}")
+        by_name = {source.name: source for source in sources}
+        ordered = [by_name[name] for name in watched.names] if set(by_name) == set(watched.names) else sources
+        columns = [list(images_in([source])) for source in ordered]
+        if len({len(column) for column in columns}) > 1:
+            counts = ", ".join(f"{len(column)} in '{s}'" for column, s in zip(columns, ordered, strict=True))
+            raise InputError(f"check: as many images of each camera are needed, taken together: {counts}")
+        return [list(frame) for frame in zip(*columns, strict=True)]
+    images = list(images_in(sources))
+    if len(images) % count:
+        raise InputError(f"check: {len(images)} images are not moments of {count} cameras each ({watched.names})")
+    return [images[k : k + count] for k in range(0, len(images), count)]
+
+
+def _read(watched: Watched, frame: Sequence[Path]) -> list[Any]:
+    """Return the images of a moment; raises InputError where one is of another size than its camera's."""
+    return [_image_of(camera, path) for camera, path in zip(watched.cameras, frame, strict=True)]
+
+
+def _image_of(camera: Camera, path: Path) -> Any:
+    image = read_image(path)
+    if (image.shape[1], image.shape[0]) != camera.size_px:
+        width, height = camera.size_px
+        raise InputError(
+            f"image '{path}' is {image.shape[1]}x{image.shape[0]} px, the calibration {width}x{height}; "
+            "take pictures of the size that was calibrated"
+        )
+    return image
+
+
+def _views(
+    watched: Watched,
+    frames: Sequence[Sequence[Path]],
+    boards: Sequence[Board],
+    left_out: list[tuple[str, str]],
+    progress: Progress,
+) -> list[FreshView]:
+    """Return the boards in all images; what has none goes to `left_out`."""
+    out: list[FreshView] = []
+    total = sum(len(frame) for frame in frames)
+    for k, frame in enumerate(frames):
+        name = f"{k:04d}"
+        for c, path in enumerate(frame):
+            progress("corners", k * len(frame) + c, total)
+            image = _image_of(watched.cameras[c], path)
+            found, reason = views_of_image(path.name, detect_boards(image, boards, camera=watched.cameras[c]), boards)
+            out += [FreshView(name, c, _counted_alike(watched, c, view, name, out)) for view in found]
+            if reason is not None:
+                left_out.append((str(path), reason))
+    progress("corners", total, total)
+    if not out:
+        raise InputError(
+            f"check: no board was found in {total} images: {left_out[0][1]}; take sharp pictures of the whole board"
+        )
+    return out
+
+
+def _counted_alike(watched: Watched, c: int, view: BoardView, frame: str, before: Sequence[FreshView]) -> BoardView:
+    """Return a view of a board that looks the same turned, counted from the end from which another camera did."""
+    same = [v for v in before if v.frame == frame and v.view.board.board_id == view.board.board_id and v.camera != c]
+    if not same or not view.board.looks_same_turned:
+        return view
+    first = same[0]
+    rays, valid = watched.cameras[first.camera].unproject(first.view.pixels)
+    try:
+        pose = board_pose(rays[valid], first.view.points()[valid]).cam_from_board
+    except RigkitError:
+        return view
+    here = watched.cam_from_rig[c] @ watched.cam_from_rig[first.camera].inverse() @ pose
+    turned = replace(view, grid=grid_turned(view.grid, view.board.size, 2))
+
+    def apart(one: BoardView) -> float:
+        pixels, seen = watched.cameras[c].project(here.apply(one.points()))
+        return float(np.median(np.linalg.norm(pixels - one.pixels, axis=1)[seen])) if seen.any() else np.inf
+
+    return turned if apart(turned) < apart(view) else view
+
+
+def _cost(watched: Watched, task: Task) -> Goal:
+    """Return what a change of the first camera (of a rig: of the pair) does to a length."""
+    if len(watched.cameras) > 1:
+        raise InputError("check: --length tells what a change of one camera costs; of a rig see `rigkit certify`")
+    return goal_of(watched.cameras[0], Reach(), task)
+
+
+def fixed_text(source: Path, check: SentinelCheck) -> str:
+    """Return the file `source` with the change that explains the pictures, and a finding that says so."""
+    data: dict[str, Any] = json.loads(source.read_text(encoding="utf-8"))
+    fixed, n = check.fixed, check.watched.size
+    said = Finding(
+        severity=Severity.LOOK,
+        message=f"corrected from {check.frames} fresh frames: {check.change}; views and residuals are older",
+        remedy="calibrate anew when there is time",
+    )
+    if "cameras" in data:
+        for entry, camera, pose in zip(data["cameras"], fixed.cameras, fixed.cam_from_rig, strict=True):
+            entry["camera"] = camera_to_json(camera)
+            entry["cam_from_rig"] = pose.matrix()[:3].tolist()
+    else:
+        data["camera"] = camera_to_json(fixed.cameras[0])
+        frame = np.array(data["frame_covariance"], dtype=np.float64)
+        data["frame_covariance"] = with_block(frame, check.covariance[:n, :n], 1.0).tolist()
+    data["covariance"] = check.covariance.tolist()
+    data["verdicts"] = [*findings_to_json([said]), *data.get("verdicts", [])]
+    return json.dumps(data, indent=1, allow_nan=False) + "\n"

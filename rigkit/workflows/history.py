@@ -1,0 +1,83 @@
+"""A register of checks over months, and its page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from rigkit.calibration.result import Calibration
+from rigkit.cameras.compare import compare_cameras, grid_pixels
+from rigkit.cameras.convert import refit_camera
+from rigkit.core.errors import InputError
+from rigkit.io.calibration_file import load_calibration
+from rigkit.io.files import ensure_writable, write_atomic, write_together
+from rigkit.io.history_file import HistoryEntry, history_text, load_history
+from rigkit.report.check_page import history_page
+from rigkit.validation.sentinel.evidence import MIN_SIGMA_PX, FreshEvidence, Watched
+from rigkit.validation.sentinel.judge import judge_evidence
+from rigkit.validation.sentinel.watch import watched_camera
+from rigkit.workflows.provenance import digest_line, software_facts
+
+__all__ = ["add_calibration", "show_history"]
+
+GRID = (40, 30)
+
+
+def show_history(
+    register: Path, *, report: Path | None = None, force: bool = False
+) -> tuple[tuple[HistoryEntry, ...], tuple[Path, ...]]:
+    """Return the entries of a register and the files written: a page, where one is asked for.
+
+    Raises InputError for another file, or a page that cannot be written.
+    """
+    if report is not None:
+        ensure_writable([report], force=force, inputs=[register])
+    entries = load_history(register)
+    if report is None:
+        return entries, ()
+    facts = software_facts() | {register.name: digest_line(register)}
+    write_atomic(report, history_page(entries, f"History: {register.stem}", facts), force=force)
+    return entries, (report,)
+
+
+def add_calibration(register: Path, new: Path, reference: Path, *, temperature_c: float | None = None) -> None:
+    """Add a calibration made anew to a register, as a change of the `reference`.
+
+    Raises InputError for cameras of two models or sizes, and files that are no calibrations.
+    """
+    now, before = load_calibration(new), load_calibration(reference)
+    if (now.camera.model, now.camera.parameters.size) != (before.camera.model, before.camera.parameters.size):
+        raise InputError(
+            f"history: '{new}' is a {now.camera.model} camera, '{reference}' a {before.camera.model}; calibrate with "
+            "the same model and degree to compare them number by number, or see `rigkit diff`"
+        )
+    check = judge_evidence(watched_camera(before, reference.stem), lambda watched: _as_evidence(watched, now))
+    entry = HistoryEntry.of_check(check, new, kind="calibration", temperature_c=temperature_c)
+    write_together({register: history_text(register, entry)}, force=True)
+
+
+def _as_evidence(watched: Watched, calibration: Calibration) -> FreshEvidence:
+    """Return what another calibration says of the camera watched: its covariance is the inverse of its information. Its
+    free rotation is taken out first."""
+    camera, new = watched.cameras[0], calibration.camera
+    difference = compare_cameras(camera, new, grid=GRID)
+    # The same lens, told with the axis of the one watched.
+    pixels = grid_pixels(camera.size_px, GRID).reshape(-1, 2)
+    rays, valid = new.unproject(pixels)
+    same = refit_camera(camera, rays[valid] @ difference.b_from_a, pixels[valid])
+    scale = np.sqrt(np.diag(calibration.covariance))
+    inverse = np.linalg.pinv(calibration.covariance / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
+    share = (max(watched.sigma_px, MIN_SIGMA_PX) * watched.overdispersion) ** 2
+    information = share * inverse[None]
+    score = information @ (same.parameters - camera.parameters)
+    corners = calibration.corner_count
+    return FreshEvidence(
+        information=information,
+        score=score,
+        variance_px2=share,
+        rms_px=difference.rms_px,
+        expected_px=difference.rms_px,
+        corners=corners,
+        left_out=0,
+    )

@@ -1,0 +1,221 @@
+"""The sentinel: quiet where nothing moved, alarmed where something did, and right about what."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.calibration_scenes import BOARD, lens
+
+from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.result import Calibration
+from rigkit.cameras.base import Camera
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
+from rigkit.io.calibration_file import calibration_text, load_calibration, save_calibration
+from rigkit.io.history_file import HistoryEntry, history_text, load_history
+from rigkit.planning.candidates import Reach
+from rigkit.planning.goal import projection_goal
+from rigkit.planning.information import CornerError, Knowledge
+from rigkit.planning.plan import plan_views
+from rigkit.report.check_page import check_page, check_words, history_page
+from rigkit.validation.sentinel.epipolar import PairMatches, check_matches
+from rigkit.validation.sentinel.evidence import FreshView, Watched
+from rigkit.validation.sentinel.judge import SentinelCheck, check_views
+from rigkit.validation.sentinel.watch import watched_camera
+from rigkit.workflows.check import fixed_text
+
+NOISE_PX = 0.03
+CHANGED_PX = 0.25
+"""Change of the projection, rms after the best rotation: what three views show beyond doubt."""
+MATCH_NOISE_PX = 0.3
+
+
+def _held(camera: Camera, count: int, reach: Reach | None = None) -> list[Rigid3]:
+    known = Knowledge.guessed(camera, CornerError(NOISE_PX))
+    plan = plan_views(known, [BOARD], projection_goal(camera), count, reach=reach)
+    return [view.cam_from_board for view in plan.views]
+
+
+def _view(camera: Camera, pose: Rigid3, name: str, rng: np.random.Generator) -> BoardView:
+    pixels, valid = camera.project(pose.apply(BOARD.points()))
+    valid &= camera.on_image(pixels)
+    noisy = np.clip(pixels[valid] + NOISE_PX * rng.standard_normal((int(valid.sum()), 2)), 0.0, None)
+    return BoardView(name, BOARD, BOARD.grid()[valid], noisy, np.full(len(noisy), NOISE_PX))
+
+
+@pytest.fixture(scope="module")
+def calibration() -> Calibration:
+    camera, rng = lens("reg"), np.random.default_rng(2)
+    views = [_view(camera, pose, f"{k}", rng) for k, pose in enumerate(_held(camera, 14))]
+    return calibrate(views, camera.size_px, model="brown", degree=5, board="flat")
+
+
+def _checked(calibration: Calibration, camera: Camera, rng: np.random.Generator) -> SentinelCheck:
+    poses = _held(lens("reg"), 3)
+    views = [FreshView(f"{k}", 0, _view(camera, pose, f"{k}", rng)) for k, pose in enumerate(poses)]
+    return check_views(watched_camera(calibration, "cam"), views)
+
+
+def _changed(what: Callable[[np.ndarray], np.ndarray]) -> Camera:
+    camera = lens("reg")
+    step = what(camera.parameters.copy()) - camera.parameters
+    size = np.sqrt(step @ projection_goal(camera).weight @ step)
+    return camera.with_parameters(camera.parameters + step * CHANGED_PX / size)
+
+
+def test_unchanged_cameras_hold(calibration: Calibration) -> None:
+    checks = [_checked(calibration, lens("reg"), np.random.default_rng(seed)) for seed in range(12)]
+    assert all(check.holds for check in checks)
+    # P-values of one and the same calibration's error are all alike, but none is impossible.
+    assert min(check.chance for check in checks) > 1e-3
+    assert "Still holds" in check_words(checks[0]).headline
+
+
+@pytest.mark.parametrize(
+    ("kind", "index", "by"),
+    [("focus", [0, 1], 1.001), ("principal point", [2], 1.001), ("distortion", [4], 1.02)],
+)
+def test_what_changed_is_found_named_and_undone(
+    kind: str, index: list[int], by: float, calibration: Calibration, rng: np.random.Generator
+) -> None:
+    def what(parameters: np.ndarray) -> np.ndarray:
+        parameters[index] *= by
+        return parameters
+
+    camera = _changed(what)
+    check = _checked(calibration, camera, rng)
+    assert not check.holds and check.chance < 1e-3
+    assert check.change is not None and check.change.cause.kind == kind
+    goal = projection_goal(camera)
+    before, after = (c.parameters - camera.parameters for c in (check.watched.cameras[0], check.fixed.cameras[0]))
+    assert goal.weight @ after @ after < 0.25 * (goal.weight @ before @ before)
+    assert check.rms_fixed_px < check.rms_px
+    assert kind.split()[0] in check_page(check, "t", {})
+
+
+def test_another_camera_is_explained_by_nothing(calibration: Calibration, rng: np.random.Generator) -> None:
+    other = lens("reg").with_parameters(lens("reg").parameters * [1.3, 1.05, 1.0, 1.0, 2.0, 0.2, 1.0, 1.0, 1.0])
+    check = _checked(calibration, other, rng)
+    assert check.unexplained and not check.holds
+    assert "another camera" in " ".join(check_words(check).sentences)
+
+
+def test_nothing_to_look_at_is_refused(calibration: Calibration) -> None:
+    with pytest.raises(InputError, match="no board was found"):
+        check_views(watched_camera(calibration, "cam"), [])
+
+
+MOUNT = Rigid3(exp_so3(np.array([0.01, -0.08, 0.02])), [-120.0, 2.0, 3.0])
+LENS_SIGMAS = [0.1, 0.1, 0.1, 0.1, 2e-5, 2e-5, 2e-5, 2e-5]
+
+
+def _rig() -> Watched:
+    camera = lens("wide")
+    return Watched(
+        names=("left", "right"),
+        cameras=(camera, camera),
+        cam_from_rig=(Rigid3.identity(), MOUNT),
+        covariance=np.diag([*LENS_SIGMAS, *LENS_SIGMAS, *[2e-5] * 3, *[0.01] * 3]) ** 2,
+        sigma_px=NOISE_PX,
+        freedom=20.0,
+    )
+
+
+def _rig_check(pose: Rigid3, second: Camera, rng: np.random.Generator) -> SentinelCheck:
+    rig, views = _rig(), []
+    for k, held in enumerate(_held(rig.cameras[0], 3, Reach(nearest_mm=300.0))):
+        views.append(FreshView(f"{k}", 0, _view(rig.cameras[0], held, f"{k}", rng)))
+        views.append(FreshView(f"{k}", 1, _view(second, pose @ held, f"{k}", rng)))
+    return check_views(rig, views)
+
+
+def test_a_rig_that_nobody_touched_holds() -> None:
+    checks = [_rig_check(MOUNT, lens("wide"), np.random.default_rng(seed)) for seed in range(8)]
+    assert all(check.holds for check in checks)
+
+
+def test_a_camera_that_turned_is_found_to_a_hundredth_of_a_degree(rng: np.random.Generator) -> None:
+    turn = np.radians([0.02, -0.015, 0.03])
+    moved = Rigid3(exp_so3(turn) @ MOUNT.rotation, exp_so3(turn) @ MOUNT.translation_mm)
+    check = _rig_check(moved, lens("wide"), rng)
+    assert not check.holds and check.change is not None
+    assert (check.change.cause.kind, check.change.cause.camera) == ("rotation", "right")
+    assert check.change.amounts == pytest.approx(np.degrees(turn), abs=4.0 * float(check.change.sigmas.max()))
+    assert check.change.sigmas.max() < 0.01
+
+
+def test_a_longer_baseline_is_a_change_of_scale_or_shift(rng: np.random.Generator) -> None:
+    moved = Rigid3(MOUNT.rotation, 1.01 * MOUNT.translation_mm)
+    check = _rig_check(moved, lens("wide"), rng)
+    assert not check.holds and check.change is not None
+    assert check.change.cause.kind == "scale"
+    assert check.change.amounts == pytest.approx([1.0], abs=0.1)
+
+
+def _matches(pose: Rigid3, rng: np.random.Generator) -> PairMatches:
+    camera = lens("wide")
+    rays, valid = camera.unproject(rng.uniform([100.0, 100.0], [1500.0, 1100.0], (600, 2)))
+    points = rays[valid] * rng.uniform(700.0, 4000.0, (int(valid.sum()), 1))
+    pixels1, seen1 = camera.project(points)
+    pixels2, seen2 = camera.project(pose.apply(points))
+    both = seen1 & seen2 & camera.on_image(pixels2)
+    noisy = [p[both] + MATCH_NOISE_PX * rng.standard_normal((int(both.sum()), 2)) for p in (pixels1, pixels2)]
+    # One match in ten is wrong.
+    wrong = rng.random(len(noisy[0])) < 0.1
+    noisy[1][wrong] += rng.uniform(-60.0, 60.0, (int(wrong.sum()), 2))
+    return PairMatches(0, 1, np.clip(noisy[0], 0.0, None), np.clip(noisy[1], 0.0, None))
+
+
+def test_a_scene_tells_of_a_mount_without_any_board() -> None:
+    quiet, named = 0, 0
+    turn = np.radians([0.05, 0.0, 0.0])
+    moved = Rigid3(exp_so3(turn) @ MOUNT.rotation, exp_so3(turn) @ MOUNT.translation_mm)
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        quiet += check_matches(_rig(), [_matches(MOUNT, rng)]).holds
+        alarmed = check_matches(_rig(), [_matches(moved, rng)])
+        assert not alarmed.holds
+        named += alarmed.change is not None and alarmed.change.cause.kind == "rotation"
+    assert quiet == 6
+    assert named >= 5
+    with pytest.raises(DegenerateError, match="texture"):
+        check_matches(_rig(), [])
+
+
+def test_the_correction_is_a_calibration_that_says_so(calibration: Calibration, tmp_path: Path) -> None:
+    camera = _changed(lambda p: p * [1.001, 1.001, 1, 1, 1, 1, 1, 1, 1])
+    check = _checked(calibration, camera, np.random.default_rng(1))
+    path = tmp_path / "calibration.json"
+    save_calibration(path, calibration)
+    path.write_text(fixed_text(path, check))
+    fixed = load_calibration(path)
+    assert fixed.camera.parameters == pytest.approx(check.fixed.cameras[0].parameters)
+    assert "focus" in fixed.verdicts[0].message
+    assert fixed.covariance[0, 0] > calibration.covariance[0, 0]
+    assert calibration_text(fixed) != calibration_text(calibration)
+
+
+def test_the_register_grows_and_is_drawn(calibration: Calibration, tmp_path: Path) -> None:
+    register = tmp_path / "cam.jsonl"
+    for seed in range(3):
+        check = _checked(calibration, lens("reg"), np.random.default_rng(seed))
+        register.write_text(
+            history_text(register, HistoryEntry.of_check(check, tmp_path / "c.json", temperature_c=21.0))
+        )
+    entries = load_history(register)
+    assert len(entries) == 3 and all(entry.holds for entry in entries)
+    assert set(entries[0].amounts) == {
+        "focus, %", "principal point 1, px", "principal point 2, px", "distortion 1, px", "distortion 2, px",
+        "distortion 3, px",
+    }  # fmt: skip
+    page = history_page(entries, "t", {})
+    assert page.count("<svg") == 6 and "21.0" in page
+    register.write_text(register.read_text() + json.dumps({"schema": "other"}) + "\n")
+    with pytest.raises(InputError, match="no register"):
+        load_history(register)
