@@ -21,7 +21,7 @@ from rigkit.workflows.provenance import digest_line, software_facts
 
 __all__ = ["add_calibration", "show_history"]
 
-GRID = (40, 30)
+RECALIBRATION_GRID = (40, 30)
 
 
 def show_history(
@@ -61,9 +61,9 @@ def _as_evidence(watched: Watched, calibration: Calibration) -> FreshEvidence:
     """Return what another calibration says of the camera watched: its covariance is the inverse of its information. Its
     free rotation is taken out first."""
     camera, new = watched.cameras[0], calibration.camera
-    difference = compare_cameras(camera, new, grid=GRID)
+    difference = compare_cameras(camera, new, grid=RECALIBRATION_GRID)
     # The same lens, told with the axis of the one watched.
-    pixels = grid_pixels(camera.size_px, GRID).reshape(-1, 2)
+    pixels = grid_pixels(camera.size_px, RECALIBRATION_GRID).reshape(-1, 2)
     rays, valid = new.unproject(pixels)
     same = refit_camera(camera, rays[valid] @ difference.b_from_a, pixels[valid])
     scale = np.sqrt(np.diag(calibration.covariance))

@@ -30,7 +30,7 @@ ALARM_CHANCE = 0.005
 """Fresh pictures that unchanged cameras would show more rarely raise an alarm."""
 ALARM_PX = 0.07
 """What moves the projection by less is of no importance, however surely it is there."""
-ROUNDS = 3
+FIX_ROUNDS = 3
 """Times that a change is linearised anew where it was found."""
 WILD = 3.0
 """Corners that scatter so many times as much as the calibration's after every explanation are explained by none."""
@@ -172,7 +172,7 @@ def _refined(watched: Watched, look: Look, change: Change) -> tuple[FloatArray, 
     amounts = change.amounts
     fixed = watched.changed(change.cause.directions @ amounts)
     after = look(fixed)
-    for _ in range(ROUNDS):
+    for _ in range(FIX_ROUNDS):
         again = _fitted(_Whitened.of(fixed, after), change.cause)
         if again is None:
             break
