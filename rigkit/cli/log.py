@@ -7,10 +7,10 @@ import logging
 import re
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from rigkit.core.errors import InputError
+from rigkit.core.errors import InputError, printable
 from rigkit.io.reading import usable_path
 
 __all__ = ["add_log_arguments", "logging_to"]
@@ -38,11 +38,27 @@ def _appending(path: Path) -> logging.Handler:
                 head = stream.read(64)
             if head and not LINE.match(head):
                 raise InputError(f"--log-file '{path}' is no log of rigkit and stays as it is; choose another name")
-        kept = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
+        kept = _InFile(path, encoding="utf-8", errors="backslashreplace")
     except OSError as error:
         raise InputError(f"--log-file '{path}': {error.strerror}; choose another file") from error
     kept.setFormatter(logging.Formatter(FORMAT))
     return kept
+
+
+class _InFile(logging.FileHandler):
+    """Appends to a file; a disk that is full loses the rest of the log, which is said once, not results."""
+
+    told = False
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        if not self.told:
+            self.told = True
+            with suppress(OSError, ValueError):
+                print(f"--log-file '{self.baseFilename}' cannot grow: the log ends here", file=sys.stderr)
+
+    def close(self) -> None:
+        with suppress(OSError):
+            super().close()
 
 
 class _OnStderr(logging.Handler):
@@ -50,7 +66,7 @@ class _OnStderr(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         try:
-            print(self.format(record), file=sys.stderr)
+            print("\n".join(map(printable, self.format(record).split("\n"))), file=sys.stderr)
         except (OSError, ValueError):
             return
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 import multiprocessing
 import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future, InvalidStateError, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from typing import ParamSpec, TypeVar
+from contextlib import contextmanager, suppress
+from typing import Any, ParamSpec, TypeVar
 
 from rigkit.core.errors import InputError
 
@@ -44,7 +45,15 @@ class _Pool(ProcessPoolExecutor):
         self, fn: Callable[Arguments, Result], /, *args: Arguments.args, **kwargs: Arguments.kwargs
     ) -> Future[Result]:
         with _terminal_silent():
-            return super().submit(fn, *args, **kwargs)
+            future = super().submit(fn, *args, **kwargs)
+        # What waits is cancelled before the workers end; the pool would then stumble, loudly, over telling it so.
+        future.set_exception = functools.partial(_tell, future)  # type: ignore[method-assign]
+        return future
+
+
+def _tell(future: Future[Any], error: BaseException | None) -> None:
+    with suppress(InvalidStateError):
+        Future.set_exception(future, error)
 
 
 @contextmanager

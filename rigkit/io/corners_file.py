@@ -43,6 +43,8 @@ def corners_text(detections: Mapping[str, Sequence[BoardDetection]]) -> str:
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(COLUMNS)
     for image, boards in detections.items():
+        # Readers take it for the end of a line, quoted or not.
+        image = image.replace("\r", "\\r")
         for number, found in enumerate(boards, 1):
             name = found.board_id or f"?{number}:{found.columns}x{found.rows}"
             for (column, row), (u, v), sigma in zip(found.grid, found.pixels, found.sigma_px, strict=True):

@@ -92,7 +92,8 @@ def write_together(files: Mapping[Path, str | bytes], *, force: bool = False) ->
                 made.append(folder)
             handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
             staged[target] = Path(name)
-            _fill(handle, data.encode("utf-8") if isinstance(data, str) else data)
+            # Names of files may have bytes that are no UTF-8.
+            _fill(handle, data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data)
             # mkstemp makes files that only the owner may read; a result should have the permissions of any new file.
             staged[target].chmod(0o666 & ~_umask())
         for target, temporary in staged.items():

@@ -244,7 +244,9 @@ def _bar(cells: Sequence[str]) -> str:
 
 
 def _in_cell(text: str) -> str:
-    """Return words for a spreadsheet, which takes a cell that begins like a formula for one: those are quoted."""
+    """Return words in one line for a spreadsheet, which takes a cell that begins like a formula for one: those are
+    quoted."""
+    text = _one_line(text)
     return f"'{text}" if text.startswith(FORMULA) and not _is_number(text) else text
 
 

@@ -15,6 +15,7 @@ import pytest
 from helpers.data import REPOSITORY
 
 from rigkit.cli.main import main
+from rigkit.io.corners_file import read_corners
 from rigkit.io.manifest import load_dataset
 from rigkit.io.session import files_of_session, load_session
 
@@ -134,3 +135,17 @@ def test_what_is_refused_is_refused_though_nobody_can_be_told(folder: Path, full
         check=False,
     )
     assert done.returncode == 2
+
+
+@pytest.mark.parametrize("name", [b"ph\xffoto.png", b"a\rb.png", b"a\nb.png", b"\x1b[31mred.png", b'<script>,"=1.png'])
+def test_names_of_images_that_no_table_expects(name: bytes, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "many").mkdir()
+    shutil.copy(LAB / "images" / "regular-general" / "view1.jpg", folder / "many" / os.fsdecode(name))
+    assert main(["detect", "many", "-j", "1", "-o", "new.csv", "--overlay", "shown"]) == 0
+    said = capsys.readouterr()
+    assert "\x1b" not in said.out + said.err and len(said.out.splitlines()) == 2
+    (read,) = read_corners(folder / "new.csv")
+    assert (folder / "new.csv").read_bytes().decode() and read.endswith(".png")
+    shutil.copy(LAB / "images" / "regular-general" / "view2.jpg", folder / "many" / ("2" + os.fsdecode(name)))
+    assert main(["init", "many", "--square-mm", "50", "--calibration", "c", "--pose-type", "auto", "-o", "d.toml"]) == 0
+    assert (folder / "d.toml").read_bytes().decode()

@@ -17,6 +17,7 @@ from rigkit.relative_pose.refinement.local import SampsonRows
 from rigkit.relative_pose.refinement.marginal import marginal_quality, marginal_weights
 from rigkit.relative_pose.refinement.refine import refine_pose
 from rigkit.relative_pose.robust.robust import robust_pose
+from rigkit.relative_pose.solvers.planar_ambiguity import other_ambiguous_poses
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 
 
@@ -166,3 +167,11 @@ def test_the_batch_ends_near_the_maximum_likelihood_pose(rng, kind):
     # How the distances' own sigmas change with the pose is left out: that is second order in the noise.
     sigma = np.sqrt(np.diag(best.covariance).max())
     assert found * sign == pytest.approx(np.broadcast_to(truth, found.shape), abs=0.1 * sigma)
+
+
+def test_a_plane_is_not_looked_for_where_no_match_fits(rng: np.random.Generator) -> None:
+    m, pose, _ = pair(rng, 30, "general")
+    none = np.zeros(30, bool)
+    assert other_ambiguous_poses(m, none, 1.0, Rigid3(pose.rotation, pose.translation_mm / 300.0)) == ()
+    none[:3] = True
+    assert other_ambiguous_poses(m, none, 1.0, Rigid3(pose.rotation, pose.translation_mm / 300.0)) == ()

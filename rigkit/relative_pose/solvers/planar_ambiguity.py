@@ -39,6 +39,8 @@ AT_REST_SIGMAS = 3.3
 PLANE_EXPLAINS_SIGMAS = 4.0
 """A plane whose chi square is no more than this many standard deviations too large explains the matches."""
 HOMOGRAPHY_FREEDOM = 8
+MIN_PLANE_POINTS = 4
+"""Fewer determine no homography, and say nothing of a plane."""
 NEARLY_ALL = 0.9
 """Of matches that fit some fit by chance, and of points some are seen on the wrong side of the horizon of a plane."""
 PLANE_ROUNDS = 5
@@ -124,7 +126,7 @@ def ambiguous_poses(matches: Matches) -> tuple[Rigid3, ...]:
     Only poses with all points on the visible side of the plane's half-space, d > 0, are returned: at most two. Raises
     DegenerateError where that plane is at infinity: a rotation explains the matches.
     """
-    if len(matches) < 4:
+    if len(matches) < MIN_PLANE_POINTS:
         return ()
     H21 = homography_of_rays(matches)
     square = np.sum(transfer_error(matches, H21) ** 2, axis=1) / (matches.sigma1_px**2 + matches.sigma2_px**2)
@@ -149,6 +151,8 @@ def other_ambiguous_poses(matches: Matches, among: BoolArray, noise: float, pose
     -----
     The parallax of a point on the plane n . x = 1 is |t x f2| (n . f1), linear in n: least squares with Cauchy weights.
     """
+    if np.count_nonzero(among) < MIN_PLANE_POINTS:
+        return ()
     rays1, f2, t = matches.rays1[among], matches.rays2[among], pose.translation_mm
     across, sigma = cross(t, f2), noise * parallax_noise(matches)[among]
     reach = np.sqrt(np.sum(across**2, axis=1))
@@ -167,6 +171,8 @@ def other_ambiguous_poses(matches: Matches, among: BoolArray, noise: float, pose
         if middle > max(0.5 * before, AT_REST_SIGMAS):
             return ()
         weights, before = 1.0 / (1.0 + (off / max(1.0, middle)) ** 2), middle
+    if not (off < AT_REST_SIGMAS).any():
+        return ()
     H21 = pose.rotation + np.outer(t, normal)
     others = _visible(rays1[off < AT_REST_SIGMAS], H21 / np.linalg.svd(H21, compute_uv=False)[1])
     return tuple(other for other in others if not compare_poses(pose, other)[1])
