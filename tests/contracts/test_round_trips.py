@@ -69,7 +69,7 @@ numbers = st.floats(allow_nan=False, allow_infinity=False, width=64)
 moderate = st.floats(-1e6, 1e6, allow_nan=False)
 positive = st.floats(1e-3, 1e3)
 identifiers = st.text(
-    st.characters(categories=("L", "Nd"), include_characters="_-+.() "), min_size=1, max_size=MAX_IDENTIFIER
+    st.characters(categories=["L", "Nd"], include_characters="_-+.() "), min_size=1, max_size=MAX_IDENTIFIER
 )
 
 
@@ -275,7 +275,7 @@ def detections(draw: Any) -> BoardDetection:
     return BoardDetection(draw(st.none() | names), columns, rows, grid, pixels, sigma)
 
 
-images = st.text(st.characters(exclude_categories=("Cs",), exclude_characters="\r"), min_size=1, max_size=40)
+images = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\r"), min_size=1, max_size=40)
 
 
 @drawn

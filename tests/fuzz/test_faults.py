@@ -76,7 +76,7 @@ def whole(path: Path) -> bool:
 def rigkit(*words: str, **options: object) -> subprocess.Popen[str]:
     """Start the program in the present folder."""
     command = [sys.executable, "-m", "rigkit", *words]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)  # type: ignore[call-overload, no-any-return]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)  # type: ignore[call-overload]
 
 
 def ended(program: subprocess.Popen[str]) -> tuple[int, list[str]]:
