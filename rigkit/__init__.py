@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from rigkit.affine.normal import normals_from_affines
     from rigkit.affine.registry import affines_from_directions
     from rigkit.calibration.calibrate import calibrate
+    from rigkit.calibration.hand_eye import HandEye, hand_eye
     from rigkit.calibration.result import Calibration
     from rigkit.calibration.rig.calibrate import calibrate_rig
     from rigkit.calibration.rig.result import RigCalibration
@@ -91,6 +92,7 @@ if TYPE_CHECKING:
         export_rig,
     )
     from rigkit.workflows.export_cloud import ExportCloudOptions, export_cloud
+    from rigkit.workflows.handeye import HandEyeOptions, PlacedCamera, calibrate_hand_eye, camera_on_board
     from rigkit.workflows.print_board import MeasuredPrint, PrintOptions, print_board, store_measured_print
     from rigkit.workflows.reconstruct import DatasetReconstruction, ReconstructOptions, reconstruct_dataset
     from rigkit.workflows.reconstruct_scene import SceneOptions, SceneResult, reconstruct_views
@@ -131,12 +133,15 @@ __all__ = [
     "ExportedCamera",
     "ExportedRig",
     "FolderOptions",
+    "HandEye",
+    "HandEyeOptions",
     "InputError",
     "MatchedPair",
     "Matches",
     "MeasuredPrint",
     "OrientedCloud",
     "PairTruth",
+    "PlacedCamera",
     "PoseType",
     "PrintOptions",
     "Quantity",
@@ -166,11 +171,13 @@ __all__ = [
     "build_calibration_page",
     "calibrate",
     "calibrate_folders",
+    "calibrate_hand_eye",
     "calibrate_rig",
     "calibrate_rig_session",
     "calibrate_session",
     "calibrate_session_file",
     "camera_model",
+    "camera_on_board",
     "certify_file",
     "compare_cameras",
     "complete_boards",
@@ -183,6 +190,7 @@ __all__ = [
     "export_cloud",
     "export_rig",
     "fundamental_for",
+    "hand_eye",
     "homography_from_affines",
     "homography_from_plane",
     "identify_pair",
@@ -276,6 +284,8 @@ _NAMES_OF = {
         "export_rig",
     ),
     "rigkit.workflows.export_cloud": ("ExportCloudOptions", "export_cloud"),
+    "rigkit.workflows.handeye": ("HandEyeOptions", "PlacedCamera", "calibrate_hand_eye", "camera_on_board"),
+    "rigkit.calibration.hand_eye": ("HandEye", "hand_eye"),
     "rigkit.workflows.print_board": ("MeasuredPrint", "PrintOptions", "print_board", "store_measured_print"),
     "rigkit.workflows.reconstruct": ("DatasetReconstruction", "ReconstructOptions", "reconstruct_dataset"),
     "rigkit.workflows.reconstruct_scene": ("SceneOptions", "SceneResult", "reconstruct_views"),

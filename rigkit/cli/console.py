@@ -7,11 +7,15 @@ import logging
 import sys
 import time
 from contextlib import suppress
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rigkit.core.progress import Progress
 
-__all__ = ["note", "print_json", "progress_on_stderr"]
+if TYPE_CHECKING:
+    from rigkit.core.arrays import FloatArray
+    from rigkit.geometry.rigid3 import Rigid3
+
+__all__ = ["note", "pose_in_words", "print_json", "progress_on_stderr"]
 
 REDRAW_S = 0.1
 BAR_WIDTH = 24
@@ -47,6 +51,20 @@ def progress_on_stderr() -> Progress:
 def note(text: str) -> None:
     """Tell the person at the terminal: through the log, which goes to stderr; results go to stdout."""
     logging.getLogger("rigkit.cli").info("%s", text)
+
+
+def pose_in_words(name: str, pose: Rigid3, turn_sigma_rad: FloatArray, move_sigma_mm: FloatArray) -> str:
+    """Return a pose as rotation vector (deg) and translation (mm), each with its standard deviation."""
+    import numpy as np
+
+    from rigkit.geometry.rotation import log_so3
+
+    turned = ", ".join(
+        f"{value:.3f} ± {sigma:.3f}"
+        for value, sigma in zip(np.degrees(log_so3(pose.rotation)), np.degrees(turn_sigma_rad), strict=True)
+    )
+    moved = ", ".join(f"{v:.2f} ± {s:.2f}" for v, s in zip(pose.translation_mm, move_sigma_mm, strict=True))
+    return f"{name}: rotation vector ({turned}) deg, translation ({moved}) mm"
 
 
 def print_json(value: Any) -> None:

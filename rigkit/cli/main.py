@@ -35,6 +35,8 @@ VERBS: dict[str, tuple[str, str]] = {
     "plan": ("rigkit.cli.plan", "which pictures to take next; what a lens, a board and so many pictures will reach"),
     "check": ("rigkit.cli.check", "fresh pictures against a calibration or rig: still holds, or what moved; exit 1"),
     "history": ("rigkit.cli.history", "a register of checks over months: drift plots with control limits"),
+    "pose": ("rigkit.cli.pose", "where a camera is in the frame of a board that is laid down"),
+    "handeye": ("rigkit.cli.handeye", "where a camera sits on a robot, from its poses and images of a board"),
     "rectify": ("rigkit.cli.rectify", "perspective, cylindrical, equirectangular or stereo images from any camera's"),
     "reconstruct": ("rigkit.cli.reconstruct", "oriented clouds (PLY) and pictures of every pair"),
     "validate": ("rigkit.cli.validate", "the tables against measured truth, report and PLY; exit 1 if a check fails"),

@@ -1,0 +1,44 @@
+"""`rigkit handeye`: where a camera sits on a robot, from the robot's poses and images of a board."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+HELP = "where a camera sits on a robot's hand, or before it, from the robot's poses and images of a board"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("poses", metavar="POSES.csv", help="image,x_mm,y_mm,z_mm,qx,qy,qz,qw: base_from_hand")
+    parser.add_argument("images", metavar="IMAGES", nargs="+", help="images of the board, or their folder")
+    parser.add_argument("--camera", type=Path, required=True, metavar="CALIB", help="the camera's calibration")
+    parser.add_argument("--board", type=Path, required=True, metavar="BOARD.toml", help="the board's file")
+    parser.add_argument("--board-on-hand", action="store_true", help="the hand carries the board; the camera stands")
+    parser.add_argument("--inverse", action="store_true", help="the poses are hand_from_base")
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE.json", help="write the result")
+    parser.add_argument("--force", action="store_true", help="replace an existing file")
+
+
+def run(args: argparse.Namespace) -> int:
+    import numpy as np
+
+    from rigkit.cli.console import pose_in_words, progress_on_stderr
+    from rigkit.workflows.handeye import POSE_NAMES, HandEyeOptions, calibrate_hand_eye
+
+    options = HandEyeOptions(
+        camera=args.camera,
+        board=args.board,
+        board_on_hand=args.board_on_hand,
+        inverse=args.inverse,
+        output=args.output,
+        force=args.force,
+    )
+    result = calibrate_hand_eye(args.poses, args.images, options, progress=progress_on_stderr())
+    turns, moves = result.sigmas()
+    first, second = POSE_NAMES[args.board_on_hand]
+    print(pose_in_words(first, result.cam_from_mount, turns[0], moves[0]))
+    print(pose_in_words(second, result.stand_from_board, turns[1], moves[1]))
+    print(f"{len(result.image_rms_px)} images, RMS {result.rms_px:.3f} px")
+    for image, mismatch in result.left_out.items():
+        print(f"left out: '{image}' turned otherwise than the robot, by {np.degrees(mismatch):.1f} degrees")
+    return 0

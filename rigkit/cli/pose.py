@@ -1,0 +1,34 @@
+"""`rigkit pose`: where a camera is against a board that is laid down."""
+
+from __future__ import annotations
+
+import argparse
+
+HELP = "where a camera is in the frame of a board that is laid down"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("image", metavar="IMAGE", help="an image that shows the board")
+    parser.add_argument("--camera", required=True, metavar="CALIB", help="the camera's calibration")
+    parser.add_argument("--board", required=True, metavar="BOARD.toml", help="the board's file")
+    parser.add_argument("--json", action="store_true", help="print the result for programs")
+
+
+def run(args: argparse.Namespace) -> int:
+    import numpy as np
+
+    from rigkit.cli.console import pose_in_words, print_json
+    from rigkit.workflows.handeye import camera_on_board
+
+    placed = camera_on_board(args.image, args.camera, args.board)
+    pose = placed.pose.cam_from_board
+    sigmas = np.sqrt(np.diag(placed.pose.covariance))
+    if args.json:
+        figures = {"cam_from_board": pose.matrix()[:3].tolist(), "covariance": placed.pose.covariance.tolist()}
+        print_json({**figures, "rms_px": placed.rms_px, "ambiguous": placed.ambiguous})
+        return 0
+    centre = pose.inverse().translation_mm
+    print(pose_in_words("cam_from_board", pose, sigmas[:3], sigmas[3:]))
+    print(f"centre of the camera on the board: {centre[0]:.2f}, {centre[1]:.2f}, {centre[2]:.2f} mm")
+    print(f"RMS {placed.rms_px:.3f} px" + ("; the board tilted the other way fits too" if placed.ambiguous else ""))
+    return 0

@@ -1,0 +1,79 @@
+"""Poses of a robot's hand as CSV: base_from_hand, one row an image.
+
+::
+
+    image,x_mm,y_mm,z_mm,qx,qy,qz,qw
+    0001.png,412.1,-88.0,630.5,0.01,0.99,0.02,0.1
+
+Lengths may be x_m, y_m, z_m instead; a rotation vector rx_rad, ry_rad, rz_rad (or rx_deg, ...) instead of the
+quaternion.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+
+import numpy as np
+
+from rigkit.core.errors import InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
+from rigkit.io.reading import read_text
+
+__all__ = ["read_robot_poses"]
+
+LENGTHS = {"mm": 1.0, "m": 1000.0}
+TURNS = {"rad": 1.0, "deg": np.pi / 180.0}
+QUATERNION = ("qx", "qy", "qz", "qw")
+UNIT_TOLERANCE = 0.01
+"""Quaternions are written with three digits at least."""
+
+
+def read_robot_poses(path: str | Path) -> dict[str, Rigid3]:
+    """Return base_from_hand by name of the image.
+
+    Raises InputError that names the line for columns that are missing, values that are no numbers, a quaternion that is
+    not of length one, and an image that is there twice.
+    """
+    source = Path(path)
+    text = read_text(source, "robot poses")
+    rows = [row for row in csv.reader(io.StringIO(text)) if row and not row[0].lstrip().startswith("#")]
+    head = [cell.strip() for cell in rows[0]] if rows else []
+    length = next((unit for unit in LENGTHS if all(f"{axis}_{unit}" in head for axis in "xyz")), None)
+    turn = next((unit for unit in TURNS if all(f"r{axis}_{unit}" in head for axis in "xyz")), None)
+    if "image" not in head or length is None or not (turn or all(key in head for key in QUATERNION)):
+        raise InputError(
+            f"'{source}': the first line must name the columns image, x_mm, y_mm, z_mm (or _m), and qx, qy, qz, qw or "
+            "rx_rad, ry_rad, rz_rad (or _deg)"
+        )
+    poses: dict[str, Rigid3] = {}
+    for number, row in enumerate(rows[1:], start=2):
+        where = f"'{source}', row {number}"
+        if len(row) != len(head):
+            raise InputError(f"{where}: {len(row)} cells under {len(head)} columns; correct the row")
+        cells = dict(zip(head, (cell.strip() for cell in row), strict=True))
+        try:
+            place = np.array([float(cells[f"{axis}_{length}"]) for axis in "xyz"]) * LENGTHS[length]
+            keys = QUATERNION if turn is None else tuple(f"r{axis}_{turn}" for axis in "xyz")
+            turned = np.array([float(cells[key]) for key in keys])
+        except ValueError as error:
+            raise InputError(f"{where}: {error}; write numbers with a decimal point") from error
+        if not (np.isfinite(place).all() and np.isfinite(turned).all()):
+            raise InputError(f"{where}: a value is not finite; correct the row")
+        if cells["image"] in poses:
+            raise InputError(f"{where}: image '{cells['image']}' is there twice; leave one")
+        if turn is None and abs(float(np.linalg.norm(turned)) - 1.0) > UNIT_TOLERANCE:
+            raise InputError(f"{where}: the quaternion has length {np.linalg.norm(turned):.3g}, not 1; correct the row")
+        rotation = exp_so3(turned * TURNS[turn]) if turn else _rotation(turned)
+        poses[cells["image"]] = Rigid3(rotation, place)
+    if not poses:
+        raise InputError(f"'{source}': no pose in it; write one row an image")
+    return poses
+
+
+def _rotation(quaternion: np.ndarray) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_quat(quaternion).as_matrix())

@@ -1,0 +1,149 @@
+"""World frames: where a camera is against a board, and where it sits on a robot."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rigkit.calibration.hand_eye import HandEye, hand_eye
+from rigkit.cameras.base import Camera
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import CheckFailed, InputError
+from rigkit.core.progress import Progress, silent
+from rigkit.detection.detect import detect_boards
+from rigkit.geometry.board_pose import BoardPose, board_poses
+from rigkit.io.board_file import load_board
+from rigkit.io.files import ensure_writable, write_atomic
+from rigkit.io.images import read_image
+from rigkit.io.robot_poses import read_robot_poses
+from rigkit.workflows.camera_files import import_camera
+from rigkit.workflows.detect import images_in
+
+__all__ = ["POSE_NAMES", "HandEyeOptions", "PlacedCamera", "calibrate_hand_eye", "camera_on_board"]
+
+HAND_EYE_SCHEMA = "rigkit.hand_eye/1"
+POSE_NAMES = (("cam_from_hand", "base_from_board"), ("cam_from_base", "hand_from_board"))
+"""What the two poses are called where the hand carries the camera, and where it carries the board."""
+PLANAR_AMBIGUITY = 1.5
+"""Two poses of one board whose errors differ by less than this factor cannot be told apart by them."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HandEyeOptions:
+    """What the images and the robot's poses do not tell."""
+
+    camera: Path
+    """The camera's calibration, ours or another tool's."""
+    board: Path
+    """The board's file."""
+    board_on_hand: bool = False
+    """The hand carries the board and the camera stands, not the reverse."""
+    inverse: bool = False
+    """The robot's poses are hand_from_base, not base_from_hand."""
+    output: Path | None = None
+    """JSON file for the result."""
+    force: bool = False
+    """Replace a file that exists."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PlacedCamera:
+    """Where a camera is against a board, from which image, the RMS in px, and whether the board tilted the other way
+    fits too."""
+
+    pose: BoardPose
+    image: Path
+    rms_px: float
+    ambiguous: bool
+
+
+def calibrate_hand_eye(
+    poses: str | Path, images: Sequence[str | Path], options: HandEyeOptions, *, progress: Progress = silent
+) -> HandEye:
+    """Return the hand-eye calibration from the robot's poses (CSV, by image) and images of a board, or folders of them.
+
+    Raises
+    ------
+    InputError
+        Files that cannot be read or written, images without a pose, a board that looks the same turned, poses and
+        images that do not belong together.
+    CheckFailed
+        No image shows the board.
+    DegenerateError
+        Too few images, or turns about one axis only.
+    """
+    paths = list(images_in([Path(path) for path in images]))
+    if options.output is not None:
+        ensure_writable(options.output, force=options.force, inputs=[poses, *paths, options.camera, options.board])
+    robot = read_robot_poses(poses)
+    missing = [path.name for path in paths if path.name not in robot]
+    if missing:
+        raise InputError(f"'{poses}': no pose of image '{missing[0]}' ({len(missing)} in all); add the rows")
+    board, camera = _one_way_up(load_board(options.board)), import_camera(options.camera)
+    views, stands = [], []
+    for done, path in enumerate(paths, start=1):
+        view = _view(path, board, camera)
+        progress("board", done, len(paths))
+        if view is not None:
+            base_from_hand = robot[path.name].inverse() if options.inverse else robot[path.name]
+            views.append(view)
+            stands.append(base_from_hand if options.board_on_hand else base_from_hand.inverse())
+    if not views:
+        raise CheckFailed(f"no image of {len(paths)} shows board '{board.board_id}'; check the board's file")
+    result = hand_eye(camera, views, stands)
+    if options.output is not None:
+        write_atomic(options.output, _text(result, options), force=options.force)
+    return result
+
+
+def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) -> PlacedCamera:
+    """Return where a camera is against a board that is laid down, from one image.
+
+    Raises InputError for files that cannot be read, CheckFailed where the image does not show the board.
+    """
+    known, lens = load_board(board), import_camera(camera)
+    view = _view(Path(image), known, lens)
+    if view is None:
+        raise CheckFailed(f"'{image}' does not show board '{known.board_id}'; check focus and the board's file")
+    rays, valid = lens.unproject(view.pixels)
+    unit = np.linalg.norm(lens.ray_jacobian(view.pixels[valid]), axis=(1, 2)) / np.sqrt(2.0)
+    points = view.points()[valid]
+    found = board_poses(rays[valid], points, view.sigma_px[valid] * unit)
+    seen, _ = lens.project(found[0].cam_from_board.apply(points))
+    rms = float(np.sqrt(((seen - view.pixels[valid]) ** 2).sum(axis=1).mean()))
+    ambiguous = len(found) > 1 and found[1].rms_rad < PLANAR_AMBIGUITY * found[0].rms_rad
+    return PlacedCamera(found[0], Path(image), rms, ambiguous)
+
+
+def _one_way_up(board: Board) -> Board:
+    if board.looks_same_turned:
+        raise InputError(
+            f"board '{board.board_id}' looks the same turned by 180 degrees: take one with an odd and an even number "
+            "of corners, or with markers"
+        )
+    return board
+
+
+def _view(path: Path, board: Board, camera: Camera) -> BoardView | None:
+    image = read_image(path)
+    found = [d for d in detect_boards(image, [board], camera=camera) if d.board_id == board.board_id]
+    return BoardView.from_detection(path.name, max(found, key=lambda d: len(d.grid)), [board]) if found else None
+
+
+def _text(result: HandEye, options: HandEyeOptions) -> str:
+    first, second = POSE_NAMES[options.board_on_hand]
+    data = {
+        "schema": HAND_EYE_SCHEMA,
+        first: result.cam_from_mount.matrix()[:3].tolist(),
+        second: result.stand_from_board.matrix()[:3].tolist(),
+        "covariance": result.covariance.tolist(),
+        "rms_px": result.rms_px,
+        "image_rms_px": result.image_rms_px,
+        "left_out_deg": {name: float(np.degrees(value)) for name, value in result.left_out.items()},
+    }
+    return json.dumps(data, indent=1, allow_nan=False) + "\n"

@@ -1,0 +1,134 @@
+"""Hand-eye calibration: errors within its own sigmas, and what makes it impossible said in words."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from cli.test_calibrate_folder import BOARD as PRINTED
+from cli.test_calibrate_folder import CAMERA as LENS
+from helpers.calibration_scenes import lens, random_views
+
+from rigkit.calibration.hand_eye import HandEye, hand_eye
+from rigkit.cli.main import main
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3, log_so3
+from rigkit.io.board_file import board_text
+from rigkit.io.calibration_file import save_camera
+from rigkit.synthetic.photometry import Photometry
+from rigkit.synthetic.placing import place_board, sees_paper
+from rigkit.synthetic.render import Optics, render
+
+X = Rigid3(exp_so3(np.array([0.3, -1.2, 0.4])), [30.0, -60.0, 90.0])
+Z = Rigid3(exp_so3(np.array([2.0, 0.4, -0.3])), [400.0, 120.0, -15.0])
+ROBOT_TURN_RAD, ROBOT_MOVE_MM = 2e-4, 0.1
+SEEDS, IMAGES = 40, 15
+MAHALANOBIS = (0.5, 2.0)
+"""Root mean square error over sigma, 480 numbers of 40 sets that 15 images each determine."""
+
+
+def errors(result: HandEye) -> np.ndarray:
+    """Return the errors (12,) of both poses as their covariance counts them."""
+    out = []
+    for found, true in ((result.cam_from_mount, X), (result.stand_from_board, Z)):
+        out += [log_so3(found.rotation @ true.rotation.T), found.translation_mm - true.translation_mm]
+    return np.concatenate(out)
+
+
+def capture(
+    rng: np.random.Generator, count: int = IMAGES, *, robot_noise: float = 1.0
+) -> tuple[list[BoardView], list[Rigid3]]:
+    """Return views, and mount_from_stand as a robot that errs a little tells it."""
+    views, rotations, translations = random_views(lens("reg"), count, rng, reach_deg=25.0, noise_px=0.1)
+    told = []
+    for rotation, translation in zip(rotations, translations, strict=True):
+        true = X.inverse() @ Rigid3(rotation, translation) @ Z.inverse()
+        turn = exp_so3(robot_noise * rng.normal(0.0, ROBOT_TURN_RAD, 3))
+        told.append(Rigid3(turn @ true.rotation, true.translation_mm + robot_noise * rng.normal(0.0, ROBOT_MOVE_MM, 3)))
+    return views, told
+
+
+def test_errors_are_within_their_sigmas(rng: np.random.Generator) -> None:
+    ratios = []
+    for _ in range(SEEDS):
+        result = hand_eye(lens("reg"), *capture(rng))
+        ratios.append(errors(result) / np.sqrt(np.diag(result.covariance)))
+        assert not result.left_out
+    rms = float(np.sqrt(np.mean(np.square(ratios))))
+    assert MAHALANOBIS[0] < rms < MAHALANOBIS[1]
+
+
+def test_an_exact_robot_gives_an_exact_answer(rng: np.random.Generator) -> None:
+    views, told = capture(rng, robot_noise=0.0)
+    error = np.abs(errors(hand_eye(lens("reg"), views, told)))
+    assert error[[0, 1, 2, 6, 7, 8]].max() < 1e-4 and error[[3, 4, 5, 9, 10, 11]].max() < 0.1
+
+
+def test_images_of_other_poses_are_left_out_and_named(rng: np.random.Generator) -> None:
+    views, told = capture(rng)
+    told[3], told[7] = told[7], told[3]
+    result = hand_eye(lens("reg"), views, told)
+    assert set(result.left_out) == {views[3].image, views[7].image}
+    assert np.abs(errors(result)[3:6]).max() < 2.0
+
+
+def test_what_cannot_be_solved_is_said(rng: np.random.Generator) -> None:
+    views, told = capture(rng)
+    with pytest.raises(InputError, match="same order"):
+        hand_eye(lens("reg"), views, told[1:] + told[:1])
+    with pytest.raises(InputError, match="the other way round"):
+        hand_eye(lens("reg"), views, [pose.inverse() for pose in told])
+    with pytest.raises(InputError, match="14 poses"):
+        hand_eye(lens("reg"), views, told[:14])
+    with pytest.raises(DegenerateError, match="at least 3"):
+        hand_eye(lens("reg"), views[:2], told[:2])
+    about_z = [Rigid3(exp_so3(np.array([0.0, 0.0, 0.1 * k])), [0.0, 0.0, 600.0]) for k in range(8)]
+    flat = []
+    for k, pose in enumerate(about_z):
+        seen, _ = lens("reg").project(pose.apply(views[0].points() - views[0].points().mean(axis=0)))
+        flat.append(BoardView(f"{k}.png", views[0].board, views[0].grid, seen, views[0].sigma_px))
+    centred = [Rigid3(p.rotation, p.translation_mm - p.rotation @ views[0].points().mean(axis=0)) for p in about_z]
+    with pytest.raises(DegenerateError, match="one axis"):
+        hand_eye(lens("reg"), flat, [X.inverse() @ p @ Z.inverse() for p in centred])
+
+
+def test_from_rendered_images_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(5)
+    (tmp_path / "images").mkdir()
+    rows, count = ["image,x_mm,y_mm,z_mm,rx_rad,ry_rad,rz_rad"], 0
+    while count < 8:
+        spot = np.array([320.0, 240.0]) + rng.uniform(-1.0, 1.0, 2) * np.array([90.0, 60.0])
+        placed = place_board(PRINTED, LENS, spot, rng.uniform(26.0, 34.0), 40.0, rng)
+        if placed is None or not sees_paper(placed, LENS, (0.0, 0.0), LENS.size_px):
+            continue
+        optics, photometry = Optics(0.7, supersample=2), Photometry(noise_levels=2.0)
+        image = render([placed], LENS, Rigid3.identity(), optics=optics, photometry=photometry, rng=rng)
+        cv2.imwrite(str(tmp_path / "images" / f"{count}.png"), image)
+        base_from_hand = (X.inverse() @ placed.world_from_board @ Z.inverse()).inverse()
+        numbers = [*base_from_hand.translation_mm, *log_so3(base_from_hand.rotation)]
+        rows.append(",".join([f"{count}.png", *(repr(float(v)) for v in numbers)]))
+        count += 1
+    (tmp_path / "poses.csv").write_text("\n".join(rows) + "\n")
+    (tmp_path / "board.toml").write_text(board_text(PRINTED, "a board", tmp_path / "board.toml"))
+    save_camera(tmp_path / "camera.json", LENS)
+    known = ["--camera", str(tmp_path / "camera.json"), "--board", str(tmp_path / "board.toml")]
+    out = tmp_path / "hand_eye.json"
+    command = ["handeye", str(tmp_path / "poses.csv"), str(tmp_path / "images"), *known]
+    assert main([*command, "-o", str(out)]) == 0
+    assert "cam_from_hand: rotation vector" in capsys.readouterr().out
+    found = json.loads(out.read_text())
+    sigma = np.sqrt(np.diag(found["covariance"]))[3:6]
+    assert np.all(np.abs(np.array(found["cam_from_hand"])[:, 3] - X.translation_mm) < 5.0 * sigma + 0.02)
+    assert np.linalg.norm(sigma) < 2.0
+    assert main([*command, "--inverse"]) == 2
+    assert "the other way round" in capsys.readouterr().err
+    assert main(["pose", str(tmp_path / "images" / "0.png"), *known]) == 0
+    assert "centre of the camera on the board" in capsys.readouterr().out
+    (tmp_path / "poses.csv").write_text("\n".join(rows[:-1]) + "\n")
+    assert main(command) == 2
+    assert "no pose of image '7.png'" in capsys.readouterr().err
