@@ -6,11 +6,12 @@ held-out error.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.calibration.coverage import covered_by_boards
+from rigkit.calibration.coverage import corner_ranges, covered_by_boards
 from rigkit.calibration.mixed import two_cameras
 from rigkit.calibration.repeats import cluster_numbers
 from rigkit.calibration.result import Calibration
@@ -68,10 +69,15 @@ class Extent:
 
 def judge_capture(calibration: Calibration, extent: Extent) -> list[Finding]:
     """Return what is wrong with how the images were taken, the gravest first."""
+    views = calibration.views
+    images = [view.image for view in views]
+    # Images that repeat others share their number.
+    clusters = cluster_numbers(images, [view.board_id for view in views], [view.pixels for view in views])
+    number = clusters.tolist()
     return [
-        *two_cameras(calibration),
-        *_repeated(calibration),
-        *_images(calibration),
+        *two_cameras(calibration, clusters),
+        *_repeated(images, number),
+        *_too_few(images, number),
         *_tilts(calibration),
         *_parallel(calibration),
         *_distances(calibration),
@@ -137,15 +143,7 @@ def _upright(c: Calibration) -> list[Finding]:
     ]
 
 
-def _numbers(c: Calibration) -> tuple[list[str], list[int]]:
-    """Return the image of every view, and its number: images that repeat others share one."""
-    images = [view.image for view in c.views]
-    number = cluster_numbers(images, [view.board_id for view in c.views], [view.pixels for view in c.views])
-    return images, number.tolist()
-
-
-def _images(c: Calibration) -> list[Finding]:
-    images, number = _numbers(c)
+def _too_few(images: Sequence[str], number: Sequence[int]) -> list[Finding]:
     count = len(set(number))
     if count >= FEW_IMAGES:
         return []
@@ -161,9 +159,8 @@ def _images(c: Calibration) -> list[Finding]:
     ]
 
 
-def _repeated(c: Calibration) -> list[Finding]:
+def _repeated(images: Sequence[str], number: Sequence[int]) -> list[Finding]:
     """Say which images show the boards where another one does."""
-    images, number = _numbers(c)
     first = dict(reversed(list(zip(number, images, strict=True))))
     again = {image: first[n] for n, image in zip(number, images, strict=True) if first[n] != image}
     if not again:
@@ -182,9 +179,7 @@ def _distances(c: Calibration) -> list[Finding]:
     """Say where all boards were equally far away: then depth was seen on their tilts alone."""
     if len(c.views) < 2:
         return []
-    shapes = {board.board_id: board.points_mm for board in c.boards}
-    depth = [v.cam_from_board.apply(shapes[v.board_id]) for v in c.views]
-    far = np.concatenate([np.linalg.norm(points, axis=1) for points in depth])
+    far = corner_ranges(c)
     if np.quantile(far, 0.95) > ONE_DISTANCE * np.quantile(far, 0.05):
         return []
     return [_look("all boards were at one distance", "hold some at half and some at double of it")]

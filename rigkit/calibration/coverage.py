@@ -1,4 +1,4 @@
-"""Where in the image boards were: elsewhere a calibration extrapolates."""
+"""Where in the image boards were, and how far away: elsewhere a calibration extrapolates."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ import numpy as np
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.core.arrays import BoolArray, FloatArray, Pixels
 
-__all__ = ["covered_by_boards"]
+__all__ = ["corner_ranges", "covered_by_boards"]
 
 REACH = 1.0
 """A pixel within this many spacings of a corner (of its board in its view) lies on a board: discs of 0.71 would leave
 no gap inside a regular grid, and perspective makes spacings differ within a view."""
-PART = 1 << 20
-"""Distances computed at a time."""
+PIXELS_AT_A_TIME = 256
+CORNERS_OF_PART = 512
+"""Distances of so many pixels to so many corners are one product that stays in the cache, too small for threads."""
 
 
 def covered_by_boards(calibration: Calibration, pixels: Pixels) -> BoolArray:
@@ -32,10 +33,18 @@ def covered_by_boards(calibration: Calibration, pixels: Pixels) -> BoolArray:
     flat, corners = (flat - middle).astype(np.float32), (corners - middle).astype(np.float32)
     # |p - c|^2 <= reach^2 as one matrix product: p . c - (|c|^2 - reach^2) / 2 >= |p|^2 / 2.
     limit = (0.5 * ((corners**2).sum(axis=1) - reach**2)).astype(np.float32)
-    step = max(1, PART // len(corners))
-    for first in range(0, len(flat), step):
-        part = flat[first : first + step]
-        found[first : first + step] = (part @ corners.T - limit).max(axis=1) >= 0.5 * (part**2).sum(axis=1)
+    half = 0.5 * (flat**2).sum(axis=1)
+    # Each part has corners of all views: most of what is covered at all is covered by the first.
+    count = -(-len(corners) // CORNERS_OF_PART)
+    parts = [(np.ascontiguousarray(corners[k::count].T), limit[k::count]) for k in range(count)]
+    for first in range(0, len(flat), PIXELS_AT_A_TIME):
+        left = np.arange(first, min(first + PIXELS_AT_A_TIME, len(flat)))
+        for some, beyond in parts:
+            there = (flat[left] @ some - beyond).max(axis=1) >= half[left]
+            found[left[there]] = True
+            left = left[~there]
+            if not left.size:
+                break
     return found.reshape(np.shape(pixels)[:-1])
 
 
@@ -53,3 +62,14 @@ def _reach_px(views: Sequence[ViewResult], corners: Pixels) -> FloatArray:
     # A single row or column leaves the other side open, which then counts as zero.
     sides = np.linalg.norm((np.linalg.pinv(normal, hermitian=True) @ moments)[:, 1:], axis=-1)
     return np.repeat(REACH * sides.max(axis=1), count)
+
+
+def corner_ranges(calibration: Calibration) -> FloatArray:
+    """Return the distances of all corners of the boards from the camera, in every view, (N,) mm."""
+    found = []
+    for board in calibration.boards:
+        poses = [view.cam_from_board for view in calibration.views if view.board_id == board.board_id]
+        back = np.array([pose.rotation.T for pose in poses])
+        there = board.points_mm @ back + np.array([[pose.translation_mm] for pose in poses])
+        found.append(np.sqrt((there**2).sum(axis=-1)).ravel())
+    return np.concatenate(found)

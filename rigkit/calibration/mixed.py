@@ -10,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rigkit.calibration.repeats import cluster_numbers
 from rigkit.calibration.result import Calibration
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.findings import Finding, Severity
@@ -31,11 +30,11 @@ MAX_STARTS = 24
 """So many views from which motions are tried."""
 
 
-def two_cameras(calibration: Calibration) -> list[Finding]:
-    """Return a finding if the images are of two cameras that see the board at once."""
+def two_cameras(calibration: Calibration, number: IntArray) -> list[Finding]:
+    """Return a finding if the images are of two cameras that see the board at once; `number` (V,) is that of each
+    view's image, as `cluster_numbers` has it."""
     views = calibration.views
     images = [view.image for view in views]
-    number = cluster_numbers(images, [view.board_id for view in views], [view.pixels for view in views])
     _, first = np.unique(number, return_index=True)
     if len(first) < 2 * MIN_PARTNERS:
         return []
@@ -82,8 +81,7 @@ def _partners(
     if not moved.any():
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     flat = ends.reshape(-1, 12)[moved]
-    tree = cKDTree(flat)
-    near = tree.query_ball_point(flat[int(np.argmax(tree.query_ball_point(flat, reach, return_length=True)))], reach)
+    near = np.linalg.norm(flat - flat[int(np.argmax(_neighbours(flat, reach)))], axis=1) <= reach
     best = np.flatnonzero(moved)[near]
     # The motion of the one that lies in the middle of those.
     middle = best[int(np.argmin(np.linalg.norm(ends[best] - np.median(ends[best], axis=0), axis=(1, 2))))]
@@ -92,3 +90,15 @@ def _partners(
     found = np.flatnonzero(np.isfinite(apart))
     found = found[(boards[found] == boards[end[found]]) & (number[found] != number[end[found]])]
     return found, end[found].astype(np.int64)
+
+
+def _neighbours(points: FloatArray, reach: float) -> IntArray:
+    """Return how many of the points (N, 12) lie within `reach` of each (N,), itself too.
+
+    A tree of twelve dimensions tells hardly anything apart: only points with a neighbour in the first three are asked.
+    """
+    count = np.asarray(cKDTree(points[:, :3]).query_ball_point(points[:, :3], reach, return_length=True))
+    some = np.flatnonzero(count > 1)
+    if some.size:
+        count[some] = cKDTree(points[some]).query_ball_point(points[some], reach, return_length=True)
+    return count
