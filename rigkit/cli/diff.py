@@ -1,4 +1,4 @@
-"""`rigkit diff`: two calibrations over the image, or two rigs, against what their uncertainties predict."""
+"""`rigkit diff`: two calibrations over the image, two rigs, or boards on one mount, against their uncertainties."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from typing import TYPE_CHECKING, Any
 from rigkit.core.errors import ExitCode
 
 if TYPE_CHECKING:
-    from rigkit.workflows.diff import CameraPair, RigPair
+    from rigkit.calibration.rig.compare import RigDifference
+    from rigkit.workflows.diff import BoardsPair, CameraPair, RigPair
 
-HELP = "difference of two calibrations over the image: px map and numbers; same camera or not; or of two rigs"
+HELP = "difference of two calibrations over the image: px map and numbers; same camera or not; of rigs; of mounts"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("a", type=Path, metavar="A.json", help="calibration, or a rig")
-    parser.add_argument("b", type=Path, metavar="B.json", help="calibration, or a rig")
+    parser.add_argument("a", type=Path, metavar="A.json", help="calibration, rig, or boards on one mount")
+    parser.add_argument("b", type=Path, metavar="B.json", help="the same of another day")
     parser.add_argument("-o", "--output", type=Path, metavar="MAP.png", help="map of the difference")
     parser.add_argument("--force", action="store_true", help="replace an existing map")
     parser.add_argument("--json", action="store_true", help="print the result for programs")
@@ -25,14 +26,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import print_json
-    from rigkit.workflows.diff import DiffOptions, RigPair, diff
+    from rigkit.workflows.diff import BoardsPair, DiffOptions, RigPair, diff
 
     done = diff(args.a, args.b, DiffOptions(output=args.output, force=args.force))
-    figures = _rig_figures(done) if isinstance(done, RigPair) else _camera_figures(done)
-    if args.json:
-        print_json(figures)
+    figures: dict[str, Any]
+    if isinstance(done, BoardsPair):
+        figures, words = _boards_figures(done), _boards_in_words(done)
+    elif isinstance(done, RigPair):
+        figures = _rig_figures(done)
+        words = _rigs_in_words(done, figures)
     else:
-        print(_rigs_in_words(figures) if isinstance(done, RigPair) else _camera_in_words(figures))
+        figures = _camera_figures(done)
+        words = _camera_in_words(figures)
+    print_json(figures) if args.json else print(words)
     return ExitCode.CHECK_FAILED if done.same is False else ExitCode.WELL
 
 
@@ -82,12 +88,29 @@ def _rig_figures(pair: RigPair) -> dict[str, Any]:
     }
 
 
-def _rigs_in_words(figures: dict[str, Any]) -> str:
-    lines = [
-        f"{m['name']}: sits {m['shift_mm']:.3f} mm and {m['rotation_deg']:.4f} deg from where it sat"
-        + ("" if m["chance"] is None else f" (chance {m['chance']:.3g})")
-        for m in figures["mounts"]
+def _boards_figures(pair: BoardsPair) -> dict[str, Any]:
+    """Return the figures of the boards of every mount."""
+    targets = {n: {"boards": [asdict(m) for m in t.mounts], "chance": t.chance} for n, t in pair.targets.items()}
+    return {"targets": targets, "same": pair.same}
+
+
+def _boards_in_words(pair: BoardsPair) -> str:
+    lines = [line for target in pair.targets.values() for line in _mounts_in_words(target)]
+    chances = ", ".join(f"{target.chance:.3g}" for target in pair.targets.values())
+    verdict = "the same mount" if pair.same else "NOT the same mount: a board moved"
+    return "\n".join([*lines, f"boards together: chance {chances}; {verdict}"])
+
+
+def _mounts_in_words(difference: RigDifference) -> list[str]:
+    return [
+        f"{m.name}: sits {m.shift_mm:.3f} mm and {m.rotation_deg:.4f} deg from where it sat"
+        + ("" if m.chance is None else f" (chance {m.chance:.3g})")
+        for m in difference.mounts
     ]
+
+
+def _rigs_in_words(pair: RigPair, figures: dict[str, Any]) -> str:
+    lines = _mounts_in_words(pair.mounts)
     lines += [f"{name}: {_camera_in_words(own)}".replace("\n", "; ") for name, own in figures["cameras"].items()]
     if figures["same"] is None:
         return "\n".join([*lines, "no verdict: a file has no covariance"])

@@ -129,6 +129,11 @@ def is_rig_file(path: str | Path) -> bool:
     return json_schema(path) == RIG_SCHEMA
 
 
+def is_board_rigs_file(path: str | Path) -> bool:
+    """Return whether a file is of boards on one mount."""
+    return json_schema(path) == BOARDS_SCHEMA
+
+
 def board_rigs_text(rigs: Sequence[BoardRig]) -> str:
     """Return the content of the file of boards on one mount, with their angles."""
     data = {

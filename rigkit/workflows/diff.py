@@ -1,4 +1,4 @@
-"""Two calibrations, or two rigs, against what their uncertainties predict."""
+"""Two calibrations, rigs, or sets of boards on one mount, against what their uncertainties predict."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rigkit.calibration.compare import CalibrationComparison, compare_calibrations
-from rigkit.calibration.rig.compare import Mounted, RigDifference, compare_mounts
+from rigkit.calibration.rig.compare import Mounted, RigDifference, compare_board_rigs, compare_mounts
 from rigkit.cameras.compare import CameraDifference, compare_cameras
 from rigkit.core.errors import InputError
 from rigkit.io.calibration_file import is_calibration, load_calibration
 from rigkit.io.files import ensure_writable, write_atomic
-from rigkit.io.rig_file import SavedRig, is_rig_file, load_saved_rig
+from rigkit.io.rig_file import SavedRig, is_board_rigs_file, is_rig_file, load_board_rigs, load_saved_rig
 from rigkit.report.figures import difference_png
 from rigkit.workflows.camera_files import import_camera, import_rig, is_ours, is_rig
 
-__all__ = ["CameraPair", "DiffOptions", "RigPair", "diff"]
+__all__ = ["BoardsPair", "CameraPair", "DiffOptions", "RigPair", "diff"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,12 +57,31 @@ class RigPair:
         return all(known) if known else None
 
 
-def diff(a: Path, b: Path, options: DiffOptions | None = None) -> CameraPair | RigPair:
-    """Compare two calibration files, or two files of rigs.
+@dataclass(frozen=True, eq=False, slots=True)
+class BoardsPair:
+    """The differences of boards on one mount, by the name of the first of each mount."""
 
-    Raises InputError for a rig and a camera, rigs of other cameras, or a map that cannot be written.
+    targets: Mapping[str, RigDifference]
+
+    @property
+    def same(self) -> bool:
+        """Whether every board sits where it sat."""
+        return all(target.same is not False for target in self.targets.values())
+
+
+def diff(a: Path, b: Path, options: DiffOptions | None = None) -> CameraPair | RigPair | BoardsPair:
+    """Compare two calibration files, two files of rigs, or two of boards on one mount.
+
+    Raises InputError for files of two kinds, rigs of other cameras or boards, or a map that cannot be written.
     """
     options = options or DiffOptions()
+    boards = [is_board_rigs_file(path) for path in (a, b)]
+    if any(boards):
+        if not all(boards):
+            raise InputError(f"diff: '{b if boards[0] else a}' is no file of boards on one mount, as the other one is")
+        if options.output is not None:
+            raise InputError("diff: a map is of two cameras, not of boards; leave out -o")
+        return _boards(a, b)
     rigs = [is_rig(path) for path in (a, b)]
     if all(rigs):
         if options.output is not None:
@@ -77,6 +96,13 @@ def diff(a: Path, b: Path, options: DiffOptions | None = None) -> CameraPair | R
     if options.output is not None:
         write_atomic(options.output, difference_png(pair.difference), force=options.force)
     return pair
+
+
+def _boards(a: Path, b: Path) -> BoardsPair:
+    first, second = ({rig.names[0]: rig for rig in load_board_rigs(path)} for path in (a, b))
+    if list(first) != list(second):
+        raise InputError(f"diff: '{a}' has mounts of {', '.join(first)}, '{b}' of {', '.join(second)}")
+    return BoardsPair({name: compare_board_rigs(rig, second[name]) for name, rig in first.items()})
 
 
 def _cameras(a: Path, b: Path) -> CameraPair:

@@ -14,6 +14,7 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
 from rigkit.calibration.rig.board_ties import suggest_ties
 from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.compare import compare_board_rigs
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
@@ -285,3 +286,25 @@ def test_boards_that_move_are_not_taken_for_mounted(rng: np.random.Generator) ->
         views += [replace(view, image=f"{k}.png") for _, view in own]
     result = calibrate(views, REG["reg"][0].size_px, model="brown", board="flat")
     assert suggest_ties(views, result) == ()
+
+
+def test_mounts_that_did_not_move_are_told_apart_as_often_as_chance_says(rng: np.random.Generator) -> None:
+    boards = [Board(name, 8, 6, 30.0, 30.0) for name in ("a", "b", "c")]
+    places = [Rigid3.identity(), *(Rigid3(exp_so3(rng.normal(size=3)), rng.normal(size=3) * 100.0) for _ in range(2))]
+    spread = rng.normal(size=(12, 12)) * np.tile([1e-4, 1e-4, 1e-4, 0.05, 0.05, 0.05], 2)[:, None]
+    covariance = spread @ spread.T
+
+    def drawn(extra: float = 0.0) -> BoardRig:
+        error = (spread @ rng.normal(size=12)).reshape(2, 6)
+        error[0, 3] += extra
+        moved = [
+            Rigid3(exp_so3(e[:3]) @ p.rotation, p.translation_mm + e[3:])
+            for e, p in zip(error, places[1:], strict=True)
+        ]
+        placed = tuple(MountedBoard(b, b.points(), p) for b, p in zip(boards, [places[0], *moved], strict=True))
+        return BoardRig(placed, covariance, 400)
+
+    chances = np.array([compare_board_rigs(drawn(), drawn(), seed=k).chance for k in range(120)])
+    # A binomial count of 120 with chance 0.25 is beyond these once in 10,000 times.
+    assert 13 <= (chances < 0.25).sum() <= 48
+    assert compare_board_rigs(drawn(), drawn(5.0)).same is False

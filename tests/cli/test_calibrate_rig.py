@@ -142,6 +142,17 @@ def test_boards_on_one_mount(tmp_path: Path, rng: np.random.Generator, capsys: p
     assert target.angle_deg("plane1", "plane2")[0] == pytest.approx(told["checks"][0]["ours"])
     assert "Boards mounted to each other" in (tmp_path / "calibration.html").read_text()
 
+    capsys.readouterr()
+    saved = tmp_path / "calibration-boards.json"
+    moved = json.loads(saved.read_text())
+    moved["rigs"][0]["boards"][1]["target_from_board"][0][3] += 2.0
+    (tmp_path / "moved.json").write_text(json.dumps(moved))
+    assert main(["diff", str(saved), str(saved)]) == 0 and "the same mount" in capsys.readouterr().out
+    assert main(["diff", str(saved), str(tmp_path / "moved.json"), "--json"]) == 1
+    told_apart = json.loads(capsys.readouterr().out)["targets"][target.names[0]]["boards"]
+    assert told_apart[0]["shift_mm"] == pytest.approx(2.0) and told_apart[1]["shift_mm"] == 0.0
+    assert main(["diff", str(saved), str(tmp_path / "calibration.json")]) == 2
+
     again = calibrate_camera(path)
     assert again.heldout_rms_px == told["cameras"][0]["heldout_rms_px"]
 

@@ -43,7 +43,7 @@ class MountedBoard:
 
     @property
     def face(self) -> FloatArray:
-        """NormalEquations of the face in the target's frame, towards whoever looks at it."""
+        """Normal of the face in the target's frame, towards whoever looks at it."""
         return -self.target_from_board.rotation[:, 2]
 
 

@@ -1,4 +1,4 @@
-"""Two calibrations of a rig: have its cameras moved against each other?
+"""Two calibrations of a rig, or of boards on one mount: have its cameras, or they, moved against each other?
 
 Boards alone leave open how a lens is turned in its camera: a moved principal point and a turned camera are the same
 image, and the mount takes the turn up. So mounts are compared as the lenses of the first rig have their axes. With W_k
@@ -19,6 +19,7 @@ from itertools import pairwise
 import numpy as np
 
 from rigkit.calibration.clustered import drawn_errors
+from rigkit.calibration.rig.board_rig import BoardRig
 from rigkit.calibration.uncertainty import projection_design
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import compare_cameras, grid_pixels
@@ -27,7 +28,7 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import log_so3, skew
 
-__all__ = ["MountDifference", "Mounted", "RigDifference", "compare_mounts"]
+__all__ = ["MountDifference", "Mounted", "RigDifference", "compare_board_rigs", "compare_mounts"]
 
 SAME_CHANCE = 0.01
 """Mounts this unlikely to be one and the same rig's are another rig's, or a rig's that was bent."""
@@ -57,8 +58,8 @@ class Mounted:
 
 @dataclass(frozen=True, slots=True)
 class MountDifference:
-    """How far one camera sits from where the other calibration has it: degrees, mm, and the chance of as much if it did
-    not move; None where a rig does not say how sure it is."""
+    """How far one camera, or board, sits from where the other calibration has it: degrees, mm, and the chance of as
+    much if it did not move; None where a rig does not say how sure it is."""
 
     name: str
     rotation_deg: float
@@ -68,7 +69,7 @@ class MountDifference:
 
 @dataclass(frozen=True, slots=True)
 class RigDifference:
-    """Of every camera but the first, and the chance of as much in all of them if nothing moved."""
+    """Of every camera (or board) but the first, and the chance of as much in all of them if nothing moved."""
 
     mounts: tuple[MountDifference, ...]
     chance: float | None
@@ -96,15 +97,41 @@ def compare_mounts(a: Mounted, b: Mounted, *, seed: int = 0) -> RigDifference:
         # As the axes of the first rig's lenses have it.
         moved = Rigid3(turn.T @ there.rotation @ turns[0], turn.T @ there.translation_mm)
         off.append(_off(here, moved))
-    apart = np.concatenate(off)
     known = None
     if a.covariance is not None and b.covariance is not None:
-        rng = np.random.default_rng(seed)
-        parts = [_moved(a, a.covariance, weights), _moved(b, b.covariance, weights)]
-        drawn = drawn_errors(parts[0], a.freedom, rng) - drawn_errors(parts[1], b.freedom, rng)
-        known = parts[0] + parts[1], drawn
+        parts = _moved(a, a.covariance, weights), _moved(b, b.covariance, weights)
+        known = _known(parts, (a.freedom, b.freedom), seed)
+    return _difference(list(a.cameras)[1:], np.concatenate(off), known)
+
+
+def compare_board_rigs(a: BoardRig, b: BoardRig, *, seed: int = 0) -> RigDifference:
+    """Compare the places of boards on one mount, in the frame of the first of them; an error of the squares' size is
+    the same in both.
+
+    Raises InputError where the boards are others.
+    """
+    if a.names != b.names:
+        raise InputError(f"other boards: {', '.join(a.names)} and {', '.join(b.names)}")
+    off = [_off(p.target_from_board, q.target_from_board) for p, q in zip(a.boards[1:], b.boards[1:], strict=True)]
+    freedom = tuple(float(max(rig.image_count - 1, 1)) for rig in (a, b))
+    known = _known((a.covariance, b.covariance), freedom, seed)
+    return _difference(a.names[1:], np.concatenate([np.zeros(0), *off]), known)
+
+
+Known = tuple[FloatArray, FloatArray]
+"""Covariance (n, n) of what may differ, and errors (n, N) drawn from what both parts of it say."""
+
+
+def _known(parts: Sequence[FloatArray], freedom: Sequence[float], seed: int) -> Known:
+    rng = np.random.default_rng(seed)
+    first, second = (drawn_errors(part, degrees, rng) for part, degrees in zip(parts, freedom, strict=True))
+    return parts[0] + parts[1], first - second
+
+
+def _difference(names: Sequence[str], apart: FloatArray, known: Known | None) -> RigDifference:
+    """Return the difference from the perturbations `apart` (6 n,) of what has the names."""
     mounts = []
-    for k, name in enumerate(list(a.cameras)[1:]):
+    for k, name in enumerate(names):
         own = slice(6 * k, 6 * k + 6)
         angle, shift = np.degrees(np.linalg.norm(apart[own][:3])), np.linalg.norm(apart[own][3:])
         chance = None if known is None else _chance(apart[own], known[0][own, own], known[1][own])
