@@ -85,6 +85,30 @@ def test_the_centre_is_the_image_of_the_centre(
     assert np.abs(off).max() < SINGLE_PX
 
 
+@pytest.mark.parametrize("board", [REGULAR, HEXAGONAL], ids=["regular", "hexagonal"])
+def test_the_lens_tells_what_neighbours_do_not(board: Board) -> None:
+    # Slanted and near: the map bends most at one rim.
+    scene = one_board(np.random.default_rng(1), lens="fisheye", board=board)
+    image, truth = scene.render(blur_px=0.7), scene.truth()[0]
+    alone, known = (detect_boards(image, [board], camera=camera)[0] for camera in (None, scene.camera))
+    off = []
+    for found in (alone, known):
+        turns = [found, *(found.turned(k) for k in board.turns)]
+        off.append(min((errors(turn, truth) for turn in turns), key=lambda e: float(np.abs(e).max())))
+    assert len(off[0]) == len(off[1]) == board.corner_count
+    assert np.sqrt((off[1] ** 2).mean()) < 0.7 * np.sqrt((off[0] ** 2).mean())
+    assert np.abs(off[1]).max() < 2.0 * MOST_BIAS_PX
+    assert np.abs(off[1].mean(axis=0)).max() < 0.2 * MOST_BIAS_PX
+
+
+def test_a_lens_that_did_not_see_the_board_is_not_asked() -> None:
+    rng = np.random.default_rng(1)
+    scene = one_board(rng, lens="fisheye", board=REGULAR)
+    image = scene.render(noise_levels=2.0, rng=rng)
+    (alone,), (wrong,) = (detect_boards(image, [REGULAR], camera=camera) for camera in (None, bench_camera("regular")))
+    assert np.array_equal(alone.pixels, wrong.pixels)
+
+
 def test_a_cut_grid_gets_its_place_where_its_borders_show() -> None:
     scene = slanted(ASYMMETRIC, "regular", 24.0, 20.0, 520.0)
     truth = scene.truth()[0]

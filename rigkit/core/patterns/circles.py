@@ -73,7 +73,7 @@ class Circles(Pattern):
         return self.layout != "regular"
 
     def check(self, columns: int, rows: int, squares_mm: tuple[float, float]) -> None:
-        nearest = NEIGHBOUR_DISTANCES[self.layout] * min(squares_mm)
+        nearest = self.nearest_mm(squares_mm)
         if self.diameter_mm is not None and not 0.0 < self.diameter_mm < nearest:
             raise InputError(
                 f"circles of {self.diameter_mm:g} mm touch: neighbours lie {nearest:g} mm apart; distance_mm is that "
@@ -107,8 +107,11 @@ class Circles(Pattern):
 
     def printed_diameter_mm(self, squares_mm: tuple[float, float]) -> float:
         """Return the diameter of the circles, the usual one where it is not given."""
-        nearest = NEIGHBOUR_DISTANCES[self.layout] * min(squares_mm)
-        return USUAL_DIAMETER * nearest if self.diameter_mm is None else self.diameter_mm
+        return USUAL_DIAMETER * self.nearest_mm(squares_mm) if self.diameter_mm is None else self.diameter_mm
+
+    def nearest_mm(self, squares_mm: tuple[float, float]) -> float:
+        """Return the distance of a circle's nearest neighbours."""
+        return NEIGHBOUR_DISTANCES[self.layout] * min(squares_mm)
 
     def describe(self, columns: int, rows: int, squares_mm: tuple[float, float]) -> str:
         x, y = squares_mm

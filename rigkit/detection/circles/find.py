@@ -14,7 +14,7 @@ from rigkit.detection.circles.lattices import LabelledBlobs, blob_lattices
 from rigkit.detection.circles.local_map import PlaneMap, local_maps
 from rigkit.detection.saddles.response import GreyImage
 
-__all__ = ["CircleGrid", "GridEvidence", "find_grids", "seen_grids"]
+__all__ = ["CircleGrid", "GridEvidence", "edge_reach", "find_grids", "seen_grids"]
 
 Rows = TypeVar("Rows", CircleFit, PlaneMap)
 
@@ -63,6 +63,7 @@ class CircleGrid:
     hexagonal : whether the second direction lies at 60 degrees to the first, not at 90.
     bright : whether the circles are brighter than what they are printed on.
     radius : of the circles, in distances of neighbours.
+    blur_px, contrast : typical blur of an edge, and how far circles differ from their ground in grey levels.
     empty : (K, 2) places beside these circles that the image shows, and no circle there.
     evidence : what speaks for a grid.
     """
@@ -74,6 +75,8 @@ class CircleGrid:
     hexagonal: bool
     bright: bool
     radius: float
+    blur_px: float
+    contrast: float
     empty: IntArray
     evidence: GridEvidence
 
@@ -177,10 +180,17 @@ def _radius(maps: FloatArray, first: FloatArray) -> float:
 
 def _fitted(grey: GreyImage, pixels: FloatArray, around: PlaneMap, radius: float, blur_px: FloatArray) -> CircleFit:
     maps = radius * around.first
-    # Half the way to the next circle; where there is none, the sheet may end there.
-    narrow = np.sqrt(np.maximum(np.linalg.eigvalsh(maps @ np.swapaxes(maps, 1, 2))[:, 0], 1.0))
-    reach = np.where(around.surrounded, 0.5 / radius, np.minimum(0.5 / radius, 1.0 + RIM_SIGMAS * blur_px / narrow))
+    reach = edge_reach(maps, 0.5 / radius, blur_px, around.surrounded)
     return fit_circles(grey, pixels, maps, radius**2 * around.second, blur_px, reach)
+
+
+def edge_reach(maps: FloatArray, half_way: float, blur_px: FloatArray, surrounded: BoolArray) -> FloatArray:
+    """Return to how many radii (N,) pixels are a circle's own.
+
+    That is half the way to the next circle; where there is none, the sheet may end there.
+    """
+    narrow = np.sqrt(np.maximum(np.linalg.eigvalsh(maps @ np.swapaxes(maps, 1, 2))[:, 0], 1.0))
+    return np.where(surrounded, half_way, np.minimum(half_way, 1.0 + RIM_SIGMAS * blur_px / narrow))
 
 
 def _sigma(fit: CircleFit) -> float:
@@ -295,6 +305,8 @@ def _finished(draft: _Draft, size_px: tuple[int, int]) -> CircleGrid | None:
         hexagonal=draft.hexagonal,
         bright=draft.bright,
         radius=draft.radius,
+        blur_px=float(np.median(fit.blur_px)),
+        contrast=float(np.median(np.abs(fit.contrast))),
         empty=empty,
         evidence=evidence,
     )

@@ -26,8 +26,8 @@ RULES = kernel.CircleRules.of(
     most_move_px=1.0,
     most_growth=0.2,
     most_light=1.5,
-    converged_px=1e-4,
-    iterations=25,
+    converged_px=1e-3,
+    iterations=15,
     fewest=16,
 )
 MODEL_SIGMA_PX = 5e-4

@@ -9,6 +9,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.detection.circles.find import find_grids
 from rigkit.detection.circles.place import lone_part, placed_on
+from rigkit.detection.circles.through_lens import seen_through
 from rigkit.detection.targets.base import Finder, Search
 
 __all__ = ["CirclesFinder"]
@@ -24,7 +25,9 @@ class CirclesFinder(Finder):
         for grid in find_grids(search.grey, fewest):
             fits = [(board, placed) for board in boards if (placed := placed_on(grid, board)) is not None]
             if fits:
-                out.append(fits[0][1])
+                board, placed = fits[0]
+                camera = search.camera
+                out.append(placed if camera is None else seen_through(search.grey, grid, placed, board, camera))
                 names.append(fits[0][0].board_id if len(fits) == 1 else None)
                 continue
             parts = [part for board in boards if (part := lone_part(grid, board)) is not None]

@@ -1,0 +1,113 @@
+"""A second look at a board of circles through its calibrated camera: exact maps, and the circles that were missed.
+
+The pose of the board says how the lens shows the plane around every circle, at the rim of a grid as well as in its
+middle, where neighbours on one side alone tell it less well (`local_map`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
+from rigkit.core.errors import DegenerateError
+from rigkit.core.patterns.circles import Circles
+from rigkit.detection.circles.find import (
+    LEAST_CONTRAST,
+    LEAST_TYPICAL,
+    MOST_CONTRAST,
+    MOST_GROWTH,
+    MOST_RESIDUAL,
+    OFF_PLACE,
+    CircleGrid,
+    edge_reach,
+)
+from rigkit.detection.circles.fit import CircleFit, fit_circles
+from rigkit.detection.circles.local_map import NEXT
+from rigkit.detection.saddles.response import GreyImage
+from rigkit.geometry.board_pose import board_pose
+from rigkit.geometry.rigid3 import Rigid3
+
+__all__ = ["seen_through"]
+
+MIN_POSE_CIRCLES = 12
+"""Circles found that tell the pose of a board."""
+MISSED_DISTANCES = 0.1
+"""A camera whose pose of the board misses circles by more (median, in distances of neighbours) did not see it."""
+
+
+def seen_through(
+    grey: GreyImage, found: CircleGrid, placed: BoardDetection, board: Board, camera: Camera
+) -> BoardDetection:
+    """Return `placed`, the grid `found` on the board, fitted with the maps of the camera, and circles that it missed.
+
+    As it is where the camera cannot have taken the image.
+    """
+    pattern = board.pattern
+    pose = _pose(placed, board, camera)
+    if pose is None or not isinstance(pattern, Circles):
+        return placed
+    nearest_mm = pattern.nearest_mm(board.squares_mm)
+    radius_mm = found.radius * nearest_mm if pattern.diameter_mm is None else 0.5 * pattern.diameter_mm
+    grid = board.grid()[board.exists()]
+    points = board.points(grid)
+    expected, maps, bends, valid = _maps(camera, pose, points, radius_mm)
+    spacing = np.sqrt(np.abs(np.linalg.det(maps))) * nearest_mm / radius_mm
+    known = np.isin(board.index(grid), board.index(placed.grid))
+    pixels = np.where(known[:, None], placed.lattice()[grid[:, 1], grid[:, 0]], expected)
+    missed = np.linalg.norm(pixels - expected, axis=1) / spacing
+    if not np.median(missed[known]) < MISSED_DISTANCES:
+        return placed
+    extent = np.sqrt((maps**2).sum(axis=2))
+    whole = ((pixels > extent) & (pixels < np.array([grey.shape[1], grey.shape[0]]) - 1.0 - extent)).all(axis=1)
+    tried = valid & (known | whole)
+    blur = np.full(int(tried.sum()), found.blur_px)
+    near = np.linalg.norm(points[tried][:, None] - points[known], axis=2) < NEXT * nearest_mm
+    surrounded = near.sum(axis=1) > (6 if found.hexagonal else 4)
+    reach = edge_reach(maps[tried], 0.5 * nearest_mm / radius_mm, blur, surrounded)
+    fit = fit_circles(grey, pixels[tried], maps[tried], bends[tried], blur, reach)
+    off = np.linalg.norm(fit.pixels - pixels[tried], axis=1) / spacing[tried]
+    good = _sound(fit, found) & (off < OFF_PLACE)
+    sigma = np.full(len(grid), np.nan)
+    sigma[known] = placed.sigma_px[np.argsort(board.index(placed.grid))]
+    at = np.flatnonzero(tried)[good]
+    pixels[at], sigma[at] = fit.pixels[good], fit.sigma_px[good]
+    kept = np.isfinite(sigma)
+    return BoardDetection(placed.board_id, *board.size, grid[kept], pixels[kept], sigma[kept])
+
+
+def _pose(placed: BoardDetection, board: Board, camera: Camera) -> Rigid3 | None:
+    rays, valid = camera.unproject(placed.pixels)
+    if valid.sum() < MIN_POSE_CIRCLES:
+        return None
+    try:
+        return board_pose(rays[valid], board.points(placed.grid[valid])).cam_from_board
+    except DegenerateError:
+        return None
+
+
+def _maps(
+    camera: Camera, pose: Rigid3, points: FloatArray, radius_mm: float
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """Return pixels (N, 2), first (N, 2, 2) and second (N, 2, 3) differences over a radius, px, and what is valid."""
+    step = radius_mm * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1], [1, -1], [-1, 1]])
+    around = points[:, None] + np.pad(step, ((0, 0), (0, 1)))
+    seen, valid = camera.project(pose.apply(around.reshape(-1, 3)))
+    at = seen.reshape(len(points), len(step), 2).transpose(1, 0, 2)
+    first = np.stack([at[1] - at[2], at[3] - at[4]], axis=-1) / 2.0
+    mixed = (at[5] + at[6] - at[7] - at[8]) / 4.0
+    second = np.stack([at[1] + at[2] - 2.0 * at[0], mixed, at[3] + at[4] - 2.0 * at[0]], axis=-1)
+    fine = valid.reshape(len(points), -1).all(axis=1) & (np.abs(np.linalg.det(first)) > 1.0)
+    return at[0], first, second, fine
+
+
+def _sound(fit: CircleFit, found: CircleGrid) -> BoolArray:
+    """Return which circles look like those of the grid."""
+    contrast = np.abs(fit.contrast)
+    part = contrast / found.contrast
+    usual = max(found.evidence.unexplained, LEAST_TYPICAL)
+    good = fit.valid & ((fit.contrast > 0.0) == found.bright) & (np.abs(fit.growth) < MOST_GROWTH).all(axis=1)
+    good &= (part > LEAST_CONTRAST) & (part < MOST_CONTRAST)
+    return np.asarray(good & (fit.residual < MOST_RESIDUAL * usual * np.maximum(contrast, 1e-9)))
