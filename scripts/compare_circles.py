@@ -1,4 +1,4 @@
-"""Circle grids beside OpenCV's findCirclesGrid: images found, and the error of cv2.calibrateCamera from either's centres.
+"""Circle grids beside OpenCV: images found, and the error of cv2.calibrateCamera from either's centres.
 
     python scripts/compare_circles.py --board circles.toml IMAGE...     real images
     python scripts/compare_circles.py                                   rendered ones, with the errors of the centres
