@@ -20,7 +20,9 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.patterns.circles import Circles
 from rigkit.detection.detect import detect_boards
+from rigkit.detection.saddles.response import grey_image
 from rigkit.io.board_file import load_board
+from rigkit.io.images import read_image
 
 FLAGS = {"regular": cv2.CALIB_CB_SYMMETRIC_GRID, "asymmetric": cv2.CALIB_CB_ASYMMETRIC_GRID}
 RENDERED = (
@@ -59,7 +61,7 @@ def reprojection_rms_px(centres: Sequence[FloatArray], board: Board, size_px: tu
 
 
 def compare_real(paths: Sequence[Path], board: Board) -> None:
-    images = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in paths]
+    images = [np.asarray(grey_image(read_image(path))) for path in paths]
     found = {name: [finder(image, board) for image in images] for name, finder in FINDERS.items()}
     common = [k for k in range(len(images)) if all(centres[k] is not None for centres in found.values())]
     size_px = (images[0].shape[1], images[0].shape[0])
