@@ -190,7 +190,7 @@ enum { LAG = 2, ACROSS_LAGS = 2 * LAG + 1, LAGS = LAG * ACROSS_LAGS + LAG + 1, O
 
 /* The constants of detection.subpixel.edge_model and detection.subpixel.edge_fit, under their names there. */
 typedef struct {
-    double reach, end_sigmas, least_reach, near_sigmas, near_px, tail_sigmas, pixel_kurtosis, sharp_blur;
+    double reach, end_sigmas, paper_sigmas, least_reach, near_sigmas, near_px, tail_sigmas, pixel_kurtosis, sharp_blur;
     double least_blur, most_blur, angle_sigma, log_blur_sigma, light_sigma;
     double most_move_px, most_turn, most_blur_change, most_light_change;
     double least_variance, ridge, converged_px, blur_lag, valid_move_px, valid_move_cells, most_mirrored, radius_px;
@@ -208,7 +208,8 @@ EXPORT void fit_edges(
     ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t count,
     ARRAY(const double, pixels, count, 2), ARRAY(const double, sides, count, 2, 2),
     ARRAY(const double, curvature, count, 2), ARRAY(const double, curvature_sigma, count, 2),
-    ARRAY(const double, gaps, count, 2, 2), ARRAY(const double, reach, count, 2, 2), ARRAY(const double, sign, count),
+    ARRAY(const double, gaps, count, 2, 2), ARRAY(const double, reach, count, 2, 2),
+    ARRAY(const double, paper, count, 2, 2), ARRAY(const double, sign, count),
     ARRAY(const double, blur, count), ARRAY(const double, contrast, count), ARRAY(const uint8_t, ends, count, 2, 2), const edge_rules_t *rules,
     ARRAY(float, scratch, edges_scratch(rules)), ARRAY(double, out, count, OUTCOMES));
 EXPORT void line_bends(

@@ -21,10 +21,10 @@ typedef int32_t words_t __attribute__((vector_size(4 * STRETCH)));
 typedef float bright_t __attribute__((vector_size(4 * STRETCH), aligned(4)));
 
 /* What the lattice says of a corner: its cell's sides, the curvature of its lines and how uncertain it is, where their
- * neighbours are, how far its window goes towards these, in sides of the cell, where that is not by rule, and which of these have
- * no corner of the lattice. */
+ * neighbours are, how far its window goes towards these, in sides of the cell, where that is not by rule, which of these
+ * have no corner of the lattice, and how bright it is beyond these, NaN where that is not known. */
 typedef struct {
-    const double *sides, *curvature, *curvature_sigma, *gaps, *reach;
+    const double *sides, *curvature, *curvature_sigma, *gaps, *reach, *paper;
     const uint8_t *ends;
 } geometry_t;
 
@@ -42,13 +42,20 @@ typedef struct {
 typedef struct {
     float cosine, sine, curvature, before, after;
     float blur, width, stretch, apart, kurtosis;
-    int tight, sharp;
+    float paper_before, paper_after;
+    int tight, sharp, ends_before, ends_after;
 } line_t;
 
 /* The model along one line over a block of pixels: the step, its derivatives, -s dS/ds, and the pixel's place. */
 typedef struct {
     float value[BLOCK], slope[BLOCK], bow[BLOCK], curl[BLOCK], grown[BLOCK], along[BLOCK], aside[BLOCK];
 } edge_t;
+
+/* What lies beyond the outer squares of one line over a block of pixels: how much of it a pixel sees, and that times how
+ * bright it is; the derivatives of both, and -s d/ds. */
+typedef struct {
+    float seen[BLOCK], seen_slope[BLOCK], seen_grown[BLOCK], paper[BLOCK], slope[BLOCK], grown[BLOCK];
+} beyond_t;
 
 typedef struct {
     double lo, hi;
@@ -109,15 +116,18 @@ INLINE void take(window_t *window, const picture_t image, int64_t v, int32_t fir
     window->count += count;
 }
 
-/* Return how far the window reaches towards neighbouring line `k` (reference.edges._reach). */
-INLINE double reach_to(const geometry_t at, int k, double blur, const edge_rules_t *rules)
+/* Return how far the window reaches towards neighbouring line `k` of cells that are `across` px wide that way
+ * (reference.edges._reach). */
+INLINE double reach_to(const geometry_t at, int k, double blur, double across, const edge_rules_t *rules)
 {
     if (isfinite(at.reach[k]))
         return at.reach[k] < rules->reach ? at.reach[k] : rules->reach;
     if (!at.ends[k])
         return rules->reach;
-    const double left = 1.0 - rules->end_sigmas * blur / (at.gaps[k] > 1e-9 ? at.gaps[k] : 1e-9);
-    return left < rules->least_reach ? rules->least_reach : left < rules->reach ? left : rules->reach;
+    const double sigmas = isfinite(at.paper[k]) ? rules->paper_sigmas : rules->end_sigmas;
+    const double far = at.gaps[k] - sigmas * blur, least = rules->least_reach * at.gaps[k];
+    const double left = (far > least ? far : least) / across;
+    return left < rules->reach ? left : rules->reach;
 }
 
 /* Gather the pixels inside the cell, the radius and the image (reference.edges.collect): of every row one or two stretches
@@ -145,8 +155,9 @@ static void collect(
     const double tallest = rules->reach * across_v + 1.0;
     const int64_t most = (int64_t)floor(tallest < rules->radius_px ? tallest : rules->radius_px);
     const range_t columns = {-window->centre_u, (double)image.width - 1.0 - window->centre_u};
-    const double left = reach_to(at, 3, blur, rules), right = reach_to(at, 2, blur, rules);
-    const double above = reach_to(at, 0, blur, rules), below = reach_to(at, 1, blur, rules);
+    const double high = fabs(area) / hypot(a[0], a[1]), wide = fabs(area) / hypot(b[0], b[1]);
+    const double left = reach_to(at, 3, blur, wide, rules), right = reach_to(at, 2, blur, wide, rules);
+    const double above = reach_to(at, 0, blur, high, rules), below = reach_to(at, 1, blur, high, rules);
     const double columns_a = area / b[1], columns_b = -area / a[1], per_area = 1.0 / area;
     const double square = rules->radius_px * rules->radius_px, rest = (double)image.height - 1.0 - window->centre_v;
     const int64_t top = -window->centre_v > -(double)most ? -(int64_t)window->centre_v : -most;
@@ -217,19 +228,23 @@ INLINE void blurred_edge(float x, float kurtosis, float out[5])
     out[4] = x * slope - 4.0f * third;
 }
 
-INLINE line_t line_of(double angle, double curvature, const double gaps[2], double blur, const edge_rules_t *rules)
+INLINE line_t line_of(
+    double angle, double curvature, const double gaps[2], const double paper[2], double blur, const edge_rules_t *rules)
 {
     const double cosine = cos(angle), sine = sin(angle), c2 = cosine * cosine, s2 = sine * sine, b2 = blur * blur;
     const double flat = rules->pixel_kurtosis * (c2 * c2 + s2 * s2);
     const int sharp = blur < rules->sharp_blur;
     const double apart = sharp ? sqrt(sqrt(-0.5 * flat)) : 0.0, width = sqrt(b2 - apart * apart);
     const double nearest = gaps[0] < gaps[1] ? gaps[0] : gaps[1];
+    const int before = isfinite(paper[0]), after = isfinite(paper[1]);
     return (line_t){
         .cosine = (float)cosine, .sine = (float)sine, .curvature = (float)curvature,
         .before = (float)gaps[0], .after = (float)gaps[1],
         .blur = (float)blur, .width = (float)width, .stretch = (float)(blur / width), .apart = (float)apart,
         .kurtosis = sharp ? 0.0f : (float)(flat / (b2 * b2)),
-        .tight = nearest * (1.0 - rules->reach) < rules->tail_sigmas * blur, .sharp = sharp};
+        .paper_before = before ? (float)paper[0] : 0.0f, .paper_after = after ? (float)paper[1] : 0.0f,
+        .tight = before || after || nearest * (1.0 - rules->reach) < rules->tail_sigmas * blur, .sharp = sharp,
+        .ends_before = before, .ends_after = after};
 }
 
 /* Add a Gaussian edge, `shift` back from the line, with weight `part`. The distances have a loop of their own: mixed
@@ -278,11 +293,48 @@ INLINE void along_line(const line_t line, const float *u, const float *v, float 
     }
     add_edge(line, 0.0f, 1.0f, out);
     if (line.tight) {
-        add_edge(line, line.before, -1.0f, out);
-        add_edge(line, -line.after, -1.0f, out);
+        /* Squares go on beyond the next line the other way round; of paper the pattern is nothing. */
+        const float before = line.ends_before ? 0.5f : 1.0f, after = line.ends_after ? 0.5f : 1.0f;
+        add_edge(line, line.before, -before, out);
+        add_edge(line, -line.after, -after, out);
+        for (int i = 0; i < BLOCK; i++)
+            out->value[i] += before - after;
     }
     for (int i = 0; i < BLOCK; i++)
         out->grown[i] += line.curvature * line.blur * out->slope[i];
+}
+
+/* Add what lies beyond the line `shift` back from `line`, on the side where `way` times the distance grows. */
+INLINE void add_paper(const line_t line, float shift, float way, float paper, const edge_t *at, beyond_t *out)
+{
+    edge_t edge;
+    for (int i = 0; i < BLOCK; i++) {
+        edge.along[i] = at->along[i];
+        edge.aside[i] = at->aside[i];
+        edge.value[i] = edge.slope[i] = edge.bow[i] = edge.curl[i] = edge.grown[i] = 0.0f;
+    }
+    add_edge(line, shift, 1.0f, &edge);
+    const float half = 0.5f * way;
+    for (int i = 0; i < BLOCK; i++) {
+        const float seen = 0.5f + half * edge.value[i], slope = half * edge.slope[i];
+        const float grown = half * (edge.grown[i] + line.curvature * line.blur * edge.slope[i]);
+        out->seen[i] += seen;
+        out->seen_slope[i] += slope;
+        out->seen_grown[i] += grown;
+        out->paper[i] += paper * seen;
+        out->slope[i] += paper * slope;
+        out->grown[i] += paper * grown;
+    }
+}
+
+/* Evaluate what lies beyond the ends of one line whose `at` is known (reference.edges._beyond). */
+INLINE void beyond_line(const line_t line, const edge_t *at, beyond_t *out)
+{
+    memset(out, 0, sizeof *out);
+    if (line.ends_before)
+        add_paper(line, line.before, -1.0f, line.paper_before, at, out);
+    if (line.ends_after)
+        add_paper(line, -line.after, 1.0f, line.paper_after, at, out);
 }
 
 /* The rows of the block of pixels that begins with `start`. */
@@ -302,15 +354,15 @@ INLINE float mixed(const edge_t *one, const edge_t *two, float rho, int i)
 /* Set the window's rows to the first `parameters` of reference.edges.linearise and the last, the residuals, and `products`
  * (rows of ROWS, lower half) to those of these rows over all pixels. */
 INLINE void multiply_rows(
-    const int parameters, const double *values, const window_t *window, const geometry_t at, const edge_rules_t *rules,
+    const int parameters, const int papered, const double *values, const window_t *window, const geometry_t at, const edge_rules_t *rules,
     double *products)
 {
     const float x = (float)values[X], y = (float)values[Y], blur = (float)values[S];
     const float base = (float)values[A], half = (float)values[B], per_size = (float)(1.0 / window->size);
     const float light_u = (float)values[GX] * per_size, light_v = (float)values[GY] * per_size;
     const float rho = (float)cos(values[T1] - values[T2]);
-    const line_t line1 = line_of(values[T1], values[K1], at.gaps, values[S], rules);
-    const line_t line2 = line_of(values[T2], values[K2], at.gaps + 2, values[S], rules);
+    const line_t line1 = line_of(values[T1], values[K1], at.gaps, at.paper, values[S], rules);
+    const line_t line2 = line_of(values[T2], values[K2], at.gaps + 2, at.paper + 2, values[S], rules);
     const float half_rho = 0.5f * rho;
     lanes_t sums[ROWS * (ROWS + 1) / 2];
     memset(sums, 0, sizeof sums);
@@ -322,21 +374,37 @@ INLINE void multiply_rows(
         edge_t one, two;
         along_line(line1, u, v, x, y, &one);
         along_line(line2, u, v, x, y, &two);
+        beyond_t past1, past2;
+        if (papered) {
+            beyond_line(line1, &one, &past1);
+            beyond_line(line2, &two, &past2);
+        }
         for (int i = 0; i < BLOCK; i++) {
-            const float pattern = mixed(&one, &two, rho, i);
+            float pattern = mixed(&one, &two, rho, i);
+            if (papered)
+                pattern += past1.paper[i] * (1.0f - 0.5f * past2.seen[i]) + past2.paper[i] * (1.0f - 0.5f * past1.seen[i]);
             const float plain = base + half * pattern;
             const float light = 1.0f + light_u * u[i] + light_v * v[i];
             const float scale = -light * half / blur;
-            const float by_d1 = scale * (one.slope[i] * two.value[i]
-                                         + rho * (one.bow[i] * two.slope[i] + half_rho * one.curl[i] * two.bow[i]));
-            const float by_d2 = scale * (two.slope[i] * one.value[i]
-                                         + rho * (two.bow[i] * one.slope[i] + half_rho * two.curl[i] * one.bow[i]));
+            float by_d1 = scale * (one.slope[i] * two.value[i]
+                                   + rho * (one.bow[i] * two.slope[i] + half_rho * one.curl[i] * two.bow[i]));
+            float by_d2 = scale * (two.slope[i] * one.value[i]
+                                   + rho * (two.bow[i] * one.slope[i] + half_rho * two.curl[i] * one.bow[i]));
+            float grown = one.grown[i] * two.value[i] + two.grown[i] * one.value[i];
+            if (papered) {
+                const float rest1 = 1.0f - 0.5f * past1.seen[i], rest2 = 1.0f - 0.5f * past2.seen[i];
+                const float half1 = 0.5f * past1.paper[i], half2 = 0.5f * past2.paper[i];
+                by_d1 -= scale * (past1.slope[i] * rest2 - half2 * past1.seen_slope[i]);
+                by_d2 -= scale * (past2.slope[i] * rest1 - half1 * past2.seen_slope[i]);
+                grown -= past1.grown[i] * rest2 - half2 * past1.seen_grown[i];
+                grown -= past2.grown[i] * rest1 - half1 * past2.seen_grown[i];
+            }
             const float bend1 = line1.curvature * one.along[i], bend2 = line2.curvature * two.along[i];
             rows[X][i] = by_d1 * (line1.sine + bend1 * line1.cosine) + by_d2 * (line2.sine + bend2 * line2.cosine);
             rows[Y][i] = by_d1 * (bend1 * line1.sine - line1.cosine) + by_d2 * (bend2 * line2.sine - line2.cosine);
             rows[T1][i] = -by_d1 * (one.along[i] + bend1 * one.aside[i]);
             rows[T2][i] = -by_d2 * (two.along[i] + bend2 * two.aside[i]);
-            rows[S][i] = -scale * (one.grown[i] * two.value[i] + two.grown[i] * one.value[i]);
+            rows[S][i] = -scale * grown;
             rows[A][i] = light;
             rows[B][i] = light * pattern;
             rows[GX][i] = plain * per_size * u[i];
@@ -375,14 +443,23 @@ FOR_EACH_PROCESSOR
 static void normal_equations(
     const double *values, const window_t *window, const geometry_t at, const edge_rules_t *rules, double *products)
 {
-    multiply_rows(FEWER, values, window, at, rules, products);
+    multiply_rows(FEWER, 0, values, window, at, rules, products);
 }
 
 FOR_EACH_PROCESSOR
 static void all_normal_equations(
     const double *values, const window_t *window, const geometry_t at, const edge_rules_t *rules, double *products)
 {
-    multiply_rows(PARAMETERS, values, window, at, rules, products);
+    multiply_rows(PARAMETERS, 0, values, window, at, rules, products);
+}
+
+/* Beside paper of known brightness. */
+FOR_EACH_PROCESSOR
+static void papered_equations(
+    const int n, const double *values, const window_t *window, const geometry_t at, const edge_rules_t *rules,
+    double *products)
+{
+    multiply_rows(n == FEWER ? FEWER : PARAMETERS, 1, values, window, at, rules, products);
 }
 
 /* Set a and b by linear least squares with everything else as it stands (reference.edges._brightness); every second block says
@@ -392,8 +469,8 @@ static void brightness(double *values, const window_t *window, const geometry_t 
 {
     const float x = (float)values[X], y = (float)values[Y];
     const float rho = (float)cos(values[T1] - values[T2]);
-    const line_t line1 = line_of(values[T1], values[K1], at.gaps, values[S], rules);
-    const line_t line2 = line_of(values[T2], values[K2], at.gaps + 2, values[S], rules);
+    const line_t line1 = line_of(values[T1], values[K1], at.gaps, at.paper, values[S], rules);
+    const line_t line2 = line_of(values[T2], values[K2], at.gaps + 2, at.paper + 2, values[S], rules);
     double n = 0.0, sum_p = 0.0, sum_i = 0.0, sum_pp = 0.0, sum_pi = 0.0;
     for (int64_t start = 0; start < window->count; start += 2 * BLOCK) {
         edge_t one, two;
@@ -671,9 +748,14 @@ static void fit_corner(
         brightness(values, window, at, rules, sign);
     const int64_t more = window->count - FEWER;
     double last[PARAMETERS] = {0.0};
-    int solved = 0;
+    int solved = 0, papered = 0;
+    for (int k = 0; k < 4; k++)
+        papered |= isfinite(at.paper[k]) != 0;
     for (int64_t turns = 0; turns < rules->iterations; turns++) {
-        (n == FEWER ? normal_equations : all_normal_equations)(values, window, at, rules, products);
+        if (papered)
+            papered_equations(n, values, window, at, rules, products);
+        else
+            (n == FEWER ? normal_equations : all_normal_equations)(values, window, at, rules, products);
         variance = products[n * ROWS + n] / (double)(more > 1 ? more : 1);
         variance = variance > rules->least_variance ? variance : rules->least_variance;
         double step[PARAMETERS];
@@ -744,12 +826,13 @@ int64_t edges_scratch(const edge_rules_t *rules)
 }
 
 /* Fit the edge model around `count` corners (reference.edges.fit_corners). pixels (N, 2), sides (N, 2, 2), curvature and its sigma
- * (N, 2), gaps, reach and ends (N, 2, 2), sign, blur and contrast (N), out (N, OUTCOMES); scratch as `edges_scratch` says, zeroed;
- * `grey` is of uint8_t if `bytes`, else of float. */
+ * (N, 2), gaps, reach, paper and ends (N, 2, 2), sign, blur and contrast (N), out (N, OUTCOMES); scratch as `edges_scratch`
+ * says, zeroed; `grey` is of uint8_t if `bytes`, else of float. */
 void fit_edges(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *sides,
-    const double *curvature, const double *curvature_sigma, const double *gaps, const double *reach, const double *sign,
-    const double *blur, const double *contrast, const uint8_t *ends, const edge_rules_t *rules, float *scratch, double *out)
+    const double *curvature, const double *curvature_sigma, const double *gaps, const double *reach, const double *paper,
+    const double *sign, const double *blur, const double *contrast, const uint8_t *ends, const edge_rules_t *rules,
+    float *scratch, double *out)
 {
     const picture_t image = {grey, width, height, bytes};
     const int64_t room = room_of_window(rules->radius_px), across = across_square(rules);
@@ -763,7 +846,8 @@ void fit_edges(
         .radius = (int64_t)floor(rules->radius_px)};
     for (int64_t n = 0; n < count; n++) {
         const geometry_t at = {
-            sides + 4 * n, curvature + 2 * n, curvature_sigma + 2 * n, gaps + 4 * n, reach + 4 * n, ends + 4 * n};
+            sides + 4 * n, curvature + 2 * n, curvature_sigma + 2 * n, gaps + 4 * n, reach + 4 * n, paper + 4 * n,
+            ends + 4 * n};
         collect(&window, image, pixels + 2 * n, at, blur[n], rules);
         fit_corner(&window, pixels + 2 * n, at, sign[n], blur[n], contrast[n], rules, out + OUTCOMES * n);
     }

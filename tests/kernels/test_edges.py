@@ -50,16 +50,22 @@ def scene(blur_px: float, noise: float, rng: np.random.Generator) -> tuple[np.nd
     return image, placed.see(camera, Rigid3.identity())[0].reshape(7, 9, 2)
 
 
+@pytest.mark.parametrize("papered", [False, True])
 @pytest.mark.parametrize(("blur_px", "noise"), [(0.3, 0.0), (0.7, 2.0), (2.0, 5.0)])
 def test_compiled_fit_is_the_numpy_fit(
-    blur_px: float, noise: float, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+    blur_px: float, noise: float, papered: bool, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     image, truth = scene(blur_px, noise, rng)
     shape = fit_cells(truth, np.ones(truth.shape[:2], bool))
     sides, cells = np.stack([shape.along_column, shape.along_row], axis=1), np.ones(truth.shape[:2], bool)
     # Windows of some go less far to some sides.
     reach = np.where(rng.random((cells.size, 2, 2)) < 0.2, rng.uniform(0.2, 0.6, (cells.size, 2, 2)), np.nan)
-    geometry = Geometry(sides, shape.curvature(), shape.gaps(), ends_of(cells, cells), reach)
+    # Some ends have paper behind them.
+    ends = ends_of(cells, cells)
+    known = ends & papered & (rng.random(ends.shape) < 0.8)
+    paper = np.where(known, rng.uniform(-1.2, 1.2, ends.shape), np.nan)
+    gaps = shape.gaps() * np.where(known, rng.uniform(0.4, 1.1, ends.shape), 1.0)
+    geometry = Geometry(sides, shape.curvature(), gaps, ends, reach, paper)
     row, column = np.indices(truth.shape[:2])
     sign = np.where((row + column) % 2 == 0, 1.0, -1.0).ravel()
     start = truth.reshape(-1, 2) + rng.uniform(-0.3, 0.3, (truth.size // 2, 2))

@@ -98,8 +98,22 @@ def may_be_discontinuous(item: RefinedLattice, size_px: tuple[int, int]) -> bool
 def without_outliers(item: RefinedLattice, size_px: tuple[int, int]) -> RefinedLattice:
     """Return `item` without corners that fit badly and are not where the others have them, trimmed.
 
-    What these leave of an outer row goes with them. `size_px` is the (width, height) of the image.
+    What these, and the fit, leave of a row that has strayed into it goes with them. `size_px` is the (width, height) of
+    the image.
     """
+    return _tidied(_without_astray(item), size_px)
+
+
+def _tidied(item: RefinedLattice, size_px: tuple[int, int]) -> RefinedLattice:
+    stray = stray_row(item.lattice, size_px)
+    while stray is not None:
+        item = item.without(stray)
+        item = item.cut(*item.lattice.extent)
+        stray = stray_row(item.lattice, size_px)
+    return item
+
+
+def _without_astray(item: RefinedLattice) -> RefinedLattice:
     known = item.lattice.known
     relative = np.zeros(known.shape)
     relative[known] = item.residual[known] / item.lattice.contrast[known]
@@ -118,12 +132,8 @@ def without_outliers(item: RefinedLattice, size_px: tuple[int, int]) -> RefinedL
         astray, in_place = _judged(item, suspect, expected)
     if not astray.any():
         return item
-    rest: BoolArray | None = astray
-    while rest is not None:
-        item = item.without(rest)
-        item = item.cut(*item.lattice.extent)
-        rest = stray_row(item.lattice, size_px)
-    return item
+    item = item.without(astray)
+    return item.cut(*item.lattice.extent)
 
 
 def _judged(item: RefinedLattice, suspect: BoolArray, expected: float) -> tuple[BoolArray, BoolArray]:

@@ -9,7 +9,7 @@ on both sides, and so do not move the corner.
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from rigkit.detection.subpixel.edge_model import (
     MIN_REACH,
     NEAR_PX,
     NEAR_SIGMAS,
+    PAPER_SIGMAS,
     PIXEL_KURTOSIS,
     SHARP_BLUR_PX,
     TAIL_SIGMAS,
@@ -92,6 +93,17 @@ class EdgeFit:
     pairs: FloatArray
     valid: BoolArray
 
+    def of(self, which: BoolArray) -> EdgeFit:
+        """Return the corners `which` (N,)."""
+        return EdgeFit(**{field.name: getattr(self, field.name)[which] for field in fields(self)})
+
+    def with_part(self, which: BoolArray, part: EdgeFit) -> EdgeFit:
+        """Return this with the corners `which` (N,) as in `part`."""
+        values = {field.name: getattr(self, field.name).copy() for field in fields(self)}
+        for name, value in values.items():
+            value[which] = getattr(part, name)
+        return EdgeFit(**values)
+
 
 def fit_edges(
     image: GreyImage,
@@ -131,6 +143,7 @@ def fit_edges(
         loose,
         geometry.gaps,
         np.full(geometry.gaps.shape, np.nan) if geometry.reach is None else geometry.reach,
+        np.full(geometry.gaps.shape, np.nan) if geometry.paper is None else geometry.paper,
         geometry.ends,
         sign,
         blur,
@@ -157,6 +170,7 @@ def _rules(radius_px: float, iterations: int, converged_px: float, mirrored: boo
     return Rules(
         reach=WINDOW_REACH,
         end_sigmas=END_SIGMAS,
+        paper_sigmas=PAPER_SIGMAS,
         least_reach=MIN_REACH,
         near_sigmas=NEAR_SIGMAS,
         near_px=NEAR_PX,

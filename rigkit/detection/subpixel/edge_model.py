@@ -24,6 +24,7 @@ __all__ = [
     "MIN_REACH",
     "NEAR_PX",
     "NEAR_SIGMAS",
+    "PAPER_SIGMAS",
     "PIXEL_KURTOSIS",
     "SHARP_BLUR_PX",
     "TAIL_SIGMAS",
@@ -51,7 +52,10 @@ NEAR_SIGMAS, NEAR_PX = 3.0, 1.5
 END_SIGMAS = 2.5
 MIN_REACH = 0.25
 """Where the lattice ends, what lies behind the next line is not known: paper, a narrow margin, another square. Pixels
-nearer to that line, s, are left out, but never those so near to the corner, in cells."""
+nearer to that line, s, are left out, but never those so near to the corner, in parts of the way to that line."""
+
+PAPER_SIGMAS = 0.0
+"""The same where it is known how bright it is beyond: the model holds as far as the line."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -66,6 +70,8 @@ class Geometry:
     ends : (N, 2, 2) whether the lattice has no corner on that line beside this one.
     reach : (N, 2, 2) how far the window goes towards that line, in sides of the cell, at most
         WINDOW_REACH; None: by rule.
+    paper : (N, 2, 2) how bright it is beyond that line, relative to the corner's mean and in units of the model's b;
+        NaN where squares go on there, or where it is not known. None: everywhere.
     """
 
     sides: FloatArray
@@ -73,6 +79,12 @@ class Geometry:
     gaps: FloatArray
     ends: BoolArray
     reach: FloatArray | None = None
+    paper: FloatArray | None = None
+
+    def of(self, which: BoolArray) -> Geometry:
+        """Return that of the corners `which` (N,)."""
+        reach, paper = (None if part is None else part[which] for part in (self.reach, self.paper))
+        return Geometry(self.sides[which], self.curvature[which], self.gaps[which], self.ends[which], reach, paper)
 
 
 def ends_of(known: BoolArray, cells: BoolArray) -> BoolArray:

@@ -20,6 +20,7 @@ from rigkit.detection.subpixel.correlation import sigma_factors
 from rigkit.detection.subpixel.edge_curvature import line_curvature
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
 from rigkit.detection.subpixel.edge_model import WINDOW_REACH, Geometry, ends_of
+from rigkit.detection.subpixel.outer_squares import beside_paper, with_paper
 from rigkit.detection.subpixel.scatter import scatter_factors
 
 __all__ = ["RefinedLattice", "refine"]
@@ -37,6 +38,10 @@ lattice to a few hundredths of a pixel; after the last step of the last one ther
 LOOSE_CURVATURE = 0.5
 """Curvatures are fitted where the lattice leaves them open by so much that the corner would move by more than this, in
 sigmas of the first pass: the edges then know them better. Everywhere it would take a quarter more time."""
+
+PAPER_ROUNDS, SETTLED_PX = 2, 0.1
+"""What lies beyond the outermost squares is read with the corners as they are fitted so far, and again if these move by
+more than the second number."""
 
 MIN_NEIGHBOURS = 3
 """An empty cell is tried if so many of its eight neighbours are known."""
@@ -57,11 +62,12 @@ DISPLACED_SIGMAS = 8.0
 """A corner further than this from where its neighbours say (in cells; and times the board's typical deviation; and
 times the standard deviation expected of it) is something else: a finger, a glint, the end of a ruler."""
 
-COVERED_NOISE, COVERED_FACTOR = 0.03, 6.0
+COVERED_NOISE, COVERED_FACTOR = 0.06, 6.0
 COVERED_OFF = 3.5
 """A corner whose noise, relative to its contrast, exceeds this and this times the board's typical one, and that lies
 off by this times the typical deviation, is covered in part, by the edge of a ruler or of a hand: its sides are not
-alike. On rendered boards under a ruler the factor is 12 and more, on boards with marks in their squares seldom 6."""
+alike. On rendered boards under a ruler the factor is 12 and more, on boards with marks in their squares seldom 6; the
+noise is 0.065 and more, while glare on single squares of blurred boards, where little other noise is left, makes 0.04."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -215,22 +221,34 @@ def _last_pass(
     # A parabola k / 2 t^2 lies k / 6 r^2 beside the corner in the mean over |t| < r.
     beside = curvature_sigma * np.minimum(radius_px, WINDOW_REACH * lengths) ** 2 / 6.0
     curvature_sigma[(beside <= LOOSE_CURVATURE * sigma_px[known][:, None]).all(axis=1)] = 0.0
-    fit = fit_edges(
-        image,
-        start.pixels[known],
-        Geometry(shape.sides, curvature, shape.gaps(), ends_of(known, known)),
-        signs[known],
-        blur[known],
-        radius_px=radius_px,
-        iterations=iterations,
-        converged_px=converged_px,
-        curvature_sigma=curvature_sigma,
-        contrast=start.contrast[known],
-    )
     owner = np.zeros(known.shape, np.int64)
     for k, part in enumerate(parts):
         owner[part] = k
     mine = owner[known]
+
+    def fitted(which: BoolArray | slice, geometry: Geometry) -> EdgeFit:
+        return fit_edges(
+            image,
+            start.pixels[known][which],
+            geometry,
+            signs[known][which],
+            blur[known][which],
+            radius_px=radius_px,
+            iterations=iterations,
+            converged_px=converged_px,
+            curvature_sigma=curvature_sigma[which],
+            contrast=start.contrast[known][which],
+        )
+
+    geometry = Geometry(shape.sides, curvature, shape.gaps(), ends_of(known, known))
+    fit = fitted(slice(None), geometry)
+    again = beside_paper(geometry, fit, mine)
+    for _ in range(PAPER_ROUNDS if again.any() else 0):
+        before = fit.pixels[again]
+        beside = with_paper(image, geometry.of(again), fit.of(again), signs[known][again])
+        fit = fit.with_part(again, fitted(again, beside))
+        if np.abs(fit.pixels[again] - before).max() < SETTLED_PX:
+            break
     factors = sigma_factors(fit, fit.valid & (fit.contrast > 0.0), shape.sides, mine, len(parts), radius_px)
     return _spread(start, fit, fit.sigma_px * factors[mine])
 

@@ -7,6 +7,7 @@ P pixels x 11 derivatives, of values 0..255, summed in products of P terms; the 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,7 @@ from rigkit.detection.subpixel.edge_model import (
     MIN_REACH,
     NEAR_PX,
     NEAR_SIGMAS,
+    PAPER_SIGMAS,
     PIXEL_KURTOSIS,
     SHARP_BLUR_PX,
     TAIL_SIGMAS,
@@ -67,13 +69,14 @@ def fit_corners(
     curvature_sigma: FloatArray,
     gaps: FloatArray,
     reach: FloatArray,
+    paper: FloatArray,
     ends: BoolArray,
     sign: FloatArray,
     blur: FloatArray,
     contrast: FloatArray,
     rules: Rules,
 ) -> FloatArray:
-    geometry, loose = Geometry(sides, curvature, gaps, ends, reach), curvature_sigma
+    geometry, loose = Geometry(sides, curvature, gaps, ends, reach, paper), curvature_sigma
     window = collect(image, pixels, geometry, blur, rules.radius_px)
     prior_mean, prior = _prior(geometry, loose, blur, window.size)
     kept = np.count_nonzero(loose > 0.0, axis=1) < 2
@@ -156,18 +159,27 @@ def line_bends(
 
 
 def _of(geometry: Geometry, keep: BoolArray) -> Geometry:
-    reach = None if geometry.reach is None else geometry.reach[keep]
-    return Geometry(geometry.sides[keep], geometry.curvature[keep], geometry.gaps[keep], geometry.ends[keep], reach)
+    return geometry.of(keep)
 
 
 def _reach(geometry: Geometry, blur: FloatArray) -> FloatArray:
     """Return (N, 2, 2) how far the window reaches, in cells: along both sides, backwards and forwards."""
-    left = 1.0 - END_SIGMAS * blur[:, None, None] / np.maximum(geometry.gaps, 1e-9)
-    out = np.where(geometry.ends, np.clip(left, MIN_REACH, WINDOW_REACH), WINDOW_REACH)
+    a, b = np.moveaxis(geometry.sides, 1, 0)
+    area = np.maximum(np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), 1.0)
+    # Of the cell across line 1, and across line 2.
+    wide = np.stack([area / np.hypot(*a.T), area / np.hypot(*b.T)], axis=1)[..., None]
+    sigmas = np.where(np.isfinite(_paper(geometry)), PAPER_SIGMAS, END_SIGMAS)
+    left = np.maximum(geometry.gaps - sigmas * blur[:, None, None], MIN_REACH * geometry.gaps) / wide
+    out = np.where(geometry.ends, np.minimum(left, WINDOW_REACH), WINDOW_REACH)
     if geometry.reach is not None:
         out = np.where(np.isfinite(geometry.reach), np.minimum(geometry.reach, WINDOW_REACH), out)
     # +90 degrees from line 1, which runs along the first side, is forwards along the second; from line 2 backwards.
     return np.stack([out[:, 1, ::-1], out[:, 0]], axis=1)
+
+
+def _paper(geometry: Geometry) -> FloatArray:
+    """Return (N, 2, 2) the `paper` of `geometry`, NaN where there is none."""
+    return np.full(geometry.gaps.shape, np.nan) if geometry.paper is None else geometry.paper
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -225,20 +237,39 @@ def collect(image: GreyImage, pixels: FloatArray, geometry: Geometry, blur: Floa
     return Window(centre, u.astype(np.float32), v.astype(np.float32), value, weight, np.maximum(radius, 2.0))
 
 
-def _step(distance: Float32, blur: Float32, flat: Float32, gaps: Float32) -> tuple[Float32, ...]:
+def _step(distance: Float32, blur: Float32, flat: Float32, gaps: Float32, paper: Float32) -> tuple[Float32, ...]:
     """Return the blurred step S over the line, S', S'', S''' (with respect to x = distance / s), and -s dS/ds.
 
     Where squares are small against the blur, the edges of the parallel lines at `gaps` (N, 2) before and after reach
-    into the window: their steps are taken away. Far from both they add up to nothing: one is -1, the other +1.
+    into the window: their steps are taken away. Far from both they add up to nothing: one is -1, the other +1. Where
+    there is `paper` (N, 2) beyond, the pattern ends: half of the step is taken away, and S is 0 there.
     """
     total = _edge(distance, blur, flat)
-    tight = (gaps * (1.0 - WINDOW_REACH) < TAIL_SIGMAS * blur).any(axis=1)
+    papered = np.isfinite(paper)
+    tight = (gaps * (1.0 - WINDOW_REACH) < TAIL_SIGMAS * blur).any(axis=1) | papered.any(axis=1)
     if tight.any():
         near, beside = distance[tight], gaps[tight]
-        for place in (-beside[:, :1], beside[:, 1:]):
+        parts = np.where(papered[tight], 0.5, 1.0).astype(np.float32)
+        for place, part in ((-beside[:, :1], parts[:, :1]), (beside[:, 1:], parts[:, 1:])):
             for mine, other in zip(total, _edge(near - place, blur[tight], flat[tight]), strict=True):
-                mine[tight] -= other
+                mine[tight] -= part * other
+        total[0][tight] += parts[:, :1] - parts[:, 1:]
     return total
+
+
+def _beyond(distance: Float32, blur: Float32, flat: Float32, gaps: Float32, paper: Float32) -> tuple[Float32, ...]:
+    """Return how much each pixel sees of what lies beyond the ends of a line that have `paper`, the derivative of that
+    with respect to x, and -s d/ds of it; then the same of it times the paper's brightness."""
+    seen = tuple(np.zeros_like(distance) for _ in range(6))
+    for place, way, bright in ((-gaps[:, :1], -1.0, paper[:, :1]), (gaps[:, 1:], 1.0, paper[:, 1:])):
+        known = np.isfinite(bright)
+        half = np.where(known, 0.5 * way, 0.0).astype(np.float32)
+        edge = _edge(distance - place, blur, flat)
+        parts = (np.where(known, np.float32(0.5), np.float32(0.0)) + half * edge[0], half * edge[1], half * edge[4])
+        for mine, mine_bright, part in zip(seen[:3], seen[3:], parts, strict=True):
+            mine += part
+            mine_bright += np.where(known, bright, 0.0).astype(np.float32) * part
+    return seen
 
 
 def _edge(distance: Float32, blur: Float32, flat: Float32) -> tuple[Float32, ...]:
@@ -275,8 +306,9 @@ def _blurred_edge(x: Float32, kurtosis: Float32) -> tuple[Float32, ...]:
     return erf(x * np.float32(np.sqrt(0.5))) - third, slope, bow, curl, x * slope - np.float32(4.0) * third
 
 
-def _parts(values: FloatArray, window: Window, geometry: Geometry) -> tuple[tuple[Float32, ...], ...]:
-    """Return for line 1 and line 2: S, S', S'', S''', -s dS/ds, along, aside, cosine, sine, curvature; (N, P), (N, 1).
+def _parts(values: FloatArray, window: Window, geometry: Geometry) -> tuple[tuple[Any, ...], ...]:
+    """Return for line 1 and line 2: S, S', S'', S''', -s dS/ds, along, aside, cosine, sine, curvature; (N, P), (N, 1);
+    and what `_beyond` does.
 
     Blur pulls a bent edge towards the inside of the bend: the mean of curvature / 2 t^2 along it is curvature / 2 s^2.
     """
@@ -290,9 +322,11 @@ def _parts(values: FloatArray, window: Window, geometry: Geometry) -> tuple[tupl
         kappa = known[:, bend, None]
         distance = aside - (np.float32(0.5) * kappa) * (along * along + blur * blur)
         flat = np.float32(PIXEL_KURTOSIS) * (cosine**4 + sine**4)
-        step = _step(distance, blur, flat, geometry.gaps[:, line].astype(np.float32))
-        step[4][...] += kappa * blur * step[1]
-        out.append((*step, along, aside, cosine, sine, kappa))
+        beside = (geometry.gaps[:, line].astype(np.float32), _paper(geometry)[:, line].astype(np.float32))
+        step, beyond = _step(distance, blur, flat, *beside), _beyond(distance, blur, flat, *beside)
+        for slope, grown in ((step[1], step[4]), (beyond[1], beyond[2]), (beyond[4], beyond[5])):
+            grown[...] += kappa * blur * slope
+        out.append((*step, along, aside, cosine, sine, kappa, beyond))
     return tuple(out)
 
 
@@ -328,12 +362,15 @@ def linearise(values: FloatArray, window: Window, geometry: Geometry) -> Float32
     """
     one, two = _parts(values, window, geometry)
     rho = _oblique(values)
-    f1, slope1, bow1, curl1, grown1, along1, aside1, cos1, sin1, kappa1 = one
-    f2, slope2, bow2, curl2, grown2, along2, aside2, cos2, sin2, kappa2 = two
+    f1, slope1, bow1, curl1, grown1, along1, aside1, cos1, sin1, kappa1, beyond1 = one
+    f2, slope2, bow2, curl2, grown2, along2, aside2, cos2, sin2, kappa2, beyond2 = two
+    # Beyond both lines, half of what lies beyond each.
+    half = np.float32(0.5)
+    rest1, rest2 = np.float32(1.0) - half * beyond1[0], np.float32(1.0) - half * beyond2[0]
     half_square = np.float32(0.5) * rho * rho
     known = values.astype(np.float32)
     weight = window.weight
-    pattern = _mixed(one, two, rho)
+    pattern = _mixed(one, two, rho) + beyond1[3] * rest2 + beyond2[3] * rest1
     plain = known[:, A, None] + known[:, B, None] * pattern
     size = window.size[:, None].astype(np.float32)
     light = (known[:, GX, None] / size) * window.u + (known[:, GY, None] / size) * window.v
@@ -349,12 +386,16 @@ def linearise(values: FloatArray, window: Window, geometry: Geometry) -> Float32
     light *= -(known[:, B] / known[:, S])[:, None]
     by_d1 = light * (slope1 * f2 + rho * bow1 * slope2 + half_square * curl1 * bow2)
     by_d2 = light * (slope2 * f1 + rho * bow2 * slope1 + half_square * curl2 * bow1)
+    by_d1 -= light * (beyond1[4] * rest2 - half * beyond2[3] * beyond1[1])
+    by_d2 -= light * (beyond2[4] * rest1 - half * beyond1[3] * beyond2[1])
+    past1 = beyond1[5] * rest2 - half * beyond2[3] * beyond1[2]
+    past2 = beyond2[5] * rest1 - half * beyond1[3] * beyond2[2]
     bend1, bend2 = kappa1 * along1, kappa2 * along2
     rows[:, X] = by_d1 * (sin1 + bend1 * cos1) + by_d2 * (sin2 + bend2 * cos2)
     rows[:, Y] = by_d1 * (bend1 * sin1 - cos1) + by_d2 * (bend2 * sin2 - cos2)
     rows[:, T1] = -by_d1 * (along1 + bend1 * aside1)
     rows[:, T2] = -by_d2 * (along2 + bend2 * aside2)
-    rows[:, S] = -light * (grown1 * f2 + grown2 * f1)
+    rows[:, S] = -light * (grown1 * f2 + grown2 * f1 - past1 - past2)
     rows[:, K1] = np.float32(-0.5) * by_d1 * (along1 * along1 + known[:, S, None] ** 2)
     rows[:, K2] = np.float32(-0.5) * by_d2 * (along2 * along2 + known[:, S, None] ** 2)
     return rows

@@ -1,0 +1,148 @@
+"""What lies beyond the outermost squares of a board, and where they end.
+
+Blur brings both into the windows of the outermost corners. Sheets are cut, and margins begin, anywhere: of some boards
+the outer squares are half as wide as the others. On the way out from such a corner the two squares differ in brightness
+to the end of them, where a blurred difference is halved, and beyond they do not, unless there are squares that the
+lattice has not. The mean of both sides goes, over the same edge, from that of the corner to the brightness beyond.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import erf
+
+import numpy as np
+
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, upper_median
+from rigkit.detection.saddles.response import GreyImage, sample
+from rigkit.detection.subpixel.edge_fit import EdgeFit
+from rigkit.detection.subpixel.edge_model import TAIL_SIGMAS, WINDOW_REACH, Geometry
+
+__all__ = ["beside_paper", "with_paper"]
+
+SUSPECT_RESIDUAL = 1.5
+"""Outermost corners that fit worse than this times what is typical of the inner ones may have more in their windows:
+chance makes 1.15."""
+
+STEPS = np.arange(0.1, 1.6001, 0.05)
+"""Where brightness is read, in squares outwards."""
+
+ASIDE = 0.4
+"""And so far to both sides of the edge, in squares: near the middles of the squares, where blur leaves most of their
+difference, but still inside where the edge is bent."""
+
+FIRST, LAST = 0.6, 1.25
+"""The difference is largest nearer than the one, in squares; squares that end beyond the other are no outer ones."""
+
+GOES_ON, CUT = -0.4, 0.8
+"""Where the difference comes back the other way round, by this part of the contrast, the board goes on; but squares
+that end so early, in squares, are cut, and what differs beyond is something else."""
+
+NEAR_WITNESS = 2.5
+"""A corner that tells what lies beyond another one lies so near to it, in sides of its cell: paper is alike there."""
+
+SEEN = 0.8413
+"""Of what lies beyond an edge a pixel sees so much one standard deviation of the blur behind it. Further out a narrow
+margin may have ended."""
+
+MAX_PAPER = 1.6
+"""Paper is this much brighter or darker than the mean of the squares at most, in half contrasts; squares are by 1."""
+
+OUTWARDS: FloatArray = np.array([[0.0, -1.0], [0.0, 1.0], [1.0, 0.0], [-1.0, 0.0]])
+"""Which way out, in cells (column, row), each of the `Geometry.ends` is, in their order."""
+
+
+def beside_paper(geometry: Geometry, fit: EdgeFit, owner: IntArray) -> BoolArray:
+    """Return which of N corners may see what lies beyond their board; `owner` (N,) is the number of that."""
+    blurred = TAIL_SIGMAS * fit.blur[:, None] > (1.0 - WINDOW_REACH) * geometry.gaps.reshape(-1, 4)
+    ends = geometry.ends.reshape(-1, 4)
+    good = fit.valid & (fit.contrast > 0.0)
+    relative = fit.residual / np.where(good, fit.contrast, np.inf)
+    usual = np.full(int(owner.max(initial=-1)) + 1, np.inf)
+    # Those that have corners on all sides; of a board that has none, all.
+    inner = good & ~ends.any(axis=1)
+    for k in np.unique(owner[good]).tolist():
+        mine = owner == k
+        usual[k] = upper_median(relative[mine & (inner if (inner & mine).any() else good)])
+    suspect = relative > SUSPECT_RESIDUAL * usual[owner]
+    return good & np.asarray((ends & (blurred | suspect[:, None])).any(axis=1))
+
+
+def with_paper(image: GreyImage, geometry: Geometry, fit: EdgeFit, sign: FloatArray) -> Geometry:
+    """Return the `geometry` of N corners `fit` with `paper` beyond their ends, and `gaps` to where it begins.
+
+    `sign` (N,) as for `edge_fit.fit_edges`.
+    """
+    who, which = np.nonzero(geometry.ends.reshape(-1, 4))
+    cell = geometry.gaps.reshape(-1, 4)[who, which]
+    one, other = _beside_the_way_out(image, geometry, fit, who, which)
+    contrast, blur = fit.contrast[who], fit.blur[who]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        end, found = _end((one - other) / (contrast * _left(geometry, fit)[who, which])[:, None])
+        step = STEPS[1] - STEPS[0]
+        at = (end + blur / cell - STEPS[0]) / step
+        first = np.nan_to_num(at).clip(0.0, len(STEPS) - 2.0).astype(np.int64)
+        mean, k = 0.5 * (one + other), np.arange(len(who))
+        level = mean[k, first] + (at - first) * (mean[k, first + 1] - mean[k, first])
+        bright = (level - sample(image, fit.pixels[who])) / (0.5 * contrast * SEEN)
+        found &= (at <= len(STEPS) - 1.0) & (np.abs(bright) < MAX_PAPER)
+    by = _witness(geometry, fit.pixels, who, which, found)
+    end, bright, found = end[by], bright[by], found[by]
+    paper, gaps = np.full((len(fit.pixels), 4), np.nan), geometry.gaps.reshape(-1, 4).copy()
+    paper[who[found], which[found]] = (bright * sign[who])[found]
+    gaps[who[found], which[found]] = (end * cell)[found]
+    return replace(geometry, gaps=gaps.reshape(-1, 2, 2), paper=paper.reshape(-1, 2, 2))
+
+
+def _left(geometry: Geometry, fit: EdgeFit) -> FloatArray:
+    """Return (N, 4) what blur leaves of the difference of the two squares at each of the `Geometry.ends`."""
+    # Beside the way out across line 1 lie squares of line 2, with their own edges and those of the next squares.
+    across = geometry.gaps[:, ::-1].mean(axis=2, keepdims=True) / (np.sqrt(2.0) * fit.blur[:, None, None])
+    left = np.array([[erf(ASIDE * x) + erf((1.0 - ASIDE) * x) - 1.0 for x in pair] for pair in across[..., 0].tolist()])
+    return np.repeat(left.reshape(-1, 2), 2, axis=1)
+
+
+def _witness(geometry: Geometry, pixels: FloatArray, who: IntArray, which: IntArray, found: BoolArray) -> IntArray:
+    """Return for each of M ends the one that tells what lies beyond it.
+
+    The way out from the corner of a board has different things on either side: the nearest on its side tells.
+    """
+    by = np.arange(len(who))
+    single = geometry.ends.reshape(-1, 4)[who].sum(axis=1) == 1
+    apart = np.linalg.norm(pixels[who, None] - pixels[who], axis=2)
+    apart[:, ~(single & found)] = np.inf
+    apart[which[:, None] != which] = np.inf
+    # The next but one at most, in sides of the cell.
+    reach = NEAR_WITNESS * np.linalg.norm(geometry.sides[who], axis=2).max(axis=1)
+    nearest = apart.argmin(axis=1) if len(by) else by
+    use = ~single & (apart[by, nearest] < reach)
+    by[use] = nearest[use]
+    return by
+
+
+def _beside_the_way_out(
+    image: GreyImage, geometry: Geometry, fit: EdgeFit, who: IntArray, which: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the brightness on both sides of the way out from corner `who` at its end `which`, (M, STEPS) each, NaN
+    outside the image."""
+    outwards = OUTWARDS[which][:, None] * STEPS[:, None]
+    across = ASIDE * OUTWARDS[which][:, None, ::-1]
+    cells = np.stack([outwards + across, outwards - across])
+    places = fit.pixels[who, None] + np.einsum("ankc,ncp->ankp", cells, geometry.sides[who])
+    inside = ((places >= 0.0) & (places <= np.array(image.shape[::-1]) - 1.0)).all(axis=3)
+    one, other = np.where(inside, sample(image, places), np.nan)
+    return one, other
+
+
+def _end(differs: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return where (M,), in squares, the relative differences (M, STEPS) end, and which of them do."""
+    k, far = np.arange(len(differs)), np.arange(len(STEPS))
+    near = np.where(np.isfinite(differs) & (STEPS < FIRST), np.abs(differs), -1.0)
+    peak = near.argmax(axis=1)
+    differs = differs * np.sign(differs[k, peak])[:, None]
+    over = (differs < 0.5) & (far > peak[:, None])
+    at = np.maximum(over.argmax(axis=1), 1)
+    before, after = differs[k, at - 1], differs[k, at]
+    end: FloatArray = STEPS[at] - (0.5 - after) / np.maximum(before - after, 1e-9) * (STEPS[1] - STEPS[0])
+    goes_on = ((differs < GOES_ON) & (far > at[:, None])).any(axis=1)
+    return end, over.any(axis=1) & (end < LAST) & ~(goes_on & (end > CUT))

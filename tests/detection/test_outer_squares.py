@@ -1,0 +1,99 @@
+"""Boards out of focus: what blur brings into the windows of the outermost corners does not move them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from helpers.data import shared_data
+
+from rigkit import detect_boards
+from rigkit.benchmark.corner_bound import corner_information, position_bound
+from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, three_boards
+from rigkit.benchmark.score import FoundBoard, Score, score
+from rigkit.core.arrays import FloatArray
+from rigkit.io.images import read_image
+from rigkit.synthetic.photometry import develop
+from rigkit.synthetic.render import Optics
+
+NOISE_LEVELS = 2.0
+SUPERSAMPLED = 8
+CELL_PX, COLUMNS, ROWS = 30.0, 7, 5
+
+
+def cut_board(ends: tuple[float, float, float, float], blur_px: float, margin: float) -> tuple[np.ndarray, FloatArray]:
+    """Return a picture of a board seen straight on, and its corners (N, 2).
+
+    `ends` is how wide the outer squares are on the left, right, top, bottom, in squares; then comes paper of brightness
+    `margin`, as wide as a square, and something darker.
+    """
+    size = (380, 300)
+    u, v = (
+        ((np.arange(n * SUPERSAMPLED) + 0.5) / SUPERSAMPLED - 0.5 - 80.25 - 0.125 * k) / CELL_PX
+        for k, n in enumerate(size)
+    )
+    left, right, top, bottom = ends
+    square = (np.floor(u)[None] + np.floor(v)[:, None]) % 2.0 == 0.0
+    on_board = (u > -left) & (u < COLUMNS - 1 + right)
+    on_board = on_board[None] & ((v > -top) & (v < ROWS - 1 + bottom))[:, None]
+    paper = (u > -left - 1.0) & (u < COLUMNS + right)
+    paper = paper[None] & ((v > -top - 1.0) & (v < ROWS + bottom))[:, None]
+    fine = np.where(on_board, np.where(square, 30.0, 200.0), np.where(paper, margin, 90.0)).astype(np.float32)
+    pixels = cv2.resize(fine, size, interpolation=cv2.INTER_AREA)
+    image = cv2.GaussianBlur(pixels, (0, 0), blur_px)
+    image += np.random.default_rng(0).normal(0.0, 0.5, image.shape)
+    corners = np.stack(np.meshgrid(np.arange(COLUMNS), np.arange(ROWS)), axis=-1).reshape(-1, 2)
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8), 80.25 + np.array([0.0, 0.125]) + CELL_PX * corners
+
+
+@pytest.mark.parametrize(
+    ("ends", "margin"),
+    [
+        ((1.0, 1.0, 1.0, 1.0), 200.0),
+        ((0.45, 1.0, 0.6, 1.0), 200.0),
+        ((0.5, 0.4, 0.5, 0.4), 200.0),
+        ((1.0, 0.7, 1.0, 0.6), 110.0),
+    ],
+    ids=["whole", "cut on two sides", "cut on all", "grey margin"],
+)
+@pytest.mark.parametrize("blur_px", [2.0, 3.0, 4.0])
+def test_squares_cut_short_do_not_pull_at_corners(
+    ends: tuple[float, float, float, float], margin: float, blur_px: float
+) -> None:
+    image, truth = cut_board(ends, blur_px, margin)
+    (found,) = detect_boards(image)
+    assert len(found.grid) == COLUMNS * ROWS
+    off = np.linalg.norm(found.pixels[:, None] - truth, axis=2).min(axis=1)
+    # Noise alone makes 0.01 px; without a model of what lies beyond, corners lie 0.14 to 2.4 px aside.
+    assert off.max() < 0.03 * blur_px
+
+
+@pytest.mark.parametrize(
+    ("lens", "blur_px", "most"), [("regular", 2.0, 1.2), ("regular", 3.0, 1.2), ("fisheye", 2.0, 1.2)]
+)
+def test_errors_out_of_focus_are_near_the_bound(lens: str, blur_px: float, most: float) -> None:
+    total, bounds = [], []
+    for seed in range(2):
+        scene = three_boards(np.random.default_rng(seed), lens=lens)
+        light = scene.radiance(Optics(blur_px))
+        photometry = replace(BENCH_PHOTOMETRY, noise_levels=NOISE_LEVELS)
+        image = np.asarray(develop(light, photometry, np.random.default_rng(seed)))
+        total.append(score(scene, [FoundBoard.of(found) for found in detect_boards(image)]))
+        bounds += [position_bound(x, NOISE_LEVELS) for x in corner_information(scene, blur_px)]
+    every = Score.sum(total)
+    assert every.complete == every.boards
+    bound = float(np.sqrt(np.trace(np.concatenate(bounds), axis1=1, axis2=2).mean()))
+    assert every.rms_px < most * bound
+
+
+@pytest.mark.parametrize("blur_px", [1.5, 2.0, 3.0, 4.0])
+def test_real_boards_out_of_focus_are_found_whole(blur_px: float) -> None:
+    paths = sorted(shared_data("real/bouguet-stereo").glob("*.jpg"))
+    assert len(paths) == 28
+    whole = 0
+    for path in paths:
+        found = detect_boards(cv2.GaussianBlur(read_image(path), (0, 0), blur_px))
+        whole += any(sorted((b.columns, b.rows)) == [6, 9] and b.complete for b in found)
+    assert whole >= 28 - (blur_px == 4.0)
