@@ -67,7 +67,7 @@ COVERED_OFF = 3.5
 """A corner whose noise, relative to its contrast, exceeds this and this times the board's typical one, and that lies
 off by this times the typical deviation, is covered in part, by the edge of a ruler or of a hand: its sides are not
 alike. On rendered boards under a ruler the factor is 12 and more, on boards with marks in their squares seldom 6; the
-noise is 0.065 and more, while glare on single squares of blurred boards, where little other noise is left, makes 0.04."""
+noise is 0.065 and more. Glare on single squares of blurred boards, where little other noise is left, makes 0.04."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
