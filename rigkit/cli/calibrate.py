@@ -31,7 +31,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = EXAMPLES
     parser.add_argument(
-        "source", nargs="+", type=Path, metavar="SESSION.toml|FOLDER", help="a session, or folders of images"
+        "source",
+        nargs="+",
+        type=Path,
+        metavar="SESSION.toml|FOLDER|VIDEO",
+        help="a session, folders of images, videos, camera:0",
     )
     parser.add_argument("-o", "--output", type=Path, help="default: calibration.json (rig.json) beside the session")
     parser.add_argument(
@@ -55,6 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     folders.add_argument(
         "--board", action="append", default=[], metavar="CxRxMM|BOARD.toml", help="such as 9x6x25 (repeatable)"
     )
+    folders.add_argument("--timestamps", type=Path, metavar="FILE.csv", help="which frames of videos are of one moment")
     folders.add_argument("--model", help="camera model (default: auto, the one that predicts best)")
 
 
@@ -75,6 +80,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _calibrated(args: argparse.Namespace) -> SessionCalibration | RigSessionCalibration:
     from rigkit.cli.console import progress_on_stderr
+    from rigkit.io.video import is_video
     from rigkit.workflows.calibrate import CalibrateOptions
     from rigkit.workflows.calibrate_any import FolderOptions, calibrate_folders, calibrate_session_file
     from rigkit.workflows.corners import Cache
@@ -92,8 +98,8 @@ def _calibrated(args: argparse.Namespace) -> SessionCalibration | RigSessionCali
     told = bool(args.board or args.model)
     if len(args.source) == 1 and first.is_dir() and not told and (first / SESSION_NAME).is_file():
         first = first / SESSION_NAME
-    if len(args.source) > 1 or first.is_dir():
-        about = FolderOptions(boards=tuple(args.board), model=args.model or "auto")
+    if len(args.source) > 1 or first.is_dir() or is_video(first):
+        about = FolderOptions(boards=tuple(args.board), model=args.model or "auto", timestamps=args.timestamps)
         return calibrate_folders(args.source, about, options, progress=progress)
     if told:
         raise InputError(f"calibrate: '{first}' says itself what board and model it has; leave out --board and --model")

@@ -15,7 +15,7 @@ HELP = "corners of every chessboard in the images, to a corners file and overlay
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("images", nargs="+", metavar="IMAGE|FOLDER", help="images, or folders of images")
+    parser.add_argument("images", nargs="+", metavar="IMAGE|FOLDER|VIDEO", help="images, folders, videos, camera:0")
     parser.add_argument(
         "--board", action="append", default=[], metavar="BOARD.toml", help="a board that may be there; repeat for more"
     )

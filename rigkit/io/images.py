@@ -23,7 +23,7 @@ from rigkit.io.image_size import announced_size
 from rigkit.io.reading import read_bytes
 from rigkit.io.tiff import as_stored, page_count
 
-__all__ = ["MAX_PIXELS", "Image", "read_image", "require_pixels", "to_grey"]
+__all__ = ["MAX_PIXELS", "Image", "quiet_opencv", "read_image", "require_pixels", "to_grey", "unread_format"]
 
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 """(H, W) grey or (H, W, 3) red green blue."""
@@ -54,6 +54,10 @@ def read_image(path: str | Path) -> Image:
     """
     source = Path(path)
     data = read_bytes(source, "image")
+    if (name := unread_format(data)) is not None:
+        raise InputError(
+            f"image '{source}' is {name}, which is not read; convert it to PNG or TIFF without changing pixels"
+        )
     fault = _fault(data)
     if fault:
         raise InputError(f"image '{source}' is {fault}; copy it again from the camera")
@@ -64,7 +68,7 @@ def read_image(path: str | Path) -> Image:
     if (frames := frame_count(data)) > 1:
         raise InputError(f"image '{source}' is an animation of {frames} frames; save each as a file of its own")
     try:
-        with _quiet_opencv():
+        with quiet_opencv():
             raw = cv2.imdecode(np.frombuffer(as_stored(data), np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise InputError(f"image '{source}' cannot be decoded ({error.err}); convert it to PNG or JPEG") from error
@@ -73,6 +77,39 @@ def read_image(path: str | Path) -> Image:
     if raw.dtype not in (np.uint8, np.uint16):
         raise InputError(f"image '{source}' has {raw.dtype} pixels; save it with 8 or 16 bits")
     return cast(Image, np.ascontiguousarray(raw if raw.ndim == 2 else raw[..., 2::-1]))
+
+
+FORMATS = {
+    b"ftypheic": "HEIC",
+    b"ftypheix": "HEIC",
+    b"ftypmif1": "HEIC",
+    b"ftypavif": "AVIF",
+    b"ftypcrx ": "a raw image (CR3)",
+    b"ftypisom": "a video (MP4)",
+    b"ftypmp42": "a video (MP4)",
+    b"ftypqt  ": "a video (MOV)",
+}
+"""By the eight bytes from the fifth on, ISO/IEC 14496-12."""
+
+STARTS = {
+    b"II*\x00\x10\x00\x00\x00CR": "a raw image (CR2)",
+    b"FUJIFILMCCD-RAW": "a raw image (RAF)",
+    b"IIU\x00": "a raw image (RW2)",
+    b"IIRO": "a raw image (ORF)",
+    b"SIMPLE  =": "FITS",
+    b"v/1\x01": "OpenEXR",
+    b"\xff\x0a": "JPEG XL",
+    b"\x00\x00\x00\x0cJXL ": "JPEG XL",
+    b"%PDF": "a PDF",
+    b"8BPS": "a Photoshop file",
+    b"\x1aE\xdf\xa3": "a video (MKV)",
+}
+
+
+def unread_format(data: bytes) -> str | None:
+    """Return what a file that begins with `data` is, where that is known and not read as an image."""
+    container = FORMATS.get(data[4:12])
+    return container or next((name for start, name in STARTS.items() if data.startswith(start)), None)
 
 
 def to_grey(image: Image) -> Image:
@@ -94,7 +131,7 @@ def require_pixels(size_px: tuple[int, int], what: str) -> None:
 
 
 @contextmanager
-def _quiet_opencv() -> Iterator[None]:
+def quiet_opencv() -> Iterator[None]:
     """Keep OpenCV's own lines off stderr: what is wrong is said once, in one line, by the error that follows."""
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

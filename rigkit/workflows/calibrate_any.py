@@ -14,9 +14,11 @@ from rigkit.io.files import ensure_writable, write_together
 from rigkit.io.reading import read_bytes
 from rigkit.io.rig_session import RigSession, is_rig_session, load_rig_session
 from rigkit.io.session import Session, load_session
+from rigkit.io.video import is_video
 from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration, calibrate_session
 from rigkit.workflows.calibrate_rig import RigSessionCalibration, calibrate_rig_session
-from rigkit.workflows.folder_session import session_of_folders
+from rigkit.workflows.folder_session import board_of_words, session_of_folders
+from rigkit.workflows.frames import frames_folder, frames_of_video, frames_of_videos, timestamps_beside, with_frames
 
 __all__ = ["FolderOptions", "calibrate_folders", "calibrate_session_file", "default_output"]
 
@@ -29,6 +31,8 @@ class FolderOptions:
     """COLUMNSxROWSxMM (inner corners along and across, mm a square), or files of boards."""
     model: str = "auto"
     """A camera model, or "auto"."""
+    timestamps: Path | None = None
+    """Which frames of several videos are of one moment; None: timestamps.csv beside them, if it is there."""
 
 
 def calibrate_session_file(
@@ -39,7 +43,7 @@ def calibrate_session_file(
 
     Raises as `calibrate_session` and `calibrate_rig_session` do.
     """
-    session = load_rig_session(path) if is_rig_session(path) else load_session(path)
+    session = with_frames(load_rig_session(path) if is_rig_session(path) else load_session(path), progress)
     output = options.output or default_output(session)
     report = output.with_suffix(".html") if options.report == Path() else options.report
     options = replace(options, output=output, report=report)
@@ -73,7 +77,7 @@ def calibrate_folders(
     DegenerateError
         The views do not determine a camera.
     """
-    places = [Path(folder) for folder in folders]
+    places = _folders_of([Path(folder) for folder in folders], folder_options, options, progress)
     place = places[0] if len(places) == 1 else Path(os.path.commonpath([p.absolute() for p in places]))
     place = place if options.output is None else options.output.parent
     wanted = session_of_folders(places, folder_options.boards, place, model=folder_options.model)
@@ -92,6 +96,34 @@ def calibrate_folders(
             with suppress(OSError):
                 path.unlink()
         raise
+
+
+def _folders_of(
+    places: Sequence[Path], about: FolderOptions, options: CalibrateOptions, progress: Progress
+) -> list[Path]:
+    """Return the folders of images, those of videos' frames in the place of the videos."""
+    videos = [place for place in places if is_video(place)]
+    if not videos:
+        return list(places)
+    if len(videos) < len(places):
+        raise InputError("calibrate: videos together with folders of images; give all cameras one way")
+    boards = [board_of_words(words) for words in about.boards]
+    if not boards:
+        raise InputError(
+            "calibrate: frames cannot tell how large the squares are; give the board, such as --board 9x6x25"
+        )
+    folder = frames_folder(videos)
+    if options.output is not None:
+        folder = options.output.parent / folder.name
+    if len(videos) == 1:
+        frames_of_video(videos[0], folder, boards, progress=progress)
+        return [folder]
+    cameras = {video.stem: video for video in videos}
+    if len(cameras) < len(videos):
+        raise InputError("calibrate: two videos have the same name, which names a camera; rename one")
+    timestamps = about.timestamps or timestamps_beside(videos)
+    frames_of_videos(cameras, folder, boards, timestamps=timestamps, progress=progress)
+    return [folder / name for name in cameras]
 
 
 def _says(path: Path, text: str) -> bool:

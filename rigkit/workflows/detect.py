@@ -25,8 +25,10 @@ from rigkit.io.board_file import load_board
 from rigkit.io.corners_file import write_corners
 from rigkit.io.files import ensure_writable, write_atomic
 from rigkit.io.images import read_image
+from rigkit.io.video import is_video
 from rigkit.report.overlay import draw_boards
 from rigkit.workflows.camera_files import import_camera
+from rigkit.workflows.frames import frames_folder, frames_of_video
 
 __all__ = ["DetectOptions", "DetectionResult", "detect_in_images", "images_in"]
 
@@ -76,7 +78,9 @@ class _DetectJob:
 def detect_in_images(
     paths: Sequence[str | Path], options: DetectOptions | None = None, *, progress: Progress = silent
 ) -> DetectionResult:
-    """Detect the boards of images, or of folders of images, and write what `options` ask for.
+    """Detect the boards of images, folders of images, and videos, and write what `options` ask for.
+
+    Of a video those frames are looked at that are worth keeping (`rigkit.workflows.frames`).
 
     An image that cannot be read is among the failures and does not end the rest; its error is raised where there is no
     other image.
@@ -95,8 +99,15 @@ def detect_in_images(
         )
     if options.jobs is not None and options.jobs < 1:
         raise InputError(f"--jobs {options.jobs}: at least one process is needed")
-    images = list(images_in([Path(path) for path in paths]))
     boards = tuple(load_board(path) for path in options.boards)
+    given = [Path(path) for path in paths]
+    videos = {
+        path: frames_of_video(path, frames_folder([path]), boards, progress=progress)
+        for path in filter(is_video, given)
+    }
+    images = list(
+        images_in([image for path in given for image in (videos[path].images[""] if path in videos else (path,))])
+    )
     if options.camera is not None and not boards:
         raise InputError("--camera helps to find boards of known size only; give them, such as --board a9x6.toml")
     camera = None if options.camera is None else import_camera(options.camera)

@@ -42,8 +42,8 @@ def cut_board(ends: tuple[float, float, float, float], blur_px: float, margin: f
     paper = paper[None] & ((v > -top - 1.0) & (v < ROWS + bottom))[:, None]
     fine = np.where(on_board, np.where(square, 30.0, 200.0), np.where(paper, margin, 90.0)).astype(np.float32)
     pixels = cv2.resize(fine, size, interpolation=cv2.INTER_AREA)
-    image = cv2.GaussianBlur(pixels, (0, 0), blur_px)
-    image += np.random.default_rng(0).normal(0.0, 0.5, image.shape)
+    blurred = cv2.GaussianBlur(pixels, (0, 0), blur_px).astype(np.float64)
+    image = blurred + np.random.default_rng(0).normal(0.0, 0.5, blurred.shape)
     corners = np.stack(np.meshgrid(np.arange(COLUMNS), np.arange(ROWS)), axis=-1).reshape(-1, 2)
     return np.clip(np.rint(image), 0, 255).astype(np.uint8), 80.25 + np.array([0.0, 0.125]) + CELL_PX * corners
 

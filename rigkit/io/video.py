@@ -1,0 +1,145 @@
+"""Videos, sequences and live cameras as images: decoded by OpenCV, one frame at a time.
+
+A source is a video file, a pattern of a sequence's files such as `img_%04d.png`, or `camera:0`. Pixels come as the
+sensor wrote them: an orientation in the file is not applied, because a calibration belongs to the sensor.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import cast
+
+import cv2
+import numpy as np
+
+from rigkit.core.errors import InputError
+from rigkit.io.images import Image, quiet_opencv, require_pixels
+from rigkit.io.reading import read_bytes
+
+__all__ = ["VIDEO_ENDINGS", "Video", "is_video", "read_timestamps"]
+
+VIDEO_ENDINGS = frozenset({".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv"})
+CAMERA = re.compile(r"camera:(\d{1,2})")
+SEQUENCE = re.compile(r"%0?\d?d")
+TIMESTAMPS = ("sync_index", "cam_id", "frame_index")
+
+
+def is_video(source: str | Path) -> bool:
+    """Say whether `source` names a video, a numbered sequence or a live camera rather than an image or a folder."""
+    name = Path(source).name
+    return (
+        Path(name).suffix.lower() in VIDEO_ENDINGS
+        or CAMERA.fullmatch(name) is not None
+        or SEQUENCE.search(name) is not None
+    )
+
+
+class Video:
+    """The frames of a video, one after the other; only one is in memory.
+
+    Attributes
+    ----------
+    source : as it was named.
+    count : frames announced, 0 where that is not known.
+    live : whether it is a camera, which has no end.
+    next_number : of the frame that comes next, from 0.
+    """
+
+    def __init__(self, source: str | Path) -> None:
+        """Open `source`; raises InputError where it cannot be."""
+        self.source = Path(source)
+        number = CAMERA.fullmatch(self.source.name)
+        self.live = number is not None
+        if not self.live and SEQUENCE.search(self.source.name) is None and not self.source.is_file():
+            raise InputError(f"video '{source}' does not exist; check the path")
+        with quiet_opencv():
+            self._capture = cv2.VideoCapture(int(number[1])) if number else cv2.VideoCapture(str(source))
+        if not self._capture.isOpened():
+            what = (
+                "is not connected, or another program has it" if self.live else "cannot be decoded; convert it to MP4"
+            )
+            raise InputError(f"{'camera' if self.live else 'video'} '{source}' {what}")
+        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+        size_px = tuple(int(self._capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        require_pixels((size_px[0], size_px[1]), f"video '{source}'")
+        count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        self.count = 0 if self.live or not np.isfinite(count) else max(int(count), 0)
+        self.next_number = 0
+
+    def __enter__(self) -> Video:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._capture.release()
+
+    def frame(self, number: int) -> Image | None:
+        """Return frame `number`, counted from 0, grey; None at the end. Frames are asked for in rising order.
+
+        Raises InputError for a frame that is past already.
+        """
+        if number < self.next_number:
+            raise InputError(
+                f"video '{self.source}': frame {number} is before frame {self.next_number}; ask in rising order"
+            )
+        with quiet_opencv():
+            while self.next_number < number:
+                if not self._capture.grab():
+                    return None
+                self.next_number += 1
+            well, picture = self._capture.read()
+        if not well:
+            return None
+        self.next_number += 1
+        # Decoders of sequences keep grey files grey.
+        grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+        return cast(Image, grey)
+
+    def frames(self) -> Iterator[tuple[int, Image]]:
+        """Yield the number and the picture of every frame that is left."""
+        while (picture := self.frame(self.next_number)) is not None:
+            yield self.next_number - 1, picture
+
+
+def read_timestamps(path: Path, cameras: Sequence[str]) -> dict[int, Mapping[str, int]]:
+    """Return moment -> camera -> number of the frame in that camera's video, from a file with the columns TIMESTAMPS.
+
+    A camera of the file, `cam_id`, is the one of `cameras` that is called so or has that number at its end. Frames are
+    counted from the first that a camera has in the file: recorders count those before the recording, too.
+
+    Raises
+    ------
+    InputError
+        Columns are missing, a field is no number, or a camera has no rows.
+    """
+    rows = list(csv.DictReader(io.StringIO(read_bytes(path, "timestamps").decode("utf-8", "replace"))))
+    if not rows or not set(TIMESTAMPS) <= set(rows[0]):
+        raise InputError(f"'{path}' has not the columns {', '.join(TIMESTAMPS)}; one row is one frame of one camera")
+    named = {_number(name): name for name in reversed(cameras)} | {name: name for name in cameras}
+    moments: dict[int, dict[str, int]] = {}
+    for k, row in enumerate(rows, start=2):
+        camera = named.get(str(row["cam_id"]).strip())
+        try:
+            moment, frame = int(row["sync_index"]), int(row["frame_index"])
+        except (TypeError, ValueError) as error:
+            raise InputError(f"'{path}' line {k}: sync_index and frame_index are whole numbers") from error
+        if camera is not None:
+            moments.setdefault(moment, {})[camera] = frame
+    for camera in cameras:
+        own = [frames[camera] for frames in moments.values() if camera in frames]
+        if not own:
+            raise InputError(
+                f"'{path}' has no rows of camera '{camera}'; its cam_id is the number at the end of its name"
+            )
+        for frames in moments.values():
+            if camera in frames:
+                frames[camera] -= min(own)
+    return {moment: moments[moment] for moment in sorted(moments)}
+
+
+def _number(name: str) -> str:
+    numbers = re.findall(r"\d+", name)
+    return str(int(numbers[-1])) if numbers else name

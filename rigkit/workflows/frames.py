@@ -1,0 +1,319 @@
+"""From videos to images: the frames worth keeping of one video, or of several taken at the same time, as PNG files.
+
+Everything that takes images takes them: they are named after their place in the video, those of one moment alike.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import numpy as np
+
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
+from rigkit.core.errors import InputError
+from rigkit.core.progress import Progress, silent
+from rigkit.detection.detect import detect_boards
+from rigkit.io.files import ensure_folder_writable, write_atomic
+from rigkit.io.images import Image
+from rigkit.io.reading import read_bytes
+from rigkit.io.rig_session import RigSession
+from rigkit.io.session import Session, beside_session
+from rigkit.io.video import Video, is_video, read_timestamps
+from rigkit.workflows.frame_choice import FrameChoice, KeptFrame, describe
+
+__all__ = [
+    "MOST_FRAMES",
+    "VideoFrames",
+    "frames_folder",
+    "frames_of_video",
+    "frames_of_videos",
+    "timestamps_beside",
+    "with_frames",
+]
+
+MOST_FRAMES = 40
+"""Frames kept of a video: a calibration gains little from more that are spread as well."""
+
+SEARCH_PIXELS = 1.3e6
+"""Boards are looked for in frames made smaller than this: a video of 4K takes a ninth of the time."""
+
+RECORD, FRAMES_SCHEMA = "frames.json", "rigkit.frames/1"
+PNG_FAST = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class VideoFrames:
+    """What was kept of videos.
+
+    Attributes
+    ----------
+    folder : where the images are, of several cameras in a folder each.
+    images : by camera, "" for the only one.
+    looked_at, with_boards, near_copies : moments looked at, those that show a board, and those whose boards are where
+        another one has them.
+    """
+
+    folder: Path
+    images: Mapping[str, tuple[Path, ...]]
+    looked_at: int
+    with_boards: int
+    near_copies: int
+
+    def words(self) -> str:
+        """Return what was done, in a line."""
+        kept = max(map(len, self.images.values()))
+        return (
+            f"{self.folder}: {kept} of {self.looked_at} frames kept; {self.with_boards} show a board, "
+            f"{self.near_copies} of them where another one has it"
+        )
+
+
+def frames_folder(sources: Sequence[Path]) -> Path:
+    """Return where the frames of videos go unless somebody says otherwise: beside the first."""
+    first = sources[0]
+    live = first.name.startswith("camera:")
+    place = Path() if live else first.parent
+    stem = "".join(c if c.isalnum() or c in "-_." else "-" for c in first.stem)
+    return place / ("frames" if len(sources) > 1 else f"{stem}-frames")
+
+
+def timestamps_beside(sources: Sequence[Path]) -> Path | None:
+    """Return the timestamps.csv in the folder of the videos, None where there is none."""
+    path = sources[0].parent / "timestamps.csv"
+    return path if len(sources) > 1 and path.is_file() else None
+
+
+def frames_of_video(
+    source: Path, folder: Path, boards: Sequence[Board] = (), *, most: int = MOST_FRAMES, progress: Progress = silent
+) -> VideoFrames:
+    """Keep the frames of a video, a sequence of files or a live camera (until it has `most`, or Ctrl-C) as PNG files.
+
+    Frames that were kept before, of the same video for the same boards, are used again.
+
+    Raises
+    ------
+    InputError
+        The video cannot be read, no frame shows a board, or `folder` cannot be written to.
+    """
+    return frames_of_videos({"": source}, folder, boards, most=most, progress=progress)
+
+
+def frames_of_videos(
+    sources: Mapping[str, Path],
+    folder: Path,
+    boards: Sequence[Board] = (),
+    *,
+    timestamps: Path | None = None,
+    most: int = MOST_FRAMES,
+    progress: Progress = silent,
+) -> VideoFrames:
+    """Keep frames of one moment of several cameras, by name; as `frames_of_video`.
+
+    `timestamps` says which frames are of one moment (`rigkit.io.video.read_timestamps`); without, those of one number
+    are: the videos began together and lost none.
+    """
+    asked = _asked(sources, boards, timestamps, most)
+    kept = _kept_before(folder, asked)
+    if kept is not None:
+        return kept
+    ensure_folder_writable(folder)
+    keeper = _Keeper(folder, FrameChoice(most))
+    looked_at = with_boards = 0
+    with ExitStack() as stack:
+        videos = {name: stack.enter_context(Video(path)) for name, path in sources.items()}
+        moments = None if timestamps is None else read_timestamps(timestamps, list(sources))
+        live = any(video.live for video in videos.values())
+        total = min((v.count for v in videos.values() if v.count), default=0) if moments is None else len(moments)
+        # Who calibrates a live camera says so when there is enough.
+        with suppress(*((KeyboardInterrupt,) if live else ())):
+            for number, pictures in _moments(videos, moments):
+                looked_at += 1
+                progress("looking at frames", looked_at, max(total, looked_at))
+                frame = _described(number, pictures, boards)
+                if frame is not None:
+                    with_boards += 1
+                    keeper.offer(frame, {name: pictures[name] for name in frame.views})
+                if live and len(keeper.choice.kept) >= most:
+                    break
+    images = keeper.finish()
+    if not images:
+        names = ", ".join(f"'{path}'" for path in sources.values())
+        raise InputError(f"{names}: no board in {looked_at} frames; check focus, light and the board's size")
+    done = VideoFrames(
+        folder=folder,
+        images={name: images.get(name, ()) for name in sources},
+        looked_at=looked_at,
+        with_boards=with_boards,
+        near_copies=keeper.choice.near_copies,
+    )
+    if not live:
+        _record(done, asked)
+    return done
+
+
+def _moments(
+    videos: Mapping[str, Video], moments: Mapping[int, Mapping[str, int]] | None
+) -> Iterator[tuple[int, dict[str, Image]]]:
+    """Yield the number of each moment and what the cameras show then; those that have no frame are left out."""
+    if moments is None:
+        number = 0
+        while pictures := {name: x for name, v in videos.items() if (x := v.frame(number)) is not None}:
+            yield number, pictures
+            number += 1
+        return
+    for number, frames in moments.items():
+        # A recorder that repeats a frame for lack of a new one has none of this moment.
+        fresh = {name: k for name, k in frames.items() if k >= videos[name].next_number}
+        pictures = {name: x for name, k in fresh.items() if (x := videos[name].frame(k)) is not None}
+        if pictures:
+            yield number, pictures
+
+
+def _described(number: int, pictures: Mapping[str, Image], boards: Sequence[Board]) -> KeptFrame | None:
+    """Return where the boards are in the pictures of a moment; None without any."""
+    views, sigmas = {}, []
+    for name, picture in pictures.items():
+        found = _quick_look(picture, boards)
+        view = describe(found, (picture.shape[1], picture.shape[0]))
+        if view is not None:
+            views[name] = view
+            sigmas.append(float(np.median(max(found, key=lambda item: len(item.grid)).sigma_px)))
+    return KeptFrame(number, views, float(np.mean(sigmas))) if views else None
+
+
+def _quick_look(picture: Image, boards: Sequence[Board]) -> list[BoardDetection]:
+    """Return the boards of a picture, looked for in a smaller one; their places and sigmas are those of the picture."""
+    factor = max(1, int(np.ceil(np.sqrt(picture.size / SEARCH_PIXELS))))
+    if factor > 1:
+        height, width = (side // factor for side in picture.shape)
+        cut = picture[: height * factor, : width * factor]
+        picture = np.asarray(cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA))
+    found = detect_boards(picture, boards)
+    return [
+        BoardDetection(
+            item.board_id,
+            item.columns,
+            item.rows,
+            item.grid,
+            factor * item.pixels + 0.5 * (factor - 1.0),
+            factor * item.sigma_px,
+        )
+        for item in found
+    ]
+
+
+AnySession = TypeVar("AnySession", Session, RigSession)
+
+
+def with_frames(session: AnySession, progress: Progress = silent) -> AnySession:
+    """Return `session` with the frames worth keeping in the place of the videos among its images.
+
+    They are kept beside the session. Videos of several cameras are taken as of the same time, by the timestamps.csv
+    beside them if there is one.
+    """
+    place = beside_session(session.path, "frames")
+    own = session.cameras if isinstance(session, RigSession) else {"": session}
+    videos = {name: tuple(filter(is_video, camera.images)) for name, camera in own.items()}
+    if not any(videos.values()):
+        return session
+    sources = {name: paths[0] for name, paths in videos.items() if paths}
+    if any(len(paths) > 1 for paths in videos.values()):
+        raise InputError(f"{session.path}: several videos of one camera; keep one")
+    boards = next(iter(own.values())).boards
+    done = frames_of_videos(
+        sources, place, boards, timestamps=timestamps_beside(list(sources.values())), progress=progress
+    )
+    cameras = {
+        name: replace(camera, images=(*(p for p in camera.images if p not in videos[name]), *done.images.get(name, ())))
+        for name, camera in own.items()
+    }
+    return replace(session, cameras=cameras) if isinstance(session, RigSession) else cameras[""]
+
+
+class _Keeper:
+    """Writes what the choice keeps. The newest frame is held back: a sharper one of the same view may follow."""
+
+    def __init__(self, folder: Path, choice: FrameChoice) -> None:
+        self.choice = choice
+        self._folder = folder
+        self._written: dict[int, dict[str, Path]] = {}
+        self._held: tuple[int, dict[str, Image]] | None = None
+
+    def offer(self, frame: KeptFrame, pictures: dict[str, Image]) -> None:
+        kept, gone = self.choice.offer(frame)
+        self._forget(gone)
+        if kept:
+            self._write_held()
+            self._held = frame.number, pictures
+
+    def finish(self) -> dict[str, tuple[Path, ...]]:
+        """Return the images by camera."""
+        self._write_held()
+        self._forget(self.choice.finish())
+        out: dict[str, list[Path]] = {}
+        for number in sorted(self._written):
+            for name, path in self._written[number].items():
+                out.setdefault(name, []).append(path)
+        return {name: tuple(paths) for name, paths in out.items()}
+
+    def _write_held(self) -> None:
+        if self._held is None:
+            return
+        number, pictures = self._held
+        self._held = None
+        self._written[number] = paths = {name: self._folder / name / f"{number:06d}.png" for name in pictures}
+        for name, path in paths.items():
+            write_atomic(path, np.asarray(cv2.imencode(".png", pictures[name], PNG_FAST)[1]).tobytes(), force=True)
+
+    def _forget(self, numbers: Sequence[int]) -> None:
+        for number in numbers:
+            if self._held is not None and self._held[0] == number:
+                self._held = None
+            for path in self._written.pop(number, {}).values():
+                path.unlink(missing_ok=True)
+
+
+def _asked(
+    sources: Mapping[str, Path], boards: Sequence[Board], timestamps: Path | None, most: int
+) -> dict[str, object]:
+    """Return what the choice depends on: the files by size and time of change, the boards."""
+    files = [*sources.values(), *([timestamps] if timestamps else [])]
+    state = {str(path.name): [s.st_size, s.st_mtime_ns] for path in files if path.is_file() and (s := path.stat())}
+    digest = hashlib.sha256(repr([(b.size, b.pattern) for b in boards]).encode()).hexdigest()
+    return {
+        "cameras": {name: path.name for name, path in sources.items()},
+        "files": state,
+        "boards": digest,
+        "most": most,
+    }
+
+
+def _record(done: VideoFrames, asked: Mapping[str, object]) -> None:
+    images = {name: [p.relative_to(done.folder).as_posix() for p in paths] for name, paths in done.images.items()}
+    counts = {"looked_at": done.looked_at, "with_boards": done.with_boards, "near_copies": done.near_copies}
+    text = json.dumps({"schema": FRAMES_SCHEMA, "asked": asked, "images": images, **counts}, indent=1)
+    write_atomic(done.folder / RECORD, text + "\n", force=True)
+
+
+def _kept_before(folder: Path, asked: Mapping[str, object]) -> VideoFrames | None:
+    """Return what was kept in `folder` before, None where that is for something else or no longer there."""
+    if not (folder / RECORD).is_file():
+        return None
+    try:
+        told = json.loads(read_bytes(folder / RECORD, "record"))
+        images = {name: tuple(folder / p for p in paths) for name, paths in told["images"].items()}
+        counts = {key: int(told[key]) for key in ("looked_at", "with_boards", "near_copies")}
+        same = told["schema"] == FRAMES_SCHEMA and told["asked"] == json.loads(json.dumps(asked))
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return None
+    if not same or not all(path.is_file() for paths in images.values() for path in paths):
+        return None
+    return VideoFrames(folder=folder, images=images, **counts)
