@@ -182,7 +182,7 @@ def _described(number: int, pictures: Mapping[str, Image], boards: Sequence[Boar
     views, sigmas = {}, []
     for name, picture in pictures.items():
         found = _quick_look(picture, boards)
-        view = describe(found, (picture.shape[1], picture.shape[0]))
+        view = describe(found)
         if view is not None:
             views[name] = view
             sigmas.append(float(np.median(max(found, key=lambda item: len(item.grid)).sigma_px)))

@@ -1,0 +1,82 @@
+"""Videos are read frame by frame; recorders' timestamps say which frames are of one moment."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rigkit.core.errors import InputError
+from rigkit.io.images import read_image
+from rigkit.io.video import Video, is_video, read_timestamps
+
+
+def video(path: Path, levels: list[int]) -> Path:
+    """Write a video, without loss, of even frames."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"FFV1"), 10, (64, 48))
+    assert writer.isOpened()
+    for level in levels:
+        writer.write(np.full((48, 64, 3), level, np.uint8))
+    writer.release()
+    return path
+
+
+def test_frames_come_by_number(tmp_path: Path) -> None:
+    with Video(video(tmp_path / "a.avi", [10, 60, 110, 160])) as source:
+        assert source.count == 4
+        for number, level in ((0, 10), (2, 110), (3, 160)):
+            frame = source.frame(number)
+            assert frame is not None
+            assert frame.shape == (48, 64)
+            assert abs(int(frame[20, 20]) - level) <= 1
+        assert source.frame(4) is None
+        with pytest.raises(InputError, match="rising order"):
+            source.frame(1)
+
+
+def test_a_sequence_of_files_is_a_video(tmp_path: Path) -> None:
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"shot_{k:03d}.png"), np.full((48, 64), 50 * k + 10, np.uint8))
+    assert is_video(tmp_path / "shot_%03d.png")
+    with Video(tmp_path / "shot_%03d.png") as source:
+        assert [int(frame[0, 0]) for _, frame in source.frames()] == [10, 60, 110]
+
+
+def test_sources_that_are_none(tmp_path: Path) -> None:
+    assert is_video("camera:0")
+    assert not is_video(tmp_path / "a.png")
+    with pytest.raises(InputError, match="does not exist"):
+        Video(tmp_path / "none.mp4")
+    (tmp_path / "bad.mp4").write_bytes(b"no video at all")
+    with pytest.raises(InputError, match="cannot be decoded"):
+        Video(tmp_path / "bad.mp4")
+
+
+def test_timestamps_count_from_the_first_frame_of_each_camera(tmp_path: Path) -> None:
+    path = tmp_path / "timestamps.csv"
+    path.write_text("sync_index,cam_id,frame_index,frame_time\n7,0,26,1.0\n7,1,30,1.0\n8,1,31,1.1\n9,0,28,1.2\n")
+    assert read_timestamps(path, ["cam_0", "cam_1"]) == {7: {"cam_0": 0, "cam_1": 0}, 8: {"cam_1": 1}, 9: {"cam_0": 2}}
+    with pytest.raises(InputError, match="no rows of camera 'cam_4'"):
+        read_timestamps(path, ["cam_0", "cam_4"])
+    path.write_text("time\n1\n")
+    with pytest.raises(InputError, match="has not the columns"):
+        read_timestamps(path, ["cam_0"])
+
+
+@pytest.mark.parametrize(
+    ("start", "name"),
+    [
+        (b"\0\0\0\x18ftypheic\0\0\0\0", "HEIC"),
+        (b"\0\0\0\x18ftypavif\0\0\0\0", "AVIF"),
+        (b"II*\0\x10\0\0\0CR\2\0", "CR2"),
+        (b"SIMPLE  =      T", "FITS"),
+        (b"\0\0\0\x18ftypisom\0\0\0\0", "a video"),
+    ],
+)
+def test_formats_that_are_not_read_are_named(start: bytes, name: str, tmp_path: Path) -> None:
+    path = tmp_path / "photo.jpg"
+    path.write_bytes(start + bytes(200))
+    with pytest.raises(InputError, match=f"{name}.*which is not read"):
+        read_image(path)

@@ -1,0 +1,110 @@
+"""From a video to the frames worth keeping."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rigkit.cameras.pinhole import Pinhole
+from rigkit.core.arrays import FloatArray
+from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
+from rigkit.io.images import read_image
+from rigkit.synthetic.photometry import Photometry, develop
+from rigkit.synthetic.render import Optics, radiance
+from rigkit.synthetic.scene import PlacedBoard
+from rigkit.workflows.detect import detect_in_images
+from rigkit.workflows.frame_choice import DIRECTIONS, FrameChoice, KeptFrame
+from rigkit.workflows.frames import frames_of_video, frames_of_videos
+
+BOARD = Board("b", 7, 5, 20.0, 20.0)
+CAMERA = Pinhole((320, 240), np.array([300.0, 300.0, 159.5, 119.5]))
+
+
+def picture(turn: tuple[float, float, float], right_mm: float, *, blur_px: float = 0.7) -> np.ndarray:
+    rotation = exp_so3(np.array(turn))
+    placed = PlacedBoard(
+        BOARD, Rigid3(rotation, np.array([right_mm, 0.0, 300.0]) - rotation @ np.array([60.0, 40.0, 0.0]))
+    )
+    light = radiance((placed,), CAMERA, Rigid3.identity(), optics=Optics(blur_px=blur_px))
+    return np.asarray(develop(light, Photometry(noise_levels=1.0), np.random.default_rng(0)))
+
+
+def video(path: Path, frames: Iterable[np.ndarray]) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"FFV1"), 10, CAMERA.size_px)
+    for frame in frames:
+        writer.write(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    return path
+
+
+def test_each_view_is_kept_once_and_sharp(tmp_path: Path) -> None:
+    """Four poses, each held for three frames of which one is sharp, and frames without a board."""
+    poses = (((0.0, 0.0, 0.0), 0.0), ((0.4, 0.0, 0.1), 20.0), ((0.0, 0.5, 0.0), -20.0), ((-0.4, 0.3, 0.3), 0.0))
+    empty = np.full((240, 320), 90, np.uint8)
+    frames = [empty]
+    for k, pose in enumerate(poses):
+        frames += [picture(*pose, blur_px=0.7 if shot == k % 3 else 2.5) for shot in range(3)]
+    done = frames_of_video(video(tmp_path / "a.avi", frames), tmp_path / "out", [BOARD])
+    assert (done.looked_at, done.with_boards, done.near_copies) == (13, 12, 8)
+    assert [path.stem for path in done.images[""]] == ["000001", "000005", "000009", "000010"]
+    kept = read_image(done.images[""][1])
+    assert np.array_equal(kept, cv2.cvtColor(cv2.cvtColor(frames[5], cv2.COLOR_GRAY2BGR), cv2.COLOR_BGR2GRAY))
+    # Nothing else is left behind, and the second time nothing is decoded.
+    assert sorted(p.name for p in (tmp_path / "out").iterdir())[:-1] == [p.name for p in done.images[""]]
+    stamp = (tmp_path / "out" / "frames.json").stat().st_mtime_ns
+    again = frames_of_video(tmp_path / "a.avi", tmp_path / "out", [BOARD])
+    assert again.images == done.images
+    assert (tmp_path / "out" / "frames.json").stat().st_mtime_ns == stamp
+    with pytest.raises(InputError, match="no board in 2 frames"):
+        frames_of_video(video(tmp_path / "b.avi", [empty, empty]), tmp_path / "other")
+
+
+def test_videos_of_two_cameras_give_frames_of_one_moment(tmp_path: Path) -> None:
+    shots = [picture((0.1 * k, 0.1, 0.0), 12.0 * k - 20.0) for k in range(4)]
+    one = video(tmp_path / "cam_0.avi", shots)
+    two = video(tmp_path / "cam_1.avi", [np.full((240, 320), 90, np.uint8), *shots[:2]])
+    stamps = tmp_path / "timestamps.csv"
+    rows = [(10 + k, 0, 5 + k) for k in range(4)] + [(11 + k, 1, 8 + k) for k in range(3)]
+    stamps.write_text("sync_index,cam_id,frame_index\n" + "".join(f"{a},{b},{c}\n" for a, b, c in rows))
+    done = frames_of_videos({"cam_0": one, "cam_1": two}, tmp_path / "frames", [BOARD], timestamps=stamps)
+    assert [p.stem for p in done.images["cam_0"]] == ["000010", "000011", "000012", "000013"]
+    assert [p.stem for p in done.images["cam_1"]] == ["000012", "000013"]
+
+
+def test_detect_takes_a_video(tmp_path: Path) -> None:
+    path = video(tmp_path / "clip.avi", [picture((0.2 * k, 0.0, 0.0), 0.0) for k in range(3)])
+    done = detect_in_images([path])
+    assert [len(found) for found in done.found.values()] == [1, 1, 1]
+    assert all(Path(name).parent == tmp_path / "clip-frames" for name in done.found)
+
+
+def frame(number: int, view: FloatArray, sigma_px: float) -> KeptFrame:
+    return KeptFrame(number, {"": view}, sigma_px)
+
+
+def test_a_long_video_keeps_few_frames_that_are_spread() -> None:
+    """A thousand places along a line: never more than twice as many kept as wanted, at the end well spread."""
+    choice = FrameChoice(10)
+    places = np.random.default_rng(3).permutation(1000) / 1000.0
+    for number, place in enumerate(places.tolist()):
+        choice.offer(frame(number, 0.1 + place * DIRECTIONS[:, 0], 0.1))
+        assert len(choice.kept) <= 20
+    choice.finish()
+    kept = np.sort([places[k] for k in choice.kept])
+    assert len(kept) == 10
+    assert np.diff(kept).min() > 0.04
+    assert np.diff(kept).max() < 0.25
+
+
+def test_blurred_frames_are_left_out() -> None:
+    choice = FrameChoice(10)
+    for number in range(6):
+        choice.offer(frame(number, 1.0 + 0.1 * number * DIRECTIONS[:, 0], 0.5 if number == 3 else 0.05))
+    assert choice.finish() == [3]
