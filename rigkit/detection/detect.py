@@ -12,6 +12,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.detection.saddles.bad_pixels import without_bad_pixels
+from rigkit.detection.saddles.mosaic import without_mosaic
 from rigkit.detection.saddles.nearby import near_any
 from rigkit.detection.saddles.response import grey_image
 from rigkit.detection.targets.base import Search
@@ -34,7 +35,7 @@ def detect_boards(
 
     Parameters
     ----------
-    image : (H, W) or (H, W, 3 or 4), uint8 or uint16 (or float 0..255), grey or RGB.
+    image : (H, W) or (H, W, 3 or 4), uint8 or uint16 (or float 0..255), grey or RGB, or the mosaic of a colour camera.
     boards : what may be in the image, if known. A grid of a board's size, either way round, is turned to its columns x
         rows; a part of a board whose borders show where it lies gets its place in the board's grid, any other part
         stays a grid of its own. A board is named only where one single given board has that size and one single
@@ -54,7 +55,7 @@ def detect_boards(
     InputError
         `image` is not an image of a supported type.
     """
-    search = Search(without_bad_pixels(grey_image(image)), boards or (), min_corners, camera)
+    search = Search(without_bad_pixels(without_mosaic(grey_image(image))), boards or (), min_corners, camera)
     found: list[BoardDetection] = []
     for kind, finder in FINDERS.items():
         own = [board for board in search.boards if board.pattern.type == kind]

@@ -1,0 +1,63 @@
+"""Raw images of colour cameras: a mosaic of pixels that see red, green or blue (Bayer's pattern, or any other of 2 x 2).
+
+A board is black and white, so its pixels differ by the sensitivity of their colour alone. Brought to one scale they are
+a grey image of full resolution, without the interpolation that makes an image of colours out of them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.detection.saddles.response import FloatImage, GreyImage
+
+__all__ = ["without_mosaic"]
+
+LOOKED_AT = 20000
+"""Squares of 2 x 2 pixels that are looked at."""
+
+MOSAIC_SHARE = 0.03
+"""A place in the squares that is, in the median, brighter or darker than its square by this part of it is of another
+colour. 586 pictures of boards and photographs have 0.009 at most, mosaics 0.1 to 0.5 unless they are white-balanced, when
+there is nothing to do."""
+
+MIN_LEVELS = 12.0
+"""Darker squares, grey levels, say nothing: rounding is a part of them."""
+
+
+def without_mosaic(grey: GreyImage) -> GreyImage:
+    """Return `grey` with the four places of its squares of 2 x 2 pixels on one scale; as it is if they are so already."""
+    height, width = (side // 2 for side in grey.shape)
+    step = max(1, int(np.sqrt(height * width / LOOKED_AT)))
+    places = [(v, u) for v in (0, 1) for u in (0, 1)]
+    seen = np.stack([grey[v : 2 * height : 2, u : 2 * width : 2][::step, ::step].ravel() for v, u in places])
+    values = seen.astype(np.float64)
+    mean = values.mean(axis=0)
+    bright = mean > max(float(np.median(mean)), MIN_LEVELS)
+    if not bright.any():
+        return grey
+    off = np.median(values[:, bright] / mean[bright] - 1.0, axis=1)
+    if float(np.abs(off).max()) < MOSAIC_SHARE:
+        return grey
+    out: FloatImage = grey.astype(np.float32)
+    for (v, u), own in zip(places, values, strict=True):
+        gain, offset = _line(own, mean, bright)
+        out[v::2, u::2] = gain * out[v::2, u::2] + offset
+    return np.clip(out, 0.0, 255.0, out=out)
+
+
+def _line(own: FloatArray, mean: FloatArray, bright: BoolArray) -> tuple[np.float32, np.float32]:
+    """Return gain and offset that take the brightness of one place to the mean of the square, by the dark and by the
+    bright half of the squares: the middle halves of either, where fewer are of other colours."""
+    (dark_own, dark_mean), (bright_own, bright_mean) = (_middle(own[half], mean[half]) for half in (~bright, bright))
+    span = bright_own - dark_own
+    gain = (bright_mean - dark_mean) / span if span > 1.0 else bright_mean / bright_own
+    return np.float32(gain), np.float32(bright_mean - gain * bright_own)
+
+
+def _middle(own: FloatArray, mean: FloatArray) -> tuple[float, float]:
+    """Return the means of both over the squares whose ratio of them is usual."""
+    ratio = own / np.maximum(mean, 1.0)
+    low, high = np.quantile(ratio, (0.25, 0.75))
+    usual = (ratio >= low) & (ratio <= high)
+    return float(own[usual].mean()), float(mean[usual].mean())
