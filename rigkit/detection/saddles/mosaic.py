@@ -1,4 +1,4 @@
-"""Raw images of colour cameras: a mosaic of pixels that see red, green or blue (Bayer's pattern, or any other of 2 x 2).
+"""Raw images of colour cameras: a mosaic of pixels that see red, green or blue (Bayer's or another pattern of 2 x 2).
 
 A board is black and white, so its pixels differ by the sensitivity of their colour alone. Brought to one scale they are
 a grey image of full resolution, without the interpolation that makes an image of colours out of them.
@@ -18,15 +18,15 @@ LOOKED_AT = 20000
 
 MOSAIC_SHARE = 0.03
 """A place in the squares that is, in the median, brighter or darker than its square by this part of it is of another
-colour. 586 pictures of boards and photographs have 0.009 at most, mosaics 0.1 to 0.5 unless they are white-balanced, when
-there is nothing to do."""
+colour. 586 pictures of boards and photographs have 0.009 at most, mosaics 0.1 to 0.5 unless they are white-balanced,
+when there is nothing to do."""
 
 MIN_LEVELS = 12.0
 """Darker squares, grey levels, say nothing: rounding is a part of them."""
 
 
 def without_mosaic(grey: GreyImage) -> GreyImage:
-    """Return `grey` with the four places of its squares of 2 x 2 pixels on one scale; as it is if they are so already."""
+    """Return `grey` with the four places of its squares of 2 x 2 pixels on one scale; as it is where they are so."""
     height, width = (side // 2 for side in grey.shape)
     step = max(1, int(np.sqrt(height * width / LOOKED_AT)))
     places = [(v, u) for v in (0, 1) for u in (0, 1)]
