@@ -13,13 +13,16 @@ from rigkit.detection.saddles.response import FloatImage, GreyImage
 
 __all__ = ["without_mosaic"]
 
-LOOKED_AT = 20000
-"""Squares of 2 x 2 pixels that are looked at."""
+GLANCE, LOOK = 1500, 20000
+"""Squares of 2 x 2 pixels that tell whether there is a mosaic, and those that tell its scales."""
 
 MOSAIC_SHARE = 0.03
 """A place in the squares that is, in the median, brighter or darker than its square by this part of it is of another
 colour. 586 pictures of boards and photographs have 0.009 at most, mosaics 0.1 to 0.5 unless they are white-balanced,
 when there is nothing to do."""
+
+PLACES = ((0, 0), (0, 1), (1, 0), (1, 1))
+"""In a square: row, column."""
 
 MIN_LEVELS = 12.0
 """Darker squares, grey levels, say nothing: rounding is a part of them."""
@@ -27,23 +30,31 @@ MIN_LEVELS = 12.0
 
 def without_mosaic(grey: GreyImage) -> GreyImage:
     """Return `grey` with the four places of its squares of 2 x 2 pixels on one scale; as it is where they are so."""
-    height, width = (side // 2 for side in grey.shape)
-    step = max(1, int(np.sqrt(height * width / LOOKED_AT)))
-    places = [(v, u) for v in (0, 1) for u in (0, 1)]
-    seen = np.stack([grey[v : 2 * height : 2, u : 2 * width : 2][::step, ::step].ravel() for v, u in places])
-    values = seen.astype(np.float64)
+    values = _squares(grey, GLANCE)
     mean = values.mean(axis=0)
     bright = mean > max(float(np.median(mean)), MIN_LEVELS)
-    if not bright.any():
+    if (
+        not bright.any()
+        or float(np.abs(np.median(values[:, bright] / mean[bright], axis=1) - 1.0).max()) < MOSAIC_SHARE
+    ):
         return grey
-    off = np.median(values[:, bright] / mean[bright] - 1.0, axis=1)
-    if float(np.abs(off).max()) < MOSAIC_SHARE:
-        return grey
+    values = _squares(grey, LOOK)
+    mean = values.mean(axis=0)
+    bright = mean > max(float(np.median(mean)), MIN_LEVELS)
     out: FloatImage = grey.astype(np.float32)
-    for (v, u), own in zip(places, values, strict=True):
+    for (v, u), own in zip(PLACES, values, strict=True):
         gain, offset = _line(own, mean, bright)
         out[v::2, u::2] = gain * out[v::2, u::2] + offset
     return np.clip(out, 0.0, 255.0, out=out)
+
+
+def _squares(grey: GreyImage, count: int) -> FloatArray:
+    """Return the brightness at the four PLACES of about `count` squares, (4, N)."""
+    height, width = (side // 2 for side in grey.shape)
+    step = max(1, int(np.sqrt(height * width / count)))
+    rows, columns = 2 * step * (height // step), 2 * step * (width // step)
+    seen = [grey[v : rows : 2 * step, u : columns : 2 * step].ravel() for v, u in PLACES]
+    return np.stack(seen).astype(np.float64)
 
 
 def _line(own: FloatArray, mean: FloatArray, bright: BoolArray) -> tuple[np.float32, np.float32]:
