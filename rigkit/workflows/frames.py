@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import cast
 
 import cv2
 import numpy as np
@@ -195,7 +195,7 @@ def _quick_look(picture: Image, boards: Sequence[Board]) -> list[BoardDetection]
     if factor > 1:
         height, width = (side // factor for side in picture.shape)
         cut = picture[: height * factor, : width * factor]
-        picture = np.asarray(cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA))
+        picture = cast(Image, cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA))
     found = detect_boards(picture, boards)
     return [
         BoardDetection(
@@ -210,17 +210,14 @@ def _quick_look(picture: Image, boards: Sequence[Board]) -> list[BoardDetection]
     ]
 
 
-AnySession = TypeVar("AnySession", Session, RigSession)
-
-
-def with_frames(session: AnySession, progress: Progress = silent) -> AnySession:
+def with_frames(session: Session | RigSession, progress: Progress = silent) -> Session | RigSession:
     """Return `session` with the frames worth keeping in the place of the videos among its images.
 
     They are kept beside the session. Videos of several cameras are taken as of the same time, by the timestamps.csv
     beside them if there is one.
     """
     place = beside_session(session.path, "frames")
-    own = session.cameras if isinstance(session, RigSession) else {"": session}
+    own: Mapping[str, Session] = session.cameras if isinstance(session, RigSession) else {"": session}
     videos = {name: tuple(filter(is_video, camera.images)) for name, camera in own.items()}
     if not any(videos.values()):
         return session
@@ -231,10 +228,10 @@ def with_frames(session: AnySession, progress: Progress = silent) -> AnySession:
     done = frames_of_videos(
         sources, place, boards, timestamps=timestamps_beside(list(sources.values())), progress=progress
     )
-    cameras = {
-        name: replace(camera, images=(*(p for p in camera.images if p not in videos[name]), *done.images.get(name, ())))
-        for name, camera in own.items()
-    }
+    cameras: dict[str, Session] = {}
+    for name, camera in own.items():
+        still = [path for path in camera.images if path not in videos[name]]
+        cameras[name] = replace(camera, images=(*still, *done.images.get(name, ())))
     return replace(session, cameras=cameras) if isinstance(session, RigSession) else cameras[""]
 
 

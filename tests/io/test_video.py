@@ -15,7 +15,7 @@ from rigkit.io.video import Video, is_video, read_timestamps
 
 def video(path: Path, levels: list[int]) -> Path:
     """Write a video, without loss, of even frames."""
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"FFV1"), 10, (64, 48))
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"FFV1"), 10, (64, 48))
     assert writer.isOpened()
     for level in levels:
         writer.write(np.full((48, 64, 3), level, np.uint8))

@@ -37,7 +37,7 @@ def picture(turn: tuple[float, float, float], right_mm: float, *, blur_px: float
 
 
 def video(path: Path, frames: Iterable[np.ndarray]) -> Path:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"FFV1"), 10, CAMERA.size_px)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"FFV1"), 10, CAMERA.size_px)
     for frame in frames:
         writer.write(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR))
     writer.release()
