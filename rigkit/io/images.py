@@ -79,7 +79,7 @@ def read_image(path: str | Path) -> Image:
     return cast(Image, np.ascontiguousarray(raw if raw.ndim == 2 else raw[..., 2::-1]))
 
 
-FORMATS = {
+UNREAD_CONTAINERS = {
     b"ftypheic": "HEIC",
     b"ftypheix": "HEIC",
     b"ftypmif1": "HEIC",
@@ -91,7 +91,7 @@ FORMATS = {
 }
 """By the eight bytes from the fifth on, ISO/IEC 14496-12."""
 
-STARTS = {
+UNREAD_STARTS = {
     b"II*\x00\x10\x00\x00\x00CR": "a raw image (CR2)",
     b"FUJIFILMCCD-RAW": "a raw image (RAF)",
     b"IIU\x00": "a raw image (RW2)",
@@ -108,8 +108,8 @@ STARTS = {
 
 def unread_format(data: bytes) -> str | None:
     """Return what a file that begins with `data` is, where that is known and not read as an image."""
-    container = FORMATS.get(data[4:12])
-    return container or next((name for start, name in STARTS.items() if data.startswith(start)), None)
+    container = UNREAD_CONTAINERS.get(data[4:12])
+    return container or next((name for start, name in UNREAD_STARTS.items() if data.startswith(start)), None)
 
 
 def to_grey(image: Image) -> Image:

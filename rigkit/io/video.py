@@ -23,7 +23,7 @@ from rigkit.io.reading import read_bytes
 __all__ = ["VIDEO_ENDINGS", "Video", "is_video", "read_timestamps"]
 
 VIDEO_ENDINGS = frozenset({".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv"})
-CAMERA = re.compile(r"camera:(\d{1,2})")
+LIVE_CAMERA = re.compile(r"camera:(\d{1,2})")
 SEQUENCE = re.compile(r"%0?\d?d")
 TIMESTAMPS = ("sync_index", "cam_id", "frame_index")
 
@@ -33,7 +33,7 @@ def is_video(source: str | Path) -> bool:
     name = Path(source).name
     return (
         Path(name).suffix.lower() in VIDEO_ENDINGS
-        or CAMERA.fullmatch(name) is not None
+        or LIVE_CAMERA.fullmatch(name) is not None
         or SEQUENCE.search(name) is not None
     )
 
@@ -52,7 +52,7 @@ class Video:
     def __init__(self, source: str | Path) -> None:
         """Open `source`; raises InputError where it cannot be."""
         self.source = Path(source)
-        number = CAMERA.fullmatch(self.source.name)
+        number = LIVE_CAMERA.fullmatch(self.source.name)
         self.live = number is not None
         if not self.live and SEQUENCE.search(self.source.name) is None and not self.source.is_file():
             raise InputError(f"video '{source}' does not exist; check the path")
