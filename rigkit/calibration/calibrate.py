@@ -101,9 +101,10 @@ def calibrate(
     used, dropped = usable_views(views, size_px)
     observations = Observations.from_views(used)
     options, failed = _fit_all(observations, size_px, wanted, progress)
+    # From here on as if one model had been asked for: what else was tried changes nothing.
+    options, wanted, others = _lens(observations, options, wanted, folds, progress)
     keep, reasons = _agreeing(observations, options)
     if reasons:
-        dropped = (*dropped, *reasons)
         observations = observations.subset(np.flatnonzero(keep))
         options, failed = _fit_all(observations, size_px, wanted, progress)
     observations = _reweighted(observations, options)
@@ -114,19 +115,17 @@ def calibrate(
         options, unfit = _fit_all(observations, size_px, beyond, progress, options)
         options = _compared(observations, options, folds, progress)
         chosen, failed = _choose(observations, options, SURELY), [*failed, *unfit]
-    candidates = [*_described(options, chosen), *failed]
+    candidates = [*others, *_described(options, chosen), *failed]
     if board != "flat" and often_seen(observations).any():
         observations, chosen, fits = _fit_shapes(observations, chosen, board)
         shapes, spared = _shapes(observations, fits, board, folds, progress)
-        if board == "auto":
-            shapes = [chosen, *shapes]
+        shapes = [*([chosen] if board == "auto" else []), *shapes]
         chosen = _choose(observations, shapes)
         candidates += [*(c for c in _described(shapes, chosen) if "board" in c.name), *spared]
-    result = assemble(observations, chosen.fit, chosen.heldout_px, dropped, tuple(candidates))
-    also = [] if model == "auto" else _at_the_end(beyond, result)
-    moved = moved_lens(observations, chosen.fit) if folds else ()
+    result = assemble(observations, chosen.fit, chosen.heldout_px, (*dropped, *reasons), tuple(candidates))
     in_force = [name for name, value in (("model", model), ("board_shape", board)) if value == "auto"]
-    return _judged(result, observations, chosen.fit, [*moved, *also], in_force)
+    moved = moved_lens(observations, chosen.fit) if folds else ()
+    return _judged(result, observations, chosen.fit, [*moved, *_at_the_end(beyond, result, in_force)], in_force)
 
 
 def _judged(
@@ -168,9 +167,11 @@ def _beyond(chosen: _Option) -> list[tuple[str, type[Camera], int | None]]:
     return [(f"{camera.model} {order}", type(camera), order) for order in more]
 
 
-def _at_the_end(beyond: Sequence[tuple[str, type[Camera], int | None]], result: Calibration) -> list[Finding]:
+def _at_the_end(
+    beyond: Sequence[tuple[str, type[Camera], int | None]], result: Calibration, in_force: Sequence[str]
+) -> list[Finding]:
     """Say that the lens may ask for more than the model has, where the largest size of all is the best."""
-    if not beyond or not any(c.name == beyond[-1][0] and c.chosen for c in result.candidates):
+    if not beyond or "model" in in_force or not any(c.name == beyond[-1][0] and c.chosen for c in result.candidates):
         return []
     return [
         Finding(
@@ -208,6 +209,36 @@ def _fit_all(
         assert error is not None
         raise error
     return options, failed
+
+
+def _lens(
+    observations: Observations,
+    options: list[_Option],
+    wanted: Sequence[tuple[str, type[Camera], int | None]],
+    folds: int,
+    progress: Progress,
+) -> tuple[list[_Option], Sequence[tuple[str, type[Camera], int | None]], list[Candidate]]:
+    """Return the options of the camera model that shows the views best, as they came, what was wanted of that model,
+    and the others as they were tried, on the same corners."""
+    if len({cls for _, cls, _ in wanted}) == 1:
+        return options, wanted, []
+    keep, _ = _agreeing(observations, options)
+    seen = observations.subset(np.flatnonzero(keep))
+    same = options if keep.all() else [replace(o, fit=_of_views(seen, o.fit, keep)) for o in options]
+    seen = _reweighted(seen, same)
+    tried = _compared(seen, same, folds, progress)
+    chosen = _choose(seen, tried, SURELY)
+    model = chosen.fit.state.camera.model
+    own = [option for option in options if option.fit.state.camera.model == model]
+    names = {option.name for option in own}
+    others = [candidate for candidate in _described(tried, chosen) if candidate.name not in names]
+    return own, [w for w in wanted if w[1].model == model], others
+
+
+def _of_views(observations: Observations, fit: Fit, keep: BoolArray) -> Fit:
+    """Return the fit of the views to keep (V,), `observations`, from that of all of them."""
+    chosen = np.flatnonzero(keep)
+    return fit_kept(observations, fit.state.subset(chosen), fit.kept[chosen], settle=True)
 
 
 def _agreeing(observations: Observations, options: list[_Option]) -> tuple[BoolArray, tuple[tuple[str, str], ...]]:

@@ -153,3 +153,19 @@ def test_frames_that_are_not_of_one_moment(rng: np.random.Generator) -> None:
         found = compare_cameras(alone.camera, camera.calibration.camera)
         assert found.rms_px < 1.0
         assert (camera.calibration.parameter_sigmas > 0.5 * alone.parameter_sigmas).all()
+
+
+def test_the_verdict_does_not_depend_on_how_the_model_was_reached(rng: np.random.Generator) -> None:
+    fish = lens("fish")
+    longer = fish.with_parameters(np.asarray(fish.parameters) * np.array([1.03, 1.03, *[1.0] * 6]))
+    views, _, _ = random_views(fish, 12, rng, reach_deg=85.0, noise_px=NOISE_PX)
+    later, _, _ = random_views(longer, 12, rng, reach_deg=85.0, noise_px=NOISE_PX)
+    together = [*prefixed(views, "a"), *prefixed(later, "b")]
+    chosen = calibrate(together, SIZE, model="auto", board="flat")
+    named = calibrate(together, SIZE, model=chosen.camera.model, board="flat")
+    assert (chosen.camera.parameters == named.camera.parameters).all()
+    assert [v.message for v in chosen.verdicts] == [v.message for v in named.verdicts]
+    assert "the lens (or the board) was another one" in str(chosen.verdicts[0])
+    tried = {candidate.name.split()[0] for candidate in chosen.candidates}
+    assert {"pinhole", "brown", "kannala_brandt", "scaramuzza"} <= tried
+    assert [c.chosen for c in chosen.candidates].count(True) == 1
