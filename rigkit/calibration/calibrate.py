@@ -214,10 +214,10 @@ def _fit_all(
 def _lens(
     observations: Observations,
     options: list[_Option],
-    wanted: Sequence[tuple[str, type[Camera], int | None]],
+    wanted: list[tuple[str, type[Camera], int | None]],
     folds: int,
     progress: Progress,
-) -> tuple[list[_Option], Sequence[tuple[str, type[Camera], int | None]], list[Candidate]]:
+) -> tuple[list[_Option], list[tuple[str, type[Camera], int | None]], list[Candidate]]:
     """Return the options of the camera model that shows the views best, as they came, what was wanted of that model,
     and the others as they were tried, on the same corners."""
     if len({cls for _, cls, _ in wanted}) == 1:
