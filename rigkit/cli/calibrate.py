@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rigkit.core.errors import ExitCode, InputError
+from rigkit.core.errors import ExitCode, InputError, RigkitError
 from rigkit.workflows.formats import FOREIGN_ENDINGS
 
 if TYPE_CHECKING:
@@ -64,6 +64,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    sessions = len(args.source) > 1 and all(path.suffix == ".toml" for path in args.source)
+    return _many(args) if sessions else _one(args)
+
+
+def _many(args: argparse.Namespace) -> int:
+    """Calibrate several sessions, one after the other; one that fails does not end the rest."""
+    from rigkit.cli.console import note
+
+    if args.output is not None or args.report or args.corners is not None:
+        raise InputError("calibrate: -o, --corners and a name for -r are of one session; results go beside each")
+    codes = []
+    for source in args.source:
+        if not args.json:
+            print(f"{source}:")
+        try:
+            codes.append(_one(argparse.Namespace(**{**vars(args), "source": [source]})))
+        except RigkitError as error:
+            note(f"{source}: {error}")
+            codes.append(error.exit_code)
+    failed = [str(source) for source, code in zip(args.source, codes, strict=True) if code]
+    note(
+        f"{len(codes) - len(failed)} of {len(codes)} sessions are well"
+        + (f"; not: {', '.join(failed)}" if failed else "")
+    )
+    return max(codes)
+
+
+def _one(args: argparse.Namespace) -> int:
     from rigkit.cli.console import note, print_json
 
     started = time.monotonic()

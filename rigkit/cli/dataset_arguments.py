@@ -23,9 +23,9 @@ __all__ = [
 ]
 
 
-def add_dataset_arguments(parser: argparse.ArgumentParser, *, optional: bool = False) -> None:
-    """Add what every verb on a data set takes; `optional`: the verb also works on something else."""
-    number = "?" if optional else None
+def add_dataset_arguments(parser: argparse.ArgumentParser, *, optional: bool = False, several: bool = False) -> None:
+    """Add what every verb on a data set takes; `optional`: the verb works on something else too; `several`: on many."""
+    number = "?" if optional else "+" if several else None
     parser.add_argument(
         "dataset", metavar="DATASET", nargs=number, help="folder with a dataset.toml, or the file itself"
     )

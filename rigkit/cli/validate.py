@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rigkit.cli.console import note, print_json, progress_on_stderr
 from rigkit.cli.dataset_arguments import (
@@ -24,13 +24,16 @@ if TYPE_CHECKING:
     from rigkit.validation.checks import ValidationReport
     from rigkit.validation.crosscheck import CrossCheckReport
     from rigkit.workflows.paper import PaperOptions
-    from rigkit.workflows.validate import DatasetValidation
+    from rigkit.workflows.validate import DatasetValidation, ValidateOptions
 
 HELP = "the tables against measured truth, report and PLY; exit code 1 if a check fails"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_dataset_arguments(parser)
+    add_dataset_arguments(parser, several=True)
+    parser.add_argument(
+        "--cluster", metavar="ADDRESS", help="of several data sets: a Dask scheduler to use instead of processes"
+    )
     add_direction_arguments(parser)
     parser.add_argument("--no-pictures", action="store_true", help="leave out PNG pictures and the HTML report")
     parser.add_argument(
@@ -53,9 +56,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from rigkit.io.manifest import load_dataset
     from rigkit.workflows.paper import PaperOptions
-    from rigkit.workflows.validate import ValidateOptions, validate_dataset
+    from rigkit.workflows.validate import validate_dataset
 
-    dataset = load_dataset(args.dataset)
+    if len(args.dataset) > 1:
+        return _many(args)
+    if args.cluster is not None:
+        raise InputError("--cluster is for several data sets; -j uses the processors of this machine")
+    dataset = load_dataset(args.dataset[0])
     common = dataset_options(args, dataset.name)
     if args.paper and direction_options(args):
         raise InputError("--paper has directions and a scale of its own; leave --directions and --det-scale out")
@@ -63,14 +70,38 @@ def run(args: argparse.Namespace) -> int:
         return _as_paper(dataset, PaperOptions(**common, own_solvers=args.own_solvers), json=args.json)
     if args.own_solvers:
         raise InputError("--own-solvers is about --paper; add that, or leave it out")
-    options = ValidateOptions(
+    options = _options(args, common)
+    return show(validate_dataset(dataset, options, progress=progress_on_stderr()), common["output"], json=args.json)
+
+
+def _options(args: argparse.Namespace, common: dict[str, Any]) -> ValidateOptions:
+    from rigkit.workflows.validate import ValidateOptions
+
+    return ValidateOptions(
         **common,
         **direction_options(args),
         pictures=not args.no_pictures,
         pdf=args.figures == "pdf",
         crosscheck=not args.no_crosscheck,
     )
-    return show(validate_dataset(dataset, options, progress=progress_on_stderr()), common["output"], json=args.json)
+
+
+def _many(args: argparse.Namespace) -> int:
+    """Validate several data sets, each in a folder of its own; print one table."""
+    import os
+
+    from rigkit.report.tables import tables_to_json, tables_to_text
+    from rigkit.workflows.validate_many import validate_datasets
+
+    if args.paper or args.own_solvers:
+        raise InputError("--paper is for one data set at a time")
+    common = dataset_options(args, "datasets")
+    jobs = args.jobs or os.cpu_count() or 1
+    progress = progress_on_stderr()
+    done = validate_datasets(args.dataset, _options(args, common), jobs=jobs, cluster=args.cluster, progress=progress)
+    print(tables_to_json([done.table]) if args.json else tables_to_text([done.table]))
+    note(f"{common['output'] / 'summary.html'}")
+    return done.code
 
 
 def _as_paper(dataset: Dataset, options: PaperOptions, *, json: bool) -> int:

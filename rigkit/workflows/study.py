@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-import importlib
 import io
 import json
-import os
-from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import as_completed
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.errors import InputError
-from rigkit.core.processes import worker_pool
 from rigkit.core.progress import Progress, silent
 from rigkit.io.files import ensure_writable, write_atomic, write_together
 from rigkit.io.sources import source_hash
@@ -29,6 +25,7 @@ from rigkit.report.study_tables import cell_table, study_tables
 from rigkit.report.tables import tables_to_csv, tables_to_markdown
 from rigkit.study.study import Study, chunk_count, run_chunk
 from rigkit.study.table import StudyTable, tabulate
+from rigkit.workflows.spread import over_items
 
 __all__ = ["StudyOptions", "StudyResult", "run_studies", "run_study", "study_key"]
 
@@ -139,7 +136,8 @@ def run_study(
             done[index] = earlier
     progress(study.name, len(done), total)
     missing = [index for index in range(total) if index not in done]
-    for index, errors in _compute(study, missing, jobs, dask):
+    for place, errors in over_items(partial(run_chunk, study), missing, jobs=jobs, cluster=dask):
+        index = missing[place]
         done[index] = errors
         if parts is not None:
             write_atomic(_part(parts, key, index), _npy(errors), force=True)
@@ -169,34 +167,3 @@ def _npy(errors: Errors) -> bytes:
     data = io.BytesIO()
     np.save(data, errors)
     return data.getvalue()
-
-
-def _compute(study: Study, indices: list[int], jobs: int, dask: str | None) -> Iterator[tuple[int, Errors]]:
-    if not indices:
-        return
-    if dask is not None:
-        yield from _on_dask(study, indices, dask)
-    elif jobs == 1 or len(indices) == 1:
-        for index in indices:
-            yield index, run_chunk(study, index)
-    else:
-        with worker_pool(min(jobs, len(indices), os.cpu_count() or 1)) as pool:
-            waiting = {pool.submit(run_chunk, study, index): index for index in indices}
-            for future in as_completed(waiting):
-                yield waiting[future], future.result()
-
-
-def _on_dask(study: Study, indices: list[int], address: str) -> Iterable[tuple[int, Errors]]:
-    """Compute through joblib's Dask backend."""
-    try:
-        distributed, joblib = (importlib.import_module(name) for name in ("distributed", "joblib"))
-    except ImportError as error:
-        raise InputError(f"simulate: --dask needs {error.name}; pip install joblib distributed") from error
-    try:
-        client: Any = distributed.Client(address, timeout="10s")
-    except (OSError, ValueError) as error:
-        raise InputError(f"simulate: no Dask scheduler answers at '{address}'; check the address") from error
-    with client, joblib.parallel_config(backend="dask"):
-        run = joblib.Parallel(return_as="list")
-        results = run(joblib.delayed(partial(run_chunk, study))(index) for index in indices)
-    return zip(indices, results, strict=True)

@@ -1,0 +1,185 @@
+"""Many data sets, each validated on its own, with one table of what they came to."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from rigkit.core.errors import ExitCode, InputError, RigkitError
+from rigkit.core.progress import Progress, silent
+from rigkit.core.tables import Cell, Column, Table
+from rigkit.io.manifest import load_dataset
+from rigkit.report.render import render, shown_table
+from rigkit.report.tables import tables_to_csv, tables_to_json, tables_to_markdown
+from rigkit.validation.tables import mean_normal_error
+from rigkit.workflows.provenance import software_facts
+from rigkit.workflows.results import require_folder, write_results
+from rigkit.workflows.spread import over_items
+from rigkit.workflows.validate import ValidateOptions, validate_dataset
+
+__all__ = ["ManyValidation", "SetOutcome", "validate_datasets"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetOutcome:
+    """What one data set of many came to.
+
+    Attributes
+    ----------
+    name : of the data set, which is also its folder of results.
+    code : the exit code that it alone would have had.
+    error : why nothing came out, or which pairs failed; empty where all were validated.
+    pairs, checks_failed : how many.
+    worst_angle_deg, mean_normal_deg, worst_baseline_sigmas : over the pairs' best estimators; None where unknown.
+    seconds : how long it took.
+    """
+
+    name: str
+    code: int
+    error: str = ""
+    pairs: int = 0
+    checks_failed: int = 0
+    worst_angle_deg: float | None = None
+    mean_normal_deg: float | None = None
+    worst_baseline_sigmas: float | None = None
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ManyValidation:
+    """What every data set came to, in the order given, as a table too, and the files of the summary."""
+
+    outcomes: tuple[SetOutcome, ...]
+    table: Table
+    written: tuple[Path, ...]
+
+    @property
+    def code(self) -> int:
+        """The gravest exit code of them: bad input before failed checks."""
+        return max((outcome.code for outcome in self.outcomes), default=ExitCode.WELL)
+
+
+def validate_datasets(
+    datasets: Sequence[str | Path],
+    options: ValidateOptions,
+    *,
+    jobs: int = 1,
+    cluster: str | None = None,
+    progress: Progress = silent,
+) -> ManyValidation:
+    """Validate data sets as `validate_dataset` does each, into folders of their names in `options.output`, and write a
+    summary there; one that fails does not end the rest.
+
+    Parameters
+    ----------
+    jobs : data sets at a time, in processes of this machine.
+    cluster : address of a Dask scheduler to use instead; it must see the same files.
+
+    Raises
+    ------
+    InputError
+        Two data sets of one name, no folder for results, or one that cannot be written; a cluster that does not answer.
+    """
+    if options.output is None:
+        raise InputError("several data sets need a folder for their results")
+    named = [(_name_of(path), Path(path).resolve()) for path in datasets]
+    names = [name for name, _ in named]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise InputError(f"two data sets are called '{twice[0]}', which names a folder of results; rename one")
+    require_folder(options.output, force=options.force)
+    work = partial(_one, options=replace(options, output=options.output.resolve(), jobs=1))
+    found: dict[int, SetOutcome] = {}
+    for place, outcome in over_items(work, named, jobs=jobs, cluster=cluster):
+        found[place] = outcome
+        progress("data sets", len(found), len(named))
+    outcomes = tuple(found[place] for place in range(len(named)))
+    table = _table(outcomes)
+    files: dict[str, str | bytes] = {
+        "summary.md": tables_to_markdown([table]),
+        "summary.csv": tables_to_csv([table]),
+        "summary.json": tables_to_json([table]),
+        "summary.html": _page(outcomes, table),
+    }
+    return ManyValidation(outcomes, table, write_results(options.output, files, force=True))
+
+
+def _name_of(path: str | Path) -> str:
+    """Return the name in the manifest; of one that cannot be read, that of its folder: it fails in its own turn."""
+    try:
+        return load_dataset(path).name
+    except RigkitError:
+        whole = Path(path).resolve()
+        return (whole.parent if whole.suffix == ".toml" else whole).name
+
+
+def _one(named: tuple[str, Path], *, options: ValidateOptions) -> SetOutcome:
+    name, path = named
+    started = time.monotonic()
+    assert options.output is not None
+    try:
+        done = validate_dataset(path, replace(options, output=options.output / name))
+    except RigkitError as error:
+        return SetOutcome(name=name, code=error.exit_code, error=str(error), seconds=time.monotonic() - started)
+    best = [pair.best for pair in done.pairs]
+    judged = [*(report.checks for report in best), *(other.checks for other in done.crosschecks)]
+    angles = [a.error_deg for report in best for a in report.angles if a.error_deg is not None]
+    baselines = [c.k for report in best for c in report.checks if c.kind == "baseline"]
+    failed = done.failures[0].error.exit_code if done.failures else ExitCode.CHECK_FAILED
+    return SetOutcome(
+        name=name,
+        code=ExitCode.WELL if done.passed else failed,
+        error="; ".join(str(failure) for failure in done.failures),
+        pairs=len(done.pairs),
+        checks_failed=sum(not c.passed for checks in judged for c in checks),
+        worst_angle_deg=max(angles, default=None),
+        mean_normal_deg=mean_normal_error(best),
+        worst_baseline_sigmas=max(map(float, np.abs(baselines)), default=None),
+        seconds=time.monotonic() - started,
+    )
+
+
+def _table(outcomes: Sequence[SetOutcome]) -> Table:
+    columns = (
+        Column("data set"),
+        Column("pairs", "", 0),
+        Column("checks failed", "", 0),
+        Column("worst angle error", "deg"),
+        Column("mean normal error", "deg"),
+        Column("worst baseline", "sigmas", 1),
+        Column("verdict"),
+        Column("why"),
+    )
+    words = {ExitCode.WELL: "pass", ExitCode.CHECK_FAILED: "FAIL"}
+    rows = tuple(
+        (
+            Cell(o.name),
+            Cell(float(o.pairs)),
+            Cell(float(o.checks_failed)),
+            Cell(o.worst_angle_deg),
+            Cell(o.mean_normal_deg),
+            Cell(o.worst_baseline_sigmas),
+            Cell(words.get(ExitCode(o.code), "not validated"), failed=o.code != ExitCode.WELL),
+            Cell(o.error),
+        )
+        for o in outcomes
+    )
+    return Table("datasets", "Data sets, each pair with its best estimator", columns, rows)
+
+
+def _page(outcomes: Sequence[SetOutcome], table: Table) -> str:
+    passed = sum(outcome.code == ExitCode.WELL for outcome in outcomes)
+    return render(
+        "summary.html",
+        title="rigkit validation: many data sets",
+        lead=f"{passed} of {len(outcomes)} data sets pass",
+        passed=passed == len(outcomes),
+        links=[(o.name, f"{o.name}/report.html") for o in outcomes if o.pairs],
+        table=shown_table(table),
+        provenance=software_facts(),
+    )

@@ -1,0 +1,103 @@
+"""Many data sets or sessions at once: one table, the same whoever computes it, and none ends the rest."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from pathlib import Path
+
+import pytest
+from cli.test_calibrate_folder import pictures  # noqa: F401 - a fixture
+from helpers.data import REPOSITORY
+
+from rigkit.cli.main import main
+
+LAB = REPOSITORY / "datasets" / "lab-a"
+QUICK = ["--no-pictures", "--no-crosscheck"]
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three data sets of one pair each, of which one contradicts what was measured, and one without its images."""
+    folder = tmp_path_factory.mktemp("captures")
+    text = (LAB / "dataset.toml").read_text(encoding="utf-8").replace("../../calib", str(REPOSITORY / "calib"))
+    text = text.replace('"images/', f'"{LAB}/images/')
+    head, *pairs = text.split("[[pairs]]")
+    pair = next(p for p in pairs if 'id = "fisheye-general"' in p)
+    for name, change in (
+        ("one", ("", "")),
+        ("two", ("value_deg = 90.0", "value_deg = 80.0")),
+        ("three", ("view1.jpg", "none.jpg")),
+        ("four", ("", "")),
+    ):
+        (folder / name).mkdir()
+        own = pair.replace(*change) if change[0] else pair
+        manifest = head.replace('name = "lab-a"', f'name = "{name}"') + "[[pairs]]" + own
+        (folder / name / "dataset.toml").write_text(manifest, encoding="utf-8")
+    return folder
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
+    return list(csv.DictReader(lines))
+
+
+def test_many_data_sets_are_one_table(captures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names = ["one", "two", "three", "four"]
+    command = ["validate", *(str(captures / name) for name in names), *QUICK]
+    assert main([*command, "-j", "1", "-o", str(tmp_path / "a")]) == 2
+    assert "three" in capsys.readouterr().out
+    found = rows(tmp_path / "a" / "summary.csv")
+    assert [row["data set"] for row in found] == names
+    assert [row["verdict"] for row in found] == ["pass", "FAIL", "not validated", "pass"]
+    assert "none.jpg" in found[2]["why"]
+    assert (tmp_path / "a" / "four" / "tables.md").is_file()
+    assert "2 of 4 data sets pass" in (tmp_path / "a" / "summary.html").read_text()
+    # By processes it is the same table.
+    assert main([*command, "-j", "2", "-o", str(tmp_path / "b")]) == 2
+    assert rows(tmp_path / "b" / "summary.csv") == found
+    twice = [str(captures / "one"), str(captures / "two"), str(captures / "one")]
+    assert main(["validate", *twice, *QUICK, "-o", str(tmp_path / "c")]) == 2
+    assert "two data sets are called 'one'" in capsys.readouterr().err
+    assert main([*command[:2], *QUICK, "--cluster", "tcp://127.0.0.1:1", "-o", str(tmp_path / "d")]) == 2
+    assert "several data sets" in capsys.readouterr().err
+
+
+def test_on_a_dask_cluster_it_is_the_same_table(captures: Path, tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    pytest.importorskip("joblib")
+    command = ["validate", *(str(captures / name) for name in ("one", "two", "four")), *QUICK]
+    assert main([*command, "-j", "1", "-o", str(tmp_path / "here")]) == 1
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        assert main([*command, "--cluster", cluster.scheduler_address, "-o", str(tmp_path / "there")]) == 1
+    assert rows(tmp_path / "there" / "summary.csv") == rows(tmp_path / "here" / "summary.csv")
+
+
+def test_a_session_that_fails_does_not_end_the_rest(
+    pictures_of_one: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("a", "b"):
+        shutil.copytree(pictures_of_one, tmp_path / name)
+        (tmp_path / name / "board.toml").write_text(
+            'schema = "rigkit.board/1"\ncolumns = 9\nrows = 6\nsquare_mm = 30.0\n'
+        )
+        (tmp_path / name / "s.toml").write_text(
+            f'schema = "rigkit.session/1"\nimages = "{"*.jpg" if name == "b" else "*.png"}"\nboard = "board.toml"\n'
+            'model = "brown"\n'
+        )
+    sessions = [str(tmp_path / name / "s.toml") for name in ("a", "b")]
+    assert main(["calibrate", *sessions]) == 2
+    said = capsys.readouterr()
+    assert (tmp_path / "b" / "s-calibration.json").is_file()
+    assert "1 of 2 sessions are well" in said.err and "a/s.toml" in said.err
+    assert main(["calibrate", *sessions, "-o", str(tmp_path / "x.json")]) == 2
+    assert "beside each" in capsys.readouterr().err
+
+
+@pytest.fixture(name="pictures_of_one")
+def _pictures_of_one(pictures: Path, tmp_path: Path) -> Path:  # noqa: F811
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for path in pictures.glob("left*.jpg"):
+        shutil.copy(path, folder / path.name)
+    return folder
