@@ -33,6 +33,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "diff": ("rigkit.cli.diff", "difference of two calibrations over the image; same camera or not"),
     "certify": ("rigkit.cli.certify", "how wrong a length, depth, plane or angle may be that is measured with them"),
     "plan": ("rigkit.cli.plan", "which pictures to take next; what a lens, a board and so many pictures will reach"),
+    "coach": ("rigkit.cli.coach", "a guided capture on a local page: says what to shoot next and when it is enough"),
     "check": ("rigkit.cli.check", "fresh pictures against a calibration or rig: still holds, or what moved; exit 1"),
     "history": ("rigkit.cli.history", "a register of checks over months: drift plots with control limits"),
     "pose": ("rigkit.cli.pose", "where a camera is in the frame of a board that is laid down"),

@@ -17,7 +17,7 @@ from rigkit.io.board_file import board_text, load_board
 from rigkit.io.session import SESSION_SCHEMA
 from rigkit.workflows.detect import IMAGE_ENDINGS
 
-__all__ = ["FolderSession", "board_of_words", "cameras_in", "session_of_folders"]
+__all__ = ["FolderSession", "board_of_words", "cameras_in", "session_of_folders", "session_to_come"]
 
 BOARD_WORDS = re.compile(r"^(\d{1,4})[xX](\d{1,4})[xX](\d{1,4}(?:\.\d{1,4})?)$")
 SIDE = r"left|right|cam(?:era)?[_-]?\d{1,3}"
@@ -91,6 +91,21 @@ def session_of_folders(
         ]
     path = place / "session.toml"
     files[path] = "\n".join(lines).rstrip() + "\n"
+    return FolderSession(path, files)
+
+
+def session_to_come(pattern: str, boards: Sequence[str], place: Path) -> FolderSession:
+    """Return the session in folder `place` of one camera whose images will match `pattern` there; boards and errors as
+    for `session_of_folders`."""
+    files: dict[Path, str] = {}
+    names = [_board_file(words, place, files) for words in boards]
+    lines = [
+        f'schema = "{SESSION_SCHEMA}"',
+        f"boards = [{', '.join(map(_quoted, names))}]",
+        f"images = {_quoted(pattern)}",
+    ]
+    path = place / "session.toml"
+    files[path] = "\n".join(lines) + "\n"
     return FolderSession(path, files)
 
 

@@ -1,0 +1,116 @@
+"""One look at a frame: the board in it, and whether the picture is sharp, still and well exposed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.calibration.usable import views_of_image
+from rigkit.core.arrays import FloatArray
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
+from rigkit.detection.detect import detect_boards
+from rigkit.detection.saddles.response import grey_image
+
+__all__ = ["Glance", "glance_at"]
+
+MAX_EDGE_PX = 4.0
+"""Edges wider than this are blurred: by focus, or by a hand that moves."""
+STILL_SHARE = 0.0015
+"""A board that moved by less than this part of the image's width since the last look is held still."""
+MIN_BOARD_CONTRAST = 30.0
+"""Grey levels of 255 between black and white squares, at the least."""
+MAX_CLIPPED = 0.2
+"""Part of the board's pixels that may be white without any detail."""
+DARK_AND_BRIGHT = (5.0, 95.0)
+STEEPEST = 99.0
+"""Percentiles of the grey levels, and of the gradients, that count as black, white, and as edges."""
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Glance:
+    """What a frame shows.
+
+    Attributes
+    ----------
+    size_px : (width, height) of the frame.
+    view : the largest board in it; None where there is none.
+    edge_px : width of its edges.
+    moved_px : median way of its corners since the last look; None where there was none.
+    contrast, clipped : grey levels between its black and white, and the part that is white without detail.
+    """
+
+    size_px: tuple[int, int]
+    view: BoardView | None
+    edge_px: float = 0.0
+    moved_px: float | None = None
+    contrast: float = 0.0
+    clipped: float = 0.0
+
+    @property
+    def sharp(self) -> bool:
+        return self.edge_px <= MAX_EDGE_PX
+
+    @property
+    def still(self) -> bool:
+        return self.moved_px is not None and self.moved_px <= STILL_SHARE * self.size_px[0]
+
+    @property
+    def exposed(self) -> bool:
+        return self.contrast >= MIN_BOARD_CONTRAST and self.clipped <= MAX_CLIPPED
+
+    @property
+    def complaint(self) -> str:
+        """What is wrong with the picture, in words; "" where nothing is."""
+        if self.view is None:
+            return "show the whole board"
+        if self.contrast < MIN_BOARD_CONTRAST:
+            return "more light"
+        if self.clipped > MAX_CLIPPED:
+            return "less light: the white is too bright"
+        if not self.still:
+            return "hold still"
+        return "" if self.sharp else "not sharp: hold still, or farther away"
+
+
+def glance_at(
+    image: NDArray[Any], boards: Sequence[Board], name: str, last: Glance | None = None, *, photo: bool = False
+) -> Glance:
+    """Return what a frame shows, `last` having been seen before it; a `photo` was taken by itself, of a board that was
+    held as still as it shows."""
+    size_px = (int(image.shape[1]), int(image.shape[0]))
+    views, _ = views_of_image(name, detect_boards(image, boards), boards)
+    if not views:
+        return Glance(size_px=size_px, view=None)
+    view = max(views, key=lambda v: len(v.grid))
+    low, high = np.floor(view.pixels.min(axis=0)), np.ceil(view.pixels.max(axis=0))
+    grey = np.asarray(grey_image(image), dtype=np.float64)
+    top = 255.0 if image.dtype == np.uint8 else float(np.iinfo(image.dtype).max)
+    part = 255.0 / top * grey[int(max(low[1], 0)) : int(high[1]) + 1, int(max(low[0], 0)) : int(high[0]) + 1]
+    dark, bright = np.percentile(part, DARK_AND_BRIGHT)
+    steepest = float(np.percentile(np.hypot(*np.gradient(part)), STEEPEST))
+    return Glance(
+        size_px=size_px,
+        view=view,
+        edge_px=float(bright - dark) / max(steepest, 1e-6),
+        moved_px=0.0 if photo else _way(view, last),
+        contrast=float(bright - dark),
+        clipped=float((part >= 254.0).mean()),
+    )
+
+
+def _way(view: BoardView, last: Glance | None) -> float | None:
+    """Return the median way, px, of the corners that were seen last time, too."""
+    if last is None or last.view is None or last.view.board.board_id != view.board.board_id:
+        return None
+    before = {(int(c), int(r)): p for (c, r), p in zip(last.view.grid, last.view.pixels, strict=True)}
+    ways: list[FloatArray] = [
+        p - before[int(c), int(r)]
+        for (c, r), p in zip(view.grid, view.pixels, strict=True)
+        if (int(c), int(r)) in before
+    ]
+    return float(np.median(np.linalg.norm(ways, axis=1))) if ways else None

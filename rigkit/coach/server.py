@@ -1,0 +1,156 @@
+"""The coach's page on this machine: nothing but the page's own requests, with the token of its address, is answered."""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+import socket
+from collections.abc import Callable
+from importlib import resources
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+from rigkit.coach.coach import Coach, decoded
+from rigkit.core.errors import InputError, InstallationError, RigkitError
+
+if TYPE_CHECKING:
+    from starlette.applications import Starlette
+    from starlette.requests import Request
+    from starlette.responses import Response
+
+__all__ = ["MAX_UPLOAD_BYTES", "coach_app", "new_token", "serve"]
+
+MAX_UPLOAD_BYTES = 64_000_000
+"""A lossless picture of 20 megapixels."""
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; img-src 'self' blob: data:; media-src 'self' blob:; "
+    "style-src 'unsafe-inline'; script-src 'unsafe-inline'; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+LOCAL = ("127.0.0.1", "localhost", "[::1]")
+
+
+def new_token() -> str:
+    """Return a token that nobody guesses."""
+    return secrets.token_urlsafe(24)
+
+
+def coach_app(coach: Coach, token: str, hosts: tuple[str, ...] = LOCAL, *, camera: str = "page") -> Starlette:
+    """Return the application. `hosts` are the names under which it may be asked; `camera` is "page" where the browser's
+    camera is used, "server" where frames come from this machine.
+
+    Raises InstallationError where starlette is missing.
+    """
+    try:
+        from starlette.applications import Starlette
+        from starlette.concurrency import run_in_threadpool
+        from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse
+        from starlette.routing import Route
+    except ImportError as error:
+        raise InstallationError('coach: needs a web server; install it with `pip install "rigkit[coach]"`') from error
+
+    async def page(request: Request) -> Response:
+        no = _refused(request, token, hosts)
+        text = resources.files("rigkit.coach").joinpath("page.html").read_text(encoding="utf-8")
+        return no or HTMLResponse(text.replace("{{camera}}", camera), 200, HEADERS)
+
+    async def act(request: Request) -> Response:
+        no = _refused(request, token, hosts)
+        if no is not None:
+            return no
+        data = await _body_of(request)
+        if data is None:
+            return PlainTextResponse("too large", 413, HEADERS)
+        what = request.path_params["what"]
+        try:
+            state = await run_in_threadpool(_done, coach, what, data)
+        except RigkitError as error:
+            return JSONResponse({"error": str(error)}, 400, HEADERS)
+        if state is None:
+            return PlainTextResponse("not found", 404, HEADERS)
+        return JSONResponse(state, 200, HEADERS)
+
+    async def preview(request: Request) -> Response:
+        from starlette.responses import Response as Plain
+
+        no = _refused(request, token, hosts)
+        picture = coach_preview.get("jpeg")
+        return no or Plain(picture or b"", 200 if picture else 404, {**HEADERS, "Content-Type": "image/jpeg"})
+
+    coach_preview: dict[str, bytes] = {}
+    app = Starlette(
+        routes=[
+            Route("/{token}/", page),
+            Route("/{token}/frame.jpg", preview),
+            Route("/{token}/{what:str}", act, methods=["POST"]),
+        ]
+    )
+    app.state.preview = coach_preview
+    return app
+
+
+def _refused(request: Request, token: str, hosts: tuple[str, ...]) -> Response | None:
+    """Refuse what is not the page's own: another token, host or origin."""
+    from starlette.responses import PlainTextResponse
+
+    given = str(request.path_params.get("token", ""))
+    if not hmac.compare_digest(given.encode(), token.encode()):
+        return PlainTextResponse("not found", 404, HEADERS)
+    host = urlsplit(f"//{request.headers.get('host', '')}")
+    name = f"[{host.hostname}]" if ":" in (host.hostname or "") else host.hostname
+    if name not in hosts:
+        return PlainTextResponse("wrong host", 403, HEADERS)
+    origin = request.headers.get("origin")
+    if origin is not None and urlsplit(origin).netloc != request.headers.get("host"):
+        return PlainTextResponse("wrong origin", 403, HEADERS)
+    if request.method == "POST" and origin is None:
+        return PlainTextResponse("no origin", 403, HEADERS)
+    return None
+
+
+async def _body_of(request: Request) -> bytes | None:
+    """Return what was sent; None where it is too much, without reading it all."""
+    told = request.headers.get("content-length", "0")
+    if not told.isdecimal() or int(told) > MAX_UPLOAD_BYTES:
+        return None
+    parts, size = [], 0
+    async for chunk in request.stream():
+        size += len(chunk)
+        if size > MAX_UPLOAD_BYTES:
+            return None
+        parts.append(chunk)
+    return b"".join(parts)
+
+
+def _done(coach: Coach, what: str, data: bytes) -> dict[str, Any] | None:
+    if what == "look":
+        return coach.look(decoded(data))
+    if what == "take":
+        return coach.look(decoded(data), take=True)
+    if what == "undo":
+        return coach.undo()
+    if what == "finish":
+        return {"finished": coach.finish()}
+    return coach.state() if what == "state" else None
+
+
+def serve(app: Starlette, host: str, port: int, ready: Callable[[int], None]) -> None:
+    """Serve until Ctrl-C; `ready` is told the port, which 0 leaves to the system.
+
+    Raises InstallationError where uvicorn is missing, InputError where the port is taken.
+    """
+    try:
+        import uvicorn
+    except ImportError as error:
+        raise InstallationError('coach: needs a web server; install it with `pip install "rigkit[coach]"`') from error
+    with socket.socket() as listening:
+        try:
+            listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listening.bind((host, port))
+        except OSError as error:
+            raise InputError(f"coach: port {port} of {host}: {error.strerror}; give another --port") from error
+        ready(int(listening.getsockname()[1]))
+        uvicorn.Server(uvicorn.Config(app, log_level="warning")).run(sockets=[listening])

@@ -1,0 +1,187 @@
+"""The coach: what it takes and keeps, that it goes on where it was left, and what its server refuses."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rigkit.cameras.brown import Brown
+from rigkit.cameras.compare import compare_cameras
+from rigkit.coach.coach import Coach
+from rigkit.coach.guide import CaptureGuide, GuideOptions
+from rigkit.coach.look import glance_at
+from rigkit.coach.server import MAX_UPLOAD_BYTES, coach_app
+from rigkit.coach.sources import watched_frames
+from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.io.calibration_file import load_calibration
+from rigkit.planning.goal import projection_goal
+from rigkit.planning.information import CornerError, Knowledge
+from rigkit.planning.plan import plan_views
+from rigkit.synthetic.photometry import Photometry
+from rigkit.synthetic.render import Optics, render
+from rigkit.synthetic.scene import PlacedBoard
+from rigkit.workflows.coach import CoachOptions, coach_frames, open_coach
+
+SIZE = (640, 480)
+BOARD = Board("board-9x6x25", 9, 6, 25.0, 25.0)
+CAMERA = Brown(SIZE, np.array([620.0, 621.0, 322.0, 236.0, -0.12, 0.05, 0.0, 0.0, 0.0]))
+FRAMES = 9
+
+
+def picture(pose: Rigid3, rng: np.random.Generator, *, blur_px: float = 0.5) -> np.ndarray:
+    grey = render(
+        [PlacedBoard(BOARD, pose)],
+        CAMERA,
+        Rigid3.identity(),
+        optics=Optics(blur_px),
+        photometry=Photometry(noise_levels=1.0),
+        rng=rng,
+    )
+    return np.repeat(grey[..., None], 3, axis=2)
+
+
+@pytest.fixture(scope="module")
+def poses() -> list[Rigid3]:
+    known = Knowledge.guessed(CAMERA, CornerError(0.1))
+    return [v.cam_from_board for v in plan_views(known, [BOARD], projection_goal(CAMERA), FRAMES).views]
+
+
+@pytest.fixture(scope="module")
+def pictures(poses: list[Rigid3]) -> list[np.ndarray]:
+    rng = np.random.default_rng(1)
+    return [picture(pose, rng) for pose in poses]
+
+
+def options(folder: Path, **more: object) -> CoachOptions:
+    guide = GuideOptions(boards=(BOARD,), hfov_deg=52.0, goal_px=0.1)
+    return CoachOptions(folder=folder, boards=("9x6x25",), guide=guide, **more)  # type: ignore[arg-type]
+
+
+def test_a_frame_is_taken_when_it_is_still_sharp_and_helps(pictures: list[np.ndarray], poses: list[Rigid3]) -> None:
+    guide = CaptureGuide(GuideOptions(boards=(BOARD,), hfov_deg=52.0))
+    first = glance_at(pictures[0], [BOARD], "a")
+    assert first.view is not None and not guide.advise(first).take, "nobody knows yet whether it is still"
+    again = glance_at(pictures[0], [BOARD], "b", first)
+    assert again.still and again.sharp and guide.advise(again).take
+    guide.add(again.view, again.size_px)  # type: ignore[arg-type]
+    assert not guide.advise(again).take, "the same once more brings little"
+    blurred = glance_at(picture(poses[1], np.random.default_rng(2), blur_px=4.0), [BOARD], "c", photo=True)
+    assert blurred.view is None or (not blurred.sharp and not guide.advise(blurred).take)
+    empty = glance_at(np.full((480, 640, 3), 90, np.uint8), [BOARD], "d")
+    advice = guide.advise(empty)
+    assert not advice.take and advice.words.startswith("Hold the board: ")
+    assert np.isfinite(advice.target_px).all()
+
+
+def test_a_watched_folder_makes_a_session_that_matches_the_truth(pictures: list[np.ndarray], tmp_path: Path) -> None:
+    watched = tmp_path / "incoming"
+    watched.mkdir()
+    for k, image in enumerate(pictures):
+        cv2.imwrite(str(watched / f"{k:02d}.png"), image)
+    (watched / "notes.png").write_text("no picture")
+    coach = open_coach(options(tmp_path / "session"))
+    coach_frames(coach, watched_frames(watched, until_idle_s=1.0), photos=True)
+    assert len(coach.guide.views) >= 7
+    kept = sorted((tmp_path / "session/images").glob("*.png"))
+    assert len(kept) == len(coach.guide.views)
+    first = np.asarray(cv2.imread(str(kept[0])))
+    assert any(np.array_equal(first, image) for image in pictures), "kept without loss"
+    assert coach.finish().startswith("Done")
+    found = load_calibration(tmp_path / "session/calibration.json")
+    error = compare_cameras(CAMERA, found.camera).rms_px
+    stated = float(projection_goal(found.camera).error(found.covariance))
+    assert error < max(4.0 * stated, 0.15)
+
+
+def test_killed_and_started_again_nothing_is_lost(pictures: list[np.ndarray], tmp_path: Path) -> None:
+    coach = open_coach(options(tmp_path))
+    for image in pictures[:5]:
+        coach.look(image, take=True)
+    # Nothing was said to it: it is simply gone.
+    again = open_coach(options(tmp_path))
+    assert len(again.guide.views) == 5
+    assert again.guide.calibration is not None
+    again.look(pictures[5], take=True)
+    assert [p.name for p in again.keeper.frames][-1] == "frame-0006.png"
+    again.undo()
+    assert len(again.guide.views) == len(again.keeper.frames) == 5
+    assert (tmp_path / "images/frame-0006.png.dropped").exists()
+    with pytest.raises(InputError, match="says something else"):
+        open_coach(CoachOptions(folder=tmp_path, boards=("8x5x20",), guide=options(tmp_path).guide))
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[tuple[Coach, int]]:
+    uvicorn = pytest.importorskip("uvicorn")
+    coach = open_coach(options(tmp_path))
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    server = uvicorn.Server(uvicorn.Config(coach_app(coach, "secret"), host="127.0.0.1", port=port, log_level="error"))
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    while not server.started:
+        time.sleep(0.02)
+    yield coach, port
+    server.should_exit = True
+    thread.join(10.0)
+
+
+def ask(port: int, method: str, path: str, body: bytes = b"", **headers: str) -> tuple[int, bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+    own = {"Origin": f"http://127.0.0.1:{port}", **headers} if method == "POST" else headers
+    connection.request(method, path, body, {k.replace("_", "-"): v for k, v in own.items() if v})
+    answer = connection.getresponse()
+    return answer.status, answer.read()
+
+
+def test_the_server_answers_its_own_page_alone(served: tuple[Coach, int], pictures: list[np.ndarray]) -> None:
+    coach, port = served
+    png = cv2.imencode(".png", pictures[0])[1].tobytes()
+    status, page = ask(port, "GET", "/secret/")
+    assert status == 200 and b"getUserMedia" in page and b"http" not in page.replace(b"http-equiv", b"")
+    status, said = ask(port, "POST", "/secret/look", png)
+    assert status == 200 and len(json.loads(said)["corners"]) == 54
+    assert coach.keeper.frames == []
+    assert ask(port, "POST", "/secret/take", png)[0] == 200
+    assert len(coach.keeper.frames) == 1
+    for method, path, body, headers, wanted in (
+        ("GET", "/", b"", {}, 404),
+        ("GET", "/wrong/", b"", {}, 404),
+        ("POST", "/wrong/take", png, {}, 404),
+        ("POST", "/secre%74x/take", png, {}, 404),
+        ("POST", "/secret/take", png, {"Origin": "http://evil.example"}, 403),
+        ("POST", "/secret/take", png, {"Origin": ""}, 403),
+        ("GET", "/secret/", b"", {"Host": "evil.example"}, 403),
+        ("GET", "/secret/../../etc/passwd", b"", {}, 404),
+        ("GET", "/secret/%2e%2e%2f%2e%2e%2fetc%2fpasswd", b"", {}, 404),
+        ("POST", "/secret/..%2fimages%2fx.png", png, {}, 404),
+        ("POST", "/secret/delete", b"", {}, 404),
+        ("POST", "/secret/take", b"no picture", {}, 400),
+        ("POST", "/secret/take", b"", {"Content-Length": str(MAX_UPLOAD_BYTES + 1)}, 413),
+    ):
+        assert ask(port, method, path, body, **headers)[0] == wanted, (method, path, headers)
+    assert len(coach.keeper.frames) == 1
+
+
+def test_without_the_extra_one_line_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import sys
+
+    from rigkit.cli.main import main
+
+    monkeypatch.setitem(sys.modules, "starlette.applications", None)
+    assert main(["coach", str(tmp_path), "--board", "9x6x25"]) == 2
+    assert "pip install" in capsys.readouterr().err
