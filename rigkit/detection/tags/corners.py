@@ -7,7 +7,7 @@ fitted in windows that reach half way to the neighbours, and are so narrow that 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from rigkit.detection.subpixel.edge_model import NEAR_PX, NEAR_SIGMAS, WINDOW_RE
 from rigkit.detection.subpixel.scatter import UNEXPLAINED
 from rigkit.detection.subpixel.subpixel import DISPLACED_CELLS, FIRST_BLUR, FIRST_PASS, LAST_PASS
 from rigkit.detection.tags.placing import TagBoard
-from rigkit.detection.tags.surface import TagSurface, seen_surface, smooth_surface
+from rigkit.detection.tags.surface import SmoothMap, TagSurface, seen_surface
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
 __all__ = ["tag_corners"]
@@ -98,25 +98,19 @@ class _Fitter:
         right, below = inwards[1 - odd[..., 0]], inwards[1 - odd[..., 1]]
         left, above = inwards[odd[..., 0]], inwards[odd[..., 1]]
         self.steps = np.stack([np.stack([above, below], axis=-1), np.stack([right, left], axis=-1)], axis=2)
-        self.guide: Guide | None = None
+        self._mapped: tuple[BoardState, SmoothMap] | None = None
+        self._fitted: tuple[BoardState, EdgeFit, FloatArray] | None = None
 
-    def surface(self, state: BoardState, cells: BoolArray, *, leave_out: bool = False) -> TagSurface:
-        """Return the map at `cells`; `leave_out`: these are the known ones, each foretold by the others."""
-        places, pixels = self.places[state.known], state.pixels[state.known]
-        wanted = self.places[cells]
-        pose = None if self.guide is None or self.guide.camera is None else self.guide.cam_from_board
-        if self.camera is None or pose is None:
-            return smooth_surface(places, pixels, wanted, leave_out=leave_out)
-        seen = seen_surface(self.camera, pose, wanted, self.unit_mm)
-        own = seen_surface(self.camera, pose, places, self.unit_mm).pixels
-        # What the lens model, or a board that is not flat, leaves over changes slowly from corner to corner.
-        valid = np.isfinite(own[:, 0])
-        if leave_out and not valid.all():
-            return seen
-        rest = smooth_surface(places[valid], (pixels - own)[valid], wanted, leave_out=leave_out)
-        near = rest.gain < 1.0
-        moved = seen.pixels + np.where(near[:, None], rest.pixels, 0.0)
-        return replace(seen, pixels=moved, gain=np.where(near, np.hypot(1.0, rest.gain), 1.0))
+    def map_of(self, state: BoardState) -> SmoothMap:
+        """Return the map through the known corners; that of the last state asked for is kept."""
+        if self._mapped is None or self._mapped[0] is not state:
+            base = None
+            if self.camera is not None and np.count_nonzero(state.known) >= MIN_GUIDE_CORNERS:
+                pose = Guide.of(self.tags.board, self.camera, state).cam_from_board
+                if pose is not None:
+                    base = partial(seen_surface, self.camera, pose, self.unit_mm)
+            self._mapped = state, SmoothMap(self.places[state.known], state.pixels[state.known], base)
+        return self._mapped[1]
 
     def fit(
         self,
@@ -165,34 +159,35 @@ class _Fitter:
         nothing = np.full(pixels.shape[:2], np.nan)
         state = BoardState(pixels, nothing, nothing, nothing, nothing, nothing)
         cells = state.known
-        fit = self.fit(cells, self.surface(state, cells), pixels[cells], FIRST_BLUR, FIRST_PASS, mirrored=False)
+        fit = self.fit(
+            cells, self.map_of(state).at(self.places[cells]), pixels[cells], FIRST_BLUR, FIRST_PASS, mirrored=False
+        )
         good = fit.valid & (fit.contrast > 0.0)
         empty = state.without(np.ones_like(cells))
         state = empty.with_fit(cells, fit, good)
         if np.count_nonzero(good) < MIN_TAG_CORNERS:
             return state
-        return self.again(state)[0]
+        return self.again(state)
 
-    def again(self, state: BoardState) -> tuple[BoardState, EdgeFit]:
-        """Return the known corners fitted with lines that bend as the corners have it, and the fit."""
+    def again(self, state: BoardState) -> BoardState:
+        """Return the known corners fitted with lines that bend as the corners have it; the fit is kept."""
         cells = state.known
-        if self.camera is not None and np.count_nonzero(cells) >= MIN_GUIDE_CORNERS:
-            self.guide = Guide.of(self.tags.board, self.camera, state)
-        surface = self.surface(state, cells)
+        surface = self.map_of(state).at(self.places[cells])
         seen = np.isfinite(surface.pixels[:, 0]) & np.isfinite(surface.sides).all(axis=(1, 2))
         cells = cells.copy()
         cells[cells] = seen
         blur = float(np.nanmedian(state.blur))
         fit = self.fit(cells, surface.of(seen), state.pixels[cells], blur, LAST_PASS)
         good = fit.valid & (fit.contrast > 0.0)
-        return state.without(cells).with_fit(cells, fit, good), fit
+        self._fitted = state.without(cells).with_fit(cells, fit, good), fit, surface.of(seen).sides
+        return self._fitted[0]
 
     def added(self, state: BoardState) -> BoardState | None:
         """Return the state with those missing corners that can be added now, None where there are none."""
         missing = ~state.known
         if not missing.any() or np.count_nonzero(state.known) < MIN_FORETELLING_CORNERS:
             return None
-        surface = self.surface(state, missing)
+        surface = self.map_of(state).at(self.places[missing])
         height, width = self.image.shape
         with np.errstate(invalid="ignore"):
             inside = (surface.pixels > MARGIN_PX) & (surface.pixels < np.array([width, height]) - 1.0 - MARGIN_PX)
@@ -220,7 +215,7 @@ class _Fitter:
             cells = state.known
             if np.count_nonzero(cells) < MIN_GUIDE_CORNERS:
                 return state
-            surface = self.surface(state, cells, leave_out=True)
+            surface = self.map_of(state).left_out()
             off = np.nan_to_num(np.linalg.norm(state.pixels[cells] - surface.pixels, axis=1)) / surface.gain
             usual = max(float(np.median(off)), SCATTER_FLOOR_PX)
             usual_sigma = float(np.median(state.sigma_px[cells]))
@@ -239,18 +234,17 @@ class _Fitter:
 
     def last(self, state: BoardState) -> tuple[BoardState, float]:
         """Return the corners as they finally are, and the factor of their sigmas."""
-        state, fit = self.again(state)
-        good = fit.valid & (fit.contrast > 0.0)
+        if self._fitted is None or self._fitted[0] is not state:
+            self.again(state)
+        assert self._fitted is not None
+        state, fit, sides = self._fitted
+        owner = np.zeros(len(sides), np.int64)
+        factor = float(sigma_factors(fit, fit.valid & (fit.contrast > 0.0), sides, owner, 1, LAST_PASS[0])[0])
         cells = state.known
-        sides = self.surface(state, cells).sides
-        every = np.zeros((len(good), 2, 2))
-        every[good] = sides
-        owner = np.zeros(len(good), np.int64)
-        factor = float(sigma_factors(fit, good, every, owner, 1, LAST_PASS[0])[0])
         if np.count_nonzero(cells) >= MIN_GUIDE_CORNERS:
-            surface = self.surface(state, cells, leave_out=True)
-            off = np.linalg.norm(state.pixels[cells] - surface.pixels, axis=1)
-            expected = factor * state.sigma_px[cells] * np.hypot(1.0, surface.gain)
+            foretold = self.map_of(state).left_out()
+            off = np.linalg.norm(state.pixels[cells] - foretold.pixels, axis=1)
+            expected = factor * state.sigma_px[cells] * np.hypot(1.0, foretold.gain)
             scatter = float(np.nanmedian(off / expected)) / MEDIAN_OF_RAYLEIGH
             factor *= scatter if scatter > UNEXPLAINED else 1.0
         return state, factor

@@ -6,7 +6,9 @@ the points around leave over, or by the points around alone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -14,10 +16,14 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.geometry.rigid3 import Rigid3
 
-__all__ = ["TagSurface", "seen_surface", "smooth_surface"]
+__all__ = ["SmoothMap", "TagSurface", "seen_surface"]
 
 MOST_DEGREE = 8
 """Of the polynomial that a lens adds to a perspective: a board that fills a fisheye of 180 degrees takes 7."""
+
+POWERS = np.array([(degree - k, k) for degree in range(MOST_DEGREE + 1) for k in range(degree + 1)])
+TERMS_OF_DEGREE = tuple((degree + 1) * (degree + 2) // 2 for degree in range(MOST_DEGREE + 1))
+"""Terms x^i y^j of polynomials, and how many there are up to a degree."""
 
 POINTS_A_TERM = 2.5
 """Points that there must be for each coefficient."""
@@ -62,26 +68,41 @@ class TagSurface:
         return TagSurface(self.pixels[which], self.sides[which], self.bends[which], self.gain[which])
 
 
-def smooth_surface(
-    places: FloatArray, pixels: FloatArray, wanted: FloatArray, *, leave_out: bool = False
-) -> TagSurface:
-    """Return the map at `wanted` (M, 2) as a perspective and a polynomial through points at `places` (N, 2).
+class SmoothMap:
+    """A smooth map through points at `places` (N, 2) of which the `pixels` (N, 2) are known.
 
-    The polynomial has the degree that foretells points best that it was not fitted to. `leave_out` : `wanted` are the
-    places themselves, each foretold by the others.
+    It is the map `base` of the board's plane, by default the perspective that fits best, and a polynomial for what that
+    leaves: the lens, and the print. The polynomial has the degree that foretells points best that it was not fitted to.
     """
-    perspective = _perspective(places, pixels)
-    flat = TagSurface(*(np.zeros((len(wanted), *shape)) for shape in ((2,), (2, 2), (2, 2), ())))
-    rest = pixels
-    if perspective is not None:
-        # What a perspective does is no polynomial; what is left is the lens, and the print.
-        flat, rest = _projected(perspective, wanted), pixels - _projected(perspective, places).pixels
-    left = _polynomial(places, rest, wanted, leave_out, certain=perspective is not None)
-    return TagSurface(flat.pixels + left.pixels, flat.sides + left.sides, flat.bends + left.bends, left.gain)
+
+    def __init__(
+        self, places: FloatArray, pixels: FloatArray, base: Callable[[FloatArray], TagSurface] | None = None
+    ) -> None:
+        self._places, self._pixels = places, pixels
+        self._base = base or _perspective(places, pixels)
+        rest, fewest = pixels, min(3, len(places))
+        if self._base is not None:
+            rest, fewest = pixels - self._base(places).pixels, 1
+        seen = np.isfinite(rest[:, 0])
+        self._polynomial = _Polynomial.through(places, np.where(seen[:, None], rest, 0.0), fewest)
+
+    def at(self, wanted: FloatArray) -> TagSurface:
+        """Return the map at `wanted` (M, 2), NaN where the base has none."""
+        left = self._polynomial.at(wanted)
+        if self._base is None:
+            return left
+        flat = self._base(wanted)
+        return TagSurface(flat.pixels + left.pixels, flat.sides + left.sides, flat.bends + left.bends, left.gain)
+
+    def left_out(self) -> TagSurface:
+        """Return the map at the places themselves, the pixels foretold by the other points."""
+        leverage = self._polynomial.leverage
+        gain = np.sqrt(leverage / (1.0 - leverage))
+        return replace(self.at(self._places), pixels=self._pixels - self._polynomial.foretold, gain=gain)
 
 
-def _perspective(places: FloatArray, pixels: FloatArray) -> FloatArray | None:
-    """Return the homography (3, 3) that fits the points best; None where none with all of them in front does."""
+def _perspective(places: FloatArray, pixels: FloatArray) -> Callable[[FloatArray], TagSurface] | None:
+    """Return the perspective that fits the points best; None where none with all of them in front does."""
     normalise = []
     for points in (places, pixels):
         middle, size = points.mean(axis=0), max(float(points.std()), 1e-9)
@@ -102,7 +123,7 @@ def _perspective(places: FloatArray, pixels: FloatArray) -> FloatArray | None:
     matrix = np.linalg.inv(normalise[1]) @ own @ normalise[0]
     matrix = matrix / (matrix[2] @ [*places.mean(axis=0), 1.0])
     depth = places @ matrix[2, :2] + matrix[2, 2]
-    return matrix if depth.min() > NEAREST_DEPTH else None
+    return partial(_projected, matrix) if depth.min() > NEAREST_DEPTH else None
 
 
 def _projected(homography: FloatArray, places: FloatArray) -> TagSurface:
@@ -116,37 +137,64 @@ def _projected(homography: FloatArray, places: FloatArray) -> TagSurface:
     return TagSurface(pixels, sides, bends, np.zeros(len(places)))
 
 
-def _polynomial(
-    places: FloatArray, values: FloatArray, wanted: FloatArray, leave_out: bool, certain: bool
-) -> TagSurface:
-    """Return `values` (N, 2) at `wanted` as a polynomial; `certain`: of degree 1 where points are too few for more."""
-    middle, size = 0.5 * (places.min(axis=0) + places.max(axis=0)), max(0.5 * float(np.ptp(places, axis=0).max()), 1e-9)
-    powers = np.array([(degree - k, k) for degree in range(MOST_DEGREE + 1) for k in range(degree + 1)])
-    powers = powers[: max(int(len(places) / POINTS_A_TERM), 1 if certain else min(3, len(places)))]
-    ends = [end for end in (1, 3, 6, 10, 15, 21, 28, 36, 45) if end <= len(powers)]
-    terms = _terms((places - middle) / size, powers[: ends[-1]])
-    basis, triangle = np.linalg.qr(terms)
-    told = basis.T @ values
-    best: tuple[float, int, FloatArray, FloatArray] | None = None
-    for end in ends:
-        own = basis[:, :end]
-        residual, leverage = values - own @ told[:end], np.minimum((own**2).sum(axis=1), 0.99)
-        foretold = residual / (1.0 - leverage)[:, None]
-        misses = float(np.median(np.linalg.norm(foretold, axis=1)))
-        if best is None or misses < best[0]:
-            best = (misses, end, foretold, leverage)
-    assert best is not None
-    _, end, foretold, leverage = best
-    factors = np.linalg.solve(triangle[:end, :end], told[:end])
-    here = (wanted - middle) / size
-    x, y = (_terms(here, powers[:end], along) @ factors / size for along in ((1, 0), (0, 1)))
-    xx, yy = (_terms(here, powers[:end], along) @ factors / size**2 for along in ((2, 0), (0, 2)))
-    if leave_out:
-        at, gain = values - foretold, np.sqrt(leverage / (1.0 - leverage))
-    else:
-        rows = _terms(here, powers[:end])
-        at, gain = rows @ factors, np.linalg.norm(np.linalg.solve(triangle[:end, :end].T, rows.T), axis=0)
-    return TagSurface(at, np.stack([x, y], axis=1), np.stack([xx, yy], axis=1), gain)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class _Polynomial:
+    """A polynomial through N points, T terms x^i y^j of places in units of `size` from `middle`.
+
+    Attributes
+    ----------
+    powers : (T, 2), factors : (T, 2), triangle : (T, T) of the QR decomposition of the terms at the points.
+    foretold : (N, 2) how far the points lie off where the others have them.
+    leverage : (N,) of each point on its own value.
+    """
+
+    middle: FloatArray
+    size: float
+    powers: IntArray
+    factors: FloatArray
+    triangle: FloatArray
+    foretold: FloatArray = field(repr=False)
+    leverage: FloatArray = field(repr=False)
+
+    @classmethod
+    def through(cls, places: FloatArray, values: FloatArray, fewest: int) -> _Polynomial:
+        """Return that of the best degree through `values` (N, 2); `fewest` terms where the points are too few."""
+        middle, size = (
+            0.5 * (places.min(axis=0) + places.max(axis=0)),
+            max(0.5 * float(np.ptp(places, axis=0).max()), 1e-9),
+        )
+        terms = max(int(len(places) / POINTS_A_TERM), fewest)
+        ends = [end for end in TERMS_OF_DEGREE if end <= terms]
+        powers = POWERS[: ends[-1]]
+        basis, triangle = np.linalg.qr(_terms((places - middle) / size, powers))
+        told, squares = basis.T @ values, np.cumsum(basis**2, axis=1)
+        best, misses = 0, np.inf
+        for end in ends:
+            foretold = (values - basis[:, :end] @ told[:end]) / (1.0 - np.minimum(squares[:, end - 1], 0.99))[:, None]
+            own = float(np.median(np.hypot(foretold[:, 0], foretold[:, 1])))
+            if own < misses:
+                best, misses = end, own
+        leverage = np.minimum(squares[:, best - 1], 0.99)
+        foretold = (values - basis[:, :best] @ told[:best]) / (1.0 - leverage)[:, None]
+        triangle = triangle[:best, :best]
+        factors = np.linalg.solve(triangle, told[:best])
+        return cls(
+            middle=middle,
+            size=size,
+            powers=powers[:best],
+            factors=factors,
+            triangle=triangle,
+            foretold=foretold,
+            leverage=leverage,
+        )
+
+    def at(self, wanted: FloatArray) -> TagSurface:
+        here = (wanted - self.middle) / self.size
+        rows = _terms(here, self.powers)
+        x, y = (_terms(here, self.powers, along) @ self.factors / self.size for along in ((1, 0), (0, 1)))
+        xx, yy = (_terms(here, self.powers, along) @ self.factors / self.size**2 for along in ((2, 0), (0, 2)))
+        gain = np.linalg.norm(np.linalg.solve(self.triangle.T, rows.T), axis=0)
+        return TagSurface(rows @ self.factors, np.stack([x, y], axis=1), np.stack([xx, yy], axis=1), gain)
 
 
 def _terms(places: FloatArray, powers: IntArray, along: tuple[int, int] = (0, 0)) -> FloatArray:
@@ -165,7 +213,7 @@ def _terms(places: FloatArray, powers: IntArray, along: tuple[int, int] = (0, 0)
     return out
 
 
-def seen_surface(camera: Camera, cam_from_board: Rigid3, wanted: FloatArray, unit_mm: FloatArray) -> TagSurface:
+def seen_surface(camera: Camera, cam_from_board: Rigid3, unit_mm: FloatArray, wanted: FloatArray) -> TagSurface:
     """Return the map at `wanted` (M, 2), in units of `unit_mm` (2,), as a camera sees it; NaN where it does not."""
     h = CHORD
     offsets = np.array([[0.0, 0.0], [h, 0.0], [-h, 0.0], [0.0, h], [0.0, -h]])
