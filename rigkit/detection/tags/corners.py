@@ -187,7 +187,7 @@ class _Fitter:
         missing = ~state.known
         if not missing.any() or np.count_nonzero(state.known) < MIN_FORETELLING_CORNERS:
             return None
-        surface = self.map_of(state).at(self.places[missing])
+        surface = self.map_of(state).beyond(self.places[missing])
         height, width = self.image.shape
         with np.errstate(invalid="ignore"):
             inside = (surface.pixels > MARGIN_PX) & (surface.pixels < np.array([width, height]) - 1.0 - MARGIN_PX)

@@ -7,7 +7,7 @@ the points around leave over, or by the points around alone.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -24,6 +24,9 @@ MOST_DEGREE = 8
 POWERS = np.array([(degree - k, k) for degree in range(MOST_DEGREE + 1) for k in range(degree + 1)])
 TERMS_OF_DEGREE = tuple((degree + 1) * (degree + 2) // 2 for degree in range(MOST_DEGREE + 1))
 """Terms x^i y^j of polynomials, and how many there are up to a degree."""
+
+MOST_LEVERAGE = 0.99
+"""A point that a term is there for alone is foretold by nothing."""
 
 POINTS_A_TERM = 2.5
 """Points that there must be for each coefficient."""
@@ -94,6 +97,11 @@ class SmoothMap:
         flat = self._base(wanted)
         return TagSurface(flat.pixels + left.pixels, flat.sides + left.sides, flat.bends + left.bends, left.gain)
 
+    def beyond(self, wanted: FloatArray) -> TagSurface:
+        """Return the map at `wanted` (M, 2), which may lie outside the points."""
+        here, (left, gain) = self.at(wanted), self._polynomial.surest(wanted)
+        return replace(here, pixels=left if self._base is None else self._base(wanted).pixels + left, gain=gain)
+
     def left_out(self) -> TagSurface:
         """Return the map at the places themselves, the pixels foretold by the other points."""
         leverage = self._polynomial.leverage
@@ -139,62 +147,70 @@ def _projected(homography: FloatArray, places: FloatArray) -> TagSurface:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class _Polynomial:
-    """A polynomial through N points, T terms x^i y^j of places in units of `size` from `middle`.
+    """Polynomials of every degree through N points, in T terms x^i y^j of places in units of `size` from `middle`.
 
     Attributes
     ----------
-    powers : (T, 2), factors : (T, 2), triangle : (T, T) of the QR decomposition of the terms at the points.
-    foretold : (N, 2) how far the points lie off where the others have them.
+    triangle : (T, T) and told : (T, 2), the QR decomposition of the terms at the points, and the values in its basis.
+    misses : (D,) how far off points usually lie where the others have them, by degree.
+    best : degree with the smallest.
+    foretold : (N, 2) how far the points lie off where the others have them, by that degree.
     leverage : (N,) of each point on its own value.
     """
 
     middle: FloatArray
     size: float
-    powers: IntArray
-    factors: FloatArray
     triangle: FloatArray
-    foretold: FloatArray = field(repr=False)
-    leverage: FloatArray = field(repr=False)
+    told: FloatArray
+    misses: FloatArray
+    best: int
+    foretold: FloatArray
+    leverage: FloatArray
 
     @classmethod
     def through(cls, places: FloatArray, values: FloatArray, fewest: int) -> _Polynomial:
-        """Return that of the best degree through `values` (N, 2); `fewest` terms where the points are too few."""
-        middle, size = (
-            0.5 * (places.min(axis=0) + places.max(axis=0)),
-            max(0.5 * float(np.ptp(places, axis=0).max()), 1e-9),
-        )
+        """Return those through `values` (N, 2); of `fewest` terms where the points are too few for more."""
+        low, high = places.min(axis=0), places.max(axis=0)
+        middle, size = 0.5 * (low + high), max(0.5 * float((high - low).max()), 1e-9)
         terms = max(int(len(places) / POINTS_A_TERM), fewest)
         ends = [end for end in TERMS_OF_DEGREE if end <= terms]
-        powers = POWERS[: ends[-1]]
-        basis, triangle = np.linalg.qr(_terms((places - middle) / size, powers))
-        told, squares = basis.T @ values, np.cumsum(basis**2, axis=1)
-        best, misses = 0, np.inf
-        for end in ends:
-            foretold = (values - basis[:, :end] @ told[:end]) / (1.0 - np.minimum(squares[:, end - 1], 0.99))[:, None]
-            own = float(np.median(np.hypot(foretold[:, 0], foretold[:, 1])))
-            if own < misses:
-                best, misses = end, own
-        leverage = np.minimum(squares[:, best - 1], 0.99)
-        foretold = (values - basis[:, :best] @ told[:best]) / (1.0 - leverage)[:, None]
-        triangle = triangle[:best, :best]
-        factors = np.linalg.solve(triangle, told[:best])
+        basis, triangle = np.linalg.qr(_terms((places - middle) / size, POWERS[: ends[-1]]))
+        told, leverages = basis.T @ values, np.minimum(np.cumsum(basis**2, axis=1), MOST_LEVERAGE)
+        left = [(values - basis[:, :k] @ told[:k]) / (1.0 - leverages[:, k - 1, None]) for k in ends]
+        misses = np.array([np.median(np.hypot(*foretold.T)) for foretold in left])
+        best = int(misses.argmin())
         return cls(
             middle=middle,
             size=size,
-            powers=powers[:best],
-            factors=factors,
             triangle=triangle,
-            foretold=foretold,
-            leverage=leverage,
+            told=told,
+            misses=misses,
+            best=best,
+            foretold=left[best],
+            leverage=leverages[:, ends[best] - 1],
         )
 
     def at(self, wanted: FloatArray) -> TagSurface:
-        here = (wanted - self.middle) / self.size
-        rows = _terms(here, self.powers)
-        x, y = (_terms(here, self.powers, along) @ self.factors / self.size for along in ((1, 0), (0, 1)))
-        xx, yy = (_terms(here, self.powers, along) @ self.factors / self.size**2 for along in ((2, 0), (0, 2)))
-        gain = np.linalg.norm(np.linalg.solve(self.triangle.T, rows.T), axis=0)
-        return TagSurface(rows @ self.factors, np.stack([x, y], axis=1), np.stack([xx, yy], axis=1), gain)
+        """Return the map at `wanted` (M, 2) by the best degree."""
+        here, end = (wanted - self.middle) / self.size, TERMS_OF_DEGREE[self.best]
+        powers, triangle = POWERS[:end], self.triangle[:end, :end]
+        factors, rows = np.linalg.solve(triangle, self.told[:end]), _terms(here, powers)
+        x, y = (_terms(here, powers, along) @ factors / self.size for along in ((1, 0), (0, 1)))
+        xx, yy = (_terms(here, powers, along) @ factors / self.size**2 for along in ((2, 0), (0, 2)))
+        gain = np.linalg.norm(np.linalg.solve(triangle.T, rows.T), axis=0)
+        return TagSurface(rows @ factors, np.stack([x, y], axis=1), np.stack([xx, yy], axis=1), gain)
+
+    def surest(self, wanted: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the values at `wanted` (M, 2), each by the degree that is surest there, and their gain (M,).
+
+        Beyond the points high degrees run wild: what counts is the usual miss times the gain.
+        """
+        rows = _terms((wanted - self.middle) / self.size, POWERS[: len(self.told)])
+        parts, ends = np.linalg.solve(self.triangle.T, rows.T), np.array(TERMS_OF_DEGREE[: len(self.misses)]) - 1
+        gains = np.sqrt(np.cumsum(parts**2, axis=0)[ends])
+        values = np.cumsum(parts[:, :, None] * self.told[:, None], axis=0)[ends]
+        surest, each = (self.misses[:, None] * np.maximum(gains, 1.0)).argmin(axis=0), np.arange(len(wanted))
+        return values[surest, each], gains[surest, each]
 
 
 def _terms(places: FloatArray, powers: IntArray, along: tuple[int, int] = (0, 0)) -> FloatArray:
