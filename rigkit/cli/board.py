@@ -21,7 +21,11 @@ BOARD_SIZE = re.compile(r"^(\d+)[xX](\d+)$")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("size", metavar="COLUMNSxROWS|BOARD.toml", help="inner corners, such as 9x6, or a board file")
+    parser.add_argument(
+        "size",
+        metavar="BOARD",
+        help="9x6 (inner corners), aprilgrid:6x6x88,spacing=0.3 (tags, mm, keys of board files), or a file",
+    )
     parser.add_argument("--square-mm", type=float, help="side of a square (with COLUMNSxROWS)")
     parser.add_argument("--paper", default="a4", help="a4 (default), a3, a2, a1, a0, letter or tabloid")
     parser.add_argument("-o", "--output", metavar="NAME", help="write NAME.pdf, NAME.svg and NAME.toml")
@@ -41,11 +45,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.core.boards import Board
+    from rigkit.io.board_words import board_in_words
     from rigkit.workflows.print_board import PrintOptions, print_board
 
     size = BOARD_SIZE.match(args.size)
     measured = args.ruler_x_mm is not None or args.ruler_y_mm is not None
-    board: Board | Path = Path(args.size)
+    board: Board | Path = board_in_words(args.size) or Path(args.size)
     if size is not None:
         if args.square_mm is None:
             raise InputError("board: --square-mm is missing; give the side of a square, such as --square-mm 30")

@@ -18,6 +18,20 @@ What else there is depends on the type. A ChArUco board::
     marker_mm = 22.0             # side of a marker with its black border
     first_marker = 0             # optional: number of the first marker
     legacy_pattern = false       # optional: true for boards drawn by OpenCV before 4.6
+    inverted = false             # optional: true where black and white are exchanged
+
+An AprilGrid::
+
+    type = "aprilgrid"
+    columns = 6                  # tags
+    rows = 6
+    tag_mm = 88.0                # side of a tag with its black border; tag_x_mm, tag_y_mm, tag_sigma_mm likewise
+    spacing = 0.3                # from tag to tag, in sides of a tag
+    family = "tag36h11"          # optional, and so are:
+    border = 2                   # modules of the black border: Kalibr's 2, OpenCV's 1
+    first_tag = 0
+    numbering = "kalibr"         # rows of tags from the bottom; "opencv": from the top
+    corner_squares = true        # small black squares between the tags, as Kalibr prints them
 """
 
 from __future__ import annotations
@@ -31,6 +45,7 @@ from rigkit.core.patterns.base import Key, Pattern, Value
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.patterns.registry import PATTERNS
+from rigkit.io.foreign_boards import foreign_board
 from rigkit.io.toml_reader import TomlTable, read_toml
 
 __all__ = ["BOARD_SCHEMA", "board_from_table", "board_text", "load_board", "load_layout"]
@@ -46,9 +61,12 @@ SQUARES_MM = (0.1, 5000.0)
 def load_board(path: str | Path) -> Board:
     """Return the board that the file describes; its id is the file's name unless it says otherwise.
 
+    Target files of other tools will do: see `rigkit.io.foreign_boards`.
+
     Raises InputError for a missing file, an unknown or missing key, or a value that makes no board.
     """
-    table = read_toml(path, BOARD_SCHEMA)
+    values = foreign_board(path)
+    table = read_toml(path, BOARD_SCHEMA) if values is None else TomlTable(values, Path(path))
     board = board_from_table(table, Path(path).stem)
     table.done()
     return board
@@ -59,7 +77,8 @@ def load_layout(path: str | Path) -> Board:
 
     Raises InputError like `load_board`.
     """
-    board, printed = load_board(path), _printed(read_toml(path, BOARD_SCHEMA))
+    board = load_board(path)
+    printed = _printed(read_toml(path, BOARD_SCHEMA)) if foreign_board(path) is None else None
     return board if printed is None else board.with_squares(*printed)
 
 

@@ -66,6 +66,10 @@ def board_sheet(board: Board, paper: str) -> PrintedSheet:
     Raises InputError where the paper is unknown or too small; the message names the paper that would do.
     """
     size = _sheet_size(board, paper)
+    if board.ink().inverted and not len(board.ink().circles):
+        raise InputError(
+            f"board '{board.board_id}': {board.pattern.type} boards are printed black on white; leave 'inverted' out"
+        )
     low, high = (edge * board.squares_mm for edge in board.pattern.outline(*board.size))
     w, h = high - low
     x0 = (size[0] - RULER_STRIP_MM - w) / 2.0

@@ -14,12 +14,13 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier
 from rigkit.io.board_file import board_text, load_board
+from rigkit.io.board_words import WORDS_HELP, board_in_words
+from rigkit.io.foreign_boards import FOREIGN_SUFFIXES
 from rigkit.io.session import SESSION_SCHEMA
 from rigkit.workflows.detect import IMAGE_ENDINGS
 
 __all__ = ["FolderSession", "board_of_words", "cameras_in", "session_of_folders", "session_to_come"]
 
-BOARD_WORDS = re.compile(r"^(\d{1,4})[xX](\d{1,4})[xX](\d{1,4}(?:\.\d{1,4})?)$")
 SIDE = r"left|right|cam(?:era)?[_-]?\d{1,3}"
 """How people call the cameras of a rig."""
 NAMED_FIRST = re.compile(rf"(?P<side>{SIDE})(?P<gap>[_-]?)(?P<number>\d+)", re.IGNORECASE)
@@ -43,7 +44,7 @@ def session_of_folders(
     Parameters
     ----------
     folders : of images; see `cameras_in`.
-    boards : files of boards, or COLUMNSxROWSxMM: inner corners along and across, side of a square.
+    boards : files of boards, or words such as 9x6x25: see `rigkit.io.board_words`.
     place : folder of the session, to which its paths are relative.
     model : of all cameras.
 
@@ -180,7 +181,7 @@ def _natural(name: str) -> list[tuple[int, str]]:
 def _board_file(words: str, place: Path, files: dict[Path, str]) -> str:
     """Return a board's file as the session names it; a new one is added to `files`."""
     board = board_of_words(words)
-    if BOARD_WORDS.match(words) is None:
+    if board_in_words(words) is None:
         return _relative(Path(words), place)
     path = place / f"{board.board_id}.toml"
     files[path] = board_text(board, f"as told by --board {words}; squares are best measured over many", path)
@@ -188,14 +189,11 @@ def _board_file(words: str, place: Path, files: dict[Path, str]) -> str:
 
 
 def board_of_words(words: str) -> Board:
-    """Return the board that `words` tell: COLUMNSxROWSxMM, or a board's file; raises InputError for anything else."""
-    match = BOARD_WORDS.match(words)
-    if match is None:
-        if not words.endswith(".toml"):
-            raise InputError(f"--board {words}: write inner corners and mm a square, such as 9x6x25, or a board file")
-        return load_board(words)
-    columns, rows, side = int(match[1]), int(match[2]), float(match[3])
-    return Board(f"board-{columns}x{rows}x{side:g}", columns, rows, side, side)
+    """Return the board that `words` tell, as `board_in_words`, or a file; raises InputError for anything else."""
+    board = board_in_words(words)
+    if board is None and not words.endswith((".toml", *FOREIGN_SUFFIXES)):
+        raise InputError(f"--board {words}: write {WORDS_HELP}, or a board file")
+    return load_board(words) if board is None else board
 
 
 def _listed(patterns: Sequence[tuple[Path, str]], place: Path) -> str:

@@ -25,6 +25,7 @@ class Charuco(Pattern):
     marker_mm : side of a marker with its black border.
     first_marker : number of the first marker; boards in one image need different ones, or different dictionaries.
     legacy : as OpenCV drew boards before 4.6: with an even number of rows of squares the first one is white.
+    inverted : black and white are exchanged.
     """
 
     type: ClassVar[str] = "charuco"
@@ -34,12 +35,14 @@ class Charuco(Pattern):
         Key("marker_mm", "marker_mm", float, "marker_mm = 22.0 (with the black border)", required=True),
         Key("first_marker", "first_marker", int, "first_marker = 0"),
         Key("legacy_pattern", "legacy", bool, "legacy_pattern = false"),
+        Key("inverted", "inverted", bool, "inverted = false (true: black and white exchanged)"),
     )
 
     dictionary: str
     marker_mm: float
     first_marker: int = 0
     legacy: bool = False
+    inverted: bool = False
 
     def first_black(self, rows: int) -> bool:
         """Say whether the square before the first inner corner is black, on a board of `rows` of inner corners."""
@@ -72,9 +75,9 @@ class Charuco(Pattern):
             cells = filled_modules(np.pad(modules[marker], 1, constant_values=True), upright=upright) * side
             cells[:, :2] += (place - 1.0) * squares_mm + gap
             out.append(cells)
-        return Ink(rectangles=np.concatenate(out), first_black=self.first_black(rows))
+        return Ink(rectangles=np.concatenate(out), first_black=self.first_black(rows), inverted=self.inverted)
 
     def describe(self, columns: int, rows: int, squares_mm: tuple[float, float]) -> str:
         plain = Pattern.describe(self, columns, rows, squares_mm)
-        old = ", legacy pattern" if self.legacy else ""
+        old = (", legacy pattern" if self.legacy else "") + (", inverted" if self.inverted else "")
         return f"{plain}, {self.dictionary} from {self.first_marker}, markers {self.marker_mm:g} mm{old}"

@@ -91,6 +91,7 @@ def _marked_corners(image: np.ndarray, board: Board) -> tuple[IntArray, FloatArr
     side = float(np.sqrt(board.square_x_mm * board.square_y_mm))
     target = cv2.aruco.CharucoBoard((board.columns + 1, board.rows + 1), side, pattern.marker_mm, dictionary, ids)
     target.setLegacyPattern(pattern.legacy)
+    image = 255 - image if pattern.inverted else image
     corners, numbers, _, _ = cv2.aruco.CharucoDetector(target).detectBoard(image)
     if numbers is None or corners is None:
         return np.zeros((0, 2), np.int64), np.zeros((0, 2))
@@ -99,10 +100,10 @@ def _marked_corners(image: np.ndarray, board: Board) -> tuple[IntArray, FloatArr
 
 
 def _empty(board: Board) -> Lattice:
-    shape = (board.rows, board.columns)
+    shape, ink = (board.rows, board.columns), board.ink()
     # Across the first edge brightness grows downwards, with the angle, where the square below it is white; that has
     # the colour of the square before the first corner.
-    return Lattice(np.full((*shape, 2), np.nan), np.full(shape, np.nan), not board.ink().first_black)
+    return Lattice(np.full((*shape, 2), np.nan), np.full(shape, np.nan), ink.first_black == ink.inverted)
 
 
 def _of(board: Board, grid: IntArray, pixels: FloatArray) -> Lattice:

@@ -1,0 +1,61 @@
+"""Boards in a word, as a command line has them: "9x6x25", "aprilgrid:6x6x88,spacing=0.3", or a file."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
+from rigkit.core.patterns.chessboard import Chessboard
+from rigkit.core.patterns.registry import PATTERNS, pattern_type
+from rigkit.io.board_file import board_from_table
+from rigkit.io.toml_reader import TomlTable
+
+__all__ = ["WORDS_HELP", "board_in_words"]
+
+BOARD_WORDS = re.compile(
+    r"^(?:(?P<type>[a-z]+):)?(?P<columns>\d{1,4})[xX](?P<rows>\d{1,4})[xX](?P<mm>\d{1,4}(?:\.\d{1,4})?)(?P<keys>(?:,\w+=[\w.+-]+)*)$"
+)
+WORDS_HELP = "9x6x25 (inner corners along and across, mm a square), aprilgrid:6x6x88,spacing=0.3 (tags, mm a tag)"
+
+
+def board_in_words(words: str) -> Board | None:
+    """Return the board that `words` say, with a name made of them; None where they are a file's name instead.
+
+    TYPE:COLUMNSxROWSxMM,KEY=VALUE,...: the types and keys are those of board files; without TYPE a chessboard.
+
+    Raises InputError for words that make no board.
+    """
+    match = BOARD_WORDS.match(words)
+    if match is None:
+        kind = words.partition(":")[0]
+        if kind in PATTERNS and kind != words:
+            raise InputError(f"board '{words}': write TYPE:COLUMNSxROWSxMM,KEY=VALUE, such as {WORDS_HELP}")
+        return None
+    kind = match["type"] or Chessboard.type
+    pattern = pattern_type(kind)
+    known = {key.name: key.kind for key in pattern.keys}
+    values: dict[str, object] = {"type": kind, "columns": int(match["columns"]), "rows": int(match["rows"])}
+    values[f"{pattern.size_word}_mm"] = float(match["mm"])
+    for pair in filter(None, match["keys"].split(",")):
+        name, _, value = pair.partition("=")
+        values[name] = _value(words, name, value, known.get(name, str))
+    name = "-".join(
+        filter(None, (match["type"] or "board", f"{match['columns']}x{match['rows']}x{float(match['mm']):g}"))
+    )
+    table = TomlTable(values, Path(f"board '{words}'"))
+    board = board_from_table(table, name)
+    table.done()
+    return board
+
+
+def _value(words: str, name: str, value: str, kind: type) -> object:
+    if kind is bool:
+        if value not in ("true", "false"):
+            raise InputError(f"board '{words}': {name} is true or false, got {value}")
+        return value == "true"
+    try:
+        return kind(value)
+    except ValueError as error:
+        raise InputError(f"board '{words}': {name} must be a number, got {value}") from error

@@ -1,0 +1,160 @@
+"""Target files of other tools: Kalibr's target.yaml, BoofCV's calibration_target.yaml, caliscope's charuco.toml, and
+the settings of OpenCV's calibration sample (XML or YAML)."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from rigkit.core.errors import InputError
+from rigkit.interop.yaml_text import parse_yaml
+from rigkit.io.reading import read_text
+
+__all__ = ["FOREIGN_SUFFIXES", "foreign_board"]
+
+FOREIGN_SUFFIXES = (".yaml", ".yml", ".xml")
+"""Of files that are no board files of rigkit's."""
+
+Values = dict[str, Any]
+INCH_MM = 25.4
+
+
+def foreign_board(path: str | Path) -> Values | None:
+    """Return what a target file says, as the keys of a board file; None for a TOML file that is a board file.
+
+    BoofCV's and OpenCV's files have no unit: their lengths are taken for mm.
+
+    Raises InputError for a missing file, or one that describes no target.
+    """
+    source = Path(path)
+    if source.suffix.lower() == ".toml":
+        return _caliscope(source)
+    if source.suffix.lower() not in FOREIGN_SUFFIXES:
+        return None
+    text = read_text(source)
+    values: Mapping[str, Any]
+    values = _opencv_xml(text) if source.suffix.lower() == ".xml" else parse_yaml(text, str(source))
+    for known, read in READERS:
+        if known in values:
+            try:
+                return read(values)
+            except (KeyError, TypeError, ValueError) as error:
+                raise InputError(
+                    f"'{source}': no target: {type(error).__name__} {error}; is the file whole?"
+                ) from error
+    raise InputError(
+        f"'{source}': neither a target of Kalibr (target_type), BoofCV (ConfigCalibrationTarget) nor OpenCV "
+        "(BoardSize_Width); write a board file"
+    )
+
+
+def _kalibr(values: Mapping[str, Any]) -> Values:
+    # https://github.com/ethz-asl/kalibr/wiki/calibration-targets: lengths in m, tagSpacing a ratio.
+    kind = values["target_type"]
+    if kind == "aprilgrid":
+        rows, columns = (_either(values, f"tag{way}", f"tag_{way.lower()}") for way in ("Rows", "Cols"))
+        size, spacing = _either(values, "tagSize", "tag_size"), _either(values, "tagSpacing", "tag_spacing")
+        return {"type": "aprilgrid", "columns": columns, "rows": rows, "tag_mm": _mm(size), "spacing": float(spacing)}
+    # Kalibr counts corners of checkerboards as we do.
+    size = {"columns": values["targetCols"], "rows": values["targetRows"]}
+    if kind == "checkerboard":
+        sides = {f"square_{a}_mm": _mm(values[f"{way}SpacingMeters"]) for a, way in (("x", "col"), ("y", "row"))}
+        return {**size, **sides}
+    if kind == "circlegrid":
+        if values.get("asymmetricGrid"):
+            return {
+                "type": "circles",
+                **size,
+                "distance_mm": 2.0 * _mm(values["spacingMeters"]),
+                "layout": "asymmetric",
+            }
+        return {"type": "circles", **size, "distance_mm": _mm(values["spacingMeters"])}
+    raise ValueError(f"target_type {kind}")
+
+
+def _boofcv(values: Mapping[str, Any]) -> Values:
+    target = values[BOOFCV]
+    grid, kind = target["grid"], target.get("type", "CHESSBOARD")
+    rows, columns = grid["numRows"], grid["numCols"]
+    if kind == "CHESSBOARD":
+        # BoofCV counts squares.
+        return {"columns": columns - 1, "rows": rows - 1, "square_mm": float(grid["shapeSize"])}
+    layouts = {"CIRCLE_GRID": "regular", "CIRCLE_HEXAGONAL": "hexagonal"}
+    if kind not in layouts:
+        raise ValueError(f"type {kind}")
+    lengths = {"distance_mm": float(grid["shapeDistance"]), "diameter_mm": float(grid["shapeSize"])}
+    return {"type": "circles", "layout": layouts[kind], "columns": columns, "rows": rows, **lengths}
+
+
+def _opencv(values: Mapping[str, Any]) -> Values:
+    # The settings of samples/cpp/tutorial_code/calib3d/camera_calibration; squares in the user's unit, mm by default.
+    kind, square = values.get("Calibrate_Pattern", "CHESSBOARD"), float(values["Square_Size"])
+    size = {"columns": int(values["BoardSize_Width"]), "rows": int(values["BoardSize_Height"])}
+    if kind == "CHARUCOBOARD":
+        # The one board of which OpenCV counts squares.
+        inner = {"columns": size["columns"] - 1, "rows": size["rows"] - 1}
+        marker = {"dictionary": values["ArUco_Dict_Name"], "marker_mm": float(values["Marker_Size"])}
+        return {"type": "charuco", **inner, "square_mm": square, **marker}
+    if kind == "CIRCLES_GRID":
+        return {"type": "circles", **size, "distance_mm": square}
+    if kind == "ASYMMETRIC_CIRCLES_GRID":
+        return {"type": "circles", **size, "distance_mm": 2.0 * square, "layout": "asymmetric"}
+    return {**size, "square_mm": square}
+
+
+def _caliscope(source: Path) -> Values | None:
+    try:
+        values = tomllib.loads(read_text(source))
+    except (tomllib.TOMLDecodeError, RecursionError, ValueError):
+        # The reader of board files says what is wrong with it.
+        return None
+    if "schema" in values or not {"columns", "rows", "dictionary", "aruco_scale"} <= set(values):
+        return None
+    try:
+        unit = {"cm": 10.0, "mm": 1.0, "inch": INCH_MM, "inches": INCH_MM, "m": 1e3}[values.get("units", "cm")]
+        if "square_size_overide_cm" in values or "square_size_override_cm" in values:
+            square = 10.0 * float(values.get("square_size_overide_cm") or values["square_size_override_cm"])
+        else:
+            square = unit * min(
+                float(values["board_width"]) / values["columns"], float(values["board_height"]) / values["rows"]
+            )
+        marker = square * float(values["aruco_scale"])
+        size = {"columns": int(values["columns"]) - 1, "rows": int(values["rows"]) - 1}
+    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
+        raise InputError(f"'{source}': no ChArUco board of caliscope: {error}; is the file whole?") from error
+    return {
+        "type": "charuco",
+        **size,
+        "square_mm": square,
+        "dictionary": values["dictionary"],
+        "marker_mm": marker,
+        "legacy_pattern": bool(values.get("legacy_pattern", False)),
+        "inverted": bool(values.get("inverted", False)),
+    }
+
+
+def _opencv_xml(text: str) -> Mapping[str, Any]:
+    """Return the flat entries of an XML file of OpenCV's; entities and nesting are left alone."""
+    found = re.findall(r"<(\w{1,40})>\s*\"?([^<>\"]{0,200}?)\"?\s*</\1>", text[:MAX_XML])
+    return {name: value.strip() for name, value in found}
+
+
+def _either(values: Mapping[str, Any], *names: str) -> Any:
+    return next(values[name] for name in (*names, names[0]) if name in values or name == names[-1])
+
+
+def _mm(metres: Any) -> float:
+    return 1e3 * float(metres)
+
+
+MAX_XML = 100_000
+BOOFCV = "boofcv.alg.fiducial.calib.ConfigCalibrationTarget"
+READERS: tuple[tuple[str, Callable[[Mapping[str, Any]], Values]], ...] = (
+    ("target_type", _kalibr),
+    (BOOFCV, _boofcv),
+    ("BoardSize_Width", _opencv),
+)
+"""A key by which a file is known, and its reader."""

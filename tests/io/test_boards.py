@@ -1,0 +1,92 @@
+"""Board files of every type, boards in words, and target files of other tools."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
+from rigkit.core.patterns.aprilgrid import AprilGrid
+from rigkit.core.patterns.charuco import Charuco
+from rigkit.core.patterns.chessboard import Chessboard
+from rigkit.io.board_file import board_text, load_board
+from rigkit.io.board_words import board_in_words
+
+PATTERNS = [
+    Chessboard(),
+    Charuco("DICT_4X4_100", 20.0, 3, legacy=True, inverted=True),
+    AprilGrid(0.25, "tag25h9", 1, 2, "opencv", corner_squares=False),
+]
+
+
+@pytest.mark.parametrize("pattern", PATTERNS, ids=lambda p: p.type)
+def test_a_board_comes_back_from_its_file(pattern: Chessboard, tmp_path: Path) -> None:
+    path = tmp_path / "b.toml"
+    before = Board("b", 8, 6, 30.0, 30.5, square_sigma_mm=0.02, pattern=pattern)
+    path.write_text(board_text(before, "made up", path))
+    after = load_board(path)
+    assert (after.size, after.squares_mm, after.square_sigma_mm) == (before.size, before.squares_mm, 0.02)
+    assert after.pattern == before.pattern
+
+
+def test_boards_in_words() -> None:
+    board = board_in_words("aprilgrid:6x5x88,spacing=0.3,numbering=opencv,corner_squares=false")
+    assert board is not None
+    assert board.size == (12, 10)
+    assert board.pattern == AprilGrid(0.3, numbering="opencv", corner_squares=False)
+    plain = board_in_words("9x6x25")
+    assert plain is not None
+    assert (plain.size, plain.square_x_mm) == ((9, 6), 25.0)
+    assert board_in_words("board.toml") is None
+    for words in (
+        "aprilgrid:6x6x88",
+        "aprilgrid:6x6",
+        "charuco:6x6x88,marker_mm=b",
+        "aprilgrid:6x6x88,spacing=0.3,gap=1",
+    ):
+        with pytest.raises(InputError, match=words.partition(",")[0]):
+            board_in_words(words)
+
+
+KALIBR = "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 5\ntagSize: 0.088\ntagSpacing: 0.3\n"
+CHECKERS = "target_type: checkerboard\ntargetCols: 7\ntargetRows: 6\nrowSpacingMeters: 0.05\ncolSpacingMeters: 0.06\n"
+BOOFCV = "boofcv.alg.fiducial.calib.ConfigCalibrationTarget:\n  grid: {numRows: 7, numCols: 5, shapeSize: 30.0}\n"
+CALISCOPE = (
+    'columns = 4\nrows = 5\nboard_height = 11.0\nboard_width = 8.5\ndictionary = "DICT_4X4_50"\nunits = "inch"\n'
+    "aruco_scale = 0.75\nsquare_size_override_cm = 5.4\ninverted = true\n"
+)
+OPENCV = (
+    "<?xml version='1.0'?><opencv_storage><Settings><BoardSize_Width>9</BoardSize_Width>"
+    "<BoardSize_Height>6</BoardSize_Height><Square_Size>50</Square_Size>"
+    '<Calibrate_Pattern>"CHESSBOARD"</Calibrate_Pattern></Settings></opencv_storage>'
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "size", "squares", "pattern"),
+    [
+        ("target.yaml", KALIBR, (12, 10), (88.0, 88.0), AprilGrid(0.3)),
+        ("checkers.yaml", CHECKERS, (7, 6), (60.0, 50.0), Chessboard()),
+        ("calibration_target.yaml", BOOFCV, (4, 6), (30.0, 30.0), Chessboard()),
+        ("charuco.toml", CALISCOPE, (3, 4), (54.0, 54.0), Charuco("DICT_4X4_50", 40.5, inverted=True)),
+        ("settings.xml", OPENCV, (9, 6), (50.0, 50.0), Chessboard()),
+    ],
+)
+def test_target_files_of_other_tools(
+    name: str, text: str, size: tuple[int, int], squares: tuple[float, float], pattern: Chessboard, tmp_path: Path
+) -> None:
+    path = tmp_path / name
+    path.write_text(text)
+    board = load_board(path)
+    assert board.size == size
+    assert board.squares_mm == pytest.approx(squares)
+    assert board.pattern == pattern
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    for name, text in (("a.yaml", "cam0: {}\n"), ("b.yaml", "target_type: aprilgrid\n"), ("c.xml", "<a>1</a>")):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(InputError, match=name):
+            load_board(tmp_path / name)
