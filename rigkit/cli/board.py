@@ -24,8 +24,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "size",
         metavar="BOARD",
-        help="9x6 (inner corners), aprilgrid:6x6x88,spacing=0.3 (tags, mm, keys of board files), or a file",
+        help="9x6 (inner corners), aprilgrid:6x6x88,spacing=0.3 (tags, mm, keys of board files), a file, or identify",
     )
+    parser.add_argument("images", nargs="*", type=Path, help="with BOARD identify: images, or folders of images")
     parser.add_argument("--square-mm", type=float, help="side of a square (with COLUMNSxROWS)")
     parser.add_argument("--paper", default="a4", help="a4 (default), a3, a2, a1, a0, letter or tabloid")
     parser.add_argument("-o", "--output", metavar="NAME", help="write NAME.pdf, NAME.svg and NAME.toml")
@@ -48,6 +49,10 @@ def run(args: argparse.Namespace) -> int:
     from rigkit.io.board_words import board_in_words
     from rigkit.workflows.print_board import PrintOptions, print_board
 
+    if args.size == "identify":
+        return _identify(args)
+    if args.images:
+        raise InputError(f"board: '{args.images[0]}' after the board; images go with rigkit board identify")
     size = BOARD_SIZE.match(args.size)
     measured = args.ruler_x_mm is not None or args.ruler_y_mm is not None
     board: Board | Path = board_in_words(args.size) or Path(args.size)
@@ -64,6 +69,31 @@ def run(args: argparse.Namespace) -> int:
     if args.output is None:
         raise InputError("board: -o is missing; give a name for the files, such as -o boards/a9x6_30")
     for path in print_board(board, PrintOptions(output=Path(args.output), paper=args.paper, force=args.force)):
+        print(path)
+    return 0
+
+
+def _identify(args: argparse.Namespace) -> int:
+    from rigkit.cli.console import progress_on_stderr
+    from rigkit.io.board_file import board_text
+    from rigkit.io.files import write_atomic
+    from rigkit.workflows.detect import images_in
+    from rigkit.workflows.identify_board import identify_board
+
+    if args.square_mm is not None and not args.square_mm > 0.0:
+        raise InputError(f"board: --square-mm {args.square_mm:g} must be positive")
+    found = identify_board(list(images_in(args.images)), progress=progress_on_stderr())
+    board = found.board
+    print(f"{board.pattern.type}: {board.describe()}".replace("s 1 x 1 mm", "s of unknown size"))
+    print(f"seen in {len(found.seen)} of {len(found.looked_at)} images")
+    print(f"--board {found.words}   (MM: the side of a {board.pattern.size_word}, measured with a rule)")
+    if args.output is not None:
+        if args.square_mm is None:
+            word = board.pattern.size_word
+            raise InputError(f"board identify: images cannot tell the scale; give --square-mm, the side of a {word}")
+        path = Path(args.output).with_suffix(".toml")
+        text = board_text(board.with_squares(args.square_mm, args.square_mm), "as seen in images", path)
+        write_atomic(path, text, force=args.force)
         print(path)
     return 0
 

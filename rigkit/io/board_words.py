@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import fields
 from pathlib import Path
 
 from rigkit.core.boards import Board
@@ -12,7 +13,7 @@ from rigkit.core.patterns.registry import PATTERNS, pattern_type
 from rigkit.io.board_file import board_from_table
 from rigkit.io.toml_reader import TomlTable
 
-__all__ = ["WORDS_HELP", "board_in_words"]
+__all__ = ["WORDS_HELP", "board_in_words", "words_of_board"]
 
 BOARD_WORDS = re.compile(
     r"^(?:(?P<type>[a-z]+):)?(?P<columns>\d{1,4})[xX](?P<rows>\d{1,4})[xX](?P<mm>\d{1,4}(?:\.\d{1,4})?)(?P<keys>(?:,\w+=[\w.+-]+)*)$"
@@ -48,6 +49,24 @@ def board_in_words(words: str) -> Board | None:
     board = board_from_table(table, name)
     table.done()
     return board
+
+
+def words_of_board(board: Board) -> str:
+    """Return a board whose scale is not known in words, with MM for the length that is to be put in."""
+    pattern, per = board.pattern, board.pattern.points_per_count
+    usual = {f.name: f.default for f in fields(pattern)}
+    keys = [
+        f"{key.name}={_written(getattr(pattern, key.field))}"
+        for key in pattern.keys
+        if key.required or getattr(pattern, key.field) != usual[key.field]
+    ]
+    kind = "" if isinstance(pattern, Chessboard) else f"{pattern.type}:"
+    words = ",".join([f"{kind}{board.columns // per}x{board.rows // per}xMM", *keys])
+    return re.sub(r"_mm=([0-9.]+)", r"_mm=(\1 MM)", words)
+
+
+def _written(value: object) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _value(words: str, name: str, value: str, kind: type) -> object:

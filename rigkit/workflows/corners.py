@@ -21,6 +21,7 @@ from rigkit.detection.detect import detect_boards
 from rigkit.io.corner_cache import CornerCache, FoundCorners, image_hash, lens_key
 from rigkit.io.images import read_image
 from rigkit.io.session import Session
+from rigkit.workflows.identify_board import explained
 
 __all__ = ["Cache", "SessionCorners", "first_camera", "image_names", "session_corners", "session_views"]
 
@@ -84,9 +85,11 @@ def session_views(
     if not views:
         reasons = Counter(reason for _, reason in dropped).most_common(1)[0]
         camera = "" if session.camera is None else f" of camera '{session.camera}'"
+        # A first calibration that fails is asked for no reason.
+        shown = explained(session.images, session.boards) if corners.source else None
         raise InputError(
-            f"{session.path}: no board can be used in {len(found)} images{camera}; {reasons[1]} times: {reasons[0]}; "
-            "check columns and rows in the board file"
+            f"{session.path}: no board can be used in {len(found)} images{camera}; "
+            + (shown or f"{reasons[1]} times: {reasons[0]}; check columns and rows in the board file")
         )
     return views, size_px, dropped
 

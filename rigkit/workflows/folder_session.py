@@ -18,6 +18,7 @@ from rigkit.io.board_words import WORDS_HELP, board_in_words
 from rigkit.io.foreign_boards import FOREIGN_SUFFIXES
 from rigkit.io.session import SESSION_SCHEMA
 from rigkit.workflows.detect import IMAGE_ENDINGS
+from rigkit.workflows.identify_board import suggested_words
 
 __all__ = ["FolderSession", "board_of_words", "cameras_in", "session_of_folders", "session_to_come"]
 
@@ -54,10 +55,7 @@ def session_of_folders(
         No board, a folder without images, or names that a session cannot hold.
     """
     if not boards:
-        raise InputError(
-            "calibrate: images cannot tell how large the squares are; give the board, such as --board 9x6x25 (inner "
-            "corners along and across, mm a square) or --board board.toml"
-        )
+        raise InputError(_untold(folders))
     cameras = cameras_in(folders)
     files: dict[Path, str] = {}
     names = [_board_file(words, place, files) for words in boards]
@@ -108,6 +106,14 @@ def session_to_come(pattern: str, boards: Sequence[str], place: Path) -> FolderS
     path = place / "session.toml"
     files[path] = "\n".join(lines) + "\n"
     return FolderSession(path, files)
+
+
+def _untold(folders: Sequence[Path]) -> str:
+    """Return what to say where no board is given: what the images show of it."""
+    entries = [entry for found in cameras_in(folders).values() for entry in found]
+    shown = suggested_words(sorted(image for folder, pattern in entries for image in folder.glob(pattern)))
+    such = f"--board {shown}, which they show, with MM measured" if shown else f"--board {WORDS_HELP}"
+    return f"calibrate: images cannot tell how large squares are; give the board, such as {such}, or --board board.toml"
 
 
 def cameras_in(folders: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:

@@ -123,7 +123,7 @@ def test_a_session_of_a_person_is_not_replaced(
     assert "columns and rows" in capsys.readouterr().err
     assert sorted({path.suffix for path in folder.iterdir()} - {".json"}) == [".JPG"]
     assert main(["calibrate", str(folder)]) == 2
-    assert "--board 9x6x25" in capsys.readouterr().err
+    assert "--board 9x6xMM" in capsys.readouterr().err
     assert main(["calibrate", str(folder), "--board", "9x6"]) == 2
     assert "mm a square" in capsys.readouterr().err
 

@@ -21,7 +21,7 @@ __all__ = ["SmoothMap", "TagSurface", "seen_surface"]
 MOST_DEGREE = 8
 """Of the polynomial that a lens adds to a perspective: a board that fills a fisheye of 180 degrees takes 7."""
 
-POWERS = np.array([(degree - k, k) for degree in range(MOST_DEGREE + 1) for k in range(degree + 1)])
+POLYNOMIAL_POWERS = np.array([(degree - k, k) for degree in range(MOST_DEGREE + 1) for k in range(degree + 1)])
 TERMS_OF_DEGREE = tuple((degree + 1) * (degree + 2) // 2 for degree in range(MOST_DEGREE + 1))
 """Terms x^i y^j of polynomials, and how many there are up to a degree."""
 
@@ -174,7 +174,7 @@ class _Polynomial:
         middle, size = 0.5 * (low + high), max(0.5 * float((high - low).max()), 1e-9)
         terms = max(int(len(places) / POINTS_A_TERM), fewest)
         ends = [end for end in TERMS_OF_DEGREE if end <= terms]
-        basis, triangle = np.linalg.qr(_terms((places - middle) / size, POWERS[: ends[-1]]))
+        basis, triangle = np.linalg.qr(_terms((places - middle) / size, POLYNOMIAL_POWERS[: ends[-1]]))
         told, leverages = basis.T @ values, np.minimum(np.cumsum(basis**2, axis=1), MOST_LEVERAGE)
         left = [(values - basis[:, :k] @ told[:k]) / (1.0 - leverages[:, k - 1, None]) for k in ends]
         misses = np.array([np.median(np.hypot(*foretold.T)) for foretold in left])
@@ -193,7 +193,7 @@ class _Polynomial:
     def at(self, wanted: FloatArray) -> TagSurface:
         """Return the map at `wanted` (M, 2) by the best degree."""
         here, end = (wanted - self.middle) / self.size, TERMS_OF_DEGREE[self.best]
-        powers, triangle = POWERS[:end], self.triangle[:end, :end]
+        powers, triangle = POLYNOMIAL_POWERS[:end], self.triangle[:end, :end]
         factors, rows = np.linalg.solve(triangle, self.told[:end]), _terms(here, powers)
         x, y = (_terms(here, powers, along) @ factors / self.size for along in ((1, 0), (0, 1)))
         xx, yy = (_terms(here, powers, along) @ factors / self.size**2 for along in ((2, 0), (0, 2)))
@@ -205,7 +205,7 @@ class _Polynomial:
 
         Beyond the points high degrees run wild: what counts is the usual miss times the gain.
         """
-        rows = _terms((wanted - self.middle) / self.size, POWERS[: len(self.told)])
+        rows = _terms((wanted - self.middle) / self.size, POLYNOMIAL_POWERS[: len(self.told)])
         parts, ends = np.linalg.solve(self.triangle.T, rows.T), np.array(TERMS_OF_DEGREE[: len(self.misses)]) - 1
         gains = np.sqrt(np.cumsum(parts**2, axis=0)[ends])
         values = np.cumsum(parts[:, :, None] * self.told[:, None], axis=0)[ends]

@@ -1,0 +1,105 @@
+"""What board images show, when nobody has said it: everything but the scale."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rigkit.core.boards import Board
+from rigkit.core.patterns.charuco import Charuco
+from rigkit.detection.detect import detect_boards
+from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.tags.unknown_charuco import MarkerSightings, guessed_charuco
+from rigkit.detection.tags.unknown_tags import TagSightings, guessed_grid
+
+__all__ = ["BoardGuess", "difference", "guess_board"]
+
+MIN_IMAGES_OF_GUESS = 2
+"""A size of chessboards is told from so many images, or from the only one."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class BoardGuess:
+    """A board that images show.
+
+    Attributes
+    ----------
+    board : with squares, or tags, of 1 mm.
+    images : indices of the images that show it.
+    """
+
+    board: Board
+    images: tuple[int, ...]
+
+
+def guess_board(images: Sequence[GreyImage]) -> BoardGuess | None:
+    """Return the board that most of the images (grey levels 0..255) show; None where none is seen.
+
+    Boards with marks are told by these: AprilGrids, ChArUco boards (also of the pattern before OpenCV 4.6, and
+    inverted). Otherwise the largest chessboard that is seen often.
+    """
+    tags, markers = TagSightings(), MarkerSightings()
+    for k, image in enumerate(images):
+        # Many dictionaries take a second a picture: a board without markers is not asked for ever.
+        if not tags.look(k, image) and (markers.images or k < MARKER_TRIES):
+            markers.look(k, image)
+    for board, seen in ((guessed_grid(tags), tags.images), (guessed_charuco(markers), markers.images)):
+        if board is not None:
+            return BoardGuess(board, tuple(seen))
+    sizes: dict[int, tuple[int, int]] = {}
+    for k, image in enumerate(images):
+        found = [d for d in detect_boards(image) if d.complete]
+        if found:
+            sizes[k] = (max(found[0].columns, found[0].rows), min(found[0].columns, found[0].rows))
+    if not sizes:
+        return None
+    # A part of a board that the frame cuts comes in many sizes; the whole board in one.
+    counts = Counter(sizes.values())
+    often = [size for size, n in counts.items() if n >= min(MIN_IMAGES_OF_GUESS, max(counts.values()))]
+    best = max(often, key=lambda size: (counts[size], size[0] * size[1]))
+    return BoardGuess(Board("board", *best, 1.0, 1.0), tuple(k for k, size in sizes.items() if size == best))
+
+
+def difference(guess: Board, declared: Board) -> str | None:
+    """Return in words what is to be changed in a declared board so that it is the one seen; None for nothing."""
+    seen, said = guess.pattern, declared.pattern
+    size = f"{guess.columns // seen.points_per_count} x {guess.rows // seen.points_per_count} {seen.count_word}"
+    if type(seen) is not type(said):
+        return f'the images show {_article(seen.type)} board of {size}; set type = "{seen.type}"'
+    if isinstance(seen, Charuco) and isinstance(said, Charuco):
+        if seen.legacy != said.legacy and guess.rows % 2 == 1:
+            words = "this is the legacy pattern" if seen.legacy else "this is not the legacy pattern"
+            return f"{words}: set legacy_pattern = {str(seen.legacy).lower()}"
+        if seen.inverted != said.inverted:
+            negation = "" if seen.inverted else "not "
+            return f"black and white are {negation}exchanged: set inverted = {str(seen.inverted).lower()}"
+        if seen.dictionary.rpartition("_")[0] != said.dictionary.rpartition("_")[0]:
+            return f'the markers are of {seen.dictionary}: set dictionary = "{seen.dictionary}"'
+    if set(guess.size) != set(declared.size) or (seen.identified and guess.size != declared.size):
+        per = said.points_per_count
+        return f"{size} are seen, {declared.columns // per} x {declared.rows // per} are declared"
+    if seen.identified:
+        # Lengths are for a ruler to say.
+        own, other = seen.key_values(), said.key_values()
+        for name in own:
+            if not name.endswith("_mm") and name != "dictionary" and _differs(own[name], other[name]):
+                return f"{name} is {other[name]} in the board file, {own[name]} in the images"
+    return None
+
+
+def _differs(one: object, two: object) -> bool:
+    if isinstance(one, float) and isinstance(two, float):
+        return bool(abs(one - two) > SAME_PRINTED_RATIO)
+    return one != two
+
+
+def _article(kind: str) -> str:
+    return f"an {kind}" if kind[0] in "aeiou" else f"a {kind}"
+
+
+MARKER_TRIES = 2
+"""Pictures in which markers are looked for, until some are seen."""
+
+SAME_PRINTED_RATIO = 0.05
+"""Ratios read from images differ from those of the print by less."""

@@ -1,0 +1,94 @@
+"""What board the images of a folder show: everything but the scale, which a rule must tell."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rigkit.core.boards import Board
+from rigkit.core.errors import CheckFailed, InputError, RigkitError
+from rigkit.core.progress import Progress, silent
+from rigkit.detection.saddles.response import GreyImage, grey_image
+from rigkit.detection.unknown import BoardGuess, difference, guess_board
+from rigkit.io.board_words import words_of_board
+from rigkit.io.images import read_image
+
+__all__ = ["IdentifiedBoard", "explained", "identify_board", "suggested_words"]
+
+ENOUGH_IMAGES = 12
+"""Images that are looked at, evenly spread: what more of them show is the same board."""
+
+EXPLAINING_IMAGES = 4
+"""Images looked at to say what is wrong with a session."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class IdentifiedBoard:
+    """A board that images show.
+
+    Attributes
+    ----------
+    board : with squares, or tags, of 1 mm.
+    seen, looked_at : names of the images that show it, and of all looked at.
+    words : as `--board` takes them, but for the length: "aprilgrid:6x6xMM,spacing=0.3".
+    """
+
+    board: Board
+    seen: tuple[str, ...]
+    looked_at: tuple[str, ...]
+    words: str
+
+
+def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) -> IdentifiedBoard:
+    """Return the board that images show.
+
+    Raises
+    ------
+    InputError
+        No image, or none that can be read.
+    CheckFailed
+        No board is seen.
+    """
+    if not paths:
+        raise InputError("board identify: no images; give some, or a folder")
+    chosen = _spread([Path(path) for path in paths], ENOUGH_IMAGES)
+    images: list[GreyImage] = []
+    for k, path in enumerate(chosen):
+        progress("reading", k, len(chosen))
+        images.append(grey_image(read_image(path)))
+    progress("reading", len(chosen), len(chosen))
+    guess = guess_board(images)
+    names = tuple(path.name for path in chosen)
+    if guess is None:
+        raise CheckFailed(f"no board is seen in {len(names)} images: no chessboard, ChArUco board or AprilGrid")
+    return IdentifiedBoard(guess.board, tuple(names[k] for k in guess.images), names, words_of_board(guess.board))
+
+
+def explained(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
+    """Return in words why images do not show the boards declared; None where that is not known."""
+    guess = _guess(paths)
+    if guess is None:
+        return None
+    words = [difference(guess.board, board) for board in boards]
+    if None in words or not words:
+        return None
+    return f"{guess.board.describe().split(', ')[0]} seen in {len(guess.images)} images; {words[0]}"
+
+
+def suggested_words(paths: Sequence[Path]) -> str | None:
+    """Return the board that images show as `--board` takes it; None where none is seen."""
+    guess = _guess(paths)
+    return None if guess is None else words_of_board(guess.board)
+
+
+def _guess(paths: Sequence[Path]) -> BoardGuess | None:
+    try:
+        return guess_board([grey_image(read_image(path)) for path in _spread(list(paths), EXPLAINING_IMAGES)])
+    except RigkitError:
+        return None
+
+
+def _spread(paths: list[Path], most: int) -> list[Path]:
+    step = max(1, -(-len(paths) // most))
+    return paths[::step]

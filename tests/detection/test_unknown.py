@@ -1,0 +1,69 @@
+"""Boards that nobody has described: all but their scale is told from images."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rigkit.benchmark.scenes import one_board
+from rigkit.core.boards import Board
+from rigkit.core.patterns.aprilgrid import AprilGrid
+from rigkit.core.patterns.base import Pattern
+from rigkit.core.patterns.charuco import Charuco
+from rigkit.core.patterns.chessboard import Chessboard
+from rigkit.detection.saddles.response import grey_image
+from rigkit.detection.unknown import difference, guess_board
+from rigkit.synthetic.render import Optics
+
+PLACES = (0.01, 0.02)
+"""How well spacing and side of markers are read, in tags and squares."""
+
+
+@pytest.mark.parametrize(
+    ("size", "pattern"),
+    [
+        ((10, 8), AprilGrid(0.25)),
+        ((8, 6), AprilGrid(0.5, "tag25h9", 1, 4, "opencv")),
+        ((8, 5), Charuco("DICT_5X5_50", 45.0)),
+        ((8, 5), Charuco("DICT_4X4_50", 45.0, legacy=True)),
+        ((8, 6), Chessboard()),
+    ],
+    ids=["kalibr", "opencv", "charuco", "legacy", "chessboard"],
+)
+def test_everything_but_the_scale_is_told(size: tuple[int, int], pattern: Pattern) -> None:
+    board = Board("b", *size, 60.0, 60.0, pattern=pattern)
+    images = []
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        scene = one_board(rng, board=board, max_tilt_deg=35.0)
+        images.append(grey_image(scene.render(optics=Optics(0.5), noise_levels=2.0, rng=rng)))
+    guess = guess_board(images)
+    assert guess is not None
+    assert guess.images == (0, 1)
+    assert guess.board.size == size
+    found = guess.board.pattern
+    if isinstance(pattern, AprilGrid):
+        assert isinstance(found, AprilGrid)
+        assert abs(found.spacing - pattern.spacing) <= PLACES[0] + 1e-9
+        assert (found.family, found.border, found.numbering) == (pattern.family, pattern.border, pattern.numbering)
+    elif isinstance(pattern, Charuco):
+        assert isinstance(found, Charuco)
+        assert abs(found.marker_mm - 0.75) <= PLACES[1] + 1e-9
+        assert (found.dictionary, found.legacy, found.inverted) == (pattern.dictionary, pattern.legacy, False)
+    else:
+        assert found == pattern
+
+
+def test_what_is_wrong_with_a_board_is_said() -> None:
+    def board(columns: int, rows: int, pattern: Pattern) -> Board:
+        return Board("b", columns, rows, 30.0, 30.0, pattern=pattern)
+
+    old, new = (board(8, 5, Charuco("DICT_4X4_50", 20.0, legacy=legacy)) for legacy in (True, False))
+    assert difference(old, new) == "this is the legacy pattern: set legacy_pattern = true"
+    assert difference(new, new) is None
+    assert difference(board(9, 6, Chessboard()), board(8, 6, Chessboard())) == (
+        "9 x 6 inner corners are seen, 8 x 6 are declared"
+    )
+    grids = [board(12, 10, AprilGrid(spacing)) for spacing in (0.3, 0.2)]
+    assert difference(*grids) == "spacing is 0.2 in the board file, 0.3 in the images"
+    assert difference(grids[0], new) == 'the images show an aprilgrid board of 6 x 5 tags; set type = "aprilgrid"'
