@@ -15,7 +15,7 @@ from rigkit.core.errors import InputError
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import grey_image
-from rigkit.detection.targets.charuco import _marked_corners
+from rigkit.detection.targets.charuco import _between_markers, _marked_corners
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics
@@ -144,3 +144,22 @@ def test_grey_values_of_sixteen_bit_images_reach_the_markers() -> None:
     assert grey_image(deep).max() <= 255.0
     (found,) = detect_boards(deep, [BOARD])
     assert found.board_id == "c"
+
+
+def test_one_misread_marker_costs_nothing(rng: np.random.Generator) -> None:
+    """OpenCV gives up a board for one marker in a wrong place."""
+    scene = one_board(rng, board=BOARD)
+    pattern = BOARD.pattern
+    assert isinstance(pattern, Charuco)
+    places = pattern.places(*BOARD.size)
+    half = 0.5 * pattern.marker_mm
+    square = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
+    on_board = (places - 0.5)[:, None] * BOARD.square_x_mm + square
+    points = np.concatenate([on_board, np.zeros((*on_board.shape[:2], 1))], axis=2)
+    quads, _ = scene.camera.project(scene.boards[0].world_from_board.apply(points))
+    numbers = np.arange(len(places))
+    numbers[[3, 9]] = numbers[[9, 3]]
+    grid, pixels = _between_markers(quads, numbers, BOARD)
+    truth = scene.truth()[0].lattice()[grid[:, 1], grid[:, 0]]
+    assert len(grid) > 30
+    assert np.abs(pixels - truth).max() < 2.0

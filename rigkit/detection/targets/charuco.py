@@ -22,6 +22,7 @@ from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.subpixel import RefinedLattice, refine
+from rigkit.detection.tags.codes import homographies, transferred
 from rigkit.detection.targets.base import Finder, Search
 
 __all__ = ["CharucoFinder"]
@@ -92,11 +93,39 @@ def _marked_corners(image: np.ndarray, board: Board) -> tuple[IntArray, FloatArr
     target = cv2.aruco.CharucoBoard((board.columns + 1, board.rows + 1), side, pattern.marker_mm, dictionary, ids)
     target.setLegacyPattern(pattern.legacy)
     image = 255 - image if pattern.inverted else image
-    corners, numbers, _, _ = cv2.aruco.CharucoDetector(target).detectBoard(image)
+    detector = cv2.aruco.CharucoDetector(target)
+    corners, numbers, quads, markers = detector.detectBoard(image)
     if numbers is None or corners is None:
-        return np.zeros((0, 2), np.int64), np.zeros((0, 2))
+        # OpenCV drops a board for one marker that is misread.
+        if markers is None or not len(markers):
+            return np.zeros((0, 2), np.int64), np.zeros((0, 2))
+        return _between_markers(np.array(quads, dtype=np.float64).reshape(-1, 4, 2), np.ravel(markers), board)
     row, column = np.divmod(np.asarray(numbers, dtype=np.int64).ravel(), board.columns)
     return np.stack([column, row], axis=-1), np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+
+
+def _between_markers(quads: FloatArray, markers: IntArray, board: Board) -> tuple[IntArray, FloatArray]:
+    """Return (column, row) and rough pixels of the corners where the two markers beside each (N, 4, 2) agree."""
+    pattern = board.pattern
+    assert isinstance(pattern, Charuco)
+    places = pattern.places(*board.size)
+    number = markers.astype(np.int64) - pattern.first_marker
+    own = (number >= 0) & (number < len(places))
+    if not own.any():
+        return np.zeros((0, 2), np.int64), np.zeros((0, 2))
+    beyond = 0.5 * (np.array(board.squares_mm) / pattern.marker_mm - 1.0)
+    unit = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    pixels = transferred(homographies(quads[own]), np.where(unit > 0, 1.0 + beyond, -beyond))
+    grid = places[number[own]][:, None] - 1 + unit
+    inside = ((grid >= 0) & (grid < board.size)).all(axis=2)
+    place, told = board.index(grid[inside]), pixels[inside]
+    side = np.repeat(np.linalg.norm(pixels[:, 1] - pixels[:, 0], axis=1)[:, None], 4, axis=1)[inside]
+    order = np.argsort(place, kind="stable")
+    place, told, side = place[order], told[order], side[order]
+    both = np.flatnonzero(place[1:] == place[:-1])
+    off = np.linalg.norm(told[both] - told[both + 1], axis=1)
+    both = both[off < SAME_CELLS * side[both]]
+    return board.grid()[place[both]], 0.5 * (told[both] + told[both + 1])
 
 
 def _empty(board: Board) -> Lattice:
