@@ -108,3 +108,9 @@ def test_tags_of_another_board_are_none(rng: np.random.Generator) -> None:
 def test_tags_that_cannot_be_are_refused(pattern: dict[str, object]) -> None:
     with pytest.raises(InputError, match="board 'k'"):
         replace(KALIBR, pattern=AprilGrid(**{"spacing": 0.3, **pattern}))  # type: ignore[arg-type]
+
+
+def test_tags_without_squares_between_them_are_said_not_to_be_found() -> None:
+    board = replace(KALIBR, pattern=AprilGrid(0.3, corner_squares=False))
+    with pytest.raises(InputError, match="corner_squares = true"):
+        detect_boards(np.zeros((64, 64), np.uint8), [board])

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
+from rigkit.core.errors import InputError
 from rigkit.detection.lattice.lattice import build_lattices
 from rigkit.detection.lattice.links import LENGTH_RATIO, find_links
 from rigkit.detection.saddles.response import pyramid
@@ -22,6 +23,12 @@ class AprilGridFinder(Finder):
 
     def find(self, search: Search, boards: Sequence[Board]) -> list[BoardDetection]:
         tags = [TagBoard.of(board) for board in boards]
+        for item in tags:
+            if not item.pattern.corner_squares:
+                raise InputError(
+                    f"board '{item.board.board_id}': tags without small squares between them are printed, but not "
+                    "found in images; print a board with corner_squares = true"
+                )
         ratio = LENGTH_RATIO * max(max(t.pattern.spacing, 1.0 / t.pattern.spacing) for t in tags)
         levels = pyramid(search.grey)
         corners, _ = find_corners(levels)
