@@ -5,7 +5,7 @@ asks (for a lens of which nothing is known: so the three say most). Changes leav
 best rotation; mounts turn by 0.02 degrees. Real captures: calibrated from images at random but three, checked with
 these three: nothing has changed.
 
-    python scripts/bench_sentinel.py [--seeds 20] [--lens NAME ...] [--rig] [--real [SET ...]] [--noise 0.05]
+    python scripts/bench_sentinel.py [--seeds 20] [--lens NAME ...] [--rig] [--real [SET ...]] [--noise 0.03]
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ def check_words(check: SentinelCheck) -> CheckWords:
             f"It moves the projection by {change.size_px:.3f} px rms; after the correction {check.rms_fixed_px:.3f} px "
             "are left."
         )
-    if change is not None:
+    if change is not None and not check.holds:
         what = "the projection over the image" if check.cost_unit == "px" else "the length"
         sentences.append(f"In {what} it makes an error of {check.cost:.3g} {check.cost_unit} rms.")
     return CheckWords(headline, tuple(sentences))

@@ -1,0 +1,100 @@
+"""`rigkit check` and `rigkit history` on rendered pictures: exit codes, correction, register, pages, refusals."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rigkit.calibration.calibrate import calibrate
+from rigkit.cameras.base import Camera
+from rigkit.cameras.brown import Brown
+from rigkit.cli.main import main
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.io.calibration_file import load_camera, save_calibration
+from rigkit.planning.goal import projection_goal
+from rigkit.planning.information import CornerError, Knowledge
+from rigkit.planning.plan import plan_views
+from rigkit.synthetic.photometry import Photometry
+from rigkit.synthetic.render import render
+from rigkit.synthetic.scene import PlacedBoard
+
+BOARD = Board("board", 9, 6, 25.0, 25.0)
+CAMERA = Brown((640, 480), np.array([620.0, 621.0, 322.0, 236.0, -0.12, 0.05, 0.0, 0.0, 0.0]))
+FOCUS_PERCENT = 0.5
+NOISE_PX = 0.03
+
+
+def _poses(count: int) -> list[Rigid3]:
+    known = Knowledge.guessed(CAMERA, CornerError(0.1))
+    return [view.cam_from_board for view in plan_views(known, [BOARD], projection_goal(CAMERA), count).views]
+
+
+def _pictures(folder: Path, camera: Camera, rng: np.random.Generator) -> Path:
+    folder.mkdir()
+    for k, pose in enumerate(_poses(3)):
+        image = render(
+            [PlacedBoard(BOARD, pose)], camera, Rigid3.identity(), photometry=Photometry(noise_levels=1.0), rng=rng
+        )
+        cv2.imwrite(str(folder / f"{k}.png"), image)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A calibration, fresh pictures of the same camera, and of one whose focus changed."""
+    root, rng = tmp_path_factory.mktemp("check"), np.random.default_rng(6)
+    views = []
+    for k, pose in enumerate(_poses(14)):
+        pixels, _ = CAMERA.project(pose.apply(BOARD.points()))
+        noisy = pixels + NOISE_PX * rng.standard_normal(pixels.shape)
+        views.append(BoardView(f"{k}", BOARD, BOARD.grid(), noisy, np.full(len(noisy), NOISE_PX)))
+    save_calibration(root / "cam.json", calibrate(views, CAMERA.size_px, model="brown", degree=5, board="flat"))
+    _pictures(root / "same", CAMERA, rng)
+    moved = CAMERA.parameters.copy()
+    moved[:2] *= 1.0 + 0.01 * FOCUS_PERCENT
+    _pictures(root / "moved", CAMERA.with_parameters(moved), rng)
+    return root
+
+
+def test_what_holds_and_what_does_not(home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    calibration, register = str(home / "cam.json"), tmp_path / "cam.jsonl"
+    also = ["--register", str(register), "--temperature", "20.5"]
+    assert main(["check", calibration, str(home / "same"), *also]) == 0
+    assert "Still holds" in capsys.readouterr().out
+    page, fixed = tmp_path / "check.html", tmp_path / "fixed.json"
+    command = ["check", calibration, str(home / "moved"), "--json", "-r", str(page), "--fix", str(fixed), *also]
+    assert main([*command, "--length", "200", "--distance", "600"]) == 1
+    said = json.loads(capsys.readouterr().out)
+    assert said["cause"] == "focus" and said["units"] == ["%"] and said["cost_unit"] == "mm"
+    assert said["amounts"] == pytest.approx([FOCUS_PERCENT], abs=0.1)
+    # A length seen through a focus that is 0.5 % off is 0.5 % off.
+    assert said["cost"] == pytest.approx(0.01 * FOCUS_PERCENT * 200.0, rel=0.4)
+    assert "does not hold" in page.read_text()
+    assert load_camera(fixed).parameters[0] == pytest.approx(CAMERA.parameters[0] * 1.005, rel=1e-3)
+    assert main(["check", str(fixed), str(home / "moved")]) == 0
+    drift = tmp_path / "drift.html"
+    assert main(["history", str(register), "--add", str(fixed), "--to", calibration, "-r", str(drift)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len([line for line in lines if "of cam.json" in line]) == 2 and "fixed.json" in lines[-1]
+    assert "20.5" in drift.read_text() and "focus, %" in drift.read_text()
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (["{cam}", "{same}", "--scene"], "of a rig only"),
+        (["{cam}", "{same}", "--length", "3"], "belong together"),
+        (["{cam}", "{home}/nothing.png"], "does not exist"),
+        (["{cam}", "{same}", "--fix", "{cam}", "--force"], "cam.json"),
+    ],
+)
+def test_what_is_refused(command: list[str], words: str, home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names = {"cam": str(home / "cam.json"), "same": str(home / "same"), "home": str(home)}
+    assert main(["check", *(part.format(**names) for part in command)]) == 2
+    assert words in capsys.readouterr().err
