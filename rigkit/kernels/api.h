@@ -322,4 +322,18 @@ EXPORT int64_t grow_patches(
     const pyramid_t *first, const pyramid_t *second, const epipolar_t *epipolar, const patch_rules_t *rules,
     const patch_grid_t *grid, ARRAY(const double, seeds, count, 8), int64_t count);
 
+/* What nodes of a grid say of the surface (reconstruction.growing.surface): values, NaN where nothing, their information
+ * (the inverse of their covariance), and the rows that predict them from a plane. */
+typedef struct {
+    ARRAY(const double, values, rows, columns, 3);
+    ARRAY(const double, information, rows, columns, 3, 3);
+    ARRAY(const double, frames, rows, columns, 3, 3);
+    int64_t rows, columns, reach, rounds;
+    double turn;
+} plane_grid_t;
+
+EXPORT void fit_planes(
+    const plane_grid_t *grid, ARRAY(double, planes, grid.rows, grid.columns, 3),
+    ARRAY(double, normals, grid.rows, grid.columns, 3, 3), ARRAY(double, support, grid.rows, grid.columns));
+
 #endif

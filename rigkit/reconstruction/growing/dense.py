@@ -31,7 +31,9 @@ __all__ = ["DenseScene", "grow_scene"]
 
 POSE_STEP = 8
 """Nodes of the pairs that the pose is estimated from, px: spread evenly, unlike features."""
-CLOUD_STEP = 4
+CLOUD_STEP = 3
+CLOUD_NODES = 80_000
+"""Nodes of a cloud beyond which they lie further apart: of images of more than 0.7 MP."""
 MAX_DISTANCE_PX = 0.7
 """From the epipolar line, of a pair that is taken; more where the correspondences show more noise."""
 GATE = 3.3
@@ -92,14 +94,15 @@ def grow_scene(
     even = _pose_from_grown(view1, view2, agreeing, sparse)
     pose, covariance = in_unit(even.pose.cam2_from_cam1, even.pose.covariance, r.baseline_mm)
     known = _knowledge(even.matches, pose)
-    grown = grow(view1, view2, agreeing, step=CLOUD_STEP, known=known)
+    step = max(CLOUD_STEP, round(float(np.sqrt(np.prod(view1.size_px) / CLOUD_NODES))))
+    grown = grow(view1, view2, agreeing, step=step, known=known).centred()
     if not len(grown):
         raise DegenerateError(
             f"no surface grows from {len(agreeing)} correspondences; check that the images are sharp and "
             "show surfaces with texture"
         )
     measured = measure(grown, r.camera1, r.camera2, pose)
-    surface = fit_surface(measured)
+    surface = fit_surface(measured, step)
     by_pose, of_pose = _moved_planes(grown, r, pose, covariance)
     cloud, nodes = _cloud(grown, surface, by_pose, of_pose, image1)
     matches, _ = grown.correspondences().matches(r.camera1, r.camera2)
@@ -139,7 +142,7 @@ def _pose_from_grown(
     gate = max(MAX_DISTANCE_PX, GATE * sparse.sigma_px)
     for k in range(MAX_GROWTHS):
         known = LineKnowledge(essential_from_pose(pose), gate)
-        pairs = grow(view1, view2, seeds, step=POSE_STEP, known=known).correspondences()
+        pairs = grow(view1, view2, seeds, step=POSE_STEP, known=known).centred().correspondences()
         matches, _ = pairs.matches(view1.camera, view2.camera)
         if len(matches) < MIN_GROWN:
             raise DegenerateError(

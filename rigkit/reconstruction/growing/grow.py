@@ -8,7 +8,7 @@ pixel, and nothing is rectified.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,12 +28,10 @@ COARSEST = 2
 MIN_CORRELATION = 0.9
 MAX_MOVE_PX = 2.0
 """From where a neighbour predicts a patch."""
-MAX_SIGMA_PX = 0.3
+MAX_SIGMA_PX = 0.15
 """Along the axis of which least is known; beyond, a patch slides along an edge."""
 MAX_TRIES = 3
 """Of a node, from different neighbours."""
-EXCESS_NOISE = 4.0
-"""Variance of patches over that of independent noise: neighbouring pixels err together, being interpolated."""
 RAY_SPACING_PX = 8.0
 """Rays are interpolated in between by cubics: to 1e-4 px even for strong fisheyes."""
 
@@ -83,7 +81,7 @@ class LineKnowledge:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class GrownPatches:
-    """Pairs on a grid of nodes in image 1, NaN where there is none.
+    """Pairs on a grid of nodes in image 1, NaN where there is none, at its node or near it.
 
     Attributes
     ----------
@@ -109,22 +107,28 @@ class GrownPatches:
     def __len__(self) -> int:
         return int(self.valid.sum())
 
-    def only(self, which: BoolArray) -> GrownPatches:
-        """Return the same without the pairs at the nodes (R, C) that are not in `which`."""
+    def centred(self) -> GrownPatches:
+        """Return the pairs each at the place of its patch that it knows best, instead of at its node.
 
-        def kept(values: FloatArray) -> FloatArray:
-            mask = which.reshape(*which.shape, *(1,) * (values.ndim - 2))
-            return np.where(mask, values, np.nan)
-
-        return GrownPatches(
-            step=self.step,
-            pixels1=self.pixels1,
-            pixels2=kept(self.pixels2),
-            A21=kept(self.A21),
-            correlation=kept(self.correlation),
-            coarser=kept(self.coarser),
-            covariance=kept(self.covariance),
-        )
+        A patch measures the surface where its texture is. Beside an edge of a near surface that is the edge, and not
+        the far surface at the node.
+        """
+        at = self.valid
+        covariance, A21 = self.covariance[at], self.A21[at]
+        # The place q2 + A d of least variance, both coordinates together.
+        of_A = covariance[:, 2:4, 2:4] + covariance[:, 4:6, 4:6]
+        with_place = covariance[:, 2:4, 0] + covariance[:, 4:6, 1]
+        move = -np.linalg.solve(of_A, with_place[..., None])[..., 0]
+        length = np.linalg.norm(move, axis=1, keepdims=True)
+        most = HALF_WIDTH * 2.0 ** self.coarser[at][:, None]
+        move *= np.minimum(1.0, most / np.maximum(length, 1e-9))
+        moved = np.broadcast_to(np.eye(6), covariance.shape).copy()
+        moved[:, 0, 2:4] = moved[:, 1, 4:6] = move
+        pixels1, pixels2, spread = self.pixels1.copy(), self.pixels2.copy(), self.covariance.copy()
+        pixels1[at] += move
+        pixels2[at] += np.einsum("nij,nj->ni", A21, move)
+        spread[at] = moved @ covariance @ np.swapaxes(moved, 1, 2)
+        return replace(self, pixels1=pixels1, pixels2=pixels2, covariance=spread)
 
     def correspondences(self) -> Correspondences:
         """Return the pairs in the order of their nodes, row by row."""
@@ -163,7 +167,6 @@ def grow(
         most_move=MAX_MOVE_PX,
         least_correlation=min_correlation,
         most_sigma=MAX_SIGMA_PX,
-        excess_noise=EXCESS_NOISE,
     )
     assert seeds.A21 is not None
     starts = starts_of(seeds.pixels1, seeds.pixels2, seeds.A21)

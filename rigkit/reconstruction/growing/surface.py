@@ -19,17 +19,18 @@ from rigkit.core.arrays import BoolArray, FloatArray, Normals, Points
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.triangulation import triangulate_rays
+from rigkit.kernels.planes import fitted_planes
 from rigkit.reconstruction.growing.grow import GrownPatches
 
 __all__ = ["GrownSurface", "NodeMeasurements", "fit_surface", "measure"]
 
-PLANE_REACH = 2
-"""Nodes to either side that a plane is fitted to: 5 x 5."""
+PLANE_REACH_PX = 9.0
+"""To either side, of the nodes that a plane is fitted to."""
 PLANE_ROUNDS = 5
-CAUCHY_TURN = 2.385
-"""In standard deviations: where Cauchy's loss turns; 95 % efficient for Gaussian noise."""
-MIN_SUPPORT = 5.0
-"""Neighbours, in sum of weights, that a plane needs."""
+TURN_OF_LOSS = 2.385
+"""In standard deviations a component: from there on a neighbour is on another surface rather than noisy."""
+MIN_SUPPORT = 0.2
+"""Share of the nodes around, in sum of weights, that a plane needs: fewer agree by chance, or across an edge."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -112,76 +113,50 @@ def measure(grown: GrownPatches, camera1: Camera, camera2: Camera, cam2_from_cam
     return NodeMeasurements(z=spread(z), covariance=spread(covariance), frame=spread(frame), slope=spread(slope))
 
 
-def fit_surface(measured: NodeMeasurements, *, reach: int = PLANE_REACH) -> GrownSurface:
-    """Return the planes around all nodes.
+def fit_surface(measured: NodeMeasurements, step: int) -> GrownSurface:
+    """Return the planes around all nodes, which are `step` px apart.
 
     Notes
     -----
-    Minimises over m sum_j w_ij (z_j - F_j m)^T C_j^-1 (z_j - F_j m), w_ij of Cauchy's loss on the distance of neighbour
-    j's range from the plane, which in the first round is the node's own, as uncertain as that is.
+    Minimises over m sum_j w_ij (z_j - F_j m)^T C_j^-1 (z_j - F_j m), w_ij of the loss of Geman and McClure on the
+    distance of what neighbour j says, range and gradient, from the plane. The first plane is the node's own, as
+    uncertain as that is.
     """
+    reach = max(2, round(PLANE_REACH_PX / step))
     valid = np.isfinite(measured.z[..., 0])
-    F, z = np.nan_to_num(measured.frame), np.nan_to_num(measured.z)
-    C = np.where(valid[..., None, None], measured.covariance, np.eye(3))
-    information = np.linalg.inv(C)
-    Ft = np.swapaxes(F, -1, -2) @ information
-    own_normal, own_right = Ft @ F, (Ft @ z[..., None])[..., 0]
-    own_normal[~valid], own_right[~valid] = 0.0, 0.0
-    variance = np.where(valid, C[..., 0, 0], np.inf)
-    plane, spread = _solved(own_normal, own_right, valid)
-    support = np.zeros(valid.shape)
-    for k in range(PLANE_ROUNDS):
-        normal, right = np.zeros_like(own_normal), np.zeros_like(own_right)
-        support = np.zeros(valid.shape)
-        for dv in range(-reach, reach + 1):
-            for du in range(-reach, reach + 1):
-                here, there = _shifted(valid.shape, dv, du)
-                ray = F[there][..., 0, :]
-                miss = z[there][..., 0] - np.sum(plane[here] * ray, axis=-1)
-                expected = variance[there]
-                if k == 0:
-                    expected = expected + np.einsum("...i,...ij,...j->...", ray, spread[here], ray)
-                with np.errstate(invalid="ignore"):
-                    weight = np.nan_to_num(1.0 / (1.0 + miss**2 / (CAUCHY_TURN**2 * expected)))
-                weight = np.where(valid[there] & valid[here], weight, 0.0)
-                normal[here] += weight[..., None, None] * own_normal[there]
-                right[here] += weight[..., None] * own_right[there]
-                support[here] += weight
-        plane, spread = _solved(normal, right, valid)
-    ray = F[..., 0, :]
-    inverse = np.sum(plane * ray, axis=-1)
+    covariance = np.where(valid[..., None, None], measured.covariance, np.eye(3))
+    plane, normal, support = fitted_planes(
+        measured.z,
+        np.linalg.inv(covariance),
+        measured.frame,
+        reach=reach,
+        rounds=PLANE_ROUNDS,
+        turn=TURN_OF_LOSS,
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
-        keep = valid & (inverse > 0.0) & (support >= MIN_SUPPORT)
+        ray = measured.frame[..., 0, :]
+        inverse = np.sum(plane * ray, axis=-1)
+        keep = (inverse > 0.0) & (support >= MIN_SUPPORT * (2 * reach + 1) ** 2)
         points = ray / inverse[..., None]
         normals = -plane / np.linalg.norm(plane, axis=-1, keepdims=True)
-        misfit = (z[..., 0] - inverse) * measured.slope
+        misfit = (measured.z[..., 0] - inverse) * measured.slope
+    spread = np.full(normal.shape, np.nan)
+    spread[keep] = _inverse(normal[keep])
     return GrownSurface(
         points=_where(keep, points),
         normals=_where(keep, normals),
         plane=_where(keep, plane),
-        covariance=_where(keep, spread),
+        covariance=spread,
         support=_where(keep, support),
         misfit=_where(keep, misfit),
     )
 
 
-def _solved(normal: FloatArray, right: FloatArray, valid: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Return the solutions of the systems at the nodes that are `valid`, and the inverses; NaN elsewhere."""
-    plane, spread = np.full(right.shape, np.nan), np.full(normal.shape, np.nan)
-    # Rays are of length one and the gradient's part is not: scaled, the systems are well conditioned.
-    some = normal[valid]
-    scale = 1.0 / np.sqrt(np.einsum("nii->ni", some))
-    inverse = np.linalg.inv(some * scale[:, :, None] * scale[:, None, :]) * scale[:, :, None] * scale[:, None, :]
-    plane[valid], spread[valid] = np.einsum("nij,nj->ni", inverse, right[valid]), inverse
-    return plane, spread
-
-
-def _shifted(shape: tuple[int, ...], dv: int, du: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Return the nodes that have a neighbour at (dv, du), and those neighbours."""
-    rows, columns = shape
-    here = slice(max(0, -dv), rows - max(0, dv)), slice(max(0, -du), columns - max(0, du))
-    there = slice(max(0, dv), rows - max(0, -dv)), slice(max(0, du), columns - max(0, -du))
-    return here, there
+def _inverse(normal: FloatArray) -> FloatArray:
+    """Return the inverses of normal matrices (N, 3, 3), scaled: rays are of length one, their derivatives are not."""
+    scale = 1.0 / np.sqrt(np.einsum("nii->ni", normal))
+    both = scale[:, :, None] * scale[:, None, :]
+    return np.asarray(np.linalg.inv(normal * both) * both)
 
 
 def _where(keep: BoolArray, values: FloatArray) -> FloatArray:

@@ -1,0 +1,42 @@
+"""Calls of the kernel in planes.c: planes through what the nodes of a grid say of a surface."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.core.arrays import FloatArray
+from rigkit.kernels import kernels
+from rigkit.kernels.calls import Struct, structure
+
+__all__ = ["fitted_planes"]
+
+
+@structure("plane_grid_t")
+class _PlaneGrid(Struct):
+    """What the nodes say, and how planes are fitted."""
+
+
+def fitted_planes(
+    values: FloatArray, information: FloatArray, frames: FloatArray, *, reach: int, rounds: int, turn: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the planes (R, C, 3), the normal matrices of their fits (R, C, 3, 3) and the sums of weights (R, C).
+
+    `values` (R, C, 3), NaN where there are none, their `information` (R, C, 3, 3) and `frames` (R, C, 3, 3), by which
+    a plane predicts them. Of a neighbour at the Mahalanobis distance s from a plane the weight is
+    1 / (1 + s^2 / (3 turn^2))^2 (Geman and McClure), in the first round with the uncertainty of the node's own plane.
+    """
+    rows, columns = values.shape[:2]
+    values, information, frames = (np.ascontiguousarray(v, np.float64) for v in (values, information, frames))
+    grid = _PlaneGrid.of(
+        values=values,
+        information=information,
+        frames=frames,
+        rows=rows,
+        columns=columns,
+        reach=reach,
+        rounds=rounds,
+        turn=turn,
+    )
+    planes, normals, support = np.empty((rows, columns, 3)), np.empty((rows, columns, 3, 3)), np.empty((rows, columns))
+    kernels().fit_planes(grid, planes, normals, support)
+    return planes, normals, support
