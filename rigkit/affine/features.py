@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.affine.correspondences import Correspondences
-from rigkit.affine.refine_patches import refine_patches
+from rigkit.affine.refine_patches import patch_pyramid, refine_patches
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, in_8_bits
 from rigkit.core.errors import DegenerateError, InputError
+from rigkit.kernels.patches import Pyramid
 
 __all__ = ["grey_of", "match_affine_features"]
 
@@ -28,6 +29,14 @@ SAME_POINT_PX = 8.0
 """Features of different simulated views this near are one point: no rivals in the ratio test."""
 RIVALS = 8
 MIN_CORRELATION = 0.9
+FEATURES = (600, 6000)
+"""In a tilted view; and at most in a plain one."""
+AREA_OF_FEATURE = 150.0
+"""Pixels of a plain view to one of its strongest features."""
+MAX_TILTED_AREA = 1e6
+"""Pixels of a tilted view: larger images are shrunk first."""
+ENOUGH = 80
+"""Correspondences of plain views; with fewer the tilted ones are looked at too."""
 MIN_SIZE_PX = 64
 
 
@@ -41,10 +50,10 @@ def match_affine_features(
     image1: NDArray[Any],
     image2: NDArray[Any],
     *,
-    tilts: Sequence[float] = TILTS,
-    features_per_view: int = 600,
+    tilts: Sequence[float] | None = None,
+    features_per_view: int | None = None,
     ratio: float = 0.85,
-    half_width_px: int = 12,
+    half_width_px: int = 16,
     min_correlation: float = MIN_CORRELATION,
 ) -> Correspondences:
     """Return affine correspondences of two images; contaminated by some wrong ones, as matches are.
@@ -52,8 +61,8 @@ def match_affine_features(
     Parameters
     ----------
     image1, image2 : (H, W) or (H, W, 3) RGB, uint8 or uint16.
-    tilts : simulated tilts, 1 (none) and above; (1.0,) for nearly equal views is fastest.
-    features_per_view : strongest SIFT features kept in each simulated view.
+    tilts : simulated tilts, 1 (none) and above. None: none, and where that finds too little, those of TILTS too.
+    features_per_view : strongest SIFT features kept in each simulated view; None: by the area of the image.
     ratio : a match must be nearer than this times its best rival elsewhere in the image.
     half_width_px : of the patches aligned; surfaces are taken as flat within.
     min_correlation : of two aligned patches.
@@ -65,28 +74,49 @@ def match_affine_features(
     DegenerateError
         No correspondences: no texture, or images of different scenes.
     """
-    grey1, grey2 = grey_of(image1, "image1"), grey_of(image2, "image2")
-    first, second = (_features(grey, tilts, features_per_view) for grey in (grey1, grey2))
+    greys = grey_of(image1, "image1"), grey_of(image2, "image2")
+    pyramid1, pyramid2 = (patch_pyramid(grey) for grey in greys)
+    found: _Found | None = None
+    for views in (_views(tilts),) if tilts is not None else (_views((1.0,)), _views(TILTS)):
+        first, second = (_features(grey, views, features_per_view) for grey in greys)
+        found = _aligned(first, second, pyramid1, pyramid2, ratio, half_width_px, min_correlation)
+        if len(found.pairs) >= ENOUGH:
+            break
+    assert found is not None
+    if not len(found.pairs):
+        raise DegenerateError(
+            f"affine features: none of {found.tried} matches could be aligned; check that the images show one textured "
+            "scene"
+        )
+    return found.pairs
+
+
+class _Found(NamedTuple):
+    """The correspondences, and how many matches were tried to align."""
+
+    pairs: Correspondences
+    tried: int
+
+
+def _aligned(
+    first: _Features,
+    second: _Features,
+    pyramid1: Pyramid,
+    pyramid2: Pyramid,
+    ratio: float,
+    half_width_px: int,
+    min_correlation: float,
+) -> _Found:
+    """Return the matches of two images' features whose patches align."""
     i, j, rank = _match(first, second, ratio)
     once = _unrepeated(first.pixels[i], second.pixels[j], rank)
     i, j = i[once], j[once]
     A21 = second.frames[j] @ np.linalg.inv(first.frames[i]) if i.size else np.zeros((0, 2, 2))
-    refined = refine_patches(
-        grey1.astype(np.float32),
-        grey2.astype(np.float32),
-        first.pixels[i],
-        second.pixels[j],
-        A21,
-        half_width_px=half_width_px,
-    )
+    refined = refine_patches(pyramid1, pyramid2, first.pixels[i], second.pixels[j], A21, half_width_px=half_width_px)
     with np.errstate(invalid="ignore"):
         good = refined.valid & (refined.correlation >= min_correlation)
-    if not good.any():
-        raise DegenerateError(
-            f"affine features: none of {i.size} matches could be aligned; check that the images show one textured scene"
-        )
     good[good] = _unrepeated(first.pixels[i][good], refined.pixels2[good], refined.sigma_A[good])
-    return Correspondences(
+    pairs = Correspondences(
         first.pixels[i][good],
         refined.pixels2[good],
         refined.A21[good],
@@ -94,6 +124,18 @@ def match_affine_features(
         refined.sigma_px[good],
         refined.sigma_A[good],
     )
+    return _Found(pairs, i.size)
+
+
+def _views(tilts: Sequence[float]) -> list[tuple[float, float]]:
+    """Return tilt and roll (rad) of the simulated views."""
+    views = []
+    for tilt in tilts:
+        if tilt < 1.0:
+            raise InputError(f"affine features: tilts are 1 and above, got {tilt}")
+        rolls = np.arange(0.0, 180.0, ROLL_STEP_DEG / tilt) if tilt > 1.0 else [0.0]
+        views += [(float(tilt), float(np.radians(roll))) for roll in rolls]
+    return views
 
 
 def grey_of(image: NDArray[Any], name: str) -> NDArray[np.uint8]:
@@ -117,33 +159,44 @@ def grey_of(image: NDArray[Any], name: str) -> NDArray[np.uint8]:
     return np.ascontiguousarray(array)
 
 
-def _features(grey: NDArray[np.uint8], tilts: Sequence[float], count: int) -> _Features:
+def _features(grey: NDArray[np.uint8], views: Sequence[tuple[float, float]], count: int | None) -> _Features:
     """Return the features of all simulated views in the pixels of the image itself."""
     import cv2
 
-    detector = cv2.SIFT.create(nfeatures=count)
     parts = []
-    for tilt in tilts:
-        if tilt < 1.0:
-            raise InputError(f"affine features: tilts are 1 and above, got {tilt}")
-        rolls = np.arange(0.0, 180.0, ROLL_STEP_DEG / tilt) if tilt > 1.0 else [0.0]
-        for roll in rolls:
-            view, mask, view_from_image = _simulated(grey, float(tilt), float(np.radians(roll)))
-            keypoints, descriptors = detector.detectAndCompute(view, mask)
-            if not keypoints:
-                continue
-            inverse = np.linalg.inv(view_from_image[:, :2])
-            pixels = (np.array([k.pt for k in keypoints]) - view_from_image[:, 2]) @ inverse.T
-            angle = np.radians([k.angle for k in keypoints])
-            c, s = np.cos(angle), np.sin(angle)
-            turn = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
-            size = np.array([k.size for k in keypoints])[:, None, None]
-            # RootSIFT: Euclidean distances of square roots compare histograms better.
-            root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6))
-            parts.append(_Features(pixels, inverse @ (size * turn), root.astype(np.float32)))
+    for tilt, roll in views:
+        image, scale = (grey, 1.0) if tilt == 1.0 else _shrunk(grey)
+        area = image.shape[0] * image.shape[1]
+        most = int(np.clip(area / AREA_OF_FEATURE, *FEATURES)) if tilt == 1.0 else FEATURES[0]
+        view, mask, view_from_image = _simulated(image, tilt, roll)
+        keypoints, descriptors = cv2.SIFT.create(nfeatures=count or most).detectAndCompute(view, mask)
+        if not keypoints:
+            continue
+        inverse = np.linalg.inv(view_from_image[:, :2])
+        pixels = (np.array([k.pt for k in keypoints]) - view_from_image[:, 2]) @ inverse.T
+        angle = np.radians([k.angle for k in keypoints])
+        c, s = np.cos(angle), np.sin(angle)
+        turn = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
+        size = np.array([k.size for k in keypoints])[:, None, None]
+        # RootSIFT: Euclidean distances of square roots compare histograms better.
+        root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6))
+        # Of a smaller image pixels are larger, and their centres lie elsewhere.
+        pixels = scale * (pixels + 0.5) - 0.5
+        parts.append(_Features(pixels, scale * inverse @ (size * turn), root.astype(np.float32)))
     if not parts:
         return _Features(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 128), dtype=np.float32))
     return _Features(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def _shrunk(grey: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float]:
+    """Return the image of no more than MAX_TILTED_AREA, and how many of its own pixels one of that is."""
+    import cv2
+
+    scale = np.sqrt(grey.shape[0] * grey.shape[1] / MAX_TILTED_AREA)
+    if scale <= 1.0:
+        return grey, 1.0
+    size = round(grey.shape[1] / scale), round(grey.shape[0] / scale)
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8), grey.shape[1] / size[0]
 
 
 def _simulated(

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.arrays import Affines, BoolArray, FloatArray, Pixels
-from rigkit.kernels.patches import MOST_LEVELS, PatchRules, PatchTable, Pyramid, aligned, starts_of
+from rigkit.kernels.patches import MOST_LEVELS, PatchRules, Pyramid, aligned, starts_of
 
-__all__ = ["RefinedPatches", "align", "patch_pyramid", "patch_rules", "refine_patches"]
+__all__ = ["RefinedPatches", "patch_pyramid", "patch_rules", "refine_patches"]
 
 PATCH_STEPS = 20
 SETTLED_PX = 1e-3
@@ -29,6 +29,9 @@ BLUR_PX = 0.8
 """Both images are smoothed by this: gradients of raw pixels are not those of what interpolation makes of them."""
 MIN_LEVEL_SIDE_PX = 40
 """Of the coarsest level of a pyramid: below, no patch fits in."""
+EXCESS_NOISE = 4.0
+"""Variance of a patch's place and affinity over that of noise independent from pixel to pixel: both images are smoothed
+and interpolated, so that neighbouring pixels err together."""
 QUANTISATION = 0.3
 """Grey levels: the noise of an image that is rounded to whole ones."""
 
@@ -97,31 +100,26 @@ def patch_rules(
     )
 
 
-def align(first: Pyramid, second: Pyramid, pixels1: Pixels, pixels2: Pixels, A21: Affines, half: int) -> PatchTable:
-    """Return the surroundings of `pixels1` (N, 2) aligned from `pixels2` (N, 2) and A21 (N, 2, 2) on."""
-    rules = patch_rules(half, most_move=0.5 * half)
-    return aligned(first, second, rules, starts_of(pixels1, pixels2, A21))
-
-
 def refine_patches(
-    image1: NDArray[np.generic],
-    image2: NDArray[np.generic],
+    pyramid1: Pyramid,
+    pyramid2: Pyramid,
     pixels1: Pixels,
     pixels2: Pixels,
     A21: Affines,
     *,
-    half_width_px: int = 12,
+    half_width_px: int = 16,
 ) -> RefinedPatches:
     """Return the affinities and points of image 2 that align the surroundings of `pixels1` best.
 
     Parameters
     ----------
-    image1, image2 : (H, W) grey levels 0 to 255.
+    pyramid1, pyramid2 : of the two images (`patch_pyramid`).
     pixels1, pixels2 : (N, 2); pixels2 good to a few px.
     A21 : (N, 2, 2) good to a few tenths.
     half_width_px : of the patch in the image that shows it larger; the surface is taken as flat within.
     """
-    found = align(patch_pyramid(image1), patch_pyramid(image2), pixels1, pixels2, A21, half_width_px)
+    rules = patch_rules(half_width_px, most_move=0.5 * half_width_px, excess_noise=EXCESS_NOISE)
+    found = aligned(pyramid1, pyramid2, rules, starts_of(pixels1, pixels2, A21))
     variances = np.einsum("nii->ni", found.covariance)
     return RefinedPatches(
         A21=found.A21,

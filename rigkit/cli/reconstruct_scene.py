@@ -24,6 +24,11 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument("--camera", metavar="CALIB", help="calibration of the camera (of image A)")
     group.add_argument("--camera2", metavar="CALIB", help="calibration of the camera of image B (default: the same)")
+    group.add_argument(
+        "--rig", metavar="RIG", help="the rig that took both images, instead of --camera; its pose is kept"
+    )
+    group.add_argument("--names", nargs=2, metavar=("ONE", "TWO"), help="cameras of the rig (default: its first two)")
+    group.add_argument("--pose", metavar="FILE", help="measured cam2_from_cam1, 3x4 or 4x4 numbers, mm; it is kept")
     group.add_argument("--baseline-mm", type=float, metavar="MM", help="measured baseline (default: it is the unit)")
     group.add_argument("--pose-type", choices=POSE_TYPES, default="general", help="of the two views (default general)")
     group.add_argument("--sparse", action="store_true", help="only the matched features; do not grow a dense cloud")
@@ -35,9 +40,9 @@ def is_scene(args: argparse.Namespace) -> bool:
     scene = bool(args.images or args.correspondences)
     if scene == bool(args.dataset):
         raise InputError("reconstruct: give either a DATASET, or --images A B or --correspondences FILE with --camera")
-    if scene and not args.camera:
+    if scene and not (args.camera or args.rig):
         raise InputError(
-            "reconstruct: a scene needs --camera CALIB, a calibration file such as `rigkit calibrate` writes"
+            "reconstruct: a scene needs --camera CALIB, a calibration file such as `rigkit calibrate` writes, or --rig"
         )
     return scene
 
@@ -50,7 +55,10 @@ def run_scene(args: argparse.Namespace) -> int:
     name = Path(args.correspondences or args.images[0]).stem
     out = results_folder(args, name)
     options = SceneOptions(
-        camera=Path(args.camera),
+        camera=Path(args.camera) if args.camera else None,
+        rig=Path(args.rig) if args.rig else None,
+        rig_names=tuple(args.names) if args.names else None,
+        pose=Path(args.pose) if args.pose else None,
         camera2=Path(args.camera2) if args.camera2 else None,
         images=(Path(args.images[0]), Path(args.images[1])) if args.images else None,
         correspondences=Path(args.correspondences) if args.correspondences else None,

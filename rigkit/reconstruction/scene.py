@@ -25,7 +25,7 @@ from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.metric import triangulate_matches
 from rigkit.reconstruction.reconstruct import Reconstruction, colours_at, oriented_cloud
-from rigkit.reconstruction.scene_pose import MIN_MATCHES, ScenePose, fit_scene_pose
+from rigkit.reconstruction.scene_pose import MIN_MATCHES, KnownPose, ScenePose, fit_scene_pose, known_scene_pose
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 from rigkit.relative_pose.solvers.weights import usable_affinities
 
@@ -67,6 +67,7 @@ def reconstruct_scene(
     pose_type: PoseType | str = PoseType.GENERAL,
     level_sigma_rad: float | None = None,
     baseline_mm: float | None = None,
+    known_pose: KnownPose | None = None,
     image1: NDArray[np.generic] | None = None,
     seed: int = 0,
 ) -> SceneReconstruction:
@@ -76,11 +77,11 @@ def reconstruct_scene(
     ----------
     correspondences : may be contaminated; their sigmas are only believed relative to each other.
     camera1, camera2 : calibrated cameras, one object twice where one camera was moved.
-    pair_id : for messages.
+    pair_id, seed : for messages; of the robust search.
     pose_type, level_sigma_rad : as for `reconstruct_pair`.
     baseline_mm : length of the baseline where it was measured: then the cloud is in mm.
+    known_pose : the pose where it was measured: it is used as it is, and gives the baseline.
     image1 : image of camera 1: colours of the cloud.
-    seed : of the robust search.
 
     Raises
     ------
@@ -89,12 +90,12 @@ def reconstruct_scene(
     DegenerateError
         Too few of them agree with any pose; no baseline.
     """
+    baseline_mm = baseline_mm if known_pose is None else known_pose.baseline_mm
     matches, seen = _matches(correspondences, camera1, camera2, baseline_mm, pair_id)
     try:
-        fit = fit_scene_pose(matches, PoseType(pose_type), level_sigma_rad, np.random.default_rng(seed))
-        affinities = _affinities(correspondences.select(seen), fit)
+        fit = _fit(matches, known_pose, PoseType(pose_type), level_sigma_rad, seed)
         pose, covariance = in_unit(fit.refined.cam2_from_cam1, fit.refined.covariance, baseline_mm or 1.0)
-        cloud, chosen = _cloud(fit, affinities, pose, covariance, image1)
+        cloud, chosen, affinities = _cloud(fit, correspondences.select(seen), pose, covariance, image1)
     except DegenerateError as error:
         raise DegenerateError(f"'{pair_id}': {error}") from error
     reconstruction = Reconstruction(
@@ -118,6 +119,14 @@ def reconstruct_scene(
         level_sigma_rad=fit.level_sigma_rad,
     )
     return _with_scatter(reconstruction, fit, np.flatnonzero(seen), chosen, len(seen), metric=baseline_mm is not None)
+
+
+def _fit(
+    matches: Matches, known_pose: KnownPose | None, pose_type: PoseType, level_sigma_rad: float | None, seed: int
+) -> ScenePose:
+    if known_pose is not None:
+        return known_scene_pose(matches, known_pose)
+    return fit_scene_pose(matches, pose_type, level_sigma_rad, np.random.default_rng(seed))
 
 
 def _with_scatter(
@@ -199,19 +208,20 @@ def _affinities(found: Correspondences, fit: ScenePose) -> Affinities:
 
 def _cloud(
     fit: ScenePose,
-    affinities: Affinities,
+    found: Correspondences,
     pose: Rigid3,
     covariance: FloatArray,
     image1: NDArray[np.generic] | None,
-) -> tuple[OrientedCloud, NDArray[np.int64]]:
-    """Return the cloud and which matches are in it."""
+) -> tuple[OrientedCloud, NDArray[np.int64], Affinities]:
+    """Return the cloud, which matches are in it, and the affinities of all."""
+    affinities = _affinities(found, fit)
     points = triangulate_matches(fit.matches, pose, covariance)
     colours = colours_at(image1, fit.matches.pixels1)
     cloud, kept = oriented_cloud(points, fit.matches, pose, covariance, affinities, colours=colours)
     sure = cloud.sigma_mm < MAX_RANGE_SIGMA * np.linalg.norm(cloud.points_mm, axis=1)
     if not sure.any():
         raise DegenerateError("no point's distance is known; the baseline is too short for this scene")
-    return cloud.select(sure), np.flatnonzero(kept)[sure]
+    return cloud.select(sure), np.flatnonzero(kept)[sure], affinities
 
 
 def in_unit(pose: Rigid3, covariance: FloatArray, scale: float) -> tuple[Rigid3, FloatArray]:

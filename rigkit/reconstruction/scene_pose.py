@@ -23,7 +23,7 @@ from rigkit.relative_pose.solvers.pose import essential_from_pose
 from rigkit.relative_pose.solvers.registry import fundamental_for
 from rigkit.relative_pose.solvers.weights import affinity_distances, affinity_residuals, usable_affinities
 
-__all__ = ["MIN_MATCHES", "ScenePose", "fit_scene_pose"]
+__all__ = ["MIN_MATCHES", "KnownPose", "ScenePose", "fit_scene_pose", "known_scene_pose"]
 
 MIN_MATCHES = 8
 """Fewer that agree are chance among many that do not."""
@@ -48,6 +48,51 @@ class ScenePose:
     pose_type: PoseType
     level_sigma_rad: float | None
     notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class KnownPose:
+    """A measured pose, mm, and its covariance (6, 6) of (left rotation perturbation rad, translation mm)."""
+
+    cam2_from_cam1: Rigid3
+    covariance: FloatArray
+
+    @property
+    def baseline_mm(self) -> float:
+        """Length of the translation."""
+        return float(np.linalg.norm(self.cam2_from_cam1.translation_mm))
+
+
+def known_scene_pose(matches: Matches, known: KnownPose) -> ScenePose:
+    """Return a measured pose, which is not estimated again, with the matches that agree and the noise they show.
+
+    Raises
+    ------
+    DegenerateError
+        Too few agree: it is not the pose of these images, or not of these cameras.
+    """
+    length = known.baseline_mm
+    pose = Rigid3(known.cam2_from_cam1.rotation, known.cam2_from_cam1.translation_mm / length)
+    inliers = np.abs(_in_sigmas(matches, pose)) < QUANTILE * MAX_NOISE
+    for _ in range(SCENE_ROUNDS):
+        _require(inliers)
+        matches = _with_shown_noise(matches, pose, inliers)
+        inliers = _agreeing(matches, pose)
+    _require(inliers)
+    _a_contrario_test(matches, pose, inliers, 0)
+    px = _in_sigmas(matches, pose)[inliers] * matches.sigma1_px[inliers]
+    to_unit = np.repeat([1.0, 1.0 / length], 3)
+    refined = RefinedPose(
+        cam2_from_cam1=pose,
+        covariance=to_unit[:, None] * known.covariance * to_unit,
+        sampson_rms_px=float(np.sqrt(np.mean(px**2))),
+        cost=float(np.sum((px / matches.sigma1_px[inliers]) ** 2)),
+        variance_factor=1.0,
+        weights=np.ones(int(inliers.sum())),
+        iterations=0,
+        converged=True,
+    )
+    return ScenePose(matches, refined, inliers, PoseType.GENERAL, None, ())
 
 
 def fit_scene_pose(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,15 +13,19 @@ from numpy.typing import NDArray
 
 from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.features import match_affine_features
+from rigkit.cameras.base import Camera
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.progress import Progress, silent
+from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.correspondences import correspondences_text, read_correspondences
 from rigkit.io.ply import ply_bytes
+from rigkit.io.reading import read_text
 from rigkit.reconstruction.growing.dense import grow_scene
 from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene
+from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.report.figures import cloud_png, epipolar_png
 from rigkit.report.scene_figure import normals_png
-from rigkit.workflows.camera_files import import_camera
+from rigkit.workflows.camera_files import import_camera, import_rig
 from rigkit.workflows.pairs import read_for
 from rigkit.workflows.results import require_folder, write_results
 
@@ -35,10 +40,16 @@ Images: TypeAlias = tuple[NDArray[Any], NDArray[Any]]
 class SceneOptions:
     """What is there of a scene, and how to reconstruct it."""
 
-    camera: Path
-    """Calibration of the camera (of the first image)."""
+    camera: Path | None = None
+    """Calibration of the camera (of the first image); None: `rig` has it."""
     camera2: Path | None = None
     """Calibration of the second image's camera; None: the same."""
+    rig: Path | None = None
+    """Calibrated rig that took both images: its cameras, and their pose, which is not estimated."""
+    rig_names: tuple[str, str] | None = None
+    """Cameras of the two images; None: the rig's first two."""
+    pose: Path | None = None
+    """Measured pose: cam2_from_cam1 as 3 x 4 or 4 x 4 numbers, mm; it is not estimated."""
     images: tuple[Path, Path] | None = None
     """The two images: their features are matched; with `correspondences` they colour the cloud."""
     correspondences: Path | None = None
@@ -103,8 +114,7 @@ def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> 
     name = options.name
     if options.output is not None:
         require_folder(options.output, force=options.force)
-    camera1 = import_camera(options.camera)
-    camera2 = import_camera(options.camera2) if options.camera2 else camera1
+    camera1, camera2, known_pose, notes = _cameras(options)
     images = None
     if options.images:
         a, b = options.images
@@ -123,15 +133,62 @@ def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> 
         pose_type=options.pose_type,
         level_sigma_rad=None if options.level_sigma_deg is None else float(np.deg2rad(options.level_sigma_deg)),
         baseline_mm=options.baseline_mm,
+        known_pose=known_pose,
         image1=images[0] if images else None,
     )
     if images and options.grow:
-        scene, found = _grown(scene, found, images, progress)
+        scene, found = _grown(scene, found, images, progress, pose_is_known=known_pose is not None)
+    if notes:
+        r = scene.reconstruction
+        scene = replace(scene, reconstruction=replace(r, notes=(*notes, *r.notes)))
     files = _files(options, scene, found, images)
     if options.output is not None:
-        read = (*(options.images or ()), options.correspondences, options.camera, options.camera2)
+        cameras = (options.camera, options.camera2, options.rig, options.pose)
+        read = (*(options.images or ()), options.correspondences, *cameras)
         write_results(options.output, files, force=options.force, inputs=[path for path in read if path])
     return SceneResult(name=name, scene=scene, correspondences=found, files=files)
+
+
+def _cameras(options: SceneOptions) -> tuple[Camera, Camera, KnownPose | None, list[str]]:
+    """Return the cameras of both images, the pose between them where it is known, and what to say of them."""
+    if options.rig is not None:
+        if options.camera or options.camera2 or options.pose:
+            raise InputError("a scene of a rig: the rig's file has the cameras and their pose; leave the others out")
+        cameras = import_rig(options.rig)
+        names = options.rig_names or tuple(cameras)[:2]
+        missing = [name for name in names if name not in cameras]
+        if missing or len(names) < 2:
+            raise InputError(f"'{options.rig}': no camera '{', '.join(missing)}'; there are {', '.join(cameras)}")
+        (camera1, cam1_from_rig), (camera2, cam2_from_rig) = (cameras[name] for name in names)
+        return camera1, camera2, KnownPose(cam2_from_rig @ cam1_from_rig.inverse(), np.zeros((6, 6))), []
+    if options.camera is None:
+        raise InputError("a scene needs a calibration: of its camera, or of the rig that took both images")
+    camera1 = import_camera(options.camera)
+    camera2 = import_camera(options.camera2) if options.camera2 else camera1
+    known = None if options.pose is None else KnownPose(_read_pose(options.pose), np.zeros((6, 6)))
+    notes = []
+    if options.camera2 is None:
+        notes.append("one calibration is used for both images: right if one camera was moved, else name the other's")
+    return camera1, camera2, known, notes
+
+
+def _read_pose(path: Path) -> Rigid3:
+    """Return cam2_from_cam1 of a text or JSON file of 3 x 4 or 4 x 4 numbers; raises InputError for anything else."""
+    words = re.findall(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", re.sub(r'"[^"]*"', "", read_text(path, "pose")))
+    if len(words) not in (12, 16):
+        raise InputError(
+            f"pose '{path}': {len(words)} numbers; expected the rows of [R t], 3 x 4, or of a 4 x 4 matrix"
+        )
+    matrix = np.vstack([np.array(words[:12], dtype=np.float64).reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
+    if len(words) == 16 and not np.allclose(np.array(words[12:], dtype=np.float64), matrix[3]):
+        raise InputError(f"pose '{path}': the last row of a pose is 0 0 0 1")
+    try:
+        pose = Rigid3.from_matrix(matrix)
+    except InputError as error:
+        raise InputError(f"pose '{path}': {error}") from error
+    if not np.linalg.norm(pose.translation_mm) > 0.0:
+        raise InputError(f"pose '{path}': no translation, so no distances; give cam2_from_cam1 in mm")
+    return pose
 
 
 def _correspondences(options: SceneOptions, images: Images | None, progress: Progress) -> Correspondences:
@@ -145,12 +202,12 @@ def _correspondences(options: SceneOptions, images: Images | None, progress: Pro
 
 
 def _grown(
-    scene: SceneReconstruction, seeds: Correspondences, images: Images, progress: Progress
+    scene: SceneReconstruction, seeds: Correspondences, images: Images, progress: Progress, *, pose_is_known: bool
 ) -> tuple[SceneReconstruction, Correspondences]:
     """Return the dense scene and its correspondences; where nothing grows, the sparse one that says why."""
     progress("growing correspondences", 0, 1)
     try:
-        dense = grow_scene(scene, seeds, *images)
+        dense = grow_scene(scene, seeds, *images, pose_is_known=pose_is_known)
     except DegenerateError as error:
         notes = (*scene.reconstruction.notes, f"no dense cloud: {error}")
         return replace(scene, reconstruction=replace(scene.reconstruction, notes=notes)), seeds

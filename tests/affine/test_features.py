@@ -11,7 +11,7 @@ from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.features import match_affine_features
 from rigkit.affine.homography import affines_from_homography
 from rigkit.affine.normal import normals_from_affines
-from rigkit.affine.refine_patches import refine_patches
+from rigkit.affine.refine_patches import patch_pyramid, refine_patches
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
@@ -116,7 +116,7 @@ def test_refinement_pulls_in_a_poor_start(images: tuple[np.ndarray, np.ndarray],
     pixels2, A21 = truth(pixels1)
     start = A21 + 0.08 * rng.normal(size=A21.shape)
     moved = pixels2 + 0.8 * rng.normal(size=pixels2.shape)
-    out = refine_patches(*(v.astype(np.float32) for v in images), pixels1, moved, start)
+    out = refine_patches(*(patch_pyramid(v) for v in images), pixels1, moved, start)
     assert out.valid.mean() > 0.7
     good = out.valid & (out.correlation > 0.9)
     assert np.median(np.linalg.norm(out.pixels2 - pixels2, axis=1)[good]) < 0.15
@@ -125,10 +125,17 @@ def test_refinement_pulls_in_a_poor_start(images: tuple[np.ndarray, np.ndarray],
 
 def test_patches_outside_are_invalid(images: tuple[np.ndarray, np.ndarray]) -> None:
     at = np.array([[2.0, 2.0], [200.0, 150.0]])
-    out = refine_patches(*(images[0].astype(np.float32),) * 2, at, at, np.stack([np.eye(2)] * 2))
+    out = refine_patches(*(patch_pyramid(images[0]),) * 2, at, at, np.stack([np.eye(2)] * 2))
     assert out.valid.tolist() == [False, True]
     np.testing.assert_allclose(out.A21[1], np.eye(2), atol=1e-6)
-    assert len(refine_patches(images[0], images[1], at[:0], at[:0], np.zeros((0, 2, 2))).valid) == 0
+    assert (
+        len(
+            refine_patches(
+                patch_pyramid(images[0]), patch_pyramid(images[1]), at[:0], at[:0], np.zeros((0, 2, 2))
+            ).valid
+        )
+        == 0
+    )
 
 
 def test_refusals(images: tuple[np.ndarray, np.ndarray]) -> None:

@@ -90,6 +90,32 @@ def test_two_images(tmp_path: Path, rng: np.random.Generator, capsys: pytest.Cap
     assert found == ["cloud.png", "correspondences.csv", "epipolar.png", "normals.png", "scene.ply"]
 
 
+def test_a_measured_pose_is_kept(tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]) -> None:
+    corner = Corner.random(rng)
+    save_camera(tmp_path / "camera.json", SMALL)
+    names = []
+    for name, pose in (("a.png", Rigid3.identity()), ("b.png", CAM2_FROM_CAM1)):
+        cv2.imwrite(str(tmp_path / name), corner.image(SMALL, pose, rng))
+        names.append(str(tmp_path / name))
+    np.savetxt(tmp_path / "pose.txt", CAM2_FROM_CAM1.matrix())
+    said = ("--images", *names, "--json", "--no-pictures", "--pose")
+    assert run(tmp_path, *said, str(tmp_path / "pose.txt")) == 0
+    result = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose(result["cam2_from_cam1"], CAM2_FROM_CAM1.matrix(), atol=1e-9)
+    assert result["unit"] == "mm"
+    cloud = read_ply(tmp_path / "out" / "scene.ply")
+    assert len(cloud) == result["points"] > 1000
+    # The corner is 1.3 m away; its diagonal is 1.5 m.
+    assert 800.0 < np.median(np.linalg.norm(cloud.points_mm, axis=1)) < 1500.0
+    wrong = Rigid3(exp_so3(np.array([0.0, 0.0, 0.3])) @ TURN, CAM2_FROM_CAM1.translation_mm)
+    (tmp_path / "wrong.json").write_text(json.dumps({"cam2_from_cam1": wrong.matrix().tolist()}))
+    assert run(tmp_path, *said, str(tmp_path / "wrong.json"), "--force") == 3
+    assert "agree" in capsys.readouterr().err
+    (tmp_path / "short.txt").write_text("1 2 3")
+    assert run(tmp_path, *said, str(tmp_path / "short.txt"), "--force") == 2
+    assert "3 numbers" in capsys.readouterr().err
+
+
 def test_bad_input_is_one_line(files: tuple[Path, Rigid3], capsys: pytest.CaptureFixture[str]) -> None:
     folder, _ = files
     found, camera = str(folder / "found.csv"), str(folder / "camera.json")

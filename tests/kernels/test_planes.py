@@ -8,7 +8,7 @@ from kernels.reference import planes as reference
 from rigkit.geometry.rotation import unit
 from rigkit.kernels.planes import fitted_planes
 
-RULES = {"reach": 3, "rounds": 5, "turn": 2.385}
+REACH, ROUNDS, TURN = 3, 5, 2.385
 ROUNDING = 1e-4
 """Both solve badly scaled systems of three unknowns, twice as many digits lost as kept; the loss has several minima."""
 
@@ -32,7 +32,10 @@ def step_edge(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
 
 def test_planes_are_fitted_as_defined(rng: np.random.Generator) -> None:
     values, information, frames, _ = step_edge(rng)
-    ours, theirs = (fit(values, information, frames, **RULES) for fit in (fitted_planes, reference.fitted_planes))
+    ours, theirs = (
+        fit(values, information, frames, reach=REACH, rounds=ROUNDS, turn=TURN)
+        for fit in (fitted_planes, reference.fitted_planes)
+    )
     for one, two in zip(ours, theirs, strict=True):
         np.testing.assert_array_equal(np.isfinite(one), np.isfinite(two))
         scale = np.nanmax(np.abs(two))
@@ -41,7 +44,7 @@ def test_planes_are_fitted_as_defined(rng: np.random.Generator) -> None:
 
 def test_an_edge_stays_sharp(rng: np.random.Generator) -> None:
     values, information, frames, truth = step_edge(rng)
-    planes, _, support = fitted_planes(values, information, frames, **RULES)
+    planes, _, support = fitted_planes(values, information, frames, reach=REACH, rounds=ROUNDS, turn=TURN)
     good = np.isfinite(support)
     assert good.sum() > 450
     off = np.abs(np.sum((planes - truth) * frames[..., 0, :], axis=-1))[good]

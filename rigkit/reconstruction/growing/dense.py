@@ -23,7 +23,7 @@ from rigkit.reconstruction.growing.surface import GrownSurface, fit_surface, mea
 from rigkit.reconstruction.growing.systematic import SystematicPose, pose_with_field
 from rigkit.reconstruction.reconstruct import Reconstruction, colours_at
 from rigkit.reconstruction.scene import MAX_RANGE_SIGMA, SceneReconstruction, in_unit
-from rigkit.reconstruction.scene_pose import fit_scene_pose
+from rigkit.reconstruction.scene_pose import KnownPose, fit_scene_pose, known_scene_pose
 from rigkit.relative_pose.solvers.pose import essential_from_pose, translation_basis
 from rigkit.relative_pose.solvers.weights import affinity_residuals
 
@@ -79,8 +79,12 @@ def grow_scene(
     seeds: Correspondences,
     image1: NDArray[np.generic],
     image2: NDArray[np.generic],
+    *,
+    pose_is_known: bool = False,
 ) -> DenseScene:
     """Return the dense cloud of two images whose `seeds` gave the reconstruction `sparse`.
+
+    With `pose_is_known` its pose is not estimated again.
 
     Raises
     ------
@@ -91,7 +95,7 @@ def grow_scene(
     view1 = GrowingView.of(grey_of(image1, "image 1"), r.camera1)
     view2 = GrowingView.of(grey_of(image2, "image 2"), r.camera2)
     agreeing = seeds.select(sparse.inliers)
-    even = _pose_from_grown(view1, view2, agreeing, sparse)
+    even = _pose_from_grown(view1, view2, agreeing, sparse, fixed=pose_is_known)
     pose, covariance = in_unit(even.pose.cam2_from_cam1, even.pose.covariance, r.baseline_mm)
     known = _knowledge(even.matches, pose)
     step = max(CLOUD_STEP, round(float(np.sqrt(np.prod(view1.size_px) / CLOUD_NODES))))
@@ -134,9 +138,9 @@ class _EvenPose(NamedTuple):
 
 
 def _pose_from_grown(
-    view1: GrowingView, view2: GrowingView, seeds: Correspondences, sparse: SceneReconstruction
+    view1: GrowingView, view2: GrowingView, seeds: Correspondences, sparse: SceneReconstruction, *, fixed: bool
 ) -> _EvenPose:
-    """Return the pose of evenly spread pairs, grown until it does not move any more."""
+    """Return the pose of evenly spread pairs, grown until it does not move any more; where it is `fixed`, as it was."""
     r = sparse.reconstruction
     pose = Rigid3(r.cam2_from_cam1.rotation, unit(r.cam2_from_cam1.translation_mm))
     gate = max(MAX_DISTANCE_PX, GATE * sparse.sigma_px)
@@ -148,6 +152,11 @@ def _pose_from_grown(
             raise DegenerateError(
                 f"only {len(matches)} pairs grow from {len(seeds)} correspondences; the surfaces lack texture"
             )
+        if fixed:
+            assert r.pose_covariance is not None
+            kept = known_scene_pose(matches, KnownPose(r.cam2_from_cam1, r.pose_covariance))
+            found = SystematicPose(kept.refined.cam2_from_cam1, kept.refined.covariance, 0.0)
+            return _EvenPose(found, kept.matches.select(kept.inliers))
         fit = fit_scene_pose(_floored(matches), r.pose_type, r.level_sigma_rad, np.random.default_rng(0), start=pose)
         even = fit.matches.select(fit.inliers)
         found = pose_with_field(
