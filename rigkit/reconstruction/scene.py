@@ -76,7 +76,6 @@ def reconstruct_scene(
     Parameters
     ----------
     correspondences : may be contaminated; their sigmas are only believed relative to each other.
-    camera1, camera2 : calibrated cameras, one object twice where one camera was moved.
     pair_id, seed : for messages; of the robust search.
     pose_type, level_sigma_rad : as for `reconstruct_pair`.
     baseline_mm : length of the baseline where it was measured: then the cloud is in mm.
