@@ -76,7 +76,7 @@ def match_affine_features(
     """
     greys = grey_of(image1, "image1"), grey_of(image2, "image2")
     pyramid1, pyramid2 = (patch_pyramid(grey) for grey in greys)
-    found: _Found | None = None
+    found: _AlignedMatches | None = None
     for views in (_views(tilts),) if tilts is not None else (_views((1.0,)), _views(TILTS)):
         first, second = (_features(grey, views, features_per_view) for grey in greys)
         found = _aligned(first, second, pyramid1, pyramid2, ratio, half_width_px, min_correlation)
@@ -91,7 +91,7 @@ def match_affine_features(
     return found.pairs
 
 
-class _Found(NamedTuple):
+class _AlignedMatches(NamedTuple):
     """The correspondences, and how many matches were tried to align."""
 
     pairs: Correspondences
@@ -106,7 +106,7 @@ def _aligned(
     ratio: float,
     half_width_px: int,
     min_correlation: float,
-) -> _Found:
+) -> _AlignedMatches:
     """Return the matches of two images' features whose patches align."""
     i, j, rank = _match(first, second, ratio)
     once = _unrepeated(first.pixels[i], second.pixels[j], rank)
@@ -124,7 +124,7 @@ def _aligned(
         refined.sigma_px[good],
         refined.sigma_A[good],
     )
-    return _Found(pairs, i.size)
+    return _AlignedMatches(pairs, i.size)
 
 
 def _views(tilts: Sequence[float]) -> list[tuple[float, float]]:

@@ -75,7 +75,7 @@ def reconstruct_scene(
 
     Parameters
     ----------
-    correspondences : may be contaminated; their sigmas are only believed relative to each other.
+    correspondences, camera1, camera2 : some may be wrong, their sigmas only count relative to each other; calibrated.
     pair_id, seed : for messages; of the robust search.
     pose_type, level_sigma_rad : as for `reconstruct_pair`.
     baseline_mm : length of the baseline where it was measured: then the cloud is in mm.
