@@ -19,7 +19,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, in_8_bit
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.kernels.patches import Pyramid
 
-__all__ = ["grey_of", "match_affine_features"]
+__all__ = ["TILTS", "grey_of", "match_affine_features"]
 
 TILTS = (1.0, np.sqrt(2.0), 2.0)
 """Simulated tilts: together with those of the other image they cover slants of 60 degrees and more."""
@@ -29,13 +29,13 @@ SAME_POINT_PX = 8.0
 """Features of different simulated views this near are one point: no rivals in the ratio test."""
 RIVALS = 8
 MIN_CORRELATION = 0.9
-FEATURES = (600, 6000)
+FEATURES_OF_VIEWS = (600, 6000)
 """In a tilted view; and at most in a plain one."""
 AREA_OF_FEATURE = 150.0
 """Pixels of a plain view to one of its strongest features."""
 MAX_TILTED_AREA = 1e6
 """Pixels of a tilted view: larger images are shrunk first."""
-ENOUGH = 80
+ENOUGH_PLAIN = 300
 """Correspondences of plain views; with fewer the tilted ones are looked at too."""
 MIN_SIZE_PX = 64
 
@@ -80,7 +80,7 @@ def match_affine_features(
     for views in (_views(tilts),) if tilts is not None else (_views((1.0,)), _views(TILTS)):
         first, second = (_features(grey, views, features_per_view) for grey in greys)
         found = _aligned(first, second, pyramid1, pyramid2, ratio, half_width_px, min_correlation)
-        if len(found.pairs) >= ENOUGH:
+        if len(found.pairs) >= ENOUGH_PLAIN:
             break
     assert found is not None
     if not len(found.pairs):
@@ -167,7 +167,7 @@ def _features(grey: NDArray[np.uint8], views: Sequence[tuple[float, float]], cou
     for tilt, roll in views:
         image, scale = (grey, 1.0) if tilt == 1.0 else _shrunk(grey)
         area = image.shape[0] * image.shape[1]
-        most = int(np.clip(area / AREA_OF_FEATURE, *FEATURES)) if tilt == 1.0 else FEATURES[0]
+        most = int(np.clip(area / AREA_OF_FEATURE, *FEATURES_OF_VIEWS)) if tilt == 1.0 else FEATURES_OF_VIEWS[0]
         view, mask, view_from_image = _simulated(image, tilt, roll)
         keypoints, descriptors = cv2.SIFT.create(nfeatures=count or most).detectAndCompute(view, mask)
         if not keypoints:

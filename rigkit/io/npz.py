@@ -1,20 +1,23 @@
-"""A reconstruction as npz: for numpy, without loss."""
+"""Arrays as npz, and a reconstruction: for numpy, without loss."""
 
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rigkit.reconstruction.reconstruct import Reconstruction
 
-__all__ = ["cloud_npz"]
+__all__ = ["cloud_npz", "npz_bytes"]
 
 
 def cloud_npz(reconstruction: Reconstruction) -> bytes:
     """Return an npz file: points, normals, sigmas, corners, affinities and the relative pose, units in the names."""
     cloud, matches = reconstruction.cloud, reconstruction.matches
-    arrays = {
+    arrays: dict[str, NDArray[Any]] = {
         "points_mm": cloud.points_mm,
         "normals": cloud.normals,
         "colours": cloud.colours,
@@ -32,6 +35,11 @@ def cloud_npz(reconstruction: Reconstruction) -> bytes:
         arrays["A21"] = matches.A21
     if reconstruction.pose_covariance is not None:
         arrays["pose_covariance"] = reconstruction.pose_covariance
+    return npz_bytes(arrays)
+
+
+def npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    """Return an npz file of these arrays."""
     stream = io.BytesIO()
     np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
     return stream.getvalue()

@@ -11,6 +11,7 @@ from rigkit.core.errors import DegenerateError, RigkitError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import rotation_angle
 from rigkit.geometry.sampson import sampson_distances
 from rigkit.optim.robust_scale import MEDIAN_OF_NORMAL, MEDIAN_OF_RAYLEIGH
 from rigkit.reconstruction.geometry import decide_pose_type
@@ -34,6 +35,8 @@ GATE = 3.3
 AFFINITY_GATE = 3.7
 """The same for the length of two residuals."""
 SCENE_ROUNDS = 4
+CONTRADICTION = 1.5
+"""Times as many matches agree with another pose as with the measured one: that is wrong."""
 MAX_FALSE_ALARMS = 1e-2
 SAMPLE_KINDS: tuple[Sample, ...] = ("points", "affine")
 
@@ -73,13 +76,14 @@ def known_scene_pose(matches: Matches, known: KnownPose) -> ScenePose:
     """
     length = known.baseline_mm
     pose = Rigid3(known.cam2_from_cam1.rotation, known.cam2_from_cam1.translation_mm / length)
-    inliers = np.abs(_in_sigmas(matches, pose)) < QUANTILE * MAX_NOISE
+    near = np.abs(_in_sigmas(matches, pose)) < QUANTILE * MAX_NOISE
+    _require(near)
+    _refuse_contradiction(matches, pose, near)
+    inliers = near
     for _ in range(SCENE_ROUNDS):
-        _require(inliers)
         matches = _with_shown_noise(matches, pose, inliers)
-        inliers = _agreeing(matches, pose)
-    _require(inliers)
-    _a_contrario_test(matches, pose, inliers, 0)
+        inliers = near & _agreeing(matches, pose)
+        _require(inliers)
     px = _in_sigmas(matches, pose)[inliers] * matches.sigma1_px[inliers]
     to_unit = np.repeat([1.0, 1.0 / length], 3)
     refined = RefinedPose(
@@ -93,6 +97,23 @@ def known_scene_pose(matches: Matches, known: KnownPose) -> ScenePose:
         converged=True,
     )
     return ScenePose(matches, refined, inliers, PoseType.GENERAL, None, ())
+
+
+def _refuse_contradiction(matches: Matches, pose: Rigid3, near: BoolArray) -> None:
+    """Raise DegenerateError where another pose explains far more of the matches than the measured one."""
+    try:
+        other = _search(matches, PoseType.GENERAL, np.random.default_rng(0)).refined.cam2_from_cam1
+    except RigkitError:
+        # The matches alone do not determine a pose; nothing speaks against the measured one.
+        return
+    better = np.abs(_in_sigmas(matches, other)) < QUANTILE * MAX_NOISE
+    if better.sum() > CONTRADICTION * near.sum():
+        turn = np.degrees(rotation_angle(other.rotation @ pose.rotation.T))
+        raise DegenerateError(
+            f"{int(near.sum())} of {len(matches)} correspondences agree with the measured pose and {int(better.sum())} "
+            f"with another, turned by {turn:.2f} deg from it; check which camera took which image, and that the pose "
+            "is cam2_from_cam1"
+        )
 
 
 def fit_scene_pose(

@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.affine.correspondences import Correspondences
-from rigkit.affine.features import match_affine_features
+from rigkit.affine.features import TILTS, match_affine_features
 from rigkit.cameras.base import Camera
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.progress import Progress, silent
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.correspondences import correspondences_text, read_correspondences
+from rigkit.io.npz import npz_bytes
 from rigkit.io.ply import ply_bytes
 from rigkit.io.reading import read_text
 from rigkit.reconstruction.growing.dense import grow_scene
@@ -32,6 +33,8 @@ from rigkit.workflows.results import require_folder, write_results
 __all__ = ["CLOUD", "SceneOptions", "SceneResult", "reconstruct_views"]
 
 CLOUD = "scene.ply"
+MAPS = "maps.npz"
+"""Depth, range and normals at pixels of the first image."""
 
 Images: TypeAlias = tuple[NDArray[Any], NDArray[Any]]
 
@@ -124,24 +127,15 @@ def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> 
                 f"images A '{a}' and B '{b}' are the same picture to the last pixel: no baseline; give two images "
                 "taken from different places"
             )
-    found = _correspondences(options, images, progress)
-    scene = reconstruct_scene(
-        found,
-        camera1,
-        camera2,
-        pair_id=name,
-        pose_type=options.pose_type,
-        level_sigma_rad=None if options.level_sigma_deg is None else float(np.deg2rad(options.level_sigma_deg)),
-        baseline_mm=options.baseline_mm,
-        known_pose=known_pose,
-        image1=images[0] if images else None,
-    )
+    scene, found = _sparse(options, (camera1, camera2), known_pose, images, progress)
+    maps: Mapping[str, NDArray[Any]] = {}
     if images and options.grow:
-        scene, found = _grown(scene, found, images, progress, pose_is_known=known_pose is not None)
-    if notes:
-        r = scene.reconstruction
-        scene = replace(scene, reconstruction=replace(r, notes=(*notes, *r.notes)))
+        scene, found, maps = _grown(scene, found, images, progress, pose_is_known=known_pose is not None)
+    r = scene.reconstruction
+    scene = replace(scene, reconstruction=replace(r, notes=(*notes, *r.notes)))
     files = _files(options, scene, found, images)
+    if maps:
+        files[MAPS] = npz_bytes(maps)
     if options.output is not None:
         cameras = (options.camera, options.camera2, options.rig, options.pose)
         read = (*(options.images or ()), options.correspondences, *cameras)
@@ -191,29 +185,59 @@ def _read_pose(path: Path) -> Rigid3:
     return pose
 
 
-def _correspondences(options: SceneOptions, images: Images | None, progress: Progress) -> Correspondences:
+def _sparse(
+    options: SceneOptions,
+    cameras: tuple[Camera, Camera],
+    known_pose: KnownPose | None,
+    images: Images | None,
+    progress: Progress,
+) -> tuple[SceneReconstruction, Correspondences]:
+    """Return the scene of the correspondences given or matched, and these.
+
+    Where those of plain features do not determine the pose, those of tilted views might.
+    """
+
+    def scene_of(found: Correspondences) -> SceneReconstruction:
+        return reconstruct_scene(
+            found,
+            *cameras,
+            pair_id=options.name,
+            pose_type=options.pose_type,
+            level_sigma_rad=None if options.level_sigma_deg is None else float(np.deg2rad(options.level_sigma_deg)),
+            baseline_mm=options.baseline_mm,
+            known_pose=known_pose,
+            image1=images[0] if images else None,
+        )
+
     if options.correspondences:
-        return read_correspondences(options.correspondences)
+        found = read_correspondences(options.correspondences)
+        return scene_of(found), found
     assert images is not None
-    progress("matching affine features", 0, 1)
-    found = match_affine_features(*images)
-    progress("matching affine features", 1, 1)
-    return found
+    for k, tilts in enumerate((None, TILTS)):
+        progress("matching affine features", 0, 1)
+        found = match_affine_features(*images, tilts=tilts)
+        progress("matching affine features", 1, 1)
+        try:
+            return scene_of(found), found
+        except DegenerateError:
+            if k:
+                raise
+    raise AssertionError("one of two attempts returns or raises")
 
 
 def _grown(
     scene: SceneReconstruction, seeds: Correspondences, images: Images, progress: Progress, *, pose_is_known: bool
-) -> tuple[SceneReconstruction, Correspondences]:
-    """Return the dense scene and its correspondences; where nothing grows, the sparse one that says why."""
+) -> tuple[SceneReconstruction, Correspondences, Mapping[str, NDArray[Any]]]:
+    """Return the dense scene, its correspondences and maps; where nothing grows, the sparse one that says why."""
     progress("growing correspondences", 0, 1)
     try:
         dense = grow_scene(scene, seeds, *images, pose_is_known=pose_is_known)
     except DegenerateError as error:
         notes = (*scene.reconstruction.notes, f"no dense cloud: {error}")
-        return replace(scene, reconstruction=replace(scene.reconstruction, notes=notes)), seeds
+        return replace(scene, reconstruction=replace(scene.reconstruction, notes=notes)), seeds, {}
     finally:
         progress("growing correspondences", 1, 1)
-    return dense.scene, dense.correspondences
+    return dense.scene, dense.correspondences, dense.maps()
 
 
 def _files(

@@ -87,7 +87,14 @@ def test_two_images(tmp_path: Path, rng: np.random.Generator, capsys: pytest.Cap
     result = json.loads(capsys.readouterr().out)
     assert max(pose_errors_deg(Rigid3.from_matrix(result["cam2_from_cam1"]), CAM2_FROM_CAM1)) < 0.5
     found = sorted(p.name for p in (tmp_path / "out").iterdir())
-    assert found == ["cloud.png", "correspondences.csv", "epipolar.png", "normals.png", "scene.ply"]
+    assert found == ["cloud.png", "correspondences.csv", "epipolar.png", "maps.npz", "normals.png", "scene.ply"]
+    with np.load(tmp_path / "out" / "maps.npz") as maps:
+        known = np.isfinite(maps["depth"])
+        assert known.sum() == result["points"]
+        points, _ = corner.surface(SMALL, maps["pixels"][known])
+        scale = np.median(points[:, 2] / maps["depth"][known])
+        assert np.median(np.abs(scale * maps["depth"][known] / points[:, 2] - 1.0)) < 0.02
+        np.testing.assert_allclose(np.linalg.norm(maps["normals"][known], axis=-1), 1.0)
 
 
 def test_a_measured_pose_is_kept(tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,7 +9,7 @@ import pytest
 from helpers.epipolar_scenes import pose_errors_deg
 from helpers.textured_scene import Corner
 
-from rigkit.affine.features import match_affine_features
+from rigkit.affine.features import TILTS, match_affine_features
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.geometry.rigid3 import Rigid3
@@ -34,7 +34,7 @@ def grown_corner(lens: str) -> tuple[SceneReconstruction, DenseScene, Corner]:
     rng = np.random.default_rng(5)
     corner, camera = Corner.random(rng), LENSES[lens]
     images = [corner.image(camera, pose, rng) for pose in (Rigid3.identity(), CAM2_FROM_CAM1)]
-    seeds = match_affine_features(*images)
+    seeds = match_affine_features(*images, tilts=TILTS)
     sparse = reconstruct_scene(seeds, camera, camera, baseline_mm=BASELINE_MM, image1=images[0])
     return sparse, grow_scene(sparse, seeds, *images), corner
 
@@ -65,6 +65,8 @@ def test_a_corner_is_grown_densely_and_its_errors_are_as_stated(lens: str) -> No
     turned = angle_between(cloud.normals, normals)
     assert np.median(off[same] / np.linalg.norm(points, axis=1)[same]) < 1.0e-3
     assert np.degrees(np.median(turned[same])) < 1.0
+    # Half of the deviations of two normal distributions are within this.
+    assert 0.5 < np.median(turned[same] / cloud.normal_sigma_rad[same]) / 0.8326 < 2.0
     np.testing.assert_array_equal(r.pixels1, dense.grown.pixels1.reshape(-1, 2)[dense.nodes])
     # The grid's own planes are the cloud.
     np.testing.assert_allclose(dense.surface.points.reshape(-1, 3)[dense.nodes], cloud.points_mm)

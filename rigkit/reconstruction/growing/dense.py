@@ -73,6 +73,25 @@ class DenseScene:
         """All pairs that were grown."""
         return self.grown.correspondences()
 
+    def maps(self) -> dict[str, NDArray[np.float64]]:
+        """Return depth (along the axis of camera 1), range and normals at the pixels of image 1 that are nodes.
+
+        Arrays (R, C) and (R, C, 3) with `pixels` (R, C, 2); NaN where the surface is not known.
+        """
+        r = self.scene.reconstruction
+        step, shape = self.grown.step, self.surface.valid.shape
+        pixels = np.stack(np.meshgrid(*(step * np.arange(float(n)) for n in shape[::-1])), axis=-1)
+        rays, seen = r.camera1.unproject(pixels)
+        plane = np.full((*shape, 3), np.nan)
+        known = np.zeros(seen.size, dtype=bool)
+        known[self.nodes] = True
+        known &= seen.ravel()
+        plane.reshape(-1, 3)[known] = self.surface.plane.reshape(-1, 3)[known]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = 1.0 / np.sum(plane * rays, axis=-1)
+            normals = -plane / np.linalg.norm(plane, axis=-1, keepdims=True)
+        return {"pixels": pixels, "depth": distance * rays[..., 2], "range": distance, "normals": normals}
+
 
 def grow_scene(
     sparse: SceneReconstruction,
@@ -106,7 +125,7 @@ def grow_scene(
             "show surfaces with texture"
         )
     measured = measure(grown, r.camera1, r.camera2, pose)
-    surface = fit_surface(measured, step)
+    surface = fit_surface(measured, step, even.pose.amplitude_px)
     by_pose, of_pose = _moved_planes(grown, r, pose, covariance)
     cloud, nodes = _cloud(grown, surface, by_pose, of_pose, image1)
     matches, _ = grown.correspondences().matches(r.camera1, r.camera2)

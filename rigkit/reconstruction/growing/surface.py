@@ -18,8 +18,10 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, Normals, Points
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import angle_between
 from rigkit.geometry.triangulation import triangulate_rays
 from rigkit.kernels.planes import fitted_planes
+from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 from rigkit.reconstruction.growing.grow import GrownPatches
 
 __all__ = ["GrownSurface", "NodeMeasurements", "fit_surface", "measure"]
@@ -113,8 +115,11 @@ def measure(grown: GrownPatches, camera1: Camera, camera2: Camera, cam2_from_cam
     return NodeMeasurements(z=spread(z), covariance=spread(covariance), frame=spread(frame), slope=spread(slope))
 
 
-def fit_surface(measured: NodeMeasurements, step: int) -> GrownSurface:
+def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -> GrownSurface:
     """Return the planes around all nodes, which are `step` px apart.
+
+    Their covariance is scaled by what planes disagree by that share no node: neighbouring patches share their pixels,
+    and surfaces are not flat. `shared_px` is what all places around err by together along their epipolar lines.
 
     Notes
     -----
@@ -142,6 +147,8 @@ def fit_surface(measured: NodeMeasurements, step: int) -> GrownSurface:
         misfit = (measured.z[..., 0] - inverse) * measured.slope
     spread = np.full(normal.shape, np.nan)
     spread[keep] = _inverse(normal[keep])
+    spread *= max(_disagreement(_where(keep, normals), _where(keep, plane), spread, 2 * reach), 1.0) ** 2
+    spread += ((shared_px / measured.slope) ** 2)[..., None, None] * ray[..., :, None] * ray[..., None, :]
     return GrownSurface(
         points=_where(keep, points),
         normals=_where(keep, normals),
@@ -150,6 +157,20 @@ def fit_surface(measured: NodeMeasurements, step: int) -> GrownSurface:
         support=_where(keep, support),
         misfit=_where(keep, misfit),
     )
+
+
+def _disagreement(normals: Normals, plane: FloatArray, covariance: FloatArray, lag: int) -> float:
+    """Return by how many of their standard deviations the normals of nodes `lag` apart differ; 1 where none do."""
+    across = np.eye(3) - normals[..., :, None] * normals[..., None, :]
+    variance = np.einsum("...ij,...jk,...ik->...", across, covariance, across) / np.sum(plane**2, axis=-1)
+    ratios = []
+    for one, other in ((np.s_[:, :-lag], np.s_[:, lag:]), (np.s_[:-lag], np.s_[lag:])):
+        angle = angle_between(normals[one], normals[other])
+        ratios.append((angle / np.sqrt(variance[one] + variance[other])).ravel())
+    ratio = np.concatenate(ratios)
+    ratio = ratio[np.isfinite(ratio)]
+    # The angle has two components.
+    return float(np.median(ratio)) * np.sqrt(2.0) / MEDIAN_OF_RAYLEIGH if ratio.size else 1.0
 
 
 def _inverse(normal: FloatArray) -> FloatArray:
