@@ -40,6 +40,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "handeye": ("rigkit.cli.handeye", "where a camera sits on a robot, from its poses and images of a board"),
     "rectify": ("rigkit.cli.rectify", "perspective, cylindrical, equirectangular or stereo images from any camera's"),
     "reconstruct": ("rigkit.cli.reconstruct", "oriented clouds (PLY) and pictures of every pair"),
+    "mesh": ("rigkit.cli.mesh", "a surface through an oriented cloud (screened Poisson), as a mesh"),
     "validate": ("rigkit.cli.validate", "the tables against measured truth, report and PLY; exit 1 if a check fails"),
     "simulate": ("rigkit.cli.simulate", "the synthetic study: sweeps over noise, box plots, tables"),
     "crosscheck": ("rigkit.cli.crosscheck", "the same pairs through pycolmap and other ways"),

@@ -32,6 +32,8 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--baseline-mm", type=float, metavar="MM", help="measured baseline (default: it is the unit)")
     group.add_argument("--pose-type", choices=POSE_TYPES, default="general", help="of the two views (default general)")
     group.add_argument("--sparse", action="store_true", help="only the matched features; do not grow a dense cloud")
+    group.add_argument("--float", action="store_true", help="write the cloud in single precision")
+    group.add_argument("--confidence", action="store_true", help="the length of a normal says how sure it is")
     group.add_argument("--level-sigma-deg", type=float, metavar="DEG", help="how well that pose type holds")
 
 
@@ -69,6 +71,8 @@ def run_scene(args: argparse.Namespace) -> int:
         force=args.force,
         pictures=not args.no_pictures,
         grow=not args.sparse,
+        single_precision=args.float,
+        confidence=args.confidence,
     )
     done = reconstruct_views(options, progress=progress_on_stderr())
     scene, r = done.scene, done.scene.reconstruction

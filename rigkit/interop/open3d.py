@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Normals, Points, as_array
 from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import DegenerateError
 
-__all__ = ["from_open3d", "mean_and_covariance", "plane_inliers", "to_open3d"]
+__all__ = ["Mesh", "from_open3d", "mean_and_covariance", "plane_inliers", "poisson_mesh", "to_open3d"]
 
 
 def to_open3d(cloud: OrientedCloud) -> Any:
@@ -64,3 +65,44 @@ def _point_cloud(points: Points) -> Any:
 
     # Open3D takes a view of the memory and refuses one that is read-only.
     return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(np.array(points, dtype=np.float64)))
+
+
+class Mesh(NamedTuple):
+    """A triangle mesh: points (V, 3) and normals (V, 3) of its vertices, colours (V, 3) uint8, triangles (T, 3)."""
+
+    points: Points
+    normals: Normals
+    colours: NDArray[np.uint8]
+    triangles: NDArray[np.int32]
+
+
+def poisson_mesh(cloud: OrientedCloud, *, depth: int, cut: float) -> Mesh:
+    """Return the screened Poisson surface of an oriented cloud (Kazhdan and Hoppe, TOG 2013).
+
+    Parameters
+    ----------
+    cloud : its normals say which side is outside.
+    depth : of the octree: 2^depth cells along the longest side.
+    cut : share of the vertices, those with the fewest points near, that is cut off: Poisson closes every surface.
+
+    Raises
+    ------
+    DegenerateError
+        Nothing is left of the surface.
+    """
+    import open3d
+
+    mesh, density = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
+        to_open3d(cloud), depth=depth, n_threads=1
+    )
+    if cut > 0.0 and len(mesh.vertices):
+        mesh.remove_vertices_by_mask(np.asarray(density) < np.quantile(np.asarray(density), cut))
+    if not len(mesh.triangles):
+        raise DegenerateError(f"mesh: no surface of {len(cloud)} points; lower the depth or the cut")
+    mesh.compute_vertex_normals()
+    return Mesh(
+        np.asarray(mesh.vertices, dtype=np.float64),
+        np.asarray(mesh.vertex_normals, dtype=np.float64),
+        np.rint(255.0 * np.asarray(mesh.vertex_colors)).astype(np.uint8),
+        np.asarray(mesh.triangles, dtype=np.int32),
+    )

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from rigkit.core.arrays import FloatArray
 from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import InputError
 from rigkit.io.files import write_atomic
@@ -75,15 +76,30 @@ def write_ply(
 
 
 def ply_bytes(
-    cloud: OrientedCloud, *, single_precision: bool = False, comments: Iterable[str] = (), unit: str = "mm"
+    cloud: OrientedCloud,
+    *,
+    single_precision: bool = False,
+    confidence: bool = False,
+    comments: Iterable[str] = (),
+    unit: str = "mm",
 ) -> bytes:
-    """Return the file's content; raises InputError for an empty cloud."""
+    """Return the file's content; raises InputError for an empty cloud.
+
+    With `confidence` the length of a normal says how sure it is, one for the median: what PoissonRecon's --confidence
+    weights points by.
+    """
     if len(cloud) == 0:
         raise InputError("point cloud: it has no points, so there is nothing to write; see what was dropped, and why")
     real = "float" if single_precision else "double"
+    normals = cloud.normals
+    if confidence:
+        sigma = cloud.normal_sigma_rad
+        known = np.isfinite(sigma) & (sigma > 0.0)
+        usual = float(np.median(sigma[known])) if known.any() else 1.0
+        normals = normals * (usual / np.where(known, sigma, usual))[:, None]
     columns: list[tuple[str, str, NDArray[np.generic]]] = [
         *((name, real, cloud.points_mm[:, i]) for i, name in enumerate(POINT)),
-        *((name, real, cloud.normals[:, i]) for i, name in enumerate(NORMAL_COLUMNS)),
+        *((name, real, normals[:, i]) for i, name in enumerate(NORMAL_COLUMNS)),
         *((name, "uchar", cloud.colours[:, i]) for i, name in enumerate(COLOUR)),
         ("board", "int", cloud.board_index),
         ("column", "int", cloud.grid[:, 0]),
@@ -137,7 +153,7 @@ def read_ply(path: str | Path) -> OrientedCloud:
     try:
         return OrientedCloud(
             points_mm=np.stack([table[name] for name in POINT], axis=-1).astype(np.float64),
-            normals=np.stack([table[name] for name in NORMAL_COLUMNS], axis=-1).astype(np.float64),
+            normals=_unit_normals(np.stack([table[name] for name in NORMAL_COLUMNS], axis=-1).astype(np.float64)),
             colours=np.stack([column(name, 128) for name in COLOUR], axis=-1).astype(np.uint8),
             board_index=column("board", -1).astype(np.int64),
             grid=np.stack([column("column", 0), column("row", 0)], axis=-1).astype(np.int64),
@@ -148,6 +164,14 @@ def read_ply(path: str | Path) -> OrientedCloud:
         )
     except InputError as error:
         raise InputError(f"point cloud '{source}': {error}") from error
+
+
+def _unit_normals(normals: FloatArray) -> FloatArray:
+    """Return normals (N, 3) of length one: some files' lengths say how sure they are. Zero ones stay."""
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    # Those that are of length one but for rounding are as they were written.
+    whole = (np.abs(length - 1.0) < 1e-6) | ~(length > 0.0)
+    return np.asarray(normals / np.where(whole, 1.0, length))
 
 
 def _header(data: bytes, source: Path) -> tuple[int, list[tuple[str, str]], tuple[str, ...], int]:

@@ -69,6 +69,10 @@ class SceneOptions:
     """Folder for the results; None: nothing is written."""
     force: bool = False
     """Replace results that are there; what was read is never replaced."""
+    single_precision: bool = False
+    """Write the cloud in 32 bits, for programs that know no other."""
+    confidence: bool = False
+    """Let the length of the cloud's normals say how sure they are."""
     pictures: bool = True
     """Draw the cloud, the epipolar curves and the normals."""
 
@@ -245,7 +249,9 @@ def _files(
 ) -> dict[str, str | bytes]:
     r = scene.reconstruction
     unit = "mm" if scene.metric else "baselines"
-    files: dict[str, str | bytes] = {CLOUD: ply_bytes(r.cloud, unit=unit)}
+    files: dict[str, str | bytes] = {
+        CLOUD: ply_bytes(r.cloud, unit=unit, single_precision=options.single_precision, confidence=options.confidence)
+    }
     if not options.correspondences:
         files["correspondences.csv"] = correspondences_text(found)
     if not options.pictures:

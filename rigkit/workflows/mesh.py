@@ -1,0 +1,55 @@
+"""A mesh through an oriented cloud."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from rigkit.core.errors import InputError
+from rigkit.core.progress import Progress, silent
+from rigkit.interop.open3d import Mesh, poisson_mesh
+from rigkit.io.files import ensure_writable, write_atomic
+from rigkit.io.mesh_file import mesh_bytes
+from rigkit.io.ply import read_ply
+
+__all__ = ["MeshOptions", "mesh_cloud"]
+
+MAX_OCTREE_DEPTH = 12
+"""Each level more takes four times the memory: of this one, several GB."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeshOptions:
+    """How a cloud becomes a mesh."""
+
+    output: Path
+    """PLY file to write."""
+    depth: int = 9
+    """Of the octree: 2^depth cells along the longest side."""
+    cut: float = 0.02
+    """Share of the vertices, those with the fewest points near, that is cut off."""
+    force: bool = False
+    """Replace an existing file; the cloud is never replaced."""
+
+
+def mesh_cloud(cloud: str | Path, options: MeshOptions, *, progress: Progress = silent) -> Mesh:
+    """Write the screened Poisson surface of the oriented cloud in a PLY file, and return it.
+
+    Raises
+    ------
+    InputError
+        The cloud cannot be read or has no normals, the file cannot be written, options without a meaning.
+    DegenerateError
+        Nothing is left of the surface.
+    """
+    if not 3 <= options.depth <= MAX_OCTREE_DEPTH:
+        raise InputError(f"mesh: the depth of the octree is 3 to {MAX_OCTREE_DEPTH}, got {options.depth}")
+    if not 0.0 <= options.cut < 1.0:
+        raise InputError(f"mesh: the share that is cut off is from 0 to below 1, got {options.cut}")
+    ensure_writable(options.output, force=options.force, inputs=[Path(cloud)])
+    points = read_ply(cloud)
+    progress("fitting the surface", 0, 1)
+    mesh = poisson_mesh(points, depth=options.depth, cut=options.cut)
+    progress("fitting the surface", 1, 1)
+    write_atomic(options.output, mesh_bytes(*mesh), force=options.force)
+    return mesh

@@ -1,0 +1,202 @@
+"""Clouds of real pairs against truth: points, depth, normals, meshes and poses, beside OpenCV's semi-global matching.
+
+python scripts/bench_clouds.py ../shared/data/scenes            every pair of pairs.json
+python scripts/bench_clouds.py ../shared/data/scenes motorcycle --known-pose
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from rigkit.affine.features import grey_of, match_affine_features
+from rigkit.cameras.base import Camera
+from rigkit.cameras.registry import camera_model
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import angle_between, log_so3, rotation_angle, unit
+from rigkit.interop.open3d import poisson_mesh
+from rigkit.io.images import read_image
+from rigkit.reconstruction.growing.dense import DenseScene, grow_scene
+from rigkit.reconstruction.scene import reconstruct_scene
+from rigkit.reconstruction.scene_pose import KnownPose
+from rigkit.relative_pose.solvers.pose import translation_basis
+
+AUC_DEG = (1.0, 5.0, 10.0)
+NEAR_REL = 0.02
+"""Share of the depth that a mesh may be off by."""
+PLANE_PX = 3
+MAX_UNEVEN_PX = 0.15
+"""Where truth is a plane: over 7 x 7 pixels, to this part of a disparity."""
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A pair with its truth."""
+
+    name: str
+    kind: str
+    images: tuple[Any, Any]
+    cameras: tuple[Camera, Camera]
+    pose: Rigid3
+
+
+def cases(folder: Path, names: list[str]) -> list[Case]:
+    out = []
+    for entry in json.loads((folder / "pairs.json").read_text()):
+        if names and entry["name"] not in names and entry["set"] not in names:
+            continue
+        images = read_image(folder / entry["image1"]), read_image(folder / entry["image2"])
+        first, second = (
+            camera_model(model)(tuple(size), np.array(values))
+            for model, size, values in (entry["camera1"], entry["camera2"])
+        )
+        t = entry["baseline"] * unit(np.array(entry["cam2_from_cam1_t_direction"]))
+        pose = Rigid3(np.array(entry["cam2_from_cam1_R"]), t)
+        out.append(Case(entry["name"], entry["set"], images, (first, second), pose))
+    return out
+
+
+def reconstructed(case: Case, known: bool) -> tuple[DenseScene, float, float]:
+    """Return the dense scene, and the processor time of matching and of the rest."""
+    start = time.process_time()
+    seeds = match_affine_features(*case.images)
+    matched = time.process_time()
+    pose = KnownPose(case.pose, np.zeros((6, 6))) if known else None
+    length = float(np.linalg.norm(case.pose.translation_mm))
+    sparse = reconstruct_scene(seeds, *case.cameras, baseline_mm=length, known_pose=pose, image1=case.images[0])
+    dense = grow_scene(sparse, seeds, *case.images, pose_is_known=known)
+    return dense, matched - start, time.process_time() - matched
+
+
+def pose_errors(dense: DenseScene, truth: Rigid3) -> tuple[float, float, float]:
+    """Return rotation and direction errors in degrees, and the root of Mahalanobis' distance a degree of freedom."""
+    r = dense.scene.reconstruction
+    t, true = unit(r.cam2_from_cam1.translation_mm), unit(truth.translation_mm)
+    turn = truth.rotation @ r.cam2_from_cam1.rotation.T
+    to_five = np.zeros((5, 6))
+    to_five[:3, :3], to_five[3:, 3:] = np.eye(3), translation_basis(t) / r.baseline_mm
+    off = np.concatenate([log_so3(turn), translation_basis(t) @ (true - t)])
+    assert r.pose_covariance is not None
+    covariance = to_five @ r.pose_covariance @ to_five.T
+    distance = off @ np.linalg.solve(covariance, off) / 5.0 if covariance.any() else np.nan
+    degrees = np.degrees([float(rotation_angle(turn)), float(angle_between(t, true))])
+    return float(degrees[0]), float(degrees[1]), float(np.sqrt(distance))
+
+
+def disparity_truth(folder: Path, case: Case) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return depth, normals and where these are known, (H, W, ...), of a rectified pair with its disparities."""
+    with np.load(folder / "middlebury" / f"{case.name}_disp.npz") as stored:
+        disparity = stored[stored.files[0]].astype(np.float64)
+    f, _, cx1, cy = (float(value) for value in case.cameras[0].parameters[:4])
+    shift = case.cameras[1].parameters[2] - cx1
+    disparity[~np.isfinite(disparity)] = np.nan
+    inverse = (disparity + shift) / (f * np.linalg.norm(case.pose.translation_mm))
+    return depth_and_normals(inverse, f, cx1, cy)
+
+
+def depth_and_normals(inverse: np.ndarray, f: float, cx: float, cy: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return depth, normals by differentiating over 7 x 7 pixels, and where the surface is smooth."""
+    side = 2 * PLANE_PX + 1
+    line = np.arange(-PLANE_PX, PLANE_PX + 1.0)
+    known = np.isfinite(inverse)
+    filled = np.where(known, inverse, 0.0)
+    by_u = cv2.filter2D(filled, -1, np.outer(np.ones(side), line) / (side * np.sum(line**2)))
+    by_v = cv2.filter2D(filled, -1, np.outer(line, np.ones(side)) / (side * np.sum(line**2)))
+    variance = cv2.blur(filled**2, (side, side)) - cv2.blur(filled, (side, side)) ** 2
+    uneven = np.sqrt(np.maximum(variance - (by_u**2 + by_v**2) * np.mean(line**2), 0.0))
+    scale = np.nanmedian(inverse)
+    whole = cv2.erode(known.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+    u, v = np.meshgrid(np.arange(inverse.shape[1]), np.arange(inverse.shape[0]))
+    x, y = (u - cx) / f, (v - cy) / f
+    plane = np.stack([f * by_u, f * by_v, filled - by_u * f * x - by_v * f * y], axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = 1.0 / inverse
+        normals = -plane / np.linalg.norm(plane, axis=-1, keepdims=True)
+    # A disparity of the median depth is one part in (scale * f * b) of it; b is in the unit of the depth.
+    return depth, normals, whole & (uneven < MAX_UNEVEN_PX / 70.0 * scale)
+
+
+def against_truth(
+    points: np.ndarray, normals: np.ndarray, pixels: np.ndarray, truth: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> str:
+    depth, true_normals, smooth = truth
+    height, width = depth.shape
+    u, v = np.clip(np.rint(pixels).astype(int), 0, [width - 1, height - 1]).T
+    good = np.isfinite(depth[v, u]) & np.isfinite(points[:, 2])
+    off = np.abs(points[:, 2] / depth[v, u] - 1.0)[good]
+    compared = good & smooth[v, u]
+    angle = np.degrees(angle_between(normals[compared], true_normals[v, u][compared]))
+    return f"{len(points)} points, depth {100 * np.median(off):.3f} %, normals {np.median(angle):.2f} deg"
+
+
+def mesh_share(dense: DenseScene, camera: Camera, depth: np.ndarray) -> float:
+    """Return the share of the true pixels that the Poisson mesh of the cloud is within NEAR_REL of."""
+    import open3d
+
+    mesh = poisson_mesh(dense.scene.reconstruction.cloud, depth=9, cut=0.0)
+    scene = open3d.t.geometry.RaycastingScene()
+    scene.add_triangles(
+        open3d.core.Tensor(mesh.points.astype(np.float32)), open3d.core.Tensor(mesh.triangles.astype(np.uint32))
+    )
+    v, u = np.nonzero(np.isfinite(depth))
+    rays, _ = camera.unproject(np.stack([u, v], axis=-1).astype(np.float64))
+    hit = scene.cast_rays(open3d.core.Tensor(np.concatenate([np.zeros_like(rays), rays], axis=1).astype(np.float32)))
+    found = hit["t_hit"].numpy() * rays[:, 2]
+    return float(np.mean(np.abs(found / depth[v, u] - 1.0) < NEAR_REL))
+
+
+def semi_global(case: Case) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return points, normals and pixels by OpenCV's StereoSGBM on a rectified pair, normals as those of the truth."""
+    grey1, grey2 = (grey_of(image, "image") for image in case.images)
+    matcher = cv2.StereoSGBM.create(0, 80, 5, 8 * 25, 32 * 25, 1, 0, 10, 100, 2, cv2.STEREO_SGBM_MODE_HH)
+    disparity = matcher.compute(grey1, grey2).astype(np.float64) / 16.0
+    f, _, cx1, cy = (float(value) for value in case.cameras[0].parameters[:4])
+    shift = case.cameras[1].parameters[2] - cx1
+    inverse = np.where(disparity > 0.0, disparity + shift, np.nan) / (f * np.linalg.norm(case.pose.translation_mm))
+    depth, normals, _ = depth_and_normals(inverse, f, cx1, cy)
+    v, u = np.nonzero(np.isfinite(depth))
+    x = np.stack([(u - cx1) / f, (v - cy) / f, np.ones(len(u))], axis=-1)
+    return x * depth[v, u][:, None], normals[v, u], np.stack([u, v], axis=-1).astype(np.float64)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="with pairs.json")
+    parser.add_argument("names", nargs="*", help="pairs or sets (default: all)")
+    parser.add_argument("--known-pose", action="store_true", help="use the true pose instead of estimating it")
+    args = parser.parse_args()
+    errors, distances = [], []
+    for case in cases(args.folder, args.names):
+        dense, matching, rest = reconstructed(case, args.known_pose)
+        turn, swing, distance = pose_errors(dense, case.pose)
+        errors.append(max(turn, swing))
+        distances.append(distance)
+        cloud = dense.scene.reconstruction.cloud
+        print(
+            f"{case.kind} {case.name}: {len(cloud)} points, pose {turn:.3f}/{swing:.3f} deg ({distance:.1f} sigma), "
+            f"{matching:.1f} + {rest:.1f} s",
+            flush=True,
+        )
+        axis = np.degrees(np.arccos(unit(cloud.points_mm)[:, 2]))
+        print(f"  to {axis.max():.0f} deg off axis")
+        if (args.folder / "middlebury" / f"{case.name}_disp.npz").exists():
+            truth = disparity_truth(args.folder, case)
+            print(
+                f"  rigkit: {against_truth(cloud.points_mm, cloud.normals, dense.scene.reconstruction.pixels1, truth)}"
+            )
+            print(f"  StereoSGBM on the rectified pair: {against_truth(*semi_global(case), truth)}")
+            share = mesh_share(dense, case.cameras[0], truth[0])
+            print(f"  Poisson within {100 * NEAR_REL:.0f} %: {100 * share:.0f} % of true pixels")
+    areas = [f"{100 * np.mean(np.maximum(1.0 - np.array(errors) / limit, 0.0)):.1f}" for limit in AUC_DEG]
+    print(f"{len(errors)} pairs: AUC@1/5/10 {'/'.join(areas)}, rms sigmas {np.sqrt(np.mean(np.square(distances))):.1f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,60 @@
+"""`rigkit mesh` end to end: a cloud in, a mesh out that other programs read; bad input in one line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.reconstructions import make_reconstruction
+
+from rigkit.cli.main import main
+from rigkit.io.ply import ply_bytes, read_ply, write_ply
+
+SQUARE_MM = 50.0
+
+
+def test_the_surface_goes_through_the_points(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import open3d
+
+    cloud = make_reconstruction().cloud
+    write_ply(tmp_path / "cloud.ply", cloud)
+    assert main(["mesh", str(tmp_path / "cloud.ply"), "--depth", "6", "--cut", "0.15", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    mesh = open3d.io.read_triangle_mesh(said["mesh"])
+    assert len(mesh.triangles) == said["triangles"] > 100
+    assert len(mesh.vertices) == said["vertices"]
+    assert mesh.has_vertex_normals() and mesh.has_vertex_colors()
+    # Normals that pointed to the wrong side would turn the surface inside out and far away from the points.
+    surface = np.asarray(mesh.sample_points_uniformly(50_000).points)
+    nearest = np.array([np.linalg.norm(surface - p, axis=1).min() for p in cloud.points_mm])
+    assert np.median(nearest) < 0.25 * SQUARE_MM
+
+
+def test_what_cannot_be_meshed_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_ply(tmp_path / "cloud.ply", make_reconstruction().cloud)
+    cloud, taken = str(tmp_path / "cloud.ply"), str(tmp_path / "taken.ply")
+    (tmp_path / "taken.ply").write_text("mine")
+    for arguments, words in (
+        (["gone.ply"], "gone.ply"),
+        ([cloud, "--depth", "40"], "depth"),
+        ([cloud, "--cut", "2"], "cut off"),
+        ([cloud, "-o", taken], "--force"),
+        ([cloud, "-o", cloud, "--force"], "cloud.ply"),
+    ):
+        assert main(["mesh", *arguments]) == 2
+        assert words in capsys.readouterr().err
+    assert (tmp_path / "taken.ply").read_text() == "mine"
+
+
+def test_normals_that_say_how_sure_they_are_are_read_as_unit_ones(tmp_path: Path) -> None:
+    cloud = make_reconstruction().cloud
+    (tmp_path / "sure.ply").write_bytes(ply_bytes(cloud, confidence=True, single_precision=True))
+    np.testing.assert_allclose(read_ply(tmp_path / "sure.ply").normals, cloud.normals, atol=1e-6)
+    import open3d
+
+    length = np.linalg.norm(np.asarray(open3d.io.read_point_cloud(str(tmp_path / "sure.ply")).normals), axis=1)
+    sigma = cloud.normal_sigma_rad
+    assert np.median(length) == pytest.approx(1.0, rel=0.05)
+    np.testing.assert_allclose(length * sigma / np.median(sigma), 1.0, rtol=1e-5)
