@@ -141,13 +141,12 @@ def mesh_share(dense: DenseScene, camera: Camera, depth: np.ndarray) -> float:
     import open3d
 
     mesh = poisson_mesh(dense.scene.reconstruction.cloud, depth=9, cut=0.0)
+    tensor: Any = open3d.core.Tensor
     scene = open3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        open3d.core.Tensor(mesh.points.astype(np.float32)), open3d.core.Tensor(mesh.triangles.astype(np.uint32))
-    )
+    scene.add_triangles(tensor(mesh.points.astype(np.float32)), tensor(mesh.triangles.astype(np.uint32)))
     v, u = np.nonzero(np.isfinite(depth))
     rays, _ = camera.unproject(np.stack([u, v], axis=-1).astype(np.float64))
-    hit = scene.cast_rays(open3d.core.Tensor(np.concatenate([np.zeros_like(rays), rays], axis=1).astype(np.float32)))
+    hit = scene.cast_rays(tensor(np.concatenate([np.zeros_like(rays), rays], axis=1).astype(np.float32)))
     found = hit["t_hit"].numpy() * rays[:, 2]
     return float(np.mean(np.abs(found / depth[v, u] - 1.0) < NEAR_REL))
 

@@ -54,7 +54,7 @@ def test_normals_that_say_how_sure_they_are_are_read_as_unit_ones(tmp_path: Path
     np.testing.assert_allclose(read_ply(tmp_path / "sure.ply").normals, cloud.normals, atol=1e-6)
     import open3d
 
-    length = np.linalg.norm(np.asarray(open3d.io.read_point_cloud(str(tmp_path / "sure.ply")).normals), axis=1)
+    length = np.linalg.norm(np.asarray(open3d.io.read_point_cloud(tmp_path / "sure.ply").normals), axis=1)
     sigma = cloud.normal_sigma_rad
     assert np.median(length) == pytest.approx(1.0, rel=0.05)
     np.testing.assert_allclose(length * sigma / np.median(sigma), 1.0, rtol=1e-5)
