@@ -54,7 +54,6 @@ def test_a_corner_is_grown_densely_and_its_errors_are_as_stated(lens: str) -> No
     sparse, dense, corner = grown_corner(lens)
     r = dense.scene.reconstruction
     cloud = r.cloud
-    # Three quarters of the nodes whose patches the second image has too.
     assert len(cloud) > 10 * len(sparse.reconstruction.cloud)
     assert len(cloud) == len(r.matches) == len(dense.nodes) == len(dense.scene.kept)
     assert max(pose_errors_deg(r.cam2_from_cam1, CAM2_FROM_CAM1)) < 0.1

@@ -33,7 +33,7 @@ POSE_STEP = 8
 """Nodes of the pairs that the pose is estimated from, px: spread evenly, unlike features."""
 CLOUD_STEP = 3
 CLOUD_NODES = 80_000
-"""Nodes of a cloud beyond which they lie further apart: of images of more than 0.7 MP."""
+"""Nodes of a cloud beyond which they lie further apart: of images of more than 1 MP."""
 MAX_DISTANCE_PX = 0.7
 """From the epipolar line, of a pair that is taken; more where the correspondences show more noise."""
 GATE = 3.3
