@@ -128,22 +128,23 @@ def grow_scene(
     surface = fit_surface(measured, step, even.pose.amplitude_px)
     by_pose, of_pose = _moved_planes(grown, r, pose, covariance)
     cloud, nodes = _cloud(grown, surface, by_pose, of_pose, image1)
-    matches, _ = grown.correspondences().matches(r.camera1, r.camera2)
+    matches, seen = grown.correspondences().matches(r.camera1, r.camera2)
     chosen = np.cumsum(grown.valid.ravel())[nodes] - 1
-    distances = _distances(matches, pose)
+    # A pair at the border of a field of view has no match; nor has it a plane.
+    matches = matches.select(np.cumsum(seen)[chosen] - 1)
     dense = replace(
         r,
         affine_method="grown affinities",
-        matches=matches.select(chosen),
-        pixels1=matches.pixels1[chosen],
-        pixels2=matches.pixels2[chosen],
+        matches=matches,
+        pixels1=matches.pixels1,
+        pixels2=matches.pixels2,
         cam2_from_cam1=pose,
         pose_covariance=covariance,
         E21=essential_from_pose(pose),
         cloud=cloud,
-        sampson_rms_px=float(np.sqrt(np.mean(distances[chosen] ** 2))),
+        sampson_rms_px=float(np.sqrt(np.mean(_distances(matches, pose) ** 2))),
     )
-    inliers = np.zeros(len(matches), dtype=bool)
+    inliers = np.zeros(len(seen), dtype=bool)
     inliers[chosen] = True
     scene = SceneReconstruction(dense, sparse.metric, inliers, chosen, known.sigma_px, known.sigma_A)
     return DenseScene(scene=scene, grown=grown, surface=surface, nodes=nodes)
