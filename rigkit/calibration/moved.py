@@ -2,10 +2,13 @@
 
 A board that is not what the model says sets halves apart too, wherever they show it in different ways. So the halves in
 time are compared with halves by place: boards left and right, near and far, tilted this way and that. Only what time
-tells apart more clearly than any of those is a lens that moved.
+tells apart more clearly than any of those is a lens that moved. The same holds for images whose names are of two kinds.
 """
 
 from __future__ import annotations
+
+import re
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -13,7 +16,7 @@ from rigkit.calibration.fit import Fit
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.solver import solve
 from rigkit.calibration.state import State, evaluate
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.findings import Finding, Severity
 
 __all__ = ["moved_lens"]
@@ -26,10 +29,12 @@ AGAINST_PLACE = 1.4
 """They are, if no other way to halve the images sets them apart by more than a part of this. Measured: at most 1.2 for
 one lens with flat, bent and wavy boards, 1.5 and more for 2 % of focal length."""
 HALVES_TOLERANCE = 1e-6
+DIGITS = re.compile(r"\d+")
 
 
 def moved_lens(observations: Observations, fit: Fit) -> tuple[Finding, ...]:
-    """Return a verdict if the two halves of the images, in the order given, have different intrinsics."""
+    """Return a verdict if the two halves of the images, in the order given, have different intrinsics, or those whose
+    names are alike and the others."""
     images = list(dict.fromkeys(observations.images))
     if len(images) < MIN_IMAGES_FOR_HALVES:
         return ()
@@ -37,22 +42,58 @@ def moved_lens(observations: Observations, fit: Fit) -> tuple[Finding, ...]:
     number = np.array([place[name] for name in observations.images])
     # The shape of the boards stays as it was found: two shapes are not two lenses.
     state = fit.state.with_boards_held()
-    distance = _apart(observations, fit, state, number >= len(images) // 2)
-    if not distance > MIN_HALF_SIGMAS:
+    later = np.arange(len(images)) >= len(images) // 2
+    named = _named_alike(images)
+    if named is not None and not (named == later).all() and not (named != later).all():
+        distance = _surely_apart(observations, fit, state, number, named)
+        if distance is not None:
+            other, one = images[int(np.argmax(named))], images[int(np.argmin(named))]
+            message = (
+                f"two cameras are mixed in these images: those called like '{one}' and those called like '{other}' are "
+                f"of different lenses ({distance:.0f} standard deviations)"
+            )
+            return (_bad(message, "calibrate each camera from its own images"),)
+    distance = _surely_apart(observations, fit, state, number, later)
+    if distance is None:
         return ()
+    message = (
+        "the lens (or the board) was another one in the second half of the images, from "
+        f"'{images[len(images) // 2]}' on ({distance:.0f} standard deviations): another camera, or focus, zoom or "
+        "mount moved"
+    )
+    return (_bad(message, "calibrate the halves apart, or retake all"),)
+
+
+def _bad(message: str, remedy: str) -> Finding:
+    return Finding(severity=Severity.BAD, message=message, remedy=remedy)
+
+
+def _named_alike(images: Sequence[str]) -> BoolArray | None:
+    """Return which images (N,) have names other than the first one's but for their digits, of two kinds of names with
+    a fair number each; None where there are no two such kinds."""
+    kinds = [DIGITS.sub("", name) for name in images]
+    if len(set(kinds)) != 2:
+        return None
+    other = np.array([kind != kinds[0] for kind in kinds])
+    return other if 2 * min(other.sum(), (~other).sum()) >= MIN_IMAGES_FOR_HALVES else None
+
+
+def _surely_apart(
+    observations: Observations, fit: Fit, state: State, number: IntArray, second: BoolArray
+) -> float | None:
+    """Return by how many standard deviations the lenses of the images (N,) that are `second` and of the others differ,
+    if by more than those of halves by place; `number` is that of the image of each view (V,)."""
+    distance = _apart(observations, fit, state, second[number])
+    if not distance > MIN_HALF_SIGMAS:
+        return None
     for values in (*_places(observations, state), number % 2):
         of_image = np.bincount(number, values) / np.bincount(number)
-        half = np.argsort(np.argsort(of_image)) >= len(images) // 2
+        half = np.argsort(np.argsort(of_image)) >= len(second) // 2
+        if (half == second).all() or (half != second).all():
+            continue
         if distance < AGAINST_PLACE * _apart(observations, fit, state, half[number]):
-            return ()
-    return (
-        Finding(
-            severity=Severity.BAD,
-            message="the lens (or the board) was another one in the second half of the images, from "
-            f"'{images[len(images) // 2]}' on ({distance:.0f} standard deviations): focus, zoom or mount moved",
-            remedy="calibrate the halves apart, or retake all",
-        ),
-    )
+            return None
+    return distance
 
 
 def _places(observations: Observations, state: State) -> FloatArray:

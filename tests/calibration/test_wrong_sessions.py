@@ -169,3 +169,15 @@ def test_the_verdict_does_not_depend_on_how_the_model_was_reached(rng: np.random
     tried = {candidate.name.split()[0] for candidate in chosen.candidates}
     assert {"pinhole", "brown", "kannala_brandt", "scaramuzza"} <= tried
     assert [c.chosen for c in chosen.candidates].count(True) == 1
+
+
+def test_images_with_two_kinds_of_names_are_of_two_cameras(rng: np.random.Generator) -> None:
+    left = lens("reg")
+    right = left.with_parameters(np.asarray(left.parameters) * np.array([1.03, 1.03, *[1.0] * 7]))
+    views = prefixed(random_views(left, 12, rng, reach_deg=33.0)[0], "left")
+    other = prefixed(random_views(right, 12, rng, reach_deg=33.0)[0], "right")
+    in_turns = [view for pair in zip(views, other, strict=True) for view in pair]
+    mixed = calibrate(in_turns, SIZE, model="brown", board="flat")
+    assert "those called like 'left000.png' and those called like 'right000.png'" in first(mixed)
+    two_names = [replace(v, image=f"{'a' if k % 2 else 'b'}{v.image}") for k, v in enumerate(views)]
+    assert "mixed" not in str(calibrate(two_names, SIZE, model="brown", board="flat").verdicts)

@@ -140,7 +140,7 @@ def test_bad_input(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
     board = session.parent / "board.toml"
     board.write_text(BOARD.replace("columns = 9", "columns = 7"))
     assert main(["calibrate", str(session)]) == 2
-    assert "check columns and rows" in capsys.readouterr().err
+    assert "9 x 6 inner corners are seen in 5 of 5 images, 7 x 6 are declared" in capsys.readouterr().err
 
     board.write_text(BOARD.replace("rows = 6", "rows = 7"))
     assert main(["calibrate", str(session)]) == 2
