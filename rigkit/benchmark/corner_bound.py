@@ -26,7 +26,15 @@ from rigkit.core.errors import InputError
 from rigkit.synthetic.photometry import develop
 from rigkit.synthetic.render import Optics
 
-__all__ = ["ROUNDING_VARIANCE", "corner_information", "position_bound"]
+__all__ = [
+    "BLUR_STEP_PX",
+    "ROUNDING_VARIANCE",
+    "SHIFT_PX",
+    "corner_information",
+    "noise_free_levels",
+    "position_bound",
+    "shifted_scene",
+]
 
 ROUNDING_VARIANCE = 1.0 / 12.0
 """Of rounding to whole grey levels, which is noise wherever brightness varies: it bounds noise-free images, too."""
@@ -46,9 +54,9 @@ def corner_information(scene: BenchScene, blur_px: float) -> tuple[FloatArray, .
     """
     slopes = []
     for axis in (0, 1):
-        before, after = (_levels(_shifted(scene, axis, sign * SHIFT_PX), blur_px) for sign in (-1, 1))
+        before, after = (noise_free_levels(shifted_scene(scene, axis, sign * SHIFT_PX), blur_px) for sign in (-1, 1))
         slopes.append((after - before) / (2.0 * SHIFT_PX))
-    sharper, wider = (_levels(scene, blur_px + sign * BLUR_STEP_PX) for sign in (-1, 1))
+    sharper, wider = (noise_free_levels(scene, blur_px + sign * BLUR_STEP_PX) for sign in (-1, 1))
     pictures = np.stack([*slopes, (wider - sharper) / (2.0 * BLUR_STEP_PX), 0.5 * (wider + sharper)])
     return tuple(_of_board(detection, pictures) for detection in scene.truth())
 
@@ -62,7 +70,7 @@ def position_bound(information: FloatArray, noise_levels: float) -> FloatArray:
     return out
 
 
-def _levels(scene: BenchScene, blur_px: float) -> FloatArray:
+def noise_free_levels(scene: BenchScene, blur_px: float) -> FloatArray:
     """Return the noise-free picture in grey levels, not rounded."""
     picture = scene.radiance(Optics(blur_px))
     # The light is the same whatever is in the picture: that of a white one, in steps of 1/257 of a level.
@@ -70,7 +78,7 @@ def _levels(scene: BenchScene, blur_px: float) -> FloatArray:
     return picture * light
 
 
-def _shifted(scene: BenchScene, axis: int, by_px: float) -> BenchScene:
+def shifted_scene(scene: BenchScene, axis: int, by_px: float) -> BenchScene:
     """Return the scene with its whole picture moved along u (axis 0) or v (axis 1)."""
     names = list(scene.camera.parameter_names())
     centre = ("cx", "cy")[axis]

@@ -8,8 +8,10 @@
 
 enum { X, Y, E1, E2, E3, S, A, B, GX, GY, PARAMETERS };
 
-/* Steps of w = inverse(M) (x - c - H(w, w) / 2): each gains the ratio of bend to size, a tenth. */
+/* Steps of w = inverse(M) (x - c - H(w, w) / 2), at most: each gains the ratio of bend to size. */
 enum { INVERSIONS = 4 };
+/* What the place of a pixel may be off for them, in radii. */
+static const double PLACE_ERROR = 1e-5;
 
 typedef struct {
     double u, v, value;
@@ -17,6 +19,7 @@ typedef struct {
 
 typedef struct {
     double c[2], M[4], H[6], s, a, b, g[2], size;
+    int inversions;
 } circle_t;
 
 /* A pixel as the map places it: place in radii and its distance r from the centre, distance d from the edge in px
@@ -29,7 +32,7 @@ INLINE place_t place_of(const circle_t *at, const double inverse[4], double du, 
 {
     const double *H = at->H, *M = at->M;
     double x = inverse[0] * du + inverse[1] * dv, y = inverse[2] * du + inverse[3] * dv;
-    for (int k = 0; k < INVERSIONS; k++) {
+    for (int k = 0; k < at->inversions; k++) {
         const double hu = du - 0.5 * (H[0] * x * x + 2.0 * H[1] * x * y + H[2] * y * y);
         const double hv = dv - 0.5 * (H[3] * x * x + 2.0 * H[4] * x * y + H[5] * y * y);
         x = inverse[0] * hu + inverse[1] * hv;
@@ -248,6 +251,14 @@ void fit_circles(
         memcpy(at.M, maps + 4 * n, sizeof at.M);
         memcpy(at.H, bends + 6 * n, sizeof at.H);
         at.size = sqrt(fabs(at.M[0] * at.M[3] - at.M[1] * at.M[2]));
+        /* The narrower of its axes is at least area over the longer. */
+        const double longest = sqrt(at.M[0] * at.M[0] + at.M[1] * at.M[1] + at.M[2] * at.M[2] + at.M[3] * at.M[3]);
+        double bend = 0.0, left_over = 1.0;
+        for (int k = 0; k < 6; k++)
+            bend += fabs(at.H[k]);
+        const double ratio = 0.5 * bend * longest / (at.size * at.size);
+        for (at.inversions = 0; at.inversions < INVERSIONS && left_over * ratio > PLACE_ERROR; at.inversions++)
+            left_over *= ratio;
         const double band = rules->near_sigmas * at.s + rules->near_px;
         const int64_t seen = gather(&at, grey, bytes, width, height, reach[n], band, spots, most);
         double N[PARAMETERS * PARAMETERS], step[PARAMETERS], sum = 0.0;

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from rigkit.benchmark.blanks import BLANKS, blank
+from rigkit.benchmark.circle_bound import circle_information
+from rigkit.benchmark.corner_bound import position_bound
 from rigkit.benchmark.scenes import BenchScene, bench_camera, bench_field_deg, one_board
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
@@ -30,6 +32,8 @@ MOST_BIAS_PX = 0.01
 """Of the centres of a slanted grid without noise, in the mean."""
 HONEST = (0.8, 1.25)
 """RMS error over predicted standard deviation."""
+MOST_BOUND = 1.15
+"""RMS error over the Cramer-Rao bound."""
 SINGLE_PX = 0.12
 """A rim circle of a grid seen by a fisheye at 60 degrees from near by: its neighbours lie on one side."""
 
@@ -154,3 +158,21 @@ def test_chessboards_are_no_grids_of_circles() -> None:
         rng = np.random.default_rng(5)
         scene = one_board(rng, lens="regular", board=Board("b", 9, 6, 30.0, 30.0))
         assert find_grids(grey_image(scene.render(blur_px=blur_px, noise_levels=2.0, rng=rng))) == []
+
+
+@pytest.mark.parametrize("board", [REGULAR, HEXAGONAL], ids=["regular", "hexagonal"])
+@pytest.mark.parametrize("lens", ["regular", "fisheye"])
+def test_centres_are_as_fine_as_the_pixels_allow(board: Board, lens: str) -> None:
+    relative = []
+    for seed in (0, 2):
+        rng = np.random.default_rng(seed)
+        scene = one_board(rng, lens=lens, board=board)
+        truth = scene.truth()[0]
+        bound = position_bound(circle_information(scene, 0.7), 2.0)
+        for _ in range(3):
+            (found,) = detect_boards(scene.render(noise_levels=2.0, rng=rng), [board])
+            turns = [found, *(found.turned(k) for k in board.turns)]
+            off = min((errors(turn, truth) for turn in turns), key=lambda e: float(np.abs(e).max()))
+            assert found.complete
+            relative.append((off**2).sum(axis=1).mean() / np.trace(bound, axis1=1, axis2=2).mean())
+    assert np.sqrt(np.mean(relative)) < MOST_BOUND

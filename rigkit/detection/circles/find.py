@@ -14,7 +14,7 @@ from rigkit.detection.circles.lattices import LabelledBlobs, blob_lattices
 from rigkit.detection.circles.local_map import PlaneMap, local_maps
 from rigkit.detection.saddles.response import GreyImage
 
-__all__ = ["CircleGrid", "GridEvidence", "edge_reach", "find_grids", "seen_grids"]
+__all__ = ["CircleGrid", "GridEvidence", "edge_reach", "find_grids", "like_contrast", "seen_grids"]
 
 Rows = TypeVar("Rows", CircleFit, PlaneMap)
 
@@ -28,15 +28,17 @@ MOST_GROWTH = 0.25
 OFF_PLACE = 0.12
 """How far a circle may lie from where its neighbours say, in their distance."""
 LEAST_CONTRAST, MOST_CONTRAST = 0.35, 2.5
-"""Contrast of a circle over the grid's typical one: shadows and glare."""
+"""Contrast of a circle over the grid's typical one, or that of its share of the brightness, which a shadow leaves as it
+is: what is far outside of both is another thing."""
 MOST_RESIDUAL = 3.0
 """RMS residual over contrast, over the grid's typical one: more, and something lies across the circle."""
 LEAST_TYPICAL = 0.03
 """Residuals over contrast below this are small anyway."""
 SUPPORT = 5
 """Neighbours that must foretell a circle which no blob shows."""
-RIM_SIGMAS = 2.5
-"""A circle without a neighbour on some side is fitted to the pixels up to so many sigmas of blur outside of it."""
+RIM_SIGMAS = 4.0
+"""A circle without a neighbour on some side is fitted to the pixels up to so many sigmas of blur outside of it: 2.5 cost
+a quarter of the accuracy there."""
 MOST_GAIN = 10.0
 """How much less certain than a circle a place may be that neighbours foretell: a corner of the grid, by its neighbours
 on one side, is five times."""
@@ -63,7 +65,8 @@ class CircleGrid:
     hexagonal : whether the second direction lies at 60 degrees to the first, not at 90.
     bright : whether the circles are brighter than what they are printed on.
     radius : of the circles, in distances of neighbours.
-    blur_px, contrast : typical blur of an edge, and how far circles differ from their ground in grey levels.
+    blur_px, contrast, share : typical blur of an edge, how far circles differ from their ground in grey levels, and how
+        far in parts of the brighter of both.
     empty : (K, 2) places beside these circles that the image shows, and no circle there.
     evidence : what speaks for a grid.
     """
@@ -77,6 +80,7 @@ class CircleGrid:
     radius: float
     blur_px: float
     contrast: float
+    share: float
     empty: IntArray
     evidence: GridEvidence
 
@@ -184,6 +188,12 @@ def _fitted(grey: GreyImage, pixels: FloatArray, around: PlaneMap, radius: float
     return fit_circles(grey, pixels, maps, radius**2 * around.second, blur_px, reach)
 
 
+def like_contrast(fit: CircleFit, contrast: float, share: float) -> BoolArray:
+    """Return which circles (N,) have about the usual `contrast`, or the usual `share` of the brightness."""
+    parts = np.stack([np.abs(fit.contrast) / contrast, fit.share / share])
+    return np.asarray(((parts > LEAST_CONTRAST) & (parts < MOST_CONTRAST)).any(axis=0))
+
+
 def edge_reach(maps: FloatArray, half_way: float, blur_px: FloatArray, surrounded: BoolArray) -> FloatArray:
     """Return to how many radii (N,) pixels are a circle's own.
 
@@ -207,8 +217,8 @@ def _judged(draft: _Draft, lenience: float = 1.0) -> _Draft:
     contrast = np.abs(fit.contrast)
     relative = fit.residual / np.maximum(contrast, 1e-9)
     usual = max(float(np.median(relative[good])), LEAST_TYPICAL)
-    part = contrast / float(np.median(contrast[good]))
-    good &= (part > LEAST_CONTRAST) & (part < MOST_CONTRAST) & (relative < lenience * MOST_RESIDUAL * usual)
+    good &= like_contrast(fit, float(np.median(contrast[good])), float(np.median(fit.share[good])))
+    good &= relative < lenience * MOST_RESIDUAL * usual
     if good.sum() < MIN_CIRCLES:
         return draft.chosen(good)
     expected = local_maps(
@@ -307,6 +317,7 @@ def _finished(draft: _Draft, size_px: tuple[int, int]) -> CircleGrid | None:
         radius=draft.radius,
         blur_px=float(np.median(fit.blur_px)),
         contrast=float(np.median(np.abs(fit.contrast))),
+        share=float(np.median(fit.share)),
         empty=empty,
         evidence=evidence,
     )

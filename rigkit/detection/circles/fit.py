@@ -64,6 +64,12 @@ class CircleFit:
     valid: BoolArray
 
     @property
+    def share(self) -> FloatArray:
+        """Return the contrasts (N,) in parts of the brighter of circle and ground."""
+        brighter = np.maximum(self.brightness, self.brightness + self.contrast)
+        return np.asarray(np.abs(self.contrast) / np.maximum(brighter, 1e-6))
+
+    @property
     def sigma_px(self) -> FloatArray:
         """Return the standard deviations (N,) of a coordinate of `pixels`, the mean of both."""
         return np.asarray(np.sqrt(0.5 * np.trace(self.covariance, axis1=1, axis2=2)))

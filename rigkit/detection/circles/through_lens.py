@@ -15,14 +15,13 @@ from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import DegenerateError
 from rigkit.core.patterns.circles import Circles
 from rigkit.detection.circles.find import (
-    LEAST_CONTRAST,
     LEAST_TYPICAL,
-    MOST_CONTRAST,
     MOST_GROWTH,
     MOST_RESIDUAL,
     OFF_PLACE,
     CircleGrid,
     edge_reach,
+    like_contrast,
 )
 from rigkit.detection.circles.fit import CircleFit, fit_circles
 from rigkit.detection.circles.local_map import NEXT
@@ -106,8 +105,7 @@ def _maps(
 def _sound(fit: CircleFit, found: CircleGrid) -> BoolArray:
     """Return which circles look like those of the grid."""
     contrast = np.abs(fit.contrast)
-    part = contrast / found.contrast
     usual = max(found.evidence.unexplained, LEAST_TYPICAL)
     good = fit.valid & ((fit.contrast > 0.0) == found.bright) & (np.abs(fit.growth) < MOST_GROWTH).all(axis=1)
-    good &= (part > LEAST_CONTRAST) & (part < MOST_CONTRAST)
+    good &= like_contrast(fit, found.contrast, found.share)
     return np.asarray(good & (fit.residual < MOST_RESIDUAL * usual * np.maximum(contrast, 1e-9)))
