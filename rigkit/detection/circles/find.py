@@ -37,8 +37,8 @@ LEAST_TYPICAL = 0.03
 SUPPORT = 5
 """Neighbours that must foretell a circle which no blob shows."""
 RIM_SIGMAS = 4.0
-"""A circle without a neighbour on some side is fitted to the pixels up to so many sigmas of blur outside of it: 2.5 cost
-a quarter of the accuracy there."""
+"""A circle without a neighbour on some side is fitted to the pixels up to so many sigmas of blur outside of it: with
+2.5 the error there is a quarter over the bound, with 4 a tenth."""
 MOST_GAIN = 10.0
 """How much less certain than a circle a place may be that neighbours foretell: a corner of the grid, by its neighbours
 on one side, is five times."""
