@@ -11,7 +11,7 @@ import numpy as np
 
 from rigkit.benchmark.corner_bound import BLUR_STEP_PX, SHIFT_PX, noise_free_levels, shifted_scene
 from rigkit.benchmark.scenes import BenchScene
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.errors import InputError
 from rigkit.core.patterns.circles import Circles
 from rigkit.synthetic.scene import PlacedBoard
@@ -52,9 +52,9 @@ def circle_information(scene: BenchScene, blur_px: float) -> FloatArray:
     return out
 
 
-def _sides(scene: BenchScene, placed: PlacedBoard, grid: FloatArray, half_mm: float) -> FloatArray:
+def _sides(scene: BenchScene, placed: PlacedBoard, grid: IntArray, half_mm: float) -> FloatArray:
     """Return (N, 2, 2) how far the image moves over half the way to a neighbour along x and y, px, in columns."""
-    points = placed.board.points(np.asarray(grid, np.int64))
+    points = placed.board.points(grid)
     ends = []
     for axis in (0, 1):
         step = half_mm * np.eye(3)[axis]
