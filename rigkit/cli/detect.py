@@ -58,7 +58,8 @@ def run(args: argparse.Namespace) -> int:
         print_json({image: [_summary(item) for item in items] for image, items in done.found.items()})
     else:
         for image, items in done.found.items():
-            print(f"{printable(image)}: " + (", ".join(_words(item) for item in items) or "no board"))
+            nothing = " (".join(["no board", *([f"{done.doubtful[image]})"] if image in done.doubtful else [])])
+            print(f"{printable(image)}: " + (", ".join(_words(item) for item in items) or nothing))
         missing = sum(not items for items in done.found.values())
         total = len(done.found)
         print(f"{sum(map(len, done.found.values()))} boards in {total - missing} of {total} images")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -20,6 +20,7 @@ from rigkit.core.errors import CheckFailed, InputError
 from rigkit.core.processes import worker_pool
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
+from rigkit.detection.doubtful import doubtful_grid
 from rigkit.detection.lattices import MIN_BOARD_CORNERS
 from rigkit.io.board_file import load_board
 from rigkit.io.corners_file import write_corners
@@ -57,10 +58,12 @@ class DetectOptions:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DetectionResult:
-    """What was found, by image, in the order given; and by image why others could not be looked at."""
+    """What was found, by image, in the order given; by image why others could not be looked at; and what is seen, but
+    not trusted, in those that show no board."""
 
     found: Mapping[str, tuple[BoardDetection, ...]]
     failures: Mapping[str, InputError]
+    doubtful: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -119,16 +122,19 @@ def detect_in_images(
         _DetectJob(image, overlay, boards, camera, options.min_corners, options.force)
         for image, overlay in zip(images, overlays, strict=True)
     ]
-    outcomes = _over_images(tasks, options.jobs, progress)
+    outcomes, doubtful = _over_images(tasks, options.jobs, progress)
     failures = {name: outcome for name, outcome in outcomes.items() if isinstance(outcome, InputError)}
     found = {name: outcome for name, outcome in outcomes.items() if not isinstance(outcome, InputError)}
     if failures and not found:
         raise next(iter(failures.values()))
     if not any(found.values()) and not failures:
-        raise CheckFailed(f"no chessboard found in {len(images)} images; check focus and exposure, or --min-corners")
+        seen = next((f"; in '{name}' {words}" for name, words in doubtful.items()), "")
+        raise CheckFailed(
+            f"no chessboard found in {len(images)} images; check focus and exposure, or --min-corners{seen}"
+        )
     if options.output is not None and any(found.values()):
         write_corners(options.output, found, force=options.force)
-    return DetectionResult(found, failures)
+    return DetectionResult(found, failures, doubtful)
 
 
 def images_in(paths: Sequence[Path]) -> Iterator[Path]:
@@ -162,14 +168,20 @@ def _overlay_paths(images: Sequence[Path], folder: Path | None) -> list[Path | N
 Outcome: TypeAlias = tuple[BoardDetection, ...] | InputError
 
 
-def _over_images(tasks: Sequence[_DetectJob], processes: int | None, progress: Progress) -> dict[str, Outcome]:
-    """Return the detections per image in their order, whatever the number of processes."""
+def _over_images(
+    tasks: Sequence[_DetectJob], processes: int | None, progress: Progress
+) -> tuple[dict[str, Outcome], dict[str, str]]:
+    """Return the detections per image in their order, whatever the number of processes, and what is seen in images
+    without any."""
     jobs = min(processes or os.cpu_count() or 1, len(tasks))
     found: dict[str, Outcome] = {}
+    doubtful: dict[str, str] = {}
 
     def collect(results: Any) -> None:
-        for task, result in zip(tasks, results, strict=True):
+        for task, (result, seen) in zip(tasks, results, strict=True):
             found[str(task.image)] = result
+            if seen is not None:
+                doubtful[str(task.image)] = seen
             progress("detecting", len(found), len(tasks))
 
     if jobs == 1:
@@ -177,25 +189,26 @@ def _over_images(tasks: Sequence[_DetectJob], processes: int | None, progress: P
     else:
         with worker_pool(jobs) as pool:
             collect(pool.map(_detect, tasks, chunksize=max(1, min(8, len(tasks) // (4 * jobs)))))
-    return found
+    return found, doubtful
 
 
-def _detect(job: _DetectJob) -> Outcome:
-    """Detect the boards of one image and write its overlay; return the error where the image is of no use."""
+def _detect(job: _DetectJob) -> tuple[Outcome, str | None]:
+    """Detect the boards of one image and write its overlay; return the error where the image is of no use. The second
+    result is what is seen, but not trusted, where there is no board."""
     cv2.setNumThreads(1)
     try:
         image = read_image(job.image)
         found = _boards_in(image, job)
+        seen = None if found else doubtful_grid(image)
     except InputError as error:
-        return error
+        return error, None
     except MemoryError as error:
-        return InputError(
-            f"image '{job.image}': {error or 'out of memory'}; use fewer processes (-j 1), or a smaller one"
-        )
+        words = f"image '{job.image}': {error or 'out of memory'}; use fewer processes (-j 1), or a smaller one"
+        return InputError(words), None
     if job.overlay is not None:
         picture = cv2.cvtColor(draw_boards(image, found), cv2.COLOR_RGB2BGR)
         write_atomic(job.overlay, np.asarray(cv2.imencode(".png", picture)[1]).tobytes(), force=job.force)
-    return found
+    return found, seen
 
 
 def _boards_in(image: NDArray[Any], job: _DetectJob) -> tuple[BoardDetection, ...]:
