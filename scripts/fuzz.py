@@ -62,6 +62,10 @@ def _camera_file(name: str, *more: tuple[str, ...]) -> Kind:
     return Kind(name, (("export", "{case}", "--to", "rigkit", "-o", "{out}/new.json"), *more))
 
 
+def _board_file(name: str) -> Kind:
+    return Kind(name, (("rigkit.io.board_file:load_board", "{case}"), ("board", "{case}", "-o", "{out}/b")))
+
+
 KINDS: dict[str, Kind] = {
     "png": Kind("image.png", (("rigkit.io.images:read_image", "{case}"), ("detect", "-j", "1", "{case}"))),
     "png16": Kind("deep.png", (("rigkit.io.images:read_image", "{case}"),)),
@@ -70,7 +74,9 @@ KINDS: dict[str, Kind] = {
     "bmp": Kind("image.bmp", (("rigkit.io.images:read_image", "{case}"),)),
     "pgm": Kind("image.pgm", (("rigkit.io.images:read_image", "{case}"),)),
     "webp": Kind("image.webp", (("rigkit.io.images:read_image", "{case}"),)),
-    "board": Kind("board.toml", (("rigkit.io.board_file:load_board", "{case}"), ("board", "{case}", "-o", "{out}/b"))),
+    "board": _board_file("board.toml"),
+    "aprilgrid": _board_file("aprilgrid.toml"),
+    "circles": _board_file("circles.toml"),
     "session": Kind("session.toml", (("rigkit.io.session:load_session", "{case}"),)),
     "rig-session": Kind("rig-session.toml", (("rigkit.io.rig_session:load_rig_session", "{case}"),)),
     "dataset": Kind("dataset.toml", (("rigkit.io.manifest:load_dataset", "{case}"),)),
@@ -80,6 +86,7 @@ KINDS: dict[str, Kind] = {
         (
             ("rigkit.io.calibration_file:load_calibration", "{case}"),
             ("diff", "{case}", "calibration.json"),
+            ("plan", "{case}", "-n", "1"),
             ("certify", "{case}", "--length", "200", "--distance", "900"),
             ("export", "{case}", "--to", "opencv", "-o", "{out}/new.yaml"),
             ("rectify", "image.png", "--camera", "{case}", "-o", "{out}/new.png"),
@@ -92,6 +99,8 @@ KINDS: dict[str, Kind] = {
             ("diff", "{case}", "rig.json"),
             ("certify", "{case}", "--depth", "200", "--distance", "900"),
             ("export", "{case}", "--to", "kalibr", "-o", "{out}/new.yaml"),
+            ("export", "{case}", "--to", "opencv", "-o", "{out}/new.yaml"),
+            ("rectify", "image.png", "image.jpg", "--rig", "{case}", "-o", "{out}/new.png"),
         ),
     ),
     "board-rigs": Kind("board-rigs.json", (("rigkit.io.rig_file:load_board_rigs", "{case}"),)),
@@ -104,6 +113,8 @@ KINDS: dict[str, Kind] = {
     "ply": Kind("cloud.ply", (("rigkit.io.ply:read_ply", "{case}"),)),
     "opencv": _camera_file("opencv.yaml", ("export", "{case}", "--from", "opencv", "-o", "{out}/new.json")),
     "kalibr": _camera_file("kalibr.yaml", ("rigkit.workflows.camera_files:import_camera", "{case}")),
+    "chain": Kind("chain.yaml", (("export", "{case}", "--to", "mrcal", "-o", "{out}/new.cameramodel"),)),
+    "opencv-stereo": Kind("stereo.yaml", (("export", "{case}", "--to", "kalibr", "-o", "{out}/new.yaml"),)),
     "ros": _camera_file("ros.yaml", ("export", "{case}", "--from", "ros", "-o", "{out}/new.json")),
     "colmap": _camera_file("cameras.txt"),
     "mrcal": _camera_file("lens.cameramodel"),

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import random
 import tempfile
+import traceback
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +17,7 @@ from fuzz_mutations import strange_arrays
 from fuzz_seeds import SIZE_PX, small_cloud, small_detection
 
 import rigkit
+from rigkit.affine.correspondences import Correspondences
 from rigkit.core.boards import Board
 from rigkit.core.errors import RigkitError
 from rigkit.interop.ocamcalib import read_py_ocamcalib
@@ -81,10 +86,73 @@ def _calls() -> list[Call]:
         (rigkit.detect_boards, {"image": image, "boards": [SMALL], "min_corners": 12}),
         (rigkit.complete_boards, {"image": image, "detections": [d], "boards": [SMALL]}),
         (rigkit.rectify_map, {"camera": cameras[1], "target": cameras[0], "target_from_cam": np.eye(3)}),
-        (rigkit.DirectionPairs, {"directions1": directions, "directions2": directions, "valid": np.ones((n, 2), bool)}),
+        (
+            rigkit.DirectionPairs,
+            {
+                "image1": directions,
+                "image2": directions,
+                "valid": np.ones((n, 2), bool),
+                "kinds": ("horizontal", "vertical"),
+            },
+        ),
         (rigkit.normals_from_affines, {"J1": np.ones((n, 2, 3)), "J2": np.ones((n, 2, 3)), "A21": directions}),
     ]
+    matches = rigkit.Matches.from_cameras(
+        cameras[0], cameras[0], d.pixels, d.pixels * 1.1 + 2.0, sigma1_px=d.sigma_px, sigma2_px=d.sigma_px,
+        A21=directions, sigma_A=d.sigma_px,
+    )  # fmt: skip
+    remap, pose = rigkit.rectify_map(cameras[1], cameras[0]), rigkit.Rigid3(np.eye(3), np.array([1.0, 2.0, 3.0]))
+    pairs = rigkit.DirectionPairs(
+        image1=directions, image2=directions, valid=np.ones((n, 2), bool), kinds=("horizontal", "vertical"),
+        pixels1=d.pixels, pixels2=d.pixels,
+    )  # fmt: skip
+    given = {
+        "pixels1": d.pixels, "pixels2": d.pixels * 1.1, "sigma1_px": d.sigma_px, "sigma2_px": d.sigma_px,
+        "A21": directions, "sigma_A": d.sigma_px,
+    }  # fmt: skip
+    view = {"image": "a", "board": SMALL, "grid": d.grid, "pixels": d.pixels, "sigma_px": d.sigma_px}
+    calls += [
+        (functools.partial(rigkit.Matches.from_cameras, cameras[0], cameras[1]), given),
+        (matches.select, {"which": np.arange(4)}),
+        (matches.with_affinities, {"A21": directions, "sigma_A": d.sigma_px}),
+        (Correspondences, {k: given[k] for k in ("pixels1", "pixels2", "A21", "sigma_A")} | {"sigma_px": d.sigma_px}),
+        (functools.partial(rigkit.affines_from_directions, pairs), {"method": "F2UDIR", "F21": np.eye(3)}),
+        (functools.partial(rigkit.affines_from_mixed_directions, pairs), {"scaled": np.ones((n, 2), bool)}),
+        (rigkit.affines_from_homography, {"H21": np.eye(3), "pixels1": d.pixels}),
+        (rigkit.homography_from_affines, {"pixels1": d.pixels, "pixels2": d.pixels, "A21": directions}),
+        (
+            functools.partial(rigkit.homography_from_plane, cam2_from_cam1=pose),
+            {"K1": np.eye(3), "K2": np.eye(3), "normal": np.array([0.0, 0.0, 1.0]), "offset_mm": 900.0},
+        ),
+        (_calibrated, {"model": "pinhole", **view}),
+        (pose.apply, {"points": points}),
+        (remap.pixels, {"pixels": d.pixels}),
+        (remap.source_pixels, {"pixels": d.pixels}),
+        (remap.image, {"image": np.zeros((480, 640)), "interpolation": "linear", "fill": 0.0}),
+        (
+            functools.partial(rigkit.compare_cameras, cameras[0], cameras[1], grid=(20, 15)),
+            {"mask": np.ones((15, 20), bool), "weights": np.ones((15, 20))},
+        ),
+        (functools.partial(_solved, matches), {"weights": np.ones(n)}),
+        (rigkit.BoardView, view),
+    ]
     return calls
+
+
+def _calibrated(model: str, image: str, board: Board, grid: Any, pixels: Any, sigma_px: Any) -> None:
+    """Calibrate from four views, one of which is spoilt."""
+    d = small_detection()
+    good = rigkit.BoardView("0", SMALL, d.grid, d.pixels, d.sigma_px)
+    views = [replace(good, image=str(k), pixels=good.pixels * (1.0 + 0.1 * k)) for k in range(3)]
+    views.append(rigkit.BoardView(image, board, grid, pixels, sigma_px))
+    rigkit.calibrate(views, (640, 480), model=model, board="flat", folds=0)
+
+
+def _solved(matches: rigkit.Matches, weights: Any) -> None:
+    """Every linear solver with weights."""
+    for kind in ("general", "planar", "standard", "forward"):
+        with contextlib.suppress(RigkitError):
+            rigkit.fundamental_for(kind).solve(matches, weights=weights)
 
 
 def run_case(seed: int, number: int) -> None:
@@ -105,10 +173,13 @@ def run_case(seed: int, number: int) -> None:
     except RigkitError:
         return
     except Exception as error:
-        name = getattr(function, "__qualname__", str(function))
+        name = getattr(getattr(function, "func", function), "__qualname__", "a call")
+        where = traceback.extract_tb(error.__traceback__)[-1]
         shown = np.array2string(np.asarray(spoilt[key]), threshold=6)[:200].replace("\n", " ")
         shape = np.shape(spoilt[key])
-        raise type(error)(f"{name}({key}={shown}, shape {shape}): {error}") from error
+        raise AssertionError(
+            f"{name}({key}={shown}, shape {shape}): {type(error).__name__}: {error} ({where.filename}:{where.lineno})"
+        ) from error
 
 
 def _positional(function: Callable[..., object], arguments: dict[str, Any]) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from rigkit.interop.kalibr import write_kalibr
 from rigkit.interop.mrcal import write_cameramodel
 from rigkit.interop.ocamcalib import write_ocamcalib
 from rigkit.interop.opencv import write_opencv
+from rigkit.interop.opencv_stereo import opencv_stereo
 from rigkit.interop.ros import write_camera_info
 from rigkit.io import corner_cache
 from rigkit.io.corners_file import corners_text
@@ -38,6 +39,31 @@ square_sigma_mm = 0.05
 dictionary = "DICT_5X5_100"
 marker_mm = 20.0
 first_marker = 0
+""",
+    "aprilgrid.toml": """schema = "rigkit.board/1"
+type = "aprilgrid"
+id = "tags"
+columns = 3
+rows = 2
+tag_mm = 40.0
+spacing = 0.3
+family = "tag36h11"
+border = 2
+first_tag = 4
+numbering = "kalibr"
+corner_squares = true
+tag_sigma_mm = 0.05
+""",
+    "circles.toml": """schema = "rigkit.board/1"
+type = "circles"
+id = "dots"
+columns = 4
+rows = 5
+distance_mm = 40.0
+layout = "asymmetric"
+stagger = "left"
+diameter_mm = 15.0
+inverted = false
 """,
     "session.toml": """schema = "rigkit.session/1"
 images = "image*.png"
@@ -119,6 +145,22 @@ COMMANDS: tuple[tuple[str, ...], ...] = (
     ("rectify", "image.png", "--camera", "calibration.json", "-o", "new.png", "--hfov-deg", "70", "--size", "80x60"),
     ("rectify", "image.png", "--camera", "calibration.json", "-o", "new.png", "--projection", "cylindrical",
      "--yaw-deg", "10", "--pitch-deg", "5", "--roll-deg", "3"),
+    ("rectify", "pairs", "--camera", "calibration.json", "-o", "new", "--maps", "new.npz", "--interpolation", "linear"),
+    ("plan", "calibration.json", "-n", "1", "--length", "200", "--distance", "900", "--near", "200", "--field", "80"),
+    ("plan", "--lens", "60", "--size", "320x240", "--board", "5x4x30", "--board", "floor.toml", "--views", "4",
+     "--sigma-px", "0.2", "--model", "brown", "--far", "2000", "--json"),
+    ("detect", "-j", "1", "--board", "aprilgrid.toml", "--board", "circles.toml", "image.png", "image.jpg"),
+    ("calibrate", "pairs", "image.jpg", "--board", "5x4x30", "--model", "pinhole", "-o", "new.json", "--no-cache"),
+    ("calibrate", "session.toml", "--corners", "corners.csv", "-o", "new.json", "--export", "opencv", "ros"),
+    ("reconstruct", "--images", "image.png", "image.jpg", "--camera", "calibration.json", "--sparse", "-o", "new",
+     "--pose-type", "general", "--baseline-mm", "100", "--no-pictures"),
+    ("reconstruct", "--correspondences", "pairs.csv", "--camera", "calibration.json", "--camera2", "opencv.yaml", "-o",
+     "new", "--level-sigma-deg", "0.2", "--pose-type", "planar", "--no-pictures"),
+    ("export", "rig.json", "--to", "mrcal", "-o", "new.cameramodel"),
+    ("export", "rig.json", "--to", "colmap", "-o", "new.json"),
+    ("export", "stereo.yaml", "--to", "ros", "-o", "new.yaml"),
+    ("fetch", "bumblebee2", "-o", "new"),
+    ("board", "aprilgrid.toml", "--paper", "a4", "-o", "new"),
     ("rectify", "image.png", "image.jpg", "--rig", "rig.json", "-o", "new.png", "--names", "left", "right"),
     ("reconstruct", "dataset.toml", "-o", "new", "-j", "1", "--method", "3SDIR", "--pair", "first"),
     ("validate", "dataset.toml", "-o", "new", "-j", "1", "--no-pictures", "--no-crosscheck"),
@@ -214,6 +256,7 @@ def _write_cameras(folder: Path) -> None:
         "opencv.yaml": write_opencv(fisheye).text,
         "kalibr.yaml": write_kalibr([brown]).text,
         "chain.yaml": write_kalibr([brown, fisheye], [Rigid3(np.eye(3), np.zeros(3)), turned]).text,
+        "stereo.yaml": opencv_stereo(brown, brown, turned).text,
         "ros.yaml": write_camera_info(brown).text,
         "cameras.txt": write_colmap_cameras({1: brown})[0],
         "lens.cameramodel": write_cameramodel(brown).text,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigkit.core.arrays import Affines, BoolArray, FloatArray, Mat3, Pixels, RayJacobians, Rays, as_array
+from rigkit.core.arrays import Affines, BoolArray, FloatArray, Mat3, Pixels, RayJacobians, Rays, as_array, as_floats
 from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
 from rigkit.geometry.sampson import epipolar_normals
@@ -55,8 +55,8 @@ class EpipolarNormals:
     @classmethod
     def from_F(cls, F21: Mat3, pixels1: Pixels, pixels2: Pixels) -> EpipolarNormals:
         """Build from a fundamental matrix and pixels (N, 2) of perspective images without distortion."""
-        f = np.asarray(F21, dtype=np.float64)
-        q1, q2 = np.asarray(pixels1, dtype=np.float64), np.asarray(pixels2, dtype=np.float64)
+        f = as_array(F21, (3, 3), "F21")
+        q1, q2 = as_floats(pixels1, (2,), "pixels1"), as_floats(pixels2, (2,), "pixels2")
         return cls(q2 @ f[:2, :2] + f[2, :2], q1 @ f[:2, :2].T + f[:2, 2])
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from rigkit.core.arrays import Affines, BoolArray, Mat3, Normals, Pixels
+from rigkit.core.arrays import Affines, BoolArray, Mat3, Normals, Pixels, as_array, as_floats
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 
@@ -25,8 +27,10 @@ def affines_from_homography(H21: Mat3, pixels1: Pixels) -> tuple[Affines, BoolAr
     A = (H[:2, :2] - q2 H[2, :2]) / (H[2] q1^). Erratum: the paper prints a2 = (h2 - h8 v2)/s and a3 = (h4 - h7 u2)/s;
     it is a2 = (h2 - h8 u2)/s and a3 = (h4 - h7 v2)/s (tests/affine/test_homography.py).
     """
-    h = np.asarray(H21, dtype=np.float64)
-    q = np.asarray(pixels1, dtype=np.float64)
+    h = as_floats(H21, (3, 3), "H21")
+    q = as_floats(pixels1, (2,), "pixels1")
+    if h.shape[:-2] not in ((), q.shape[:-1]):
+        raise InputError(f"H21: one homography, or one a pixel, got {h.shape} for pixels {q.shape}")
     mapped = np.einsum("...ij,...j->...i", h[..., :, :2], q) + h[..., :, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         s = mapped[..., 2, None, None]
@@ -42,7 +46,9 @@ def homography_from_plane(K1: Mat3, K2: Mat3, cam2_from_cam1: Rigid3, normal: No
     """
     if offset_mm == 0.0:
         raise DegenerateError("homography of a plane: the plane goes through the centre of camera 1")
-    n = np.asarray(normal, dtype=np.float64)
+    n, K1, K2 = as_array(normal, (3,), "normal"), as_array(K1, (3, 3), "K1"), as_array(K2, (3, 3), "K2")
+    if not math.isfinite(offset_mm) or np.linalg.matrix_rank(K1) < 3:
+        raise InputError("homography of a plane: the offset is no number, or K1 has no inverse")
     euclidean = cam2_from_cam1.rotation + np.outer(cam2_from_cam1.translation_mm, n) / offset_mm
     H21 = K2 @ euclidean @ np.linalg.inv(K1)
     return np.asarray(H21 / np.linalg.norm(H21))
@@ -69,7 +75,7 @@ def homography_from_affines(pixels1: Pixels, pixels2: Pixels, A21: Affines, *, a
     -----
     A point gives the two rows of the direct linear transform, an affinity H[r, c] - q2_r H[2, c] - a_rc (H[2] q1^) = 0.
     """
-    q1, q2, A = (np.asarray(v, dtype=np.float64) for v in (pixels1, pixels2, A21))
+    q1, q2, A = as_floats(pixels1, (2,), "pixels1"), as_floats(pixels2, (2,), "pixels2"), as_floats(A21, (2, 2), "A21")
     n = len(q1)
     if n < 2 or q1.shape != (n, 2) or q2.shape != (n, 2) or A.shape != (n, 2, 2):
         raise InputError(f"homography from affinities: two points or more with pixels and affinities, got {q1.shape}")
@@ -89,6 +95,8 @@ def homography_from_affines(pixels1: Pixels, pixels2: Pixels, A21: Affines, *, a
             affine[:, r, c, 2, c] = -x2[:, r]
             affine[:, r, c, 2] -= A[:, r, c, None] * x1h
     system = np.concatenate([points.reshape(-1, 9), affine_weight * affine.reshape(-1, 9)])
+    if not np.isfinite(system).all():
+        raise InputError("homography from affinities: pixels or affinities are too large to be squared")
     _, singular, vt = np.linalg.svd(system, full_matrices=False)
     if singular[7] < DEGENERATE * singular[0]:
         raise DegenerateError("homography from affinities: points and affinities do not determine it")

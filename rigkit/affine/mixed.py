@@ -82,6 +82,8 @@ def _checked(n: int, k: int, scaled: BoolArray, epipolar: EpipolarNormals | None
     if epipolar is not None and len(epipolar) != n:
         raise InputError(f"mixed directions: {n} corners but epipolar normals of {len(epipolar)}")
     try:
+        if np.asarray(scaled).dtype != np.bool_:
+            raise InputError(f"mixed directions: scaled must be truth values, got {np.asarray(scaled).dtype}")
         return np.broadcast_to(scaled, (n, k))
     except ValueError as error:
         raise InputError(f"mixed directions: scaled must broadcast to {n}x{k}, got {np.shape(scaled)}") from error

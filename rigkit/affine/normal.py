@@ -13,7 +13,7 @@ import numpy as np
 
 from rigkit.affine.components import blocks, finite
 from rigkit.affine.surface import linear_gauge
-from rigkit.core.arrays import Affines, BoolArray, FloatArray, Normals
+from rigkit.core.arrays import Affines, BoolArray, FloatArray, Normals, as_floats
 from rigkit.core.errors import InputError
 from rigkit.geometry.rotation import angle_between
 
@@ -93,11 +93,8 @@ def normals_from_affines(
 
 def _matching(J1: FloatArray, J2: FloatArray, A21: Affines) -> tuple[FloatArray, FloatArray, Affines]:
     """Return the three as float64; raises InputError where they are not of the same N points."""
-    try:
-        J1, J2, A21 = (np.asarray(v, dtype=np.float64) for v in (J1, J2, A21))
-    except (TypeError, ValueError) as error:
-        raise InputError(f"normals: J1, J2 or A21 is no array of numbers ({error})") from error
-    n = len(J1) if J1.ndim else 0
+    J1, J2, A21 = as_floats(J1, (2, 3), "J1"), as_floats(J2, (2, 3), "J2"), as_floats(A21, (2, 2), "A21")
+    n = len(J1)
     if J1.shape != (n, 2, 3) or J2.shape != (n, 2, 3) or A21.shape != (n, 2, 2):
         raise InputError(
             f"normals: J1 and J2 of shape (N, 2, 3) and A21 of (N, 2, 2) are needed, got {J1.shape}, {J2.shape} and "

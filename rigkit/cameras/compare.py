@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Pixels, as_array
+from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Pixels, as_array, as_mask
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import exp_so3, nearest_rotation, rotation_angle, skew
 
@@ -22,6 +22,7 @@ ROTATION_SETTLED_RAD = 1e-12
 """The fit of the rotation stops at steps that move no pixel by a millionth."""
 MIN_PIXELS = 20
 """Fewer common pixels say nothing about the image."""
+MAX_WEIGHT = 1e150
 MAX_GRID = 10_000
 """Of a map's columns and rows: more than any image has pixels to show."""
 
@@ -104,13 +105,16 @@ def compare_cameras(
         raise InputError(f"cameras of {a.size_px} and {b.size_px} px cannot be compared; calibrate at one image size")
     columns, rows = grid = _checked_grid(grid)
     pixels = grid_pixels(a.size_px, grid)
-    for name, array in (("mask", mask), ("weights", weights)):
-        if array is not None and np.shape(array) != (rows, columns):
-            raise InputError(f"{name}: expected shape {rows}x{columns} as the grid, got {np.shape(array)}")
+    if mask is not None:
+        mask = as_mask(mask, (rows, columns), "mask")
+    if weights is not None:
+        weights = as_array(weights, (rows, columns), "weights")
+        if not ((weights >= 0.0) & (weights < MAX_WEIGHT)).all():
+            raise InputError("weights: they cannot be negative, or too large to be summed")
     rays, covered = a.unproject(pixels)
     if mask is not None:
         covered = covered & mask
-    weight = np.ones((rows, columns)) if weights is None else np.asarray(weights, dtype=np.float64)
+    weight = np.ones((rows, columns)) if weights is None else weights
     b_from_a = np.eye(3)
     if fit_rotation and covered.sum() >= MIN_PIXELS:
         b_from_a = _best_rotation(rays[covered], pixels[covered], weight[covered], b)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,8 @@ if TYPE_CHECKING:
     from rigkit.workflows.plan import PlannedSession, PlanOptions
 
 __all__ = ["HELP", "add_arguments", "run"]
+
+SIZE_PX = re.compile(r"([0-9]{1,6})[xX]([0-9]{1,6})")
 
 HELP = "which pictures to take next, or what a lens, a board and so many pictures will reach"
 
@@ -68,6 +71,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _planned(args: argparse.Namespace) -> PlannedSession:
     from rigkit.cli.console import progress_on_stderr
+    from rigkit.io.files import ensure_writable
     from rigkit.workflows.folder_session import board_of_words
     from rigkit.workflows.plan import USUAL_SIGMA_PX, LensOptions, plan_lens, plan_session
 
@@ -80,15 +84,19 @@ def _planned(args: argparse.Namespace) -> PlannedSession:
         return plan_session(args.source, _options(args, 3), progress=progress_on_stderr())
     if not (args.size and args.board):
         raise InputError("plan: --lens needs --size 1280x960 and --board 9x6x25")
-    width, _, height = args.size.lower().partition("x")
-    if not (width.isdecimal() and height.isdecimal()):
+    size = SIZE_PX.fullmatch(args.size)
+    if size is None:
         raise InputError(f"--size {args.size}: write width and height in pixels, such as 1280x960")
+    if args.report is not None:
+        ensure_writable(
+            args.report, force=args.force, inputs=[words for words in args.board if words.endswith(".toml")]
+        )
     sigma = USUAL_SIGMA_PX if args.sigma_px is None else args.sigma_px
     if not 0.0 < sigma < float("inf"):
         raise InputError(f"--sigma-px {sigma}: it must be positive")
     lens = LensOptions(
         hfov_deg=args.lens,
-        size_px=(int(width), int(height)),
+        size_px=(int(size[1]), int(size[2])),
         boards=tuple(board_of_words(words) for words in args.board),
         model=args.model,
         sigma_px=sigma,

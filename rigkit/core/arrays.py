@@ -26,7 +26,9 @@ __all__ = [
     "Rays",
     "as_array",
     "as_covariance",
+    "as_floats",
     "as_indices",
+    "as_mask",
     "in_8_bits",
     "upper_median",
     "without_nan",
@@ -85,6 +87,26 @@ def as_array(value: ArrayLike, shape: tuple[int | None, ...], name: str, *, fini
         bad = int((~np.isfinite(array)).sum())
         raise InputError(f"{name}: {bad} of {array.size} values are NaN or infinite; remove them first")
     array.flags.writeable = False
+    return array
+
+
+def as_floats(value: ArrayLike, tail: tuple[int, ...], name: str) -> FloatArray:
+    """Return `value` as float64, not copied, which has the axes `tail` behind any others; else raises InputError."""
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{name}: not an array of numbers ({error})") from error
+    if array.shape[array.ndim - len(tail) :] != tail or array.ndim < len(tail):
+        raise InputError(f"{name}: expected shape (..., {', '.join(map(str, tail))}), got {array.shape}")
+    return array
+
+
+def as_mask(value: ArrayLike, shape: tuple[int, ...], name: str) -> BoolArray:
+    """Return `value`, which has to be an array of truth values of this shape; else raises InputError."""
+    array = np.asarray(value)
+    if array.dtype != np.bool_ or array.shape != shape:
+        words = "x".join(map(str, shape))
+        raise InputError(f"{name}: truth values of shape {words} are needed, got {array.dtype} of {array.shape}")
     return array
 
 

@@ -55,11 +55,11 @@ class Board:
             words = self.pattern.point_word
             raise InputError(f"board '{self.board_id}': at least 2x2 {words}, got {self.columns}x{self.rows}")
         for side in self.squares_mm:
-            if not (np.isfinite(side) and side > 0.0):
+            if not 0.0 < side < np.inf:
                 word = self.pattern.size_word
                 raise InputError(f"board '{self.board_id}': the {word} size must be positive, got {side} mm")
         sigma = self.square_sigma_mm
-        if sigma is not None and not (np.isfinite(sigma) and sigma >= 0.0):
+        if sigma is not None and not 0.0 <= sigma < np.inf:
             raise InputError(f"board '{self.board_id}': {self.pattern.size_word}_sigma_mm cannot be {sigma}")
         try:
             self.pattern.check(self.columns, self.rows, self.squares_mm)

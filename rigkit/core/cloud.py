@@ -50,6 +50,8 @@ class OrientedCloud:
         object.__setattr__(self, "sigma_mm", as_array(self.sigma_mm, (n,), "sigma_mm", finite=False))
         sigma = as_array(self.normal_sigma_rad, (n,), "normal_sigma_rad", finite=False)
         object.__setattr__(self, "normal_sigma_rad", sigma)
+        if not isinstance(self.calibration_in_sigmas, bool | np.bool_):
+            raise InputError(f"calibration_in_sigmas: True or False is needed, got {self.calibration_in_sigmas!r}")
         colours = np.array(self.colours, dtype=np.uint8)
         if colours.shape != (n, 3):
             raise InputError(f"colours: expected {n}x3, got {colours.shape}")

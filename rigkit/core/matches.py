@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rigkit.core.arrays import (
     Affines,
@@ -186,21 +187,26 @@ class Matches:
 
     def select(self, which: BoolArray | IntArray) -> Matches:
         """Return the matches picked by a mask or by indices."""
+        index: NDArray[Any] = np.asarray(which)
+        n = len(self)
+        mask = index.dtype == np.bool_ and index.shape == (n,)
+        if not mask and (index.dtype.kind not in "iu" or index.ndim != 1 or not ((index >= -n) & (index < n)).all()):
+            raise InputError(f"matches: a mask or indices of {n} are needed, got {index.dtype} of {index.shape}")
 
         def pick(array: FloatArray | None) -> FloatArray | None:
-            return None if array is None else array[which]
+            return None if array is None else array[index]
 
         return Matches(
-            pixels1=self.pixels1[which],
-            pixels2=self.pixels2[which],
-            rays1=self.rays1[which],
-            rays2=self.rays2[which],
-            jacobians1=self.jacobians1[which],
-            jacobians2=self.jacobians2[which],
-            sigma1_px=self.sigma1_px[which],
-            sigma2_px=self.sigma2_px[which],
-            board_index=self.board_index[which],
-            grid=self.grid[which],
+            pixels1=self.pixels1[index],
+            pixels2=self.pixels2[index],
+            rays1=self.rays1[index],
+            rays2=self.rays2[index],
+            jacobians1=self.jacobians1[index],
+            jacobians2=self.jacobians2[index],
+            sigma1_px=self.sigma1_px[index],
+            sigma2_px=self.sigma2_px[index],
+            board_index=self.board_index[index],
+            grid=self.grid[index],
             K1=self.K1,
             K2=self.K2,
             A21=pick(self.A21),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigkit.core.arrays import FloatArray, Mat3, Points, as_array
+from rigkit.core.arrays import FloatArray, Mat3, Points, as_array, as_floats
 from rigkit.core.errors import InputError
 from rigkit.geometry.rotation import nearest_rotation, unit
 
@@ -77,7 +77,7 @@ class Rigid3:
 
     def apply(self, points: Points) -> Points:
         """Map points (..., 3) from the source frame to the target frame."""
-        return np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation_mm
+        return as_floats(points, (3,), "points") @ self.rotation.T + self.translation_mm
 
     def inverse(self) -> Rigid3:
         return Rigid3(self.rotation.T, -self.rotation.T @ self.translation_mm)

@@ -98,7 +98,10 @@ def read_kalibr(text: str, name: str = "camchain") -> tuple[tuple[Camera, ...], 
         cameras.append(_camera(block, f"{name}, {key}"))
         if len(cameras) > 1:
             matrix = numbers(field(block, "T_cn_cnm1", f"{name}, {key}"), name, f"{key}: T_cn_cnm1", 16).reshape(4, 4)
-            step = Rigid3(matrix[:3, :3], matrix[:3, 3] * MM_PER_M)
+            try:
+                step = Rigid3(matrix[:3, :3], matrix[:3, 3] * MM_PER_M)
+            except InputError as error:
+                raise InputError(f"'{name}', {key}: T_cn_cnm1: {error}") from error
             poses.append(step @ poses[-1])
     return tuple(cameras), tuple(poses)
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from rigkit.core.errors import InputError
+from rigkit.core.errors import InputError, RigkitError
 
-__all__ = ["MAX_BINARY_BYTES", "MAX_TEXT_BYTES", "read_bytes", "read_text", "usable_path"]
+__all__ = ["MAX_BINARY_BYTES", "MAX_TEXT_BYTES", "about", "read_bytes", "read_text", "usable_path"]
 
 MAX_TEXT_BYTES = 64_000_000
 """The corners of ten thousand images."""
@@ -69,6 +71,17 @@ def read_text(path: str | Path, what: str = "", *, max_bytes: int = MAX_TEXT_BYT
     except UnicodeDecodeError as error:
         raise InputError(f"{_named(path, what)} cannot be read: not UTF-8 text; save it as UTF-8") from error
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+@contextmanager
+def about(path: str | Path) -> Iterator[None]:
+    """Let errors of the block, which is about one file, name it."""
+    try:
+        yield
+    except RigkitError as error:
+        if str(path) in str(error):
+            raise
+        raise type(error)(f"'{path}': {error}") from error
 
 
 def _named(path: str | Path, what: str) -> str:

@@ -11,6 +11,7 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibration_file import load_calibration
 from rigkit.io.files import ensure_writable, write_together
+from rigkit.io.reading import about
 from rigkit.io.rig_file import is_rig_file, load_saved_rig
 from rigkit.report.certificate_page import CertificateWords, certificate_page, certificate_pdf, in_words
 from rigkit.validation.certificate.certify import certify
@@ -62,7 +63,8 @@ def certify_file(path: str | Path, task: Task, options: CertifyOptions | None = 
     ensure_writable(targets, force=options.force, inputs=[path])
     if options.limit is not None and not (np.isfinite(options.limit) and options.limit > 0.0):
         raise InputError(f"certificate: the limit must be positive, got {options.limit}")
-    certificate = certify(load_instrument(path, options.cameras, options.sigma_px), task)
+    with about(path):
+        certificate = certify(load_instrument(path, options.cameras, options.sigma_px), task)
     title = f"Certificate: {task.quantity} with {Path(path).name}"
     facts = {Path(path).name: digest_line(Path(path)), **software_facts()}
     files: dict[Path, str | bytes] = {}

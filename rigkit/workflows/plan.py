@@ -93,6 +93,8 @@ def plan_session(
             f"plan: '{source}' is of a rig; give the calibration of the camera that is to be improved, rig-CAMERA.json"
         )
     inputs: list[Path] = [source]
+    if options.report is not None:
+        ensure_writable([options.report], force=options.force, inputs=inputs)
     if source.suffix == ".toml":
         session = load_session(source)
         calibrating = CalibrateOptions(cache=Cache.UPDATE)

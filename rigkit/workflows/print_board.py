@@ -9,6 +9,7 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.io.board_file import board_text, load_layout
 from rigkit.io.files import write_atomic, write_together
+from rigkit.io.reading import about
 from rigkit.report.board_sheet import board_sheet, pdf_bytes, svg_text
 
 __all__ = ["MeasuredPrint", "PrintOptions", "print_board", "store_measured_print"]
@@ -53,7 +54,8 @@ def print_board(board: Board | str | Path, options: PrintOptions) -> tuple[Path,
     Raises InputError for a board that does not fit on the paper, or a file that cannot be written.
     """
     layout = board if isinstance(board, Board) else load_layout(board)
-    sheet = board_sheet(layout, options.paper)
+    with about(f"board '{layout.board_id}'" if isinstance(board, Board) else board):
+        sheet = board_sheet(layout, options.paper)
     files: dict[Path, str | bytes] = {
         Path(f"{options.output}.pdf"): pdf_bytes(sheet),
         Path(f"{options.output}.svg"): svg_text(sheet),

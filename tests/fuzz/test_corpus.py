@@ -57,3 +57,19 @@ def test_faults_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "though sound" in str(fuzz.fault_of(call, "case.toml", sound=True))
     monkeypatch.setattr(cli, "build_parser", raising(ValueError("bad")))
     assert "exit 70" in str(fuzz.fault_of(["export"], None, sound=False))
+
+
+QUICK = 12
+"""Cases of a class, beyond its sound ones; `scripts/fuzz.py --count 1000` looks longer."""
+
+
+@pytest.mark.parametrize("label", sorted(fuzz.KINDS))
+def test_a_few_damaged_inputs_of_each_class(
+    label: str, tmp_path: Path, seeds: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In a process of its own, as the harness has them."""
+    shutil.copytree(seeds, tmp_path / "seeds")
+    count = len(fuzz.KINDS[label].readers) * (label != "commands") + (100 if label == "api" else QUICK)
+    assert fuzz.main(["--classes", label, "--count", str(count), "--seed", "1", "--keep", str(tmp_path)]) == 0, (
+        capsys.readouterr().out
+    )

@@ -35,6 +35,8 @@ WRITES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("export opencv.yaml --to rigkit", "-o", ("opencv.yaml",)),
     ("export dataset.toml --to ply --pair first", "-o",
      ("dataset.toml", "session.toml", "board.toml", "floor.toml", "image.png", "image.jpg", "calibration.json")),
+    ("plan calibration.json -n 1", "-r", ("calibration.json",)),
+    ("plan --lens 60 --size 320x240 --board board.toml --views 4", "-r", ("board.toml",)),
     (INIT, "-o", ("calibration.json", *IMAGES)),
 )  # fmt: skip
 """Commands, the option that names what they write, and what they read."""

@@ -78,6 +78,8 @@ def reweighted(
     if isinstance(weights, RowWeights):
         return solve(weights), weights
     rule: WeightRule = "noise" if weights is None else weights
+    if not isinstance(rule, str):
+        raise InputError(f"weights: RowWeights or the name of a rule are needed, got {type(rule).__name__}")
     if rule == "equal":
         row_weights = equal_weights(matches)
         return solve(row_weights), row_weights
