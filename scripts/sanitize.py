@@ -26,6 +26,8 @@ WATCHED = (
     "-fsanitize=address,undefined",
     # What is undefined ends the run instead of being told and forgotten.
     "-fno-sanitize-recover=all",
+    # One copy of each function instead of one a processor: the compiler is slow enough here.
+    "-Dtarget_clones(...)=unused",
 )
 """In place of the optimisation: arithmetic, and what is exported, are as always."""
 OPTIONS = {

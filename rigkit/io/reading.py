@@ -74,14 +74,14 @@ def read_text(path: str | Path, what: str = "", *, max_bytes: int = MAX_TEXT_BYT
 
 
 @contextmanager
-def about(path: str | Path) -> Iterator[None]:
-    """Let errors of the block, which is about one file, name it."""
+def about(*paths: str | Path) -> Iterator[None]:
+    """Let errors of the block, which is about these files, name them."""
     try:
         yield
     except RigkitError as error:
-        if str(path) in str(error):
+        if any(str(path) in str(error) for path in paths):
             raise
-        raise type(error)(f"'{path}': {error}") from error
+        raise type(error)(" and ".join(f"'{path}'" for path in paths) + f": {error}") from error
 
 
 def _named(path: str | Path, what: str) -> str:

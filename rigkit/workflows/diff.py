@@ -12,6 +12,7 @@ from rigkit.cameras.compare import CameraDifference, compare_cameras
 from rigkit.core.errors import InputError
 from rigkit.io.calibration_file import is_calibration, load_calibration
 from rigkit.io.files import ensure_writable, write_atomic
+from rigkit.io.reading import about
 from rigkit.io.rig_file import SavedRig, is_board_rigs_file, is_rig_file, load_board_rigs, load_saved_rig
 from rigkit.report.figures import difference_png
 from rigkit.workflows.camera_files import import_camera, import_rig, is_ours, is_rig
@@ -92,7 +93,8 @@ def diff(a: Path, b: Path, options: DiffOptions | None = None) -> CameraPair | R
         raise InputError(f"diff: a rig and a camera; compare '{other}' with the calibration beside the rig")
     if options.output is not None:
         ensure_writable(options.output, force=options.force, inputs=(a, b))
-    pair = _cameras(a, b)
+    with about(a, b):
+        pair = _cameras(a, b)
     if options.output is not None:
         write_atomic(options.output, difference_png(pair.difference), force=options.force)
     return pair

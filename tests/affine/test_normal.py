@@ -286,5 +286,5 @@ class TestWeighted:
 def test_arrays_of_other_shapes_are_refused(wrong: object, which: int, method: str) -> None:
     arrays: list[object] = [np.ones((4, 2, 3)), np.ones((4, 2, 3)), np.ones((4, 2, 2))]
     arrays[which] = wrong
-    with pytest.raises(InputError, match="J1|J2|A21"):
+    with pytest.raises(InputError, match=r"J1|J2|A21"):
         normals_from_affines(*arrays, method=method)  # type: ignore[arg-type]

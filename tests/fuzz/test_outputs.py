@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import stat
 from pathlib import Path
@@ -133,3 +134,36 @@ def test_one_unreadable_image_does_not_end_a_manifest(place: Path, capsys: pytes
     assert main([*INIT.split(), "-o", "new.toml"]) == 2
     assert (place / "new.toml").is_file()
     assert "left out: image" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["kalibr.yaml", "cameras.txt", "lens.cameramodel", "ros.yaml"])
+def test_formats_of_others_are_recognised_by_content(
+    name: str, place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nobody says which one it is, and nobody is told to calibrate again."""
+    assert main(["diff", name, "kalibr.yaml"]) == 0
+    assert "difference 0.0000 px rms" in capsys.readouterr().out
+
+
+def test_a_difference_that_cannot_be_told_names_both_files(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = refused("diff calibration.json opencv.yaml", capsys)
+    assert "'calibration.json' and 'opencv.yaml'" in line and "one image size" in line
+
+
+def test_one_changed_number_of_a_covariance_is_no_calibration(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = json.loads((place / "calibration.json").read_text())
+    data["frame_covariance"][5][3] = 1e-8
+    (place / "changed.json").write_text(json.dumps(data))
+    assert "changed.json" in refused("diff changed.json calibration.json", capsys)
+
+
+@pytest.mark.parametrize("name", ["tables.md", "report.html"])
+def test_a_pair_called_as_a_file_of_results_is_refused_before_the_work(
+    name: str, place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rigkit.workflows.validate.load_cameras", lambda *_, **__: pytest.fail("work was done"))
+    text = (place / "dataset.toml").read_text()
+    (place / "dataset.toml").write_text(text.replace('id = "first"', f'id = "{name}"'))
+    assert name in refused("validate dataset.toml -o new -j 1", capsys)
+    (place / "dataset.toml").write_text(text.replace('id = "first"', f'id = "{256 * "x"}"'))
+    assert "at most 60" in refused("validate dataset.toml -o new -j 1", capsys)
