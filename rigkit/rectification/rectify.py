@@ -143,9 +143,10 @@ class RectifyMap:
     ) -> NDArray[Any]:
         width, height = self.camera.size_px
         if image.shape[:2] != (height, width) or image.ndim not in (2, 3):
+            shown = f"{image.shape[1]} x {image.shape[0]} px" if image.ndim in (2, 3) else f"shape {image.shape}"
             raise InputError(
-                f"image of {image.shape[1] if image.ndim > 1 else 0} x {image.shape[0]} px, but the camera was "
-                f"calibrated at {width} x {height}; take the image size of the calibration"
+                f"image of {shown}, but the camera was calibrated at {width} x {height}; take the image size of the "
+                "calibration"
             )
         sampler = _Sampler(image, interpolation)
         columns, rows = self.target.size_px
