@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 __all__ = ["HELP", "add_arguments", "run"]
 
-SIZE_PX = re.compile(r"([0-9]{1,6})[xX]([0-9]{1,6})")
+IMAGE_SIZE = re.compile(r"([0-9]{1,6})[xX]([0-9]{1,6})")
 
 HELP = "which pictures to take next, or what a lens, a board and so many pictures will reach"
 
@@ -84,7 +84,7 @@ def _planned(args: argparse.Namespace) -> PlannedSession:
         return plan_session(args.source, _options(args, 3), progress=progress_on_stderr())
     if not (args.size and args.board):
         raise InputError("plan: --lens needs --size 1280x960 and --board 9x6x25")
-    size = SIZE_PX.fullmatch(args.size)
+    size = IMAGE_SIZE.fullmatch(args.size)
     if size is None:
         raise InputError(f"--size {args.size}: write width and height in pixels, such as 1280x960")
     if args.report is not None:
