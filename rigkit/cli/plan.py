@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 __all__ = ["HELP", "add_arguments", "run"]
 
-IMAGE_SIZE = re.compile(r"([0-9]{1,6})[xX]([0-9]{1,6})")
+IMAGE_SIZE = re.compile(r"^([0-9]{1,6})[xX]([0-9]{1,6})$")
 
 HELP = "which pictures to take next, or what a lens, a board and so many pictures will reach"
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 HELP = "perspective, cylindrical or equirectangular image from any camera's image, or a stereo pair"
 
-IMAGE_SIZE = re.compile(r"^(\d+)[xX](\d+)$")
+IMAGE_SIZE = re.compile(r"^([0-9]{1,6})[xX]([0-9]{1,6})$")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
