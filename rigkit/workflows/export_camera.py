@@ -18,6 +18,7 @@ from rigkit.interop.rigs import RIG_FORMATS, Rig, write_rig
 from rigkit.interop.ros import write_camera_info
 from rigkit.io.calibration_file import refuse_mirrored, save_camera
 from rigkit.io.files import ensure_writable, write_atomic, write_together
+from rigkit.io.reading import about
 from rigkit.workflows.camera_files import import_camera, import_rig
 from rigkit.workflows.formats import CAMERA_FORMATS, FOREIGN_ENDINGS
 
@@ -80,12 +81,14 @@ def export_camera(source: str | Path, options: ExportCameraOptions) -> ExportedC
     if kind not in CAMERA_FORMATS:
         raise InputError(f"export: say the camera's format with --to, one of {', '.join(CAMERA_FORMATS)}")
     ensure_writable(options.output, force=options.force, inputs=[source])
-    camera = import_camera(source, options.source_kind)
+    with about(source):
+        camera = import_camera(source, options.source_kind)
     refuse_mirrored(camera, source)
     if kind == "rigkit":
         save_camera(options.output, camera, force=options.force)
         return ExportedCamera(camera=camera, kind=kind, max_error_px=0.0)
-    text, worst_px, words = _foreign(camera, kind)
+    with about(source):
+        text, worst_px, words = _foreign(camera, kind)
     write_atomic(options.output, text, force=options.force)
     if words:
         _log.info(words)
@@ -108,7 +111,8 @@ def export_rig(source: str | Path, options: ExportCameraOptions, names: Sequence
             f"'{source}': no camera '{', '.join(missing) or names[0]}' to pick; there are {', '.join(rig)}"
         )
     rig = {name: rig[name] for name in names or rig}
-    foreign = write_rig(rig, kind)
+    with about(source):
+        foreign = write_rig(rig, kind)
     files = {_of_camera(options.output, key): text for key, text in foreign.files.items()}
     ensure_writable(list(files), force=options.force, inputs=[source])
     write_together(dict(files), force=options.force)
