@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from rigkit.core.arrays import Affines, BoolArray, FloatArray, Mat3, Pixels, RayJacobians, Rays, as_array, as_floats
 from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
+from rigkit.core.printing import brief
 from rigkit.geometry.sampson import epipolar_normals
 
 __all__ = ["Affinities", "DirectionNoise", "EpipolarNormals"]
@@ -35,6 +36,8 @@ class EpipolarNormals:
 
     n1: FloatArray
     n2: FloatArray
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         n = len(np.asarray(self.n1))

@@ -282,6 +282,8 @@ def _projective_fit(tangent: _Tangent, index: IntArray, steps: FloatArray) -> tu
     -----
     Gauss-Newton from the linear start: with w = 1 + g.s and the fitted y, the rows are
     [s/w, 1/w, -y s/w] (V, c, g) = y_measured - y + y/w, whitened by each corner's covariance in this tangent plane.
+    Undamped, unlike what `rigkit.optim` solves: the start is the fit without perspective, which is off by a few per
+    cent, the rows are nearly linear in (V, c, g), and what would not converge shows as w <= 0 and is refused.
     """
     n, m, d = steps.shape
     measured, usable, cosine = tangent.positions(index)

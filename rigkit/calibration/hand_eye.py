@@ -20,6 +20,7 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.printing import brief
 from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3, nearest_rotation, rotation_angle, skew
@@ -62,6 +63,8 @@ class HandEye:
     rms_px: float
     image_rms_px: dict[str, float]
     left_out: dict[str, float]
+
+    __repr__ = brief
 
     def sigmas(self) -> tuple[FloatArray, FloatArray]:
         """Return standard deviations (2, 3) of the turns (rad) and of the translations (mm) of both poses."""

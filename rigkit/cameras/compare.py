@@ -141,7 +141,11 @@ def grid_pixels(size_px: tuple[int, int], grid: tuple[int, int]) -> Pixels:
 
 
 def _best_rotation(rays: FloatArray, pixels: FloatArray, weight: FloatArray, b: Camera) -> Mat3:
-    """Return the rotation b_from_a at which `b` projects `rays` nearest to `pixels`: rays first, then pixels."""
+    """Return the rotation b_from_a at which `b` projects `rays` nearest to `pixels`: rays first, then pixels.
+
+    Undamped Gauss-Newton: the fit of the rays starts it within pixels of the end, with hundreds of rays for three
+    unknowns.
+    """
     rays_b, seen = b.unproject(pixels)
     covariance = np.einsum("n,ni,nj->ij", weight[seen], rays_b[seen], rays[seen])
     rotation = nearest_rotation(covariance) if seen.sum() >= 3 else np.eye(3)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Normals, Points, as_array, as_indices
 from rigkit.core.errors import InputError
+from rigkit.core.printing import brief
 
 __all__ = ["OrientedCloud"]
 
@@ -40,6 +41,8 @@ class OrientedCloud:
     normal_sigma_rad: FloatArray
     board_ids: tuple[str, ...]
     calibration_in_sigmas: bool = False
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         n = len(np.asarray(self.points_mm))

@@ -10,6 +10,7 @@ import numpy as np
 from rigkit.core.arrays import FloatArray, IntArray, Pixels, Points, as_array, as_indices
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
+from rigkit.core.printing import brief
 
 __all__ = ["BoardDetection", "BoardView", "common_corners", "grid_turned"]
 
@@ -28,6 +29,14 @@ def grid_turned(grid: IntArray, size: tuple[int, int], quarter_turns: int) -> In
         column, row = rows - 1 - row, column
         columns, rows = rows, columns
     return np.stack([column, row], axis=-1)
+
+
+def _check_corners(seen: BoardDetection | BoardView) -> None:
+    """Make grid, pixels and sigmas arrays of one length; raises InputError where they are not."""
+    object.__setattr__(seen, "grid", as_indices(seen.grid, (None, 2), "grid"))
+    n = len(seen.grid)
+    object.__setattr__(seen, "pixels", as_array(seen.pixels, (n, 2), "pixels"))
+    object.__setattr__(seen, "sigma_px", as_array(seen.sigma_px, (n,), "sigma_px"))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -51,11 +60,10 @@ class BoardDetection:
     pixels: Pixels
     sigma_px: FloatArray
 
+    __repr__ = brief
+
     def __post_init__(self) -> None:
-        object.__setattr__(self, "grid", as_indices(self.grid, (None, 2), "grid"))
-        n = len(self.grid)
-        object.__setattr__(self, "pixels", as_array(self.pixels, (n, 2), "pixels"))
-        object.__setattr__(self, "sigma_px", as_array(self.sigma_px, (n,), "sigma_px"))
+        _check_corners(self)
         inside = (self.grid >= 0).all() and (self.grid < [self.columns, self.rows]).all()
         if not inside:
             raise InputError(f"board detection: a corner lies outside the {self.columns}x{self.rows} grid")
@@ -101,11 +109,10 @@ class BoardView:
     pixels: Pixels
     sigma_px: FloatArray
 
+    __repr__ = brief
+
     def __post_init__(self) -> None:
-        object.__setattr__(self, "grid", as_indices(self.grid, (None, 2), "grid"))
-        n = len(self.grid)
-        object.__setattr__(self, "pixels", as_array(self.pixels, (n, 2), "pixels"))
-        object.__setattr__(self, "sigma_px", as_array(self.sigma_px, (n,), "sigma_px"))
+        _check_corners(self)
 
     @classmethod
     def from_detection(cls, image: str, detection: BoardDetection, boards: Sequence[Board]) -> BoardView:

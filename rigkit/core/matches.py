@@ -21,6 +21,7 @@ from rigkit.core.arrays import (
     as_indices,
 )
 from rigkit.core.errors import InputError
+from rigkit.core.printing import brief
 
 __all__ = ["CentralCamera", "DirectionPairs", "Matches"]
 
@@ -55,6 +56,8 @@ class DirectionPairs:
     kinds: tuple[str, ...] = ("horizontal", "vertical", "diagonal")
     pixels1: Pixels | None = None
     pixels2: Pixels | None = None
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         first = np.asarray(self.image1)
@@ -108,6 +111,8 @@ class Matches:
     K2: Mat3 | None = None
     A21: Affines | None = None
     sigma_A: FloatArray | None = None
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         n = len(np.asarray(self.pixels1))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.core.errors import InputError
+from rigkit.core.printing import brief
 
 __all__ = ["Feature", "MeasuredAngle", "MeasuredDistance", "MeasuredLength", "PairTruth"]
 
@@ -107,6 +108,8 @@ class PairTruth:
     baseline: MeasuredLength | None = None
     angles: tuple[MeasuredAngle, ...] = ()
     distances: tuple[MeasuredDistance, ...] = ()
+
+    __repr__ = brief
 
     @property
     def count(self) -> int:

@@ -10,6 +10,7 @@ from typing import TypeVar
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.posetype import PoseType
+from rigkit.core.printing import brief
 from rigkit.core.truth import PairTruth
 from rigkit.identification.board_ids import BOARD_SIDES
 from rigkit.io.board_file import board_from_table, load_board
@@ -96,6 +97,8 @@ class Dataset:
     cameras: tuple[CameraEntry, ...]
     pairs: tuple[Pair, ...]
     sources: tuple[Path, ...] = ()
+
+    __repr__ = brief
 
     @property
     def inputs(self) -> tuple[Path, ...]:

@@ -45,6 +45,7 @@ from pathlib import Path, PurePath
 
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
+from rigkit.core.printing import brief
 from rigkit.core.truth import MeasuredLength, PairTruth
 from rigkit.identification.board_ids import BOARD_SIDES
 from rigkit.io.session import SESSION_SCHEMA, Session, beside_session, boards_of, images_of, options_of
@@ -105,6 +106,8 @@ class RigSession:
     frames: str | None
     baselines: tuple[MeasuredBaseline, ...]
     rigid_boards: tuple[RigidBoards, ...] = ()
+
+    __repr__ = brief
 
     @property
     def rig_path(self) -> Path:

@@ -22,6 +22,7 @@ from rigkit.calibration.shape import SHAPES
 from rigkit.cameras.registry import MODELS, check_order
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
+from rigkit.core.printing import brief
 from rigkit.io.board_file import load_board
 from rigkit.io.toml_reader import TomlTable, named_path, read_toml
 
@@ -62,6 +63,8 @@ class Session:
     degree: int | None
     board_shape: str
     camera: str | None = None
+
+    __repr__ = brief
 
     @property
     def calibration_path(self) -> Path:

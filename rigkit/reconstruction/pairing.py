@@ -18,6 +18,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection, common_corners
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import DirectionPairs, Matches
+from rigkit.core.printing import brief
 from rigkit.core.truth import MeasuredAngle
 from rigkit.identification.identify import identify_pair
 from rigkit.identification.measured_angles import ids_by_angles
@@ -60,6 +61,8 @@ class MatchedPair:
     directions: DirectionPairs
     noise: DirectionNoise
     notes: tuple[str, ...] = ()
+
+    __repr__ = brief
 
     def noisier(self, factor: float) -> MatchedPair:
         """Return the same pair with all standard deviations of corners and directions multiplied by `factor`."""

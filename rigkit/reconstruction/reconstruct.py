@@ -24,6 +24,7 @@ from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
+from rigkit.core.printing import brief
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.sampson import sampson_distances
@@ -97,6 +98,8 @@ class Reconstruction:
     level_sigma_rad: float | None = None
     geometry: PairGeometry | None = None
     kept: BoolArray | None = None
+
+    __repr__ = brief
 
     def same_points(self, other: Reconstruction) -> bool:
         """Return whether both have the very same points: of one geometry, and the same corners."""

@@ -144,6 +144,7 @@ def _similarity_scale(
         floor = 1e-12 * np.trace(covariances, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         whiten = np.linalg.inv(np.linalg.cholesky(covariances + floor))
     noise, gram = 1.0, np.eye(7)
+    # Reweighted at every step, which changes the cost that `rigkit.optim` would hold fixed; the robust start is near.
     for iteration in range(ITERATIONS):
         turned = centred @ R.T
         residual = np.einsum("nij,nj->ni", whiten, points - k * turned - c)

@@ -22,6 +22,7 @@ from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
+from rigkit.core.printing import brief
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.metric import triangulate_matches
 from rigkit.reconstruction.reconstruct import Reconstruction, colours_at, oriented_cloud
@@ -56,6 +57,8 @@ class SceneReconstruction:
     kept: NDArray[np.int64]
     sigma_px: float
     sigma_A: float
+
+    __repr__ = brief
 
 
 def reconstruct_scene(

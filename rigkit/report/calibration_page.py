@@ -15,6 +15,7 @@ from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.uncertainty import uncertainty_map
 from rigkit.core.arrays import Pixels
 from rigkit.core.findings import Finding
+from rigkit.core.printing import brief
 from rigkit.core.tables import Cell, Column, Table
 from rigkit.io.images import Image
 from rigkit.planning.plan import Plan
@@ -62,6 +63,8 @@ class CalibrationSection:
     calibration: Calibration
     thumbnails: Mapping[str, bytes] = field(default_factory=dict)
     plan: Plan | None = None
+
+    __repr__ = brief
 
 
 def build_calibration_page(

@@ -17,6 +17,7 @@ import numpy as np
 
 from rigkit.core.arrays import without_nan
 from rigkit.core.errors import InputError
+from rigkit.core.printing import brief
 from rigkit.core.truth import PairTruth
 from rigkit.reconstruction.lattice_planes import LatticePlanes
 from rigkit.reconstruction.reconstruct import Reconstruction
@@ -96,6 +97,8 @@ class ValidationReport:
     count: int
     notes: tuple[str, ...] = ()
     lattice_normal_errors: Mapping[str, NormalErrors] = field(default_factory=dict)
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         if all(check.kind in DECLARED for check in self.checks):

@@ -17,6 +17,7 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray, without_nan
 from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.printing import brief
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, log_so3, rotation_angle, unit
 from rigkit.interop.colmap import colmap_pair, solve_pair
@@ -89,6 +90,8 @@ class CrossCheckReport:
     checks: tuple[Check, ...]
     skipped: tuple[str, ...]
     diagnosis: tuple[str, ...]
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         if not self.checks:

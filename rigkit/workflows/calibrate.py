@@ -10,6 +10,7 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.board_ties import suggest_ties
 from rigkit.calibration.verdicts import judge_session
+from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.calibration_file import calibration_text
 from rigkit.io.files import ensure_writable, write_together
@@ -65,6 +66,8 @@ class SessionCalibration:
     calibration: Calibration
     unreadable: Mapping[str, str]
     written: tuple[Path, ...]
+
+    __repr__ = brief
 
 
 def calibrate_session(

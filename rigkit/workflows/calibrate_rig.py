@@ -11,6 +11,7 @@ from rigkit.calibration.rig.board_ties import suggest_ties
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.verdicts import judge
+from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.calibration_file import calibration_text
 from rigkit.io.files import ensure_writable, write_together
@@ -53,6 +54,8 @@ class RigSessionCalibration:
     checks: tuple[Check, ...]
     unreadable: Mapping[str, str]
     written: tuple[Path, ...]
+
+    __repr__ = brief
 
     @property
     def passed(self) -> bool:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from rigkit.core.errors import InputError
+from rigkit.core.printing import brief
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibration_file import load_calibration
 from rigkit.io.files import ensure_writable, write_together
@@ -46,6 +47,8 @@ class CertifiedFile:
     certificate: Certificate
     words: CertificateWords
     written: tuple[Path, ...]
+
+    __repr__ = brief
 
 
 def certify_file(path: str | Path, task: Task, options: CertifyOptions | None = None) -> CertifiedFile:

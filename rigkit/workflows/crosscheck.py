@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.core.tables import Table
 from rigkit.io.manifest import Dataset, Pair
@@ -44,6 +45,8 @@ class DatasetCrossCheck:
     failures: tuple[PairFailure, ...]
     table: Table
     files: Mapping[str, str | bytes]
+
+    __repr__ = brief
 
     @property
     def passed(self) -> bool:

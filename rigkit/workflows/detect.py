@@ -17,6 +17,7 @@ from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import CheckFailed, InputError
+from rigkit.core.printing import brief
 from rigkit.core.processes import worker_pool
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
@@ -64,6 +65,8 @@ class DetectionResult:
     found: Mapping[str, tuple[BoardDetection, ...]]
     failures: Mapping[str, InputError]
     doubtful: Mapping[str, str] = field(default_factory=dict)
+
+    __repr__ = brief
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -10,6 +10,7 @@ from rigkit.calibration.compare import CalibrationComparison, compare_calibratio
 from rigkit.calibration.rig.compare import Mounted, RigDifference, compare_board_rigs, compare_mounts
 from rigkit.cameras.compare import CameraDifference, compare_cameras
 from rigkit.core.errors import InputError
+from rigkit.core.printing import brief
 from rigkit.io.calibration_file import is_calibration, load_calibration
 from rigkit.io.files import ensure_writable, write_atomic
 from rigkit.io.reading import about
@@ -38,6 +39,8 @@ class CameraPair:
     difference: CameraDifference
     judged: CalibrationComparison | None
 
+    __repr__ = brief
+
     @property
     def same(self) -> bool | None:
         """Whether it is the same camera; None: nobody can tell."""
@@ -50,6 +53,8 @@ class RigPair:
 
     mounts: RigDifference
     cameras: Mapping[str, CameraPair]
+
+    __repr__ = brief
 
     @property
     def same(self) -> bool | None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from rigkit.cameras.base import Camera
 from rigkit.core.errors import InputError
+from rigkit.core.printing import brief
 from rigkit.interop.colmap_cameras import write_colmap_cameras
 from rigkit.interop.kalibr import write_kalibr
 from rigkit.interop.mrcal import write_cameramodel
@@ -62,6 +63,8 @@ class ExportedCamera:
     kind: str
     max_error_px: float
 
+    __repr__ = brief
+
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class ExportedRig:
@@ -70,6 +73,8 @@ class ExportedRig:
     kind: str
     max_error_px: float
     written: tuple[Path, ...]
+
+    __repr__ = brief
 
 
 def export_camera(source: str | Path, options: ExportCameraOptions) -> ExportedCamera:

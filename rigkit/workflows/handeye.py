@@ -14,6 +14,7 @@ from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import CheckFailed, InputError
+from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
 from rigkit.geometry.board_pose import BoardPose, board_poses
@@ -60,6 +61,8 @@ class PlacedCamera:
     image: Path
     rms_px: float
     ambiguous: bool
+
+    __repr__ = brief
 
 
 def calibrate_hand_eye(

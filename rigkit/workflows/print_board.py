@@ -7,6 +7,7 @@ from pathlib import Path
 
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
+from rigkit.core.printing import brief
 from rigkit.io.board_file import board_text, load_layout
 from rigkit.io.files import write_atomic, write_together
 from rigkit.io.reading import about
@@ -44,6 +45,8 @@ class MeasuredPrint:
     """How well the rule could be read."""
     paper: str = "a4"
     """What it was printed on, which decides how long the rulers are."""
+
+    __repr__ = brief
 
 
 def print_board(board: Board | str | Path, options: PrintOptions) -> tuple[Path, ...]:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.manifest import Dataset, Pair
 from rigkit.io.ply import ply_bytes
@@ -53,6 +54,8 @@ class DatasetReconstruction:
     pairs: tuple[PairReconstruction, ...]
     failures: tuple[PairFailure, ...]
     files: Mapping[str, str | bytes]
+
+    __repr__ = brief
 
 
 @dataclass(frozen=True, eq=False, slots=True)

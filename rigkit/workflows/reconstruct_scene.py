@@ -15,6 +15,7 @@ from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.features import TILTS, match_affine_features
 from rigkit.cameras.base import Camera
 from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.correspondences import correspondences_text, read_correspondences
@@ -101,6 +102,8 @@ class SceneResult:
     scene: SceneReconstruction
     correspondences: Correspondences
     files: Mapping[str, str | bytes]
+
+    __repr__ = brief
 
     @property
     def unit(self) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.errors import InputError
+from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.files import ensure_writable, write_atomic, write_together
 from rigkit.io.images import read_image, require_pixels
@@ -56,6 +57,8 @@ class RectifiedImage:
     path: Path
     map: RectifyMap
     covered: float
+
+    __repr__ = brief
 
 
 def rectify_image(

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.errors import InputError
+from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.files import ensure_writable, write_atomic, write_together
 from rigkit.io.sources import source_hash
@@ -57,6 +58,8 @@ class StudyResult:
     study: Study
     table: StudyTable
     written: tuple[Path, ...]
+
+    __repr__ = brief
 
 
 def run_studies(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rigkit.affine.registry import AFFINE_METHODS
 from rigkit.core.errors import InputError, RigkitError
 from rigkit.core.findings import Finding, Severity
+from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.manifest import Dataset, Pair
 from rigkit.io.paper_tables import load_paper_tables
@@ -83,6 +84,8 @@ class DatasetValidation:
     causes: tuple[Finding, ...]
     files: Mapping[str, str | bytes]
     seconds: float
+
+    __repr__ = brief
 
     @property
     def reports(self) -> tuple[ValidationReport, ...]:

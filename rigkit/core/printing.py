@@ -1,0 +1,47 @@
+"""How results print: what they are and hold, in a few lines, never their arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import numpy as np
+
+__all__ = ["brief"]
+
+MAX_LENGTH = 60
+"""Letters of one value; of more the first are shown."""
+MAX_TOGETHER = 440
+"""Letters of all values: under five lines of a hundred."""
+MAX_LISTED = 3
+"""A collection of more is counted."""
+
+
+def brief(self: Any) -> str:
+    """Return a dataclass with its values as far as they are short; arrays by their shape, collections by their size.
+
+    Classes take it as their `__repr__`.
+    """
+    said = [f"{field.name}={_value(getattr(self, field.name))}" for field in fields(self)]
+    words = ", ".join(said)
+    if len(words) > MAX_TOGETHER:
+        words = words[: words.rindex(",", 0, MAX_TOGETHER)] + ", ..."
+    return f"{type(self).__name__}({words})"
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return f"<{'x'.join(str(n) for n in value.shape)}>"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, str | bytes | type(None)) or not isinstance(value, Collection):
+        words = f"<{type(value).__name__}>" if is_dataclass(value) else repr(value)
+    elif isinstance(value, Mapping):
+        listed = len(value) <= MAX_LISTED
+        words = f"{{{', '.join(map(str, value))}}}" if listed else f"<{len(value)} entries>"
+    else:
+        words = f"<{len(value)} {type(value).__name__}>"
+        if len(value) <= MAX_LISTED and all(isinstance(v, str | int | float) for v in value):
+            words = repr(value)
+    return words.splitlines()[0] if len(words) <= MAX_LENGTH else f"{words.splitlines()[0][:MAX_LENGTH]}..."

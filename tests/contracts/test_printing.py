@@ -1,0 +1,91 @@
+"""Every public object prints in a few lines, whatever it holds."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.calibration_scenes import lens, random_views
+
+import rigkit
+from rigkit.calibration.calibrate import calibrate
+from rigkit.cameras.compare import compare_cameras
+from rigkit.core.findings import Finding, Severity
+from rigkit.core.printing import brief
+
+MAX_LINES = 5
+COLUMNS = 120
+
+PUBLIC: dict[str, type[Any]] = {
+    name: found
+    for name, found in ((name, getattr(rigkit, name)) for name in rigkit.__all__)
+    if inspect.isclass(found) and dataclasses.is_dataclass(found)
+}
+BULK = (
+    np.arange(6000.0).reshape(1000, 6),
+    tuple(f"a note that says much, number {k}" for k in range(400)),
+    {f"image{k}": np.zeros((9, 9)) for k in range(300)},
+    "a message\nof several lines " * 40,
+    1.0 / 3.0,
+    Path("/a/long/path") / ("x" * 200),
+    Finding(severity=Severity.LOOK, message="m" * 300),
+)
+
+
+def filled(kind: type[Any], shift: int, values: tuple[Any, ...] = BULK) -> Any:
+    """Return an object of that class whose fields hold much, whatever they are declared to hold."""
+    made = object.__new__(kind)
+    for k, field in enumerate(dataclasses.fields(kind)):
+        object.__setattr__(made, field.name, values[(k + shift) % len(values)])
+    return made
+
+
+def with_words_of_its_own(name: str) -> Any:
+    """Return an object of a class that prints itself in another way."""
+    camera = lens("reg")
+    if name == "Calibration":
+        views = random_views(camera, 8, np.random.default_rng(1), reach_deg=24.0, noise_px=0.1)[0]
+        return calibrate(views, camera.size_px, model="brown")
+    if name == "RigCalibration":
+        rig = filled(rigkit.RigCalibration, 0, (0.25,))
+        cameras = [SimpleNamespace(name=f"camera{k}") for k in range(6)]
+        parts = {"cameras": cameras, "left_out": (), "verdicts": (Finding(severity=Severity.GOOD, message="well"),)}
+        for key, value in parts.items():
+            object.__setattr__(rig, key, value)
+        return rig
+    made = {
+        "Board": lambda: rigkit.Board("plane1", 8, 6, 50.0, 50.0),
+        "Camera": lambda: camera,
+        "CameraDifference": lambda: compare_cameras(camera, camera),
+        "Rigid3": rigkit.Rigid3.identity,
+        "Task": lambda: rigkit.Task(quantity=rigkit.Quantity.LENGTH, size_mm=100.0, distance_mm=1000.0),
+    }
+    return made[name]()
+
+
+def lines_of(words: str) -> int:
+    return sum(-(-max(len(line), 1) // COLUMNS) for line in words.splitlines())
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_it_prints_in_a_few_lines(name: str) -> None:
+    kind = PUBLIC[name]
+    if vars(kind).get("__repr__") is brief:
+        printed = [repr(filled(kind, shift)) for shift in range(len(BULK))]
+    elif name.endswith("Options"):
+        printed = [repr(filled(kind, 0, (Path("folder/session.toml"), 0.1, None, ("ros", "opencv"))))]
+    else:
+        printed = [repr(with_words_of_its_own(name))]
+    for words in printed:
+        assert name.removesuffix("Camera") in words or name == "Camera"
+        assert lines_of(words) <= MAX_LINES, words
+
+
+def test_values_are_shown_where_they_are_short() -> None:
+    found = rigkit.BoardDetection("a", 3, 2, np.array([[0, 0], [1, 0]]), np.zeros((2, 2)), np.full(2, 0.1))
+    assert repr(found) == "BoardDetection(board_id='a', columns=3, rows=2, grid=<2x2>, pixels=<2x2>, sigma_px=<2>)"
