@@ -69,7 +69,7 @@ def test_equals_crossing_planes_in_space(corners: Corners, rng: np.random.Genera
             for J, d in ((corners.J1, directions.image1), (corners.J2, directions.image2))
         ]
         tangents.append(np.cross(*planes))
-    crossing = unit(np.cross(*tangents))
+    crossing = unit(np.cross(tangents[0], tangents[1]))
     crossing *= -np.sign(np.sum(crossing * corners.points, axis=1, keepdims=True))
     found = affines_from_directions(directions, "F2UDIR", epipolar=corners.epipolar, min_conditioning=0.0)
     normals, valid = normals_from_affines(corners.J1, corners.J2, found.A21)

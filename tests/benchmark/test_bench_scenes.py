@@ -60,7 +60,8 @@ def test_blank_pictures_are_sharp_and_reproducible(name: str, rng: np.random.Gen
     assert picture.shape == (240, 320)
     assert picture.dtype == np.uint8
     assert picture.std() > 15.0
-    np.testing.assert_array_equal(*(blank(name, np.random.default_rng(1), (160, 120)) for _ in range(2)))
+    first, again = (blank(name, np.random.default_rng(1), (160, 120)) for _ in range(2))
+    np.testing.assert_array_equal(first, again)
     with pytest.raises(InputError, match="known: noise"):
         blank("chessboard", rng)
 

@@ -157,7 +157,7 @@ def test_scaramuzza_converges_quickly(rng: np.random.Generator) -> None:
     theta = np.linspace(0.02, 1.62, 80)
     radius = truth.camera.project(np.stack([np.sin(theta), 0 * theta, np.cos(theta)], -1))[0][:, 0] - 808.0
     camera = Scaramuzza.from_radial_curve(
-        truth.camera.size_px, RadialCurve([808.0, 615.0], theta, 1.05 * radius), order=6
+        truth.camera.size_px, RadialCurve(np.array([808.0, 615.0]), theta, 1.05 * radius), order=6
     )
     solution = solve(observations, replace(truth, camera=camera))
     assert solution.convergence.converged

@@ -15,7 +15,9 @@ def grid(columns: int, rows: int, *, corners: int | None = None) -> BoardDetecti
     cells = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2)
     # The outer corners stay, so that the size does.
     kept = np.r_[np.arange(columns * rows - 1)[:corners], columns * rows - 1]
-    return BoardDetection(None, columns, rows, cells[kept], 20.0 * cells[kept] + 50.0, np.full(len(kept), 0.05))
+    return BoardDetection(
+        None, columns, rows, cells[kept], np.asarray(20.0 * cells[kept] + 50.0), np.full(len(kept), 0.05)
+    )
 
 
 def shown(*grids: BoardDetection) -> dict[str, list[BoardDetection]]:

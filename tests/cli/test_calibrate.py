@@ -300,6 +300,7 @@ def test_boards_that_nobody_has(session: Path, capsys: pytest.CaptureFixture[str
 def test_images_of_two_sizes(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def halve(name: str) -> None:
         image = cv2.imread(str(session.parent / name))
+        assert image is not None
         cv2.imwrite(str(session.parent / name), cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
 
     halve("04.jpg")

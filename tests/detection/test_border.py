@@ -46,7 +46,8 @@ def part_scene(seed: int, lens: str, covered: bool) -> tuple[BenchScene, np.rand
             spot = np.round(spot / 15.0) * 15.0
         angle = rng.choice([0.0, 0.5 * np.pi, rng.uniform(0.0, np.pi)])
         pose = placed.world_from_board @ Rigid3(exp_so3(np.array([0.0, 0.0, angle])), np.array([*spot, -1.0]))
-        panels = (Panel(pose, *rng.uniform(20.0, 300.0, 2), rng.choice([0.06, 0.35, 0.6, 0.8, 0.85])),)
+        width_mm, height_mm = rng.uniform(20.0, 300.0, 2)
+        panels = (Panel(pose, width_mm, height_mm, rng.choice([0.06, 0.35, 0.6, 0.8, 0.85])),)
     behind = placed.world_from_board @ Rigid3(np.eye(3), np.array([100.0, 100.0, 3.0]))
     wall = Panel(behind, 3000.0, 3000.0, rng.choice([0.05, 0.35, 0.6, 0.8]))
     field = 185.0 if lens == "fisheye" else None

@@ -26,7 +26,8 @@ def test_large_squares_at_the_rim_of_a_fisheye(noise: float) -> None:
     camera = KannalaBrandt((640, 480), np.array([190.0, 190.0, 325.3, 236.1, -0.03, 0.004, -0.001, 0.0]))
     board = Board("a", 5, 4, 60.0, 60.0)
     rng = np.random.default_rng(3)
-    errors, sigmas = [], []
+    errors: list[np.ndarray] = []
+    sigmas: list[np.ndarray] = []
     while len(errors) < 6:
         angle = rng.uniform(0.0, 2.0 * np.pi)
         middle = np.array([325.0 + 156.0 * np.cos(angle), 236.0 + 130.0 * np.sin(angle)])

@@ -50,7 +50,8 @@ def random_views(
     points = board.points() if points_mm is None else points_mm
     middle = board.points().mean(axis=0)
     extent = float(np.ptp(board.points(), axis=0).max())
-    views, rotations, translations = [], [], []
+    views: list[BoardView] = []
+    rotations, translations = [], []
     for _ in range(20000):
         if len(views) == count:
             break

@@ -42,7 +42,8 @@ def pair(
     pose: Rigid3 | None = None,
 ) -> tuple[Matches, Rigid3, np.ndarray]:
     """Matches, true pose, points. `sigma_A` 0 gives exact affinities with a nominal sigma; None gives none."""
-    given, points = pose, []
+    given = pose
+    points: list[np.ndarray] = []
     pose = pose_of(kind, rng) if pose is None else pose
     drawn = 0
     while len(points) < count:

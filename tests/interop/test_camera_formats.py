@@ -358,7 +358,9 @@ def test_published_poses_of_py_ocamcalib_meet_the_corners() -> None:
     board = np.stack(np.meshgrid(np.arange(8.0), np.arange(6.0), [0.0]), axis=-1).reshape(-1, 3)
     points = board @ file_from_board[:, :3].T + file_from_board[:, 3]
     pixels, valid = camera.project(points @ cam_from_file.T)
-    found, corners = cv2.findChessboardCornersSB(cv2.imread(str(folder / "Fisheye1_1.jpg"), 0), (8, 6))
+    image = cv2.imread(str(folder / "Fisheye1_1.jpg"), 0)
+    assert image is not None
+    found, corners = cv2.findChessboardCornersSB(image, (8, 6))
     assert found and valid.all()
     distance = np.linalg.norm(pixels[:, None] - corners.reshape(1, -1, 2), axis=-1).min(axis=1)
     assert np.sqrt(np.mean(distance**2)) < PUBLISHED_RMS_PX

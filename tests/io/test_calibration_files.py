@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -129,7 +130,23 @@ def test_session_file(tmp_path: Path) -> None:
             load_session(path)
 
 
-WEIRD = (None, True, -1, 10**400, 1e308, float("nan"), "x", "", [], {}, [1], [[]], [None], {"a": 1}, [[1, 2], [3]])
+WEIRD: tuple[Any, ...] = (
+    None,
+    True,
+    -1,
+    10**400,
+    1e308,
+    float("nan"),
+    "x",
+    "",
+    [],
+    {},
+    [1],
+    [[]],
+    [None],
+    {"a": 1},
+    [[1, 2], [3]],
+)
 
 
 def spoiled(data: object, rng: np.random.Generator) -> object:

@@ -20,7 +20,7 @@ WRITTEN_PX = 1e-5
 def detections() -> dict[str, tuple[BoardDetection, ...]]:
     board = Board("a", 4, 3, 30.0, 30.0)
     grid = board.grid()
-    pixels = 12.345678 * grid + 100.0
+    pixels = 12.345678 * grid.astype(float) + 100.0
     named = BoardDetection("a", 4, 3, grid, pixels, np.full(12, 0.0123))
     partial = BoardDetection(None, 5, 4, grid[:7], pixels[:7] + 200.0, np.full(7, 0.02))
     return {"one, with comma.png": (named, partial), "two.png": (partial,)}

@@ -78,6 +78,7 @@ def test_affine_extractor(tmp_path: Path, separator: str, rng: np.random.Generat
     lines = [separator.join(f"{value:.17e}" for value in row) for row in np.array(columns).T]
     (tmp_path / "AffsLK.txt").write_text("\n".join(lines) + "\n")
     found = read_correspondences(tmp_path / "AffsLK.txt")
+    assert found.A21 is not None
     np.testing.assert_allclose(found.A21, A21, rtol=1e-15)
     np.testing.assert_allclose(found.pixels1, q1, rtol=1e-15)
     np.testing.assert_allclose(found.pixels2, q2, atol=1e-9)

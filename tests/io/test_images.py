@@ -99,7 +99,8 @@ def test_orientation_in_exif_is_not_applied(tmp_path: Path, colour: np.ndarray) 
     (tmp_path / "turned.jpg").write_bytes(
         plain[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + plain[2:]
     )
-    assert cv2.imread(str(tmp_path / "turned.jpg")).shape == (80, 60, 3)
+    turned = cv2.imread(str(tmp_path / "turned.jpg"))
+    assert turned is not None and turned.shape == (80, 60, 3)
     np.testing.assert_array_equal(read_image(tmp_path / "turned.jpg"), read_image(tmp_path / "a.jpg"))
 
 

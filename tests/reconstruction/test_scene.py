@@ -91,6 +91,7 @@ def test_directions_instead_of_affinities(rng):
     m, _, _ = pair(rng, 60, sigma_A=0.0)
     angles = rng.uniform(0.0, np.pi, (60, 1)) + np.array([0.0, 1.0, 2.0])
     d1 = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    assert m.A21 is not None
     d2 = np.einsum("nij,nkj->nki", m.A21, d1) * rng.uniform(0.5, 2.0, (60, 3, 1))
     pairs = DirectionPairs(
         image1=d1, image2=d2, valid=np.ones((60, 3), dtype=bool), scaled=False, kinds=("a", "b", "c")

@@ -123,6 +123,7 @@ def test_affinities_from_the_epipolar_geometry_tell_nothing_about_it(rng):
     epipolar = EpipolarNormals.from_rays(m.rays1, m.jacobians1, m.rays2, m.jacobians2, wrong)
     angle = rng.uniform(0.0, np.pi, (40, 1)) + np.arange(3.0)
     d1 = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    assert m.A21 is not None
     directions = DirectionPairs(image1=d1, image2=d1 @ np.swapaxes(m.A21, 1, 2), valid=np.ones((40, 3), dtype=bool))
     computed = affines_from_directions(directions, "F3UDIR", epipolar=epipolar)
     circular = replace(m, A21=computed.A21, sigma_A=np.full(40, 1e-4))

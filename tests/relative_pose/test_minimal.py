@@ -25,6 +25,7 @@ def samples(rng, camera, kind="general", count=40):
     for _ in range(count):
         m, pose, _ = pair(rng, 7, kind, sigma_A=0.0, camera=camera)
         points.append(point_rows(m.rays1, m.rays2))
+        assert m.A21 is not None
         affinities.append(affinity_rows(m.rays1, m.rays2, m.jacobians1, m.jacobians2, m.A21)[:2])
         truth.append(essential_from_pose(pose))
     return np.array(points), np.array(affinities), np.array(truth)

@@ -11,7 +11,7 @@ from rigkit.report.overlay import OVERLAY_COLOURS, draw_boards
 
 def test_rows_are_drawn_through_the_corners() -> None:
     board = Board("a", 4, 3, 30.0, 30.0)
-    pixels = 30.0 * board.grid() + 40.0
+    pixels = 30.0 * board.grid().astype(float) + 40.0
     found = BoardDetection("a", 4, 3, board.grid(), pixels, np.full(12, 0.01))
     for image in (np.full((150, 200), 128, np.uint8), np.full((150, 200, 3), 30000, np.uint16)):
         before = image.copy()

@@ -9,9 +9,10 @@ from helpers.reconstructions import make_reconstruction
 
 from rigkit.cameras.base import Camera
 from rigkit.core.truth import MeasuredAngle, MeasuredLength, PairTruth
+from rigkit.geometry.principal_axes import principal_axes
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.validation.checks import validate
-from rigkit.validation.intrinsics import calibration_shifts, principal_axes
+from rigkit.validation.intrinsics import calibration_shifts
 from rigkit.validation.measure import measure
 
 DRAWS = 20

@@ -124,7 +124,7 @@ def test_lattice_finds_square_sizes_order_and_handedness() -> None:
     assert (result.square_x_ratio, result.square_y_ratio) == pytest.approx((50.0 / 48.0, 1.0), abs=1e-12)
     assert result.skew_deg < 1e-6
     assert result.right_handed
-    mirrored = true.grid() * [-1, 1] + [7, 0]
+    mirrored = true.grid() * np.array([-1, 1]) + np.array([7, 0])
     assert not measure_board(true, points, np.tile(normal, (48, 1)), mirrored).right_handed
 
 
@@ -224,7 +224,7 @@ def test_points_that_shared_errors_move_far_pull_less(rng: np.random.Generator) 
     points, normal = board_points()
     moves = bend(2, 0.5)
     common, covariance = moves[:, :, None] * normal, np.tile(np.eye(3), (48, 1, 1))
-    tilts = {"told": [], "untold": []}
+    tilts: dict[str, list[np.ndarray]] = {"told": [], "untold": []}
     for _ in range(200):
         off = points + (rng.normal(size=2) @ moves + 0.05 * rng.normal(size=48))[:, None] * normal
         tilts["told"].append(angle_between(fit_plane(off, covariance, common).normal, normal))
