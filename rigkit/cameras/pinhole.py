@@ -24,11 +24,6 @@ class Pinhole(FocalCamera):
     model: ClassVar[str] = "pinhole"
 
     @classmethod
-    def from_K(cls, K: Mat3, size_px: tuple[int, int]) -> Pinhole:
-        """Build from a camera matrix without skew."""
-        return cls(size_px, np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]))
-
-    @classmethod
     def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
         theta, radius = curve.below(np.pi / 2, cls.model)
         tangent = np.tan(theta)

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import math
 import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rigkit.cli.console import note, progress_on_stderr
+from rigkit.cli.lengths import told_baselines, told_length
 from rigkit.core.errors import ExitCode, InputError
 from rigkit.core.identifiers import MAX_IDENTIFIER
 from rigkit.io.reading import usable_path
 
 if TYPE_CHECKING:
-    from rigkit.io.manifest_writer import FoundPair
+    pass
 
 HELP = "write a manifest from a folder of images"
 
@@ -40,38 +40,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.detection.detect import detect_boards
     from rigkit.io.files import ensure_writable, write_atomic
-    from rigkit.io.images import read_image, to_grey
     from rigkit.io.manifest import load_dataset
-    from rigkit.io.manifest_writer import Sighting, board_sizes, find_images, group_pairs, manifest_text
+    from rigkit.io.manifest_writer import find_images, group_pairs, manifest_text
+    from rigkit.workflows.sightings import sight_boards
 
     if args.square_mm is not None:
-        _length("--square-mm", args.square_mm)
+        told_length("--square-mm", args.square_mm)
     root = usable_path(args.folder).resolve()
     target = args.output or root / "dataset.toml"
     images = find_images(root)
     read = [*images, *([target.parent / args.calibration] if args.calibration else [])]
     ensure_writable(target, force=args.force, inputs=read)
     _require_told(args)
-    progress = progress_on_stderr()
-    sightings = []
-    unreadable: list[InputError] = []
-    for done, path in enumerate(images, start=1):
-        try:
-            image = read_image(path)
-            sizes = board_sizes(detect_boards(to_grey(image)))
-            sightings.append(Sighting(path, (image.shape[1], image.shape[0]), sizes))
-        except InputError as error:
-            unreadable.append(error)
-            note(f"left out: {error}")
-        progress("looking for boards", done, len(images))
-    if not sightings:
-        raise unreadable[0]
+    sightings, unreadable = sight_boards(images, progress_on_stderr())
+    for error in unreadable:
+        note(f"left out: {error}")
     pairs = group_pairs(sightings, root)
     for pair in pairs:
         note(f"pair '{pair.name}': {pair.first.image.name}, {pair.second.image.name}")
-    square_mm = args.square_mm or _length("--square-mm", _ask("side of a square, mm"))
+    square_mm = args.square_mm or told_length("--square-mm", _ask("side of a square, mm"))
     calibration = args.calibration or _ask("path of calibration.json (relative to the manifest)")
     poses = {p.name: args.pose_type or _ask(f"pose type of '{p.name}'", POSE_TYPES) for p in pairs}
     text = manifest_text(
@@ -81,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
         square_mm,
         calibration,
         poses,
-        _baselines(args, pairs),
+        told_baselines(args.baseline_mm, [pair.name for pair in pairs]),
     )
     write_atomic(target, text, force=args.force)
     print(target)
@@ -121,27 +109,3 @@ def _ask(question: str, choices: tuple[str, ...] = ()) -> str:
         answer = line.strip()
         if answer and (not choices or answer in choices):
             return answer
-
-
-def _baselines(args: argparse.Namespace, pairs: list[FoundPair]) -> dict[str, tuple[float, float]]:
-    out = {}
-    known = {pair.name for pair in pairs}
-    for text in args.baseline_mm:
-        name, _, value = text.partition("=")
-        number, _, sigma = value.partition("+-")
-        if name not in known:
-            raise InputError(f"init: --baseline-mm names '{name}'; pairs found: {', '.join(sorted(known))}")
-        what = f"--baseline-mm '{text}': write PAIR=MM+-SIGMA, such as {name}=300+-2"
-        out[name] = (_length(what, number), _length(what, sigma))
-    return out
-
-
-def _length(what: str, value: str | float) -> float:
-    """Return a length in mm; raises InputError where it is no positive number."""
-    try:
-        number = float(value)
-    except ValueError:
-        number = math.nan
-    if not (math.isfinite(number) and number > 0.0):
-        raise InputError(f"init: {what}: a positive number of mm is needed, got '{value}'")
-    return number

@@ -13,7 +13,7 @@ from pathlib import Path
 from rigkit.core.errors import InputError, printable
 from rigkit.io.reading import usable_path
 
-__all__ = ["add_log_arguments", "logging_to"]
+__all__ = ["add_log_arguments", "logged_run", "logging_to"]
 
 FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 LINE = re.compile(rb"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} [A-Z]+ rigkit")
@@ -93,3 +93,14 @@ def logging_to(*, verbose: bool, log_file: Path | None) -> Iterator[None]:
         for handler in handlers:
             root.removeHandler(handler)
             handler.close()
+
+
+def logged_run(args: argparse.Namespace) -> int:
+    """Run the verb, with its options and what ends it in the log."""
+    log = logging.getLogger(__name__)
+    log.debug("rigkit %s: %s", args.verb, {k: v for k, v in vars(args).items() if k not in ("verb", "run")})
+    try:
+        return int(args.run(args))
+    except BaseException:
+        log.debug("ended by", exc_info=True)
+        raise

@@ -7,21 +7,15 @@ A verb is a module in this package with `HELP: str`, `add_arguments(parser)` and
 from __future__ import annotations
 
 import argparse
-import contextlib
-import errno
 import importlib
-import io
-import logging
 import os
 import signal
 import sys
-import threading
 import traceback
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from types import FrameType
+from collections.abc import Sequence
 
-from rigkit.cli.log import add_log_arguments, logging_to
+from rigkit.cli.log import add_log_arguments, logged_run, logging_to
+from rigkit.cli.surroundings import SURROUNDINGS, Terminated, open_streams, say, signals_interrupt
 from rigkit.core.errors import ExitCode, RigkitError, printable
 
 __all__ = ["VERBS", "main"]
@@ -50,19 +44,6 @@ VERBS: dict[str, tuple[str, str]] = {
     "board": ("rigkit.cli.board", "a board to print, true to scale"),
 }
 """Verb -> (module, one-line help)."""
-
-SURROUNDINGS = {
-    getattr(errno, name, None) for name in ("ENOSPC", "EDQUOT", "EROFS", "EACCES", "EPERM", "EIO", "EMFILE", "ENFILE")
-} - {None}
-"""Errors of the system that are nobody's bug: a full disk, a folder that may not be written, too many open files."""
-
-
-class _Terminated(KeyboardInterrupt):
-    """SIGTERM or SIGHUP, taken as Ctrl-C is: what is half done is cleared away on the way out."""
-
-    def __init__(self, number: int) -> None:
-        super().__init__()
-        self.number = number
 
 
 class _Version(argparse.Action):
@@ -107,79 +88,33 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     arguments = list(sys.argv[1:] if argv is None else argv)
     verb = next((a for a in arguments if not a.startswith("-")), None)
-    _open_streams()
+    open_streams()
     try:
-        with _signals_interrupt():
+        with signals_interrupt():
             args = build_parser(verb).parse_args(arguments)
             with logging_to(verbose=args.verbose, log_file=args.log_file):
-                return _logged_run(args)
+                return logged_run(args)
     except RigkitError as error:
-        _say(f"{error}")
+        say(f"{error}")
         return error.exit_code
     except BrokenPipeError:
         sys.stderr.close()
         return 0
     except KeyboardInterrupt as stop:
-        number = stop.number if isinstance(stop, _Terminated) else signal.SIGINT
-        _say("interrupted")
+        number = stop.number if isinstance(stop, Terminated) else signal.SIGINT
+        say("interrupted")
         return ExitCode.BY_SIGNAL + number
     except Exception as error:
         if isinstance(error, MemoryError) or (type(error).__module__ == "cv2" and "Insufficient memory" in str(error)):
             reason = printable(str(error)) or "out of memory"
-            _say(f"{reason}; use fewer processes (-j 1), smaller images, or a machine with more memory")
+            say(f"{reason}; use fewer processes (-j 1), smaller images, or a machine with more memory")
             return ExitCode.BAD_INPUT
         if isinstance(error, OSError) and error.errno in SURROUNDINGS:
             where = f"'{error.filename}': " if error.filename else ""
-            _say(printable(f"{where}{error.strerror}; make room or choose another folder"))
+            say(printable(f"{where}{error.strerror}; make room or choose another folder"))
             return ExitCode.BAD_INPUT
-        _say("this is a bug in rigkit; please report the lines above", before=traceback.format_exc())
+        say("this is a bug in rigkit; please report the lines above", before=traceback.format_exc())
         return ExitCode.BUG
-
-
-def _say(words: str, *, before: str = "") -> None:
-    """Print the last line of a run to stderr; the exit code says it too where nobody can read that."""
-    with contextlib.suppress(OSError, ValueError):
-        print(f"{before}rigkit: {words}", file=sys.stderr, flush=True)
-
-
-def _open_streams() -> None:
-    """Let results be printed whatever the terminal's letters are, and nothing end because nobody listens to stderr."""
-    if sys.stderr is None:
-        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - for the rest of the process
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
-
-
-def _logged_run(args: argparse.Namespace) -> int:
-    log = logging.getLogger(__name__)
-    log.debug("rigkit %s: %s", args.verb, {k: v for k, v in vars(args).items() if k not in ("verb", "run")})
-    try:
-        return int(args.run(args))
-    except BaseException:
-        log.debug("ended by", exc_info=True)
-        raise
-
-
-@contextmanager
-def _signals_interrupt() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP interrupt the block as Ctrl-C does; a signal that is ignored (nohup) stays ignored."""
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        raise _Terminated(number)
-
-    taken = []
-    if threading.current_thread() is threading.main_thread():
-        # Windows has no SIGHUP.
-        known = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-        taken = [n for n in known if signal.getsignal(n) is signal.SIG_DFL]
-    for number in taken:
-        signal.signal(number, stop)
-    try:
-        yield
-    finally:
-        for number in taken:
-            signal.signal(number, signal.SIG_DFL)
 
 
 if __name__ == "__main__":

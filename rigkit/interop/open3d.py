@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Normals, Points, as_array
+from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Points, as_array
 from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import DegenerateError
 
-__all__ = ["Mesh", "from_open3d", "mean_and_covariance", "plane_inliers", "poisson_mesh", "to_open3d"]
+__all__ = ["Mesh", "mean_and_covariance", "plane_inliers", "poisson_mesh", "to_open3d"]
 
 
 def to_open3d(cloud: OrientedCloud) -> Any:
@@ -22,13 +22,6 @@ def to_open3d(cloud: OrientedCloud) -> Any:
     out.normals = open3d.utility.Vector3dVector(np.array(cloud.normals))
     out.colors = open3d.utility.Vector3dVector(cloud.colours / 255.0)
     return out
-
-
-def from_open3d(point_cloud: Any) -> tuple[Points, Normals]:
-    """Return points and normals (N, 3) of an `open3d.geometry.PointCloud`; normals are NaN where it has none."""
-    points = np.array(point_cloud.points, dtype=np.float64).reshape(-1, 3)
-    normals = np.array(point_cloud.normals, dtype=np.float64).reshape(-1, 3)
-    return points, normals if len(normals) == len(points) else np.full_like(points, np.nan)
 
 
 def mean_and_covariance(points: Points) -> tuple[FloatArray, Mat3]:

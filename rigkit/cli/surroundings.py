@@ -1,0 +1,65 @@
+"""What a program owes the system it runs in: its streams, its signals, and errors that are nobody's bug."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+__all__ = ["SURROUNDINGS", "Terminated", "open_streams", "say", "signals_interrupt"]
+
+SURROUNDINGS = {
+    getattr(errno, name, None) for name in ("ENOSPC", "EDQUOT", "EROFS", "EACCES", "EPERM", "EIO", "EMFILE", "ENFILE")
+} - {None}
+"""Errors of the system that are nobody's bug: a full disk, a folder that may not be written, too many open files."""
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM or SIGHUP, taken as Ctrl-C is: what is half done is cleared away on the way out."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
+
+
+def say(words: str, *, before: str = "") -> None:
+    """Print the last line of a run to stderr; the exit code says it too where nobody can read that."""
+    with contextlib.suppress(OSError, ValueError):
+        print(f"{before}rigkit: {words}", file=sys.stderr, flush=True)
+
+
+def open_streams() -> None:
+    """Let results be printed whatever the terminal's letters are, and nothing end because nobody listens to stderr."""
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - for the rest of the process
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+@contextmanager
+def signals_interrupt() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP interrupt the block as Ctrl-C does; a signal that is ignored (nohup) stays ignored."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise Terminated(number)
+
+    taken = []
+    if threading.current_thread() is threading.main_thread():
+        # Windows has no SIGHUP.
+        known = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+        taken = [n for n in known if signal.getsignal(n) is signal.SIG_DFL]
+    for number in taken:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number in taken:
+            signal.signal(number, signal.SIG_DFL)
