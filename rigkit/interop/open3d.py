@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Points, as_array
+from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Normals, Points, as_array
 from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import DegenerateError
 

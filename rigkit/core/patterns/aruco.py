@@ -9,7 +9,7 @@ import numpy as np
 from rigkit.core.arrays import BoolArray
 from rigkit.core.errors import InputError
 
-__all__ = ["dictionary_modules"]
+__all__ = ["dictionary_modules", "marker_count"]
 
 
 @functools.cache
@@ -35,3 +35,8 @@ def dictionary_modules(name: str) -> BoolArray:
     out: BoolArray = np.array(rows) == 0
     out.flags.writeable = False
     return out
+
+
+def marker_count(name: str) -> int:
+    """Return how many markers a dictionary has; raises InputError like `dictionary_modules`."""
+    return len(dictionary_modules(name))
