@@ -9,6 +9,7 @@ import time
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
+from rigkit.core.errors import printable
 from rigkit.core.progress import Progress
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ def progress_on_stderr() -> Progress:
 
 def note(text: str) -> None:
     """Tell the person at the terminal: through the log, which goes to stderr; results go to stdout."""
-    logging.getLogger("rigkit.cli").info("%s", text)
+    logging.getLogger("rigkit.cli").info("%s", printable(text))
 
 
 def pose_in_words(name: str, pose: Rigid3, turn_sigma_rad: FloatArray, move_sigma_mm: FloatArray) -> str:

@@ -130,6 +130,8 @@ def _stereographic(rays: Rays) -> FloatArray:
 def _spline_of(camera: Camera) -> tuple[str, FloatArray]:
     """Return lens model and intrinsics of the spline through the camera's own rays, by linear least squares."""
     pixels, rays = _samples(camera, SPLINE_GRID)
+    if not len(rays):
+        raise InputError("mrcal: this camera sees nothing on its image; calibrate again")
     u = _stereographic(rays)
     # The spline covers fov_x_deg on the horizontal, and as much as its knots reach on the vertical.
     fov_x = int(np.ceil(np.degrees(4.0 * np.arctan(np.abs(u).max(axis=0)[0] / 2.0)))) + 2

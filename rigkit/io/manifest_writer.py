@@ -50,12 +50,17 @@ class FoundPair:
 
 
 def find_images(folder: Path) -> list[Path]:
-    """Return all images below `folder`, sorted; raises InputError where there are none."""
+    """Return all images below `folder`, sorted; raises InputError where there are none, or a name is no text."""
     if not folder.is_dir():
         raise InputError(f"init: '{folder}' is not a folder; give the folder that holds the images")
     images = sorted(p for p in folder.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
     if not images:
         raise InputError(f"init: no images ({', '.join(sorted(IMAGE_SUFFIXES))}) under '{folder}'")
+    unspeakable = [path for path in images if path.name != path.name.encode("utf-8", "ignore").decode()]
+    if unspeakable:
+        raise InputError(
+            f"init: the name of image '{unspeakable[0]}' is not UTF-8, which a manifest cannot hold; rename the file"
+        )
     return images
 
 
