@@ -247,7 +247,7 @@ def _in_cell(text: str) -> str:
     """Return words in one line for a spreadsheet, which takes a cell that begins like a formula for one: those are
     quoted."""
     text = _one_line(text)
-    return f"'{text}" if text.startswith(FORMULA) and not _is_number(text) else text
+    return f"'{text}" if text.lstrip().startswith(FORMULA) and not _is_number(text) else text
 
 
 def _one_line(text: str) -> str:

@@ -145,7 +145,7 @@ def test_bad_input(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
     board.write_text(BOARD.replace("rows = 6", "rows = 7"))
     assert main(["calibrate", str(session)]) == 2
     said = capsys.readouterr().err
-    assert "9x7" in said and "9x6" in said and "board file" in said
+    assert "9 x 7" in said and "9 x 6" in said and "board file" in said
 
     board.write_text(BOARD)
     whole = (session.parent / "02.jpg").read_bytes()
@@ -286,7 +286,7 @@ def test_degrees_that_no_model_has(
         ("columns = 9000", "'columns' is 9000, more than 1000"),
         ("square_mm = 0.03", "write mm"),
         ("square_mm = inf", "must be a finite number"),
-        ("rows = 1", "must be at least 2"),
+        ("rows = 1", "at least 2x2 inner corners"),
     ],
 )
 def test_boards_that_nobody_has(session: Path, capsys: pytest.CaptureFixture[str], line: str, said: str) -> None:

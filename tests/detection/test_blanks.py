@@ -8,7 +8,7 @@ import pytest
 
 from rigkit.benchmark.blanks import BLANKS, blank
 from rigkit.benchmark.scenes import one_board
-from rigkit.detection import detect
+from rigkit.detection import lattices as lattices_of_images
 from rigkit.detection.checks.validate import compact, has_edge_offset
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.lattice import grow
@@ -37,7 +37,7 @@ def test_nothing_is_found_and_work_is_bounded(name: str, monkeypatch: pytest.Mon
         grown.append(out[0].count)
         return out
 
-    monkeypatch.setattr(detect, "refine", counted_refine)
+    monkeypatch.setattr(lattices_of_images, "refine", counted_refine)
     monkeypatch.setattr(grow, "_grown", counted_growth)
     for seed in range(4):
         fitted.clear()
