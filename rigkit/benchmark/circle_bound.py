@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.benchmark.corner_bound import BLUR_STEP_PX, SHIFT_PX, noise_free_levels, shifted_scene
+from rigkit.benchmark.corner_bound import BLUR_STEP_PX, SHIFT_PX, noise_free_levels, pixels_around, shifted_scene
 from rigkit.benchmark.scenes import BenchScene
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.errors import InputError
@@ -66,16 +66,13 @@ def _sides(scene: BenchScene, placed: PlacedBoard, grid: IntArray, half_mm: floa
 def _derivatives(centre: FloatArray, matrix: FloatArray, pictures: FloatArray) -> FloatArray:
     """Return the derivatives (10, P) of the pixels of the round cell about `centre`, |w| < 1 in place matrix @ w."""
     reach = np.sqrt((matrix**2).sum(axis=1))
-    height, width = pictures.shape[1:]
-    low = np.maximum(np.ceil(centre - reach), 0).astype(int)
-    high = np.minimum(np.floor(centre + reach), [width - 1, height - 1]).astype(int)
-    if not np.isfinite(matrix).all() or (high < low).any():
+    window = pixels_around(centre, reach, pictures)
+    if window is None:
         return np.zeros((CIRCLE_PARAMETERS, 0))
-    v, u = np.mgrid[low[1] : high[1] + 1, low[0] : high[0] + 1]
-    offset = np.stack([u.ravel() - centre[0], v.ravel() - centre[1]])
+    offset, cut = window
     place = np.linalg.solve(matrix, offset)
     inside = np.hypot(*place) <= 1.0
-    by_u, by_v, by_blur, light = pictures[:, low[1] : high[1] + 1, low[0] : high[0] + 1].reshape(4, -1)[:, inside]
+    by_u, by_v, by_blur, light = cut[:, inside]
     shapes = [
         by_u * moved[0] + by_v * moved[1] for moved in (matrix @ shape @ place[:, inside] for shape in CIRCLE_CHANGES)
     ]

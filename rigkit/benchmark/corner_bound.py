@@ -32,6 +32,7 @@ __all__ = [
     "SHIFT_PX",
     "corner_information",
     "noise_free_levels",
+    "pixels_around",
     "position_bound",
     "shifted_scene",
 ]
@@ -110,20 +111,31 @@ def _centred(lattice: FloatArray, axis: int) -> FloatArray:
     return np.asarray(mean)
 
 
-def _derivatives(centre: FloatArray, sides: FloatArray, pictures: FloatArray) -> FloatArray:
-    """Return the derivatives (9, P) of the pixels of the cell round `centre` with `sides` (2, 2)."""
-    reach = HALF_CELL * np.abs(sides).sum(axis=0)
+def pixels_around(centre: FloatArray, reach: FloatArray, pictures: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    """Return the pixels of `pictures` (K, H, W) within `reach` (2,) of `centre` along u and v: their offsets (2, P)
+    from it and values (K, P); None where there are none, or `reach` is not finite."""
+    if not np.isfinite(reach).all():
+        return None
     height, width = pictures.shape[1:]
     low = np.maximum(np.ceil(centre - reach), 0).astype(int)
     high = np.minimum(np.floor(centre + reach), [width - 1, height - 1]).astype(int)
-    if not np.isfinite(sides).all() or (high < low).any():
-        return np.zeros((PARAMETERS, 0))
+    if (high < low).any():
+        return None
     v, u = np.mgrid[low[1] : high[1] + 1, low[0] : high[0] + 1]
     offset = np.stack([u.ravel() - centre[0], v.ravel() - centre[1]])
+    return offset, pictures[:, low[1] : high[1] + 1, low[0] : high[0] + 1].reshape(len(pictures), -1)
+
+
+def _derivatives(centre: FloatArray, sides: FloatArray, pictures: FloatArray) -> FloatArray:
+    """Return the derivatives (9, P) of the pixels of the cell round `centre` with `sides` (2, 2)."""
+    reach = HALF_CELL * np.abs(sides).sum(axis=0)
+    window = pixels_around(centre, reach, pictures)
+    if window is None:
+        return np.zeros((PARAMETERS, 0))
+    offset, cut = window
     cells = np.linalg.solve(sides.T, offset)
     inside = (np.abs(cells) <= HALF_CELL).all(axis=0)
-    cut = pictures[:, low[1] : high[1] + 1, low[0] : high[0] + 1].reshape(len(pictures), -1)[:, inside]
-    by_u, by_v, by_blur, light = cut
+    by_u, by_v, by_blur, light = cut[:, inside]
     du, dv = offset[:, inside]
     # To turn line 1 alone, points move along line 2 in proportion to how far out along line 1 they are.
     turns = [
