@@ -96,7 +96,13 @@ if TYPE_CHECKING:
     from rigkit.workflows.print_board import MeasuredPrint, PrintOptions, print_board, store_measured_print
     from rigkit.workflows.reconstruct import DatasetReconstruction, ReconstructOptions, reconstruct_dataset
     from rigkit.workflows.reconstruct_scene import SceneOptions, SceneResult, reconstruct_views
-    from rigkit.workflows.rectify import RectifiedImage, RectifyOptions, rectify_image, rectify_stereo_images
+    from rigkit.workflows.rectify import (
+        RectificationResult,
+        RectifiedImage,
+        RectifyOptions,
+        rectify_image,
+        rectify_stereo_images,
+    )
     from rigkit.workflows.study import StudyOptions, StudyResult, run_studies, run_study
     from rigkit.workflows.validate import DatasetValidation, ValidateOptions, validate_dataset
 
@@ -147,6 +153,7 @@ __all__ = [
     "Quantity",
     "ReconstructOptions",
     "Reconstruction",
+    "RectificationResult",
     "RectifiedImage",
     "RectifyOptions",
     "RigCalibration",
@@ -289,7 +296,13 @@ _NAMES_OF = {
     "rigkit.workflows.print_board": ("MeasuredPrint", "PrintOptions", "print_board", "store_measured_print"),
     "rigkit.workflows.reconstruct": ("DatasetReconstruction", "ReconstructOptions", "reconstruct_dataset"),
     "rigkit.workflows.reconstruct_scene": ("SceneOptions", "SceneResult", "reconstruct_views"),
-    "rigkit.workflows.rectify": ("RectifiedImage", "RectifyOptions", "rectify_image", "rectify_stereo_images"),
+    "rigkit.workflows.rectify": (
+        "RectificationResult",
+        "RectifiedImage",
+        "RectifyOptions",
+        "rectify_image",
+        "rectify_stereo_images",
+    ),
     "rigkit.workflows.study": ("StudyOptions", "StudyResult", "run_studies", "run_study"),
     "rigkit.workflows.validate": ("DatasetValidation", "ValidateOptions", "validate_dataset"),
 }

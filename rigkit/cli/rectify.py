@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rigkit.core.errors import InputError
+from rigkit.core.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
     from rigkit.workflows.rectify import RectifiedImage
@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import print_json, progress_on_stderr
+    from rigkit.cli.console import note, print_json, progress_on_stderr
     from rigkit.workflows.rectify import RectifyOptions, rectify_image, rectify_stereo_images
 
     options = RectifyOptions(
@@ -68,28 +68,28 @@ def run(args: argparse.Namespace) -> int:
     if args.image2 is None and args.rig is None:
         if args.camera is None:
             raise InputError("rectify: --camera is missing; give the camera's calibration.json")
-        written = rectify_image(args.image, args.camera, options, progress=progress_on_stderr())
-        if args.json:
-            found = [_summary(one, args.projection) for one in written]
-            print_json({"images": found} if Path(args.image).is_dir() else found[0])
-            return 0
-        for one in written:
-            print(_words(one, args.projection))
-        return 0
-    if args.image2 is None or args.rig is None:
+        done = rectify_image(args.image, args.camera, options, progress=progress_on_stderr())
+        found = [_summary(one, args.projection) for one in done.images]
+        result = {"images": found} if Path(args.image).is_dir() else found[0]
+    elif args.image2 is None or args.rig is None:
         raise InputError("rectify: a stereo pair needs two images and --rig RIG.json")
-    names = None if args.names is None else tuple(args.names)
-    done, pair = rectify_stereo_images(
-        (args.image, args.image2), args.rig, options, names, progress=progress_on_stderr()
-    )
-    baseline = pair.rect2_from_rect1.translation_mm.tolist()
+    else:
+        names = None if args.names is None else tuple(args.names)
+        both = (args.image, args.image2)
+        done = rectify_stereo_images(both, args.rig, options, names, progress=progress_on_stderr())
+        result = {"images": [_summary(one, args.projection) for one in done.images]}
+        if done.pair is not None:
+            result["rect2_from_rect1_mm"] = done.pair.rect2_from_rect1.translation_mm.tolist()
+    for error in done.failures.values():
+        note(f"left out: {error}")
     if args.json:
-        print_json({"images": [_summary(one, args.projection) for one in done], "rect2_from_rect1_mm": baseline})
-        return 0
-    for one in done:
-        print(_words(one, args.projection))
-    print(f"baseline {abs(baseline[0]):.3f} mm along the rows")
-    return 0
+        print_json(result)
+    else:
+        for one in done.images:
+            print(_words(one, args.projection))
+        if done.pair is not None:
+            print(f"baseline {abs(done.pair.rect2_from_rect1.translation_mm[0]):.3f} mm along the rows")
+    return ExitCode.BAD_INPUT if done.failures else ExitCode.WELL
 
 
 def _summary(one: RectifiedImage, projection: str) -> dict[str, Any]:

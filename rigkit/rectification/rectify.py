@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -92,23 +92,19 @@ class RectifyMap:
         bands = self._sampled_bands(self._supersampling() if antialias else 1)
         return self._resampled(np.asarray(image), interpolation, bands, fill)
 
-    def images(
-        self,
-        images: Iterable[NDArray[Any]],
-        *,
-        interpolation: Interpolation = "spline",
-        antialias: bool = True,
-        fill: float = 0.0,
-    ) -> Iterator[NDArray[Any]]:
-        """Yield each image as `target` sees it, as `image` does; where it fits in memory, the map is computed once."""
+    def resampler(
+        self, *, interpolation: Interpolation = "spline", antialias: bool = True, fill: float = 0.0
+    ) -> Callable[[NDArray[Any]], NDArray[Any]]:
+        """Return a function that does what `image` does; where it fits in memory, the map is computed once for all."""
         samples = self._supersampling() if antialias else 1
         keeps = samples * samples * self.target.size_px[0] * self.target.size_px[1] <= MAX_KEPT_SAMPLES
-        kept: list[_Band] = []
-        for image in images:
-            bands: Iterable[_Band] = kept or self._sampled_bands(samples)
-            if keeps and not kept:
-                bands = kept = list(bands)
-            yield self._resampled(np.asarray(image), interpolation, bands, fill)
+        kept = list(self._sampled_bands(samples)) if keeps else None
+
+        def resample(image: NDArray[Any]) -> NDArray[Any]:
+            bands = self._sampled_bands(samples) if kept is None else kept
+            return self._resampled(np.asarray(image), interpolation, bands, fill)
+
+        return resample
 
     def maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return the columns and rows (h, w) of the camera's image that the target's pixels come from, as cv2.remap

@@ -128,7 +128,7 @@ def detect_in_images(
     outcomes, doubtful = _over_images(tasks, options.jobs, progress)
     failures = {name: outcome for name, outcome in outcomes.items() if isinstance(outcome, InputError)}
     found = {name: outcome for name, outcome in outcomes.items() if not isinstance(outcome, InputError)}
-    if failures and not found:
+    if failures and len(outcomes) == 1:
         raise next(iter(failures.values()))
     if not any(found.values()) and not failures:
         seen = next((f"; in '{name}' {words}" for name, words in doubtful.items()), "")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -15,14 +16,14 @@ from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.files import ensure_writable, write_atomic, write_together
-from rigkit.io.images import read_image, require_pixels
+from rigkit.io.images import quiet_opencv, read_image, require_pixels
 from rigkit.rectification.rectify import RectifyMap, rectify_map, rotation_from_view_angles
 from rigkit.rectification.stereo import StereoRectification, rectify_pair
 from rigkit.rectification.targets import target_camera
 from rigkit.workflows.camera_files import import_camera, import_rig
 from rigkit.workflows.detect import IMAGE_ENDINGS
 
-__all__ = ["RectifiedImage", "RectifyOptions", "rectify_image", "rectify_stereo_images"]
+__all__ = ["RectificationResult", "RectifiedImage", "RectifyOptions", "rectify_image", "rectify_stereo_images"]
 
 EIGHT_BIT = (".jpg", ".jpeg", ".bmp", ".webp")
 
@@ -61,12 +62,25 @@ class RectifiedImage:
     __repr__ = brief
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class RectificationResult:
+    """What was written, by image why others were not, and of stereo pairs the geometry."""
+
+    images: tuple[RectifiedImage, ...]
+    failures: Mapping[str, InputError]
+    pair: StereoRectification | None = None
+
+    __repr__ = brief
+
+
 def rectify_image(
     image: str | Path, camera: str | Path, options: RectifyOptions, *, progress: Progress = silent
-) -> tuple[RectifiedImage, ...]:
+) -> RectificationResult:
     """Write an image, or all of a folder, as an ideal camera would have taken them; `camera` is the calibration's file.
 
-    Raises InputError for a view that the camera does not have, a damaged file, or one that cannot be written.
+    An image that cannot be read, or has another size, is among the failures and does not end the rest; its error is
+    raised where there is no other. Raises InputError for a view that the camera does not have, a damaged calibration,
+    or a file that cannot be written.
     """
     jobs = _outputs(Path(image), options.output)
     _ensure_all([out for _, out in jobs], options, (*(source for source, _ in jobs), camera))
@@ -77,7 +91,7 @@ def rectify_image(
     remap = rectify_map(source, target, target_from_cam=rotation)
     done = _write([(jobs, remap)], options, progress)
     _write_maps([remap], None, options)
-    return done
+    return RectificationResult(*done)
 
 
 def rectify_stereo_images(
@@ -87,13 +101,13 @@ def rectify_stereo_images(
     names: tuple[str, str] | None = None,
     *,
     progress: Progress = silent,
-) -> tuple[tuple[RectifiedImage, ...], StereoRectification]:
+) -> RectificationResult:
     """Write two images taken at once by cameras `names` of a rig's file (None: its first two) so that a point has the
-    same row in both, or two folders of such images in the order of their names; return what was written, and the
-    geometry.
+    same row in both, or two folders of such images in the order of their names.
 
-    Raises InputError for cameras that are not there, angles or a size of the view, folders with unlike numbers of
-    images, a damaged file, or one that cannot be written.
+    Two images of which one cannot be read are left out, as by `rectify_image`. Raises InputError for cameras that are
+    not there, angles or a size of the view, folders with unlike numbers of images, a damaged rig, or a file that cannot
+    be written.
     """
     if options.hfov_deg is not None or options.size_px is not None or any(options.angles_deg):
         raise InputError("rectify: the baseline decides the view of a stereo pair; leave out its angles and its size")
@@ -115,7 +129,7 @@ def rectify_stereo_images(
     pair = rectify_pair(camera1, camera2, cam2_from_rig @ cam1_from_rig.inverse(), projection=options.projection)
     done = _write(list(zip(jobs, (pair.map1, pair.map2), strict=True)), options, progress)
     _write_maps([pair.map1, pair.map2], pair, options)
-    return done, pair
+    return RectificationResult(*done, pair)
 
 
 def _outputs(image: Path, output: Path) -> list[tuple[Path, Path]]:
@@ -141,26 +155,41 @@ def _ensure_all(outputs: list[Path], options: RectifyOptions, inputs: tuple[str 
 
 def _write(
     jobs: list[tuple[list[tuple[Path, Path]], RectifyMap]], options: RectifyOptions, progress: Progress
-) -> tuple[RectifiedImage, ...]:
+) -> tuple[tuple[RectifiedImage, ...], dict[str, InputError]]:
     """Resample and write the images of each map, one after the other; two images of a pair come together or not."""
     for job, remap in jobs:
         require_pixels(remap.target.size_px, f"rectified image '{job[0][1]}' (--size)")
     covered = [float(remap.coverage().mean()) for _, remap in jobs]
     if min(covered) == 0.0:
         raise InputError("rectify: the camera sees nothing of this view; change --yaw-deg, --pitch-deg or --hfov-deg")
-    total, done = len(jobs[0][0]), []
-    streams = [
-        remap.images((read_image(source) for source, _ in job), interpolation=options.interpolation)
-        for job, remap in jobs
-    ]
-    for i, seen in enumerate(zip(*streams, strict=True)):
+    total, done, failures = len(jobs[0][0]), [], {}
+    resamplers = [remap.resampler(interpolation=options.interpolation) for _, remap in jobs]
+    for i in range(total):
         files: dict[Path, str | bytes] = {}
-        for image, (job, remap), share in zip(seen, jobs, covered, strict=True):
-            files[job[i][1]] = _encoded(image, job[i][1])
-            done.append(RectifiedImage(job[i][1], remap, share))
-        write_together(files, force=options.force)
+        for (job, _), resample in zip(jobs, resamplers, strict=True):
+            source, to = job[i]
+            try:
+                files[to] = _rectified(source, to, resample)
+            except InputError as error:
+                if total == 1:
+                    raise
+                failures[str(source)] = error
+        if len(files) == len(jobs):
+            write_together(files, force=options.force)
+            done += [RectifiedImage(job[i][1], m, share) for (job, m), share in zip(jobs, covered, strict=True)]
         progress("rectify", i + 1, total)
-    return tuple(done)
+    return tuple(done), failures
+
+
+def _rectified(source: Path, to: Path, resample: Callable[[NDArray[Any]], NDArray[Any]]) -> bytes:
+    """Return the file of one image; raises InputError that names it."""
+    image = read_image(source)
+    try:
+        return _encoded(resample(image), to)
+    except InputError as error:
+        raise InputError(f"'{source}': {error}") from error
+    except MemoryError as error:
+        raise InputError(f"'{source}': {error or 'out of memory'}; use a smaller --size, or a smaller image") from error
 
 
 def _write_maps(maps: list[RectifyMap], pair: StereoRectification | None, options: RectifyOptions) -> None:
@@ -192,7 +221,8 @@ def _encoded(image: NDArray[Any], path: Path) -> bytes:
     if suffix in EIGHT_BIT and image.dtype != np.uint8:
         raise InputError(f"'{path}': a {suffix} file has no 16-bit pixels; write a .png or .tif")
     try:
-        done, data = cv2.imencode(suffix, image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1]))
+        with quiet_opencv():
+            done, data = cv2.imencode(suffix, image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1]))
     except cv2.error:
         done = False
     if not done:

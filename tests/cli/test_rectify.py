@@ -194,3 +194,48 @@ def test_an_image_that_is_too_large_is_refused(
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line and name in line and "--size" in line
     assert not (tmp_path / name).exists()
+
+
+def test_one_bad_image_does_not_end_a_folder(
+    files: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A truncated image, one of another size and one that is none: the rest is written, each is named, exit 2."""
+    folder, out = tmp_path / "many", tmp_path / "out"
+    folder.mkdir()
+    whole = Path(files[0]).read_bytes()
+    bad = {"b": whole[: len(whole) // 2], "c": b"no image", "e": None}
+    for name in "abcdef":
+        (folder / f"{name}.png").write_bytes(bad.get(name) or whole)
+    cv2.imwrite(str(folder / "e.png"), np.zeros((60, 80), np.uint8))
+    command = ["rectify", str(folder), "--camera", files[1], "-o", str(out), "--interpolation", "linear"]
+    assert main(command) == 2
+    said = capsys.readouterr()
+    assert sorted(p.stem for p in out.iterdir()) == ["a", "d", "f"] and len(said.out.splitlines()) == 3
+    assert [name for name in "abcdef" if f"'{folder / name}.png'" in said.err] == sorted(bad)
+    for name in "abdf":
+        (folder / f"{name}.png").unlink()
+    assert main(command) == 2
+    told = capsys.readouterr().err
+    assert "c.png" in told and "e.png" in told
+
+
+def test_one_bad_image_of_a_pair_leaves_out_both(
+    files: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    poses = {"left": Rigid3.identity(), "right": Rigid3(np.eye(3), [-200.0, 0.0, 0.0])}
+    for name in poses:
+        (tmp_path / name).mkdir()
+        for k in range(3):
+            (tmp_path / name / f"{k}.png").write_bytes(Path(files[0]).read_bytes())
+    (tmp_path / "right" / "1.png").write_bytes(b"no image")
+    entries = [
+        {"name": name, "camera": camera_to_json(CAMERA), "cam_from_rig": pose.matrix()[:3].tolist(), "rms_px": 0.1}
+        for name, pose in poses.items()
+    ]
+    rig, out = tmp_path / "rig.json", tmp_path / "out"
+    rig.write_text(json.dumps({"schema": "rigkit.rig/1", "cameras": entries}))
+    both = [str(tmp_path / name) for name in poses]
+    assert main(["rectify", *both, "--rig", str(rig), "-o", str(out), "--interpolation", "linear", "--json"]) == 2
+    said = capsys.readouterr()
+    assert len(json.loads(said.out)["images"]) == 4 and "right/1.png" in said.err
+    assert sorted(p.stem for p in out.rglob("*.png")) == ["0", "0", "2", "2"]
