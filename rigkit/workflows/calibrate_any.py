@@ -78,9 +78,13 @@ def calibrate_folders(
         The views do not determine a camera.
     """
     places = _folders_of([Path(folder) for folder in folders], folder_options, options, progress)
-    place = places[0] if len(places) == 1 else Path(os.path.commonpath([p.absolute() for p in places]))
-    place = place if options.output is None else options.output.parent
-    wanted = session_of_folders(places, folder_options.boards, place, model=folder_options.model)
+    wanted = session_of_folders(
+        places,
+        folder_options.boards,
+        _session_path(places, options.output),
+        model=folder_options.model,
+        output=options.output,
+    )
     new = {path: text for path, text in wanted.files.items() if not _says(path, text)}
     results = [path for path in (options.output, options.report) if path not in (None, Path())]
     ensure_writable([*new, *results], force=options.force, inputs=set(wanted.files) - set(new))
@@ -96,6 +100,15 @@ def calibrate_folders(
             with suppress(OSError):
                 path.unlink()
         raise
+
+
+def _session_path(places: Sequence[Path], output: Path | None) -> Path:
+    """Return where the session is written: named after the result where that has a name, so that two results in one
+    folder have a session each."""
+    if output is not None:
+        return output.parent / f"{output.stem}-session.toml"
+    place = places[0] if len(places) == 1 else Path(os.path.commonpath([p.absolute() for p in places]))
+    return place / "session.toml"
 
 
 def _folders_of(

@@ -38,16 +38,17 @@ class FolderSession:
 
 
 def session_of_folders(
-    folders: Sequence[Path], boards: Sequence[str], place: Path, *, model: str = "auto"
+    folders: Sequence[Path], boards: Sequence[str], path: Path, *, model: str = "auto", output: Path | None = None
 ) -> FolderSession:
-    """Return the session of one folder, or of several that hold a camera's images each, to be kept in folder `place`.
+    """Return the session of one folder, or of several that hold a camera's images each, to be kept in the file `path`.
 
     Parameters
     ----------
     folders : of images; see `cameras_in`.
     boards : files of boards, or words such as 9x6x25: see `rigkit.io.board_words`.
-    place : folder of the session, to which its paths are relative.
+    path : of the session, to whose folder its paths are relative.
     model : of all cameras.
+    output : where the calibration goes, if not to where the session's name says.
 
     Raises
     ------
@@ -57,12 +58,14 @@ def session_of_folders(
     if not boards:
         raise InputError(_untold(folders))
     cameras = cameras_in(folders)
+    place = path.parent
     files: dict[Path, str] = {}
     names = [_board_file(words, place, files) for words in boards]
+    named = "" if output is None else f" -o {_relative(output, place)}"
     shown = " ".join([*map(str, folders), *(f"--board {words}" for words in boards)])
     lines = [
         "# " + " ".join(f"Written by rigkit calibrate {shown}".split()),
-        "# Calibrate again with: rigkit calibrate session.toml --force",
+        f"# Calibrate again with: rigkit calibrate {path.name}{named} --force",
         f'schema = "{SESSION_SCHEMA}"',
         "",
         "# The board in the images; a rule over many of its squares tells their true size.",
@@ -88,7 +91,6 @@ def session_of_folders(
             "# sigma_mm = 1.0",
             '# how = "steel rule"',
         ]
-    path = place / "session.toml"
     files[path] = "\n".join(lines).rstrip() + "\n"
     return FolderSession(path, files)
 

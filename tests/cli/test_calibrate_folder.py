@@ -108,6 +108,17 @@ def test_from_pictures_to_a_page_and_two_formats_in_one_command(
     assert {path.name for path in folder.iterdir()} == {path.name for path in before} | {"corners.json"}
 
 
+def test_results_in_one_folder_have_a_session_each(pictures: Path, tmp_path: Path) -> None:
+    for name, model in (("near", "brown"), ("far", "pinhole")):
+        folder = of_one_camera(pictures, tmp_path / f"{name}-photos")
+        output = tmp_path / f"{name}.json"
+        command = ["calibrate", str(folder), "--board", "9x6x30", "--model", model, "-o", str(output)]
+        assert main(command) == 0
+        session = load_session(tmp_path / f"{name}-session.toml")
+        assert session.model == model and {image.parent for image in session.images} == {folder}
+        assert f"rigkit calibrate {name}-session.toml -o {name}.json --force" in session.path.read_text()
+
+
 def test_a_session_of_a_person_is_not_replaced(
     pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -185,7 +196,7 @@ def test_a_name_that_a_session_cannot_hold(tmp_path: Path) -> None:
     folder.mkdir()
     (folder / "1.jpg").touch()
     with pytest.raises(InputError, match="rename"):
-        session_of_folders([folder], ["9x6x25"], tmp_path)
+        session_of_folders([folder], ["9x6x25"], tmp_path / "session.toml")
 
 
 @pytest.mark.parametrize("kind", ["csv", "vnl", "json"])
