@@ -7,6 +7,7 @@ taken over the same pixels, with the same three rotations projected out.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -16,7 +17,7 @@ from rigkit.calibration.clustered import NULL_DRAWS, drawn_errors
 from rigkit.calibration.coverage import covered_by_boards
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import projection_design
-from rigkit.cameras.base import Camera
+from rigkit.cameras.base import Camera, image_center
 from rigkit.cameras.compare import CameraDifference, compare_cameras, grid_pixels
 from rigkit.cameras.convert import refit_camera
 from rigkit.core.arrays import FloatArray, Pixels
@@ -29,6 +30,8 @@ SAME_CHANCE = 0.01
 """A difference this unlikely for one and the same camera is no chance."""
 COVARIANCE_FLOOR_PX = 0.05
 """Of no combination of the parameters does a covariance from images know that it moves the projection by less."""
+USUAL = 0.9
+"""Part of the differences of one and the same camera that is called usual."""
 IMPORTANT_PX = 0.1
 """What is smaller is of no importance, however surely it is there: corners of real images are hardly better."""
 
@@ -49,8 +52,10 @@ class CalibrationComparison:
     ----------
     difference : where both had boards, after the best rotation.
     predicted_px : the usual rms difference of two calibrations of one camera, there and after the best rotation: half
-        of them differ by more. A difference is mostly of one kind (the focal length), and the mean of its square is
-        that of a few large ones.
+        of them differ by more. A difference is mostly of one kind (the focal length, which the distances of the boards
+        take up): it scatters like the size of a single number, by several times, and its mean square is that of a few
+        large ones.
+    usual_px : between these lie nine of ten.
     chance : probability of a difference at least this large if both were calibrations of the same, unchanged camera,
         each in its own model.
     same_model : both are of one model and size.
@@ -58,6 +63,7 @@ class CalibrationComparison:
 
     difference: CameraDifference
     predicted_px: float
+    usual_px: tuple[float, float]
     chance: float
     same_model: bool
 
@@ -88,11 +94,10 @@ def compare_calibrations(
 
     Notes
     -----
-    The null distribution of the difference, of its size and of its size in units of what is expected of it, is
-    sampled: both calibrations' errors are drawn from their covariances (Student's t with the degrees of freedom that
-    these have) and turned into differences by the projection's derivatives. Models of different kinds or sizes show one
-    lens differently, which no covariance knows: that difference, from each camera refitted as the other is modelled, is
-    a part of the null.
+    The null distribution of the difference is sampled: both calibrations' errors are drawn from their covariances
+    (Student's t with the degrees of freedom that these have) and turned into differences by the projection's
+    derivatives. Models of different kinds or sizes show one lens differently, which no covariance knows: that
+    difference, from each camera refitted as the other is modelled, is a part of the null.
     """
     pixels = grid_pixels(a.camera.size_px, grid)
     both = covered_by_boards(a, pixels) & covered_by_boards(b, pixels)
@@ -103,9 +108,7 @@ def compare_calibrations(
     # The rotation that the comparison fits, at first order. In two calibrations of one camera both are the same.
     turn = np.linalg.qr(designs[0][:, -3:])[0]
     by_model = _by_model(a, b, difference, turn)[:, None]
-    columns = [design[:, :-3] for design in designs] + [by_model]
-    together = np.concatenate([column - turn @ (turn.T @ column) for column in columns], axis=1)
-    gram = together.T @ together / len(pixels)
+    p = a.camera.parameters.size
     rng = np.random.default_rng(seed)
     drawn = np.concatenate(
         [
@@ -114,39 +117,100 @@ def compare_calibrations(
             1.0 + REFIT_SIGMA * rng.normal(size=(1, NULL_DRAWS)),
         ]
     )
-    expected_by = np.zeros((len(gram), len(gram)))
-    p = a.camera.parameters.size
-    expected_by[:p, :p], expected_by[p:-1, p:-1] = a.covariance, b.covariance
-    expected_by[-1, -1] = 1.0 + REFIT_SIGMA**2
-    found = difference.difference_px[difference.covered].reshape(-1)
-    chance = _chance(found - turn @ (turn.T @ found), together, expected_by, drawn)
-    usual = float(np.sqrt(np.median(np.einsum("kn,kn->n", drawn, gram @ drawn))))
-    return CalibrationComparison(difference, usual, chance, _kind(a.camera) == _kind(b.camera))
+    covariance = np.zeros((len(drawn), len(drawn)))
+    covariance[:p, :p], covariance[p:-1, p:-1] = a.covariance, b.covariance
+    covariance[-1, -1] = 1.0 + REFIT_SIGMA**2
+    columns = [*(design[:, :-3] for design in designs), by_model]
+    found = _Modes.of(
+        _without(difference.difference_px[difference.covered].reshape(-1), turn),
+        np.concatenate([_without(column, turn) for column in columns], axis=1),
+        covariance,
+        drawn,
+    )
+    chance = found.chance([_without(way, turn) for way in _touched(a.camera, pixels)])
+    usual = np.sqrt(np.quantile((found.null**2).sum(axis=0), (0.5 - 0.5 * USUAL, 0.5, 0.5 + 0.5 * USUAL)))
+    low, median, high = usual.tolist()
+    same_model = _kind(a.camera) == _kind(b.camera)
+    return CalibrationComparison(difference, median, (low, high), chance, same_model)
 
 
-def _chance(found: FloatArray, design: FloatArray, covariance: FloatArray, drawn: FloatArray) -> float:
-    """Return the probability of a difference as large as `found` (2 N,), from draws (K, NULL_DRAWS) of the errors of K
-    unknowns, their derivatives `design` (2 N, K) and covariance.
+def _without(column: FloatArray, turn: FloatArray) -> FloatArray:
+    """Return differences (2 N,) or (2 N, K) without what the rotation `turn` (2 N, 3), of orthonormal columns, does."""
+    return np.asarray(column - turn @ (turn.T @ column))
 
-    Two sizes count, and the one that says more is compared with what it would say by chance (Tippett's combination):
-    the mean square, which large differences in few ways show best, and the difference in units of what is expected
-    (Mahalanobis), in which each way to differ is judged by how far it may: a part of a pixel is small beside what a
-    principal point may do, and plain beside what a focal length may. What is known better than COVARIANCE_FLOOR_PX is
-    taken for known to so much: of the surest combinations a covariance from some images says least.
+
+def _touched(camera: Camera, pixels: Pixels) -> list[FloatArray]:
+    """Return what happens to lenses, as ways to differ (2 N, K) at pixels (N, 2): focus or zoom make the image larger
+    about the principal point; lens or sensor shift."""
+    centre = camera.project(np.array([0.0, 0.0, 1.0]))[0]
+    if not np.isfinite(centre).all():
+        centre = image_center(camera.size_px)
+    return [(pixels - centre).reshape(-1, 1), np.tile(np.eye(2), (len(pixels), 1))]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Modes:
+    """A difference over N pixels in its principal modes: the combinations of the unknowns that move the projection
+    independently of each other.
+
+    Attributes
+    ----------
+    axes : (2 N, K) the modes over the pixels, of mean square one.
+    found : (K,) the difference found, px rms in each mode.
+    null : (K, NULL_DRAWS) differences drawn for one and the same camera.
+    expected : (K,) their variances.
+    beyond : mean square of what of the difference is in none of the modes, px^2.
     """
-    pixels = len(found) / 2.0
-    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    safe = np.where(sigma > 0.0, sigma, 1.0)
-    basis, how = np.linalg.qr(design * safe / np.sqrt(pixels))
-    spread, axes = np.linalg.eigh(how @ (covariance / np.outer(safe, safe)) @ how.T)
-    known = np.maximum(spread, 0.0) + COVARIANCE_FLOOR_PX**2
-    total = float(found @ found) / pixels
-    seen = (axes.T @ (basis.T @ found)) ** 2 / pixels
-    beyond = max(total - float(seen.sum()), 0.0)
-    null = (axes.T @ (how @ (drawn / safe[:, None]))) ** 2
-    weighted = float((seen / known).sum()) + beyond / COVARIANCE_FLOOR_PX**2
-    likely = np.minimum(_exceeded(total, null.sum(axis=0)), _exceeded(weighted, (null / known[:, None]).sum(axis=0)))
-    return float(np.count_nonzero(likely <= likely[0]) / len(likely))
+
+    axes: FloatArray
+    found: FloatArray
+    null: FloatArray
+    expected: FloatArray
+    beyond: float
+
+    @classmethod
+    def of(cls, found: FloatArray, design: FloatArray, covariance: FloatArray, drawn: FloatArray) -> _Modes:
+        """Return a difference (2 N,) in the modes of K unknowns, from their derivatives `design` (2 N, K), covariance
+        and errors drawn (K, NULL_DRAWS)."""
+        pixels = len(found) / 2.0
+        # Parameters have units of their own: in standard deviations they can be compared.
+        sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        safe = np.where(sigma > 0.0, sigma, 1.0)
+        basis, how = np.linalg.qr(design * safe / np.sqrt(pixels))
+        expected, turned = np.linalg.eigh(how @ (covariance / np.outer(safe, safe)) @ how.T)
+        axes = basis @ turned / np.sqrt(pixels)
+        modes = axes.T @ found
+        beyond = max(float(found @ found) / pixels - float(modes @ modes), 0.0)
+        null = turned.T @ (how @ (drawn / safe[:, None]))
+        return cls(axes, modes, null, np.maximum(expected, 0.0), beyond)
+
+    def chance(self, ways: Sequence[FloatArray]) -> float:
+        """Return the probability of a difference as large as the one found.
+
+        What is large is asked in several ways, and the one that says most is compared with what it would say by chance
+        (Tippett's combination). Of anything: the mean square, and the difference in units of what is expected
+        (Mahalanobis), in which each mode is judged by how far it may. Of each of the `ways` (2 N, k) to differ: how
+        much of it there is by generalised least squares, in standard deviations; where it is the way, no other test
+        finds less of it. What is known better than COVARIANCE_FLOOR_PX is taken for known to so much: of the surest
+        combinations a covariance from some images says least.
+        """
+        known = (self.expected + COVARIANCE_FLOOR_PX**2)[:, None]
+        null = self.null**2
+        likely = [
+            _exceeded(float((self.found**2).sum()) + self.beyond, null.sum(axis=0)),
+            _exceeded(
+                float((self.found**2 / known[:, 0]).sum()) + self.beyond / COVARIANCE_FLOOR_PX**2,
+                (null / known).sum(axis=0),
+            ),
+        ]
+        for way in ways:
+            weighted = self.axes.T @ way / known
+            inverse = np.linalg.pinv(weighted.T @ (self.expected[:, None] * weighted), hermitian=True)
+            size, by_chance = weighted.T @ self.found, weighted.T @ self.null
+            null_size = np.einsum("in,ij,jn->n", by_chance, inverse, by_chance)
+            likely.append(_exceeded(float(size @ inverse @ size), null_size))
+        least = np.min(likely, axis=0)
+        return float(np.count_nonzero(least <= least[0]) / len(least))
 
 
 def _exceeded(size: float, null: FloatArray) -> FloatArray:

@@ -51,6 +51,7 @@ def _camera_figures(pair: CameraPair) -> dict[str, Any]:
         "rotation_deg": difference.rotation_deg,
         "coverage": difference.coverage,
         "predicted_px": None if judged is None else judged.predicted_px,
+        "usual_px": None if judged is None else list(judged.usual_px),
         "ratio": None if judged is None else judged.ratio,
         "chance": None if judged is None else judged.chance,
         "verdict": None if judged is None else str(judged.verdict),
@@ -70,9 +71,11 @@ def _camera_in_words(figures: dict[str, Any]) -> str:
     )
     if not known:
         return line + "no verdict: a file has no covariance"
+    low, high = figures["usual_px"]
     at = f" at {figures['rms_px']:.2g} px" if figures["verdict"] == CameraVerdict.UNIMPORTANT else ""
     return line + (
-        f"expected of one camera {figures['predicted_px']:.4f} px, {figures['ratio']:.2f} times as much is found "
+        f"expected of one camera {figures['predicted_px']:.4f} px ({low:.3f} to {high:.3f} in nine of ten cases), "
+        f"{figures['ratio']:.2f} times as much is found "
         f"(chance {figures['chance']:.3g}): {figures['verdict']}{at}"
         + ("" if figures["same_model"] else "; the chance allows for what their different models make of one lens")
     )

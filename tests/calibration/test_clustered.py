@@ -26,6 +26,8 @@ about 10 %."""
 CORNERS_PX, IMAGES_PX = 0.05, 0.15
 GOOD_PX, FAIR_PX = 0.03, 0.05
 """Errors in common of a good image, and of one with which a thousandth of a focal length is not found any more."""
+MOVED_PX = {"reg": 2.47, "wide": 1.82, "fish": 0.46}
+"""Along x, and half as much along y: 0.2 px rms remain after the best rotation."""
 
 
 def disturbed(views: list[BoardView], rng: np.random.Generator, images_px: float) -> list[BoardView]:
@@ -42,6 +44,17 @@ def disturbed(views: list[BoardView], rng: np.random.Generator, images_px: float
 def calibrated(views: list[BoardView], start: State) -> Calibration:
     observations = Observations.from_views(views)
     return assemble(observations, fit_kept(observations, start, observations.present), None, (), ())
+
+
+def sessions(name: str, images_px: float, count: int) -> list[Calibration]:
+    """Return calibrations of a lens from sessions of 20 images each."""
+    rng = np.random.default_rng(3)
+    camera = lens(name)
+    views = [
+        disturbed(random_views(camera, 20, rng, reach_deg=REACH_DEG[name], noise_px=0.0)[0], rng, images_px)
+        for _ in range(count)
+    ]
+    return [calibrate(own, camera.size_px, model=camera.model, board="flat") for own in views]
 
 
 @pytest.mark.parametrize("images_px", [0.0, IMAGES_PX])
@@ -67,24 +80,31 @@ def test_sigmas_are_right_whatever_repeats(images_px: float) -> None:
     [
         GOOD_PX,
         pytest.param(
-            FAIR_PX, marks=pytest.mark.xfail(strict=True, reason="chance 0.012, a little over the limit of 0.01")
+            FAIR_PX,
+            marks=pytest.mark.xfail(strict=True, reason="chance 0.0102: twice what the focal length does by chance"),
         ),
     ],
 )
 def test_power_and_false_alarms(images_px: float) -> None:
-    rng = np.random.default_rng(3)
-    camera = lens("fish")
-    pixels_of = [
-        disturbed(random_views(camera, 20, rng, reach_deg=REACH_DEG["fish"], noise_px=0.0)[0], rng, images_px)
-        for _ in range(4)
-    ]
-    results = [calibrate(views, camera.size_px, model="kannala_brandt", board="flat") for views in pixels_of]
+    results = sessions("fish", images_px, 4)
     for a, b in itertools.pairwise(results):
         assert compare_calibrations(a, b).verdict is not CameraVerdict.OTHER
     longer = np.array(results[1].camera.parameters)
     longer[:2] *= 1.001
     touched = replace(results[1], camera=results[1].camera.with_parameters(longer))
     assert compare_calibrations(results[0], touched).verdict is CameraVerdict.OTHER
+
+
+@pytest.mark.parametrize("name", ["reg", "wide", "fish"])
+def test_a_moved_principal_point_is_found_behind_an_uncertain_focal_length(name: str) -> None:
+    """Of the move hardly more is left than what the focal length does by chance, but it is of another kind."""
+    results = sessions(name, FAIR_PX if name != "fish" else 0.0, 2)
+    moved = np.array(results[1].camera.parameters)
+    moved[2:4] += MOVED_PX[name] * np.array([1.0, 0.5])
+    touched = replace(results[1], camera=results[1].camera.with_parameters(moved))
+    found = compare_calibrations(results[0], touched)
+    assert found.verdict is CameraVerdict.OTHER
+    assert found.difference.rms_px < 2.0 * found.usual_px[1]
 
 
 def test_few_clusters_say_nothing() -> None:
