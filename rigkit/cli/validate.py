@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from rigkit.cli.console import note, print_json, progress_on_stderr
@@ -140,34 +140,23 @@ def show(done: DatasetValidation, out: Path, *, json: bool) -> int:
                 note(f"to look at: {cause.text}")
             else:
                 print(f"probable cause: {cause.text}")
+        # What is no cause comes after the causes: first it would be taken for one.
+        _say_notes(done.reports, done.crosschecks)
         failed = "NOT every pair was validated" if done.failures else "a check FAILED"
         page = "report.html" if "report.html" in done.files else "tables.md"
         print(f"{'all checks passed' if done.passed else failed}; {out / page}, {done.seconds:.1f} s")
     return exit_code_of(done.failures, ExitCode.WELL if done.passed else ExitCode.CHECK_FAILED)
 
 
-def _say_failures(reports: Iterable[ValidationReport], compared: Iterable[CrossCheckReport]) -> None:
-    # What several estimators share is one fact: it is said once, with all of them.
-    failed: dict[tuple[str, str, str], list[str]] = {}
-    for report in reports:
-        for c in report.checks:
-            if not c.passed:
-                words = (
-                    f"{c.name}: {c.ours:.3f} {c.unit}, measured {c.measured:g} ± {c.measured_sigma:g} ({c.how}), off "
-                    f"by {c.k:.1f} combined sigmas"
-                )
-                failed.setdefault(("FAILED", report.pair_id, words), []).append(report.affine_method)
-        for words in report.unchecked:
-            failed.setdefault(("NOT CHECKED", report.pair_id, words), []).append(report.affine_method)
-    for (what, pair_id, words), methods in failed.items():
-        print(f"{what} {pair_id} {','.join(methods)} {words}")
+def _say_failures(reports: Sequence[ValidationReport], compared: Sequence[CrossCheckReport]) -> None:
+    from rigkit.report.validation_verdict import failed_facts
+
+    for fact in failed_facts(reports, compared):
+        print(" ".join(filter(None, [fact.what, fact.pair_id, ",".join(fact.methods), fact.words])))
+
+
+def _say_notes(reports: Sequence[ValidationReport], compared: Sequence[CrossCheckReport]) -> None:
     for other in compared:
-        for c in other.checks:
-            if not c.passed:
-                print(
-                    f"DISAGREES {other.pair_id} {c.name}: {c.ours:.4f} {c.unit}, {c.how} {c.measured:.4f}, "
-                    f"{c.k:.1f} combined sigmas apart"
-                )
         for words in other.skipped:
             note(f"{other.pair_id}: not cross-checked by {words}")
     for words in dict.fromkeys(f"{report.pair_id}: {n}" for report in reports for n in report.notes):

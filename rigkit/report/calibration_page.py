@@ -14,7 +14,7 @@ from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.uncertainty import uncertainty_map
 from rigkit.core.arrays import Pixels
-from rigkit.core.findings import Finding
+from rigkit.core.findings import Finding, worst
 from rigkit.core.printing import brief
 from rigkit.core.tables import Cell, Column, Table
 from rigkit.io.images import Image
@@ -23,7 +23,7 @@ from rigkit.report.calibration_charts import histogram_svg, images_svg, lens_svg
 from rigkit.report.calibration_drawings import coverage_svg, pattern_svg, residuals_svg, uncertainty_svg
 from rigkit.report.plan_page import shown_views
 from rigkit.report.render import data_uri, drawing, render, shown_table
-from rigkit.report.rig_tables import rig_basis, rig_tables
+from rigkit.report.rig_tables import rig_basis, rig_reach, rig_tables
 from rigkit.report.scene_view import boards_scene, rig_scene
 from rigkit.report.tables import rounded_words
 from rigkit.validation.check import Check
@@ -51,6 +51,7 @@ IN_PX = ("fx", "fy", "cx", "cy")
 REACH_GRID = (24, 18)
 MAX_RATIO_BEYOND = 3.0
 """Where the projection is no worse than so many times the worst place that boards reached, all of the image serves."""
+BADGE_WORDS = {"good": "good", "look": "usable, with care", "bad": "do not use"}
 VERDICTS = {"good": "pass", "look": "look", "bad": "fail"}
 
 
@@ -114,6 +115,7 @@ def _shared(rig: RigCalibration, checks: Sequence[Check]) -> dict[str, Any]:
         "heldout": "not available (too few frames)" if rig.heldout_rms_px is None else f"{rig.heldout_rms_px:.3f} px",
         "training": f"{rig.rms_px:.3f} px",
         "findings": _findings(rig.verdicts),
+        "told": _told(rig.verdicts, rig_reach(rig, checks)),
         "basis": rig_basis(rig),
         "scene": rig_scene(rig),
         "tables": [shown_table(table) for table in rig_tables(rig, checks)],
@@ -130,7 +132,7 @@ def _shown(section: CalibrationSection) -> dict[str, Any]:
         "training": f"{c.rms_px:.3f} px",
         "basis": _basis(c),
         "findings": _findings(c.verdicts),
-        "reach": _reach(c),
+        "told": _told(c.verdicts, _reach(c)),
         "scene": boards_scene(c.views, c.boards),
         "drawings": [(name, drawing(draw(c))) for name, draw in DRAWINGS],
         "next": [] if section.plan is None else shown_views(section.plan, _kept(c)),
@@ -158,6 +160,12 @@ def _basis(c: Calibration) -> str:
 def _findings(found: Sequence[Finding]) -> list[tuple[str, str, str]]:
     """Return severity, colour and words of each finding."""
     return [(str(one.severity), VERDICTS[one.severity], one.text) for one in found]
+
+
+def _told(found: Sequence[Finding], sentence: str) -> dict[str, str]:
+    """Return the verdict that stands first: the gravest finding's severity, and the result in the user's units."""
+    severity = worst(found)
+    return {"words": BADGE_WORDS[severity], "colour": VERDICTS[severity], "headline": sentence}
 
 
 def _reach(c: Calibration) -> str:

@@ -10,8 +10,8 @@ import numpy as np
 from rigkit.core.findings import Severity
 from rigkit.core.tables import Cell, Column, Table
 from rigkit.report.certificate_figure import bound_figure, sheet_pdf
+from rigkit.report.facts_page import build_facts_page
 from rigkit.report.figures import as_png
-from rigkit.report.render import data_uri, render, shown_table
 from rigkit.validation.certificate.contracts import Certificate, Quantity
 
 __all__ = ["CertificateWords", "causes_table", "certificate_page", "certificate_pdf", "in_words"]
@@ -81,18 +81,16 @@ def certificate_page(
 ) -> str:
     """Return the certificate as an HTML page that needs no other file."""
     words = in_words(certificate, limit)
-    colour = {None: "look", True: "pass", False: "fail"}[words.passed]
-    verdict = {None: "no limit given", True: "within the limit", False: "beyond the limit"}[words.passed]
-    return render(
-        "certificate.html",
-        title=title,
-        lead=words.headline,
-        verdict=verdict,
-        colour=colour,
+    return build_facts_page(
+        title,
+        words.headline,
+        [causes_table(certificate)],
+        {**_facts(certificate), **provenance},
+        badge={None: "no limit given", True: "within the limit", False: "beyond the limit"}[words.passed],
+        passed=words.passed,
         sentences=words.sentences,
-        map=data_uri("image/png", as_png(bound_figure(certificate))),
-        tables=[shown_table(causes_table(certificate))],
-        provenance={**_facts(certificate), **provenance},
+        pictures=[("The bound over the image and its causes", "image/png", as_png(bound_figure(certificate)))],
+        signed=True,
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.tables import Cell, Column, Table
 from rigkit.io.history_file import HistoryEntry
-from rigkit.report.render import drawing, render, shown_table
+from rigkit.report.facts_page import build_facts_page
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, SentinelCheck
 
 __all__ = ["CheckWords", "check_page", "check_table", "check_words", "drift_svg", "history_page"]
@@ -93,16 +93,17 @@ def check_table(check: SentinelCheck) -> Table:
 def check_page(check: SentinelCheck, title: str, provenance: Mapping[str, str]) -> str:
     """Return the check as an HTML page that needs no other file."""
     words = check_words(check)
-    return render(
-        "check.html",
-        title=title,
-        lead=words.headline,
-        verdict="holds" if check.holds else "does not hold",
-        colour="pass" if check.holds else "fail",
+    chance = check.holds and check.chance >= ALARM_CHANCE
+    moves = "no more than chance; magnified" if chance else "how the best explanation moves what it sees"
+    return build_facts_page(
+        title,
+        words.headline,
+        [check_table(check)],
+        provenance,
+        badge="holds" if check.holds else "does not hold",
+        passed=check.holds,
         sentences=words.sentences,
-        drawings=[(name, drawing(change_svg(check, c))) for c, name in enumerate(check.watched.names)],
-        tables=[shown_table(check_table(check))],
-        provenance=provenance,
+        drawings=[(f"{name}: {moves}", change_svg(check, c)) for c, name in enumerate(check.watched.names)],
     )
 
 
@@ -137,14 +138,21 @@ def history_page(entries: Sequence[HistoryEntry], title: str, provenance: Mappin
     """Return the register as a page: one drift plot for each thing that may change, then every entry."""
     names = list(dict.fromkeys(name for entry in entries for name in entry.amounts))
     alarms = sum(not entry.holds for entry in entries)
-    lead = f"{len(entries)} entries from {entries[0].date[:10]} to {entries[-1].date[:10]}, {alarms} of them alarms."
-    return render(
-        "history.html",
-        title=title,
-        lead=lead,
-        drawings=[(name, drawing(drift_svg(entries, name))) for name in names],
-        tables=[shown_table(_history_table(entries))],
-        provenance=provenance,
+    told = {0: "none an alarm", 1: "one an alarm"}.get(alarms, f"{alarms} of them alarms")
+    count = "one entry" if len(entries) == 1 else f"{len(entries)} entries, {told}"
+    lead = f"{count}, from {entries[0].date[:10]} to {entries[-1].date[:10]}."
+    return build_facts_page(
+        title,
+        f"The last entry {'holds' if entries[-1].holds else 'is an alarm'}; {lead}",
+        [_history_table(entries)],
+        provenance,
+        badge="holds" if entries[-1].holds else "does not hold",
+        passed=entries[-1].holds,
+        sentences=[
+            "Each amount as if it alone had changed since the calibration, with its standard deviation. Dashed: "
+            "control limits, three standard deviations of a usual check. Red: entries that raised an alarm."
+        ],
+        drawings=[(name, drift_svg(entries, name)) for name in names],
     )
 
 
@@ -179,7 +187,8 @@ def drift_svg(entries: Sequence[HistoryEntry], name: str) -> str:
             f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3.4" fill="{colour}">'
             f"<title>{escape(_of(entry, name))}</title></circle>"
         )
-    for a, entry, anchor in {0: (x[0], own[0], "start"), 1: (x[-1], own[-1], "end")}.values():
+    ends = [(x[0], own[0], "start"), (x[-1], own[-1], "end")]
+    for a, entry, anchor in ends if len(own) > 1 else [(x[0], own[0], "middle")]:
         out.append(
             f'<text x="{a:.1f}" y="{DRIFT_HEIGHT - 6:.1f}" text-anchor="{anchor}" fill="#333">{entry.date[:10]}</text>'
         )

@@ -41,6 +41,8 @@ __all__ = [
 BOARD_COLOURS = ("#e6550d", "#1f77b4", "#2ca02c", "#9467bd", "#d6b300", "#17becf", "#e377c2", "#7f7f7f")
 """One colour a board, the same in every picture; readable on dark and light images."""
 
+MIN_SHOWN_PX = 1e-4
+"""Differences of cameras below this are drawn as none."""
 DPI = 110
 NORMAL_LENGTH_SQUARES = 0.8
 BARE_NORMAL = 0.08
@@ -197,9 +199,11 @@ def difference_png(difference: CameraDifference) -> bytes:
     FigureCanvasAgg(figure)
     axis: Any = figure.subplots()
     u, v = difference.pixels[..., 0], difference.pixels[..., 1]
-    mesh = axis.pcolormesh(u, v, difference.map_px, shading="nearest", cmap="viridis")
+    # Below this there is only rounding, which must not look like a pattern.
+    top = max(float(difference.max_px), MIN_SHOWN_PX)
+    mesh = axis.pcolormesh(u, v, difference.map_px, shading="nearest", cmap="viridis", vmin=0.0, vmax=top)
     some = np.s_[::3, ::3]
-    arrows = difference.difference_px[some]
+    arrows = difference.difference_px[some] if difference.max_px > MIN_SHOWN_PX else np.zeros((*u[some].shape, 2))
     axis.quiver(u[some], v[some], arrows[..., 0], arrows[..., 1], angles="xy", color="white", width=0.002)
     axis.set_aspect("equal")
     axis.invert_yaxis()

@@ -14,6 +14,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.report.render import data_uri, render, shown_table
 from rigkit.report.scene_view import DEPTH, camera_pyramid, rounded
+from rigkit.report.validation_verdict import ValidationVerdict
 
 __all__ = ["PairSection", "build_page", "scene_of"]
 
@@ -34,12 +35,14 @@ class PairSection:
 def build_page(
     title: str,
     lead: str,
-    passed: bool,
+    verdict: ValidationVerdict,
     summary: Sequence[Table],
     pairs: Sequence[PairSection],
     provenance: Mapping[str, str],
+    remarks: Sequence[str] = (),
 ) -> str:
-    """Return the page as text; everything it needs is inside it."""
+    """Return the page as text; everything it needs is inside it. Its 3D view is of the first pair that fails, or of the
+    first; `remarks` stand below the tables of the `summary`."""
     shown = [
         {
             "pair_id": pair.pair_id,
@@ -55,11 +58,29 @@ def build_page(
         "validation.html",
         title=title,
         lead=lead,
-        passed=passed,
+        passed=verdict.passed,
+        verdict=_first_screen(verdict, pairs),
+        remarks=remarks,
         summary=[shown_table(table) for table in summary],
         pairs=shown,
         provenance=provenance,
     )
+
+
+def _first_screen(verdict: ValidationVerdict, pairs: Sequence[PairSection]) -> dict[str, Any]:
+    failed = {fact.pair_id for fact in verdict.failed}
+    seen = [pair for pair in pairs if pair.scene is not None]
+    shown = next((pair for pair in seen if pair.pair_id in failed), seen[0] if seen else None)
+    return {
+        "words": "all checks passed" if verdict.passed else "a check failed" if verdict.failed else "not complete",
+        "colour": "pass" if verdict.passed else "fail",
+        "headline": verdict.headline,
+        "fineness": verdict.fineness,
+        "failed": verdict.failed,
+        "causes": verdict.causes,
+        "shown": "" if shown is None else shown.pair_id,
+        "scene": None if shown is None else shown.scene,
+    }
 
 
 def scene_of(reconstruction: Reconstruction) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from rigkit.geometry.rotation import log_so3
 from rigkit.report.tables import rounded_words
 from rigkit.validation.check import Check
 
-__all__ = ["rig_basis", "rig_tables"]
+__all__ = ["rig_basis", "rig_reach", "rig_tables"]
 
 
 def rig_tables(rig: RigCalibration, checks: Sequence[Check]) -> tuple[Table, ...]:
@@ -108,6 +108,30 @@ def rig_basis(rig: RigCalibration) -> str:
         f"{rig.corner_count} corners, {rig.shared_count} poses shared by several views. Frames disagree "
         f"{rig.overdispersion:.2f} times as much as independent corners would; all sigmas count that in."
     )
+
+
+def rig_reach(rig: RigCalibration, checks: Sequence[Check]) -> str:
+    """Say how sure the distances of the cameras are, and where one sees what another does; what was measured too."""
+    sentences = []
+    names = [camera.name for camera in rig.cameras]
+    pairs = list(combinations(names, 2))
+    if pairs:
+        values = {pair: rig.baseline_mm(*pair) for pair in pairs}
+        (a, b), (value, sigma) = max(values.items(), key=lambda of: of[1][1])
+        least = "" if len(pairs) == 1 else ", the least certain distance,"
+        sentences.append(f"{a} and {b}{least} are {rounded_words(value, sigma)} mm apart.")
+        sure = {pair: transfer_uncertainty(rig, *pair) for pair in pairs}
+        known = {pair: transfer for pair, transfer in sure.items() if transfer is not None}
+        if known:
+            (a, b), transfer = max(known.items(), key=lambda of: of[1].worst_px)
+            sentences.append(
+                f"A point that {a} sees appears in {b} within ±{transfer.median_px:.2g} px of where it is expected "
+                f"(±{transfer.worst_px:.2g} px at worst; one standard deviation)."
+            )
+    if checks:
+        held = sum(check.passed for check in checks)
+        sentences.append(f"{held} of {len(checks)} measured facts hold.")
+    return " ".join(sentences)
 
 
 def _baselines(rig: RigCalibration, checks: Sequence[Check]) -> Table:

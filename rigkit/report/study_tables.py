@@ -6,7 +6,7 @@ from rigkit.core.tables import Cell, Column, Table
 from rigkit.study.study import STUDY_PLANES, Study
 from rigkit.study.table import ALL_PLANES, StudyCell, StudyTable
 
-__all__ = ["cell_table", "study_tables"]
+__all__ = ["cell_table", "study_setup", "study_tables"]
 
 
 def study_tables(found: StudyTable) -> tuple[Table, ...]:
@@ -49,7 +49,7 @@ def cell_table(found: StudyTable) -> Table:
         )
         for cell in found.cells
     )
-    return Table("cells", found.study.title, columns, rows, _setup(found.study))
+    return Table("cells", found.study.title, columns, rows, study_setup(found.study))
 
 
 def _median_table(found: StudyTable, pose_type: str) -> Table:
@@ -61,7 +61,7 @@ def _median_table(found: StudyTable, pose_type: str) -> Table:
             rows.append((Cell(f"{sigma:g}"), Cell(_plane(plane)), *(Cell(_quartiles(cell)) for cell in cells)))
             missing += sum(cell.missing for cell in cells) if plane == ALL_PLANES else 0
     columns = (Column("noise", study.unit), Column("plane"), *(Column(method, "deg") for method in study.methods))
-    note = f"Angle between estimated and true normal: median (quartiles); {_setup(study)}."
+    note = f"Angle between estimated and true normal: median (quartiles); {study_setup(study)}."
     if missing:
         note += f" {missing} estimates are missing: their directions do not determine an affinity."
     return Table(f"medians-{pose_type}", f"{study.title}: {pose_type} motion", columns, tuple(rows), note)
@@ -75,7 +75,8 @@ def _plane(plane: int) -> str:
     return "all" if plane == ALL_PLANES else str(plane)
 
 
-def _setup(study: Study) -> str:
+def study_setup(study: Study) -> str:
+    """Return what was simulated, in words."""
     images = {"1": "image 1", "2": "image 2", "both": "both images"}[str(study.images)]
     corners = STUDY_PLANES * study.board.corner_count
     return f"noise on {study.noise} of {images}; {study.trials} trials of {corners} corners"

@@ -213,7 +213,31 @@ def _diagnose_angles(report: ValidationReport) -> list[str]:
             for c in supplement
         ]
     ids = [result.board.board_id for result in report.boards]
-    involved = Counter(b for name in names for b in ids if b in name.split("-") or name.startswith(f"{b}-"))
-    common = [b for b, count in involved.items() if count == len(failed)]
-    where = f"board '{common[0]}' does not stand as measured" if len(failed) > 1 and common else "the boards' angle"
-    return [f"pair '{report.pair_id}': {', '.join(names)}: {where}; measure it again, or look at the calibration"]
+    involved = {
+        c.name: [b for b in ids if b in name.split("-") or name.startswith(f"{b}-")]
+        for c, name in zip(failed, names, strict=True)
+    }
+    counts = Counter(b for boards in involved.values() for b in boards)
+    common = [b for b, count in counts.items() if count == len(failed)]
+    if len(failed) > 1 and common:
+        words = f"board '{common[0]}' does not stand as measured; measure it again, or look at the calibration"
+        return [f"pair '{report.pair_id}': {', '.join(names)}: {words}"]
+    return [f"pair '{report.pair_id}': {name}: {_lone_angle(report, c)}" for c, name in zip(failed, names, strict=True)]
+
+
+def _lone_angle(report: ValidationReport, check: Check) -> str:
+    """Return what one angle that fails most probably comes from: what was written, if all else speaks for ours."""
+    angle = next(a for a in report.angles if check.name == f"angle {a.a}-{a.b}" or check.name == f"angle {a.b}-{a.a}")
+    if angle.lattice_deg is not None and abs(angle.lattice_deg - check.ours) > 0.5 * abs(check.difference):
+        return (
+            f"planes through the points say {check.ours:.2f} deg, the boards' known squares {angle.lattice_deg:.2f}: a "
+            "board is bent, or the calibration does not fit; see what the corners leave over"
+        )
+    others = [c for c in report.checks if c.kind == "angle" and c is not check]
+    witnesses = [] if angle.lattice_deg is None else [f"the boards' known squares say {angle.lattice_deg:.2f} deg too"]
+    witnesses += ["the other angles hold"] if others and all(c.passed for c in others) else []
+    misread = (
+        f"{check.measured:g} was probably misread" if witnesses else f"the boards do not stand at {check.measured:g}"
+    )
+    why = f" ({', and '.join(witnesses)})" if witnesses else ""
+    return f"{misread}: the images show {check.ours:.2f} deg{why}; measure it again"

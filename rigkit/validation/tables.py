@@ -6,7 +6,7 @@ normal errors) and 2 (baselines by estimator). How a table looks as text is the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 
@@ -36,6 +36,9 @@ TIE_MM = 1e-3
 
 TIE_DEG = 1e-6
 """Estimators whose normal errors differ by less find the same normals: rounding must not choose between them."""
+
+RIGHT_ANGLE_ERROR, ANGLE_ERROR = "orthogonality error", "angle error"
+"""The paper's word where every angle measured is a right one, and ours for others."""
 
 Printed = Mapping[str, Mapping[str, str]]
 
@@ -124,7 +127,7 @@ def plane_table(reports: Sequence[ValidationReport], method: str, paper: PaperTa
     for a, b in combinations(ids, 2):
         label = f"orthogonality {number[a]}-{number[b]}"
         cells = [Cell(_orthogonality(r, a, b), paper.plane(label, r.pair_id)) for r in chosen.values()]
-        rows.append((Cell(f"orthogonality error {a}, {b}"), *cells))
+        rows.append((Cell(f"{_angle_error_label(chosen.values(), a, b)} {a}, {b}"), *cells))
     for kind in ("mean", "median"):
         for board_id in ids:
             label = f"{kind} normal error {number[board_id]}"
@@ -205,8 +208,9 @@ def average_table(reports: Sequence[ValidationReport], method: str, paper: Paper
     """Return the averages over all cells that the paper has too, and how many times smaller ours are; None without."""
     rows = []
     cells = [(row[0], cell) for row in plane_table(reports, method, paper).rows for cell in row[1:]]
-    for what in ("orthogonality error", "mean normal error", "median normal error"):
-        both = [(c.value, float(c.paper)) for head, c in cells if str(head.value).startswith(what) and c.paper]
+    for what in (RIGHT_ANGLE_ERROR, "mean normal error", "median normal error"):
+        starts = (what, ANGLE_ERROR) if what == RIGHT_ANGLE_ERROR else (what,)
+        both = [(c.value, float(c.paper)) for head, c in cells if str(head.value).startswith(starts) and c.paper]
         rows.append(_average_row(f"{what}, {method}", "deg", [(v, p) for v, p in both if isinstance(v, float)]))
     differences = []
     for report in reports:
@@ -224,21 +228,25 @@ def average_table(reports: Sequence[ValidationReport], method: str, paper: Paper
 
 
 def check_table(reports: Sequence[ValidationReport]) -> Table:
-    """Return every measured quantity beside ours with its verdict; what could not be checked is a row that failed."""
-    rows: list[tuple[Cell, ...]] = []
+    """Return every measured quantity beside ours with its verdict; what could not be checked is a row that failed.
+
+    One row a fact: what estimators of a pair have in common, as all do that kept the same points, is said once.
+    """
+    found: dict[tuple[str, tuple[Cell, ...]], list[str]] = {}
     for report in reports:
-        head = (Cell(report.pair_id), Cell(report.affine_method))
         for c in report.checks:
             verdict = Cell("pass" if c.passed else "FAIL", failed=not c.passed)
-            numbers = (Cell(c.measured, sigma=c.measured_sigma), Cell(c.ours, sigma=c.our_sigma), Cell(c.difference))
+            sigma = c.our_sigma if np.isfinite(c.our_sigma) else None
+            numbers = (Cell(c.measured, sigma=c.measured_sigma), Cell(c.ours, sigma=sigma), Cell(c.difference))
             tail = (Cell(c.combined_sigma), Cell(c.k), verdict, Cell(float(c.count)), Cell(c.how))
-            rows.append((*head, Cell(c.name), Cell(c.unit), *numbers, *tail))
+            row = (Cell(c.name), Cell(c.unit), *numbers, *tail)
+            found.setdefault((report.pair_id, row), []).append(report.affine_method)
         for lost in report.unchecked:
             name, _, why = lost.partition(": ")
             nothing = (Cell(None),) * 5
-            rows.append(
-                (*head, Cell(name), Cell(None), *nothing, Cell("NOT CHECKED", failed=True), Cell(0.0), Cell(why))
-            )
+            row = (Cell(name), Cell(None), *nothing, Cell("NOT CHECKED", failed=True), Cell(0.0), Cell(why))
+            found.setdefault((report.pair_id, row), []).append(report.affine_method)
+    rows = [(Cell(pair_id), Cell(", ".join(methods)), *row) for (pair_id, row), methods in found.items()]
     columns = (
         Column("pair"),
         Column("estimator"),
@@ -254,7 +262,10 @@ def check_table(reports: Sequence[ValidationReport]) -> Table:
         Column("measured by"),
     )
     limits = sorted({c.limit_k for r in reports for c in r.checks})
-    note = f"Passes where |difference| <= k x combined sigma, k = {', '.join(f'{k:g}' for k in limits)}."
+    note = (
+        "k: the difference in combined sigmas (root of the sum of both variances). Passes up to k = "
+        f"{', '.join(f'{k:.3g}' for k in limits)}."
+    )
     return Table("checks", "Checks against what was measured", columns, tuple(rows), note)
 
 
@@ -296,6 +307,11 @@ def _board_ids(reports: Sequence[ValidationReport]) -> tuple[str, ...]:
 
 def _orthogonality(report: ValidationReport, a: str, b: str) -> float | None:
     return next((angle.error_deg for angle in report.angles if {angle.a, angle.b} == {a, b}), None)
+
+
+def _angle_error_label(reports: Iterable[ValidationReport], a: str, b: str) -> str:
+    measured = {x.measured_deg for r in reports for x in r.angles if {x.a, x.b} == {a, b}} - {None}
+    return RIGHT_ANGLE_ERROR if measured <= {90.0} else ANGLE_ERROR
 
 
 def _normal_error(report: ValidationReport, board_id: str, statistic: str) -> float | None:

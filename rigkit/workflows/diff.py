@@ -27,6 +27,8 @@ class DiffOptions:
 
     output: Path | None = None
     """File for the map; None: no map."""
+    report: Path | None = None
+    """A page that `write_diff_page` will write; its place is looked at before the work."""
     force: bool = False
     """Replace a map that exists."""
 
@@ -81,6 +83,8 @@ def diff(a: Path, b: Path, options: DiffOptions | None = None) -> CameraPair | R
     Raises InputError for files of two kinds, rigs of other cameras or boards, or a map that cannot be written.
     """
     options = options or DiffOptions()
+    if options.report is not None:
+        ensure_writable(options.report, force=options.force, inputs=(a, b))
     boards = [is_board_rigs_file(path) for path in (a, b)]
     if any(boards):
         if not all(boards):

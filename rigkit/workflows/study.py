@@ -22,10 +22,12 @@ from rigkit.io.files import ensure_writable, write_atomic, write_together
 from rigkit.io.sources import source_hash
 from rigkit.io.study_file import load_study
 from rigkit.report.study_figure import study_figure
+from rigkit.report.study_page import study_page
 from rigkit.report.study_tables import cell_table, study_tables
 from rigkit.report.tables import tables_to_csv, tables_to_markdown
 from rigkit.study.study import Study, chunk_count, run_chunk
 from rigkit.study.table import StudyTable, tabulate
+from rigkit.workflows.provenance import software_facts
 from rigkit.workflows.spread import over_items
 
 __all__ = ["StudyOptions", "StudyResult", "run_studies", "run_study", "study_key"]
@@ -90,6 +92,7 @@ def run_studies(
                 "json": json.dumps(table.to_dict(), indent=1, allow_nan=False) + "\n",
                 "md": tables_to_markdown(study_tables(table)),
                 options.figure: study_figure(table, options.figure),
+                "html": study_page(table, software_facts()),
             }
             write_together({path: contents[suffix] for suffix, path in places.items()}, force=options.force)
         yield StudyResult(study, table, tuple(places.values()))
@@ -99,7 +102,9 @@ def _files_of(study: Study, options: StudyOptions) -> dict[str, Path]:
     """Return where the files of a study go, by their ending."""
     if options.output is None:
         return {}
-    return {suffix: options.output / f"{study.name}.{suffix}" for suffix in ("csv", "json", "md", options.figure)}
+    return {
+        suffix: options.output / f"{study.name}.{suffix}" for suffix in ("csv", "json", "md", "html", options.figure)
+    }
 
 
 def study_key(study: Study) -> str:

@@ -152,7 +152,7 @@ def validate_dataset(
     # Where everything passed they explain nothing, but a person should know.
     severity = Severity.LOOK if passed else Severity.BAD
     seconds = time.monotonic() - started
-    files = validation_files(known, cameras, pairs, failures, paper, passed=passed, options=options, seconds=seconds)
+    files = validation_files(known, cameras, pairs, failures, paper, causes=causes, options=options, seconds=seconds)
     if options.output is not None:
         write_results(options.output, files, force=options.force, inputs=known.inputs)
     return DatasetValidation(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from rigkit.core.tables import Table
+from rigkit.calibration.result import Calibration
 from rigkit.io.manifest import Dataset
 from rigkit.report.page import PairSection, build_page
 from rigkit.report.tables import tables_to_csv, tables_to_json, tables_to_latex, tables_to_markdown
-from rigkit.report.validation_page import camera_table, crosscheck_table, summary_table
+from rigkit.report.validation_page import SUMMARY_WORDS, camera_remarks, camera_table, crosscheck_table, summary_table
+from rigkit.report.validation_verdict import verdict_of
 from rigkit.validation.checks import ValidationReport
 from rigkit.validation.crosscheck import CrossCheckReport
 from rigkit.validation.tables import PaperTables, build_tables
@@ -54,14 +55,15 @@ def validation_files(
     failures: Sequence[PairFailure],
     paper: PaperTables | None,
     *,
-    passed: bool,
+    causes: Sequence[str],
     options: DatasetOptions,
     seconds: float,
 ) -> dict[str, str | bytes]:
     """Return everything that a validation came to, relative path -> content; the page where there are pictures."""
     reports = [report for pair in pairs for report in pair.reports]
     compared = [pair.crosscheck for pair in pairs if pair.crosscheck is not None]
-    tables = [summary_table([pair.best for pair in pairs]), *build_tables(reports, paper)]
+    summary = replace(summary_table([pair.best for pair in pairs]), note=SUMMARY_WORDS)
+    tables = [summary, *build_tables(reports, paper)]
     if compared:
         tables.insert(-2, crosscheck_table(compared))
     files: dict[str, str | bytes] = {
@@ -75,23 +77,28 @@ def validation_files(
         files |= pair.files
     sections = [pair.section for pair in pairs if pair.section is not None]
     if sections:
-        lead = f"pairs: {len(pairs)}; reconstructions: {len(reports)}; {seconds:.0f} s"
+        best = [pair.best for pair in pairs]
+        verdict = verdict_of(best, reports, compared, causes, complete=not failures)
+        lead = f"{len(pairs)} {'pair' if len(pairs) == 1 else 'pairs'}, each by {len(pairs[0].reports)} estimators of "
+        lead += f"affine transformations, {seconds:.0f} s"
         lead += "".join(f"; not validated: {failure}" for failure in failures)
         shown = [table for table in tables if table.key not in ("checks", "estimators")]
-        shown += _calibrations(dataset, cameras)
+        known = _calibrations(dataset, cameras)
+        shown += [camera_table(known)] if known else []
         title = f"rigkit validation: {dataset.name}"
-        files[PAGE] = build_page(title, lead, passed, shown, sections, _facts(dataset, cameras, options))
+        files[PAGE] = build_page(
+            title, lead, verdict, shown, sections, _facts(dataset, cameras, options), camera_remarks(known)
+        )
     return files
 
 
-def _calibrations(dataset: Dataset, cameras: LoadedCameras) -> list[Table]:
-    """Return the table of the cameras in use; none where their files say no more than the camera."""
-    known = {
+def _calibrations(dataset: Dataset, cameras: LoadedCameras) -> dict[str, Calibration]:
+    """Return the calibrations in use by camera; not those whose files say no more than the camera."""
+    return {
         name: loaded.calibration
         for name, loaded in cameras.known.items()
         if name in dataset.used_cameras and loaded.calibration is not None
     }
-    return [camera_table(known)] if known else []
 
 
 def _facts(dataset: Dataset, cameras: LoadedCameras, options: DatasetOptions) -> dict[str, str]:

@@ -98,8 +98,11 @@ def test_diff_has_a_verdict_on_rigs_and_their_cameras(
     for k in range(3):
         saved["cameras"][1]["cam_from_rig"][k][3] += 1.0
     (folder / "again.json").write_text(json.dumps(saved))
-    assert main(["diff", str(folder / "rig.json"), str(folder / "again.json")]) == 1
+    page = folder / "diff.html"
+    assert main(["diff", str(folder / "rig.json"), str(folder / "again.json"), "-r", str(page)]) == 1
     said = capsys.readouterr().out
+    text = page.read_text()
+    assert "NOT the same rig" in text and text.count("data:image/png") == len(NAMES)
     assert "NOT the same rig" in said and said.count("no contradiction") == len(NAMES)
     assert main(["diff", str(folder / "rig.json"), str(folder / "rig-reg.json")]) == 2
 

@@ -38,7 +38,7 @@ def study(tmp_path: Path) -> Path:
 def test_tables_and_figure_are_written(study: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     assert main(["simulate", str(study), "-o", str(out)]) == 0
-    assert sorted(p.name for p in out.iterdir()) == ["small.csv", "small.json", "small.md", "small.png"]
+    assert sorted(p.name for p in out.iterdir()) == ["small.csv", "small.html", "small.json", "small.md", "small.png"]
     printed = capsys.readouterr()
     assert printed.out.strip() == (out / "small.md").read_text().strip()
     assert "| lengths help | **" in printed.out

@@ -16,6 +16,7 @@ from rigkit.core.truth import MeasuredAngle, PairTruth
 from rigkit.report.figures import as_jpeg, cloud_png
 from rigkit.report.page import build_page
 from rigkit.report.validation_page import pair_section, summary_table
+from rigkit.report.validation_verdict import verdict_of
 from rigkit.validation.checks import validate
 
 QUIET = [
@@ -59,7 +60,9 @@ def test_the_page_works_without_network(tmp_path: Path) -> None:
     report = validate(reconstruction, truth)
     picture = ("The cloud", "image/jpeg", as_jpeg(cloud_png(reconstruction)))
     section = pair_section(reconstruction, [report], [picture])
-    page = build_page("A & B", "lead", report.passed, [summary_table([report])], [section], {"rigkit": "x"})
+    page = build_page(
+        "A & B", "lead", verdict_of([report], [report]), [summary_table([report])], [section], {"rigkit": "x"}
+    )
     assert not re.search(r"""(src|href)=["']?https?:""", page)
     assert "set &lt;square&gt;" in page
     path = tmp_path / "report.html"
@@ -134,7 +137,9 @@ def test_the_page_fits_a_phone_a_tablet_and_a_screen(tmp_path: Path) -> None:
     report = validate(reconstruction, PairTruth(angles=(MeasuredAngle("plane1", "plane2", 90.0, 0.3, "set square"),)))
     picture = ("The cloud", "image/jpeg", as_jpeg(cloud_png(reconstruction)))
     section = pair_section(reconstruction, [report], [picture])
-    page = build_page("title", "lead", report.passed, [summary_table([report])], [section], {"rigkit": "x" * 200})
+    page = build_page(
+        "title", "lead", verdict_of([report], [report]), [summary_table([report])], [section], {"rigkit": "x" * 200}
+    )
     for width, (wide, small) in measured_at_widths(page, tmp_path).items():
         assert wide <= width
         assert small >= MIN_FONT_PX

@@ -103,6 +103,22 @@ def test_a_board_that_stands_otherwise_is_named() -> None:
     assert "'plane2' does not stand as measured" in found[0]
 
 
+def test_one_angle_that_was_misread_is_told_by_the_others_that_hold() -> None:
+    found = diagnose([reported(stated_deg=88.0, distances=False)])
+    assert found == (
+        "pair 'made': plane1-plane2: 88 was probably misread: the images show 90.00 deg (the other angles hold); "
+        "measure it again",
+    )
+
+
+def test_planes_of_points_and_of_squares_that_disagree_blame_no_ruler() -> None:
+    report = reported(angles=(91.6, 90.0, 90.0), distances=False)
+    bent = tuple(replace(a, lattice_deg=90.0) if (a.a, a.b) == ("plane1", "plane2") else a for a in report.angles)
+    found = diagnose([replace(report, angles=bent)])
+    assert len(found) == 1
+    assert "a board is bent, or the calibration does not fit" in found[0]
+
+
 def test_a_supplement_is_recognised() -> None:
     found = diagnose([reported(angles=(91.6, 90.0, 90.0), stated_deg=88.4, distances=False)])
     assert len(found) == 1

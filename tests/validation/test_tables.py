@@ -28,7 +28,7 @@ from rigkit.report.tables import (
     tables_to_text,
 )
 from rigkit.validation.checks import ValidationReport, validate
-from rigkit.validation.tables import PaperTables, best_method, best_report, build_tables
+from rigkit.validation.tables import PaperTables, best_method, best_report, build_tables, check_table, plane_table
 
 REPO = Path(__file__).parents[2]
 PAPER = REPO / "datasets" / "hajder2021"
@@ -238,3 +238,17 @@ def test_a_small_sigma_is_not_shown_as_nothing() -> None:
     assert measured_words(301.0, 0.5, 2) == "301.00 ± 0.50"
     assert measured_words(301.0, 0.0, 2) == "301.00 ± 0.00"
     assert measured_words(301.0, None, 2) == measured_words(301.0, float("nan"), 2) == "301.00"
+
+
+def test_what_estimators_share_is_one_row_and_another_angle_than_a_right_one_has_its_own_word(
+    reports: list[ValidationReport],
+) -> None:
+    one = reports[0]
+    twin = replace(one, affine_method="TWIN")
+    rows = check_table([one, twin]).rows
+    assert len(rows) == len(one.checks) + len(one.unchecked)
+    assert {row[1].value for row in rows} == {f"{one.affine_method}, TWIN"}
+    other = replace(one, angles=tuple(replace(a, measured_deg=88.0) for a in one.angles))
+    names = [str(row[0].value) for row in plane_table([other], other.affine_method, PaperTables()).rows]
+    assert any(name.startswith("angle error plane1") for name in names)
+    assert not any(name.startswith("orthogonality") for name in names)

@@ -1,0 +1,53 @@
+"""A page of facts in the one look of all: the verdict and its sentences, pictures, drawings, tables, provenance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from rigkit.core.tables import Table
+from rigkit.report.render import data_uri, drawing, render, shown_table
+
+__all__ = ["build_facts_page"]
+
+BADGES = {None: "look", True: "pass", False: "fail"}
+
+
+def build_facts_page(
+    title: str,
+    headline: str,
+    tables: Sequence[Table],
+    provenance: Mapping[str, str],
+    *,
+    badge: str = "",
+    passed: bool | None = None,
+    sentences: Sequence[str] = (),
+    links: Sequence[tuple[str, str]] = (),
+    pictures: Sequence[tuple[str, str, bytes]] = (),
+    drawings: Sequence[tuple[str, str]] = (),
+    signed: bool = False,
+) -> str:
+    """Return the page as text; everything it needs is inside it.
+
+    Parameters
+    ----------
+    title, headline, tables, provenance : what every page has; the headline is the result in the user's units.
+    badge, passed : the verdict in a word or two ("": none), and its colour: good, bad, or (None) neither.
+    sentences : below the headline.
+    links : (words, page) beside them.
+    pictures : (words for those who cannot see them, MIME type, bytes).
+    drawings : (heading, SVG of rigkit itself).
+    signed : whether it ends in lines for date, name and signature.
+    """
+    return render(
+        "facts.html",
+        title=title,
+        lead="",
+        told={"words": badge, "colour": BADGES[passed], "headline": headline},
+        sentences=sentences,
+        links=links,
+        pictures=[(words, data_uri(mime, data)) for words, mime, data in pictures],
+        drawings=[(name, drawing(svg)) for name, svg in drawings],
+        tables=[shown_table(table) for table in tables],
+        signed=signed,
+        provenance=provenance,
+    )

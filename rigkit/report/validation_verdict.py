@@ -1,0 +1,124 @@
+"""What a validation came to in a few sentences: for its page's first screen, and for the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rigkit.report.tables import measured_words
+from rigkit.validation.check import Check
+from rigkit.validation.checks import ValidationReport
+from rigkit.validation.crosscheck import CrossCheckReport
+
+__all__ = ["FailedFact", "ValidationVerdict", "failed_facts", "verdict_of"]
+
+FINER = 4.0
+"""Where the ruler is so many times less certain than we are, it decides nothing finer."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FailedFact:
+    """One fact that does not hold, whoever found it: `what` happened, of which pair, by which estimators (none: by an
+    independent method), in words."""
+
+    what: str
+    pair_id: str
+    methods: tuple[str, ...]
+    words: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ValidationVerdict:
+    """What a validation came to: whether everything holds, how well in a sentence, how fine that could be tested
+    ("" where nothing limits it), what does not hold, and probably why."""
+
+    passed: bool
+    headline: str
+    fineness: str
+    failed: tuple[FailedFact, ...]
+    causes: tuple[str, ...]
+
+
+def verdict_of(
+    best: Sequence[ValidationReport],
+    reports: Sequence[ValidationReport],
+    compared: Sequence[CrossCheckReport] = (),
+    causes: Sequence[str] = (),
+    *,
+    complete: bool = True,
+) -> ValidationVerdict:
+    """Return what a validation came to.
+
+    Parameters
+    ----------
+    best : one report a pair, of the estimator shown.
+    reports : of all estimators.
+    compared, causes : comparisons with independent methods; what probably explains the failures.
+    complete : whether every pair could be reconstructed.
+    """
+    failed = failed_facts(reports, compared)
+    return ValidationVerdict(
+        passed=complete and not failed,
+        headline=_headline(best),
+        fineness=_fineness(best),
+        failed=failed,
+        causes=tuple(causes),
+    )
+
+
+def failed_facts(
+    reports: Sequence[ValidationReport], compared: Sequence[CrossCheckReport] = ()
+) -> tuple[FailedFact, ...]:
+    """Return what failed or could not be checked; what several estimators share is one fact."""
+    found: dict[tuple[str, str, str], list[str]] = {}
+    for report in reports:
+        for c in report.checks:
+            if not c.passed:
+                found.setdefault(("FAILED", report.pair_id, _in_words(c)), []).append(report.affine_method)
+        for words in report.unchecked:
+            found.setdefault(("NOT CHECKED", report.pair_id, words), []).append(report.affine_method)
+    facts = [FailedFact(what=w, pair_id=p, methods=tuple(m), words=words) for (w, p, words), m in found.items()]
+    for other in compared:
+        for c in other.checks:
+            if not c.passed:
+                words = f"{c.name}: {c.ours:.4f} {c.unit}, {c.how} {c.measured:.4f}, {c.k:.1f} combined sigmas apart"
+                facts.append(FailedFact(what="DISAGREES", pair_id=other.pair_id, methods=(), words=words))
+    return tuple(facts)
+
+
+def _in_words(c: Check) -> str:
+    return (
+        f"{c.name}: {c.ours:.3f} {c.unit}, measured {c.measured:g} ± {c.measured_sigma:g} ({c.how}), off "
+        f"by {c.k:.1f} combined sigmas"
+    )
+
+
+def _headline(best: Sequence[ValidationReport]) -> str:
+    """Return how many of the facts measured agree, and by how much at most; `best`: one report a pair."""
+    checks = [(report.pair_id, c) for report in best for c in report.checks]
+    unchecked = sum(len(report.unchecked) for report in best)
+    held = [(pair, c) for pair, c in checks if c.passed]
+    pairs = f"of {len(best)} pairs" if len(best) > 1 else "of the pair"
+    words = f"{len(held)} of {len(checks) + unchecked} facts that were measured or declared {pairs} hold"
+    parts = []
+    for kinds, what, decimals in ((("baseline", "distance"), "lengths", 2), (("angle",), "angles", 3)):
+        own = [(pair, c) for pair, c in held if c.kind in kinds]
+        if own:
+            pair, worst = max(own, key=lambda of: abs(of[1].difference))
+            share = f" ({100.0 * abs(worst.difference) / worst.measured:.2g} %)" if what == "lengths" else ""
+            parts.append(f"{what} to {abs(worst.difference):.{decimals}f} {worst.unit}{share}, the worst in '{pair}'")
+    return words + (": " + "; ".join(parts) if parts else "") + "."
+
+
+def _fineness(best: Sequence[ValidationReport]) -> str:
+    """Return where the ruler is too coarse to show what the reconstruction could."""
+    lengths = [c for report in best for c in report.checks if c.kind in ("baseline", "distance") and c.passed]
+    coarse = [c for c in lengths if c.measured_sigma > FINER * c.our_sigma]
+    if not coarse:
+        return ""
+    c = max(coarse, key=lambda c: c.measured_sigma / max(c.our_sigma, 1e-9))
+    ours = measured_words(c.ours, c.our_sigma, 2)
+    return (
+        f"The rule (±{c.measured_sigma:g} mm) is coarser than what was reconstructed ({ours} mm): it would not show "
+        "smaller errors."
+    )

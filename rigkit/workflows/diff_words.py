@@ -1,0 +1,184 @@
+"""A difference of two cameras, rigs or mounts as figures, in words, and as a page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rigkit.calibration.compare import CameraVerdict
+from rigkit.calibration.rig.compare import RigDifference
+from rigkit.core.tables import Cell, Column, Table
+from rigkit.io.files import write_atomic
+from rigkit.report.facts_page import build_facts_page
+from rigkit.report.figures import difference_png
+from rigkit.workflows.diff import BoardsPair, CameraPair, RigPair
+from rigkit.workflows.provenance import digest_line, software_facts
+
+__all__ = ["figures_of", "words_of", "write_diff_page"]
+
+Pair = CameraPair | RigPair | BoardsPair
+
+
+def figures_of(pair: Pair) -> dict[str, Any]:
+    """Return the figures for programs."""
+    if isinstance(pair, BoardsPair):
+        return _boards_figures(pair)
+    return _rig_figures(pair) if isinstance(pair, RigPair) else _camera_figures(pair)
+
+
+def words_of(pair: Pair) -> list[str]:
+    """Return what a person should know, in lines, the verdict last."""
+    if isinstance(pair, BoardsPair):
+        return _boards_in_words(pair)
+    if isinstance(pair, RigPair):
+        return _rigs_in_words(pair, _rig_figures(pair))
+    return _camera_in_words(_camera_figures(pair)).split("\n")
+
+
+def write_diff_page(path: Path, pair: Pair, files: tuple[Path, Path], *, force: bool) -> None:
+    """Write the difference of two `files` as a page; its place was looked at by `diff`."""
+    *sentences, verdict = words_of(pair)
+    badge = {True: "no contradiction", False: "not the same", None: "no verdict"}[pair.same]
+    cameras: Mapping[str, CameraPair] = (
+        {"": pair} if isinstance(pair, CameraPair) else pair.cameras if isinstance(pair, RigPair) else {}
+    )
+    pictures = [
+        (f"{name} difference over the image".strip(), "image/png", difference_png(own.difference))
+        for name, own in cameras.items()
+    ]
+    tables = [_camera_table(cameras)] if cameras else []
+    if isinstance(pair, RigPair) and pair.mounts.mounts:
+        tables.append(_mount_table("Mounts", pair.mounts))
+    if isinstance(pair, BoardsPair):
+        tables += [_mount_table(f"Boards with {name}", target) for name, target in pair.targets.items()]
+    facts = software_facts() | {f"{which} {p.name}": digest_line(p) for which, p in zip("AB", files, strict=True)}
+    title = f"rigkit diff: {files[0].name} and {files[1].name}"
+    sentences = [line[0].upper() + line[1:] + "." for line in sentences]
+    if isinstance(pair, CameraPair):
+        # The verdict's own figures first: how much, and how much is usual.
+        verdict, sentences = f"{sentences[0][:-1]}; {verdict}", []
+    headline = verdict[0].upper() + verdict[1:] + "."
+    page = build_facts_page(
+        title, headline, tables, facts, badge=badge, passed=pair.same, sentences=sentences, pictures=pictures
+    )
+    write_atomic(path, page, force=force)
+
+
+def _camera_table(cameras: Mapping[str, CameraPair]) -> Table:
+    columns = (
+        Column("camera"),
+        Column("difference rms", "px", 4),
+        Column("at most", "px", 4),
+        Column("expected of one camera", "px", 4),
+        Column("times as much", "", 2),
+        Column("chance of as much"),
+        Column("turned by", "deg", 4),
+        Column("of the image", "%", 0),
+        Column("verdict"),
+    )
+    rows = []
+    for name, own in cameras.items():
+        f = _camera_figures(own)
+        chance = "–" if f["chance"] is None else f"{f['chance']:.3g}"
+        numbers = (f["rms_px"], f["max_px"], f["predicted_px"], f["ratio"])
+        tail = (Cell(f["rotation_deg"]), Cell(100.0 * f["coverage"]), Cell(f["verdict"] or "no covariance"))
+        rows.append((Cell(name or "camera"), *map(Cell, numbers), Cell(chance), *tail))
+    note = (
+        "After the rotation that brings the two closest, where both had boards: a camera's own frame turns with every "
+        "calibration. Chance: of at least as much between two calibrations of one camera."
+    )
+    return Table("cameras", "Lenses", columns, tuple(rows), note)
+
+
+def _mount_table(title: str, difference: RigDifference) -> Table:
+    columns = (Column("which"), Column("moved by", "mm"), Column("turned by", "deg", 4), Column("chance of as much"))
+    rows = tuple(
+        (
+            Cell(m.name),
+            Cell(m.shift_mm),
+            Cell(m.rotation_deg),
+            Cell("–" if m.chance is None else f"{m.chance:.3g}"),
+        )
+        for m in difference.mounts
+    )
+    return Table("mounts", title, columns, rows, "Against the first one.")
+
+
+def _camera_figures(pair: CameraPair) -> dict[str, Any]:
+    """Return the figures for programs; `same` is None where a file has no covariance."""
+    judged, difference = pair.judged, pair.difference
+    return {
+        "rms_px": difference.rms_px,
+        "max_px": difference.max_px,
+        "rotation_deg": difference.rotation_deg,
+        "coverage": difference.coverage,
+        "predicted_px": None if judged is None else judged.predicted_px,
+        "usual_px": None if judged is None else list(judged.usual_px),
+        "ratio": None if judged is None else judged.ratio,
+        "chance": None if judged is None else judged.chance,
+        "verdict": None if judged is None else str(judged.verdict),
+        "same": pair.same,
+        "same_model": None if judged is None else judged.same_model,
+    }
+
+
+def _camera_in_words(figures: dict[str, Any]) -> str:
+    known = figures["same"] is not None
+    line = (
+        f"difference {figures['rms_px']:.4f} px rms, {figures['max_px']:.4f} px at most, over "
+        f"{100 * figures['coverage']:.0f} % of the image{', where both had boards' if known else ''}, after a rotation "
+        f"of {figures['rotation_deg']:.4f} deg\n"
+    )
+    if not known:
+        return line + "no verdict: a file has no covariance"
+    low, high = figures["usual_px"]
+    at = f" at {figures['rms_px']:.2g} px" if figures["verdict"] == CameraVerdict.UNIMPORTANT else ""
+    return line + (
+        f"expected of one camera {figures['predicted_px']:.4f} px ({low:.3f} to {high:.3f} in nine of ten cases), "
+        f"{figures['ratio']:.2f} times as much is found "
+        f"(chance {figures['chance']:.3g}): {figures['verdict']}{at}"
+        + ("" if figures["same_model"] else "; the chance allows for what their different models make of one lens")
+    )
+
+
+def _rig_figures(pair: RigPair) -> dict[str, Any]:
+    """Return the figures of the mounts, and of the cameras."""
+    return {
+        "mounts": [asdict(m) for m in pair.mounts.mounts],
+        "chance": pair.mounts.chance,
+        "cameras": {name: _camera_figures(own) for name, own in pair.cameras.items()},
+        "same": pair.same,
+    }
+
+
+def _boards_figures(pair: BoardsPair) -> dict[str, Any]:
+    """Return the figures of the boards of every mount."""
+    targets = {n: {"boards": [asdict(m) for m in t.mounts], "chance": t.chance} for n, t in pair.targets.items()}
+    return {"targets": targets, "same": pair.same}
+
+
+def _boards_in_words(pair: BoardsPair) -> list[str]:
+    lines = [line for target in pair.targets.values() for line in _mounts_in_words(target)]
+    chances = ", ".join(f"{target.chance:.3g}" for target in pair.targets.values())
+    verdict = "the same mount" if pair.same else "NOT the same mount: a board moved"
+    return [*lines, f"boards together: chance {chances}; {verdict}"]
+
+
+def _mounts_in_words(difference: RigDifference) -> list[str]:
+    return [
+        f"{m.name}: sits {m.shift_mm:.3f} mm and {m.rotation_deg:.4f} deg from where it sat"
+        + ("" if m.chance is None else f" (chance {m.chance:.3g})")
+        for m in difference.mounts
+    ]
+
+
+def _rigs_in_words(pair: RigPair, figures: dict[str, Any]) -> list[str]:
+    lines = _mounts_in_words(pair.mounts)
+    lines += [f"{name}: {_camera_in_words(own)}".replace("\n", "; ") for name, own in figures["cameras"].items()]
+    if figures["same"] is None:
+        return [*lines, "no verdict: a file has no covariance"]
+    chance = "" if figures["chance"] is None else f"mounts together: chance {figures['chance']:.3g}; "
+    verdict = "the same rig" if figures["same"] else "NOT the same rig: a camera or a lens moved"
+    return [*lines, f"{chance}{verdict}"]
