@@ -14,12 +14,14 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.brown import Brown
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
+from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.io.images import read_image, to_grey
 
 
 def opencv_corners(path: Path, board: Board) -> BoardView | None:
     """Return the corners that cv2.findChessboardCornersSB finds, None where it finds no board."""
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    image = to_grey(read_image(path))
     flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
     found, corners = cv2.findChessboardCornersSB(image, board.size, flags=flags)
     if not found:
@@ -33,7 +35,7 @@ def opencv_corners(path: Path, board: Board) -> BoardView | None:
 
 def opencv_views(paths: Sequence[Path], board: Board) -> tuple[list[BoardView], tuple[int, int]]:
     """Return the views of all images on which OpenCV finds the board, and the images' size."""
-    height, width = cv2.imread(str(paths[0]), cv2.IMREAD_GRAYSCALE).shape
+    height, width = read_image(paths[0]).shape[:2]
     return [view for path in paths if (view := opencv_corners(path, board)) is not None], (width, height)
 
 
@@ -86,7 +88,9 @@ def opencv_released(views: list[BoardView], size_px: tuple[int, int]) -> tuple[f
 
 
 def _released(objects: list[np.ndarray], images: list[np.ndarray], size_px: tuple[int, int], fixed: int) -> Any:
-    found = cv2.calibrateCameraRO([o[0] for o in objects], [i[0] for i in images], size_px, fixed, None, None)
+    # Its stubs know no None, which asks it to make the arrays.
+    untyped: Any = cv2
+    found = untyped.calibrateCameraRO([o[0] for o in objects], [i[0] for i in images], size_px, fixed, None, None)
     rms, K, d, rvecs, tvecs, released, *_ = found
     return rms, K, d, rvecs, tvecs, released, None
 
@@ -118,6 +122,8 @@ def colmap_pair(pixels: tuple[np.ndarray, np.ndarray], cameras: tuple[Camera, Ca
         pairs,
         pycolmap.TwoViewGeometryOptions(compute_relative_pose=True),
     )
+    if found.cam2_from_cam1 is None:
+        raise DegenerateError("pycolmap finds no relative pose")
     matrix = found.cam2_from_cam1.matrix()
     pose = Rigid3(matrix[:, :3], matrix[:, 3])
     return _triangulated([_flat(p, camera) for p, camera in zip(pixels, cameras, strict=True)], pose)

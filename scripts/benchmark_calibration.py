@@ -17,6 +17,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -147,7 +148,7 @@ def ceres(count: int, repeats: int) -> None:
     observations = Observations.from_views(views)
     start = next(initialise(observations, SIZE, KannalaBrandt, None))
     found = solve(observations, start, prior_sigma_px=0.0)
-    models = []
+    models: list[Any] = []
 
     def run() -> float:
         model = colmap_model(pycolmap, views, start)
@@ -186,15 +187,23 @@ def failures(seeds: int, omnidir: int) -> None:
         for seed in range(seeds):
             views, _, _ = random_views(lens(name), count, np.random.default_rng(1000 + seed), reach_deg=reach)
             failed += [
-                _fails(lambda views=views: ours(views, "kannala_brandt", None)[0]),
-                _fails(lambda views=views: opencv_fisheye(views, SIZE)[0]),
-                _fails(lambda views=views, K=K: opencv_fisheye(views, SIZE, K)[0]),
+                _fails(partial(ours_rms, views)),
+                _fails(partial(fisheye_rms, views)),
+                _fails(partial(fisheye_rms, views, K)),
             ]
-            slow += seed < omnidir and _fails(lambda views=views: opencv_omnidir(views, SIZE))
+            slow += seed < omnidir and _fails(partial(opencv_omnidir, views, SIZE))
         tried = min(seeds, omnidir)
         rows.append([name, f"{reach:g}", str(count), *(f"{n} of {seeds}" for n in failed), f"{slow} of {tried}"])
     columns = ["lens", "boards out to deg", "views", "rigkit", "cv2.fisheye", "with K 5 % off", "cv2.omnidir"]
     table("Failures (RMS beyond 1.1 times the noise, views dropped, or an exception), no guess", columns, rows)
+
+
+def ours_rms(views: list[BoardView]) -> float:
+    return ours(views, "kannala_brandt", None)[0]
+
+
+def fisheye_rms(views: list[BoardView], K: np.ndarray | None = None) -> float:
+    return opencv_fisheye(views, SIZE, K)[0]
 
 
 def _fails(run: Callable[[], float]) -> bool:
@@ -212,7 +221,7 @@ def scale(repeats: int) -> None:
             BoardView(f"{k}", v.board, v.grid, v.pixels, v.sigma_px)
             for k, v in enumerate((base * (count // len(base) + 1))[:count])
         ]
-        run = clocked(lambda views=views: ours(views, "kannala_brandt", None))
+        run = clocked(partial(ours, views, "kannala_brandt", None))
         spent = timed({"": run}, max(1, repeats // 3))[""]
         rows.append([str(count), f"{1000 * spent:.1f}", f"{1e6 * spent / count:.1f}"])
     table("Time against the number of views (kannala_brandt, fish)", ["views", "CPU ms", "us a view"], rows)

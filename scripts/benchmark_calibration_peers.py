@@ -122,7 +122,9 @@ def opencv_omnidir(views: list[BoardView], size_px: tuple[int, int]) -> float:
     """Return the RMS, infinite where views were dropped."""
     objects, images = opencv_points(views, np.float64)
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-8)
-    rms, *_, used = cv2.omnidir.calibrate(objects, images, size_px, None, None, None, 0, criteria)
+    # Its stubs know no None, which asks it to make the arrays.
+    omnidir: Any = cv2.omnidir
+    rms, *_, used = omnidir.calibrate(objects, images, size_px, None, None, None, 0, criteria)
     return float(rms) if np.size(used) == len(views) else np.inf
 
 
@@ -140,7 +142,8 @@ def opencv_multiview(
     objects3 = [(board.points() / board.square_x_mm).astype(np.float32)] * len(used)
     sizes = [size_px] * len(seen)
     pinhole = np.zeros(len(seen), np.uint8)
-    *_, T = cv2.calibrateMultiview(objects3, pixels, sizes, mask, pinhole, None, None, None, None)
+    untyped: Any = cv2
+    *_, T = untyped.calibrateMultiview(objects3, pixels, sizes, mask, pinhole, None, None, None, None)
     return [np.ravel(t) * board.square_x_mm for t in T]
 
 

@@ -16,6 +16,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -231,7 +232,7 @@ def epipolar_rows() -> Iterator[Row]:
     yield from minimal_rows(rng)
     m = scene(rng, 150)
     for kind in ("general", "planar"):
-        yield row(f"{kind}, 150 matches, linear", 1, lambda kind=kind: fundamental_for(kind).solve(m))
+        yield row(f"{kind}, 150 matches, linear", 1, partial(fundamental_for(kind).solve, m))
     points = Matches.from_cameras(CAMERA, CAMERA, m.pixels1, m.pixels2, sigma1_px=m.sigma1_px, sigma2_px=m.sigma2_px)
     yield row(
         "general, 150 points, maximum likelihood from a pose",
@@ -245,11 +246,13 @@ def epipolar_rows() -> Iterator[Row]:
 
 def planar_rows(rng: np.random.Generator, problems: int = 20000, each: int = 10) -> Iterator[Row]:
     m = scene(rng, problems * each)
+    A21 = m.A21
+    assert A21 is not None
     entries = np.array(PLANAR_ENTRIES)
 
     def grams() -> np.ndarray:
         points = point_rows(m.rays1, m.rays2)[:, None, entries]
-        affine = affinity_rows(m.rays1, m.rays2, m.jacobians1, m.jacobians2, m.A21)[..., entries]
+        affine = affinity_rows(m.rays1, m.rays2, m.jacobians1, m.jacobians2, A21)[..., entries]
         rows = np.concatenate([points, affine * (NOISE_PX / SIGMA_A)], axis=1).reshape(problems, 3 * each, 4)
         return np.asarray(np.swapaxes(rows, 1, 2) @ rows)
 
@@ -289,8 +292,10 @@ def loop_planar(gram: np.ndarray) -> np.ndarray:
 
 def minimal_rows(rng: np.random.Generator, problems: int = 2000) -> Iterator[Row]:
     m = scene(rng, 7 * problems)
+    A21 = m.A21
+    assert A21 is not None
     points = point_rows(m.rays1, m.rays2).reshape(problems, 7, 9)
-    affine = affinity_rows(m.rays1, m.rays2, m.jacobians1, m.jacobians2, m.A21).reshape(problems, 14, 9)
+    affine = affinity_rows(m.rays1, m.rays2, m.jacobians1, m.jacobians2, A21).reshape(problems, 14, 9)
     pixels = [q.reshape(problems, 7, 2)[:LOOPED] for q in (m.pixels1, m.pixels2)]
     rays = [np.ascontiguousarray(f.reshape(problems, 7, 3)[:LOOPED, :5]) for f in (m.rays1, m.rays2)]
 

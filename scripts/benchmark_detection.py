@@ -21,7 +21,7 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -129,7 +129,7 @@ def counts(total: Score) -> dict[str, str | float]:
 
 def accuracy(tables: Tables, poses: int) -> list[Asked]:
     """Errors beside the Cramer-Rao bound, over blur and noise."""
-    kinds = {"one board": one_board, "three boards": three_boards}
+    kinds: dict[str, Callable[..., BenchScene]] = {"one board": one_board, "three boards": three_boards}
     totals: dict[tuple[str, str, float, int], tuple[Score, float]] = {}
     for lens in LENSES:
         for kind, make in kinds.items():
@@ -321,7 +321,8 @@ def pairs(tables: Tables, count: int) -> list[Asked]:
             rng=np.random.default_rng(seed),
         )
         try:
-            found = identify_pair(*(detect_boards(v) for v in views), EQUAL_BOARDS, scene.camera1, scene.camera2)
+            one, two = (detect_boards(v) for v in views)
+            found = identify_pair(one, two, EQUAL_BOARDS, scene.camera1, scene.camera2)
             verdict = judge_pair(scene, found.pairs(), found.ambiguous)
         except RigkitError:
             verdict = PairVerdict.INCOMPLETE

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers.board_scenes import Scene, detection, fisheye_camera, regular_camera, trihedral_scene
 
-from rigkit.affine.directions import direction_field
+from rigkit.affine.directions import Support, direction_field
 from rigkit.cameras.base import Camera
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
@@ -25,7 +25,15 @@ OPENCV_REL = 2e-3
 """Both minimise the pixel error to first order; at 2 px of noise they agreed to 1.6e-3 of the largest in 20 draws."""
 
 BOARD = Board("a", 8, 6, 50.0, 40.0)
-SUPPORTS = [("neighbours", 1), ("line", 1), ("line", 3), ("line", None), ("patch", 1), ("patch", 2), ("patch", None)]
+SUPPORTS: list[tuple[Support, int | None]] = [
+    ("neighbours", 1),
+    ("line", 1),
+    ("line", 3),
+    ("line", None),
+    ("patch", 1),
+    ("patch", 2),
+    ("patch", None),
+]
 CAMERAS = {"regular": regular_camera(), "fisheye": fisheye_camera()}
 
 
@@ -47,7 +55,7 @@ def angle_errors(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 @pytest.mark.parametrize(("support", "window"), SUPPORTS)
 def test_exact_with_lengths_borders_and_diagonals(
-    camera: Camera, support: str, window: int | None, rng: np.random.Generator
+    camera: Camera, support: Support, window: int | None, rng: np.random.Generator
 ) -> None:
     scene = trihedral_scene(rng, (BOARD,), camera)
     one, two = detection(BOARD, scene.pixels1["a"]), detection(BOARD, scene.pixels2["a"])
@@ -74,7 +82,7 @@ def test_exact_beyond_a_right_angle_from_the_axis() -> None:
 
 
 @pytest.mark.parametrize(("support", "window"), SUPPORTS)
-def test_predicted_sigma(support: str, window: int | None, rng: np.random.Generator) -> None:
+def test_predicted_sigma(support: Support, window: int | None, rng: np.random.Generator) -> None:
     scene = trihedral_scene(rng, (BOARD,), fisheye_camera())
     truth = true_directions(scene, BOARD, 1)
     ratio = []
@@ -126,7 +134,7 @@ def test_wider_support_is_quieter(rng: np.random.Generator) -> None:
     truth = true_directions(scene, BOARD, 1)
     draws = [detection(BOARD, scene.pixels1["a"], rng, 0.1) for _ in range(20)]
 
-    def rms(support: str, window: int | None) -> float:
+    def rms(support: Support, window: int | None) -> float:
         fields = [direction_field(d, scene.camera1, support=support, window=window) for d in draws]
         return float(np.sqrt(np.mean([angle_errors(f.vectors, truth) ** 2 for f in fields])))
 
@@ -136,7 +144,7 @@ def test_wider_support_is_quieter(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize(("support", "window"), SUPPORTS)
-def test_missing_corners(support: str, window: int | None, rng: np.random.Generator) -> None:
+def test_missing_corners(support: Support, window: int | None, rng: np.random.Generator) -> None:
     """Holes leave exact directions where enough corners are left, and say where there are not."""
     scene = trihedral_scene(rng, (BOARD,), regular_camera())
     pixels = scene.pixels1["a"].copy()

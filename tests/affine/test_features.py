@@ -116,7 +116,8 @@ def test_refinement_pulls_in_a_poor_start(images: tuple[np.ndarray, np.ndarray],
     pixels2, A21 = truth(pixels1)
     start = A21 + 0.08 * rng.normal(size=A21.shape)
     moved = pixels2 + 0.8 * rng.normal(size=pixels2.shape)
-    out = refine_patches(*(patch_pyramid(v) for v in images), pixels1, moved, start)
+    one, two = (patch_pyramid(v) for v in images)
+    out = refine_patches(one, two, pixels1, moved, start)
     assert out.valid.mean() > 0.7
     good = out.valid & (out.correlation > 0.9)
     assert np.median(np.linalg.norm(out.pixels2 - pixels2, axis=1)[good]) < 0.15
@@ -151,10 +152,13 @@ def test_refusals(images: tuple[np.ndarray, np.ndarray]) -> None:
 
 
 def test_colour_and_16_bits_give_the_same(images: tuple[np.ndarray, np.ndarray]) -> None:
-    options = {"tilts": (1.0,), "features_per_view": 150}
-    plain = match_affine_features(*images, **options)
-    colour = match_affine_features(*(np.repeat(v[..., None], 3, axis=2) for v in images), **options)
-    deep = match_affine_features(*(v.astype(np.uint16) << 8 for v in images), **options)
+
+    def matched(one: np.ndarray, two: np.ndarray) -> Correspondences:
+        return match_affine_features(one, two, tilts=(1.0,), features_per_view=150)
+
+    plain = matched(*images)
+    colour = matched(*(np.repeat(v[..., None], 3, axis=2) for v in images))
+    deep = matched(*(v.astype(np.uint16) << 8 for v in images))
     np.testing.assert_array_equal(plain.pixels2, colour.pixels2)
     np.testing.assert_array_equal(plain.pixels2, deep.pixels2)
 

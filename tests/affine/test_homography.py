@@ -93,7 +93,7 @@ def test_a_homography_of_unknown_numbers_is_refused(name):
     given = {"pixels1": np.eye(2), "pixels2": np.eye(2), "A21": np.tile(np.eye(2), (2, 1, 1))}
     given[name][1] = np.nan
     with pytest.raises(InputError, match="NaN"):
-        homography_from_affines(**given)
+        homography_from_affines(given["pixels1"], given["pixels2"], given["A21"])
 
 
 def test_a_homography_of_many_points_needs_little_memory(rng):

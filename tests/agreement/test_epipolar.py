@@ -26,10 +26,12 @@ def test_eight_point_is_opencvs_on_exact_points(rng):
 
 
 def test_eight_point_is_no_worse_than_opencvs_on_noisy_points(rng):
-    ours, theirs = [], []
+    ours: list[tuple[float, float]] = []
+    theirs: list[tuple[float, float]] = []
     for _ in range(40):
         m, pose, _ = pair(rng, 30, noise_px=0.5)
         F, _ = cv2.findFundamentalMat(m.pixels1, m.pixels2, cv2.FM_8POINT)
+        assert m.K1 is not None and m.K2 is not None
         for found, E in ((ours, fundamental_for("general").solve(m).E21), (theirs, m.K2.T @ F @ m.K1)):
             found.append(pose_errors_deg(choose_pose(E, m.rays1, m.rays2), pose))
     assert np.all(np.median(ours, axis=0) < 1.05 * np.median(theirs, axis=0))
@@ -61,7 +63,8 @@ def test_pose_and_points_agree_with_opencv(rng):
 
 
 def test_refined_pose_is_better_than_opencvs_essential(rng):
-    ours, theirs = [], []
+    ours: list[tuple[float, float]] = []
+    theirs: list[tuple[float, float]] = []
     for _ in range(30):
         m, pose, _ = pair(rng, 60, noise_px=0.5)
         E, _ = cv2.findEssentialMat(m.pixels1, m.pixels2, REGULAR.K, method=cv2.RANSAC, prob=0.999, threshold=2.0)
@@ -79,7 +82,8 @@ def test_robust_pose_is_no_worse_than_colmaps(rng):
     options = pycolmap.TwoViewGeometryOptions()
     options.compute_relative_pose = True
     options.ransac.random_seed = 0
-    ours, theirs = [], []
+    ours: list[tuple[float, float]] = []
+    theirs: list[tuple[float, float]] = []
     for _ in range(40):
         m, pose, _ = pair(rng, 150, noise_px=0.5)
         q2 = np.array(m.pixels2)

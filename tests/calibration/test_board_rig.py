@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from operator import methodcaller
 
 import numpy as np
 import pytest
@@ -148,11 +149,9 @@ def test_sigmas_of_angles_and_distances_follow_the_covariance(rng: np.random.Gen
 
     quantities: list[Callable[[BoardRig], tuple[float, float]]] = []
     for a, b in [("floor", "left"), ("left", "right"), ("right", "floor")]:
-        quantities += [
-            lambda r, a=a, b=b: r.angle_deg(a, b),
-            lambda r, a=a, b=b: r.distance_mm(Feature(a, centre=True), Feature(b, grid=(2, 3))),
-            lambda r, a=a, b=b: r.distance_mm(Feature(a), Feature(b, grid=(5, 1))),
-        ]
+        between = ((Feature(a, centre=True), Feature(b, grid=(2, 3))), (Feature(a), Feature(b, grid=(5, 1))))
+        quantities.append(methodcaller("angle_deg", a, b))
+        quantities += [methodcaller("distance_mm", *features) for features in between]
     for quantity in quantities:
         steps = 1e-6 * np.eye(12)
         slope = np.array([(quantity(rig(d))[0] - quantity(rig(-d))[0]) / 2e-6 for d in steps])

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers.data import read_grey
 from helpers.detection_scenes import single
 
 from rigkit.cli.main import main
@@ -57,7 +58,7 @@ def camera_file(path: Path, size_px: tuple[int, int] = (640, 480)) -> Path:
 
 def test_a_known_camera_adds_corners_whatever_the_number_of_processes(images: Path, tmp_path: Path) -> None:
     for path in sorted(images.iterdir()):
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        image = read_grey(path)
         cv2.line(image, (150, 0), (420, 479), 128, 40)
         cv2.imwrite(str(path), image)
     camera = camera_file(tmp_path / "camera.json")

@@ -15,7 +15,7 @@ from rigkit.cameras.registry import camera_model
 from rigkit.cli.main import main
 from rigkit.core.errors import InputError
 
-PINHOLE = camera_model("pinhole")((640, 480), [500.0, 500.0, 320.0, 240.0])
+PINHOLE = camera_model("pinhole")((640, 480), np.array([500.0, 500.0, 320.0, 240.0]))
 
 
 @pytest.mark.parametrize("focal", ["-500.0", "0.0"])
@@ -38,14 +38,14 @@ def test_no_file_s_camera_has_a_focal_length_that_is_not_positive(
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: camera_model("pinhole")((640.5, 480), PINHOLE.parameters), "whole numbers"),
-        (lambda: camera_model("pinhole")((float("nan"), 480), PINHOLE.parameters), "camera size"),
+        (lambda: camera_model("pinhole")((640.5, 480), PINHOLE.parameters), "whole numbers"),  # type: ignore[arg-type]
+        (lambda: camera_model("pinhole")((float("nan"), 480), PINHOLE.parameters), "camera size"),  # type: ignore[arg-type]
         (lambda: PINHOLE.project(np.zeros((3, 7))), r"\(3, 7\)"),
         (lambda: PINHOLE.project(np.zeros((5, 2))), r"\(5, 2\)"),
         (lambda: PINHOLE.project_with_jacobians(np.zeros(4)), r"\(4,\)"),
         (lambda: PINHOLE.unproject(np.zeros((2, 5))), r"\(2, 5\)"),
         (lambda: PINHOLE.on_image(np.zeros((4, 3))), r"\(4, 3\)"),
-        (lambda: rigkit.Board("b", 9.5, 6, 30.0, 30.0), "whole numbers"),
+        (lambda: rigkit.Board("b", 9.5, 6, 30.0, 30.0), "whole numbers"),  # type: ignore[arg-type]
         (lambda: rigkit.Board("b", 9, 6, 30.0, 30.0, square_sigma_mm=-1.0), "square_sigma_mm"),
         (lambda: rigkit.PoseType("sideways"), "general, planar, standard, forward, auto"),
     ],

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
 from helpers.detection_scenes import corner_scene, errors_by_position, fisheye, match, regular, single
 
 from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
 from rigkit.detection.detect import detect_boards
 
@@ -91,7 +94,7 @@ def test_symmetric_board_is_right_up_to_its_own_symmetry(columns: int, rows: int
     assert hits[0] in ((0, 2) if columns != rows or columns % 2 else (0, 1, 2, 3))
 
 
-def _agrees(found: object, board: Board, truth: np.ndarray) -> bool:
+def _agrees(found: BoardDetection, board: Board, truth: np.ndarray) -> bool:
     same = np.array_equal(found.grid, board.grid())
     return same and bool(np.abs(found.pixels - truth).max() < 0.1)
 
@@ -156,7 +159,7 @@ def test_foreshortened_by_75_degrees(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("change", [{"exposure": 0.025, "noise_levels": 0.3}, {"jpeg_quality": 60}, {"exposure": 1.6}])
-def test_light_and_compression(change: dict[str, object], rng: np.random.Generator) -> None:
+def test_light_and_compression(change: dict[str, Any], rng: np.random.Generator) -> None:
     scene = single(Board("a", 9, 6, 30.0, 30.0), [0.3, 0.2, 0.1], 600.0)
     (found,) = detect_boards(scene.image(rng, **change))
     assert found.complete

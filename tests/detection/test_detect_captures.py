@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 
-import cv2
 import numpy as np
 import pytest
-from helpers.data import shared_data
+from helpers.data import read_grey, shared_data
 from helpers.detection_scenes import errors_by_position, match
 
 from rigkit.core.boards import Board
@@ -29,7 +28,7 @@ def test_lab_captures(lens: str, pose: str) -> None:
     folder = shared_data(f"lab-a/captures/{lens}-{pose}")
     truth = json.loads((folder / "truth.json").read_text())
     for view in ("view1", "view2"):
-        found = detect_boards(cv2.imread(str(folder / f"{view}.jpg"), cv2.IMREAD_GRAYSCALE))
+        found = detect_boards(read_grey(folder / f"{view}.jpg"))
         assert [(d.columns, d.rows, d.complete) for d in found] == [(8, 6, True)] * 3
         exact = [(np.zeros((0, 2)), np.array(board["uv_px"])) for board in truth[view].values()]
         matched = match(found, exact)
@@ -40,7 +39,7 @@ def test_lab_captures(lens: str, pose: str) -> None:
 
 @pytest.mark.parametrize("name, count", [("e1", 1), ("e2", 3), ("e3", 7), ("e5", 12), ("e6", 0)])
 def test_rooms_with_many_boards(name: str, count: int) -> None:
-    image = cv2.imread(str(shared_data("real/multi-board") / f"{name}.png"), cv2.IMREAD_GRAYSCALE)
+    image = read_grey(shared_data("real/multi-board") / f"{name}.png")
     found = detect_boards(image)
     assert len(found) == count
     assert sum(d.complete for d in found) >= count - (name == "e3")
@@ -48,7 +47,7 @@ def test_rooms_with_many_boards(name: str, count: int) -> None:
 
 @pytest.mark.parametrize("number, size", [*[(k, (7, 5)) for k in range(1, 8)], (8, (6, 4)), (9, (21, 19))])
 def test_public_single_boards(number: int, size: tuple[int, int]) -> None:
-    image = cv2.imread(str(shared_data("real/opencv-detector") / f"chess{number}.png"), cv2.IMREAD_GRAYSCALE)
+    image = read_grey(shared_data("real/opencv-detector") / f"chess{number}.png")
     (found,) = detect_boards(image)
     assert found.complete
     assert sorted((found.columns, found.rows)) == sorted(size)
@@ -56,7 +55,7 @@ def test_public_single_boards(number: int, size: tuple[int, int]) -> None:
 
 @pytest.mark.parametrize("number", [1, 2, 3])
 def test_boards_with_a_corner_missing_are_not_whole(number: int) -> None:
-    image = cv2.imread(str(shared_data("real/opencv-detector") / f"negative_{number}.png"), cv2.IMREAD_GRAYSCALE)
+    image = read_grey(shared_data("real/opencv-detector") / f"negative_{number}.png")
     assert not any(found.complete for found in detect_boards(image))
 
 
@@ -73,7 +72,7 @@ def test_public_calibration_sets(folder: str, pattern: str, size: tuple[int, int
     images = sorted(shared_data(f"real/{folder}").glob(pattern))
     assert len(images) == count
     for path in images:
-        found = detect_boards(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), [board])
+        found = detect_boards(read_grey(path), [board])
         named = [d for d in found if d.board_id == "b"]
         assert len(named) == 1, path.name
         assert named[0].complete, path.name
@@ -85,7 +84,7 @@ def test_public_calibration_sets(folder: str, pattern: str, size: tuple[int, int
 def test_boards_cut_by_the_frame_are_not_whole() -> None:
     for number in (1, 2, 3):
         path = shared_data("real/opencv-detector") / f"negative_{number}.png"
-        for found in detect_boards(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), [Board("b", 7, 6, 30.0, 30.0)]):
+        for found in detect_boards(read_grey(path), [Board("b", 7, 6, 30.0, 30.0)]):
             assert not found.complete
 
 
@@ -96,7 +95,7 @@ def test_a_board_with_markers_in_its_squares() -> None:
         lines = path.read_text().splitlines()
         start = next(i for i, line in enumerate(lines) if line.startswith("encoding")) + 1
         corners = np.array([[float(x) for x in line.split(",")[3:5]] for line in lines[start:] if line.strip()])
-        boards = detect_boards(cv2.imread(str(path.with_suffix(".png")), cv2.IMREAD_GRAYSCALE))
+        boards = detect_boards(read_grey(path.with_suffix(".png")))
         pixels = np.concatenate([board.pixels for board in boards])
         found += int((np.linalg.norm(corners[:, None] - pixels, axis=2).min(axis=1) < 3.0).sum())
         published += len(corners)

@@ -99,8 +99,10 @@ def test_finds_its_own_corners(rng: np.random.Generator) -> None:
         blind = fit_edges(image, start, straight, np.ones(6), np.full(6, 1.2), radius_px=18.0, iterations=12)
         moved = np.abs(blind.pixels - pixels).max()
         assert (moved > 0.1) == (bend > 0.0), "curvature is what keeps a bent row from pulling the corner aside"
-        loose = {"curvature_sigma": np.full((6, 2), 0.02)}
-        free = fit_edges(image, start, straight, np.ones(6), np.full(6, 1.2), radius_px=18.0, iterations=12, **loose)
+        loose = np.full((6, 2), 0.02)
+        free = fit_edges(
+            image, start, straight, np.ones(6), np.full(6, 1.2), radius_px=18.0, iterations=12, curvature_sigma=loose
+        )
         assert np.abs(free.pixels - pixels).max() < EXACT_PX, "a curvature known to be uncertain is fitted"
 
 
@@ -236,7 +238,8 @@ def test_sharp_edges_have_the_pixel_s_shape() -> None:
                     true += 0.25 * wa * wb * np.array([math.erf(v / (math.sqrt(2.0) * blur)) for v in at])
             width = math.hypot(blur, math.sqrt(1.0 / 12.0))
             flat = PIXEL_KURTOSIS * (np.cos(angle) ** 4 + np.sin(angle) ** 4)
-            ours = _edge(x[None].astype(np.float32), np.float32([[width]]), np.float32([[flat]]))[0][0]
+            shape = (np.array([[width]], np.float32), np.array([[flat]], np.float32))
+            ours = _edge(x[None].astype(np.float32), *shape)[0][0]
             assert 100.0 * np.abs(ours - true).max() / 2.0 < most, (blur, angle)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from rigkit.calibration.result import Calibration, Candidate
 from rigkit.cameras.base import Camera
 from rigkit.cameras.brown import Brown
 from rigkit.cameras.kannala_brandt import KannalaBrandt
@@ -128,3 +129,9 @@ def _facing(direction: FloatArray) -> FloatArray:
     helper = np.array([1.0, 0.0, 0.0]) if abs(direction[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
     x = unit(np.cross(np.cross(direction, helper), direction))
     return np.stack([x, np.cross(direction, x), direction], axis=-1)
+
+
+def heldout(result: Calibration | Candidate) -> float:
+    """Return the held-out error of what has one."""
+    assert result.heldout_rms_px is not None
+    return result.heldout_rms_px

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -18,3 +20,10 @@ def shared_data(sub: str) -> Path:
     if not folder.exists():
         pytest.skip(f"needs captures outside the repository: {folder} is not there (set RIGKIT_DATA)")
     return folder
+
+
+def read_grey(path: Path) -> np.ndarray:
+    """Return the image as OpenCV reads it in shades of grey; a test whose image is missing fails."""
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert image is not None, path
+    return image

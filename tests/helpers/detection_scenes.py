@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from rigkit.cameras.base import Camera
@@ -27,7 +29,7 @@ class Scene:
     camera: Camera
     cam_from_world: Rigid3
 
-    def image(self, rng: np.random.Generator, *, blur_px: float = 0.7, **photometry: object) -> np.ndarray:
+    def image(self, rng: np.random.Generator, *, blur_px: float = 0.7, **photometry: Any) -> np.ndarray:
         light = radiance(self.boards, self.camera, self.cam_from_world, optics=Optics(blur_px=blur_px))
         settings = {"noise_levels": 2.0, "vignetting": 0.25, **photometry}
         return np.asarray(develop(light, Photometry(**settings), rng))
@@ -69,11 +71,11 @@ def corner_scene(
 
 def single(
     board: Board,
-    rotation: np.ndarray,
+    rotation: ArrayLike,
     distance_mm: float,
     *,
     shift_mm: tuple[float, float] = (0.0, 0.0),
-    **kwargs: object,
+    **kwargs: Any,
 ) -> Scene:
     """Return one board, its middle at `distance_mm` before the regular camera, turned by the rotation vector."""
     turn = exp_so3(np.asarray(rotation, dtype=np.float64))

@@ -13,6 +13,7 @@ from rigkit.core.boards import Board
 from rigkit.core.matches import Matches
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, exp_so3, rotation_angle, unit
+from rigkit.relative_pose.solvers.estimate import EpipolarEstimate
 
 REGULAR = Pinhole((1624, 1240), np.array([1350.0, 1340.0, 800.0, 620.0]))
 FISHEYE = KannalaBrandt((1624, 1240), np.array([420.0, 418.0, 810.0, 622.0, -0.02, 0.004, -0.002, 0.0003]))
@@ -143,6 +144,18 @@ def board_pair(
         grid=cells[seen],
     )
     return matches, points[seen]
+
+
+def affinities(matches: Matches) -> np.ndarray:
+    """The affinities of matches that have some."""
+    assert matches.A21 is not None
+    return matches.A21
+
+
+def pixel_fundamental(estimate: EpipolarEstimate) -> np.ndarray:
+    """The fundamental matrix in pixels of an estimate from perspective views."""
+    assert estimate.F21 is not None
+    return estimate.F21
 
 
 def pose_errors_deg(found: Rigid3, true: Rigid3) -> tuple[float, float]:

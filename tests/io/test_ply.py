@@ -23,11 +23,11 @@ def test_open3d_reads_it_unchanged(cloud_file: Path) -> None:
     import open3d
 
     cloud = make_reconstruction().cloud
-    seen = open3d.io.read_point_cloud(str(cloud_file))
+    seen = open3d.io.read_point_cloud(cloud_file)
     np.testing.assert_array_equal(np.asarray(seen.points), cloud.points_mm)
     np.testing.assert_array_equal(np.asarray(seen.normals), cloud.normals)
     np.testing.assert_array_equal(np.rint(np.asarray(seen.colors) * 255.0), cloud.colours)
-    tensor = open3d.t.io.read_point_cloud(str(cloud_file))
+    tensor = open3d.t.io.read_point_cloud(cloud_file)
     np.testing.assert_array_equal(tensor.point["board"].numpy().ravel(), cloud.board_index)
     np.testing.assert_array_equal(tensor.point["sigma_mm"].numpy().ravel(), cloud.sigma_mm)
 
@@ -52,7 +52,7 @@ def test_files_of_other_programs(tmp_path: Path) -> None:
 
     cloud = make_reconstruction().cloud
     plain = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(np.array(cloud.points_mm)))
-    target = str(tmp_path / "other.ply")
+    target = tmp_path / "other.ply"
     open3d.io.write_point_cloud(target, plain)
     with pytest.raises(InputError, match="no nx, ny, nz"):
         read_ply(target)

@@ -70,7 +70,7 @@ def test_levels(name: str, depth: type, in_numpy: Callable[..., list[Level]]) ->
 @pytest.mark.parametrize("depth", [np.uint8, np.float32])
 @pytest.mark.parametrize("factor", [2, 4, 8])
 def test_shrinking(factor: int, depth: type, rng: np.random.Generator, in_numpy: Callable[..., np.ndarray]) -> None:
-    image = (rng.random((67, 85)) * 256).astype(depth)
+    image: np.ndarray = (rng.random((67, 85)) * 256).astype(depth)
     ours, theirs = response._shrunk(image, factor), in_numpy(response._shrunk, image, factor)
     assert ours.shape == theirs.shape == (67 // factor, 85 // factor)
     assert np.abs(ours - theirs).max() < SMOOTH_LEVELS
@@ -126,7 +126,7 @@ def test_peaks_beyond_float32_are_the_strongest(
         assert len(fewer[0]) < len(everything[0])
         infinite = [at[np.isinf(height)] for at, height in (everything, fewer)]
         assert len(infinite[0]) > 0
-        assert np.array_equal(*infinite)
+        assert np.array_equal(infinite[0], infinite[1])
 
 
 @pytest.mark.parametrize("name", list(_images()))
@@ -166,7 +166,7 @@ def test_links_of_a_crowd(rng: np.random.Generator, in_numpy: Callable[..., link
     pixels = np.concatenate([rng.uniform(20, 280, (800, 2)), rng.uniform(100, 130, (800, 2)), [[399.0, 1.0]]])
     angles = rng.uniform(0.0, np.pi, (len(pixels), 1)) + np.array([0.0, 0.5 * np.pi])
     corners = Corners(pixels, angles, np.exp(rng.uniform(0.0, 5.0, len(pixels))), np.ones(len(pixels)))
-    level = Level(image, 1.0, 1.0, 0.0)
+    level = Level(np.asarray(image, np.float32), 1.0, 1.0, 0.0)
     ours, theirs = find_links(corners, level), in_numpy(find_links, corners, level)
     assert (theirs.corner >= 0).sum() > 100
     assert ((ours.corner == theirs.corner) & (ours.arm == theirs.arm)).mean() >= SAME_SHARE

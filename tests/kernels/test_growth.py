@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from helpers.detection_scenes import corner_scene, fisheye, regular
@@ -42,10 +44,10 @@ def test_local_fits(
 ) -> None:
     pixels = bent_lattice(rng, missing)
     cells = rng.random(pixels.shape[:2]) < 0.8
-    settings = {"degree": degree, "ridge": ridge, "width": 1.3, "leave_out": leave_out}
-    compiled = local_fit.fit_cells(pixels, cells, **settings)
+    fitted = partial(local_fit.fit_cells, pixels, cells, degree=degree, ridge=ridge, width=1.3, leave_out=leave_out)
+    compiled = fitted()
     monkeypatch.setattr(local_fit, "fit", reference.fit)
-    plain = local_fit.fit_cells(pixels, cells, **settings)
+    plain = fitted()
     clear = plain.support > 15
     assert clear.sum() > 60
     for name in ("pixels", "along_column", "along_row", "bend_column", "bend_row", "support", "gain"):

@@ -120,7 +120,7 @@ def test_arguments_are_counted() -> None:
 
 def test_members_are_checked() -> None:
     with pytest.raises(TypeError, match="'brightness' is float64"):
-        ImageOf.make(np.zeros((4, 5)))
+        ImageOf.make(np.zeros((4, 5)))  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="'brightness' is float32"):
         ImageOf.of(brightness=np.zeros((4, 5), np.float32), height=5, width=4)
     with pytest.raises(TypeError, match="wants brightness, width, height"):
@@ -129,7 +129,7 @@ def test_members_are_checked() -> None:
 
 def test_the_header_is_read_as_c_reads_it() -> None:
     """Members in their order; sizes and offsets are then those of C, which ctypes follows."""
-    assert [name for name, _ in FitRules._fields_] == ["degree", "radius", "leave_out", "width", "ridge"]
+    assert [member[0] for member in FitRules._fields_] == ["degree", "radius", "leave_out", "width", "ridge"]
     assert ctypes.sizeof(FitRules) == 3 * 8 + 3 * 8
     found = parsed(
         "enum { A = 3, B = 2 * A };  /* int64_t none; */\n#define X 1\n"
@@ -138,7 +138,8 @@ def test_the_header_is_read_as_c_reads_it() -> None:
     )
     assert found.constants == {"A": 3, "B": 6}
     assert [(m.name, m.length) for m in found.structures["s_t"]] == [("a", None), ("b", 6), ("c", None), ("n", None)]
-    assert found.structures["s_t"][2].array.shape == "(n // 2, B,)"
+    array = found.structures["s_t"][2].array
+    assert array is not None and array.shape == "(n // 2, B,)"
     assert [(p.name, p.pointer, p.array is None) for p in found.functions["f"]] == [
         ("s", True, True),
         ("any", False, False),

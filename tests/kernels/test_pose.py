@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.epipolar_scenes import FISHEYE, REGULAR, pair
+from helpers.epipolar_scenes import FISHEYE, REGULAR, affinities, pair
 from kernels.reference import local as reference_local
 from kernels.reference import minimal as reference_minimal
 
@@ -80,13 +80,15 @@ def test_five_equations(rng, camera, affine, in_numpy):
     m, _, _ = pair(rng, 400, camera=camera, noise_px=0.5, sigma_A=0.03)
     rows = point_rows(m.rays1, m.rays2).reshape(-1, 5, 9)
     if affine:
-        more = affinity_rows(m.rays1, m.rays2, m.jacobians1, m.jacobians2, m.A21)[::5]
+        more = affinity_rows(m.rays1, m.rays2, m.jacobians1, m.jacobians2, affinities(m))[::5]
         rows = np.concatenate([rows[:, :3], more], axis=1)
     ours, theirs = essential_from_five_rows(rows), in_numpy(essential_from_five_rows, rows)
     real = [np.isfinite(found).all(axis=(2, 3)) for found in (ours, theirs)]
     assert real[0].sum() > 3 * len(rows)
     assert np.mean(real[0].sum(axis=1) == real[1].sum(axis=1)) >= 1.0 - 1.5 / len(rows)
-    off = np.where(real[0][:, :, None] & real[1][:, None], _off(ours[:, :, None], theirs[:, None]), np.inf)
+    off = np.asarray(_off(ours[:, :, None], theirs[:, None]))
+    both = np.asarray(real[0])[:, :, None] & np.asarray(real[1])[:, None]
+    off = np.where(both, off, np.inf)
     for nearest in (off.min(axis=2)[real[0]], off.min(axis=1)[real[1]]):
         assert np.mean(nearest < SOLUTION) >= SAME_SHARE
         assert np.median(nearest) < 1e-12
@@ -125,7 +127,7 @@ def test_what_five_equations_find_is_essential(rng):
 
 def test_six_equations(rng, in_numpy):
     m, _, _ = pair(rng, 200, noise_px=0.5, sigma_A=0.05)
-    more = affinity_rows(m.rays1, m.rays2, m.jacobians1, m.jacobians2, m.A21)
+    more = affinity_rows(m.rays1, m.rays2, m.jacobians1, m.jacobians2, affinities(m))
     rows = np.concatenate([point_rows(m.rays1, m.rays2)[:, None], more], axis=1).reshape(-1, 6, 9)
     ours, theirs = essential_from_six_rows(rows), in_numpy(essential_from_six_rows, rows)
     assert _off(ours, theirs).max() < SOLUTION
@@ -155,7 +157,8 @@ def test_how_arrays_lie_in_memory_does_not_matter(rng):
 
 def test_the_precision_of_the_hypotheses_does_not_matter(rng):
     wild, pose = _matches(rng)
-    rows, E21 = SampsonRows.of(wild), _starts(rng, pose).astype(np.float32)
+    rows = SampsonRows.of(wild)
+    E21: np.ndarray = _starts(rng, pose).astype(np.float32)
     same = E21.astype(np.float64)
     assert np.array_equal(rows.residuals(E21), rows.residuals(same))
     assert rows.quality_ahead(E21, 5.0, 6.0) == pytest.approx(rows.quality_ahead(same, 5.0, 6.0), rel=1e-4)

@@ -34,7 +34,8 @@ def test_rendered_pairs(first: int, noise_levels: float) -> None:
             photometry=replace(BENCH_PHOTOMETRY, noise_levels=noise_levels),
             rng=np.random.default_rng(seed),
         )
-        found = identify_pair(*map(detect_boards, images), EQUAL_BOARDS, scene.camera1, scene.camera2)
+        one, two = map(detect_boards, images)
+        found = identify_pair(one, two, EQUAL_BOARDS, scene.camera1, scene.camera2)
         verdict = judge_pair(scene, found.pairs(), found.ambiguous)
         assert verdict != PairVerdict.WRONG, f"seed {seed}: {what}"
         symmetric = "symmetric" in what

@@ -41,11 +41,11 @@ def geometry_of(
     scene: StereoScene, rng: np.random.Generator, sigma_px: float = SIGMA_PX, boards: Sequence[Board] = BOARDS
 ) -> PairGeometry:
     """Return the geometry of a scene from noisy corners."""
-    found = [
+    one, two = (
         [detection(b, np.array(d.pixels), rng, sigma_px) for b, d in zip(boards, exact, strict=True)]
         for exact in scene.detections()
-    ]
-    pair = match_pair("made", scene.camera1, scene.camera2, *found, boards)
+    )
+    pair = match_pair("made", scene.camera1, scene.camera2, one, two, boards)
     return pair_geometry(pair, pose_type=PoseType.GENERAL)
 
 
@@ -111,7 +111,7 @@ def test_the_squares_sigma_moves_lengths_and_not_angles(rng: np.random.Generator
     assert stated.angle_deg("plane1", "plane2")[1] < 1.5 * exact.angle_deg("plane1", "plane2")[1]
     # Three boards, each with its own ruler: the common size is known to a thousandth over the root of three.
     assert stated.baseline_mm()[1] == pytest.approx(0.001 * scene.baseline_mm / np.sqrt(3.0), rel=0.2)
-    points, covariance = stated.points(boards[0], boards[0].grid())
+    points, covariance = stated.points(boards[0], boards[0].grid().astype(np.float64))
     assert points.shape == (boards[0].corner_count, 3)
     assert np.linalg.norm(points - points[0], axis=1).max() == pytest.approx(
         np.linalg.norm(boards[0].points(), axis=1).max(), rel=1e-9

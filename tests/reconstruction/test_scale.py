@@ -24,10 +24,11 @@ def reconstruction(rng, sigma=0.0):
         points.append((board.points() @ R.T + rng.normal(size=3) * 500.0) / TRUE)
         index.append(np.full(board.corner_count, b))
         grid.append(board.grid())
-    points, index, grid = np.concatenate(points), np.concatenate(index), np.concatenate(grid)
+    exact = np.concatenate(points)
     spread = np.array([1.0, 1.0, 10.0]) * sigma
-    covariance = np.broadcast_to(np.diag(np.maximum(spread, 1e-9) ** 2), (len(points), 3, 3))
-    return points + rng.normal(size=points.shape) * spread, index, grid, covariance
+    covariance = np.broadcast_to(np.diag(np.maximum(spread, 1e-9) ** 2), (len(exact), 3, 3))
+    noisy = exact + rng.normal(size=exact.shape) * spread
+    return noisy, np.concatenate(index), np.concatenate(grid), covariance
 
 
 def neighbour_median(points, index, grid):

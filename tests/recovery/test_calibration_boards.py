@@ -6,7 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.calibration_scenes import BOARD, REACH_DEG, SIZE, lens, projection_difference, random_views, with_outliers
+from helpers.calibration_scenes import (
+    BOARD,
+    REACH_DEG,
+    SIZE,
+    heldout,
+    lens,
+    projection_difference,
+    random_views,
+    with_outliers,
+)
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.evidence import fit_shapes
@@ -67,7 +76,7 @@ def test_bumpy_board_is_released(rng: np.random.Generator) -> None:
     assert result.boards[0].kind == "released"
     assert difference(result.camera, "reg") < BUMPS_LIMIT_PX
     flat = calibrate(views, SIZE, model="brown", board="flat")
-    assert result.heldout_rms_px < 0.9 * flat.heldout_rms_px
+    assert heldout(result) < 0.9 * heldout(flat)
     # Heights of the corners, up to the plane that a pose can absorb.
     design = np.column_stack([BOARD.points()[:, :2], np.ones(BOARD.corner_count)])
     heights = [
@@ -108,7 +117,7 @@ def test_uneven_feed_is_part_of_the_warp(rng: np.random.Generator) -> None:
     views, _, _ = random_views(lens("reg"), 40, rng, reach_deg=REACH_DEG["reg"], points_mm=points)
     result = calibrate(views, SIZE, model="brown")
     assert result.boards[0].kind == "warp"
-    assert result.heldout_rms_px < 0.9 * calibrate(views, SIZE, model="brown", board="flat").heldout_rms_px
+    assert heldout(result) < 0.9 * heldout(calibrate(views, SIZE, model="brown", board="flat"))
 
 
 def test_corners_that_scatter_more_at_the_rim_are_no_outliers(rng: np.random.Generator) -> None:

@@ -192,10 +192,10 @@ def test_images_of_every_kind(boards: str, lens: str, pose_type: PoseType) -> No
     scene = trihedral_pair(
         BOARDS[boards], LENSES[lens], pose_type, rng, baseline_mm=150.0, level_sigma_deg=0.3, distance=distance
     )
-    found = [
+    one, two = (
         detect_boards(image, BOARDS[boards]) for image in scene.images(optics=optics, photometry=photometry, rng=rng)
-    ]
-    pair = match_pair("held out", scene.camera1, scene.camera2, *found, BOARDS[boards])
+    )
+    pair = match_pair("held out", scene.camera1, scene.camera2, one, two, BOARDS[boards])
     result = reconstruct_pair(pair, pose_type=pose_type, level_sigma_rad=np.radians(0.3))
     corners = sum(board.corner_count for board in BOARDS[boards])
     assert len(result.boards) == 3

@@ -58,11 +58,11 @@ def report_of(scene: StereoScene, rng: np.random.Generator, calibrate: Calibrate
         tuple(MeasuredAngle(a, b, 90.0, 1e-9, "made") for a, b in PAIRS),
     )
     camera, covariance = (scene.camera1, None) if calibrate is None else calibrate()
-    found = [
+    one, two = (
         [detection(b, np.array(d.pixels), rng, SIGMA_PX) for b, d in zip(BOARDS, exact, strict=True)]
         for exact in scene.detections()
-    ]
-    matched = match_pair("made", camera, camera, *found, BOARDS)
+    )
+    matched = match_pair("made", camera, camera, one, two, BOARDS)
     reconstruction = reconstruct_pair(matched, pose_type=scene.pose_type)
     shifts = None
     if covariance is not None:

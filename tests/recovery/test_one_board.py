@@ -29,8 +29,8 @@ def test_the_shape_of_the_board_tells_which_pose(rng: np.random.Generator, camer
     for k in range(SCENES):
         scene = trihedral_pair(BOARDS, camera, PoseType.GENERAL, rng, distance=(0.9, 1.3), walls=False)
         board = BOARDS[k % len(BOARDS)]
-        found = [[detection(board, view[k % len(BOARDS)].pixels, rng, SIGMA_PX)] for view in scene.detections()]
-        r = reconstruct_pair(match_pair("one", camera, camera, *found, [board]), pose_type=PoseType.GENERAL)
+        one, two = ([detection(board, v[k % len(BOARDS)].pixels, rng, SIGMA_PX)] for v in scene.detections())
+        r = reconstruct_pair(match_pair("one", camera, camera, one, two, [board]), pose_type=PoseType.GENERAL)
         off = r.cam2_from_cam1.rotation @ scene.cam2_from_cam1.rotation.T
         assert np.rad2deg(rotation_angle(off)) < FAR_DEG
         assert abs(r.baseline_mm - scene.baseline_mm) < MOST_SIGMAS * r.baseline_sigma_mm
@@ -41,6 +41,6 @@ def test_a_board_without_any_noise_is_no_exception(rng: np.random.Generator) -> 
     camera = regular_camera()
     for k in range(3):
         scene = trihedral_pair(BOARDS, camera, PoseType.GENERAL, rng, distance=(0.9, 1.3), walls=False)
-        found = [[detection(BOARDS[k], view[k].pixels, rng, 0.0)] for view in scene.detections()]
-        r = reconstruct_pair(match_pair("one", camera, camera, *found, [BOARDS[k]]), pose_type=PoseType.GENERAL)
+        one, two = ([detection(BOARDS[k], view[k].pixels, rng, 0.0)] for view in scene.detections())
+        r = reconstruct_pair(match_pair("one", camera, camera, one, two, [BOARDS[k]]), pose_type=PoseType.GENERAL)
         assert abs(r.baseline_mm - scene.baseline_mm) < EXACT_MM

@@ -81,7 +81,8 @@ def test_panoramas_refuse_what_they_do_not_show(name: str) -> None:
     pixel[axis] += 118.0 * 3.3
     assert not camera.unproject(pixel)[1]
     with pytest.raises(InputError, match="target of rectification"):
-        type(camera).from_radial_curve((10, 10), RadialCurve((5.0, 5.0), [0.1, 0.2, 0.3, 0.4], [1.0, 2.0, 3.0, 4.0]))
+        curve = RadialCurve(np.array([5.0, 5.0]), np.array([0.1, 0.2, 0.3, 0.4]), np.array([1.0, 2.0, 3.0, 4.0]))
+        type(camera).from_radial_curve((10, 10), curve)
 
 
 @pytest.mark.parametrize("name", sorted(TARGETS))
@@ -163,7 +164,7 @@ def test_dtype_channels_and_size() -> None:
     remap = rectify_map(source, Pinhole((40, 30), np.array([20.0, 20.0, 19.5, 14.5])))
     grey = np.full((48, 64), 200, dtype=np.uint8)
     for interpolation in ("spline", "lanczos", "linear", "nearest"):
-        assert (remap.image(grey, interpolation=interpolation) == 200).all()  # type: ignore[arg-type]
+        assert (remap.image(grey, interpolation=interpolation) == 200).all()
     colour = np.stack([grey, grey // 2, grey // 4], axis=-1).astype(np.uint16) * 100
     out = remap.image(colour)
     assert out.dtype == np.uint16

@@ -63,7 +63,7 @@ def test_forward_motion_around_the_baseline(projection: str, rng: np.random.Gene
 def test_images_of_a_wall_meet_after_rectification() -> None:
     """A wall far away looks the same to both: the two rectified pictures of it agree."""
     cameras = [CAMERAS["kannala_brandt"], CAMERAS["brown"]]
-    pair = rectify_pair(*cameras, Rigid3(SIDE.rotation, 1e-3 * SIDE.translation_mm))
+    pair = rectify_pair(cameras[0], cameras[1], Rigid3(SIDE.rotation, 1e-3 * SIDE.translation_mm))
     pictures = []
     for remap, turn in ((pair.map1, np.eye(3)), (pair.map2, SIDE.rotation)):
         columns, rows = remap.camera.size_px

@@ -109,12 +109,12 @@ def test_predicted_covariance_and_no_bias(rng, kind, camera, with_affinities):
         )
         predicted.append(refined.covariance)
         factor.append(refined.variance_factor)
-    errors, expected = np.array(errors), np.mean(predicted, axis=0)
+    off, expected = np.array(errors), np.mean(predicted, axis=0)
     free = np.diag(expected) > 1e-6 * np.trace(expected)
-    ratio = np.sqrt(np.mean(errors**2, axis=0)[free] / np.diag(expected)[free])
+    ratio = np.sqrt(np.mean(off**2, axis=0)[free] / np.diag(expected)[free])
     assert np.abs(ratio - 1.0).max() < COVARIANCE_REL
     standard_error = np.sqrt(np.diag(expected)[free] / runs)
-    assert np.abs(errors.mean(axis=0)[free] / standard_error).max() < 4.0
+    assert np.abs(off.mean(axis=0)[free] / standard_error).max() < 4.0
     assert np.mean(factor) == pytest.approx(1.0, abs=0.05)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.reconstructions import make_reconstruction
+from mpl_toolkits.mplot3d import Axes3D
 
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.report.figures import as_pdf, cloud_figure, corners_figure
@@ -42,6 +43,7 @@ def test_no_axis_name_lies_over_a_number(baseline_mm: tuple[float, float, float]
     figure.canvas.draw()
     checked = 0
     for axes in figure.axes:
+        assert isinstance(axes, Axes3D)
         three = (axes.xaxis, axes.yaxis, axes.zaxis)
         numbers = [
             tick.label1.get_window_extent()

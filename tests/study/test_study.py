@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -205,6 +206,6 @@ def test_csv_has_every_cell() -> None:
         ({"trials": 0}, "one trial"),
     ],
 )
-def test_refusals(change: dict[str, object], words: str) -> None:
+def test_refusals(change: dict[str, Any], words: str) -> None:
     with pytest.raises(InputError, match=words):
         replace(GENERAL, **change)

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers.data import read_grey
 
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
@@ -29,7 +30,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def refined(image: Path, corners: list[list[float]]) -> float:
     """Return the rms distance of OpenCV's corners from the true ones."""
-    grey = cv2.imread(str(image), cv2.IMREAD_GRAYSCALE)
+    grey = read_grey(image)
     assert grey.shape == (720, 960)
     truth = np.array(corners)
     start = truth.astype(np.float32).reshape(-1, 1, 2)

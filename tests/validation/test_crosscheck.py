@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ CAMERAS = {
 }
 
 
-def made(camera: Camera, **options: object) -> Reconstruction:
+def made(camera: Camera, **options: Any) -> Reconstruction:
     return make_reconstruction(camera=camera, pose_covariance=POSE_COVARIANCE, baseline_sigma_mm=0.02, **options)
 
 
