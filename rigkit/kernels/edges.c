@@ -21,10 +21,10 @@ typedef int32_t words_t __attribute__((vector_size(4 * STRETCH)));
 typedef float bright_t __attribute__((vector_size(4 * STRETCH), aligned(4)));
 
 /* What the lattice says of a corner: its cell's sides, the curvature of its lines and how uncertain it is, where their
- * neighbours are, how far its window goes towards these, in sides of the cell, where that is not by rule, which of these
+ * neighbours are and by how much these are turned, how far its window goes towards these, in sides of the cell, where that is not by rule, which of these
  * have no corner of the lattice, and how bright it is beyond these, NaN where that is not known. */
 typedef struct {
-    const double *sides, *curvature, *curvature_sigma, *gaps, *reach, *paper;
+    const double *sides, *curvature, *curvature_sigma, *gaps, *tilts, *reach, *paper;
     const uint8_t *ends;
 } geometry_t;
 
@@ -40,7 +40,7 @@ typedef struct {
 /* A line through the corner as float32 arithmetic wants it. A sharp edge is two of less `width`, `apart` to either side;
  * `stretch` is s / width (reference.edges._edge). */
 typedef struct {
-    float cosine, sine, curvature, before, after;
+    float cosine, sine, curvature, before, after, tilt_before, tilt_after;
     float blur, width, stretch, apart, kurtosis;
     float paper_before, paper_after;
     int tight, sharp, ends_before, ends_after;
@@ -229,7 +229,7 @@ INLINE void blurred_edge(float x, float kurtosis, float out[5])
 }
 
 INLINE line_t line_of(
-    double angle, double curvature, const double gaps[2], const double paper[2], double blur, const edge_rules_t *rules)
+    double angle, double curvature, const double gaps[2], const double tilts[2], const double paper[2], double blur, const edge_rules_t *rules)
 {
     const double cosine = cos(angle), sine = sin(angle), c2 = cosine * cosine, s2 = sine * sine, b2 = blur * blur;
     const double flat = rules->pixel_kurtosis * (c2 * c2 + s2 * s2);
@@ -240,6 +240,7 @@ INLINE line_t line_of(
     return (line_t){
         .cosine = (float)cosine, .sine = (float)sine, .curvature = (float)curvature,
         .before = (float)gaps[0], .after = (float)gaps[1],
+        .tilt_before = (float)tilts[0], .tilt_after = (float)tilts[1],
         .blur = (float)blur, .width = (float)width, .stretch = (float)(blur / width), .apart = (float)apart,
         .kurtosis = sharp ? 0.0f : (float)(flat / (b2 * b2)),
         .paper_before = before ? (float)paper[0] : 0.0f, .paper_after = after ? (float)paper[1] : 0.0f,
@@ -247,16 +248,16 @@ INLINE line_t line_of(
         .ends_before = before, .ends_after = after};
 }
 
-/* Add a Gaussian edge, `shift` back from the line, with weight `part`. The distances have a loop of their own: mixed
+/* Add a Gaussian edge, `shift` back from the line and turned by `tilt`, with weight `part`. The distances have a loop of their own: mixed
  * with what follows, their limits become branches that keep the compiler from vectorising. */
-INLINE void add_gaussian(const line_t line, float shift, float part, edge_t *out)
+INLINE void add_gaussian(const line_t line, float shift, float tilt, float part, edge_t *out)
 {
     float x[BLOCK];
     const float per_width = 1.0f / line.width;
     for (int i = 0; i < BLOCK; i++) {
         const float along = out->along[i];
         const float bend = 0.5f * line.curvature * (along * along + line.blur * line.blur);
-        const float at = (out->aside[i] - bend + shift) * per_width;
+        const float at = (out->aside[i] - bend - tilt * along + shift) * per_width;
         const float most = at < FLAT_SIGMAS ? at : FLAT_SIGMAS;
         x[i] = most > -FLAT_SIGMAS ? most : -FLAT_SIGMAS;
     }
@@ -272,14 +273,14 @@ INLINE void add_gaussian(const line_t line, float shift, float part, edge_t *out
     }
 }
 
-/* reference.edges._edge, `shift` back from the line. */
-INLINE void add_edge(const line_t line, float shift, float part, edge_t *out)
+/* reference.edges._edge, `shift` back from the line and turned by `tilt`. */
+INLINE void add_edge(const line_t line, float shift, float tilt, float part, edge_t *out)
 {
     if (line.sharp) {
-        add_gaussian(line, shift - line.apart, 0.5f * part, out);
-        add_gaussian(line, shift + line.apart, 0.5f * part, out);
+        add_gaussian(line, shift - line.apart, tilt, 0.5f * part, out);
+        add_gaussian(line, shift + line.apart, tilt, 0.5f * part, out);
     } else {
-        add_gaussian(line, shift, part, out);
+        add_gaussian(line, shift, tilt, part, out);
     }
 }
 
@@ -291,12 +292,12 @@ INLINE void along_line(const line_t line, const float *u, const float *v, float 
         out->aside[i] = line.cosine * (v[i] - y) - line.sine * (u[i] - x);
         out->value[i] = out->slope[i] = out->bow[i] = out->curl[i] = out->grown[i] = 0.0f;
     }
-    add_edge(line, 0.0f, 1.0f, out);
+    add_edge(line, 0.0f, 0.0f, 1.0f, out);
     if (line.tight) {
         /* Squares go on beyond the next line the other way round; of paper the pattern is nothing. */
         const float before = line.ends_before ? 0.5f : 1.0f, after = line.ends_after ? 0.5f : 1.0f;
-        add_edge(line, line.before, -before, out);
-        add_edge(line, -line.after, -after, out);
+        add_edge(line, line.before, line.tilt_before, -before, out);
+        add_edge(line, -line.after, line.tilt_after, -after, out);
         for (int i = 0; i < BLOCK; i++)
             out->value[i] += before - after;
     }
@@ -304,8 +305,8 @@ INLINE void along_line(const line_t line, const float *u, const float *v, float 
         out->grown[i] += line.curvature * line.blur * out->slope[i];
 }
 
-/* Add what lies beyond the line `shift` back from `line`, on the side where `way` times the distance grows. */
-INLINE void add_paper(const line_t line, float shift, float way, float paper, const edge_t *at, beyond_t *out)
+/* Add what lies beyond the line `shift` back from `line`, turned by `tilt`, on the side where `way` times the distance grows. */
+INLINE void add_paper(const line_t line, float shift, float tilt, float way, float paper, const edge_t *at, beyond_t *out)
 {
     edge_t edge;
     for (int i = 0; i < BLOCK; i++) {
@@ -313,7 +314,7 @@ INLINE void add_paper(const line_t line, float shift, float way, float paper, co
         edge.aside[i] = at->aside[i];
         edge.value[i] = edge.slope[i] = edge.bow[i] = edge.curl[i] = edge.grown[i] = 0.0f;
     }
-    add_edge(line, shift, 1.0f, &edge);
+    add_edge(line, shift, tilt, 1.0f, &edge);
     const float half = 0.5f * way;
     for (int i = 0; i < BLOCK; i++) {
         const float seen = 0.5f + half * edge.value[i], slope = half * edge.slope[i];
@@ -332,9 +333,9 @@ INLINE void beyond_line(const line_t line, const edge_t *at, beyond_t *out)
 {
     memset(out, 0, sizeof *out);
     if (line.ends_before)
-        add_paper(line, line.before, -1.0f, line.paper_before, at, out);
+        add_paper(line, line.before, line.tilt_before, -1.0f, line.paper_before, at, out);
     if (line.ends_after)
-        add_paper(line, -line.after, 1.0f, line.paper_after, at, out);
+        add_paper(line, -line.after, line.tilt_after, 1.0f, line.paper_after, at, out);
 }
 
 /* The rows of the block of pixels that begins with `start`. */
@@ -361,8 +362,8 @@ INLINE void multiply_rows(
     const float base = (float)values[A], half = (float)values[B], per_size = (float)(1.0 / window->size);
     const float light_u = (float)values[GX] * per_size, light_v = (float)values[GY] * per_size;
     const float rho = (float)cos(values[T1] - values[T2]);
-    const line_t line1 = line_of(values[T1], values[K1], at.gaps, at.paper, values[S], rules);
-    const line_t line2 = line_of(values[T2], values[K2], at.gaps + 2, at.paper + 2, values[S], rules);
+    const line_t line1 = line_of(values[T1], values[K1], at.gaps, at.tilts, at.paper, values[S], rules);
+    const line_t line2 = line_of(values[T2], values[K2], at.gaps + 2, at.tilts + 2, at.paper + 2, values[S], rules);
     const float half_rho = 0.5f * rho;
     lanes_t sums[ROWS * (ROWS + 1) / 2];
     memset(sums, 0, sizeof sums);
@@ -469,8 +470,8 @@ static void brightness(double *values, const window_t *window, const geometry_t 
 {
     const float x = (float)values[X], y = (float)values[Y];
     const float rho = (float)cos(values[T1] - values[T2]);
-    const line_t line1 = line_of(values[T1], values[K1], at.gaps, at.paper, values[S], rules);
-    const line_t line2 = line_of(values[T2], values[K2], at.gaps + 2, at.paper + 2, values[S], rules);
+    const line_t line1 = line_of(values[T1], values[K1], at.gaps, at.tilts, at.paper, values[S], rules);
+    const line_t line2 = line_of(values[T2], values[K2], at.gaps + 2, at.tilts + 2, at.paper + 2, values[S], rules);
     double n = 0.0, sum_p = 0.0, sum_i = 0.0, sum_pp = 0.0, sum_pi = 0.0;
     for (int64_t start = 0; start < window->count; start += 2 * BLOCK) {
         edge_t one, two;
@@ -826,11 +827,11 @@ int64_t edges_scratch(const edge_rules_t *rules)
 }
 
 /* Fit the edge model around `count` corners (reference.edges.fit_corners). pixels (N, 2), sides (N, 2, 2), curvature and its sigma
- * (N, 2), gaps, reach, paper and ends (N, 2, 2), sign, blur and contrast (N), out (N, OUTCOMES); scratch as `edges_scratch`
+ * (N, 2), gaps, tilts, reach, paper and ends (N, 2, 2), sign, blur and contrast (N), out (N, OUTCOMES); scratch as `edges_scratch`
  * says, zeroed; `grey` is of uint8_t if `bytes`, else of float. */
 void fit_edges(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *sides,
-    const double *curvature, const double *curvature_sigma, const double *gaps, const double *reach, const double *paper,
+    const double *curvature, const double *curvature_sigma, const double *gaps, const double *tilts, const double *reach, const double *paper,
     const double *sign, const double *blur, const double *contrast, const uint8_t *ends, const edge_rules_t *rules,
     float *scratch, double *out)
 {
@@ -846,7 +847,7 @@ void fit_edges(
         .radius = (int64_t)floor(rules->radius_px)};
     for (int64_t n = 0; n < count; n++) {
         const geometry_t at = {
-            sides + 4 * n, curvature + 2 * n, curvature_sigma + 2 * n, gaps + 4 * n, reach + 4 * n, paper + 4 * n,
+            sides + 4 * n, curvature + 2 * n, curvature_sigma + 2 * n, gaps + 4 * n, tilts + 4 * n, reach + 4 * n, paper + 4 * n,
             ends + 4 * n};
         collect(&window, image, pixels + 2 * n, at, blur[n], rules);
         fit_corner(&window, pixels + 2 * n, at, sign[n], blur[n], contrast[n], rules, out + OUTCOMES * n);

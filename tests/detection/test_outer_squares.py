@@ -12,7 +12,7 @@ from helpers.data import shared_data
 from rigkit import detect_boards
 from rigkit.benchmark.corner_bound import corner_information, position_bound
 from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, three_boards
-from rigkit.benchmark.score import FoundBoard, Score, score
+from rigkit.benchmark.score import FoundBoard, score
 from rigkit.core.arrays import FloatArray
 from rigkit.io.images import read_image
 from rigkit.synthetic.photometry import develop
@@ -21,6 +21,8 @@ from rigkit.synthetic.render import Optics
 NOISE_LEVELS = 2.0
 SUPERSAMPLED = 8
 CELL_PX, COLUMNS, ROWS = 30.0, 7, 5
+MOST_PER_BLUR = 0.015
+"""Of the blur, by which a corner may lie aside: where squares are cut at 3 blurs, half of it was measured."""
 
 
 def cut_board(ends: tuple[float, float, float, float], blur_px: float, margin: float) -> tuple[np.ndarray, FloatArray]:
@@ -67,24 +69,22 @@ def test_squares_cut_short_do_not_pull_at_corners(
     assert len(found.grid) == COLUMNS * ROWS
     off = np.linalg.norm(found.pixels[:, None] - truth, axis=2).min(axis=1)
     # Noise alone makes 0.01 px; without a model of what lies beyond, corners lie 0.14 to 2.4 px aside.
-    assert off.max() < 0.03 * blur_px
+    assert off.max() < MOST_PER_BLUR * blur_px
 
 
 @pytest.mark.parametrize(
-    ("lens", "blur_px", "most"), [("regular", 2.0, 1.2), ("regular", 3.0, 1.2), ("fisheye", 2.0, 1.2)]
+    ("lens", "blur_px", "most"),
+    [("regular", 2.0, 1.2), ("regular", 4.0, 1.2), ("fisheye", 3.0, 1.2), ("fisheye", 4.0, 1.2)],
 )
 def test_errors_out_of_focus_are_near_the_bound(lens: str, blur_px: float, most: float) -> None:
-    total, bounds = [], []
-    for seed in range(2):
-        scene = three_boards(np.random.default_rng(seed), lens=lens)
-        light = scene.radiance(Optics(blur_px))
-        photometry = replace(BENCH_PHOTOMETRY, noise_levels=NOISE_LEVELS)
-        image = np.asarray(develop(light, photometry, np.random.default_rng(seed)))
-        total.append(score(scene, [FoundBoard.of(found) for found in detect_boards(image)]))
-        bounds += [position_bound(x, NOISE_LEVELS) for x in corner_information(scene, blur_px)]
-    every = Score.sum(total)
+    scene = three_boards(np.random.default_rng(0), lens=lens)
+    light = scene.radiance(Optics(blur_px))
+    photometry = replace(BENCH_PHOTOMETRY, noise_levels=NOISE_LEVELS)
+    image = np.asarray(develop(light, photometry, np.random.default_rng(0)))
+    every = score(scene, [FoundBoard.of(found) for found in detect_boards(image)])
     assert every.complete == every.boards
-    bound = float(np.sqrt(np.trace(np.concatenate(bounds), axis1=1, axis2=2).mean()))
+    bounds = np.concatenate([position_bound(x, NOISE_LEVELS) for x in corner_information(scene, blur_px)])
+    bound = float(np.sqrt(np.trace(bounds, axis1=1, axis2=2).mean()))
     assert every.rms_px < most * bound
 
 

@@ -142,6 +142,7 @@ def fit_edges(
         geometry.curvature,
         loose,
         geometry.gaps,
+        np.zeros(geometry.gaps.shape) if geometry.tilts is None else geometry.tilts,
         np.full(geometry.gaps.shape, np.nan) if geometry.reach is None else geometry.reach,
         np.full(geometry.gaps.shape, np.nan) if geometry.paper is None else geometry.paper,
         geometry.ends,

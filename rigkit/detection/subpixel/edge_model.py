@@ -13,7 +13,7 @@ blur, sharpening) does not move the corner; but it adds to the residuals, and so
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,6 +31,7 @@ __all__ = [
     "WINDOW_REACH",
     "Geometry",
     "ends_of",
+    "tilted",
 ]
 
 TAIL_SIGMAS = 3.0
@@ -58,6 +59,10 @@ PAPER_SIGMAS = 0.0
 """The same where it is known how bright it is beyond: the model holds as far as the line."""
 
 
+NEIGHBOURS = ((-1, 0), (1, 0), (0, 1), (0, -1))
+"""Where, in rows and columns, the lines before and after line 1 and line 2 have their corners."""
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Geometry:
     """What the lattice says of N corners.
@@ -72,6 +77,7 @@ class Geometry:
         WINDOW_REACH; None: by rule.
     paper : (N, 2, 2) how bright it is beyond that line, relative to the corner's mean and in units of the model's b;
         NaN where squares go on there, or where it is not known. None: everywhere.
+    tilts : (N, 2, 2) by how much that line is turned against this one, towards +90 degrees, rad; None: nowhere.
     """
 
     sides: FloatArray
@@ -80,11 +86,33 @@ class Geometry:
     ends: BoolArray
     reach: FloatArray | None = None
     paper: FloatArray | None = None
+    tilts: FloatArray | None = None
 
     def of(self, which: BoolArray) -> Geometry:
         """Return that of the corners `which` (N,)."""
-        reach, paper = (None if part is None else part[which] for part in (self.reach, self.paper))
-        return Geometry(self.sides[which], self.curvature[which], self.gaps[which], self.ends[which], reach, paper)
+        rest = (None if part is None else part[which] for part in (self.reach, self.paper, self.tilts))
+        return Geometry(self.sides[which], self.curvature[which], self.gaps[which], self.ends[which], *rest)
+
+
+def tilted(geometry: Geometry, cells: BoolArray) -> Geometry:
+    """Return the `geometry` of the `cells` (R, C) of a lattice with `tilts`, and `gaps` beside the corner itself.
+
+    The gaps are those at the neighbouring corners, which lie aslant. Beyond the ends of the lattice its lines go on
+    turning as they do on the other side.
+    """
+    sides = np.full((cells.shape[0] + 2, cells.shape[1] + 2, 2, 2), np.nan)
+    sides[1:-1, 1:-1][cells] = geometry.sides
+    row, column = np.nonzero(cells)
+    own = geometry.sides / np.linalg.norm(geometry.sides, axis=2, keepdims=True)
+    tilts = np.empty(geometry.gaps.shape)
+    for k, ((down, right), line) in enumerate(zip(NEIGHBOURS, (0, 0, 1, 1), strict=True)):
+        there, here = sides[row + 1 + down, column + 1 + right, line], own[:, line]
+        turn = (here[:, 0] * there[:, 1] - here[:, 1] * there[:, 0]) / np.linalg.norm(there, axis=1)
+        tilts[:, line, k % 2] = turn
+    tilts = np.nan_to_num(np.where(np.isnan(tilts), -tilts[:, :, ::-1], tilts))
+    # How far along line 1 and 2 the corner after, along row and column, lies.
+    aslant = (geometry.sides[:, ::-1] * own).sum(axis=2) * (1.0, -1.0)
+    return replace(geometry, gaps=geometry.gaps - tilts * aslant[:, :, None], tilts=tilts)
 
 
 def ends_of(known: BoolArray, cells: BoolArray) -> BoolArray:

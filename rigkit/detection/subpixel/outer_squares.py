@@ -8,6 +8,7 @@ lattice has not. The mean of both sides goes, over the same edge, from that of t
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from math import erf
 
@@ -74,17 +75,22 @@ def beside_paper(geometry: Geometry, fit: EdgeFit, owner: IntArray) -> BoolArray
     return good & np.asarray((ends & (blurred | suspect[:, None])).any(axis=1))
 
 
-def with_paper(image: GreyImage, geometry: Geometry, fit: EdgeFit, sign: FloatArray) -> Geometry:
+def with_paper(
+    image: GreyImage, geometry: Geometry, fit: EdgeFit, sign: FloatArray, owner: IntArray
+) -> Geometry:
     """Return the `geometry` of N corners `fit` with `paper` beyond their ends, and `gaps` to where it begins.
 
-    `sign` (N,) as for `edge_fit.fit_edges`.
+    `sign` (N,) as for `edge_fit.fit_edges`, `owner` (N,) the number of each corner's board.
     """
     who, which = np.nonzero(geometry.ends.reshape(-1, 4))
-    cell = geometry.gaps.reshape(-1, 4)[who, which]
+    # The way out is as long as the cell's side, which is the mean of what lies before and behind the corner.
+    cell = np.repeat(geometry.gaps.mean(axis=2), 2, axis=1)[who, which]
     one, other = _beside_the_way_out(image, geometry, fit, who, which)
-    contrast, blur = fit.contrast[who], fit.blur[who]
+    beside = _beside(geometry, fit.pixels, owner, who, which)
+    # Out there, a corner that was fitted without what lies beyond is wrong in contrast and blur, some more than others.
+    contrast, blur = _middle(fit.contrast[who], beside), _middle(fit.blur[who], beside)
     with np.errstate(invalid="ignore", divide="ignore"):
-        end, found = _end((one - other) / (contrast * _left(geometry, fit)[who, which])[:, None])
+        end, found = _end((one - other) / (contrast * _left(geometry, who, which, blur))[:, None])
         step = STEPS[1] - STEPS[0]
         at = (end + blur / cell - STEPS[0]) / step
         first = np.nan_to_num(at).clip(0.0, len(STEPS) - 2.0).astype(np.int64)
@@ -92,38 +98,43 @@ def with_paper(image: GreyImage, geometry: Geometry, fit: EdgeFit, sign: FloatAr
         level = mean[k, first] + (at - first) * (mean[k, first + 1] - mean[k, first])
         bright = (level - sample(image, fit.pixels[who])) / (0.5 * contrast * SEEN)
         found &= (at <= len(STEPS) - 1.0) & (np.abs(bright) < MAX_PAPER)
-    by = _witness(geometry, fit.pixels, who, which, found)
-    end, bright, found = end[by], bright[by], found[by]
+        # Sheets are cut straight, and paper is alike: what noise makes of a single reading, its neighbours do not say.
+        end, bright = (_middle(np.where(found, values, np.nan), beside) for values in (end, bright))
+        found = np.isfinite(end)
     paper, gaps = np.full((len(fit.pixels), 4), np.nan), geometry.gaps.reshape(-1, 4).copy()
     paper[who[found], which[found]] = (bright * sign[who])[found]
     gaps[who[found], which[found]] = (end * cell)[found]
     return replace(geometry, gaps=gaps.reshape(-1, 2, 2), paper=paper.reshape(-1, 2, 2))
 
 
-def _left(geometry: Geometry, fit: EdgeFit) -> FloatArray:
-    """Return (N, 4) what blur leaves of the difference of the two squares at each of the `Geometry.ends`."""
+def _left(geometry: Geometry, who: IntArray, which: IntArray, blur: FloatArray) -> FloatArray:
+    """Return (M,) what blur leaves of the difference of the two squares beside each way out."""
     # Beside the way out across line 1 lie squares of line 2, with their own edges and those of the next squares.
-    across = geometry.gaps[:, ::-1].mean(axis=2, keepdims=True) / (np.sqrt(2.0) * fit.blur[:, None, None])
-    left = np.array([[erf(ASIDE * x) + erf((1.0 - ASIDE) * x) - 1.0 for x in pair] for pair in across[..., 0].tolist()])
-    return np.repeat(left.reshape(-1, 2), 2, axis=1)
+    across = geometry.gaps[who, 1 - which // 2].mean(axis=1) / (np.sqrt(2.0) * blur)
+    return np.array([erf(ASIDE * x) + erf((1.0 - ASIDE) * x) - 1.0 for x in across.tolist()])
 
 
-def _witness(geometry: Geometry, pixels: FloatArray, who: IntArray, which: IntArray, found: BoolArray) -> IntArray:
-    """Return for each of M ends the one that tells what lies beyond it.
+def _beside(geometry: Geometry, pixels: FloatArray, owner: IntArray, who: IntArray, which: IntArray) -> BoolArray:
+    """Return (M, M) which ends tell of each end what lies beyond it: those near it, on its side of the board.
 
-    The way out from the corner of a board has different things on either side: the nearest on its side tells.
+    The way out from the corner of a board has different things on either side: it tells nothing where others do.
     """
-    by = np.arange(len(who))
-    single = geometry.ends.reshape(-1, 4)[who].sum(axis=1) == 1
     apart = np.linalg.norm(pixels[who, None] - pixels[who], axis=2)
-    apart[:, ~(single & found)] = np.inf
-    apart[which[:, None] != which] = np.inf
-    # The next but one at most, in sides of the cell.
-    reach = NEAR_WITNESS * np.linalg.norm(geometry.sides[who], axis=2).max(axis=1)
-    nearest = apart.argmin(axis=1) if len(by) else by
-    use = ~single & (apart[by, nearest] < reach)
-    by[use] = nearest[use]
-    return by
+    near: BoolArray = apart < NEAR_WITNESS * np.linalg.norm(geometry.sides[who], axis=2).max(axis=1)[:, None]
+    near &= (which[:, None] == which) & (owner[who, None] == owner[who])
+    single = geometry.ends.reshape(-1, 4)[who].sum(axis=1) == 1
+    witnessed = near & single
+    return np.asarray(np.where(witnessed.any(axis=1, keepdims=True), witnessed, near))
+
+
+def _middle(values: FloatArray, beside: BoolArray) -> FloatArray:
+    """Return the medians (M,) of those `values` (M,) that are `beside` (M, M) each and known; NaN for none."""
+    table = np.where(beside, values, np.nan)
+    table[~np.isfinite(table).any(axis=1)] = np.nan
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        middle: FloatArray = np.nanmedian(table, axis=1)
+    return middle
 
 
 def _beside_the_way_out(

@@ -19,7 +19,7 @@ from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.correlation import sigma_factors
 from rigkit.detection.subpixel.edge_curvature import line_curvature
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
-from rigkit.detection.subpixel.edge_model import WINDOW_REACH, Geometry, ends_of
+from rigkit.detection.subpixel.edge_model import TAIL_SIGMAS, WINDOW_REACH, Geometry, ends_of, tilted
 from rigkit.detection.subpixel.outer_squares import beside_paper, with_paper
 from rigkit.detection.subpixel.scatter import scatter_factors
 
@@ -39,7 +39,7 @@ LOOSE_CURVATURE = 0.5
 """Curvatures are fitted where the lattice leaves them open by so much that the corner would move by more than this, in
 sigmas of the first pass: the edges then know them better. Everywhere it would take a quarter more time."""
 
-PAPER_ROUNDS, SETTLED_PX = 2, 0.1
+PAPER_ROUNDS, SETTLED_PX = 4, 0.03
 """What lies beyond the outermost squares is read with the corners as they are fitted so far, and again if these move by
 more than the second number."""
 
@@ -149,6 +149,10 @@ def refine(image: GreyImage, lattices: Sequence[Lattice]) -> list[RefinedLattice
     first = _first_pass(image, start, sheet.signs)
     start, holes = _with_holes(first.lattice, sheet.signs != 0.0)
     last = _last_pass(image, start, sheet.signs, _typical_blur(first, sheet.parts), first.sigma_px, sheet.parts)
+    if _reached_by_others(last):
+        # Where the edges of neighbouring lines reach into the windows, it matters where exactly these are.
+        blur = _typical_blur(last, sheet.parts)
+        last = _last_pass(image, last.lattice, sheet.signs, blur, last.sigma_px, sheet.parts)
     if holes.any():
         last = _confirmed(last, start, holes)
     checked = _checked(last, sheet.parts)
@@ -241,16 +245,26 @@ def _last_pass(
         )
 
     geometry = Geometry(shape.sides, curvature, shape.gaps(), ends_of(known, known))
+    if TAIL_SIGMAS * blur[known].max(initial=0.0) > (1.0 - WINDOW_REACH) * geometry.gaps.min(initial=np.inf):
+        # The edges of neighbouring lines reach into the windows.
+        geometry = tilted(geometry, known)
     fit = fitted(slice(None), geometry)
     again = beside_paper(geometry, fit, mine)
     for _ in range(PAPER_ROUNDS if again.any() else 0):
         before = fit.pixels[again]
-        beside = with_paper(image, geometry.of(again), fit.of(again), signs[known][again])
+        beside = with_paper(image, geometry.of(again), fit.of(again), signs[known][again], mine[again])
         fit = fit.with_part(again, fitted(again, beside))
         if np.abs(fit.pixels[again] - before).max() < SETTLED_PX:
             break
     factors = sigma_factors(fit, fit.valid & (fit.contrast > 0.0), shape.sides, mine, len(parts), radius_px)
     return _spread(start, fit, fit.sigma_px * factors[mine])
+
+
+def _reached_by_others(item: RefinedLattice) -> bool:
+    """Return whether blur brings the edges of neighbouring lines into the windows of corners."""
+    known = item.lattice.known
+    gaps = fit_cells(item.lattice.pixels, known, degree=1).gaps().reshape(-1, 4)
+    return bool((TAIL_SIGMAS * item.blur_px[known] > (1.0 - WINDOW_REACH) * gaps.min(axis=1, initial=np.inf)).any())
 
 
 def _spread(start: Lattice, fit: EdgeFit, sigma_px: FloatArray) -> RefinedLattice:

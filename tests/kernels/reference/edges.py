@@ -68,6 +68,7 @@ def fit_corners(
     curvature: FloatArray,
     curvature_sigma: FloatArray,
     gaps: FloatArray,
+    tilts: FloatArray,
     reach: FloatArray,
     paper: FloatArray,
     ends: BoolArray,
@@ -76,7 +77,7 @@ def fit_corners(
     contrast: FloatArray,
     rules: Rules,
 ) -> FloatArray:
-    geometry, loose = Geometry(sides, curvature, gaps, ends, reach, paper), curvature_sigma
+    geometry, loose = Geometry(sides, curvature, gaps, ends, reach, paper, tilts), curvature_sigma
     window = collect(image, pixels, geometry, blur, rules.radius_px)
     prior_mean, prior = _prior(geometry, loose, blur, window.size)
     kept = np.count_nonzero(loose > 0.0, axis=1) < 2
@@ -237,11 +238,13 @@ def collect(image: GreyImage, pixels: FloatArray, geometry: Geometry, blur: Floa
     return Window(centre, u.astype(np.float32), v.astype(np.float32), value, weight, np.maximum(radius, 2.0))
 
 
-def _step(distance: Float32, blur: Float32, flat: Float32, gaps: Float32, paper: Float32) -> tuple[Float32, ...]:
+def _step(
+    distance: Float32, turned: tuple[Float32, Float32], blur: Float32, flat: Float32, gaps: Float32, paper: Float32
+) -> tuple[Float32, ...]:
     """Return the blurred step S over the line, S', S'', S''' (with respect to x = distance / s), and -s dS/ds.
 
     Where squares are small against the blur, the edges of the parallel lines at `gaps` (N, 2) before and after reach
-    into the window: their steps are taken away. Far from both they add up to nothing: one is -1, the other +1. Where
+    into the window, `turned` further away by the way that they are tilted: their steps are taken away. Far from both they add up to nothing: one is -1, the other +1. Where
     there is `paper` (N, 2) beyond, the pattern ends: half of the step is taken away, and S is 0 there.
     """
     total = _edge(distance, blur, flat)
@@ -250,21 +253,25 @@ def _step(distance: Float32, blur: Float32, flat: Float32, gaps: Float32, paper:
     if tight.any():
         near, beside = distance[tight], gaps[tight]
         parts = np.where(papered[tight], 0.5, 1.0).astype(np.float32)
-        for place, part in ((-beside[:, :1], parts[:, :1]), (beside[:, 1:], parts[:, 1:])):
-            for mine, other in zip(total, _edge(near - place, blur[tight], flat[tight]), strict=True):
+        places = (-beside[:, :1], parts[:, :1], turned[0]), (beside[:, 1:], parts[:, 1:], turned[1])
+        for place, part, off in places:
+            for mine, other in zip(total, _edge(near - off[tight] - place, blur[tight], flat[tight]), strict=True):
                 mine[tight] -= part * other
         total[0][tight] += parts[:, :1] - parts[:, 1:]
     return total
 
 
-def _beyond(distance: Float32, blur: Float32, flat: Float32, gaps: Float32, paper: Float32) -> tuple[Float32, ...]:
+def _beyond(
+    distance: Float32, turned: tuple[Float32, Float32], blur: Float32, flat: Float32, gaps: Float32, paper: Float32
+) -> tuple[Float32, ...]:
     """Return how much each pixel sees of what lies beyond the ends of a line that have `paper`, the derivative of that
     with respect to x, and -s d/ds of it; then the same of it times the paper's brightness."""
     seen = tuple(np.zeros_like(distance) for _ in range(6))
-    for place, way, bright in ((-gaps[:, :1], -1.0, paper[:, :1]), (gaps[:, 1:], 1.0, paper[:, 1:])):
+    sides = (-gaps[:, :1], -1.0, paper[:, :1], turned[0]), (gaps[:, 1:], 1.0, paper[:, 1:], turned[1])
+    for place, way, bright, off in sides:
         known = np.isfinite(bright)
         half = np.where(known, 0.5 * way, 0.0).astype(np.float32)
-        edge = _edge(distance - place, blur, flat)
+        edge = _edge(distance - off - place, blur, flat)
         parts = (np.where(known, np.float32(0.5), np.float32(0.0)) + half * edge[0], half * edge[1], half * edge[4])
         for mine, mine_bright, part in zip(seen[:3], seen[3:], parts, strict=True):
             mine += part
@@ -323,7 +330,10 @@ def _parts(values: FloatArray, window: Window, geometry: Geometry) -> tuple[tupl
         distance = aside - (np.float32(0.5) * kappa) * (along * along + blur * blur)
         flat = np.float32(PIXEL_KURTOSIS) * (cosine**4 + sine**4)
         beside = (geometry.gaps[:, line].astype(np.float32), _paper(geometry)[:, line].astype(np.float32))
-        step, beyond = _step(distance, blur, flat, *beside), _beyond(distance, blur, flat, *beside)
+        tilts = np.zeros((len(qu), 2)) if geometry.tilts is None else geometry.tilts[:, line]
+        before, after = (tilt[:, None].astype(np.float32) * along for tilt in tilts.T)
+        around = ((before, after), blur, flat, *beside)
+        step, beyond = _step(distance, *around), _beyond(distance, *around)
         for slope, grown in ((step[1], step[4]), (beyond[1], beyond[2]), (beyond[4], beyond[5])):
             grown[...] += kappa * blur * slope
         out.append((*step, along, aside, cosine, sine, kappa, beyond))
