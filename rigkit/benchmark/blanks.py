@@ -1,5 +1,6 @@
 """Pictures without a chessboard, on which a detector must find nothing and should not lose time: noise, a page of
-dots, text, texture, cloth, codes, and patterns that have something of a chessboard.
+dots, text, texture, cloth, codes, patterns that have something of a chessboard, and the things of
+`rigkit.benchmark.things`.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rigkit.benchmark.things import THINGS
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 
@@ -195,5 +197,6 @@ BLANKS: dict[str, Callable[[np.random.Generator, tuple[int, int]], FloatArray]] 
     "codes": _codes,
     "windows": _windows,
     "packed": _packed,
+    **THINGS,
 }
 """Pictures by name; each draws grey levels (height, width) from (rng, size_px), before lens and sensor."""

@@ -75,9 +75,7 @@ def beside_paper(geometry: Geometry, fit: EdgeFit, owner: IntArray) -> BoolArray
     return good & np.asarray((ends & (blurred | suspect[:, None])).any(axis=1))
 
 
-def with_paper(
-    image: GreyImage, geometry: Geometry, fit: EdgeFit, sign: FloatArray, owner: IntArray
-) -> Geometry:
+def with_paper(image: GreyImage, geometry: Geometry, fit: EdgeFit, sign: FloatArray, owner: IntArray) -> Geometry:
     """Return the `geometry` of N corners `fit` with `paper` beyond their ends, and `gaps` to where it begins.
 
     `sign` (N,) as for `edge_fit.fit_edges`, `owner` (N,) the number of each corner's board.
