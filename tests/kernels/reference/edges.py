@@ -245,7 +245,8 @@ def _step(
 
     Where squares are small against the blur, the edges of the neighbouring lines at `gaps` (N, 2) before and after,
     and `turned` (N, P) further off, reach into the window: their steps are taken away. Far from both they add up to
-    nothing: one is -1, the other +1. Where there is `paper` (N, 2) beyond, the pattern ends: half of the step is taken away, and S is 0 there.
+    nothing: one is -1, the other +1. Where there is `paper` (N, 2) beyond, the pattern ends: half of the step is taken
+    away, and S is 0 there.
     """
     total = _edge(distance, blur, flat)
     papered = np.isfinite(paper)
