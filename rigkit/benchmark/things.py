@@ -122,7 +122,7 @@ def _code(rng: np.random.Generator) -> Sheet:
         cells[max(row - 1, 0) : row + 8, max(column - 1, 0) : column + 8] = 225.0
         for ring, shade in ((0, 25.0), (1, 225.0), (2, 25.0)):
             cells[row + ring : row + 7 - ring, column + ring : column + 7 - ring] = shade
-    return cv2.copyMakeBorder(_tiled(cells, 0), 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=225)
+    return np.pad(_tiled(cells, 0), 60, constant_values=225)
 
 
 def _stones(rng: np.random.Generator) -> Sheet:
@@ -194,7 +194,7 @@ def _grey(levels: FloatArray) -> Sheet:
 def _tiled(cells: FloatArray, side: int) -> Sheet:
     """Return `cells` of `side` px over the whole sheet; 0: once, as large as the sheet."""
     if side == 0:
-        return cv2.resize(_grey(cells), (SHEET, SHEET), interpolation=cv2.INTER_NEAREST)
+        return np.asarray(cv2.resize(_grey(cells), (SHEET, SHEET), interpolation=cv2.INTER_NEAREST), np.uint8)
     block = np.repeat(np.repeat(_grey(cells), side, axis=0), side, axis=1)
     times = -(-SHEET // len(block))
     return np.ascontiguousarray(np.tile(block, (times, times))[:SHEET, :SHEET])
