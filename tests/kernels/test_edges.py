@@ -66,7 +66,7 @@ def test_compiled_fit_is_the_numpy_fit(
     paper = np.where(known, rng.uniform(-1.2, 1.2, ends.shape), np.nan)
     gaps = shape.gaps() * np.where(known, rng.uniform(0.4, 1.1, ends.shape), 1.0)
     tilts = rng.normal(0.0, 0.05, ends.shape)
-    geometry = Geometry(sides, shape.curvature(), gaps, ends, reach, paper, tilts)
+    geometry = Geometry(sides, shape.curvature(), gaps, ends, reach=reach, paper=paper, tilts=tilts)
     row, column = np.indices(truth.shape[:2])
     sign = np.where((row + column) % 2 == 0, 1.0, -1.0).ravel()
     start = truth.reshape(-1, 2) + rng.uniform(-0.3, 0.3, (truth.size // 2, 2))

@@ -13,7 +13,7 @@ blur, sharpening) does not move the corner; but it adds to the residuals, and so
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
 
@@ -84,14 +84,16 @@ class Geometry:
     curvature: FloatArray
     gaps: FloatArray
     ends: BoolArray
+    _: KW_ONLY
     reach: FloatArray | None = None
     paper: FloatArray | None = None
     tilts: FloatArray | None = None
 
     def of(self, which: BoolArray) -> Geometry:
         """Return that of the corners `which` (N,)."""
-        rest = (None if part is None else part[which] for part in (self.reach, self.paper, self.tilts))
-        return Geometry(self.sides[which], self.curvature[which], self.gaps[which], self.ends[which], *rest)
+        optional = {"reach": self.reach, "paper": self.paper, "tilts": self.tilts}
+        known = {name: part[which] for name, part in optional.items() if part is not None}
+        return Geometry(self.sides[which], self.curvature[which], self.gaps[which], self.ends[which], **known)
 
 
 def tilted(geometry: Geometry, cells: BoolArray) -> Geometry:

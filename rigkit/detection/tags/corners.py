@@ -134,7 +134,7 @@ class _Fitter:
             surface.curvature(),
             gaps,
             np.zeros(gaps.shape, np.bool_),
-            np.minimum(0.5 * steps, WINDOW_REACH),
+            reach=np.minimum(0.5 * steps, WINDOW_REACH),
         )
         signs = np.where(self._odd(cells), 1.0, -1.0)
         radius_px, iterations, converged_px = stage

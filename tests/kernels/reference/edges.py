@@ -77,7 +77,7 @@ def fit_corners(
     contrast: FloatArray,
     rules: Rules,
 ) -> FloatArray:
-    geometry, loose = Geometry(sides, curvature, gaps, ends, reach, paper, tilts), curvature_sigma
+    geometry, loose = Geometry(sides, curvature, gaps, ends, reach=reach, paper=paper, tilts=tilts), curvature_sigma
     window = collect(image, pixels, geometry, blur, rules.radius_px)
     prior_mean, prior = _prior(geometry, loose, blur, window.size)
     kept = np.count_nonzero(loose > 0.0, axis=1) < 2
