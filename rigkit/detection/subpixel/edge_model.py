@@ -59,7 +59,7 @@ PAPER_SIGMAS = 0.0
 """The same where it is known how bright it is beyond: the model holds as far as the line."""
 
 
-NEIGHBOURS = ((-1, 0), (1, 0), (0, 1), (0, -1))
+LINES_BESIDE = ((-1, 0), (1, 0), (0, 1), (0, -1))
 """Where, in rows and columns, the lines before and after line 1 and line 2 have their corners."""
 
 
@@ -107,7 +107,7 @@ def tilted(geometry: Geometry, cells: BoolArray) -> Geometry:
     row, column = np.nonzero(cells)
     own = geometry.sides / np.linalg.norm(geometry.sides, axis=2, keepdims=True)
     tilts = np.empty(geometry.gaps.shape)
-    for k, ((down, right), line) in enumerate(zip(NEIGHBOURS, (0, 0, 1, 1), strict=True)):
+    for k, ((down, right), line) in enumerate(zip(LINES_BESIDE, (0, 0, 1, 1), strict=True)):
         there, here = sides[row + 1 + down, column + 1 + right, line], own[:, line]
         turn = (here[:, 0] * there[:, 1] - here[:, 1] * there[:, 0]) / np.linalg.norm(there, axis=1)
         tilts[:, line, k % 2] = turn
