@@ -1,14 +1,22 @@
-"""OpenCV and COLMAP on the captures of the table of truth: each finds its own corners and uses its own defaults."""
+"""OpenCV, mrcal and COLMAP on the captures of the table of truth, each with its own defaults.
+
+All get the corners that rigkit found and kept, so that calibrations are compared and not detectors; OpenCV runs on
+those that cv2.findChessboardCornersSB finds as well.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from benchmark_calibration_peers import opencv_fisheye, opencv_points, opencv_regular
+from bench_truth_colmap import colmap_camera
+from bench_truth_resection import Fit, Size, Views
+from benchmark_calibration_peers import Mrcal, opencv_fisheye, opencv_points, opencv_regular
 
 from rigkit.cameras.base import Camera
 from rigkit.cameras.brown import Brown
@@ -17,6 +25,108 @@ from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.images import read_image, to_grey
+
+MRCAL_LENS = "LENSMODEL_OPENCV8"
+MRCAL_FISHEYE = "LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_Nx=14_Ny=10_fov_x_deg=180"
+"""The models that its documentation recommends, lean and rich."""
+
+
+@cache
+def mrcal_there() -> bool:
+    return Mrcal.available()
+
+
+@dataclass(frozen=True, slots=True)
+class Peer:
+    """A tool in the table, and in which variant."""
+
+    tool: str
+    variant: str = ""
+
+
+def opencv_fit(views: Views, size_px: Size, fisheye: bool) -> Fit:
+    """Return cv2.calibrateCamera's or cv2.fisheye.calibrate's camera, the board flat. The latter is given a start, half
+    the view over half the width, without which it often ends at once."""
+    if not fisheye:
+        rms, camera = opencv_regular(list(views), size_px)
+        return Fit(camera, rms)
+    width, height = size_px
+    f = width / np.pi
+    guess = np.array([[f, 0.0, 0.5 * (width - 1)], [0.0, f, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
+    rms, camera = opencv_fisheye(list(views), size_px, guess)
+    return Fit(camera, rms)
+
+
+def opencv_released_fit(views: Views, size_px: Size, fisheye: bool) -> Fit:
+    """Return cv2.calibrateCameraRO's camera and corners: all free but three. It takes whole boards only."""
+    whole = [view for view in views if len(view.grid) == view.board.corner_count]
+    if fisheye or len(whole) < 3:
+        raise DegenerateError("cv2.calibrateCameraRO: needs whole boards through a regular lens")
+    board = whole[0].board
+    objects, images = opencv_points([in_order(view) for view in whole])
+    # Its stubs know no None, which asks it to make the arrays.
+    untyped: Any = cv2
+    rms, K, d, _, _, released, *_ = untyped.calibrateCameraRO(
+        [o[0] for o in objects], [i[0] for i in images], size_px, board.columns - 1, None, None
+    )
+    camera = Brown(size_px, np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *np.ravel(d)[:5]]))
+    return Fit(camera, float(rms), np.asarray(released, dtype=np.float64).reshape(-1, 3))
+
+
+def in_order(view: BoardView) -> BoardView:
+    """Return the view with its corners row by row."""
+    order = np.lexsort((view.grid[:, 0], view.grid[:, 1]))
+    return BoardView(view.image, view.board, view.grid[order], view.pixels[order], view.sigma_px[order])
+
+
+CAMERA_FITS: Mapping[Peer, Any] = {
+    Peer("OpenCV"): opencv_fit,
+    Peer("OpenCV", "board released"): opencv_released_fit,
+    Peer("COLMAP"): lambda views, size_px, fisheye: colmap_camera(views, size_px, fisheye, released=False),
+    Peer("COLMAP", "points free"): lambda views, size_px, fisheye: colmap_camera(
+        views, size_px, fisheye, released=True
+    ),
+}
+"""Peers whose cameras rigkit can hold: how they fit."""
+
+
+def mrcal_takes(board: Board) -> bool:
+    """Say whether mrcal can have the board: its points are a square lattice."""
+    steps = np.diff(board.points().reshape(board.rows, board.columns, 3)[:, :, 0], axis=1)
+    return bool(np.allclose(steps, board.square_x_mm) and np.isclose(board.square_x_mm, board.square_y_mm))
+
+
+def mrcal_held_out(views: Views, size_px: Size, lens: str, folds: Sequence[Sequence[int]]) -> float:
+    """Return mrcal's 2-D RMS on images held out, px, the board warped as it finds it from the others."""
+    with Mrcal({(k, 0): view for k, view in enumerate(views)}, size_px, lens, warp=True) as tool:
+        squares, count = 0.0, 0
+        for fold in folds:
+            tool.run(fold)
+            squares, count = squares + tool.last["squares"], count + tool.last["count"]
+    return float(np.sqrt(squares / count))
+
+
+def mrcal_points(views: Views, size_px: Size) -> np.ndarray:
+    """Return the board's corners as mrcal has them, warped."""
+    with Mrcal({(k, 0): view for k, view in enumerate(views)}, size_px, MRCAL_LENS, warp=True) as tool:
+        tool.run()
+        return np.array(tool.last["board"])
+
+
+def mrcal_focal(views: Views, size_px: Size) -> float:
+    """Return mrcal's focal length along x, px."""
+    with Mrcal({(k, 0): view for k, view in enumerate(views)}, size_px, MRCAL_LENS, warp=True) as tool:
+        tool.run()
+        return float(tool.last["intrinsics"][0][0])
+
+
+def mrcal_rig(frames: Sequence[Mapping[int, BoardView]], size_px: Size) -> tuple[float, list[Rigid3]]:
+    """Return the 2-D RMS and where the cameras after the first sit, cam_from_first, from frames {camera: view}."""
+    views = {(k, camera): view for k, frame in enumerate(frames) for camera, view in frame.items()}
+    with Mrcal(views, size_px, MRCAL_LENS, warp=True) as tool:
+        tool.run()
+    mounts = [Rigid3(cv2.Rodrigues(np.array(m[:3]))[0], np.array(m[3:])) for m in tool.last["mounts"]]
+    return float(np.sqrt(2.0) * tool.last["rms"]), mounts
 
 
 def opencv_corners(path: Path, board: Board) -> BoardView | None:
@@ -33,110 +143,55 @@ def opencv_corners(path: Path, board: Board) -> BoardView | None:
     return BoardView(path.name, board, board.grid(), pixels, np.ones(len(pixels)))
 
 
-def opencv_views(paths: Sequence[Path], board: Board) -> tuple[list[BoardView], tuple[int, int]]:
-    """Return the views of all images on which OpenCV finds the board, and the images' size."""
-    height, width = read_image(paths[0]).shape[:2]
-    return [view for path in paths if (view := opencv_corners(path, board)) is not None], (width, height)
+def opencv_views(paths: Sequence[Path], board: Board) -> list[BoardView]:
+    """Return the views of all images on which OpenCV finds the board."""
+    return [view for path in paths if (view := opencv_corners(path, board)) is not None]
 
 
-def opencv_camera(views: list[BoardView], size_px: tuple[int, int], fisheye: bool) -> tuple[float, Camera]:
-    """Return the RMS and the camera; a fisheye lens is given a start, half the view over half the width, without which
-    cv2.fisheye.calibrate often ends at once."""
-    if not fisheye:
-        return opencv_regular(views, size_px)
-    width, height = size_px
-    f = width / np.pi
-    guess = np.array([[f, 0.0, 0.5 * (width - 1)], [0.0, f, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
-    return opencv_fisheye(views, size_px, guess)
-
-
-def opencv_stereo(
-    left: list[BoardView], right: list[BoardView], size_px: tuple[int, int]
-) -> tuple[float, tuple[Camera, Camera], Rigid3]:
-    """Return the RMS, both cameras and right_from_left by cv2.stereoCalibrate, started from each camera alone. Views
-    are matched by the number in their images' names; boards that look the same turned are read alike in both."""
-    by_number = {_number(view.image): view for view in right}
-    pairs = [(view, by_number[_number(view.image)]) for view in left if _number(view.image) in by_number]
-    objects, first = opencv_points([a for a, _ in pairs])
-    _, second = opencv_points([b for _, b in pairs])
+def opencv_stereo(pairs: Sequence[tuple[BoardView, BoardView]], size_px: Size) -> tuple[float, Rigid3]:
+    """Return the RMS and second_from_first by cv2.stereoCalibrate, started from each camera alone; corners that only
+    one view has are left out, for it wants them in both."""
+    common = [_common(a, b) for a, b in pairs]
+    common = [pair for pair in common if len(pair[0].grid) >= 6]
+    objects, first = opencv_points([a for a, _ in common])
+    _, second = opencv_points([b for _, b in common])
     K, d = [], []
-    for own in ([a for a, _ in pairs], [b for _, b in pairs]):
+    for own in ([a for a, _ in common], [b for _, b in common]):
         p = opencv_regular(own, size_px)[1].parameters
         K.append(np.array([[p[0], 0.0, p[2]], [0.0, p[1], p[3]], [0.0, 0.0, 1.0]]))
         d.append(p[4:9].copy())
-    rms, K1, d1, K2, d2, R, t, *_ = cv2.stereoCalibrate(
+    rms, _, _, _, _, R, t, *_ = cv2.stereoCalibrate(
         [o[0] for o in objects], [p[0] for p in first], [p[0] for p in second], K[0], d[0], K[1], d[1], size_px, flags=0
     )
-    cameras = (_brown(size_px, K1, d1), _brown(size_px, K2, d2))
-    return float(rms), cameras, Rigid3(R, np.ravel(t))
+    return float(rms), Rigid3(R, np.ravel(t))
 
 
-def _brown(size_px: tuple[int, int], K: np.ndarray, d: np.ndarray) -> Brown:
-    return Brown(size_px, np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *np.ravel(d)[:5]]))
-
-
-def _number(name: str) -> str:
-    return "".join(c for c in Path(name).stem if c.isdigit())
-
-
-def opencv_released(views: list[BoardView], size_px: tuple[int, int]) -> tuple[float, np.ndarray]:
-    """Return the RMS and the board's corners by cv2.calibrateCameraRO, which frees them but for three."""
-    board = views[0].board
-    objects, images = opencv_points(views)
-    rms, *_, released, _ = _released(objects, images, size_px, board.columns - 1)
-    return float(rms), np.asarray(released, dtype=np.float64).reshape(-1, 3)
-
-
-def _released(objects: list[np.ndarray], images: list[np.ndarray], size_px: tuple[int, int], fixed: int) -> Any:
-    # Its stubs know no None, which asks it to make the arrays.
-    untyped: Any = cv2
-    found = untyped.calibrateCameraRO([o[0] for o in objects], [i[0] for i in images], size_px, fixed, None, None)
-    rms, K, d, rvecs, tvecs, released, *_ = found
-    return rms, K, d, rvecs, tvecs, released, None
+def _common(first: BoardView, second: BoardView) -> tuple[BoardView, BoardView]:
+    keys = [view.board.index(view.grid) for view in (first, second)]
+    _, a, b = np.intersect1d(*keys, return_indices=True)
+    one, two = (
+        BoardView(view.image, view.board, view.grid[own], view.pixels[own], view.sigma_px[own])
+        for view, own in ((first, a), (second, b))
+    )
+    return one, two
 
 
 def opencv_pair(pixels: tuple[np.ndarray, np.ndarray], cameras: tuple[Camera, Camera]) -> np.ndarray:
     """Return points (N, 3), in baselines: cv2.findEssentialMat, recoverPose and triangulatePoints."""
-    flat = [_flat(p, camera) for p, camera in zip(pixels, cameras, strict=True)]
+    flat = [flattened(p, camera) for p, camera in zip(pixels, cameras, strict=True)]
     E, _ = cv2.findEssentialMat(flat[0], flat[1], np.eye(3), cv2.RANSAC, 0.999, 1e-3)
     _, R, t, _ = cv2.recoverPose(E, flat[0], flat[1], np.eye(3))
-    return _triangulated(flat, Rigid3(R, np.ravel(t)))
+    return triangulated(flat, Rigid3(R, np.ravel(t)))
 
 
-def colmap_pair(pixels: tuple[np.ndarray, np.ndarray], cameras: tuple[Camera, Camera]) -> np.ndarray:
-    """Return points (N, 3), in baselines, by COLMAP's calibrated two-view geometry; the cameras are OpenCV's."""
-    import pycolmap
-
-    own = []
-    for k, camera in enumerate(cameras):
-        fx, fy, cx, cy, k1, k2, p1, p2, k3 = camera.parameters.tolist()
-        parameters = [fx, fy, cx + 0.5, cy + 0.5, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]
-        width, height = camera.size_px
-        own.append(pycolmap.Camera(camera_id=k + 1, model="FULL_OPENCV", width=width, height=height, params=parameters))
-    pairs = np.repeat(np.arange(len(pixels[0]))[:, None], 2, axis=1).astype(np.uint32)
-    found = pycolmap.estimate_calibrated_two_view_geometry(
-        own[0],
-        pixels[0] + 0.5,
-        own[1],
-        pixels[1] + 0.5,
-        pairs,
-        pycolmap.TwoViewGeometryOptions(compute_relative_pose=True),
-    )
-    if found.cam2_from_cam1 is None:
-        raise DegenerateError("pycolmap finds no relative pose")
-    matrix = found.cam2_from_cam1.matrix()
-    pose = Rigid3(matrix[:, :3], matrix[:, 3])
-    return _triangulated([_flat(p, camera) for p, camera in zip(pixels, cameras, strict=True)], pose)
-
-
-def _flat(pixels: np.ndarray, camera: Camera) -> np.ndarray:
+def flattened(pixels: np.ndarray, camera: Camera) -> np.ndarray:
     """Return the points of the plane z = 1 that pixels see, by OpenCV."""
     p = camera.parameters
     K = np.array([[p[0], 0.0, p[2]], [0.0, p[1], p[3]], [0.0, 0.0, 1.0]])
     return cv2.undistortPoints(pixels[:, None].astype(np.float64), K, p[4:9])[:, 0]
 
 
-def _triangulated(flat: Sequence[np.ndarray], pose: Rigid3) -> np.ndarray:
+def triangulated(flat: Sequence[np.ndarray], pose: Rigid3) -> np.ndarray:
     first = np.hstack([np.eye(3), np.zeros((3, 1))])
     second = np.column_stack([pose.rotation, pose.translation_mm])
     points = cv2.triangulatePoints(first, second, flat[0].T, flat[1].T)

@@ -9,7 +9,7 @@ import json
 import os
 import subprocess
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -28,10 +28,18 @@ MRCAL_WORKER = Path(__file__).with_name("mrcal_worker.py")
 
 
 class Mrcal:
-    """mrcal on views by (frame, camera), started once; a context manager."""
+    """mrcal on views by (frame, camera), started once; a context manager. `warp`: the board may be bent, and outliers
+    are left out, as mrcal-calibrate-cameras does."""
 
-    def __init__(self, views: Mapping[tuple[int, int], BoardView], size_px: tuple[int, int]) -> None:
-        self._views, self._size_px = views, size_px
+    def __init__(
+        self,
+        views: Mapping[tuple[int, int], BoardView],
+        size_px: tuple[int, int],
+        model: str = "LENSMODEL_OPENCV5",
+        *,
+        warp: bool = False,
+    ) -> None:
+        self._views, self._size_px, self._model, self._warp = views, size_px, model, warp
         self.last: dict[str, Any] = {}
 
     @staticmethod
@@ -55,8 +63,14 @@ class Mrcal:
             observations[k, view.grid[:, 1], view.grid[:, 0], :2] = view.pixels
             observations[k, view.grid[:, 1], view.grid[:, 0], 2] = 1.0
         frame_camera = np.array([(frames[frame], camera) for frame, camera in keys], dtype=np.int32)
+        options = {"model": np.array(self._model), "warp": np.array(self._warp)}
         np.savez(
-            path, observations=observations, frame_camera=frame_camera, spacing=board.square_x_mm, size=self._size_px
+            path,
+            observations=observations,
+            frame_camera=frame_camera,
+            spacing=board.square_x_mm,
+            size=self._size_px,
+            **options,
         )
         environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
         self._process = subprocess.Popen(
@@ -68,12 +82,15 @@ class Mrcal:
         )
         return self
 
-    def run(self) -> float:
-        """Calibrate once; the answer is in `last`."""
+    def run(self, hold_out: Sequence[int] = ()) -> float:
+        """Calibrate once, without the frames `hold_out`, by number; the answer is in `last`."""
         assert self._process.stdin is not None and self._process.stdout is not None
-        self._process.stdin.write("run\n")
+        self._process.stdin.write(json.dumps({"hold_out": list(hold_out)}) + "\n")
         self._process.stdin.flush()
-        self.last = json.loads(self._process.stdout.readline())
+        answer = self._process.stdout.readline()
+        if not answer:
+            raise RuntimeError("mrcal gave up; its message is above")
+        self.last = json.loads(answer)
         return float(self.last["seconds"])
 
     def cameras(self) -> list[Camera]:

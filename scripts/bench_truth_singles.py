@@ -1,0 +1,29 @@
+"""Single images of the table of truth: how many tags of AprilGrids are found."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import cv2
+from bench_truth_table import OPENCV, RIGKIT, Bench, Row
+
+from rigkit.detection.detect import detect_boards
+from rigkit.io.images import read_image, to_grey
+
+
+def aprilgrid(bench: Bench) -> Iterator[Row]:
+    """Yield the tags found, of 36 a board, by rigkit's corners and by cv2.aruco's detector of the same family."""
+    ours = theirs = 0
+    parameters = cv2.aruco.DetectorParameters()
+    # Kalibr prints tags with a border of two modules.
+    parameters.markerBorderBits = 2
+    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11), parameters)
+    paths = bench.images("*.png")
+    for path in paths:
+        image = to_grey(read_image(path))
+        ours += sum(len(found.grid) for found in detect_boards(image, [bench.board])) // 4
+        corners, _, _ = detector.detectMarkers(image)
+        theirs += len(corners)
+    how = f"{len(paths)} single images"
+    yield bench.row("tags found", RIGKIT, float(ours), "", how=how)
+    yield bench.row("tags found", OPENCV, float(theirs), "", how=how)
