@@ -11,7 +11,7 @@ from pathlib import Path
 import bench_truth_peers as peers
 import cv2
 import numpy as np
-from bench_truth_resection import Fit, Size, Views, folds_of, held_out_rms, rms_of
+from bench_truth_resection import FOLDS, Fit, Size, Views, folds_of, held_out_rms, rms_of
 from bench_truth_table import MRCAL, OPENCV, RIGKIT, Bench, Row
 
 from rigkit.calibration.calibrate import calibrate
@@ -32,10 +32,13 @@ PEER_FAILURES = (RigkitError, cv2.error, RuntimeError, ValueError, np.linalg.Lin
 
 
 def kept_views(found: Calibration, boards: Sequence[Board]) -> list[BoardView]:
-    """Return the corners that rigkit kept, as it reads its boards."""
+    """Return the corners that rigkit kept, as it reads its boards. Boards seen in part, of which nothing tells which
+    part, are left out."""
     known = {board.board_id: board for board in boards}
     out = []
     for view in found.views:
+        if view.board_id not in known:
+            continue
         board, kept = known[view.board_id], view.kept
         ones = np.ones(int(kept.sum()))
         out.append(BoardView(view.image, board, view.grid[kept], view.pixels[kept], ones))
@@ -56,21 +59,32 @@ def again(found: Calibration, size_px: Size) -> Callable[[Views], Fit]:
     return fitted
 
 
+def seen(count: int, total: int) -> str:
+    """Return in words how many corners an error counts: one beyond a camera's field of view cannot be judged."""
+    return f"{count} of {total} corners"
+
+
 def compared(bench: Bench, found: Calibration, fisheye: bool) -> Iterator[Row]:
     """Yield each tool's error on images held out, all on the corners that rigkit kept."""
     views, size_px = kept_views(found, bench.found.described.boards), found.camera.size_px
-    about = f"{found.camera.model}, board {found.boards[0].kind}; {len(views)} images"
-    yield bench.row(HELD_OUT, RIGKIT, held_out_rms(views, again(found, size_px)), how=about)
+    if len(views) < FOLDS:
+        how = f"its own folds; boards seen in part, which no peer takes; {found.camera.model}"
+        yield bench.row(HELD_OUT, RIGKIT, found.heldout_rms_px, how=how)
+        return
+    total = sum(len(view.grid) for view in views)
+    rms, count = held_out_rms(views, again(found, size_px))
+    about = f"{found.camera.model}, board {found.boards[0].kind}; {len(views)} images; {seen(count, total)}"
+    yield bench.row(HELD_OUT, RIGKIT, rms, how=about)
     for peer, fit in peers.CAMERA_FITS.items():
         try:
-            rms: float | None = held_out_rms(views, partial(fit, size_px=size_px, fisheye=fisheye))
+            rms, count = held_out_rms(views, partial(fit, size_px=size_px, fisheye=fisheye))
         except PEER_FAILURES as error:
             why = str(error).splitlines()[-1]
             print(f"{bench.name}: {peer}: {why}")
-            if peer.variant:
-                continue
-            rms = None
-        yield bench.row(HELD_OUT, peer.tool, rms, variant=peer.variant)
+            if not peer.variant:
+                yield bench.row(HELD_OUT, peer.tool, None, how=why)
+            continue
+        yield bench.row(HELD_OUT, peer.tool, rms, variant=peer.variant, how=seen(count, total))
     if peers.mrcal_takes(views[0].board):
         yield from mrcal_rows(bench, HELD_OUT, views, size_px, fisheye, folds_of(views))
 
@@ -172,18 +186,18 @@ def ov_plane(bench: Bench) -> Iterator[Row]:
     for shape in ("flat", "auto"):
         found = calibrate(train, size_px, model=bench.model, board=shape)
         rms, count = rms_of(Fit(found.camera, found.rms_px, found.boards[0].points_mm), test)
-        about = f"{found.camera.model}; {count} of {total} corners"
+        about = f"{found.camera.model}; {seen(count, total)}"
         yield bench.row(quantity, RIGKIT, rms, variant=f"board {found.boards[0].kind}", how=about)
     for peer, fit in peers.CAMERA_FITS.items():
         if peer.variant:
             continue
         try:
             found_peer = fit(train, size_px, True)
-            value: float | None = rms_of(found_peer, test)[0]
+            rms, count = rms_of(found_peer, test)
         except PEER_FAILURES as error:
-            value = None
-            print(f"{bench.name}: {peer.tool}: {str(error).splitlines()[-1]}")
-        yield bench.row(quantity, peer.tool, value)
+            yield bench.row(quantity, peer.tool, None, how=str(error).splitlines()[-1])
+            continue
+        yield bench.row(quantity, peer.tool, rms, how=seen(count, total))
     held = range(len(train), len(train) + len(test))
     yield from mrcal_rows(bench, quantity, [*train, *test], size_px, True, [held])
 

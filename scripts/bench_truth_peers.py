@@ -167,8 +167,8 @@ def opencv_stereo(pairs: Sequence[tuple[BoardView, BoardView]], size_px: Size) -
 
 
 def _common(first: BoardView, second: BoardView) -> tuple[BoardView, BoardView]:
-    keys = [view.board.index(view.grid) for view in (first, second)]
-    _, a, b = np.intersect1d(*keys, return_indices=True)
+    keys1, keys2 = (view.board.index(view.grid) for view in (first, second))
+    _, a, b = np.intersect1d(keys1, keys2, return_indices=True)
     one, two = (
         BoardView(view.image, view.board, view.grid[own], view.pixels[own], view.sigma_px[own])
         for view, own in ((first, a), (second, b))

@@ -84,11 +84,11 @@ def folds_of(views: Views) -> list[list[int]]:
     return [[k for k, view in enumerate(views) if images.index(view.image) % FOLDS == fold] for fold in range(FOLDS)]
 
 
-def held_out_rms(views: Views, fitted: Callable[[Views], Fit]) -> float:
-    """Return the 2-D RMS over images that took no part, px."""
+def held_out_rms(views: Views, fitted: Callable[[Views], Fit]) -> tuple[float, int]:
+    """Return the 2-D RMS over images that took no part, px, and the number of corners that the cameras see."""
     total, count = 0.0, 0
     for fold in folds_of(views):
         found = fitted([view for k, view in enumerate(views) if k not in fold])
         own, corners = squares(found, [views[k] for k in fold])
         total, count = total + own, count + corners
-    return float(np.sqrt(total / count)) if count else np.nan
+    return (float(np.sqrt(total / count)) if count else np.nan), count

@@ -63,14 +63,14 @@ class Mrcal:
             observations[k, view.grid[:, 1], view.grid[:, 0], :2] = view.pixels
             observations[k, view.grid[:, 1], view.grid[:, 0], 2] = 1.0
         frame_camera = np.array([(frames[frame], camera) for frame, camera in keys], dtype=np.int32)
-        options = {"model": np.array(self._model), "warp": np.array(self._warp)}
         np.savez(
             path,
             observations=observations,
             frame_camera=frame_camera,
             spacing=board.square_x_mm,
             size=self._size_px,
-            **options,
+            model=np.array(self._model),
+            warp=np.array(self._warp),
         )
         environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
         self._process = subprocess.Popen(

@@ -71,7 +71,7 @@ def calibrated(given: dict[str, Any], kept: np.ndarray) -> dict[str, Any]:
         distortion[:] = 0.0
     intrinsics, warp = np.concatenate([core, distortion], axis=1), np.zeros(2)
     inputs |= {"intrinsics": intrinsics, "lensmodel": model, "do_apply_regularization": True}
-    stages = [before]
+    stages: list[dict[str, Any]] = [before]
     if warped:
         # Like the tool: everything but the warp, then the warp too, outliers left out.
         stages.append({"calobject_warp": warp, "do_optimize_calobject_warp": True, "do_apply_outlier_rejection": True})
