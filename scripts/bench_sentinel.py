@@ -1,41 +1,78 @@
 """Does the sentinel alarm when something moved, name what, and keep quiet otherwise?
 
-Simulated corners: cameras calibrated from planned views, checked with three fresh ones held by hand where the planner
-asks (for a lens of which nothing is known: so the three say most). Changes leave 0.15 px rms over the image after the
-best rotation; mounts turn by 0.02 degrees. Real captures: calibrated from images at random but three, checked with
-these three: nothing has changed.
+lens, rig: simulated corners. Cameras calibrated from planned views, checked with three fresh ones held by hand where
+the planner asks (for a lens of which nothing is known: so the three say most). Changes leave 0.15 px rms over the image
+after the best rotation; mounts turn by 0.02 degrees.
+rendered: pictures of all five lenses, detected; three or half of them are checked against the rest, and three pictures
+after a change.
+scene: a rig before rendered textured walls; a mount turns by 0.05 degrees.
+pairs: real pairs of textured scenes whose cameras and pose are known; the pose told is right, or 0.05 degrees off.
+real: real captures; three, or half, of the images are checked against a calibration from the others.
 
-    python scripts/bench_sentinel.py [--seeds 20] [--lens NAME ...] [--rig] [--real [SET ...]] [--noise 0.03]
+    python scripts/bench_sentinel.py [lens] [rig] [rendered] [scene] [pairs] [real] [--seeds 20] [--lens NAME ...]
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import pickle
+import sys
 import tempfile
 from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from bench_planner import BOARD, LENSES, Lens, by_hand
+from bench_planner import BOARD, LENSES, Lens, by_hand, free_poses, see
 from split_halves import load
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.usable import views_of_image
 from rigkit.cameras.base import Camera
+from rigkit.cameras.registry import camera_model
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import RigkitError
+from rigkit.detection.detect import detect_boards
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3
+from rigkit.geometry.rotation import exp_so3, unit
+from rigkit.io.images import read_image
 from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import plan_views
+from rigkit.synthetic.photometry import Photometry
+from rigkit.synthetic.render import Optics, render
+from rigkit.synthetic.scene import PlacedBoard
+from rigkit.validation.sentinel.epipolar import check_scene
 from rigkit.validation.sentinel.evidence import FreshView, Watched
 from rigkit.validation.sentinel.judge import SentinelCheck, check_views
 from rigkit.validation.sentinel.watch import watched_camera
 
-CHANGED_PX = 0.15
+CHANGED_PX, TURNED_DEG, SCENE_TURNED_DEG, STRETCHED = 0.15, 0.02, 0.05, 1.003
 VIEWS, FRESH = 16, 3
+RENDERED_PLANNED, RENDERED_FREE = 16, 12
+KINDS = ("focus", "principal point", "distortion")
+MOUNT = Rigid3(exp_so3(np.array([0.0, -0.08, 0.01])), [-120.0, 1.0, 2.0])
+PAIR_PX, PAIR_DEG = 0.1, 0.01
+"""How sure published cameras and mounts of pairs are taken to be: over the image, and per axis."""
+
+TALLY: dict[str, list[int]] = {}
+
+
+def tell(title: str, checks: Sequence[SentinelCheck], what: str) -> None:
+    """Print how many of the checks alarm, and how many of these name `what` happened; keep the sums."""
+    alarms = [c for c in checks if not c.holds]
+    kinds = Counter("none" if c.change is None else c.change.cause.kind for c in alarms)
+    right = kinds[what]
+    print(
+        f"{title:32s} {len(alarms):3d} of {len(checks)} alarm, {right} of them rightly named: {dict(kinds)}", flush=True
+    )
+    sums = TALLY.setdefault("unchanged" if what == "nothing" else "changed", [0, 0, 0])
+    for k, more in enumerate((len(alarms), len(checks), right)):
+        sums[k] += more
 
 
 def held(lens: Lens, count: int, rng: np.random.Generator) -> list[Rigid3]:
@@ -79,121 +116,244 @@ def changed(lens: Lens, what: str, rng: np.random.Generator) -> Camera:
     return camera.with_parameters(camera.parameters + step * CHANGED_PX / np.sqrt(step @ weight @ step))
 
 
+def known_of(lens: Lens, views: Sequence[BoardView]) -> Calibration:
+    model = lens.camera.model
+    degree = 5 if model == "brown" else None
+    return calibrate(views, lens.camera.size_px, model=model, degree=degree, board="flat", folds=0)
+
+
+def checked(known: Calibration, views: Sequence[BoardView]) -> SentinelCheck:
+    return check_views(watched_camera(known, "camera"), [FreshView(v.image, 0, v) for v in views])
+
+
 def one_camera(name: str, seeds: int, noise_px: float) -> None:
     lens = LENSES[name]
-    model = lens.camera.model
-    for what in ("nothing", "focus", "principal point", "distortion"):
-        checks = []
-        for seed in range(seeds):
-            rng = np.random.default_rng([seed, 11])
-            views = views_of(lens, lens.camera, VIEWS, noise_px, rng)
-            known = calibrate(
-                views, lens.camera.size_px, model=model, degree=5 if model == "brown" else None, board="flat", folds=0
-            )
-            fresh = views_of(lens, changed(lens, what, rng), FRESH, noise_px, rng)
-            checks.append(check_views(watched_camera(known, "camera"), [FreshView(v.image, 0, v) for v in fresh]))
+    found: dict[str, list[SentinelCheck]] = {what: [] for what in ("nothing", *KINDS)}
+    for seed in range(seeds):
+        rng = np.random.default_rng([seed, 11])
+        known = known_of(lens, views_of(lens, lens.camera, VIEWS, noise_px, rng))
+        for what, checks in found.items():
+            checks.append(checked(known, views_of(lens, changed(lens, what, rng), FRESH, noise_px, rng)))
+    for what, checks in found.items():
         tell(f"{name}: {what}", checks, what)
 
 
-def tell(title: str, checks: list[SentinelCheck], what: str) -> None:
-    alarms = [c for c in checks if not c.holds]
-    kinds = Counter("none" if c.change is None else c.change.cause.kind for c in alarms)
-    right = sum(n for kind, n in kinds.items() if kind == what)
-    print(
-        f"{title:28s} {len(alarms):3d} of {len(checks)} alarm, {right} of them rightly named: {dict(kinds)}", flush=True
+def stereo(seeds: int, noise_px: float, name: str) -> None:
+    """A rig of two: mounts that turn or stretch, and one camera that changes."""
+    lens = LENSES[name]
+    camera = lens.camera
+    found: dict[str, list[SentinelCheck]] = {what: [] for what in ("nothing", "rotation", "scale", "focus")}
+    for seed in range(seeds):
+        rng = np.random.default_rng([seed, 13])
+
+        def frames(count: int, second: Camera, pose: Rigid3, rng: np.random.Generator = rng) -> list[FreshView]:
+            poses = held(lens, count, rng)
+            both = [
+                (f"{k:02d}", c, seen(own, mount @ board, f"{k:02d}", noise_px, rng))
+                for k, board in enumerate(poses)
+                for c, (own, mount) in enumerate(((camera, Rigid3.identity()), (second, pose)))
+            ]
+            return [FreshView(frame, c, view) for frame, c, view in both if view is not None]
+
+        watched = watched_rig(frames(VIEWS, camera, MOUNT), camera)
+        turn = exp_so3(np.radians(TURNED_DEG) * unit(rng.standard_normal(3)))
+        poses = {
+            "rotation": Rigid3(turn @ MOUNT.rotation, turn @ MOUNT.translation_mm),
+            "scale": Rigid3(MOUNT.rotation, STRETCHED * MOUNT.translation_mm),
+        }
+        for what, checks in found.items():
+            second = changed(lens, what, rng)
+            checks.append(check_views(watched, frames(FRESH, second, poses.get(what, MOUNT))))
+    for what, checks in found.items():
+        tell(f"rig {name}: {what}", checks, what)
+
+
+def watched_rig(views: Sequence[FreshView], camera: Camera) -> Watched:
+    """Return a rig of two as `views` calibrate it."""
+    names = ("left", "right")
+    own = {name: [(v.frame, v.view) for v in views if v.camera == c] for c, name in enumerate(names)}
+    rig = calibrate_rig(own, dict.fromkeys(names, camera.size_px), model=camera.model)
+    return Watched(
+        names=names,
+        cameras=tuple(c.camera for c in rig.cameras),
+        cam_from_rig=tuple(c.cam_from_rig for c in rig.cameras),
+        covariance=rig.covariance,
+        sigma_px=rig.sigma_px,
+        overdispersion=rig.overdispersion,
+        freedom=rig.freedom,
     )
 
 
-def stereo(seeds: int, noise_px: float, name: str = "60") -> None:
-    """A rig of two: mounts that turn, and one camera whose focus changes."""
-    lens = LENSES[name]
-    camera = lens.camera
-    mount = Rigid3(exp_so3(np.array([0.0, -0.08, 0.01])), [-120.0, 1.0, 2.0])
-    for what in ("nothing", "rotation", "focus", "scale"):
-        checks = []
-        for seed in range(seeds):
-            rng = np.random.default_rng([seed, 13])
+def rendered_view(camera: Camera, pose: Rigid3, name: str, rng: np.random.Generator) -> BoardView | None:
+    """Return what is found of a board in a rendered picture."""
+    image = render(
+        [PlacedBoard(BOARD, pose)],
+        camera,
+        Rigid3.identity(),
+        optics=Optics(0.6),
+        photometry=Photometry(noise_levels=1.5),
+        rng=rng,
+    )
+    views, _ = views_of_image(name, detect_boards(image, [BOARD]), [BOARD])
+    return views[0] if views else None
 
-            def frames(
-                count: int, second: Camera, pose: Rigid3, rng: np.random.Generator = rng
-            ) -> list[list[BoardView | None]]:
-                return [
-                    [
-                        seen(camera, board, f"{k:02d}", noise_px, rng),
-                        seen(second, pose @ board, f"{k:02d}", noise_px, rng),
-                    ]
-                    for k, board in enumerate(held(lens, count, rng))
-                ]
 
-            both = frames(VIEWS, camera, mount)
-            own = {c: [(v.image, v) for pair in both if (v := pair[k])] for k, c in enumerate(("left", "right"))}
-            rig = calibrate_rig(own, {"left": camera.size_px, "right": camera.size_px}, model="brown")
-            axis = rng.standard_normal(3)
-            turn = exp_so3(np.radians(0.02) * axis / np.linalg.norm(axis))
-            pose, second = mount, camera
-            if what == "rotation":
-                pose = Rigid3(turn @ mount.rotation, turn @ mount.translation_mm)
-            elif what == "scale":
-                pose = Rigid3(mount.rotation, 1.003 * mount.translation_mm)
-            elif what == "focus":
-                second = changed(lens, what, rng)
-            fresh = frames(FRESH, second, pose)
-            given = [FreshView(v.image, c, v) for pair in fresh for c, v in enumerate(pair) if v is not None]
-            covariance = rig.covariance
-            watched = Watched(
-                names=("left", "right"),
-                cameras=tuple(c.camera for c in rig.cameras),
-                cam_from_rig=tuple(c.cam_from_rig for c in rig.cameras),
-                covariance=covariance,
-                sigma_px=rig.sigma_px,
-                overdispersion=rig.overdispersion,
-                freedom=rig.freedom,
-            )
-            checks.append(check_views(watched, given))
-        tell(f"rig {name}: {what}", checks, what)
+def rendered(name: str, seeds: int, cache: Path) -> None:
+    """Pictures of one lens, unchanged and changed."""
+    lens, kept = LENSES[name], cache / f"sentinel-{name}-{seeds}.pickle"
+    if not kept.is_file():
+        rng = np.random.default_rng(17)
+        free = free_poses(lens, rng)
+        poses = held(lens, RENDERED_PLANNED, rng)
+        while len(poses) < RENDERED_PLANNED + RENDERED_FREE:
+            placed = next(free)
+            if see(placed, lens, "", rng) is not None:
+                poses.append(placed.world_from_board)
+        before = [rendered_view(lens.camera, pose, f"{k:02d}", rng) for k, pose in enumerate(poses)]
+        after = {
+            what: [
+                [rendered_view(camera, pose, f"f{k}", rng) for k, pose in enumerate(held(lens, FRESH, rng))]
+                for camera in (changed(lens, what, rng) for _ in range(max(seeds // 4, 2)))
+            ]
+            for what in KINDS
+        }
+        kept.write_bytes(pickle.dumps((before, after)))
+    before, after = pickle.loads(kept.read_bytes())
+    views = [view for view in before if view is not None]
+    unchanged(f"rendered {name}", [[v] for v in views], seeds, lambda own: known_of(lens, own))
+    known = known_of(lens, views[:VIEWS])
+    for what, sessions in after.items():
+        tell(f"rendered {name}: {what}", [checked(known, [v for v in s if v is not None]) for s in sessions], what)
+
+
+def unchanged(
+    title: str,
+    images: Sequence[Sequence[BoardView]],
+    draws: int,
+    solve: Callable[[list[BoardView]], Calibration],
+) -> None:
+    """Check images of a camera that did not change: three, and halves, against calibrations from the others."""
+    for fresh in (FRESH, len(images) // 2):
+        rng, checks = np.random.default_rng([fresh, 3]), []
+        for _ in range(draws):
+            order = rng.permutation(len(images)).tolist()
+            try:
+                known = solve([v for i in order[fresh:] for v in images[i]])
+                checks.append(checked(known, [v for i in order[:fresh] for v in images[i]]))
+            except RigkitError as error:
+                print(f"{title}: {error}")
+        tell(f"{title}: unchanged, {fresh} of {len(images)}", checks, "nothing")
+        for c in checks:
+            if not c.holds:
+                print(f"   chance {c.chance:.2g}, {c.change}, size {c.change.size_px if c.change else 0.0:.3f} px, "
+                      f"rms {c.rms_px:.3f} -> {c.rms_fixed_px:.3f}, expected {c.expected_px:.3f}")  # fmt: skip
 
 
 def real(name: str, data: Path, cache: Path, draws: int) -> None:
     found, size = load(name, data, cache)
-    images = sorted(found)
-    checks = []
-    rng = np.random.default_rng(3)
-    model = calibrate([v for own in found.values() for v in own], size, model="auto", board="flat").camera.model
-    for _ in range(draws):
-        names = rng.permutation(images).tolist()
-        try:
-            known = calibrate([v for n in names[FRESH:] for v in found[n]], size, model=model, board="auto")
-            fresh = [FreshView(n, 0, v) for n in names[:FRESH] for v in found[n]]
-            checks.append(check_views(watched_camera(known, "camera"), fresh))
-        except RigkitError as error:
-            print(f"{name}: {error}")
-    tell(f"{name}: unchanged ({model})", checks, "nothing")
-    for c in checks:
-        if not c.holds:
-            print(f"   chance {c.chance:.2g}, {c.change}, size {c.change.size_px if c.change else 0.0:.3f} px, rms "
-                  f"{c.rms_px:.3f} -> {c.rms_fixed_px:.3f}, expected {c.expected_px:.3f}")  # fmt: skip
+    full = calibrate([v for own in found.values() for v in own], size)
+    model, board = full.camera.model, full.boards[0].kind
+    print(f"{name}: {model}, board {board}, {full.rms_px:.3f} px")
+    unchanged(name, list(found.values()), draws, lambda own: calibrate(own, size, model=model, board="auto", folds=0))
+
+
+def turned(pose: Rigid3, degrees: float, rng: np.random.Generator) -> Rigid3:
+    turn = exp_so3(np.radians(degrees) * unit(rng.standard_normal(3)))
+    return Rigid3(turn @ pose.rotation, turn @ pose.translation_mm)
+
+
+def scene(seeds: int, noise_px: float, name: str) -> None:
+    """A rig before rendered textured walls, without boards."""
+    sys.path.append(str(Path(__file__).parents[1] / "tests"))
+    from helpers.textured_scene import Corner
+
+    lens = LENSES[name]
+    camera = lens.camera
+    found: dict[str, list[SentinelCheck]] = {"nothing": [], "rotation": []}
+    for seed in range(seeds):
+        rng = np.random.default_rng([seed, 19])
+        views = []
+        for k, board in enumerate(held(lens, VIEWS, rng)):
+            for c, mount in enumerate((Rigid3.identity(), MOUNT)):
+                view = seen(camera, mount @ board, f"{k:02d}", noise_px, rng)
+                views += [] if view is None else [FreshView(f"{k:02d}", c, view)]
+        watched, walls = watched_rig(views, camera), Corner.random(rng)
+        left = walls.image(camera, Rigid3.identity(), rng)
+        for what, checks in found.items():
+            pose = turned(MOUNT, SCENE_TURNED_DEG if what == "rotation" else 0.0, rng)
+            checks.append(check_scene(watched, [[left, walls.image(camera, pose, rng)]]))
+    for what, checks in found.items():
+        tell(f"scene {name}: {what}", checks, what)
+
+
+def pairs(data: Path, seeds: int) -> None:
+    """Real pairs: the pose as published, and as if the mount had turned since."""
+    found: dict[str, list[SentinelCheck]] = {"nothing": [], "rotation": []}
+    for pair in json.loads((data / "scenes/pairs.json").read_text()):
+        cameras = tuple(
+            camera_model(kind)(tuple(size), np.array(numbers))
+            for kind, size, numbers in (pair["camera1"], pair["camera2"])
+        )
+        true = Rigid3(np.array(pair["cam2_from_cam1_R"]), 100.0 * unit(np.array(pair["cam2_from_cam1_t_direction"])))
+        images = [read_image(data / "scenes" / pair[key]) for key in ("image1", "image2")]
+        lenses = [lens_covariance(camera) for camera in cameras]
+        sizes = [len(own) for own in lenses]
+        covariance = np.zeros((sum(sizes) + 6, sum(sizes) + 6))
+        covariance[: sizes[0], : sizes[0]] = lenses[0]
+        covariance[sizes[0] : sum(sizes), sizes[0] : sum(sizes)] = lenses[1]
+        covariance[-6:, -6:] = np.diag([np.radians(PAIR_DEG)] * 3 + [0.1] * 3) ** 2
+        for seed in range(seeds):
+            rng = np.random.default_rng([seed, 23])
+            for what, checks in found.items():
+                told = turned(true, SCENE_TURNED_DEG if what == "rotation" else 0.0, rng)
+                if what == "nothing" and seed > 0:
+                    continue
+                watched = Watched(
+                    names=("left", "right"), cameras=cameras, cam_from_rig=(Rigid3.identity(), told),
+                    covariance=covariance, sigma_px=0.1,
+                )  # fmt: skip
+                checks.append(check_scene(watched, [images]))
+                if checks[-1].holds == (what == "rotation"):
+                    print(f"   {pair['name']}: {what}, chance {checks[-1].chance:.2g}, {checks[-1].change}")
+    for what, checks in found.items():
+        tell(f"pairs: {what}", checks, what)
+
+
+def lens_covariance(camera: Camera) -> np.ndarray:
+    """Return a covariance of a camera's parameters that leaves PAIR_PX over the image, each parameter alike."""
+    goal = projection_goal(camera)
+    return np.diag(PAIR_PX**2 / (camera.parameters.size * np.maximum(np.diag(goal.weight), 1e-12)))
+
+
+REAL = ("caliper", "camodocal", "ov-plane", "ocam", "fisheye-chess", "cylinder", "bouguet-left", "bouguet-right",
+        "charuco-lifecam", "aprilgrid-mocap", "lab-regular", "lab-fisheye")  # fmt: skip
 
 
 def main() -> None:
+    kinds = ("lens", "rig", "rendered", "scene", "pairs", "real")
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("kinds", nargs="*", choices=[*kinds, []], help="default all")
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--lens", nargs="+", choices=sorted(LENSES), default=list(LENSES))
-    parser.add_argument("--noise", type=float, default=0.03, help="of a corner per coordinate, px")
-    parser.add_argument("--rig", action="store_true", help="a rig of two instead")
-    parser.add_argument("--real", nargs="*", metavar="SET", help="real captures instead (see scripts/split_halves.py)")
+    parser.add_argument("--sets", nargs="+", default=REAL, metavar="SET", help="of split_halves.py")
+    parser.add_argument("--noise", type=float, default=0.03, help="of a simulated corner per coordinate, px")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "split_halves")
     args = parser.parse_args()
-    if args.real is not None:
-        args.cache.mkdir(parents=True, exist_ok=True)
-        for name in args.real or ("caliper", "camodocal", "ov-plane", "lab-regular", "lab-fisheye"):
-            real(name, args.data, args.cache, args.seeds)
-        return
-    if args.rig:
-        stereo(args.seeds, args.noise)
-        return
-    for name in args.lens:
-        one_camera(name, args.seeds, args.noise)
+    args.cache.mkdir(parents=True, exist_ok=True)
+    work: dict[str, Callable[[], None]] = {
+        "lens": lambda: [one_camera(n, args.seeds, args.noise) for n in args.lens] and None,
+        "rig": lambda: [stereo(args.seeds, args.noise, n) for n in args.lens] and None,
+        "rendered": lambda: [rendered(n, args.seeds, args.cache) for n in args.lens] and None,
+        "scene": lambda: [scene(args.seeds, args.noise, n) for n in args.lens] and None,
+        "pairs": lambda: pairs(args.data, args.seeds),
+        "real": lambda: [real(n, args.data, args.cache, args.seeds) for n in args.sets] and None,
+    }
+    for kind in args.kinds or kinds:
+        TALLY.clear()
+        work[kind]()
+        for what, (alarms, count, right) in TALLY.items():
+            print(f"== {kind}: {what}: {alarms} of {count} alarm, {right} named rightly", flush=True)
 
 
 if __name__ == "__main__":

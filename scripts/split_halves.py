@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import json
+import pickle
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,6 +29,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import RigkitError
 from rigkit.detection.detect import detect_boards
+from rigkit.io.board_words import board_in_words
 from rigkit.io.images import read_image
 
 Views = dict[str, list[BoardView]]
@@ -45,6 +46,12 @@ class Capture:
     rendered: bool = False
 
 
+def identified(words: str) -> Board:
+    board = board_in_words(words)
+    assert board is not None
+    return board
+
+
 CAPTURES = {
     "bouguet-left": Capture("real/bouguet-stereo", "left*.jpg", Board("b", 9, 6, 30.0, 30.0)),
     "bouguet-right": Capture("real/bouguet-stereo", "right*.jpg", Board("b", 9, 6, 30.0, 30.0)),
@@ -56,6 +63,16 @@ CAPTURES = {
     "cylinder": Capture("public/cylinder/201", "*", Board("b", 19, 14, 10.0, 10.0)),
     "bumblebee-left": Capture("public/bumblebee2", "left*.jpg", Board("b", 4, 6, 30.0, 30.0)),
     "bumblebee-right": Capture("public/bumblebee2", "right*.jpg", Board("b", 4, 6, 30.0, 30.0)),
+    "charuco-stereo-left": Capture(
+        "public/charuco-stereo", "left*", identified("charuco:30x15x49.33,dictionary=DICT_4X4_250,marker_mm=38.46")
+    ),
+    "charuco-stereo-right": Capture(
+        "public/charuco-stereo", "right*", identified("charuco:30x15x49.33,dictionary=DICT_4X4_250,marker_mm=38.46")
+    ),
+    "charuco-lifecam": Capture(
+        "public/charuco-lifecam", "*.jpg", identified("charuco:7x7x25.4,dictionary=DICT_4X4_50,marker_mm=19.05")
+    ),
+    "aprilgrid-mocap": Capture("public/aprilgrid-mocap/cam0/data", "*", identified("aprilgrid:6x6x88,spacing=0.3")),
     "lab-regular": Capture("lab-a/calibration/regular", "*.jpg", Board("b", 9, 6, 30.0, 30.0), True),
     "lab-fisheye": Capture("lab-a/calibration/fisheye", "*.jpg", Board("b", 9, 6, 30.0, 30.0), True),
 }
@@ -80,24 +97,13 @@ def views_of(path: Path, board: Board, cache: Path) -> tuple[list[BoardView], tu
     if path.suffix == ".orpc":
         return published_corners(path, board)
     digest = hashlib.sha256(path.read_bytes() + repr(board).encode()).hexdigest()[:20]
-    kept = cache / f"{digest}.npz"
+    kept = cache / f"{digest}.pickle"
     if not kept.is_file():
         image = read_image(path)
         views, _ = views_of_image(path.name, detect_boards(image, [board]), [board])
-        arrays: dict[str, np.ndarray] = {"size": np.array([image.shape[1], image.shape[0]])}
-        for k, view in enumerate(views[:1]):
-            part = view.board
-            about = json.dumps([part.board_id, part.columns, part.rows, part.square_x_mm, part.square_y_mm])
-            arrays |= {f"board{k}": np.array(about), f"grid{k}": view.grid}
-            arrays |= {f"pixels{k}": view.pixels, f"sigma{k}": view.sigma_px}
-        np.savez(kept, **arrays)  # type: ignore[arg-type]
-    with np.load(kept) as data:
-        width, height = data["size"].tolist()
-        views = []
-        if "grid0" in data:
-            part = Board(*json.loads(str(data["board0"])))
-            views = [BoardView(path.name, part, data["grid0"], data["pixels0"], data["sigma0"])]
-    return views, (width, height)
+        kept.write_bytes(pickle.dumps((views[:1], (image.shape[1], image.shape[0]))))
+    views, size = pickle.loads(kept.read_bytes())
+    return [replace(view, image=path.name) for view in views], size
 
 
 def load(name: str, data: Path, cache: Path) -> tuple[Views, tuple[int, int]]:
