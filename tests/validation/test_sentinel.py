@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from helpers.calibration_scenes import BOARD, lens
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
+from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
@@ -219,3 +221,24 @@ def test_the_register_grows_and_is_drawn(calibration: Calibration, tmp_path: Pat
     register.write_text(register.read_text() + json.dumps({"schema": "other"}) + "\n")
     with pytest.raises(InputError, match="no register"):
         load_history(register)
+
+
+def test_a_declared_board_of_another_size_is_accepted(calibration: Calibration, rng: np.random.Generator) -> None:
+    camera, name = lens("reg"), calibration.boards[0].board_id
+    larger = Board(name, 12, 9, 20.0, 20.0)
+    known = Knowledge.guessed(camera, CornerError(NOISE_PX))
+    views = []
+    for k, proposal in enumerate(plan_views(known, [larger], projection_goal(camera), 3).views):
+        pixels, _ = camera.project(proposal.cam_from_board.apply(larger.points()))
+        noisy = pixels + NOISE_PX * rng.standard_normal(pixels.shape)
+        view = BoardView(f"{k}", larger, larger.grid(), noisy, np.full(len(noisy), NOISE_PX))
+        views.append(FreshView(f"{k}", 0, view))
+    assert check_views(watched_camera(calibration, "cam"), views).holds
+
+
+def test_images_that_disagree_are_judged_more_carefully(calibration: Calibration) -> None:
+    camera = _changed(lambda p: p * [1.001, 1.001, 1, 1, 1, 1, 1, 1, 1])
+    sure = _checked(calibration, camera, np.random.default_rng(1))
+    disagreeing = replace(calibration, overdispersion=4.0)
+    unsure = _checked(disagreeing, camera, np.random.default_rng(1))
+    assert sure.chance < 1e-3 and unsure.chance > 1e3 * sure.chance

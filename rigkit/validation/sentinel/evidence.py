@@ -19,6 +19,7 @@ from rigkit.calibration.poses import refine_poses
 from rigkit.calibration.state import State, evaluate
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, IntArray, Points
+from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.board_pose import board_pose
@@ -29,6 +30,9 @@ __all__ = ["FreshEvidence", "FreshView", "Watched", "evidence_of"]
 
 MIN_SIGMA_PX = 0.02
 """No corner is better than this: of exact ones everything would be a change."""
+SAME_BOARD = 0.02
+"""A board of the calibration's name whose corners lie farther from where it found them than this part of its size is
+another one."""
 POSE_ROUNDS = 3
 """Gauss-Newton steps of a board that several cameras see: the best single view is where they start."""
 
@@ -43,7 +47,8 @@ class Watched:
     covariance : (T, T) of theta.
     sigma_px, overdispersion : of a corner, and by how much more images disagree than independent corners would.
     freedom : degrees of freedom of the covariance.
-    boards_mm : corners (N, 3) of boards, by name, as the calibration found them; others are as stated.
+    boards_mm : corners (N, 3) of boards, by name, as the calibration found them; others, and boards of another size
+        that have the name, are as stated.
     """
 
     names: tuple[str, ...]
@@ -72,9 +77,17 @@ class Watched:
 
     def state(self, c: int, observations: Observations, rotation: FloatArray, translation_mm: Points) -> State:
         """Return camera `c` before boards in these poses, with the shapes that are known of them."""
-        known = [self.boards_mm.get(board.board_id, board.points()) for board in observations.boards]
+        known = [self._shape(board) for board in observations.boards]
         start = State.start(self.cameras[c], rotation, translation_mm, observations)
         return replace(start, shape=replace(start.shape, flat=np.concatenate(known)))
+
+    def _shape(self, board: Board) -> Points:
+        found, stated = self.boards_mm.get(board.board_id), board.points()
+        if found is None or found.shape != stated.shape:
+            return stated
+        square = min(board.squares_mm)
+        same = np.abs(found - stated).max() < SAME_BOARD * square * max(board.size)
+        return found if same else stated
 
     def changed(self, change: FloatArray) -> Watched:
         """Return cameras and mounts after a change (T,) of theta."""
@@ -125,7 +138,8 @@ def evidence_of(watched: Watched, views: Sequence[FreshView]) -> FreshEvidence:
         found = found.moved(np.asarray(step, dtype=np.float64))
     information, score = reduced_by_cluster(found.products(watched), watched.size, found.frame)
     squares, count, left_out = found.residual_squares(watched)
-    sigma = max(watched.sigma_px, MIN_SIGMA_PX) * watched.overdispersion
+    # Images that agree better than independent corners would do so by chance.
+    sigma = max(watched.sigma_px, MIN_SIGMA_PX) * max(watched.overdispersion, 1.0)
     return FreshEvidence(
         information=information,
         score=score,

@@ -26,8 +26,12 @@ __all__ = ["Change", "Look", "SentinelCheck", "check_views", "judge_evidence"]
 Look: TypeAlias = Callable[[Watched], FreshEvidence]
 """What fresh frames say, given cameras and mounts."""
 
-ALARM_CHANCE = 0.005
+ALARM_CHANCE = 0.01
 """Fresh pictures that unchanged cameras would show more rarely raise an alarm."""
+COMMON_FREEDOM = 10.0
+"""By how much more images disagree than independent corners would is one number, the mean over all directions: lens and
+board bend in some ways more than in others. Where measured, the variances of directions scatter around their mean by
+about half of it, as a mean square of so many values does."""
 ALARM_PX = 0.07
 """What moves the projection by less is of no importance, however surely it is there."""
 FIX_ROUNDS = 3
@@ -205,8 +209,16 @@ class _Whitened:
         left = vectors[:, seen] * root / scale[:, None]
         own = (vectors[:, seen] * scale[:, None]).T @ score / root
         covariance = np.eye(len(own)) + left.T @ watched.covariance @ left
-        # How much frames scatter is one number from all directions of all frames of the calibration.
-        return cls(own, covariance, left.T, watched.freedom * len(own))
+        return cls(own, covariance, left.T, _freedom(watched, len(own)))
+
+
+def _freedom(watched: Watched, directions: int) -> float:
+    """Return the degrees of freedom of the variance in one direction (Satterthwaite): what corners scatter is known
+    from all directions of all images; of what images disagree beyond it, only the mean over the directions is."""
+    beyond = max(0.0, 1.0 - 1.0 / watched.overdispersion**2) if watched.overdispersion > 0.0 else 0.0
+    unsure = beyond**2 * (1.0 / watched.freedom + 1.0 / COMMON_FREEDOM)
+    unsure += (1.0 - beyond) ** 2 / (watched.freedom * directions)
+    return min(1.0 / max(unsure, 1.0 / LARGE_FREEDOM), LARGE_FREEDOM)
 
 
 def _fitted(whitened: _Whitened, cause: Cause) -> Change | None:
@@ -223,8 +235,7 @@ def _fitted(whitened: _Whitened, cause: Cause) -> Change | None:
     amounts = covariance @ right
     gain = float(right @ amounts)
     m = len(amounts)
-    freedom = min(whitened.freedom, LARGE_FREEDOM)
-    chance = float(f_distribution.sf(gain / m, m, freedom))
+    chance = float(f_distribution.sf(gain / m, m, whitened.freedom))
     return Change(cause, amounts, covariance, chance, 0.0, gain)
 
 
