@@ -21,6 +21,7 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -341,17 +342,18 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "split_halves")
     args = parser.parse_args()
     args.cache.mkdir(parents=True, exist_ok=True)
-    work: dict[str, Callable[[], None]] = {
-        "lens": lambda: [one_camera(n, args.seeds, args.noise) for n in args.lens] and None,
-        "rig": lambda: [stereo(args.seeds, args.noise, n) for n in args.lens] and None,
-        "rendered": lambda: [rendered(n, args.seeds, args.cache) for n in args.lens] and None,
-        "scene": lambda: [scene(args.seeds, args.noise, n) for n in args.lens] and None,
-        "pairs": lambda: pairs(args.data, args.seeds),
-        "real": lambda: [real(n, args.data, args.cache, args.seeds) for n in args.sets] and None,
+    work: dict[str, list[Callable[[], None]]] = {
+        "lens": [partial(one_camera, n, args.seeds, args.noise) for n in args.lens],
+        "rig": [partial(stereo, args.seeds, args.noise, n) for n in args.lens],
+        "rendered": [partial(rendered, n, args.seeds, args.cache) for n in args.lens],
+        "scene": [partial(scene, args.seeds, args.noise, n) for n in args.lens],
+        "pairs": [partial(pairs, args.data, args.seeds)],
+        "real": [partial(real, n, args.data, args.cache, args.seeds) for n in args.sets],
     }
     for kind in args.kinds or kinds:
         TALLY.clear()
-        work[kind]()
+        for part in work[kind]:
+            part()
         for what, (alarms, count, right) in TALLY.items():
             print(f"== {kind}: {what}: {alarms} of {count} alarm, {right} named rightly", flush=True)
 
