@@ -63,14 +63,21 @@ def cases(folder: Path, names: list[str]) -> list[Case]:
     return out
 
 
-def reconstructed(case: Case, known: bool) -> tuple[DenseScene, float, float]:
+def reconstructed(case: Case, known: bool, pose_type: str | None) -> tuple[DenseScene, float, float]:
     """Return the dense scene, and the processor time of matching and of the rest."""
     start = time.process_time()
     seeds = match_affine_features(*case.images)
     matched = time.process_time()
     pose = KnownPose(case.pose, np.zeros((6, 6))) if known else None
     length = float(np.linalg.norm(case.pose.translation_mm))
-    sparse = reconstruct_scene(seeds, *case.cameras, baseline_mm=length, known_pose=pose, image1=case.images[0])
+    sparse = reconstruct_scene(
+        seeds,
+        *case.cameras,
+        pose_type=pose_type,
+        baseline_mm=length,
+        known_pose=pose,
+        image1=case.images[0],
+    )
     dense = grow_scene(sparse, seeds, *case.images, pose_is_known=known)
     return dense, matched - start, time.process_time() - matched
 
@@ -170,10 +177,11 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="with pairs.json")
     parser.add_argument("names", nargs="*", help="pairs or sets (default: all)")
     parser.add_argument("--known-pose", action="store_true", help="use the true pose instead of estimating it")
+    parser.add_argument("--pose-type", help="as of `rigkit reconstruct` (default: general, or of a rectified pair)")
     args = parser.parse_args()
     errors, distances = [], []
     for case in cases(args.folder, args.names):
-        dense, matching, rest = reconstructed(case, args.known_pose)
+        dense, matching, rest = reconstructed(case, args.known_pose, args.pose_type)
         turn, swing, distance = pose_errors(dense, case.pose)
         errors.append(max(turn, swing))
         distances.append(distance)
@@ -194,7 +202,10 @@ def main() -> None:
             share = mesh_share(dense, case.cameras[0], truth[0])
             print(f"  Poisson within {100 * NEAR_REL:.0f} %: {100 * share:.0f} % of true pixels")
     areas = [f"{100 * np.mean(np.maximum(1.0 - np.array(errors) / limit, 0.0)):.1f}" for limit in AUC_DEG]
-    print(f"{len(errors)} pairs: AUC@1/5/10 {'/'.join(areas)}, rms sigmas {np.sqrt(np.mean(np.square(distances))):.1f}")
+    # A pose that is exact has no sigmas.
+    squares = np.square([d for d in distances if np.isfinite(d)])
+    rms = f", rms sigmas {np.sqrt(squares.mean()):.1f}" if squares.size else ""
+    print(f"{len(errors)} pairs: AUC@1/5/10 {'/'.join(areas)}{rms}")
 
 
 if __name__ == "__main__":

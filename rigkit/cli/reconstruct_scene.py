@@ -30,7 +30,9 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--names", nargs=2, metavar=("ONE", "TWO"), help="cameras of the rig (default: its first two)")
     group.add_argument("--pose", metavar="FILE", help="measured cam2_from_cam1, 3x4 or 4x4 numbers, mm; it is kept")
     group.add_argument("--baseline-mm", type=float, metavar="MM", help="measured baseline (default: it is the unit)")
-    group.add_argument("--pose-type", choices=POSE_TYPES, default="general", help="of the two views (default general)")
+    group.add_argument(
+        "--pose-type", choices=POSE_TYPES, help="of the two views (default general, or a rectified pair's)"
+    )
     group.add_argument("--sparse", action="store_true", help="only the matched features; do not grow a dense cloud")
     group.add_argument("--float", action="store_true", help="write the cloud in single precision")
     group.add_argument("--confidence", action="store_true", help="the length of a normal says how sure it is")

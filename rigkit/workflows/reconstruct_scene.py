@@ -60,8 +60,9 @@ class SceneOptions:
     """Correspondences with affinities or directions (CSV, NPZ or AffineExtractor's text)."""
     baseline_mm: float | None = None
     """Measured baseline; None: it is the unit of the result."""
-    pose_type: str = "general"
-    """Of the two views: general, planar, standard, forward or auto."""
+    pose_type: str | None = None
+    """Of the two views: general, planar, standard, forward or auto; None: general, or exactly that of a rectified pair
+    where cameras and matches are those of one."""
     level_sigma_deg: float | None = None
     """How well that pose type holds."""
     grow: bool = True

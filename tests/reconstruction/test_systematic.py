@@ -62,8 +62,23 @@ def test_a_smooth_field_is_told_from_noise(rng: np.random.Generator) -> None:
 
 def test_without_a_field_nothing_is_lost(rng: np.random.Generator) -> None:
     _, fitted, plain_error, fitted_error = errors(rng, 0.0)
-    assert 0.7 < np.sqrt(np.mean(np.square(fitted))) < 1.3
+    # The least field is allowed for even here: what is stated is a little too large.
+    assert 0.5 < np.sqrt(np.mean(np.square(fitted))) < 1.3
     assert np.median(fitted_error) < 1.15 * np.median(plain_error)
+
+
+def test_noise_that_neighbours_share_is_not_a_field(rng: np.random.Generator) -> None:
+    """Four pairs of the same noise are one: told so, the pose does not follow it, and its covariance says so."""
+    distances = []
+    for _ in range(TRIALS):
+        m, pose, _ = pair(rng, 400, noise_px=NOISE_PX)
+        four = m.select(np.repeat(np.arange(len(m)), 4))
+        found = pose_with_field(four, pose, REGULAR.size_px, PoseType.GENERAL, None, 4.0)
+        once = pose_with_field(m, pose, REGULAR.size_px, PoseType.GENERAL, None, 1.0)
+        np.testing.assert_allclose(found.covariance, once.covariance, rtol=1e-6, atol=1e-18)
+        assert max(pose_errors_deg(found.cam2_from_cam1, once.cam2_from_cam1)) < 1e-6
+        distances.append(distance(found.cam2_from_cam1, found.covariance, pose))
+    assert 0.5 < np.sqrt(np.mean(np.square(distances))) < 1.3
 
 
 def test_a_pose_without_freedom_stays(rng: np.random.Generator) -> None:

@@ -177,7 +177,9 @@ def _pose_from_grown(
             kept = known_scene_pose(matches, KnownPose(r.cam2_from_cam1, r.pose_covariance))
             found = SystematicPose(kept.refined.cam2_from_cam1, kept.refined.covariance, 0.0)
             return _EvenPose(found, kept.matches.select(kept.inliers))
-        fit = fit_scene_pose(_floored(matches), r.pose_type, r.level_sigma_rad, np.random.default_rng(0), start=pose)
+        # Without a level a type holds exactly.
+        level = r.level_sigma_rad or 0.0
+        fit = fit_scene_pose(_floored(matches), r.pose_type, level, np.random.default_rng(0), start=pose)
         even = fit.matches.select(fit.inliers)
         found = pose_with_field(
             even, fit.refined.cam2_from_cam1, view1.size_px, fit.pose_type, fit.level_sigma_rad, OVERLAP
