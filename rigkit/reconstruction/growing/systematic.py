@@ -65,7 +65,8 @@ def pose_with_field(
     field = waves / (np.sqrt(2.0) * matches.sigma1_px[:, None])
     free = free_directions(PoseType.GENERAL if level_sigma_rad is not None else pose_type)
     count = len(free)
-    amplitude, covariance = 0.0, np.zeros((count, count))
+    amplitude = 0.0
+    covariance: FloatArray = np.zeros((count, count))
     basis = translation_basis(t)
     for _ in range(FIELD_STEPS if count else 0):
         basis = translation_basis(t)
@@ -82,7 +83,7 @@ def pose_with_field(
         change = np.zeros(5)
         change[free] = -(inverse @ right)[:count]
         R, t = exp_so3(change[:3]) @ R, unit(t + change[3:] @ basis)
-        covariance = inverse[:count, :count]
+        covariance = np.array(inverse[:count, :count])
     to_six = np.zeros((6, 5))
     to_six[:3, :3], to_six[3:, 3:] = np.eye(3), basis.T
     spread = to_six[:, free]
