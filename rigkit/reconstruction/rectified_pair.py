@@ -14,7 +14,7 @@ __all__ = ["RECTIFIED_NOTE", "are_rectified", "seen_as_rectified"]
 
 SAME_ROW = 1e-9
 """Tangents of rows of two rectified images agree to rounding: they are computed, not measured."""
-GRID = 9
+PIXELS_A_SIDE = 9
 RECTIFIED_NOTE = (
     "the cameras and the matches are those of a rectified pair, whose pose is exact; for one camera moved sideways by "
     "hand declare the pose type 'general'"
@@ -31,7 +31,9 @@ def are_rectified(camera1: Camera, camera2: Camera) -> bool:
     tangents = []
     for camera in (camera1, camera2):
         width, height = camera.size_px
-        at = np.stack(np.meshgrid(np.linspace(0, width - 1, GRID), np.linspace(0, height - 1, GRID)), axis=-1)
+        at = np.stack(
+            np.meshgrid(np.linspace(0, width - 1, PIXELS_A_SIDE), np.linspace(0, height - 1, PIXELS_A_SIDE)), axis=-1
+        )
         rays, seen = camera.unproject(at)
         if not (seen.all() and (rays[..., 2] > 0.0).all()):
             return False

@@ -81,11 +81,10 @@ def reconstruct_scene(
     ----------
     correspondences, camera1, camera2 : some may be wrong, their sigmas only count relative to each other; calibrated.
     pair_id, seed : for messages; of the robust search.
-    pose_type, level_sigma_rad : as for `reconstruct_pair`. None: general, but where cameras and matches are those of a
-        rectified pair exactly that.
+    pose_type, level_sigma_rad : as for `reconstruct_pair`. None: general, or exactly that of a rectified pair.
     baseline_mm : length of the baseline where it was measured: then the cloud is in mm.
     known_pose : the pose where it was measured: it is used as it is, and gives the baseline.
-    image1 : image of camera 1: colours of the cloud.
+    image1 : image of camera 1, for colours.
 
     Raises
     ------
@@ -97,9 +96,7 @@ def reconstruct_scene(
     baseline_mm = baseline_mm if known_pose is None else known_pose.baseline_mm
     matches, seen = _matches(correspondences, camera1, camera2, baseline_mm, pair_id)
     try:
-        fit = _fit(matches, known_pose, None if pose_type is None else PoseType(pose_type), level_sigma_rad, seed)
-        if pose_type is None and known_pose is None and are_rectified(camera1, camera2):
-            fit = _as_rectified(fit, seed)
+        fit = _fit(matches, known_pose, pose_type, level_sigma_rad, seed, are_rectified(camera1, camera2))
         pose, covariance = in_unit(fit.refined.cam2_from_cam1, fit.refined.covariance, baseline_mm or 1.0)
         cloud, chosen, affinities = _cloud(fit, correspondences.select(seen), pose, covariance, image1)
     except DegenerateError as error:
@@ -128,16 +125,18 @@ def reconstruct_scene(
 
 
 def _fit(
-    matches: Matches, known_pose: KnownPose | None, pose_type: PoseType | None, level_sigma_rad: float | None, seed: int
+    matches: Matches,
+    known_pose: KnownPose | None,
+    pose_type: PoseType | str | None,
+    level_sigma_rad: float | None,
+    seed: int,
+    rectified: bool,
 ) -> ScenePose:
     if known_pose is not None:
         return known_scene_pose(matches, known_pose)
-    return fit_scene_pose(matches, pose_type or PoseType.GENERAL, level_sigma_rad, np.random.default_rng(seed))
-
-
-def _as_rectified(fit: ScenePose, seed: int) -> ScenePose:
-    """Return the fit with the pose of a rectified pair, where the agreeing matches speak for it."""
-    if not seen_as_rectified(fit.matches.select(fit.inliers)):
+    declared = PoseType(pose_type or "general")
+    fit = fit_scene_pose(matches, declared, level_sigma_rad, np.random.default_rng(seed))
+    if pose_type is not None or not (rectified and seen_as_rectified(fit.matches.select(fit.inliers))):
         return fit
     exact = fit_scene_pose(fit.matches, PoseType.STANDARD, 0.0, np.random.default_rng(seed))
     return replace(exact, notes=(*exact.notes, RECTIFIED_NOTE))
