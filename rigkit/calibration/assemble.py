@@ -19,7 +19,7 @@ from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
 
-__all__ = ["assemble", "board_shapes", "motion_of_world", "require_determined", "solution_normal"]
+__all__ = ["assemble", "board_shapes", "motion_of_world", "outliers_of", "require_determined", "solution_normal"]
 
 UNKNOWN_SHARE = 0.05
 """A projection that is uncertain by this part of the image's width, where the boards were, is not determined."""
@@ -51,7 +51,7 @@ def assemble(
         sigma_px=sigma,
         views=ViewResult.of_views(observations.views, poses, px, fit.kept),
         dropped=dropped,
-        outliers=_outliers(observations, fit),
+        outliers=outliers_of(observations, fit),
         candidates=candidates,
         convergence=fit.convergence,
         boards=board_shapes(observations, state.shape, state.unknowns),
@@ -84,7 +84,8 @@ def _clusters(observations: Observations) -> IntArray:
     return cluster_numbers(observations.images, boards, [view.pixels for view in observations.views])
 
 
-def _outliers(observations: Observations, fit: Fit) -> tuple[Outlier, ...]:
+def outliers_of(observations: Observations, fit: Fit) -> tuple[Outlier, ...]:
+    """Return the corners that a fit leaves out."""
     out = []
     for i, j in np.argwhere(observations.present & ~fit.kept).tolist():
         view = observations.views[i]

@@ -23,6 +23,8 @@ EXAMPLES = """examples:
   rigkit calibrate photos --board 9x6x25 -r          one camera; 9x6 inner corners, squares of 25 mm; with a page
   rigkit calibrate left right --board board.toml     a rig, one folder a camera; so is a folder of left01, right01, ...
   rigkit calibrate photos --board 9x6x25 --export opencv ros
+  rigkit calibrate left right --board 9x6x25 --only-extrinsics left.json right.json -o rig.json
+  rigkit calibrate left right top --board 9x6x25 --add-camera rig.json -o rig3.json
   rigkit calibrate session.toml --force              again, from the session written the first time
 """
 
@@ -55,6 +57,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--force", action="store_true", help="replace existing results")
     parser.add_argument("--json", action="store_true", help="print the result for programs")
+    rigs = parser.add_argument_group("rigs", "what is known stays; how unsure it is counts in all results")
+    rigs.add_argument(
+        "--only-extrinsics",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="CALIB",
+        help="lenses stay as these files have them (one a camera, or one rig): only the mounts are found",
+    )
+    rigs.add_argument(
+        "--add-camera",
+        type=Path,
+        metavar="RIG",
+        help="cameras of this rig stay, lens and mount: the others are added to it",
+    )
     folders = parser.add_argument_group("folders", f"the session used is kept as {SESSION_NAME} for the next time")
     folders.add_argument(
         "--board", action="append", default=[], metavar="CxRxMM|BOARD.toml", help="such as 9x6x25 (repeatable)"
@@ -112,6 +129,7 @@ def _calibrated(args: argparse.Namespace) -> SessionCalibration | RigSessionCali
     from rigkit.workflows.calibrate import CalibrateOptions
     from rigkit.workflows.calibrate_any import FolderOptions, calibrate_folders, calibrate_session_file
     from rigkit.workflows.corners import Cache
+    from rigkit.workflows.folder_session import Known
 
     options = CalibrateOptions(
         output=args.output,
@@ -120,6 +138,7 @@ def _calibrated(args: argparse.Namespace) -> SessionCalibration | RigSessionCali
         cache=Cache.OFF if args.no_cache else Cache.UPDATE,
         corners=args.corners,
         exports=tuple(dict.fromkeys(args.export)),
+        known=Known(tuple(args.only_extrinsics), args.add_camera),
     )
     progress = progress_on_stderr()
     first: Path = args.source[0]

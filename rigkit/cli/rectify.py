@@ -44,6 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     view.add_argument("--roll-deg", type=float, default=0.0, metavar="DEG", help="turn the view clockwise")
     view.add_argument("--size", metavar="WxH", help="of the result, px (default: keeps the source's resolution)")
     view.add_argument(
+        "--crop", action="store_true", help="cut to the largest rectangle that is seen whole (by both of a pair)"
+    )
+    view.add_argument(
         "--interpolation",
         choices=("spline", "lanczos", "linear", "nearest"),
         default="spline",
@@ -62,6 +65,7 @@ def run(args: argparse.Namespace) -> int:
         angles_deg=(args.yaw_deg, args.pitch_deg, args.roll_deg),
         size_px=_size(args.size),
         interpolation=args.interpolation,
+        crop=args.crop,
         maps=args.maps,
         force=args.force,
     )

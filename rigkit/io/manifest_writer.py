@@ -123,7 +123,8 @@ def manifest_text(
     root: Path,
     pairs: Sequence[FoundPair],
     square_mm: float,
-    calibration: str,
+    calibrations: Mapping[str, str],
+    cameras: Mapping[str, tuple[str, str]],
     pose_types: Mapping[str, str],
     baselines: Mapping[str, tuple[float, float]],
 ) -> str:
@@ -135,7 +136,8 @@ def manifest_text(
     root : folder of the manifest; images are named relative to it.
     pairs : at least one.
     square_mm : side of a square of all boards, as a person measured it.
-    calibration : path of the calibration file, as it shall stand in the manifest.
+    calibrations : camera -> path of its calibration file, as it shall stand in the manifest.
+    cameras : pair -> the cameras of its two images.
     pose_types : pair -> pose type.
     baselines : pair -> (mm, sigma mm), where measured.
     """
@@ -159,26 +161,29 @@ def manifest_text(
         out += ["[[boards]]", f'id = "plane{number}"', f"columns = {columns}", f"rows = {rows}"]
         out += [f"square_mm = {square_mm:g}", ""]
     size = pairs[0].first.size_px
-    out += [
-        f"# Images are {size[0]}x{size[1]} px, taken as those of one camera that was moved. Where there are two,",
-        "# add another [[cameras]] with its own calibration, and name it in camera2 below.",
-        "[[cameras]]",
-        'id = "camera"',
-        f"calibration = {_quoted(calibration)}",
-        "",
-    ]
+    out.append(f"# Images are {size[0]}x{size[1]} px.")
+    if len(calibrations) == 1:
+        out += ["# All taken as those of one camera that was moved. Where there are two, add another [[cameras]]"]
+        out += ["# with its own calibration, and name it in camera2 below."]
+    for camera, calibration in calibrations.items():
+        out += ["[[cameras]]", f"id = {_quoted(camera)}", f"calibration = {_quoted(calibration)}", ""]
     boards = ", ".join(f'"plane{n}"' for n in range(1, len(most) + 1))
     for pair in pairs:
-        out += _pair_lines(pair, root, pose_types[pair.name], boards, baselines.get(pair.name))
+        out += _pair_lines(pair, root, cameras[pair.name], pose_types[pair.name], boards, baselines.get(pair.name))
     return "\n".join(out)
 
 
 def _pair_lines(
-    pair: FoundPair, root: Path, pose_type: str, boards: str, baseline: tuple[float, float] | None
+    pair: FoundPair,
+    root: Path,
+    cameras: tuple[str, str],
+    pose_type: str,
+    boards: str,
+    baseline: tuple[float, float] | None,
 ) -> list[str]:
     seen = " and ".join(_words(s) for s in (pair.first, pair.second))
     out = [f"# Complete boards found: {seen}.", "[[pairs]]", f'id = "{pair.name}"']
-    out += ['camera1 = "camera"', 'camera2 = "camera"']
+    out += [f"camera{i} = {_quoted(camera)}" for i, camera in enumerate(cameras, start=1)]
     out += [f"image{i} = {_quoted(_relative(s.image, root))}" for i, s in enumerate((pair.first, pair.second), start=1)]
     out += [f'pose_type = "{pose_type}"', f"boards = [{boards}]", "", "[pairs.truth]"]
     if baseline is not None:

@@ -6,10 +6,12 @@
     board = "board.toml"             # or boards = [...]
     model = "brown"                  # of all cameras; a camera may have its own `model` and `degree`
     frames = "number"                # optional: which images were taken at the same moment (below)
+    rig = "rig.json"                 # optional: cameras in this rig stay as they are, lens and mount; others are added
 
     [[cameras]]
     id = "left"
     images = "left*.jpg"
+    calibration = "left.json"        # optional: this lens stays as it is; only its mount is found
 
     [[cameras]]
     id = "right"
@@ -39,7 +41,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path, PurePath
 
@@ -99,6 +101,8 @@ class RigSession:
     frames : "name", "number" or "order"; None to choose.
     baselines : what was measured between cameras.
     rigid_boards : what is mounted to each other.
+    lenses : by camera, the file of a lens that stays as it is.
+    known_rig : the file of a rig of which the cameras stay as they are, lens and mount; None: of none.
     """
 
     path: Path
@@ -106,6 +110,8 @@ class RigSession:
     frames: str | None
     baselines: tuple[MeasuredBaseline, ...]
     rigid_boards: tuple[RigidBoards, ...] = ()
+    lenses: Mapping[str, Path] = field(default_factory=dict)
+    known_rig: Path | None = None
 
     __repr__ = brief
 
@@ -143,7 +149,9 @@ def load_rig_session(path: str | Path) -> RigSession:
     frames = None
     if table.has("frames"):
         frames = table.text("frames", hint='frames = "number"', choices=FRAMES)
+    known_rig = table.path_to("rig", hint='rig = "rig.json"') if table.has("rig") else None
     cameras: dict[str, Session] = {}
+    lenses: dict[str, Path] = {}
     for entry in table.tables("cameras", hint='[[cameras]] with id = "left" and images = "left*.jpg"'):
         name = entry.identifier("id", hint=HINT_ID)
         if name in cameras:
@@ -152,6 +160,8 @@ def load_rig_session(path: str | Path) -> RigSession:
         if entry.has("model"):
             own, own_degree, _ = options_of(entry)
         images = images_of(entry)
+        if entry.has("calibration"):
+            lenses[name] = entry.path_to("calibration", hint='calibration = "left.json"')
         entry.done()
         cameras[name] = Session(
             path=source, images=images, boards=boards, model=own, degree=own_degree, board_shape=shape, camera=name
@@ -160,7 +170,7 @@ def load_rig_session(path: str | Path) -> RigSession:
         raise table.error("a rig has at least two [[cameras]]; for one, write its `images` without [[cameras]]")
     baselines = _baselines(table, tuple(cameras))
     table.done()
-    return RigSession(source, cameras, frames, baselines, rigid)
+    return RigSession(source, cameras, frames, baselines, rigid, lenses, known_rig)
 
 
 def _rigid_boards(table: TomlTable, boards: Sequence[Board]) -> tuple[RigidBoards, ...]:

@@ -151,8 +151,10 @@ def files_of_session(path: str | Path) -> tuple[Path, ...]:
     boards = table.texts("boards", hint=HINT_BOARD) if table.has("boards") else (table.text("board", hint=HINT_BOARD),)
     out = [source, *map(table.beside, boards)]
     entries = table.tables("cameras", hint="[[cameras]]") if table.has("cameras") else (table,)
+    out += [table.path_to("rig", hint='rig = "rig.json"')] if table.has("rig") else []
     for entry in entries:
         out += images_of(entry)
+        out += [entry.path_to("calibration", hint="calibration")] if entry.has("calibration") else []
         name = f"-{entry.text('id', hint='id')}" if entry is not table else ""
         out.append(beside_session(source, f"corners{name}.json"))
     return tuple(out)

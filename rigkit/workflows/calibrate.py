@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from rigkit.calibration.calibrate import calibrate
@@ -18,6 +18,7 @@ from rigkit.io.rig_session import RigSession
 from rigkit.io.session import Session, files_of_session, load_session
 from rigkit.workflows.corners import Cache, SessionCorners, session_corners, session_views
 from rigkit.workflows.export_camera import foreign_files, foreign_paths
+from rigkit.workflows.folder_session import Known
 from rigkit.workflows.given_corners import given_corners
 from rigkit.workflows.session_page import session_page
 
@@ -46,6 +47,8 @@ class CalibrateOptions:
     """What becomes of the corners kept beside the session."""
     corners: Path | None = None
     """File of corners (ours, or another detector's) to use instead of looking for them; None: they are looked for."""
+    known: Known = field(default_factory=Known)
+    """Of a rig: files of lenses that stay as they are, or of a rig to which the others of the session are added."""
     exports: tuple[str, ...] = ()
     """Other tools' formats to write the camera in, beside `output` (`rigkit.workflows.formats`)."""
 
@@ -117,6 +120,7 @@ def session_inputs(session: Session | RigSession, options: CalibrateOptions) -> 
     out = [path for own in cameras for path in (*own.images, own.corners_path)]
     # A session made in Python need not have a file.
     out += files_of_session(session.path) if session.path.is_file() else [session.path]
+    out += options.known.files
     return out if options.corners is None else [*out, options.corners]
 
 

@@ -49,6 +49,8 @@ def calibrate_session_file(
     options = replace(options, output=output, report=report)
     if isinstance(session, RigSession):
         return calibrate_rig_session(session, options, progress=progress)
+    if options.known.files:
+        raise InputError("one camera has no mounts to find; `rigkit pose` says where it is against a board")
     return calibrate_session(session, options, progress=progress)
 
 
@@ -84,6 +86,7 @@ def calibrate_folders(
         _session_path(places, options.output),
         model=folder_options.model,
         output=options.output,
+        known=options.known,
     )
     new = {path: text for path, text in wanted.files.items() if not _says(path, text)}
     results = [path for path in (options.output, options.report) if path not in (None, Path())]

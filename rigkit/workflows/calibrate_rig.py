@@ -23,6 +23,7 @@ from rigkit.validation.checks import COVERAGE
 from rigkit.workflows.calibrate import CalibrateOptions, calibration_from, corners_of, session_inputs
 from rigkit.workflows.corners import Cache, SessionCorners, session_corners, session_views
 from rigkit.workflows.export_camera import foreign_files, foreign_paths, foreign_rig_files, foreign_rig_paths
+from rigkit.workflows.known_cameras import known_cameras, with_known, with_known_first
 from rigkit.workflows.rigid_boards import named_as_listed, named_by_rule, require_distinct
 from rigkit.workflows.session_page import rig_page
 
@@ -79,6 +80,8 @@ def calibrate_rig_session(
     options = options or CalibrateOptions()
     if not isinstance(session, RigSession):
         session = load_rig_session(session)
+    session = with_known_first(with_known(session, options.known))
+    known_cameras(session)  # complaints before the work
     targets = _targets(session, options)
     ensure_writable(targets, force=options.force, inputs=session_inputs(session, options))
     require_distinct(session)
@@ -186,6 +189,7 @@ def rig_from(
         degree={name: own.degree for name, own in session.cameras.items()},
         board=next(iter(session.cameras.values())).board_shape,
         rigid_boards=[group.boards for group in session.rigid_boards],
+        known=known_cameras(session),
         progress=progress,
     )
     rig = named_by_rule(session, rig)

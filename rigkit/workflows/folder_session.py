@@ -20,7 +20,7 @@ from rigkit.io.session import SESSION_SCHEMA
 from rigkit.workflows.detect import IMAGE_ENDINGS
 from rigkit.workflows.identify_board import suggested_words
 
-__all__ = ["FolderSession", "board_of_words", "cameras_in", "session_of_folders", "session_to_come"]
+__all__ = ["FolderSession", "Known", "board_of_words", "cameras_in", "session_of_folders", "session_to_come"]
 
 SIDE = r"left|right|cam(?:era)?[_-]?\d{1,3}"
 """How people call the cameras of a rig."""
@@ -37,8 +37,38 @@ class FolderSession:
     files: Mapping[Path, str]
 
 
+@dataclass(frozen=True, slots=True)
+class Known:
+    """Files of what stays as it is: lenses, one a camera in their order or one for all of them, and a rig."""
+
+    lenses: tuple[Path, ...] = ()
+    rig: Path | None = None
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """All of them."""
+        return self.lenses if self.rig is None else (*self.lenses, self.rig)
+
+    def of_cameras(self, names: Sequence[str]) -> dict[str, Path]:
+        """Return the lens's file of each camera; raises InputError for a number of them that is not that of cameras."""
+        if not self.lenses:
+            return {}
+        if len(self.lenses) not in (1, len(names)):
+            raise InputError(
+                f"{len(self.lenses)} lenses for {len(names)} cameras ({', '.join(names)}); give one file a camera in "
+                "that order, or one rig"
+            )
+        return dict(zip(names, self.lenses * (len(names) if len(self.lenses) == 1 else 1), strict=True))
+
+
 def session_of_folders(
-    folders: Sequence[Path], boards: Sequence[str], path: Path, *, model: str = "auto", output: Path | None = None
+    folders: Sequence[Path],
+    boards: Sequence[str],
+    path: Path,
+    *,
+    model: str = "auto",
+    output: Path | None = None,
+    known: Known | None = None,
 ) -> FolderSession:
     """Return the session of one folder, or of several that hold a camera's images each, to be kept in the file `path`.
 
@@ -49,6 +79,7 @@ def session_of_folders(
     path : of the session, to whose folder its paths are relative.
     model : of all cameras.
     output : where the calibration goes, if not to where the session's name says.
+    known : what stays as it is of several cameras.
 
     Raises
     ------
@@ -80,8 +111,17 @@ def session_of_folders(
         lines.append(f"images = {_listed(cameras[''], place)}")
     else:
         lines += ["# Those of one moment have the same name, or the same number at its end.", ""]
+        known = known or Known()
+        if known.rig is not None:
+            lines += [
+                "# Its cameras stay as they are, lens and mount.",
+                f"rig = {_quoted(_relative(known.rig, place))}",
+            ]
+            lines += [""]
+        lenses = known.of_cameras(list(cameras))
         for name, patterns in cameras.items():
-            lines += ["[[cameras]]", f"id = {_quoted(name)}", f"images = {_listed(patterns, place)}", ""]
+            lines += ["[[cameras]]", f"id = {_quoted(name)}", f"images = {_listed(patterns, place)}"]
+            lines += [f"calibration = {_quoted(_relative(lenses[name], place))}", ""] if name in lenses else [""]
         lines += [
             "# What a rule says of the distance of two cameras is compared with the result:",
             "# [[baselines]]",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +17,7 @@ from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.files import ensure_writable, write_atomic, write_together
 from rigkit.io.images import quiet_opencv, read_image, require_pixels
+from rigkit.rectification.crop import cropped
 from rigkit.rectification.rectify import RectifyMap, rectify_map, rotation_from_view_angles
 from rigkit.rectification.stereo import StereoRectification, rectify_pair
 from rigkit.rectification.targets import target_camera
@@ -45,6 +46,8 @@ class RectifyOptions:
     """Of the result; None: keeps the source's resolution."""
     interpolation: Literal["spline", "lanczos", "linear", "nearest"] = "spline"
     """Between pixels: spline keeps positions to a thousandth of a pixel, linear is quick."""
+    crop: bool = False
+    """Cut to the largest rectangle of which every pixel is seen, by both cameras of a pair."""
     maps: Path | None = None
     """npz file for the geometry: the target's K and rotation, maps for cv2.remap, and of a pair P1, P2 and Q (mm)."""
     force: bool = False
@@ -89,6 +92,8 @@ def rectify_image(
     target = target_camera(source, options.projection, hfov_rad=hfov_rad, size_px=options.size_px)
     rotation = rotation_from_view_angles(*np.radians(options.angles_deg))
     remap = rectify_map(source, target, target_from_cam=rotation)
+    if options.crop:
+        (remap,) = cropped([remap])
     done = _write([(jobs, remap)], options, progress)
     _write_maps([remap], None, options)
     return RectificationResult(*done)
@@ -127,6 +132,9 @@ def rectify_stereo_images(
         jobs = [[(Path(one), out.with_name(f"{out.stem}-{i}{out.suffix}"))] for i, one in enumerate(images, start=1)]
     _ensure_all([to for job in jobs for _, to in job], options, (*(source for job in jobs for source, _ in job), rig))
     pair = rectify_pair(camera1, camera2, cam2_from_rig @ cam1_from_rig.inverse(), projection=options.projection)
+    if options.crop:
+        map1, map2 = cropped([pair.map1, pair.map2])
+        pair = replace(pair, map1=map1, map2=map2)
     done = _write(list(zip(jobs, (pair.map1, pair.map2), strict=True)), options, progress)
     _write_maps([pair.map1, pair.map2], pair, options)
     return RectificationResult(*done, pair)

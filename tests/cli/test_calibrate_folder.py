@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, nearest_rotation
-from rigkit.interop.opencv import read_opencv
+from rigkit.interop.opencv import read_opencv, write_opencv
 from rigkit.interop.ros import read_camera_info
 from rigkit.io.calibration_file import load_calibration
 from rigkit.io.corners_file import read_corners
@@ -248,3 +249,44 @@ def test_a_session_file_from_python_too(pictures: Path, tmp_path: Path) -> None:
     )
     done = calibrate_session_file(tmp_path / "session.toml", CalibrateOptions())
     assert done.written == (tmp_path / "calibration.json",)
+
+
+def test_lenses_that_are_known_stay_and_a_camera_is_added_to_a_rig(
+    pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Only the mount is found with the lenses of files; a camera joins a rig that stays as it is; the session written
+    says so, and does the same again."""
+    folder = tmp_path / "rig"
+    shutil.copytree(pictures, folder)
+    lens = tmp_path / "lens.yaml"
+    lens.write_text(write_opencv(CAMERA).text)
+    command = ["calibrate", str(folder), "--board", "9x6x30"]
+    assert main([*command, "--only-extrinsics", str(lens), str(lens)]) == 0
+    rig = load_rig(folder / "rig.json")
+    for camera, _ in rig.values():
+        np.testing.assert_allclose(camera.parameters, CAMERA.parameters, rtol=1e-8, atol=1e-10)
+    moved = rig["right"][1].translation_mm - RIGHT_FROM_LEFT.translation_mm
+    assert np.linalg.norm(moved) < 0.1
+    assert list(load_rig_session(folder / "session.toml").lenses) == ["left", "right"]
+    before = (folder / "rig.json").read_bytes()
+    assert main(["calibrate", str(folder / "session.toml"), "--force"]) == 0
+    assert (folder / "rig.json").read_bytes() == before
+
+    # The right camera anew, with the left one as a rig of its own frame has it.
+    saved = json.loads(before)
+    saved["cameras"], saved["covariance"] = saved["cameras"][:1], np.eye(9).tolist()
+    saved["covariance"] = (1e-12 * np.eye(9)).tolist()
+    known = tmp_path / "known.json"
+    known.write_text(json.dumps(saved | {"baselines": []}))
+    added = tmp_path / "out" / "rig.json"
+    added.parent.mkdir()
+    assert main([*command, "--add-camera", str(known), "-o", str(added), "--model", "brown"]) == 0
+    rig = load_rig(added)
+    np.testing.assert_allclose(rig["left"][0].parameters, CAMERA.parameters, rtol=1e-8, atol=1e-10)
+    assert worst_px(rig["right"][0]) < SAME_LENS_PX
+    capsys.readouterr()
+    assert main([*command, "--only-extrinsics", str(lens), str(lens), str(lens), "--force"]) == 2
+    assert "3 lenses for 2 cameras" in capsys.readouterr().err
+    one = of_one_camera(pictures, tmp_path / "one")
+    assert main(["calibrate", str(one), "--board", "9x6x30", "--only-extrinsics", str(lens)]) == 2
+    assert "rigkit pose" in capsys.readouterr().err

@@ -9,6 +9,7 @@ from helpers.data import REPOSITORY
 from rigkit.cli.main import main
 from rigkit.io.manifest import load_dataset
 from rigkit.io.manifest_writer import Sighting, group_pairs
+from rigkit.io.rig_session import load_rig_session
 
 IMAGES = REPOSITORY / "datasets" / "lab-a" / "images"
 CALIBRATION = REPOSITORY / "calib" / "cameras" / "mvca020_fe185" / "calibration.json"
@@ -85,3 +86,45 @@ def test_lengths_that_are_none(options: list[str], tmp_path: Path, capsys: pytes
     assert main(["init", str(tmp_path), "--calibration", "c.json", "--pose-type", "general", *options]) == 2
     assert "positive number" in capsys.readouterr().err
     assert not (tmp_path / "dataset.toml").exists()
+
+
+def test_several_cameras_and_pose_types(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two calibrations are those of the two images; of more, patterns say which pairs are whose; paths are as typed."""
+    root = tmp_path / "lab"
+    for pair in ("fisheye-general", "fisheye-standard"):
+        shutil.copytree(IMAGES / pair, root / "images" / pair)
+    for name in ("wide", "tele"):
+        shutil.copy(CALIBRATION, tmp_path / f"{name}.json")
+    monkeypatch.chdir(tmp_path)
+    command = ["init", "lab", "--square-mm", "50", "--force"]
+    told = ["--pose-type", "*-standard=standard", "--pose-type", "general"]
+    assert main([*command, "--calibration", "wide.json", "--calibration", "tele.json", *told]) == 0
+    dataset = load_dataset(root)
+    assert [(p.pose_type, p.camera1.camera_id, p.camera2.camera_id) for p in dataset.pairs] == [
+        ("general", "camera1", "camera2"),
+        ("standard", "camera1", "camera2"),
+    ]
+    assert dataset.pairs[0].camera1.calibration == (tmp_path / "wide.json").resolve()
+    three = [f"--calibration={name}" for name in ("w=wide.json", "t=tele.json", "x=wide.json")]
+    assert main([*command, *three, *told]) == 2
+    assert "which cameras took pair 'fisheye-general'; add --cameras" in capsys.readouterr().err
+    assert main([*command, *three, *told, "--cameras", "*-general=w,t", "--cameras", "*=t,t"]) == 0
+    cameras = [(p.camera1.camera_id, p.camera2.camera_id) for p in load_dataset(root).pairs]
+    assert cameras == [("w", "t"), ("t", "t")]
+    for wrong in (["--cameras", "*=w,y"], ["--cameras", "w,t"], ["--pose-type", "sideways"]):
+        assert main([*command, *three, *told, *wrong]) == 2
+
+
+def test_a_session_of_two_cameras_is_written_and_loads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for side in ("left", "right"):
+        (tmp_path / side).mkdir()
+        shutil.copy(IMAGES / "fisheye-general" / "view1.jpg", tmp_path / side / "01.jpg")
+    command = ["init", str(tmp_path), "--session", "--board", "8x6x50"]
+    assert main(command) == 0
+    session = load_rig_session(tmp_path / "session.toml")
+    assert list(session.cameras) == ["left", "right"]
+    assert session.cameras["left"].boards[0].square_x_mm == 50.0
+    assert main(command) == 2
+    assert main([*command, "--square-mm", "50", "--force"]) == 2

@@ -239,3 +239,30 @@ def test_one_bad_image_of_a_pair_leaves_out_both(
     said = capsys.readouterr()
     assert len(json.loads(said.out)["images"]) == 4 and "right/1.png" in said.err
     assert sorted(p.stem for p in out.rglob("*.png")) == ["0", "0", "2", "2"]
+
+
+def test_a_crop_is_seen_whole_and_its_geometry_follows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of a lens whose image ends in a circle: nothing black is left, K moved by the corner cut off, and a pixel of the
+    crop is the same ray as before."""
+    save_camera(tmp_path / "camera.json", CAMERA)
+    cv2.imwrite(str(tmp_path / "image.png"), np.full((120, 160), 200, dtype=np.uint8))
+    command = ["rectify", str(tmp_path / "image.png"), "--camera", str(tmp_path / "camera.json"), "--json"]
+    command += ["--interpolation", "linear", "--hfov-deg", "120", "--yaw-deg", "50", "--roll-deg", "20"]
+    told = {}
+    for name, more in (("whole", []), ("crop", ["--crop", "--maps", str(tmp_path / "maps.npz")])):
+        assert main([*command, *more, "-o", str(tmp_path / f"{name}.png")]) == 0
+        told[name] = json.loads(capsys.readouterr().out)
+    assert told["whole"]["covered"] < 1.0 == told["crop"]["covered"]
+    image, part = (cv2.imread(str(tmp_path / f"{name}.png"), cv2.IMREAD_GRAYSCALE) for name in ("whole", "crop"))
+    assert image is not None and part is not None
+    assert image.min() == 0 and part.min() > 100
+    assert told["crop"]["size_px"] == [part.shape[1], part.shape[0]]
+    left, top = (round(told["whole"]["parameters"][k] - told["crop"]["parameters"][k]) for k in ("cx", "cy"))
+    np.testing.assert_array_equal(part, image[top : top + part.shape[0], left : left + part.shape[1]])
+    maps = np.load(tmp_path / "maps.npz")
+    assert maps["map_x"].shape == part.shape and maps["K"][0, 2] == pytest.approx(told["crop"]["parameters"]["cx"])
+    # No side has room for another row or column.
+    seen = np.pad(image > 100, 1)
+    rows, columns = slice(top + 1, top + 1 + part.shape[0]), slice(left + 1, left + 1 + part.shape[1])
+    assert not seen[top, columns].all() and not seen[rows.stop, columns].all()
+    assert not seen[rows, left].all() and not seen[rows, columns.stop].all()

@@ -44,7 +44,7 @@ def assemble_rig(
     clustered = clustered_by_frame(observations, state, normal, unit, joint.frames, sigma)
     overdispersion = clustered.overdispersion
     covariance = with_block(unit * sigma**2, clustered.covariance, overdispersion**2)
-    covariance += _error_of_held(observations, layout, single, unit)
+    covariance += _error_of_held(joint, names, layout, single, unit)
     off = shape_error(observations, state, sigma * overdispersion)
     covariance[: len(off), : len(off)] += np.outer(off, off)
     own *= (sigma * overdispersion) ** 2
@@ -109,14 +109,21 @@ def _of_camera(
 
 
 def _error_of_held(
-    observations: RigObservations, layout: Layout, single: Sequence[Calibration], unit: FloatArray
+    joint: JointRig, names: Sequence[str], layout: Layout, single: Sequence[Calibration], unit: FloatArray
 ) -> FloatArray:
-    """Return what the errors of the solutions near which lenses are held add to the covariance (G, G) of all globals:
-    K W C W K, with the information W by which they are held and each camera's own covariance C."""
+    """Return what the errors of the values near which lenses and mounts are held add to the covariance (G, G) of all
+    globals: K W C W K, with the information W by which they are held and the covariance C of those values."""
     out = np.zeros_like(unit)
-    for where, alone, (_, information) in zip(layout.cameras, single, observations.held, strict=False):
-        through = unit[:, where] @ information
-        out += through @ alone.covariance @ through.T
+    known = joint.known
+    held = zip(names, layout.cameras, single, joint.observations.held, strict=False)
+    for name, where, alone, (_, information) in held:
+        if known is None or name not in known.cameras:
+            through = unit[:, where] @ information
+            out += through @ alone.covariance @ through.T
+    if known is not None and known.covariance is not None:
+        index = known.index(names, layout)
+        through = unit[:, index] * known.weights(joint.observations, layout)[index]
+        out += through @ known.covariance @ through.T
     return out
 
 

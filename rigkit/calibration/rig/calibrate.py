@@ -12,11 +12,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from rigkit.calibration.calibrate import FOLDS, calibrate
+from rigkit.calibration.posed import posed_calibration
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.assemble import assemble_rig
 from rigkit.calibration.rig.board_places import board_places
 from rigkit.calibration.rig.heldout import heldout_rms
 from rigkit.calibration.rig.joint import solve_jointly
+from rigkit.calibration.rig.known import KnownCameras
 from rigkit.calibration.rig.observations import FrameObservations, Places, frame_observations
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.verdicts import judge_rig
@@ -39,6 +41,7 @@ def calibrate_rig(
     degree: int | Mapping[str, int | None] | None = None,
     board: str = "flat",
     rigid_boards: Sequence[Sequence[str]] = (),
+    known: KnownCameras | None = None,
     folds: int = FOLDS,
     progress: Progress = silent,
 ) -> RigCalibration:
@@ -53,6 +56,8 @@ def calibrate_rig(
         the joint solution, one for all cameras.
     rigid_boards : groups of ids of boards that are mounted to each other. Boards of a group that look alike may be
         named and counted in any way; their arrangement sorts that out.
+    known : lenses, or lenses and mounts, that stay as they are; what is not sure of them is in all covariances. Boards
+        of a rig whose lenses are all known are flat.
     folds : of the cross-validations, of each camera alone and of the rig; 0 for none.
 
     Raises
@@ -71,7 +76,9 @@ def calibrate_rig(
             raise InputError(f"rig: {what} has no entry for camera '{missing[0]}'")
     for name, own in views.items():
         _require_one_image(name, own)
-    options = _Options(sizes_px, model, degree, board, folds)
+    if known is not None:
+        _require_known(views, sizes_px, known)
+    options = _Options(sizes_px, model, degree, board, folds, known)
     single = options.each_alone(views, progress)
     seen = [frame_observations(own, result) for own, result in zip(views.values(), single, strict=True)]
     places: Places = {}
@@ -86,7 +93,7 @@ def calibrate_rig(
             again = [frame_observations(own, result) for own, result in zip(views.values(), single, strict=True)]
             named, places, notes = board_places(rigid_boards, again, boards)
         seen = named
-    joint = solve_jointly(list(views), seen, single, places, progress)
+    joint = solve_jointly(list(views), seen, single, places, progress, known)
     heldout = heldout_rms(joint, folds)
     rig = assemble_rig(list(views), single, joint, places, heldout)
     return replace(rig, verdicts=judge_rig(rig, (*notes, *joint.notes), in_force=options.in_force))
@@ -111,6 +118,20 @@ def _require_one_image(name: str, own: Sequence[tuple[str, BoardView]]) -> None:
             )
 
 
+def _require_known(views: Views, sizes_px: Mapping[str, tuple[int, int]], known: KnownCameras) -> None:
+    """Raise InputError where a known camera has no views or another size, or does not come first with its mount."""
+    for name, (camera, _) in known.cameras.items():
+        if name not in views:
+            raise InputError(f"rig: the known camera '{name}' has no views; there are {', '.join(views)}")
+        if tuple(camera.size_px) != tuple(sizes_px[name]):
+            raise InputError(
+                f"camera '{name}': the known lens is of {camera.size_px[0]}x{camera.size_px[1]} px, the images are "
+                f"{sizes_px[name][0]}x{sizes_px[name][1]}; give the calibration of such images"
+            )
+    if known.mounted and known.mounted[0] != next(iter(views)):
+        raise InputError(f"rig: camera '{known.mounted[0]}', in whose frame the mounts are known, has to be the first")
+
+
 @dataclass(frozen=True, slots=True)
 class _Options:
     """How every camera is calibrated alone."""
@@ -120,6 +141,7 @@ class _Options:
     degree: int | Mapping[str, int | None] | None
     board: str
     folds: int
+    known: KnownCameras | None
 
     @property
     def in_force(self) -> list[str]:
@@ -133,6 +155,10 @@ class _Options:
         for i, (name, own) in enumerate(views.items()):
             progress("cameras", i, len(views))
             try:
+                if self.known is not None and name in self.known.cameras:
+                    lens, _ = self.known.cameras[name]
+                    single.append(posed_calibration([view for _, view in own], lens, self.known.of_lens(name)))
+                    continue
                 single.append(
                     calibrate(
                         [view for _, view in own],

@@ -22,6 +22,7 @@ from rigkit.calibration.rig.disagree import (
     why,
 )
 from rigkit.calibration.rig.frames import apart, first_frames, mounts_of, turned_alike
+from rigkit.calibration.rig.known import KnownCameras
 from rigkit.calibration.rig.observations import FrameObservations, Places
 from rigkit.calibration.rig.shape import common_shape
 from rigkit.calibration.rig.solver import RigSolution, solve_rig
@@ -57,6 +58,7 @@ class JointRig:
     cost_sigmas : how many sigmas sharing a pose usually costs; about 1 where the models hold.
     left_out : (frame, target, reason).
     notes : what is not sure.
+    known : what was held where it was known.
     """
 
     observations: RigObservations
@@ -66,6 +68,7 @@ class JointRig:
     cost_sigmas: float
     left_out: tuple[tuple[str, str, str], ...]
     notes: tuple[Finding, ...]
+    known: KnownCameras | None = None
 
     @property
     def frames(self) -> IntArray:
@@ -86,12 +89,14 @@ def solve_jointly(
     single: Sequence[Calibration],
     places: Places,
     progress: Progress,
+    known: KnownCameras | None = None,
 ) -> JointRig:
     """Solve for everything together, leaving out targets on which the cameras (or the target's boards) disagree.
 
     Raises InputError where a camera shares nothing with the others, DegenerateError where too little is left.
     """
     mounts, notes = mounts_of(names, seen, places)
+    mounts = list(mounts) if known is None else known.mounts(names, mounts)
     seen = turned_alike(seen, mounts, places)
     shared = len(shared_keys(seen))
     left_out = part_far(seen, apart(seen, mounts, [result.camera for result in single], places))
@@ -99,12 +104,12 @@ def solve_jointly(
     for i in range(MAX_ROUNDS):
         progress("rig", i, MAX_ROUNDS)
         _require_agreement(names, seen, places, len(left_out), shared)
-        observations, solution = _solved(seen, mounts, single, places, sigma)
+        observations, solution = _solved(names, seen, mounts, single, places, sigma, known)
         cost = cost_of_sharing(observations, solution, seen)
         usual = usual_cost(cost, sigma)
         worse = bad_ones(cost, usual)
         if not worse and masked(cost, sigma):
-            worse = _one_bad(names, seen, mounts, single, places, sigma, cost)
+            worse = _one_bad(names, seen, mounts, single, places, sigma, cost, known)
         if not worse or i == MAX_ROUNDS - 1:
             break
         for key in worse:
@@ -122,6 +127,8 @@ def solve_jointly(
         )
     if usual_sigmas > DISAGREES:
         observations = replace(observations, held=_held(single, sigma, (usual_sigmas / DISAGREES) ** 2 - 1.0))
+        if known is not None:
+            observations = known.hold(observations, solution.state, names)
         solution = solve_rig(observations, solution.state, sigma)
         notes = (_disagreement(cost, sigma, usual_sigmas, several=len(seen) > 1), *notes)
     return JointRig(
@@ -132,15 +139,18 @@ def solve_jointly(
         cost_sigmas=usual_sigmas,
         left_out=tuple(left_out),
         notes=notes,
+        known=known,
     )
 
 
 def _solved(
+    names: Sequence[str],
     seen: Sequence[FrameObservations],
     mounts: Sequence[Rigid3],
     single: Sequence[Calibration],
     places: Places,
     sigma: float,
+    known: KnownCameras | None,
 ) -> tuple[RigObservations, RigSolution]:
     observations, unknowns = _observations(seen, single, places, sigma)
     frame_rotation, frame_mm = first_frames(observations.keys, seen, mounts, places)
@@ -155,6 +165,8 @@ def _solved(
         board_mm=board_mm,
         unknowns=unknowns,
     )
+    if known is not None:
+        observations = known.hold(observations, start, names)
     return observations, solve_rig(observations, start, sigma)
 
 
@@ -198,6 +210,7 @@ def _one_bad(
     places: Places,
     sigma: float,
     cost: Mapping[Key, float],
+    known: KnownCameras | None,
 ) -> list[Key]:
     """Return the one target, if any, without which the others agree: among few, a bad one pulls the mounts so far that
     all of them look bad."""
@@ -209,7 +222,7 @@ def _one_bad(
             mounts_of(names, trial, places)
         except InputError:
             continue
-        without = cost_of_sharing(*_solved(trial, mounts, single, places, sigma), trial)
+        without = cost_of_sharing(*_solved(names, trial, mounts, single, places, sigma, known), trial)
         found.append((sum(without.values()), usual_cost(without, sigma, mean=True), key))
     if not found:
         return []

@@ -22,7 +22,7 @@ from rigkit.calibration.result import Convergence
 from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.calibration.solver import COST_TOLERANCE, Linearised, minimise
 from rigkit.core.arrays import FloatArray, IntArray, Mat3, Points
-from rigkit.geometry.rotation import skew
+from rigkit.geometry.rotation import log_so3, skew
 
 __all__ = [
     "PoseJacobians",
@@ -142,6 +142,12 @@ def with_rig_priors(
     normal = normal.with_priors(cameras, layout.shape, observations.shape.sigma, state.unknowns, sigma_px)
     for (where, camera), (near, information) in zip(cameras, observations.held, strict=False):
         normal = normal.with_quadratic(where, camera.parameters - near, information)
+    for c, held in enumerate(observations.held_mounts):
+        run = layout.mounts[c]
+        if held is not None and run is not None:
+            turned = log_so3(state.mount_rotation[c] @ held[0].rotation.T)
+            off = np.concatenate([turned, state.mount_mm[c] - held[0].translation_mm])
+            normal = normal.with_quadratic(run, off, held[1])
     return normal
 
 

@@ -20,6 +20,7 @@ from rigkit.calibration.state import State
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Points
 from rigkit.core.errors import RigkitError
+from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 
 __all__ = ["Key", "Layout", "RigObservations", "RigState"]
@@ -69,6 +70,8 @@ class RigObservations:
     places : (B,) whether a board has a place to find on its target (the first one of a target is its frame).
     held : near which parameters (P,) the lens of each camera is held, and by which information (P, P) px^2; empty where
         none is.
+    held_mounts : near which mount each camera is held, and by which information (6, 6) px^2 per rad and mm; None or
+        empty where none is.
     """
 
     cameras: tuple[Observations, ...]
@@ -78,6 +81,7 @@ class RigObservations:
     keys: tuple[Key, ...]
     places: tuple[bool, ...]
     held: tuple[tuple[FloatArray, FloatArray], ...] = ()
+    held_mounts: tuple[tuple[Rigid3, FloatArray] | None, ...] = ()
 
     @property
     def tied(self) -> bool:

@@ -1,0 +1,119 @@
+"""Views of boards under a camera that is known: poses are found, its lens stays as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from rigkit.calibration.assemble import board_shapes, outliers_of
+from rigkit.calibration.fit import CAUCHY_SIGMAS, OUTLIER_SIGMAS, SETTLE_ROUNDS, Fit, inliers, sigma_of
+from rigkit.calibration.linearise import normal_equations
+from rigkit.calibration.observations import Observations
+from rigkit.calibration.poses import find_poses, refine_poses
+from rigkit.calibration.result import Calibration, Convergence, ViewResult
+from rigkit.calibration.state import State, evaluate
+from rigkit.calibration.usable import usable_views
+from rigkit.calibration.verdicts import judge
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import FloatArray
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import DegenerateError
+from rigkit.core.findings import Finding, Severity
+from rigkit.geometry.rigid3 import Rigid3
+
+__all__ = ["posed_calibration"]
+
+START_MM = 1000.0
+MIN_KEPT_SHARE = 0.5
+"""A view in which fewer of the corners fit the known lens is dropped."""
+MISFIT_PX = 1.0
+"""A known lens that leaves more than this, 2-D RMS, is another lens, or the images are of another size or focus."""
+
+
+def posed_calibration(views: Sequence[BoardView], camera: Camera, covariance: FloatArray | None = None) -> Calibration:
+    """Return a calibration of which only the boards' poses were solved for: the lens is `camera`, boards are flat.
+
+    Its held-out error is its training error: no image took part in the lens.
+
+    Parameters
+    ----------
+    views : boards as they were seen.
+    camera : the lens, which stays as it is.
+    covariance : (P, P) of its parameters; None: it is exact.
+
+    Raises
+    ------
+    InputError
+        No view can be used, or corners lie outside the camera's image.
+    DegenerateError
+        No view fits the lens.
+    """
+    used, dropped = usable_views(views, camera.size_px)
+    observations = Observations.from_views(used)
+    count, p = len(used), camera.parameters.size
+    away = np.broadcast_to([0.0, 0.0, START_MM], (count, 3)).copy()
+    start = State.start(camera, np.broadcast_to(np.eye(3), (count, 3, 3)).copy(), away, observations)
+    state = find_poses(observations, start, observations.weight, None)
+    norm = evaluate(state, observations).weighted(observations)
+    sigma = sigma_of(norm, observations.present)
+    if norm.max() > OUTLIER_SIGMAS * sigma:
+        state = find_poses(observations, state, observations.weight, CAUCHY_SIGMAS * sigma)
+        norm = evaluate(state, observations).weighted(observations)
+        sigma = sigma_of(norm, observations.present)
+    kept = inliers(norm, observations, sigma, camera.size_px)
+    for _ in range(SETTLE_ROUNDS):
+        state, _ = refine_poses(observations, state, np.where(kept, observations.weight, 0.0))
+        norm = evaluate(state, observations).weighted(observations)
+        agree = inliers(norm, observations, sigma_of(norm, kept), camera.size_px)
+        if (agree == kept).all():
+            break
+        kept = agree
+    fits = kept.sum(axis=1) >= np.maximum(MIN_KEPT_SHARE * observations.present.sum(axis=1), 4)
+    if not fits.any():
+        raise DegenerateError("no view fits the known lens; is it that of another camera, image size or focus?")
+    dropped += tuple(
+        (view.image, "fewer than half of its corners fit the known lens; retake it")
+        for view, ok in zip(used, fits, strict=True)
+        if not ok
+    )
+    chosen = np.flatnonzero(fits)
+    observations, state, kept = observations.subset(chosen), state.subset(chosen), kept[chosen]
+    data = normal_equations(observations, state, np.where(kept, observations.weight, 0.0))
+    freedom = 2 * int(kept.sum()) - 6 * len(chosen)
+    if freedom <= 0:
+        raise DegenerateError("as many unknowns as corners; take views with more corners")
+    fit = Fit(
+        state,
+        data,
+        kept,
+        float(np.sqrt(data.costs.sum() / freedom)),
+        Convergence(0, True, "only poses were solved for"),
+    )
+    px = np.where(fit.residuals.valid[..., None], fit.residuals.px, np.nan)
+    own = np.zeros((p, p)) if covariance is None else covariance
+    frame = np.zeros((p + 6, p + 6))
+    frame[:p, :p] = own
+    result = Calibration(
+        camera=camera,
+        rms_px=fit.rms_px,
+        heldout_rms_px=fit.rms_px,
+        covariance=own,
+        frame_covariance=frame,
+        sigma_px=fit.sigma_px,
+        views=ViewResult.of_views(observations.views, Rigid3.stack(state.rotation, state.translation_mm), px, kept),
+        dropped=dropped,
+        outliers=outliers_of(observations, fit),
+        candidates=(),
+        convergence=fit.convergence,
+        boards=board_shapes(observations, state.shape, state.unknowns),
+    )
+    return replace(result, verdicts=judge(result, _misfit(result)))
+
+
+def _misfit(result: Calibration) -> tuple[Finding, ...]:
+    if result.rms_px <= MISFIT_PX:
+        return ()
+    message = f"the known lens leaves {result.rms_px:.2f} px: the lens of another camera, image size or focus?"
+    return (Finding(severity=Severity.BAD, message=message, remedy="calibrate it anew"),)

@@ -1,0 +1,74 @@
+"""The largest upright rectangle of rectified images of which every pixel is seen, and maps into it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.errors import DegenerateError
+from rigkit.rectification.rectify import RectifyMap
+
+__all__ = ["cropped", "largest_rectangle"]
+
+COARSE = 300
+"""The rectangle is found on so many cells a side that are seen as a whole, then grown by pixels."""
+
+
+def cropped(maps: Sequence[RectifyMap]) -> tuple[RectifyMap, ...]:
+    """Return maps into one target, as all of `maps` have it, cut to what every camera sees: the principal point moves
+    with the corner cut off, nothing else.
+
+    Raises DegenerateError where there is nothing that all see.
+    """
+    seen = np.logical_and.reduce([one.coverage() for one in maps])
+    left, top, right, bottom = largest_rectangle(seen)
+    if right == left:
+        raise DegenerateError("crop: no part of the view is seen by all cameras; choose another view")
+    target = maps[0].target
+    parameters: FloatArray = target.parameters.copy()
+    parameters[2:4] -= (left, top)
+    part = type(target)((right - left, bottom - top), parameters)
+    return tuple(replace(one, target=part) for one in maps)
+
+
+def largest_rectangle(seen: BoolArray) -> tuple[int, int, int, int]:
+    """Return (left, top, right, bottom), ends excluded, of a large upright rectangle of True: the largest one of coarse
+    cells, grown until no side has room. Empty where nothing is True."""
+    step = max(-(-max(seen.shape) // COARSE), 1)
+    rows, columns = (size // step for size in seen.shape)
+    whole = seen[: rows * step, : columns * step].reshape(rows, step, columns, step).all(axis=(1, 3))
+    left, top, right, bottom = (step * edge for edge in _of_cells(whole))
+    if right == left:
+        return 0, 0, 0, 0
+    grown = True
+    while grown:
+        grown = False
+        if left > 0 and seen[top:bottom, left - 1].all():
+            left, grown = left - 1, True
+        if right < seen.shape[1] and seen[top:bottom, right].all():
+            right, grown = right + 1, True
+        if top > 0 and seen[top - 1, left:right].all():
+            top, grown = top - 1, True
+        if bottom < seen.shape[0] and seen[bottom, left:right].all():
+            bottom, grown = bottom + 1, True
+    return left, top, right, bottom
+
+
+def _of_cells(whole: BoolArray) -> tuple[int, int, int, int]:
+    """Return the largest rectangle of True cells: under each row's histogram of heights, by a stack."""
+    best, found = 0, (0, 0, 0, 0)
+    height = np.zeros(whole.shape[1], dtype=np.int64)
+    for row, cells in enumerate(whole):
+        height = np.where(cells, height + 1, 0)
+        stack: list[tuple[int, int]] = []  # (first column, height), rising
+        for column, h in enumerate([*height.tolist(), 0]):
+            first = column
+            while stack and stack[-1][1] >= h:
+                first, tall = stack.pop()
+                if tall * (column - first) > best:
+                    best, found = tall * (column - first), (first, row + 1 - tall, column, row + 1)
+            stack.append((first, h))
+    return found

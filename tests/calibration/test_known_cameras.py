@@ -1,0 +1,119 @@
+"""Lenses, and whole cameras of a rig, that are known before: they stay, and what is not sure of them goes through."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from calibration.test_rig import NOISE_PX, mounts, rig_views
+from helpers.calibration_scenes import lens
+
+from rigkit.calibration.posed import posed_calibration
+from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.known import KnownCameras
+from rigkit.cameras.base import Camera
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import log_so3
+
+NAMES = ("reg", "wide", "fish")
+
+
+def sizes() -> dict[str, tuple[int, int]]:
+    return {name: camera.size_px for name, (camera, _) in mounts().items()}
+
+
+def off_in_sigmas(pose: Rigid3, true: Rigid3, covariance: np.ndarray) -> float:
+    """The mount's error as a chi of six numbers, over the root of six."""
+    error = np.concatenate([log_so3(pose.rotation @ true.rotation.T), pose.translation_mm - true.translation_mm])
+    return float(np.sqrt(error @ np.linalg.solve(covariance, error) / 6.0))
+
+
+def test_lenses_that_are_known_stay_and_the_mounts_are_found(rng: np.random.Generator) -> None:
+    views = rig_views(rng, 12)
+    known = KnownCameras({name: (camera, None) for name, (camera, _) in mounts().items()})
+    rig = calibrate_rig(views, sizes(), known=known)
+    for k, camera in enumerate(rig.cameras):
+        assert camera.camera.parameters == pytest.approx(lens(camera.name).parameters, rel=1e-9, abs=1e-12)
+        if k:
+            covariance = rig.covariance[rig.mount(k), rig.mount(k)]
+            assert off_in_sigmas(camera.cam_from_rig, mounts()[camera.name][1], covariance) < 2.0
+    assert rig.sigma_px == pytest.approx(NOISE_PX, rel=0.1)
+    assert rig.heldout_rms_px == pytest.approx(np.sqrt(2.0) * NOISE_PX, rel=0.1)
+
+
+def test_mounts_of_lenses_not_known_exactly_are_as_unsure(rng: np.random.Generator) -> None:
+    """With the covariance of another calibration the mounts are less sure than with exact lenses, and by what its
+    errors do: the files' errors, drawn from it, move the mounts by so much."""
+    views = rig_views(rng, 12)
+    two = {name: views[name] for name in ("reg", "wide")}
+    exact = {name: (lens(name), None) for name in two}
+    free = calibrate_rig(
+        {name: rig_views(np.random.default_rng(7), 12)[name] for name in two},
+        sizes(),
+        model={"reg": "brown", "wide": "kannala_brandt"},
+    )
+    count = sum(camera.parameters.size for camera, _ in exact.values())
+    covariance = free.covariance[:count, :count]
+    sure = calibrate_rig(two, sizes(), known=KnownCameras(exact))
+    unsure = calibrate_rig(two, sizes(), known=KnownCameras(exact, covariance))
+    added = unsure.covariance[unsure.mount(1), unsure.mount(1)] - sure.covariance[sure.mount(1), sure.mount(1)]
+    moved = []
+    for draw in np.random.default_rng(3).multivariate_normal(np.zeros(count), covariance, size=40):
+        wrong, start = {}, 0
+        for name, (camera, _) in exact.items():
+            size = camera.parameters.size
+            wrong[name] = (camera.with_parameters(camera.parameters + draw[start : start + size]), None)
+            start += size
+        pose = calibrate_rig(two, sizes(), known=KnownCameras(wrong), folds=0).cameras[1].cam_from_rig
+        there = sure.cameras[1].cam_from_rig
+        moved.append(
+            np.concatenate([log_so3(pose.rotation @ there.rotation.T), pose.translation_mm - there.translation_mm])
+        )
+    # Forty draws tell a standard deviation to 11 %: four times that.
+    assert np.std(moved, axis=0) == pytest.approx(np.sqrt(np.diag(added)), rel=0.45)
+
+
+def test_a_camera_is_added_to_a_rig_that_stays(rng: np.random.Generator) -> None:
+    cameras = mounts()
+    before = {name: cameras[name] for name in ("reg", "wide")}
+    rig = calibrate_rig(
+        rig_views(rng, 12),
+        sizes(),
+        model={"reg": "brown", "wide": "kannala_brandt", "fish": "kannala_brandt"},
+        known=KnownCameras(before),
+    )
+    for camera in rig.cameras[:2]:
+        true_lens, true_mount = before[camera.name]
+        assert camera.camera.parameters == pytest.approx(true_lens.parameters, rel=1e-9, abs=1e-12)
+        assert camera.cam_from_rig.matrix() == pytest.approx(true_mount.matrix(), abs=1e-6)
+    new = rig.cameras[2]
+    assert new.camera.parameters != pytest.approx(lens("fish").parameters, rel=1e-12)
+    assert off_in_sigmas(new.cam_from_rig, cameras["fish"][1], rig.covariance[rig.mount(2), rig.mount(2)]) < 2.0
+
+
+def test_a_lens_of_another_size_or_place_is_refused(rng: np.random.Generator) -> None:
+    views, cameras = rig_views(rng, 6), mounts()
+    two = {name: views[name] for name in ("wide", "reg")}
+    with pytest.raises(InputError, match="known lens is of"):
+        calibrate_rig(two, sizes() | {"reg": (640, 480)}, known=KnownCameras({"reg": (lens("reg"), None)}))
+    with pytest.raises(InputError, match="has to be the first"):
+        calibrate_rig(two, sizes(), known=KnownCameras({"reg": cameras["reg"]}))
+    with pytest.raises(InputError, match="has no views"):
+        calibrate_rig(two, sizes(), known=KnownCameras({"fish": (lens("fish"), None)}))
+
+
+def test_views_under_a_wrong_lens_say_so(rng: np.random.Generator) -> None:
+    views = [view for _, view in rig_views(rng, 6)["wide"]]
+    right = posed_calibration(views, lens("wide"))
+    assert right.rms_px == pytest.approx(np.sqrt(2.0) * NOISE_PX, rel=0.1)
+    try:
+        wrong = posed_calibration(views, _longer(lens("wide")))
+    except DegenerateError:
+        return
+    assert wrong.rms_px > 5.0 * right.rms_px
+
+
+def _longer(camera: Camera) -> Camera:
+    parameters = camera.parameters.copy()
+    parameters[4:] += 0.2
+    return camera.with_parameters(parameters)

@@ -1,0 +1,44 @@
+"""The largest rectangle that is seen whole, against trying all of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rigkit.rectification.crop import largest_rectangle
+
+
+def brute(seen: np.ndarray) -> int:
+    """The area of the largest rectangle of True, by trying all."""
+    total = np.zeros((seen.shape[0] + 1, seen.shape[1] + 1), dtype=int)
+    total[1:, 1:] = seen.cumsum(axis=0).cumsum(axis=1)
+    best = 0
+    for top in range(seen.shape[0]):
+        for bottom in range(top + 1, seen.shape[0] + 1):
+            for left in range(seen.shape[1]):
+                for right in range(left + 1, seen.shape[1] + 1):
+                    area = (bottom - top) * (right - left)
+                    whole = total[bottom, right] - total[top, right] - total[bottom, left] + total[top, left] == area
+                    best = max(best, area if whole else 0)
+    return best
+
+
+def test_the_rectangle_is_the_largest(rng: np.random.Generator) -> None:
+    for share in (0.3, 0.8, 0.95):
+        seen = rng.random((13, 17)) < share
+        left, top, right, bottom = largest_rectangle(seen)
+        assert seen[top:bottom, left:right].all()
+        assert (bottom - top) * (right - left) == brute(seen)
+
+
+def test_a_disk_of_any_size_gives_the_square_in_it() -> None:
+    for radius in (90, 700):
+        v, u = np.mgrid[-radius : radius + 1, -radius : radius + 1]
+        left, top, right, bottom = largest_rectangle(np.hypot(u, v) <= radius)
+        assert np.hypot(u, v)[top:bottom, left:right].max() <= radius
+        # The square has 2 r^2; a cell of the coarse grid may be lost before it grows.
+        assert (bottom - top) * (right - left) == pytest.approx(2.0 * radius**2, rel=0.02)
+
+
+def test_nothing_seen_is_nothing() -> None:
+    assert largest_rectangle(np.zeros((40, 50), dtype=bool)) == (0, 0, 0, 0)
