@@ -96,7 +96,7 @@ class Bench:
     def rig(self, patterns: Mapping[str, str], shape: str = "auto") -> RigSessionCalibration:
         """Return the rig of cameras {name: pattern of their images}; numbers in the names say what belongs together."""
         sessions = {name: self.session(pattern, name, shape) for name, pattern in patterns.items()}
-        rig = RigSession(self.work / f"{self.name}.toml", sessions, "number", ())
+        rig = RigSession(path=self.work / f"{self.name}.toml", cameras=sessions, frames="number", baselines=())
         return calibrate_rig_session(rig, CalibrateOptions(cache=Cache.UPDATE))
 
     def measured(self, what: str) -> PublicMeasurement:

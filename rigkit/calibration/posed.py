@@ -17,7 +17,7 @@ from rigkit.calibration.state import State, evaluate
 from rigkit.calibration.usable import usable_views
 from rigkit.calibration.verdicts import judge
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError
 from rigkit.core.findings import Finding, Severity
@@ -28,7 +28,7 @@ __all__ = ["posed_calibration"]
 START_MM = 1000.0
 MIN_KEPT_SHARE = 0.5
 """A view in which fewer of the corners fit the known lens is dropped."""
-MISFIT_PX = 1.0
+MAX_LENS_MISFIT_PX = 1.0
 """A known lens that leaves more than this, 2-D RMS, is another lens, or the images are of another size or focus."""
 
 
@@ -52,24 +52,7 @@ def posed_calibration(views: Sequence[BoardView], camera: Camera, covariance: Fl
     """
     used, dropped = usable_views(views, camera.size_px)
     observations = Observations.from_views(used)
-    count, p = len(used), camera.parameters.size
-    away = np.broadcast_to([0.0, 0.0, START_MM], (count, 3)).copy()
-    start = State.start(camera, np.broadcast_to(np.eye(3), (count, 3, 3)).copy(), away, observations)
-    state = find_poses(observations, start, observations.weight, None)
-    norm = evaluate(state, observations).weighted(observations)
-    sigma = sigma_of(norm, observations.present)
-    if norm.max() > OUTLIER_SIGMAS * sigma:
-        state = find_poses(observations, state, observations.weight, CAUCHY_SIGMAS * sigma)
-        norm = evaluate(state, observations).weighted(observations)
-        sigma = sigma_of(norm, observations.present)
-    kept = inliers(norm, observations, sigma, camera.size_px)
-    for _ in range(SETTLE_ROUNDS):
-        state, _ = refine_poses(observations, state, np.where(kept, observations.weight, 0.0))
-        norm = evaluate(state, observations).weighted(observations)
-        agree = inliers(norm, observations, sigma_of(norm, kept), camera.size_px)
-        if (agree == kept).all():
-            break
-        kept = agree
+    state, kept = _posed(observations, camera)
     fits = kept.sum(axis=1) >= np.maximum(MIN_KEPT_SHARE * observations.present.sum(axis=1), 4)
     if not fits.any():
         raise DegenerateError("no view fits the known lens; is it that of another camera, image size or focus?")
@@ -84,14 +67,10 @@ def posed_calibration(views: Sequence[BoardView], camera: Camera, covariance: Fl
     freedom = 2 * int(kept.sum()) - 6 * len(chosen)
     if freedom <= 0:
         raise DegenerateError("as many unknowns as corners; take views with more corners")
-    fit = Fit(
-        state,
-        data,
-        kept,
-        float(np.sqrt(data.costs.sum() / freedom)),
-        Convergence(0, True, "only poses were solved for"),
-    )
+    sigma = float(np.sqrt(data.costs.sum() / freedom))
+    fit = Fit(state, data, kept, sigma, Convergence(0, True, "only poses were solved for"))
     px = np.where(fit.residuals.valid[..., None], fit.residuals.px, np.nan)
+    p = camera.parameters.size
     own = np.zeros((p, p)) if covariance is None else covariance
     frame = np.zeros((p + 6, p + 6))
     frame[:p, :p] = own
@@ -112,8 +91,31 @@ def posed_calibration(views: Sequence[BoardView], camera: Camera, covariance: Fl
     return replace(result, verdicts=judge(result, _misfit(result)))
 
 
+def _posed(observations: Observations, camera: Camera) -> tuple[State, BoolArray]:
+    """Return the poses of all views, each at its own minimum, and which corners (V, C) are no outliers there."""
+    count = len(observations.views)
+    away = np.broadcast_to([0.0, 0.0, START_MM], (count, 3)).copy()
+    start = State.start(camera, np.broadcast_to(np.eye(3), (count, 3, 3)).copy(), away, observations)
+    state = find_poses(observations, start, observations.weight, None)
+    norm = evaluate(state, observations).weighted(observations)
+    sigma = sigma_of(norm, observations.present)
+    if norm.max() > OUTLIER_SIGMAS * sigma:
+        state = find_poses(observations, state, observations.weight, CAUCHY_SIGMAS * sigma)
+        norm = evaluate(state, observations).weighted(observations)
+        sigma = sigma_of(norm, observations.present)
+    kept = inliers(norm, observations, sigma, camera.size_px)
+    for _ in range(SETTLE_ROUNDS):
+        state, _ = refine_poses(observations, state, np.where(kept, observations.weight, 0.0))
+        norm = evaluate(state, observations).weighted(observations)
+        agree = inliers(norm, observations, sigma_of(norm, kept), camera.size_px)
+        if (agree == kept).all():
+            break
+        kept = agree
+    return state, kept
+
+
 def _misfit(result: Calibration) -> tuple[Finding, ...]:
-    if result.rms_px <= MISFIT_PX:
+    if result.rms_px <= MAX_LENS_MISFIT_PX:
         return ()
     message = f"the known lens leaves {result.rms_px:.2f} px: the lens of another camera, image size or focus?"
     return (Finding(severity=Severity.BAD, message=message, remedy="calibrate it anew"),)

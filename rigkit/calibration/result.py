@@ -87,7 +87,14 @@ class ViewResult:
 
 @dataclass(frozen=True, slots=True)
 class Outlier:
-    """A corner that took no part in the solution: `residual_px` is its distance from where the board puts it."""
+    """A corner that took no part in the solution.
+
+    Attributes
+    ----------
+    image, board_id : in which image, of which board.
+    column, row : which corner.
+    residual_px : its distance from where the board puts it.
+    """
 
     image: str
     board_id: str
@@ -100,7 +107,13 @@ class Outlier:
 class Candidate:
     """A model or board shape that was tried, and why it was (not) taken.
 
-    `heldout_rms_px` is what the choice rests on; None where it could not be had (too few images).
+    Attributes
+    ----------
+    name : what was tried.
+    parameter_count : how many numbers it has.
+    rms_px : training error.
+    heldout_rms_px : what the choice rests on; None where it could not be had (too few images).
+    chosen, reason : whether it was taken, and why.
     """
 
     name: str
@@ -113,7 +126,13 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Convergence:
-    """How the last solve ended: `reason` in words."""
+    """How the last solve ended.
+
+    Attributes
+    ----------
+    iterations : steps taken.
+    converged, reason : whether it ended where it should, and how in words.
+    """
 
     iterations: int
     converged: bool

@@ -21,7 +21,7 @@ HELP = "write a manifest of pairs to validate, or a session to calibrate, from a
 POSE_TYPES = ("general", "planar", "standard", "forward", "auto")
 ONE_CAMERA, TWO_CAMERAS = ("camera",), ("camera1", "camera2")
 
-EXAMPLES = """examples:
+_EXAMPLES = """examples:
   rigkit init lab --square-mm 50 --calibration camera.json --pose-type general --baseline-mm first=300+-2
   rigkit init lab --square-mm 50 --calibration left.json --calibration right.json --pose-type standard
   rigkit init lab --square-mm 50 --calibration wide=w.json --calibration tele=t.json \\
@@ -32,7 +32,7 @@ EXAMPLES = """examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = EXAMPLES
+    parser.epilog = _EXAMPLES
     parser.add_argument("folder", type=Path, help="folder with the images of the pairs, or of the cameras")
     parser.add_argument("--name", help="name of the data set (default: the folder's)")
     parser.add_argument("--square-mm", type=float, help="side of a square, as measured on the printed board")

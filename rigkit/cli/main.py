@@ -39,9 +39,10 @@ VERBS: dict[str, tuple[str, str]] = {
     "simulate": ("rigkit.cli.simulate", "the synthetic study: sweeps over noise, box plots, tables"),
     "crosscheck": ("rigkit.cli.crosscheck", "the same pairs through pycolmap and other ways"),
     "fetch": ("rigkit.cli.fetch", "public captures with measured truth: list them, or fetch one"),
-    "init": ("rigkit.cli.init", "write a manifest from a folder of images"),
+    "init": ("rigkit.cli.init", "write a manifest, or a session, from a folder of images"),
     "export": ("rigkit.cli.export", "cameras in other tools' formats; clouds as PLY, npz or a COLMAP model"),
     "board": ("rigkit.cli.board", "a board to print, true to scale"),
+    "schema": ("rigkit.cli.schema", "JSON Schema of a file that rigkit reads or writes: for editors and programs"),
 }
 """Verb -> (module, one-line help)."""
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -26,9 +26,11 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.files import write_atomic
 from rigkit.io.json_reader import read_json, real, whole
 from rigkit.io.reading import usable_path
+from rigkit.io.schema_calibration import CALIBRATION_FILE, keys_of
 
 __all__ = [
     "CALIBRATION_SCHEMA",
+    "Made",
     "calibration_text",
     "camera_from_json",
     "camera_to_json",
@@ -44,12 +46,11 @@ __all__ = [
 ]
 
 CALIBRATION_SCHEMA = "rigkit.calibration/1"
-CAMERA_KEYS = {"model", "size_px", "parameters"}
-CALIBRATION_KEYS = {
-    "schema", "camera", "rms_px", "heldout_rms_px", "sigma_px", "covariance", "frame_covariance", "verdicts",
-    "candidates", "convergence", "dropped", "outliers", "boards", "views", "overdispersion", "freedom",
-}  # fmt: skip
-LATER_KEYS = {"overdispersion", "freedom"}
+CAMERA_KEYS = keys_of(CALIBRATION_FILE, "camera")
+CALIBRATION_KEYS = keys_of(CALIBRATION_FILE)
+Made = Mapping[str, Any]
+"""By what, when and from what a file was made: see `rigkit.workflows.provenance.made`."""
+LATER_KEYS = {"overdispersion", "freedom", "made"}
 """Former files do not have them."""
 
 
@@ -58,11 +59,12 @@ def save_calibration(path: str | Path, calibration: Calibration, *, force: bool 
     write_atomic(path, calibration_text(calibration), force=force)
 
 
-def calibration_text(calibration: Calibration) -> str:
-    """Return the content of the calibration's file."""
+def calibration_text(calibration: Calibration, made: Made | None = None) -> str:
+    """Return the content of the calibration's file, with what is known of how it was made."""
     c = calibration
     data = {
         "schema": CALIBRATION_SCHEMA,
+        **({} if made is None else {"made": made}),
         "camera": camera_to_json(c.camera),
         "rms_px": c.rms_px,
         "heldout_rms_px": c.heldout_rms_px,

@@ -21,22 +21,18 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.io.calibration_file import camera_from_json, camera_to_json, damage_named, findings_to_json
+from rigkit.io.calibration_file import Made, camera_from_json, camera_to_json, damage_named, findings_to_json
 from rigkit.io.json_reader import json_schema, read_json, real, whole
+from rigkit.io.schema_calibration import BOARD_RIG_FILE, RIG_FILE, keys_of
 
 __all__ = ["BOARDS_SCHEMA", "RIG_SCHEMA", "SavedRig", "board_rigs_text", "is_rig_file", "load_board_rigs", "load_rig"]
 __all__ += ["load_saved_rig", "rig_text"]
 
 RIG_SCHEMA = "rigkit.rig/1"
 BOARDS_SCHEMA = "rigkit.board_rig/1"
-RIG_KEYS = {
-    "schema", "cameras", "rms_px", "heldout_rms_px", "sigma_px", "overdispersion", "scale_sigma", "covariance",
-    "baselines", "verdicts", "freedom",
-}  # fmt: skip
-FORMER_KEYS = {"spread"}
-"""What `overdispersion` was called."""
-RIG_CAMERA_KEYS = {"name", "camera", "cam_from_rig", "rms_px"}
-BOARD_KEYS = {"board_id", "size", "square_mm", "square_sigma_mm", "points_mm", "target_from_board"}
+RIG_KEYS = keys_of(RIG_FILE)
+RIG_CAMERA_KEYS = keys_of(RIG_FILE, "cameras")
+BOARD_KEYS = keys_of(BOARD_RIG_FILE, "rigs", "boards")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -54,11 +50,12 @@ class SavedRig:
     overdispersion: float = 1.0
 
 
-def rig_text(rig: RigCalibration) -> str:
-    """Return the content of the rig's file."""
+def rig_text(rig: RigCalibration, made: Made | None = None) -> str:
+    """Return the content of the rig's file, with what is known of how it was made."""
     pairs = [(a, b, *rig.baseline_mm(a, b)) for a, b in combinations([c.name for c in rig.cameras], 2)]
     data = {
         "schema": RIG_SCHEMA,
+        **({} if made is None else {"made": made}),
         "heldout_rms_px": rig.heldout_rms_px,
         "rms_px": rig.rms_px,
         "sigma_px": rig.sigma_px,
@@ -91,7 +88,7 @@ def load_saved_rig(path: str | Path) -> SavedRig:
 
     Raises InputError for a missing or damaged file, another schema or an unknown key.
     """
-    data = _read(path, RIG_SCHEMA, RIG_KEYS | FORMER_KEYS)
+    data = _read(path, RIG_SCHEMA, RIG_KEYS)
     cameras: dict[str, tuple[Camera, Rigid3]] = {}
     with damage_named(path):
         for entry in data["cameras"]:
@@ -168,7 +165,7 @@ def board_rigs_text(rigs: Sequence[BoardRig]) -> str:
 
 def load_board_rigs(path: str | Path) -> tuple[BoardRig, ...]:
     """Return the boards on one mount; raises InputError like `load_saved_rig`."""
-    data = _read(path, BOARDS_SCHEMA, {"schema", "rigs"})
+    data = _read(path, BOARDS_SCHEMA, keys_of(BOARD_RIG_FILE))
     with damage_named(path):
         return tuple(
             BoardRig(

@@ -90,7 +90,7 @@ class RigidBoards:
     truth: PairTruth
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class RigSession:
     """What to calibrate together.
 
@@ -143,7 +143,7 @@ def load_rig_session(path: str | Path) -> RigSession:
             path=source, images=images_of(table), boards=boards, model=model, degree=degree, board_shape=shape
         )
         table.done()
-        return RigSession(source, {ONE: one}, None, (), rigid)
+        return RigSession(path=source, cameras={ONE: one}, frames=None, baselines=(), rigid_boards=rigid)
     if table.has("images"):
         raise table.error("'images' together with [[cameras]]; give every camera its own images")
     frames = None
@@ -170,7 +170,15 @@ def load_rig_session(path: str | Path) -> RigSession:
         raise table.error("a rig has at least two [[cameras]]; for one, write its `images` without [[cameras]]")
     baselines = _baselines(table, tuple(cameras))
     table.done()
-    return RigSession(source, cameras, frames, baselines, rigid, lenses, known_rig)
+    return RigSession(
+        path=source,
+        cameras=cameras,
+        frames=frames,
+        baselines=baselines,
+        rigid_boards=rigid,
+        lenses=lenses,
+        known_rig=known_rig,
+    )
 
 
 def _rigid_boards(table: TomlTable, boards: Sequence[Board]) -> tuple[RigidBoards, ...]:

@@ -39,8 +39,8 @@ def largest_rectangle(seen: BoolArray) -> tuple[int, int, int, int]:
     cells, grown until no side has room. Empty where nothing is True."""
     step = max(-(-max(seen.shape) // COARSE), 1)
     rows, columns = (size // step for size in seen.shape)
-    whole = seen[: rows * step, : columns * step].reshape(rows, step, columns, step).all(axis=(1, 3))
-    left, top, right, bottom = (step * edge for edge in _of_cells(whole))
+    cells = seen[: rows * step, : columns * step].reshape(rows, step, columns, step)
+    left, top, right, bottom = (step * edge for edge in _of_cells(np.asarray(cells.all(axis=(1, 3)))))
     if right == left:
         return 0, 0, 0, 0
     grown = True

@@ -20,6 +20,7 @@ from rigkit.workflows.corners import Cache, SessionCorners, session_corners, ses
 from rigkit.workflows.export_camera import foreign_files, foreign_paths
 from rigkit.workflows.folder_session import Known
 from rigkit.workflows.given_corners import given_corners
+from rigkit.workflows.provenance import made
 from rigkit.workflows.session_page import session_page
 
 __all__ = [
@@ -96,7 +97,7 @@ def calibrate_session(
     calibration = calibration_from(session, corners, progress=progress)
     files: dict[Path, str] = {}
     if options.output is not None:
-        files[options.output] = calibration_text(calibration)
+        files[options.output] = calibration_text(calibration, made(session.path, {"": session.images}))
         files |= foreign_files(calibration.camera, options.output, options.exports)
     if options.report is not None:
         files[options.report] = session_page(session, calibration, corners, files)

@@ -24,6 +24,7 @@ from rigkit.workflows.calibrate import CalibrateOptions, calibration_from, corne
 from rigkit.workflows.corners import Cache, SessionCorners, session_corners, session_views
 from rigkit.workflows.export_camera import foreign_files, foreign_paths, foreign_rig_files, foreign_rig_paths
 from rigkit.workflows.known_cameras import known_cameras, with_known, with_known_first
+from rigkit.workflows.provenance import made
 from rigkit.workflows.rigid_boards import named_as_listed, named_by_rule, require_distinct
 from rigkit.workflows.session_page import rig_page
 
@@ -90,13 +91,14 @@ def calibrate_rig_session(
     checks = measured_checks(session, rig)
     files: dict[Path, str] = {}
     if options.output is not None:
+        about = made(session.path, {name: own.images for name, own in session.cameras.items()})
         if len(session.cameras) > 1:
-            files[options.output] = rig_text(rig)
+            files[options.output] = rig_text(rig, about)
             mounted = {c.name: (c.camera, c.cam_from_rig) for c in rig.cameras}
             files |= foreign_rig_files(mounted, options.output, options.exports)
         for camera in rig.cameras:
             own = _beside(session, options.output, camera.name)
-            files[own] = calibration_text(judged(camera.calibration))
+            files[own] = calibration_text(judged(camera.calibration), about)
             files |= foreign_files(camera.camera, own, options.exports)
         if session.rigid_boards:
             files[_boards_file(options.output)] = board_rigs_text(rig.board_rigs)

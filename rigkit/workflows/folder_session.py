@@ -110,29 +110,34 @@ def session_of_folders(
     if len(cameras) == 1:
         lines.append(f"images = {_listed(cameras[''], place)}")
     else:
-        lines += ["# Those of one moment have the same name, or the same number at its end.", ""]
-        known = known or Known()
-        if known.rig is not None:
-            lines += [
-                "# Its cameras stay as they are, lens and mount.",
-                f"rig = {_quoted(_relative(known.rig, place))}",
-            ]
-            lines += [""]
-        lenses = known.of_cameras(list(cameras))
-        for name, patterns in cameras.items():
-            lines += ["[[cameras]]", f"id = {_quoted(name)}", f"images = {_listed(patterns, place)}"]
-            lines += [f"calibration = {_quoted(_relative(lenses[name], place))}", ""] if name in lenses else [""]
-        lines += [
-            "# What a rule says of the distance of two cameras is compared with the result:",
-            "# [[baselines]]",
-            f"# a = {_quoted(next(iter(cameras)))}",
-            f"# b = {_quoted(list(cameras)[1])}",
-            "# value_mm = 100.0",
-            "# sigma_mm = 1.0",
-            '# how = "steel rule"',
-        ]
+        lines += _cameras_in_words(cameras, place, known or Known())
     files[path] = "\n".join(lines).rstrip() + "\n"
     return FolderSession(path, files)
+
+
+def _cameras_in_words(cameras: Mapping[str, Sequence[tuple[Path, str]]], place: Path, known: Known) -> list[str]:
+    """Return the lines of several cameras in a session in folder `place`."""
+    lines = ["# Those of one moment have the same name, or the same number at its end.", ""]
+    if known.rig is not None:
+        lines += [
+            "# Its cameras stay as they are, lens and mount.",
+            f"rig = {_quoted(_relative(known.rig, place))}",
+        ]
+        lines += [""]
+    lenses = known.of_cameras(list(cameras))
+    for name, patterns in cameras.items():
+        lines += ["[[cameras]]", f"id = {_quoted(name)}", f"images = {_listed(patterns, place)}"]
+        lines += [f"calibration = {_quoted(_relative(lenses[name], place))}", ""] if name in lenses else [""]
+    lines += [
+        "# What a rule says of the distance of two cameras is compared with the result:",
+        "# [[baselines]]",
+        f"# a = {_quoted(next(iter(cameras)))}",
+        f"# b = {_quoted(list(cameras)[1])}",
+        "# value_mm = 100.0",
+        "# sigma_mm = 1.0",
+        '# how = "steel rule"',
+    ]
+    return lines
 
 
 def session_to_come(pattern: str, boards: Sequence[str], place: Path) -> FolderSession:

@@ -8,8 +8,11 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
-__all__ = ["digest_line", "digest_of_many", "software_facts"]
+from rigkit.io.corner_cache import image_hash
+
+__all__ = ["digest_line", "digest_of_many", "made", "software_facts"]
 
 PACKAGES = ("numpy", "opencv-contrib-python-headless")
 """Whose versions every result depends on."""
@@ -20,6 +23,19 @@ def software_facts(*packages: str) -> dict[str, str]:
     facts = {"rigkit": version("rigkit"), "Python": platform.python_version()}
     facts |= {name: version(name) for name in (*PACKAGES, *packages)}
     return facts | {"written": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")}
+
+
+def made(session: Path, images: Mapping[str, Sequence[Path]]) -> dict[str, Any]:
+    """Return by what, when and from what a calibration's file is made, as it stands in it: the SHA-256 of the session,
+    and one of the images of every camera (""): of what `sha256sum` prints of them; images that are gone have none."""
+    inputs = {} if not session.is_file() else {session.name: hashlib.sha256(session.read_bytes()).hexdigest()}
+    for name, paths in images.items():
+        there = [path for path in paths if path.is_file()]
+        if there:
+            label = f"{len(there)} images{f' of {name}' if name else ''}"
+            inputs[label] = _digest_of([(path.name, image_hash(path)) for path in there])
+    written = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    return {"rigkit": version("rigkit"), "written": written, "inputs": inputs}
 
 
 def digest_line(source: Path | str | bytes) -> str:
@@ -33,5 +49,8 @@ def digest_line(source: Path | str | bytes) -> str:
 def digest_of_many(hashes: Mapping[str, str] | Sequence[tuple[str, str]]) -> str:
     """Return one SHA-256 of several files, given (name, SHA-256) of each, in words that say how to compute it."""
     pairs = list(hashes.items()) if isinstance(hashes, Mapping) else list(hashes)
-    digest = hashlib.sha256("".join(f"{own}  {name}\n" for name, own in pairs).encode()).hexdigest()
-    return f"{len(pairs)} files; SHA-256 of what `sha256sum` prints of them: {digest}"
+    return f"{len(pairs)} files; SHA-256 of what `sha256sum` prints of them: {_digest_of(pairs)}"
+
+
+def _digest_of(pairs: Sequence[tuple[str, str]]) -> str:
+    return hashlib.sha256("".join(f"{own}  {name}\n" for name, own in pairs).encode()).hexdigest()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -72,6 +73,14 @@ def of_one_camera(pictures: Path, folder: Path) -> Path:
     return folder
 
 
+def undated(path: Path) -> dict[str, Any]:
+    """A result without the day it was made on; what it was made from stays."""
+    data: dict[str, Any] = json.loads(path.read_text())
+    assert data["made"]["inputs"] and data["made"]["rigkit"]
+    del data["made"]["written"]
+    return data
+
+
 def worst_px(camera: Camera) -> float:
     """Return how far the projections are off in the middle of the image, but for a rotation of the camera."""
     u, v = np.meshgrid(np.linspace(150.0, 490.0, 18), np.linspace(120.0, 360.0, 13))
@@ -101,11 +110,12 @@ def test_from_pictures_to_a_page_and_two_formats_in_one_command(
     assert len(session.images) == FRAMES and session.model == "auto"
     assert session.boards[0].size == (9, 6) and session.boards[0].square_x_mm == 30.0
     before = {path: path.read_bytes() for path in folder.iterdir()}
+    result = undated(folder / "calibration.json")
     assert main(command) == 2
     assert "calibration.json' exists" in capsys.readouterr().err
     for again in ([str(folder / "session.toml")], [str(folder)]):
         assert main(["calibrate", *again, "--force"]) == 0
-        assert (folder / "calibration.json").read_bytes() == before[folder / "calibration.json"]
+        assert undated(folder / "calibration.json") == result
     assert {path.name for path in folder.iterdir()} == {path.name for path in before} | {"corners.json"}
 
 
@@ -268,12 +278,12 @@ def test_lenses_that_are_known_stay_and_a_camera_is_added_to_a_rig(
     moved = rig["right"][1].translation_mm - RIGHT_FROM_LEFT.translation_mm
     assert np.linalg.norm(moved) < 0.1
     assert list(load_rig_session(folder / "session.toml").lenses) == ["left", "right"]
-    before = (folder / "rig.json").read_bytes()
+    before = undated(folder / "rig.json")
     assert main(["calibrate", str(folder / "session.toml"), "--force"]) == 0
-    assert (folder / "rig.json").read_bytes() == before
+    assert undated(folder / "rig.json") == before
 
     # The right camera anew, with the left one as a rig of its own frame has it.
-    saved = json.loads(before)
+    saved = before
     saved["cameras"], saved["covariance"] = saved["cameras"][:1], np.eye(9).tolist()
     saved["covariance"] = (1e-12 * np.eye(9)).tolist()
     known = tmp_path / "known.json"

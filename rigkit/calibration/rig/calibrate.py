@@ -56,8 +56,7 @@ def calibrate_rig(
         the joint solution, one for all cameras.
     rigid_boards : groups of ids of boards that are mounted to each other. Boards of a group that look alike may be
         named and counted in any way; their arrangement sorts that out.
-    known : lenses, or lenses and mounts, that stay as they are; what is not sure of them is in all covariances. Boards
-        of a rig whose lenses are all known are flat.
+    known : lenses, or lenses and mounts, that stay as they are; what is not sure of them is in all covariances.
     folds : of the cross-validations, of each camera alone and of the rig; 0 for none.
 
     Raises
@@ -70,14 +69,10 @@ def calibrate_rig(
     """
     if not views or (len(views) < 2 and not rigid_boards):
         raise InputError(f"rig: {len(views)} camera; a rig has at least two, or boards that are mounted to each other")
-    for what, given in (("sizes_px", sizes_px), ("model", model), ("degree", degree)):
-        missing = [name for name in views if isinstance(given, Mapping) and name not in given]
-        if missing:
-            raise InputError(f"rig: {what} has no entry for camera '{missing[0]}'")
+    _require_entries(views, sizes_px=sizes_px, model=model, degree=degree)
     for name, own in views.items():
         _require_one_image(name, own)
-    if known is not None:
-        _require_known(views, sizes_px, known)
+    _require_known(views, sizes_px, known)
     options = _Options(sizes_px, model, degree, board, folds, known)
     single = options.each_alone(views, progress)
     seen = [frame_observations(own, result) for own, result in zip(views.values(), single, strict=True)]
@@ -99,6 +94,14 @@ def calibrate_rig(
     return replace(rig, verdicts=judge_rig(rig, (*notes, *joint.notes), in_force=options.in_force))
 
 
+def _require_entries(views: Views, **given: object) -> None:
+    """Raise InputError where something is given by camera, and one has none."""
+    for what, entries in given.items():
+        missing = [name for name in views if isinstance(entries, Mapping) and name not in entries]
+        if missing:
+            raise InputError(f"rig: {what} has no entry for camera '{missing[0]}'")
+
+
 def _require_one_image(name: str, own: Sequence[tuple[str, BoardView]]) -> None:
     """Raise InputError where the camera shows a board twice in a frame, or one image in two frames."""
     shown: set[tuple[str, str]] = set()
@@ -118,8 +121,10 @@ def _require_one_image(name: str, own: Sequence[tuple[str, BoardView]]) -> None:
             )
 
 
-def _require_known(views: Views, sizes_px: Mapping[str, tuple[int, int]], known: KnownCameras) -> None:
+def _require_known(views: Views, sizes_px: Mapping[str, tuple[int, int]], known: KnownCameras | None) -> None:
     """Raise InputError where a known camera has no views or another size, or does not come first with its mount."""
+    if known is None:
+        return
     for name, (camera, _) in known.cameras.items():
         if name not in views:
             raise InputError(f"rig: the known camera '{name}' has no views; there are {', '.join(views)}")

@@ -1,0 +1,44 @@
+"""`rigkit schema`: the keys of every file, as JSON Schema for editors and programs, or as a table."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from rigkit.core.errors import ExitCode
+
+HELP = "JSON Schema of a file that rigkit reads or writes: for editors and other programs"
+
+_EXAMPLES = """examples:
+  rigkit schema                          which files there are
+  rigkit schema session --keys           every key of a session, and what it means
+  rigkit schema session -o session.json  and in the session's first line: #:schema ./session.json
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = _EXAMPLES
+    parser.add_argument("name", nargs="?", metavar="NAME", help="of the file; without one all are listed")
+    parser.add_argument("--keys", action="store_true", help="as a table of keys instead of JSON")
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE.json", help="file to write")
+    parser.add_argument("--force", action="store_true", help="replace an existing file")
+
+
+def run(args: argparse.Namespace) -> int:
+    from rigkit.io.files import write_atomic
+    from rigkit.io.schema import SCHEMAS, key_rows, schema_named, schema_text
+
+    if args.name is None:
+        for name, schema in SCHEMAS.items():
+            print(f"{name:14}{schema['title']}")
+        return ExitCode.WELL
+    if args.output is not None:
+        write_atomic(args.output, schema_text(args.name), force=args.force)
+        print(args.output)
+    elif args.keys:
+        for key, kind, words in key_rows(schema_named(args.name)):
+            print(f"{key:40}{kind:30}{words}")
+    else:
+        print(schema_text(args.name), end="")
+    return ExitCode.WELL

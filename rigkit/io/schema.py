@@ -1,0 +1,69 @@
+"""JSON Schemas (draft 2020-12) of every file that rigkit reads or writes, by the name in its `schema` key."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+
+from rigkit.core.errors import InputError
+from rigkit.io import schema_calibration, schema_results, schema_toml
+from rigkit.io.schema_words import ANY_OF, Schema
+
+__all__ = ["SCHEMAS", "key_rows", "schema_named", "schema_text"]
+
+SCHEMAS: dict[str, Schema] = {
+    str(schema["properties"]["schema"]["const"]).removeprefix("rigkit.").partition("/")[0]: schema
+    for module in (schema_toml, schema_calibration, schema_results)
+    for schema in (getattr(module, name) for name in module.__all__)
+    if isinstance(schema, dict)
+}
+"""By name, such as "session" or "calibration"."""
+_KIND_WORDS = {"string": "text", "object": "table", "boolean": "true or false", "integer": "whole number"}
+
+
+def schema_named(name: str) -> Schema:
+    """Return the schema of a kind of file; raises InputError that lists the kinds."""
+    if name not in SCHEMAS:
+        raise InputError(f"no file is called '{name}'; there are {', '.join(SCHEMAS)}")
+    return SCHEMAS[name]
+
+
+def schema_text(name: str) -> str:
+    """Return the schema as a file."""
+    return json.dumps(schema_named(name), indent=1, ensure_ascii=False) + "\n"
+
+
+def key_rows(schema: Schema, prefix: str = "") -> Iterator[tuple[str, str, str]]:
+    """Yield (key, what it holds, what it means) of every key of a schema, those of inner objects after `prefix`."""
+    required = schema.get("required", [])
+    for key, own in schema["properties"].items():
+        if key == "schema":
+            continue
+        words = own.get("description", "")
+        yield f"{prefix}{key}", _kind(own), words if key in required else f"{words} (optional)".strip()
+        inner = _inner(own)
+        if inner is not None:
+            yield from key_rows(inner, f"{prefix}{key}{'[]' if own.get('type') == 'array' else ''}.")
+
+
+def _inner(schema: Schema) -> Schema | None:
+    """Return the object that a schema is, or is a list or a choice of; None where it is none."""
+    if "properties" in schema:
+        return schema
+    for one in (schema.get("items"), schema.get("additionalProperties"), *schema.get(ANY_OF, ())):
+        found = _inner(one) if isinstance(one, dict) else None
+        if found is not None:
+            return found
+    return None
+
+
+def _kind(schema: Schema) -> str:
+    """Return what a schema holds, in a word or two."""
+    if "const" in schema or "enum" in schema:
+        return ", ".join(f"`{value}`" for value in schema.get("enum", [schema.get("const")]))
+    if ANY_OF in schema:
+        return " or ".join(dict.fromkeys(filter(None, map(_kind, schema[ANY_OF]))))
+    kind = schema.get("type", "")
+    if kind == "array":
+        return f"list of {_kind(schema['items'])}".replace("list of list of number", "matrix")
+    return _KIND_WORDS.get(kind, str(kind))

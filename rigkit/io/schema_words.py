@@ -1,0 +1,110 @@
+"""Pieces of JSON Schemas (draft 2020-12): objects with every key described, arrays, tables of dataclasses."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import types
+from collections.abc import Mapping, Sequence
+from inspect import cleandoc
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+__all__ = ["ANY_OF", "array", "choice", "file", "matrix", "nullable", "obj", "of_dataclass", "row", "said", "table"]
+__all__ += ["BOOLEAN", "INTEGER", "NUMBER", "POSITIVE", "TEXT", "Schema"]
+
+Schema = dict[str, Any]
+ANY_OF = "anyOf"
+TEXT: Schema = {"type": "string"}
+NUMBER: Schema = {"type": "number"}
+POSITIVE: Schema = {"type": "number", "exclusiveMinimum": 0}
+INTEGER: Schema = {"type": "integer", "minimum": 0}
+BOOLEAN: Schema = {"type": "boolean"}
+PLAIN_KINDS: Mapping[type, Schema] = {str: TEXT, float: NUMBER, int: INTEGER, bool: BOOLEAN}
+
+
+def said(schema: Schema, words: str) -> Schema:
+    """Return the schema with what it means."""
+    return {**schema, "description": words}
+
+
+def choice(*values: str) -> Schema:
+    """Return the schema of one of some words."""
+    return {"enum": list(values)}
+
+
+def nullable(schema: Schema) -> Schema:
+    """Return the schema of that, or null where there is none."""
+    return {ANY_OF: [schema, {"type": "null"}]}
+
+
+def array(items: Schema, least: int = 0) -> Schema:
+    """Return the schema of a list of at least so many."""
+    return {"type": "array", "items": items, **({"minItems": least} if least else {})}
+
+
+def row(length: int, items: Schema = NUMBER) -> Schema:
+    """Return the schema of a list of exactly so many."""
+    return {"type": "array", "items": items, "minItems": length, "maxItems": length}
+
+
+def matrix(rows: int | None = None, columns: int | None = None) -> Schema:
+    """Return the schema of a matrix, row by row; None: of any number."""
+    inner = array(NUMBER) if columns is None else row(columns)
+    return array(inner) if rows is None else row(rows, inner)
+
+
+def obj(properties: Mapping[str, Schema], required: Sequence[str] = (), words: str = "") -> Schema:
+    """Return the schema of an object with these keys and no others."""
+    out: Schema = {"type": "object", "properties": dict(properties), "additionalProperties": False}
+    if required:
+        out["required"] = list(required)
+    return said(out, words) if words else out
+
+
+def table(values: Schema) -> Schema:
+    """Return the schema of an object whose keys are names that somebody chose."""
+    return {"type": "object", "additionalProperties": values}
+
+
+def file(schema: str, title: str, properties: Mapping[str, Schema], required: Sequence[str] = ()) -> Schema:
+    """Return the schema of a whole file, which says itself which one it is."""
+    own = obj({"schema": {"const": schema}, **properties}, ["schema", *required])
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": title, **own}
+
+
+def of_dataclass(cls: type, *, only: Sequence[str] = (), without: Sequence[str] = ()) -> Schema:
+    """Return the schema of a result as `asdict` gives it: its fields, with what its docstring says of them. Numbers may
+    be null, which is what files have for NaN."""
+    hints, words = get_type_hints(cls), _attributes(cls)
+    properties = {}
+    for field in dataclasses.fields(cls):
+        if field.name not in without and (not only or field.name in only):
+            one = _of_type(hints[field.name])
+            properties[field.name] = said(one, words[field.name]) if field.name in words else one
+    return obj(properties, list(properties))
+
+
+def _of_type(hint: Any) -> Schema:
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin in (Union, types.UnionType):
+        return nullable(_of_type(next(one for one in inner if one is not type(None))))
+    if origin is tuple:
+        return array(_of_type(inner[0]))
+    if hint is float:
+        return nullable(NUMBER)
+    return PLAIN_KINDS.get(hint, {})
+
+
+def _attributes(cls: type) -> dict[str, str]:
+    """Return what the docstring of a class says of each field under "Attributes"."""
+    lines = cleandoc(cls.__doc__ or "").partition("----------")[2].splitlines()
+    out: dict[str, str] = {}
+    names: list[str] = []
+    for line in lines:
+        begins = re.match(r"^(\w+(?:, \w+)*) : (.*)$", line)
+        if begins:
+            names = begins[1].split(", ")
+            out |= dict.fromkeys(names, begins[2].strip())
+        elif line.startswith("    ") and names:
+            out |= {name: f"{out[name]} {line.strip()}" for name in names}
+    return out

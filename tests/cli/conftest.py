@@ -1,0 +1,48 @@
+"""Every file that a command writes is of its published schema: each test of a command is a test of that too."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from helpers.schemas import faults
+
+from rigkit.io import files
+
+MAX_BYTES = 400_000
+"""Larger files have more of the same, and take a checker seconds."""
+
+
+@pytest.fixture(autouse=True)
+def _files_are_of_their_schemas(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    found: list[str] = []
+    fill = files._fill
+
+    def checked(handle: int, data: bytes) -> None:
+        fill(handle, data)
+        for document in _documents(data) if len(data) < MAX_BYTES else ():
+            found.extend(faults(document))
+
+    monkeypatch.setattr(files, "_fill", checked)
+    yield
+    assert not found, found[:3]
+
+
+def _documents(data: bytes) -> Iterator[Any]:
+    """Yield what a file says, if it is JSON, JSON lines or TOML with a schema."""
+    if b"rigkit." not in data[:400] or data[:1] not in b"{#s\n":
+        return
+    text = data.decode()
+    if not text.lstrip().startswith("{"):
+        try:
+            yield tomllib.loads(text)
+        except tomllib.TOMLDecodeError:
+            return
+        return
+    try:
+        yield json.loads(text)
+    except json.JSONDecodeError:
+        yield from map(json.loads, filter(None, text.splitlines()))

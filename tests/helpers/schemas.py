@@ -1,0 +1,35 @@
+"""Documents held against the published schemas."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import jsonschema
+
+from rigkit.io.schema import SCHEMAS
+
+FREE = ("frames", "check")
+"""What is no file of anybody's: a record of frames, and how a coach's page is asked."""
+
+
+@functools.cache
+def validator(name: str) -> jsonschema.Draft202012Validator:
+    jsonschema.Draft202012Validator.check_schema(SCHEMAS[name])
+    return jsonschema.Draft202012Validator(SCHEMAS[name])
+
+
+def faults(document: Any) -> list[str]:
+    """What is wrong with a document that names its schema; nothing with one that names none."""
+    schema = document.get("schema", "") if isinstance(document, dict) else ""
+    if not str(schema).startswith("rigkit."):
+        return []
+    name = str(schema).removeprefix("rigkit.").partition("/")[0]
+    if name in FREE:
+        return []
+    if name not in SCHEMAS:
+        return [f"no schema is published for {schema}"]
+    return [
+        f"{schema} {'.'.join(map(str, e.absolute_path))}: {e.message[:200]}"
+        for e in validator(name).iter_errors(document)
+    ]
