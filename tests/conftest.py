@@ -12,3 +12,9 @@ import pytest
 def rng(request: pytest.FixtureRequest) -> np.random.Generator:
     """A generator seeded by the test's own name: fixed for the test, different from every other test's."""
     return np.random.default_rng(zlib.crc32(request.node.name.encode()))
+
+
+@pytest.fixture(autouse=True)
+def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands start no processes of their own unless a test asks for some (-j 2): each costs seconds of imports."""
+    monkeypatch.setattr("os.cpu_count", lambda: 1)

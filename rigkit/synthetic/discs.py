@@ -7,12 +7,13 @@ from numpy.typing import NDArray
 
 from rigkit.core.arrays import FloatArray
 
-__all__ = ["covered_shares"]
+__all__ = ["MAX_CELL", "MIN_CELL", "covered_shares"]
 
 Float32 = NDArray[np.float32]
 
-LEAST_CELL = 1e-6
-"""Side of a cell in squares, at least."""
+MIN_CELL, MAX_CELL = 1e-6, 2.0
+"""A cell's side, in squares or panel sides: shorter is none; longer, the plane is seen edge on and differences mean
+nothing."""
 
 
 def covered_shares(axes: Float32, discs: FloatArray, squares_mm: tuple[float, float]) -> Float32:
@@ -25,7 +26,10 @@ def covered_shares(axes: Float32, discs: FloatArray, squares_mm: tuple[float, fl
     out = np.zeros(x.shape, np.float32)
     if min(x.shape) < 2:
         return out
-    slopes = [np.gradient(part) for part in (x, y)]
+    slopes = [
+        [np.clip(slope, -MAX_CELL, MAX_CELL) * np.float32(side) for slope in np.gradient(axis)]
+        for axis, side in zip(axes, squares_mm, strict=True)
+    ]
     reach = float(max(np.abs(part).max() for pair in slopes for part in pair)) * 2.0
     low, high = discs[:, :2] - discs[:, 2:] - reach, discs[:, :2] + discs[:, 2:] + reach
     seen = (high[:, 0] > x.min()) & (low[:, 0] < x.max()) & (high[:, 1] > y.min()) & (low[:, 1] < y.max())
@@ -44,7 +48,7 @@ def covered_shares(axes: Float32, discs: FloatArray, squares_mm: tuple[float, fl
 
 def _inside(distance: Float32, sides: Float32) -> Float32:
     """Return the share of each cell on the positive side of an edge; the integral of a trapezoid."""
-    wide, narrow = np.maximum(sides.max(axis=0), LEAST_CELL), np.maximum(sides.min(axis=0), LEAST_CELL)
+    wide, narrow = np.maximum(sides.max(axis=0), MIN_CELL), np.maximum(sides.min(axis=0), MIN_CELL)
     far = np.abs(distance)
     slope = np.clip(far - 0.5 * (wide - narrow), 0.0, narrow)
     share = (np.minimum(far, 0.5 * (wide + narrow)) - slope * slope / (2.0 * narrow)) / wide

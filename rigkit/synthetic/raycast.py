@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.synthetic.discs import covered_shares
+from rigkit.synthetic.discs import MAX_CELL, MIN_CELL, covered_shares
 from rigkit.synthetic.scene import Panel, PlacedBoard
 
 __all__ = ["FULL", "NONE", "PART", "Chart", "Float32", "Surface", "board_surface", "paint", "panel_surface"]
@@ -23,9 +23,6 @@ FAR_SQUARES = 1e4
 """Board coordinate given to rays that miss a board's plane."""
 RIM_MARGIN = 0.1
 """Cosine by which the nodes must clear the lens's rim for a whole tile to be lit: they stop short of its edge."""
-MIN_CELL, MAX_CELL = 1e-6, 2.0
-"""A cell's side, in squares or panel sides: shorter is none; longer, the plane is seen edge on and differences mean
-nothing."""
 SMOOTH_DEPTH_RATIO = 0.5
 """Depth ratio over a tile above which x and y are fitted themselves: the fit's error is below 6 ** -NODES = 1e-7."""
 

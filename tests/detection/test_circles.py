@@ -10,7 +10,7 @@ import pytest
 from rigkit.benchmark.blanks import BLANKS, blank
 from rigkit.benchmark.circle_bound import circle_information
 from rigkit.benchmark.corner_bound import position_bound
-from rigkit.benchmark.scenes import BenchScene, bench_camera, bench_field_deg, one_board
+from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, BenchScene, bench_camera, bench_field_deg, one_board
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.circles import Circles
@@ -19,6 +19,8 @@ from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import grey_image
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
+from rigkit.synthetic.photometry import develop
+from rigkit.synthetic.render import Optics
 from rigkit.synthetic.scene import Panel, PlacedBoard
 
 REGULAR = Board("r", 10, 8, 25.0, 25.0, pattern=Circles(diameter_mm=15.0))
@@ -169,8 +171,9 @@ def test_centres_are_as_fine_as_the_pixels_allow(board: Board, lens: str) -> Non
         scene = one_board(rng, lens=lens, board=board)
         truth = scene.truth()[0]
         bound = position_bound(circle_information(scene, 0.7), 2.0)
+        light, photometry = scene.radiance(Optics(0.7)), replace(BENCH_PHOTOMETRY, noise_levels=2.0)
         for _ in range(3):
-            (found,) = detect_boards(scene.render(noise_levels=2.0, rng=rng), [board])
+            (found,) = detect_boards(develop(light, photometry, rng), [board])
             turns = [found, *(found.turned(k) for k in board.turns)]
             off = min((errors(turn, truth) for turn in turns), key=lambda e: float(np.abs(e).max()))
             assert found.complete

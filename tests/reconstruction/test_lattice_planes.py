@@ -25,7 +25,7 @@ from rigkit.relative_pose.solvers.pose import essential_from_pose
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
 
 SIGMA_PX = 0.03
-DRAWS = 30
+DRAWS = 18
 CLOUDS = 12
 MEAN_OVER_SIGMA = (0.45, 1.4)
 """Root mean square error over sigma of 36 boards, three of a scene correlated: 1 for normals within 4 standard

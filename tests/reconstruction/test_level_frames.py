@@ -72,14 +72,14 @@ def test_predicted_covariance_holds_in_the_cameras_frames() -> None:
     frames = LevelFrames.from_down(TILTS[0].T[:, 1], TILTS[1].T[:, 1])
     axis = TILTS[1].T[:, 1]
     ratios = []
-    for seed in range(30):
+    for seed in range(16):
         pair, truth = tilted_pair(np.random.default_rng(seed))
         found = pair_geometry(pair, pose_type="planar", level_sigma_rad=0.0, level_frames=frames).metric
         turn = found.cam2_from_cam1.rotation @ truth.rotation.T
         error = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2.0
         assert np.linalg.norm(error - (error @ axis) * axis) < 1e-9
         ratios.append((error @ axis) ** 2 / (axis @ found.covariance[:3, :3] @ axis))
-    assert 0.55 < np.sqrt(np.mean(ratios)) < 1.45  # 30 numbers: known to 13 %; three of that
+    assert 0.47 < np.sqrt(np.mean(ratios)) < 1.53  # 16 numbers: known to 18 %; three of that
 
 
 def test_only_planar_motion_has_level_frames() -> None:

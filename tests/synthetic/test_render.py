@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from itertools import product
 
 import cv2
@@ -15,6 +16,7 @@ from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
+from rigkit.core.patterns.circles import Circles
 from rigkit.geometry.rigid3 import Rigid3, cam_from_world_look_at
 from rigkit.geometry.rotation import exp_so3
 from rigkit.synthetic.photometry import Photometry, Shadow, develop
@@ -190,6 +192,19 @@ def test_nearer_board_hides_the_farther_one_and_a_back_shows_no_pattern() -> Non
     assert not behind.see(camera, Rigid3.identity())[1].any()
     back = radiance([behind], camera, Rigid3.identity())
     assert back[36:44, 44:52].min() > 0.84
+
+
+def test_nothing_is_seen_at_the_horizon_of_a_print_of_circles() -> None:
+    """There a sub-sample spans any length of the board's plane, its circles included."""
+    board = Board("c", 9, 7, 30.0, 30.0, pattern=Circles(diameter_mm=15.0))
+    camera = KannalaBrandt((160, 120), np.array([59.0, 59.0, 81.0, 57.8, -0.022, 0.0015, 0.0, 0.0]))
+    turn = exp_so3(np.array([0.2, 1.0, 0.1]))
+    placed = PlacedBoard(board, Rigid3(turn, np.array([0.0, 0.0, 300.0]) - turn @ np.array([120.0, 90.0, 0.0])))
+    printed, plain = (radiance([p], camera, Rigid3.identity()) for p in (placed, replace(placed, black=placed.white)))
+    pixels, valid = placed.see(camera, Rigid3.identity())
+    v, u = np.nonzero(np.abs(printed - plain) > 1e-6)
+    nearest = np.hypot(u[:, None] - pixels[valid, 0], v[:, None] - pixels[valid, 1]).min(axis=1)
+    assert len(u) > 300 and nearest.max() < 12.0
 
 
 def test_outside_the_lens_is_black_and_panels_lie_behind_boards() -> None:
