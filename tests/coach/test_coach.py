@@ -44,7 +44,7 @@ def picture(pose: Rigid3, rng: np.random.Generator, *, blur_px: float = 0.5) -> 
         [PlacedBoard(BOARD, pose)],
         CAMERA,
         Rigid3.identity(),
-        optics=Optics(blur_px),
+        optics=Optics(blur_px, supersample=2),
         photometry=Photometry(noise_levels=1.0),
         rng=rng,
     )
