@@ -22,9 +22,10 @@ typedef float bright_t __attribute__((vector_size(4 * STRETCH), aligned(4)));
 
 /* What the lattice says of a corner: its cell's sides, the curvature of its lines and how uncertain it is, where their
  * neighbours are and by how much these are turned, how far its window goes towards these, in sides of the cell, where that is not by rule, which of these
- * have no corner of the lattice, and how bright it is beyond these, NaN where that is not known. */
+ * have no corner of the lattice, and how bright it is beyond these, NaN where that is not known. Of a corner of one square
+ * alone, on which side of its lines that lies, +1 or -1; of others 0. */
 typedef struct {
-    const double *sides, *curvature, *curvature_sigma, *gaps, *tilts, *reach, *paper;
+    const double *sides, *curvature, *curvature_sigma, *gaps, *tilts, *reach, *paper, *single;
     const uint8_t *ends;
 } geometry_t;
 
@@ -364,7 +365,7 @@ INLINE void multiply_rows(
     const float rho = (float)cos(values[T1] - values[T2]);
     const line_t line1 = line_of(values[T1], values[K1], at.gaps, at.tilts, at.paper, values[S], rules);
     const line_t line2 = line_of(values[T2], values[K2], at.gaps + 2, at.tilts + 2, at.paper + 2, values[S], rules);
-    const float half_rho = 0.5f * rho;
+    const float half_rho = 0.5f * rho, single1 = (float)at.single[0], single2 = (float)at.single[1];
     lanes_t sums[ROWS * (ROWS + 1) / 2];
     memset(sums, 0, sizeof sums);
     for (int64_t start = 0; start < window->count; start += BLOCK) {
@@ -384,6 +385,8 @@ INLINE void multiply_rows(
             float pattern = mixed(&one, &two, rho, i);
             if (papered)
                 pattern += past1.paper[i] * (1.0f - 0.5f * past2.seen[i]) + past2.paper[i] * (1.0f - 0.5f * past1.seen[i]);
+            if (papered)
+                pattern -= single2 * one.value[i] + single1 * two.value[i];
             const float plain = base + half * pattern;
             const float light = 1.0f + light_u * u[i] + light_v * v[i];
             const float scale = -light * half / blur;
@@ -393,6 +396,9 @@ INLINE void multiply_rows(
                                    + rho * (two.bow[i] * one.slope[i] + half_rho * two.curl[i] * one.bow[i]));
             float grown = one.grown[i] * two.value[i] + two.grown[i] * one.value[i];
             if (papered) {
+                by_d1 += scale * single2 * one.slope[i];
+                by_d2 += scale * single1 * two.slope[i];
+                grown += single2 * one.grown[i] + single1 * two.grown[i];
                 const float rest1 = 1.0f - 0.5f * past1.seen[i], rest2 = 1.0f - 0.5f * past2.seen[i];
                 const float half1 = 0.5f * past1.paper[i], half2 = 0.5f * past2.paper[i];
                 by_d1 -= scale * (past1.slope[i] * rest2 - half2 * past1.seen_slope[i]);
@@ -454,7 +460,7 @@ static void all_normal_equations(
     multiply_rows(PARAMETERS, 0, values, window, at, rules, products);
 }
 
-/* Beside paper of known brightness. */
+/* Beside paper of known brightness, and at corners of single squares. */
 FOR_EACH_PROCESSOR
 static void papered_equations(
     const int n, const double *values, const window_t *window, const geometry_t at, const edge_rules_t *rules,
@@ -749,7 +755,7 @@ static void fit_corner(
         brightness(values, window, at, rules, sign);
     const int64_t more = window->count - FEWER;
     double last[PARAMETERS] = {0.0};
-    int solved = 0, papered = 0;
+    int solved = 0, papered = at.single[0] != 0.0;
     for (int k = 0; k < 4; k++)
         papered |= isfinite(at.paper[k]) != 0;
     for (int64_t turns = 0; turns < rules->iterations; turns++) {
@@ -827,11 +833,11 @@ int64_t edges_scratch(const edge_rules_t *rules)
 }
 
 /* Fit the edge model around `count` corners (reference.edges.fit_corners). pixels (N, 2), sides (N, 2, 2), curvature and its sigma
- * (N, 2), gaps, tilts, reach, paper and ends (N, 2, 2), sign, blur and contrast (N), out (N, OUTCOMES); scratch as `edges_scratch`
+ * and single (N, 2), gaps, tilts, reach, paper and ends (N, 2, 2), sign, blur and contrast (N), out (N, OUTCOMES); scratch as `edges_scratch`
  * says, zeroed; `grey` is of uint8_t if `bytes`, else of float. */
 void fit_edges(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *sides,
-    const double *curvature, const double *curvature_sigma, const double *gaps, const double *tilts, const double *reach, const double *paper,
+    const double *curvature, const double *curvature_sigma, const double *gaps, const double *tilts, const double *reach, const double *paper, const double *single,
     const double *sign, const double *blur, const double *contrast, const uint8_t *ends, const edge_rules_t *rules,
     float *scratch, double *out)
 {
@@ -847,7 +853,7 @@ void fit_edges(
         .radius = (int64_t)floor(rules->radius_px)};
     for (int64_t n = 0; n < count; n++) {
         const geometry_t at = {
-            sides + 4 * n, curvature + 2 * n, curvature_sigma + 2 * n, gaps + 4 * n, tilts + 4 * n, reach + 4 * n, paper + 4 * n,
+            sides + 4 * n, curvature + 2 * n, curvature_sigma + 2 * n, gaps + 4 * n, tilts + 4 * n, reach + 4 * n, paper + 4 * n, single + 2 * n,
             ends + 4 * n};
         collect(&window, image, pixels + 2 * n, at, blur[n], rules);
         fit_corner(&window, pixels + 2 * n, at, sign[n], blur[n], contrast[n], rules, out + OUTCOMES * n);

@@ -38,6 +38,7 @@ def fit_corners(
     tilts: FloatArray,
     reach: FloatArray,
     paper: FloatArray,
+    single: FloatArray,
     ends: BoolArray,
     sign: FloatArray,
     blur: FloatArray,
@@ -47,7 +48,7 @@ def fit_corners(
     """Return the `OUTCOMES` of N corners, (N, 35). Arguments as `detection.subpixel.edge_fit.fit_edges`."""
     library = kernels()
     grey = np.ascontiguousarray(image, None if image.dtype == np.uint8 else np.float32)
-    parts = (pixels, sides, curvature, curvature_sigma, gaps, tilts, reach, paper, sign, blur, contrast)
+    parts = (pixels, sides, curvature, curvature_sigma, gaps, tilts, reach, paper, single, sign, blur, contrast)
     known = [np.ascontiguousarray(part, np.float64) for part in parts]
     out = np.empty((len(pixels), OUTCOMES))
     scratch = np.zeros(library.edges_scratch(rules), np.float32)

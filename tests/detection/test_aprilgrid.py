@@ -57,8 +57,14 @@ def test_what_is_printed_is_what_opencv_reads(family: str) -> None:
 @pytest.mark.parametrize("lens", ["regular", "fisheye"])
 @pytest.mark.parametrize(
     "pattern",
-    [AprilGrid(0.3), AprilGrid(0.5, "tag25h9", first_tag=7), AprilGrid(0.25, "tag16h5", 1, numbering="opencv")],
-    ids=["kalibr", "25h9", "16h5"],
+    [
+        AprilGrid(0.3),
+        AprilGrid(0.5, "tag25h9", first_tag=7),
+        AprilGrid(0.25, "tag16h5", 1, numbering="opencv"),
+        AprilGrid(0.3, corner_squares=False),
+        AprilGrid(0.5, "tag25h9", 1, 7, "opencv", corner_squares=False),
+    ],
+    ids=["kalibr", "25h9", "16h5", "tags alone", "25h9 alone"],
 )
 def test_every_corner_has_its_own_number(lens: str, pattern: AprilGrid, rng: np.random.Generator) -> None:
     scene = one_board(rng, lens=lens, board=replace(KALIBR, pattern=pattern))
@@ -66,7 +72,7 @@ def test_every_corner_has_its_own_number(lens: str, pattern: AprilGrid, rng: np.
     assert found.board_id == "k"
     assert len(found.grid) >= 78
     off = errors(found, scene.truth()[0])
-    assert np.abs(off).max() < 0.3
+    assert (np.abs(off) < np.maximum(0.3, 5.0 * found.sigma_px[:, None])).all()
     assert 0.7 < np.sqrt(((off / found.sigma_px[:, None]) ** 2).mean()) < 1.3
 
 
@@ -108,9 +114,3 @@ def test_tags_of_another_board_are_none(rng: np.random.Generator) -> None:
 def test_tags_that_cannot_be_are_refused(pattern: dict[str, object]) -> None:
     with pytest.raises(InputError, match="board 'k'"):
         replace(KALIBR, pattern=AprilGrid(**{"spacing": 0.3, **pattern}))  # type: ignore[arg-type]
-
-
-def test_tags_without_squares_between_them_are_said_not_to_be_found() -> None:
-    board = replace(KALIBR, pattern=AprilGrid(0.3, corner_squares=False))
-    with pytest.raises(InputError, match="corner_squares = true"):
-        detect_boards(np.zeros((64, 64), np.uint8), [board])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from kernels.reference import edges as reference
@@ -25,6 +26,9 @@ ROUNDING_PX = 5e-5
 
 ROUNDING_REL = 2e-3
 """Of sigma and residual: a pixel whose place on the window's edge is decided by rounding is one of two hundred."""
+
+SIGMA_REL = 0.25
+"""Of the errors of 48 corners, which chance makes a tenth larger or smaller."""
 
 SAME_PAIRS_REL = 0.02
 """Of the sums over pairs of pixels, likewise: a pixel has a mirror image or not, and is one of a hundred."""
@@ -90,6 +94,37 @@ def test_compiled_fit_is_the_numpy_fit(
     for ours, theirs in ((compiled.pairs, plain.pairs), (compiled.products, plain.products)):
         assert np.abs(ours - theirs)[good].max() <= SAME_PAIRS_REL * theirs[good, :1].max()
     assert np.abs(compiled.used - plain.used).max() <= 2.0
+
+
+def test_compiled_fit_of_single_squares_is_the_numpy_fit(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Eight samples a pixel both ways.
+    v, u = (np.mgrid[:1600, :1920] + 0.5) / 8.0 - 0.5
+    x, y = np.mod(0.98 * u + 0.12 * v, 40.0), np.mod(0.99 * v - 0.09 * u, 40.0)
+    fine = np.where((x < 24.0) & (y < 24.0), 30.0, 200.0)
+    image = cv2.GaussianBlur(fine.reshape(200, 8, 240, 8).mean(axis=(1, 3)), (0, 0), 1.2)
+    image = (image + rng.normal(0.0, 2.0, image.shape)).astype(np.float32)
+    along = np.linalg.inv(np.array([[0.98, 0.12], [-0.09, 0.99]]))
+    cells = np.stack(np.meshgrid(np.arange(1, 5), np.arange(1, 4)), axis=-1).reshape(-1, 2)
+    alone = np.array([[1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]])
+    corners = np.array([[0.0, 0.0], [24.0, 0.0], [24.0, 24.0], [0.0, 24.0]])
+    truth = ((40.0 * cells[:, None] + corners) @ along.T).reshape(-1, 2)
+    single = np.tile(alone, (len(cells), 1))
+    count = len(truth)
+    sides = np.broadcast_to(24.0 * along.T, (count, 2, 2))
+    gaps, ends = np.full((count, 2, 2), 1e4), np.zeros((count, 2, 2), bool)
+    geometry = Geometry(sides, np.zeros((count, 2)), gaps, ends, reach=np.full(gaps.shape, 0.3), single=single)
+    arguments = (image, truth + rng.uniform(-0.4, 0.4, truth.shape), geometry, single.prod(axis=1), np.ones(count))
+    options = {"radius_px": 14.0, "iterations": 8, "contrast": np.full(count, 85.0), "mirrored": False}
+    compiled, plain = both(*arguments, monkeypatch=monkeypatch, **options)
+    assert plain.valid.all()
+    assert compiled.valid.all()
+    assert np.abs(compiled.pixels - plain.pixels).max() < ROUNDING_PX
+    assert np.abs(compiled.sigma_px / plain.sigma_px - 1.0).max() < ROUNDING_REL
+    off = np.linalg.norm(compiled.pixels - truth, axis=1)
+    assert np.sqrt(np.mean(off**2) / 2.0) == pytest.approx(np.sqrt(np.mean(compiled.sigma_px**2)), rel=SIGMA_REL)
+    assert np.median(compiled.contrast) == pytest.approx(85.0, rel=0.02)
 
 
 def test_same_pixels_whatever_the_cell(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:

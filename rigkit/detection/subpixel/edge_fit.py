@@ -145,6 +145,7 @@ def fit_edges(
         np.zeros(geometry.gaps.shape) if geometry.tilts is None else geometry.tilts,
         np.full(geometry.gaps.shape, np.nan) if geometry.reach is None else geometry.reach,
         np.full(geometry.gaps.shape, np.nan) if geometry.paper is None else geometry.paper,
+        np.zeros((len(pixels), 2)) if geometry.single is None else geometry.single,
         geometry.ends,
         sign,
         blur,

@@ -7,6 +7,9 @@ rows do not pull the corner aside), S the step of an edge as a Gaussian lens and
 standard deviation s together, a and b brightness and half contrast, g the gradient of the light. Parameters: corner
 (2), angles of the lines (2), s, a, b, g (2), curvatures (2).
 
+The corner of a square that stands alone, on the sides n1 and n2 (+1, -1) of the lines, has S1 S2 + n2 S1 + n1 S2 in
+place of S1 S2, and 4 b is its contrast.
+
 The model is symmetric about the corner but for curvature and light, so what it gets wrong otherwise (the shape of the
 blur, sharpening) does not move the corner; but it adds to the residuals, and so to the predicted sigma.
 """
@@ -78,6 +81,8 @@ class Geometry:
     paper : (N, 2, 2) how bright it is beyond that line, relative to the corner's mean and in units of the model's b;
         NaN where squares go on there, or where it is not known. None: everywhere.
     tilts : (N, 2, 2) by how much that line is turned against this one, towards +90 degrees, rad; None: nowhere.
+    single : (N, 2) of the corner of one square alone, on which side of line 1 and 2 that lies, +1 towards +90 degrees
+        or -1; 0 where four squares meet. None: everywhere.
     """
 
     sides: FloatArray
@@ -88,10 +93,11 @@ class Geometry:
     reach: FloatArray | None = None
     paper: FloatArray | None = None
     tilts: FloatArray | None = None
+    single: FloatArray | None = None
 
     def of(self, which: BoolArray) -> Geometry:
         """Return that of the corners `which` (N,)."""
-        optional = {"reach": self.reach, "paper": self.paper, "tilts": self.tilts}
+        optional = {"reach": self.reach, "paper": self.paper, "tilts": self.tilts, "single": self.single}
         known = {name: part[which] for name, part in optional.items() if part is not None}
         return Geometry(self.sides[which], self.curvature[which], self.gaps[which], self.ends[which], **known)
 

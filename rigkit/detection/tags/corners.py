@@ -1,5 +1,8 @@
 """The corners of a board of tags as finely as those of a chessboard.
 
+Where tags stand alone, four squares never meet: their corners are those of single squares, to which the same edge model
+is fitted in another form, with all that it leaves taken for noise.
+
 Where small squares fill the corners between tags, the corners of tags are saddles like those of chessboards, only that
 their lines are not evenly spaced: a side of a tag to one side, the gap to the next to the other. The edge model is
 fitted in windows that reach half way to the neighbours, and are so narrow that they end before the tag's code.
@@ -24,7 +27,7 @@ from rigkit.detection.guided.guided import (
     MOVED_CELLS,
     SCATTER_FLOOR_PX,
 )
-from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.saddles.response import GreyImage, sample
 from rigkit.detection.subpixel.correlation import sigma_factors
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
 from rigkit.detection.subpixel.edge_model import NEAR_PX, NEAR_SIGMAS, WINDOW_REACH, Geometry
@@ -50,6 +53,10 @@ WIDE_BLUR = 0.15
 
 MAX_TAG_ROUNDS = 12
 """Rounds in which missing corners are added, each foretold by those of the one before."""
+
+NOTHING_NEAR_PX, LEAST_CONTRAST = 1e4, 10.0
+"""Of tags that stand alone no neighbouring lines are reckoned with; and grey levels between ink and paper that the fit
+starts from at least."""
 
 TAG_OUTLIER, JUDGING_GAIN = 6.0, 1.5
 """A corner that lies off where those around have it by more than this, times what is usual and its own standard
@@ -126,6 +133,16 @@ class _Fitter:
         heights, steps = surface.heights(), self.steps[cells]
         gaps = steps * heights[:, :, None]
         pattern, side = self.tags.pattern, self.tags.codes.modules
+        signs = np.where(self._odd(cells), 1.0, -1.0)
+        single = contrast = None
+        if not pattern.corner_squares:
+            gaps = np.full(gaps.shape, NOTHING_NEAR_PX)
+            row, column = (np.where(part % 2 == 0, 1.0, -1.0) for part in np.nonzero(cells))
+            # Line 1 runs along the row; +90 degrees from it are down, and from line 2 to the left.
+            single = np.stack([row, -column], axis=1)
+            inwards = (np.stack([column, row], axis=1)[:, None] @ surface.sides)[:, 0]
+            ink, paper = start + 0.5 * pattern.border / side * inwards, start - 0.25 * pattern.spacing * inwards
+            contrast = 0.5 * np.maximum(sample(self.image, paper) - sample(self.image, ink), LEAST_CONTRAST)
         border = pattern.border / side * heights.min(axis=1)
         wide = np.broadcast_to(np.asarray(blur, dtype=np.float64), (len(start),))
         narrow = np.minimum(wide, (border - MARKER_BLURS * wide - NEAR_PX) / NEAR_SIGMAS)
@@ -135,8 +152,8 @@ class _Fitter:
             gaps,
             np.zeros(gaps.shape, np.bool_),
             reach=np.minimum(0.5 * steps, WINDOW_REACH),
+            single=single,
         )
-        signs = np.where(self._odd(cells), 1.0, -1.0)
         radius_px, iterations, converged_px = stage
         return fit_edges(
             self.image,
@@ -147,7 +164,8 @@ class _Fitter:
             radius_px=radius_px,
             iterations=iterations,
             converged_px=converged_px,
-            mirrored=mirrored,
+            mirrored=mirrored and pattern.corner_squares,
+            contrast=contrast,
         )
 
     def _odd(self, cells: BoolArray) -> BoolArray:
@@ -238,8 +256,10 @@ class _Fitter:
             self.again(state)
         assert self._fitted is not None
         state, fit, sides = self._fitted
-        owner = np.zeros(len(sides), np.int64)
-        factor = float(sigma_factors(fit, fit.valid & (fit.contrast > 0.0), sides, owner, 1, LAST_PASS[0])[0])
+        owner, factor = np.zeros(len(sides), np.int64), 1.0
+        if self.tags.pattern.corner_squares:
+            good = fit.valid & (fit.contrast > 0.0)
+            factor = float(sigma_factors(fit, good, sides, owner, 1, LAST_PASS[0])[0])
         cells = state.known
         if np.count_nonzero(cells) >= MIN_GUIDE_CORNERS:
             foretold = self.map_of(state).left_out()

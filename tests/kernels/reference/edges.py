@@ -71,13 +71,17 @@ def fit_corners(
     tilts: FloatArray,
     reach: FloatArray,
     paper: FloatArray,
+    single: FloatArray,
     ends: BoolArray,
     sign: FloatArray,
     blur: FloatArray,
     contrast: FloatArray,
     rules: Rules,
 ) -> FloatArray:
-    geometry, loose = Geometry(sides, curvature, gaps, ends, reach=reach, paper=paper, tilts=tilts), curvature_sigma
+    geometry, loose = (
+        Geometry(sides, curvature, gaps, ends, reach=reach, paper=paper, tilts=tilts, single=single),
+        curvature_sigma,
+    )
     window = collect(image, pixels, geometry, blur, rules.radius_px)
     prior_mean, prior = _prior(geometry, loose, blur, window.size)
     kept = np.count_nonzero(loose > 0.0, axis=1) < 2
@@ -381,7 +385,8 @@ def linearise(values: FloatArray, window: Window, geometry: Geometry) -> Float32
     half_square = np.float32(0.5) * rho * rho
     known = values.astype(np.float32)
     weight = window.weight
-    pattern = _mixed(one, two, rho) + beyond1[3] * rest2 + beyond2[3] * rest1
+    single1, single2 = _single(geometry, len(values))
+    pattern = _mixed(one, two, rho) + beyond1[3] * rest2 + beyond2[3] * rest1 - single2 * f1 - single1 * f2
     plain = known[:, A, None] + known[:, B, None] * pattern
     size = window.size[:, None].astype(np.float32)
     light = (known[:, GX, None] / size) * window.u + (known[:, GY, None] / size) * window.v
@@ -399,6 +404,8 @@ def linearise(values: FloatArray, window: Window, geometry: Geometry) -> Float32
     by_d2 = light * (slope2 * f1 + rho * bow2 * slope1 + half_square * curl2 * bow1)
     by_d1 -= light * (beyond1[4] * rest2 - half * beyond2[3] * beyond1[1])
     by_d2 -= light * (beyond2[4] * rest1 - half * beyond1[3] * beyond2[1])
+    by_d1 += light * single2 * slope1
+    by_d2 += light * single1 * slope2
     past1 = beyond1[5] * rest2 - half * beyond2[3] * beyond1[2]
     past2 = beyond2[5] * rest1 - half * beyond1[3] * beyond2[2]
     bend1, bend2 = kappa1 * along1, kappa2 * along2
@@ -406,10 +413,17 @@ def linearise(values: FloatArray, window: Window, geometry: Geometry) -> Float32
     rows[:, Y] = by_d1 * (bend1 * sin1 - cos1) + by_d2 * (bend2 * sin2 - cos2)
     rows[:, T1] = -by_d1 * (along1 + bend1 * aside1)
     rows[:, T2] = -by_d2 * (along2 + bend2 * aside2)
-    rows[:, S] = -light * (grown1 * f2 + grown2 * f1 - past1 - past2)
+    alone = single2 * grown1 + single1 * grown2
+    rows[:, S] = -light * (grown1 * f2 + grown2 * f1 + alone - past1 - past2)
     rows[:, K1] = np.float32(-0.5) * by_d1 * (along1 * along1 + known[:, S, None] ** 2)
     rows[:, K2] = np.float32(-0.5) * by_d2 * (along2 * along2 + known[:, S, None] ** 2)
     return rows
+
+
+def _single(geometry: Geometry, count: int) -> Float32:
+    """Return the `single` of `geometry`, (2, N, 1)."""
+    single = np.zeros((count, 2)) if geometry.single is None else geometry.single
+    return np.asarray(single.T[:, :, None], np.float32)
 
 
 def _prior(geometry: Geometry, loose: FloatArray, blur: FloatArray, size: FloatArray) -> tuple[FloatArray, FloatArray]:
