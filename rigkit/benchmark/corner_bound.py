@@ -15,12 +15,13 @@ along the other line.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, BenchScene
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
 from rigkit.synthetic.photometry import develop
@@ -28,9 +29,12 @@ from rigkit.synthetic.render import Optics
 
 __all__ = [
     "BLUR_STEP_PX",
+    "PARAMETERS",
     "ROUNDING_VARIANCE",
     "SHIFT_PX",
+    "changing_pictures",
     "corner_information",
+    "derivatives_around",
     "noise_free_levels",
     "pixels_around",
     "position_bound",
@@ -53,13 +57,18 @@ def corner_information(scene: BenchScene, blur_px: float) -> tuple[FloatArray, .
 
     Divide by the noise's variance, ROUNDING_VARIANCE included. NaN where a cell holds too few pixels.
     """
+    pictures = changing_pictures(scene, blur_px)
+    return tuple(_of_board(detection, pictures) for detection in scene.truth())
+
+
+def changing_pictures(scene: BenchScene, blur_px: float) -> FloatArray:
+    """Return the noise-free picture and how it changes, (4, H, W): along u, along v, with the blur, and itself."""
     slopes = []
     for axis in (0, 1):
         before, after = (noise_free_levels(shifted_scene(scene, axis, sign * SHIFT_PX), blur_px) for sign in (-1, 1))
         slopes.append((after - before) / (2.0 * SHIFT_PX))
     sharper, wider = (noise_free_levels(scene, blur_px + sign * BLUR_STEP_PX) for sign in (-1, 1))
-    pictures = np.stack([*slopes, (wider - sharper) / (2.0 * BLUR_STEP_PX), 0.5 * (wider + sharper)])
-    return tuple(_of_board(detection, pictures) for detection in scene.truth())
+    return np.stack([*slopes, (wider - sharper) / (2.0 * BLUR_STEP_PX), 0.5 * (wider + sharper)])
 
 
 def position_bound(information: FloatArray, noise_levels: float) -> FloatArray:
@@ -96,7 +105,7 @@ def _of_board(detection: BoardDetection, pictures: FloatArray) -> FloatArray:
     out = np.full((len(detection.grid), PARAMETERS, PARAMETERS), np.nan)
     for n, ((column, row), centre) in enumerate(zip(detection.grid, detection.pixels, strict=True)):
         sides = np.stack([step[row, column] for step in columns])
-        rows = _derivatives(centre, sides, pictures)
+        rows = derivatives_around(centre, sides, pictures, lambda cells: (np.abs(cells) <= HALF_CELL).all(axis=0))
         if rows.shape[1] > PARAMETERS:
             out[n] = rows @ rows.T
     return out
@@ -126,15 +135,24 @@ def pixels_around(centre: FloatArray, reach: FloatArray, pictures: FloatArray) -
     return offset, pictures[:, low[1] : high[1] + 1, low[0] : high[0] + 1].reshape(len(pictures), -1)
 
 
-def _derivatives(centre: FloatArray, sides: FloatArray, pictures: FloatArray) -> FloatArray:
-    """Return the derivatives (9, P) of the pixels of the cell round `centre` with `sides` (2, 2)."""
-    reach = HALF_CELL * np.abs(sides).sum(axis=0)
+def derivatives_around(
+    centre: FloatArray,
+    sides: FloatArray,
+    pictures: FloatArray,
+    within: Callable[[FloatArray], BoolArray],
+    reach_sides: float = HALF_CELL,
+) -> FloatArray:
+    """Return the derivatives (PARAMETERS, P) of pixels round `centre` by what the image of a corner depends on.
+
+    `within` says which places (2, N), in `sides` (2, 2) from the corner, are looked at, up to `reach_sides` of these.
+    """
+    reach = reach_sides * np.abs(sides).sum(axis=0)
     window = pixels_around(centre, reach, pictures)
     if window is None:
         return np.zeros((PARAMETERS, 0))
     offset, cut = window
     cells = np.linalg.solve(sides.T, offset)
-    inside = (np.abs(cells) <= HALF_CELL).all(axis=0)
+    inside = within(cells)
     by_u, by_v, by_blur, light = cut[:, inside]
     du, dv = offset[:, inside]
     # To turn line 1 alone, points move along line 2 in proportion to how far out along line 1 they are.

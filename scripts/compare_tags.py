@@ -1,0 +1,172 @@
+#!/usr/bin/env python3
+"""AprilGrids beside what is possible, beside pupil-apriltags, and beside motion capture.
+
+    python scripts/compare_tags.py
+    python scripts/compare_tags.py --board grid.toml IMAGE...
+    python scripts/compare_tags.py --board grid.toml --calibration grid.json --body body0.csv --target data.csv IMAGE...
+
+The first renders boards: errors over the Cramer-Rao bound. The second counts tags and processor time, those of
+pupil-apriltags, too, where it is installed. The third compares board poses with tracked ones after one hand-eye fit.
+Tracked poses are CSV: time in ns, x, y, z in m, quaternion x, y, z, w. Images are named by their time in ns.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import cv2
+import numpy as np
+from scipy.optimize import least_squares
+
+from rigkit.benchmark.corner_bound import position_bound
+from rigkit.benchmark.scenes import LENSES, one_board
+from rigkit.benchmark.tag_bound import tag_information
+from rigkit.core.arrays import FloatArray
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
+from rigkit.core.patterns.aprilgrid import AprilGrid
+from rigkit.detection.detect import detect_boards
+from rigkit.detection.saddles.response import grey_image
+from rigkit.geometry.board_pose import board_pose
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3, log_so3
+from rigkit.io.board_file import load_board
+from rigkit.io.calibration_file import load_calibration
+from rigkit.io.images import read_image
+
+BLUR_PX, NOISE_LEVELS = 0.7, 2.0
+REPEATS, STARTS = 5, 5
+RAD_PER_MM = 1e-3
+"""A board a metre away turns by so much where an end of it moves by a millimetre."""
+
+
+def rendered(count: int) -> None:
+    for squares in (True, False):
+        board = Board("k", 10, 8, 60.0, 60.0, pattern=AprilGrid(0.3, corner_squares=squares))
+        for lens in LENSES:
+            squared, bounds, relative, corners = [], [], [], 0
+            for seed in range(count):
+                rng = np.random.default_rng(seed)
+                scene = one_board(rng, lens=lens, board=board)
+                found = detect_boards(scene.render(blur_px=BLUR_PX, noise_levels=NOISE_LEVELS, rng=rng), [board])
+                truth, bound = scene.truth()[0], np.full((board.rows, board.columns), np.nan)
+                covariance = position_bound(tag_information(scene, BLUR_PX), NOISE_LEVELS)
+                bound[truth.grid[:, 1], truth.grid[:, 0]] = np.trace(covariance, axis1=1, axis2=2)
+                for item in found:
+                    off = item.pixels - truth.lattice()[item.grid[:, 1], item.grid[:, 0]]
+                    own = bound[item.grid[:, 1], item.grid[:, 0]]
+                    seen = np.isfinite(own)
+                    squared.append((off[seen] ** 2).sum(axis=1))
+                    bounds.append(own[seen])
+                    relative.append((off[seen] / item.sigma_px[seen, None]) ** 2)
+                    corners += len(off)
+            rms, best = (float(np.sqrt(np.concatenate(part).mean())) for part in (squared, bounds))
+            each = float(np.sqrt((np.concatenate(squared) / np.concatenate(bounds)).mean()))
+            z = float(np.sqrt(np.concatenate(relative).mean()))
+            name = "Kalibr" if squares else "tags alone"
+            print(f"{name}, {lens}: {corners} of {80 * count} corners, rms {rms:.4f} px, bound {best:.4f} px: ", end="")
+            print(f"{rms / best:.2f}, corner by corner {each:.2f}; errors over sigmas {z:.2f}")
+
+
+def least_ms(call: Callable[[], object]) -> float:
+    times = []
+    for _ in range(REPEATS):
+        start = time.process_time()
+        call()
+        times.append(time.process_time() - start)
+    return 1e3 * min(times)
+
+
+def real(paths: Sequence[Path], board: Board) -> None:
+    cv2.setNumThreads(1)
+    try:
+        from pupil_apriltags import Detector
+
+        peers = {f"pupil-apriltags 1/{k}": Detector(families="tag36h11", nthreads=1, quad_decimate=k) for k in (1, 2)}
+    except ImportError:
+        peers = {}
+    for path in paths:
+        grey = np.asarray(grey_image(read_image(path)))
+        tags = sum(len(item.grid) for item in detect_boards(grey, [board])) / 4
+        words = [f"rigkit {tags:g} tags, {least_ms(lambda: detect_boards(grey, [board])):.1f} ms"]  # noqa: B023
+        for name, peer in peers.items():
+            count = len(peer.detect(grey))
+            words.append(f"{name} {count} tags, {least_ms(lambda: peer.detect(grey)):.1f} ms")  # noqa: B023
+        print(f"{path.name}:", "; ".join(words))
+
+
+class Track:
+    """Poses of a body that is tracked: turns are interpolated between the two samples beside a moment."""
+
+    def __init__(self, path: Path) -> None:
+        from scipy.spatial.transform import Rotation, Slerp
+
+        table = np.loadtxt(path, delimiter=",", skiprows=1)
+        self.times, self.places_mm = table[:, 0], 1e3 * table[:, 1:4]
+        self.turns = Slerp(self.times, Rotation.from_quat(table[:, 4:8]))
+
+    def at(self, moment: float) -> Rigid3:
+        place = [np.interp(moment, self.times, self.places_mm[:, k]) for k in range(3)]
+        return Rigid3(self.turns(np.clip(moment, self.times[0], self.times[-1])).as_matrix(), place)
+
+
+def tracked(paths: Sequence[Path], board: Board, calibration: Path, body: Path, target: Path) -> None:
+    camera, hand, stand = load_calibration(calibration).camera, Track(body), Track(target)
+    views = [
+        BoardView.from_detection(path.name, item, [board])
+        for path in paths
+        for item in detect_boards(grey_image(read_image(path)), [board], camera=camera)
+    ]
+    moments = [float(Path(view.image).stem) for view in views]
+    seen = []
+    for view in views:
+        rays, valid = camera.unproject(view.pixels)
+        seen.append(board_pose(rays[valid], view.points()[valid]).cam_from_board)
+    told = [hand.at(t).inverse() @ stand.at(t) for t in moments]
+
+    def residuals(unknown: FloatArray) -> FloatArray:
+        """Turns, in units of RAD_PER_MM, and places of the boards, mm."""
+        cam_from_body, target_from_board = (Rigid3(exp_so3(x[:3]), x[3:]) for x in np.split(unknown, 2))
+        off = [(cam_from_body @ t @ target_from_board).inverse() @ s for t, s in zip(told, seen, strict=True)]
+        return np.array([[*(log_so3(x.rotation) / RAD_PER_MM), *x.translation_mm] for x in off]).ravel()
+
+    fits = []
+    for start in range(STARTS):
+        turns = np.random.default_rng(start).normal(0.0, 1.5, (2, 3))
+        unknown = np.concatenate([[*turn, 0.0, 0.0, 0.0] for turn in turns])
+        fits.append(least_squares(residuals, unknown, loss="soft_l1", f_scale=3.0, max_nfev=60))
+    best = residuals(min(fits, key=lambda fit: float(fit.cost)).x).reshape(-1, 2, 3)
+    angles, distances = np.linalg.norm(best, axis=2).T
+    angles = np.degrees(angles * RAD_PER_MM)
+    print(
+        f"{len(moments)} images: median {np.median(distances):.2f} mm, {np.median(angles):.3f} deg; "
+        f"largest {distances.max():.2f} mm, {angles.max():.3f} deg"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("images", nargs="*", type=Path)
+    parser.add_argument("--board", type=Path)
+    parser.add_argument("--count", type=int, default=6, help="rendered images of each kind")
+    parser.add_argument("--calibration", type=Path)
+    parser.add_argument("--body", type=Path)
+    parser.add_argument("--target", type=Path)
+    args = parser.parse_args()
+    if args.calibration:
+        tracked(args.images, load_board(args.board), args.calibration, args.body, args.target)
+    elif args.images:
+        real(args.images, load_board(args.board))
+    else:
+        rendered(args.count)
+
+
+if __name__ == "__main__":
+    main()
