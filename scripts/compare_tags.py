@@ -13,6 +13,7 @@ Tracked poses are CSV: time in ns, x, y, z in m, quaternion x, y, z, w. Images a
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -87,9 +88,10 @@ def least_ms(call: Callable[[], object]) -> float:
 def real(paths: Sequence[Path], board: Board) -> None:
     cv2.setNumThreads(1)
     try:
-        from pupil_apriltags import Detector
-
-        peers = {f"pupil-apriltags 1/{k}": Detector(families="tag36h11", nthreads=1, quad_decimate=k) for k in (1, 2)}
+        peer = importlib.import_module("pupil_apriltags")
+        peers = {
+            f"pupil-apriltags 1/{k}": peer.Detector(families="tag36h11", nthreads=1, quad_decimate=k) for k in (1, 2)
+        }
     except ImportError:
         peers = {}
     for path in paths:
