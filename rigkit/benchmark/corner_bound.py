@@ -105,10 +105,14 @@ def _of_board(detection: BoardDetection, pictures: FloatArray) -> FloatArray:
     out = np.full((len(detection.grid), PARAMETERS, PARAMETERS), np.nan)
     for n, ((column, row), centre) in enumerate(zip(detection.grid, detection.pixels, strict=True)):
         sides = np.stack([step[row, column] for step in columns])
-        rows = derivatives_around(centre, sides, pictures, lambda cells: (np.abs(cells) <= HALF_CELL).all(axis=0))
+        rows = derivatives_around(centre, sides, pictures, _in_cell)
         if rows.shape[1] > PARAMETERS:
             out[n] = rows @ rows.T
     return out
+
+
+def _in_cell(cells: FloatArray) -> BoolArray:
+    return np.asarray((np.abs(cells) <= HALF_CELL).all(axis=0))
 
 
 def _centred(lattice: FloatArray, axis: int) -> FloatArray:
@@ -151,7 +155,7 @@ def derivatives_around(
     if window is None:
         return np.zeros((PARAMETERS, 0))
     offset, cut = window
-    cells = np.linalg.solve(sides.T, offset)
+    cells: FloatArray = np.linalg.solve(sides.T, offset)
     inside = within(cells)
     by_u, by_v, by_blur, light = cut[:, inside]
     du, dv = offset[:, inside]
