@@ -155,7 +155,7 @@ def derivatives_around(
     if window is None:
         return np.zeros((PARAMETERS, 0))
     offset, cut = window
-    cells: FloatArray = np.linalg.solve(sides.T, offset)
+    cells = np.asarray(np.linalg.solve(sides.T, offset), np.float64)
     inside = within(cells)
     by_u, by_v, by_blur, light = cut[:, inside]
     du, dv = offset[:, inside]

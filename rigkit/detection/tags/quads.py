@@ -68,7 +68,7 @@ def _agreeing(corners: FloatArray, place: IntArray, step: float) -> BoolArray:
     """
     tag = 0.5 * step * place + 0.5
     middle = corners.mean(axis=1)
-    inverse: FloatArray = np.linalg.inv(homographies(corners))
+    inverse = np.asarray(np.linalg.inv(homographies(corners)), np.float64)
     # Where each tag (first index) has the others, in its own sides from its own first corner, and where it should.
     has = np.stack([transferred(inverse[k : k + 1], middle)[0] for k in range(len(middle))])
     should = tag - tag[:, None] + 0.5
