@@ -13,6 +13,8 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection, BoardView
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import IDENTIFIER, MAX_IDENTIFIER
+from rigkit.core.patterns.chessboard import Chessboard
+from rigkit.core.patterns.circles import Circles
 
 __all__ = ["MIN_CORNERS_OF_VIEW", "other_size", "usable_views", "views_of_image"]
 
@@ -108,8 +110,8 @@ def views_of_image(
 ) -> tuple[list[BoardView], str | None]:
     """Return the views that an image gives, or why it gives none.
 
-    A detection that could be several boards, or part of one, still is a flat grid of known squares: it becomes a view
-    of a board of its own, called "<board> part of <image>".
+    A detection that could be several boards, or part of one, still is a flat grid of known points: it becomes a view of
+    a board of its own, called "<board> part of <image>".
     """
     views: list[BoardView] = []
     other: list[str] = []
@@ -123,7 +125,10 @@ def views_of_image(
             continue
         name = _part_name(parent.board_id, image, k + 1 if len(detections) > 1 else None)
         sides = parent.square_x_mm, parent.square_y_mm
-        part = Board(name, turned.columns, turned.rows, *sides, square_sigma_mm=parent.square_sigma_mm)
+        # Rows of circles keep their stagger, which a part is counted by; all else needs a place on the board.
+        pattern = parent.pattern if isinstance(parent.pattern, Circles) else Chessboard()
+        sigma_mm = parent.square_sigma_mm
+        part = Board(name, turned.columns, turned.rows, *sides, square_sigma_mm=sigma_mm, pattern=pattern)
         views.append(BoardView(image, part, turned.grid, turned.pixels, turned.sigma_px))
     if views:
         return views, None
@@ -143,7 +148,8 @@ def _parent(found: BoardDetection, boards: Sequence[Board]) -> tuple[Board | Non
     """Return the smallest board that the detection can be part of, and the detection turned to it."""
     for board in sorted(boards, key=lambda b: b.corner_count):
         square = board.square_x_mm == board.square_y_mm
-        for turns in (0, 1):
+        staggered = isinstance(board.pattern, Circles) and board.pattern.staggered
+        for turns in (0,) if staggered else (0, 1):
             turned = found.turned(turns)
             fits = turned.columns <= board.columns and turned.rows <= board.rows
             if fits and (square or (turned.columns, turned.rows) == board.size):

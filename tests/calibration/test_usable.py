@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from rigkit.calibration.usable import other_size
+from rigkit.calibration.usable import other_size, views_of_image
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
+from rigkit.core.patterns.circles import Circles
 
 STATED = (Board("stated", 9, 7, 30.0, 30.0),)
 
@@ -44,3 +46,16 @@ def test_parts_of_the_stated_board_are_not() -> None:
     assert other_size(shown(*[grid(9, 6)] * 2), STATED) is None
     assert other_size(shown(*[grid(9, 6, corners=50)] * 5), STATED) is None
     assert other_size({}, STATED) is None
+
+
+@pytest.mark.parametrize("layout", ["regular", "asymmetric", "hexagonal"])
+@pytest.mark.parametrize("stagger", ["right", "left"])
+def test_a_part_of_a_grid_of_circles_keeps_its_stagger(layout: str, stagger: str) -> None:
+    board = Board("c", 4, 11, 40.0, 40.0, pattern=Circles(layout, stagger))
+    (view,), why = views_of_image("cut.png", [grid(3, 8)], [board])
+    assert why is None and view.board.board_id == "c part of cut.png"
+    np.testing.assert_allclose(view.points(), board.points(view.grid))
+    # Staggered rows are not turned: along the columns nothing is half a step aside.
+    (lying,), _ = views_of_image("cut.png", [grid(3, 2)], [board])
+    assert lying.board.size == (3, 2)
+    assert (views_of_image("cut.png", [grid(8, 3)], [board])[0] == []) == (layout != "regular")
