@@ -1,15 +1,19 @@
 #!/usr/bin/env python3
 """Measure what tells chessboards from other patterns: fit the weights of `rigkit.detection.checks.evidence` again.
 
-    python scripts/measure_thresholds.py [--boards DIR ...] [--without DIR ...] [--seeds 12]
+    python scripts/measure_thresholds.py [--boards DIR ...] [--without DIR ...] [--seeds 12] [--worse 4]
 
 Rendered boards (all conditions of the benchmark, blurs up to 3.5 px, squares down to 8 px) and rendered patterns (the
-blank pictures of the benchmark, grids of dots) are always measured; `--boards` adds folders of images of which every
-large grid is a board, `--without` folders of images that show none. Every lattice that reaches the judgement counts;
-chance blocks of codes and mosaics, which are true pieces of chessboards, are left to `validate.compact`.
+blank pictures of the benchmark, grids of dots) are always measured; `--boards` adds folders of images of boards,
+`--without` folders of images that show none. Of each real image, and of each pattern, there are the image itself and
+some that are worse: blurred, noisy, compressed, sharpened, faint, shrunk, covered, cut. Boards are those lattices that
+lie where boards are found in the image itself; all other lattices of such images are left out. Chance blocks of codes
+and mosaics, which are true pieces of chessboards, are left to `validate.compact`.
 
-Prints the weights of a logistic regression (classes of images weigh the same), then the scores of the boards seen
-worst and of the patterns that resemble boards most, by the weights in use: the margin on both sides of 0.
+Prints the weights of a logistic regression (kinds of images weigh the same; with the prior that
+`rigkit.detection.checks.evidence` states), how many lattices it takes for the wrong thing where their kind of image had
+no say in it, then the scores of the boards seen worst and of the patterns that resemble boards most, by the weights in
+use: the margin on both sides of 0.
 """
 
 from __future__ import annotations
@@ -20,9 +24,12 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import zlib
 
 import cv2
 import numpy as np
@@ -31,8 +38,10 @@ from scipy.optimize import minimize
 
 from rigkit.benchmark.blanks import BLANKS, blank
 from rigkit.benchmark.scenes import CONDITIONS, LENSES, one_board
-from rigkit.detection.checks.evidence import MIN_SPACING_CHANGE, MIN_UNEXPLAINED, OFFSET, SCORE, Evidence
+from rigkit.core.arrays import FloatArray
+from rigkit.detection.checks.evidence import MIN_BLUR, MIN_MISFIT, MIN_SPACING_CHANGE, OFFSET, SCORE, Evidence
 from rigkit.detection.checks.validate import compact, has_edge_offset
+from rigkit.detection.detect import detect_boards
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.lattices import candidates
@@ -49,9 +58,27 @@ BLURS_PX, NOISE_LEVELS = (1.5, 2.5, 3.5), 5.0
 SQUARES_PX = (8.0, 12.0)
 MIN_CELL_PX = 6.0
 """Boards of smaller squares, pictures of boards in the background among them, are listed apart."""
-CHANCE = ("codes", "mosaic")
-RIDGE = 1e-3
+CHANCE = ("codes", "mosaic", "code")
+RIDGE = 1e-4
+MOST_RAGGED = 4.0
+"""The prior: what keeps weights near 0, and that of raggedness at most this far from it."""
+SAME_CELLS, SAME_SHARE = 0.25, 0.9
+"""A lattice is a board seen before where so much of it lies so near, in cells, to corners of that."""
 SHOWN = 10
+WORSE: dict[str, tuple[float, ...]] = {
+    "noisy": (10.0, 25.0),
+    "faint": (0.15,),
+    "dark": (0.4, 2.5),
+    "blurred": (1.5, 3.0, 4.0),
+    "sharpened": (2.0, 5.0),
+    "compressed": (30.0, 10.0),
+    "small": (0.5, 0.34),
+    "covered": (0.2,),
+    "cut": (0.5,),
+    "webcam": (6.0,),
+}
+"""What is done to images, and how much: grey levels of noise, contrast, gamma, px of blur, ..."""
+Grey = NDArray[np.uint8]
 SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff")
 
 
@@ -68,13 +95,14 @@ class Candidate:
 
     def measures(self) -> list[float]:
         """Return the logarithms that are weighed."""
-        sigma_cells, scatter, unexplained, change, raggedness = self.evidence
+        sigma_cells, scatter, misfit, change, raggedness, blur = self.evidence
         return [
             float(np.log(sigma_cells)),
             float(np.log(scatter)),
-            float(np.log(max(unexplained, MIN_UNEXPLAINED))),
+            float(np.log(max(misfit, MIN_MISFIT))),
             float(np.log(max(change, MIN_SPACING_CHANGE))),
             float(np.log(raggedness)),
+            float(np.log(max(blur, MIN_BLUR))),
         ]
 
 
@@ -91,6 +119,56 @@ def dot_grid(rng: np.random.Generator, size_px: tuple[int, int]) -> NDArray[np.u
     image = 230.0 - image if rng.random() < 0.5 else image
     image = cv2.GaussianBlur(image, (0, 0), rng.uniform(0.6, 2.0)) + 2.0 * rng.standard_normal(image.shape)
     return np.asarray(np.clip(np.rint(image), 0, 255), np.uint8)
+
+
+def worsened(grey: Grey, rng: np.random.Generator) -> tuple[str, Grey, FloatArray]:
+    """Return a name, a worse image, and the scale and place (3,) of the first in it: p' = s p + t."""
+    name = str(rng.choice(list(WORSE)))
+    values: Any = grey.astype(np.float32)
+    height, width = grey.shape
+    moved = np.array([1.0, 0.0, 0.0])
+    amount = WORSE[name][int(rng.integers(len(WORSE[name])))]
+    if name == "noisy":
+        values = values + amount * rng.standard_normal(grey.shape)
+    elif name == "faint":
+        values = 128.0 + amount * (values - 128.0) + 1.5 * rng.standard_normal(grey.shape)
+    elif name == "dark":
+        values = 255.0 * (values / 255.0) ** amount
+    elif name == "blurred":
+        values = cv2.GaussianBlur(values, (0, 0), amount)
+    elif name == "sharpened":
+        values = values + amount * (values - cv2.GaussianBlur(values, (0, 0), 1.2))
+    elif name == "compressed":
+        values = cv2.imdecode(cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, int(amount)])[1], 0)
+    elif name == "small":
+        values = cv2.resize(values, None, fx=amount, fy=amount, interpolation=cv2.INTER_AREA)
+        moved = np.array([amount, 0.5 * amount - 0.5, 0.5 * amount - 0.5])
+    elif name == "covered":
+        for _ in range(4):
+            middle, axes = rng.uniform(0.2, 0.8, 2) * (width, height), rng.uniform(0.02, amount, 2) * height
+            box: Any = (tuple(middle.tolist()), tuple((2.0 * axes).tolist()), float(rng.uniform(0, 180)))
+            cv2.ellipse(values, box, float(rng.uniform(0, 255)), -1)
+    elif name == "cut":
+        left, top = (int(part * amount * rng.random()) for part in (width, height))
+        values, moved = values[top:, left:], np.array([1.0, -left, -top])
+    elif name == "webcam":
+        soft = cv2.GaussianBlur(values, (0, 0), 1.2) + amount * rng.standard_normal(grey.shape)
+        values = soft + 3.0 * (soft - cv2.GaussianBlur(soft, (0, 0), 1.2))
+    return name, np.ascontiguousarray(np.clip(np.rint(values), 0, 255).astype(np.uint8)), moved
+
+
+def looks(name: str, pixels: NDArray[np.generic], times: int) -> Iterator[tuple[str, Grey, FloatArray]]:
+    """Yield (what was done, image, where the first lies in it) of an image and `times` worse ones."""
+    seen: Any = grey_image(pixels)
+    if seen.dtype == np.uint8:
+        grey = np.asarray(seen)
+    else:
+        low, high = float(seen.min()), float(seen.max())
+        grey = np.asarray((seen - low) * (255.0 / max(high - low, 1e-6)), np.uint8)
+    yield "", grey, np.array([1.0, 0.0, 0.0])
+    rng = np.random.default_rng(zlib.crc32(name.encode()))
+    for _ in range(times):
+        yield worsened(grey, rng)
 
 
 def rendered(seeds: int) -> Iterator[tuple[str, str, bool, NDArray[np.generic]]]:
@@ -124,9 +202,18 @@ def real(folders: list[Path], board: bool) -> Iterator[tuple[str, str, bool, NDA
             yield folder.name, f"{folder.name}/{path.name}", board, read_image(path)
 
 
-def judged(kind: str, image: str, board: bool, pixels: NDArray[np.generic]) -> list[Candidate]:
-    """Return what of an image reaches the judgement, whatever that says."""
-    grey = without_bad_pixels(grey_image(pixels))
+def judged(kind: str, image: str, board: bool, pixels: NDArray[np.generic], worse: int) -> list[Candidate]:
+    """Return what of an image, and of `worse` ones made from it, reaches the judgement, whatever that says."""
+    known = [item.pixels for item in detect_boards(pixels)] if board else []
+    out = []
+    for done, grey, moved in looks(image, pixels, worse):
+        boards = [moved[0] * corners + moved[1:] for corners in known]
+        out += _judged(kind, f"{image} {done}".strip(), board, grey, boards)
+    return out
+
+
+def _judged(kind: str, image: str, board: bool, pixels: Grey, boards: list[FloatArray]) -> list[Candidate]:
+    grey = without_bad_pixels(pixels)
 
     def promising(_: GreyImage, finest: Level, lattice: Lattice) -> bool:
         return not (lattice.solid and has_edge_offset(lattice, finest))
@@ -136,8 +223,15 @@ def judged(kind: str, image: str, board: bool, pixels: NDArray[np.generic]) -> l
     fitted = refine(grey, candidates(grey, MIN_CORNERS, promising))
     kept = [item for item in fitted if item.lattice.count >= least and compact(item.lattice, size_px)]
     return [
-        Candidate(kind, image, board, item.lattice.count, _cell_px(item.lattice), Evidence.of(item)) for item in kept
+        Candidate(kind, image, board, item.lattice.count, _cell_px(item.lattice), Evidence.of(item))
+        for item in kept
+        if not board or any(_of_board(item.lattice, corners) for corners in boards)
     ]
+
+
+def _of_board(lattice: Lattice, corners: FloatArray) -> bool:
+    off = np.linalg.norm(lattice.pixels[lattice.known][:, None] - corners, axis=2).min(axis=1)
+    return float(np.mean(off < SAME_CELLS * _cell_px(lattice))) > SAME_SHARE
 
 
 def _cell_px(lattice: Lattice) -> float:
@@ -145,20 +239,41 @@ def _cell_px(lattice: Lattice) -> float:
     return float(np.median(fit_cells(lattice.pixels, lattice.known, degree=1).cell_px()))
 
 
-def fitted_weights(found: list[Candidate]) -> NDArray[np.float64]:
-    """Return the weights of the measures and the offset of a logistic regression; kinds of images weigh the same."""
-    measures, sign = np.array([c.measures() for c in found]), np.array([1.0 if c.board else -1.0 for c in found])
-    counts = Counter((c.board, c.kind) for c in found)
+def fitted_weights(found: list[Candidate], left_out: tuple[bool, str] | None = None) -> FloatArray:
+    """Return the weights of the measures and the offset of a logistic regression; kinds of images weigh the same.
+
+    `left_out` is a kind, of boards or not, that has no say.
+    """
+    used = [c for c in found if (c.board, c.kind) != left_out]
+    measures, sign = np.array([c.measures() for c in used]), np.array([1.0 if c.board else -1.0 for c in used])
+    counts = Counter((c.board, c.kind) for c in used)
     kinds = Counter(board for board, _ in counts)
-    weight = np.array([0.5 / kinds[c.board] / counts[c.board, c.kind] for c in found])
-    mean = measures.mean(axis=0)
+    weight = np.array([0.5 / kinds[c.board] / counts[c.board, c.kind] for c in used])
+    mean, spread = measures.mean(axis=0), measures.std(axis=0)
+    scaled = (measures - mean) / spread
 
-    def cost(p: NDArray[np.float64]) -> float:
-        score = (measures - mean) @ p[:-1] + p[-1]
-        return float(weight @ np.logaddexp(0.0, -sign * score) + RIDGE * p[:-1] @ p[:-1])
+    def cost(p: FloatArray) -> tuple[float, FloatArray]:
+        z = sign * (scaled @ p[:-1] + p[-1])
+        slope = -sign * weight / (1.0 + np.exp(np.clip(z, -50.0, 50.0)))
+        value = float(weight @ np.logaddexp(0.0, -z) + RIDGE * p[:-1] @ p[:-1])
+        return value, np.append(scaled.T @ slope + 2.0 * RIDGE * p[:-1], slope.sum())
 
-    best = minimize(cost, np.zeros(measures.shape[1] + 1)).x
-    return np.append(best[:-1], best[-1] - mean @ best[:-1])
+    limits: list[tuple[float | None, float | None]] = [(None, 0.0)] * len(SCORE) + [(None, None)]
+    ragged = list(SCORE).index("raggedness")
+    limits[ragged] = (-MOST_RAGGED * spread[ragged], 0.0)
+    best = minimize(cost, np.zeros(len(SCORE) + 1), jac=True, bounds=limits, method="L-BFGS-B").x
+    return np.append(best[:-1] / spread, best[-1] - mean @ (best[:-1] / spread))
+
+
+def cross_validated(found: list[Candidate]) -> tuple[int, int]:
+    """Return how many boards are refused, and other patterns taken for boards, where their own kind had no say."""
+    wrong = Counter[bool]()
+    for board, kind in {(c.board, c.kind) for c in found}:
+        *weights, offset = fitted_weights(found, (board, kind))
+        for c in found:
+            if (c.board, c.kind) == (board, kind) and (np.dot(weights, c.measures()) + offset > 0.0) != board:
+                wrong[board] += 1
+    return wrong[True], wrong[False]
 
 
 def main() -> None:
@@ -166,9 +281,10 @@ def main() -> None:
     parser.add_argument("--boards", type=Path, nargs="*", default=[], help="folders of images of boards")
     parser.add_argument("--without", type=Path, nargs="*", default=[], help="folders of images without boards")
     parser.add_argument("--seeds", type=int, default=12, help="rendered pictures of each kind")
+    parser.add_argument("--worse", type=int, default=4, help="worse images made from each")
     args = parser.parse_args()
     images = (*rendered(args.seeds), *real(args.boards, True), *real(args.without, False))
-    found = [candidate for image in images for candidate in judged(*image)]
+    found = [candidate for image in images for candidate in judged(*image, args.worse)]
     tiny = sorted(c.evidence.score for c in found if c.board and c.cell_px < MIN_CELL_PX)
     found = [c for c in found if not c.board or c.cell_px >= MIN_CELL_PX]
     print(f"boards with squares under {MIN_CELL_PX:g} px: {len(tiny)}, scores", ", ".join(f"{s:.1f}" for s in tiny))
@@ -176,9 +292,11 @@ def main() -> None:
         print(f"{what}: {sum(c.board is board for c in found)} lattices reach the judgement")
     *weights, offset = fitted_weights(found)
     print("fitted:  ", ", ".join(f"{n} {w:.2f}" for n, w in zip(SCORE, weights, strict=True)), f"offset {offset:.2f}")
+    refused, taken = cross_validated(found)
+    print(f"without a say of their kind: {refused} boards refused, {taken} other patterns taken for boards")
     print("in use:  ", ", ".join(f"{n} {w:.2f}" for n, w in SCORE.items()), f"offset {OFFSET:.2f}")
-    print("\n| score | image | corners | sigma, cells | scatter | unexplained | spacing change | raggedness |")
-    print("|--:|:--|--:|--:|--:|--:|--:|--:|")
+    print("\n| score | image | corners | sigma, cells | scatter | misfit | spacing change | raggedness | blur, cells |")
+    print("|--:|:--|--:|--:|--:|--:|--:|--:|--:|")
     for board in (True, False):
         mine = [c for c in found if c.board is board]
         ranked = sorted(mine, key=lambda c: c.evidence.score, reverse=not board)
