@@ -16,7 +16,12 @@ POSE_TYPES = ("general", "planar", "standard", "forward", "auto")
 
 def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("a textured scene without boards, instead of DATASET")
-    group.add_argument("--images", nargs=2, metavar=("A", "B"), help="match affine features of these two images")
+    group.add_argument(
+        "--images",
+        nargs="+",
+        metavar="IMAGE",
+        help="match affine features of these two images; of three and more, of a --rig, fuse the clouds of near pairs",
+    )
     group.add_argument(
         "--correspondences",
         metavar="FILE",
@@ -27,7 +32,7 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--rig", metavar="RIG", help="the rig that took both images, instead of --camera; its pose is kept"
     )
-    group.add_argument("--names", nargs=2, metavar=("ONE", "TWO"), help="cameras of the rig (default: its first two)")
+    group.add_argument("--names", nargs="+", metavar="CAMERA", help="cameras of the images (default: the rig's first)")
     group.add_argument("--pose", metavar="FILE", help="measured cam2_from_cam1, 3x4 or 4x4 numbers, mm; it is kept")
     group.add_argument("--baseline-mm", type=float, metavar="MM", help="measured baseline (default: it is the unit)")
     group.add_argument(
@@ -52,10 +57,15 @@ def is_scene(args: argparse.Namespace) -> bool:
 
 
 def run_scene(args: argparse.Namespace) -> int:
+    if args.images and len(args.images) > 2:
+        return _run_rig(args)
     import numpy as np
 
     from rigkit.workflows.reconstruct_scene import CLOUD, SceneOptions, reconstruct_views
 
+    for option, given in (("--images", args.images), ("--names", args.names)):
+        if given and len(given) != 2:
+            raise InputError(f"reconstruct: {option} names two, or with --rig three and more; got {len(given)}")
     name = Path(args.correspondences or args.images[0]).stem
     out = results_folder(args, name)
     options = SceneOptions(
@@ -103,5 +113,60 @@ def run_scene(args: argparse.Namespace) -> int:
         print(
             f"{out / CLOUD}: {len(r.cloud)} points ({done.unit}) of {len(done.correspondences)} correspondences, "
             f"{inliers} of which agree, Sampson rms {r.sampson_rms_px:.3f} px, {r.pose_type}"
+        )
+    return ExitCode.WELL
+
+
+def _run_rig(args: argparse.Namespace) -> int:
+    from rigkit.workflows.reconstruct_rig import CLOUD, RigSceneOptions, reconstruct_rig_views
+
+    if not args.rig:
+        raise InputError(
+            f"reconstruct: {len(args.images)} images need --rig RIG, a file that says where their cameras stand; or "
+            "give two of them with --camera"
+        )
+    alone = {
+        "--correspondences": args.correspondences,
+        "--camera": args.camera,
+        "--camera2": args.camera2,
+        "--pose": args.pose,
+        "--baseline-mm": args.baseline_mm,
+        "--pose-type": args.pose_type,
+        "--sparse": args.sparse,
+    }
+    for option, given in alone.items():
+        if given:
+            raise InputError(f"reconstruct: {option} is for two images; with three and more the rig's file says it all")
+    name = Path(args.rig).stem
+    out = results_folder(args, name)
+    options = RigSceneOptions(
+        rig=Path(args.rig),
+        images=tuple(Path(image) for image in args.images),
+        names=tuple(args.names) if args.names else None,
+        output=out,
+        force=args.force,
+        single_precision=args.float,
+        confidence=args.confidence,
+        pictures=not args.no_pictures,
+    )
+    done = reconstruct_rig_views(options, progress=progress_on_stderr())
+    for words in done.notes:
+        note(f"{name}: {words}")
+    if args.json:
+        print_json(
+            {
+                "output": str(out),
+                "ply": CLOUD,
+                "points": len(done.cloud),
+                "merged": done.merged,
+                "unit": "mm",
+                "pairs": [{"cameras": list(names), "points": points} for names, points in done.pairs.items()],
+                "notes": list(done.notes),
+            }
+        )
+    else:
+        print(
+            f"{out / CLOUD}: {len(done.cloud)} points (mm) of {len(done.pairs)} pairs, {done.merged} seen by more "
+            "than one of them"
         )
     return ExitCode.WELL

@@ -47,6 +47,10 @@ DPI = 110
 NORMAL_LENGTH_SQUARES = 0.8
 BARE_NORMAL = 0.08
 """Length of a drawn normal where there are no squares, relative to the median distance of the points."""
+BARE_POINT = 1.5
+MOST_NORMALS = 300
+"""Of a cloud without boards: more are not drawn."""
+NORMAL_COLOUR = "#1f6fd0"
 PYRAMID_DEPTH_IN_FIGURE = 0.18
 """Depth of a drawn camera pyramid, relative to the median distance of the points."""
 
@@ -164,6 +168,12 @@ def cloud_figure(reconstruction: Reconstruction, *, unit: str = "mm") -> Figure:
             if not on.any():
                 continue
             p, n = _upright(scene[on]), _upright(cloud.normals[on]) * square * NORMAL_LENGTH_SQUARES
+            if not reconstruction.boards:
+                # As photographed; thousands of normals would hide it.
+                axis.scatter(*p.T, s=BARE_POINT, c=cloud.colours[on] / 255.0, depthshade=False, linewidths=0)
+                some = np.s_[:: max(1, len(p) // MOST_NORMALS)]
+                axis.quiver(*p[some].T, *n[some].T, color=NORMAL_COLOUR, linewidth=0.5, arrow_length_ratio=0.0)
+                continue
             colour = board_colour(index)
             axis.scatter(*p.T, s=5, color=colour, label=name, depthshade=False)
             axis.quiver(*p.T, *n.T, color=colour, linewidth=0.6, arrow_length_ratio=0.25)
@@ -179,7 +189,8 @@ def cloud_figure(reconstruction: Reconstruction, *, unit: str = "mm") -> Figure:
             axis.set_zticks([])
         axis.set_zlabel("" if from_above else f"-y {unit}", fontsize=7)
         axis.tick_params(labelsize=6)
-    axis.legend(fontsize=7, loc="upper right")
+    if reconstruction.boards:
+        axis.legend(fontsize=7, loc="upper right")
     title = f"{reconstruction.pair_id}, {reconstruction.affine_method}: {len(cloud)} points, "
     figure.suptitle(f"{title}baseline {reconstruction.baseline_mm:.2f} {unit}", fontsize=10)
     return figure

@@ -1,0 +1,203 @@
+"""Clouds of several pairs of views with known poses, fused into one.
+
+What one pair says of a place, another pair may have said before: then the two are one point. A point of a later cloud
+is looked for where the camera of an earlier one saw it; where its distance from the surface there is no more than the
+errors of both along the surface's normal, the two are merged by these errors, and their colours with them. Distances
+across the surface do not matter: both clouds are samples of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels
+from rigkit.core.cloud import OrientedCloud
+from rigkit.core.errors import InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import unit
+from rigkit.reconstruction.growing.dense import DenseScene
+
+__all__ = ["FusedCloud", "PosedCloud", "fuse_clouds"]
+
+GATE = 3.3
+"""In standard deviations: one good point in a thousand is not merged."""
+MAX_TURN_DEG = 45.0
+"""Between the normals of two points of one surface: both sides of a thin board are two surfaces."""
+REACH_STEPS = 1.0
+"""In steps of the earlier cloud's nodes: further from its nearest one it saw nothing."""
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class PosedCloud:
+    """The cloud of one pair of views, in the frame of its first camera.
+
+    Attributes
+    ----------
+    cloud : N points. pixels : (N, 2) of its first image, where each was seen; nodes were `step_px` apart.
+    camera, world_from_cam : the first camera, and where it stands.
+    """
+
+    cloud: OrientedCloud
+    pixels: Pixels
+    step_px: float
+    camera: Camera
+    world_from_cam: Rigid3
+
+    @classmethod
+    def of(cls, dense: DenseScene, world_from_cam1: Rigid3) -> PosedCloud:
+        """Return the cloud of a dense scene whose first camera stands there."""
+        r = dense.scene.reconstruction
+        return cls(
+            cloud=r.cloud,
+            pixels=r.pixels1,
+            step_px=float(dense.grown.step),
+            camera=r.camera1,
+            world_from_cam=world_from_cam1,
+        )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FusedCloud:
+    """A cloud of several pairs.
+
+    Attributes
+    ----------
+    cloud : in the world's frame; every normal faces the camera that saw its point.
+    pairs_of : (N,) int, how many pairs' points are in each.
+    source : (N,) int, the cloud that a point was in first.
+    """
+
+    cloud: OrientedCloud
+    pairs_of: IntArray
+    source: IntArray
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class _Surface:
+    """A cloud in the world, and what later clouds add to it."""
+
+    posed: PosedCloud
+    points: FloatArray
+    normals: FloatArray
+    errors: FloatArray
+    variance: FloatArray
+    keep: BoolArray
+    weights: FloatArray
+    offsets: FloatArray
+    normal_weights: FloatArray
+    normal_sums: FloatArray
+    colour_sums: FloatArray
+    counts: NDArray[np.int64]
+
+
+def fuse_clouds(clouds: Sequence[PosedCloud]) -> FusedCloud:
+    """Return the clouds of several pairs as one, what they say twice merged by covariance.
+
+    Sigmas of merged points are those of independent errors: poses and calibrations that err are not averaged away.
+    Raises InputError for no clouds.
+    """
+    if not clouds:
+        raise InputError("clouds: there is none to fuse")
+    # The clouds that know their points best come first: they see what is merged into them.
+    order = sorted(range(len(clouds)), key=lambda k: float(np.median(clouds[k].cloud.sigma_mm)))
+    surfaces: list[_Surface] = []
+    for k in order:
+        later = _surface(clouds[k])
+        for earlier in surfaces:
+            _merge(earlier, later)
+        surfaces.append(later)
+    return _fused(surfaces, order)
+
+
+def _surface(posed: PosedCloud) -> _Surface:
+    cloud, turn = posed.cloud, posed.world_from_cam.rotation
+    rays = unit(cloud.points_mm)
+    normals, errors = cloud.normals @ turn.T, (cloud.sigma_mm[:, None] * rays) @ turn.T
+    variance = _variance(errors, normals)
+    sure = _information(cloud.normal_sigma_rad)
+    return _Surface(
+        posed=posed,
+        points=posed.world_from_cam.apply(cloud.points_mm),
+        normals=normals,
+        errors=errors,
+        variance=variance,
+        keep=np.ones(len(cloud), dtype=bool),
+        weights=1.0 / variance,
+        offsets=np.zeros(len(cloud)),
+        normal_weights=sure,
+        normal_sums=sure[:, None] * normals,
+        colour_sums=cloud.colours.astype(np.float64),
+        counts=np.ones(len(cloud), dtype=np.int64),
+    )
+
+
+def _variance(errors: FloatArray, normals: FloatArray) -> FloatArray:
+    """Return the variance of a distance along normals for errors along rays, infinite where it is not known."""
+    variance = np.sum(errors * normals, axis=1) ** 2
+    return np.where(np.isfinite(variance) & (variance > 0.0), variance, np.inf)
+
+
+def _information(sigma: FloatArray) -> FloatArray:
+    """Return 1 / sigma^2, that of the median where none is known."""
+    known = np.isfinite(sigma) & (sigma > 0.0)
+    usual = float(np.median(sigma[known])) if known.any() else 1.0
+    return np.asarray(1.0 / np.where(known, sigma, usual) ** 2)
+
+
+def _merge(earlier: _Surface, later: _Surface) -> None:
+    """Add to `earlier` what `later` says of its points, and keep these no more in `later`."""
+    from scipy.spatial import cKDTree
+
+    posed = earlier.posed
+    left = np.flatnonzero(later.keep & np.isfinite(later.variance))
+    pixels, seen = posed.camera.project(posed.world_from_cam.inverse().apply(later.points[left]))
+    left, pixels = left[seen], pixels[seen]
+    there = np.flatnonzero(earlier.keep & np.isfinite(earlier.variance))
+    if not left.size or not there.size:
+        return
+    reach = REACH_STEPS * posed.step_px
+    distance, nearest = cKDTree(posed.pixels[there]).query(pixels, distance_upper_bound=reach)
+    left, into = left[np.isfinite(distance)], there[nearest[np.isfinite(distance)]]
+    normal = earlier.normals[into]
+    off = np.sum(normal * (later.points[left] - earlier.points[into]), axis=1)
+    variance = _variance(later.errors[left], normal)
+    both = np.sqrt(earlier.variance[into] + variance)
+    turned = np.sum(normal * later.normals[left], axis=1) < np.cos(np.radians(MAX_TURN_DEG))
+    same = (np.abs(off) < GATE * both) & ~turned
+    left, into, off, variance = left[same], into[same], off[same], variance[same]
+    np.add.at(earlier.offsets, into, off / variance)
+    np.add.at(earlier.weights, into, 1.0 / variance)
+    np.add.at(earlier.normal_weights, into, later.normal_weights[left])
+    np.add.at(earlier.normal_sums, into, later.normal_sums[left])
+    np.add.at(earlier.colour_sums, into, later.colour_sums[left])
+    np.add.at(earlier.counts, into, later.counts[left])
+    later.keep[left] = False
+
+
+def _fused(surfaces: Sequence[_Surface], order: Sequence[int]) -> FusedCloud:
+    def joined(of: Sequence[FloatArray]) -> FloatArray:
+        return np.concatenate([values[s.keep] for values, s in zip(of, surfaces, strict=True)])
+
+    weights, counts = joined([s.weights for s in surfaces]), np.concatenate([s.counts[s.keep] for s in surfaces])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        move = np.where(weights > 0.0, joined([s.offsets for s in surfaces]) / weights, 0.0)
+        shrink = np.sqrt(1.0 / weights / joined([s.variance for s in surfaces]))
+    normals = joined([s.normals for s in surfaces])
+    count = len(counts)
+    cloud = OrientedCloud(
+        points_mm=joined([s.points for s in surfaces]) + move[:, None] * normals,
+        normals=unit(joined([s.normal_sums for s in surfaces])),
+        colours=np.rint(joined([s.colour_sums for s in surfaces]) / counts[:, None]).astype(np.uint8),
+        board_index=np.full(count, -1),
+        grid=np.zeros((count, 2), dtype=np.int64),
+        sigma_mm=joined([s.posed.cloud.sigma_mm for s in surfaces]) * np.nan_to_num(shrink, nan=1.0),
+        normal_sigma_rad=1.0 / np.sqrt(joined([s.normal_weights for s in surfaces])),
+        board_ids=(),
+    )
+    sizes = [int(s.keep.sum()) for s in surfaces]
+    return FusedCloud(cloud, counts, np.repeat(np.array(order, dtype=np.int64), sizes))

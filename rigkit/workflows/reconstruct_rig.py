@@ -1,0 +1,205 @@
+"""Several views of a scene with known poses, of a rig or of one camera that was tracked, into one fused cloud."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.affine.features import match_affine_features
+from rigkit.cameras.base import Camera
+from rigkit.core.cloud import OrientedCloud
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.printing import brief
+from rigkit.core.progress import Progress, silent
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.io.ply import ply_bytes
+from rigkit.reconstruction.growing.dense import DenseScene, grow_scene
+from rigkit.reconstruction.growing.fuse import FusedCloud, PosedCloud, fuse_clouds
+from rigkit.reconstruction.scene import reconstruct_scene
+from rigkit.reconstruction.scene_pose import KnownPose
+from rigkit.report.figures import cloud_png
+from rigkit.workflows.camera_files import import_rig
+from rigkit.workflows.pairs import read_for
+from rigkit.workflows.results import require_folder, write_results
+
+__all__ = ["RigScene", "RigSceneOptions", "reconstruct_rig_views"]
+
+CLOUD = "scene.ply"
+PARTNERS = 3
+"""Views nearest to each that it is paired with."""
+MAX_AXES_DEG = 60.0
+"""Between the axes of two views that see a surface alike enough to match; of wide lenses more, if there is no other."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RigSceneOptions:
+    """What is there of a scene, and how to reconstruct it."""
+
+    rig: Path
+    """Cameras and where they stand: our rig's file, Kalibr's camchain, OpenCV's pair."""
+    images: tuple[Path, ...]
+    """One for each camera."""
+    names: tuple[str, ...] | None = None
+    """Cameras of the images; None: the rig's first ones in its order."""
+    output: Path | None = None
+    """Folder for the results; None: nothing is written."""
+    force: bool = False
+    """Replace results that are there; what was read is never replaced."""
+    single_precision: bool = False
+    """Write the cloud in 32 bits, for programs that know no other."""
+    confidence: bool = False
+    """Let the length of the cloud's normals say how sure they are."""
+    pictures: bool = True
+    """Draw the cloud."""
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class RigScene:
+    """What a scene came to.
+
+    Attributes
+    ----------
+    cloud : fused, in the frame of the first image's camera, mm.
+    pairs : names of the two cameras -> points that the pair grew.
+    merged : points of the cloud that more than one pair saw.
+    notes : pairs that gave nothing, in words.
+    files : relative path -> content of everything, whether it was written or not.
+    """
+
+    cloud: OrientedCloud
+    pairs: Mapping[tuple[str, str], int]
+    merged: int
+    notes: tuple[str, ...]
+    files: Mapping[str, str | bytes]
+
+    __repr__ = brief
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _View:
+    name: str
+    camera: Camera
+    cam_from_world: Rigid3
+    image: NDArray[np.generic]
+
+
+def reconstruct_rig_views(options: RigSceneOptions, *, progress: Progress = silent) -> RigScene:
+    """Reconstruct every pair of views that lie near each other and fuse their clouds; write what `options` ask for.
+
+    Raises
+    ------
+    InputError
+        A file cannot be read or written, a camera is missing, an image is of another size than its camera's.
+    DegenerateError
+        No pair gives a cloud.
+    """
+    if options.output is not None:
+        require_folder(options.output, force=options.force)
+    views = _views(options)
+    pairs = near_pairs([v.cam_from_world for v in views])
+    grown: dict[tuple[str, str], PosedCloud] = {}
+    notes: list[str] = []
+    first: DenseScene | None = None
+    for k, (i, j) in enumerate(pairs):
+        progress("growing correspondences of pairs", k, len(pairs))
+        one, other = views[i], views[j]
+        try:
+            dense = _dense(one, other)
+        except DegenerateError as error:
+            notes.append(str(error))
+            continue
+        # The picture shows the pair of the first camera, whose frame is the world's.
+        first = dense if first is None and i == 0 else first
+        grown[one.name, other.name] = PosedCloud.of(dense, one.cam_from_world.inverse())
+    progress("growing correspondences of pairs", len(pairs), len(pairs))
+    if not grown:
+        raise DegenerateError(
+            f"none of {len(pairs)} pairs of views gives a cloud; check which camera took which image (--names), and "
+            f"that the images are of one moment. The first: {notes[0]}"
+        )
+    fused = fuse_clouds(tuple(grown.values()))
+    files = _files(options, fused, first)
+    if options.output is not None:
+        write_results(options.output, files, force=options.force, inputs=[options.rig, *options.images])
+    return RigScene(
+        cloud=fused.cloud,
+        pairs={names: len(posed.cloud) for names, posed in grown.items()},
+        merged=int((fused.pairs_of > 1).sum()),
+        notes=tuple(notes),
+        files=files,
+    )
+
+
+def near_pairs(cam_from_world: Sequence[Rigid3]) -> list[tuple[int, int]]:
+    """Return which views to pair: each with the PARTNERS nearest ones that look the same way, at other places."""
+    centres = np.array([pose.inverse().translation_mm for pose in cam_from_world])
+    axes = np.array([pose.rotation[2] for pose in cam_from_world])
+    distance = np.linalg.norm(centres[:, None] - centres, axis=-1)
+    turned = np.degrees(np.arccos(np.clip(axes @ axes.T, -1.0, 1.0)))
+    # A view that looks another way comes after all others.
+    far = distance + np.where(turned > MAX_AXES_DEG, 2.0 * distance.max(), 0.0)
+    far[distance <= 1e-9 * max(float(distance.max()), 1.0)] = np.inf
+    chosen = np.zeros(far.shape, dtype=bool)
+    nearest = np.argsort(far, axis=1, kind="stable")[:, :PARTNERS]
+    np.put_along_axis(chosen, nearest, np.isfinite(np.take_along_axis(far, nearest, axis=1)), axis=1)
+    return [(int(i), int(j)) for i, j in np.argwhere(np.triu(chosen | chosen.T))]
+
+
+def _views(options: RigSceneOptions) -> list[_View]:
+    """Return the views, the world being the frame of the first; raises InputError where rig and images do not fit."""
+    cameras = import_rig(options.rig)
+    names = options.names or tuple(cameras)[: len(options.images)]
+    missing = [name for name in names if name not in cameras]
+    if missing or len(names) != len(options.images) or len(set(names)) < len(names):
+        what = (
+            f"no camera '{', '.join(missing)}'" if missing else f"{len(options.images)} images for {len(names)} names"
+        )
+        raise InputError(f"'{options.rig}': {what}; its cameras are {', '.join(cameras)}; one image for each (--names)")
+    if len(names) < 2:
+        raise InputError("a cloud needs two images or more")
+    rig_from_first = cameras[names[0]][1].inverse()
+    views = [
+        _View(name, cameras[name][0], cameras[name][1] @ rig_from_first, read_for(cameras[name][0], path, f"'{name}'"))
+        for name, path in zip(names, options.images, strict=True)
+    ]
+    for k, view in enumerate(views):
+        for path, other in zip(options.images[:k], views[:k], strict=True):
+            if np.array_equal(view.image, other.image):
+                raise InputError(
+                    f"images '{path}' and '{options.images[k]}' are the same picture to the last pixel; give one of "
+                    "each camera"
+                )
+    if not any(np.linalg.norm(v.cam_from_world.inverse().translation_mm) > 0.0 for v in views):
+        raise InputError(f"'{options.rig}': all cameras stand at one place: no baseline, so no distances")
+    return views
+
+
+def _dense(one: _View, other: _View) -> DenseScene:
+    """Return the cloud of two views; raises DegenerateError where they do not see the same surfaces."""
+    pose = KnownPose(other.cam_from_world @ one.cam_from_world.inverse(), np.zeros((6, 6)))
+    try:
+        seeds = match_affine_features(one.image, other.image)
+        name = f"{one.name}-{other.name}"
+        sparse = reconstruct_scene(seeds, one.camera, other.camera, pair_id=name, known_pose=pose, image1=one.image)
+        return grow_scene(sparse, seeds, one.image, other.image, pose_is_known=True)
+    except (DegenerateError, InputError) as error:
+        raise DegenerateError(f"pair {one.name}, {other.name}: {error}") from error
+
+
+def _files(options: RigSceneOptions, fused: FusedCloud, first: DenseScene | None) -> dict[str, str | bytes]:
+    comments = [f"fused of several pairs; {int((fused.pairs_of > 1).sum())} points were seen by more than one"]
+    files: dict[str, str | bytes] = {
+        CLOUD: ply_bytes(
+            fused.cloud,
+            single_precision=options.single_precision,
+            confidence=options.confidence,
+            comments=comments,
+        )
+    }
+    if options.pictures and first is not None:
+        files["cloud.png"] = cloud_png(replace(first.scene.reconstruction, pair_id=options.rig.stem, cloud=fused.cloud))
+    return files

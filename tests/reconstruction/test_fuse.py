@@ -1,0 +1,93 @@
+"""Clouds of several pairs fused: nearer to the exact surface than each, normals to their cameras, nothing twice."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from helpers.textured_scene import Corner
+
+from rigkit.affine.features import match_affine_features
+from rigkit.cameras.pinhole import Pinhole
+from rigkit.core.errors import InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import angle_between, exp_so3
+from rigkit.reconstruction.growing.dense import grow_scene
+from rigkit.reconstruction.growing.fuse import PosedCloud, fuse_clouds
+from rigkit.reconstruction.scene import reconstruct_scene
+from rigkit.reconstruction.scene_pose import KnownPose
+
+CAMERA = Pinhole((400, 300), np.array([350.0, 350.0, 199.5, 149.5]))
+TURNS = ((0.0, 0.0, 0.0), (0.05, -0.25, 0.1), (0.02, -0.12, 0.05))
+PLACES_MM = ((0.0, 0.0, 0.0), (320.0, -60.0, 60.0), (150.0, -90.0, 30.0))
+CAM_FROM_WORLD = tuple(
+    Rigid3(exp_so3(np.array(w)), -exp_so3(np.array(w)) @ np.array(c)) for w, c in zip(TURNS, PLACES_MM, strict=True)
+)
+
+
+@cache
+def corner_clouds() -> tuple[Corner, list[PosedCloud]]:
+    rng = np.random.default_rng(5)
+    corner = Corner.random(rng)
+    images = [corner.image(CAMERA, pose, rng) for pose in CAM_FROM_WORLD]
+    clouds = []
+    for i, j in ((0, 1), (0, 2), (2, 1)):
+        pose = CAM_FROM_WORLD[j] @ CAM_FROM_WORLD[i].inverse()
+        seeds = match_affine_features(images[i], images[j])
+        known = KnownPose(pose, np.zeros((6, 6)))
+        sparse = reconstruct_scene(seeds, CAMERA, CAMERA, known_pose=known, image1=images[i])
+        dense = grow_scene(sparse, seeds, images[i], images[j], pose_is_known=True)
+        clouds.append(PosedCloud.of(dense, CAM_FROM_WORLD[i].inverse()))
+    return corner, clouds
+
+
+def distances(corner: Corner, points: np.ndarray) -> np.ndarray:
+    """From the nearest of the three planes."""
+    return np.abs((points - corner.apex_mm) @ corner.axes).min(axis=1)
+
+
+def test_what_pairs_say_of_one_place_becomes_one_point_and_more_exact() -> None:
+    corner, clouds = corner_clouds()
+    fused = fuse_clouds(clouds)
+    sizes = [len(c.cloud) for c in clouds]
+    assert max(sizes) < len(fused.cloud) < 0.75 * sum(sizes)
+    assert fused.pairs_of.sum() == sum(sizes)
+    assert len(fused.cloud) == len(fused.pairs_of) == len(fused.source)
+    alone = [np.median(distances(corner, c.world_from_cam.apply(c.cloud.points_mm))) for c in clouds]
+    merged = fused.pairs_of >= 2
+    assert merged.sum() > 2000
+    assert np.median(distances(corner, fused.cloud.points_mm[merged])) < min(alone)
+    # Towards the camera that saw the point, and turned by no more than grown normals are.
+    centres = np.array([c.world_from_cam.translation_mm for c in clouds])[fused.source]
+    assert (np.sum(fused.cloud.normals * (fused.cloud.points_mm - centres), axis=1) < 0.0).all()
+    plane = np.argmin(np.abs((fused.cloud.points_mm - corner.apex_mm) @ corner.axes), axis=1)
+    angle = angle_between(fused.cloud.normals, corner.axes.T[plane])
+    assert np.degrees(np.median(np.minimum(angle, np.pi - angle))) < 1.0
+
+
+def test_the_order_of_the_clouds_and_the_frame_do_not_matter() -> None:
+    _, clouds = corner_clouds()
+    fused = fuse_clouds(clouds)
+    turned = fuse_clouds(clouds[::-1])
+    assert len(turned.cloud) == len(fused.cloud)
+    np.testing.assert_allclose(turned.cloud.points_mm, fused.cloud.points_mm, atol=1e-9)
+
+
+def test_one_cloud_stays_and_surfaces_apart_are_not_merged() -> None:
+    _, clouds = corner_clouds()
+    alone = fuse_clouds(clouds[:1])
+    np.testing.assert_allclose(alone.cloud.points_mm, clouds[0].world_from_cam.apply(clouds[0].cloud.points_mm))
+    np.testing.assert_allclose(alone.cloud.sigma_mm, clouds[0].cloud.sigma_mm)
+    far = PosedCloud(
+        cloud=clouds[0].cloud,
+        pixels=clouds[0].pixels,
+        step_px=clouds[0].step_px,
+        camera=CAMERA,
+        # By far more than any sigma.
+        world_from_cam=clouds[0].world_from_cam @ Rigid3(np.eye(3), [0.0, 0.0, 200.0]),
+    )
+    apart = fuse_clouds([clouds[0], far])
+    assert (apart.pairs_of == 1).mean() > 0.95
+    with pytest.raises(InputError, match="none to fuse"):
+        fuse_clouds([])
