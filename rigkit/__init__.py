@@ -70,6 +70,7 @@ if TYPE_CHECKING:
     from rigkit.rectification.rectify import rectify_map
     from rigkit.relative_pose.solvers.registry import fundamental_for
     from rigkit.report.calibration_page import CalibrationSection, build_calibration_page
+    from rigkit.report.notebook import notebook_progress
     from rigkit.validation.certificate.contracts import Quantity, Task
     from rigkit.validation.checks import ValidationReport, validate
     from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
@@ -211,6 +212,7 @@ __all__ = [
     "load_session",
     "match_pair",
     "normals_from_affines",
+    "notebook_progress",
     "print_board",
     "read_image",
     "read_ply",
@@ -268,6 +270,7 @@ _NAMES_OF = {
     "rigkit.rectification.rectify": ("rectify_map",),
     "rigkit.relative_pose.solvers.registry": ("fundamental_for",),
     "rigkit.report.calibration_page": ("CalibrationSection", "build_calibration_page"),
+    "rigkit.report.notebook": ("notebook_progress",),
     "rigkit.validation.certificate.contracts": ("Quantity", "Task"),
     "rigkit.validation.checks": ("ValidationReport", "validate"),
     "rigkit.validation.crosscheck": ("CrossCheckReport", "crosscheck"),

@@ -13,6 +13,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
+from rigkit.core.printing import drawn
 from rigkit.geometry.rigid3 import Rigid3
 
 __all__ = ["BoardShape", "Calibration", "Candidate", "Convergence", "Outlier", "ViewResult"]
@@ -222,6 +223,8 @@ class Calibration:
     verdicts: tuple[Finding, ...] = ()
     overdispersion: float = 1.0
     freedom: float = float("inf")
+
+    _repr_html_ = drawn
 
     def __post_init__(self) -> None:
         p = self.camera.parameters.size

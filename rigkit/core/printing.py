@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Collection, Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
 
-__all__ = ["brief"]
+__all__ = ["brief", "drawn"]
+
+NOTEBOOK = "rigkit.report.notebook"
+"""What draws results; it knows them, they know only its name, and a notebook alone asks for it."""
 
 MAX_LENGTH = 60
 """Letters of one value; of more the first are shown."""
@@ -28,6 +32,11 @@ def brief(self: Any) -> str:
     if len(words) > MAX_TOGETHER:
         words = words[: words.rindex(",", 0, MAX_TOGETHER)] + ", ..."
     return f"{type(self).__name__}({words})"
+
+
+def drawn(self: Any) -> str:
+    """Return a result as HTML with a small picture. Classes that a notebook shows take it as their `_repr_html_`."""
+    return str(importlib.import_module(NOTEBOOK).html_of(self))
 
 
 def _value(value: Any) -> str:

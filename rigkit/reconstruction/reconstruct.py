@@ -24,7 +24,7 @@ from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
-from rigkit.core.printing import brief
+from rigkit.core.printing import brief, drawn
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.sampson import sampson_distances
@@ -100,6 +100,7 @@ class Reconstruction:
     kept: BoolArray | None = None
 
     __repr__ = brief
+    _repr_html_ = drawn
 
     def same_points(self, other: Reconstruction) -> bool:
         """Return whether both have the very same points: of one geometry, and the same corners."""

@@ -12,6 +12,7 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, as_array
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
+from rigkit.core.printing import drawn
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
 
@@ -79,6 +80,8 @@ class RigCalibration:
     scale_sigma: float = 0.0
     board_rigs: tuple[BoardRig, ...] = ()
     verdicts: tuple[Finding, ...] = ()
+
+    _repr_html_ = drawn
 
     def __post_init__(self) -> None:
         count = sum(c.camera.parameters.size for c in self.cameras) + 6 * (len(self.cameras) - 1)

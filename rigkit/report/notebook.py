@@ -1,0 +1,128 @@
+"""Results and progress in a notebook: a verdict with a small picture, and a bar that fills."""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.rig.result import RigCalibration
+from rigkit.core.arrays import FloatArray
+from rigkit.core.findings import Finding, Severity, worst
+from rigkit.core.progress import Progress, silent
+from rigkit.geometry.rotation import exp_so3
+from rigkit.reconstruction.reconstruct import Reconstruction
+from rigkit.report.page import scene_of
+from rigkit.report.rig_tables import rig_reach
+from rigkit.report.scene_view import boards_scene, rig_scene
+from rigkit.report.tables import measured_words
+
+__all__ = ["html_of", "notebook_progress", "scene_svg"]
+
+WIDTH, HEIGHT, RIM = 420.0, 300.0, 14.0
+MAX_DRAWN_POINTS = 600
+"""Points drawn; of more, every second, third, ..."""
+SHADES = ("#e6550d", "#1f77b4", "#2ca02c", "#9467bd", "#b79a00", "#17becf", "#e377c2", "#7f7f7f")
+COLOUR_OF = {Severity.GOOD: "#1a7f42", Severity.LOOK: "#8a5f00", Severity.BAD: "#b3261e"}
+VIEWED_FROM = exp_so3(np.array([0.45, 0.0, 0.0])) @ exp_so3(np.array([0.0, 0.45, 0.0]))
+"""From above and from the side, as the 3D view of pages begins."""
+REDRAW_AFTER_S = 0.1
+
+
+def html_of(result: Calibration | RigCalibration | Reconstruction) -> str:
+    """Return a result as a notebook shows it: what it is, the verdict, and its 3D scene as a drawing."""
+    if isinstance(result, Calibration):
+        scene = boards_scene(result.views, result.boards)
+        return _shown(repr(result), result.verdicts[:2], scene)
+    if isinstance(result, RigCalibration):
+        return _shown(f"{result!r}\n  {rig_reach(result, ())}", result.verdicts[:2], rig_scene(result))
+    baseline = measured_words(result.baseline_mm, result.baseline_sigma_mm, 2)
+    words = (
+        f"Reconstruction of '{result.pair_id}', {result.pose_type}, {result.affine_method}: {len(result.cloud)} "
+        f"points, {len(result.boards)} boards, baseline {baseline} mm, Sampson rms {result.sampson_rms_px:.3f} px"
+    )
+    return _shown(words, (), scene_of(result))
+
+
+def _shown(words: str, findings: Sequence[Finding], scene: Mapping[str, Any]) -> str:
+    colour = COLOUR_OF[worst(findings)] if findings else "#1f5fa8"
+    lines = [line.strip() for line in words.splitlines()]
+    lines = [*(line for line in lines if line not in {str(f) for f in findings}), *(str(f) for f in findings)]
+    told = "<br>".join(escape(line) for line in lines)
+    return (
+        f'<div style="border-left: 4px solid {colour}; padding-left: 10px; max-width: 60em">{told}<br>'
+        f"{scene_svg(scene)}</div>"
+    )
+
+
+def scene_svg(scene: Mapping[str, Any]) -> str:
+    """Draw a 3D scene, as pages have it for their viewer, from above and aside, orthographic."""
+    cameras = [np.array(camera["corners"]) for camera in scene["cameras"]]
+    planes = [np.array(plane["corners"]) for plane in scene["planes"]]
+    points = np.array(scene["points"]).reshape(-1, 3)
+    everything = np.concatenate([*cameras, *planes, points]) @ VIEWED_FROM.T
+    low, high = everything[:, :2].min(axis=0), everything[:, :2].max(axis=0)
+    zoom = float(min((np.array([WIDTH, HEIGHT]) - 2.0 * RIM) / np.maximum(high - low, 1e-9)))
+
+    def drawn(places: FloatArray) -> FloatArray:
+        return np.asarray((places @ VIEWED_FROM.T)[:, :2] - low) * zoom + RIM
+
+    height = zoom * (high[1] - low[1]) + 2.0 * RIM
+    out = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH:g}" viewBox="0 0 {WIDTH:g} {height:.0f}" role="img" '
+        'style="background: #fff" font-family="sans-serif" font-size="11"><title>cameras and boards</title>'
+    ]
+    for plane, corners in zip(scene["planes"], planes, strict=True):
+        colour = SHADES[plane["board"] % len(SHADES)]
+        outline = _path(drawn(corners))
+        out.append(f'<path d="{outline}Z" fill="{colour}" fill-opacity="0.08" stroke="{colour}" stroke-opacity="0.6"/>')
+    step = -(-len(points) // MAX_DRAWN_POINTS) or 1
+    board = np.array(scene["board"], dtype=np.int64)
+    for index in np.unique(board[::step]).tolist():
+        dots = drawn(points[::step][board[::step] == index])
+        path = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in dots)
+        out.append(f'<path d="{path}" stroke="{SHADES[index % len(SHADES)]}" stroke-width="3" stroke-linecap="round"/>')
+    for camera, corners in zip(scene["cameras"], cameras, strict=True):
+        tip, *base = drawn(corners)
+        wire = _path(np.array(base)) + "Z" + "".join(_path(np.array([tip, corner])) for corner in base)
+        out.append(f'<path d="{wire}" fill="none" stroke="#333"/>')
+        out.append(f'<text x="{tip[0] + 5:.1f}" y="{tip[1] + 4:.1f}" fill="#333">{escape(camera["name"])}</text>')
+    return "".join([*out, "</svg>"])
+
+
+def _path(places: FloatArray) -> str:
+    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in places)
+
+
+def notebook_progress() -> Progress:
+    """Return a progress callback that fills a bar below the notebook's cell; silent where there is no notebook."""
+    try:
+        display, html = (getattr(importlib.import_module("IPython.display"), name) for name in ("display", "HTML"))
+        shell = importlib.import_module("IPython").get_ipython()
+    except ImportError:
+        return silent
+    if shell is None:
+        return silent
+    handles: dict[str, Any] = {}
+    drawn: dict[str, float] = {}
+
+    def show(what: str, done: int, total: int) -> None:
+        now = time.monotonic()
+        if done < total and now - drawn.get(what, 0.0) < REDRAW_AFTER_S:
+            return
+        drawn[what] = now
+        words = escape(f"{what}: {done} of {total}")
+        bar = html(f'<label>{words} <progress value="{done}" max="{max(total, 1)}"></progress></label>')
+        if what in handles:
+            handles[what].update(bar)
+        else:
+            handles[what] = display(bar, display_id=True)
+        if done >= total:
+            handles.pop(what)
+
+    return show

@@ -1,0 +1,66 @@
+"""The scripts of examples/ run as they are."""
+
+from __future__ import annotations
+
+import runpy
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+from cli.test_calibrate_folder import pictures  # noqa: F401 - a fixture
+from helpers.data import REPOSITORY
+
+EXAMPLES = REPOSITORY / "examples"
+
+
+def run(
+    name: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], folder: Path
+) -> str:
+    monkeypatch.setattr(sys, "argv", [name, *arguments])
+    monkeypatch.chdir(folder)
+    runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+    return capsys.readouterr().out
+
+
+def test_one_camera(
+    pictures: Path,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for path in pictures.glob("left*.jpg"):
+        shutil.copy(path, folder)
+    said = run("one_camera.py", [str(folder), "9x6x30"], monkeypatch, capsys, tmp_path)
+    assert "held-out RMS" in said and "100% of it seen" in said
+    assert (folder / "camera.yaml").is_file() and (folder / "calibration.html").is_file()
+
+
+def test_stereo(
+    pictures: Path,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for side in ("left", "right"):
+        (tmp_path / side).mkdir()
+        for path in pictures.glob(f"{side}*.jpg"):
+            shutil.copy(path, tmp_path / side / path.name.replace(side, "IMG"))
+    sides = [str(tmp_path / side) for side in ("left", "right")]
+    said = run("stereo.py", [*sides, "9x6x30"], monkeypatch, capsys, tmp_path)
+    # The cameras stand 90 mm apart.
+    assert "mm apart" in said and abs(float(said.split(" ±")[0].split()[-1]) - 90.0) < 0.3
+    assert len(list((tmp_path / "rectified").rglob("*.jpg"))) == 2 * len(list((tmp_path / "left").iterdir()))
+
+
+def test_against_a_ruler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    lab = str(REPOSITORY / "datasets" / "lab-a")
+    said = run("against_a_ruler.py", [lab, "fisheye-standard"], monkeypatch, capsys, tmp_path)
+    assert "baseline" in said and "FAILS" not in said and "144 oriented points" in said
+
+
+def test_every_example_is_listed() -> None:
+    listed = (EXAMPLES / "README.md").read_text(encoding="utf-8")
+    assert all(f"`{path.name} " in listed for path in EXAMPLES.glob("*.py"))

@@ -1,0 +1,96 @@
+"""Pages for everybody: axe-core finds no fault, by day and by night, on a phone and on a screen.
+
+axe-core is not part of this repository: `npm install --no-save axe-core` puts it where this looks, or RIGKIT_AXE says
+where axe.min.js is.
+"""
+
+from __future__ import annotations
+
+import html
+import json
+import os
+import re
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calibration.test_rig import rig_views
+from helpers.calibration_scenes import lens
+from helpers.data import REPOSITORY
+from report.test_first_screen import page_of, reported
+from report.test_page_in_browser import QUIET, chromium
+
+from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.core.tables import Cell, Column, Table
+from rigkit.report.calibration_charts import images_svg
+from rigkit.report.calibration_page import CalibrationSection, build_calibration_page
+from rigkit.report.facts_page import build_facts_page
+
+SCHEMES = {"light": "--blink-settings=preferredColorScheme=1", "dark": "--blink-settings=preferredColorScheme=0"}
+RUN = """<script>%s</script><script>
+addEventListener("load", () => axe.run(document, {runOnly: ["wcag2a", "wcag2aa", "best-practice"]}).then((found) => {
+  document.body.dataset.faults = JSON.stringify(found.violations.map((v) => [v.impact, v.id, v.nodes[0].html]));
+  document.body.dataset.checked = found.passes.length;
+  document.body.dataset.scheme = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
+}));
+</script></body>"""
+MIN_CHECKED = 15
+"""Rules that apply to any of our pages: fewer, and it did not run."""
+
+
+@pytest.fixture(scope="module")
+def axe() -> str:
+    places = [Path(os.environ.get("RIGKIT_AXE", "")), REPOSITORY / "node_modules" / "axe-core" / "axe.min.js"]
+    found = [place for place in places if place.is_file()]
+    if not found:
+        pytest.skip("no axe-core (npm install --no-save axe-core, or RIGKIT_AXE=.../axe.min.js)")
+    return found[0].read_text(encoding="utf-8")
+
+
+def validation_page() -> str:
+    return page_of(reported(88.0))
+
+
+def rig_page() -> str:
+    views = {name: own for name, own in rig_views(np.random.default_rng(3), 8).items() if name != "fish"}
+    sizes = {name: lens(name).size_px for name in views}
+    rig = calibrate_rig(views, sizes, model={"reg": "brown", "wide": "kannala_brandt"})
+    sections = [CalibrationSection(c.name, c.calibration) for c in rig.cameras]
+    return build_calibration_page("A rig", "lead", sections, {"rigkit": "x"}, rig)
+
+
+def facts_page() -> str:
+    views = {name: own for name, own in rig_views(np.random.default_rng(3), 8).items() if name != "fish"}
+    sizes = {name: lens(name).size_px for name in views}
+    rig = calibrate_rig(views, sizes, model={"reg": "brown", "wide": "kannala_brandt"}, folds=0)
+    table = Table("t", "A table", (Column("what"), Column("how much", "mm")), ((Cell("a length"), Cell(3.2)),))
+    return build_facts_page(
+        "Facts",
+        "A length: 95 % of errors within 0.3 mm",
+        [table],
+        {"rigkit": "x"},
+        badge="no limit given",
+        sentences=["Half of the view keeps 0.2 mm."],
+        links=[("one", "one/report.html")],
+        drawings=[("by image", images_svg(rig.cameras[0].calibration))],
+    )
+
+
+@pytest.mark.parametrize("make", [validation_page, rig_page, facts_page])
+def test_axe_finds_no_fault(axe: str, make: Callable[[], str], tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    page.write_text(make().replace("</body>", RUN % axe.replace("</script>", "<\\/script>")), encoding="utf-8")
+    for scheme, setting in SCHEMES.items():
+        profile = f"--user-data-dir={tmp_path / scheme}"
+        done = subprocess.run(
+            [chromium(), *QUIET, setting, profile, "--dump-dom", page.as_uri()],
+            capture_output=True,
+            text=True,
+            timeout=240,
+            check=True,
+        )
+        told = dict(re.findall(r'data-(faults|checked|scheme)="([^"]*)"', done.stdout))
+        assert told["scheme"] == scheme and int(told["checked"]) >= MIN_CHECKED
+        assert json.loads(html.unescape(told["faults"])) == []
