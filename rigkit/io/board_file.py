@@ -51,7 +51,7 @@ from rigkit.io.toml_reader import TomlTable, read_toml
 __all__ = ["BOARD_SCHEMA", "board_from_table", "board_text", "load_board", "load_layout"]
 
 BOARD_SCHEMA = "rigkit.board/1"
-MOST_CORNERS = 1000
+MAX_CORNERS = 1000
 """Along one side: no image resolves more."""
 BOTH_PRINTED = "printed_x_mm = 30.0 and printed_y_mm = 30.0"
 SQUARES_MM = (0.1, 5000.0)
@@ -96,9 +96,9 @@ def board_from_table(table: TomlTable, default_id: str) -> Board:
     columns = table.integer("columns", hint=f"columns = 9 ({kind.count_word} along x)", at_least=1)
     rows = table.integer("rows", hint=f"rows = 6 ({kind.count_word} along y)", at_least=1)
     for key, count in (("columns", columns), ("rows", rows)):
-        if count > MOST_CORNERS:
+        if count > MAX_CORNERS:
             raise table.error(
-                f"'{key}' is {count}, more than {MOST_CORNERS}; count the {kind.count_word} along one side"
+                f"'{key}' is {count}, more than {MAX_CORNERS}; count the {kind.count_word} along one side"
             )
     word = kind.size_word
     if table.has(f"{word}_x_mm") or table.has(f"{word}_y_mm"):

@@ -10,6 +10,7 @@ import numpy as np
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import projection_uncertainty
 from rigkit.core.arrays import FloatArray
+from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 
 __all__ = ["histogram_svg", "images_svg", "lens_svg", "radius_svg"]
 
@@ -127,7 +128,7 @@ def histogram_svg(calibration: Calibration) -> str:
     """Draw how often residuals of each size are, u and v together, beside the normal curve of their scatter."""
     _, residuals = _kept(calibration)
     values = residuals.reshape(-1)
-    sigma = float(1.4826 * np.median(np.abs(values)))
+    sigma = float(SIGMA_OF_MEDIAN * np.median(np.abs(values)))
     reach = _round_up(max(4.0 * sigma, 1e-6), fine=True)
     counts, edges = np.histogram(values, BINS, (-reach, reach))
     step = edges[1] - edges[0]

@@ -25,7 +25,7 @@ __all__ = [
     "tables_to_text",
 ]
 
-MOST_DECIMALS = 6
+MAX_DECIMALS = 6
 """Of a value with its sigma: nanometres."""
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
@@ -193,7 +193,7 @@ def measured_words(value: float, sigma: float | None, decimals: int) -> str:
     """
     if sigma is None or not np.isfinite(sigma):
         return f"{value:.{decimals}f}"
-    while decimals < MOST_DECIMALS and 0.0 < sigma < 0.5 * 10.0**-decimals:
+    while decimals < MAX_DECIMALS and 0.0 < sigma < 0.5 * 10.0**-decimals:
         decimals += 1
     return f"{value:.{decimals}f} ± {sigma:.{decimals}f}"
 

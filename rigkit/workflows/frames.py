@@ -30,7 +30,7 @@ from rigkit.io.video import Video, is_video, read_timestamps
 from rigkit.workflows.frame_choice import FrameChoice, KeptFrame, describe
 
 __all__ = [
-    "MOST_FRAMES",
+    "MAX_FRAMES",
     "VideoFrames",
     "frames_folder",
     "frames_of_video",
@@ -39,7 +39,7 @@ __all__ = [
     "with_frames",
 ]
 
-MOST_FRAMES = 40
+MAX_FRAMES = 40
 """Frames kept of a video: a calibration gains little from more that are spread as well."""
 
 SEARCH_PIXELS = 1.3e6
@@ -92,7 +92,7 @@ def timestamps_beside(sources: Sequence[Path]) -> Path | None:
 
 
 def frames_of_video(
-    source: Path, folder: Path, boards: Sequence[Board] = (), *, most: int = MOST_FRAMES, progress: Progress = silent
+    source: Path, folder: Path, boards: Sequence[Board] = (), *, most: int = MAX_FRAMES, progress: Progress = silent
 ) -> VideoFrames:
     """Keep the frames of a video, a sequence of files or a live camera (until it has `most`, or Ctrl-C) as PNG files.
 
@@ -112,7 +112,7 @@ def frames_of_videos(
     boards: Sequence[Board] = (),
     *,
     timestamps: Path | None = None,
-    most: int = MOST_FRAMES,
+    most: int = MAX_FRAMES,
     progress: Progress = silent,
 ) -> VideoFrames:
     """Keep frames of one moment of several cameras, by name; as `frames_of_video`.

@@ -36,7 +36,7 @@ MIXED = (Board("plane1", 8, 6, 50.0, 50.0), Board("plane2", 7, 6, 50.0, 50.0), B
 NOISE_PX = 0.05
 RULER_MM, SQUARE_DEG = 0.5, 0.1
 """What a careful person's rule and protractor would do; the images are good to a few hundredths of that."""
-MOST_CORNERS = 0.95
+MAX_CORNERS = 0.95
 """A few at the rim of a fisheye or in a shadow's edge may be refused."""
 CORNER_PX = 1.0
 """Every corner is the right one; how good it is, is measured elsewhere."""
@@ -199,7 +199,7 @@ def test_images_of_every_kind(boards: str, lens: str, pose_type: PoseType) -> No
     result = reconstruct_pair(pair, pose_type=pose_type, level_sigma_rad=np.radians(0.3))
     corners = sum(board.corner_count for board in BOARDS[boards])
     assert len(result.boards) == 3
-    assert len(pair.captured) > MOST_CORNERS * corners
+    assert len(pair.captured) > MAX_CORNERS * corners
     points = [np.concatenate(scene.points_in_cam1())]
     points.append(scene.cam2_from_cam1.apply(points[0]))
     pixels = [c.project(p)[0] for c, p in zip((scene.camera1, scene.camera2), points, strict=True)]

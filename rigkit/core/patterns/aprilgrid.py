@@ -25,7 +25,7 @@ TAG_FAMILIES: dict[str, str] = {
 NUMBERINGS = ("kalibr", "opencv")
 """Kalibr counts the rows of tags from the bottom, OpenCV's GridBoard from the top; both from the left."""
 
-MOST_BORDER = 2
+MAX_BORDER = 2
 """Modules of the widest black border that is in use: Kalibr's; AprilTag's own and OpenCV's is 1."""
 
 
@@ -78,7 +78,7 @@ class AprilGrid(Pattern):
             raise InputError(f"{columns}x{rows} corners are no whole tags; an AprilGrid has two columns and rows a tag")
         if not 0.0 < self.spacing <= 2.0:
             raise InputError(f"a spacing of {self.spacing} is not a part of a tag's side; Kalibr's tags have 0.3")
-        if not 1 <= self.border <= MOST_BORDER:
+        if not 1 <= self.border <= MAX_BORDER:
             raise InputError(f"a border of {self.border} modules is unknown; Kalibr's tags have 2, OpenCV's 1")
         if self.numbering not in NUMBERINGS:
             raise InputError(f"numbering '{self.numbering}' is unknown; known: {', '.join(NUMBERINGS)}")

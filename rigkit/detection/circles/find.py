@@ -23,23 +23,23 @@ MIN_CIRCLES, MIN_SIDE = 9, 3
 """Fewer than 3 x 3 circles are too often none."""
 FIRST_SIGMA_PX = 0.1
 """Of the centroids of blobs."""
-MOST_GROWTH = 0.25
+MAX_CIRCLE_GROWTH = 0.25
 """How far a circle's size and slant may differ from what its neighbours say."""
 OFF_PLACE = 0.12
 """How far a circle may lie from where its neighbours say, in their distance."""
-LEAST_CONTRAST, MOST_CONTRAST = 0.35, 2.5
+MIN_CIRCLE_CONTRAST, MAX_CIRCLE_CONTRAST = 0.35, 2.5
 """Contrast of a circle over the grid's typical one, or that of its share of the brightness, which a shadow leaves as it
 is: what is far outside of both is another thing."""
-MOST_RESIDUAL = 3.0
+MAX_CIRCLE_RESIDUAL = 3.0
 """RMS residual over contrast, over the grid's typical one: more, and something lies across the circle."""
-LEAST_TYPICAL = 0.03
+MIN_TYPICAL_CIRCLE = 0.03
 """Residuals over contrast below this are small anyway."""
 SUPPORT = 5
 """Neighbours that must foretell a circle which no blob shows."""
 RIM_SIGMAS = 4.0
 """A circle without a neighbour on some side is fitted to the pixels up to so many sigmas of blur outside of it: with
 2.5 the error there is a quarter over the bound, with 4 a tenth."""
-MOST_GAIN = 10.0
+MAX_GAIN = 10.0
 """How much less certain than a circle a place may be that neighbours foretell: a corner of the grid, by its neighbours
 on one side, is five times."""
 SURE_GAIN = 1.5
@@ -191,7 +191,7 @@ def _fitted(grey: GreyImage, pixels: FloatArray, around: PlaneMap, radius: float
 def like_contrast(fit: CircleFit, contrast: float, share: float) -> BoolArray:
     """Return which circles (N,) have about the usual `contrast`, or the usual `share` of the brightness."""
     parts = np.stack([np.abs(fit.contrast) / contrast, fit.share / share])
-    return np.asarray(((parts > LEAST_CONTRAST) & (parts < MOST_CONTRAST)).any(axis=0))
+    return np.asarray(((parts > MIN_CIRCLE_CONTRAST) & (parts < MAX_CIRCLE_CONTRAST)).any(axis=0))
 
 
 def edge_reach(maps: FloatArray, half_way: float, blur_px: FloatArray, surrounded: BoolArray) -> FloatArray:
@@ -211,14 +211,14 @@ def _judged(draft: _Draft, lenience: float = 1.0) -> _Draft:
     """Return the draft without what is no circle of it; `lenience` multiplies the limits of shape and residual."""
     fit = draft.fit
     good = fit.valid & ((fit.contrast > 0.0) == draft.bright)
-    good &= (np.abs(fit.growth) < lenience * MOST_GROWTH).all(axis=1)
+    good &= (np.abs(fit.growth) < lenience * MAX_CIRCLE_GROWTH).all(axis=1)
     if good.sum() < MIN_CIRCLES:
         return draft.chosen(good)
     contrast = np.abs(fit.contrast)
     relative = fit.residual / np.maximum(contrast, 1e-9)
-    usual = max(float(np.median(relative[good])), LEAST_TYPICAL)
+    usual = max(float(np.median(relative[good])), MIN_TYPICAL_CIRCLE)
     good &= like_contrast(fit, float(np.median(contrast[good])), float(np.median(fit.share[good])))
-    good &= relative < lenience * MOST_RESIDUAL * usual
+    good &= relative < lenience * MAX_CIRCLE_RESIDUAL * usual
     if good.sum() < MIN_CIRCLES:
         return draft.chosen(good)
     expected = local_maps(
@@ -230,7 +230,7 @@ def _judged(draft: _Draft, lenience: float = 1.0) -> _Draft:
         leave_out=True,
     )
     off = np.linalg.norm(fit.pixels - expected.pixels, axis=1) / _spacing(expected)
-    good &= (off < OFF_PLACE) | (expected.gain > MOST_GAIN)
+    good &= (off < OFF_PLACE) | (expected.gain > MAX_GAIN)
     return draft.chosen(good)
 
 
@@ -288,7 +288,7 @@ def _beside(draft: _Draft, size_px: tuple[int, int]) -> tuple[IntArray, PlaneMap
     around = local_maps(draft.label, draft.fit.pixels, places, hexagonal=draft.hexagonal, sigma_px=_sigma(draft.fit))
     extent = draft.radius * np.sqrt((around.first**2).sum(axis=2))
     inside = ((around.pixels > extent) & (around.pixels < np.array(size_px) - 1.0 - extent)).all(axis=1)
-    fine = inside & (around.support >= SUPPORT) & (around.gain < MOST_GAIN) & (extent.min(axis=1) > 1.0)
+    fine = inside & (around.support >= SUPPORT) & (around.gain < MAX_GAIN) & (extent.min(axis=1) > 1.0)
     return places[fine], _of(around, fine)
 
 

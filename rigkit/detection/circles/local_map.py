@@ -25,7 +25,7 @@ TYPICAL_DERIVATIVES = (np.inf, np.inf, 0.3, 0.1, 0.03)
 """How large derivatives of order 0 to 4 are taken to be, in distances of neighbours: each is a third of the one before
 where a lens or slant bends the lattice as strongly as its circles can still be linked. What the scatter of few
 neighbours would make of them beyond that is kept out."""
-LEAST_RIDGE = 1e-9
+MIN_RIDGE = 1e-9
 """Keeps the equations solvable where there are fewer neighbours than terms."""
 SLIGHT = 1e-4
 """Pull on the perspective of a homography, as a part of its neighbours' weight: few neighbours leave it open."""
@@ -93,7 +93,7 @@ def local_maps(
     middle = np.nansum(np.where(known[..., None], around, 0.0), axis=1) / np.maximum(known.sum(axis=1), 1)[:, None]
     values = np.where(known[..., None], around - middle[:, None], 0.0)
     pitch = np.sqrt(np.nanmean(np.where(known[..., None], values, np.nan) ** 2) / np.mean(x * x + y * y))
-    ridge = np.array([(sigma_px / (pitch * TYPICAL_DERIVATIVES[i + j])) ** 2 for i, j in POWERS]) + LEAST_RIDGE
+    ridge = np.array([(sigma_px / (pitch * TYPICAL_DERIVATIVES[i + j])) ** 2 for i, j in POWERS]) + MIN_RIDGE
     homography, own = _homographies(plane, values, weight)
     rest = np.where(known[..., None], values - homography, 0.0)
     normal = np.einsum("mk,ki,kj->mij", weight, terms, terms, optimize=True) + np.diag(ridge)
@@ -127,7 +127,7 @@ def _homographies(plane: FloatArray, values: FloatArray, weight: FloatArray) -> 
     weighted = rows * np.repeat(weight, 2, axis=1)[..., None]
     scale = np.maximum((weight[..., None] * values**2).mean(axis=(1, 2)), 1e-9)
     pull = np.zeros((count, 8))
-    pull[:, :6], pull[:, 6:] = LEAST_RIDGE, (scale * SLIGHT)[:, None]
+    pull[:, :6], pull[:, 6:] = MIN_RIDGE, (scale * SLIGHT)[:, None]
     normal = np.swapaxes(weighted, 1, 2) @ rows + pull[:, :, None] * np.eye(8)
     found = np.linalg.solve(normal, np.swapaxes(weighted, 1, 2) @ values.reshape(count, -1, 1))[..., 0]
     offset, matrix, bend = found[:, [0, 3]], found[:, [1, 2, 4, 5]].reshape(count, 2, 2), found[:, 6:]

@@ -22,7 +22,7 @@ __all__ = ["lone_part", "placed_on"]
 
 TELLING = 2
 """A place in the board is preferred to another that leaves more than so many more places empty."""
-MOST_EMPTY = 0.2
+MAX_EMPTY = 0.2
 """Part of a board's circles that may be covered where the others show their place."""
 EMPTY_LINE = 0.5
 """A line of the board beside the circles, of which this part is seen to be paper, is not there: it is another board."""
@@ -45,7 +45,7 @@ def placed_on(found: CircleGrid, board: Board) -> BoardDetection | None:
     if not places:
         return None
     least = min(place.empty for place in places)
-    if least > MOST_EMPTY * board.corner_count:
+    if least > MAX_EMPTY * board.corner_count:
         return None
     good = [place for place in places if place.empty <= least + TELLING]
     if len({_key(place.grid, board) for place in good}) > 1:

@@ -15,9 +15,9 @@ from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import DegenerateError
 from rigkit.core.patterns.circles import Circles
 from rigkit.detection.circles.find import (
-    LEAST_TYPICAL,
-    MOST_GROWTH,
-    MOST_RESIDUAL,
+    MAX_CIRCLE_GROWTH,
+    MAX_CIRCLE_RESIDUAL,
+    MIN_TYPICAL_CIRCLE,
     OFF_PLACE,
     CircleGrid,
     edge_reach,
@@ -105,7 +105,7 @@ def _maps(
 def _sound(fit: CircleFit, found: CircleGrid) -> BoolArray:
     """Return which circles look like those of the grid."""
     contrast = np.abs(fit.contrast)
-    usual = max(found.evidence.unexplained, LEAST_TYPICAL)
-    good = fit.valid & ((fit.contrast > 0.0) == found.bright) & (np.abs(fit.growth) < MOST_GROWTH).all(axis=1)
+    usual = max(found.evidence.unexplained, MIN_TYPICAL_CIRCLE)
+    good = fit.valid & ((fit.contrast > 0.0) == found.bright) & (np.abs(fit.growth) < MAX_CIRCLE_GROWTH).all(axis=1)
     good &= like_contrast(fit, found.contrast, found.share)
-    return np.asarray(good & (fit.residual < MOST_RESIDUAL * usual * np.maximum(contrast, 1e-9)))
+    return np.asarray(good & (fit.residual < MAX_CIRCLE_RESIDUAL * usual * np.maximum(contrast, 1e-9)))

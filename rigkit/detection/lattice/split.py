@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.detections import grid_turned
 from rigkit.detection.lattice.lattice import Lattice, margins
 from rigkit.detection.lattice.local_fit import PLIANT, STIFF, fit_cells
 from rigkit.detection.lattice.spacing import SpacingChange, spacing_changes
@@ -257,7 +258,7 @@ def _joined(one: _LatticePart, two: _LatticePart) -> Lattice | None:
     if not off < MEETS_AT_ALL:
         return None
     for quarter in range(4):
-        shift = whole.astype(np.int64) - _turned_grid(two.grid[near], two.lattice.size, quarter)
+        shift = whole.astype(np.int64) - grid_turned(two.grid[near], two.lattice.size, quarter)
         if (shift == shift[0]).all():
             close = apart < DIAGONAL * GAP * longest
             far = far_off < FAR_MEETS_CELLS
@@ -326,14 +327,6 @@ def _alike(one: _Cell, two: _Cell) -> bool:
             return True
         u1, v1, u2, v2 = u2, v2, -u1, -v1
     return False
-
-
-def _turned_grid(grid: IntArray, size: tuple[int, int], quarter_turns: int) -> IntArray:
-    columns, rows = size
-    for _ in range(quarter_turns):
-        grid = np.stack([rows - 1 - grid[:, 1], grid[:, 0]], axis=1)
-        columns, rows = rows, columns
-    return grid
 
 
 def _facing(one: Lattice, two: Lattice, steps: int, shape: int = cv2.MORPH_CROSS) -> int:

@@ -25,7 +25,7 @@ POLYNOMIAL_POWERS = np.array([(degree - k, k) for degree in range(MOST_DEGREE + 
 TERMS_OF_DEGREE = tuple((degree + 1) * (degree + 2) // 2 for degree in range(MOST_DEGREE + 1))
 """Terms x^i y^j of polynomials, and how many there are up to a degree."""
 
-MOST_LEVERAGE = 0.99
+MAX_LEVERAGE = 0.99
 """A point that a term is there for alone is foretold by nothing."""
 
 POINTS_A_TERM = 2.5
@@ -175,7 +175,7 @@ class _Polynomial:
         terms = max(int(len(places) / POINTS_A_TERM), fewest)
         ends = [end for end in TERMS_OF_DEGREE if end <= terms]
         basis, triangle = np.linalg.qr(_terms((places - middle) / size, POLYNOMIAL_POWERS[: ends[-1]]))
-        told, leverages = basis.T @ values, np.minimum(np.cumsum(basis**2, axis=1), MOST_LEVERAGE)
+        told, leverages = basis.T @ values, np.minimum(np.cumsum(basis**2, axis=1), MAX_LEVERAGE)
         left = [(values - basis[:, :k] @ told[:k]) / (1.0 - leverages[:, k - 1, None]) for k in ends]
         misses = np.array([np.median(np.hypot(*foretold.T)) for foretold in left])
         best = int(misses.argmin())

@@ -10,7 +10,7 @@ import numpy as np
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import grid_turned
-from rigkit.core.patterns.aprilgrid import MOST_BORDER, TAG_FAMILIES, AprilGrid
+from rigkit.core.patterns.aprilgrid import MAX_BORDER, TAG_FAMILIES, AprilGrid
 from rigkit.core.patterns.aruco import marker_count
 from rigkit.detection.lattice.lattice import Lattice, build_lattices
 from rigkit.detection.lattice.links import LENGTH_RATIO, find_links
@@ -61,7 +61,7 @@ class TagSightings:
         best: tuple[float, tuple[str, int], TagCode] | None = None
         for family, dictionary in TAG_FAMILIES.items():
             every = np.arange(marker_count(dictionary))
-            for border in range(1, MOST_BORDER + 1):
+            for border in range(1, MAX_BORDER + 1):
                 codes = read_tags(image, quads, Codes.of(AprilGrid(1.0, family, border, numbering="opencv"), every))
                 total = float(codes.likeness[codes.read].sum())
                 if np.count_nonzero(codes.read) >= MIN_TAGS_READ and (best is None or total > best[0]):
