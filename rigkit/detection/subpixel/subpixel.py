@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray, upper_median
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, upper_median
 from rigkit.detection.lattice.lattice import Lattice, LatticeStack, padded
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.response import GreyImage
@@ -42,6 +42,10 @@ sigmas of the first pass: the edges then know them better. Everywhere it would t
 PAPER_ROUNDS, SETTLED_PX = 4, 0.03
 """What lies beyond the outermost squares is read with the corners as they are fitted so far, and again if these move by
 more than the second number."""
+
+REACHED = 0.25
+"""Of the corners of a board: where blur brings the edges of neighbouring lines into so many windows, all are fitted
+once more. Squares at a slant, or at the rim, do not make a sharp image slower by a third."""
 
 MIN_NEIGHBOURS = 3
 """An empty cell is tried if so many of its eight neighbours are known."""
@@ -148,11 +152,14 @@ def refine(image: GreyImage, lattices: Sequence[Lattice]) -> list[RefinedLattice
     start = Lattice(sheet.pixels, sheet.contrast, True)
     first = _first_pass(image, start, sheet.signs)
     start, holes = _with_holes(first.lattice, sheet.signs != 0.0)
-    last = _last_pass(image, start, sheet.signs, _typical_blur(first, sheet.parts), first.sigma_px, sheet.parts)
-    if _reached_by_others(last):
-        # Where the edges of neighbouring lines reach into the windows, it matters where exactly these are.
-        blur = _typical_blur(last, sheet.parts)
-        last = _last_pass(image, last.lattice, sheet.signs, blur, last.sigma_px, sheet.parts)
+    blur = _typical_blur(first, sheet.parts)
+    last, reached = _last_pass(image, start, sheet.signs, blur, first.sigma_px, sheet.parts)
+    if reached.any():
+        # It matters where exactly the neighbouring lines are, whose edges reach into the windows.
+        once = last.without(~reached)
+        blur = _typical_blur(once, sheet.parts)
+        again, _ = _last_pass(image, once.lattice, sheet.signs, blur, once.sigma_px, sheet.parts)
+        last = last.without(reached).filled(again)
     if holes.any():
         last = _confirmed(last, start, holes)
     checked = _checked(last, sheet.parts)
@@ -212,8 +219,9 @@ def _last_pass(
     blur: FloatArray,
     sigma_px: FloatArray,
     parts: Sequence[Part],
-) -> RefinedLattice:
-    """Fit all corners of the sheet `start`, known to `sigma_px` (R, C); those that fail are left out.
+) -> tuple[RefinedLattice, BoolArray]:
+    """Fit all corners of the sheet `start`, known to `sigma_px` (R, C); those that fail are left out. Say (R, C) which
+    are of boards whose neighbouring lines reach into the windows.
 
     Noise is told from other residuals, and how that of neighbouring pixels is correlated on each of the `parts`.
     """
@@ -245,8 +253,7 @@ def _last_pass(
         )
 
     geometry = Geometry(shape.sides, curvature, shape.gaps(), ends_of(known, known))
-    if TAIL_SIGMAS * blur[known].max(initial=0.0) > (1.0 - WINDOW_REACH) * geometry.gaps.min(initial=np.inf):
-        # The edges of neighbouring lines reach into the windows.
+    if _reached_by_others(geometry.gaps, blur[known], mine).any():
         geometry = tilted(geometry, known)
     fit = fitted(slice(None), geometry)
     again = beside_paper(geometry, fit, mine)
@@ -257,14 +264,19 @@ def _last_pass(
         if np.abs(fit.pixels[again] - before).max() < SETTLED_PX:
             break
     factors = sigma_factors(fit, fit.valid & (fit.contrast > 0.0), shape.sides, mine, len(parts), radius_px)
-    return _spread(start, fit, fit.sigma_px * factors[mine])
+    reached = np.zeros(known.shape, np.bool_)
+    reached[known] = _reached_by_others(geometry.gaps, fit.blur, mine)
+    return _spread(start, fit, fit.sigma_px * factors[mine]), reached
 
 
-def _reached_by_others(item: RefinedLattice) -> bool:
-    """Return whether blur brings the edges of neighbouring lines into the windows of corners."""
-    known = item.lattice.known
-    gaps = fit_cells(item.lattice.pixels, known, degree=1).gaps().reshape(-1, 4)
-    return bool((TAIL_SIGMAS * item.blur_px[known] > (1.0 - WINDOW_REACH) * gaps.min(axis=1, initial=np.inf)).any())
+def _reached_by_others(gaps: FloatArray, blur: FloatArray, owner: IntArray) -> BoolArray:
+    """Return which corners (N,) are of boards that blur brings the edges of neighbouring lines into REACHED windows of.
+
+    `gaps` (N, 2, 2) as of `Geometry`, `owner` (N,) the number of each corner's board.
+    """
+    reached = TAIL_SIGMAS * blur > (1.0 - WINDOW_REACH) * gaps.reshape(-1, 4).min(axis=1, initial=np.inf)
+    boards: BoolArray = np.bincount(owner, reached) > REACHED * np.bincount(owner)
+    return np.asarray(boards[owner])
 
 
 def _spread(start: Lattice, fit: EdgeFit, sigma_px: FloatArray) -> RefinedLattice:
