@@ -86,3 +86,12 @@ def test_a_pose_without_freedom_stays(rng: np.random.Generator) -> None:
     found = pose_with_field(m, pose, REGULAR.size_px, PoseType.STANDARD, None, 1.0)
     assert found.cam2_from_cam1.allclose(Rigid3(pose.rotation, unit(pose.translation_mm)))
     assert not found.covariance.any()
+
+
+def test_the_field_of_a_known_pose_is_measured(rng: np.random.Generator) -> None:
+    for amplitude_px in (0.0, 0.3):
+        m, pose, _ = pair(rng, 1500, noise_px=NOISE_PX)
+        m = with_field(rng, m, amplitude_px)
+        found = pose_with_field(m, pose, REGULAR.size_px, PoseType.STANDARD, None, 1.0)
+        # One draw of four waves, of which the part across the epipolar lines is seen.
+        assert found.amplitude_px < 0.06 if amplitude_px == 0.0 else 0.1 < found.amplitude_px < 0.6

@@ -14,6 +14,7 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import DegenerateError
 from rigkit.core.matches import Matches
+from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, rotation_angle, unit
 from rigkit.geometry.sampson import sampson_distances
@@ -175,8 +176,11 @@ def _pose_from_grown(
         if fixed:
             assert r.pose_covariance is not None
             kept = known_scene_pose(matches, KnownPose(r.cam2_from_cam1, r.pose_covariance))
-            found = SystematicPose(kept.refined.cam2_from_cam1, kept.refined.covariance, 0.0)
-            return _EvenPose(found, kept.matches.select(kept.inliers))
+            even = kept.matches.select(kept.inliers)
+            # What pairs err by together across their epipolar lines they err by along them too.
+            there = kept.refined.cam2_from_cam1
+            misfit = pose_with_field(even, there, view1.size_px, PoseType.STANDARD, None, OVERLAP).amplitude_px
+            return _EvenPose(SystematicPose(there, kept.refined.covariance, misfit), even)
         # Without a level a type holds exactly.
         level = r.level_sigma_rad or 0.0
         fit = fit_scene_pose(_floored(matches), r.pose_type, level, np.random.default_rng(0), start=pose)

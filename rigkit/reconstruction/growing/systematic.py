@@ -56,7 +56,7 @@ def pose_with_field(
     ----------
     matches : that agree with `start`; their sigmas are those that they show.
     size_px : of image 1.
-    pose_type, level_sigma_rad : as in `refine_pose`.
+    pose_type, level_sigma_rad : as in `refine_pose`. Without freedom the pose stays, and only the field is measured.
     overlap : pairs that share their pixels, so that their noise is that of one. To waves much longer than a window
         that is independent noise of so many times its variance.
     """
@@ -68,7 +68,7 @@ def pose_with_field(
     amplitude = 0.0
     covariance: FloatArray = np.zeros((count, count))
     basis = translation_basis(t)
-    for _ in range(FIELD_STEPS if count else 0):
+    for _ in range(FIELD_STEPS):
         basis = translation_basis(t)
         r, J = point_terms(matches, R, t, basis)
         weight = cauchy_weights(r) / overlap
