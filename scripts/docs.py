@@ -12,7 +12,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import round_trips
+
 import rigkit
+from rigkit.io.schema import SCHEMAS, key_rows, schema_text
+from rigkit.report.calibration_drawings import uncertainty_svg
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = ROOT / "docs" / "pages"
@@ -35,10 +39,61 @@ FRAMES = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 640 240" font-f
 """
 
 
+PIXELS = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 640 200" font-family="sans-serif" font-size="14">
+<rect width="640" height="200" fill="#fff"/><g stroke="#888" fill="none">GRID</g>
+<circle cx="80" cy="70" r="4"/><text x="92" y="66">(0, 0): the centre of the first pixel</text>
+<circle cx="50" cy="40" r="4" fill="#b3261e"/>
+<text x="62" y="30" fill="#b3261e">(-0.5, -0.5): the corner of the image</text>
+<text x="400" y="70">OpenCV, Kalibr, ROS, mrcal: the same</text>
+<text x="400" y="100">COLMAP: 0.5 more, (0, 0) is the corner</text>
+<text x="400" y="130">MATLAB: 1 more, (1, 1) is the centre</text></svg>
+"""
+POSES = (
+    ("general", "M100 90l-26 40h52z", "M180 60l-44 18l30 34z"),
+    ("planar", "M100 90l-26 40h52z", "M178 84l-40 26l46 22z"),
+    ("standard", "M100 90l-26 40h52z", "M190 90l-26 40h52z"),
+    ("forward", "M100 100l-26 40h52z", "M100 50l-26 40h52z"),
+)
+"""Name, and two cameras from above that look downwards in the drawing."""
+
+
+def poses_svg() -> str:
+    """Draw how two cameras may stand, from above."""
+    out = ['<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 880 180" font-family="sans-serif" font-size="14">']
+    out.append('<rect width="880" height="180" fill="#fff"/>')
+    for k, (name, first, second) in enumerate(POSES):
+        out.append(f'<g transform="translate({220 * k} 0)"><path d="{first}" fill="none" stroke="#1f4e8c"/>')
+        out.append(
+            f'<path d="{second}" fill="none" stroke="#b3261e"/><text x="60" y="170">{name}, from above</text></g>'
+        )
+    return "".join([*out, "</svg>\n"])
+
+
+def keys_page() -> str:
+    """Return the page with every key of every file."""
+    parts = ["# All keys\n\nMade of the definitions that `rigkit schema` prints and that readers are held against.\n"]
+    for name, schema in SCHEMAS.items():
+        parts.append(f'## {name}\n\n{schema["title"]}: `schema = "{schema["properties"]["schema"]["const"]}"`')
+        parts.append(f"([JSON Schema](made/{name}.json)).\n\n| key | holds | |\n| :-- | :-- | :-- |")
+        for key, kind, words in key_rows(schema):
+            parts.append("| " + " | ".join(text.replace("|", "\\|") for text in (f"`{key}`", kind, words)) + " |")
+        parts.append("")
+    return "\n".join(parts)
+
+
 def made_pictures() -> None:
-    """Write the pictures that pages show."""
+    """Write the pictures and tables that pages show, and the schemas."""
     MADE.mkdir(exist_ok=True)
     shutil.copyfile(ROOT / "datasets" / "lab-a" / "pictures" / "cloud.jpg", MADE / "cloud.jpg")
+    calibration = rigkit.load_calibration(ROOT / "calib" / "cameras" / "mvca020_r61" / "calibration.json")
+    (MADE / "uncertainty.svg").write_text(uncertainty_svg(calibration), encoding="utf-8")
+    grid = "".join(f'<path d="M{50 + 60 * k} 40V160M50 {40 + 60 * k}H290"/>' for k in range(3))
+    grid += '<path d="M230 40V160M290 40V160"/>'
+    (MADE / "pixels.svg").write_text(PIXELS.replace("GRID", grid), encoding="utf-8")
+    (MADE / "poses.svg").write_text(poses_svg(), encoding="utf-8")
+    (MADE / "round-trips.md").write_text(round_trips.table(), encoding="utf-8")
+    for name in SCHEMAS:
+        (MADE / f"{name}.json").write_text(schema_text(name), encoding="utf-8")
     squares = "".join(f'<path d="M{400 + 30 * k} 50V200M400 {50 + 30 * k}H{580}"/>' for k in range(6))
     (MADE / "frames.svg").write_text(FRAMES.replace("BOARD", squares), encoding="utf-8")
 
@@ -57,6 +112,7 @@ def main() -> int:
     parser.add_argument("--serve", action="store_true", help="serve the pages on this machine instead of building them")
     args = parser.parse_args()
     made_pictures()
+    (PAGES / "keys.md").write_text(keys_page(), encoding="utf-8")
     (PAGES / "api.md").write_text(api_page(), encoding="utf-8")
     command = [
         sys.executable,

@@ -214,8 +214,9 @@ def difference_png(difference: CameraDifference) -> bytes:
     top = max(float(difference.max_px), MIN_SHOWN_PX)
     mesh = axis.pcolormesh(u, v, difference.map_px, shading="nearest", cmap="viridis", vmin=0.0, vmax=top)
     some = np.s_[::3, ::3]
-    arrows = difference.difference_px[some] if difference.max_px > MIN_SHOWN_PX else np.zeros((*u[some].shape, 2))
-    axis.quiver(u[some], v[some], arrows[..., 0], arrows[..., 1], angles="xy", color="white", width=0.002)
+    arrows = difference.difference_px[some]
+    if difference.max_px > MIN_SHOWN_PX:
+        axis.quiver(u[some], v[some], arrows[..., 0], arrows[..., 1], angles="xy", color="white", width=0.002)
     axis.set_aspect("equal")
     axis.invert_yaxis()
     figure.colorbar(mesh, ax=axis, label="px", shrink=0.85)

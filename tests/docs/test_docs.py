@@ -15,7 +15,7 @@ from helpers.data import REPOSITORY
 from rigkit.cli.main import main
 
 PAGES = REPOSITORY / "docs" / "pages"
-MADE_BY_THE_BUILD = ("made/", "api.md")
+MADE_BY_THE_BUILD = ("made/", "api.md", "keys.md")
 BLOCK = re.compile(r"^( *)```(console|python)\n(.*?)^ *```$", re.MULTILINE | re.DOTALL)
 NEEDS = re.compile(r"<!-- with: ([a-z ]+) -->")
 LINK = re.compile(r"\]\(([^)\s]+)\)")

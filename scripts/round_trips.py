@@ -1,0 +1,153 @@
+"""Every camera model through every format and back, by the same lens: the largest error over the image, px, and what
+the other programs' own readers make of the files. The table is part of the documentation.
+
+python scripts/round_trips.py
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from rigkit.cameras.base import Camera
+from rigkit.cameras.compare import grid_pixels
+from rigkit.cameras.convert import convert_camera
+from rigkit.cameras.kannala_brandt import KannalaBrandt
+from rigkit.cameras.registry import MODELS
+from rigkit.core.errors import RigkitError
+from rigkit.interop.colmap_cameras import read_colmap_cameras, write_colmap_cameras
+from rigkit.interop.exchange import Written
+from rigkit.interop.kalibr import read_kalibr, write_kalibr
+from rigkit.interop.mrcal import read_cameramodel, write_cameramodel
+from rigkit.interop.ocamcalib import read_ocamcalib, write_ocamcalib
+from rigkit.interop.opencv import read_opencv, write_opencv
+from rigkit.interop.ros import read_camera_info, write_camera_info
+
+LENS = KannalaBrandt((1280, 960), np.array([720.0, 721.0, 643.2, 477.9, -0.03, 0.004, -0.0008, 0.0]))
+"""A lens of 85 by 65 degrees that every model can follow nearly."""
+GRID = (41, 31)
+SYSTEM_PYTHON = "/usr/bin/python3"
+PROJECT = (
+    "import sys, mrcal, numpy as np; lens = mrcal.cameramodel(sys.argv[1]).intrinsics(); "
+    "np.save(sys.argv[3], mrcal.project(np.load(sys.argv[2]), *lens))"
+)
+EXACT_PX = 1e-6
+"""Below this a file brings the same camera back: text has every digit."""
+FORMATS: dict[str, tuple[Callable[[Camera], Written], Callable[[str], Camera]]] = {
+    "opencv": (write_opencv, read_opencv),
+    "ros": (write_camera_info, read_camera_info),
+    "kalibr": (lambda c: write_kalibr([c]).cameras[0], lambda t: read_kalibr(t)[0][0]),
+    "colmap": (lambda c: write_colmap_cameras({1: c})[1][1], lambda t: read_colmap_cameras(t)[1]),
+    "mrcal": (write_cameramodel, lambda t: read_cameramodel(t)[0]),
+    "ocamcalib": (write_ocamcalib, lambda t: read_ocamcalib(t)[0]),
+}
+
+
+def lens_as(model: str) -> Camera:
+    """Return the lens as a camera of a model."""
+    return convert_camera(LENS, model, order={"brown": 5, "scaramuzza": 6}.get(model)).camera
+
+
+def pixels_and_rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Return pixels (N, 2) over the image, and their rays (N, 3)."""
+    pixels = grid_pixels(camera.size_px, GRID).reshape(-1, 2)
+    rays, valid = camera.unproject(pixels)
+    return pixels[valid], rays[valid]
+
+
+def cell(camera: Camera, kind: str) -> str:
+    """Return what a format makes of a camera: the largest error after writing and reading."""
+    write, read = FORMATS[kind]
+    try:
+        written = write(camera)
+        back = read(written.text)
+    except RigkitError:
+        return "cannot"
+    pixels, rays = pixels_and_rays(camera)
+    found, valid = back.project(rays)
+    off = np.linalg.norm(found - pixels, axis=1)[valid]
+    words = f"{off.max():.1e}" if off.max() < EXACT_PX else f"{off.max():.2g}"
+    share = "" if valid.all() else f" over {valid.mean():.0%}"
+    return words + share + (", refitted" if written.max_error_px > 0.0 else "")
+
+
+def by_opencv(camera: Camera) -> float | None:
+    """Return the largest error of OpenCV's own projection with what its own reader has of the file."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "camera.yaml"
+        path.write_text(write_opencv(camera).text)
+        stored = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        K, d = stored.getNode("camera_matrix").mat(), stored.getNode("distortion_coefficients").mat()
+        stored.release()
+    pixels, rays = pixels_and_rays(camera)
+    points = np.ascontiguousarray(rays[:, None, :])
+    zero = np.zeros(3)
+    if camera.model == "kannala_brandt":
+        found, _ = cv2.fisheye.projectPoints(points, zero, zero, K, d.reshape(-1, 1)[:4])
+    elif camera.model in ("pinhole", "brown"):
+        found, _ = cv2.projectPoints(points, zero, zero, K, d)
+    else:
+        return None
+    return float(np.linalg.norm(found.reshape(-1, 2) - pixels, axis=1).max())
+
+
+def by_pycolmap(camera: Camera) -> float | None:
+    """Return the largest error of pycolmap's own projection of the line that COLMAP's file has; its pixels count from
+    the corner of the image."""
+    import pycolmap
+
+    try:
+        text = write_colmap_cameras({1: camera})[0]
+    except RigkitError:
+        return None
+    words = next(line for line in text.splitlines() if line and not line.startswith("#")).split()
+    theirs = pycolmap.Camera(
+        model=words[1], width=int(words[2]), height=int(words[3]), params=[float(v) for v in words[4:]]
+    )
+    pixels, rays = pixels_and_rays(camera)
+    found = np.asarray(theirs.img_from_cam(rays / rays[:, 2:]))
+    return float(np.linalg.norm(found - 0.5 - pixels, axis=1).max())
+
+
+def by_mrcal(camera: Camera) -> float | None:
+    """Return the largest error of mrcal's own projection with what its own reader has of the file; None where the
+    system's Python has no mrcal (Debian: python3-mrcal)."""
+    if subprocess.run([SYSTEM_PYTHON, "-c", "import mrcal"], capture_output=True, check=False).returncode != 0:
+        return None
+    pixels, rays = pixels_and_rays(camera)
+    with tempfile.TemporaryDirectory() as folder:
+        path, given, found = (Path(folder) / name for name in ("camera.cameramodel", "rays.npy", "pixels.npy"))
+        path.write_text(write_cameramodel(camera).text)
+        np.save(given, rays)
+        subprocess.run([SYSTEM_PYTHON, "-c", PROJECT, str(path), str(given), str(found)], check=True)
+        return float(np.linalg.norm(np.load(found) - pixels, axis=1).max())
+
+
+READERS = {"OpenCV's own": by_opencv, "pycolmap's own": by_pycolmap, "mrcal's own": by_mrcal}
+
+
+def table() -> str:
+    """Return the table as Markdown."""
+    head = ["model", *FORMATS, *READERS]
+    lines = [f"| {' | '.join(head)} |", "| :-- " + "| --: " * (len(head) - 1) + "|"]
+    for model in MODELS:
+        camera = lens_as(model)
+        own = [reader(camera) for reader in READERS.values()]
+        cells = [cell(camera, kind) for kind in FORMATS] + ["-" if v is None else f"{v:.1e}" for v in own]
+        lines.append(f"| `{model}` | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> int:
+    print(table(), end="")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
