@@ -1,7 +1,8 @@
 """Calibrating one camera from views of chessboards, without any guess.
 
 Every model (degree, board shape) in question is fitted; what is chosen is the one with the fewest numbers among those
-whose held-out error is as good as the smallest. All are compared on the same corners.
+whose held-out error is as good as the smallest. All are compared on the same corners. Boards that are not flat bend the
+lenses to themselves: lenses are compared on flat boards first, and again on boards as they were found.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 
 from rigkit.calibration.assemble import assemble, not_identifiable, require_determined, solution_normal
 from rigkit.calibration.board_orientation import turned_views, with_views_turned
+from rigkit.calibration.choice import SURELY, Option, choose, described
 from rigkit.calibration.evidence import fit_shapes
 from rigkit.calibration.fit import Fit, fit_kept, fit_model, heldout_squares, robust_sigma
 from rigkit.calibration.linearise import normal_equations
@@ -25,7 +27,7 @@ from rigkit.calibration.usable import usable_views
 from rigkit.calibration.verdicts import judge
 from rigkit.cameras.base import Camera
 from rigkit.cameras.registry import MODELS, camera_model, check_order
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding, Severity
@@ -34,11 +36,6 @@ from rigkit.core.progress import Progress, silent
 __all__ = ["DEGREES_TRIED", "FOLDS", "calibrate"]
 
 FOLDS = 5
-MARGIN = 0.02
-"""A model or a board shape with more numbers must lower the held-out error by this part to be chosen,"""
-SURELY = 1.0
-"""or, a model, by this many standard errors of the difference, as images have it: a lens that is not quite right hides
-in the poses, and 0.3 % of held-out error may be three times the error of the lens."""
 COMPARABLE = 1.5
 """Corners are outliers only if every model with a scatter within this factor of the best one says so."""
 MIN_KEPT_SHARE = 0.5
@@ -47,24 +44,6 @@ DEGREES_TRIED: dict[str, tuple[int | None, ...]] = {"scaramuzza": (4, 5, 6, 7, 8
 """Sizes tried of models that come in several, where none is asked for,"""
 DEGREES_BEYOND: dict[str, tuple[int, ...]] = {"scaramuzza": (9, 10)}
 """and those tried where the largest of them is the best: precise corners, or lenses of more than 200 degrees."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Option:
-    """A model in the running."""
-
-    name: str
-    fit: Fit
-    heldout: FloatArray | None = None
-    """Squared held-out residuals of each image, px^2."""
-
-    @property
-    def heldout_px(self) -> float | None:
-        return None if self.heldout is None else float(np.sqrt(self.heldout.sum() / self.fit.kept.sum()))
-
-    @property
-    def count(self) -> int:
-        return int(self.fit.state.camera.parameters.size + self.fit.state.shape.count)
 
 
 def calibrate(
@@ -100,32 +79,89 @@ def calibrate(
     wanted = _wanted(model, degree, board, folds)
     used, dropped = usable_views(views, size_px)
     observations = Observations.from_views(used)
+    how = _How(size_px, degree, board, folds, progress)
     options, failed = _fit_all(observations, size_px, wanted, progress)
-    # From here on as if one model had been asked for: what else was tried changes nothing.
-    options, wanted, others = _lens(observations, options, wanted, folds, progress)
+    tried, name = _lens(observations, options, how)
+    found = _solved(observations, *_only(options, wanted, name), failed, how)
+    if len(tried) > 1 and found.chosen.fit.state.shape.kind != "flat":
+        # Boards that are not flat bend the lenses to themselves: as they were found, another one may be the better.
+        on_boards, other = _lens_on_boards(found, tried, how)
+        if other != name:
+            again = _solved(observations, *_only(options, wanted, other), failed, how)
+            if choose(again.observations, [found.chosen, again.chosen], SURELY) is again.chosen:
+                found, tried, name = again, on_boards, other
+    others = _others(observations, tried, name)
+    result = assemble(
+        found.observations,
+        found.chosen.fit,
+        found.chosen.heldout_px,
+        (*dropped, *found.reasons),
+        (*others, *found.candidates),
+    )
+    in_force = [name for name, value in (("model", model), ("board_shape", board)) if value == "auto"]
+    moved = moved_lens(found.observations, found.chosen.fit) if folds else ()
+    also = [*moved, *_at_the_end(found.beyond, result, in_force)]
+    return _judged(result, found.observations, found.chosen.fit, also, in_force)
+
+
+Wanted = list[tuple[str, type[Camera], int | None]]
+"""Name, camera model and size of what is to be fitted."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _How:
+    """What `calibrate` was asked for, but the model."""
+
+    size_px: tuple[int, int]
+    degree: int | None
+    board: str
+    folds: int
+    progress: Progress
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Solved:
+    """What one camera model came to: the observations used, why views were left out, the size and board shape chosen,
+    what was tried, and which larger sizes were."""
+
+    observations: Observations
+    reasons: tuple[tuple[str, str], ...]
+    chosen: Option
+    candidates: list[Candidate]
+    beyond: Wanted
+
+
+def _only(options: list[Option], wanted: Wanted, model: str) -> tuple[list[Option], Wanted]:
+    """Return the options and what was wanted of one camera model."""
+    own = [option for option in options if option.fit.state.camera.model == model]
+    return own, [w for w in wanted if w[1].model == model]
+
+
+def _solved(
+    observations: Observations, options: list[Option], wanted: Wanted, failed: list[Candidate], how: _How
+) -> _Solved:
+    """Return what one camera model comes to; what else was tried changes nothing."""
+    size_px, board, folds, progress = how.size_px, how.board, how.folds, how.progress
     keep, reasons = _agreeing(observations, options)
     if reasons:
         observations = observations.subset(np.flatnonzero(keep))
         options, failed = _fit_all(observations, size_px, wanted, progress)
     observations = _reweighted(observations, options)
     options = _compared(observations, options, folds, progress)
-    chosen = _choose(observations, options, SURELY)
-    beyond = [] if degree is not None else _beyond(chosen)
+    chosen = choose(observations, options, SURELY)
+    beyond = [] if how.degree is not None else _beyond(chosen)
     if beyond:
         options, unfit = _fit_all(observations, size_px, beyond, progress, options)
         options = _compared(observations, options, folds, progress)
-        chosen, failed = _choose(observations, options, SURELY), [*failed, *unfit]
-    candidates = [*others, *_described(options, chosen), *failed]
+        chosen, failed = choose(observations, options, SURELY), [*failed, *unfit]
+    candidates = [*described(options, chosen), *failed]
     if board != "flat" and often_seen(observations).any():
         observations, chosen, fits = _fit_shapes(observations, chosen, board)
         shapes, spared = _shapes(observations, fits, board, folds, progress)
         shapes = [*([chosen] if board == "auto" else []), *shapes]
-        chosen = _choose(observations, shapes)
-        candidates += [*(c for c in _described(shapes, chosen) if "board" in c.name), *spared]
-    result = assemble(observations, chosen.fit, chosen.heldout_px, (*dropped, *reasons), tuple(candidates))
-    in_force = [name for name, value in (("model", model), ("board_shape", board)) if value == "auto"]
-    moved = moved_lens(observations, chosen.fit) if folds else ()
-    return _judged(result, observations, chosen.fit, [*moved, *_at_the_end(beyond, result, in_force)], in_force)
+        chosen = choose(observations, shapes)
+        candidates += [*(c for c in described(shapes, chosen) if "board" in c.name), *spared]
+    return _Solved(observations, reasons, chosen, candidates, beyond)
 
 
 def _judged(
@@ -158,7 +194,7 @@ def _wanted(model: str, degree: int | None, board: str, folds: int) -> list[tupl
     return out
 
 
-def _beyond(chosen: _Option) -> list[tuple[str, type[Camera], int | None]]:
+def _beyond(chosen: Option) -> list[tuple[str, type[Camera], int | None]]:
     """Return the larger sizes to try of the model chosen, if it is of the largest size tried so far."""
     camera = chosen.fit.state.camera
     tried, more = DEGREES_TRIED.get(camera.model, (None,)), DEGREES_BEYOND.get(camera.model, ())
@@ -188,8 +224,8 @@ def _fit_all(
     size_px: tuple[int, int],
     wanted: Sequence[tuple[str, type[Camera], int | None]],
     progress: Progress,
-    known: Sequence[_Option] = (),
-) -> tuple[list[_Option], list[Candidate]]:
+    known: Sequence[Option] = (),
+) -> tuple[list[Option], list[Candidate]]:
     """Return the options `known` and those `wanted`, fitted, and which could not be; raises where there is none."""
     options = list(known)
     failed: list[Candidate] = []
@@ -200,7 +236,7 @@ def _fit_all(
             fit = fit_model(observations, size_px, cls, order)
             if not solution_normal(fit).identifiable:
                 raise not_identifiable(name)
-            options.append(_Option(name, fit))
+            options.append(Option(name, fit))
         except (DegenerateError, InputError) as caught:
             error = caught
             failed.append(Candidate(name, 0, float("nan"), None, False, str(caught)))
@@ -211,28 +247,48 @@ def _fit_all(
     return options, failed
 
 
-def _lens(
-    observations: Observations,
-    options: list[_Option],
-    wanted: list[tuple[str, type[Camera], int | None]],
-    folds: int,
-    progress: Progress,
-) -> tuple[list[_Option], list[tuple[str, type[Camera], int | None]], list[Candidate]]:
-    """Return the options of the camera model that shows the views best, as they came, what was wanted of that model,
-    and the others as they were tried, on the same corners."""
-    if len({cls for _, cls, _ in wanted}) == 1:
-        return options, wanted, []
+def _lens(observations: Observations, options: list[Option], how: _How) -> tuple[list[Option], str]:
+    """Return the options as they were compared on the same corners, and the camera model that shows the views best."""
+    models = {option.fit.state.camera.model for option in options}
+    if len(models) == 1:
+        return [], models.pop()
     keep, _ = _agreeing(observations, options)
     seen = observations.subset(np.flatnonzero(keep))
     same = options if keep.all() else [replace(o, fit=_of_views(seen, o.fit, keep)) for o in options]
     seen = _reweighted(seen, same)
-    tried = _compared(seen, same, folds, progress)
-    chosen = _choose(seen, tried, SURELY)
-    model = chosen.fit.state.camera.model
-    own = [option for option in options if option.fit.state.camera.model == model]
-    names = {option.name for option in own}
-    others = [candidate for candidate in _described(tried, chosen) if candidate.name not in names]
-    return own, [w for w in wanted if w[1].model == model], others
+    tried = _compared(seen, same, how.folds, how.progress)
+    return tried, choose(seen, tried, SURELY).fit.state.camera.model
+
+
+def _lens_on_boards(found: _Solved, tried: list[Option], how: _How) -> tuple[list[Option], str]:
+    """Return the lenses tried, fitted to boards with their corners as they were found and warps that are free again,
+    and the camera model that then shows the views best."""
+    observations, kept = found.observations, found.chosen.fit.kept
+    state = found.chosen.fit.state.with_corners_held()
+    options = []
+    for model in dict.fromkeys(option.fit.state.camera.model for option in tried):
+        # A model's size is told by flat boards well enough.
+        best = choose(observations, [o for o in tried if o.fit.state.camera.model == model], SURELY)
+        start = replace(state, camera=best.fit.state.camera)
+        # The scatter that priors are weighed by is known after the first round.
+        fit = fit_kept(observations, fit_kept(observations, start, kept).state, kept)
+        options.append(replace(best, fit=fit, heldout=None))
+    # What does not even show the images that it was fitted to as well as another one predicts them is no better.
+    options.sort(key=lambda o: o.fit.rms_px)
+    compared: list[Option] = []
+    for option in options:
+        if all(option.fit.rms_px <= (o.heldout_px or np.inf) for o in compared):
+            compared.append(replace(option, heldout=heldout_squares(observations, option.fit, how.folds)))
+    return compared, choose(observations, compared, SURELY).fit.state.camera.model
+
+
+def _others(observations: Observations, tried: list[Option], model: str) -> list[Candidate]:
+    """Return the lenses tried but those of the `model` chosen, against the best of those."""
+    own = [option for option in tried if option.fit.state.camera.model == model]
+    if not own:
+        return []
+    against = choose(observations, own, SURELY)
+    return described([*(o for o in tried if o not in own), against], against)[:-1]
 
 
 def _of_views(observations: Observations, fit: Fit, keep: BoolArray) -> Fit:
@@ -241,7 +297,7 @@ def _of_views(observations: Observations, fit: Fit, keep: BoolArray) -> Fit:
     return fit_kept(observations, fit.state.subset(chosen), fit.kept[chosen], settle=True)
 
 
-def _agreeing(observations: Observations, options: list[_Option]) -> tuple[BoolArray, tuple[tuple[str, str], ...]]:
+def _agreeing(observations: Observations, options: list[Option]) -> tuple[BoolArray, tuple[tuple[str, str], ...]]:
     """Return which views to keep, and the reason for each that goes, judged by the model with the least scatter."""
     best = _best(observations, options)
     kept = best.fit.kept.sum(axis=1)
@@ -257,14 +313,14 @@ def _agreeing(observations: Observations, options: list[_Option]) -> tuple[BoolA
     return keep, reasons
 
 
-def _best(observations: Observations, options: list[_Option]) -> _Option:
+def _best(observations: Observations, options: list[Option]) -> Option:
     """Return the option with the least scatter."""
     if len(options) == 1:
         return options[0]
     return min(options, key=lambda o: robust_sigma(o.fit, observations))
 
 
-def _reweighted(observations: Observations, options: list[_Option]) -> Observations:
+def _reweighted(observations: Observations, options: list[Option]) -> Observations:
     """Return the observations with weights that count the error which the best model leaves to all corners alike."""
     if float(np.ptp(observations.sigma_px[observations.present])) == 0.0:
         return observations
@@ -273,7 +329,7 @@ def _reweighted(observations: Observations, options: list[_Option]) -> Observati
     return observations.with_common_error(squared, best.fit.kept)
 
 
-def _compared(observations: Observations, options: list[_Option], folds: int, progress: Progress) -> list[_Option]:
+def _compared(observations: Observations, options: list[Option], folds: int, progress: Progress) -> list[Option]:
     """Return the options refitted to the same corners, with their held-out errors, where they are not yet."""
     sigma = [robust_sigma(o.fit, observations) for o in options] if len(options) > 1 else [0.0]
     near = [o.fit.kept for o, s in zip(options, sigma, strict=True) if s <= COMPARABLE * min(sigma)]
@@ -292,7 +348,7 @@ def _compared(observations: Observations, options: list[_Option], folds: int, pr
     return out
 
 
-def _fit_shapes(observations: Observations, flat: _Option, board: str) -> tuple[Observations, _Option, dict[str, Fit]]:
+def _fit_shapes(observations: Observations, flat: Option, board: str) -> tuple[Observations, Option, dict[str, Fit]]:
     """Return the shapes fitted, and views and flat boards with every board that looks the same turned counted from the
     same end, where the shapes tell."""
     fits = fit_shapes(observations, flat.fit, board)
@@ -309,57 +365,11 @@ def _fit_shapes(observations: Observations, flat: _Option, board: str) -> tuple[
 
 def _shapes(
     observations: Observations, fits: dict[str, Fit], board: str, folds: int, progress: Progress
-) -> tuple[list[_Option], list[Candidate]]:
+) -> tuple[list[Option], list[Candidate]]:
     """Return the shapes in the running, and what was not tried."""
-    options = [_Option(f"board {kind}", fit) for kind, fit in fits.items()]
+    options = [Option(f"board {kind}", fit) for kind, fit in fits.items()]
     spared = []
     if board == "auto" and "released" not in fits:
         reason = "not tried: corners stray from the warp by no more than chance"
         spared.append(Candidate("board released", 0, float("nan"), None, False, reason))
     return _compared(observations, options, folds, progress), spared
-
-
-def _choose(observations: Observations, options: list[_Option], surely: float | None = None) -> _Option:
-    """Return the option with the fewest numbers among those whose held-out error is the smallest, within MARGIN and
-    (if given) `surely` standard errors of the difference; with too few images for that, the one with the smallest BIC.
-
-    Reference: L. Breiman et al., "Classification and Regression Trees" (1984), section 3.4.3: the one-standard-error
-    rule, here paired over images.
-    """
-    judged = [(o.heldout, o) for o in options if o.heldout is not None]
-    if not judged:
-        return min(options, key=lambda o: _bic(observations, o))
-    best = min((heldout for heldout, _ in judged), key=lambda heldout: float(heldout.sum()))
-    good = []
-    for heldout, option in judged:
-        more = heldout - best
-        chance = float(np.sqrt(len(more)) * more.std(ddof=1))
-        within = float(heldout.sum()) <= float(best.sum()) * (1.0 + MARGIN) ** 2
-        if within and (surely is None or float(more.sum()) <= surely * chance):
-            good.append(option)
-    return min(good, key=lambda o: o.count)
-
-
-def _bic(observations: Observations, option: _Option) -> float:
-    """Return Schwarz's criterion, n log(mean squared residual) + parameters log n."""
-    n = 2 * int(option.fit.kept.sum())
-    error = option.fit.rms_px
-    return float(n * np.log(error**2 + np.finfo(float).tiny) + option.count * np.log(n))
-
-
-def _described(options: list[_Option], chosen: _Option) -> list[Candidate]:
-    out = []
-    for o in options:
-        if len(options) == 1:
-            reason = "the only one tried"
-        elif o.heldout_px is None or chosen.heldout_px is None:
-            reason = "too few images to cross-validate: " + ("smallest BIC" if o is chosen else "larger BIC")
-        elif o is chosen:
-            reason = "fewest numbers among those whose held-out error is as good as the smallest"
-        else:
-            reason = f"held-out error {100.0 * (o.heldout_px / chosen.heldout_px - 1.0):+.1f} % against the chosen one"
-            if o.heldout_px < chosen.heldout_px:
-                more = o.count - chosen.count
-                reason += f", too little for {'one number' if more == 1 else f'{more} numbers'} more"
-        out.append(Candidate(o.name, o.count, o.fit.rms_px, o.heldout_px, o is chosen, reason))
-    return out

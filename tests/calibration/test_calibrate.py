@@ -236,3 +236,18 @@ def test_poses_of_views_that_hardly_project_raise_nothing(rng: np.random.Generat
     away = State.start(lens("fish"), rotation @ np.diag([1.0, -1.0, -1.0]), -translation, observations)
     found = find_poses(observations, away, observations.weight, 0.5)
     assert np.median(evaluate(found, observations).norm(observations)) < 1.0
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_lens_and_board_are_chosen_together(seed: int) -> None:
+    """On a bent board that counts as flat another lens than the true one predicts the images best."""
+    x, y = (BOARD.grid() / (np.array(BOARD.size) - 1.0) * 2.0 - 1.0).T
+    rng = np.random.default_rng(seed)
+    bent = BOARD.points()
+    bent[:, 2] += 0.5 * (1.0 - x * x) * rng.choice([-1.0, 1.0]) + 0.15 * x * y
+    views, _, _ = random_views(lens("reg"), 20, rng, reach_deg=33.0, noise_px=0.05, points_mm=bent)
+    assert calibrate(views, SIZE, model="auto", board="flat").camera.model != "brown"
+    together = calibrate(views, SIZE, model="auto")
+    assert together.camera.model == "brown" and together.boards[0].kind != "flat"
+    chosen = [candidate.name for candidate in together.candidates if candidate.chosen]
+    assert chosen[0] == "brown 5" and len(chosen) == 2
