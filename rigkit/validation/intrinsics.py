@@ -13,17 +13,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rigkit.affine.affinities import EpipolarNormals
+from rigkit.affine.normal import normals_from_affines
+from rigkit.affine.registry import affines_from_directions, needs_epipolar
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray, Normals
+from rigkit.core.errors import InputError
 from rigkit.core.matches import Matches
 from rigkit.geometry.principal_axes import principal_axes
+from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.metric import triangulate_matches
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.reconstruction.scale import metric_scale
 from rigkit.relative_pose.refinement.refine import refine_pose
+from rigkit.relative_pose.solvers.pose import essential_from_pose
 
-__all__ = ["CalibrationShifts", "calibration_shifts"]
+__all__ = ["CalibrationShifts", "calibration_shifts", "with_calibrations"]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -127,3 +133,58 @@ def _again(
         baseline_mm=scale,
     )
     return estimated, found
+
+
+def with_calibrations(reconstruction: Reconstruction, shifts: CalibrationShifts) -> Reconstruction:
+    """Return the reconstruction with the share of the calibrations in the sigmas of its cloud's points and normals.
+
+    Along each axis of `shifts` a point moves, and its normal turns: by the moved point, pose and cameras, from the same
+    affinity in the image, or where affinities follow from the epipolar geometry from the same directions. Sigmas of
+    points that not all of the moved cameras see are NaN: nobody knows them.
+
+    Raises InputError for a reconstruction that is of no boards: its corners' noise is not known any more.
+    """
+    geometry, kept = reconstruction.geometry, reconstruction.kept
+    if geometry is None or kept is None:
+        raise InputError(f"pair '{reconstruction.pair_id}': the calibrations' share is for free points of boards")
+    cloud, known = reconstruction.cloud, shifts.known
+    moves = shifts.points()[:, known]
+    covariance = geometry.points.covariance[kept][known] + np.einsum("kni,knj->nij", moves, moves)
+    base, *turned = (_normals(reconstruction, shift, known) for shift in (shifts.base, *shifts.moved))
+    tilt = sum((np.sum((normals - base) ** 2, axis=1) for normals in turned), np.zeros(int(known.sum())))
+    sigma_mm, normal_sigma = np.full(len(cloud), np.nan), np.full(len(cloud), np.nan)
+    sigma_mm[known] = np.sqrt(np.linalg.eigvalsh(covariance)[:, -1])
+    normal_sigma[known] = np.sqrt(cloud.normal_sigma_rad[known] ** 2 + tilt)
+    whole = replace(cloud, sigma_mm=sigma_mm, normal_sigma_rad=normal_sigma, calibration_in_sigmas=True)
+    return replace(reconstruction, cloud=whole)
+
+
+def _normals(reconstruction: Reconstruction, moved: Reconstruction, known: BoolArray) -> Normals:
+    """Return the normals (n, 3) of the `known` points as moved cameras have them."""
+    m = reconstruction.matches.select(known)
+    rays, jacobians = [], []
+    for camera, was, pixels, by_pixel in (
+        (moved.camera1, reconstruction.camera1, reconstruction.pixels1[known], m.jacobians1),
+        (moved.camera2, reconstruction.camera2, reconstruction.pixels2[known], m.jacobians2),
+    ):
+        rays.append(camera.unproject(pixels)[0])
+        # The coordinates of the affinities (rectified, or the captured pixels) move with the pixels as they did.
+        captured_by_pixel = np.linalg.pinv(was.ray_jacobian(pixels)) @ by_pixel
+        jacobians.append(camera.ray_jacobian(pixels) @ captured_by_pixel)
+    J1, J2 = pair_projection_jacobians(
+        moved.cloud.points_mm[known], rays[0], jacobians[0], rays[1], jacobians[1], moved.cam2_from_cam1
+    )
+    A21 = m.A21
+    if needs_epipolar(reconstruction.affine_method):
+        assert reconstruction.geometry is not None and reconstruction.kept is not None
+        E21 = essential_from_pose(moved.cam2_from_cam1)
+        seen = EpipolarNormals.from_rays(rays[0], jacobians[0], rays[1], jacobians[1], E21)
+        chosen = np.flatnonzero(reconstruction.kept)[known]
+        n1, n2 = np.full((2, len(reconstruction.kept), 2), np.nan)
+        n1[chosen], n2[chosen] = seen.n1, seen.n2
+        directions = reconstruction.geometry.pair.directions
+        A21 = affines_from_directions(directions, reconstruction.affine_method, epipolar=EpipolarNormals(n1, n2)).A21[
+            chosen
+        ]
+    assert A21 is not None
+    return normals_from_affines(J1, J2, A21)[0]

@@ -12,8 +12,9 @@ from rigkit.io.manifest import Dataset, Pair
 from rigkit.io.ply import ply_bytes
 from rigkit.reconstruction.reconstruct import Planes, Reconstruction
 from rigkit.report.figures import cloud_png, corners_png, epipolar_png
+from rigkit.validation.intrinsics import with_calibrations
 from rigkit.workflows.datasets import DatasetOptions, LoadedCamera, PairFailure, load_cameras, over_pairs, ready_dataset
-from rigkit.workflows.pairs import match_images, reconstruct_on_lattice, reconstruct_with
+from rigkit.workflows.pairs import match_images, reconstruct_on_lattice, reconstruct_with, shifts_of
 from rigkit.workflows.results import require_folder, write_results
 
 __all__ = ["DatasetReconstruction", "PairReconstruction", "ReconstructOptions", "reconstruct_dataset"]
@@ -102,6 +103,8 @@ def _reconstruct(job: _ReconstructJob) -> PairReconstruction:
     r = reconstruct_with(matched, pair, options.method, image1, det_scale=options.det_scale)
     if options.planes == "lattice":
         r = reconstruct_on_lattice(r, job.camera1, job.camera2)
+    elif (shifts := shifts_of(r, job.camera1, job.camera2)) is not None:
+        r = with_calibrations(r, shifts)
     ply = f"{pair.pair_id}/{options.method if options.planes == 'free' else options.planes}.ply"
     files = {ply: ply_bytes(r.cloud)}
     if options.pictures:

@@ -27,7 +27,7 @@ from rigkit.report.validation_page import crosscheck_table, pair_section
 from rigkit.validation.checks import ValidationReport, validate_each
 from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
 from rigkit.validation.diagnose import diagnose, diagnose_cameras
-from rigkit.validation.intrinsics import CalibrationShifts
+from rigkit.validation.intrinsics import CalibrationShifts, with_calibrations
 from rigkit.validation.tables import PaperTables, best_report
 from rigkit.workflows.datasets import (
     DatasetOptions,
@@ -201,7 +201,8 @@ def _judge(
     reports = validate_each(list(reconstructions.values()), pair.truth, [shifts[m] for m in reconstructions], lattice)
     best = best_report(reports)
     files: dict[str, bytes] = {
-        f"{pair.pair_id}/{method}.ply": ply_bytes(r.cloud) for method, r in reconstructions.items()
+        f"{pair.pair_id}/{method}.ply": ply_bytes(_with_sigmas(r, shifts[method]).cloud)
+        for method, r in reconstructions.items()
     }
     shown = reconstructions[best.affine_method]
     compared = None
@@ -222,6 +223,11 @@ def _judge(
         files=files,
         section=section,
     )
+
+
+def _with_sigmas(reconstruction: Reconstruction, shifts: CalibrationShifts | None) -> Reconstruction:
+    """Return the reconstruction with the calibrations in its cloud's sigmas, where they are known."""
+    return reconstruction if shifts is None else with_calibrations(reconstruction, shifts)
 
 
 def _shifts(reconstructions: Mapping[str, Reconstruction], job: _ValidateJob) -> dict[str, CalibrationShifts | None]:
