@@ -19,7 +19,7 @@ class Check:
     Attributes
     ----------
     name : "baseline", "angle plane1-plane2", "distance plane1.centre to plane2", "pose type planar", "level".
-    kind : "baseline", "angle", "distance", "pose type" or "level".
+    kind : "baseline", "angle", "distance", or of a declaration "pose type", "level", "board size", "layout".
     unit : "mm" or "deg", of all values.
     measured, measured_sigma, how : what a person wrote down.
     ours, our_sigma : what was reconstructed, with the predicted standard deviation.

@@ -23,7 +23,7 @@ from rigkit.reconstruction.lattice_planes import LatticePlanes
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.validation.boards import BoardResult
 from rigkit.validation.check import Check, compare
-from rigkit.validation.declarations import DECLARED, declaration_checks
+from rigkit.validation.declarations import DECLARED, contradicted_boards, declaration_checks
 from rigkit.validation.intrinsics import CalibrationShifts
 from rigkit.validation.measure import Measured, measure
 from rigkit.validation.planes import NormalErrors, normal_errors
@@ -187,10 +187,12 @@ def validate_each(
     truth: PairTruth,
     shifts: Sequence[CalibrationShifts | None],
     lattice: LatticePlanes | None = None,
+    layout: Mapping[str, str] | None = None,
 ) -> tuple[ValidationReport, ...]:
     """Return `validate` of reconstructions of one pair by several estimators, each with its shifts.
 
-    Estimators that kept the same corners have the same points, whose planes are fitted once.
+    Estimators that kept the same corners have the same points, whose planes are fitted once. `layout` says on which
+    side boards were declared to hang.
     """
     known: list[tuple[Reconstruction, CalibrationShifts | None, Measured]] = []
     reports = []
@@ -199,7 +201,8 @@ def validate_each(
         if measured is None:
             measured = measure(reconstruction, moved)
             known.append((reconstruction, moved, measured))
-        reports.append(_report(reconstruction, measured.with_normals(reconstruction), truth, moved, lattice, COVERAGE))
+        own = measured.with_normals(reconstruction)
+        reports.append(_report(reconstruction, own, truth, moved, lattice, COVERAGE, layout))
     return tuple(reports)
 
 
@@ -210,6 +213,7 @@ def _report(
     shifts: CalibrationShifts | None,
     lattice: LatticePlanes | None,
     coverage: float,
+    layout: Mapping[str, str] | None = None,
 ) -> ValidationReport:
     baseline_sigma_mm = reconstruction.baseline_sigma_mm
     if shifts is not None:
@@ -239,7 +243,7 @@ def _report(
         checks.append(
             compare(name, "distance", "mm", known, measured.distance_mm(distance), coverage, measured.count(*ends))
         )
-    checks += held
+    checks += [*held, *contradicted_boards(measured.boards, layout or {})]
     unchecked += unheld
     stated = {frozenset((angle.a, angle.b)): angle.value_deg for angle in truth.angles}
     return ValidationReport(

@@ -1,25 +1,69 @@
-"""What was declared of a pair against what its corners show: the pose type and the level, each a check of its own.
+"""What was declared of a pair against what its corners show: pose type, level, sizes and sides of the boards.
 
-A declaration enters the reconstruction as a prior. One that does not hold bends the result without any trace in the
-measured lengths and angles, so it has to be judged by itself.
+A declaration enters the reconstruction as a prior, or names its parts. One that does not hold bends or confuses the
+result without any trace in the measured lengths and angles, so it has to be judged by itself: pose type and level
+always, sizes and sides where they are contradicted.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from rigkit.core.posetype import PoseType
+from rigkit.identification.board_ids import BOARD_SIDES
 from rigkit.reconstruction.geometry import PoseTypeDecision
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.relative_pose.refinement.select import CONTRADICTION_P, TypeEvidence
-from rigkit.validation.check import Check
+from rigkit.validation.boards import BoardResult
+from rigkit.validation.check import Check, compare
 
-__all__ = ["DECLARED", "declaration_checks"]
+__all__ = ["DECLARED", "contradicted_boards", "declaration_checks"]
 
-DECLARED = ("pose type", "level")
+DECLARED = ("pose type", "level", "board size", "layout")
 """Kinds of checks that are about a declaration, not about a measured quantity."""
 MAX_TOLD_SIGMAS = 38.0
 """A chance below the smallest number there is is told as this many standard deviations."""
+
+
+BOARDS_AGREE = 0.003
+"""Squares of boards that were measured well come out alike within this part: paper, flatness, the pose."""
+RULER_MM = 0.25
+"""Standard deviation of a square's side that was stated without one: half of a ruler's millimetre, read at both ends
+of some squares."""
+SIDE_DEG = 15.0
+"""Standard deviation of the direction that a person calls a side of a scene."""
+LIMIT_K = 2.0
+
+
+def contradicted_boards(boards: Mapping[str, BoardResult], layout: Mapping[str, str]) -> tuple[Check, ...]:
+    """Return a failed check for every board whose squares are of another size than declared, against those of the other
+    boards, and for every one that faces another side than the layout says.
+
+    Of two boards that disagree nobody knows which one is wrong: both fail.
+    """
+    ratio = {name: float(np.sqrt(b.square_x_ratio * b.square_y_ratio)) for name, b in boards.items()}
+    checks = []
+    for name, found in boards.items():
+        # Of three and more the middle one is right, whichever is wrong.
+        others = [value for other, value in ratio.items() if other != name or len(ratio) > 2]
+        side = float(np.sqrt(found.board.square_x_mm * found.board.square_y_mm))
+        if others:
+            ours = (side * ratio[name] / float(np.median(others)), BOARDS_AGREE * side)
+            known = (side, found.board.square_sigma_mm or RULER_MM, "declared; by the other boards")
+            checks.append(compare(f"size {name}", "board size", "mm", known, ours, LIMIT_K, found.plane.count))
+        if name in layout:
+            off = {
+                s: np.degrees(np.arccos(np.clip(found.plane.normal @ to, -1.0, 1.0))) for s, to in BOARD_SIDES.items()
+            }
+            nearest = min(off, key=lambda s: float(off[s]))
+            # How much nearer the board faces another side: nothing where the declared one is the nearest.
+            beyond = (float(off[layout[name]] - off[nearest]), float("nan"))
+            words = f"declared {layout[name]}, looks {nearest}"
+            known = (0.0, SIDE_DEG, words)
+            checks.append(compare(f"layout {name}", "layout", "deg", known, beyond, LIMIT_K, found.plane.count))
+    return tuple(check for check in checks if not check.passed)
 
 
 def declaration_checks(reconstruction: Reconstruction) -> tuple[tuple[Check, ...], tuple[str, ...]]:

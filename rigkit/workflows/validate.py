@@ -198,7 +198,8 @@ def _judge(
     }
     shifts = _shifts(reconstructions, job)
     lattice = lattice_of(geometry, *job.cameras.of(pair))
-    reports = validate_each(list(reconstructions.values()), pair.truth, [shifts[m] for m in reconstructions], lattice)
+    known = [shifts[m] for m in reconstructions]
+    reports = validate_each(list(reconstructions.values()), pair.truth, known, lattice, pair.layout)
     best = best_report(reports)
     files: dict[str, bytes] = {
         f"{pair.pair_id}/{method}.ply": ply_bytes(_with_sigmas(r, shifts[method]).cloud)

@@ -2,23 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.board_scenes import detection, regular_camera
 from helpers.reconstructions import BOARDS
 
+from rigkit.core.boards import Board
 from rigkit.core.posetype import PoseType
 from rigkit.core.truth import MeasuredAngle, PairTruth
+from rigkit.identification.board_ids import BOARD_SIDES
 from rigkit.reconstruction.pairing import match_pair
 from rigkit.reconstruction.reconstruct import Reconstruction, reconstruct_pair
 from rigkit.synthetic.pairs import trihedral_pair
-from rigkit.validation.checks import validate
+from rigkit.validation.checks import validate, validate_each
 
 TRUTH = PairTruth(None, (MeasuredAngle("plane1", "plane2", 90.0, 0.3, "set square"),))
 
 
-def declared(true: PoseType, said: PoseType, rng: np.random.Generator, level_deg: float = 0.2) -> Reconstruction:
-    """Return a reconstruction of a pair of one pose type that was declared another."""
+def declared(
+    true: PoseType,
+    said: PoseType,
+    rng: np.random.Generator,
+    level_deg: float = 0.2,
+    boards: Sequence[Board] = BOARDS,
+) -> Reconstruction:
+    """Return a reconstruction of a pair of one pose type that was declared another, or with `boards` declared."""
     scene = trihedral_pair(
         BOARDS, regular_camera(), true, rng, level_sigma_deg=level_deg, distance=(0.9, 1.3), walls=False
     )
@@ -26,7 +37,7 @@ def declared(true: PoseType, said: PoseType, rng: np.random.Generator, level_deg
         [detection(b, np.array(d.pixels), rng, 0.03) for b, d in zip(BOARDS, exact, strict=True)]
         for exact in scene.detections()
     )
-    pair = match_pair("made", scene.camera1, scene.camera2, first, second, BOARDS)
+    pair = match_pair("made", scene.camera1, scene.camera2, first, second, boards)
     return reconstruct_pair(pair, pose_type=said, level_sigma_rad=np.deg2rad(0.2))
 
 
@@ -62,3 +73,23 @@ def test_nothing_declared_is_nothing_to_check(rng: np.random.Generator) -> None:
     for said in (PoseType.GENERAL, PoseType.AUTO):
         report = validate(declared(PoseType.STANDARD, said, rng), TRUTH)
         assert {check.kind for check in report.checks} == {"angle"}
+
+
+def test_a_board_of_another_size_than_declared_fails_with_its_size(rng: np.random.Generator) -> None:
+    wrong = replace(BOARDS[1], square_x_mm=1.04 * BOARDS[1].square_x_mm, square_y_mm=1.04 * BOARDS[1].square_y_mm)
+    report = validate(declared(PoseType.GENERAL, PoseType.GENERAL, rng, boards=[BOARDS[0], wrong, BOARDS[2]]), TRUTH)
+    row = report.check(f"size {wrong.board_id}")
+    assert not row.passed and not report.passed
+    assert row.ours == pytest.approx(BOARDS[1].square_x_mm, rel=0.01) and row.measured == wrong.square_x_mm
+    assert [check.name for check in report.checks if check.kind == "board size"] == [row.name]
+
+
+def test_a_board_on_another_side_than_declared_fails(rng: np.random.Generator) -> None:
+    reconstruction = declared(PoseType.GENERAL, PoseType.GENERAL, rng)
+    plane = validate(reconstruction, TRUTH).boards[0]
+    facing = {side: float(np.dot(to, plane.plane.normal)) for side, to in BOARD_SIDES.items()}
+    for side, holds in ((max(facing, key=lambda s: facing[s]), True), (min(facing, key=lambda s: facing[s]), False)):
+        (report,) = validate_each([reconstruction], TRUTH, [None], layout={plane.board.board_id: side})
+        rows = [check for check in report.checks if check.kind == "layout"]
+        assert [row.passed for row in rows] == ([] if holds else [False])
+        assert report.passed == holds
