@@ -88,7 +88,8 @@ class Pair:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Dataset:
-    """A manifest as read; every path is absolute; `sources` are the files of boards and truth that it names."""
+    """A manifest as read; every path is absolute; `sources` are the files of boards and truth that it names; `images`
+    says "real" or "rendered", None where the manifest does not."""
 
     name: str
     root: Path
@@ -97,6 +98,7 @@ class Dataset:
     cameras: tuple[CameraEntry, ...]
     pairs: tuple[Pair, ...]
     sources: tuple[Path, ...] = ()
+    images: str | None = None
 
     __repr__ = brief
 
@@ -145,6 +147,7 @@ def load_dataset(path: str | Path) -> Dataset:
     source = source.resolve()
     top = read_toml(source, DATASET_SCHEMA)
     name = top.identifier("name", hint='name = "my-lab"')
+    images = top.text("images", hint='images = "real"', choices=("real", "rendered")) if top.has("images") else None
     boards = tuple(_board(t) for t in top.tables("boards", hint='[[boards]] with id = "plane1" and file or sizes'))
     cameras = tuple(_camera(t) for t in top.tables("cameras", hint='[[cameras]] with id = "left" and calibration'))
     _refuse_twice(top, "boards", [b.board_id for b in boards])
@@ -165,6 +168,7 @@ def load_dataset(path: str | Path) -> Dataset:
         cameras=cameras,
         pairs=pairs,
         sources=tuple(named),
+        images=images,
     )
 
 

@@ -63,9 +63,12 @@ class PaperTables:
         return self.baselines.get(_capture(pair_id), {}).get(column)
 
 
-def build_tables(reports: Sequence[ValidationReport], paper: PaperTables | None = None) -> tuple[Table, ...]:
+def build_tables(
+    reports: Sequence[ValidationReport], paper: PaperTables | None = None, images: str | None = None
+) -> tuple[Table, ...]:
     """Return all tables of reports (pairs x estimators): planes, baselines, averages, checks, estimators.
 
+    `images` says whether they are "real" or "rendered", None where nobody did.
     Tables that would be empty are left out; raises InputError where there is no report.
     """
     if not reports:
@@ -78,7 +81,7 @@ def build_tables(reports: Sequence[ValidationReport], paper: PaperTables | None 
         tables.insert(1, angles)
     if any(_measured_baseline(report) is not None for report in reports):
         tables.insert(-2, baseline_table(reports, printed))
-    averages = average_table(reports, method, printed)
+    averages = average_table(reports, method, printed, images, "maximum likelihood")
     if averages is not None:
         tables.insert(-2, averages)
     return tuple(tables)
@@ -204,8 +207,13 @@ def baseline_table(reports: Sequence[ValidationReport], paper: PaperTables) -> T
     return Table("baselines", "Baseline by estimator", columns, tuple(rows), note)
 
 
-def average_table(reports: Sequence[ValidationReport], method: str, paper: PaperTables) -> Table | None:
-    """Return the averages over all cells that the paper has too, and how many times smaller ours are; None without."""
+def average_table(
+    reports: Sequence[ValidationReport], method: str, paper: PaperTables, images: str | None, mode: str
+) -> Table | None:
+    """Return the averages over all cells that the paper has too, and how many times smaller ours are; None without.
+
+    Beside every ratio stand what `images` it is of, the paper's being real, and the `mode` of the pipeline.
+    """
     rows = []
     cells = [(row[0], cell) for row in plane_table(reports, method, paper).rows for cell in row[1:]]
     for what in (RIGHT_ANGLE_ERROR, "mean normal error", "median normal error"):
@@ -218,13 +226,13 @@ def average_table(reports: Sequence[ValidationReport], method: str, paper: Paper
         if known is not None and printed is not None:
             differences.append((abs(report.baseline_mm - known[0]), abs(float(printed) - known[0])))
     rows.append(_average_row("baseline error, all estimators", "mm", differences))
-    full = tuple(row for row in rows if row is not None)
+    full = tuple((*row, Cell(images or "not stated"), Cell(mode)) for row in rows if row is not None)
     if not full:
         return None
-    columns = (Column("average"), Column("unit"), Column("cells", "", 0), Column("ours", "", 4), Column("paper", "", 4))
-    return Table(
-        "averages", "Averages over the cells that the paper has", (*columns, Column("paper / ours", "", 1)), full
-    )
+    first = (Column("average"), Column("unit"), Column("cells", "", 0), Column("ours", "", 4), Column("paper", "", 4))
+    columns = (*first, Column("paper / ours", "", 1), Column("images"), Column("mode"))
+    note = "The paper's images are real: with rendered ones the ratio is not like for like."
+    return Table("averages", "Averages over the cells that the paper has", columns, full, note)
 
 
 def check_table(reports: Sequence[ValidationReport]) -> Table:

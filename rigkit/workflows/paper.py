@@ -111,7 +111,7 @@ def validate_as_paper(
         _repeat, known.pairs, job_of, jobs=options.jobs, what="repeating the paper on pairs", progress=progress
     )
     reports = tuple(report for of_pair in found for report in of_pair)
-    tables = _tables(reports, printed)
+    tables = _tables(reports, printed, known.images)
     files = {
         "tables.md": tables_to_markdown(tables),
         "tables.csv": tables_to_csv(tables),
@@ -144,12 +144,12 @@ def _repeat(job: _PaperJob) -> tuple[ValidationReport, ...]:
     return tuple(reports)
 
 
-def _tables(reports: Sequence[ValidationReport], printed: PaperTables) -> tuple[Table, ...]:
+def _tables(reports: Sequence[ValidationReport], printed: PaperTables, images: str | None) -> tuple[Table, ...]:
     method = best_method(reports)
     tables = [plane_table(reports, method, printed)]
     if any(check.kind == "baseline" for report in reports for check in report.checks):
         tables.append(baseline_table(reports, printed))
-    averages = average_table(reports, method, printed)
+    averages = average_table(reports, method, printed, images, "as in the paper")
     if averages is not None:
         tables.append(averages)
     tables += [estimator_order_table(reports, printed), claim_table(reports, method, printed), estimator_table(reports)]

@@ -63,7 +63,7 @@ def validation_files(
     reports = [report for pair in pairs for report in pair.reports]
     compared = [pair.crosscheck for pair in pairs if pair.crosscheck is not None]
     summary = replace(summary_table([pair.best for pair in pairs]), note=SUMMARY_WORDS)
-    tables = [summary, *build_tables(reports, paper)]
+    tables = [summary, *build_tables(reports, paper, dataset.images)]
     if compared:
         tables.insert(-2, crosscheck_table(compared))
     files: dict[str, str | bytes] = {

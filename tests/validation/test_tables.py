@@ -135,6 +135,7 @@ def test_averages_are_over_the_cells_that_the_paper_has(tables: tuple[Table, ...
     assert row[2].value == 6.0
     assert row[3].value == pytest.approx(0.5 / 3.0)
     assert row[4].value == pytest.approx(np.mean([3.6010, 0.2599, 4.1743, 0.5946, 1.1304, 0.6968]))
+    assert [cell.value for cell in row[-2:]] == ["not stated", "maximum likelihood"]
     baseline = averages.rows[-1]
     assert (baseline[3].value, baseline[4].value) == pytest.approx((5.5, (7.10 + 9.30) / 2.0))
 
