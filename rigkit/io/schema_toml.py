@@ -228,6 +228,7 @@ DATASET_FILE = file(
             ),
             "two images of the same boards each",
         ),
+        "images": said(choice("real", "rendered"), "what they are: stands beside ratios to the paper's results"),
         "truth_table": said(TEXT, "a CSV file with what was measured, kept in a spreadsheet"),
     },
     ["name", "boards", "cameras", "pairs"],

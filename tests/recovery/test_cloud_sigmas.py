@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.board_scenes import detection
 from helpers.calibration_scenes import REACH_DEG, lens
 from helpers.reconstructions import BOARDS
-from recovery.test_honest_sigmas import SIGMA_PX, detection, random_scene, recalibration
+from recovery.test_honest_sigmas import SIGMA_PX, random_scene, recalibration
 from scipy.spatial import cKDTree
 
 from rigkit.core.posetype import PoseType
@@ -50,19 +51,19 @@ def test_sigmas_of_free_clouds_include_the_calibration(rng: np.random.Generator,
     for k in range(DRAWS):
         scene = scenes[k % SCENES]
         calibrated, covariance = calibrate()
-        found = [
+        one, two = (
             [detection(b, np.array(d.pixels), rng, SIGMA_PX) for b, d in zip(BOARDS, exact, strict=True)]
             for exact in scene.detections()
-        ]
-        matched = match_pair("made", calibrated, calibrated, *found, BOARDS)
-        exact = reconstruct_pair(matched, pose_type=scene.pose_type, affine_method=method)
-        whole = with_calibrations(exact, calibration_shifts(exact, covariance, level_sigma_rad=exact.level_sigma_rad))
+        )
+        matched = match_pair("made", calibrated, calibrated, one, two, BOARDS)
+        given = reconstruct_pair(matched, pose_type=scene.pose_type, affine_method=method)
+        whole = with_calibrations(given, calibration_shifts(given, covariance, level_sigma_rad=given.level_sigma_rad))
         assert whole.cloud.calibration_in_sigmas and np.isfinite(whole.cloud.sigma_mm).all()
         off = errors(whole, scene)
         off_mm.append(off[0])
         off_rad.append(off[1])
         sigma_mm.append(whole.cloud.sigma_mm)
         sigma_rad.append(whole.cloud.normal_sigma_rad)
-        exact_mm.append(exact.cloud.sigma_mm)
+        exact_mm.append(given.cloud.sigma_mm)
     assert POINTS[0] < ratio(off_mm, sigma_mm) < POINTS[1] < ratio(off_mm, exact_mm)
     assert NORMALS[0] < ratio(off_rad, sigma_rad) < NORMALS[1]
