@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from rigkit.cli.sizes import size_of_words
 from rigkit.core.errors import InputError
-from rigkit.workflows.formats import CAMERA_FORMATS, CLOUD_FORMATS
+from rigkit.workflows.formats import CAMERA_FORMATS, CLOUD_FORMATS, READ_FORMATS
 
 HELP = "cameras in other tools' formats; clouds as PLY, npz or a COLMAP model"
 
@@ -18,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--to", choices=sorted({*CAMERA_FORMATS, *CLOUD_FORMATS}), help="format (default: by the ending)"
     )
     parser.add_argument(
-        "--from", dest="source_format", choices=CAMERA_FORMATS, help="of a camera file (default: told by its content)"
+        "--from", dest="source_format", choices=READ_FORMATS, help="of a camera file (default: told by its content)"
     )
     parser.add_argument(
         "--names",
@@ -26,6 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="CAMERA",
         help="of a rig, in this order (default: all)",
     )
+    parser.add_argument("--size", metavar="WxH", help="of the images, px: py-OCamCalib's files do not say it")
     parser.add_argument("-p", "--pair", help="pair of the data set whose cloud is exported")
     parser.add_argument("--method", default="3SDIR", help="affine estimator of the normals (default 3SDIR)")
     parser.add_argument("--force", action="store_true", help="replace existing files")
@@ -40,7 +42,13 @@ def run(args: argparse.Namespace) -> int:
     from rigkit.workflows.camera_files import is_rig
     from rigkit.workflows.export_camera import ExportCameraOptions, export_camera, export_rig
 
-    options = ExportCameraOptions(output=args.output, kind=args.to, source_kind=args.source_format, force=args.force)
+    options = ExportCameraOptions(
+        output=args.output,
+        kind=args.to,
+        source_kind=args.source_format,
+        size_px=None if args.size is None else size_of_words(args.size),
+        force=args.force,
+    )
     if args.source_format is None and is_rig(args.source):
         rig = export_rig(args.source, options, tuple(args.names or ()))
         print(f"{', '.join(map(str, rig.written))}: {rig.kind}, at most {rig.max_error_px:.4g} px from the rig given")

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rigkit.cli.sizes import size_of_words
 from rigkit.core.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
 __all__ = ["HELP", "add_arguments", "run"]
 
-IMAGE_SIZE = re.compile(r"^([0-9]{1,6})[xX]([0-9]{1,6})$")
 
 HELP = "which pictures to take next, or what a lens, a board and so many pictures will reach"
 
@@ -84,9 +83,7 @@ def _planned(args: argparse.Namespace) -> PlannedSession:
         return plan_session(args.source, _options(args, 3), progress=progress_on_stderr())
     if not (args.size and args.board):
         raise InputError("plan: --lens needs --size 1280x960 and --board 9x6x25")
-    size = IMAGE_SIZE.fullmatch(args.size)
-    if size is None:
-        raise InputError(f"--size {args.size}: write width and height in pixels, such as 1280x960")
+    size_px = size_of_words(args.size)
     if args.report is not None:
         ensure_writable(
             args.report, force=args.force, inputs=[words for words in args.board if words.endswith(".toml")]
@@ -96,7 +93,7 @@ def _planned(args: argparse.Namespace) -> PlannedSession:
         raise InputError(f"--sigma-px {sigma}: it must be positive")
     lens = LensOptions(
         hfov_deg=args.lens,
-        size_px=(int(size[1]), int(size[2])),
+        size_px=size_px,
         boards=tuple(board_of_words(words) for words in args.board),
         model=args.model,
         sigma_px=sigma,

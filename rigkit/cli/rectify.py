@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rigkit.cli.sizes import size_of_words
 from rigkit.core.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
     from rigkit.workflows.rectify import RectifiedImage
 
 HELP = "perspective, cylindrical or equirectangular image from any camera's image, or a stereo pair"
-
-IMAGE_SIZE = re.compile(r"^([0-9]{1,6})[xX]([0-9]{1,6})$")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -63,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
         projection=args.projection,
         hfov_deg=args.hfov_deg,
         angles_deg=(args.yaw_deg, args.pitch_deg, args.roll_deg),
-        size_px=_size(args.size),
+        size_px=None if args.size is None else size_of_words(args.size),
         interpolation=args.interpolation,
         crop=args.crop,
         maps=args.maps,
@@ -116,12 +114,3 @@ def _words(one: RectifiedImage, projection: str) -> str:
         f"{one.path}: {projection}, {width} x {height} px, focal length {focal:.2f} px, "
         f"{100.0 * one.covered:.1f} % of it seen by the camera"
     )
-
-
-def _size(text: str | None) -> tuple[int, int] | None:
-    if text is None:
-        return None
-    match = IMAGE_SIZE.match(text)
-    if match is None:
-        raise InputError(f"--size {text}: give width and height in px, such as --size 1280x960")
-    return int(match[1]), int(match[2])

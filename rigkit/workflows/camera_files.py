@@ -12,19 +12,20 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.interop.colmap_cameras import read_colmap_cameras
 from rigkit.interop.kalibr import read_kalibr
 from rigkit.interop.mrcal import read_cameramodel
-from rigkit.interop.ocamcalib import read_ocamcalib
+from rigkit.interop.ocamcalib import read_ocamcalib, read_py_ocamcalib
 from rigkit.interop.opencv import read_opencv
 from rigkit.interop.opencv_stereo import read_opencv_stereo
 from rigkit.interop.ros import read_camera_info
 from rigkit.io.calibration_file import load_camera
 from rigkit.io.reading import read_text
 from rigkit.io.rig_file import is_rig_file, load_rig
-from rigkit.workflows.formats import CAMERA_FORMATS
+from rigkit.workflows.formats import READ_FORMATS
 
 __all__ = ["camera_format", "import_camera", "import_rig", "is_ours", "is_rig"]
 
 SIGNS = (
     ("mrcal", re.compile(r"['\"]lens_?model['\"]\s*:")),
+    ("py-ocamcalib", re.compile(r'\A\s*\{.*"taylor_coefficient"\s*:', re.DOTALL)),
     ("rigkit", re.compile(r'\A\s*\{\s*["}]')),
     ("ocamcalib", re.compile(r"\A\s*#\s*polynomial coefficients", re.IGNORECASE)),
     ("kalibr", re.compile(r"^cam\d+\s*:", re.MULTILINE)),
@@ -40,8 +41,10 @@ STEREO = re.compile(r"^M1\s*:", re.MULTILINE)
 _log = logging.getLogger(__name__)
 
 
-def import_camera(path: str | Path, kind: str | None = None) -> Camera:
+def import_camera(path: str | Path, kind: str | None = None, *, size_px: tuple[int, int] | None = None) -> Camera:
     """Return the camera of a file, of ours or of another tool's; `kind` is told by the content where it is None.
+
+    `size_px` is what py-OCamCalib's files do not say, the images' size; all others say it, and need none.
 
     Raises InputError for a file that is no camera of that format, holds several, or whose format nobody can tell.
     """
@@ -49,9 +52,9 @@ def import_camera(path: str | Path, kind: str | None = None) -> Camera:
     text, name = read_text(source, "camera file"), str(source)
     kind = kind or camera_format(text)
     if kind is None:
-        raise InputError(f"'{name}': none of the known camera formats ({', '.join(CAMERA_FORMATS)}); check the file")
-    if kind not in CAMERA_FORMATS:
-        raise InputError(f"'{kind}' is no camera format; known are {', '.join(CAMERA_FORMATS)}")
+        raise InputError(f"'{name}': none of the known camera formats ({', '.join(READ_FORMATS)}); check the file")
+    if kind not in READ_FORMATS:
+        raise InputError(f"'{kind}' is no camera format; known are {', '.join(READ_FORMATS)}")
     if kind == "rigkit":
         return load_camera(source)
     if kind == "kalibr":
@@ -65,11 +68,15 @@ def import_camera(path: str | Path, kind: str | None = None) -> Camera:
         return camera
     if kind == "ocamcalib":
         return read_ocamcalib(text, name)[0]
+    if kind == "py-ocamcalib":
+        if size_px is None:
+            raise InputError(f"'{name}': py-OCamCalib writes no image size; use `rigkit export --size`")
+        return read_py_ocamcalib(text, size_px, name)[0]
     return read_opencv(text, name) if kind == "opencv" else read_camera_info(text, name)
 
 
 def camera_format(text: str) -> str | None:
-    """Return the format of a camera file's content, one of `CAMERA_FORMATS`; None where none of them looks so."""
+    """Return the format of a camera file's content, one of `READ_FORMATS`; None where none of them looks so."""
     return next((kind for kind, sign in SIGNS if sign.search(text)), None)
 
 

@@ -51,6 +51,8 @@ class ExportCameraOptions:
     """Format, one of `CAMERA_FORMATS`; None: ours where the name ends on .json."""
     source_kind: str | None = None
     """Format of the camera given; None: told by its content."""
+    size_px: tuple[int, int] | None = None
+    """Of the images, where the file does not say it (py-OCamCalib's)."""
     force: bool = False
     """Replace a file that exists; what was read is never replaced."""
 
@@ -87,7 +89,7 @@ def export_camera(source: str | Path, options: ExportCameraOptions) -> ExportedC
         raise InputError(f"export: say the camera's format with --to, one of {', '.join(CAMERA_FORMATS)}")
     ensure_writable(options.output, force=options.force, inputs=[source])
     with about(source):
-        camera = import_camera(source, options.source_kind)
+        camera = import_camera(source, options.source_kind, size_px=options.size_px)
     refuse_mirrored(camera, source)
     if kind == "rigkit":
         save_camera(options.output, camera, force=options.force)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["CAMERA_FORMATS", "CLOUD_FORMATS", "FOREIGN_ENDINGS"]
+__all__ = ["CAMERA_FORMATS", "CLOUD_FORMATS", "FOREIGN_ENDINGS", "READ_FORMATS"]
 
 FOREIGN_ENDINGS = {
     "opencv": ".yaml",
@@ -14,4 +14,5 @@ FOREIGN_ENDINGS = {
 }
 """Other tools' formats of cameras, and how the names of their files end."""
 CAMERA_FORMATS = ("rigkit", *FOREIGN_ENDINGS)
+READ_FORMATS = (*CAMERA_FORMATS, "py-ocamcalib")
 CLOUD_FORMATS = ("ply", "npz", "colmap")

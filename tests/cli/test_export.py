@@ -202,3 +202,25 @@ def test_what_is_missing_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert "--pair" in capsys.readouterr().err
     assert main(["export", str(tmp_path / "none.yaml"), "--from", "opencv", "-o", str(tmp_path / "x.json")]) == 2
     assert "none.yaml" in capsys.readouterr().err
+
+
+def test_a_camera_of_py_ocamcalib_needs_the_size_of_its_images(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    theirs, ours = tmp_path / "fisheye.json", tmp_path / "ours.json"
+    said = {
+        "date": "today",
+        "taylor_coefficient": [300.0, 0.0, -1.1e-3, 1.2e-6, -2.5e-9],
+        "distortion_center": [640.5, 480.25],
+        "stretch_matrix": [[1.001, 0.002], [-0.001, 1.0]],
+        "extrinsics_t": [],
+    }
+    theirs.write_text(json.dumps(said))
+    assert main(["export", str(theirs), "-o", str(ours)]) == 2
+    assert "--size" in capsys.readouterr().err
+    assert main(["export", str(theirs), "--size", "1280x", "-o", str(ours)]) == 2
+    assert "1280x960" in capsys.readouterr().err
+    assert main(["export", str(theirs), "--size", "1280x960", "-o", str(ours)]) == 0
+    camera = load_camera(ours)
+    assert camera.size_px == (1280, 960)
+    np.testing.assert_allclose(camera.project(np.array([0.0, 0.0, 1.0]))[0], [640.5, 480.25], atol=1e-9)
