@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 from rigkit.core.boards import Board
 from rigkit.core.patterns.charuco import Charuco
+from rigkit.core.patterns.circles import Circles
+from rigkit.detection.circles.unknown import CircleSightings, guessed_circles
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.tags.unknown_charuco import MarkerSightings, guessed_charuco
@@ -37,7 +39,7 @@ def guess_board(images: Sequence[GreyImage]) -> BoardGuess | None:
     """Return the board that most of the images (grey levels 0..255) show; None where none is seen.
 
     Boards with marks are told by these: AprilGrids, ChArUco boards (also of the pattern before OpenCV 4.6, and
-    inverted). Otherwise the largest chessboard that is seen often.
+    inverted). Otherwise it is the largest chessboard that is seen often, or a grid of circles that more images show.
     """
     tags, markers = TagSightings(), MarkerSightings()
     for k, image in enumerate(images):
@@ -48,10 +50,16 @@ def guess_board(images: Sequence[GreyImage]) -> BoardGuess | None:
         if board is not None:
             return BoardGuess(board, tuple(seen))
     sizes: dict[int, tuple[int, int]] = {}
+    circles = CircleSightings()
     for k, image in enumerate(images):
         found = [d for d in detect_boards(image) if d.complete]
         if found:
             sizes[k] = (max(found[0].columns, found[0].rows), min(found[0].columns, found[0].rows))
+        else:
+            circles.look(k, image)
+    grid = guessed_circles(circles)
+    if grid is not None and len(grid[1]) > len(sizes):
+        return BoardGuess(*grid)
     if not sizes:
         return None
     # A part of a board that the frame cuts comes in many sizes; the whole board in one.
@@ -76,6 +84,11 @@ def difference(guess: Board, declared: Board) -> str | None:
             return f"black and white are {negation}exchanged: set inverted = {str(seen.inverted).lower()}"
         if seen.dictionary.rpartition("_")[0] != said.dictionary.rpartition("_")[0]:
             return f'the markers are of {seen.dictionary}: set dictionary = "{seen.dictionary}"'
+    if isinstance(seen, Circles) and isinstance(said, Circles):
+        for name in ("layout", "inverted"):
+            if getattr(seen, name) != getattr(said, name):
+                shown, told = (str(getattr(pattern, name)).lower() for pattern in (seen, said))
+                return f"{name} is {told} in the board file, {shown} in the images"
     if set(guess.size) != set(declared.size) or (seen.identified and guess.size != declared.size):
         per = said.points_per_count
         return f"{size} are seen, {declared.columns // per} x {declared.rows // per} are declared"

@@ -82,11 +82,16 @@ def _boofcv(values: Mapping[str, Any]) -> Values:
     if kind == "CHESSBOARD":
         # BoofCV counts squares.
         return {"columns": columns - 1, "rows": rows - 1, "square_mm": float(grid["shapeSize"])}
-    layouts = {"CIRCLE_GRID": "regular", "CIRCLE_HEXAGONAL": "hexagonal"}
-    if kind not in layouts:
+    if kind not in ("CIRCLE_GRID", "CIRCLE_HEXAGONAL"):
         raise ValueError(f"type {kind}")
     lengths = {"distance_mm": float(grid["shapeDistance"]), "diameter_mm": float(grid["shapeSize"])}
-    return {"type": "circles", "layout": layouts[kind], "columns": columns, "rows": rows, **lengths}
+    if kind == "CIRCLE_GRID":
+        return {"type": "circles", "columns": columns, "rows": rows, **lengths}
+    if columns % 2:
+        raise ValueError(f"{columns} columns, whose rows have {columns // 2 + 1} and {columns // 2} circles in turn")
+    # BoofCV counts half steps along a row; of its printed pages every second row begins further left.
+    staggered = {"layout": "hexagonal", "stagger": "left"}
+    return {"type": "circles", **staggered, "columns": columns // 2, "rows": rows, **lengths}
 
 
 def _opencv(values: Mapping[str, Any]) -> Values:

@@ -61,7 +61,9 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
     guess = guess_board(images)
     names = tuple(path.name for path in chosen)
     if guess is None:
-        raise CheckFailed(f"no board is seen in {len(names)} images: no chessboard, ChArUco board or AprilGrid")
+        raise CheckFailed(
+            f"no board is seen in {len(names)} images: no chessboard, ChArUco board, AprilGrid or grid of circles"
+        )
     return IdentifiedBoard(guess.board, tuple(names[k] for k in guess.images), names, words_of_board(guess.board))
 
 

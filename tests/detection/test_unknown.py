@@ -11,6 +11,7 @@ from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.base import Pattern
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
+from rigkit.core.patterns.circles import Circles
 from rigkit.detection.saddles.response import grey_image
 from rigkit.detection.unknown import difference, guess_board
 from rigkit.synthetic.render import Optics
@@ -27,8 +28,11 @@ PLACES = (0.01, 0.02)
         ((8, 5), Charuco("DICT_5X5_50", 45.0)),
         ((8, 5), Charuco("DICT_4X4_50", 45.0, legacy=True)),
         ((8, 6), Chessboard()),
+        ((9, 7), Circles(diameter_mm=30.0)),
+        ((4, 11), Circles("asymmetric", diameter_mm=24.0)),
+        ((8, 7), Circles("hexagonal", diameter_mm=30.0, inverted=True)),
     ],
-    ids=["kalibr", "opencv", "charuco", "legacy", "chessboard"],
+    ids=["kalibr", "opencv", "charuco", "legacy", "chessboard", "circles", "asymmetric", "hexagonal"],
 )
 def test_everything_but_the_scale_is_told(size: tuple[int, int], pattern: Pattern) -> None:
     board = Board("b", *size, 60.0, 60.0, pattern=pattern)
@@ -50,6 +54,10 @@ def test_everything_but_the_scale_is_told(size: tuple[int, int], pattern: Patter
         assert isinstance(found, Charuco)
         assert abs(found.marker_mm - 0.75) <= PLACES[1] + 1e-9
         assert (found.dictionary, found.legacy, found.inverted) == (pattern.dictionary, pattern.legacy, False)
+    elif isinstance(pattern, Circles):
+        assert isinstance(found, Circles)
+        assert (found.layout, found.inverted, found.stagger) == (pattern.layout, pattern.inverted, pattern.stagger)
+        assert found.diameter_mm == pytest.approx((pattern.diameter_mm or 0.0) / 60.0, abs=PLACES[1])
     else:
         assert found == pattern
 
@@ -64,6 +72,9 @@ def test_what_is_wrong_with_a_board_is_said() -> None:
     assert difference(board(9, 6, Chessboard()), board(8, 6, Chessboard())) == (
         "9 x 6 inner corners are seen, 8 x 6 are declared"
     )
+    dark, bright = (board(9, 7, Circles(inverted=inverted)) for inverted in (False, True))
+    assert difference(dark, bright) == "inverted is true in the board file, false in the images"
+    assert difference(dark, dark) is None
     grids = [board(12, 10, AprilGrid(spacing)) for spacing in (0.3, 0.2)]
     assert difference(*grids) == "spacing is 0.2 in the board file, 0.3 in the images"
     assert difference(grids[0], new) == 'the images show an aprilgrid board of 6 x 5 tags; set type = "aprilgrid"'

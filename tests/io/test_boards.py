@@ -9,8 +9,10 @@ import pytest
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.patterns.aprilgrid import AprilGrid
+from rigkit.core.patterns.base import Pattern
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
+from rigkit.core.patterns.circles import Circles
 from rigkit.io.board_file import board_text, load_board
 from rigkit.io.board_words import board_in_words
 
@@ -53,6 +55,10 @@ def test_boards_in_words() -> None:
 KALIBR = "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 5\ntagSize: 0.088\ntagSpacing: 0.3\n"
 CHECKERS = "target_type: checkerboard\ntargetCols: 7\ntargetRows: 6\nrowSpacingMeters: 0.05\ncolSpacingMeters: 0.06\n"
 BOOFCV = "boofcv.alg.fiducial.calib.ConfigCalibrationTarget:\n  grid: {numRows: 7, numCols: 5, shapeSize: 30.0}\n"
+HEXAGONAL = (
+    "boofcv.alg.fiducial.calib.ConfigCalibrationTarget:\n  type: CIRCLE_HEXAGONAL\n"
+    "  grid: {numRows: 24, numCols: 28, shapeSize: 1.0, shapeDistance: 1.2}\n"
+)
 CALISCOPE = (
     'columns = 4\nrows = 5\nboard_height = 11.0\nboard_width = 8.5\ndictionary = "DICT_4X4_50"\nunits = "inch"\n'
     "aruco_scale = 0.75\nsquare_size_override_cm = 5.4\ninverted = true\n"
@@ -70,12 +76,13 @@ OPENCV = (
         ("target.yaml", KALIBR, (12, 10), (88.0, 88.0), AprilGrid(0.3)),
         ("checkers.yaml", CHECKERS, (7, 6), (60.0, 50.0), Chessboard()),
         ("calibration_target.yaml", BOOFCV, (4, 6), (30.0, 30.0), Chessboard()),
+        ("hexagonal.yaml", HEXAGONAL, (14, 24), (1.2, 1.2), Circles("hexagonal", "left", 1.0)),
         ("charuco.toml", CALISCOPE, (3, 4), (54.0, 54.0), Charuco("DICT_4X4_50", 40.5, inverted=True)),
         ("settings.xml", OPENCV, (9, 6), (50.0, 50.0), Chessboard()),
     ],
 )
 def test_target_files_of_other_tools(
-    name: str, text: str, size: tuple[int, int], squares: tuple[float, float], pattern: Chessboard, tmp_path: Path
+    name: str, text: str, size: tuple[int, int], squares: tuple[float, float], pattern: Pattern, tmp_path: Path
 ) -> None:
     path = tmp_path / name
     path.write_text(text)
@@ -86,7 +93,12 @@ def test_target_files_of_other_tools(
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
-    for name, text in (("a.yaml", "cam0: {}\n"), ("b.yaml", "target_type: aprilgrid\n"), ("c.xml", "<a>1</a>")):
+    for name, text in (
+        ("a.yaml", "cam0: {}\n"),
+        ("b.yaml", "target_type: aprilgrid\n"),
+        ("odd.yaml", HEXAGONAL.replace("28", "27")),
+        ("c.xml", "<a>1</a>"),
+    ):
         (tmp_path / name).write_text(text)
         with pytest.raises(InputError, match=name):
             load_board(tmp_path / name)

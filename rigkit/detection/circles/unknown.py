@@ -1,0 +1,89 @@
+"""Circle grids that nobody has described: layout, counts, polarity and the size of circles from what is seen."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rigkit.core.boards import Board
+from rigkit.core.patterns.circles import STAGGERS, Circles
+from rigkit.detection.circles.find import CircleGrid, find_grids
+from rigkit.detection.circles.place import placed_on
+from rigkit.detection.saddles.response import GreyImage
+
+__all__ = ["CircleSightings", "guessed_circles"]
+
+MIN_SIDE_CIRCLES = 3
+"""Rows and columns of the smallest grid that is told."""
+
+NEIGHBOURS_APART = {"regular": 1.0, "asymmetric": float(np.sqrt(0.5)), "hexagonal": 1.0}
+"""Of circles, in distances of two in a row."""
+
+
+@dataclass(eq=False, slots=True)
+class CircleSightings:
+    """The grids of circles of all images.
+
+    Attributes
+    ----------
+    boards : how many images show each board whole; of distance 1 mm, without the circles' size.
+    diameters : of the circles, in distances of neighbours.
+    shown : for each image that shows a whole grid its index and the boards that this can be.
+    """
+
+    boards: Counter[tuple[str, int, int, str, bool]] = field(default_factory=Counter)
+    diameters: list[float] = field(default_factory=list)
+    shown: list[tuple[int, set[tuple[str, int, int, str, bool]]]] = field(default_factory=list)
+
+    def look(self, index: int, image: GreyImage) -> bool:
+        """Look for grids in an image; say whether it shows one."""
+        grids = find_grids(image)
+        if not grids:
+            return False
+        fits = {kind for kind in _kinds(grids[0]) if _whole(grids[0], kind)}
+        self.boards.update(fits)
+        if fits:
+            self.diameters.append(2.0 * grids[0].radius)
+            self.shown.append((index, fits))
+        return bool(fits)
+
+
+def _kinds(grid: CircleGrid) -> Iterator[tuple[str, int, int, str, bool]]:
+    """Yield layout, columns, rows, stagger and polarity of the boards that have as many circles."""
+    count = len(grid)
+    for rows in range(MIN_SIDE_CIRCLES, count // MIN_SIDE_CIRCLES + 1):
+        if count % rows:
+            continue
+        columns = count // rows
+        if grid.hexagonal:
+            yield from (("hexagonal", columns, rows, stagger, grid.bright) for stagger in STAGGERS)
+            continue
+        # Seen from the side, a regular grid is the same with columns for rows.
+        if columns >= rows:
+            yield "regular", columns, rows, STAGGERS[0], grid.bright
+        yield from (("asymmetric", columns, rows, stagger, grid.bright) for stagger in STAGGERS)
+
+
+def _board(kind: tuple[str, int, int, str, bool], diameter_mm: float | None = None) -> Board:
+    layout, columns, rows, stagger, inverted = kind
+    return Board("board", columns, rows, 1.0, 1.0, pattern=Circles(layout, stagger, diameter_mm, inverted))
+
+
+def _whole(grid: CircleGrid, kind: tuple[str, int, int, str, bool]) -> bool:
+    placed = placed_on(grid, _board(kind))
+    return placed is not None and placed.complete
+
+
+def guessed_circles(seen: CircleSightings) -> tuple[Board, tuple[int, ...]] | None:
+    """Return the grid that most images show whole, with circles 1 mm apart in a row, and which images; None for none.
+
+    A grid that looks the same from its other end is told staggered to the right.
+    """
+    if not seen.boards:
+        return None
+    best = max(seen.boards, key=lambda kind: (seen.boards[kind], kind[0] == "regular", -STAGGERS.index(kind[3]), kind))
+    diameter = round(float(np.median(seen.diameters)) * NEIGHBOURS_APART[best[0]], 2)
+    return _board(best, diameter), tuple(index for index, fits in seen.shown if best in fits)
