@@ -25,7 +25,8 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--correspondences",
         metavar="FILE",
-        help="CSV, NPZ or AffineExtractor text with affinities or directions; --images then colours the cloud",
+        help="CSV, NPZ or AffineExtractor text with affinities or directions, a matcher's NPZ or COLMAP's database; "
+        "with --images these align bare points, the cloud grows and has colours",
     )
     group.add_argument("--camera", metavar="CALIB", help="calibration of the camera (of image A)")
     group.add_argument("--camera2", metavar="CALIB", help="calibration of the camera of image B (default: the same)")

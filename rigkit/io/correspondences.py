@@ -4,6 +4,9 @@ CSV: u1_px, v1_px, u2_px, v2_px; optionally a11, a12, a21, a22; optionally du1_1
 the directions; optionally sigma_px and sigma_A. An empty field is unknown. Columns come in any order, other columns are
 an error. NPZ: arrays pixels1, pixels2 and optionally A21, directions1, directions2 (N, K, 2), sigma_px, sigma_A.
 
+NPZ of matchers (`matcher_arrays`) and COLMAP's database (`interop.colmap_database`) are read too: points, and rough
+affinities where features have frames.
+
 AffineExtractor (https://github.com/LeventeHajder/AffineExtractor): ten numbers a line, a11 a21 a12 a22 tx ty x1 y1 x2
 y2, with q2 = A q1 + t. Its refinement moves t and leaves x2, y2 as they were matched, so the point in image 2 is
 A q1 + t.
@@ -18,6 +21,7 @@ import re
 import struct
 import zipfile
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +30,9 @@ from rigkit.affine.correspondences import Correspondences
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
+from rigkit.interop.colmap_database import is_colmap_database, read_colmap_matches
 from rigkit.io.files import write_atomic
+from rigkit.io.matcher_arrays import from_matcher
 from rigkit.io.numbers import MAX_NUMBER
 from rigkit.io.reading import read_bytes
 
@@ -38,6 +44,8 @@ SIGMA_COLUMNS = ("sigma_px", "sigma_A")
 DIRECTION = re.compile(r"^(du1|dv1|du2|dv2)_([1-9]\d*)$")
 ARRAYS = ("pixels1", "pixels2", "A21", "directions1", "directions2", *SIGMA_COLUMNS)
 
+SIGMA_OF_FRAMES = 0.2
+"""Of affinities from features' own scale and orientation, or detected shape: no better than that, as matchers go."""
 MAX_ARRAY_BYTES = 500_000_000
 """Of one array of an NPZ, unpacked."""
 EXTRACTOR_COLUMNS = "a11 a21 a12 a22 tx ty x1 y1 x2 y2"
@@ -45,8 +53,10 @@ MAX_REFINEMENT_PX = 30.0
 """AffineExtractor refines within patches of this half width: a point further from its match means other columns."""
 
 
-def read_correspondences(path: str | Path) -> Correspondences:
-    """Return the correspondences of a .csv, .npz or AffineExtractor text file, told apart by their content.
+def read_correspondences(path: str | Path, images: Sequence[str] = ()) -> Correspondences:
+    """Return the correspondences of a .csv, .npz, AffineExtractor text or COLMAP database file, told by their content.
+
+    `images` are the names of the two images' files: a database has matches of many.
 
     Raises
     ------
@@ -57,6 +67,11 @@ def read_correspondences(path: str | Path) -> Correspondences:
     payload = read_bytes(source, "correspondences")
     if payload[:2] == b"PK":
         return _from_npz(source, payload)
+    if is_colmap_database(payload):
+        if len(images) != 2:
+            raise InputError(f"correspondences '{source}': COLMAP's database has many images; give the two of the pair")
+        found = read_colmap_matches(source, images)
+        return _built(source, found.pixels1, found.pixels2, found.A21, None, _rough(found.A21))
     try:
         text = payload.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -183,6 +198,13 @@ def _from_npz(source: Path, payload: bytes) -> Correspondences:
         raise InputError(
             f"correspondences '{source}': damaged NPZ, or not of numbers ({words}); write it again"
         ) from error
+    try:
+        matched = from_matcher(table)
+    except InputError as error:
+        raise InputError(f"correspondences '{source}': {error}") from error
+    if matched is not None:
+        A21 = matched.get("A21")
+        return _built(source, matched["pixels1"], matched["pixels2"], A21, None, _rough(A21))
     unknown = [name for name in table if name not in ARRAYS]
     if unknown:
         raise InputError(f"correspondences '{source}': unknown array {unknown[0]!r}; known: {', '.join(ARRAYS)}")
@@ -194,6 +216,11 @@ def _from_npz(source: Path, payload: bytes) -> Correspondences:
             raise InputError(f"correspondences '{source}': array '{name}' is missing")
     directions = (table["directions1"], table["directions2"]) if "directions1" in table else None
     return _built(source, table["pixels1"], table["pixels2"], table.get("A21"), directions, table)
+
+
+def _rough(A21: FloatArray | None) -> dict[str, FloatArray]:
+    """Return the sigma of affinities from features' own frames."""
+    return {} if A21 is None else {"sigma_A": np.full(len(A21), SIGMA_OF_FRAMES)}
 
 
 def _arrays(payload: bytes) -> dict[str, FloatArray]:

@@ -195,7 +195,7 @@ def _check(correspondences: Correspondences, baseline_mm: float | None, pair_id:
     if correspondences.A21 is None and correspondences.directions is None:
         raise InputError(
             f"'{pair_id}': the correspondences have neither affinities nor directions, without which there are no "
-            "normals; add columns a11, a12, a21, a22 or du1_1, dv1_1, ..."
+            "normals; give the images too, or add columns a11, a12, a21, a22 or du1_1, dv1_1, ..."
         )
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.features import TILTS, match_affine_features
+from rigkit.affine.from_points import are_rough, with_affinities
 from rigkit.cameras.base import Camera
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.printing import brief
@@ -57,7 +58,8 @@ class SceneOptions:
     images: tuple[Path, Path] | None = None
     """The two images: their features are matched; with `correspondences` they colour the cloud."""
     correspondences: Path | None = None
-    """Correspondences with affinities or directions (CSV, NPZ or AffineExtractor's text)."""
+    """Correspondences with affinities or directions (CSV, NPZ, AffineExtractor's text), or a matcher's (NPZ, COLMAP's
+    database): of these `images` give or refine the affinities."""
     baseline_mm: float | None = None
     """Measured baseline; None: it is the unit of the result."""
     pose_type: str | None = None
@@ -218,7 +220,9 @@ def _sparse(
         )
 
     if options.correspondences:
-        found = read_correspondences(options.correspondences)
+        found = read_correspondences(options.correspondences, [path.name for path in options.images or ()])
+        if images and are_rough(found):
+            found = with_affinities(found, *images)
         return scene_of(found), found
     assert images is not None
     for k, tilts in enumerate((None, TILTS)):
