@@ -131,7 +131,7 @@ def _solve(
     for image_id in model.images:
         config.add_image(image_id)
     if free:
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.THREE_POINTS)
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     else:
         for point_id in ids.values():
             config.add_constant_point(point_id)

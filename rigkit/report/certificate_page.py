@@ -118,6 +118,7 @@ def _facts(certificate: Certificate) -> dict[str, str]:
             f"{100.0 * i.scale_sigma:.3g} %" if i.scale_sigma else "counted as exact: nobody stated it"
         )
     percent = f"{100.0 * certificate.task.confidence:g} %"
-    facts["bound"] = f"{percent}, normal quantile of the root of the summed variances; to first order"
+    freedom = f", {i.freedom:.3g} degrees of freedom of the calibration" if np.isfinite(i.freedom) else ""
+    facts["bound"] = f"{percent}, Student's quantile of the root of the summed variances{freedom}; to first order"
     remarks = [f.text for f in certificate.findings if f.severity is not Severity.GOOD]
     return facts | ({"remarks": "; ".join(remarks)} if remarks else {})

@@ -97,6 +97,7 @@ def load_instrument(
             cam_from_rig=(Rigid3.identity(),),
             covariance=calibration.covariance,
             sigma_px=sigma_px or calibration.sigma_px,
+            freedom=calibration.freedom,
         )
     saved = load_saved_rig(path)
     if saved.covariance is None or saved.sigma_px is None:
@@ -112,4 +113,5 @@ def load_instrument(
         cameras or (names[0], names[1]),
         sigma_px=sigma_px or saved.sigma_px,
         scale_sigma=saved.scale_sigma,
+        freedom=saved.freedom,
     )

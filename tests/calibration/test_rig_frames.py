@@ -14,6 +14,7 @@ from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError
+from rigkit.core.findings import Severity
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, rotation_angle
 
@@ -144,3 +145,25 @@ def test_turned_counts_the_same_corners_from_elsewhere(board: Board, rng: np.ran
         other = seen.turned(turns)
         assert not np.array_equal(other.view.grid, view.grid)
         assert np.allclose(other.cam_from_board.apply(other.view.points()), pose.apply(view.points()))
+
+
+def test_a_rig_without_a_common_trigger_is_said_to_be_bad_and_its_sigmas_hold(rng: np.random.Generator) -> None:
+    """The board moves in every frame while three cameras look at it one after the other: by some pixels, many times
+    the corners' noise, and next to nothing of the board's size."""
+    views = rig_views(rng, 30)
+    for name in ("wide", "fish"):
+        limit = np.array(sizes()[name]) - 0.5
+        moved = [rng.normal(0.0, 60.0 * NOISE_PX, 2) for _ in views[name]]
+        views[name] = [
+            (frame, replace(view, pixels=np.clip(view.pixels + shift, -0.5, limit)))
+            for (frame, view), shift in zip(views[name], moved, strict=True)
+        ]
+    rig = calibrate_rig(views, sizes(), model=MODELS)
+    assert not rig.left_out
+    first = rig.verdicts[0]
+    assert first.severity is Severity.BAD and "not of one moment" in first.message
+    for name in ("wide", "fish"):
+        length, sigma = rig.baseline_mm("reg", name)
+        assert abs(length - np.linalg.norm(mounts()[name][1].translation_mm)) < SIGMAS * sigma
+        # What it says of itself is of the size of the disagreement, not of the corners' noise.
+        assert sigma > 0.1

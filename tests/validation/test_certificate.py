@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.cameras import PARAMETERS, SIZE_PX
+from scipy.special import stdtrit
 
 from rigkit.cameras.base import Camera
 from rigkit.cameras.registry import camera_model
@@ -16,7 +19,7 @@ from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.triangulation import triangulate_rays
 from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.contracts import Certificate, Instrument, Quantity, Task, instrument_of_rig
-from rigkit.validation.certificate.propagation import measured_points
+from rigkit.validation.certificate.propagation import CORNERS, LENSES, MOUNTS, measured_points
 
 TRIALS = 800
 COVERAGE = (0.93, 0.97)
@@ -147,6 +150,32 @@ def test_bounds_of_one_camera_hold_as_often_as_they_say(rng: np.random.Generator
         length = 2.0 * distance * np.tan(0.5 * np.arccos(np.sum(a * b, axis=-1)))
         inside += np.abs(length - task.size_mm) <= bounds[:, None]
     holds(inside)
+
+
+def test_bounds_hold_where_the_covariance_itself_is_an_estimate(rng: np.random.Generator) -> None:
+    """Eight degrees of freedom: with the normal quantile 91 % would be within. The linear error itself is drawn."""
+    joint, freedom, trials = rig_covariance(lens("brown"), rng), 8.0, 1500
+    task = Task(quantity=Quantity.LENGTH, size_mm=150.0, distance_mm=1500.0)
+    exact = certify(rig_of("brown", joint, scale_sigma=0.0), task, cells=(3, 3))
+    row, column = exact.worst_place
+    sigma = np.array([exact.sigma[cause][row, column] for cause in (CORNERS, LENSES, MOUNTS)])
+    inside, narrow = 0, 0
+    for estimate in rng.chisquare(freedom, trials) / freedom:
+        bound = bound_at(sigma * np.sqrt([1.0, estimate, estimate]), freedom)
+        error = abs(float(sigma @ rng.normal(size=3)))
+        inside += error <= bound
+        narrow += error <= bound_at(sigma * np.sqrt([1.0, estimate, estimate]), np.inf)
+    assert COVERAGE[0] <= inside / trials <= COVERAGE[1]
+    assert narrow < inside
+    known = replace(exact.instrument, freedom=freedom)
+    stated = certify(known, task, cells=(3, 3)).bound[row, column]
+    assert stated == pytest.approx(bound_at(sigma, freedom), rel=1e-9)
+
+
+def bound_at(sigma: FloatArray, freedom: float) -> float:
+    """The bound of causes (corners, lenses, mounts) by GUM G.4."""
+    whole, calibration = float(np.sum(sigma**2)), float(np.sum(sigma[1:] ** 2))
+    return float(stdtrit(min(freedom * (whole / calibration) ** 2, 1e6), 0.975)) * np.sqrt(whole)
 
 
 def test_the_causes_add_up_and_the_worst_is_named_first(rng: np.random.Generator) -> None:

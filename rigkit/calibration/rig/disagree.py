@@ -20,7 +20,7 @@ from rigkit.calibration.rig.solver import RigSolution
 from rigkit.calibration.rig.state import Key, RigObservations
 
 __all__ = ["DISAGREES", "FAR_APART", "MIN_PX", "bad_ones", "cost_of_sharing", "masked", "part", "part_far"]
-__all__ += ["shared_keys", "usual_cost", "why"]
+__all__ += ["shared_keys", "usual_cost", "usual_distance_px", "why"]
 
 FAR_APART = 12.0
 """Before the joint solve a board's pose in one image may be off by some pixels in the other: only more than this many
@@ -55,6 +55,21 @@ def cost_of_sharing(
         np.add.at(views, frame, 1.0)
     excess = np.maximum(solution.normal.costs - alone, 0.0) / np.maximum(6.0 * (views - 1.0), 1.0)
     return {key: float(e) for key, e, n in zip(observations.keys, excess, views, strict=True) if n > 1.0}
+
+
+def usual_distance_px(observations: RigObservations, cost: Mapping[Key, float]) -> float:
+    """Return how far apart, rms over corners, views that share a pose usually see them, px, from what sharing costs."""
+    poses = len(observations.keys)
+    corners, views = np.zeros(poses), np.zeros(poses)
+    for weight, frame in zip(observations.weights, observations.frame, strict=True):
+        np.add.at(corners, frame, (weight > 0.0).sum(axis=1))
+        np.add.at(views, frame, 1.0)
+    squared = [
+        cost[key] * 6.0 * (n - 1.0) / count
+        for key, n, count in zip(observations.keys, views, corners, strict=True)
+        if key in cost and count
+    ]
+    return float(np.sqrt(np.median(squared))) if squared else 0.0
 
 
 def usual_cost(cost: Mapping[Key, float], sigma_px: float, *, mean: bool = False) -> float:

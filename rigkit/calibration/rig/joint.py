@@ -19,6 +19,7 @@ from rigkit.calibration.rig.disagree import (
     part_far,
     shared_keys,
     usual_cost,
+    usual_distance_px,
     why,
 )
 from rigkit.calibration.rig.frames import apart, first_frames, mounts_of, turned_alike
@@ -35,8 +36,14 @@ from rigkit.geometry.rigid3 import Rigid3
 
 __all__ = ["JointRig", "solve_jointly"]
 
-NOTHING_IN_COMMON = 30.0
-"""Where sharing poses usually costs this many sigmas, the cameras do not see the same."""
+NOTHING_IN_COMMON = 0.1
+"""Where corners that views share are usually so far apart, as a part of the boards' size in the images, the cameras do
+not see the same. A board that moves while cameras without a common trigger look at it is a pixel or two apart, 1 or 2 %
+of its size, and each frame of such a rig is still a measurement, whose error the frames' scatter tells; other boards,
+or frames that do not belong together, are as far apart as they are large."""
+BAD = 10.0
+"""Where sharing poses usually costs so many times the corners' noise, a rig measures that much worse than its cameras
+could: it is not good."""
 MIN_SHARE = 0.5
 """More of the shared targets must agree than disagree."""
 MAX_ROUNDS = 8
@@ -120,17 +127,18 @@ def solve_jointly(
         mounts = [Rigid3(r, t) for r, t in zip(state.mount_rotation, state.mount_mm, strict=True)]
     progress("rig", MAX_ROUNDS, MAX_ROUNDS)
     usual_sigmas = float(np.sqrt(usual) / max(sigma, MIN_PX))
-    if usual_sigmas > NOTHING_IN_COMMON:
+    usual_px, size_px = usual_distance_px(observations, cost), _boards_px(seen)
+    if usual_px > NOTHING_IN_COMMON * size_px:
         raise DegenerateError(
-            f"rig: that views share their boards' poses costs {usual_sigmas:.0f} times the corners' noise: they "
-            f"disagree on where the boards are; {_advice(seen)}"
+            f"rig: views that should share their boards' poses disagree by {usual_px:.2g} px on where the boards are, "
+            f"which are {size_px:.2g} px large; {_advice(seen)}"
         )
     if usual_sigmas > DISAGREES:
-        observations = replace(observations, held=_held(single, sigma, (usual_sigmas / DISAGREES) ** 2 - 1.0))
+        observations = replace(observations, held=_held(single, sigma, usual_sigmas**2 - 1.0))
         if known is not None:
             observations = known.hold(observations, solution.state, names)
         solution = solve_rig(observations, solution.state, sigma)
-        notes = (_disagreement(cost, sigma, usual_sigmas, several=len(seen) > 1), *notes)
+        notes = (_disagreement(cost, sigma, (usual_px, usual_sigmas), several=len(seen) > 1), *notes)
     return JointRig(
         observations=observations,
         solution=solution,
@@ -170,8 +178,19 @@ def _solved(
     return observations, solve_rig(observations, start, sigma)
 
 
-def _disagreement(cost: Mapping[Key, float], sigma: float, usual_sigmas: float, *, several: bool) -> Finding:
-    """Return what to say where sharing poses usually costs more than chance."""
+def _boards_px(seen: Sequence[FrameObservations]) -> float:
+    """Return how large boards are in the images, px: the median over views of twice the corners' rms distance from
+    their middle."""
+    sizes = []
+    for entry in (entry for own in seen for entry in own.values()):
+        corners = entry.view.pixels[entry.kept] if entry.kept.any() else entry.view.pixels
+        sizes.append(2.0 * float(np.sqrt(((corners - corners.mean(axis=0)) ** 2).sum(axis=1).mean())))
+    return float(np.median(sizes))
+
+
+def _disagreement(cost: Mapping[Key, float], sigma: float, usual: tuple[float, float], *, several: bool) -> Finding:
+    """Return what to say where sharing poses usually costs more than chance: `usual` px a corner, and sigmas."""
+    usual_px, usual_sigmas = usual
     worst = sorted(cost, key=lambda key: -cost[key])[:NAMED]
     times = {frame: np.sqrt(cost[frame, target]) / max(sigma, MIN_PX) for frame, target in worst}
     frames = ", ".join(f"'{frame}' ({value:.0f})" for frame, value in times.items())
@@ -180,10 +199,11 @@ def _disagreement(cost: Mapping[Key, float], sigma: float, usual_sigmas: float, 
     if not several:
         what, remedy = "the boards give way against each other: that they keep their places", "fasten the boards"
     message = (
-        f"{what} costs {usual_sigmas:.1f} times the corners' noise, most in the frames {frames}; the lenses are held "
-        "near what each camera says alone"
+        f"{what} costs {usual_sigmas:.1f} times the corners' noise ({usual_px:.2g} px a corner), most in the frames "
+        f"{frames}; the lenses are held near what each camera says alone, and the sigmas of the rig rest on how "
+        "far its frames disagree"
     )
-    return Finding(severity=Severity.LOOK, message=message, remedy=remedy)
+    return Finding(severity=Severity.BAD if usual_sigmas > BAD else Severity.LOOK, message=message, remedy=remedy)
 
 
 def _held(single: Sequence[Calibration], sigma: float, weight: float) -> tuple[tuple[FloatArray, FloatArray], ...]:

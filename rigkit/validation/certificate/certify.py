@@ -1,4 +1,9 @@
-"""The certificate: the bound on the error of a measurement over the image, its causes, and what would halve it."""
+"""The certificate: the bound on the error of a measurement over the image, its causes, and what would halve it.
+
+The calibration's covariance rests on a dozen images or so, and is known to about a quarter itself: a bound of 95 % is
+not 1.96 standard deviations then, but Student's quantile with the degrees of freedom that the whole has (Welch and
+Satterthwaite; JCGM 100 "GUM", annex G.4), the other causes' standard deviations being known.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +11,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import ndtri, stdtrit
 
+from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding, Severity
 from rigkit.validation.certificate.contracts import Certificate, Instrument, Quantity, Task
@@ -29,6 +35,8 @@ MAP_CELLS = (33, 25)
 MAX_SHARE = 0.1
 """A bound beyond this part of what is measured (of a radian, for angles), or points as uncertain: what is derived to
 first order is then too small."""
+MANY = 1e6
+"""So many degrees of freedom are as good as a normal distribution."""
 
 
 def certify(instrument: Instrument, task: Task, *, cells: tuple[int, int] = MAP_CELLS) -> Certificate:
@@ -68,10 +76,10 @@ def certify(instrument: Instrument, task: Task, *, cells: tuple[int, int] = MAP_
         cause: np.where(seen, factor * np.sqrt(value[chosen, worst]), np.nan).reshape(u.shape)
         for cause, value in variance.items()
     }
-    quantile = float(ndtri(0.5 + 0.5 * task.confidence))
+    quantile = _quantile(sigma, instrument.freedom, task.confidence)
     bound = quantile * np.sqrt(sum(s**2 for s in sigma.values()))
     whole = factor * (1.0 if task.quantity is Quantity.ANGLE else task.size_mm)
-    uncertain = (quantile * instrument.sigma_px * farthest > MAX_SHARE * task.size_mm).reshape(u.shape)
+    uncertain = quantile * instrument.sigma_px * farthest.reshape(u.shape) > MAX_SHARE * task.size_mm
     in_view = seen.reshape(u.shape)
     certificate = Certificate(
         task=task,
@@ -83,6 +91,17 @@ def certify(instrument: Instrument, task: Task, *, cells: tuple[int, int] = MAP_
         coarse=in_view & (uncertain | (bound > MAX_SHARE * whole)),
     )
     return replace(certificate, findings=tuple(_findings(certificate)))
+
+
+def _quantile(sigma: Mapping[str, FloatArray], freedom: float, confidence: float) -> FloatArray:
+    """Return how many standard deviations of the whole the bound is at each place."""
+    upper = 0.5 + 0.5 * confidence
+    whole = np.sum([s**2 for s in sigma.values()], axis=0)
+    if not np.isfinite(freedom):
+        return np.full(whole.shape, float(ndtri(upper)))
+    calibration = np.sum([sigma[cause] ** 2 for cause in (LENSES, MOUNTS) if cause in sigma], axis=0)
+    known = freedom * (whole / np.maximum(calibration, np.finfo(float).tiny)) ** 2
+    return np.asarray(stdtrit(np.minimum(known, MANY), upper))
 
 
 def _findings(certificate: Certificate) -> list[Finding]:

@@ -39,6 +39,7 @@ class Instrument:
     sigma_px : standard deviation of a measured corner per coordinate.
     scale_sigma : relative standard deviation of all lengths, from how well the boards' squares were measured; 0 where
         nobody stated it.
+    freedom : degrees of freedom of `covariance`: a dozen images know their own disagreement to a quarter.
     """
 
     names: tuple[str, ...]
@@ -47,6 +48,7 @@ class Instrument:
     covariance: FloatArray
     sigma_px: float
     scale_sigma: float = 0.0
+    freedom: float = float("inf")
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.cameras) == len(self.names) == len(self.cam_from_rig) <= 2:
@@ -56,6 +58,8 @@ class Instrument:
             raise InputError(f"certificate: a finite covariance of {size} unknowns is needed, got {self.covariance!r}")
         if not (np.isfinite(self.sigma_px) and self.sigma_px > 0.0):
             raise InputError(f"certificate: the corners' sigma must be positive, got {self.sigma_px} px")
+        if not self.freedom > 0.0:
+            raise InputError(f"certificate: a covariance has degrees of freedom, got {self.freedom}")
 
     @property
     def is_rig(self) -> bool:
@@ -113,7 +117,8 @@ class Certificate:
     task, instrument : what is measured, with what.
     pixels : (R, C, 2) where the middle of what is measured appears in the first camera.
     in_view : (R, C) whether all of it is seen by all cameras there.
-    bound : (R, C) the error that is exceeded with probability 1 - confidence, in `task.unit`; NaN out of view.
+    bound : (R, C) the error that is exceeded with probability 1 - confidence, in `task.unit`; NaN out of view. It
+        counts in how well the calibration's covariance is known itself.
     sigma : (R, C) of each cause by name, one standard deviation, in `task.unit`; their squares add up to the whole.
     coarse : (R, C) where the bound is only a lower one: it is derived to first order, and there the error is a good
         part of what is measured, or its points are as uncertain along the lines of sight.
@@ -199,6 +204,7 @@ def instrument_of_rig(
     *,
     sigma_px: float,
     scale_sigma: float,
+    freedom: float = float("inf"),
 ) -> Instrument:
     """Return two cameras of a rig of N.
 
@@ -207,7 +213,7 @@ def instrument_of_rig(
     names, cameras, cam_from_rig : of all cameras of the rig, the first is its frame.
     covariance : of all intrinsics, then of the mounts of all cameras but the first, as a rig file has it.
     pair : names of the two cameras, the one whose image the certificate is drawn over first.
-    sigma_px, scale_sigma : see `Instrument`.
+    sigma_px, scale_sigma, freedom : see `Instrument`.
 
     Raises
     ------
@@ -236,4 +242,5 @@ def instrument_of_rig(
         covariance=joint,
         sigma_px=sigma_px,
         scale_sigma=scale_sigma,
+        freedom=freedom,
     )
