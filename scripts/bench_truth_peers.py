@@ -79,9 +79,10 @@ def in_order(view: BoardView) -> BoardView:
     return BoardView(view.image, view.board, view.grid[order], view.pixels[order], view.sigma_px[order])
 
 
+RELEASED = Peer("OpenCV", "board released")
 CAMERA_FITS: Mapping[Peer, Any] = {
     Peer("OpenCV"): opencv_fit,
-    Peer("OpenCV", "board released"): opencv_released_fit,
+    RELEASED: opencv_released_fit,
     Peer("COLMAP"): lambda views, size_px, fisheye: colmap_camera(views, size_px, fisheye, released=False),
     Peer("COLMAP", "points free"): lambda views, size_px, fisheye: colmap_camera(
         views, size_px, fisheye, released=True

@@ -126,7 +126,7 @@ def rig_trial(lens: Camera, frames: int, rng: np.random.Generator) -> Iterator[t
         sights = [c.unproject(q)[0] for c, q in zip(found.cameras, noisy, strict=True)]
         slopes = [c.ray_jacobian(q) for c, q in zip(found.cameras, noisy, strict=True)]
         pose = found.cam_from_rig[1] @ found.cam_from_rig[0].inverse()
-        points, valid = triangulate_rays(*sights, pose, jacobians1=slopes[0], jacobians2=slopes[1])
+        points, valid = triangulate_rays(sights[0], sights[1], pose, jacobians1=slopes[0], jacobians2=slopes[1])
         good = (valid & seen[0][1] & seen[1][1]).all(axis=-1)
         off = lengths_off(quantity, points[good], exact[good])
         yield str(quantity), (off <= certificate.bound[use][good][:, None]).mean(axis=0)
