@@ -18,6 +18,7 @@ from rigkit.io.session import Session
 from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration, calibrate_session
 from rigkit.workflows.calibrate_rig import RigSessionCalibration, calibrate_rig_session
 from rigkit.workflows.corners import Cache
+from rigkit.workflows.frames import with_frames
 from rigkit.workflows.truth import FetchedSet
 
 RIGKIT, OPENCV, MRCAL, COLMAP = "rigkit", "OpenCV", "mrcal", "COLMAP"
@@ -97,7 +98,9 @@ class Bench:
         """Return the rig of cameras {name: pattern of their images}; numbers in the names say what belongs together."""
         sessions = {name: self.session(pattern, name, shape) for name, pattern in patterns.items()}
         rig = RigSession(path=self.work / f"{self.name}.toml", cameras=sessions, frames="number", baselines=())
-        return calibrate_rig_session(rig, CalibrateOptions(cache=Cache.UPDATE))
+        ready = with_frames(rig)
+        assert isinstance(ready, RigSession)
+        return calibrate_rig_session(ready, CalibrateOptions(cache=Cache.UPDATE))
 
     def measured(self, what: str) -> PublicMeasurement:
         return self.found.described.measurement(what)
