@@ -79,9 +79,9 @@ def main() -> None:
         if found.missing:
             print(f"{name}: {len(found.missing)} files are not here, such as '{found.missing[0]}': left out")
             continue
-        rows += measure(name, Bench(found, args.work, args.model, args.most))
+        own = measure(name, Bench(found, args.work, args.model, args.most))
+        rows = merged(args.json, own, list(BENCHES)) if args.json else [*rows, *own]
         if args.json:
-            rows = merged(args.json, rows, list(BENCHES))
             args.json.write_text(json.dumps(as_json(rows), indent=1) + "\n")
     for page, table in ((args.page, long_table(rows)), (args.short, short_table(rows))):
         if page:

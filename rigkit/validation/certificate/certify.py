@@ -35,7 +35,7 @@ MAP_CELLS = (33, 25)
 MAX_SHARE = 0.1
 """A bound beyond this part of what is measured (of a radian, for angles), or points as uncertain: what is derived to
 first order is then too small."""
-MANY = 1e6
+AS_NORMAL = 1e6
 """So many degrees of freedom are as good as a normal distribution."""
 
 
@@ -101,7 +101,7 @@ def _quantile(sigma: Mapping[str, FloatArray], freedom: float, confidence: float
         return np.full(whole.shape, float(ndtri(upper)))
     calibration = np.sum([sigma[cause] ** 2 for cause in (LENSES, MOUNTS) if cause in sigma], axis=0)
     known = freedom * (whole / np.maximum(calibration, np.finfo(float).tiny)) ** 2
-    return np.asarray(stdtrit(np.minimum(known, MANY), upper))
+    return np.asarray(stdtrit(np.minimum(known, AS_NORMAL), upper))
 
 
 def _findings(certificate: Certificate) -> list[Finding]:
