@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import cv2
 from bench_truth_table import OPENCV, RIGKIT, Bench, Row
 
+from rigkit.core.arrays import in_8_bits
 from rigkit.detection.detect import detect_boards
 from rigkit.io.images import read_image, to_grey
 
@@ -20,7 +21,7 @@ def aprilgrid(bench: Bench) -> Iterator[Row]:
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11), parameters)
     paths = bench.images("*.png")
     for path in paths:
-        image = to_grey(read_image(path))
+        image = in_8_bits(to_grey(read_image(path)))
         ours += sum(len(found.grid) for found in detect_boards(image, [bench.board])) // 4
         corners, _, _ = detector.detectMarkers(image)
         theirs += len(corners)
