@@ -88,7 +88,7 @@ def posed_calibration(views: Sequence[BoardView], camera: Camera, covariance: Fl
         convergence=fit.convergence,
         boards=board_shapes(observations, state.shape, state.unknowns),
     )
-    return replace(result, verdicts=judge(result, _misfit(result)))
+    return replace(result, verdicts=judge(result, _misfit(result), in_force=("model", "board_shape")))
 
 
 def _posed(observations: Observations, camera: Camera) -> tuple[State, BoolArray]:

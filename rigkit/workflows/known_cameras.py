@@ -121,10 +121,11 @@ def _saved(path: Path, names: Sequence[str]) -> SavedRig:
 def _lens(path: Path, name: str, names: Sequence[str]) -> tuple[Camera, FloatArray | None]:
     """Return a camera and its covariance, None where the file has none; of a rig that of the name."""
     if is_rig(path):
-        cameras = _saved(path, names).cameras
-        if name not in cameras:
-            raise InputError(f"'{path}' has no camera '{name}'; there are {', '.join(cameras)}")
-        return cameras[name][0], None
+        rig = _saved(path, names)
+        if name not in rig.cameras:
+            raise InputError(f"'{path}' has no camera '{name}'; there are {', '.join(rig.cameras)}")
+        own = _places_in(rig, [name])
+        return rig.cameras[name][0], None if rig.covariance is None else rig.covariance[np.ix_(own, own)]
     if is_ours(path) and is_calibration(path):
         calibration = load_calibration(path)
         return calibration.camera, np.asarray(calibration.covariance)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from rigkit.workflows.calibrate import CalibrateOptions
 from rigkit.workflows.calibrate_any import calibrate_session_file
 from rigkit.workflows.camera_files import import_rig
 from rigkit.workflows.folder_session import cameras_in, session_of_folders
+from rigkit.workflows.known_cameras import known_cameras
 
 CAMERA = Brown((640, 480), np.array([520.0, 521.0, 322.3, 236.1, -0.21, 0.06, 4e-4, -3e-4, 0.0]))
 RIGHT_FROM_LEFT = Rigid3(exp_so3(np.array([0.01, -0.04, 0.02])), [-90.0, 1.0, 2.0])
@@ -294,6 +296,11 @@ def test_lenses_that_are_known_stay_and_a_camera_is_added_to_a_rig(
     rig = load_rig(added)
     np.testing.assert_allclose(rig["left"][0].parameters, CAMERA.parameters, rtol=1e-8, atol=1e-10)
     assert worst_px(rig["right"][0]) < SAME_LENS_PX
+    # The lenses of a rig's file come with how unsure they are.
+    session = replace(load_rig_session(folder / "session.toml"), lenses={"right": added})
+    told, saved_rig = known_cameras(session), load_saved_rig(added)
+    assert told is not None and told.covariance is not None and saved_rig.covariance is not None
+    np.testing.assert_array_equal(told.covariance, saved_rig.covariance[9:18, 9:18])
     capsys.readouterr()
     assert main([*command, "--only-extrinsics", str(lens), str(lens), str(lens), "--force"]) == 2
     assert "3 lenses for 2 cameras" in capsys.readouterr().err
