@@ -250,8 +250,8 @@ def _pattern(c: Calibration, in_force: Collection[str]) -> list[Finding]:
         return [_look(what + "the board's shape or the lens model does not fit", 'try board_shape = "auto"')]
     if "model" not in in_force:
         return [_look(what + "the lens model, or the board's shape, does not quite fit", 'try model = "auto"')]
-    what += "neither the lens models nor the boards' shapes follow all of it"
-    return [_look(what, "take a board that does not bend")]
+    what += "neither the lens models nor the boards' shapes follow all of it, so that something differs between images"
+    return [_look(what, "fix focus and stabilisation, hold camera and board still, take a board that does not bend")]
 
 
 def _overfit(c: Calibration) -> list[Finding]:
