@@ -41,8 +41,8 @@ from rigkit.planning.plan import choose_views, exchanged_views, plan_views
 from rigkit.synthetic.placing import place_board, sees_paper
 from rigkit.synthetic.scene import PlacedBoard
 
-Options = tuple[str, int | None]
-"""A camera model and its size."""
+Options = tuple[str, int | None, str]
+"""A camera model, its size, and what is assumed of the board."""
 
 SIZE = (1280, 960)
 BOARD = Board("b", 9, 6, 25.0, 25.0)
@@ -280,9 +280,9 @@ def of_image(view: BoardView, knowledge: Knowledge) -> np.ndarray:
 
 
 def of_images(views: list[BoardView], chosen: list[int], size: tuple[int, int], how: Options) -> Calibration | None:
-    model, degree = how
+    model, degree, board = how
     try:
-        return calibrate([views[i] for i in chosen], size, model=model, degree=degree, board="flat", folds=0)
+        return calibrate([views[i] for i in chosen], size, model=model, degree=degree, board=board, folds=0)
     except RigkitError:
         return None
 
@@ -290,10 +290,12 @@ def of_images(views: list[BoardView], chosen: list[int], size: tuple[int, int], 
 def real(name: str, data: Path, cache: Path, draws: int) -> None:
     found, size = load(name, data, cache)
     views = [view for own in found.values() for view in own[:1]]
-    full = calibrate(views, size, model="auto", board="flat")
+    full = calibrate(views, size)
     camera = full.camera
     degree = {"scaramuzza": camera.parameters.size - 5, "brown": 5}.get(camera.model)
-    how = (camera.model, degree if degree is None or degree in type(camera).orders else None)
+    # Ten images do not tell every corner of a board: its bow and its aspect they do.
+    board = "flat" if full.boards[0].kind == "flat" else "warp"
+    how = (camera.model, degree if degree is None or degree in type(camera).orders else None, board)
     mask = covered_by_boards(full, grid_pixels(size, GRID))
 
     covered = grid_pixels(size, GRID)[mask]

@@ -9,6 +9,9 @@ from rigkit.core.errors import ExitCode, InputError
 
 __all__ = ["HELP", "add_arguments", "run"]
 
+MAX_CAMERAS = 8
+"""Of a browser: more streams than this no machine carries."""
+
 HELP = "a guided capture on a local page: says what to shoot next, takes it, stops when it is enough"
 
 
@@ -22,35 +25,66 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--near", type=float, default=0.0, metavar="MM", help="the board is not sharp nearer than this")
     parser.add_argument("--far", type=float, default=float("inf"), metavar="MM", help="nor held farther than this")
     parser.add_argument("--field", type=float, metavar="DEG", help="the lens sees no more than this full angle")
+    parser.add_argument("--length", type=float, metavar="MM", help="a length so long is to be measured,")
+    parser.add_argument("--distance", type=float, metavar="MM", help="at this distance,")
+    parser.add_argument("--goal-mm", type=float, metavar="MM", help="as well as this (standard error)")
     source = parser.add_mutually_exclusive_group()
-    source.add_argument("--watch", type=Path, metavar="FOLDER", help="pictures appear in this folder")
-    source.add_argument("--video", type=Path, metavar="FILE", help="frames of a video")
-    source.add_argument("--device", type=int, metavar="N", help="camera N of this machine; default: the browser's")
+    source.add_argument(
+        "--cameras", type=int, default=1, metavar="N", help="of the browser, taken together (default: 1)"
+    )
+    each = "; once a camera for several taken together"
+    source.add_argument(
+        "--watch", type=Path, action="append", default=[], metavar="FOLDER", help=f"pictures appear in it{each}"
+    )
+    source.add_argument(
+        "--video", type=Path, action="append", default=[], metavar="FILE", help=f"frames of a video{each}"
+    )
+    source.add_argument(
+        "--device", type=int, action="append", default=[], metavar="N", help=f"camera N of this machine{each}"
+    )
+    parser.add_argument(
+        "--lan", action="store_true", help="other machines in this network may use the page: unencrypted"
+    )
     parser.add_argument("--port", type=int, default=8137, help="default: 8137")
 
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.coach.guide import GuideOptions
     from rigkit.planning.candidates import Reach
+    from rigkit.validation.certificate.contracts import Quantity, Task
     from rigkit.workflows.coach import CoachOptions, run_coach
     from rigkit.workflows.folder_session import board_of_words
 
     if not 0.0 < args.goal < float("inf"):
         raise InputError(f"--goal {args.goal}: it must be positive")
+    told = [args.length, args.distance, args.goal_mm]
+    if any(value is not None for value in told) and None in told:
+        raise InputError("coach: --length, --distance and --goal-mm belong together")
+    if not 1 <= args.cameras <= MAX_CAMERAS:
+        raise InputError(f"--cameras {args.cameras}: 1 to {MAX_CAMERAS}")
+    if args.goal_mm is not None and not 0.0 < args.goal_mm < float("inf"):
+        raise InputError(f"--goal-mm {args.goal_mm}: it must be positive")
+    length = None
+    if args.goal_mm is not None:
+        length = Task(quantity=Quantity.LENGTH, size_mm=args.length, distance_mm=args.distance)
     guide = GuideOptions(
         boards=tuple(board_of_words(words) for words in args.board),
         hfov_deg=args.lens,
         goal_px=args.goal,
+        goal_mm=args.goal_mm,
         reach=Reach(nearest_mm=args.near, farthest_mm=args.far, field_deg=args.field),
     )
     options = CoachOptions(
         folder=args.folder,
         boards=tuple(args.board),
         guide=guide,
-        watch=args.watch,
-        video=args.video,
-        device=args.device,
+        length=length,
+        cameras=args.cameras,
+        watch=tuple(args.watch),
+        video=tuple(args.video),
+        device=tuple(args.device),
         port=args.port,
+        lan=args.lan,
     )
     run_coach(options, lambda words: print(words, flush=True))
     return ExitCode.WELL

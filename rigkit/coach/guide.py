@@ -1,16 +1,16 @@
-"""What to take next, whether a frame is worth taking, and when there are enough: the coach without its page."""
+"""What to take next of one camera, whether a frame is worth taking, and when there are enough."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
+from rigkit.cameras.compare import grid_pixels
 from rigkit.coach.look import Glance
 from rigkit.core.arrays import Pixels
 from rigkit.core.boards import Board
@@ -19,13 +19,13 @@ from rigkit.core.errors import RigkitError
 from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.candidates import Reach
-from rigkit.planning.goal import Goal, projection_goal
+from rigkit.planning.goal import Goal, projection_goal, turned_design
 from rigkit.planning.guess import guessed_camera
 from rigkit.planning.information import CornerError, HeldBoards, Knowledge, view_information
 from rigkit.planning.plan import Plan, covariance_of, plan_views
 from rigkit.planning.words import placement
 
-__all__ = ["Advice", "CaptureGuide", "GuideOptions"]
+__all__ = ["WORTH_TAKING", "Advice", "CaptureGuide", "GuideOptions", "held_view"]
 
 FIRST_FRAMES = 4
 """Before so many frames there is no calibration: the coach goes by a guess of the lens."""
@@ -36,6 +36,7 @@ WORTH_TAKING = 0.6
 WORTH_GOING_ON = 0.05
 """Where two more frames would bring less than this, there are enough."""
 MODELS_TRIED = (("brown", 5), ("kannala_brandt", None))
+MAP_GRID = (24, 16)
 USUAL_ERROR = CornerError(0.15, 0.05)
 
 
@@ -47,14 +48,29 @@ class GuideOptions:
     ----------
     boards : those that may be shown.
     hfov_deg : rough field of view across the image, until pictures say better.
-    goal_px : rms error of the projection at which there are enough.
+    goal_px : rms error of the projection at which there are enough; of a rig also of what one camera tells another.
+    goal_mm : error of `measured` at which there are enough, instead; None: only the projection counts.
+    measured : says of a camera what is to be measured with it, in mm.
     reach : where boards can be held.
     """
 
     boards: tuple[Board, ...]
     hfov_deg: float = 70.0
     goal_px: float = 0.1
+    goal_mm: float | None = None
+    measured: Callable[[Camera], Goal] | None = None
     reach: Reach = field(default_factory=Reach)
+
+    def goal(self, camera: Camera) -> Goal:
+        """Return what is to become small."""
+        if self.goal_mm is not None and self.measured is not None:
+            return self.measured(camera)
+        return projection_goal(camera, self.reach.field_deg)
+
+    @property
+    def wanted(self) -> float:
+        """How small, in the goal's unit."""
+        return self.goal_px if self.goal_mm is None or self.measured is None else self.goal_mm
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -65,16 +81,21 @@ class Advice:
     ----------
     words : what to do now.
     target_px : (K, 2) outline to hold the board into.
+    worth : what this very frame brings, as a part of what a board in the outline would.
     take : this very frame is worth taking.
     enough : there are enough frames.
-    error_px : rms error of the projection that the frames so far leave; None where nobody knows yet.
+    error : what the frames so far leave of what is to become small, in `unit`; None where nobody knows yet.
+    error_px : rms error of the projection that they leave.
     more_percent : what two more frames would bring.
     """
 
     words: str
     target_px: Pixels
+    worth: float
     take: bool
     enough: bool
+    error: float | None
+    unit: str
     error_px: float | None
     more_percent: float | None
 
@@ -90,6 +111,7 @@ class CaptureGuide:
         self._plan: Plan | None = None
         self._held: list[HeldBoards] = []
         self._last: Rigid3 | None = None
+        self._map: list[list[float | None]] | None = None
 
     def add(self, view: BoardView, size_px: tuple[int, int]) -> None:
         """Take a frame: calibrate anew, and plan the next."""
@@ -100,8 +122,8 @@ class CaptureGuide:
         pose = self._pose_of(view)
         if pose is not None:
             self._last = pose
-            self._held.append(_held(view, pose))
-        self._plan = None
+            self._held.append(held_view(view, pose))
+        self._plan = self._map = None
 
     def advise(self, glance: Glance) -> Advice:
         """Return what to do, and whether to take this frame."""
@@ -114,21 +136,59 @@ class CaptureGuide:
         enough = (
             error is not None
             and len(self.views) >= ENOUGH_FRAMES
-            and (error <= self.options.goal_px or plan.gain < WORTH_GOING_ON)
+            and (error <= self.options.wanted or plan.gain < WORTH_GOING_ON)
         )
+        unit = plan.goal.unit
         words = f"Hold the board: {where}"
-        if glance.view is None or worth >= WORTH_TAKING:
-            words = glance.complaint.capitalize() if glance.complaint and glance.view is not None else words
+        if glance.view is not None and worth >= WORTH_TAKING and glance.complaint:
+            words = glance.complaint.capitalize()
         if enough:
-            words = f"Enough: {error:.2g} px; two more pictures would bring {100.0 * plan.gain:.0f} %"
+            words = f"Enough: {error:.2g} {unit}; two more pictures would bring {100.0 * plan.gain:.0f} %"
         return Advice(
             words=words,
             target_px=where.outline_px,
+            worth=worth,
             take=bool(take and not enough),
             enough=bool(enough),
-            error_px=error,
+            error=error,
+            unit=unit,
+            error_px=None if error is None else self._error_px(plan),
             more_percent=None if error is None else 100.0 * plan.gain,
         )
+
+    def camera(self, size_px: tuple[int, int]) -> Camera:
+        """Return the camera as far as it is known."""
+        return self._planned(size_px).knowledge.camera
+
+    def corner_error(self, size_px: tuple[int, int]) -> CornerError:
+        """Return how wrong its corners are."""
+        return self._planned(size_px).knowledge.error
+
+    def pose_of(self, view: BoardView, size_px: tuple[int, int]) -> Rigid3 | None:
+        """Return where a board is; None where the lens does not see enough of it."""
+        return _pose(self.camera(size_px), view)
+
+    def _error_px(self, plan: Plan) -> float:
+        projection = projection_goal(plan.knowledge.camera, self.options.reach.field_deg)
+        return float(projection.error(covariance_of(plan.knowledge.information)))
+
+    def sigma_map(self) -> list[list[float | None]] | None:
+        """Return the rms error of the projection over the image, rows of MAP_GRID px, None where the lens does not
+        see; None before there is a calibration."""
+        if self.calibration is None or self.size_px is None:
+            return None
+        if self._map is None:
+            plan = self._planned(self.size_px)
+            camera = plan.knowledge.camera
+            pixels = grid_pixels(camera.size_px, MAP_GRID).reshape(-1, 2)
+            rays, valid = camera.unproject(pixels)
+            turned = turned_design(camera, rays[valid])
+            covariance = covariance_of(plan.knowledge.information)
+            sigma = np.full(len(pixels), np.nan)
+            sigma[valid] = np.sqrt(np.einsum("nip,pq,niq->n", turned, covariance, turned))
+            rows = sigma.reshape(MAP_GRID[1], MAP_GRID[0])
+            self._map = [[None if np.isnan(s) else round(float(s), 4) for s in row] for row in rows]
+        return self._map
 
     def _planned(self, size_px: tuple[int, int]) -> Plan:
         if self._plan is None:
@@ -144,7 +204,7 @@ class CaptureGuide:
             knowledge = Knowledge.guessed(guessed_camera(self.options.hfov_deg, size_px), USUAL_ERROR)
             for held in self._held:
                 knowledge = knowledge.with_views(held)
-        return knowledge, projection_goal(knowledge.camera, self.options.reach.field_deg)
+        return knowledge, self.options.goal(knowledge.camera)
 
     def _worth(self, view: BoardView | None, plan: Plan) -> float:
         """Return what this frame brings, as a part of what the outline would."""
@@ -154,7 +214,7 @@ class CaptureGuide:
         if pose is None:
             return 0.0
         known = plan.knowledge
-        more = view_information(known.camera, _held(view, pose), known.error)[0]
+        more = view_information(known.camera, held_view(view, pose), known.error)[0]
         after = float(plan.goal.error(covariance_of(known.information + more)))
         return (plan.error - after) / max(plan.error - plan.views[0].error, 1e-12)
 
@@ -162,45 +222,19 @@ class CaptureGuide:
         if camera is None:
             assert self.size_px is not None
             camera = self._known(self.size_px)[0].camera
-        rays, valid = camera.unproject(view.pixels)
-        try:
-            return board_pose(rays[valid], view.points()[valid]).cam_from_board
-        except RigkitError:
-            return None
-
-    def state(self, glance: Glance | None, advice: Advice | None) -> dict[str, Any]:
-        """Return what the page shows."""
-        out: dict[str, Any] = {"frames": len(self.views), "size_px": self.size_px}
-        step = max(1, sum(len(v.pixels) for v in self.views) // 1500)
-        seen = np.concatenate([v.pixels for v in self.views])[::step] if self.views else np.zeros((0, 2))
-        out["covered"] = np.round(seen, 1).tolist()
-        if advice is not None:
-            target = advice.target_px
-            out |= {
-                "words": advice.words,
-                "target": np.round(target[np.isfinite(target).all(axis=1)], 1).tolist(),
-                "take": advice.take,
-                "enough": advice.enough,
-                "error_px": advice.error_px,
-                "more_percent": advice.more_percent,
-                "goal_px": self.options.goal_px,
-            }
-        if glance is not None:
-            corners = [] if glance.view is None else np.round(glance.view.pixels, 1).tolist()
-            out |= {
-                "size_px": glance.size_px,
-                "corners": corners,
-                "edge_px": round(glance.edge_px, 2),
-                "moved_px": None if glance.moved_px is None else round(glance.moved_px, 2),
-                "contrast": round(glance.contrast, 1),
-                "sharp": glance.sharp,
-                "still": glance.still,
-                "exposed": glance.exposed,
-            }
-        return out
+        return _pose(camera, view)
 
 
-def _held(view: BoardView, pose: Rigid3) -> HeldBoards:
+def _pose(camera: Camera, view: BoardView) -> Rigid3 | None:
+    rays, valid = camera.unproject(view.pixels)
+    try:
+        return board_pose(rays[valid], view.points()[valid]).cam_from_board
+    except RigkitError:
+        return None
+
+
+def held_view(view: BoardView, pose: Rigid3) -> HeldBoards:
+    """Return the corners of a view as a board that is held."""
     seen = np.zeros((1, view.board.corner_count), dtype=bool)
     seen[0, view.board.index(view.grid)] = True
     return HeldBoards(view.board.points(), pose.rotation[None], pose.translation_mm[None], seen)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,22 +14,33 @@ from rigkit.core.errors import InputError
 from rigkit.io.files import write_atomic
 from rigkit.io.images import read_image
 
-__all__ = ["Keeper"]
+__all__ = ["FRAME_FOLDER", "ONLY", "Keeper", "folder_of"]
 
 FRAME_NAME = "frame-{:04d}.png"
 FRAME_FOLDER = "images"
+ONLY = "camera"
+"""What a camera is called that is the only one."""
+
+
+def folder_of(name: str, count: int) -> str:
+    """Return the folder of the frames of the camera `name`, of `count`, in that of the session."""
+    return FRAME_FOLDER if count == 1 else f"{FRAME_FOLDER}/{name}"
 
 
 class Keeper:
-    """A session's folder: `session.toml`, the boards' files, and `images/frame-0001.png` and on."""
+    """A session's folder: `session.toml`, the boards' files, and `images/frame-0001.png` and on; of several cameras
+    `images/NAME/frame-0001.png`."""
 
-    def __init__(self, folder: Path, files: dict[Path, str]) -> None:
-        """Make the folder, or go on with it. `files` (path -> text) are the session and its boards.
+    def __init__(self, folder: Path, files: dict[Path, str], names: Sequence[str] = (ONLY,)) -> None:
+        """Make the folder, or go on with it. `files` (path -> text) are the session and its boards, `names` those of
+        the cameras.
 
         Raises InputError where the folder holds another session.
         """
-        self.folder = folder
-        (folder / FRAME_FOLDER).mkdir(parents=True, exist_ok=True)
+        self.folder, self.names = folder, tuple(names)
+        self._places = [folder / folder_of(name, len(self.names)) for name in self.names]
+        for place in self._places:
+            place.mkdir(parents=True, exist_ok=True)
         for path, text in files.items():
             if path.exists() and path.read_text(encoding="utf-8") != text:
                 raise InputError(f"coach: '{path}' says something else; give another folder, or the same boards")
@@ -36,25 +48,28 @@ class Keeper:
                 write_atomic(path, text)
 
     @property
-    def frames(self) -> list[Path]:
-        """The frames taken, in order."""
-        return sorted((self.folder / FRAME_FOLDER).glob(FRAME_NAME.format(0).replace("0000", "*")))
+    def frames(self) -> list[str]:
+        """The names of the frames taken, in order."""
+        pattern = FRAME_NAME.format(0).replace("0000", "*")
+        return sorted({path.name for place in self._places for path in place.glob(pattern)})
 
-    def images(self) -> list[tuple[str, NDArray[Any]]]:
-        """Return the frames taken before, by name."""
-        return [(path.name, read_image(path)) for path in self.frames]
+    def images(self) -> list[tuple[str, list[NDArray[Any]]]]:
+        """Return the frames taken before that are there of every camera, by name."""
+        whole = [name for name in self.frames if all((place / name).exists() for place in self._places)]
+        return [(name, [read_image(place / name) for place in self._places]) for name in whole]
 
-    def keep(self, image: NDArray[Any]) -> Path:
-        """Write a frame, whole or not at all, and return where it is."""
+    def keep(self, images: Sequence[NDArray[Any]]) -> str:
+        """Write a frame, every image whole or not at all, and return its name."""
         taken = self.frames
-        number = 1 + (int(taken[-1].stem.rsplit("-", 1)[1]) if taken else 0)
-        path = self.folder / FRAME_FOLDER / FRAME_NAME.format(number)
-        bgr = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-        write_atomic(path, np.asarray(cv2.imencode(".png", bgr)[1]).tobytes())
-        return path
+        name = FRAME_NAME.format(1 + (int(Path(taken[-1]).stem.rsplit("-", 1)[1]) if taken else 0))
+        for place, image in zip(self._places, images, strict=True):
+            bgr = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+            write_atomic(place / name, np.asarray(cv2.imencode(".png", bgr)[1]).tobytes())
+        return name
 
     def drop_last(self) -> None:
         """Set the last frame aside: it stays on disk, under a name that no session reads."""
-        taken = self.frames
-        if taken:
-            taken[-1].rename(taken[-1].with_suffix(".png.dropped"))
+        for name in self.frames[-1:]:
+            for path in (place / name for place in self._places):
+                if path.exists():
+                    path.rename(path.with_suffix(".png.dropped"))

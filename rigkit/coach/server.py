@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import hmac
+import html
+import json
 import secrets
 import socket
 from collections.abc import Callable
 from importlib import resources
+from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
@@ -18,7 +21,7 @@ if TYPE_CHECKING:
     from starlette.requests import Request
     from starlette.responses import Response
 
-__all__ = ["MAX_UPLOAD_BYTES", "coach_app", "new_token", "serve"]
+__all__ = ["LOCAL", "MAX_UPLOAD_BYTES", "coach_app", "new_token", "own_address", "serve"]
 
 MAX_UPLOAD_BYTES = 64_000_000
 """A lossless picture of 20 megapixels."""
@@ -55,7 +58,8 @@ def coach_app(coach: Coach, token: str, hosts: tuple[str, ...] = LOCAL, *, camer
     async def page(request: Request) -> Response:
         no = _refused(request, token, hosts)
         text = resources.files("rigkit.coach").joinpath("page.html").read_text(encoding="utf-8")
-        return no or HTMLResponse(text.replace("{{camera}}", camera), 200, HEADERS)
+        names = html.escape(json.dumps(coach.keeper.names), quote=True)
+        return no or HTMLResponse(text.replace("{{camera}}", camera).replace("{{names}}", names), 200, HEADERS)
 
     async def act(request: Request) -> Response:
         no = _refused(request, token, hosts)
@@ -66,7 +70,8 @@ def coach_app(coach: Coach, token: str, hosts: tuple[str, ...] = LOCAL, *, camer
             return PlainTextResponse("too large", 413, HEADERS)
         what = request.path_params["what"]
         try:
-            state = await run_in_threadpool(_done, coach, what, data)
+            parts = _parts(data, request.query_params.get("sizes"))
+            state = await run_in_threadpool(_done, coach, what, parts)
         except RigkitError as error:
             return JSONResponse({"error": str(error)}, 400, HEADERS)
         if state is None:
@@ -77,14 +82,14 @@ def coach_app(coach: Coach, token: str, hosts: tuple[str, ...] = LOCAL, *, camer
         from starlette.responses import Response as Plain
 
         no = _refused(request, token, hosts)
-        picture = coach_preview.get("jpeg")
+        picture = coach_preview.get(request.path_params["camera"])
         return no or Plain(picture or b"", 200 if picture else 404, {**HEADERS, "Content-Type": "image/jpeg"})
 
-    coach_preview: dict[str, bytes] = {}
+    coach_preview: dict[int, bytes] = {}
     app = Starlette(
         routes=[
             Route("/{token}/", page),
-            Route("/{token}/frame.jpg", preview),
+            Route("/{token}/frame{camera:int}.jpg", preview),
             Route("/{token}/{what:str}", act, methods=["POST"]),
         ]
     )
@@ -125,16 +130,41 @@ async def _body_of(request: Request) -> bytes | None:
     return b"".join(parts)
 
 
-def _done(coach: Coach, what: str, data: bytes) -> dict[str, Any] | None:
-    if what == "look":
-        return coach.look(decoded(data))
-    if what == "take":
-        return coach.look(decoded(data), take=True)
+def _parts(data: bytes, sizes: str | None) -> list[bytes]:
+    """Return the pictures in what was sent, one after the other, each of so many bytes as `sizes` ("12,34") says;
+    raises InputError where these are not the whole."""
+    if sizes is None:
+        return [data] if data else []
+    told = sizes.split(",")
+    counts = [int(part) if part.isdecimal() and len(part) < 10 else -1 for part in told]
+    if min(counts) < 0 or sum(counts) != len(data):
+        raise InputError("coach: the pictures are not as long as said")
+    ends = list(accumulate(counts))
+    return [data[end - count : end] for end, count in zip(ends, counts, strict=True)]
+
+
+def _done(coach: Coach, what: str, parts: list[bytes]) -> dict[str, Any] | None:
+    if what in ("look", "take", "photo"):
+        images = [decoded(part) for part in parts]
+        if what == "photo":
+            return coach.look(images, take=True, photo=True)
+        return coach.look(images, take=what == "take")
     if what == "undo":
         return coach.undo()
     if what == "finish":
         return {"finished": coach.finish()}
     return coach.state() if what == "state" else None
+
+
+def own_address() -> str:
+    """Return the address of this machine in its network; nothing is sent. Raises InputError where it has none."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as way:
+        try:
+            # Any address beyond this network will do: which of our own would be asked for it?
+            way.connect(("192.0.2.1", 9))
+        except OSError as error:
+            raise InputError("coach: --lan: this machine is in no network") from error
+        return str(way.getsockname()[0])
 
 
 def serve(app: Starlette, host: str, port: int, ready: Callable[[int], None]) -> None:

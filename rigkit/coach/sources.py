@@ -1,9 +1,9 @@
-"""Frames that do not come from the page: a folder that is watched, a video, or a camera of this machine."""
+"""Frames that do not come from the page: folders that are watched, videos, or cameras of this machine."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from rigkit.core.errors import InputError
 from rigkit.io.images import read_image
+from rigkit.io.rig_session import frames_of_images
 
 __all__ = ["Frame", "device_frames", "video_frames", "watched_frames"]
 
@@ -21,48 +22,76 @@ SETTLED_S = 0.2
 """A file that has not grown for so long is whole."""
 ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"}
 
-Frame = NDArray[Any]
+Frame = list[NDArray[Any]]
+"""An image a camera, taken together."""
 
 
-def watched_frames(folder: Path, *, until_idle_s: float = float("inf")) -> Iterator[Frame]:
-    """Yield every picture in a folder, those to come as well, by name; ends when none has come for `until_idle_s`.
+def watched_frames(folders: Sequence[Path], *, until_idle_s: float = float("inf")) -> Iterator[Frame]:
+    """Yield every picture in a folder, those to come as well, by name; of several folders, one a camera, those of one
+    name, or of one number, as soon as all are there. Ends when none has come for `until_idle_s`.
 
     Raises InputError where there is no such folder. What is no picture is left alone.
     """
-    if not folder.is_dir():
-        raise InputError(f"coach: '{folder}' is not a folder; give one in which pictures will appear")
+    for folder in folders:
+        if not folder.is_dir():
+            raise InputError(f"coach: '{folder}' is not a folder; give one in which pictures will appear")
     seen: set[str] = set()
     last = time.monotonic()
     while time.monotonic() - last < until_idle_s:
-        for path in sorted(p for p in folder.iterdir() if p.suffix.lower() in ENDINGS and p.name not in seen):
-            if time.time() - path.stat().st_mtime < SETTLED_S:
+        for name, paths in _moments(folders).items():
+            if name in seen or any(time.time() - path.stat().st_mtime < SETTLED_S for path in paths):
                 continue
-            seen.add(path.name)
+            seen.add(name)
             last = time.monotonic()
             try:
-                yield read_image(path)
+                yield [read_image(path) for path in paths]
             except InputError:
                 continue
         time.sleep(POLL_S)
 
 
-def video_frames(path: Path) -> Iterator[Frame]:
-    """Yield every frame of a video; raises InputError where it cannot be read."""
-    yield from _captured(cv2.VideoCapture(str(path)), f"video '{path}'")
-
-
-def device_frames(number: int) -> Iterator[Frame]:
-    """Yield frames of camera `number` of this machine, the newest each time; raises InputError where there is none."""
-    yield from _captured(cv2.VideoCapture(number), f"camera {number}")
-
-
-def _captured(source: cv2.VideoCapture, name: str) -> Iterator[Frame]:
+def _moments(folders: Sequence[Path]) -> dict[str, list[Path]]:
+    """Return the pictures of every moment that all cameras have, one a camera, by its name and in its order."""
+    found = [sorted(p for p in folder.iterdir() if p.suffix.lower() in ENDINGS) for folder in folders]
+    if len(found) == 1:
+        return {path.name: [path] for path in found[0]}
+    by_path = {str(k): {path.name: path for path in own} for k, own in enumerate(found)}
     try:
-        good, frame = source.read()
-        if not good:
-            raise InputError(f"coach: {name} gives no picture; check the path, or that no other program has it")
-        while good:
-            yield np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB))
-            good, frame = source.read()
+        frames = frames_of_images({name: list(own) for name, own in by_path.items()})
+    except InputError:
+        # Nothing yet that all have.
+        return {}
+    moments: dict[str, dict[str, Path]] = {}
+    for camera, own in frames.items():
+        for image, frame in own.items():
+            moments.setdefault(frame, {})[camera] = by_path[camera][image]
+    return {f: [m[k] for k in by_path] for f, m in sorted(moments.items()) if len(m) == len(folders)}
+
+
+def video_frames(paths: Sequence[Path]) -> Iterator[Frame]:
+    """Yield every frame of a video, or of several that run together; raises InputError where one cannot be read."""
+    yield from _captured([cv2.VideoCapture(str(path)) for path in paths], [f"video '{path}'" for path in paths])
+
+
+def device_frames(numbers: Sequence[int]) -> Iterator[Frame]:
+    """Yield frames of cameras of this machine, the newest each time; raises InputError where there is none."""
+    yield from _captured([cv2.VideoCapture(number) for number in numbers], [f"camera {number}" for number in numbers])
+
+
+def _captured(sources: Sequence[cv2.VideoCapture], names: Sequence[str]) -> Iterator[Frame]:
+    try:
+        first = True
+        while True:
+            # All are told to take theirs before any is fetched, so that they are of one moment.
+            grabbed = [source.grab() for source in sources]
+            read = [source.retrieve() for source in sources]
+            bad = [n for n, good, (got, _) in zip(names, grabbed, read, strict=True) if not (good and got)]
+            if bad and first:
+                raise InputError(f"coach: {bad[0]} gives no picture; check the path, or that no other program has it")
+            if bad:
+                return
+            first = False
+            yield [np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)) for _, frame in read]
     finally:
-        source.release()
+        for source in sources:
+            source.release()

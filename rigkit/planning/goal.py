@@ -12,7 +12,7 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import FloatArray, Pixels, Rays
 
-__all__ = ["Goal", "projection_goal", "rays_within"]
+__all__ = ["Goal", "projection_goal", "rays_within", "turned_design"]
 
 GOAL_GRID = (24, 18)
 """Columns and rows of the pixels that the goal averages over."""
@@ -37,11 +37,18 @@ def projection_goal(camera: Camera, field_deg: float | None = None, pixels: Pixe
     if pixels is None:
         pixels = grid_pixels(camera.size_px, GOAL_GRID).reshape(-1, 2)
     rays = rays_within(camera, pixels, field_deg)
+    left = turned_design(camera, rays).reshape(-1, camera.parameters.size)
+    return Goal(left.T @ left / len(rays), "px", "rms error of the projection over the image")
+
+
+def turned_design(camera: Camera, rays: Rays) -> FloatArray:
+    """Return d pixel / d parameters along rays (N, 3) at infinity, (N, 2, P), after the rotation that hides them
+    best."""
     p = camera.parameters.size
     design = projection_design(camera, rays).transpose(2, 0, 1).reshape(-1, p + 3)
     turn = np.linalg.qr(design[:, p:])[0]
     left = design[:, :p] - turn @ (turn.T @ design[:, :p])
-    return Goal(left.T @ left / len(rays), "px", "rms error of the projection over the image")
+    return np.asarray(left.reshape(len(rays), 2, p))
 
 
 def rays_within(camera: Camera, pixels: Pixels, field_deg: float | None) -> Rays:

@@ -27,7 +27,8 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
 from rigkit.core.boards import Board
 from rigkit.geometry.rigid3 import Rigid3
 
-__all__ = ["CornerError", "HeldBoards", "Knowledge", "board_of_shape", "lens_prior", "view_information"]
+__all__ = ["CornerError", "HeldBoards", "Knowledge", "board_of_shape", "lens_prior", "pose_information"]
+__all__ += ["view_information"]
 
 LENS_UNKNOWN = 0.1
 """A lens that is only guessed shows things this part of half the image's diagonal from where it is thought to."""
@@ -133,6 +134,18 @@ def board_of_shape(board_id: str, points_mm: Points) -> Board:
 
 def view_information(camera: Camera, held: HeldBoards, error: CornerError) -> FloatArray:
     """Return what each view of a board in C poses tells of the camera's parameters, (C, P, P)."""
+    products = _products(camera, held, error)
+    return reduced_by_cluster(products, camera.parameters.size, np.arange(len(products)))[0]
+
+
+def pose_information(camera: Camera, held: HeldBoards, error: CornerError) -> FloatArray:
+    """Return what each view of a board in C poses tells of that pose where the camera is known, (C, 6, 6): of a turn
+    about the board's origin (rad), and of a shift (mm), in the camera frame."""
+    p = camera.parameters.size
+    return _products(camera, held, error)[:, p : p + 6, p : p + 6]
+
+
+def _products(camera: Camera, held: HeldBoards, error: CornerError) -> FloatArray:
     views, corners = held.seen.shape
     observations = Observations(
         views=(),
@@ -148,8 +161,7 @@ def view_information(camera: Camera, held: HeldBoards, error: CornerError) -> Fl
     rigid = ShapeModel("flat", held.points_mm, np.zeros((corners, 3, 0)), np.zeros(0), np.zeros(0, dtype=np.int64))
     state = State(camera, held.rotation, held.translation_mm, rigid, np.zeros(0))
     weight = held.seen / np.sqrt(error.variance(held.seen.sum(axis=1, dtype=np.float64)))[:, None]
-    products = view_products(observations, state, weight)
-    return reduced_by_cluster(products, camera.parameters.size, np.arange(views))[0]
+    return view_products(observations, state, weight)
 
 
 def lens_prior(camera: Camera) -> FloatArray:

@@ -5,27 +5,35 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 
+from rigkit.cameras.base import Camera
 from rigkit.coach.coach import Coach
 from rigkit.coach.guide import GuideOptions
-from rigkit.coach.keeper import FRAME_FOLDER, Keeper
-from rigkit.coach.server import coach_app, new_token, serve
+from rigkit.coach.keeper import ONLY, Keeper, folder_of
+from rigkit.coach.server import LOCAL, coach_app, new_token, own_address, serve
 from rigkit.coach.sources import Frame, device_frames, video_frames, watched_frames
 from rigkit.core.errors import InputError, RigkitError
 from rigkit.core.findings import worst
-from rigkit.io.session import load_session
-from rigkit.workflows.calibrate import CalibrateOptions, calibrate_session
+from rigkit.planning.goal import Goal
+from rigkit.validation.certificate.contracts import Task
+from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration
+from rigkit.workflows.calibrate_any import calibrate_session_file
 from rigkit.workflows.corners import Cache
 from rigkit.workflows.folder_session import session_to_come
+from rigkit.workflows.next_views import goal_of
 
 __all__ = ["CoachOptions", "coach_frames", "open_coach", "run_coach"]
 
 SESSION = "session.toml"
-LOCALHOST = "127.0.0.1"
+LOCALHOST, EVERYWHERE = "127.0.0.1", "0.0.0.0"
+LAN_WARNING = (
+    "--lan: everybody in this network who has the address sees the pictures, and nothing is encrypted; the address "
+    "is a secret, and a network of strangers is no place for it"
+)
 _log = logging.getLogger(__name__)
 
 
@@ -38,13 +46,19 @@ class CoachOptions:
     boards: tuple[str, ...]
     """COLUMNSxROWSxMM, or files of boards."""
     guide: GuideOptions
-    watch: Path | None = None
-    """Folder in which pictures appear."""
-    video: Path | None = None
-    device: int | None = None
-    """Camera of this machine; with all three None the page's own camera is used."""
+    length: Task | None = None
+    """A length at a distance that is to be measured as well as `guide.goal_mm` says."""
+    cameras: int = 1
+    """Of the page's own, whose frames are taken together."""
+    watch: tuple[Path, ...] = ()
+    """Folders in which pictures appear, one a camera."""
+    video: tuple[Path, ...] = ()
+    device: tuple[int, ...] = ()
+    """Cameras of this machine; without all three the page's own are used."""
     port: int = 8137
     """0: any that is free."""
+    lan: bool = False
+    """Other machines in this network may use the page."""
 
 
 def open_coach(options: CoachOptions) -> Coach:
@@ -53,38 +67,55 @@ def open_coach(options: CoachOptions) -> Coach:
     Raises InputError where the folder holds another session.
     """
     options.folder.mkdir(parents=True, exist_ok=True)
-    wanted = session_to_come(f"{FRAME_FOLDER}/*.png", options.boards, options.folder)
-    return Coach(options.guide, Keeper(options.folder, dict(wanted.files)), lambda: finished_words(options.folder))
+    names = _names(options)
+    patterns = {name: f"{folder_of(name, len(names))}/*.png" for name in names}
+    wanted = session_to_come(patterns, options.boards, options.folder)
+    keeper = Keeper(options.folder, dict(wanted.files), names)
+    guide, length = options.guide, options.length
+    if length is not None:
+
+        def measured(camera: Camera) -> Goal:
+            return goal_of(camera, guide.reach, length)
+
+        guide = replace(guide, measured=measured)
+    return Coach(guide, keeper, lambda: finished_words(options.folder))
+
+
+def _names(options: CoachOptions) -> tuple[str, ...]:
+    """Return what the cameras are called."""
+    names = [path.stem for path in (*options.watch, *options.video)] or [f"camera{n}" for n in options.device]
+    names = names or [f"camera{n}" for n in range(options.cameras)]
+    if len(names) == 1:
+        return (ONLY,)
+    if len(set(names)) < len(names):
+        raise InputError(f"coach: folders and videos name the cameras, and two are called alike: {', '.join(names)}")
+    return tuple(names)
 
 
 def finished_words(folder: Path) -> str:
     """Calibrate the session of a folder, write the result beside it, and say what came of it.
 
-    Raises as `calibrate_session`.
+    Raises as `calibrate_session_file`.
     """
-    session = load_session(folder / SESSION)
-    output = session.calibration_path
-    done = calibrate_session(
-        session,
-        CalibrateOptions(output=output, report=output.with_suffix(".html"), force=True, cache=Cache.UPDATE),
-    )
-    c = done.calibration
+    done = calibrate_session_file(folder / SESSION, CalibrateOptions(report=Path(), force=True, cache=Cache.UPDATE))
+    c = done.calibration if isinstance(done, SessionCalibration) else done.rig
     held = c.rms_px if c.heldout_rms_px is None else c.heldout_rms_px
-    return f"Done: {c.camera.model}, held-out {held:.3f} px, {worst(c.verdicts)}; {output.name} written"
+    what = c.camera.model if isinstance(done, SessionCalibration) else f"{len(done.rig.cameras)} cameras"
+    return f"Done: {what}, held-out {held:.3f} px, {worst(c.verdicts)}; {done.written[0].name} written"
 
 
 def coach_frames(
-    coach: Coach, frames: Iterator[Frame], *, photos: bool, show: Callable[[bytes], None] | None = None
+    coach: Coach, frames: Iterator[Frame], *, photos: bool, show: Callable[[list[bytes]], None] | None = None
 ) -> None:
     """Offer frames to the coach until there are enough, or no more."""
-    for frame in frames:
+    for images in frames:
         try:
-            state = coach.offer(frame, photo=photos)
+            state = coach.offer(images, photo=photos)
         except RigkitError as error:
             _log.warning("%s", error)
             continue
         if show is not None:
-            show(cv2.imencode(".jpg", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))[1].tobytes())
+            show([cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes() for image in images])
         if state.get("enough"):
             break
 
@@ -97,27 +128,33 @@ def run_coach(options: CoachOptions, told: Callable[[str], None]) -> None:
     coach = open_coach(options)
     frames = _frames(options)
     token = new_token()
-    app = coach_app(coach, token, camera="page" if frames is None else "server")
+    host = own_address() if options.lan else LOCALHOST
+    app = coach_app(coach, token, (host, *LOCAL), camera="page" if frames is None else "server")
     if frames is not None:
-        preview: dict[str, bytes] = app.state.preview
+        preview: dict[int, bytes] = app.state.preview
 
         def work() -> None:
-            coach_frames(coach, frames, photos=options.watch is not None, show=lambda jpeg: preview.update(jpeg=jpeg))
+            coach_frames(
+                coach, frames, photos=bool(options.watch), show=lambda jpegs: preview.update(dict(enumerate(jpegs)))
+            )
             try:
                 told(coach.finish())
             except RigkitError as error:
                 told(str(error))
 
         threading.Thread(target=work, daemon=True).start()
-    serve(app, LOCALHOST, options.port, lambda port: told(f"http://{LOCALHOST}:{port}/{token}/"))
+    if options.lan:
+        _log.warning("%s", LAN_WARNING)
+    serve(
+        app, EVERYWHERE if options.lan else LOCALHOST, options.port, lambda port: told(f"http://{host}:{port}/{token}/")
+    )
 
 
 def _frames(options: CoachOptions) -> Iterator[Frame] | None:
-    sources = [source for source in (options.watch, options.video, options.device) if source is not None]
-    if len(sources) > 1:
+    if sum(bool(source) for source in (options.watch, options.video, options.device)) > 1:
         raise InputError("coach: frames come from one place: --watch, --video or --device")
-    if options.watch is not None:
+    if options.watch:
         return watched_frames(options.watch)
-    if options.video is not None:
+    if options.video:
         return video_frames(options.video)
-    return None if options.device is None else device_frames(options.device)
+    return device_frames(options.device) if options.device else None

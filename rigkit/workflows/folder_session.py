@@ -140,16 +140,19 @@ def _cameras_in_words(cameras: Mapping[str, Sequence[tuple[Path, str]]], place: 
     return lines
 
 
-def session_to_come(pattern: str, boards: Sequence[str], place: Path) -> FolderSession:
-    """Return the session in folder `place` of one camera whose images will match `pattern` there; boards and errors as
-    for `session_of_folders`."""
+def session_to_come(patterns: Mapping[str, str], boards: Sequence[str], place: Path) -> FolderSession:
+    """Return the session in folder `place` of cameras whose images will match `patterns` there, by camera; those of one
+    moment will have one name. Boards and errors as for `session_of_folders`."""
     files: dict[Path, str] = {}
     names = [_board_file(words, place, files) for words in boards]
-    lines = [
-        f'schema = "{SESSION_SCHEMA}"',
-        f"boards = [{', '.join(map(_quoted, names))}]",
-        f"images = {_quoted(pattern)}",
-    ]
+    lines = [f'schema = "{SESSION_SCHEMA}"', f"boards = [{', '.join(map(_quoted, names))}]"]
+    if len(patterns) == 1:
+        lines += [f"images = {_quoted(pattern)}" for pattern in patterns.values()]
+    else:
+        lines.append('frames = "name"')
+        for name, pattern in patterns.items():
+            check_identifier(name, "camera")
+            lines += ["", "[[cameras]]", f"id = {_quoted(name)}", f"images = {_quoted(pattern)}"]
     path = place / "session.toml"
     files[path] = "\n".join(lines) + "\n"
     return FolderSession(path, files)

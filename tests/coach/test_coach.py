@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
-import socket
-import threading
-import time
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -19,7 +16,7 @@ from rigkit.cameras.compare import compare_cameras
 from rigkit.coach.coach import Coach
 from rigkit.coach.guide import CaptureGuide, GuideOptions
 from rigkit.coach.look import glance_at
-from rigkit.coach.server import MAX_UPLOAD_BYTES, coach_app
+from rigkit.coach.server import LOCAL, MAX_UPLOAD_BYTES
 from rigkit.coach.sources import watched_frames
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
@@ -76,7 +73,7 @@ def test_a_frame_is_taken_when_it_is_still_sharp_and_helps(pictures: list[np.nda
     assert again.still and again.sharp and guide.advise(again).take
     guide.add(again.view, again.size_px)  # type: ignore[arg-type]
     assert not guide.advise(again).take, "the same once more brings little"
-    blurred = glance_at(picture(poses[1], np.random.default_rng(2), blur_px=4.0), [BOARD], "c", photo=True)
+    blurred = glance_at(picture(poses[1], np.random.default_rng(2), blur_px=4.0), [BOARD], "c").as_photo()
     assert blurred.view is None or (not blurred.sharp and not guide.advise(blurred).take)
     empty = glance_at(np.full((480, 640, 3), 90, np.uint8), [BOARD], "d")
     advice = guide.advise(empty)
@@ -91,10 +88,10 @@ def test_a_watched_folder_makes_a_session_that_matches_the_truth(pictures: list[
         cv2.imwrite(str(watched / f"{k:02d}.png"), image)
     (watched / "notes.png").write_text("no picture")
     coach = open_coach(options(tmp_path / "session"))
-    coach_frames(coach, watched_frames(watched, until_idle_s=1.0), photos=True)
-    assert len(coach.guide.views) >= 7
+    coach_frames(coach, watched_frames([watched], until_idle_s=1.0), photos=True)
+    assert len(coach.guide.frames) >= 7
     kept = sorted((tmp_path / "session/images").glob("*.png"))
-    assert len(kept) == len(coach.guide.views)
+    assert len(kept) == len(coach.guide.frames)
     first = np.asarray(cv2.imread(str(kept[0])))
     assert any(np.array_equal(first, image) for image in pictures), "kept without loss"
     assert coach.finish().startswith("Done")
@@ -107,35 +104,24 @@ def test_a_watched_folder_makes_a_session_that_matches_the_truth(pictures: list[
 def test_killed_and_started_again_nothing_is_lost(pictures: list[np.ndarray], tmp_path: Path) -> None:
     coach = open_coach(options(tmp_path))
     for image in pictures[:5]:
-        coach.look(image, take=True)
+        coach.look([image], take=True)
     # Nothing was said to it: it is simply gone.
     again = open_coach(options(tmp_path))
-    assert len(again.guide.views) == 5
-    assert again.guide.calibration is not None
-    again.look(pictures[5], take=True)
-    assert [p.name for p in again.keeper.frames][-1] == "frame-0006.png"
+    assert len(again.guide.frames) == 5
+    assert again.guide.lenses[0].calibration is not None
+    again.look([pictures[5]], take=True)
+    assert again.keeper.frames[-1] == "frame-0006.png"
     again.undo()
-    assert len(again.guide.views) == len(again.keeper.frames) == 5
+    assert len(again.guide.frames) == len(again.keeper.frames) == 5
     assert (tmp_path / "images/frame-0006.png.dropped").exists()
     with pytest.raises(InputError, match="says something else"):
         open_coach(CoachOptions(folder=tmp_path, boards=("8x5x20",), guide=options(tmp_path).guide))
 
 
 @pytest.fixture
-def served(tmp_path: Path) -> Iterator[tuple[Coach, int]]:
-    uvicorn = pytest.importorskip("uvicorn")
+def served(tmp_path: Path, serve: Callable[[Coach, tuple[str, ...]], int]) -> tuple[Coach, int]:
     coach = open_coach(options(tmp_path))
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    server = uvicorn.Server(uvicorn.Config(coach_app(coach, "secret"), host="127.0.0.1", port=port, log_level="error"))
-    thread = threading.Thread(target=server.run, daemon=True)
-    thread.start()
-    while not server.started:
-        time.sleep(0.02)
-    yield coach, port
-    server.should_exit = True
-    thread.join(10.0)
+    return coach, serve(coach, LOCAL)
 
 
 def ask(port: int, method: str, path: str, body: bytes = b"", **headers: str) -> tuple[int, bytes]:
@@ -152,7 +138,7 @@ def test_the_server_answers_its_own_page_alone(served: tuple[Coach, int], pictur
     status, page = ask(port, "GET", "/secret/")
     assert status == 200 and b"getUserMedia" in page and b"http" not in page.replace(b"http-equiv", b"")
     status, said = ask(port, "POST", "/secret/look", png)
-    assert status == 200 and len(json.loads(said)["corners"]) == 54
+    assert status == 200 and len(json.loads(said)["cameras"][0]["corners"]) == 54
     assert coach.keeper.frames == []
     assert ask(port, "POST", "/secret/take", png)[0] == 200
     assert len(coach.keeper.frames) == 1
@@ -168,6 +154,11 @@ def test_the_server_answers_its_own_page_alone(served: tuple[Coach, int], pictur
         ("GET", "/secret/%2e%2e%2f%2e%2e%2fetc%2fpasswd", b"", {}, 404),
         ("POST", "/secret/..%2fimages%2fx.png", png, {}, 404),
         ("POST", "/secret/delete", b"", {}, 404),
+        ("GET", "/secret/frame0.jpg", b"", {}, 404),
+        ("POST", f"/secret/take?sizes={len(png)},9", png, {}, 400),
+        ("POST", f"/secret/take?sizes={len(png)},-9,9", png, {}, 400),
+        ("POST", "/secret/take?sizes=x", png, {}, 400),
+        ("POST", f"/secret/take?sizes={len(png)},{len(png)}", png + png, {}, 400),
         ("POST", "/secret/take", b"no picture", {}, 400),
         ("POST", "/secret/take", b"", {"Content-Length": str(MAX_UPLOAD_BYTES + 1)}, 413),
     ):

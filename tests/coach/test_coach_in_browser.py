@@ -16,6 +16,7 @@ from rigkit.cameras.compare import compare_cameras
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.io.calibration_file import load_calibration
+from rigkit.io.images import read_image
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import plan_views
@@ -29,13 +30,11 @@ EXACT_PX = 0.05
 """Nobody asks for less from 640x480 px through a browser's video."""
 
 
-@pytest.fixture(scope="module")
-def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A person-like session as Y4M: boards held where a plan asks, within a hand's error, and moved between."""
+def person_like_video(path: Path, poses: int) -> Path:
+    """Write a session as Y4M: boards held where a plan asks, within a hand's error, and moved between."""
     rng = np.random.default_rng(4)
     known = Knowledge.guessed(CAMERA, CornerError(0.1))
-    plan = plan_views(known, [BOARD], projection_goal(CAMERA), POSES)
-    path = tmp_path_factory.mktemp("video") / "session.y4m"
+    plan = plan_views(known, [BOARD], projection_goal(CAMERA), poses)
     with path.open("wb") as out:
         out.write(f"YUV4MPEG2 W{SIZE[0]} H{SIZE[1]} F{RATE}:1 Ip A1:1 C420jpeg\n".encode())
         for view in plan.views:
@@ -70,27 +69,42 @@ def _browse(browser: str, video: Path, url: str, profile: Path, log: Path) -> su
     )  # fmt: skip
 
 
-def test_a_capture_from_beginning_to_end(video: Path, tmp_path: Path) -> None:
-    browser = chromium()
-    pytest.importorskip("uvicorn")
-    log, folder = tmp_path / "browser.log", tmp_path / "session"
+def _guided(video: Path, folder: Path, place: Path, stop_at: int | None) -> int:
+    """Run the coach and its page until so many frames are taken, or to its own end, kill both, and return how many
+    there are; nothing may be complained of in the browser's console."""
+    browser, log = chromium(), place / "browser.log"
     command = ["-c", "import sys; from rigkit.cli.main import main; sys.exit(main())", "coach", str(folder)]
     command += ["--board", "9x6x25", "--lens", "52", "--goal", "0.12", "--port", "0"]
-    frames: list[int] = []
+    with subprocess.Popen([sys.executable, *command], stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdout is not None
+        url = server.stdout.readline().strip()
+        page = _browse(browser, video, url, place / f"profile{stop_at}", log)
+        try:
+            frames = _wait(folder, stop_at)
+        finally:
+            page.kill()
+            page.wait()
+            server.kill()
+    said = log.read_text(errors="replace")
+    assert not [line for line in said.splitlines() if "CONSOLE" in line], said[-2000:]
+    return frames
+
+
+def test_the_page_finds_a_board_and_takes_a_frame(tmp_path: Path) -> None:
+    chromium()
+    pytest.importorskip("uvicorn")
+    video = person_like_video(tmp_path / "session.y4m", 2)
+    assert _guided(video, tmp_path / "session", tmp_path, 1) >= 1
+    assert read_image(tmp_path / "session/images/frame-0001.png").shape[:2] == SIZE[::-1]
+
+
+@pytest.mark.slow
+def test_a_capture_from_beginning_to_end(tmp_path: Path) -> None:
+    chromium()
+    pytest.importorskip("uvicorn")
+    video, folder = person_like_video(tmp_path / "session.y4m", POSES), tmp_path / "session"
     # Killed in the middle, and started again.
-    for stop_at in (3, None):
-        with subprocess.Popen([sys.executable, *command], stdout=subprocess.PIPE, text=True) as server:
-            assert server.stdout is not None
-            url = server.stdout.readline().strip()
-            page = _browse(browser, video, url, tmp_path / f"profile{stop_at}", log)
-            try:
-                frames.append(_wait(folder, stop_at))
-            finally:
-                page.kill()
-                page.wait()
-                server.kill()
-        said = log.read_text(errors="replace")
-        assert not [line for line in said.splitlines() if "CONSOLE" in line], said[-2000:]
+    frames = [_guided(video, folder, tmp_path, stop_at) for stop_at in (3, None)]
     assert frames[0] >= 3
     kept = len(list((folder / "images").glob("*.png")))
     assert kept == frames[1] > frames[0]

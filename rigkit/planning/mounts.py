@@ -1,0 +1,76 @@
+"""How sure frames of a rig make where one camera stands to another, once the lenses are known.
+
+A board that two cameras a and b see at once has a pose in each, b_from_board and a_from_board, and b_from_a is the one
+times the inverse of the other: its error is that of both poses. Frames are independent, so their information adds up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import FloatArray
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3, log_so3, skew
+from rigkit.planning.information import CornerError, HeldBoards, pose_information
+
+__all__ = ["SharedViews", "mean_motion", "mount_error_px", "mount_information"]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SharedViews:
+    """C boards that cameras `a` and `b` see at once, as either holds them, and how wrong corners are."""
+
+    a: Camera
+    b: Camera
+    in_a: HeldBoards
+    in_b: HeldBoards
+    error: CornerError
+
+
+def mount_information(shared: SharedViews) -> FloatArray:
+    """Return what each of C shared boards tells of b_from_a, (C, 6, 6): of a turn about the origin of b (rad), and of
+    a shift (mm)."""
+    turn = shared.in_b.rotation @ np.swapaxes(shared.in_a.rotation, -1, -2)
+    swung = np.einsum("cij,cj->ci", turn, shared.in_a.translation_mm)
+    by_a, by_b = np.zeros((len(turn), 6, 6)), np.zeros((len(turn), 6, 6))
+    # With b_from_a = B A^-1, errors (w, v) of either pose, x -> exp(w) R x + t + v, make w = w_b - R_ba w_a and
+    # v = v_b - R_ba v_a - w x (R_ba t_a).
+    by_b[:, :3, :3] = by_b[:, 3:, 3:] = np.eye(3)
+    by_b[:, 3:, :3] = skew(swung)
+    by_a[:, :3, :3] = by_a[:, 3:, 3:] = -turn
+    by_a[:, 3:, :3] = -skew(swung) @ turn
+    covariance = by_a @ _inverse(pose_information(shared.a, shared.in_a, shared.error)) @ np.swapaxes(by_a, -1, -2)
+    covariance += by_b @ _inverse(pose_information(shared.b, shared.in_b, shared.error)) @ np.swapaxes(by_b, -1, -2)
+    return _inverse(covariance)
+
+
+def mount_error_px(shared: SharedViews, information: FloatArray) -> float:
+    """Return how wrong, rms px, the boards' corners appear in b if they are taken over from a: by what `information`
+    (6, 6) leaves open of the mount."""
+    turn = shared.in_b.rotation @ np.swapaxes(shared.in_a.rotation, -1, -2)
+    lever = np.einsum("cij,cj->ci", turn, shared.in_a.translation_mm)
+    # A turn about the origin of b moves the board's origin, too.
+    as_pose = np.tile(np.eye(6), (len(turn), 1, 1))
+    as_pose[:, 3:, :3] = -skew(lever)
+    unit = pose_information(shared.b, shared.in_b, CornerError(1.0))
+    weight = np.swapaxes(as_pose, -1, -2) @ unit @ as_pose
+    mean = weight.sum(axis=0) / float(shared.in_b.seen.sum())
+    return float(np.sqrt(max(np.trace(mean @ _inverse(information)), 0.0)))
+
+
+def mean_motion(motions: list[Rigid3]) -> Rigid3:
+    """Return the middle of motions that are nearly alike: medians of turns about the first, and of shifts."""
+    first = motions[0]
+    turns = np.array([log_so3(m.rotation @ first.rotation.T) for m in motions])
+    shifts = np.array([m.translation_mm for m in motions])
+    return Rigid3(exp_so3(np.median(turns, axis=0)) @ first.rotation, np.median(shifts, axis=0))
+
+
+def _inverse(matrices: FloatArray) -> FloatArray:
+    """Return the inverses of matrices (..., 6, 6), scaled first: radians and millimetres differ much."""
+    scale = 1.0 / np.sqrt(np.maximum(np.einsum("...ii->...i", matrices), np.finfo(float).tiny))
+    unit = matrices * scale[..., :, None] * scale[..., None, :]
+    return np.asarray(np.linalg.pinv(unit, hermitian=True) * scale[..., :, None] * scale[..., None, :])

@@ -1,0 +1,194 @@
+"""Several cameras whose frames are taken together: what they are told, what is kept, and how sure their mounts are."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from coach.test_coach import BOARD, CAMERA, SIZE, ask, options, picture
+
+from rigkit.coach.coach import Coach
+from rigkit.coach.guide import GuideOptions
+from rigkit.coach.look import Glance, glance_at
+from rigkit.coach.rig import SHARED_FRAMES, RigGuide
+from rigkit.coach.sources import watched_frames
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import InputError
+from rigkit.geometry.board_pose import board_pose
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3, log_so3
+from rigkit.io.rig_session import load_rig_session
+from rigkit.planning.candidates import Reach, held_boards
+from rigkit.planning.information import CornerError, HeldBoards
+from rigkit.planning.mounts import SharedViews, mean_motion, mount_error_px, mount_information
+from rigkit.workflows.coach import CoachOptions, open_coach
+
+MOUNT = Rigid3(exp_so3(np.array([0.0, 0.06, 0.01])), [-60.0, 1.0, 2.0])
+NOISE_PX, DRAWS = 0.05, 120
+REACH = Reach(nearest_mm=250.0)
+
+
+def shared_boards(count: int) -> tuple[HeldBoards, HeldBoards]:
+    """Boards that both cameras see whole."""
+    in_a = held_boards(CAMERA, BOARD, REACH)
+    pixels = [CAMERA.project((MOUNT @ in_a.pose(k)).apply(BOARD.points()))[0] for k in range(len(in_a))]
+    inside = np.array([CAMERA.on_image(p).all() for p in pixels])
+    chosen = in_a.chosen(np.flatnonzero(inside)[:count])
+    rotation = MOUNT.rotation @ chosen.rotation
+    translation = chosen.translation_mm @ MOUNT.rotation.T + MOUNT.translation_mm
+    return chosen, HeldBoards(chosen.points_mm, rotation, translation, chosen.seen)
+
+
+def test_the_error_of_a_mount_is_what_repeated_frames_show(rng: np.random.Generator) -> None:
+    in_a, in_b = shared_boards(1)
+    shared = SharedViews(CAMERA, CAMERA, in_a, in_b, CornerError(NOISE_PX))
+    information = mount_information(shared)
+    errors = []
+    for _ in range(DRAWS):
+        poses = []
+        for held in (in_a, in_b):
+            exact, _ = CAMERA.project(held.pose(0).apply(BOARD.points()))
+            rays, _ = CAMERA.unproject(exact + NOISE_PX * rng.standard_normal(exact.shape))
+            poses.append(board_pose(rays, BOARD.points()).cam_from_board)
+        found = poses[1] @ poses[0].inverse()
+        turn, shift = log_so3(found.rotation @ MOUNT.rotation.T), found.translation_mm - MOUNT.translation_mm
+        errors.append(np.concatenate([turn, shift]))
+    # Errors in units of what is stated have the covariance 1; so many draws tell it to a quarter.
+    whitened = np.array(errors) @ np.linalg.cholesky(information[0])
+    assert (whitened**2).mean() == pytest.approx(1.0, abs=0.25)
+    in_px = mount_error_px(shared, information[0])
+    assert 0.3 * NOISE_PX < in_px < 3.0 * NOISE_PX
+    assert mount_error_px(shared, 4.0 * information[0]) == pytest.approx(0.5 * in_px)
+    assert np.allclose(mean_motion([MOUNT] * 3).matrix(), MOUNT.matrix())
+
+
+def glance(pose: Rigid3, rng: np.random.Generator, name: str) -> Glance:
+    """What a camera sees of a board held still, without a picture."""
+    pixels, valid = CAMERA.project(pose.apply(BOARD.points()))
+    valid &= CAMERA.on_image(pixels)
+    if valid.sum() < 30:
+        return Glance(size_px=SIZE, view=None)
+    noisy = np.clip(pixels[valid] + NOISE_PX * rng.standard_normal((int(valid.sum()), 2)), -0.5, np.array(SIZE) - 0.5)
+    view = BoardView(name, BOARD, BOARD.grid()[valid], noisy, np.full(len(noisy), NOISE_PX))
+    return Glance(size_px=SIZE, view=view, edge_px=2.0, moved_px=0.0, contrast=150.0)
+
+
+def both(pose: Rigid3, rng: np.random.Generator, name: str) -> list[Glance]:
+    return [glance(pose, rng, name), glance(MOUNT @ pose, rng, name)]
+
+
+def test_a_rig_is_enough_when_lenses_and_mounts_are(rng: np.random.Generator) -> None:
+    guide = RigGuide(("left", "right"), GuideOptions(boards=(BOARD,), hfov_deg=52.0, goal_px=0.3, reach=REACH))
+    empty = [Glance(size_px=SIZE, view=None)] * 2
+    first = guide.advise(empty)
+    assert first.words.startswith("left: Hold the board") and first.targets[1] is None and first.mount_px is None
+    # Every camera by itself: both lenses are known well, and of the mount nothing.
+    alone = held_boards(CAMERA, BOARD, REACH)
+    for k in range(0, 220, 10):
+        own = glance(alone.pose(k), rng, f"{k}")
+        guide.add([own, empty[0]] if k % 20 else [empty[0], own])
+    lenses_known = guide.advise(empty)
+    assert all(lens.enough for lens in lenses_known.lenses)
+    assert not lenses_known.enough and "both see it" in lenses_known.words
+    in_a, _ = shared_boards(40)
+    for k in range(0, 40, 5):
+        now = both(in_a.pose(k), rng, f"s{k}")
+        advice = guide.advise(now)
+        if advice.enough:
+            break
+        assert k >= 25 or advice.take, "a board that both see is worth it"
+        guide.add(now)
+        asked = guide.advise(empty)
+        assert asked.enough or all(target is not None for target in asked.targets), "outlines in both images"
+    assert advice.enough and k >= 5 * (SHARED_FRAMES - 1)
+    assert advice.mount_px is not None and advice.mount_px < 0.3
+    state = guide.state(now, advice)
+    assert [camera["name"] for camera in state["cameras"]] == ["left", "right"]
+    assert state["cameras"][0]["map"][0] and json.dumps(state)
+
+
+@pytest.fixture(scope="module")
+def pairs() -> Sequence[list[np.ndarray]]:
+    in_a, in_b = shared_boards(3)
+    rng = np.random.default_rng(3)
+    return [[picture(held.pose(k), rng) for held in (in_a, in_b)] for k in range(3)]
+
+
+def rig_options(folder: Path, **more: object) -> CoachOptions:
+    return CoachOptions(folder=folder, boards=("9x6x25",), guide=options(folder).guide, **more)  # type: ignore[arg-type]
+
+
+def test_frames_of_several_cameras_are_kept_together(pairs: Sequence[list[np.ndarray]], tmp_path: Path) -> None:
+    incoming = [tmp_path / "in" / name for name in ("left", "right")]
+    for c, folder in enumerate(incoming):
+        folder.mkdir(parents=True)
+        for k, pair in enumerate(pairs):
+            cv2.imwrite(str(folder / f"img{k}.png"), pair[c])
+    # Taken by one camera only: it waits for the other's.
+    (incoming[0] / "img7.png").write_bytes((incoming[0] / "img0.png").read_bytes())
+    coach = open_coach(rig_options(tmp_path / "session", watch=tuple(incoming)))
+    for images in watched_frames(incoming, until_idle_s=0.7):
+        coach.look(images, take=True)
+    taken = len(coach.guide.frames)
+    assert taken == len(pairs)
+    kept = [sorted((tmp_path / "session/images" / name).glob("*.png")) for name in ("left", "right")]
+    assert [p.name for p in kept[0]] == [p.name for p in kept[1]] and len(kept[0]) == taken
+    session = load_rig_session(tmp_path / "session/session.toml")
+    assert list(session.cameras) == ["left", "right"]
+    # Killed between two images of a frame: what is whole goes on, and what there is stays.
+    kept[1][-1].unlink()
+    again = open_coach(rig_options(tmp_path / "session", watch=tuple(incoming)))
+    assert len(again.guide.frames) == taken - 1 and kept[0][-1].exists()
+    again.look(pairs[0], take=True)
+    assert again.keeper.frames[-1] == f"frame-{taken + 1:04d}.png"
+    with pytest.raises(InputError, match="1 images of 2 cameras"):
+        again.look(pairs[0][:1])
+    with pytest.raises(InputError, match="called alike"):
+        open_coach(rig_options(tmp_path / "other", watch=(tmp_path / "a/left", tmp_path / "b/left")))
+
+
+def test_two_images_come_in_one_upload(
+    pairs: Sequence[list[np.ndarray]], tmp_path: Path, serve: Callable[[Coach, tuple[str, ...]], int]
+) -> None:
+    coach: Coach = open_coach(rig_options(tmp_path, cameras=2))
+    port = serve(coach, ("127.0.0.1", "192.168.7.7"))
+    data = [cv2.imencode(".png", image)[1].tobytes() for image in pairs[0]]
+    path = f"/secret/look?sizes={len(data[0])},{len(data[1])}"
+    status, said = ask(port, "POST", path, data[0] + data[1])
+    assert status == 200 and [len(camera["corners"]) for camera in json.loads(said)["cameras"]] == [54, 54]
+    status, page = ask(port, "GET", "/secret/")
+    assert status == 200 and b'data-names="[&quot;camera0&quot;, &quot;camera1&quot;]"' in page
+    # As from another machine of the network, by the address that it was told, and by another name.
+    assert ask(port, "GET", "/secret/", Host=f"192.168.7.7:{port}")[0] == 200
+    assert ask(port, "GET", "/secret/", Host=f"192.168.7.8:{port}")[0] == 403
+
+
+def test_a_look_at_a_smaller_picture_shows_the_same(pairs: Sequence[list[np.ndarray]]) -> None:
+    image = pairs[0][0]
+    whole, half = glance_at(image, [BOARD], "a"), glance_at(image, [BOARD], "a", shrink=2)
+    assert whole.view is not None and half.view is not None and half.size_px == SIZE
+    order = [np.lexsort(g.view.pixels.T) for g in (whole, half) if g.view is not None]
+    assert np.abs(whole.view.pixels[order[0]] - half.view.pixels[order[1]]).max() < 0.6
+    assert half.edge_px == pytest.approx(whole.edge_px, rel=0.05)
+    assert half.as_photo().still and not half.still
+
+
+def test_the_goal_may_be_a_length_in_mm(tmp_path: Path, rng: np.random.Generator) -> None:
+    from rigkit.validation.certificate.contracts import Quantity, Task
+
+    guide = GuideOptions(boards=(BOARD,), hfov_deg=52.0, goal_mm=0.2, reach=REACH)
+    length = Task(quantity=Quantity.LENGTH, size_mm=100.0, distance_mm=500.0)
+    coach = open_coach(CoachOptions(folder=tmp_path, boards=("9x6x25",), guide=guide, length=length))
+    held = held_boards(CAMERA, BOARD, REACH)
+    for k in range(0, 120, 10):
+        coach.guide.add([glance(held.pose(k), rng, f"{k}")])
+    advice = coach.guide.advise([glance(held.pose(7), rng, "x")])
+    lens = advice.lenses[0]
+    assert lens.unit == "mm" and lens.error is not None and lens.error_px is not None
+    # A pixel is about 0.8 mm there.
+    assert 0.02 * lens.error_px < lens.error < 5.0 * lens.error_px
+    assert advice.enough == (lens.error <= 0.2 or (lens.more_percent or 0.0) < 5.0)
