@@ -241,14 +241,18 @@ def held_view(view: BoardView, pose: Rigid3) -> HeldBoards:
 
 
 def _calibrated(views: Sequence[BoardView], size_px: tuple[int, int]) -> Calibration | None:
-    """Return the better of the usual narrow and wide models, quickly; None where the views do not determine it."""
-    best: Calibration | None = None
+    """Return the better of the usual narrow and wide models, quickly; None where the views do not determine it. Boards
+    bow a little: taken for flat, they make the lens seem to be what it is not, once there are views enough to tell."""
     named = [replace(view, image=f"{k:04d}") for k, view in enumerate(views)]
-    for model, degree in MODELS_TRIED:
-        try:
-            found = calibrate(named, size_px, model=model, degree=degree, board="flat", folds=0)
-        except RigkitError:
-            continue
-        if best is None or found.rms_px < best.rms_px:
-            best = found
-    return best
+    for board in ("warp", "flat") if len(views) >= ENOUGH_FRAMES else ("flat",):
+        best: Calibration | None = None
+        for model, degree in MODELS_TRIED:
+            try:
+                found = calibrate(named, size_px, model=model, degree=degree, board=board, folds=0)
+            except RigkitError:
+                continue
+            if best is None or found.rms_px < best.rms_px:
+                best = found
+        if best is not None:
+            return best
+    return None

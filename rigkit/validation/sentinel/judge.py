@@ -4,7 +4,7 @@ Scores of frames have, where nothing changed, the covariance A + A C A in units 
 information and C the covariance of theta: the frames scatter, and the calibration was a little off from the start. With
 A = L L^T, w = L^+ score has the covariance I + L^T C L, and a change theta += D a moves it by L^T D a. Every cause D is
 fitted alone; the simplest that explains enough is named (Schwarz's criterion), and the chance that unchanged cameras
-show as much of any cause is Bonferroni's bound over F-tests.
+show as much of any cause is that of the smallest chance of F-tests, drawn or by Bonferroni's bound.
 """
 
 from __future__ import annotations
@@ -45,6 +45,8 @@ RARE = {"lens": 6.0, "moved": 6.0}
 """Twice the log odds against several things at once: one time in twenty."""
 RARE_IN_RIGS = {"principal point": 6.0}
 """Mounts turn, by what looks nearly the same, much more often than the glass moves in its barrel."""
+DRAWS, FEW_DRAWS = 4000, 8
+"""Of what unchanged cameras show; fewer than so many tell no chance."""
 LARGE_FREEDOM = 1e6
 """As good as infinite, which the F distribution does not take."""
 
@@ -137,7 +139,7 @@ def judge_evidence(watched: Watched, look: Look, cost: Goal | None = None) -> Se
     step, covariance, change, chance = np.zeros(watched.size), watched.covariance, None, 1.0
     fixed, after = watched, evidence
     if known:
-        chance = min(1.0, len(known) * min(c.chance for c in known))
+        chance = _chance_of_any(whitened, known)
         penalty = float(np.log(max(len(whitened.score), 3)))
         best = max(known, key=lambda c: _evident(c, penalty))
         amounts, fixed, after = _refined(watched, look, best)
@@ -161,6 +163,27 @@ def judge_evidence(watched: Watched, look: Look, cost: Goal | None = None) -> Se
         cost=float(np.sqrt(max([0.0, *(float(step @ g.weight @ step) for g in goals)]))),
         cost_unit=goals[0].unit,
     )
+
+
+def _chance_of_any(whitened: _Whitened, known: Sequence[Change]) -> float:
+    """Return the probability that unchanged cameras show as much of any cause as they show of the likeliest. Causes
+    overlap, so that it is less than the sum of their chances: drawn, as long as draws tell; else Bonferroni's bound."""
+    best = min(c.chance for c in known)
+    bound = min(1.0, len(known) * best)
+    if bound < FEW_DRAWS / DRAWS:
+        return bound
+    rng = np.random.default_rng(0)
+    spread, axes = np.linalg.eigh(whitened.covariance)
+    root = axes / np.sqrt(spread)
+    drawn = rng.standard_normal((len(spread), DRAWS))
+    scale = rng.chisquare(whitened.freedom, DRAWS) / whitened.freedom if whitened.freedom < LARGE_FREEDOM else 1.0
+    least = np.ones(DRAWS)
+    for change in known:
+        basis = np.linalg.qr(root.T @ whitened.by_theta @ change.cause.directions)[0]
+        m = basis.shape[1]
+        gain = ((basis.T @ drawn) ** 2).sum(axis=0) / scale
+        least = np.minimum(least, f_distribution.sf(gain / m, m, whitened.freedom))
+    return float(min(bound, (1.0 + np.count_nonzero(least <= best)) / (DRAWS + 1.0)))
 
 
 def _evident(change: Change, penalty: float) -> float:
