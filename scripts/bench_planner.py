@@ -36,7 +36,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import projection_goal
-from rigkit.planning.information import CornerError, HeldBoards, Knowledge, view_information
+from rigkit.planning.information import CornerError, HeldBoards, Knowledge
 from rigkit.planning.plan import choose_views, exchanged_views, plan_views
 from rigkit.synthetic.placing import place_board, sees_paper
 from rigkit.synthetic.scene import PlacedBoard
@@ -260,7 +260,7 @@ def choose_images(
     for _ in range(EXCHANGES):
         calibration = of_images(views, taken, size, how)
         if calibration is not None:
-            known = Knowledge.guessed(calibration.camera, CornerError.of(calibration))
+            known = Knowledge.unseen(calibration)
             information = np.array([of_image(view, known) for view in views])
             goal = projection_goal(calibration.camera, pixels=covered)
             taken = exchanged_views(known.information, information, goal, taken)
@@ -276,7 +276,7 @@ def of_image(view: BoardView, knowledge: Knowledge) -> np.ndarray:
     except RigkitError:
         return np.zeros_like(knowledge.information)
     held = HeldBoards(points, pose.rotation[None], pose.translation_mm[None], valid[None])
-    return view_information(knowledge.camera, held, knowledge.error)[0]
+    return knowledge.of_views(held, view.board.board_id)[0]
 
 
 def of_images(views: list[BoardView], chosen: list[int], size: tuple[int, int], how: Options) -> Calibration | None:

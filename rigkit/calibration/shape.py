@@ -16,6 +16,7 @@ from rigkit.calibration.observations import Observations
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
 
 __all__ = ["SHAPES", "ShapeModel", "often_seen", "released_groups", "released_sigma", "shape_model", "warp_groups"]
+__all__ += ["WARP_UNKNOWNS", "warp_of_board"]
 
 SHAPES = ("flat", "warp", "released")
 
@@ -146,26 +147,32 @@ def _half_diagonal(points: Points) -> float:
 
 
 def _warp(observations: Observations, flat: Points) -> ShapeModel:
-    """The unknowns of a board: aspect, shear, bow along x, bow along y, twist (bows in mm at the centre, twist in mm at
-    the corner), and six of a stretch that changes over the print (mm at the rim: x and y, each quadratic in x and y).
-    An overall scale would only move the board away: it is not among them."""
     often = np.flatnonzero(often_seen(observations))
     basis = np.zeros((len(flat), 3, WARP_UNKNOWNS * len(often)))
-    sigma: list[float] = []
+    sigma = [np.zeros(0)]
     for i, board in enumerate(often.tolist()):
         rows = _rows(observations, board)
-        points = flat[rows]
-        centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
-        half = 0.5 * np.ptp(points, axis=0)
-        x, y = ((points - centre)[:, :2]).T
-        block = basis[rows, :, WARP_UNKNOWNS * i : WARP_UNKNOWNS * (i + 1)]
-        block[:, 0, 0], block[:, 1, 0] = 0.5 * x, -0.5 * y
-        block[:, 0, 1], block[:, 1, 1] = 0.5 * y, 0.5 * x
-        x, y = x / half[0], y / half[1]
-        block[:, 2, 2], block[:, 2, 3], block[:, 2, 4] = 1.0 - x**2, 1.0 - y**2, x * y
-        # Legendre's polynomials: a stretch is not to be taken for a shift.
-        stretch = np.stack([1.5 * x**2 - 0.5, x * y, 1.5 * y**2 - 0.5], axis=-1)
-        block[:, 0, 5:8] = block[:, 1, 8:11] = stretch
-        size = _half_diagonal(points)
-        sigma += [ASPECT_SIGMA, SHEAR_SIGMA, *[BOW_SIGMA * size] * 3, *[STRETCH_SIGMA * size] * 6]
-    return ShapeModel("warp", flat, basis, np.array(sigma), NONE)
+        own = warp_of_board(flat[rows])
+        basis[rows, :, WARP_UNKNOWNS * i : WARP_UNKNOWNS * (i + 1)] = own.basis
+        sigma.append(own.sigma)
+    return ShapeModel("warp", flat, basis, np.concatenate(sigma), NONE)
+
+
+def warp_of_board(points: Points) -> ShapeModel:
+    """Return the warp of a board with its corners at `points` (N, 3): aspect, shear, bow along x, bow along y, twist
+    (bows in mm at the centre, twist in mm at the corner), and six of a stretch that changes over the print (mm at the
+    rim: x and y, each quadratic in x and y). An overall scale would only move the board away: it is not among them."""
+    centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    half = 0.5 * np.ptp(points, axis=0)
+    x, y = ((points - centre)[:, :2]).T
+    basis = np.zeros((len(points), 3, WARP_UNKNOWNS))
+    basis[:, 0, 0], basis[:, 1, 0] = 0.5 * x, -0.5 * y
+    basis[:, 0, 1], basis[:, 1, 1] = 0.5 * y, 0.5 * x
+    x, y = x / half[0], y / half[1]
+    basis[:, 2, 2], basis[:, 2, 3], basis[:, 2, 4] = 1.0 - x**2, 1.0 - y**2, x * y
+    # Legendre's polynomials: a stretch is not to be taken for a shift.
+    stretch = np.stack([1.5 * x**2 - 0.5, x * y, 1.5 * y**2 - 0.5], axis=-1)
+    basis[:, 0, 5:8] = basis[:, 1, 8:11] = stretch
+    size = _half_diagonal(points)
+    sigma = np.array([ASPECT_SIGMA, SHEAR_SIGMA, *[BOW_SIGMA * size] * 3, *[STRETCH_SIGMA * size] * 6])
+    return ShapeModel("warp", points, basis, sigma, NONE)

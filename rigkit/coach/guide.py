@@ -21,7 +21,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import Goal, projection_goal, turned_design
 from rigkit.planning.guess import guessed_camera
-from rigkit.planning.information import CornerError, HeldBoards, Knowledge, view_information
+from rigkit.planning.information import CornerError, HeldBoards, Knowledge
 from rigkit.planning.plan import Plan, covariance_of, plan_views
 from rigkit.planning.words import placement
 
@@ -183,7 +183,8 @@ class CaptureGuide:
             pixels = grid_pixels(camera.size_px, MAP_GRID).reshape(-1, 2)
             rays, valid = camera.unproject(pixels)
             turned = turned_design(camera, rays[valid])
-            covariance = covariance_of(plan.knowledge.information)
+            p = camera.parameters.size
+            covariance = covariance_of(plan.knowledge.information)[:p, :p]
             sigma = np.full(len(pixels), np.nan)
             sigma[valid] = np.sqrt(np.einsum("nip,pq,niq->n", turned, covariance, turned))
             rows = sigma.reshape(MAP_GRID[1], MAP_GRID[0])
@@ -214,7 +215,7 @@ class CaptureGuide:
         if pose is None:
             return 0.0
         known = plan.knowledge
-        more = view_information(known.camera, held_view(view, pose), known.error)[0]
+        more = known.of_views(held_view(view, pose), view.board.board_id)[0]
         after = float(plan.goal.error(covariance_of(known.information + more)))
         return (plan.error - after) / max(plan.error - plan.views[0].error, 1e-12)
 

@@ -167,10 +167,10 @@ class RigGuide:
         translation = in_a.translation_mm @ moved.rotation.T + moved.translation_mm
         paper = outline_mm(board) @ np.swapaxes(rotation, -1, -2) + translation[:, None, :]
         pixels, valid = shared.b.project(paper)
-        both = (valid & shared.b.on_image(pixels)).all(axis=1)
+        both = np.all(valid & shared.b.on_image(pixels), axis=1)
         if not both.any():
             return words, targets
-        chosen = in_a.chosen(both)
+        chosen = in_a.chosen(np.flatnonzero(both))
         in_b = HeldBoards(in_a.points_mm, rotation[both], translation[both], in_a.seen[both])
         told = mount_information(SharedViews(shared.a, shared.b, chosen, in_b, shared.error))
         known = mount_information(shared).sum(axis=0)

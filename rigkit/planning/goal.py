@@ -27,8 +27,9 @@ class Goal:
     what: str
 
     def error(self, covariance: FloatArray) -> FloatArray:
-        """Return what covariances (..., P, P) leave, (...,)."""
-        return np.asarray(np.sqrt(np.maximum((self.weight * covariance).sum(axis=(-1, -2)), 0.0)))
+        """Return what covariances (..., T, T) leave, (...,); the camera's parameters are the first of T."""
+        p = len(self.weight)
+        return np.asarray(np.sqrt(np.maximum((self.weight * covariance[..., :p, :p]).sum(axis=(-1, -2)), 0.0)))
 
 
 def projection_goal(camera: Camera, field_deg: float | None = None, pixels: Pixels | None = None) -> Goal:

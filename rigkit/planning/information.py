@@ -9,7 +9,7 @@ Reference: L. Kish, "Survey Sampling" (1965), section 5.4.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from rigkit.calibration.clustered import reduced_by_cluster
 from rigkit.calibration.linearise import view_products
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.shape import ShapeModel
+from rigkit.calibration.shape import WARP_UNKNOWNS, ShapeModel, warp_of_board
 from rigkit.calibration.state import State
 from rigkit.calibration.uncertainty import projection_design
 from rigkit.cameras.base import Camera
@@ -83,11 +83,20 @@ class HeldBoards:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Knowledge:
-    """What is known of a camera: its estimate, the information (P, P) on its parameters, and how wrong corners are."""
+    """What is known of a camera.
+
+    Attributes
+    ----------
+    camera : its estimate.
+    information : (T, T) on its parameters, and then on the warps of the boards that are not known to be flat.
+    error : how wrong corners are.
+    warped : names of these boards.
+    """
 
     camera: Camera
     information: FloatArray
     error: CornerError
+    warped: tuple[str, ...] = ()
 
     @classmethod
     def guessed(cls, camera: Camera, error: CornerError) -> Knowledge:
@@ -95,10 +104,21 @@ class Knowledge:
         return cls(camera, lens_prior(camera), error)
 
     @classmethod
+    def unseen(cls, calibration: Calibration) -> Knowledge:
+        """Return what is known of a calibrated lens without its views."""
+        camera = calibration.camera
+        warped = [shape for shape in calibration.boards if shape.kind != "flat"]
+        p = camera.parameters.size
+        information = np.zeros((p + WARP_UNKNOWNS * len(warped),) * 2)
+        information[:p, :p] = lens_prior(camera)
+        sigma = np.concatenate([np.zeros(0), *(warp_of_board(shape.points_mm).sigma for shape in warped)])
+        information[p:, p:] = np.diag(sigma**-2)
+        return cls(camera, information, CornerError.of(calibration), tuple(shape.board_id for shape in warped))
+
+    @classmethod
     def of(cls, calibration: Calibration) -> Knowledge:
         """Return what a calibration's views say."""
-        error, camera = CornerError.of(calibration), calibration.camera
-        known = lens_prior(camera)
+        known = cls.unseen(calibration)
         for shape in calibration.boards:
             views = [v for v in calibration.views if v.board_id == shape.board_id and v.kept.any()]
             columns = board_of_shape(shape.board_id, shape.points_mm).columns
@@ -112,13 +132,26 @@ class Knowledge:
                 np.array([pose.translation_mm for pose in poses]).reshape(-1, 3),
                 seen,
             )
-            known = known + view_information(camera, held, error).sum(axis=0)
-        return cls(camera, known, error)
+            known = known.with_views(held, shape.board_id)
+        return known
 
-    def with_views(self, held: HeldBoards) -> Knowledge:
+    def of_views(self, held: HeldBoards, board_id: str = "") -> FloatArray:
+        """Return what each view of the board `board_id` in C poses adds, (C, T, T)."""
+        camera, p = self.camera, self.camera.parameters.size
+        out = np.zeros((len(held), *self.information.shape))
+        if board_id not in self.warped:
+            out[:, :p, :p] = view_information(camera, held, self.error)
+            return out
+        first = p + WARP_UNKNOWNS * self.warped.index(board_id)
+        own = np.r_[0:p, first : first + WARP_UNKNOWNS]
+        products = _products(camera, held, self.error, warp_of_board(held.points_mm))
+        told = reduced_by_cluster(products, p + WARP_UNKNOWNS, np.arange(len(held)))[0]
+        out[:, own[:, None], own] = told
+        return out
+
+    def with_views(self, held: HeldBoards, board_id: str = "") -> Knowledge:
         """Return what is known once these views are taken."""
-        more = view_information(self.camera, held, self.error).sum(axis=0)
-        return Knowledge(self.camera, self.information + more, self.error)
+        return replace(self, information=self.information + self.of_views(held, board_id).sum(axis=0))
 
 
 def board_of_shape(board_id: str, points_mm: Points) -> Board:
@@ -145,7 +178,7 @@ def pose_information(camera: Camera, held: HeldBoards, error: CornerError) -> Fl
     return _products(camera, held, error)[:, p : p + 6, p : p + 6]
 
 
-def _products(camera: Camera, held: HeldBoards, error: CornerError) -> FloatArray:
+def _products(camera: Camera, held: HeldBoards, error: CornerError, shape: ShapeModel | None = None) -> FloatArray:
     views, corners = held.seen.shape
     observations = Observations(
         views=(),
@@ -158,8 +191,10 @@ def _products(camera: Camera, held: HeldBoards, error: CornerError) -> FloatArra
         first_row=np.array([0, corners]),
         board=np.zeros(views, dtype=np.int64),
     )
-    rigid = ShapeModel("flat", held.points_mm, np.zeros((corners, 3, 0)), np.zeros(0), np.zeros(0, dtype=np.int64))
-    state = State(camera, held.rotation, held.translation_mm, rigid, np.zeros(0))
+    if shape is None:
+        none = np.zeros(0, dtype=np.int64)
+        shape = ShapeModel("flat", held.points_mm, np.zeros((corners, 3, 0)), np.zeros(0), none)
+    state = State(camera, held.rotation, held.translation_mm, shape, np.zeros(len(shape.sigma)))
     weight = held.seen / np.sqrt(error.variance(held.seen.sum(axis=1, dtype=np.float64)))[:, None]
     return view_products(observations, state, weight)
 

@@ -13,7 +13,7 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.candidates import Reach, held_boards
 from rigkit.planning.goal import Goal
-from rigkit.planning.information import Knowledge, view_information
+from rigkit.planning.information import Knowledge
 
 __all__ = ["Plan", "Proposal", "choose_views", "covariance_of", "exchanged_views", "plan_views"]
 
@@ -136,7 +136,7 @@ def plan_views(
     if not boards or count < 1:
         raise InputError("plan: at least one board and one view are needed")
     held = [held_boards(knowledge.camera, board, reach or Reach()) for board in boards]
-    views = np.concatenate([view_information(knowledge.camera, h, knowledge.error) for h in held])
+    views = np.concatenate([knowledge.of_views(h, b.board_id) for h, b in zip(held, boards, strict=True)])
     rotation = np.concatenate([h.rotation for h in held])
     middle = np.concatenate([h.rotation @ h.points_mm.mean(axis=0) + h.translation_mm for h in held])
     start = last or Rigid3(np.eye(3), np.array([0.0, 0.0, float(np.median(np.linalg.norm(middle, axis=-1)))]))

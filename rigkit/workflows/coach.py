@@ -98,10 +98,18 @@ def finished_words(folder: Path) -> str:
     Raises as `calibrate_session_file`.
     """
     done = calibrate_session_file(folder / SESSION, CalibrateOptions(report=Path(), force=True, cache=Cache.UPDATE))
-    c = done.calibration if isinstance(done, SessionCalibration) else done.rig
-    held = c.rms_px if c.heldout_rms_px is None else c.heldout_rms_px
-    what = c.camera.model if isinstance(done, SessionCalibration) else f"{len(done.rig.cameras)} cameras"
-    return f"Done: {what}, held-out {held:.3f} px, {worst(c.verdicts)}; {done.written[0].name} written"
+    if isinstance(done, SessionCalibration):
+        what, c = done.calibration.camera.model, done.calibration
+        return _finished(what, c.rms_px, c.heldout_rms_px, worst(c.verdicts), done.written[0])
+    rig = done.rig
+    return _finished(
+        f"{len(rig.cameras)} cameras", rig.rms_px, rig.heldout_rms_px, worst(rig.verdicts), done.written[0]
+    )
+
+
+def _finished(what: str, rms_px: float, heldout_px: float | None, verdict: object, written: Path) -> str:
+    held = rms_px if heldout_px is None else heldout_px
+    return f"Done: {what}, held-out {held:.3f} px, {verdict}; {written.name} written"
 
 
 def coach_frames(

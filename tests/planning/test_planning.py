@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.calibration_scenes import BOARD, REACH_DEG, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.shape import WARP_UNKNOWNS, warp_of_board
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import compare_cameras, grid_pixels
 from rigkit.core.boards import Board
@@ -169,3 +172,29 @@ def test_views_taken_for_want_of_better_ones_are_exchanged() -> None:
     goal = Goal(np.eye(2), "px", "both")
     assert sorted(exchanged_views(np.eye(2), views, goal, [0, 3])) == [1, 2]
     assert exchanged_views(np.eye(2), views, goal, [2, 1]) == [2, 1]
+
+
+def test_a_board_that_may_bow_is_shown_turned() -> None:
+    """Of a board whose aspect is not known, views that are all the same way up leave the ratio of the focal lengths."""
+    camera = lens("reg")
+    known = Knowledge.guessed(camera, CornerError(0.1))
+    p = camera.parameters.size
+    warp = warp_of_board(BOARD.points())
+    information = np.zeros((p + WARP_UNKNOWNS, p + WARP_UNKNOWNS))
+    information[:p, :p], information[p:, p:] = known.information, np.diag(warp.sigma**-2)
+    unsure = replace(known, information=information, warped=(BOARD.board_id,))
+    held = held_boards(camera, BOARD, Reach())
+    level = np.abs(held.rotation[:, 0, 0]) > np.abs(held.rotation[:, 1, 0])
+    half = 6
+    same = held.chosen(np.flatnonzero(level)[: 2 * half])
+    turned = held.chosen(np.concatenate([np.flatnonzero(level)[:half], np.flatnonzero(~level)[:half]]))
+    ratio = np.zeros(p)
+    ratio[:2] = 1.0, -1.0
+
+    def unknown(knowledge: Knowledge, views: HeldBoards) -> float:
+        covariance = covariance_of(knowledge.with_views(views, BOARD.board_id).information)[:p, :p]
+        return float(np.sqrt(ratio @ covariance @ ratio))
+
+    flat_gain, warp_gain = (unknown(k, same) / unknown(k, turned) for k in (known, unsure))
+    assert warp_gain > 2.0 * flat_gain
+    assert unknown(unsure, turned) > unknown(known, turned)
