@@ -36,7 +36,7 @@ WORTH_TAKING = 0.6
 WORTH_GOING_ON = 0.05
 """Where two more frames would bring less than this, there are enough."""
 MODELS_TRIED = (("brown", 5), ("kannala_brandt", None))
-MAP_GRID = (24, 16)
+LIVE_GRID = (24, 16)
 USUAL_ERROR = CornerError(0.15, 0.05)
 
 
@@ -173,21 +173,21 @@ class CaptureGuide:
         return float(projection.error(covariance_of(plan.knowledge.information)))
 
     def sigma_map(self) -> list[list[float | None]] | None:
-        """Return the rms error of the projection over the image, rows of MAP_GRID px, None where the lens does not
+        """Return the rms error of the projection over the image, rows of LIVE_GRID px, None where the lens does not
         see; None before there is a calibration."""
         if self.calibration is None or self.size_px is None:
             return None
         if self._map is None:
             plan = self._planned(self.size_px)
             camera = plan.knowledge.camera
-            pixels = grid_pixels(camera.size_px, MAP_GRID).reshape(-1, 2)
+            pixels = grid_pixels(camera.size_px, LIVE_GRID).reshape(-1, 2)
             rays, valid = camera.unproject(pixels)
             turned = turned_design(camera, rays[valid])
             p = camera.parameters.size
             covariance = covariance_of(plan.knowledge.information)[:p, :p]
             sigma = np.full(len(pixels), np.nan)
             sigma[valid] = np.sqrt(np.einsum("nip,pq,niq->n", turned, covariance, turned))
-            rows = sigma.reshape(MAP_GRID[1], MAP_GRID[0])
+            rows = sigma.reshape(LIVE_GRID[1], LIVE_GRID[0])
             self._map = [[None if np.isnan(s) else round(float(s), 4) for s in row] for row in rows]
         return self._map
 

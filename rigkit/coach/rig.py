@@ -25,7 +25,7 @@ __all__ = ["RigAdvice", "RigGuide"]
 
 SHARED_FRAMES = 5
 """Fewer boards that two cameras see at once do not tell how these disagree."""
-COVERED = 1500
+MAX_MARKS = 1500
 """Corners that are drawn, at the most."""
 
 
@@ -199,7 +199,7 @@ class RigGuide:
             }
         cameras = []
         for c, (name, lens) in enumerate(zip(self.names, self.lenses, strict=True)):
-            step = max(1, sum(len(v.pixels) for v in lens.views) // COVERED)
+            step = max(1, sum(len(v.pixels) for v in lens.views) // MAX_MARKS)
             seen = np.concatenate([v.pixels for v in lens.views])[::step] if lens.views else np.zeros((0, 2))
             own: dict[str, Any] = {"name": name, "covered": np.round(seen, 1).tolist(), "map": lens.sigma_map()}
             own["size_px"] = lens.size_px
