@@ -15,7 +15,7 @@ import traceback
 from collections.abc import Sequence
 
 from rigkit.cli.log import add_log_arguments, logged_run, logging_to
-from rigkit.cli.surroundings import SURROUNDINGS, Terminated, open_streams, say, signals_interrupt
+from rigkit.cli.surroundings import SURROUNDINGS, Terminated, open_streams, say, settle_stderr, signals_interrupt
 from rigkit.core.errors import ExitCode, RigkitError, printable
 
 __all__ = ["VERBS", "main"]
@@ -116,6 +116,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             return ExitCode.BAD_INPUT
         say("this is a bug in rigkit; please report the lines above", before=traceback.format_exc())
         return ExitCode.BUG
+    finally:
+        settle_stderr()
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-__all__ = ["SURROUNDINGS", "Terminated", "open_streams", "say", "signals_interrupt"]
+__all__ = ["SURROUNDINGS", "Terminated", "open_streams", "say", "settle_stderr", "signals_interrupt"]
 
 SURROUNDINGS = {
     getattr(errno, name, None) for name in ("ENOSPC", "EDQUOT", "EROFS", "EACCES", "EPERM", "EIO", "EMFILE", "ENFILE")
@@ -33,6 +33,15 @@ def say(words: str, *, before: str = "") -> None:
     """Print the last line of a run to stderr; the exit code says it too where nobody can read that."""
     with contextlib.suppress(OSError, ValueError):
         print(f"{before}rigkit: {words}", file=sys.stderr, flush=True)
+
+
+def settle_stderr() -> None:
+    """Leave nothing unwritten to a stderr that takes nothing: Python (up to 3.11.2) ends with a code of its own, 120,
+    where it cannot write the rest."""
+    try:
+        sys.stderr.flush()
+    except (OSError, ValueError):
+        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - for the rest of the process
 
 
 def open_streams() -> None:

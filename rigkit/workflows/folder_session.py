@@ -78,7 +78,7 @@ def session_of_folders(
     boards : files of boards, or words such as 9x6x25: see `rigkit.io.board_words`.
     path : of the session, to whose folder its paths are relative.
     model : of all cameras.
-    output : where the calibration goes, if not to where the session's name says.
+    output : of the calibration, beside the session, if not where the session's name says.
     known : what stays as it is of several cameras.
 
     Raises
@@ -92,7 +92,7 @@ def session_of_folders(
     place = path.parent
     files: dict[Path, str] = {}
     names = [_board_file(words, place, files) for words in boards]
-    named = "" if output is None else f" -o {_relative(output, place)}"
+    named = "" if output is None else f" -o {output.name}"
     shown = " ".join([*map(str, folders), *(f"--board {words}" for words in boards)])
     lines = [
         "# " + " ".join(f"Written by rigkit calibrate {shown}".split()),
