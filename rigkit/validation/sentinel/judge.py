@@ -16,8 +16,11 @@ from typing import TypeAlias
 import numpy as np
 from scipy.stats import f as f_distribution
 
+from rigkit.calibration.uncertainty import projection_design
+from rigkit.cameras.base import Camera
+from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import FloatArray
-from rigkit.planning.goal import Goal
+from rigkit.planning.goal import GOAL_GRID, Goal
 from rigkit.validation.sentinel.causes import Cause, causes_of, lens_goals
 from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched, evidence_of
 
@@ -263,8 +266,16 @@ def _fitted(whitened: _Whitened, cause: Cause) -> Change | None:
 
 
 def _size_px(watched: Watched, evidence: FreshEvidence, step: FloatArray) -> float:
-    """Return how large a change is: over the image of the camera that suffers most, after the best rotation; or what
-    the corners show of it."""
+    """Return how large a change is: over the image of the camera that suffers most, after the best rotation; how far a
+    camera that turned on its mount sees what is far away move; or what the corners show of it."""
     shown = float(step @ evidence.information.sum(axis=0) @ step) / evidence.corners
+    turns = [_turned_px2(camera, step[watched.mount(c)][:3]) for c, camera in enumerate(watched.cameras) if c > 0]
     lenses = [float(step @ goal.weight @ step) for goal in lens_goals(watched)]
-    return float(np.sqrt(max([0.0, shown, *lenses])))
+    return float(np.sqrt(max([0.0, shown, *lenses, *turns])))
+
+
+def _turned_px2(camera: Camera, turn: FloatArray) -> float:
+    """Return the mean square, over the image, of how far a turn (3,), rad, moves what is far away."""
+    rays, valid = camera.unproject(grid_pixels(camera.size_px, GOAL_GRID).reshape(-1, 2))
+    by_turn = projection_design(camera, rays[valid])[:, camera.parameters.size :]
+    return float((np.einsum("ikm,k->im", by_turn, turn) ** 2).sum(axis=0).mean())
