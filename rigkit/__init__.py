@@ -93,7 +93,13 @@ if TYPE_CHECKING:
         export_rig,
     )
     from rigkit.workflows.export_cloud import ExportCloudOptions, export_cloud
-    from rigkit.workflows.handeye import HandEyeOptions, PlacedCamera, calibrate_hand_eye, camera_on_board
+    from rigkit.workflows.handeye import (
+        HandEyeCalibration,
+        HandEyeOptions,
+        PlacedCamera,
+        calibrate_hand_eye,
+        camera_on_board,
+    )
     from rigkit.workflows.print_board import MeasuredPrint, PrintOptions, print_board, store_measured_print
     from rigkit.workflows.reconstruct import DatasetReconstruction, ReconstructOptions, reconstruct_dataset
     from rigkit.workflows.reconstruct_scene import SceneOptions, SceneResult, reconstruct_views
@@ -141,6 +147,7 @@ __all__ = [
     "ExportedRig",
     "FolderOptions",
     "HandEye",
+    "HandEyeCalibration",
     "HandEyeOptions",
     "InputError",
     "MatchedPair",
@@ -294,7 +301,14 @@ _NAMES_OF = {
         "export_rig",
     ),
     "rigkit.workflows.export_cloud": ("ExportCloudOptions", "export_cloud"),
-    "rigkit.workflows.handeye": ("HandEyeOptions", "PlacedCamera", "calibrate_hand_eye", "camera_on_board"),
+    "rigkit.workflows.handeye": (
+        "HandEyeCalibration",
+        "HandEyeCalibration",
+        "HandEyeOptions",
+        "PlacedCamera",
+        "calibrate_hand_eye",
+        "camera_on_board",
+    ),
     "rigkit.calibration.hand_eye": ("HandEye", "hand_eye"),
     "rigkit.workflows.print_board": ("MeasuredPrint", "PrintOptions", "print_board", "store_measured_print"),
     "rigkit.workflows.reconstruct": ("DatasetReconstruction", "ReconstructOptions", "reconstruct_dataset"),

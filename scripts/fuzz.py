@@ -15,6 +15,7 @@ import contextlib
 import importlib
 import io
 import json
+import multiprocessing
 import os
 import random
 import resource
@@ -25,15 +26,16 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from types import FrameType
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-import fuzz_api
 import fuzz_seeds
+from fuzz_kinds import KINDS, Kind
+from fuzz_messages import fault_of_message
 from fuzz_mutations import mutated, mutated_arguments
 
 DOCUMENTED = {0, 1, 2, 3}
@@ -42,89 +44,16 @@ PATIENCE = 4.0
 """A process that does not answer for so many times the limit of a case is killed: it hangs where no signal comes in."""
 
 
+POLL_S = 0.05
+PROCESSES = multiprocessing.get_context("forkserver")
+"""A process that is forked where OpenCV has threads would wait for those of its parent for ever."""
+PROCESSES.set_forkserver_preload(["fuzz"])
+DRAWN = {"api": "fuzz_api", "requests": "fuzz_requests"}
+"""Classes without files, and the modules whose `run_case(seed, number)` draws and runs a case."""
+
+
 class TooLong(BaseException):
     """The case is over its time; no handler of Exception may keep it."""
-
-
-@dataclass(frozen=True)
-class Kind:
-    """A class of input: the file that is changed, and what reads it ("{case}", "{out}"); "module:function" is called.
-
-    Without a file the words of the command, or the arguments of a call, are changed.
-    """
-
-    file: str | None
-    readers: tuple[tuple[str, ...], ...]
-    names_file: bool = True
-
-
-def _camera_file(name: str, *more: tuple[str, ...]) -> Kind:
-    return Kind(name, (("export", "{case}", "--to", "rigkit", "-o", "{out}/new.json"), *more))
-
-
-def _board_file(name: str) -> Kind:
-    return Kind(name, (("rigkit.io.board_file:load_board", "{case}"), ("board", "{case}", "-o", "{out}/b")))
-
-
-KINDS: dict[str, Kind] = {
-    "png": Kind("image.png", (("rigkit.io.images:read_image", "{case}"), ("detect", "-j", "1", "{case}"))),
-    "png16": Kind("deep.png", (("rigkit.io.images:read_image", "{case}"),)),
-    "jpg": Kind("image.jpg", (("rigkit.io.images:read_image", "{case}"), ("detect", "-j", "1", "{case}"))),
-    "tif": Kind("image.tif", (("rigkit.io.images:read_image", "{case}"),)),
-    "bmp": Kind("image.bmp", (("rigkit.io.images:read_image", "{case}"),)),
-    "pgm": Kind("image.pgm", (("rigkit.io.images:read_image", "{case}"),)),
-    "webp": Kind("image.webp", (("rigkit.io.images:read_image", "{case}"),)),
-    "board": _board_file("board.toml"),
-    "aprilgrid": _board_file("aprilgrid.toml"),
-    "circles": _board_file("circles.toml"),
-    "session": Kind("session.toml", (("rigkit.io.session:load_session", "{case}"),)),
-    "rig-session": Kind("rig-session.toml", (("rigkit.io.rig_session:load_rig_session", "{case}"),)),
-    "dataset": Kind("dataset.toml", (("rigkit.io.manifest:load_dataset", "{case}"),)),
-    "study": Kind("study.toml", (("rigkit.io.study_file:load_study", "{case}"),)),
-    "calibration": Kind(
-        "calibration.json",
-        (
-            ("rigkit.io.calibration_file:load_calibration", "{case}"),
-            ("diff", "{case}", "calibration.json"),
-            ("plan", "{case}", "-n", "1"),
-            ("certify", "{case}", "--length", "200", "--distance", "900"),
-            ("export", "{case}", "--to", "opencv", "-o", "{out}/new.yaml"),
-            ("rectify", "image.png", "--camera", "{case}", "-o", "{out}/new.png"),
-        ),
-    ),
-    "rig": Kind(
-        "rig.json",
-        (
-            ("rigkit.io.rig_file:load_saved_rig", "{case}"),
-            ("diff", "{case}", "rig.json"),
-            ("certify", "{case}", "--depth", "200", "--distance", "900"),
-            ("export", "{case}", "--to", "kalibr", "-o", "{out}/new.yaml"),
-            ("export", "{case}", "--to", "opencv", "-o", "{out}/new.yaml"),
-            ("rectify", "image.png", "image.jpg", "--rig", "{case}", "-o", "{out}/new.png"),
-        ),
-    ),
-    "board-rigs": Kind("board-rigs.json", (("rigkit.io.rig_file:load_board_rigs", "{case}"),)),
-    "corners-json": Kind("corners.json", (("rigkit.io.corners_file:read_corners", "{case}"),)),
-    "corners-csv": Kind("corners.csv", (("rigkit.io.corners_file:read_corners", "{case}"),)),
-    "corners-vnl": Kind("corners.vnl", (("fuzz_api:read_vnl", "{case}"),)),
-    "truth-csv": Kind("truth.csv", (("fuzz_api:read_truth", "{case}"),)),
-    "pairs-csv": Kind("pairs.csv", (("rigkit.io.correspondences:read_correspondences", "{case}"),)),
-    "pairs-npz": Kind("pairs.npz", (("rigkit.io.correspondences:read_correspondences", "{case}"),)),
-    "ply": Kind("cloud.ply", (("rigkit.io.ply:read_ply", "{case}"),)),
-    "opencv": _camera_file("opencv.yaml", ("export", "{case}", "--from", "opencv", "-o", "{out}/new.json")),
-    "kalibr": _camera_file("kalibr.yaml", ("rigkit.workflows.camera_files:import_camera", "{case}")),
-    "chain": Kind("chain.yaml", (("export", "{case}", "--to", "mrcal", "-o", "{out}/new.cameramodel"),)),
-    "opencv-stereo": Kind("stereo.yaml", (("export", "{case}", "--to", "kalibr", "-o", "{out}/new.yaml"),)),
-    "ros": _camera_file("ros.yaml", ("export", "{case}", "--from", "ros", "-o", "{out}/new.json")),
-    "colmap": _camera_file("cameras.txt"),
-    "mrcal": _camera_file("lens.cameramodel"),
-    "mrcal-spline": _camera_file("spline.cameramodel"),
-    "ocamcalib": _camera_file("calib_results.txt"),
-    "py-ocamcalib": Kind("ocam.json", (("fuzz_api:read_py_ocam", "{case}"),)),
-    "commands": Kind(None, fuzz_seeds.COMMANDS, names_file=False),
-    "api": Kind(None, (), names_file=False),
-}
-"""Every class of input."""
 
 
 def case_of(kind: Kind, label: str, seed: int, number: int, seeds: Path, place: Path) -> list[str]:
@@ -133,8 +62,8 @@ def case_of(kind: Kind, label: str, seed: int, number: int, seeds: Path, place: 
     The first case of each reader is sound: nothing is changed.
     """
     rng = random.Random(f"{seed}/{label}/{number}")
-    if label == "api":
-        return [f"fuzz_api:case_{seed}_{number}"]
+    if label in DRAWN:
+        return [f"{DRAWN[label]}:case_{seed}_{number}"]
     shutil.copytree(seeds, place)
     (place / "out").mkdir()
     sound = number < len(kind.readers)
@@ -161,13 +90,14 @@ def fault_of(words: Sequence[str], names_file: str | None, sound: bool) -> str |
             if ":" in words[0] and words[0].partition(":")[0].replace(".", "").isidentifier():
                 module, _, function = words[0].partition(":")
                 if function.startswith("case_"):
-                    fuzz_api.run_case(*map(int, function.split("_")[1:]))
+                    importlib.import_module(module).run_case(*map(int, function.split("_")[1:]))
                     return None
                 getattr(importlib.import_module(module), function)(*map(Path, words[1:]))
                 return None
             code = main(list(words))
     except RigkitError as error:
-        return f"refused, though sound: {error}" if sound else _unnamed(str(error), names_file)
+        said = f"refused, though sound: {error}" if sound else None
+        return said or fault_of_message(str(error), names_file, words)
     except SystemExit as stop:
         return None if stop.code in (0, 2) else f"SystemExit {stop.code}"
     except TooLong:
@@ -175,27 +105,20 @@ def fault_of(words: Sequence[str], names_file: str | None, sound: bool) -> str |
     except BaseException as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
         return f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})"
-    said = err.getvalue().strip()
-    if code not in DOCUMENTED or (sound and code and names_file is not None):
-        lines = said.splitlines()
-        return f"exit {code}: " + " | ".join(line.strip() for line in lines[-5:])
-    return _unnamed(said, names_file) if code in (2, 3) else None
-
-
-def _unnamed(message: str, name: str | None) -> str | None:
-    """Return a fault for a message that does not name the file."""
-    if name is not None and name not in message:
-        return f"message does not name the file: {message[:300]}"
-    return None
+    lines = [line.strip() for line in err.getvalue().strip().splitlines()]
+    if code not in DOCUMENTED or (sound and code):
+        return f"exit {code}: " + " | ".join(lines[-5:])
+    return fault_of_message(" | ".join(lines), names_file, words) if code in (2, 3) else None
 
 
 def _command(label: str, words: Sequence[str], place: Path) -> str:
     """Return the shell line that shows a case again."""
     scripts = Path(__file__).resolve().parent
     head = f"cd {shlex.quote(str(place))} && " if place.is_dir() else ""
-    if label == "api":
+    if label in DRAWN:
         seed, number = words[0].split("_")[-2:]
-        return f"cd {shlex.quote(str(scripts))} && python -c 'import fuzz_api; fuzz_api.run_case({seed}, {number})'"
+        code = f"import {DRAWN[label]} as kind; kind.run_case({seed}, {number})"
+        return f"cd {shlex.quote(str(scripts))} && python -c {shlex.quote(code)}"
     if ":" in words[0]:
         module, _, function = words[0].partition(":")
         code = f"from {module} import {function}; {function}({', '.join(map(repr, words[1:]))})"
@@ -203,8 +126,9 @@ def _command(label: str, words: Sequence[str], place: Path) -> str:
     return f"{head}rigkit {shlex.join(words)}"
 
 
-def run_cases(kind: Kind, label: str, args: argparse.Namespace, start: int, seeds: Path, log: Path) -> None:
+def run_cases(label: str, args: argparse.Namespace, start: int, seeds: Path, log: Path) -> None:
     """Run the cases from number `start` on in this process, noting each before it begins and each fault in `log`."""
+    kind = KINDS[label]
     limit = int(args.memory_gb * 2**30)
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -222,12 +146,12 @@ def run_cases(kind: Kind, label: str, args: argparse.Namespace, start: int, seed
             place = args.keep / f"{label}-{args.seed}-{number}"
             shutil.rmtree(place, ignore_errors=True)
             words = case_of(kind, label, args.seed, number, seeds, place)
-            notes.write(json.dumps({"number": number, "words": words}) + "\n")
+            notes.write(json.dumps({"number": number, "words": words, "mb": _most_mb()}) + "\n")
             os.chdir(place if place.is_dir() else args.keep)
             case = next((w for w in words if w.startswith("case.")), None) if kind.names_file else None
             signal.setitimer(signal.ITIMER_PROF, args.seconds)
             try:
-                fault = fault_of(words, case, number < len(kind.readers))
+                fault = fault_of(words, case, sound=number < len(kind.readers) and not kind.judged)
             except TooLong:
                 fault = "takes too long"
             signal.setitimer(signal.ITIMER_PROF, 0.0)
@@ -236,26 +160,25 @@ def run_cases(kind: Kind, label: str, args: argparse.Namespace, start: int, seed
                 shutil.rmtree(place, ignore_errors=True)
             else:
                 notes.write(json.dumps({"number": number, "fault": fault, "words": words}) + "\n")
+        notes.write(json.dumps({"number": args.count, "mb": _most_mb()}) + "\n")
 
 
-def run_class(label: str, args: argparse.Namespace, seeds: Path) -> list[tuple[int, str, str]]:
-    """Return number, fault and command of the findings of a class; a process that dies or hangs is one, and the rest
-    goes on in a new one."""
+def _most_mb() -> int:
+    """Return the most memory that this process had."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+
+
+def run_class(label: str, args: argparse.Namespace, seeds: Path) -> tuple[list[tuple[int, str, str]], int]:
+    """Return number, fault and command of the findings of a class, and the most memory in MB; a process that dies or
+    hangs is a finding, and the rest goes on in a new one."""
     log = args.keep / f"{label}-{args.seed}.jsonl"
     log.unlink(missing_ok=True)
     log.touch()
     start = 0
     died: dict[int, str] = {}
     while start < args.count:
-        child = os.fork()
-        if child == 0:
-            code = 1
-            try:
-                run_cases(KINDS[label], label, args, start, seeds, log)
-                code = 0
-            except BaseException:
-                (args.keep / f"{label}-harness.txt").write_text(traceback.format_exc())
-            os._exit(code)
+        child = PROCESSES.Process(target=run_cases, args=(label, args, start, seeds, log))
+        child.start()
         reason = _wait(child, log, PATIENCE * args.seconds)
         if reason is None:
             break
@@ -263,28 +186,31 @@ def run_class(label: str, args: argparse.Namespace, seeds: Path) -> list[tuple[i
         last = lines[-1]["number"] if lines else start
         died[last] = reason
         start = last + 1
+    notes = list(map(json.loads, log.read_text().splitlines()))
     findings = {}
-    for line in map(json.loads, log.read_text().splitlines()):
-        number = line["number"]
-        fault = line.get("fault") or died.get(number)
+    for note in notes:
+        number = note["number"]
+        fault = note.get("fault") or died.get(number)
         if fault:
             place = args.keep / f"{label}-{args.seed}-{number}"
-            findings[number] = (number, fault, _command(label, line["words"], place))
-    return list(findings.values())
+            findings[number] = (number, fault, _command(label, note.get("words", ["?"]), place))
+    return list(findings.values()), max((note.get("mb", 0) for note in notes), default=0)
 
 
-def _wait(child: int, log: Path, patience: float) -> str | None:
+def _wait(child: ForkServerProcess, log: Path, patience: float) -> str | None:
     """Wait for the process; return how it died, None where it ended well. One that notes nothing is killed."""
+    size, waited = -1, 0.0
     while True:
-        done, status = os.waitpid(child, os.WNOHANG)
-        if done:
-            code = os.waitstatus_to_exitcode(status)
+        child.join(POLL_S)
+        code = child.exitcode
+        if code is not None:
             return None if code == 0 else (f"killed by signal {-code}" if code < 0 else "the harness itself failed")
-        if time.time() - max(log.stat().st_mtime, log.stat().st_ctime) > patience:
-            os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
+        # Counted by looks, not by the clock: a machine that was asleep is no process that hangs.
+        size, waited = log.stat().st_size, waited + POLL_S if log.stat().st_size == size else 0.0
+        if waited > patience:
+            child.kill()
+            child.join()
             return "hangs where no signal comes in"
-        time.sleep(0.05)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -308,9 +234,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     total = 0
     for label in labels:
         begun = time.monotonic()
-        findings = run_class(label, args, seeds)
+        findings, most_mb = run_class(label, args, seeds)
         total += len(findings)
-        print(f"{label}: {args.count} cases, {len(findings)} findings, {time.monotonic() - begun:.0f} s", flush=True)
+        took, counts = time.monotonic() - begun, f"{args.count} cases, {len(findings)} findings"
+        print(f"{label}: {counts}, {took:.0f} s, at most {most_mb} MB", flush=True)
         for number, fault, command in findings:
             print(f"  {label} {number}: {fault}\n    {command}", flush=True)
     print(f"{total} findings; seed {args.seed}; files in {args.keep}")
@@ -318,5 +245,4 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    _run: Callable[[], int] = main
-    sys.exit(_run())
+    sys.exit(main())

@@ -1,4 +1,4 @@
-"""Calls of the library with arguments that make no sense, and readers that need more than a path, for `fuzz.py`."""
+"""Calls of the library with arguments that make no sense, for `fuzz.py`."""
 
 from __future__ import annotations
 
@@ -20,30 +20,11 @@ import rigkit
 from rigkit.affine.correspondences import Correspondences
 from rigkit.core.boards import Board
 from rigkit.core.errors import RigkitError
-from rigkit.interop.ocamcalib import read_py_ocamcalib
-from rigkit.io.corners_file import read_corners
-from rigkit.io.reading import read_text
-from rigkit.io.truth_csv import load_truth_csv
 
 SMALL = Board("small", 5, 4, 30.0, 30.0)
 NUMBERS = (float("nan"), float("inf"), -float("inf"), 0, -1, 1e300, -1e300, 1e-320, 0.5, 10**30, 2**63)
 
 Call = tuple[Callable[..., object], dict[str, Any]]
-
-
-def read_vnl(path: Path) -> None:
-    """Read corners of mrgingham, which are about one board."""
-    read_corners(path, [SMALL])
-
-
-def read_truth(path: Path) -> None:
-    """Read a truth table about boards that are there."""
-    load_truth_csv(path, {"first": (Board("wall", 5, 4, 30.0, 30.0), Board("floor", 5, 4, 30.0, 30.0))})
-
-
-def read_py_ocam(path: Path) -> None:
-    """Read a camera of py-OCamCalib."""
-    read_py_ocamcalib(read_text(path), (640, 480), str(path))
 
 
 def _calls() -> list[Call]:

@@ -22,6 +22,7 @@ VALUES = (
 WORDS = (
     '""', '" "', '"\\u0000"', '"a\\nb"', '"' + "x" * 300 + '"', '"../../.."', '"."', "[]", "1", "null", "true", "{}",
     '"=1+1"', '"<script>"', '"\u001b[31m"', '"\\ud800"', '"case"', '"*"', '"/proc/self/mem"', '"/dev/zero"', "nan",
+    '"' + 140_000 * "x" + '"',
 )  # fmt: skip
 """In place of a string or a key."""
 ARGUMENTS = (

@@ -1,4 +1,4 @@
-"""The good files that `fuzz.py` damages, one of each kind that rigkit reads, and good commands on them."""
+"""The good files that `fuzz.py` damages, one of each kind that rigkit reads."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import cv2
+import fuzz_media
 import numpy as np
 
 from rigkit.affine.correspondences import Correspondences
@@ -135,46 +136,6 @@ distances = [{ a = "wall.centre", b = "floor", value_mm = 412.5, sigma_mm = 1.0,
 """,
 }
 
-COMMANDS: tuple[tuple[str, ...], ...] = (
-    ("detect", "-j", "1", "--board", "floor.toml", "image.png", "-o", "new.csv", "--min-corners", "9", "--json"),
-    ("detect", "-j", "1", "--camera", "calibration.json", "--board", "floor.toml", "image.png", "--overlay", "out"),
-    ("calibrate", "session.toml", "-o", "new.json", "--no-cache", "--json"),
-    ("diff", "calibration.json", "calibration.json", "-o", "new.png", "--force", "--json"),
-    ("certify", "calibration.json", "--length", "200", "--distance", "900", "--distance-sigma", "1", "--limit", "2"),
-    ("certify", "rig.json", "--angle", "200", "--distance", "900", "--confidence", "95", "--cameras", "left", "right"),
-    ("rectify", "image.png", "--camera", "calibration.json", "-o", "new.png", "--hfov-deg", "70", "--size", "80x60"),
-    ("rectify", "image.png", "--camera", "calibration.json", "-o", "new.png", "--projection", "cylindrical",
-     "--yaw-deg", "10", "--pitch-deg", "5", "--roll-deg", "3"),
-    ("rectify", "pairs", "--camera", "calibration.json", "-o", "new", "--maps", "new.npz", "--interpolation", "linear"),
-    ("plan", "calibration.json", "-n", "1", "--length", "200", "--distance", "900", "--near", "200", "--field", "80"),
-    ("plan", "--lens", "60", "--size", "320x240", "--board", "5x4x30", "--board", "floor.toml", "--views", "4",
-     "--sigma-px", "0.2", "--model", "brown", "--far", "2000", "--json"),
-    ("detect", "-j", "1", "--board", "aprilgrid.toml", "--board", "circles.toml", "image.png", "image.jpg"),
-    ("calibrate", "pairs", "image.jpg", "--board", "5x4x30", "--model", "pinhole", "-o", "new.json", "--no-cache"),
-    ("calibrate", "session.toml", "--corners", "corners.csv", "-o", "new.json", "--export", "opencv", "ros"),
-    ("reconstruct", "--images", "image.png", "image.jpg", "--camera", "calibration.json", "--sparse", "-o", "new",
-     "--pose-type", "general", "--baseline-mm", "100", "--no-pictures"),
-    ("reconstruct", "--correspondences", "pairs.csv", "--camera", "calibration.json", "--camera2", "opencv.yaml", "-o",
-     "new", "--level-sigma-deg", "0.2", "--pose-type", "planar", "--no-pictures"),
-    ("export", "rig.json", "--to", "mrcal", "-o", "new.cameramodel"),
-    ("export", "rig.json", "--to", "colmap", "-o", "new.json"),
-    ("export", "stereo.yaml", "--to", "ros", "-o", "new.yaml"),
-    ("fetch", "bumblebee2", "-o", "new"),
-    ("board", "aprilgrid.toml", "--paper", "a4", "-o", "new"),
-    ("rectify", "image.png", "image.jpg", "--rig", "rig.json", "-o", "new.png", "--names", "left", "right"),
-    ("reconstruct", "dataset.toml", "-o", "new", "-j", "1", "--method", "3SDIR", "--pair", "first"),
-    ("validate", "dataset.toml", "-o", "new", "-j", "1", "--no-pictures", "--no-crosscheck"),
-    ("init", "pairs", "--name", "small", "--square-mm", "30", "--calibration", "calibration.json", "-o", "new.toml"),
-    ("export", "rig.json", "--to", "kalibr", "-o", "new.yaml"),
-    ("export", "opencv.yaml", "--from", "opencv", "--to", "mrcal", "-o", "new.cameramodel"),
-    ("export", "dataset.toml", "--to", "ply", "--pair", "first", "--method", "3SDIR", "-o", "new.ply"),
-    ("board", "9x6", "--square-mm", "25", "--paper", "a4", "-o", "new"),
-    ("board", "7x5", "--square-mm", "25", "--charuco", "DICT_4X4_50", "--marker-mm", "18", "--first-marker", "2",
-     "-o", "new"),
-    ("board", "floor.toml", "--ruler-x-mm", "180.2", "--ruler-y-mm", "150.1", "--sigma-mm", "0.1", "--force"),
-)  # fmt: skip
-"""What is tried with other words; none of them takes long as it stands here."""
-
 
 def write_seeds(folder: Path) -> None:
     """Write the good files into the new folder."""
@@ -184,13 +145,16 @@ def write_seeds(folder: Path) -> None:
     plain = TOMLS["board.toml"].split("dictionary")[0].replace("small", "floor")
     (folder / "floor.toml").write_text(plain)
     (folder / "study.toml").write_bytes((ROOT / "datasets/synthetic/special.toml").read_bytes())
-    _write_images(folder)
+    write_images(folder)
     _write_calibrations(folder)
     _write_cameras(folder)
     _write_tables(folder)
+    fuzz_media.write_media(folder)
+    (folder / "other").mkdir()
+    (folder / "other" / "dataset.toml").write_text(TOMLS["dataset.toml"].replace('"small"', '"other"', 1))
 
 
-def _write_images(folder: Path) -> None:
+def write_images(folder: Path) -> None:
     """A chessboard with a soft edge and noise, in every kind of image that is read."""
     v, u = np.mgrid[: SIZE_PX[1], : SIZE_PX[0]]
     column, row = (u - 20) // SQUARE_PX, (v - 12) // SQUARE_PX

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rigkit.core.errors import InputError
+from rigkit.core.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
     from rigkit.core.patterns.base import Pattern
@@ -74,28 +74,32 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _identify(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import progress_on_stderr
+    from rigkit.cli.console import note, progress_on_stderr
     from rigkit.io.board_file import board_text
-    from rigkit.io.files import write_atomic
+    from rigkit.io.files import ensure_writable, write_atomic
     from rigkit.workflows.detect import images_in
     from rigkit.workflows.identify_board import identify_board
 
     if args.square_mm is not None and not args.square_mm > 0.0:
         raise InputError(f"board: --square-mm {args.square_mm:g} must be positive")
-    found = identify_board(list(images_in(args.images)), progress=progress_on_stderr())
+    path = None if args.output is None else Path(args.output).with_suffix(".toml")
+    if path is not None and args.square_mm is None:
+        raise InputError("board identify: images cannot tell the scale; give --square-mm, the side of a square or tag")
+    images = list(images_in(args.images))
+    if path is not None:
+        ensure_writable(path, force=args.force, inputs=images)
+    found = identify_board(images, progress=progress_on_stderr())
     board = found.board
     print(f"{board.pattern.type}: {board.describe()}".replace("s 1 x 1 mm", "s of unknown size"))
     print(f"seen in {len(found.seen)} of {len(found.looked_at)} images")
     print(f"--board {found.words}   (MM: the side of a {board.pattern.size_word}, measured with a rule)")
-    if args.output is not None:
-        if args.square_mm is None:
-            word = board.pattern.size_word
-            raise InputError(f"board identify: images cannot tell the scale; give --square-mm, the side of a {word}")
-        path = Path(args.output).with_suffix(".toml")
+    if path is not None:
         text = board_text(board.with_squares(args.square_mm, args.square_mm), "as seen in images", path)
         write_atomic(path, text, force=args.force)
         print(path)
-    return 0
+    for error in found.unreadable:
+        note(f"left out: {error}")
+    return ExitCode.BAD_INPUT if found.unreadable else ExitCode.WELL
 
 
 def _store_measured(args: argparse.Namespace) -> int:

@@ -1,4 +1,5 @@
-"""`rigkit check CALIBRATION IMAGES`: does it still hold, or what moved? Exit code 1 where it does not."""
+"""`rigkit check CALIBRATION IMAGES`: does it still hold, or what moved? Exit code 1 where it does not, 2
+where it does, but an image could not be read."""
 
 from __future__ import annotations
 
@@ -88,6 +89,7 @@ def run(args: argparse.Namespace) -> int:
                 "rms_fixed_px": check.rms_fixed_px,
                 "expected_px": check.expected_px,
                 "left_out": [list(entry) for entry in done.left_out],
+                "unreadable": list(done.unreadable),
             }
         )
     else:
@@ -98,6 +100,10 @@ def run(args: argparse.Namespace) -> int:
             print(tables_to_text([check_table(check)]))
     for image, reason in done.left_out:
         note(f"left out: {image}: {reason}")
+    for reason in done.unreadable:
+        note(f"left out: {reason}")
     for path in done.written:
         note(f"{path} written")
-    return ExitCode.WELL if check.holds else ExitCode.CHECK_FAILED
+    if not check.holds:
+        return ExitCode.CHECK_FAILED
+    return ExitCode.BAD_INPUT if done.unreadable else ExitCode.WELL

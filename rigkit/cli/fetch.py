@@ -44,7 +44,15 @@ def run(args: argparse.Namespace) -> int:
         for name, one in known.items() if not args.json else ():
             print(f"{name}: {one.about} ({one.licence}; {len(one.urls)} of {len(one.sha256)} files fetchable)")
         return ExitCode.WELL
-    done = [fetch_public_set(known[name], args.output, progress=progress_on_stderr()) for name in args.names]
+    done, failed = [], False
+    for name in args.names:
+        try:
+            done.append(fetch_public_set(known[name], args.output, progress=progress_on_stderr()))
+        except InputError as error:
+            if len(args.names) == 1:
+                raise
+            note(f"{name}: {error}")
+            failed = True
     if args.json:
         print_json(
             {d.described.name: {"folder": str(d.folder), "present": len(d.present), "missing": d.missing} for d in done}
@@ -57,4 +65,6 @@ def run(args: argparse.Namespace) -> int:
                 f"{d.described.name}: {len(d.missing)} files are not fetchable yet, such as '{d.missing[0]}'; "
                 f"get them from {d.described.source}"
             )
+    if failed:
+        return ExitCode.BAD_INPUT
     return ExitCode.CHECK_FAILED if any(d.missing for d in done) else ExitCode.WELL

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from rigkit.core.errors import ExitCode
+
 HELP = "where a camera sits on a robot's hand, or before it, from the robot's poses and images of a board"
 
 
@@ -22,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     import numpy as np
 
-    from rigkit.cli.console import pose_in_words, progress_on_stderr
+    from rigkit.cli.console import note, pose_in_words, progress_on_stderr
     from rigkit.workflows.handeye import POSE_NAMES, HandEyeOptions, calibrate_hand_eye
 
     options = HandEyeOptions(
@@ -33,7 +35,8 @@ def run(args: argparse.Namespace) -> int:
         output=args.output,
         force=args.force,
     )
-    result = calibrate_hand_eye(args.poses, args.images, options, progress=progress_on_stderr())
+    done = calibrate_hand_eye(args.poses, args.images, options, progress=progress_on_stderr())
+    result = done.result
     turns, moves = result.sigmas()
     first, second = POSE_NAMES[args.board_on_hand]
     print(pose_in_words(first, result.cam_from_mount, turns[0], moves[0]))
@@ -41,4 +44,6 @@ def run(args: argparse.Namespace) -> int:
     print(f"{len(result.image_rms_px)} images, RMS {result.rms_px:.3f} px")
     for image, mismatch in result.left_out.items():
         print(f"left out: '{image}' turned otherwise than the robot, by {np.degrees(mismatch):.1f} degrees")
-    return 0
+    for error in done.unreadable:
+        note(f"left out: {error}")
+    return ExitCode.BAD_INPUT if done.unreadable else ExitCode.WELL

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rigkit.core.errors import ExitCode
+from rigkit.core.errors import ExitCode, printable
 
 __all__ = ["HELP", "add_arguments", "run"]
 
@@ -40,7 +40,9 @@ def run(args: argparse.Namespace) -> int:
     else:
         for entry in entries:
             heat = "" if entry.temperature_c is None else f", {entry.temperature_c:g} C"
-            print(f"{entry.date} {entry.kind} of {entry.source}{heat}: p = {entry.chance:.3g}, {entry.verdict}")
+            print(
+                printable(f"{entry.date} {entry.kind} of {entry.source}{heat}: p = {entry.chance:.3g}, {entry.verdict}")
+            )
     for path in written:
         note(f"{path} written")
     return ExitCode.WELL

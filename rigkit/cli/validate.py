@@ -100,6 +100,9 @@ def _many(args: argparse.Namespace) -> int:
     progress = progress_on_stderr()
     done = validate_datasets(args.dataset, _options(args, common), jobs=jobs, cluster=args.cluster, progress=progress)
     print(tables_to_json([done.table]) if args.json else tables_to_text([done.table]))
+    for path, outcome in zip(args.dataset, done.outcomes, strict=True):
+        if outcome.error:
+            note(f"'{path}': {outcome.error}")
     note(f"{common['output'] / 'summary.html'}")
     return done.code
 

@@ -16,6 +16,8 @@ from rigkit.coach.keeper import Keeper
 from rigkit.coach.look import Glance, glance_at
 from rigkit.coach.rig import RigGuide
 from rigkit.core.errors import InputError
+from rigkit.io.image_size import announced_size
+from rigkit.io.images import quiet_opencv
 
 __all__ = ["Coach", "decoded"]
 
@@ -31,10 +33,18 @@ Image = NDArray[Any]
 def decoded(data: bytes) -> Image:
     """Return the picture (H, W, 3) RGB in an upload, as the sensor has it, whatever way up it was held; raises
     InputError where it is none, or too large."""
-    how = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    picture = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), how) if data else None
-    if picture is None or max(picture.shape[:2]) > MAX_PICTURE_PX:
-        raise InputError("coach: that is no picture")
+    # Before a decoder makes room for them.
+    size_px = announced_size(data)
+    if size_px is None or max(size_px) > MAX_PICTURE_PX:
+        raise InputError(f"coach: that is no picture of at most {MAX_PICTURE_PX} px a side; send a PNG or JPEG")
+    try:
+        with quiet_opencv():
+            how = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+            picture = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), how)
+    except cv2.error:
+        picture = None
+    if picture is None:
+        raise InputError("coach: the picture is damaged; send it again")
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +15,14 @@ from numpy.typing import NDArray
 from rigkit.core.errors import InputError
 from rigkit.io.files import write_atomic
 from rigkit.io.images import read_image
+from rigkit.io.reading import read_text
 
 __all__ = ["FRAME_FOLDER", "ONLY", "Keeper", "folder_of"]
 
+_log = logging.getLogger(__name__)
+
 FRAME_NAME = "frame-{:04d}.png"
+KEPT = re.compile(r"frame-(\d{4,6})\.png")
 FRAME_FOLDER = "images"
 ONLY = "camera"
 """What a camera is called that is the only one."""
@@ -42,7 +48,7 @@ class Keeper:
         for place in self._places:
             place.mkdir(parents=True, exist_ok=True)
         for path, text in files.items():
-            if path.exists() and path.read_text(encoding="utf-8") != text:
+            if path.exists() and read_text(path, "coach:") != text:
                 raise InputError(f"coach: '{path}' says something else; give another folder, or the same boards")
             if not path.exists():
                 write_atomic(path, text)
@@ -50,18 +56,23 @@ class Keeper:
     @property
     def frames(self) -> list[str]:
         """The names of the frames taken, in order."""
-        pattern = FRAME_NAME.format(0).replace("0000", "*")
-        return sorted({path.name for place in self._places for path in place.glob(pattern)})
+        found = {path.name for place in self._places for path in place.iterdir() if KEPT.fullmatch(path.name)}
+        return sorted(found, key=_number)
 
-    def images(self) -> list[tuple[str, list[NDArray[Any]]]]:
-        """Return the frames taken before that are there of every camera, by name."""
-        whole = [name for name in self.frames if all((place / name).exists() for place in self._places)]
-        return [(name, [read_image(place / name) for place in self._places]) for name in whole]
+    def images(self) -> Iterator[tuple[str, list[NDArray[Any]]]]:
+        """Yield the frames taken before that are there of every camera, by name; one of which an image cannot be read
+        is told of, and left out."""
+        for name in self.frames:
+            if all((place / name).exists() for place in self._places):
+                try:
+                    yield name, [read_image(place / name) for place in self._places]
+                except InputError as error:
+                    _log.warning("left out: %s", error)
 
     def keep(self, images: Sequence[NDArray[Any]]) -> str:
         """Write a frame, every image whole or not at all, and return its name."""
         taken = self.frames
-        name = FRAME_NAME.format(1 + (int(Path(taken[-1]).stem.rsplit("-", 1)[1]) if taken else 0))
+        name = FRAME_NAME.format(1 + (_number(taken[-1]) if taken else 0))
         for place, image in zip(self._places, images, strict=True):
             bgr = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
             write_atomic(place / name, np.asarray(cv2.imencode(".png", bgr)[1]).tobytes())
@@ -73,3 +84,9 @@ class Keeper:
             for path in (place / name for place in self._places):
                 if path.exists():
                     path.rename(path.with_suffix(".png.dropped"))
+
+
+def _number(name: str) -> int:
+    match = KEPT.fullmatch(name)
+    assert match is not None
+    return int(match[1])

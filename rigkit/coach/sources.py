@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -24,13 +25,14 @@ ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"}
 
 Frame = list[NDArray[Any]]
 """An image a camera, taken together."""
+_log = logging.getLogger(__name__)
 
 
 def watched_frames(folders: Sequence[Path], *, until_idle_s: float = float("inf")) -> Iterator[Frame]:
     """Yield every picture in a folder, those to come as well, by name; of several folders, one a camera, those of one
     name, or of one number, as soon as all are there. Ends when none has come for `until_idle_s`.
 
-    Raises InputError where there is no such folder. What is no picture is left alone.
+    Raises InputError where there is no such folder, or it is gone. A picture that cannot be read is told of.
     """
     for folder in folders:
         if not folder.is_dir():
@@ -39,20 +41,35 @@ def watched_frames(folders: Sequence[Path], *, until_idle_s: float = float("inf"
     last = time.monotonic()
     while time.monotonic() - last < until_idle_s:
         for name, paths in _moments(folders).items():
-            if name in seen or any(time.time() - path.stat().st_mtime < SETTLED_S for path in paths):
+            if name in seen or not all(map(_settled, paths)):
                 continue
             seen.add(name)
             last = time.monotonic()
             try:
                 yield [read_image(path) for path in paths]
-            except InputError:
-                continue
+            except InputError as error:
+                _log.warning("left out: %s", error)
         time.sleep(POLL_S)
+
+
+def _settled(path: Path) -> bool:
+    """Say whether nobody writes the picture any more; one that is gone while we look is none."""
+    try:
+        return time.time() - path.stat().st_mtime >= SETTLED_S
+    except OSError:
+        return False
+
+
+def _pictures(folder: Path) -> list[Path]:
+    try:
+        return sorted(path for path in folder.iterdir() if path.suffix.lower() in ENDINGS)
+    except OSError as error:
+        raise InputError(f"coach: '{folder}' cannot be read any more: {error.strerror}; start again") from error
 
 
 def _moments(folders: Sequence[Path]) -> dict[str, list[Path]]:
     """Return the pictures of every moment that all cameras have, one a camera, by its name and in its order."""
-    found = [sorted(p for p in folder.iterdir() if p.suffix.lower() in ENDINGS) for folder in folders]
+    found = [_pictures(folder) for folder in folders]
     if len(found) == 1:
         return {path.name: [path] for path in found[0]}
     by_path = {str(k): {path.name: path for path in own} for k, own in enumerate(found)}

@@ -73,7 +73,9 @@ def read_ocamcalib(text: str, name: str = "calib_results.txt") -> tuple[Scaramuz
         raise InputError(f"'{name}': {len(rows)} lines of numbers, expected 5; is it OCamCalib's calib_results.txt?")
     ss_row = _line(rows[0], name, "polynomial")
     if ss_row[0] != ss_row.size - 1:
-        raise InputError(f"'{name}': {ss_row[0]:g} terms of the polynomial announced, {ss_row.size - 1} given")
+        raise InputError(
+            f"'{name}': {ss_row[0]:g} terms of the polynomial announced, {ss_row.size - 1} given; is the file whole?"
+        )
     row, column = _line(rows[2], name, "center", 2)
     c, d, e = _line(rows[3], name, "affine parameters", 3)
     height, width = image_size(_line(rows[4], name, "image size", 2), name, "image size")
@@ -111,7 +113,7 @@ def _from_ocam(
     """Build from a forward polynomial and (u, v) = affine (right, down) + centre; return also cam_from_ocam."""
     if polynomial.size - 1 not in DEGREES:
         degrees = f"{DEGREES[0]} to {DEGREES[-1]}"
-        raise InputError(f"'{name}': a polynomial of degree {polynomial.size - 1}; rigkit takes {degrees}")
+        raise InputError(f"'{name}': a polynomial of degree {polynomial.size - 1}; it must be of {degrees}")
     if polynomial[0] <= 0.0 or polynomial[1] != 0.0:
         raise InputError(f"'{name}': the polynomial must look forward and have no linear term; is it OCamCalib's?")
     if not abs(np.linalg.det(affine)) > 0.0:

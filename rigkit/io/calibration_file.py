@@ -183,7 +183,7 @@ def camera_from_json(data: Any, path: str | Path) -> Camera:
         width, height = (whole(v) for v in data["size_px"])
         values = np.array([real(v) for v in data["parameters"].values()])
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"'{path}': camera: {error}; size_px is [width, height], parameters are numbers") from error
+        raise InputError(f"'{path}': camera: {error}; size_px must be [width, height], parameters numbers") from error
     try:
         camera = camera_model(str(data["model"]))((width, height), values)
     except InputError as error:

@@ -23,7 +23,7 @@ from rigkit.core.errors import InputError
 from rigkit.io.corner_cache import kept_corners
 from rigkit.io.files import write_atomic
 from rigkit.io.json_reader import parse_json
-from rigkit.io.reading import read_text
+from rigkit.io.reading import csv_rows, read_text
 
 __all__ = ["COLUMNS", "corners_text", "read_corners", "write_corners"]
 
@@ -74,11 +74,11 @@ def read_corners(path: str | Path, boards: Sequence[Board] = ()) -> dict[str, tu
         return _from_json(source, text)
     if text.startswith("#"):
         return _from_vnl(source, text, boards)
-    lines = csv.reader(io.StringIO(text))
-    if tuple(next(lines, ())) != COLUMNS:
+    lines = csv_rows(source, "corners file")
+    if tuple(next(lines, (0, []))[1]) != COLUMNS:
         raise InputError(f"corners file '{source}': the first line must be {','.join(COLUMNS)}")
     rows: dict[str, dict[str, list[tuple[float, ...]]]] = {}
-    for number, line in enumerate(lines, 2):
+    for number, line in lines:
         try:
             image, board, *numbers = line
             column, row = int(numbers[0]), int(numbers[1])
@@ -99,7 +99,7 @@ def read_corners(path: str | Path, boards: Sequence[Board] = ()) -> dict[str, tu
             for image, found in rows.items()
         }
     except (InputError, OverflowError) as error:
-        raise InputError(f"corners file '{source}': {error}") from error
+        raise InputError(f"corners file '{source}': {error}; correct the lines, or detect the corners again") from error
 
 
 def _from_json(source: Path, text: str) -> dict[str, tuple[BoardDetection, ...]]:

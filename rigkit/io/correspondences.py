@@ -34,7 +34,7 @@ from rigkit.interop.colmap_database import is_colmap_database, read_colmap_match
 from rigkit.io.files import write_atomic
 from rigkit.io.matcher_arrays import from_matcher
 from rigkit.io.numbers import MAX_NUMBER
-from rigkit.io.reading import read_bytes
+from rigkit.io.reading import csv_rows, read_bytes
 
 __all__ = ["correspondences_text", "read_correspondences", "write_correspondences"]
 
@@ -78,10 +78,10 @@ def read_correspondences(path: str | Path, images: Sequence[str] = ()) -> Corres
         raise InputError(f"correspondences '{source}': neither text nor NPZ; expected .csv or .npz") from error
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if not lines:
-        raise InputError(f"correspondences '{source}': the file is empty")
+        raise InputError(f"correspondences '{source}': the file is empty; give another")
     if _is_number(re.split(r"[\s,;]+", lines[0].strip())[0]):
         return _from_extractor(source, lines)
-    return _from_csv(source, text)
+    return _from_csv(source)
 
 
 def correspondences_text(found: Correspondences) -> str:
@@ -111,9 +111,9 @@ def write_correspondences(path: str | Path, found: Correspondences, *, force: bo
     write_atomic(path, correspondences_text(found), force=force)
 
 
-def _from_csv(source: Path, text: str) -> Correspondences:
-    lines = csv.reader(io.StringIO(text))
-    header = [name.strip() for name in next(lines)]
+def _from_csv(source: Path) -> Correspondences:
+    lines = csv_rows(source, "correspondences")
+    header = [name.strip() for name in next(lines)[1]]
     fixed = (*POINT_COLUMNS, *AFFINE, *SIGMA_COLUMNS)
     unknown = [name for name in header if name not in fixed and not DIRECTION.match(name)]
     if unknown or len(set(header)) != len(header):
@@ -121,24 +121,24 @@ def _from_csv(source: Path, text: str) -> Correspondences:
         known = ", ".join((*POINT_COLUMNS, *AFFINE, "du1_1", "...", *SIGMA_COLUMNS))
         raise InputError(f"correspondences '{source}': {what}; known: {known}")
     rows = []
-    for line in lines:
-        if not line or line[0].lstrip().startswith("#"):
+    for number, line in lines:
+        if line[0].lstrip().startswith("#"):
             continue
         try:
             rows.append([float(field) if field.strip() else np.nan for field in line])
         except ValueError as error:
             raise InputError(
-                f"correspondences '{source}', line {lines.line_num}: {error}; write a number, or nothing"
+                f"correspondences '{source}', line {number}: {error}; write a number, or nothing"
             ) from error
         if len(line) != len(header):
             raise InputError(
-                f"correspondences '{source}', line {lines.line_num}: {len(line)} fields for {len(header)} columns"
+                f"correspondences '{source}', line {number}: {len(line)} fields for {len(header)} columns; correct it"
             )
     table = dict(zip(header, np.array(rows, dtype=np.float64).reshape(-1, len(header)).T, strict=True))
     for group in (POINT_COLUMNS, AFFINE):
         lacking = [name for name in group if name not in table]
         if lacking and (group == POINT_COLUMNS or len(lacking) < len(group)):
-            raise InputError(f"correspondences '{source}': column '{lacking[0]}' is missing")
+            raise InputError(f"correspondences '{source}': column '{lacking[0]}' is missing; add it")
     points = np.stack([table[name] for name in POINT_COLUMNS], axis=1)
     A21 = np.stack([table[name] for name in AFFINE], axis=1).reshape(-1, 2, 2) if AFFINE[0] in table else None
     return _built(source, points[:, :2], points[:, 2:], A21, _directions(source, table), table)
@@ -155,7 +155,7 @@ def _directions(source: Path, table: dict[str, FloatArray]) -> tuple[FloatArray,
             names = (f"du{image}_{k}", f"dv{image}_{k}")
             for name in names:
                 if name not in table:
-                    raise InputError(f"correspondences '{source}': column '{name}' is missing")
+                    raise InputError(f"correspondences '{source}': column '{name}' is missing; add it")
             each.append(np.stack([table[name] for name in names], axis=1))
         images.append(np.stack(each, axis=1))
     return images[0], images[1]
@@ -213,7 +213,7 @@ def _from_npz(source: Path, payload: bytes) -> Correspondences:
         needed += ["directions1", "directions2"]
     for name in needed:
         if name not in table:
-            raise InputError(f"correspondences '{source}': array '{name}' is missing")
+            raise InputError(f"correspondences '{source}': array '{name}' is missing; add it")
     directions = (table["directions1"], table["directions2"]) if "directions1" in table else None
     return _built(source, table["pixels1"], table["pixels2"], table.get("A21"), directions, table)
 
@@ -269,7 +269,7 @@ def _built(
             )
         return Correspondences(pixels1, pixels2, A21, pairs, table.get("sigma_px"), table.get("sigma_A"))
     except InputError as error:
-        raise InputError(f"correspondences '{source}': {error}") from error
+        raise InputError(f"correspondences '{source}': {error}; correct the columns") from error
 
 
 def _is_number(word: str) -> bool:

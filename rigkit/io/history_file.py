@@ -3,21 +3,22 @@ anew, with the date and what each thing that may change came to. The file only g
 
 from __future__ import annotations
 
+import errno
 import json
-import math
-from collections.abc import Mapping
+import os
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from rigkit.core.errors import InputError
-from rigkit.io.calibration_file import damage_named
-from rigkit.io.json_reader import real
-from rigkit.io.reading import read_bytes
+from rigkit.core.errors import InputError, printable
+from rigkit.io.files import ensure_writable
+from rigkit.io.json_reader import parse_json, real, whole
+from rigkit.io.reading import read_text
 from rigkit.validation.sentinel.judge import SentinelCheck
 
-__all__ = ["HISTORY_SCHEMA", "HistoryEntry", "history_text", "load_history"]
+__all__ = ["HISTORY_SCHEMA", "HistoryEntry", "add_entry", "ensure_register", "load_history"]
 
 HISTORY_SCHEMA = "rigkit.history/1"
 
@@ -84,32 +85,81 @@ class HistoryEntry:
         )
 
 
-def history_text(path: Path, entry: HistoryEntry) -> str:
-    """Return the content of the register at `path` with one entry more; raises InputError where it is none."""
-    before = ""
+def ensure_register(path: Path, inputs: Iterable[Path] = ()) -> None:
+    """Raise InputError where no entry could be added to the register at `path`: call it before the work.
+
+    It is refused where it is one of `inputs`, which the work reads, or a file that is none.
+    """
     if path.exists():
+        if path.resolve() in {other.resolve() for other in inputs}:
+            raise InputError(f"cannot add to '{path}': this command reads it; give another name for the register")
         load_history(path)
-        before = path.read_text(encoding="utf-8")
-        before = before if before.endswith("\n") else before + "\n"
-    values = {"schema": HISTORY_SCHEMA, **asdict(entry)}
-    return before + json.dumps(values, allow_nan=False) + "\n"
+        if not os.access(path, os.W_OK):
+            raise InputError(f"cannot add to '{path}': no permission; choose another register")
+    else:
+        ensure_writable(path, inputs=inputs)
+
+
+def add_entry(path: Path, entry: HistoryEntry) -> None:
+    """Add an entry to the register at `path`, which is made where it is missing; what others add meanwhile stays.
+
+    Raises InputError where it cannot be written; the entry is there whole or not at all.
+    """
+    line = json.dumps({"schema": HISTORY_SCHEMA, **asdict(entry)}, allow_nan=False).encode() + b"\n"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o666)
+        try:
+            before = os.fstat(handle).st_size
+            if before and os.pread(handle, 1, before - 1) != b"\n":
+                line = b"\n" + line
+            if os.write(handle, line) < len(line):
+                os.ftruncate(handle, before)
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+    except OSError as error:
+        raise InputError(f"cannot add to '{path}': {error.strerror}; nothing was changed") from error
 
 
 def load_history(path: str | Path) -> tuple[HistoryEntry, ...]:
-    """Return the entries of a register by their dates; raises InputError for another or a damaged file."""
-    lines = read_bytes(Path(path), "register").decode("utf-8", errors="replace").splitlines()
-    with damage_named(path):
-        entries = [_entry(json.loads(line), path) for line in lines if line.strip()]
+    """Return the entries of a register by date; raises InputError, with the line, for another or a damaged file."""
+    entries = []
+    for number, line in enumerate(read_text(path, "register").splitlines(), start=1):
+        if line.strip():
+            try:
+                entries.append(_entry(parse_json(line)))
+            except (ValueError, TypeError, KeyError, AttributeError) as error:
+                words = printable(str(error))[:120]
+                raise InputError(
+                    f"register '{path}', line {number}: no entry of {HISTORY_SCHEMA} ({words}); correct or remove that "
+                    "line, or give a file that `rigkit check --register` wrote"
+                ) from error
     if not entries:
-        raise InputError(f"'{path}': nothing in the register; `rigkit check --register` adds to it")
+        raise InputError(f"register '{path}': nothing in it; `rigkit check --register` adds to it")
     return tuple(sorted(entries, key=lambda entry: entry.date))
 
 
-def _entry(data: Any, path: str | Path) -> HistoryEntry:
+def _entry(data: Any) -> HistoryEntry:
     if not isinstance(data, dict) or data.pop("schema", None) != HISTORY_SCHEMA:
-        raise InputError(f"'{path}': no register of checks ({HISTORY_SCHEMA})")
-    amounts = {str(name): (real(a), real(s)) for name, (a, s) in data.pop("amounts").items()}
-    datetime.fromisoformat(data["date"])
-    if not math.isfinite(real(data["chance"])):
-        raise ValueError("chance")
-    return HistoryEntry(amounts=amounts, **data)
+        raise ValueError("it states another schema")
+    temperature, chance, holds = data.pop("temperature_c"), real(data.pop("chance")), data.pop("holds")
+    if not (0.0 <= chance <= 1.0 and isinstance(holds, bool)):
+        raise ValueError("chance is from 0 to 1, holds true or false")
+    texts = {name: data.pop(name) for name in ("date", "kind", "source", "verdict")}
+    if not all(isinstance(text, str) for text in texts.values()):
+        raise ValueError("date, kind, source and verdict are words")
+    datetime.fromisoformat(texts["date"])
+    entry = HistoryEntry(
+        holds=holds,
+        chance=chance,
+        frames=whole(data.pop("frames")),
+        rms_px=real(data.pop("rms_px")),
+        temperature_c=None if temperature is None else real(temperature),
+        amounts={str(name): (real(a), real(s)) for name, (a, s) in data.pop("amounts").items()},
+        **texts,
+    )
+    if data:
+        raise ValueError(f"unknown key {next(iter(data))!r}")
+    return entry

@@ -208,7 +208,7 @@ def _declared(lines: list[str], source: Path) -> tuple[int, list[tuple[str, str]
             break
         elif words[:1] == ["property"]:
             if words[1] not in PLY_TYPES:
-                raise InputError(f"'{source}': a point has a property of type '{words[1]}', which is not read")
+                raise InputError(f"'{source}': properties of type '{words[1]}' are not read; convert it with Open3D")
             if words[2] in dict(fields):
                 raise InputError(f"'{source}': property '{words[2]}' is declared twice; write or copy the file again")
             fields.append((words[2], PLY_TYPES[words[1]]))

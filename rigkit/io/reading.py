@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import os
 import stat
 from collections.abc import Iterator
@@ -10,7 +12,7 @@ from pathlib import Path
 
 from rigkit.core.errors import InputError, RigkitError
 
-__all__ = ["MAX_BINARY_BYTES", "MAX_TEXT_BYTES", "about", "read_bytes", "read_text", "usable_path"]
+__all__ = ["MAX_BINARY_BYTES", "MAX_TEXT_BYTES", "about", "csv_rows", "read_bytes", "read_text", "usable_path"]
 
 MAX_TEXT_BYTES = 64_000_000
 """The corners of ten thousand images."""
@@ -71,6 +73,20 @@ def read_text(path: str | Path, what: str = "", *, max_bytes: int = MAX_TEXT_BYT
     except UnicodeDecodeError as error:
         raise InputError(f"{_named(path, what)} cannot be read: not UTF-8 text; save it as UTF-8") from error
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def csv_rows(path: str | Path, what: str = "", *, delimiter: str = ",") -> Iterator[tuple[int, list[str]]]:
+    """Yield line number and cells of the rows of a CSV file that are not empty.
+
+    Raises InputError as `read_text` does, and for a line that is none of a table.
+    """
+    reader = csv.reader(io.StringIO(read_text(path, what)), delimiter=delimiter)
+    try:
+        for row in reader:
+            if row:
+                yield reader.line_num, row
+    except csv.Error as error:
+        raise InputError(f"{_named(path, what)}, line {reader.line_num}: {error}; correct the line") from error
 
 
 @contextmanager

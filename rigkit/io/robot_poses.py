@@ -11,8 +11,6 @@ quaternion.
 
 from __future__ import annotations
 
-import csv
-import io
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +18,7 @@ import numpy as np
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.io.reading import read_text
+from rigkit.io.reading import csv_rows
 
 __all__ = ["read_robot_poses"]
 
@@ -38,9 +36,8 @@ def read_robot_poses(path: str | Path) -> dict[str, Rigid3]:
     not of length one, and an image that is there twice.
     """
     source = Path(path)
-    text = read_text(source, "robot poses")
-    rows = [row for row in csv.reader(io.StringIO(text)) if row and not row[0].lstrip().startswith("#")]
-    head = [cell.strip() for cell in rows[0]] if rows else []
+    rows = [(line, row) for line, row in csv_rows(source, "robot poses") if not row[0].lstrip().startswith("#")]
+    head = [cell.strip() for cell in rows[0][1]] if rows else []
     length = next((unit for unit in LENGTHS if all(f"{axis}_{unit}" in head for axis in "xyz")), None)
     turn = next((unit for unit in TURNS if all(f"r{axis}_{unit}" in head for axis in "xyz")), None)
     if "image" not in head or length is None or not (turn or all(key in head for key in QUATERNION)):
@@ -49,8 +46,8 @@ def read_robot_poses(path: str | Path) -> dict[str, Rigid3]:
             "rx_rad, ry_rad, rz_rad (or _deg)"
         )
     poses: dict[str, Rigid3] = {}
-    for number, row in enumerate(rows[1:], start=2):
-        where = f"'{source}', row {number}"
+    for line, row in rows[1:]:
+        where = f"'{source}', line {line}"
         if len(row) != len(head):
             raise InputError(f"{where}: {len(row)} cells under {len(head)} columns; correct the row")
         cells = dict(zip(head, (cell.strip() for cell in row), strict=True))

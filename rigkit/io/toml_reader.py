@@ -227,6 +227,6 @@ def read_toml(path: str | Path, schema: str) -> TomlTable:
     if found != schema:
         name, _, version = schema.partition("/")
         if found.partition("/")[0] == name:
-            raise table.error(f"schema {_shown(found)} is of another version; this rigkit reads version {version}")
+            raise table.error(f"schema {_shown(found)} is of another version; write {name}/{version}, or update rigkit")
         raise table.error(f'schema is {_shown(found)}, but a file with schema = "{schema}" is needed here')
     return table

@@ -13,8 +13,6 @@ commas or semicolons; numbers have a decimal point.
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -23,7 +21,7 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.truth import MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
 from rigkit.io.numbers import fault_of_number
-from rigkit.io.reading import read_text
+from rigkit.io.reading import csv_rows, read_text
 from rigkit.io.truth_file import make_angle, make_distance
 
 __all__ = ["load_truth_csv"]
@@ -84,12 +82,11 @@ def load_truth_csv(path: str | Path, boards: Mapping[str, Sequence[Board]]) -> d
 
 def _read(source: Path) -> tuple[list[str], list[tuple[int, Row]]]:
     """Return the head and the rows that are not empty, each with its line."""
-    text = read_text(source, "truth table")
-    first = text.partition("\n")[0]
-    reader = csv.reader(io.StringIO(text), delimiter=";" if first.count(";") > first.count(",") else ",")
+    first = read_text(source, "truth table").partition("\n")[0]
+    delimiter = ";" if first.count(";") > first.count(",") else ","
     head: list[str] = []
     rows: list[tuple[int, Row]] = []
-    for cells in reader:
+    for line, cells in csv_rows(source, "truth table", delimiter=delimiter):
         cleaned = [cell.strip() for cell in cells]
         if not any(cleaned):
             continue
@@ -98,10 +95,10 @@ def _read(source: Path) -> tuple[list[str], list[tuple[int, Row]]]:
             continue
         if len(cleaned) != len(head):
             raise InputError(
-                f"{source}: line {reader.line_num}: {len(cleaned)} cells, but the head has {len(head)}; put quotes "
+                f"{source}: line {line}: {len(cleaned)} cells, but the head has {len(head)}; put quotes "
                 "around text with a comma, and write numbers with a decimal point"
             )
-        rows.append((reader.line_num, dict(zip(head, cleaned, strict=True))))
+        rows.append((line, dict(zip(head, cleaned, strict=True))))
     if not rows:
         raise InputError(f"{source}: no measurements; start with the head {EXAMPLE} and add a row each")
     return head, rows

@@ -6,8 +6,7 @@ sensor wrote them: an orientation in the file is not applied, because a calibrat
 
 from __future__ import annotations
 
-import csv
-import io
+import logging
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -18,13 +17,17 @@ import numpy as np
 
 from rigkit.core.errors import InputError
 from rigkit.io.images import Image, quiet_opencv, require_pixels
-from rigkit.io.reading import read_bytes
+from rigkit.io.reading import csv_rows
 
 __all__ = ["VIDEO_ENDINGS", "Video", "is_video", "read_timestamps"]
+
+_log = logging.getLogger(__name__)
 
 VIDEO_ENDINGS = frozenset({".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv"})
 LIVE_CAMERA = re.compile(r"camera:(\d{1,2})")
 SEQUENCE = re.compile(r"%0?\d?d")
+COMPLETE = 0.95
+"""Part of the frames announced: containers without an index tell the duration alone."""
 TIMESTAMPS = ("sync_index", "cam_id", "frame_index")
 
 
@@ -88,15 +91,26 @@ class Video:
         with quiet_opencv():
             while self.next_number < number:
                 if not self._capture.grab():
+                    self._tell_of_the_rest()
                     return None
                 self.next_number += 1
             well, picture = self._capture.read()
         if not well:
+            self._tell_of_the_rest()
             return None
         self.next_number += 1
         # Decoders of sequences keep grey files grey.
         grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
         return cast(Image, grey)
+
+    def _tell_of_the_rest(self) -> None:
+        """Say once that the video ends before the frames that it announces do."""
+        if self.next_number < COMPLETE * self.count:
+            _log.warning(
+                f"video '{self.source}': {self.next_number} of {self.count} frames can be decoded; it is cut off or "
+                "damaged: copy it again from the camera"
+            )
+            self.count = 0
 
     def frames(self) -> Iterator[tuple[int, Image]]:
         """Yield the number and the picture of every frame that is left."""
@@ -115,17 +129,21 @@ def read_timestamps(path: Path, cameras: Sequence[str]) -> dict[int, Mapping[str
     InputError
         Columns are missing, a field is no number, or a camera has no rows.
     """
-    rows = list(csv.DictReader(io.StringIO(read_bytes(path, "timestamps").decode("utf-8", "replace"))))
-    if not rows or not set(TIMESTAMPS) <= set(rows[0]):
-        raise InputError(f"'{path}' has not the columns {', '.join(TIMESTAMPS)}; one row is one frame of one camera")
+    lines = csv_rows(path, "timestamps")
+    head = [cell.strip() for cell in next(lines, (0, []))[1]]
+    if not set(TIMESTAMPS) <= set(head):
+        raise InputError(f"'{path}': the first line must name the columns {', '.join(TIMESTAMPS)}, a row a frame")
+    places = [head.index(name) for name in TIMESTAMPS]
     named = {_number(name): name for name in reversed(cameras)} | {name: name for name in cameras}
     moments: dict[int, dict[str, int]] = {}
-    for k, row in enumerate(rows, start=2):
-        camera = named.get(str(row["cam_id"]).strip())
+    for line, row in lines:
         try:
-            moment, frame = int(row["sync_index"]), int(row["frame_index"])
-        except (TypeError, ValueError) as error:
-            raise InputError(f"'{path}' line {k}: sync_index and frame_index are whole numbers") from error
+            at, called, counted = (row[place] for place in places)
+            camera, moment, frame = named.get(called.strip()), int(at), int(counted)
+        except (IndexError, ValueError) as error:
+            raise InputError(
+                f"'{path}', line {line}: sync_index and frame_index must be whole numbers; correct the line"
+            ) from error
         if camera is not None:
             moments.setdefault(moment, {})[camera] = frame
     for camera in cameras:

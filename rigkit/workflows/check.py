@@ -22,7 +22,7 @@ from rigkit.detection.detect import detect_boards
 from rigkit.geometry.board_pose import board_pose
 from rigkit.io.calibration_file import camera_to_json, findings_to_json, load_calibration
 from rigkit.io.files import ensure_writable, write_together
-from rigkit.io.history_file import HistoryEntry, history_text
+from rigkit.io.history_file import HistoryEntry, add_entry, ensure_register
 from rigkit.io.images import read_image
 from rigkit.io.rig_file import is_rig_file, load_saved_rig
 from rigkit.planning.candidates import Reach
@@ -65,11 +65,13 @@ class CheckOptions:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class CheckedPictures:
-    """The verdict, what it says in words, images without a board by the reason, and the files that were written."""
+    """The verdict, what it says in words, images without a board by the reason, those that cannot be used at all (cut
+    off, of another size), and the files that were written."""
 
     check: SentinelCheck
     words: CheckWords
     left_out: tuple[tuple[str, str], ...]
+    unreadable: tuple[str, ...]
     written: tuple[Path, ...]
 
 
@@ -83,7 +85,8 @@ def check_pictures(
     """Check a calibration, or a rig, with fresh images (or folders of them).
 
     Of a rig give one folder a camera, in the rig's order or called as its cameras are, with as many images each, taken
-    together in the order of their names; or the images themselves, moment by moment, each in the rig's order.
+    together in the order of their names; or the images themselves, moment by moment, each in the rig's order. An image
+    that cannot be read does not end the rest; its error is raised where there is no other.
 
     Raises
     ------
@@ -98,17 +101,21 @@ def check_pictures(
     inputs = [source, *(image for frame in frames for image in frame)]
     outputs = [target for target in (options.fix, options.report) if target is not None]
     ensure_writable(outputs, force=options.force, inputs=inputs)
+    if options.history is not None:
+        ensure_register(options.history, inputs)
     cost = None if options.length is None else _cost(watched, options.length)
     left_out: list[tuple[str, str]] = []
+    unreadable: list[str] = []
     if options.scene:
         if len(watched.cameras) < 2:
             raise InputError("check: a scene without boards tells of a rig only; one camera needs pictures of a board")
-        check = check_scene(watched, [_read(watched, frame) for frame in frames], cost, progress=progress)
+        read = [_read(watched, frame, unreadable) for frame in frames]
+        check = check_scene(watched, [images for images in read if images], cost, progress=progress)
     else:
         boards = options.boards or known
         if not boards:
             raise InputError("check: a rig's file does not say what boards there are; give --board 9x6x25")
-        views = _views(watched, frames, boards, left_out, progress)
+        views = _views(watched, frames, boards, left_out, unreadable, progress)
         check = check_views(watched, views, cost)
     words = check_words(check)
     files: dict[Path, str | bytes] = {}
@@ -121,9 +128,11 @@ def check_pictures(
         write_together(files, force=options.force)
     if options.history is not None:
         entry = HistoryEntry.of_check(check, source, temperature_c=options.temperature_c)
-        write_together({options.history: history_text(options.history, entry)}, force=True)
+        add_entry(options.history, entry)
     written = (*files, *([options.history] if options.history is not None else []))
-    return CheckedPictures(check=check, words=words, left_out=tuple(left_out), written=written)
+    return CheckedPictures(
+        check=check, words=words, left_out=tuple(left_out), unreadable=tuple(unreadable), written=written
+    )
 
 
 def load_watched(source: Path) -> tuple[Watched, tuple[Board, ...]]:
@@ -173,12 +182,22 @@ def _frames(watched: Watched, sources: Sequence[Path]) -> list[list[Path]]:
     return [images[k : k + count] for k in range(0, len(images), count)]
 
 
-def _read(watched: Watched, frame: Sequence[Path]) -> list[Any]:
-    """Return the images of a moment; raises InputError where one is of another size than its camera's."""
-    return [_image_of(camera, path) for camera, path in zip(watched.cameras, frame, strict=True)]
+def _read(watched: Watched, frame: Sequence[Path], unreadable: list[str]) -> list[Any]:
+    """Return the images of a moment, none where one cannot be used: why goes to `unreadable`."""
+    images = [_image_of(camera, path, unreadable) for camera, path in zip(watched.cameras, frame, strict=True)]
+    return [] if any(image is None for image in images) else images
 
 
-def _image_of(camera: Camera, path: Path) -> Any:
+def _image_of(camera: Camera, path: Path, unreadable: list[str]) -> Any:
+    """Return an image of the camera; None where it cannot be used, which goes to `unreadable`."""
+    try:
+        return _whole_image_of(camera, path)
+    except InputError as error:
+        unreadable.append(str(error))
+        return None
+
+
+def _whole_image_of(camera: Camera, path: Path) -> Any:
     image = read_image(path)
     if (image.shape[1], image.shape[0]) != camera.size_px:
         width, height = camera.size_px
@@ -194,24 +213,28 @@ def _views(
     frames: Sequence[Sequence[Path]],
     boards: Sequence[Board],
     left_out: list[tuple[str, str]],
+    unreadable: list[str],
     progress: Progress,
 ) -> list[FreshView]:
-    """Return the boards in all images; what has none goes to `left_out`."""
+    """Return the boards in all images; what has none goes to `left_out`, what cannot be used to `unreadable`."""
     out: list[FreshView] = []
     total = sum(len(frame) for frame in frames)
     for k, frame in enumerate(frames):
         name = f"{k:04d}"
         for c, path in enumerate(frame):
             progress("corners", k * len(frame) + c, total)
-            image = _image_of(watched.cameras[c], path)
+            image = _image_of(watched.cameras[c], path, unreadable)
+            if image is None:
+                continue
             found, reason = views_of_image(path.name, detect_boards(image, boards, camera=watched.cameras[c]), boards)
             out += [FreshView(name, c, _counted_alike(watched, c, view, name, out)) for view in found]
             if reason is not None:
                 left_out.append((str(path), reason))
     progress("corners", total, total)
     if not out:
+        reason = next(iter([*(reason for _, reason in left_out), *unreadable]))
         raise InputError(
-            f"check: no board was found in {total} images: {left_out[0][1]}; take sharp pictures of the whole board"
+            f"check: no board was found in {total} images: {reason}; take sharp pictures of the whole board"
         )
     return out
 

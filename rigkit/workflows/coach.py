@@ -7,8 +7,11 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from rigkit.cameras.base import Camera
 from rigkit.coach.coach import Coach
@@ -123,9 +126,16 @@ def coach_frames(
             _log.warning("%s", error)
             continue
         if show is not None:
-            show([cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes() for image in images])
+            show([_preview(image) for image in images])
         if state.get("enough"):
             break
+
+
+def _preview(frame: NDArray[Any]) -> bytes:
+    """Return an image, of one or three channels of 8 or 16 bits, as JPEG."""
+    shown = frame if frame.dtype == np.uint8 else (frame >> 8).astype(np.uint8)
+    bgr = shown if shown.ndim == 2 else cv2.cvtColor(shown, cv2.COLOR_RGB2BGR)
+    return bytes(cv2.imencode(".jpg", bgr)[1])
 
 
 def run_coach(options: CoachOptions, told: Callable[[str], None]) -> None:
@@ -142,10 +152,10 @@ def run_coach(options: CoachOptions, told: Callable[[str], None]) -> None:
         preview: dict[int, bytes] = app.state.preview
 
         def work() -> None:
-            coach_frames(
-                coach, frames, photos=bool(options.watch), show=lambda jpegs: preview.update(dict(enumerate(jpegs)))
-            )
             try:
+                coach_frames(
+                    coach, frames, photos=bool(options.watch), show=lambda jpegs: preview.update(dict(enumerate(jpegs)))
+                )
                 told(coach.finish())
             except RigkitError as error:
                 told(str(error))

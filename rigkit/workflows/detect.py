@@ -30,7 +30,7 @@ from rigkit.io.images import read_image
 from rigkit.io.video import is_video
 from rigkit.report.overlay import draw_boards
 from rigkit.workflows.camera_files import import_camera
-from rigkit.workflows.frames import frames_folder, frames_of_video
+from rigkit.workflows.frames import VideoFrames, frames_folder, frames_of_video
 
 __all__ = ["DetectOptions", "DetectionResult", "detect_in_images", "images_in"]
 
@@ -107,12 +107,12 @@ def detect_in_images(
         raise InputError(f"--jobs {options.jobs}: at least one process is needed")
     boards = tuple(load_board(path) for path in options.boards)
     given = [Path(path) for path in paths]
-    videos = {
-        path: frames_of_video(path, frames_folder([path]), boards, progress=progress)
-        for path in filter(is_video, given)
-    }
+    videos, bad = _frames_of(list(filter(is_video, given)), boards, progress)
+    if bad and len(given) == len(bad) == 1:
+        raise next(iter(bad.values()))
+    stills = [path for path in given if str(path) not in bad]
     images = list(
-        images_in([image for path in given for image in (videos[path].images[""] if path in videos else (path,))])
+        images_in([image for path in stills for image in (videos[path].images[""] if path in videos else (path,))])
     )
     if options.camera is not None and not boards:
         raise InputError("--camera helps to find boards of known size only; give them, such as --board a9x6.toml")
@@ -126,10 +126,11 @@ def detect_in_images(
         for image, overlay in zip(images, overlays, strict=True)
     ]
     outcomes, doubtful = _over_images(tasks, options.jobs, progress)
-    failures = {name: outcome for name, outcome in outcomes.items() if isinstance(outcome, InputError)}
+    failures = bad | {name: outcome for name, outcome in outcomes.items() if isinstance(outcome, InputError)}
     found = {name: outcome for name, outcome in outcomes.items() if not isinstance(outcome, InputError)}
-    if failures and len(outcomes) == 1:
-        raise next(iter(failures.values()))
+    if failures and not found:
+        more = f"; so it is with {len(failures) - 1} more" if len(failures) > 1 else ""
+        raise InputError(f"{next(iter(failures.values()))}{more}")
     if not any(found.values()) and not failures:
         seen = next((f"; in '{name}' {words}" for name, words in doubtful.items()), "")
         raise CheckFailed(
@@ -138,6 +139,19 @@ def detect_in_images(
     if options.output is not None and any(found.values()):
         write_corners(options.output, found, force=options.force)
     return DetectionResult(found, failures, doubtful)
+
+
+def _frames_of(
+    videos: Sequence[Path], boards: Sequence[Board], progress: Progress
+) -> tuple[dict[Path, VideoFrames], dict[str, InputError]]:
+    """Return the frames kept of each video, and why there are none of others."""
+    kept, bad = {}, {}
+    for path in videos:
+        try:
+            kept[path] = frames_of_video(path, frames_folder([path]), boards, progress=progress)
+        except InputError as error:
+            bad[str(path)] = error
+    return kept, bad
 
 
 def images_in(paths: Sequence[Path]) -> Iterator[Path]:

@@ -23,7 +23,7 @@ from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
 from rigkit.io.files import ensure_folder_writable, write_atomic
 from rigkit.io.images import Image
-from rigkit.io.reading import read_bytes
+from rigkit.io.reading import read_text
 from rigkit.io.rig_session import RigSession
 from rigkit.io.session import Session, beside_session
 from rigkit.io.video import Video, is_video, read_timestamps
@@ -101,7 +101,7 @@ def frames_of_video(
     Raises
     ------
     InputError
-        The video cannot be read, no frame shows a board, or `folder` cannot be written to.
+        The video cannot be read, no frame shows a board, or `folder` cannot be written to, or holds other files.
     """
     return frames_of_videos({"": source}, folder, boards, most=most, progress=progress)
 
@@ -124,13 +124,13 @@ def frames_of_videos(
     kept = _kept_before(folder, asked)
     if kept is not None:
         return kept
-    ensure_folder_writable(folder)
     keeper = _Keeper(folder, FrameChoice(most))
     looked_at = with_boards = 0
     with ExitStack() as stack:
         videos = {name: stack.enter_context(Video(path)) for name, path in sources.items()}
         moments = None if timestamps is None else read_timestamps(timestamps, list(sources))
         live = any(video.live for video in videos.values())
+        _take_folder(folder, live)
         total = min((v.count for v in videos.values() if v.count), default=0) if moments is None else len(moments)
         # Who calibrates a live camera says so when there is enough.
         with suppress(*((KeyboardInterrupt,) if live else ())):
@@ -293,6 +293,18 @@ def _asked(
     }
 
 
+def _take_folder(folder: Path, live: bool) -> None:
+    """Make the folder one of kept frames; raises InputError where it holds anything else, or frames that nobody can
+    take again."""
+    ensure_folder_writable(folder)
+    own = (folder / RECORD).is_file()
+    if folder.is_dir() and any(folder.iterdir()) and (live or not own):
+        what = "frames of an earlier capture" if own else "other files than frames kept of a video"
+        raise InputError(f"'{folder}' holds {what}, which stay as they are; rename or remove that folder")
+    if not own:
+        write_atomic(folder / RECORD, json.dumps({"schema": FRAMES_SCHEMA, "asked": None}) + "\n")
+
+
 def _record(done: VideoFrames, asked: Mapping[str, object]) -> None:
     images = {name: [p.relative_to(done.folder).as_posix() for p in paths] for name, paths in done.images.items()}
     counts = {"looked_at": done.looked_at, "with_boards": done.with_boards, "near_copies": done.near_copies}
@@ -305,11 +317,11 @@ def _kept_before(folder: Path, asked: Mapping[str, object]) -> VideoFrames | Non
     if not (folder / RECORD).is_file():
         return None
     try:
-        told = json.loads(read_bytes(folder / RECORD, "record"))
+        told = json.loads(read_text(folder / RECORD, "record"))
         images = {name: tuple(folder / p for p in paths) for name, paths in told["images"].items()}
         counts = {key: int(told[key]) for key in ("looked_at", "with_boards", "near_copies")}
         same = told["schema"] == FRAMES_SCHEMA and told["asked"] == json.loads(json.dumps(asked))
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except (InputError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
     if not same or not all(path.is_file() for paths in images.values() for path in paths):
         return None

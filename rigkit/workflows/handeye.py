@@ -25,7 +25,14 @@ from rigkit.io.robot_poses import read_robot_poses
 from rigkit.workflows.camera_files import import_camera
 from rigkit.workflows.detect import images_in
 
-__all__ = ["POSE_NAMES", "HandEyeOptions", "PlacedCamera", "calibrate_hand_eye", "camera_on_board"]
+__all__ = [
+    "POSE_NAMES",
+    "HandEyeCalibration",
+    "HandEyeOptions",
+    "PlacedCamera",
+    "calibrate_hand_eye",
+    "camera_on_board",
+]
 
 HAND_EYE_SCHEMA = "rigkit.hand_eye/1"
 POSE_NAMES = (("cam_from_hand", "base_from_board"), ("cam_from_base", "hand_from_board"))
@@ -53,6 +60,16 @@ class HandEyeOptions:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class HandEyeCalibration:
+    """The hand-eye calibration, and why some of the images could not be read."""
+
+    result: HandEye
+    unreadable: tuple[InputError, ...]
+
+    __repr__ = brief
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class PlacedCamera:
     """Where a camera is against a board, from which image, the RMS in px, and whether the board tilted the other way
     fits too."""
@@ -67,14 +84,14 @@ class PlacedCamera:
 
 def calibrate_hand_eye(
     poses: str | Path, images: Sequence[str | Path], options: HandEyeOptions, *, progress: Progress = silent
-) -> HandEye:
+) -> HandEyeCalibration:
     """Return the hand-eye calibration from the robot's poses (CSV, by image) and images of a board, or folders of them.
 
     Raises
     ------
     InputError
         Files that cannot be read or written, images without a pose, a board that looks the same turned, poses and
-        images that do not belong together.
+        images that do not belong together. One image of many that cannot be read does not end the rest.
     CheckFailed
         No image shows the board.
     DegenerateError
@@ -88,20 +105,29 @@ def calibrate_hand_eye(
     if missing:
         raise InputError(f"'{poses}': no pose of image '{missing[0]}' ({len(missing)} in all); add the rows")
     board, camera = _one_way_up(load_board(options.board)), import_camera(options.camera)
-    views, stands = [], []
+    views, stands, unreadable = [], [], []
     for done, path in enumerate(paths, start=1):
-        view = _view(path, board, camera)
-        progress("board", done, len(paths))
+        try:
+            view = _view(path, board, camera)
+        except InputError as error:
+            if len(paths) == 1:
+                raise
+            unreadable.append(error)
+            continue
+        finally:
+            progress("board", done, len(paths))
         if view is not None:
             base_from_hand = robot[path.name].inverse() if options.inverse else robot[path.name]
             views.append(view)
             stands.append(base_from_hand if options.board_on_hand else base_from_hand.inverse())
     if not views:
+        if unreadable:
+            raise InputError(f"no image of {len(paths)} shows board '{board.board_id}': {unreadable[0]}")
         raise CheckFailed(f"no image of {len(paths)} shows board '{board.board_id}'; check the board's file")
     result = hand_eye(camera, views, stands)
     if options.output is not None:
         write_atomic(options.output, _text(result, options), force=options.force)
-    return result
+    return HandEyeCalibration(result, tuple(unreadable))
 
 
 def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) -> PlacedCamera:

@@ -11,8 +11,8 @@ from rigkit.cameras.compare import compare_cameras, grid_pixels
 from rigkit.cameras.convert import refit_camera
 from rigkit.core.errors import InputError
 from rigkit.io.calibration_file import load_calibration
-from rigkit.io.files import ensure_writable, write_atomic, write_together
-from rigkit.io.history_file import HistoryEntry, history_text, load_history
+from rigkit.io.files import ensure_writable, write_atomic
+from rigkit.io.history_file import HistoryEntry, add_entry, ensure_register, load_history
 from rigkit.report.check_page import history_page
 from rigkit.validation.sentinel.evidence import MIN_SIGMA_PX, FreshEvidence, Watched
 from rigkit.validation.sentinel.judge import judge_evidence
@@ -46,6 +46,7 @@ def add_calibration(register: Path, new: Path, reference: Path, *, temperature_c
 
     Raises InputError for cameras of two models or sizes, and files that are no calibrations.
     """
+    ensure_register(register, [new, reference])
     now, before = load_calibration(new), load_calibration(reference)
     if (now.camera.model, now.camera.parameters.size) != (before.camera.model, before.camera.parameters.size):
         raise InputError(
@@ -54,7 +55,7 @@ def add_calibration(register: Path, new: Path, reference: Path, *, temperature_c
         )
     check = judge_evidence(watched_camera(before, reference.stem), lambda watched: _as_evidence(watched, now))
     entry = HistoryEntry.of_check(check, new, kind="calibration", temperature_c=temperature_c)
-    write_together({register: history_text(register, entry)}, force=True)
+    add_entry(register, entry)
 
 
 def _as_evidence(watched: Watched, calibration: Calibration) -> FreshEvidence:

@@ -32,12 +32,14 @@ class IdentifiedBoard:
     board : with squares, or tags, of 1 mm.
     seen, looked_at : names of the images that show it, and of all looked at.
     words : as `--board` takes them, but for the length: "aprilgrid:6x6xMM,spacing=0.3".
+    unreadable : why other images could not be read.
     """
 
     board: Board
     seen: tuple[str, ...]
     looked_at: tuple[str, ...]
     words: str
+    unreadable: tuple[InputError, ...] = ()
 
 
 def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) -> IdentifiedBoard:
@@ -53,18 +55,28 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
     if not paths:
         raise InputError("board identify: no images; give some, or a folder")
     chosen = _spread([Path(path) for path in paths], ENOUGH_IMAGES)
-    images: list[GreyImage] = []
+    images: dict[str, GreyImage] = {}
+    unreadable: list[InputError] = []
     for k, path in enumerate(chosen):
         progress("reading", k, len(chosen))
-        images.append(grey_image(read_image(path)))
+        try:
+            images[str(path)] = grey_image(read_image(path))
+        except InputError as error:
+            unreadable.append(error)
+    if not images:
+        raise unreadable[0]
     progress("reading", len(chosen), len(chosen))
-    guess = guess_board(images)
-    names = tuple(path.name for path in chosen)
+    guess = guess_board(list(images.values()))
+    names = tuple(Path(path).name for path in images)
     if guess is None:
+        if unreadable:
+            raise InputError(f"no board is seen in {len(names)} images, and {unreadable[0]}")
         raise CheckFailed(
             f"no board is seen in {len(names)} images: no chessboard, ChArUco board, AprilGrid or grid of circles"
         )
-    return IdentifiedBoard(guess.board, tuple(names[k] for k in guess.images), names, words_of_board(guess.board))
+    return IdentifiedBoard(
+        guess.board, tuple(names[k] for k in guess.images), names, words_of_board(guess.board), tuple(unreadable)
+    )
 
 
 def explained(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:

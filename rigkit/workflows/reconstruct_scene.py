@@ -185,11 +185,11 @@ def _read_pose(path: Path) -> Rigid3:
         )
     matrix = np.vstack([np.array(words[:12], dtype=np.float64).reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
     if len(words) == 16 and not np.allclose(np.array(words[12:], dtype=np.float64), matrix[3]):
-        raise InputError(f"pose '{path}': the last row of a pose is 0 0 0 1")
+        raise InputError(f"pose '{path}': the last row of a pose must be 0 0 0 1")
     try:
         pose = Rigid3.from_matrix(matrix)
     except InputError as error:
-        raise InputError(f"pose '{path}': {error}") from error
+        raise InputError(f"pose '{path}': {error}; correct the numbers") from error
     if not np.linalg.norm(pose.translation_mm) > 0.0:
         raise InputError(f"pose '{path}': no translation, so no distances; give cam2_from_cam1 in mm")
     return pose

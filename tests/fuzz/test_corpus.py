@@ -7,6 +7,7 @@ from pathlib import Path
 
 import fuzz
 import pytest
+from fuzz_kinds import KINDS
 
 CORPUS = Path(__file__).resolve().parents[1] / "corpus"
 CASES = sorted(path for path in CORPUS.rglob("*") if path.is_file())
@@ -18,13 +19,13 @@ def test_what_once_ended_badly(damaged: Path, place: Path) -> None:
     (place / "out").mkdir()
     case = f"case{damaged.suffix}"
     shutil.copy(damaged, case)
-    for reader in fuzz.KINDS[damaged.parent.name].readers:
+    for reader in KINDS[damaged.parent.name].readers:
         words = [word.replace("{case}", case).replace("{out}", "out") for word in reader]
         assert fuzz.fault_of(words, case, sound=False) is None, words
 
 
 def test_cases_depend_on_seed_class_and_number_alone(seeds: Path, tmp_path: Path) -> None:
-    kind = fuzz.KINDS["board"]
+    kind = KINDS["board"]
     words = [fuzz.case_of(kind, "board", 7, 40, seeds, tmp_path / name) for name in ("a", "b", "c")]
     texts = [(tmp_path / name / "case.toml").read_bytes() for name in ("a", "b")]
     assert words[0] == words[1] and texts[0] == texts[1]
@@ -40,19 +41,19 @@ def test_faults_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
 
         return reader
 
-    import fuzz_api
+    import fuzz_readers
 
     from rigkit.cli import main as cli
     from rigkit.core.errors import InputError
 
-    call = ["fuzz_api:read_vnl", "case.toml"]
+    call = ["fuzz_readers:read_vnl", "case.toml"]
     for error, said in (
         (ValueError("bad"), "ValueError: bad"),
         (InputError("no name"), "does not name"),
     ):
-        monkeypatch.setattr(fuzz_api, "read_vnl", raising(error))
+        monkeypatch.setattr(fuzz_readers, "read_vnl", raising(error))
         assert said in str(fuzz.fault_of(call, "case.toml", sound=False))
-    monkeypatch.setattr(fuzz_api, "read_vnl", raising(InputError("case.toml: one line")))
+    monkeypatch.setattr(fuzz_readers, "read_vnl", raising(InputError("case.toml: one line")))
     assert fuzz.fault_of(call, "case.toml", sound=False) is None
     assert "though sound" in str(fuzz.fault_of(call, "case.toml", sound=True))
     monkeypatch.setattr(cli, "build_parser", raising(ValueError("bad")))
@@ -63,13 +64,13 @@ QUICK = 12
 """Cases of a class, beyond its sound ones; `scripts/fuzz.py --count 1000` looks longer."""
 
 
-@pytest.mark.parametrize("label", sorted(fuzz.KINDS))
+@pytest.mark.parametrize("label", sorted(KINDS))
 def test_a_few_damaged_inputs_of_each_class(
     label: str, tmp_path: Path, seeds: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """In a process of its own, as the harness has them."""
     shutil.copytree(seeds, tmp_path / "seeds")
-    count = len(fuzz.KINDS[label].readers) * (label != "commands") + (100 if label == "api" else QUICK)
+    count = len(KINDS[label].readers) * (label != "commands") + (100 if label == "api" else QUICK)
     assert fuzz.main(["--classes", label, "--count", str(count), "--seed", "1", "--keep", str(tmp_path)]) == 0, (
         capsys.readouterr().out
     )

@@ -61,7 +61,7 @@ def test_timestamps_count_from_the_first_frame_of_each_camera(tmp_path: Path) ->
     with pytest.raises(InputError, match="no rows of camera 'cam_4'"):
         read_timestamps(path, ["cam_0", "cam_4"])
     path.write_text("time\n1\n")
-    with pytest.raises(InputError, match="has not the columns"):
+    with pytest.raises(InputError, match="must name the columns"):
         read_timestamps(path, ["cam_0"])
 
 

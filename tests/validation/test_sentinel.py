@@ -20,7 +20,7 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.io.calibration_file import calibration_text, load_calibration, save_calibration
-from rigkit.io.history_file import HistoryEntry, history_text, load_history
+from rigkit.io.history_file import HistoryEntry, add_entry, load_history
 from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, Knowledge
@@ -207,9 +207,7 @@ def test_the_register_grows_and_is_drawn(calibration: Calibration, tmp_path: Pat
     register = tmp_path / "cam.jsonl"
     for seed in range(3):
         check = _checked(calibration, lens("reg"), np.random.default_rng(seed))
-        register.write_text(
-            history_text(register, HistoryEntry.of_check(check, tmp_path / "c.json", temperature_c=21.0))
-        )
+        add_entry(register, HistoryEntry.of_check(check, tmp_path / "c.json", temperature_c=21.0))
     entries = load_history(register)
     assert len(entries) == 3 and all(entry.holds for entry in entries)
     assert set(entries[0].amounts) == {
@@ -219,7 +217,7 @@ def test_the_register_grows_and_is_drawn(calibration: Calibration, tmp_path: Pat
     page = history_page(entries, "t", {})
     assert page.count("<svg") == 6 and "21.0" in page
     register.write_text(register.read_text() + json.dumps({"schema": "other"}) + "\n")
-    with pytest.raises(InputError, match="no register"):
+    with pytest.raises(InputError, match=r"line 4.*another schema"):
         load_history(register)
 
 

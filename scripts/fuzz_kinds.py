@@ -1,0 +1,149 @@
+"""The classes of input that `fuzz.py` damages, and what reads each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fuzz_commands import COMMANDS
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A class of input: the file that is changed, and what reads it ("{case}", "{out}"); "module:function" is called.
+
+    Without a file the words of the command, or the arguments of a call, are changed.
+    """
+
+    file: str | None
+    readers: tuple[tuple[str, ...], ...]
+    names_file: bool = True
+    judged: bool = False
+    """What is read is also judged: a sound case may end with any documented code."""
+
+
+def _camera_file(name: str, *more: tuple[str, ...]) -> Kind:
+    return Kind(name, (("export", "{case}", "--to", "rigkit", "-o", "{out}/new.json"), *more))
+
+
+def _board_file(name: str) -> Kind:
+    return Kind(name, (("rigkit.io.board_file:load_board", "{case}"), ("board", "{case}", "-o", "{out}/b")))
+
+
+def _video(name: str) -> Kind:
+    read = ("detect", "-j", "1", "--board", "floor.toml", "{case}")
+    return Kind(name, (("fuzz_readers:read_frames", "{case}"), ("fuzz_readers:coach_video", "{case}"), read))
+
+
+KINDS: dict[str, Kind] = {
+    "png": Kind(
+        "image.png",
+        (
+            ("rigkit.io.images:read_image", "{case}"),
+            ("detect", "-j", "1", "{case}"),
+            ("board", "identify", "{case}"),
+            ("pose", "{case}", "--camera", "calibration.json", "--board", "floor.toml"),
+            ("rectify", "{case}", "--camera", "calibration.json", "-o", "{out}/new.png"),
+        ),
+    ),
+    "png16": Kind("deep.png", (("rigkit.io.images:read_image", "{case}"),)),
+    "jpg": Kind("image.jpg", (("rigkit.io.images:read_image", "{case}"), ("detect", "-j", "1", "{case}"))),
+    "tif": Kind("image.tif", (("rigkit.io.images:read_image", "{case}"),)),
+    "bmp": Kind("image.bmp", (("rigkit.io.images:read_image", "{case}"),)),
+    "pgm": Kind("image.pgm", (("rigkit.io.images:read_image", "{case}"),)),
+    "webp": Kind("image.webp", (("rigkit.io.images:read_image", "{case}"),)),
+    "board": _board_file("board.toml"),
+    "aprilgrid": _board_file("aprilgrid.toml"),
+    "circles": _board_file("circles.toml"),
+    "session": Kind("session.toml", (("rigkit.io.session:load_session", "{case}"),)),
+    "rig-session": Kind("rig-session.toml", (("rigkit.io.rig_session:load_rig_session", "{case}"),)),
+    "dataset": Kind("dataset.toml", (("rigkit.io.manifest:load_dataset", "{case}"),)),
+    "study": Kind("study.toml", (("rigkit.io.study_file:load_study", "{case}"),)),
+    "calibration": Kind(
+        "calibration.json",
+        (
+            ("rigkit.io.calibration_file:load_calibration", "{case}"),
+            ("diff", "{case}", "calibration.json"),
+            ("plan", "{case}", "-n", "1"),
+            ("certify", "{case}", "--length", "200", "--distance", "900"),
+            ("export", "{case}", "--to", "opencv", "-o", "{out}/new.yaml"),
+            ("rectify", "image.png", "--camera", "{case}", "-o", "{out}/new.png"),
+        ),
+    ),
+    "rig": Kind(
+        "rig.json",
+        (
+            ("rigkit.io.rig_file:load_saved_rig", "{case}"),
+            ("diff", "{case}", "rig.json"),
+            ("certify", "{case}", "--depth", "200", "--distance", "900"),
+            ("export", "{case}", "--to", "kalibr", "-o", "{out}/new.yaml"),
+            ("export", "{case}", "--to", "opencv", "-o", "{out}/new.yaml"),
+            ("rectify", "image.png", "image.jpg", "--rig", "{case}", "-o", "{out}/new.png"),
+        ),
+    ),
+    "board-rigs": Kind("board-rigs.json", (("rigkit.io.rig_file:load_board_rigs", "{case}"),)),
+    "corners-json": Kind(
+        "corners.json", (("rigkit.io.corners_file:read_corners", "{case}"), ("fuzz_readers:read_cache", "{case}"))
+    ),
+    "corners-csv": Kind("corners.csv", (("rigkit.io.corners_file:read_corners", "{case}"),)),
+    "corners-vnl": Kind("corners.vnl", (("fuzz_readers:read_vnl", "{case}"),)),
+    "truth-csv": Kind("truth.csv", (("fuzz_readers:read_truth", "{case}"),)),
+    "pairs-csv": Kind("pairs.csv", (("rigkit.io.correspondences:read_correspondences", "{case}"),)),
+    "pairs-npz": Kind("pairs.npz", (("rigkit.io.correspondences:read_correspondences", "{case}"),)),
+    "ply": Kind(
+        "cloud.ply",
+        (("rigkit.io.ply:read_ply", "{case}"), ("mesh", "{case}", "-o", "{out}/new.ply", "--depth", "3")),
+    ),
+    "history": Kind(
+        "history.jsonl",
+        (
+            ("history", "{case}", "--json"),
+            ("history", "{case}", "-r", "{out}/new.html"),
+            ("history", "{case}", "--add", "calibration.json", "--to", "calibration.json"),
+        ),
+    ),
+    "check": Kind(
+        "calibration.json", (("check", "{case}", "image.png", "--board", "floor.toml", "--json"),), judged=True
+    ),
+    "check-rig": Kind(
+        "rig.json", (("check", "{case}", "image.png", "image.jpg", "--board", "floor.toml"),), judged=True
+    ),
+    "check-image": Kind(
+        "image.png",
+        (("check", "calibration.json", "{case}", "--board", "floor.toml", "--fix", "{out}/new.json"),),
+        judged=True,
+    ),
+    "poses": Kind("poses.csv", (("rigkit.io.robot_poses:read_robot_poses", "{case}"),)),
+    "poses-turned": Kind("turns.csv", (("rigkit.io.robot_poses:read_robot_poses", "{case}"),)),
+    "pose": Kind("pose.txt", (("rigkit.workflows.reconstruct_scene:_read_pose", "{case}"),)),
+    "avi": _video("film.avi"),
+    "mp4": _video("film.mp4"),
+    "mkv": _video("film.mkv"),
+    "timestamps": Kind("times.csv", (("fuzz_readers:read_times", "{case}"),)),
+    "frames-record": Kind("frames.json", (("fuzz_readers:read_record", "{case}"),)),
+    "coach-watch": Kind("image.png", (("fuzz_readers:coach_folder", "{case}"), ("fuzz_readers:coach_again", "{case}"))),
+    "many": Kind(
+        "dataset.toml",
+        (("validate", "{case}", "other/dataset.toml", "-o", "{out}/v", "-j", "1", "--no-pictures"),),
+        judged=True,
+    ),
+    "kalibr-target": _board_file("target.yaml"),
+    "kalibr-checkerboard": _board_file("checkerboard.yaml"),
+    "boofcv-target": _board_file("boofcv.yaml"),
+    "opencv-target": _board_file("settings.xml"),
+    "caliscope-target": _board_file("charuco.toml"),
+    "public-set": Kind("public.toml", (("rigkit.io.public_set:load_public_set", "{case}"),)),
+    "opencv": _camera_file("opencv.yaml", ("export", "{case}", "--from", "opencv", "-o", "{out}/new.json")),
+    "kalibr": _camera_file("kalibr.yaml", ("rigkit.workflows.camera_files:import_camera", "{case}")),
+    "chain": Kind("chain.yaml", (("export", "{case}", "--to", "mrcal", "-o", "{out}/new.cameramodel"),)),
+    "opencv-stereo": Kind("stereo.yaml", (("export", "{case}", "--to", "kalibr", "-o", "{out}/new.yaml"),)),
+    "ros": _camera_file("ros.yaml", ("export", "{case}", "--from", "ros", "-o", "{out}/new.json")),
+    "colmap": _camera_file("cameras.txt"),
+    "mrcal": _camera_file("lens.cameramodel"),
+    "mrcal-spline": _camera_file("spline.cameramodel"),
+    "ocamcalib": _camera_file("calib_results.txt"),
+    "py-ocamcalib": Kind("ocam.json", (("fuzz_readers:read_py_ocam", "{case}"),)),
+    "commands": Kind(None, COMMANDS, names_file=False, judged=True),
+    "api": Kind(None, (), names_file=False),
+    "requests": Kind(None, (), names_file=False),
+}
+"""Every class of input."""

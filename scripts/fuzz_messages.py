@@ -1,0 +1,45 @@
+"""What a message of an error has to say: about which file or option, and what to do. For `fuzz.py`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import PurePath
+
+__all__ = ["fault_of_message"]
+
+VERBS = (
+    "add|ask|calibrate|change|check|choose|compare|convert|copy|correct|create|describe|detect|export|get|give|increase|"
+    "install|keep|leave|list|lower|make|mark|measure|move|name|pip|put|raise|remove|rename|repeat|run|save|see|select|"
+    "set|shorten|show|split|start|take|update|use|wait|write"
+)
+REMEDY = re.compile(
+    # What to do, after a break of the sentence, ...
+    rf"(?:[;:,.(]|\band|\bor|\bthen|\binstead) (?:please )?(?:{VERBS})\b"
+    # ... or what would be right instead.
+    r"|\b(?:known|there are|there is only|expected|must|needs?|needed|should|did you mean|is it|is the file|only|"
+    r"at least|at most)\b|--[a-z]|\bpip install\b"
+)
+"""An imperative, or what was expected."""
+USAGE = re.compile(r"^usage: ")
+
+
+def fault_of_message(message: str, file: str | None, words: Sequence[str]) -> str | None:
+    """Return what the message lacks: the name of the damaged `file`, or, without one, any of the command's `words` or
+    an option; and what to do. None where it lacks nothing."""
+    if file is not None and file not in message:
+        return f"message does not name the file: {message[:300]}"
+    if file is None and not _tells_of(message, words):
+        return f"message names nothing of the command: {message[:300]}"
+    if not REMEDY.search(message):
+        return f"message does not say what to do: {message[:300]}"
+    return None
+
+
+def _tells_of(message: str, words: Sequence[str]) -> bool:
+    """Return whether the message names a word of the command (shown with escapes, or cut), or an option."""
+    if re.search(r"--[a-z]|(?<!\w)-[a-z]\b", message):
+        return True
+    return any(
+        shown and (shown[:40] in message) for word in words for shown in (word, ascii(word)[1:-1], PurePath(word).name)
+    )

@@ -1,0 +1,88 @@
+"""Readers that need more than a path, for `fuzz.py`."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from rigkit.coach.coach import Coach
+from rigkit.coach.guide import GuideOptions
+from rigkit.coach.sources import video_frames, watched_frames
+from rigkit.core.boards import Board
+from rigkit.interop.ocamcalib import read_py_ocamcalib
+from rigkit.io.corner_cache import CornerCache
+from rigkit.io.corners_file import read_corners
+from rigkit.io.reading import read_text
+from rigkit.io.truth_csv import load_truth_csv
+from rigkit.io.video import read_timestamps
+from rigkit.workflows.coach import CoachOptions, coach_frames, open_coach
+from rigkit.workflows.frames import frames_of_video
+
+SMALL = Board("small", 5, 4, 30.0, 30.0)
+GUIDE = GuideOptions(boards=(SMALL,))
+
+
+def read_vnl(path: Path) -> None:
+    """Read corners of mrgingham, which are about one board."""
+    read_corners(path, [SMALL])
+
+
+def read_truth(path: Path) -> None:
+    """Read a truth table about boards that are there."""
+    load_truth_csv(path, {"first": (Board("wall", 5, 4, 30.0, 30.0), Board("floor", 5, 4, 30.0, 30.0))})
+
+
+def read_py_ocam(path: Path) -> None:
+    """Read a camera of py-OCamCalib."""
+    read_py_ocamcalib(read_text(path), (640, 480), str(path))
+
+
+def read_cache(path: Path) -> None:
+    """Read the corners kept beside a session: what is damaged is as good as none."""
+    cache = CornerCache(path, [SMALL])
+    for name in cache.images:
+        cache.get(name, cache.digest(name))
+
+
+def read_frames(path: Path) -> None:
+    """Keep the frames of a video that show the board."""
+    frames_of_video(path, Path("out/frames"), [SMALL], most=4)
+
+
+def read_record(path: Path) -> None:
+    """Keep the frames of a video where a record of former ones is damaged: they are chosen anew."""
+    Path("out/frames").mkdir()
+    shutil.copy(path, "out/frames/frames.json")
+    frames_of_video(Path("film.avi"), Path("out/frames"), [SMALL], most=4)
+
+
+def read_times(path: Path) -> None:
+    """Read which frames of two videos are of one moment."""
+    read_timestamps(path, ["cam1", "cam2"])
+
+
+def coach_video(path: Path) -> None:
+    """Let the coach choose from the frames of a video."""
+    coach_frames(_coach(), video_frames([path]), photos=False, show=lambda jpeg: None)
+
+
+def coach_folder(path: Path) -> None:
+    """Let the coach watch a folder with a damaged picture: it names it, and goes on to the next."""
+    Path("watched").mkdir()
+    for name in (path.name, "image.png"):
+        shutil.copy(name, Path("watched") / name)
+    coach = _coach()
+    coach_frames(coach, watched_frames([Path("watched")], until_idle_s=0.5), photos=True, show=lambda jpeg: None)
+    assert coach.guide.size_px is not None, "the picture after the damaged one was not looked at"
+
+
+def coach_again(path: Path) -> None:
+    """Let the coach go on with a session of which a frame is damaged."""
+    _coach()
+    shutil.copy(path, "out/coach/images/frame-0001.png")
+    shutil.copy("image.png", "out/coach/images/frame-0002.png")
+    assert _coach().guide.views, "the frame after the damaged one was not read"
+
+
+def _coach() -> Coach:
+    return open_coach(CoachOptions(folder=Path("out/coach"), boards=("5x4x30",), guide=GUIDE))
