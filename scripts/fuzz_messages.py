@@ -11,13 +11,14 @@ __all__ = ["fault_of_message"]
 VERBS = (
     "add|ask|calibrate|change|check|choose|compare|convert|copy|correct|create|describe|detect|export|get|give|increase|"
     "install|keep|leave|list|lower|make|mark|measure|move|name|pip|put|raise|remove|rename|repeat|run|save|see|select|"
-    "set|shorten|show|split|start|take|update|use|wait|write"
+    "set|shorten|show|split|start|take|turn|update|use|wait|write|look|print|restore|say|send|decide|rectify|recalibrate|another"
 )
 REMEDY = re.compile(
     # What to do, after a break of the sentence, ...
     rf"(?:[;:,.(]|\band|\bor|\bthen|\binstead) (?:please )?(?:{VERBS})\b"
     # ... or what would be right instead.
-    r"|\b(?:known|there are|there is only|expected|must|needs?|needed|should|did you mean|is it|is the file|only|"
+    r"|\b(?:known|there are|there is only|another name|another folder|expected|must|needs?|needed|should|did you mean|"
+    r"is it|is the file|only|"
     r"at least|at most)\b|--[a-z]|\bpip install\b"
 )
 """An imperative, or what was expected."""

@@ -34,7 +34,6 @@ TOKENS = (
     "..",
     "x" * 5000,
     "\x00",
-    "\udcff",
 )
 ACTIONS = (
     "look", "look", "take", "take", "undo", "finish", "state", "", "frame.jpg", "../../etc/passwd", "..%2f..%2fetc",

@@ -232,7 +232,9 @@ class Calibration:
         frame = as_array(self.frame_covariance, (p + 6, p + 6), "frame_covariance")
         object.__setattr__(self, "frame_covariance", frame)
         if not self.views:
-            raise InputError("calibration: no view was used; a calibration without data cannot be built")
+            raise InputError(
+                "calibration: no view was used; a calibration without data cannot be built; give images with boards"
+            )
 
     def __repr__(self) -> str:
         width, height = self.camera.size_px

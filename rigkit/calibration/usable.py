@@ -56,7 +56,10 @@ def usable_views(
         else:
             dropped.append((view.image, reason))
     if not used:
-        raise InputError(f"calibration: none of {len(views)} views can be used; the first: {dropped[0][1]}")
+        raise InputError(
+            f"calibration: none of {len(views)} views can be used; the first: {dropped[0][1]}; "
+            "check columns and rows of the board"
+        )
     return used, tuple(dropped)
 
 

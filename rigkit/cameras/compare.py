@@ -121,7 +121,10 @@ def compare_cameras(
     projected, seen = b.project(rays @ b_from_a.T)
     covered = covered & seen
     if covered.sum() < MIN_PIXELS:
-        raise DegenerateError(f"the cameras share {covered.sum()} of {covered.size} pixels; they look elsewhere")
+        raise DegenerateError(
+            f"the cameras share {covered.sum()} of {covered.size} pixels; they look elsewhere; "
+            "compare cameras of one view"
+        )
     difference = np.where(covered[..., None], projected - pixels, np.nan)
     return CameraDifference(pixels, difference, covered, b_from_a)
 

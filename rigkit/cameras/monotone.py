@@ -47,7 +47,7 @@ def first_root(coefficients: FloatArray, limit: float) -> float:
     degree = coefficients.shape[-1] - 1
     scaled = coefficients * limit ** np.arange(degree + 1.0)
     if not np.isfinite(scaled).all():
-        raise InputError("lens polynomial: its coefficients are too large for any lens")
+        raise InputError("lens polynomial: its coefficients are too large for any lens; calibrate again")
     # Eigenvalues of this companion matrix are 1 / x: a leading coefficient of zero is no special case.
     companion = np.zeros((*coefficients.shape[:-1], degree, degree))
     companion.reshape(-1, degree * degree)[:, degree :: degree + 1] = 1.0

@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     if args.size == "identify":
         return _identify(args)
     if args.images:
-        raise InputError(f"board: '{args.images[0]}' after the board; images go with rigkit board identify")
+        raise InputError(f"board: '{args.images[0]}' after the board; give images to rigkit board identify alone")
     size = BOARD_SIZE.match(args.size)
     measured = args.ruler_x_mm is not None or args.ruler_y_mm is not None
     board: Board | Path = board_in_words(args.size) or Path(args.size)

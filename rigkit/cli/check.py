@@ -5,8 +5,12 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rigkit.core.errors import ExitCode, InputError
+
+if TYPE_CHECKING:
+    from rigkit.workflows.check import CheckedPictures
 
 __all__ = ["HELP", "add_arguments", "run"]
 
@@ -71,27 +75,7 @@ def run(args: argparse.Namespace) -> int:
     done = check_pictures(args.calibration, args.images, options, progress=progress_on_stderr())
     check = done.check
     if args.json:
-        change = check.change
-        print_json(
-            {
-                "holds": check.holds,
-                "chance": check.chance,
-                "statement": done.words.headline,
-                "cause": None if change is None else change.cause.kind,
-                "camera": None if change is None else change.cause.camera,
-                "amounts": [] if change is None else change.amounts.tolist(),
-                "sigmas": [] if change is None else change.sigmas.tolist(),
-                "units": [] if change is None else list(change.cause.units),
-                "size_px": None if change is None else change.size_px,
-                "cost": check.cost,
-                "cost_unit": check.cost_unit,
-                "rms_px": check.rms_px,
-                "rms_fixed_px": check.rms_fixed_px,
-                "expected_px": check.expected_px,
-                "left_out": [list(entry) for entry in done.left_out],
-                "unreadable": list(done.unreadable),
-            }
-        )
+        print_json(_summary(done))
     else:
         print(done.words.headline)
         for sentence in done.words.sentences:
@@ -107,3 +91,25 @@ def run(args: argparse.Namespace) -> int:
     if not check.holds:
         return ExitCode.CHECK_FAILED
     return ExitCode.BAD_INPUT if done.unreadable else ExitCode.WELL
+
+
+def _summary(done: CheckedPictures) -> dict[str, Any]:
+    check, change = done.check, done.check.change
+    return {
+        "holds": check.holds,
+        "chance": check.chance,
+        "statement": done.words.headline,
+        "cause": None if change is None else change.cause.kind,
+        "camera": None if change is None else change.cause.camera,
+        "amounts": [] if change is None else change.amounts.tolist(),
+        "sigmas": [] if change is None else change.sigmas.tolist(),
+        "units": [] if change is None else list(change.cause.units),
+        "size_px": None if change is None else change.size_px,
+        "cost": check.cost,
+        "cost_unit": check.cost_unit,
+        "rms_px": check.rms_px,
+        "rms_fixed_px": check.rms_fixed_px,
+        "expected_px": check.expected_px,
+        "left_out": [list(entry) for entry in done.left_out],
+        "unreadable": list(done.unreadable),
+    }

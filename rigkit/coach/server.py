@@ -93,6 +93,8 @@ def coach_app(coach: Coach, token: str, hosts: tuple[str, ...] = LOCAL, *, camer
             Route("/{token}/{what:str}", act, methods=["POST"]),
         ]
     )
+    # A redirect would come before the token and the host are looked at.
+    app.router.redirect_slashes = False
     app.state.preview = coach_preview
     return app
 
@@ -102,14 +104,17 @@ def _refused(request: Request, token: str, hosts: tuple[str, ...]) -> Response |
     from starlette.responses import PlainTextResponse
 
     given = str(request.path_params.get("token", ""))
-    if not hmac.compare_digest(given.encode(), token.encode()):
+    if not hmac.compare_digest(given.encode("utf-8", "backslashreplace"), token.encode()):
         return PlainTextResponse("not found", 404, HEADERS)
-    host = urlsplit(f"//{request.headers.get('host', '')}")
-    name = f"[{host.hostname}]" if ":" in (host.hostname or "") else host.hostname
-    if name not in hosts:
-        return PlainTextResponse("wrong host", 403, HEADERS)
     origin = request.headers.get("origin")
-    if origin is not None and urlsplit(origin).netloc != request.headers.get("host"):
+    try:
+        host = urlsplit(f"//{request.headers.get('host', '')}").hostname or ""
+        stranger = origin is not None and urlsplit(origin).netloc != request.headers.get("host")
+    except ValueError:
+        return PlainTextResponse("no address", 400, HEADERS)
+    if (f"[{host}]" if ":" in host else host) not in hosts:
+        return PlainTextResponse("wrong host", 403, HEADERS)
+    if stranger:
         return PlainTextResponse("wrong origin", 403, HEADERS)
     if request.method == "POST" and origin is None:
         return PlainTextResponse("no origin", 403, HEADERS)
@@ -119,7 +124,7 @@ def _refused(request: Request, token: str, hosts: tuple[str, ...]) -> Response |
 async def _body_of(request: Request) -> bytes | None:
     """Return what was sent; None where it is too much, without reading it all."""
     told = request.headers.get("content-length", "0")
-    if not told.isdecimal() or int(told) > MAX_UPLOAD_BYTES:
+    if not told.isdecimal() or len(told) > len(str(MAX_UPLOAD_BYTES)) or int(told) > MAX_UPLOAD_BYTES:
         return None
     parts, size = [], 0
     async for chunk in request.stream():

@@ -122,17 +122,25 @@ def as_covariance(value: ArrayLike, name: str, size: int) -> FloatArray:
     covariance = as_array(value if size else np.zeros((0, 0)), (size, size), name)
     variance = np.diag(covariance)
     if (variance < 0.0).any():
-        raise InputError(f"{name}: a variance is negative ({variance.min():.3g}); the numbers were changed or damaged")
+        raise InputError(
+            f"{name}: a variance is negative ({variance.min():.3g}); the numbers were changed or damaged; "
+            "calibrate again"
+        )
     sigma = np.sqrt(variance)
     # What has no variance has no covariance either.
     scale = np.outer(sigma, sigma)
     if (np.abs(covariance - covariance.T) > MAX_ASYMMETRY * scale).any():
-        raise InputError(f"{name}: it is not symmetric, as covariances are; the numbers were changed or damaged")
+        raise InputError(
+            f"{name}: it is not symmetric, as covariances are; the numbers were changed or damaged; calibrate again"
+        )
     if (np.abs(covariance) > (1.0 - MIN_EIGENVALUE) * scale).any():
-        raise InputError(f"{name}: a correlation is beyond 1; the numbers were changed or damaged")
+        raise InputError(f"{name}: a correlation is beyond 1; the numbers were changed or damaged; calibrate again")
     correlation = np.divide(covariance, scale, out=np.zeros_like(covariance), where=scale > 0.0)
     if size and float(np.linalg.eigvalsh(correlation + correlation.T)[0]) < 2.0 * MIN_EIGENVALUE * size:
-        raise InputError(f"{name}: it has a negative variance in some direction; the numbers were changed or damaged")
+        raise InputError(
+            f"{name}: it has a negative variance in some direction; the numbers were changed or damaged; "
+            "calibrate again"
+        )
     return covariance
 
 

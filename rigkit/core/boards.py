@@ -48,9 +48,8 @@ class Board:
     def __post_init__(self) -> None:
         check_identifier(self.board_id, "board")
         if not all(isinstance(count, int | np.integer) for count in (self.columns, self.rows)):
-            raise InputError(
-                f"board '{self.board_id}': columns and rows are whole numbers, got {self.columns!r} and {self.rows!r}"
-            )
+            got = f"{self.columns!r} and {self.rows!r}"
+            raise InputError(f"board '{self.board_id}': columns and rows must be whole numbers, got {got}")
         if self.columns < 2 or self.rows < 2:
             words = self.pattern.point_word
             raise InputError(f"board '{self.board_id}': at least 2x2 {words}, got {self.columns}x{self.rows}")

@@ -66,7 +66,10 @@ class BoardDetection:
         _check_corners(self)
         inside = (self.grid >= 0).all() and (self.grid < [self.columns, self.rows]).all()
         if not inside:
-            raise InputError(f"board detection: a corner lies outside the {self.columns}x{self.rows} grid")
+            raise InputError(
+                f"board detection: a corner lies outside the {self.columns}x{self.rows} grid; "
+                "correct its column and row"
+            )
 
     @property
     def complete(self) -> bool:

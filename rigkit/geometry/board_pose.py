@@ -213,7 +213,7 @@ def _pose_from_homography(h: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return rotation and translation from H ~ [r1 r2 t]."""
     scale = np.sqrt(np.linalg.norm(h[:, 0]) * np.linalg.norm(h[:, 1]))
     if not scale > 0.0:
-        raise DegenerateError("board pose: the homography has no scale; the target is seen edge-on")
+        raise DegenerateError("board pose: the homography has no scale; the target is seen edge-on; take another view")
     r1, r2, t = (h / scale).T
     return nearest_rotation(np.stack([r1, r2, np.cross(r1, r2)], axis=1)), t
 

@@ -223,5 +223,8 @@ def _unit_baseline(cam2_from_cam1: Any) -> Rigid3:
     pose = Rigid3.from_matrix(cam2_from_cam1.matrix())
     length = float(np.linalg.norm(pose.translation_mm))
     if not length > 0.0:
-        raise DegenerateError("pycolmap finds a relative pose without baseline; the two images show the same view")
+        raise DegenerateError(
+            "pycolmap finds a relative pose without baseline; the two images show the same view; "
+            "take them from different places"
+        )
     return Rigid3(pose.rotation, pose.translation_mm / length)

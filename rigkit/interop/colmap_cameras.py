@@ -90,7 +90,7 @@ def read_colmap_cameras(text: str, name: str = "cameras.txt") -> dict[int, Camer
         if camera_id in cameras:
             raise InputError(f"{where}: camera {camera_id} is there twice; leave one")
         if len(values) != len(keys):
-            raise InputError(f"{where}: {words[1]} has {len(keys)} parameters, found {len(values)}")
+            raise InputError(f"{where}: {words[1]} has {len(keys)} parameters, found {len(values)}; correct the line")
         parameters = _parameters(model, dict(zip(keys, values, strict=True)))
         cameras[camera_id] = camera_of(model, image_size(size, where.strip("'"), "size"), parameters, where.strip("'"))
     if not cameras:

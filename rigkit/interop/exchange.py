@@ -105,7 +105,9 @@ def best_accepted(camera: Camera, accepted: Sequence[Accepted], format_name: str
             note += f" within {reach:.0f} degrees of the axis ({100.0 * c.covered:.0f} % of the image); wrong beyond"
         found.append(Chosen(c.camera, kind, c.max_px, c.rms_px, c.covered, note))
     if not found:
-        raise InputError(f"{format_name}: none of its models can follow this {camera.model} camera")
+        raise InputError(
+            f"{format_name}: none of its models can follow this {camera.model} camera; choose another format"
+        )
     widest = max(c.covered for c in found)
     return min((c for c in found if c.covered >= widest - 0.01), key=lambda c: c.max_error_px)
 

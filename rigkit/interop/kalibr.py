@@ -101,7 +101,7 @@ def read_kalibr(text: str, name: str = "camchain") -> tuple[tuple[Camera, ...], 
             try:
                 step = Rigid3(matrix[:3, :3], matrix[:3, 3] * MM_PER_M)
             except InputError as error:
-                raise InputError(f"'{name}', {key}: T_cn_cnm1: {error}") from error
+                raise InputError(f"'{name}', {key}: T_cn_cnm1: {error}; is the file whole?") from error
             poses.append(step @ poses[-1])
     return tuple(cameras), tuple(poses)
 

@@ -91,7 +91,9 @@ def read_cameramodel(
     kind = lens.removeprefix("LENSMODEL_")
     if kind in counts:
         if intrinsics.size != counts[kind]:
-            raise InputError(f"'{name}': {lens} has {counts[kind]} intrinsics, found {intrinsics.size}")
+            raise InputError(
+                f"'{name}': {lens} has {counts[kind]} intrinsics, found {intrinsics.size}; is the file whole?"
+            )
         if kind == "PINHOLE":
             return camera_of("pinhole", size, intrinsics, name), pose, 0.0
         return camera_of("brown", size, intrinsics, name), pose, 0.0

@@ -81,7 +81,7 @@ def read_opencv(text: str, name: str = "OpenCV YAML") -> Camera:
     if "xi" in data:
         xi = float(numbers(data["xi"]["data"] if _is_matrix(data["xi"]) else data["xi"], name, "xi", 1)[0])
         if d.any():
-            raise InputError(f"'{name}': distortion on top of the unified model (xi) is not supported; recalibrate")
+            raise InputError(f"'{name}': distortion on top of the unified model (xi) is not read; calibrate without it")
         return unified_from_xi(size, xi, _core(K, name), name)
     return camera_from_arrays(size, K, d, fisheye=bool(data.get("fisheye_model")), name=name)
 

@@ -68,7 +68,7 @@ def read_camera_info(text: str, name: str = "camera_info") -> Camera:
     size = image_size(sides, name, "image_width, image_height")
     K = numbers(field(field(data, "camera_matrix", name), "data", name), name, "camera_matrix", 9)
     if K[1] != 0.0:
-        raise InputError(f"'{name}': camera_matrix has skew {K[1]:g}, which no model here has")
+        raise InputError(f"'{name}': camera_matrix has skew {K[1]:g}, which no model here has; calibrate without skew")
     core = K[[0, 4, 2, 5]]
     distortion = numbers(field(field(data, "distortion_coefficients", name), "data", name), name, "distortion")
     model = field(data, "distortion_model", name)
@@ -82,7 +82,7 @@ def read_camera_info(text: str, name: str = "camera_info") -> Camera:
             f"'{name}': distortion_model '{model}' is unknown; known: plumb_bob, rational_polynomial, equidistant"
         )
     if distortion.size > count and distortion[count:].any():
-        raise InputError(f"'{name}': {model} has {count} coefficients, found {distortion.size}")
+        raise InputError(f"'{name}': {model} has {count} coefficients, found {distortion.size}; is the file whole?")
     distortion = np.concatenate([distortion[:count], np.zeros(max(count - distortion.size, 0))])
     if ours == "brown" and not distortion.any():
         return camera_of("pinhole", size, core, name)

@@ -72,7 +72,7 @@ def _written(value: object) -> str:
 def _value(words: str, name: str, value: str, kind: type) -> object:
     if kind is bool:
         if value not in ("true", "false"):
-            raise InputError(f"board '{words}': {name} is true or false, got {value}")
+            raise InputError(f"board '{words}': {name} must be true or false, got {value}")
         return value == "true"
     try:
         return kind(value)

@@ -163,7 +163,7 @@ def read_ply(path: str | Path) -> OrientedCloud:
             calibration_in_sigmas=f"\ncomment {SIGMAS_COMMENT[True]}\n".encode() in data[:start],
         )
     except InputError as error:
-        raise InputError(f"point cloud '{source}': {error}") from error
+        raise InputError(f"point cloud '{source}': {error}; write it again") from error
 
 
 def _unit_normals(normals: FloatArray) -> FloatArray:

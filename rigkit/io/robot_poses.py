@@ -18,6 +18,7 @@ import numpy as np
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
+from rigkit.io.numbers import MAX_NUMBER
 from rigkit.io.reading import csv_rows
 
 __all__ = ["read_robot_poses"]
@@ -57,8 +58,8 @@ def read_robot_poses(path: str | Path) -> dict[str, Rigid3]:
             turned = np.array([float(cells[key]) for key in keys])
         except ValueError as error:
             raise InputError(f"{where}: {error}; write numbers with a decimal point") from error
-        if not (np.isfinite(place).all() and np.isfinite(turned).all()):
-            raise InputError(f"{where}: a value is not finite; correct the row")
+        if not (np.abs([*place, *turned]) <= MAX_NUMBER).all():
+            raise InputError(f"{where}: a value is not finite, or larger than anything measured; correct the row")
         if cells["image"] in poses:
             raise InputError(f"{where}: image '{cells['image']}' is there twice; leave one")
         if turn is None and abs(float(np.linalg.norm(turned)) - 1.0) > UNIT_TOLERANCE:

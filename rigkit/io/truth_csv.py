@@ -128,7 +128,7 @@ def _units(source: Path, head: Sequence[str]) -> Units:
         if pair[0] is not None and pair[1] is not None and pair[0][1] != pair[1][1]:
             raise InputError(f"{source}: columns '{pair[0][0]}' and '{pair[1][0]}' mix units; give both in one")
     if len(set(head)) != len(head):
-        raise InputError(f"{source}: a column is there twice; the head is {', '.join(head)}")
+        raise InputError(f"{source}: a column is there twice; the head is {', '.join(head)}; leave one")
     return units
 
 

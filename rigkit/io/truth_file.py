@@ -68,7 +68,10 @@ def make_distance(
         if feature.grid is None:
             continue
         if feature.grid[0] >= board.columns or feature.grid[1] >= board.rows:
-            raise InputError(f"{feature} lies outside the {board.columns}x{board.rows} inner corners (counted from 0)")
+            raise InputError(
+                f"{feature} lies outside the {board.columns}x{board.rows} inner corners (counted from 0); "
+                "correct the feature"
+            )
         if board.looks_same_turned and first.board_id != second.board_id:
             raise InputError(
                 f"{feature}: board '{board.board_id}' looks the same turned by 180 degrees, so nobody can say which "

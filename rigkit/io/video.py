@@ -150,7 +150,7 @@ def read_timestamps(path: Path, cameras: Sequence[str]) -> dict[int, Mapping[str
         own = [frames[camera] for frames in moments.values() if camera in frames]
         if not own:
             raise InputError(
-                f"'{path}' has no rows of camera '{camera}'; its cam_id is the number at the end of its name"
+                f"'{path}' has no rows of camera '{camera}'; its cam_id must be the number at the end of its name"
             )
         for frames in moments.values():
             if camera in frames:

@@ -154,7 +154,8 @@ def lattice_planes(
     views, boards = _views(geometry, moved)
     if not boards:
         raise DegenerateError(
-            f"pair '{pair.pair_id}': no board has {MIN_CORNERS_OF_BOARD} corners in each view for its own plane"
+            f"pair '{pair.pair_id}': no board has {MIN_CORNERS_OF_BOARD} corners in each view for its own plane; "
+            "take images that show whole boards"
         )
     sigma = np.array([(b.square_sigma_mm or 0.0) / np.sqrt(b.square_x_mm * b.square_y_mm) for b in boards])
     identity = pair.identity

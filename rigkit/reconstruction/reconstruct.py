@@ -226,7 +226,10 @@ def on_lattice(reconstruction: Reconstruction, planes: LatticePlanes) -> Reconst
     known = np.array([name in planes.board_ids for name in names])
     placed = (cloud.board_index >= 0) & known[cloud.board_index]
     if not placed.any():
-        raise DegenerateError(f"pair '{reconstruction.pair_id}': no point is on a board whose lattice was fitted")
+        raise DegenerateError(
+            f"pair '{reconstruction.pair_id}': no point is on a board whose lattice was fitted; "
+            "take images that show whole boards"
+        )
     baseline_mm, baseline_sigma_mm = planes.baseline_mm()
     lost = [name for name, fitted in zip(names, known, strict=True) if not fitted]
     told = f"left out, for their lattices could not be fitted: {', '.join(lost)}"

@@ -72,7 +72,8 @@ def scale_and_gradient(
     known = np.isfinite(scales)
     if not known.any():
         raise DegenerateError(
-            f"no scale: none of {len(boards)} boards has {MIN_CORNERS_FOR_SCALE} triangulated corners that span it"
+            f"no scale: none of {len(boards)} boards has {MIN_CORNERS_FOR_SCALE} triangulated corners that span it; "
+            "take images in which both cameras see one whole"
         )
     square = [(board.square_sigma_mm or 0.0) / min(board.square_x_mm, board.square_y_mm) for board in boards]
     variance = sigmas**2 + (scales * np.array(square)) ** 2

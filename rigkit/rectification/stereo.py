@@ -148,7 +148,10 @@ def _extent(maps: list[RectifyMap], reach: FloatArray) -> tuple[FloatArray, Floa
         there, valid = remap.pixels(grid)
         valid &= (np.abs(np.where(valid[..., None], there, np.inf)) <= reach).all(axis=-1)
         if not valid.any():
-            raise DegenerateError("stereo rectification: a camera looks away from the plane that both could share")
+            raise DegenerateError(
+                "stereo rectification: a camera looks away from the plane that both could share; "
+                "rectify each alone (--camera)"
+            )
         lows.append(there[valid].min(axis=0))
         highs.append(there[valid].max(axis=0))
         scales.append(remap.scale(grid[valid]))

@@ -56,7 +56,8 @@ def planar_pnp(reconstruction: Reconstruction) -> PnpResult:
     sights = _sights([reconstruction])
     if not sights:
         raise DegenerateError(
-            f"pair '{reconstruction.pair_id}': no board has {MIN_CORNERS_FOR_PNP} corners for its own pose"
+            f"pair '{reconstruction.pair_id}': no board has {MIN_CORNERS_FOR_PNP} corners for its own pose; "
+            "take images that show whole boards"
         )
     poses = {b: (board_pose(s.rays1[0], s.points), board_pose(s.rays2[0], s.points)) for b, s in sights.items()}
     counts = {b: len(s.points) for b, s in sights.items()}

@@ -178,7 +178,10 @@ def _frames(watched: Watched, sources: Sequence[Path]) -> list[list[Path]]:
         return [list(frame) for frame in zip(*columns, strict=True)]
     images = list(images_in(sources))
     if len(images) % count:
-        raise InputError(f"check: {len(images)} images are not moments of {count} cameras each ({watched.names})")
+        raise InputError(
+            f"check: {len(images)} images are not moments of {count} cameras each ({watched.names}); "
+            "give as many of each camera"
+        )
     return [images[k : k + count] for k in range(0, len(images), count)]
 
 

@@ -173,7 +173,9 @@ def _kept_alone(session: Session, kept: CornerCache) -> SessionCorners:
     first = {name: item for name in kept.images if (item := kept.get(name, None)) is not None}
     if not first:
         whose = "" if session.camera is None else f" of camera '{session.camera}'"
-        raise InputError(f"{session.path}: no image matches 'images'{whose}, and no corners are kept beside it")
+        raise InputError(
+            f"{session.path}: no image matches 'images'{whose}, and no corners are kept beside it; correct the pattern"
+        )
     lens = _lens_of(session, {name: kept.digest(name) for name in first})
     through = {name: item for name in first if (item := kept.get(name, None, lens)) is not None}
     source = f"the corners of {len(first)} images kept in {session.corners_path.name} are used"

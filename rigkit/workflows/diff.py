@@ -88,7 +88,10 @@ def diff(a: Path, b: Path, options: DiffOptions | None = None) -> CameraPair | R
     boards = [is_board_rigs_file(path) for path in (a, b)]
     if any(boards):
         if not all(boards):
-            raise InputError(f"diff: '{b if boards[0] else a}' is no file of boards on one mount, as the other one is")
+            raise InputError(
+                f"diff: '{b if boards[0] else a}' is no file of boards on one mount, as the other one is; "
+                "give two such files"
+            )
         if options.output is not None:
             raise InputError("diff: a map is of two cameras, not of boards; leave out -o")
         return _boards(a, b)
@@ -112,7 +115,9 @@ def diff(a: Path, b: Path, options: DiffOptions | None = None) -> CameraPair | R
 def _boards(a: Path, b: Path) -> BoardsPair:
     first, second = ({rig.names[0]: rig for rig in load_board_rigs(path)} for path in (a, b))
     if list(first) != list(second):
-        raise InputError(f"diff: '{a}' has mounts of {', '.join(first)}, '{b}' of {', '.join(second)}")
+        raise InputError(
+            f"diff: '{a}' has mounts of {', '.join(first)}, '{b}' of {', '.join(second)}; give files of the same boards"
+        )
     return BoardsPair({name: compare_board_rigs(rig, second[name]) for name, rig in first.items()})
 
 
@@ -129,7 +134,10 @@ def _rigs(a: Path, b: Path) -> RigPair:
     first, second = _named_like(first, second, a), _named_like(second, first, b)
     names = list(first.cameras)
     if names != list(second.cameras):
-        raise InputError(f"diff: '{a}' has the cameras {', '.join(names)}, '{b}' {', '.join(second.cameras)}")
+        raise InputError(
+            f"diff: '{a}' has the cameras {', '.join(names)}, '{b}' {', '.join(second.cameras)}; "
+            "give rigs of the same cameras"
+        )
     mounts = compare_mounts(*(Mounted(rig.cameras, rig.covariance, rig.freedom) for rig in (first, second)))
     cameras = {}
     for name in names:

@@ -179,7 +179,7 @@ def foreign_paths(beside: Path, kinds: Sequence[str]) -> list[Path]:
     """Return where `foreign_files` go; raises InputError for a format that nobody knows."""
     unknown = [kind for kind in kinds if kind not in FOREIGN_ENDINGS]
     if unknown:
-        raise InputError(f"export: '{unknown[0]}' is none of the formats {', '.join(FOREIGN_ENDINGS)}")
+        raise InputError(f"export: '{unknown[0]}' is none of the known formats {', '.join(FOREIGN_ENDINGS)}")
     return [beside.with_name(f"{beside.stem}-{kind}{FOREIGN_ENDINGS[kind]}") for kind in kinds]
 
 

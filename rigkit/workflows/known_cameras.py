@@ -59,7 +59,8 @@ def known_cameras(session: RigSession) -> KnownCameras | None:
             raise InputError(f"'{session.known_rig}': its first camera, '{first}', is none of {', '.join(names)}")
         if len(mounted) == len(names):
             raise InputError(
-                f"'{session.known_rig}' has all cameras already ({', '.join(names)}); there is none to add"
+                f"'{session.known_rig}' has all cameras already ({', '.join(names)}); there is none to add; "
+                "name a new one"
             )
     cameras: dict[str, tuple[Camera, Rigid3 | None]] = {name: rig.cameras[name] for name in mounted}
     alone: dict[str, FloatArray | None] = {}

@@ -43,9 +43,9 @@ def mesh_cloud(cloud: str | Path, options: MeshOptions, *, progress: Progress = 
         Nothing is left of the surface.
     """
     if not 3 <= options.depth <= MAX_OCTREE_DEPTH:
-        raise InputError(f"mesh: the depth of the octree is 3 to {MAX_OCTREE_DEPTH}, got {options.depth}")
+        raise InputError(f"mesh: the depth of the octree must be 3 to {MAX_OCTREE_DEPTH}, got {options.depth}")
     if not 0.0 <= options.cut < 1.0:
-        raise InputError(f"mesh: the share that is cut off is from 0 to below 1, got {options.cut}")
+        raise InputError(f"mesh: the share that is cut off must be from 0 to below 1, got {options.cut}")
     ensure_writable(options.output, force=options.force, inputs=[Path(cloud)])
     points = read_ply(cloud)
     progress("fitting the surface", 0, 1)

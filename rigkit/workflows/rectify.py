@@ -148,7 +148,7 @@ def _outputs(image: Path, output: Path) -> list[tuple[Path, Path]]:
     if not found:
         raise InputError(f"rectify: folder '{image}' has no images ({' '.join(sorted(IMAGE_ENDINGS))}); give another")
     if output.suffix:
-        raise InputError(f"rectify: '{image}' is a folder, so -o names one too, not '{output.name}'")
+        raise InputError(f"rectify: '{image}' is a folder, so -o must name one too, not '{output.name}'")
     return [(path, output / (path.name if cv2.haveImageWriter(path.name) else f"{path.stem}.png")) for path in found]
 
 

@@ -135,7 +135,7 @@ def _copy(source: Path, path: Path, expected: str) -> None:
     from rigkit.io.files import write_atomic
 
     if not source.is_file():
-        raise InputError(f"'{source}' cannot be fetched: there is no such file")
+        raise InputError(f"'{source}' cannot be fetched: there is no such file; correct the address")
     _require(source, expected)
     write_atomic(path, source.read_bytes())
 

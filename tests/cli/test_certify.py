@@ -74,7 +74,7 @@ def test_the_result_for_programs(rig: Path, capsys: pytest.CaptureFixture[str]) 
         (["--length", "-3", "--distance", "900"], "the size must be positive"),
         (["--length", "3", "--distance", "900", "--sigma-px", "0"], "--sigma-px 0.0: it must be positive"),
         (["--length", "3", "--distance", "900", "--limit", "nan"], "the limit must be positive"),
-        (["--length", "3", "--distance", "900", "--confidence", "100"], "the confidence lies between 0 and 1"),
+        (["--length", "3", "--distance", "900", "--confidence", "100"], "the confidence must lie between 0 and 1"),
         (["--length", "3", "--distance", "900", "--cameras", "left", "top"], "two different cameras of left, right"),
         (["--length", "3", "--distance", "900", "--report", "rig.json", "--force"], "rig.json"),
     ],

@@ -49,11 +49,12 @@ def test_faults_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     call = ["fuzz_readers:read_vnl", "case.toml"]
     for error, said in (
         (ValueError("bad"), "ValueError: bad"),
-        (InputError("no name"), "does not name"),
+        (InputError("no name; write one"), "does not name"),
+        (InputError("case.toml: it is wrong"), "does not say what to do"),
     ):
         monkeypatch.setattr(fuzz_readers, "read_vnl", raising(error))
         assert said in str(fuzz.fault_of(call, "case.toml", sound=False))
-    monkeypatch.setattr(fuzz_readers, "read_vnl", raising(InputError("case.toml: one line")))
+    monkeypatch.setattr(fuzz_readers, "read_vnl", raising(InputError("case.toml: one line is wrong; correct it")))
     assert fuzz.fault_of(call, "case.toml", sound=False) is None
     assert "though sound" in str(fuzz.fault_of(call, "case.toml", sound=True))
     monkeypatch.setattr(cli, "build_parser", raising(ValueError("bad")))

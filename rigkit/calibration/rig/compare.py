@@ -86,7 +86,10 @@ def compare_mounts(a: Mounted, b: Mounted, *, seed: int = 0) -> RigDifference:
     cameras look elsewhere.
     """
     if list(a.cameras) != list(b.cameras):
-        raise InputError(f"rigs of other cameras: {', '.join(a.cameras)} and {', '.join(b.cameras)}")
+        raise InputError(
+            f"rigs of other cameras: {', '.join(a.cameras)} and {', '.join(b.cameras)}; "
+            "compare rigs of the same cameras"
+        )
     turns = []
     weights = [_weights(a, k) * _weights(b, k) for k in range(len(a.cameras))]
     for (first, _), (second, _), weight in zip(a.cameras.values(), b.cameras.values(), weights, strict=True):
@@ -111,7 +114,9 @@ def compare_board_rigs(a: BoardRig, b: BoardRig, *, seed: int = 0) -> RigDiffere
     Raises InputError where the boards are others.
     """
     if a.names != b.names:
-        raise InputError(f"other boards: {', '.join(a.names)} and {', '.join(b.names)}")
+        raise InputError(
+            f"other boards: {', '.join(a.names)} and {', '.join(b.names)}; compare mounts of the same boards"
+        )
     off = [_off(p.target_from_board, q.target_from_board) for p, q in zip(a.boards[1:], b.boards[1:], strict=True)]
     freedom = tuple(float(max(rig.image_count - 1, 1)) for rig in (a, b))
     known = _known((a.covariance, b.covariance), freedom, seed)

@@ -119,7 +119,9 @@ class RigCalibration:
         difference = self._centre(second) - self._centre(first)
         length = float(np.linalg.norm(difference))
         if length == 0.0:
-            raise InputError(f"rig: cameras '{name1}' and '{name2}' have the same centre")
+            raise InputError(
+                f"rig: cameras '{name1}' and '{name2}' have the same centre; measure a baseline between others"
+            )
         row = np.zeros(len(self.covariance))
         for k, sign in ((first, -1.0), (second, 1.0)):
             if k > 0:

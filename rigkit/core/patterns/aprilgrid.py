@@ -75,11 +75,14 @@ class AprilGrid(Pattern):
 
     def check(self, columns: int, rows: int, squares_mm: tuple[float, float]) -> None:
         if columns % 2 or rows % 2:
-            raise InputError(f"{columns}x{rows} corners are no whole tags; an AprilGrid has two columns and rows a tag")
+            raise InputError(f"{columns}x{rows} corners are no whole tags; there must be two columns and rows a tag")
         if not 0.0 < self.spacing <= 2.0:
-            raise InputError(f"a spacing of {self.spacing} is not a part of a tag's side; Kalibr's tags have 0.3")
+            raise InputError(
+                f"a spacing of {self.spacing} is not a part of a tag's side; "
+                "write the gap over it, such as Kalibr's 0.3"
+            )
         if not 1 <= self.border <= MAX_BORDER:
-            raise InputError(f"a border of {self.border} modules is unknown; Kalibr's tags have 2, OpenCV's 1")
+            raise InputError(f"a border of {self.border} modules is unknown; write 2 for Kalibr's tags, 1 for OpenCV's")
         if self.numbering not in NUMBERINGS:
             raise InputError(f"numbering '{self.numbering}' is unknown; known: {', '.join(NUMBERINGS)}")
         count = len(dictionary_modules(self.dictionary))

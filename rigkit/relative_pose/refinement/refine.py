@@ -220,7 +220,7 @@ def project_to_type(pose: Rigid3, pose_type: PoseType | str) -> tuple[FloatArray
 
 def _split(pose: Rigid3) -> tuple[FloatArray, FloatArray]:
     if not np.linalg.norm(pose.translation_mm) > 0.0:
-        raise DegenerateError("the start of the refinement has no baseline")
+        raise DegenerateError("the start of the refinement has no baseline; take the images from different places")
     return np.array(pose.rotation), unit(pose.translation_mm)
 
 

@@ -54,7 +54,9 @@ class ForwardRollSolver:
             system = np.concatenate([points * row_weights.points[:, None], more.reshape(-1, 2)])
             s, vt = right_singular(system)
             if s[0] < MIN_OFF_AXIS * np.abs(row_weights.points).max():
-                raise DegenerateError("the roll is not determined: all points lie on the optical axis")
+                raise DegenerateError(
+                    "the roll is not determined: all points lie on the optical axis; take images with points all over"
+                )
             return np.asarray((vt[-1] @ BASIS).reshape(3, 3))
 
         check_baseline(m)

@@ -31,7 +31,10 @@ def essential_from_pose(cam2_from_cam1: Rigid3) -> Mat3:
     E21 = skew(cam2_from_cam1.translation_mm) @ cam2_from_cam1.rotation
     size = float(np.linalg.norm(E21))
     if size == 0.0:
-        raise DegenerateError("no baseline: the pose has a zero translation and no epipolar geometry")
+        raise DegenerateError(
+            "no baseline: the pose has a zero translation and no epipolar geometry; "
+            "take the images from different places"
+        )
     return np.asarray(E21 / size)
 
 

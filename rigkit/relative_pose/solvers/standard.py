@@ -90,7 +90,9 @@ class _Rows:
         point = self.ahead & (weights.points > 0.0)
         affine = self.ahead & (weights.affinities > 0.0)
         if not (point.any() or affine.any()):
-            raise DegenerateError("the relation between the images' rows is not determined: no point lies ahead")
+            raise DegenerateError(
+                "the relation between the images' rows is not determined: no point lies ahead; check the pose type"
+            )
         some = point if point.any() else affine
         shift1, shift2 = float(self.y1[some].mean()), float(self.y2[some].mean())
         spread = float(np.std(self.y1[some]))

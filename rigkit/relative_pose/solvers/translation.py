@@ -48,7 +48,10 @@ class TranslationSolver:
             rows = np.concatenate([points * row_weights.points[:, None], more.reshape(-1, 3)])[:, columns]
             s, vt = right_singular(rows)
             if s[len(columns) - 2] < 1e-12 * np.abs(row_weights.points).max():
-                raise DegenerateError("the translation is not determined: the two images show the same rays")
+                raise DegenerateError(
+                    "the translation is not determined: the two images show the same rays; "
+                    "take them from different places"
+                )
             t = np.zeros(3)
             t[columns] = vt[-1]
             return skew(t)

@@ -100,7 +100,7 @@ class Task:
         if not (np.isfinite(self.distance_sigma_mm) and self.distance_sigma_mm >= 0.0):
             raise InputError(f"certificate: the distance cannot be known to {self.distance_sigma_mm} mm")
         if not 0.0 < self.confidence < 1.0:
-            raise InputError(f"certificate: the confidence lies between 0 and 1, got {self.confidence}")
+            raise InputError(f"certificate: the confidence must lie between 0 and 1, got {self.confidence}")
 
     @property
     def unit(self) -> str:

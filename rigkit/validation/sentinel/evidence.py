@@ -246,7 +246,10 @@ def _posed(watched: Watched, c: int, observations: Observations) -> tuple[State,
     for view in observations.views:
         rays, valid = camera.unproject(view.pixels)
         if valid.sum() < 4:
-            raise DegenerateError(f"image '{view.image}': the lens does not see where board '{view.board.board_id}' is")
+            raise DegenerateError(
+                f"image '{view.image}': the lens does not see where board '{view.board.board_id}' is; "
+                "check the board's size"
+            )
         poses.append(board_pose(rays[valid], view.points()[valid]).cam_from_board)
     rotation = np.array([pose.rotation for pose in poses])
     translation = np.array([pose.translation_mm for pose in poses])
