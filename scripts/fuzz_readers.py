@@ -73,7 +73,7 @@ def coach_folder(path: Path) -> None:
         shutil.copy(name, Path("watched") / name)
     coach = _coach()
     coach_frames(coach, watched_frames([Path("watched")], until_idle_s=0.5), photos=True, show=lambda jpeg: None)
-    assert coach.guide.size_px is not None, "the picture after the damaged one was not looked at"
+    assert coach.guide.frames, "the picture after the damaged one was not looked at"
 
 
 def coach_again(path: Path) -> None:
@@ -81,7 +81,7 @@ def coach_again(path: Path) -> None:
     _coach()
     shutil.copy(path, "out/coach/images/frame-0001.png")
     shutil.copy("image.png", "out/coach/images/frame-0002.png")
-    assert _coach().guide.views, "the frame after the damaged one was not read"
+    assert _coach().guide.frames, "the frame after the damaged one was not read"
 
 
 def _coach() -> Coach:

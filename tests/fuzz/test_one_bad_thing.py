@@ -101,7 +101,7 @@ def test_the_coach(place: Path, capsys: pytest.CaptureFixture[str], caplog: pyte
     shutil.copy("image.png", "coach/images/frame-0002.png")
     (place / "coach/images/frame-one.png").write_bytes(b"not of ours")
     coach = open_coach(options)
-    assert len(coach.guide.views) == 1 and "frame-0001.png" in caplog.text
+    assert len(coach.guide.frames) == 1 and "frame-0001.png" in caplog.text
     assert coach.keeper.keep([np.zeros((4, 5, 3), np.uint8)]) == "frame-0003.png"
     caplog.clear()
     assert len(list(watched_frames([place / "pairs"], until_idle_s=1.5))) == 2 and "bad.png" in caplog.text
