@@ -41,7 +41,7 @@ def foreign_board(path: str | Path) -> Values | None:
         if known in values:
             try:
                 return read(values)
-            except (KeyError, TypeError, ValueError) as error:
+            except (KeyError, TypeError, ValueError, OverflowError) as error:
                 raise InputError(
                     f"'{source}': no target: {type(error).__name__} {error}; is the file whole?"
                 ) from error
@@ -128,7 +128,7 @@ def _caliscope(source: Path) -> Values | None:
             )
         marker = square * float(values["aruco_scale"])
         size = {"columns": int(values["columns"]) - 1, "rows": int(values["rows"]) - 1}
-    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
         raise InputError(f"'{source}': no ChArUco board of caliscope: {error}; is the file whole?") from error
     return {
         "type": "charuco",

@@ -321,7 +321,7 @@ def _kept_before(folder: Path, asked: Mapping[str, object]) -> VideoFrames | Non
         images = {name: tuple(folder / p for p in paths) for name, paths in told["images"].items()}
         counts = {key: int(told[key]) for key in ("looked_at", "with_boards", "near_copies")}
         same = told["schema"] == FRAMES_SCHEMA and told["asked"] == json.loads(json.dumps(asked))
-    except (InputError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except (InputError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
         return None
     if not same or not all(path.is_file() for paths in images.values() for path in paths):
         return None

@@ -11,6 +11,7 @@ from rigkit.interop.open3d import Mesh, poisson_mesh
 from rigkit.io.files import ensure_writable, write_atomic
 from rigkit.io.mesh_file import mesh_bytes
 from rigkit.io.ply import read_ply
+from rigkit.io.reading import about
 
 __all__ = ["MeshOptions", "mesh_cloud"]
 
@@ -49,7 +50,8 @@ def mesh_cloud(cloud: str | Path, options: MeshOptions, *, progress: Progress = 
     ensure_writable(options.output, force=options.force, inputs=[Path(cloud)])
     points = read_ply(cloud)
     progress("fitting the surface", 0, 1)
-    mesh = poisson_mesh(points, depth=options.depth, cut=options.cut)
+    with about(cloud):
+        mesh = poisson_mesh(points, depth=options.depth, cut=options.cut)
     progress("fitting the surface", 1, 1)
     write_atomic(options.output, mesh_bytes(*mesh), force=options.force)
     return mesh
