@@ -63,12 +63,16 @@ def parse_yaml(text: str, name: str) -> dict[str, Any]:
 
 
 def flow(values: Any) -> str:
-    """Return numbers (possibly nested) as a YAML flow sequence that reads back to the same doubles."""
+    """Return numbers (possibly nested) as a YAML flow sequence that reads back to the same doubles, in YAML 1.1 too,
+    where 1e-9 is a word and 1.0e-9 a number (PyYAML, and with it Kalibr and ROS)."""
     if hasattr(values, "tolist"):
         values = values.tolist()
     if isinstance(values, list | tuple):
         return "[" + ", ".join(flow(v) for v in values) + "]"
-    return repr(float(values)) if isinstance(values, float) else repr(values)
+    if not isinstance(values, float):
+        return repr(values)
+    text = repr(float(values))
+    return text.replace("e", ".0e") if "e" in text and "." not in text else text
 
 
 def _float(text: str) -> float:

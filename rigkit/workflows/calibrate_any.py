@@ -11,7 +11,7 @@ from pathlib import Path
 from rigkit.core.errors import InputError
 from rigkit.core.progress import Progress, silent
 from rigkit.io.files import ensure_writable, write_together
-from rigkit.io.reading import read_bytes
+from rigkit.io.reading import read_bytes, usable_path
 from rigkit.io.rig_session import RigSession, is_rig_session, load_rig_session
 from rigkit.io.session import Session, load_session
 from rigkit.io.video import is_video
@@ -109,7 +109,7 @@ def _session_path(places: Sequence[Path], output: Path | None) -> Path:
     """Return where the session is written: named after the result where that has a name, so that two results in one
     folder have a session each."""
     if output is not None:
-        return output.parent / f"{output.stem}-session.toml"
+        return usable_path(usable_path(output).with_name(f"{output.stem}-session.toml"))
     place = places[0] if len(places) == 1 else Path(os.path.commonpath([p.absolute() for p in places]))
     return place / "session.toml"
 

@@ -220,7 +220,7 @@ def test_a_pair_without_a_baseline_does_not_take_the_others_with_it(
         pair_toml(scenes["same"], "same", ("regular", "regular")),
     )
     out = folder / "results"
-    code = main(["validate", str(folder), "-o", str(out), "-j", jobs, "--no-crosscheck", "--no-pictures"])
+    code = main(["validate", str(folder), "-o", str(out), "-j", jobs, "--no-crosscheck"])
     captured = capsys.readouterr()
     assert code == 3
     assert "NOT every pair was validated" in captured.out
