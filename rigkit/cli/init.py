@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import argparse
-import os
-import re
-import sys
-from collections.abc import Sequence
-from fnmatch import fnmatch
 from pathlib import Path
 
 from rigkit.cli.console import note, progress_on_stderr
 from rigkit.cli.lengths import told_baselines, told_length
+from rigkit.cli.manifest_words import (
+    POSE_TYPES,
+    ask,
+    cameras_of,
+    pose_type_of,
+    require_told,
+    told_calibrations,
+    told_poses,
+)
 from rigkit.core.errors import ExitCode, InputError
-from rigkit.core.identifiers import MAX_IDENTIFIER, check_identifier
 from rigkit.io.reading import usable_path
 
 HELP = "write a manifest of pairs to validate, or a session to calibrate, from a folder of images"
-
-POSE_TYPES = ("general", "planar", "standard", "forward", "auto")
-ONE_CAMERA, TWO_CAMERAS = ("camera",), ("camera1", "camera2")
 
 _EXAMPLES = """examples:
   rigkit init lab --square-mm 50 --calibration camera.json --pose-type general --baseline-mm first=300+-2
@@ -95,139 +95,45 @@ def _session(args: argparse.Namespace) -> int:
 
 
 def _manifest(args: argparse.Namespace) -> int:
-    from rigkit.io.files import ensure_writable, write_atomic
-    from rigkit.io.manifest import load_dataset
-    from rigkit.io.manifest_writer import find_images, group_pairs, manifest_text
-    from rigkit.workflows.sightings import sight_boards
+    from rigkit.io.files import ensure_writable
+    from rigkit.io.manifest_writer import find_images
+    from rigkit.workflows.new_manifest import NewManifest, find_pairs, write_manifest
 
     if args.board or args.model:
         raise InputError("init: --board and --model are of --session; a manifest takes --square-mm")
     if args.square_mm is not None:
         told_length("--square-mm", args.square_mm)
-    poses_told = _told_poses(args.pose_type)
+    poses_told = told_poses(args.pose_type)
     root = usable_path(args.folder).resolve()
     target = args.output or root / "dataset.toml"
     images = find_images(root)
-    calibrations = _told_calibrations(args.calibration, target.parent)
+    calibrations = told_calibrations(args.calibration, target.parent)
     read = [*images, *(target.parent / path for path in calibrations.values())]
     ensure_writable(target, force=args.force, inputs=read)
-    _require_told(args)
-    sightings, unreadable = sight_boards(images, progress_on_stderr())
-    for error in unreadable:
+    require_told(args)
+    found = find_pairs(root, images, on_progress=progress_on_stderr())
+    for error in found.unreadable:
         note(f"left out: {error}")
-    pairs = group_pairs(sightings, root)
-    names = [pair.name for pair in pairs]
-    for pair in pairs:
+    names = [pair.name for pair in found.pairs]
+    for pair in found.pairs:
         note(f"pair '{pair.name}': {pair.first.image.name}, {pair.second.image.name}")
-    square_mm = args.square_mm or told_length("--square-mm", _ask("side of a square, mm"))
+    square_mm = args.square_mm or told_length("--square-mm", ask("side of a square, mm"))
     if not calibrations:
-        calibrations = _told_calibrations([_ask("path of calibration.json")], target.parent)
-    cameras = _cameras_of(names, calibrations, args.cameras)
-    poses = {name: _matching(poses_told, name) or _ask(f"pose type of '{name}'", POSE_TYPES) for name in names}
-    text = manifest_text(
-        args.name or _name_of(root),
-        target.parent.resolve(),
-        pairs,
-        square_mm,
-        calibrations,
-        cameras,
-        poses,
-        told_baselines(args.baseline_mm, names),
+        calibrations = told_calibrations([ask("path of calibration.json")], target.parent)
+    cameras = cameras_of(names, calibrations, args.cameras)
+    poses = {name: pose_type_of(poses_told, name) or ask(f"pose type of '{name}'", POSE_TYPES) for name in names}
+    new = NewManifest(
+        root=root,
+        name=args.name,
+        pairs=found.pairs,
+        square_mm=square_mm,
+        calibrations=calibrations,
+        cameras=cameras,
+        pose_types=poses,
+        baselines=told_baselines(args.baseline_mm, names),
     )
-    write_atomic(target, text, force=args.force)
+    incomplete = write_manifest(new, target, force=args.force)
     print(target)
-    try:
-        load_dataset(target)
-    except InputError as error:
-        note(f"to be completed: {error}")
-    return ExitCode.BAD_INPUT if unreadable else ExitCode.WELL
-
-
-def _require_told(args: argparse.Namespace) -> None:
-    """Raise InputError that names everything that nobody has said and that, without a terminal, nobody can be asked."""
-    needed = {
-        "--square-mm": ("side of a square, mm", args.square_mm),
-        "--calibration": ("camera's calibration.json", args.calibration or None),
-        "--pose-type": (f"pose type of the pairs ({', '.join(POSE_TYPES)})", args.pose_type or None),
-    }
-    missing = {option: question for option, (question, value) in needed.items() if value is None}
-    if missing and (sys.stdin is None or not sys.stdin.isatty()):
-        said = "; ".join(f"the {question}: {option}" for option, question in missing.items())
-        raise InputError(f"init: images cannot tell everything; say {said}")
-
-
-def _told_calibrations(told: Sequence[str], folder: Path) -> dict[str, str]:
-    """Return camera -> path of its calibration, as it stands in a manifest in `folder`; paths are as typed, or from
-    that folder."""
-    usual = TWO_CAMERAS if len(told) == 2 else ONE_CAMERA
-    out: dict[str, str] = {}
-    for k, words in enumerate(told):
-        name, found, path = words.partition("=")
-        if not found or Path(words).exists():
-            if len(told) > len(TWO_CAMERAS):
-                raise InputError(f"--calibration {words}: of more than two cameras name each, such as wide={words}")
-            name, path = usual[k], words
-        if check_identifier(name, "camera") in out:
-            raise InputError(f"--calibration: two are called '{name}'; name each differently")
-        typed = Path(path)
-        if not typed.is_absolute() and typed.exists():
-            path = Path(os.path.relpath(typed, folder)).as_posix()
-        out[name] = path
-    return out
-
-
-def _cameras_of(pairs: Sequence[str], calibrations: dict[str, str], told: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """Return the cameras of every pair; raises InputError for cameras that are not there, or pairs of more than two
-    that nobody gives cameras to."""
-    known = list(calibrations)
-    patterns: list[tuple[str, tuple[str, str]]] = []
-    for words in told:
-        pattern, found, both = words.rpartition("=")
-        first, comma, second = both.partition(",")
-        if not found or not comma:
-            raise InputError(f"--cameras {words}: write PAIRS=ONE,TWO, such as 'fisheye-*={known[0]},{known[-1]}'")
-        for name in (first, second):
-            if name not in known:
-                raise InputError(f"--cameras {words}: no camera is called '{name}'; known: {', '.join(known)}")
-        patterns.append((pattern, (first, second)))
-    out = {}
-    for pair in pairs:
-        usual = (known[0], known[-1]) if len(known) <= len(TWO_CAMERAS) else None
-        found_cameras = next((cameras for pattern, cameras in patterns if fnmatch(pair, pattern)), usual)
-        if found_cameras is None:
-            raise InputError(f"init: nothing says which cameras took pair '{pair}'; add --cameras {pair}=ONE,TWO")
-        out[pair] = found_cameras
-    return out
-
-
-def _told_poses(told: Sequence[str]) -> list[tuple[str, str]]:
-    """Return (pattern of pairs, pose type)."""
-    out = []
-    for words in told:
-        pattern, _, pose_type = words.rpartition("=")
-        if pose_type not in POSE_TYPES:
-            raise InputError(f"--pose-type {words}: '{pose_type}' is unknown; known: {', '.join(POSE_TYPES)}")
-        out.append((pattern or "*", pose_type))
-    return out
-
-
-def _matching(told: Sequence[tuple[str, str]], name: str) -> str | None:
-    return next((value for pattern, value in told if fnmatch(name, pattern)), None)
-
-
-def _name_of(folder: Path) -> str:
-    """Return the folder's name without the letters that no data set's name has."""
-    return re.sub(r"[^\w .+()-]|^\W+|\.(?=\.)", "", folder.name)[:MAX_IDENTIFIER].strip() or "data"
-
-
-def _ask(question: str, choices: tuple[str, ...] = ()) -> str:
-    """Ask at the terminal until there is an answer."""
-    hint = f" ({', '.join(choices)})" if choices else ""
-    while True:
-        print(f"{question}{hint}: ", end="", file=sys.stderr, flush=True)
-        line = sys.stdin.readline()
-        if not line:
-            raise InputError(f"init: nobody says the {question}; give it as an option, see rigkit init --help")
-        answer = line.strip()
-        if answer and (not choices or answer in choices):
-            return answer
+    if incomplete is not None:
+        note(f"to be completed: {incomplete}")
+    return ExitCode.BAD_INPUT if found.unreadable else ExitCode.WELL

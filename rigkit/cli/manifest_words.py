@@ -1,0 +1,102 @@
+"""What the options of `rigkit init` say about a manifest, and the questions for what they leave open."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from fnmatch import fnmatch
+from pathlib import Path
+
+from rigkit.core.errors import InputError
+from rigkit.core.identifiers import check_identifier
+
+POSE_TYPES = ("general", "planar", "standard", "forward", "auto")
+ONE_CAMERA, TWO_CAMERAS = ("camera",), ("camera1", "camera2")
+
+
+def require_told(args: argparse.Namespace) -> None:
+    """Raise InputError that names everything that nobody has said and that, without a terminal, nobody can be asked."""
+    needed = {
+        "--square-mm": ("side of a square, mm", args.square_mm),
+        "--calibration": ("camera's calibration.json", args.calibration or None),
+        "--pose-type": (f"pose type of the pairs ({', '.join(POSE_TYPES)})", args.pose_type or None),
+    }
+    missing = {option: question for option, (question, value) in needed.items() if value is None}
+    if missing and (sys.stdin is None or not sys.stdin.isatty()):
+        said = "; ".join(f"the {question}: {option}" for option, question in missing.items())
+        raise InputError(f"init: images cannot tell everything; say {said}")
+
+
+def told_calibrations(told: Sequence[str], folder: Path) -> dict[str, str]:
+    """Return camera -> path of its calibration, as it stands in a manifest in `folder`; paths are as typed, or from
+    that folder."""
+    usual = TWO_CAMERAS if len(told) == 2 else ONE_CAMERA
+    out: dict[str, str] = {}
+    for k, words in enumerate(told):
+        name, found, path = words.partition("=")
+        if not found or Path(words).exists():
+            if len(told) > len(TWO_CAMERAS):
+                raise InputError(f"--calibration {words}: of more than two cameras name each, such as wide={words}")
+            name, path = usual[k], words
+        if check_identifier(name, "camera") in out:
+            raise InputError(f"--calibration: two are called '{name}'; name each differently")
+        typed = Path(path)
+        if not typed.is_absolute() and typed.exists():
+            path = Path(os.path.relpath(typed, folder)).as_posix()
+        out[name] = path
+    return out
+
+
+def cameras_of(pairs: Sequence[str], calibrations: dict[str, str], told: Sequence[str]) -> dict[str, tuple[str, str]]:
+    """Return the cameras of every pair; raises InputError for cameras that are not there, or pairs of more than two
+    that nobody gives cameras to."""
+    known = list(calibrations)
+    patterns: list[tuple[str, tuple[str, str]]] = []
+    for words in told:
+        pattern, found, both = words.rpartition("=")
+        first, comma, second = both.partition(",")
+        if not found or not comma:
+            raise InputError(f"--cameras {words}: write PAIRS=ONE,TWO, such as 'fisheye-*={known[0]},{known[-1]}'")
+        for name in (first, second):
+            if name not in known:
+                raise InputError(f"--cameras {words}: no camera is called '{name}'; known: {', '.join(known)}")
+        patterns.append((pattern, (first, second)))
+    out = {}
+    for pair in pairs:
+        usual = (known[0], known[-1]) if len(known) <= len(TWO_CAMERAS) else None
+        found_cameras = next((cameras for pattern, cameras in patterns if fnmatch(pair, pattern)), usual)
+        if found_cameras is None:
+            raise InputError(f"init: nothing says which cameras took pair '{pair}'; add --cameras {pair}=ONE,TWO")
+        out[pair] = found_cameras
+    return out
+
+
+def told_poses(told: Sequence[str]) -> list[tuple[str, str]]:
+    """Return (pattern of pairs, pose type)."""
+    out = []
+    for words in told:
+        pattern, _, pose_type = words.rpartition("=")
+        if pose_type not in POSE_TYPES:
+            raise InputError(f"--pose-type {words}: '{pose_type}' is unknown; known: {', '.join(POSE_TYPES)}")
+        out.append((pattern or "*", pose_type))
+    return out
+
+
+def pose_type_of(told: Sequence[tuple[str, str]], name: str) -> str | None:
+    """Return the first pose type that is told of the pair `name`, or None."""
+    return next((value for pattern, value in told if fnmatch(name, pattern)), None)
+
+
+def ask(question: str, choices: tuple[str, ...] = ()) -> str:
+    """Ask at the terminal until there is an answer."""
+    hint = f" ({', '.join(choices)})" if choices else ""
+    while True:
+        print(f"{question}{hint}: ", end="", file=sys.stderr, flush=True)
+        line = sys.stdin.readline()
+        if not line:
+            raise InputError(f"init: nobody says the {question}; give it as an option, see rigkit init --help")
+        answer = line.strip()
+        if answer and (not choices or answer in choices):
+            return answer

@@ -1,0 +1,79 @@
+"""A new manifest from a folder of images: the pairs that the images show, and the file with what else was told."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rigkit.core.errors import InputError
+from rigkit.core.identifiers import MAX_IDENTIFIER
+from rigkit.core.progress import Progress, silent
+from rigkit.io.files import write_atomic
+from rigkit.io.manifest import load_dataset
+from rigkit.io.manifest_writer import FoundPair, group_pairs, manifest_text
+from rigkit.workflows.sightings import sight_boards
+
+__all__ = ["FoundPairs", "NewManifest", "find_pairs", "write_manifest"]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FoundPairs:
+    """The pairs of a folder, and why the images that are left out could not be read."""
+
+    pairs: tuple[FoundPair, ...]
+    unreadable: tuple[InputError, ...]
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class NewManifest:
+    """What a manifest says.
+
+    `root` is the folder of the images; `name` defaults to its name. `calibrations` maps a camera to the path of its
+    file, absolute or from the folder of the manifest. `cameras`, `pose_types` and `baselines` (mm, sigma mm) go by the
+    names of the pairs.
+    """
+
+    root: Path
+    pairs: Sequence[FoundPair]
+    square_mm: float
+    calibrations: Mapping[str, str]
+    cameras: Mapping[str, tuple[str, str]]
+    pose_types: Mapping[str, str]
+    baselines: Mapping[str, tuple[float, float]]
+    name: str | None = None
+
+
+def find_pairs(root: Path, images: Sequence[Path], *, on_progress: Progress = silent) -> FoundPairs:
+    """Return the pairs among `images`, which lie below `root`. Raises InputError where no image can be read."""
+    sightings, unreadable = sight_boards(images, on_progress)
+    return FoundPairs(tuple(group_pairs(sightings, root)), tuple(unreadable))
+
+
+def write_manifest(new: NewManifest, path: Path, *, force: bool = False) -> InputError | None:
+    """Write the manifest and return what it still lacks to be loaded, or None.
+
+    Raises InputError where the file exists, unless `force`, or cannot be written.
+    """
+    text = manifest_text(
+        new.name or _name_of(new.root),
+        path.parent.resolve(),
+        new.pairs,
+        new.square_mm,
+        new.calibrations,
+        new.cameras,
+        new.pose_types,
+        new.baselines,
+    )
+    write_atomic(path, text, force=force)
+    try:
+        load_dataset(path)
+    except InputError as error:
+        return error
+    return None
+
+
+def _name_of(folder: Path) -> str:
+    """Return the folder's name without the letters that no data set's name has."""
+    return re.sub(r"[^\w .+()-]|^\W+|\.(?=\.)", "", folder.name)[:MAX_IDENTIFIER].strip() or "data"
