@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import progress_on_stderr
-    from rigkit.cli.validate import show
+    from rigkit.cli.validation_words import show
     from rigkit.workflows.demo import DemoOptions, run_demo
 
     options = DemoOptions(output=Path(args.output), seed=args.seed, jobs=args.jobs)

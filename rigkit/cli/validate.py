@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from rigkit.cli.console import note, print_json, progress_on_stderr
@@ -15,16 +14,13 @@ from rigkit.cli.dataset_arguments import (
     exit_code_of,
     failed_pairs,
 )
+from rigkit.cli.validation_words import show
 from rigkit.core.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from rigkit.io.manifest import Dataset
-    from rigkit.validation.checks import ValidationReport
-    from rigkit.validation.crosscheck import CrossCheckReport
     from rigkit.workflows.paper import PaperOptions
-    from rigkit.workflows.validate import DatasetValidation, ValidateOptions
+    from rigkit.workflows.validate import ValidateOptions
 
 HELP = "the tables against measured truth, report and PLY; exit code 1 if a check fails"
 
@@ -120,47 +116,3 @@ def _as_paper(dataset: Dataset, options: PaperOptions, *, json: bool) -> int:
         print(tables_to_text([table for table in done.tables if table.key != "estimators"]))
         print(f"{options.output}")
     return exit_code_of(done.failures, ExitCode.WELL)
-
-
-def show(done: DatasetValidation, out: Path, *, json: bool) -> int:
-    """Print what a data set came to, of which the files are in `out`; return the exit code."""
-    from rigkit.report.tables import tables_to_text
-    from rigkit.report.validation_page import summary_table
-
-    if json:
-        result = {
-            "passed": done.passed,
-            "output": str(out),
-            "causes": [cause.text for cause in done.causes],
-            "reports": [report.to_dict() for report in done.reports],
-        }
-        print_json(result | failed_pairs(done.failures))
-    else:
-        print(tables_to_text([summary_table([pair.best for pair in done.pairs])]))
-        _say_failures(done.reports, done.crosschecks)
-        for cause in done.causes:
-            if done.passed:
-                note(f"to look at: {cause.text}")
-            else:
-                print(f"probable cause: {cause.text}")
-        # What is no cause comes after the causes: first it would be taken for one.
-        _say_notes(done.reports, done.crosschecks)
-        failed = "NOT every pair was validated" if done.failures else "a check FAILED"
-        page = "report.html" if "report.html" in done.files else "tables.md"
-        print(f"{'all checks passed' if done.passed else failed}; {out / page}, {done.seconds:.1f} s")
-    return exit_code_of(done.failures, ExitCode.WELL if done.passed else ExitCode.CHECK_FAILED)
-
-
-def _say_failures(reports: Sequence[ValidationReport], compared: Sequence[CrossCheckReport]) -> None:
-    from rigkit.report.validation_verdict import failed_facts
-
-    for fact in failed_facts(reports, compared):
-        print(" ".join(filter(None, [fact.what, fact.pair_id, ",".join(fact.methods), fact.words])))
-
-
-def _say_notes(reports: Sequence[ValidationReport], compared: Sequence[CrossCheckReport]) -> None:
-    for other in compared:
-        for words in other.skipped:
-            note(f"{other.pair_id}: not cross-checked by {words}")
-    for words in dict.fromkeys(f"{report.pair_id}: {n}" for report in reports for n in report.notes):
-        note(words)
