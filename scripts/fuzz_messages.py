@@ -9,7 +9,7 @@ from pathlib import PurePath
 __all__ = ["fault_of_message"]
 
 VERBS = (
-    "add|ask|calibrate|change|check|choose|compare|convert|copy|correct|create|describe|detect|export|get|give|increase|"
+    "add|ask|calibrate|change|check|choose|compare|convert|copy|correct|count|create|describe|detect|export|get|give|increase|"
     "install|keep|leave|list|lower|make|mark|measure|move|name|pip|put|raise|remove|rename|repeat|run|save|see|select|"
     "set|shorten|show|split|start|take|turn|update|use|wait|write|look|print|restore|say|send|decide|rectify|recalibrate|another"
 )

@@ -132,7 +132,10 @@ def _camera(block: Any, name: str) -> Camera:
     if model not in expected:
         raise InputError(f"'{name}': camera_model '{model}' is unknown; known: {', '.join(expected)}")
     if intrinsics.size != expected[model]:
-        raise InputError(f"'{name}': {model} has {expected[model]} intrinsics, found {intrinsics.size}")
+        raise InputError(
+            f"'{name}': {model} has {expected[model]} intrinsics, found {intrinsics.size}; "
+            "correct 'intrinsics' or 'camera_model'"
+        )
     if model == "pinhole" and distortion_model == "equidistant":
         return camera_of("kannala_brandt", size, np.concatenate([intrinsics, distortion]), name)
     if model == "pinhole" and distortion_model == "radtan" and distortion.any():

@@ -60,6 +60,10 @@ def _point_cloud(points: Points) -> Any:
     return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(np.array(points, dtype=np.float64)))
 
 
+MAX_MESH_MM = 1e30
+"""Of a coordinate: single precision ends at 3e38, and the surface goes some way beyond the points."""
+
+
 class Mesh(NamedTuple):
     """A triangle mesh: points (V, 3) and normals (V, 3) of its vertices, colours (V, 3) uint8, triangles (T, 3)."""
 
@@ -81,21 +85,47 @@ def poisson_mesh(cloud: OrientedCloud, *, depth: int, cut: float) -> Mesh:
     Raises
     ------
     DegenerateError
-        Nothing is left of the surface.
+        The points with a normal are fewer than three, in one place, or beyond the single precision of meshes; or
+        nothing is left of the surface.
     """
     import open3d
 
-    mesh, density = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
-        to_open3d(cloud), depth=depth, n_threads=1
-    )
+    used = cloud.normals.any(axis=1)
+    middle, half = _middle_and_half_extent(cloud.points_mm[used])
+    # Open3D computes in single precision, and dies of an octree without extent: it gets the cloud in a unit cube.
+    within = _point_cloud((cloud.points_mm[used] - middle) / half)
+    within.normals = open3d.utility.Vector3dVector(np.array(cloud.normals[used]))
+    within.colors = open3d.utility.Vector3dVector(cloud.colours[used] / 255.0)
+    mesh, density = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(within, depth=depth, n_threads=1)
     if cut > 0.0 and len(mesh.vertices):
         mesh.remove_vertices_by_mask(np.asarray(density) < np.quantile(np.asarray(density), cut))
     if not len(mesh.triangles):
         raise DegenerateError(f"mesh: no surface of {len(cloud)} points; lower the depth or the cut")
     mesh.compute_vertex_normals()
     return Mesh(
-        np.asarray(mesh.vertices, dtype=np.float64),
+        np.asarray(mesh.vertices, dtype=np.float64) * half + middle,
         np.asarray(mesh.vertex_normals, dtype=np.float64),
         np.rint(255.0 * np.asarray(mesh.vertex_colors)).astype(np.uint8),
         np.asarray(mesh.triangles, dtype=np.int32),
     )
+
+
+def _middle_and_half_extent(points: Points) -> tuple[FloatArray, float]:
+    """Return the middle (3,) of the box around points (N, 3) and half its longest side.
+
+    Raises DegenerateError for fewer than three points, and where single precision keeps no extent of them.
+    """
+    if len(points) < 3:
+        raise DegenerateError(f"mesh: {len(points)} points have a normal; at least 3 are needed")
+    low, high = points.min(axis=0), points.max(axis=0)
+    if max(-low.min(), high.max()) > MAX_MESH_MM:
+        raise DegenerateError(
+            f"mesh: points as far away as {max(-low.min(), high.max()):.3g} mm; at most {MAX_MESH_MM:.0e} mm are "
+            "possible in the single precision of meshes; remove the points that are wrong"
+        )
+    if not (high.astype(np.float32) > low.astype(np.float32)).any():
+        raise DegenerateError(
+            f"mesh: the {len(points)} points are all in one place in the single precision of meshes; move the cloud "
+            "to the origin, or use one with an extent"
+        )
+    return (low + high) / 2.0, float((high - low).max()) / 2.0

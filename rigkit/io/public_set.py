@@ -109,7 +109,7 @@ def load_public_set(path: str | Path) -> PublicSet:
     if table.has("measured"):
         entries = table.tables("measured", hint="[[measured]] with id, value, unit and how")
         measured = tuple(_measurement(entry) for entry in entries)
-    sha256 = _texts(table, "files", SHA256, "a SHA-256 (64 characters of 0-9 and a-f)")
+    sha256 = _texts(table, "files", SHA256, "a SHA-256; write the 64 characters of 0-9 and a-f that `sha256sum` prints")
     urls = _texts(table, "urls", URL, "an address (https://...)") if table.has("urls") else {}
     for name in urls:
         if name not in sha256:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 from helpers.reconstructions import make_reconstruction
 
 from rigkit.cli.main import main
+from rigkit.core.errors import DegenerateError
+from rigkit.interop.open3d import poisson_mesh
 from rigkit.io.ply import ply_bytes, read_ply, write_ply
 
 SQUARE_MM = 50.0
@@ -46,6 +49,46 @@ def test_what_cannot_be_meshed_is_said(tmp_path: Path, capsys: pytest.CaptureFix
         assert main(["mesh", *arguments]) == 2
         assert words in capsys.readouterr().err
     assert (tmp_path / "taken.ply").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [(0.0, "in one place"), (1e-60, "in one place"), (1e60, "far away"), (1e300, "far away")],
+)
+def test_an_extent_that_no_octree_bears_is_refused(
+    factor: float, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Open3D dies of these by a signal: nothing of the sort reaches it."""
+    cloud = make_reconstruction().cloud
+    write_ply(tmp_path / "cloud.ply", replace(cloud, points_mm=cloud.points_mm * factor))
+    assert main(["mesh", str(tmp_path / "cloud.ply"), "--depth", "3"]) == 3
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert words in said and "cloud.ply" in said
+
+
+@pytest.mark.parametrize("factor", [1e-20, 1e20])
+def test_the_surface_does_not_depend_on_the_unit(factor: float) -> None:
+    cloud = make_reconstruction().cloud
+    usual = poisson_mesh(cloud, depth=5, cut=0.1)
+    scaled = poisson_mesh(replace(cloud, points_mm=cloud.points_mm * factor), depth=5, cut=0.1)
+    assert len(scaled.triangles) == pytest.approx(len(usual.triangles), rel=0.05)
+    extent, other = np.ptp(usual.points, axis=0), np.ptp(scaled.points, axis=0) / factor
+    np.testing.assert_allclose(other, extent, rtol=0.05)
+
+
+def test_normals_as_long_as_numbers_are_become_unit_ones(tmp_path: Path) -> None:
+    cloud = make_reconstruction().cloud
+    for factor in (1e-200, 1e200):
+        write_ply(tmp_path / "cloud.ply", replace(cloud, normals=cloud.normals * factor), force=True)
+        np.testing.assert_allclose(read_ply(tmp_path / "cloud.ply").normals, cloud.normals, atol=1e-12)
+
+
+def test_points_without_a_normal_are_left_out() -> None:
+    cloud = make_reconstruction().cloud
+    normals = cloud.normals.copy()
+    normals[2:] = 0.0
+    with pytest.raises(DegenerateError, match="2 points have a normal"):
+        poisson_mesh(replace(cloud, normals=normals), depth=3, cut=0.0)
 
 
 def test_normals_that_say_how_sure_they_are_are_read_as_unit_ones(tmp_path: Path) -> None:

@@ -31,6 +31,7 @@ from rigkit.validation.sentinel.evidence import FreshView, Watched
 from rigkit.validation.sentinel.judge import SentinelCheck, check_views
 from rigkit.validation.sentinel.watch import watched_camera
 from rigkit.workflows.check import fixed_text
+from rigkit.workflows.history import add_calibration
 
 NOISE_PX = 0.03
 CHANGED_PX = 0.25
@@ -219,6 +220,23 @@ def test_the_register_grows_and_is_drawn(calibration: Calibration, tmp_path: Pat
     register.write_text(register.read_text() + json.dumps({"schema": "other"}) + "\n")
     with pytest.raises(InputError, match=r"line 4.*another schema"):
         load_history(register)
+
+
+def test_the_same_calibration_again_is_no_change(calibration: Calibration, tmp_path: Path) -> None:
+    """What rounding leaves of no difference at all is of no importance, however little was expected."""
+    save_calibration(tmp_path / "c.json", calibration)
+    add_calibration(tmp_path / "cam.jsonl", tmp_path / "c.json", tmp_path / "c.json")
+    (entry,) = load_history(tmp_path / "cam.jsonl")
+    assert entry.holds and entry.verdict == "holds"
+    assert entry.chance > 0.5
+
+
+def test_what_moves_nothing_is_no_other_camera(calibration: Calibration) -> None:
+    """Rounding alone can leave many times as much as expected where that is nothing, as in the same camera again."""
+    check = _checked(calibration, lens("reg"), np.random.default_rng(0))
+    rounded = replace(check, chance=1.0, expected_px=4e-14, rms_px=4e-14, rms_fixed_px=2e-12)
+    assert rounded.holds and not rounded.unexplained
+    assert replace(check, expected_px=0.03, rms_fixed_px=0.3).unexplained
 
 
 def test_a_declared_board_of_another_size_is_accepted(calibration: Calibration, rng: np.random.Generator) -> None:

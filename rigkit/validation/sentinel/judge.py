@@ -115,7 +115,7 @@ class SentinelCheck:
     @property
     def unexplained(self) -> bool:
         """Nothing that may happen to these cameras explains the pictures: another camera, or another board."""
-        return self.rms_fixed_px > WILD * self.expected_px
+        return self.rms_fixed_px > max(WILD * self.expected_px, ALARM_PX)
 
     @property
     def holds(self) -> bool:
