@@ -14,6 +14,7 @@ from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.calibration_file import calibration_text
 from rigkit.io.files import ensure_writable, write_together
+from rigkit.io.reading import about
 from rigkit.io.rig_session import RigSession
 from rigkit.io.session import Session, files_of_session, load_session
 from rigkit.workflows.corners import Cache, SessionCorners, session_corners, session_views
@@ -132,13 +133,14 @@ def calibration_from(session: Session, corners: SessionCorners, *, progress: Pro
     camera.
     """
     views, size_px, dropped = session_views(session, corners)
-    result = calibrate(
-        views,
-        size_px,
-        model=session.model,
-        degree=session.degree,
-        board=session.board_shape,
-        progress=progress,
-    )
+    with about(session.path):
+        result = calibrate(
+            views,
+            size_px,
+            model=session.model,
+            degree=session.degree,
+            board=session.board_shape,
+            progress=progress,
+        )
     verdicts = judge_session(result, dropped, suggest_ties(views, result))
     return replace(result, dropped=(*dropped, *result.dropped), verdicts=verdicts)
