@@ -1,0 +1,99 @@
+"""The arguments of `rigkit calibrate`, and the options that they make."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rigkit.workflows.formats import FOREIGN_ENDINGS
+
+if TYPE_CHECKING:
+    from rigkit.workflows.calibrate import CalibrateOptions
+    from rigkit.workflows.calibrate_any import FolderOptions
+
+SESSION_NAME = "session.toml"
+
+EXAMPLES = """examples:
+  rigkit calibrate photos --board 9x6x25 -r          one camera; 9x6 inner corners, squares of 25 mm; with a page
+  rigkit calibrate left right --board board.toml     a rig, one folder a camera; so is a folder of left01, right01, ...
+  rigkit calibrate photos --board 9x6x25 --export opencv ros
+  rigkit calibrate left right --board 9x6x25 --only-extrinsics left.json right.json -o rig.json
+  rigkit calibrate left right top --board 9x6x25 --add-camera rig.json -o rig3.json
+  rigkit calibrate session.toml --force              again, from the session written the first time
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = EXAMPLES
+    parser.add_argument(
+        "source",
+        nargs="+",
+        type=Path,
+        metavar="SESSION.toml|FOLDER|VIDEO",
+        help="a session, folders of images, videos, camera:0",
+    )
+    parser.add_argument("-o", "--output", type=Path, help="default: calibration.json (rig.json) beside the session")
+    parser.add_argument(
+        "-r",
+        "--report",
+        nargs="?",
+        const="",
+        metavar="FILE.html",
+        help="write a page to look at; without a name beside the output",
+    )
+    parser.add_argument(
+        "--export", nargs="+", default=[], choices=sorted(FOREIGN_ENDINGS), help="also in these formats, beside it"
+    )
+    parser.add_argument("--corners", type=Path, metavar="FILE", help="use these: corners.csv, corners.json, .vnl")
+    parser.add_argument(
+        "--no-cache", action="store_true", help="find all corners anew, and keep none beside the session"
+    )
+    parser.add_argument("--force", action="store_true", help="replace existing results")
+    parser.add_argument("--json", action="store_true", help="print the result for programs")
+    rigs = parser.add_argument_group("rigs", "what is known stays; how unsure it is counts in all results")
+    rigs.add_argument(
+        "--only-extrinsics",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="CALIB",
+        help="lenses stay as these files have them (one a camera, or one rig): only the mounts are found",
+    )
+    rigs.add_argument(
+        "--add-camera",
+        type=Path,
+        metavar="RIG",
+        help="cameras of this rig stay, lens and mount: the others are added to it",
+    )
+    folders = parser.add_argument_group("folders", f"the session used is kept as {SESSION_NAME} for the next time")
+    folders.add_argument(
+        "--board", action="append", default=[], metavar="CxRxMM|BOARD.toml", help="such as 9x6x25 (repeatable)"
+    )
+    folders.add_argument("--timestamps", type=Path, metavar="FILE.csv", help="which frames of videos are of one moment")
+    folders.add_argument("--model", help="camera model (default: auto, the one that predicts best)")
+
+
+def calibrate_options(args: argparse.Namespace) -> CalibrateOptions:
+    """Return what is written where, and what is known before."""
+    from rigkit.workflows.calibrate import CalibrateOptions
+    from rigkit.workflows.corners import Cache
+    from rigkit.workflows.folder_session import Known
+
+    return CalibrateOptions(
+        output=args.output,
+        report=None if args.report is None else Path(args.report),
+        force=args.force,
+        cache=Cache.OFF if args.no_cache else Cache.UPDATE,
+        corners=args.corners,
+        exports=tuple(dict.fromkeys(args.export)),
+        known=Known(tuple(args.only_extrinsics), args.add_camera),
+    )
+
+
+def folder_options(args: argparse.Namespace) -> FolderOptions:
+    """Return what folders of images do not tell of themselves."""
+    from rigkit.workflows.calibrate_any import FolderOptions
+
+    return FolderOptions(boards=tuple(args.board), model=args.model or "auto", timestamps=args.timestamps)
