@@ -33,7 +33,7 @@ deviations of about 0.12; sigmas of points are those along their worst axis and 
 MAX_RMS_DEG = 0.01
 """Free planes are known to a tenth or two of a degree here; those of known lattices to less than a hundredth."""
 WITHIN_ONE, WITHIN_TWO = (0.52, 0.84), (0.88, 1.0)
-"""68.3 and 95.4 % for a Gaussian: 90 angles are good to 4.9 and 2.2 %, and three of a scene are correlated."""
+"""68.3 and 95.4 % for a Gaussian: 54 angles are good to 6.3 and 2.9 %, and three of a scene are correlated."""
 PAIRS = (("plane1", "plane2"), ("plane1", "plane3"), ("plane2", "plane3"))
 
 
