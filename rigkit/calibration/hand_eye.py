@@ -177,7 +177,8 @@ def _check_axes(seen: Sequence[Rigid3]) -> None:
     rotation = np.stack([pose.rotation for pose in seen])
     i, j = np.triu_indices(len(seen), 1)
     turns = log_so3(rotation[i] @ np.swapaxes(rotation[j], -1, -2))
-    spread = np.sqrt(np.linalg.eigvalsh(turns.T @ turns)[::-1])
+    # Rounding takes a sum of squares that is 0 below it.
+    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(turns.T @ turns)[::-1], 0.0))
     if not spread[0] > 0.0 or spread[1] < MIN_SECOND_AXIS * spread[0]:
         raise DegenerateError(
             "hand-eye: the hand turned about one axis only, which leaves the place along it open; turn it about two"

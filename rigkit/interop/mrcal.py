@@ -30,6 +30,8 @@ SPLINED = re.compile(
 )
 MM_PER_M = 1000.0
 KNOTS_X = 40
+MAX_KNOTS_Y = 160
+"""An image that is four times as high as wide, in angle: damage rather than a lens, and 330 MB of equations."""
 SMOOTHING = 1e-6
 """Weight of the second differences of the control points: it carries the surface smoothly over the image's border."""
 SPLINE_GRID = (161, 121)
@@ -139,6 +141,11 @@ def _spline_of(camera: Camera) -> tuple[str, FloatArray]:
     fov_x = int(np.ceil(np.degrees(4.0 * np.arctan(np.abs(u).max(axis=0)[0] / 2.0)))) + 2
     reach = 2.0 * np.tan(np.radians(fov_x) / 4.0)
     ny = int(np.ceil((KNOTS_X - 3) * np.abs(u).max(axis=0)[1] / reach)) + 4
+    if ny > MAX_KNOTS_Y:
+        raise InputError(
+            f"mrcal: in angle this camera's image is {ny / KNOTS_X:.0f} times as high as wide, which its splines do not "
+            "follow; check its fx and fy"
+        )
     lens = f"LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_Nx={KNOTS_X}_Ny={ny}_fov_x_deg={fov_x}"
     centre, _ = camera.project(np.array([0.0, 0.0, 1.0]))
     focal = camera.focal_px
