@@ -41,6 +41,7 @@ def _tells_of(message: str, words: Sequence[str]) -> bool:
     """Return whether the message names a word of the command (shown with escapes, or cut), or an option."""
     if re.search(r"--[a-z]|(?<!\w)-[a-z]\b", message):
         return True
-    return any(
-        shown and (shown[:40] in message) for word in words for shown in (word, ascii(word)[1:-1], PurePath(word).name)
-    )
+    # Pairs and cameras are called after their files.
+    stems = [f"'{stem}'" for stem in (PurePath(word).stem for word in words) if stem]
+    shown = [name for word in words for name in (word, ascii(word)[1:-1], PurePath(word).name) if name]
+    return any(name[:40] in message for name in (*stems, *shown))

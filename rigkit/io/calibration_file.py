@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
 
@@ -130,10 +130,10 @@ def load_calibration(path: str | Path) -> Calibration:
             sigma_px=real(data["sigma_px"]),
             views=tuple(_view_in(v) for v in data["views"]),
             dropped=tuple((str(image), str(reason)) for image, reason in data["dropped"]),
-            outliers=tuple(Outlier(**_finite(v)) for v in data["outliers"]),
-            candidates=tuple(Candidate(**_finite(v, ("rms_px",))) for v in data["candidates"]),
-            convergence=Convergence(**data["convergence"]),
-            boards=tuple(BoardShape(**v) for v in data["boards"]),
+            outliers=tuple(_entry(Outlier, _finite(v)) for v in data["outliers"]),
+            candidates=tuple(_entry(Candidate, _finite(v, ("rms_px",))) for v in data["candidates"]),
+            convergence=_entry(Convergence, data["convergence"]),
+            boards=tuple(_entry(BoardShape, v) for v in data["boards"]),
             verdicts=findings_from_json(data["verdicts"]),
             overdispersion=float(data.get("overdispersion", 1.0)),
             freedom=float(data.get("freedom") or math.inf),
@@ -253,6 +253,20 @@ def _array(value: Any) -> FloatArray:
 
 def _finite(values: dict[str, Any], nullable: tuple[str, ...] = ("residual_px",)) -> dict[str, Any]:
     return {k: math.nan if v is None and k in nullable else v for k, v in values.items()}
+
+
+Entry = TypeVar("Entry", Outlier, Candidate, Convergence, BoardShape)
+
+
+def _entry(kind: type[Entry], values: dict[str, Any]) -> Entry:
+    """Return the dataclass of these values; raises TypeError where a text, whole number or truth value is another."""
+    for name, wanted in get_type_hints(kind).items():
+        # By type, not by isinstance: true is an int in Python, and no count.
+        if wanted in (str, int, bool) and type(values.get(name)) is not wanted:
+            raise TypeError(f"'{name}' is {values.get(name)!r}, not {wanted.__name__}")
+        if wanted is float and name in values and not math.isnan(values[name]):
+            real(values[name])
+    return kind(**values)
 
 
 def _dumps(data: dict[str, Any]) -> str:

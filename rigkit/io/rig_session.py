@@ -203,7 +203,7 @@ def _rigid_boards(table: TomlTable, boards: Sequence[Board]) -> tuple[RigidBoard
             }
             for name in layout:
                 if name not in names:
-                    raise entry.error(f"layout: '{name}' is none of its boards, {', '.join(names)}")
+                    raise entry.error(f"layout: '{name}' is none of its boards; use {' or '.join(names)}")
         if entry.has("baseline"):
             raise entry.error("'baseline' is between cameras: write [[baselines]]")
         out.append(RigidBoards(names, layout, truth_from_table(entry, [known[name] for name in names])))

@@ -21,6 +21,7 @@ from rigkit.geometry.board_pose import BoardPose, board_poses
 from rigkit.io.board_file import load_board
 from rigkit.io.files import ensure_writable, write_atomic
 from rigkit.io.images import read_image
+from rigkit.io.reading import about
 from rigkit.io.robot_poses import read_robot_poses
 from rigkit.workflows.camera_files import import_camera
 from rigkit.workflows.detect import images_in
@@ -124,7 +125,8 @@ def calibrate_hand_eye(
         if unreadable:
             raise InputError(f"no image of {len(paths)} shows board '{board.board_id}': {unreadable[0]}")
         raise CheckFailed(f"no image of {len(paths)} shows board '{board.board_id}'; check the board's file")
-    result = hand_eye(camera, views, stands)
+    with about(poses):
+        result = hand_eye(camera, views, stands)
     if options.output is not None:
         write_atomic(options.output, _text(result, options), force=options.force)
     return HandEyeCalibration(result, tuple(unreadable))

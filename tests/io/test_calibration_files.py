@@ -163,6 +163,32 @@ def spoiled(data: object, rng: np.random.Generator) -> object:
     return out
 
 
+@pytest.mark.parametrize(
+    ("key", "name", "value"),
+    [
+        ("boards", "board_id", 0),
+        ("boards", "bow_mm", "wide"),
+        ("boards", "aspect", True),
+        ("candidates", "name", 7),
+        ("candidates", "chosen", 1),
+        ("candidates", "parameter_count", 1.5),
+        ("convergence", "iterations", True),
+        ("convergence", "reason", None),
+    ],
+)
+def test_values_of_another_kind_are_refused(
+    key: str, name: str, value: object, calibration: Calibration, tmp_path: Path
+) -> None:
+    path = tmp_path / "calibration.json"
+    save_calibration(path, calibration)
+    data = json.loads(path.read_text())
+    entry = data[key][0] if isinstance(data[key], list) else data[key]
+    entry[name] = value
+    path.write_text(json.dumps(data))
+    with pytest.raises(InputError, match=r"calibration\.json.*damaged"):
+        load_calibration(path)
+
+
 def test_whatever_stands_in_a_file_is_read_or_the_file_is_named(
     calibration: Calibration, tmp_path: Path, rng: np.random.Generator
 ) -> None:

@@ -133,7 +133,10 @@ def robust_pose(
             if not compare_poses(_pose(found), _pose(other))[1]:
                 found, qualities = _preferred((found, qualities), (other, others))
         return found
-    raise DegenerateError(f"no pose that enough matches agree with, from in front of both cameras, in {trials} samples")
+    raise DegenerateError(
+        f"no pose that enough matches agree with, from in front of both cameras, in {trials} samples; check that the "
+        "cameras are those of the images, and the order of the images"
+    )
 
 
 def _check_options(max_noise: float, confidence: float, max_trials: int) -> None:
