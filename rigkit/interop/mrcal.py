@@ -143,8 +143,8 @@ def _spline_of(camera: Camera) -> tuple[str, FloatArray]:
     ny = int(np.ceil((KNOTS_X - 3) * np.abs(u).max(axis=0)[1] / reach)) + 4
     if ny > MAX_KNOTS_Y:
         raise InputError(
-            f"mrcal: in angle this camera's image is {ny / KNOTS_X:.0f} times as high as wide, which its splines do not "
-            "follow; check its fx and fy"
+            f"mrcal: in angle this camera's image is {ny / KNOTS_X:.0f} times as high as wide, which its splines do "
+            "not follow; check its fx and fy"
         )
     lens = f"LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_Nx={KNOTS_X}_Ny={ny}_fov_x_deg={fov_x}"
     centre, _ = camera.project(np.array([0.0, 0.0, 1.0]))
