@@ -36,6 +36,10 @@ __all__ = ["RobustPose", "Sample", "robust_pose"]
 Sample = Literal["points", "affine", "mixed"]
 """What minimal samples consist of: points only; affine correspondences only; one affine correspondence and points."""
 
+NO_POSE = (
+    "no pose that enough matches agree with, from in front of both cameras, in {} samples; check that the cameras are "
+    "those of the images, and the order of the images"
+)
 BATCH = 96
 """Samples at a time: a little more than 40 % of wrong matches ask for."""
 WIDE = 4.0
@@ -133,10 +137,7 @@ def robust_pose(
             if not compare_poses(_pose(found), _pose(other))[1]:
                 found, qualities = _preferred((found, qualities), (other, others))
         return found
-    raise DegenerateError(
-        f"no pose that enough matches agree with, from in front of both cameras, in {trials} samples; check that the "
-        "cameras are those of the images, and the order of the images"
-    )
+    raise DegenerateError(NO_POSE.format(trials))
 
 
 def _check_options(max_noise: float, confidence: float, max_trials: int) -> None:
