@@ -180,7 +180,7 @@ def _npz(data: bytes, rng: random.Random) -> bytes:
         return _bytes(data, rng)
     name = rng.choice(sorted(arrays))
     value = arrays[name]
-    arrays[name] = rng.choice(strange_arrays(value))
+    arrays[name] = rng.choice(strange_arrays(np.atleast_1d(value)))
     if rng.random() < 0.2:
         arrays[rng.choice(("x", "A21", "pixels1", "sigma_px"))] = arrays.pop(name)
     stream = io.BytesIO()
