@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from rigkit.core.errors import InputError, RigkitError
+from rigkit.core.errors import InputError, InstallationError, RigkitError
 
 __all__ = ["MAX_BINARY_BYTES", "MAX_TEXT_BYTES", "about", "csv_rows", "read_bytes", "read_text", "usable_path"]
 
@@ -95,7 +95,7 @@ def about(*paths: str | Path) -> Iterator[None]:
     try:
         yield
     except RigkitError as error:
-        if any(str(path) in str(error) for path in paths):
+        if isinstance(error, InstallationError) or any(str(path) in str(error) for path in paths):
             raise
         raise type(error)(" and ".join(f"'{path}'" for path in paths) + f": {error}") from error
 

@@ -186,7 +186,7 @@ static void collect(
             first[0][k] = one ? (int32_t)lo1 : 0;
             count[0][k] = one ? (int32_t)(end - lo1) + 1 : 0;
             first[1][k] = two ? (int32_t)lo2 : 0;
-            count[1][k] = two & !joined ? (int32_t)(hi2 - lo2) + 1 : 0;
+            count[1][k] = (two & !joined) ? (int32_t)(hi2 - lo2) + 1 : 0;
         }
         for (int32_t k = 0; k < rows; k++)
             for (int part = 0; part < 2; part++)

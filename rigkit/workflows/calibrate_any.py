@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from rigkit.core.errors import InputError
+from rigkit.core.errors import InputError, RigkitError
 from rigkit.core.progress import Progress, silent
 from rigkit.io.files import ensure_writable, write_together
-from rigkit.io.reading import read_bytes, usable_path
+from rigkit.io.reading import about, read_bytes, usable_path
 from rigkit.io.rig_session import RigSession, is_rig_session, load_rig_session
 from rigkit.io.session import Session, load_session
 from rigkit.io.video import is_video
@@ -95,7 +95,8 @@ def calibrate_folders(
     if new:
         write_together(dict(new), force=options.force)
     try:
-        return calibrate_session_file(wanted.path, options, progress=progress)
+        with _told_of(folders, wanted.path):
+            return calibrate_session_file(wanted.path, options, progress=progress)
     except BaseException:
         if before:
             write_together(before, force=True)
@@ -103,6 +104,19 @@ def calibrate_folders(
             with suppress(OSError):
                 path.unlink()
         raise
+
+
+@contextmanager
+def _told_of(given: Sequence[str | Path], session: Path) -> Iterator[None]:
+    """Let errors of the block name the folders and videos that a person gave, not the session that was made of them:
+    after a failure it is gone again."""
+    with about(*given):
+        try:
+            yield
+        except RigkitError as error:
+            names = " and ".join(f"'{path}'" for path in given)
+            words = str(error).replace(f"'{session}'", names).replace(str(session), names)
+            raise type(error)(words) from error
 
 
 def _session_path(places: Sequence[Path], output: Path | None) -> Path:
@@ -115,7 +129,7 @@ def _session_path(places: Sequence[Path], output: Path | None) -> Path:
 
 
 def _folders_of(
-    places: Sequence[Path], about: FolderOptions, options: CalibrateOptions, progress: Progress
+    places: Sequence[Path], told: FolderOptions, options: CalibrateOptions, progress: Progress
 ) -> list[Path]:
     """Return the folders of images, those of videos' frames in the place of the videos."""
     videos = [place for place in places if is_video(place)]
@@ -123,7 +137,7 @@ def _folders_of(
         return list(places)
     if len(videos) < len(places):
         raise InputError("calibrate: videos together with folders of images; give all cameras one way")
-    boards = [board_of_words(words) for words in about.boards]
+    boards = [board_of_words(words) for words in told.boards]
     if not boards:
         raise InputError(
             "calibrate: frames cannot tell how large the squares are; give the board, such as --board 9x6x25"
@@ -137,7 +151,7 @@ def _folders_of(
     cameras = {video.stem: video for video in videos}
     if len(cameras) < len(videos):
         raise InputError("calibrate: two videos have the same name, which names a camera; rename one")
-    timestamps = about.timestamps or timestamps_beside(videos)
+    timestamps = told.timestamps or timestamps_beside(videos)
     frames_of_videos(cameras, folder, boards, timestamps=timestamps, progress=progress)
     return [folder / name for name in cameras]
 

@@ -114,6 +114,22 @@ def test_a_session_comes_back_where_the_calibration_fails(place: Path, capsys: p
     assert content(place) == before
 
 
+@pytest.mark.parametrize(
+    ("given", "output"), [(["pairs"], "-r"), (["film.avi"], "-o new.json"), (["pairs", "again"], "-o new.json")]
+)
+def test_a_calibration_that_fails_is_told_of_what_was_given(
+    given: list[str], output: str, place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The session that was made of it is gone again; of several cameras the one at fault has its folder's name."""
+    (place / "again").mkdir()
+    (place / "again" / "view1.png").write_bytes((place / "image.png").read_bytes())
+    words = ["calibrate", *given, "--board", "5x4x30", "--model", "pinhole", "--no-cache", *output.split()]
+    assert main(words) == 3
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("rigkit: ")]
+    assert any(f"'{name}'" in line for name in given) and "session.toml" not in line, line
+    assert not list(place.glob("new-session.toml")) and not (place / "pairs/session.toml").exists()
+
+
 def test_a_file_that_is_no_cache_is_not_replaced_by_one(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (place / "corners.json").write_text('{"mine": 1}')
     main(["calibrate", "session.toml", "-o", "new.json"])
