@@ -8,7 +8,7 @@ assignment with the smallest joint residual wins, and says by how much.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,11 +17,13 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection, common_corners
 from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.truth import MeasuredAngle
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.identification.assignments import Assignment, forced_rms_px, ranked_assignments
 from rigkit.identification.board_ids import LocatedBoard, assign_board_ids, first_corner_turn
 from rigkit.identification.board_matches import BoardMatch, GridPoses, ImageObservations, matches_between
 from rigkit.identification.joint_pose import BoardObservation, JointPose, refine_joint
+from rigkit.identification.measured_angles import ids_by_angles
 from rigkit.identification.pair_identity import PairIdentity
 from rigkit.identification.placements import BoardKind, Placement, board_kinds, describe, placements
 
@@ -43,6 +45,7 @@ def identify_pair(
     camera2: Camera,
     *,
     layout: Mapping[str, str] | None = None,
+    angles: Sequence[MeasuredAngle] = (),
 ) -> PairIdentity:
     """Return the boards of two images named and turned alike, and the relative pose that they imply.
 
@@ -53,6 +56,7 @@ def identify_pair(
     camera1, camera2 : the calibrated cameras, in whose pixels the detections are.
     layout : where boards that look alike hang, by board id: "left", "right", "floor", "ceiling" or "back" (see
         `rigkit.identification.board_ids`, which also states the rule without it).
+    angles : between boards, as measured: where no layout does, they identify boards that look alike.
 
     Raises
     ------
@@ -83,7 +87,16 @@ def identify_pair(
     winner = min(tied, key=lambda s: (-len(s.matches), sum(x.against_colour for x in s.matches), _roll_rad(s)))
     rivals = [s for s in ranked if s.differs_from(winner)]
     runner_up_px = _runner_up_px(winner, rivals, matches, views, kinds)
-    return _result(winner, runner_up_px, tied, views, kinds, boards, layout)
+    identity = _result(winner, runner_up_px, tied, views, kinds, boards, layout)
+    given = {d.board_id for d in (*detections1, *detections2)} | set(layout or ())
+    fitting = ids_by_angles(identity, [b for b in boards if b.board_id not in given], angles)
+    if not fitting:
+        return identity
+    said = f"boards {', '.join(sorted(fitting[0]))} look alike and were identified by the measured angles"
+    if len(fitting) > 1:
+        said += f", which {len(fitting)} orders of the names fit: the one with the fewest changes was taken"
+    notes = (*identity.notes, f"{said}; a layout would say for certain which is which")
+    return replace(_result(winner, runner_up_px, tied, views, kinds, boards, layout, fitting[0]), notes=notes)
 
 
 def _checked_kinds(boards: Sequence[Board]) -> tuple[BoardKind, ...]:
@@ -194,10 +207,15 @@ def _result(
     kinds: Sequence[BoardKind],
     boards: Sequence[Board],
     layout: Mapping[str, str] | None,
+    renamed: Mapping[str, str] | None = None,
 ) -> PairIdentity:
-    """Name and turn the winner's boards, refine with each board's own squares, and sum up."""
+    """Name and turn the winner's boards, refine with each board's own squares, and sum up.
+
+    `renamed` maps the ids that the rules of `assign_board_ids` give to those that the boards are to have.
+    """
     seen, left_over = _identified_boards(winner, views, kinds)
     names, notes = assign_board_ids([s.located for s in seen], kinds, layout)
+    names = [(renamed or {}).get(name, name) for name in names]
     by_id = {b.board_id: b for b in boards}
     centres = [s.located.centre(kinds[s.located.kind].board) for s in seen]
     detections: tuple[dict[str, BoardDetection], dict[str, BoardDetection]] = ({}, {})

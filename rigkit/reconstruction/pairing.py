@@ -21,7 +21,6 @@ from rigkit.core.matches import DirectionPairs, Matches
 from rigkit.core.printing import brief
 from rigkit.core.truth import MeasuredAngle
 from rigkit.identification.identify import identify_pair
-from rigkit.identification.measured_angles import ids_by_angles
 from rigkit.identification.pair_identity import PairIdentity
 
 __all__ = ["Chain", "MatchedPair", "match_pair"]
@@ -42,7 +41,7 @@ class MatchedPair:
     pair_id : name of the pair.
     camera1, camera2 : calibrated cameras of the images as captured.
     boards : boards seen in both images, in the order of `matches.board_index`.
-    identity : how boards and corners were told apart.
+    identity : which board and which corner is which.
     chain : "raw": `matches` are in captured pixels; "rectified": in perspective views along each camera's axis.
     captured : the corners in captured pixels, where their noise is the same in all directions.
     matches : the corners in the coordinates of `chain`.
@@ -74,7 +73,7 @@ class MatchedPair:
         return replace(self, captured=scaled(self.captured), matches=scaled(self.matches), noise=noise)
 
     def in_chain(self, chain: Chain, *, support: Support = "patch", window: int | None = 2) -> MatchedPair:
-        """Return the same corners, told apart as they are, in the coordinates of another chain; see `match_pair`."""
+        """Return the same corners, identified as they are, in the coordinates of another chain; see `match_pair`."""
         both = (self.camera1, self.camera2)
         return _matched(self.pair_id, *both, self.boards, self.identity, chain, support, window)
 
@@ -93,7 +92,7 @@ def match_pair(
     support: Support = "patch",
     window: int | None = 2,
 ) -> MatchedPair:
-    """Tell the boards apart, match their corners, and take directions.
+    """Identify the boards, match their corners, and take directions.
 
     Parameters
     ----------
@@ -102,7 +101,7 @@ def match_pair(
     detections1, detections2 : all boards found in either image.
     boards : the boards that stand there.
     layout : board id -> "left", "right", "floor", "ceiling" or "back" where a person said so.
-    angles : between boards, as measured: they tell boards that look alike apart where no layout does.
+    angles : between boards, as measured: they identify boards that look alike where no layout does.
     chain : coordinates to work in.
     support, window : what a direction is estimated from, see `direction_field`.
 
@@ -114,20 +113,7 @@ def match_pair(
         `chain` is "rectified" and a corner lies too far off the axis.
     """
     _check_sizes(pair_id, (*detections1, *detections2), boards)
-    identity = identify_pair(detections1, detections2, boards, camera1, camera2, layout=layout)
-    given = {d.board_id for d in (*detections1, *detections2)} | set(layout or ())
-    fitting = ids_by_angles(identity, [b for b in boards if b.board_id not in given], angles)
-    if fitting:
-        before, names = identity, fitting[0]
-        first, second = (
-            [replace(d, board_id=names.get(str(d.board_id), d.board_id)) for d in found]
-            for found in (identity.detections1, identity.detections2)
-        )
-        identity = identify_pair(first, second, boards, camera1, camera2, layout=layout)
-        said = f"boards {', '.join(sorted(names))} look alike and were told apart by the measured angles"
-        if len(fitting) > 1:
-            said += f", which {len(fitting)} ways to name the boards fit: the one with the fewest changes was taken"
-        identity = replace(identity, notes=(*before.notes, f"{said}; a layout would say for certain which is which"))
+    identity = identify_pair(detections1, detections2, boards, camera1, camera2, layout=layout, angles=angles)
     return _matched(pair_id, camera1, camera2, boards, identity, chain, support, window)
 
 
@@ -141,7 +127,7 @@ def _matched(
     support: Support,
     window: int | None,
 ) -> MatchedPair:
-    """Match the corners of boards told apart, and take directions; else as `match_pair`."""
+    """Match the corners of identified boards, and take directions; else as `match_pair`."""
     pairs, unseen = _with_rays(identity.pairs(), camera1, camera2)
     if not pairs:
         reasons = "; ".join(f"{name}: {why}" for name, why in identity.missing.items())

@@ -47,7 +47,7 @@ def test_other_walls_than_right_angles_tell_equal_boards_apart(seed: int) -> Non
     assert not names_are_right(matched(made), made)
     pair = matched(made, angles=measured(angles))
     assert names_are_right(pair, made)
-    assert any("look alike and were told apart by the measured angles" in words for words in pair.notes)
+    assert any("look alike and were identified by the measured angles" in words for words in pair.notes)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -59,7 +59,7 @@ def test_where_angles_fit_several_names_the_fewest_change_and_it_is_said(seed: i
         pair = matched(made, angles=said)
         assert names_are_right(pair, made)
         (words,) = [words for words in pair.notes if "measured angles" in words]
-        assert "2 ways to name the boards fit" in words
+        assert "2 orders of the names fit" in words
 
 
 def test_boards_of_almost_the_same_squares_look_alike_too() -> None:
