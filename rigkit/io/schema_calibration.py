@@ -20,7 +20,9 @@ from rigkit.io.schema_words import (
     nullable,
     obj,
     of_dataclass,
+    optional,
     row,
+    rows,
     said,
     table,
 )
@@ -33,8 +35,7 @@ _CAMERA = obj(
         "model": said(choice(*MODELS), "camera model"),
         "size_px": said(row(2, INTEGER), "width and height of the image"),
         "parameters": said(table(NUMBER), "by name, in the model's order; pixels from the centre of the top left one"),
-    },
-    ["model", "size_px", "parameters"],
+    }
 )
 _FINDING: Schema = {
     ANY_OF: [
@@ -42,23 +43,19 @@ _FINDING: Schema = {
             {
                 "severity": said(choice(*(str(s) for s in Severity)), "good, look, or bad: do not use"),
                 "message": said(TEXT, "what is the matter, and how one can tell"),
-                "image": said(TEXT, "which image it is about"),
-                "remedy": said(TEXT, "what to do"),
-            },
-            ["severity", "message"],
+                "image?": said(TEXT, "which image it is about"),
+                "remedy?": said(TEXT, "what to do"),
+            }
         ),
         said(TEXT, "as former files have it"),
     ]
 }
-_MADE = said(
-    obj(
-        {
-            "rigkit": said(TEXT, "version"),
-            "written": said({"type": "string", "format": "date-time"}, "when, UTC"),
-            "inputs": said(table(TEXT), "SHA-256 of what it was made from: the session, and all images together"),
-        },
-        ["rigkit", "written", "inputs"],
-    ),
+_MADE = obj(
+    {
+        "rigkit": said(TEXT, "version"),
+        "written": said({"type": "string", "format": "date-time"}, "when, UTC"),
+        "inputs": said(table(TEXT), "SHA-256 of what it was made from: the session, and all images together"),
+    },
     "by what, when, and from what it was made",
 )
 _FREEDOM = said(nullable(NUMBER), "degrees of freedom of the covariances; null: too few images to know")
@@ -71,154 +68,108 @@ _VIEW = obj(
         "image": said(TEXT, "its name"),
         "board_id": said(TEXT, "which board"),
         "cam_from_board": _POSE,
-        "rms_px": said(nullable(NUMBER), "over the corners kept"),
+        "rms_px?": said(nullable(NUMBER), "over the corners kept"),
         "grid": said(matrix(columns=2), "column and row of each corner"),
         "pixels": said(matrix(columns=2), "the corners as measured"),
         "residuals_px": said(array(row(2, nullable(NUMBER))), "measured minus projected; null: does not project"),
         "kept": said(array(BOOLEAN), "false for outliers"),
-    },
-    ["image", "board_id", "cam_from_board", "grid", "pixels", "residuals_px", "kept"],
+    }
 )
 _SHAPE = obj(
     {
         "board_id": said(TEXT, "which board"),
         "kind": said(TEXT, "flat, warp or released"),
         "points_mm": said(matrix(columns=3), "its corners, row by row"),
-        "bow_mm": said(NUMBER, "largest departure from a plane"),
-        "aspect": said(NUMBER, "how much longer its squares are along x than stated, against y"),
-    },
-    ["board_id", "kind", "points_mm"],
+        "bow_mm?": said(NUMBER, "largest departure from a plane"),
+        "aspect?": said(NUMBER, "how much longer its squares are along x than stated, against y"),
+    }
 )
 CALIBRATION_FILE = file(
     "rigkit.calibration/1",
     "A calibrated camera; with `camera` alone, a camera of another tool",
     {
-        "made": _MADE,
+        "made?": _MADE,
         "camera": said(_CAMERA, "the camera"),
-        **_OF_CALIBRATION,
-        "heldout_rms_px": _HELDOUT,
-        "freedom": _FREEDOM,
-        "verdicts": said(array(_FINDING), "what is good and what is not, the headline first"),
-        "candidates": said(array(of_dataclass(Candidate)), "models, degrees and board shapes tried"),
-        "convergence": said(of_dataclass(Convergence), "of the final solve"),
-        "dropped": said(array(row(2, TEXT)), "image and why it was not used"),
-        "outliers": said(array(of_dataclass(Outlier)), "corners left out of views that were used"),
-        "covariance": said(matrix(), "of the parameters, in their order"),
-        "frame_covariance": said(matrix(), "of the parameters and the mean motion of the boards (rad, mm)"),
-        "boards": said(array(_SHAPE), "boards as the solution has them"),
-        "views": said(array(_VIEW), "the views used"),
+        **optional(_OF_CALIBRATION),
+        "heldout_rms_px?": _HELDOUT,
+        "freedom?": _FREEDOM,
+        "verdicts?": said(array(_FINDING), "what is good and what is not, the headline first"),
+        "candidates?": said(array(of_dataclass(Candidate)), "models, degrees and board shapes tried"),
+        "convergence?": said(of_dataclass(Convergence), "of the final solve"),
+        "dropped?": said(array(row(2, TEXT)), "image and why it was not used"),
+        "outliers?": said(array(of_dataclass(Outlier)), "corners left out of views that were used"),
+        "covariance?": said(matrix(), "of the parameters, in their order"),
+        "frame_covariance?": said(matrix(), "of the parameters and the mean motion of the boards (rad, mm)"),
+        "boards?": said(array(_SHAPE), "boards as the solution has them"),
+        "views?": said(array(_VIEW), "the views used"),
     },
-    ["camera"],
 )
 RIG_FILE = file(
     "rigkit.rig/1",
     "Cameras on one mount",
     {
-        "made": _MADE,
-        "cameras": said(
-            array(
-                obj(
-                    {
-                        "name": said(TEXT, "its name"),
-                        "camera": said(_CAMERA, "as all cameras together have it"),
-                        "cam_from_rig": _POSE,
-                        "rms_px": said(NUMBER, "training error in the rig"),
-                    },
-                    ["name", "camera", "cam_from_rig", "rms_px"],
-                ),
-                1,
-            ),
+        "made?": _MADE,
+        "cameras": rows(
+            {
+                "name": said(TEXT, "its name"),
+                "camera": said(_CAMERA, "as all cameras together have it"),
+                "cam_from_rig": _POSE,
+                "rms_px": said(NUMBER, "training error in the rig"),
+            },
             "the first is the rig's frame",
+            least=1,
         ),
-        "rms_px": said(NUMBER, "training error of all cameras together"),
-        "heldout_rms_px": said(nullable(NUMBER), "of frames that took no part, one pose for all cameras"),
-        "sigma_px": said(NUMBER, "standard deviation of a corner of median quality"),
-        "overdispersion": said(NUMBER, "by how much more frames disagree than the corners' scatter explains"),
-        "freedom": _FREEDOM,
-        "scale_sigma": said(NUMBER, "relative standard deviation of all lengths, from the boards' squares"),
-        "covariance": said(
+        "rms_px?": said(NUMBER, "training error of all cameras together"),
+        "heldout_rms_px?": said(nullable(NUMBER), "of frames that took no part, one pose for all cameras"),
+        "sigma_px?": said(NUMBER, "standard deviation of a corner of median quality"),
+        "overdispersion?": said(NUMBER, "by how much more frames disagree than the corners' scatter explains"),
+        "freedom?": _FREEDOM,
+        "scale_sigma?": said(NUMBER, "relative standard deviation of all lengths, from the boards' squares"),
+        "covariance?": said(
             matrix(), "of all parameters, camera by camera, then of the mounts of all but the first (rad, mm)"
         ),
-        "baselines": said(
-            array(
-                obj(
-                    {"from": TEXT, "to": TEXT, "value_mm": NUMBER, "sigma_mm": NUMBER},
-                    ["from", "to", "value_mm", "sigma_mm"],
-                )
-            ),
-            "distances between cameras",
+        "baselines?": rows(
+            {"from": TEXT, "to": TEXT, "value_mm": NUMBER, "sigma_mm": NUMBER}, "distances between cameras"
         ),
-        "verdicts": said(array(_FINDING), "what is good and what is not, the headline first"),
-        "spread": said(NUMBER, "what overdispersion was called"),
+        "verdicts?": said(array(_FINDING), "what is good and what is not, the headline first"),
+        "spread?": said(NUMBER, "what overdispersion was called"),
     },
-    ["cameras"],
 )
 BOARD_RIG_FILE = file(
     "rigkit.board_rig/1",
     "Boards on one mount",
     {
-        "rigs": said(
-            array(
-                obj(
+        "rigs": rows(
+            {
+                "image_count": said(INTEGER, "images that show several of them"),
+                "scale_sigma": said(NUMBER, "relative standard deviation of all lengths"),
+                "angles?": rows({"a": TEXT, "b": TEXT, "value_deg": NUMBER, "sigma_deg": NUMBER}, "between the boards"),
+                "boards": rows(
                     {
-                        "image_count": said(INTEGER, "images that show several of them"),
-                        "scale_sigma": said(NUMBER, "relative standard deviation of all lengths"),
-                        "angles": said(
-                            array(
-                                obj(
-                                    {"a": TEXT, "b": TEXT, "value_deg": NUMBER, "sigma_deg": NUMBER},
-                                    ["a", "b", "value_deg", "sigma_deg"],
-                                )
-                            ),
-                            "between the boards",
-                        ),
-                        "boards": said(
-                            array(
-                                obj(
-                                    {
-                                        "board_id": TEXT,
-                                        "size": said(row(2, INTEGER), "columns and rows"),
-                                        "square_mm": said(row(2), "sides of a square"),
-                                        "square_sigma_mm": nullable(NUMBER),
-                                        "target_from_board": _POSE,
-                                        "points_mm": said(matrix(columns=3), "corners, row by row"),
-                                    },
-                                    [
-                                        "board_id",
-                                        "size",
-                                        "square_mm",
-                                        "square_sigma_mm",
-                                        "target_from_board",
-                                        "points_mm",
-                                    ],
-                                )
-                            ),
-                            "the first is the target's frame",
-                        ),
-                        "covariance": said(matrix(), "of the places of all boards but the first (rad, mm)"),
+                        "board_id": TEXT,
+                        "size": said(row(2, INTEGER), "columns and rows"),
+                        "square_mm": said(row(2), "sides of a square"),
+                        "square_sigma_mm": nullable(NUMBER),
+                        "target_from_board": _POSE,
+                        "points_mm": said(matrix(columns=3), "corners, row by row"),
                     },
-                    ["image_count", "scale_sigma", "boards", "covariance"],
-                )
-            ),
+                    "the first is the target's frame",
+                ),
+                "covariance": said(matrix(), "of the places of all boards but the first (rad, mm)"),
+            },
             "one entry a mount",
         )
     },
-    ["rigs"],
 )
-_FOUND = said(
-    array(
-        obj(
-            {
-                "board_id": said(nullable(TEXT), "null: boards of this size cannot be told apart"),
-                "columns": INTEGER,
-                "rows": INTEGER,
-                "grid": said(array(row(2, {"type": "integer"})), "column and row of each corner"),
-                "pixels": matrix(columns=2),
-                "sigma_px": array(NUMBER),
-            },
-            ["board_id", "columns", "rows", "grid", "pixels", "sigma_px"],
-        )
-    ),
+_FOUND = rows(
+    {
+        "board_id": said(nullable(TEXT), "null: boards of this size cannot be told apart"),
+        "columns": INTEGER,
+        "rows": INTEGER,
+        "grid": said(array(row(2, {"type": "integer"})), "column and row of each corner"),
+        "pixels": matrix(columns=2),
+        "sigma_px": array(NUMBER),
+    },
     "the boards found",
 )
 CORNERS_FILE = file(
@@ -234,17 +185,15 @@ CORNERS_FILE = file(
                         "size_px": row(2, INTEGER),
                         "boards": _FOUND,
                         "lens": said(
-                            nullable(obj({"key": said(TEXT, "of the lens"), "boards": _FOUND}, ["key", "boards"])),
+                            nullable(obj({"key": said(TEXT, "of the lens"), "boards": _FOUND})),
                             "corners placed through a first calibration",
                         ),
-                    },
-                    ["sha256", "size_px", "boards", "lens"],
+                    }
                 )
             ),
             "by name of the image",
         ),
     },
-    ["detector", "images"],
 )
 
 

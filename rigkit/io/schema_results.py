@@ -17,7 +17,9 @@ from rigkit.io.schema_words import (
     nullable,
     obj,
     of_dataclass,
+    optional,
     row,
+    rows,
     said,
     table,
 )
@@ -47,17 +49,16 @@ _BOARD_RESULT = obj(
         "points": INTEGER,
         "normal": row(3),
         "offset_mm": NUMBER,
-        "normal_sigma_deg": _VALUE,
-        "flatness_rms_mm": NUMBER,
-        "flatness_peak_mm": NUMBER,
+        "normal_sigma_deg?": _VALUE,
+        "flatness_rms_mm?": NUMBER,
+        "flatness_peak_mm?": NUMBER,
         "normal_errors": said(_NORMALS, "of the estimated normals against the plane"),
-        "lattice_normal_errors": said(nullable(_NORMALS), "against the plane of the board's known lattice"),
-        "square_x_ratio": NUMBER,
-        "square_y_ratio": NUMBER,
-        "skew_deg": NUMBER,
-        "right_handed": BOOLEAN,
-    },
-    ["board", "points", "normal", "offset_mm", "normal_errors"],
+        "lattice_normal_errors?": said(nullable(_NORMALS), "against the plane of the board's known lattice"),
+        "square_x_ratio?": NUMBER,
+        "square_y_ratio?": NUMBER,
+        "skew_deg?": NUMBER,
+        "right_handed?": BOOLEAN,
+    }
 )
 _OF_REPORT = of_dataclass(ValidationReport, only=("pose_type", "affine_method", "baseline_mm", "baseline_sigma_mm"))
 VALIDATION_FILE = file(
@@ -65,48 +66,41 @@ VALIDATION_FILE = file(
     "The verdict on one pair by one estimator",
     {
         "pair": said(TEXT, "its name"),
-        **_OF_REPORT["properties"],
+        **optional(_OF_REPORT["properties"]),
         "passed": said(BOOLEAN, "whether everything measured was checked, and every check passed"),
-        "points": said(INTEGER, "reconstructed"),
-        "sampson_rms_px": said(_VALUE, "of the corners from their epipolar curves"),
+        "points?": said(INTEGER, "reconstructed"),
+        "sampson_rms_px?": said(_VALUE, "of the corners from their epipolar curves"),
         "checks": _CHECKS,
         "unchecked": said(array(TEXT), "what could not be checked, and why"),
         "angles": said(array(_ANGLE), "between each two boards"),
         "boards": said(array(_BOARD_RESULT), "plane, normals and frame of each board"),
-        "notes": array(TEXT),
+        "notes?": array(TEXT),
     },
-    ["pair", "passed", "checks", "unchecked", "angles", "boards"],
 )
 CROSSCHECK_FILE = file(
     "rigkit.crosscheck/1",
     "A pair by other methods",
     {
         "pair": TEXT,
-        "affine_method": TEXT,
+        "affine_method?": TEXT,
         "passed": BOOLEAN,
-        "methods": array(
-            obj(
-                {
-                    "name": TEXT,
-                    "rotation_difference_deg": _VALUE,
-                    "direction_difference_deg": _VALUE,
-                    "baseline_mm": _VALUE,
-                    "angles_deg": array(
-                        obj({"a": TEXT, "b": TEXT, "angle": NUMBER, "sigma": _VALUE}, ["a", "b", "angle", "sigma"])
-                    ),
-                    "rms_px": _VALUE,
-                    "variance_factor": _VALUE,
-                    "used": INTEGER,
-                    "excluded": INTEGER,
-                },
-                ["name"],
-            )
+        "methods": rows(
+            {
+                "name": TEXT,
+                "rotation_difference_deg?": _VALUE,
+                "direction_difference_deg?": _VALUE,
+                "baseline_mm?": _VALUE,
+                "angles_deg?": rows({"a": TEXT, "b": TEXT, "angle": NUMBER, "sigma": _VALUE}),
+                "rms_px?": _VALUE,
+                "variance_factor?": _VALUE,
+                "used?": INTEGER,
+                "excluded?": INTEGER,
+            }
         ),
         "checks": _CHECKS,
-        "skipped": said(array(TEXT), "methods that could not be used, and why"),
-        "diagnosis": array(TEXT),
+        "skipped?": said(array(TEXT), "methods that could not be used, and why"),
+        "diagnosis?": array(TEXT),
     },
-    ["pair", "passed", "methods", "checks"],
 )
 _CELL: Schema = {
     ANY_OF: [
@@ -115,12 +109,11 @@ _CELL: Schema = {
         obj(
             {
                 "value": {ANY_OF: [_VALUE, TEXT]},
-                "sigma": NUMBER,
-                "paper": said(NUMBER, "what the paper printed there"),
-                "best": BOOLEAN,
-                "failed": BOOLEAN,
-            },
-            ["value"],
+                "sigma?": NUMBER,
+                "paper?": said(NUMBER, "what the paper printed there"),
+                "best?": BOOLEAN,
+                "failed?": BOOLEAN,
+            }
         ),
     ]
 }
@@ -128,20 +121,16 @@ TABLES_FILE = file(
     "rigkit.tables/1",
     "Tables of a result",
     {
-        "tables": array(
-            obj(
-                {
-                    "key": TEXT,
-                    "title": TEXT,
-                    "note": TEXT,
-                    "units": said(table(TEXT), "by column"),
-                    "rows": said(array(table(_CELL)), "by column"),
-                },
-                ["key", "title", "rows"],
-            )
+        "tables": rows(
+            {
+                "key": TEXT,
+                "title": TEXT,
+                "note?": TEXT,
+                "units?": said(table(TEXT), "by column"),
+                "rows": said(array(table(_CELL)), "by column"),
+            }
         )
     },
-    ["tables"],
 )
 _GRID = array(array(_VALUE))
 CERTIFICATE_FILE = file(
@@ -149,22 +138,21 @@ CERTIFICATE_FILE = file(
     "How wrong a measurement may be",
     {
         "quantity": said(TEXT, "length, depth, plane or angle"),
-        "size_mm": NUMBER,
-        "distance_mm": NUMBER,
-        "confidence": NUMBER,
-        "cameras": array(TEXT),
+        "size_mm?": NUMBER,
+        "distance_mm?": NUMBER,
+        "confidence?": NUMBER,
+        "cameras?": array(TEXT),
         "unit": said(TEXT, "of all bounds and sigmas"),
         "worst": _VALUE,
-        "median": _VALUE,
-        "in_view": said(NUMBER, "share of the image that sees all of it"),
-        "shares_where_worst": said(table(NUMBER), "of the variance, by cause"),
-        "findings": array(TEXT),
-        "u_px": said(array(NUMBER), "columns of the grid"),
-        "v_px": said(array(NUMBER), "rows of the grid"),
+        "median?": _VALUE,
+        "in_view?": said(NUMBER, "share of the image that sees all of it"),
+        "shares_where_worst?": said(table(NUMBER), "of the variance, by cause"),
+        "findings?": array(TEXT),
+        "u_px?": said(array(NUMBER), "columns of the grid"),
+        "v_px?": said(array(NUMBER), "rows of the grid"),
         "bound": said(_GRID, "over the grid; null: out of view"),
-        "sigma": said(table(_GRID), "by cause"),
+        "sigma?": said(table(_GRID), "by cause"),
     },
-    ["quantity", "unit", "worst", "bound"],
 )
 STUDY_RESULT_FILE = file(
     "rigkit.study_result/1",
@@ -172,34 +160,34 @@ STUDY_RESULT_FILE = file(
     {
         "study": said({"type": "object"}, "the study, as its file has it"),
         "cells": array(of_dataclass(StudyCell)),
-        "claims": array(
-            obj({**of_dataclass(Verdict)["properties"], "verdict": said(TEXT, "in words")}, ["text", "verdict"])
+        "claims": rows(
+            {
+                **optional(of_dataclass(Verdict)["properties"], "against", "comparisons", "holds_in"),
+                "verdict": said(TEXT, "in words"),
+            }
         ),
     },
-    ["study", "cells", "claims"],
 )
 HISTORY_FILE = file(
     "rigkit.history/1",
     "One line of a register of checks (JSON lines)",
     {
-        **of_dataclass(HistoryEntry, without=("amounts",))["properties"],
+        **optional(of_dataclass(HistoryEntry, without=("amounts",))["properties"], "temperature_c"),
         "amounts": said(table(row(2)), "by cause and unit: value and standard deviation, as if it alone had changed"),
     },
-    ["date", "kind", "source", "holds", "chance", "verdict", "frames", "rms_px", "amounts"],
 )
 _POSE = matrix(3, 4)
 HAND_EYE_FILE = file(
     "rigkit.hand_eye/1",
     "Where a camera sits on a robot",
     {
-        "cam_from_hand": said(_POSE, "of a camera on the hand"),
-        "base_from_board": said(_POSE, "with it"),
-        "cam_from_base": said(_POSE, "of a camera that stands before a robot"),
-        "hand_from_board": said(_POSE, "with it"),
+        "cam_from_hand?": said(_POSE, "of a camera on the hand"),
+        "base_from_board?": said(_POSE, "with it"),
+        "cam_from_base?": said(_POSE, "of a camera that stands before a robot"),
+        "hand_from_board?": said(_POSE, "with it"),
         "covariance": said(matrix(), "of both poses (rad, mm), twelve by twelve"),
         "rms_px": NUMBER,
-        "image_rms_px": said(table(NUMBER), "by image"),
-        "left_out_deg": said(table(NUMBER), "images whose pose does not go with them, and by what angle"),
+        "image_rms_px?": said(table(NUMBER), "by image"),
+        "left_out_deg?": said(table(NUMBER), "images whose pose does not go with them, and by what angle"),
     },
-    ["covariance", "rms_px"],
 )

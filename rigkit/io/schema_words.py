@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from inspect import cleandoc
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-__all__ = ["ANY_OF", "array", "choice", "file", "matrix", "nullable", "obj", "of_dataclass", "row", "said", "table"]
-__all__ += ["BOOLEAN", "INTEGER", "NUMBER", "POSITIVE", "TEXT", "Schema"]
+__all__ = ["ANY_OF", "array", "choice", "file", "matrix", "nullable", "obj", "of_dataclass", "optional"]
+__all__ += ["BOOLEAN", "INTEGER", "NUMBER", "POSITIVE", "TEXT", "Schema", "row", "rows", "said", "table"]
 
 Schema = dict[str, Any]
 ANY_OF = "anyOf"
@@ -53,11 +53,24 @@ def matrix(rows: int | None = None, columns: int | None = None) -> Schema:
     return array(inner) if rows is None else row(rows, inner)
 
 
-def obj(properties: Mapping[str, Schema], required: Sequence[str] = (), words: str = "") -> Schema:
-    """Return the schema of an object with these keys and no others."""
-    out: Schema = {"type": "object", "properties": dict(properties), "additionalProperties": False}
+def obj(keys: Mapping[str, Schema], words: str = "") -> Schema:
+    """Return the schema of an object with these keys and no others; a key that may be missing ends with "?"."""
+    properties = {key.removesuffix("?"): schema for key, schema in keys.items()}
+    required = [key for key in keys if not key.endswith("?")]
+    out: Schema = {"type": "object", "properties": properties, "additionalProperties": False}
     if required:
-        out["required"] = list(required)
+        out["required"] = required
+    return said(out, words) if words else out
+
+
+def optional(keys: Mapping[str, Schema], *names: str) -> dict[str, Schema]:
+    """Return the keys as those of an object that may lack the ones named, or any where none is named."""
+    return {f"{key.removesuffix('?')}?" if not names or key in names else key: schema for key, schema in keys.items()}
+
+
+def rows(keys: Mapping[str, Schema], words: str = "", *, least: int = 0) -> Schema:
+    """Return the schema of a list of at least so many objects."""
+    out = array(obj(keys), least)
     return said(out, words) if words else out
 
 
@@ -66,9 +79,9 @@ def table(values: Schema) -> Schema:
     return {"type": "object", "additionalProperties": values}
 
 
-def file(schema: str, title: str, properties: Mapping[str, Schema], required: Sequence[str] = ()) -> Schema:
+def file(schema: str, title: str, keys: Mapping[str, Schema]) -> Schema:
     """Return the schema of a whole file, which says itself which one it is."""
-    own = obj({"schema": {"const": schema}, **properties}, ["schema", *required])
+    own = obj({"schema": {"const": schema}, **keys})
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": title, **own}
 
 
@@ -81,7 +94,7 @@ def of_dataclass(cls: type, *, only: Sequence[str] = (), without: Sequence[str] 
         if field.name not in without and (not only or field.name in only):
             one = _of_type(hints[field.name])
             properties[field.name] = said(one, words[field.name]) if field.name in words else one
-    return obj(properties, list(properties))
+    return obj(properties)
 
 
 def _of_type(hint: Any) -> Schema:
