@@ -10,9 +10,15 @@ size, from corners with new noise. Of the errors 95 % should lie within the cert
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from helpers.measuring import read_off
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.rig.calibrate import calibrate_rig
@@ -81,21 +87,7 @@ def frames_of(
 
 def lengths_off(quantity: Quantity, points: np.ndarray, exact: np.ndarray) -> np.ndarray:
     """Return the errors (N, ways) of what points (N, K, 3) measure, by the definition of the quantity."""
-    return np.abs(_read(quantity, points) - _read(quantity, exact))
-
-
-def _read(quantity: Quantity, points: np.ndarray) -> np.ndarray:
-    if quantity is Quantity.ANGLE:
-        a, b = points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]
-        cosine = np.sum(a * b, axis=1) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
-        return np.asarray(np.rad2deg(np.arccos(cosine)))[:, None]
-    if quantity is Quantity.PLANE:
-        centred = points - points.mean(axis=1, keepdims=True)
-        normals = np.linalg.svd(centred)[2][:, 2]
-        normals *= np.sign(np.sum(normals * points.mean(axis=1), axis=1))[:, None]
-        return np.asarray(np.einsum("nkx,nx->nk", centred, normals))
-    ends = points.reshape(len(points), -1, 2, 3)
-    return np.asarray(np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1))
+    return np.abs(read_off(quantity, points) - read_off(quantity, exact))
 
 
 def rig_trial(lens: Camera, frames: int, rng: np.random.Generator) -> Iterator[tuple[str, np.ndarray]]:

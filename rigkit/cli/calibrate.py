@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rigkit.cli.calibrate_arguments import SESSION_NAME, add_arguments, calibrate_options, folder_options
+from rigkit.cli.calibrate_arguments import add_arguments, calibrate_options, folder_options
 from rigkit.core.errors import ExitCode, InputError, RigkitError
 
 if TYPE_CHECKING:
@@ -64,20 +63,9 @@ def _one(args: argparse.Namespace) -> int:
 
 def _calibrated(args: argparse.Namespace) -> SessionCalibration | RigSessionCalibration:
     from rigkit.cli.console import progress_on_stderr
-    from rigkit.io.video import is_video
-    from rigkit.workflows.calibrate_any import calibrate_folders, calibrate_session_file
+    from rigkit.workflows.calibrate_any import calibrate_sources
 
-    options = calibrate_options(args)
-    progress = progress_on_stderr()
-    first: Path = args.source[0]
-    told = bool(args.board or args.model)
-    if len(args.source) == 1 and first.is_dir() and not told and (first / SESSION_NAME).is_file():
-        first = first / SESSION_NAME
-    if len(args.source) > 1 or first.is_dir() or is_video(first):
-        return calibrate_folders(args.source, folder_options(args), options, progress=progress)
-    if told:
-        raise InputError(f"calibrate: '{first}' says itself what board and model it has; leave out --board and --model")
-    return calibrate_session_file(first, options, progress=progress)
+    return calibrate_sources(args.source, folder_options(args), calibrate_options(args), progress=progress_on_stderr())
 
 
 def _said(done: SessionCalibration | RigSessionCalibration) -> tuple[dict[str, Any], str, bool]:

@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from rigkit.workflows.calibrate import CalibrateOptions
     from rigkit.workflows.calibrate_any import FolderOptions
 
-SESSION_NAME = "session.toml"
-
 EXAMPLES = """examples:
   rigkit calibrate photos --board 9x6x25 -r          one camera; 9x6 inner corners, squares of 25 mm; with a page
   rigkit calibrate left right --board board.toml     a rig, one folder a camera; so is a folder of left01, right01, ...
@@ -67,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="RIG",
         help="cameras of this rig stay, lens and mount: the others are added to it",
     )
-    folders = parser.add_argument_group("folders", f"the session used is kept as {SESSION_NAME} for the next time")
+    folders = parser.add_argument_group("folders", "the session used is kept as session.toml for the next time")
     folders.add_argument(
         "--board", action="append", default=[], metavar="CxRxMM|BOARD.toml", help="such as 9x6x25 (repeatable)"
     )
@@ -96,4 +94,4 @@ def folder_options(args: argparse.Namespace) -> FolderOptions:
     """Return what folders of images do not tell of themselves."""
     from rigkit.workflows.calibrate_any import FolderOptions
 
-    return FolderOptions(boards=tuple(args.board), model=args.model or "auto", timestamps=args.timestamps)
+    return FolderOptions(boards=tuple(args.board), model=args.model, timestamps=args.timestamps)

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from rigkit.cli.console import note, progress_on_stderr
-from rigkit.cli.lengths import told_baselines, told_length
 from rigkit.cli.manifest_words import (
     POSE_TYPES,
     ask,
     cameras_of,
     pose_type_of,
     require_told,
+    told_baselines,
     told_calibrations,
+    told_length,
     told_poses,
 )
 from rigkit.core.errors import ExitCode, InputError
@@ -33,36 +35,33 @@ _EXAMPLES = """examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _EXAMPLES
+    repeatable: dict[str, Any] = {"action": "append", "default": []}
     parser.add_argument("folder", type=Path, help="folder with the images of the pairs, or of the cameras")
     parser.add_argument("--name", help="name of the data set (default: the folder's)")
     parser.add_argument("--square-mm", type=float, help="side of a square, as measured on the printed board")
     parser.add_argument(
         "--calibration",
-        action="append",
-        default=[],
+        **repeatable,
         metavar="[CAMERA=]FILE",
         help="calibration of the camera; of two, give that of the first image, then that of the second; of more, name "
         "each (repeatable)",
     )
     parser.add_argument(
         "--cameras",
-        action="append",
-        default=[],
+        **repeatable,
         metavar="PAIRS=ONE,TWO",
         help="cameras of the two images of pairs whose names match, such as 'fisheye-*=f,f' (repeatable)",
     )
     parser.add_argument(
         "--pose-type",
-        action="append",
-        default=[],
+        **repeatable,
         metavar="[PAIRS=]TYPE",
         help=f"{', '.join(POSE_TYPES)}: of all pairs, or of those whose names match (repeatable; the first that "
         "matches counts)",
     )
     parser.add_argument(
         "--baseline-mm",
-        action="append",
-        default=[],
+        **repeatable,
         metavar="PAIR=MM+-SIGMA",
         help="measured baseline of a pair, such as first=300+-2 (repeatable)",
     )
@@ -70,9 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="replace an existing file")
     session = parser.add_argument_group("sessions")
     session.add_argument("--session", action="store_true", help="a session for rigkit calibrate instead")
-    session.add_argument(
-        "--board", action="append", default=[], metavar="CxRxMM|BOARD.toml", help="such as 9x6x25 (repeatable)"
-    )
+    session.add_argument("--board", **repeatable, metavar="CxRxMM|BOARD.toml", help="such as 9x6x25 (repeatable)")
     session.add_argument("--model", help="camera model (default: auto, the one that predicts best)")
 
 

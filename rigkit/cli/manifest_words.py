@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 from collections.abc import Sequence
@@ -11,8 +12,9 @@ from pathlib import Path
 
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier
+from rigkit.core.posetype import PoseType
 
-POSE_TYPES = ("general", "planar", "standard", "forward", "auto")
+POSE_TYPES = tuple(map(str, PoseType))
 ONE_CAMERA, TWO_CAMERAS = ("camera",), ("camera1", "camera2")
 
 
@@ -87,6 +89,30 @@ def told_poses(told: Sequence[str]) -> list[tuple[str, str]]:
 def pose_type_of(told: Sequence[tuple[str, str]], name: str) -> str | None:
     """Return the first pose type that is told of the pair `name`, or None."""
     return next((value for pattern, value in told if fnmatch(name, pattern)), None)
+
+
+def told_baselines(told: Sequence[str], pairs: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Return pair -> (mm, sigma mm) from PAIR=MM+-SIGMA; raises InputError for other pairs and what is no length."""
+    out = {}
+    for text in told:
+        name, _, value = text.partition("=")
+        number, _, sigma = value.partition("+-")
+        if name not in pairs:
+            raise InputError(f"init: --baseline-mm names '{name}'; pairs found: {', '.join(sorted(pairs))}")
+        what = f"--baseline-mm '{text}': write PAIR=MM+-SIGMA, such as {name}=300+-2"
+        out[name] = (told_length(what, number), told_length(what, sigma))
+    return out
+
+
+def told_length(what: str, value: str | float) -> float:
+    """Return a length in mm; raises InputError where it is no positive number."""
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    if not (math.isfinite(number) and number > 0.0):
+        raise InputError(f"init: {what}: a positive number of mm is needed, got '{value}'")
+    return number
 
 
 def ask(question: str, choices: tuple[str, ...] = ()) -> str:

@@ -8,10 +8,9 @@ from pathlib import Path
 from rigkit.cli.console import note, print_json, progress_on_stderr
 from rigkit.cli.dataset_arguments import results_folder
 from rigkit.core.errors import ExitCode, InputError
+from rigkit.core.posetype import PoseType
 
 __all__ = ["add_scene_arguments", "is_scene", "run_scene"]
-
-POSE_TYPES = ("general", "planar", "standard", "forward", "auto")
 
 
 def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,25 +18,29 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--images",
         nargs="+",
+        type=Path,
         metavar="IMAGE",
         help="match affine features of these two images; of three and more, of a --rig, fuse the clouds of near pairs",
     )
     group.add_argument(
         "--correspondences",
+        type=Path,
         metavar="FILE",
         help="CSV, NPZ or AffineExtractor text with affinities or directions, a matcher's NPZ or COLMAP's database; "
         "with --images these align bare points, the cloud grows and has colours",
     )
-    group.add_argument("--camera", metavar="CALIB", help="calibration of the camera (of image A)")
-    group.add_argument("--camera2", metavar="CALIB", help="calibration of the camera of image B (default: the same)")
+    group.add_argument("--camera", type=Path, metavar="CALIB", help="calibration of the camera (of image A)")
+    group.add_argument("--camera2", type=Path, metavar="CALIB", help="the same of image B (default: that of image A)")
     group.add_argument(
-        "--rig", metavar="RIG", help="the rig that took both images, instead of --camera; its pose is kept"
+        "--rig", type=Path, metavar="RIG", help="the rig that took both images, instead of --camera; its pose is kept"
     )
     group.add_argument("--names", nargs="+", metavar="CAMERA", help="cameras of the images (default: the rig's first)")
-    group.add_argument("--pose", metavar="FILE", help="measured cam2_from_cam1, 3x4 or 4x4 numbers, mm; it is kept")
+    group.add_argument(
+        "--pose", type=Path, metavar="FILE", help="measured cam2_from_cam1, 3x4 or 4x4 numbers, mm; it is kept"
+    )
     group.add_argument("--baseline-mm", type=float, metavar="MM", help="measured baseline (default: it is the unit)")
     group.add_argument(
-        "--pose-type", choices=POSE_TYPES, help="of the two views (default general, or a rectified pair's)"
+        "--pose-type", choices=tuple(map(str, PoseType)), help="of the views (default general, or a rectified pair's)"
     )
     group.add_argument("--sparse", action="store_true", help="only the matched features; do not grow a dense cloud")
     group.add_argument("--float", action="store_true", help="write the cloud in single precision")
@@ -60,23 +63,21 @@ def is_scene(args: argparse.Namespace) -> bool:
 def run_scene(args: argparse.Namespace) -> int:
     if args.images and len(args.images) > 2:
         return _run_rig(args)
-    import numpy as np
-
     from rigkit.workflows.reconstruct_scene import CLOUD, SceneOptions, reconstruct_views
 
     for option, given in (("--images", args.images), ("--names", args.names)):
         if given and len(given) != 2:
             raise InputError(f"reconstruct: {option} names two, or with --rig three and more; got {len(given)}")
-    name = Path(args.correspondences or args.images[0]).stem
+    name = (args.correspondences or args.images[0]).stem
     out = results_folder(args, name)
     options = SceneOptions(
-        camera=Path(args.camera) if args.camera else None,
-        rig=Path(args.rig) if args.rig else None,
+        camera=args.camera,
+        rig=args.rig,
         rig_names=tuple(args.names) if args.names else None,
-        pose=Path(args.pose) if args.pose else None,
-        camera2=Path(args.camera2) if args.camera2 else None,
-        images=(Path(args.images[0]), Path(args.images[1])) if args.images else None,
-        correspondences=Path(args.correspondences) if args.correspondences else None,
+        pose=args.pose,
+        camera2=args.camera2,
+        images=(args.images[0], args.images[1]) if args.images else None,
+        correspondences=args.correspondences,
         baseline_mm=args.baseline_mm,
         pose_type=args.pose_type,
         level_sigma_deg=args.level_sigma_deg,
@@ -91,29 +92,12 @@ def run_scene(args: argparse.Namespace) -> int:
     scene, r = done.scene, done.scene.reconstruction
     for words in r.notes:
         note(f"{name}: {words}")
-    inliers = int(scene.inliers.sum())
     if args.json:
-        print_json(
-            {
-                "output": str(out),
-                "ply": CLOUD,
-                "pose_type": str(r.pose_type),
-                "correspondences": len(done.correspondences),
-                "inliers": inliers,
-                "points": len(r.cloud),
-                "unit": done.unit,
-                "cam2_from_cam1": r.cam2_from_cam1.matrix().tolist(),
-                "pose_covariance": None if r.pose_covariance is None else r.pose_covariance.tolist(),
-                "sigma_px": scene.sigma_px,
-                "sigma_A": scene.sigma_A if np.isfinite(scene.sigma_A) else None,
-                "sampson_rms_px": r.sampson_rms_px,
-                "notes": list(r.notes),
-            }
-        )
+        print_json({"output": str(out), "ply": CLOUD, **done.figures()})
     else:
         print(
             f"{out / CLOUD}: {len(r.cloud)} points ({done.unit}) of {len(done.correspondences)} correspondences, "
-            f"{inliers} of which agree, Sampson rms {r.sampson_rms_px:.3f} px, {r.pose_type}"
+            f"{scene.inliers.sum()} of which agree, Sampson rms {r.sampson_rms_px:.3f} px, {r.pose_type}"
         )
     return ExitCode.WELL
 
@@ -126,23 +110,15 @@ def _run_rig(args: argparse.Namespace) -> int:
             f"reconstruct: {len(args.images)} images need --rig RIG, a file that says where their cameras stand; or "
             "give two of them with --camera"
         )
-    alone = {
-        "--correspondences": args.correspondences,
-        "--camera": args.camera,
-        "--camera2": args.camera2,
-        "--pose": args.pose,
-        "--baseline-mm": args.baseline_mm,
-        "--pose-type": args.pose_type,
-        "--sparse": args.sparse,
-    }
-    for option, given in alone.items():
-        if given:
-            raise InputError(f"reconstruct: {option} is for two images; with three and more the rig's file says it all")
-    name = Path(args.rig).stem
+    for option in ("correspondences", "camera", "camera2", "pose", "baseline_mm", "pose_type", "sparse"):
+        if getattr(args, option):
+            word = option.replace("_", "-")
+            raise InputError(f"reconstruct: --{word} is for two images; with three and more the rig's file says it all")
+    name = args.rig.stem
     out = results_folder(args, name)
     options = RigSceneOptions(
-        rig=Path(args.rig),
-        images=tuple(Path(image) for image in args.images),
+        rig=args.rig,
+        images=tuple(args.images),
         names=tuple(args.names) if args.names else None,
         output=out,
         force=args.force,
@@ -154,17 +130,7 @@ def _run_rig(args: argparse.Namespace) -> int:
     for words in done.notes:
         note(f"{name}: {words}")
     if args.json:
-        print_json(
-            {
-                "output": str(out),
-                "ply": CLOUD,
-                "points": len(done.cloud),
-                "merged": done.merged,
-                "unit": "mm",
-                "pairs": [{"cameras": list(names), "points": points} for names, points in done.pairs.items()],
-                "notes": list(done.notes),
-            }
-        )
+        print_json({"output": str(out), "ply": CLOUD, **done.figures()})
     else:
         print(
             f"{out / CLOUD}: {len(done.cloud)} points (mm) of {len(done.pairs)} pairs, {done.merged} seen by more "

@@ -14,7 +14,7 @@ from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
 from rigkit.io.manifest import DATASET_SCHEMA
 
-__all__ = ["FoundPair", "Sighting", "board_sizes", "find_images", "group_pairs", "manifest_text"]
+__all__ = ["FoundPair", "ImageBoards", "board_sizes", "find_images", "group_pairs", "manifest_text"]
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"}
 
@@ -32,7 +32,7 @@ SIDE_FOLDERS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Sighting:
+class ImageBoards:
     """What was found in one image: its size and the sizes of the complete boards."""
 
     image: Path
@@ -45,8 +45,8 @@ class FoundPair:
     """Two images that look like a pair."""
 
     name: str
-    first: Sighting
-    second: Sighting
+    first: ImageBoards
+    second: ImageBoards
 
 
 def find_images(folder: Path) -> list[Path]:
@@ -70,27 +70,27 @@ def board_sizes(detections: Sequence[BoardDetection]) -> tuple[tuple[int, int], 
     return tuple(sorted(sizes, reverse=True))
 
 
-def group_pairs(sightings: Sequence[Sighting], root: Path) -> list[FoundPair]:
+def group_pairs(shown: Sequence[ImageBoards], root: Path) -> list[FoundPair]:
     """Return the pairs: images whose names differ only in how the two sides are marked, images of one name in two
     folders that are marked so, or the two of a folder.
 
     Images that show no board are left out.
     """
-    free = [s for s in sightings if s.boards]
+    free = [s for s in shown if s.boards]
     pairs: list[FoundPair] = []
     for marked in (_by_name, _by_folder):
-        sides: dict[tuple[Path, str], dict[int, Sighting]] = {}
-        for sighting in free:
-            found = marked(sighting.image, root)
+        sides: dict[tuple[Path, str], dict[int, ImageBoards]] = {}
+        for one in free:
+            found = marked(one.image, root)
             if found is not None:
                 place, side = found
-                sides.setdefault(place, {})[side] = sighting
+                sides.setdefault(place, {})[side] = one
         pairs += [FoundPair(_pair_name(*place, root), s[1], s[2]) for place, s in sides.items() if len(s) == 2]
         taken = {s.image for pair in pairs for s in (pair.first, pair.second)}
         free = [s for s in free if s.image not in taken]
-    by_folder: dict[Path, list[Sighting]] = {}
-    for sighting in free:
-        by_folder.setdefault(sighting.image.parent, []).append(sighting)
+    by_folder: dict[Path, list[ImageBoards]] = {}
+    for one in free:
+        by_folder.setdefault(one.image.parent, []).append(one)
     for parent, two in by_folder.items():
         if len(two) == 2:
             pairs.append(FoundPair(_pair_name(parent, "", root), two[0], two[1]))
@@ -206,8 +206,8 @@ def _pair_name(parent: Path, stem: str, root: Path) -> str:
     return re.sub(r"[^A-Za-z0-9_-]+", "-", words)
 
 
-def _words(sighting: Sighting) -> str:
-    return ", ".join(f"{columns}x{rows}" for columns, rows in sighting.boards)
+def _words(found: ImageBoards) -> str:
+    return ", ".join(f"{columns}x{rows}" for columns, rows in found.boards)
 
 
 def _relative(path: Path, root: Path) -> str:

@@ -20,19 +20,41 @@ from rigkit.workflows.calibrate_rig import RigSessionCalibration, calibrate_rig_
 from rigkit.workflows.folder_session import board_of_words, session_of_folders
 from rigkit.workflows.frames import frames_folder, frames_of_video, frames_of_videos, timestamps_beside, with_frames
 
-__all__ = ["FolderOptions", "calibrate_folders", "calibrate_session_file", "default_output"]
+__all__ = ["FolderOptions", "calibrate_folders", "calibrate_session_file", "calibrate_sources", "default_output"]
+
+SESSION_NAME = "session.toml"
+"""The session that is kept in a folder of images for the next time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FolderOptions:
     """What folders of images do not tell of themselves."""
 
-    boards: tuple[str, ...]
+    boards: tuple[str, ...] = ()
     """COLUMNSxROWSxMM (inner corners along and across, mm a square), or files of boards."""
-    model: str = "auto"
-    """A camera model, or "auto"."""
+    model: str | None = None
+    """A camera model, or "auto"; None: the same."""
     timestamps: Path | None = None
     """Which frames of several videos are of one moment; None: timestamps.csv beside them, if it is there."""
+
+
+def calibrate_sources(
+    sources: Sequence[Path], folder_options: FolderOptions, options: CalibrateOptions, *, progress: Progress = silent
+) -> SessionCalibration | RigSessionCalibration:
+    """Calibrate what a person names: the file of a session, or folders of images, or videos.
+
+    A folder that holds a session is calibrated by it where `folder_options` say nothing of boards and model.
+    Raises as `calibrate_folders` and `calibrate_session_file` do.
+    """
+    first = sources[0]
+    is_told = bool(folder_options.boards) or folder_options.model is not None
+    if len(sources) == 1 and not is_told and (first / SESSION_NAME).is_file():
+        first = first / SESSION_NAME
+    if len(sources) > 1 or first.is_dir() or is_video(first):
+        return calibrate_folders(sources, folder_options, options, progress=progress)
+    if is_told:
+        raise InputError(f"calibrate: '{first}' says itself what board and model it has; leave out --board and --model")
+    return calibrate_session_file(first, options, progress=progress)
 
 
 def calibrate_session_file(
@@ -84,7 +106,7 @@ def calibrate_folders(
         places,
         folder_options.boards,
         _session_path(places, options.output),
-        model=folder_options.model,
+        model=folder_options.model or "auto",
         output=options.output,
         known=options.known,
     )
@@ -125,7 +147,7 @@ def _session_path(places: Sequence[Path], output: Path | None) -> Path:
     if output is not None:
         return usable_path(usable_path(output).with_name(f"{output.stem}-session.toml"))
     place = places[0] if len(places) == 1 else Path(os.path.commonpath([p.absolute() for p in places]))
-    return place / "session.toml"
+    return place / SESSION_NAME
 
 
 def _folders_of(

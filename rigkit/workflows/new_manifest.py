@@ -10,10 +10,11 @@ from pathlib import Path
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import MAX_IDENTIFIER
 from rigkit.core.progress import Progress, silent
+from rigkit.detection.detect import detect_boards
 from rigkit.io.files import write_atomic
+from rigkit.io.images import read_image, to_grey
 from rigkit.io.manifest import load_dataset
-from rigkit.io.manifest_writer import FoundPair, group_pairs, manifest_text
-from rigkit.workflows.sightings import sight_boards
+from rigkit.io.manifest_writer import FoundPair, ImageBoards, board_sizes, group_pairs, manifest_text
 
 __all__ = ["FoundPairs", "NewManifest", "find_pairs", "write_manifest"]
 
@@ -47,8 +48,19 @@ class NewManifest:
 
 def find_pairs(root: Path, images: Sequence[Path], *, on_progress: Progress = silent) -> FoundPairs:
     """Return the pairs among `images`, which lie below `root`. Raises InputError where no image can be read."""
-    sightings, unreadable = sight_boards(images, on_progress)
-    return FoundPairs(tuple(group_pairs(sightings, root)), tuple(unreadable))
+    shown: list[ImageBoards] = []
+    unreadable: list[InputError] = []
+    for done, path in enumerate(images, start=1):
+        try:
+            image = read_image(path)
+            sizes = board_sizes(detect_boards(to_grey(image)))
+            shown.append(ImageBoards(path, (image.shape[1], image.shape[0]), sizes))
+        except InputError as error:
+            unreadable.append(error)
+        on_progress("looking for boards", done, len(images))
+    if not shown and unreadable:
+        raise unreadable[0]
+    return FoundPairs(tuple(group_pairs(shown, root)), tuple(unreadable))
 
 
 def write_manifest(new: NewManifest, path: Path, *, force: bool = False) -> InputError | None:

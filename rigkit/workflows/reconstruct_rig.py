@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,6 +78,16 @@ class RigScene:
     files: Mapping[str, str | bytes]
 
     __repr__ = brief
+
+    def figures(self) -> dict[str, Any]:
+        """Return the figures of the scene for programs, as JSON takes them."""
+        return {
+            "points": len(self.cloud),
+            "merged": self.merged,
+            "unit": "mm",
+            "pairs": [{"cameras": list(names), "points": points} for names, points in self.pairs.items()],
+            "notes": list(self.notes),
+        }
 
 
 @dataclass(frozen=True, eq=False, slots=True)

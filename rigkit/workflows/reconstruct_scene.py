@@ -113,6 +113,23 @@ class SceneResult:
         """The unit of lengths: "mm", or "baselines" where none was measured."""
         return "mm" if self.scene.metric else "baselines"
 
+    def figures(self) -> dict[str, Any]:
+        """Return the figures of the scene for programs, as JSON takes them."""
+        r = self.scene.reconstruction
+        return {
+            "pose_type": str(r.pose_type),
+            "correspondences": len(self.correspondences),
+            "inliers": int(self.scene.inliers.sum()),
+            "points": len(r.cloud),
+            "unit": self.unit,
+            "cam2_from_cam1": r.cam2_from_cam1.matrix().tolist(),
+            "pose_covariance": None if r.pose_covariance is None else r.pose_covariance.tolist(),
+            "sigma_px": self.scene.sigma_px,
+            "sigma_A": self.scene.sigma_A if np.isfinite(self.scene.sigma_A) else None,
+            "sampson_rms_px": r.sampson_rms_px,
+            "notes": list(r.notes),
+        }
+
 
 def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> SceneResult:
     """Reconstruct two views of a scene and write what `options` ask for.

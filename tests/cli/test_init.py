@@ -8,7 +8,7 @@ from helpers.data import REPOSITORY
 
 from rigkit.cli.main import main
 from rigkit.io.manifest import load_dataset
-from rigkit.io.manifest_writer import Sighting, group_pairs
+from rigkit.io.manifest_writer import ImageBoards, group_pairs
 from rigkit.io.rig_session import load_rig_session
 
 IMAGES = REPOSITORY / "datasets" / "lab-a" / "images"
@@ -51,8 +51,8 @@ def test_folders_of_two_sides_and_names_with_quotes(tmp_path: Path) -> None:
 @pytest.mark.parametrize("folders", [("pose_1", "pose_2"), ("day-a", "day-b")])
 def test_folders_of_pairs_stay_so(tmp_path: Path, folders: tuple[str, str]) -> None:
     root = tmp_path.resolve()
-    sightings = [Sighting(root / f / f"{n}.jpg", (800, 600), ((8, 6),)) for f in folders for n in ("x", "y")]
-    pairs = group_pairs(sightings, root)
+    shown = [ImageBoards(root / f / f"{n}.jpg", (800, 600), ((8, 6),)) for f in folders for n in ("x", "y")]
+    pairs = group_pairs(shown, root)
     assert [(p.name, p.first.image.name, p.second.image.name) for p in pairs] == [
         (f, "x.jpg", "y.jpg") for f in folders
     ]

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.cameras import PARAMETERS, SIZE_PX
+from helpers.measuring import read_off
 from scipy.special import stdtrit
 
 from rigkit.cameras.base import Camera
@@ -69,21 +70,6 @@ def places_of(certificate: Certificate, rng: np.random.Generator) -> tuple[Float
     some = rng.choice(len(rows), PLACES, replace=False)
     pixels = certificate.pixels[rows[some], columns[some]]
     return certificate.instrument.cameras[0].unproject(pixels)[0], certificate.bound[rows[some], columns[some]]
-
-
-def read_off(quantity: Quantity, points: FloatArray) -> FloatArray:
-    """What points (N, K, 3) measure, (N, ways), by the definition of the quantity."""
-    if quantity is Quantity.ANGLE:
-        a, b = points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]
-        cosine = np.sum(a * b, axis=1) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
-        return np.asarray(np.rad2deg(np.arccos(cosine)))[:, None]
-    if quantity is Quantity.PLANE:
-        centred = points - points.mean(axis=1, keepdims=True)
-        normals = np.linalg.svd(centred)[2][:, 2]
-        normals *= np.sign(np.sum(normals * points.mean(axis=1), axis=1))[:, None]
-        return np.asarray(np.einsum("nkx,nx->nk", centred, normals))
-    ends = points.reshape(len(points), -1, 2, 3)
-    return np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)
 
 
 def holds(inside: FloatArray) -> None:
