@@ -79,7 +79,8 @@ def calibrate(
     wanted = _wanted(model, degree, board, folds)
     used, dropped = usable_views(views, size_px)
     observations = Observations.from_views(used)
-    how = _How(size_px, degree, board, folds, progress)
+    rivals = len({camera for _, camera, _ in wanted}) > 1
+    how = _How(size_px, degree, board, folds, rivals, progress)
     options, failed = _fit_all(observations, size_px, wanted, progress)
     tried, name = _lens(observations, options, how)
     found = _solved(observations, *_only(options, wanted, name), failed, how)
@@ -110,12 +111,13 @@ Wanted = list[tuple[str, type[Camera], int | None]]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _How:
-    """What `calibrate` was asked for, but the model."""
+    """What `calibrate` was asked for, but the model; `rivals`: several models are."""
 
     size_px: tuple[int, int]
     degree: int | None
     board: str
     folds: int
+    rivals: bool
     progress: Progress
 
 
@@ -154,7 +156,7 @@ def _solved(
         options, unfit = _fit_all(observations, size_px, beyond, progress, options)
         options = _compared(observations, options, folds, progress)
         chosen, failed = choose(observations, options, SURELY), [*failed, *unfit]
-    candidates = [*described(options, chosen), *failed]
+    candidates = [*described(options, chosen, rivals=how.rivals), *failed]
     if board != "flat" and often_seen(observations).any():
         observations, chosen, fits = _fit_shapes(observations, chosen, board)
         shapes, spared = _shapes(observations, fits, board, folds, progress)

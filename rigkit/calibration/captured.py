@@ -196,8 +196,8 @@ def _extrapolated(c: Calibration, extent: Extent) -> list[Finding]:
         return []
     return [
         _look(
-            f"boards were in {100.0 * extent.share:.0f} % of the image only; in the rest the lens is extrapolated, and "
-            f"uncertain by {usual:.2g} px (one standard deviation), {float(np.max(worst)):.2g} at worst",
+            f"in the {100 - round(100.0 * extent.share)} % of the image where no boards were the lens is extrapolated, "
+            f"and uncertain by {usual:.2g} px (one standard deviation, rms)",
             "hold the board there as well, up to the corners of the image",
         )
     ]

@@ -66,10 +66,11 @@ def _bic(observations: Observations, option: Option) -> float:
     return float(n * np.log(error**2 + np.finfo(float).tiny) + option.count * np.log(n))
 
 
-def described(options: list[Option], chosen: Option) -> list[Candidate]:
+def described(options: list[Option], chosen: Option, *, rivals: bool = False) -> list[Candidate]:
+    """Return what was tried, and why it was chosen or not; `rivals`: others than these were tried as well."""
     out = []
     for o in options:
-        if len(options) == 1:
+        if len(options) == 1 and not rivals:
             reason = "the only one tried"
         elif o.heldout_px is None or chosen.heldout_px is None:
             reason = "too few images to cross-validate: " + ("smallest BIC" if o is chosen else "larger BIC")

@@ -12,19 +12,8 @@ if TYPE_CHECKING:
     from rigkit.workflows.calibrate import CalibrateOptions
     from rigkit.workflows.calibrate_any import FolderOptions
 
-EXAMPLES = """examples:
-  rigkit calibrate photos --board 9x6x25 -r          one camera; 9x6 inner corners, squares of 25 mm; with a page
-  rigkit calibrate left right --board board.toml     a rig, one folder a camera; so is a folder of left01, right01, ...
-  rigkit calibrate photos --board 9x6x25 --export opencv ros
-  rigkit calibrate left right --board 9x6x25 --only-extrinsics left.json right.json -o rig.json
-  rigkit calibrate left right top --board 9x6x25 --add-camera rig.json -o rig3.json
-  rigkit calibrate session.toml --force              again, from the session written the first time
-"""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = EXAMPLES
     parser.add_argument(
         "source",
         nargs="+",

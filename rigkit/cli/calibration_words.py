@@ -31,6 +31,8 @@ def summary(calibration: Calibration) -> dict[str, Any]:
 def describe(calibration: Calibration) -> str:
     """Return the result for a person: the headline first."""
     camera = calibration.camera
+    from rigkit.report.tables import rounded_words
+
     held = calibration.heldout_rms_px
     headline = "held-out RMS not available (too few images)" if held is None else f"held-out RMS {held:.4f} px"
     lines = [
@@ -41,7 +43,7 @@ def describe(calibration: Calibration) -> str:
     ]
     sigmas = calibration.parameter_sigmas
     for name, value, sigma in zip(camera.parameter_names(), camera.parameters, sigmas, strict=True):
-        lines.append(f"  {name:>4} = {value:.9g} +- {sigma:.2g}")
+        lines.append(f"  {name:>4} = {rounded_words(float(value), float(sigma))}")
     lines += [f"dropped {image}: {reason}" for image, reason in calibration.dropped]
     lines += [
         f"tried {c.name}: held-out {'-' if c.heldout_rms_px is None else format(c.heldout_rms_px, '.4f')} px, "

@@ -16,17 +16,8 @@ __all__ = ["HELP", "add_arguments", "run"]
 
 HELP = "fresh pictures against a calibration or a rig: still holds, or what moved and by how much"
 
-CHECK_EXAMPLES = """examples:
-  rigkit check calibration.json fresh/*.png                 one to three pictures of the board
-  rigkit check rig.json fresh/left fresh/right --board 9x6x25 --fix rig-fixed.json
-  rigkit check rig.json left1.png right1.png --scene         any textured scene, no board
-  rigkit check calibration.json fresh -r check.html --register calib/history/cam.jsonl --temperature 21.5
-"""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = CHECK_EXAMPLES
     parser.add_argument("calibration", type=Path, metavar="CALIBRATION|RIG.json")
     parser.add_argument(
         "images",
@@ -51,11 +42,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import note, print_json, progress_on_stderr
+    from rigkit.io.board_words import board_of_words
     from rigkit.report.check_page import check_table
     from rigkit.report.tables import tables_to_text
     from rigkit.validation.certificate.contracts import Quantity, Task
     from rigkit.workflows.check import CheckOptions, check_pictures
-    from rigkit.workflows.folder_session import board_of_words
 
     if (args.length is None) != (args.distance is None):
         raise InputError("check: --length and --distance belong together")

@@ -50,10 +50,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.coach.guide import GuideOptions
+    from rigkit.io.board_words import board_of_words
     from rigkit.planning.candidates import Reach
     from rigkit.validation.certificate.contracts import Quantity, Task
     from rigkit.workflows.coach import CoachOptions, run_coach
-    from rigkit.workflows.folder_session import board_of_words
 
     if not 0.0 < args.goal < float("inf"):
         raise InputError(f"--goal {args.goal}: it must be positive")

@@ -17,7 +17,11 @@ HELP = "corners of every chessboard in the images, to a corners file and overlay
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("images", nargs="+", metavar="IMAGE|FOLDER|VIDEO", help="images, folders, videos, camera:0")
     parser.add_argument(
-        "--board", action="append", default=[], metavar="BOARD.toml", help="a board that may be there; repeat for more"
+        "--board",
+        action="append",
+        default=[],
+        metavar="CxRxMM|BOARD.toml",
+        help="a board that may be there, such as 9x6x25; repeat for more",
     )
     parser.add_argument(
         "--camera",

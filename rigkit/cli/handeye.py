@@ -14,7 +14,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("poses", metavar="POSES.csv", help="image,x_mm,y_mm,z_mm,qx,qy,qz,qw: base_from_hand")
     parser.add_argument("images", metavar="IMAGES", nargs="+", help="images of the board, or their folder")
     parser.add_argument("--camera", type=Path, required=True, metavar="CALIB", help="the camera's calibration")
-    parser.add_argument("--board", type=Path, required=True, metavar="BOARD.toml", help="the board's file")
+    parser.add_argument("--board", type=Path, required=True, metavar="CxRxMM|BOARD.toml", help="such as 9x6x25")
     parser.add_argument("--board-on-hand", action="store_true", help="the hand carries the board; the camera stands")
     parser.add_argument("--inverse", action="store_true", help="the poses are hand_from_base")
     parser.add_argument("-o", "--output", type=Path, metavar="FILE.json", help="write the result")

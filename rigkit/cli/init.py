@@ -23,18 +23,8 @@ from rigkit.io.reading import usable_path
 
 HELP = "write a manifest of pairs to validate, or a session to calibrate, from a folder of images"
 
-_EXAMPLES = """examples:
-  rigkit init lab --square-mm 50 --calibration camera.json --pose-type general --baseline-mm first=300+-2
-  rigkit init lab --square-mm 50 --calibration left.json --calibration right.json --pose-type standard
-  rigkit init lab --square-mm 50 --calibration wide=w.json --calibration tele=t.json \\
-      --cameras 'w-*=wide,wide' --cameras 't-*=tele,tele' --pose-type 'w-*=forward' --pose-type general
-  rigkit init photos --session --board 9x6x25        a session for rigkit calibrate, of one camera or several
-"""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = _EXAMPLES
     repeatable: dict[str, Any] = {"action": "append", "default": []}
     parser.add_argument("folder", type=Path, help="folder with the images of the pairs, or of the cameras")
     parser.add_argument("--name", help="name of the data set (default: the folder's)")

@@ -1,7 +1,8 @@
 """The `rigkit` program: finds the verb, runs it, turns errors into one line and an exit code.
 
-A verb is a module in this package with `HELP: str`, `add_arguments(parser)` and `run(args) -> int`, and one line in
-`VERBS`. Verb modules import nothing heavy at module level: `rigkit --help` must answer at once.
+A verb is a module in this package with `HELP: str`, `add_arguments(parser)` and `run(args) -> int`, one line in `VERBS`
+and its examples in `rigkit.cli.examples`. Verb modules import nothing heavy at module level: `rigkit --help` must
+answer at once.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import sys
 import traceback
 from collections.abc import Sequence
 
+from rigkit.cli.examples import EXAMPLES, FIRST_STEPS
 from rigkit.cli.log import add_log_arguments, logged_run, logging_to
 from rigkit.cli.surroundings import SURROUNDINGS, Terminated, open_streams, say, settle_stderr, signals_interrupt
 from rigkit.core.errors import ExitCode, RigkitError, printable
@@ -22,26 +24,26 @@ __all__ = ["VERBS", "main"]
 
 VERBS: dict[str, tuple[str, str]] = {
     "demo": ("rigkit.cli.demo", "render a small fisheye capture and run the whole job on it; needs no data"),
-    "detect": ("rigkit.cli.detect", "corners of every chessboard in the images"),
+    "board": ("rigkit.cli.board", "a board to print, true to scale"),
     "calibrate": ("rigkit.cli.calibrate", "calibrate a camera from images of chessboards"),
-    "diff": ("rigkit.cli.diff", "difference of two calibrations over the image; same camera or not"),
-    "certify": ("rigkit.cli.certify", "how wrong a length, depth, plane or angle may be that is measured with them"),
+    "rectify": ("rigkit.cli.rectify", "perspective, cylindrical, equirectangular or stereo images from any camera's"),
+    "export": ("rigkit.cli.export", "cameras in other tools' formats; clouds as PLY, npz or a COLMAP model"),
     "plan": ("rigkit.cli.plan", "which pictures to take next; what a lens, a board and so many pictures will reach"),
     "coach": ("rigkit.cli.coach", "a guided capture on a local page: says what to shoot next and when it is enough"),
+    "diff": ("rigkit.cli.diff", "difference of two calibrations over the image; same camera or not"),
     "check": ("rigkit.cli.check", "fresh pictures against a calibration or rig: still holds, or what moved; exit 1"),
     "history": ("rigkit.cli.history", "a register of checks over months: drift plots with control limits"),
-    "pose": ("rigkit.cli.pose", "where a camera is in the frame of a board that is laid down"),
-    "handeye": ("rigkit.cli.handeye", "where a camera sits on a robot, from its poses and images of a board"),
-    "rectify": ("rigkit.cli.rectify", "perspective, cylindrical, equirectangular or stereo images from any camera's"),
+    "certify": ("rigkit.cli.certify", "how wrong a length, depth, plane or angle may be that is measured with them"),
+    "init": ("rigkit.cli.init", "write a manifest, or a session, from a folder of images"),
+    "validate": ("rigkit.cli.validate", "the tables against measured truth, report and PLY; exit 1 if a check fails"),
     "reconstruct": ("rigkit.cli.reconstruct", "oriented clouds (PLY) and pictures of every pair"),
     "mesh": ("rigkit.cli.mesh", "a surface through an oriented cloud (screened Poisson), as a mesh"),
-    "validate": ("rigkit.cli.validate", "the tables against measured truth, report and PLY; exit 1 if a check fails"),
-    "simulate": ("rigkit.cli.simulate", "the synthetic study: sweeps over noise, box plots, tables"),
     "crosscheck": ("rigkit.cli.crosscheck", "the same pairs through pycolmap and other ways"),
+    "pose": ("rigkit.cli.pose", "where a camera is in the frame of a board that is laid down"),
+    "handeye": ("rigkit.cli.handeye", "where a camera sits on a robot, from its poses and images of a board"),
+    "detect": ("rigkit.cli.detect", "corners of every chessboard in the images"),
+    "simulate": ("rigkit.cli.simulate", "the synthetic study: sweeps over noise, box plots, tables"),
     "fetch": ("rigkit.cli.fetch", "public captures with measured truth: list them, or fetch one"),
-    "init": ("rigkit.cli.init", "write a manifest, or a session, from a folder of images"),
-    "export": ("rigkit.cli.export", "cameras in other tools' formats; clouds as PLY, npz or a COLMAP model"),
-    "board": ("rigkit.cli.board", "a board to print, true to scale"),
     "schema": ("rigkit.cli.schema", "JSON Schema of a file that rigkit reads or writes: for editors and programs"),
 }
 """Verb -> (module, one-line help)."""
@@ -68,8 +70,9 @@ def build_parser(verb: str | None) -> argparse.ArgumentParser:
     """Return the parser; only the module of `verb` is imported, all others show their one-line help."""
     parser = argparse.ArgumentParser(
         prog="rigkit",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Calibrate lab cameras, reconstruct oriented point clouds, validate them against measured truth.",
-        epilog="Exit codes: 0 well; 1 a check failed; 2 bad input; 3 degenerate geometry; 70 a bug in rigkit.",
+        epilog=FIRST_STEPS,
     )
     parser.add_argument("--version", action=_Version, help="show version, compiled kernels and platform, and exit")
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
@@ -77,6 +80,7 @@ def build_parser(verb: str | None) -> argparse.ArgumentParser:
         sub = verbs.add_parser(name, help=summary, description=summary)
         if name == verb:
             module = importlib.import_module(module_name)
+            sub.formatter_class, sub.epilog = argparse.RawDescriptionHelpFormatter, f"examples:\n{EXAMPLES[name]}"
             module.add_arguments(sub)
             add_log_arguments(sub)
             sub.set_defaults(run=module.run)
@@ -92,6 +96,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     open_streams()
     try:
         with signals_interrupt():
+            if not arguments:
+                say("no verb given; this is what there is", before=build_parser(None).format_help())
+                return ExitCode.BAD_INPUT
             args = build_parser(verb).parse_args(arguments)
             with logging_to(verbose=args.verbose, log_file=args.log_file):
                 return logged_run(args)

@@ -17,16 +17,8 @@ __all__ = ["HELP", "add_arguments", "run"]
 
 HELP = "which pictures to take next, or what a lens, a board and so many pictures will reach"
 
-PLAN_EXAMPLES = """examples:
-  rigkit plan calibration.json -r next.html               the three pictures that would help most, drawn
-  rigkit plan session.toml -n 5 --length 800 --distance 1500
-  rigkit plan --lens 120 --size 1280x960 --board 9x6x30 --views 12
-"""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = PLAN_EXAMPLES
     parser.add_argument(
         "source", nargs="?", type=Path, metavar="CALIBRATION|SESSION.toml", help="what there is so far; or give --lens"
     )
@@ -70,8 +62,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _planned(args: argparse.Namespace) -> PlannedSession:
     from rigkit.cli.console import progress_on_stderr
+    from rigkit.io.board_words import board_of_words
     from rigkit.io.files import ensure_writable
-    from rigkit.workflows.folder_session import board_of_words
     from rigkit.workflows.plan import USUAL_SIGMA_PX, LensOptions, plan_lens, plan_session
 
     if (args.source is None) == (args.lens is None):

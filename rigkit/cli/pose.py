@@ -10,7 +10,7 @@ HELP = "where a camera is in the frame of a board that is laid down"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("image", metavar="IMAGE", help="an image that shows the board")
     parser.add_argument("--camera", required=True, metavar="CALIB", help="the camera's calibration")
-    parser.add_argument("--board", required=True, metavar="BOARD.toml", help="the board's file")
+    parser.add_argument("--board", required=True, metavar="CxRxMM|BOARD.toml", help="such as 9x6x25")
     parser.add_argument("--json", action="store_true", help="print the result for programs")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -87,8 +88,9 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(result)
     else:
-        for one in done.images:
-            print(_words(one, args.projection))
+        for words, images in _alike(done.images, args.projection):
+            place = images[0] if len(images) == 1 else f"{images[0].parent}, {len(images)} images"
+            print(f"{place}: {words}")
         if done.pair is not None:
             print(f"baseline {abs(done.pair.rect2_from_rect1.translation_mm[0]):.3f} mm along the rows")
     return ExitCode.BAD_INPUT if done.failures else ExitCode.WELL
@@ -107,10 +109,18 @@ def _summary(one: RectifiedImage, projection: str) -> dict[str, Any]:
     }
 
 
+def _alike(images: Sequence[RectifiedImage], projection: str) -> list[tuple[str, list[Path]]]:
+    """Return what there is to say of images, and of which, those of one folder together."""
+    out: dict[tuple[Path, str], list[Path]] = {}
+    for one in images:
+        out.setdefault((one.path.parent, _words(one, projection)), []).append(one.path)
+    return [(words, paths) for (_, words), paths in out.items()]
+
+
 def _words(one: RectifiedImage, projection: str) -> str:
     target = one.map.target
     (width, height), focal = target.size_px, target.parameters[target.parameter_names().index("fx")]
     return (
-        f"{one.path}: {projection}, {width} x {height} px, focal length {focal:.2f} px, "
+        f"{projection}, {width} x {height} px, focal length {focal:.2f} px, "
         f"{100.0 * one.covered:.1f} % of it seen by the camera"
     )

@@ -9,16 +9,8 @@ from rigkit.core.errors import ExitCode
 
 HELP = "JSON Schema of a file that rigkit reads or writes: for editors and other programs"
 
-_EXAMPLES = """examples:
-  rigkit schema                          which files there are
-  rigkit schema session --keys           every key of a session, and what it means
-  rigkit schema session -o session.json  and in the session's first line: #:schema ./session.json
-"""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = _EXAMPLES
     parser.add_argument("name", nargs="?", metavar="NAME", help="of the file; without one all are listed")
     parser.add_argument("--keys", action="store_true", help="as a table of keys instead of JSON")
     parser.add_argument("-o", "--output", type=Path, metavar="FILE.json", help="file to write")

@@ -10,21 +10,26 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.patterns.registry import PATTERNS, pattern_type
-from rigkit.io.board_file import board_from_table
+from rigkit.io.board_file import board_from_table, load_board
+from rigkit.io.foreign_boards import FOREIGN_SUFFIXES
 from rigkit.io.toml_reader import TomlTable
 
-__all__ = ["WORDS_HELP", "board_in_words", "words_of_board"]
+__all__ = ["WORDS_HELP", "board_in_words", "board_of_words", "words_of_board"]
 
 BOARD_WORDS = re.compile(
-    r"^(?:(?P<type>[a-z]+):)?(?P<columns>\d{1,4})[xX](?P<rows>\d{1,4})[xX](?P<mm>\d{1,4}(?:\.\d{1,4})?)(?P<keys>(?:,\w+=[\w.+-]+)*)$"
+    r"^(?:(?P<type>[a-z]+):)?(?P<columns>\d{1,4})[xX](?P<rows>\d{1,4})"
+    r"(?:[xX]|, ?)(?P<mm>\d{1,4}(?:\.\d{1,4})?)(?: ?mm)?(?P<keys>(?:,\w+=[\w.+-]+)*)$"
 )
+COUNTS = re.compile(r"\d{1,4}[xX]\d{1,4}")
+"""A board but for its scale."""
 WORDS_HELP = "9x6x25 (inner corners along and across, mm a square), aprilgrid:6x6x88,spacing=0.3 (tags, mm a tag)"
 
 
 def board_in_words(words: str) -> Board | None:
     """Return the board that `words` say, with a name made of them; None where they are a file's name instead.
 
-    TYPE:COLUMNSxROWSxMM,KEY=VALUE,...: the types and keys are those of board files; without TYPE a chessboard.
+    TYPE:COLUMNSxROWSxMM,KEY=VALUE,...: the types and keys are those of board files; without TYPE a chessboard, which
+    may also be written as people say it: "9x6, 30 mm".
 
     Raises InputError for words that make no board.
     """
@@ -49,6 +54,18 @@ def board_in_words(words: str) -> Board | None:
     board = board_from_table(table, name)
     table.done()
     return board
+
+
+def board_of_words(words: str) -> Board:
+    """Return the board that `words` tell, as `board_in_words`, or a file; raises InputError for anything else."""
+    board = board_in_words(words)
+    if board is not None:
+        return board
+    if not words.endswith((".toml", *FOREIGN_SUFFIXES)) and not Path(words).is_file():
+        if COUNTS.fullmatch(words):
+            raise InputError(f"--board {words}: say how large a square is as well: {words}x25 where its side is 25 mm")
+        raise InputError(f"--board {words}: write {WORDS_HELP}, or a board file")
+    return load_board(words)
 
 
 def words_of_board(board: Board) -> str:

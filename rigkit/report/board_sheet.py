@@ -213,10 +213,15 @@ def _sheet_size(board: Board, paper: str) -> tuple[float, float]:
     size = fits(PAPERS[paper])
     if size is None:
         larger = [name for name, candidate in PAPERS.items() if fits(candidate)]
-        advice = f"use --paper {larger[0]}" if larger else "no known paper is large enough"
+        advice = f"use --paper {larger[0]}, or" if larger else "no known paper is large enough; take"
+        edge = 2.0 * UNPRINTABLE_MM + RULER_STRIP_MM
+        part = float(((np.sort(PAPERS[paper]) - edge) / (np.sort((width, height)) - edge)).min())
+        largest = np.floor(part * max(board.squares_mm))
+        known = board.pattern.size_word == "square" and largest >= 1.0
+        smaller = f"squares of up to {largest:.0f} mm" if known else "smaller ones"
         raise InputError(
             f"a board of {width:.0f} x {height:.0f} mm (with margins and rulers) does not fit on {paper}: "
-            f"{advice}, or smaller squares"
+            f"{advice} {smaller}"
         )
     return size
 

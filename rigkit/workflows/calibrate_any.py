@@ -10,14 +10,16 @@ from pathlib import Path
 
 from rigkit.core.errors import InputError, RigkitError
 from rigkit.core.progress import Progress, silent
+from rigkit.io.board_words import board_of_words
 from rigkit.io.files import ensure_writable, write_together
 from rigkit.io.reading import about, read_bytes, usable_path
 from rigkit.io.rig_session import RigSession, is_rig_session, load_rig_session
 from rigkit.io.session import Session, load_session
-from rigkit.io.video import is_video
+from rigkit.io.video import VIDEO_ENDINGS, is_video
 from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration, calibrate_session
 from rigkit.workflows.calibrate_rig import RigSessionCalibration, calibrate_rig_session
-from rigkit.workflows.folder_session import board_of_words, session_of_folders
+from rigkit.workflows.detect import IMAGE_ENDINGS
+from rigkit.workflows.folder_session import session_of_folders
 from rigkit.workflows.frames import frames_folder, frames_of_video, frames_of_videos, timestamps_beside, with_frames
 
 __all__ = ["FolderOptions", "calibrate_folders", "calibrate_session_file", "calibrate_sources", "default_output"]
@@ -154,6 +156,7 @@ def _folders_of(
     places: Sequence[Path], told: FolderOptions, options: CalibrateOptions, progress: Progress
 ) -> list[Path]:
     """Return the folders of images, those of videos' frames in the place of the videos."""
+    places = [inside for place in places for inside in _videos_inside(place)]
     videos = [place for place in places if is_video(place)]
     if not videos:
         return list(places)
@@ -176,6 +179,16 @@ def _folders_of(
     timestamps = told.timestamps or timestamps_beside(videos)
     frames_of_videos(cameras, folder, boards, timestamps=timestamps, progress=progress)
     return [folder / name for name in cameras]
+
+
+def _videos_inside(place: Path) -> list[Path]:
+    """Return the videos of a folder that holds some and no images, in its place."""
+    if is_video(place) or not place.is_dir():
+        return [place]
+    inside = sorted(path for path in place.iterdir() if path.is_file())
+    if any(path.suffix.lower() in IMAGE_ENDINGS for path in inside):
+        return [place]
+    return [path for path in inside if path.suffix.lower() in VIDEO_ENDINGS] or [place]
 
 
 def _says(path: Path, text: str) -> bool:

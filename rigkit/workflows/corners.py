@@ -81,7 +81,7 @@ def session_views(
             dropped.append((name, reason))
     wrong = other_size({name: item.detections for name, item in found.items()}, session.boards)
     if wrong is not None:
-        raise InputError(f"{session.path}: {wrong}; correct columns and rows in the board file")
+        raise InputError(f"{session.path}: {wrong}; correct columns and rows in --board or the board file")
     if not views:
         reasons = Counter(reason for _, reason in dropped).most_common(1)[0]
         camera = "" if session.camera is None else f" of camera '{session.camera}'"

@@ -23,7 +23,7 @@ from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.doubtful import doubtful_grid
 from rigkit.detection.lattices import MIN_BOARD_CORNERS
-from rigkit.io.board_file import load_board
+from rigkit.io.board_words import board_of_words
 from rigkit.io.corners_file import write_corners
 from rigkit.io.files import ensure_writable, write_atomic
 from rigkit.io.images import read_image
@@ -42,7 +42,7 @@ class DetectOptions:
     """What may be in the images, and where the results go."""
 
     boards: tuple[Path, ...] = ()
-    """Files of the boards that may be there; without any, boards of every size are looked for."""
+    """Boards that may be there, files or words such as 9x6x25; without any, boards of every size are looked for."""
     camera: Path | None = None
     """Calibration of the camera of all images: finds corners that were missed on `boards`, places all more finely."""
     min_corners: int = 12
@@ -105,7 +105,7 @@ def detect_in_images(
         )
     if options.jobs is not None and options.jobs < 1:
         raise InputError(f"--jobs {options.jobs}: at least one process is needed")
-    boards = tuple(load_board(path) for path in options.boards)
+    boards = tuple(board_of_words(str(board)) for board in options.boards)
     given = [Path(path) for path in paths]
     videos, bad = _frames_of(list(filter(is_video, given)), boards, progress)
     if bad and len(given) == len(bad) == 1:

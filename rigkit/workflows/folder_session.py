@@ -10,12 +10,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier
-from rigkit.io.board_file import board_text, load_board
-from rigkit.io.board_words import WORDS_HELP, board_in_words
-from rigkit.io.foreign_boards import FOREIGN_SUFFIXES
+from rigkit.io.board_file import board_text
+from rigkit.io.board_words import WORDS_HELP, board_in_words, board_of_words
 from rigkit.io.session import SESSION_SCHEMA
 from rigkit.workflows.detect import IMAGE_ENDINGS
 from rigkit.workflows.identify_board import suggested_words
@@ -162,8 +160,11 @@ def _untold(folders: Sequence[Path]) -> str:
     """Return what to say where no board is given: what the images show of it."""
     entries = [entry for found in cameras_in(folders).values() for entry in found]
     shown = suggested_words(sorted(image for folder, pattern in entries for image in folder.glob(pattern)))
-    such = f"--board {shown}, which they show, with MM measured" if shown else f"--board {WORDS_HELP}"
-    return f"calibrate: images cannot tell how large squares are; give the board, such as {such}, or --board board.toml"
+    if shown is None:
+        such = f"give the board, such as --board {WORDS_HELP}, or --board board.toml"
+    else:
+        such = f"they show --board {shown}: measure the squares, and say that with the mm of one for MM"
+    return f"calibrate: images cannot tell how large squares are; {such}"
 
 
 def cameras_in(folders: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
@@ -242,14 +243,6 @@ def _board_file(words: str, place: Path, files: dict[Path, str]) -> str:
     path = place / f"{board.board_id}.toml"
     files[path] = board_text(board, f"as told by --board {words}; squares are best measured over many", path)
     return path.name
-
-
-def board_of_words(words: str) -> Board:
-    """Return the board that `words` tell, as `board_in_words`, or a file; raises InputError for anything else."""
-    board = board_in_words(words)
-    if board is None and not words.endswith((".toml", *FOREIGN_SUFFIXES)):
-        raise InputError(f"--board {words}: write {WORDS_HELP}, or a board file")
-    return load_board(words) if board is None else board
 
 
 def _listed(patterns: Sequence[tuple[Path, str]], place: Path) -> str:

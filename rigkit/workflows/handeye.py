@@ -18,7 +18,7 @@ from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
 from rigkit.geometry.board_pose import BoardPose, board_poses
-from rigkit.io.board_file import load_board
+from rigkit.io.board_words import board_of_words
 from rigkit.io.files import ensure_writable, write_atomic
 from rigkit.io.images import read_image
 from rigkit.io.reading import about
@@ -49,7 +49,7 @@ class HandEyeOptions:
     camera: Path
     """The camera's calibration, ours or another tool's."""
     board: Path
-    """The board's file."""
+    """The board's file, or words such as 9x6x25."""
     board_on_hand: bool = False
     """The hand carries the board and the camera stands, not the reverse."""
     inverse: bool = False
@@ -105,7 +105,7 @@ def calibrate_hand_eye(
     missing = [path.name for path in paths if path.name not in robot]
     if missing:
         raise InputError(f"'{poses}': no pose of image '{missing[0]}' ({len(missing)} in all); add the rows")
-    board, camera = _one_way_up(load_board(options.board)), import_camera(options.camera)
+    board, camera = _one_way_up(board_of_words(str(options.board))), import_camera(options.camera)
     views, stands, unreadable = [], [], []
     for done, path in enumerate(paths, start=1):
         try:
@@ -137,7 +137,7 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
 
     Raises InputError for files that cannot be read, CheckFailed where the image does not show the board.
     """
-    known, lens = load_board(board), import_camera(camera)
+    known, lens = board_of_words(str(board)), import_camera(camera)
     view = _view(Path(image), known, lens)
     if view is None:
         raise CheckFailed(f"'{image}' does not show board '{known.board_id}'; check focus and the board's file")

@@ -227,6 +227,8 @@ def test_auto_is_as_good_as_the_best_model(rng: np.random.Generator, reach_deg: 
     # The true model is one of those tried: what another costs in the lens is chance.
     assert off < 1.5 * least + 0.05
     assert all(c.reason for c in result.candidates)
+    assert not any("only one" in c.reason for c in result.candidates)
+    assert any("only one" in c.reason for c in known.candidates)
 
 
 def test_poses_of_views_that_hardly_project_raise_nothing(rng: np.random.Generator) -> None:

@@ -14,7 +14,7 @@ from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.patterns.circles import Circles
 from rigkit.io.board_file import board_text, load_board
-from rigkit.io.board_words import board_in_words
+from rigkit.io.board_words import board_in_words, board_of_words
 
 PATTERNS = [
     Chessboard(),
@@ -41,7 +41,13 @@ def test_boards_in_words() -> None:
     plain = board_in_words("9x6x25")
     assert plain is not None
     assert (plain.size, plain.square_x_mm) == ((9, 6), 25.0)
+    for as_people_say in ("9x6, 25 mm", "9x6x25mm", "9x6,25"):
+        said = board_in_words(as_people_say)
+        assert said is not None
+        assert (said.board_id, said.size, said.square_x_mm) == (plain.board_id, plain.size, 25.0)
     assert board_in_words("board.toml") is None
+    with pytest.raises(InputError, match="say how large a square is as well: 9x6x25"):
+        board_of_words("9x6")
     for words in (
         "aprilgrid:6x6x88",
         "aprilgrid:6x6",

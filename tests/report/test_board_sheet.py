@@ -59,9 +59,9 @@ def test_svg_says_its_size_in_mm() -> None:
 
 
 def test_too_large_a_board_is_told_which_paper_would_do() -> None:
-    with pytest.raises(InputError, match="use --paper a2"):
+    with pytest.raises(InputError, match="use --paper a2, or squares of up to 26 mm"):
         board_sheet(Board("b", 8, 6, 50.0, 50.0), "a4")
-    with pytest.raises(InputError, match="smaller squares"):
+    with pytest.raises(InputError, match="take squares of up to 26 mm"):
         board_sheet(Board("b", 30, 30, 50.0, 50.0), "a0")
     with pytest.raises(InputError, match="known: a4"):
         board_sheet(Board("b", 8, 6, 5.0, 5.0), "a7")

@@ -19,6 +19,8 @@ from rigkit.io.images import read_image
 from rigkit.synthetic.photometry import Photometry, develop
 from rigkit.synthetic.render import Optics, radiance
 from rigkit.synthetic.scene import PlacedBoard
+from rigkit.workflows.calibrate import CalibrateOptions
+from rigkit.workflows.calibrate_any import FolderOptions, calibrate_folders
 from rigkit.workflows.detect import detect_in_images
 from rigkit.workflows.frame_choice import DIRECTIONS, FrameChoice, KeptFrame
 from rigkit.workflows.frames import frames_of_video, frames_of_videos
@@ -108,3 +110,11 @@ def test_blurred_frames_are_left_out() -> None:
     for number in range(6):
         choice.offer(frame(number, 1.0 + 0.1 * number * DIRECTIONS[:, 0], 0.5 if number == 3 else 0.05))
     assert choice.finish() == [3]
+
+
+def test_a_folder_of_videos_is_a_camera_each(tmp_path: Path) -> None:
+    for name in ("left", "right"):
+        video(tmp_path / f"{name}.avi", [np.full((240, 320), 90, np.uint8)] * 2)
+    (tmp_path / "notes.txt").write_text("of two cameras")
+    with pytest.raises(InputError, match=r"left\.avi', '.*right\.avi': no board in 2 frames"):
+        calibrate_folders([tmp_path], FolderOptions(boards=("7x5x20",)), CalibrateOptions())
