@@ -219,6 +219,24 @@ EXPORT void line_bends(
     ARRAY(const double, sides, count, 2), const bend_rules_t *rules, ARRAY(double, out, count, 2),
     ARRAY(double, out_sigma, count, 2));
 
+/* paper.c */
+
+/* The constants of detection.subpixel.outer_squares, under their names there. */
+typedef struct {
+    ARRAY(const double, steps, step_count);
+    int64_t step_count;
+    double aside, first, last, goes_on, cut, near_witness, seen, max_paper;
+} paper_rules_t;
+
+EXPORT int64_t paper_memory(int64_t count);
+EXPORT void find_paper(
+    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t count,
+    ARRAY(const double, pixels, count, 2), ARRAY(const double, sides, count, 2, 2), ARRAY(const double, gaps, count, 2, 2),
+    ARRAY(const uint8_t, ends, count, 2, 2), ARRAY(const double, contrast, count), ARRAY(const double, blur, count),
+    ARRAY(const double, sign, count), ARRAY(const int64_t, owner, count), const paper_rules_t *rules,
+    ARRAY(double, scratch, 2 * rules.step_count + 4 * count), ARRAY(uint8_t, memory, paper_memory(count)),
+    ARRAY(int64_t, near, 4 * count), ARRAY(double, paper, count, 2, 2), ARRAY(double, out_gaps, count, 2, 2));
+
 /* circles.c */
 
 /* What comes out of a circle: u, v, the map (4), covariance of (u, v) at noise of variance 1 (uu, uv, vv), blur, brightness

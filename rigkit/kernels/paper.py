@@ -1,0 +1,48 @@
+"""The kernel in paper.c: what lies beyond the outermost squares of boards."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.kernels import kernels
+from rigkit.kernels.calls import Struct, structure
+
+__all__ = ["PaperRules", "find_paper"]
+
+
+@structure("paper_rules_t")
+class PaperRules(Struct):
+    """The constants of `detection.subpixel.outer_squares`."""
+
+
+def find_paper(
+    image: NDArray[np.uint8] | NDArray[np.float32],
+    pixels: FloatArray,
+    sides: FloatArray,
+    gaps: FloatArray,
+    ends: BoolArray,
+    contrast: FloatArray,
+    blur: FloatArray,
+    sign: FloatArray,
+    owner: IntArray,
+    rules: PaperRules,
+) -> tuple[FloatArray, FloatArray]:
+    """Return `paper` and `gaps`, (N, 2, 2) each, as `detection.subpixel.outer_squares.with_paper` sets them."""
+    library, count = kernels(), len(pixels)
+    grey = np.ascontiguousarray(image, None if image.dtype == np.uint8 else np.float32)
+    height, width = grey.shape
+    before, after = (
+        [np.ascontiguousarray(part, np.float64) for part in parts]
+        for parts in ((pixels, sides, gaps), (contrast, blur, sign))
+    )
+    scratch, near = np.empty(2 * rules.step_count + 4 * count), np.empty(4 * count, np.int64)
+    memory = np.empty(library.paper_memory(count), np.uint8)
+    paper, out_gaps = np.empty((2, count, 2, 2))
+    library.find_paper(
+        *(grey, grey.dtype == np.uint8, width, height, count),
+        *(*before, np.ascontiguousarray(ends, np.bool_), *after, np.ascontiguousarray(owner, np.int64)),
+        *(rules, scratch, memory, near, paper, out_gaps),
+    )
+    return paper, out_gaps
