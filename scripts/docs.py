@@ -86,7 +86,8 @@ def made_pictures() -> None:
     MADE.mkdir(exist_ok=True)
     shutil.copyfile(ROOT / "datasets" / "lab-a" / "pictures" / "cloud.jpg", MADE / "cloud.jpg")
     calibration = rigkit.load_calibration(ROOT / "calib" / "cameras" / "mvca020_r61" / "calibration.json")
-    (MADE / "uncertainty.svg").write_text(uncertainty_svg(calibration), encoding="utf-8")
+    drawing, end, _ = uncertainty_svg(calibration).partition("</svg>")
+    (MADE / "uncertainty.svg").write_text(drawing + end, encoding="utf-8")
     grid = "".join(f'<path d="M{50 + 60 * k} 40V160M50 {40 + 60 * k}H290"/>' for k in range(3))
     grid += '<path d="M230 40V160M290 40V160"/>'
     (MADE / "pixels.svg").write_text(PIXELS.replace("GRID", grid), encoding="utf-8")

@@ -1,4 +1,7 @@
-"""Drawings of a calibration as SVG: residuals, what they have in common, coverage, and the uncertainty map."""
+"""Drawings of a calibration: residuals, what they have in common, coverage, and the uncertainty map.
+
+Each is an SVG and, after it, the words that stand below (HTML).
+"""
 
 from __future__ import annotations
 
@@ -11,11 +14,12 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import projection_uncertainty, uncertainty_map
 from rigkit.core.arrays import FloatArray, Pixels
 
-__all__ = ["coverage_svg", "pattern_svg", "residuals_svg", "uncertainty_svg"]
+__all__ = ["MAP_GRID", "coverage_svg", "pattern_svg", "residuals_svg", "uncertainty_svg"]
 
 WIDTH = 600.0
 """Width of the drawn image, in units of the drawing."""
-FOOT = 44.0
+FOOT = 24.0
+"""Below the image: room for a scale or a bar of colours."""
 MAX_VECTORS = 5000
 """More residuals make the drawing black and the page heavy: of more, every second, third, ... is drawn."""
 RMS_LENGTH = 0.02
@@ -140,7 +144,7 @@ def uncertainty_svg(calibration: Calibration) -> str:
     for j, i in np.argwhere(known):
         place = f'x="{i * w:.1f}" y="{j * h:.1f}" width="{w:.1f}" height="{h:.1f}"'
         out.append(f'<rect {place} fill="{_colour(float(level[j, i]))}"/>')
-    out += ["</g>", _contours(grid.worst_px, w, h), _colour_bar(zoom * height + 26.0, low, high)]
+    out += ["</g>", _contours(grid.worst_px, w, h), _colour_bar(zoom * height + 7.0, low, high)]
     pixels, _, kept = _corners(calibration)
     hull = cv2.convexHull(pixels[kept].astype(np.float32))[:, 0]
     outline = " ".join(f"{x:.1f},{y:.1f}" for x, y in zoom * hull)
@@ -155,6 +159,8 @@ def _contours(worst_px: FloatArray, cell_width: float, cell_height: float) -> st
 
     rows, columns = worst_px.shape
     x, y = (np.arange(columns) + 0.5) * cell_width, (np.arange(rows) + 0.5) * cell_height
+    thirds = np.linspace(0.0, 1.0, 3)
+    figures = np.stack(np.meshgrid(thirds * columns * cell_width, thirds * rows * cell_height), axis=-1).reshape(-1, 2)
     generator = contour_generator(x, y, np.ma.masked_invalid(np.log(worst_px)))
     out = []
     for value in CONTOURS_PX:
@@ -163,7 +169,9 @@ def _contours(worst_px: FloatArray, cell_width: float, cell_height: float) -> st
             path = "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in line)
             out.append(f'<path d="{path}" fill="none" stroke="#fff" stroke-opacity=".75" stroke-width="1"/>')
         if lines:
-            a, b = max(lines, key=len)[len(max(lines, key=len)) // 3]
+            # Where the line is far from the figures that stand on the map.
+            longest = max(lines, key=len)
+            a, b = longest[np.linalg.norm(longest[:, None] - figures, axis=-1).min(axis=1).argmax()]
             out.append(f'<text x="{a:.1f}" y="{b:.1f}" font-size="12.5" fill="#fff">{value:g}</text>')
     return "".join(out)
 
@@ -172,7 +180,7 @@ def _scale(calibration: Calibration, times: float) -> str:
     """Return a stroke below the drawing as long as a round number of pixels, magnified as the residuals are."""
     per_px = _zoom(calibration) * times
     length = _magnification(0.15 * WIDTH / per_px)
-    y, x = _zoom(calibration) * calibration.camera.size_px[1] + 30.0, WIDTH - 4.0
+    y, x = _zoom(calibration) * calibration.camera.size_px[1] + 12.0, WIDTH - 4.0
     return (
         f'<path d="M{x - length * per_px:.1f} {y:.1f}H{x}m0 -4v8m{-length * per_px:.1f} 0v-8" stroke="#333"/>'
         f'<text x="{x - length * per_px - 6:.1f}" y="{y + 4:.1f}" text-anchor="end" fill="#333">{length:g} px</text>'
@@ -274,9 +282,10 @@ def _open(calibration: Calibration, title: str) -> str:
 
 
 def _foot(calibration: Calibration, *lines: str) -> str:
-    """Close the drawing: a frame over what sticks out, and lines of text below it."""
+    """Close the drawing with a frame over what sticks out; what there is to say stands below it, as words of the page:
+    those stay legible where the drawing is small."""
     height = _zoom(calibration) * calibration.camera.size_px[1]
-    words = "".join(
-        f'<text x="0" y="{height + 18 + 18 * k:.1f}" fill="#333">{escape(line)}</text>' for k, line in enumerate(lines)
+    words = "<br>".join(escape(line) for line in lines if line)
+    return (
+        f'<rect width="{WIDTH:g}" height="{height:.1f}" fill="none" stroke="#b8c0cc"/></svg><p class="foot">{words}</p>'
     )
-    return f'<rect width="{WIDTH:g}" height="{height:.1f}" fill="none" stroke="#b8c0cc"/>{words}</svg>'

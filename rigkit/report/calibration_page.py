@@ -20,7 +20,7 @@ from rigkit.core.tables import Cell, Column, Table
 from rigkit.io.images import Image
 from rigkit.planning.plan import Plan
 from rigkit.report.calibration_charts import histogram_svg, images_svg, lens_svg, radius_svg
-from rigkit.report.calibration_drawings import coverage_svg, pattern_svg, residuals_svg, uncertainty_svg
+from rigkit.report.calibration_drawings import MAP_GRID, coverage_svg, pattern_svg, residuals_svg, uncertainty_svg
 from rigkit.report.plan_page import shown_views
 from rigkit.report.render import data_uri, drawing, render, shown_table
 from rigkit.report.rig_tables import rig_basis, rig_reach, rig_tables
@@ -48,7 +48,6 @@ DRAWINGS: tuple[tuple[str, Callable[[Calibration], str]], ...] = (
     ("The lens", lens_svg),
 )
 IN_PX = ("fx", "fy", "cx", "cy")
-REACH_GRID = (24, 18)
 MAX_RATIO_BEYOND = 3.0
 """Where the projection is no worse than so many times the worst place that boards reached, all of the image serves."""
 BADGE_WORDS = {"good": "good", "look": "usable, with care", "bad": "do not use"}
@@ -170,7 +169,7 @@ def _told(found: Sequence[Finding], sentence: str) -> dict[str, str]:
 
 def _reach(c: Calibration) -> str:
     """Say how sure the projection is where boards were and beyond, in pixels."""
-    grid = uncertainty_map(c, grid=REACH_GRID)
+    grid = uncertainty_map(c, grid=MAP_GRID)
     known = np.isfinite(grid.worst_px)
     inside = covered_by_boards(c, grid.pixels) & known
     if not inside.any():

@@ -62,9 +62,8 @@ def check_words(check: SentinelCheck) -> CheckWords:
             f"It moves the projection by {change.size_px:.3f} px rms; after the correction {check.rms_fixed_px:.3f} px "
             "are left."
         )
-    if change is not None and not check.holds:
-        what = "the projection over the image" if check.cost_unit == "px" else "the length"
-        sentences.append(f"In {what} it makes an error of {check.cost:.3g} {check.cost_unit} rms.")
+    if change is not None and not check.holds and check.cost_unit != "px":
+        sentences.append(f"In the length it makes an error of {check.cost:.3g} {check.cost_unit} rms.")
     return CheckWords(headline, tuple(sentences))
 
 
@@ -123,14 +122,14 @@ def change_svg(check: SentinelCheck, c: int) -> str:
         f"M{x:.1f} {y:.1f}l{dx:.1f} {dy:.1f}" for (x, y), (dx, dy) in zip(zoom * start, zoom * times * by, strict=True)
     )
     dots = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in zoom * start)
-    words = f"{longest:.3f} px at most, magnified {times:.0f} times" if times else "nothing moves"
+    words = f"{longest:.3g} px at most, drawn {times:.2g} times as long" if times else "nothing moves"
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="-1 -1 {DRAWN_WIDTH + 2:g} {height + 26:.1f}" role="img" '
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="-1 -1 {DRAWN_WIDTH + 2:g} {height + 2:.1f}" role="img" '
         f'font-family="sans-serif" font-size="13"><title>{words}</title>'
         f'<rect width="{DRAWN_WIDTH:g}" height="{height:.1f}" fill="#fbfcfd" stroke="#b8c0cc"/>'
         f'<path d="{path}" stroke="{LINE}" stroke-width="1.3" fill="none"/>'
         f'<path d="{dots}" stroke="{LINE}" stroke-width="3" stroke-linecap="round"/>'
-        f'<text x="0" y="{height + 18:.1f}" fill="#333">{words}</text></svg>'
+        f'</svg><p class="foot">{words}</p>'
     )
 
 

@@ -163,7 +163,7 @@ def _boards_in_words(pair: BoardsPair) -> list[str]:
     lines = [line for target in pair.targets.values() for line in _mounts_in_words(target)]
     chances = ", ".join(f"{target.chance:.3g}" for target in pair.targets.values())
     verdict = "the same mount" if pair.same else "NOT the same mount: a board moved"
-    return [*lines, f"boards together: chance {chances}; {verdict}"]
+    return [*lines, f"{verdict} (boards together: chance {chances})"]
 
 
 def _mounts_in_words(difference: RigDifference) -> list[str]:
@@ -179,6 +179,6 @@ def _rigs_in_words(pair: RigPair, figures: dict[str, Any]) -> list[str]:
     lines += [f"{name}: {_camera_in_words(own)}".replace("\n", "; ") for name, own in figures["cameras"].items()]
     if figures["same"] is None:
         return [*lines, "no verdict: a file has no covariance"]
-    chance = "" if figures["chance"] is None else f"mounts together: chance {figures['chance']:.3g}; "
+    chance = "" if figures["chance"] is None else f" (mounts together: chance {figures['chance']:.3g})"
     verdict = "the same rig" if figures["same"] else "NOT the same rig: a camera or a lens moved"
-    return [*lines, f"{chance}{verdict}"]
+    return [*lines, f"{verdict}{chance}"]

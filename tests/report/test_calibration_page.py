@@ -167,3 +167,11 @@ def test_the_pictures_to_take_next_are_on_the_page(calibration: Calibration) -> 
     text = build_calibration_page("t", "l", [CalibrationSection("cam", calibration, {}, plan)], {})
     assert "Take these 2 next" in text and plan_words(plan)[1] in text
     assert "Take these" not in build_calibration_page("t", "l", [CalibrationSection("cam", calibration)], {})
+
+
+def test_the_sentence_and_the_map_have_one_worst_place(calibration: Calibration) -> None:
+    text = page(calibration)
+    beyond = re.search(r"to ±([\d.e+]+) px at worst outside", text)
+    drawn = re.search(r"px at best, ([\d.e+]+) px at worst", text)
+    assert beyond is not None and drawn is not None
+    assert beyond[1] == f"{float(drawn[1]):.2g}"
