@@ -296,13 +296,11 @@ _NAMES_OF = {
         "ExportCameraOptions",
         "ExportedCamera",
         "ExportedRig",
-        "ExportedRig",
         "export_camera",
         "export_rig",
     ),
     "rigkit.workflows.export_cloud": ("ExportCloudOptions", "export_cloud"),
     "rigkit.workflows.handeye": (
-        "HandEyeCalibration",
         "HandEyeCalibration",
         "HandEyeOptions",
         "PlacedCamera",

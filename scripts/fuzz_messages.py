@@ -6,8 +6,6 @@ import re
 from collections.abc import Sequence
 from pathlib import PurePath
 
-__all__ = ["fault_of_message"]
-
 VERBS = (
     "add|ask|calibrate|change|check|choose|compare|convert|copy|correct|count|create|describe|detect|export|get|give|increase|"
     "install|keep|leave|list|lower|make|mark|measure|move|name|pip|put|raise|remove|rename|repeat|run|save|see|select|"

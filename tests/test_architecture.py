@@ -178,6 +178,16 @@ def test_classes_of_many_fields_take_keywords() -> None:
     assert not positional, f"need kw_only=True: {sorted(positional)}"
 
 
+def test_what_begins_with_an_underscore_stays_in_its_module() -> None:
+    """The underscore says which names are a module's own; all others may be imported."""
+    taken = []
+    for path in MODULES:
+        for node in ast.walk(tree_of(path)):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("rigkit."):
+                taken += [place_of(path, alias.name) for alias in node.names if alias.name.startswith("_")]
+    assert not taken
+
+
 def test_a_class_name_means_one_thing() -> None:
     homes: dict[str, list[str]] = {}
     for path in MODULES:

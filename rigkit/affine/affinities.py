@@ -17,8 +17,6 @@ from rigkit.core.matches import DirectionPairs
 from rigkit.core.printing import brief
 from rigkit.geometry.sampson import epipolar_normals
 
-__all__ = ["Affinities", "DirectionNoise", "EpipolarNormals"]
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class EpipolarNormals:

@@ -14,17 +14,6 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.matches import DirectionPairs
 
-__all__ = [
-    "PlanarDirections",
-    "blocks",
-    "finite",
-    "first_of",
-    "last_of",
-    "smallest_singular",
-    "solve_each",
-    "unit_weights",
-]
-
 CORNERS_AT_A_TIME = 8192
 """Corners worked on at a time: about fifty rows of this length fit a second-level cache."""
 

@@ -11,8 +11,6 @@ from rigkit.core.arrays import Affines, BoolArray, FloatArray, IntArray, Pixels,
 from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs, Matches
 
-__all__ = ["Correspondences"]
-
 DEFAULT_SIGMA_PX = 0.5
 """Where nobody said how accurate the points are: about what a good feature detector reaches."""
 

@@ -20,8 +20,6 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
 
-__all__ = ["SUPPORTS", "DirectionField", "Support", "direction_field"]
-
 Support = Literal["chord", "neighbours", "line", "patch"]
 SUPPORTS: tuple[Support, ...] = get_args(Support)
 

@@ -14,8 +14,6 @@ from rigkit.affine.components import PlanarDirections, finite, first_of, smalles
 from rigkit.core.arrays import Affines, BoolArray, FloatArray
 from rigkit.core.matches import DirectionPairs
 
-__all__ = ["epipolar_alignment", "epipolar_block", "epipolar_sensitivity", "soft_epipolar", "usable_directions"]
-
 
 def epipolar_alignment(directions: DirectionPairs, epipolar: EpipolarNormals) -> FloatArray:
     """Return |unit(d2) . unit(n2)|, (N, K): 0 where a direction lies along its epipolar line and tells nothing."""

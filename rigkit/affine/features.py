@@ -19,8 +19,6 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, in_8_bit
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.kernels.patches import Pyramid
 
-__all__ = ["TILTS", "grey_of", "match_affine_features"]
-
 TILTS = (1.0, np.sqrt(2.0), 2.0)
 """Simulated tilts: together with those of the other image they cover slants of 60 degrees and more."""
 ROLL_STEP_DEG = 72.0

@@ -13,8 +13,6 @@ from rigkit.affine.refine_patches import patch_pyramid, refine_patches
 from rigkit.core.arrays import Affines, Pixels
 from rigkit.core.errors import DegenerateError
 
-__all__ = ["are_rough", "with_affinities"]
-
 ROUGH_SIGMA_A = 0.1
 """Affinities that are known no better than that are only where an alignment starts."""
 

@@ -18,8 +18,6 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, skew, unit
 from rigkit.geometry.triangulation import triangulate_midpoint
 
-__all__ = ["geometry_covariance"]
-
 STEP_PX = 1e-3
 STEP_RAD = 1e-7
 BASELINE_STEP = 1e-6

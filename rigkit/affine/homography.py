@@ -10,12 +10,6 @@ from rigkit.core.arrays import Affines, BoolArray, Mat3, Normals, Pixels, as_arr
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 
-__all__ = [
-    "affines_from_homography",
-    "homography_from_affines",
-    "homography_from_plane",
-]
-
 
 def affines_from_homography(H21: Mat3, pixels1: Pixels) -> tuple[Affines, BoolArray]:
     """Return d pixel2 / d pixel1 (N, 2, 2) of H21 (3, 3) or (N, 3, 3) at pixels1 (N, 2), and where it is defined.

@@ -15,8 +15,6 @@ from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
 
-__all__ = ["affines_from_mixed_directions"]
-
 
 def affines_from_mixed_directions(
     directions: DirectionPairs,

@@ -17,14 +17,6 @@ from rigkit.core.arrays import Affines, BoolArray, FloatArray, Normals, as_float
 from rigkit.core.errors import InputError
 from rigkit.geometry.rotation import angle_between
 
-__all__ = [
-    "NORMAL_METHODS",
-    "NormalEstimate",
-    "estimate_normals",
-    "normal_covariance",
-    "normals_from_affines",
-]
-
 NORMAL_METHODS = ("optimal", "fne", "nullvector")
 
 MIN_PARALLAX = 1e-9

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from rigkit.core.arrays import Affines, BoolArray, FloatArray, Pixels
 from rigkit.kernels.patches import MOST_LEVELS, PatchRules, Pyramid, aligned, starts_of
 
-__all__ = ["RefinedPatches", "patch_pyramid", "patch_rules", "refine_patches"]
-
 PATCH_STEPS = 20
 SETTLED_PX = 1e-3
 """Move of a patch's border at which it is done."""

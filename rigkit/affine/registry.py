@@ -13,8 +13,6 @@ from rigkit.core.arrays import Affines, BoolArray, FloatArray, Mat3, as_array
 from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
 
-__all__ = ["AFFINE_METHODS", "MIN_CONDITIONING", "affines_from_directions", "needs_epipolar", "needs_lengths"]
-
 AFFINE_METHODS = ("F2UDIR", "F3UDIR", "DET3UDIR", "2SDIR", "3SDIR")
 
 MIN_CONDITIONING = 0.05

@@ -8,8 +8,6 @@ from rigkit.affine.components import PlanarDirections, smallest_singular, solve_
 from rigkit.core.arrays import Affines, BoolArray, FloatArray
 from rigkit.core.matches import DirectionPairs
 
-__all__ = ["scaled_block", "scaled_sensitivity"]
-
 
 def scaled_block(directions: PlanarDirections) -> tuple[FloatArray, FloatArray]:
     """Return vec(A), (4, n), and the conditioning, (n,), from all directions in use (two at least).

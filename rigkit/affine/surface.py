@@ -8,8 +8,6 @@ import numpy as np
 
 from rigkit.core.arrays import Affines, BoolArray, FloatArray, Normals
 
-__all__ = ["LinearGauge", "affines_from_normals", "affines_from_normals_by_minors", "linear_gauge"]
-
 
 class LinearGauge(NamedTuple):
     """A = G - h y^T for the surface n ~ J1^T y + d: the affinity is linear in two numbers.

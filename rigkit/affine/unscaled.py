@@ -16,8 +16,6 @@ from rigkit.core.arrays import Affines, BoolArray, FloatArray
 from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
 
-__all__ = ["SCALES", "determinant_block", "determinant_from_lengths", "determinant_sensitivity", "shape_block"]
-
 SCALES = ("area", "ls", "sqmean", "diagonal")
 
 MAX_NEWTON_STEPS = 40

@@ -15,8 +15,6 @@ from rigkit.benchmark.things import THINGS
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 
-__all__ = ["BLANKS", "blank"]
-
 BLANK_NOISE_LEVELS = 2.0
 BLANK_BLUR_PX = 0.7
 WORDS = "of the lens and a board that no one can see from here while it is not there but every corner counts"

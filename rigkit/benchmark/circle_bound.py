@@ -16,8 +16,6 @@ from rigkit.core.errors import InputError
 from rigkit.core.patterns.circles import Circles
 from rigkit.synthetic.scene import PlacedBoard
 
-__all__ = ["circle_information"]
-
 CIRCLE_PARAMETERS = 10
 CIRCLE_CHANGES = (np.eye(2), np.diag([1.0, -1.0]), np.array([[0.0, 1.0], [1.0, 0.0]]))
 """Changes of a circle: of its size, and of its slant along and aslant of x."""

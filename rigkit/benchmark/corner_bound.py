@@ -27,20 +27,6 @@ from rigkit.core.errors import InputError
 from rigkit.synthetic.photometry import develop
 from rigkit.synthetic.render import Optics
 
-__all__ = [
-    "BLUR_STEP_PX",
-    "PARAMETERS",
-    "ROUNDING_VARIANCE",
-    "SHIFT_PX",
-    "changing_pictures",
-    "corner_information",
-    "derivatives_around",
-    "noise_free_levels",
-    "pixels_around",
-    "position_bound",
-    "shifted_scene",
-]
-
 ROUNDING_VARIANCE = 1.0 / 12.0
 """Of rounding to whole grey levels, which is noise wherever brightness varies: it bounds noise-free images, too."""
 SHIFT_PX = 0.07

@@ -24,8 +24,6 @@ from rigkit.geometry.rotation import exp_so3
 from rigkit.synthetic.pairs import StereoScene, random_pair, trihedral_pair
 from rigkit.synthetic.scene import PlacedBoard, room_walls, wall_axes
 
-__all__ = ["EQUAL_BOARDS", "PairVerdict", "equal_boards_pair", "judge_pair"]
-
 EQUAL_BOARDS = tuple(Board(name, 8, 6, 40.0, 40.0) for name in ("plane1", "plane2", "plane3"))
 """Columns + rows is even: each looks the same turned by 180 degrees."""
 SAME_PX = 1.0

@@ -29,23 +29,6 @@ from rigkit.synthetic.placing import place_board, sees_paper
 from rigkit.synthetic.render import Optics, radiance
 from rigkit.synthetic.scene import Panel, PlacedBoard, exact_detection
 
-__all__ = [
-    "BENCH_PHOTOMETRY",
-    "CONDITIONS",
-    "LENSES",
-    "SCENES",
-    "BenchScene",
-    "bench_camera",
-    "bench_field_deg",
-    "covered_board",
-    "empty",
-    "one_board",
-    "partial_board",
-    "room",
-    "small_board",
-    "three_boards",
-]
-
 LENSES = ("regular", "fisheye")
 """A 6.1 mm lens without distortion and a 2.7 mm, 185 degree lens, both over a 1/1.8 inch sensor."""
 FISHEYE_FIELD_DEG = 185.0

@@ -12,8 +12,6 @@ from rigkit.benchmark.scenes import BenchScene
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels
 from rigkit.core.detections import BoardDetection
 
-__all__ = ["FoundBoard", "Score", "score"]
-
 FOUND_PX = 1.0
 """A corner counts as found within this distance of the truth."""
 FALSE_SHARE = 0.5

@@ -14,8 +14,6 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.errors import InputError
 from rigkit.core.patterns.aprilgrid import AprilGrid
 
-__all__ = ["tag_information"]
-
 CODE_SIGMAS = 2.5
 """Blurs (of lens and pixel together) round the code that show it."""
 PIXEL_SIGMA_PX = 0.29

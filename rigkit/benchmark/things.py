@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from rigkit.core.arrays import FloatArray
 
-__all__ = ["THINGS"]
-
 SHEET = 1200
 """Sides of the sheets that things are drawn on, px."""
 

@@ -19,8 +19,6 @@ from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
 
-__all__ = ["assemble", "board_shapes", "motion_of_world", "outliers_of", "require_determined", "solution_normal"]
-
 UNKNOWN_SHARE = 0.05
 """A projection that is uncertain by this part of the image's width, where the boards were, is not determined."""
 MIN_RESULT_SIGMA_PX = 0.02

@@ -27,8 +27,6 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import grid_turned
 from rigkit.geometry.rigid3 import Rigid3
 
-__all__ = ["board_turn", "same_looks", "turned_views", "with_views_turned"]
-
 SURE = 10.0
 """Log odds from which a view is turned: 20000 to 1, as most views are counted alike to begin with. Measured on boards
 whose first corner is known: up to 4.3 for the wrong end, 8 to 70 for views that were turned."""

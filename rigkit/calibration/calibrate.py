@@ -33,8 +33,6 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding, Severity
 from rigkit.core.progress import Progress, silent
 
-__all__ = ["DEGREES_TRIED", "FOLDS", "calibrate"]
-
 FOLDS = 5
 COMPARABLE = 1.5
 """Corners are outliers only if every model with a scatter within this factor of the best one says so."""

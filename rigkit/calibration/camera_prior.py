@@ -13,8 +13,6 @@ import numpy as np
 from rigkit.cameras.base import Camera, image_center
 from rigkit.core.arrays import FloatArray, IntArray
 
-__all__ = ["camera_prior"]
-
 CENTRE_SIGMA = 0.15
 """Of the distance from the middle of the image to the optical axis, as a part of the image's longer side."""
 SQUARE_SIGMA = 0.01

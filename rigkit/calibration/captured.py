@@ -20,8 +20,6 @@ from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import BoolArray, FloatArray, Pixels
 from rigkit.core.findings import Finding, Severity
 
-__all__ = ["Extent", "judge_capture"]
-
 FEW_IMAGES = 8
 FAR_TOO_FEW = 3
 """Fewer images show a lens, but nothing by which one could tell that it is wrong."""

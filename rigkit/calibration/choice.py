@@ -11,8 +11,6 @@ from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Candidate
 from rigkit.core.arrays import FloatArray
 
-__all__ = ["SURELY", "Option", "choose", "described"]
-
 MARGIN = 0.02
 """A model or a board shape with more numbers must lower the held-out error by this part to be chosen,"""
 SURELY = 1.0

@@ -30,9 +30,6 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray, IntArray
 
-__all__ = ["MIN_CLUSTERS", "NULL_DRAWS", "Clustered", "clustered_covariance", "drawn_errors", "reduced_by_cluster"]
-__all__ += ["with_block"]
-
 MIN_CLUSTERS = 4
 """Fewer images (or frames) say nothing about how they differ."""
 MIN_LEFT = 0.05

@@ -22,8 +22,6 @@ from rigkit.cameras.compare import CameraDifference, compare_cameras, grid_pixel
 from rigkit.cameras.convert import refit_camera
 from rigkit.core.arrays import FloatArray, Pixels
 
-__all__ = ["CalibrationComparison", "CameraVerdict", "compare_calibrations"]
-
 REFIT_SIGMA = 0.5
 """What the models make of one lens is known from a refit to about half: poses and noise had their part in the fits."""
 SAME_CHANCE = 0.01

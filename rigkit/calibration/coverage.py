@@ -9,8 +9,6 @@ import numpy as np
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.core.arrays import BoolArray, FloatArray, Pixels
 
-__all__ = ["corner_ranges", "covered_by_boards"]
-
 REACH = 1.0
 """A pixel within this many spacings of a corner (of its board in its view) lies on a board: discs of 0.71 would leave
 no gap inside a regular grid, and perspective makes spacings differ within a view."""

@@ -23,8 +23,6 @@ from rigkit.calibration.solver import solve, with_priors
 from rigkit.calibration.state import State, evaluate
 from rigkit.core.arrays import BoolArray, FloatArray
 
-__all__ = ["fit_shapes"]
-
 SIZE_ROUNDS = 2
 """More rounds change the sizes by a few per cent and the lens not at all."""
 STRAY_SIGMAS = 3.0

@@ -19,19 +19,6 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.errors import DegenerateError
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
-__all__ = [
-    "CAUCHY_SIGMAS",
-    "OUTLIER_SIGMAS",
-    "SETTLE_ROUNDS",
-    "Fit",
-    "fit_kept",
-    "fit_model",
-    "heldout_squares",
-    "inliers",
-    "robust_sigma",
-    "sigma_of",
-]
-
 OUTLIER_SIGMAS = 5.0
 """A corner is an outlier when its weighted 2-D residual exceeds this many robust standard deviations per coordinate,
 sigma = median |r| / 1.177: by chance alone 4 corners in a million do."""

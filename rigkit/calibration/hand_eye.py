@@ -28,8 +28,6 @@ from rigkit.optim.damping import Damping, Stop
 from rigkit.optim.levenberg_marquardt import DenseProblem, DenseStep, minimise
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 
-__all__ = ["HandEye", "hand_eye"]
-
 MIN_POSES = 3
 MAX_MISMATCH_RAD = np.radians(1.0)
 """Robots and boards tell a rotation to some hundredths of a degree: more is a picture of another pose."""

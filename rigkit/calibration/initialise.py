@@ -26,8 +26,6 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rotation import nearest_rotation
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 
-__all__ = ["initialise", "start_error"]
-
 EXPONENTS = ((0, 2, 3, 4), (0, 2, 4), (0, 2), (0,))
 """Polynomials tried from rich to poor, until the angle increases with the radius."""
 POLYNOMIAL_ROUNDS = 2

@@ -19,8 +19,6 @@ from rigkit.calibration.state import State, lost_px
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Points
 
-__all__ = ["normal_equations", "view_products"]
-
 CORNERS_AT_A_TIME = 8192
 """Corners linearised at a time: their derivatives then stay in the cache, and memory does not grow with the views."""
 

@@ -14,8 +14,6 @@ from rigkit.calibration.result import Calibration
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.findings import Finding, Severity
 
-__all__ = ["two_cameras"]
-
 SAME_MOTION = 0.005
 """Boards that land within this part of their distance were moved alike."""
 MIN_MOTION = 2.0

@@ -19,8 +19,6 @@ from rigkit.calibration.state import State, evaluate
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.findings import Finding, Severity
 
-__all__ = ["moved_lens"]
-
 MIN_IMAGES_FOR_HALVES = 10
 MIN_HALF_SIGMAS = 3.0
 """Halves this far apart (root of the mean squared distance of the parameters, in standard deviations) may be two

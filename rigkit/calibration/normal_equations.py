@@ -12,8 +12,6 @@ from rigkit.calibration.observations import Observations
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray
 
-__all__ = ["NormalEquations", "Residuals", "SchurStep"]
-
 MAX_CONDITION = 1e12
 """A pose whose scaled block is worse has directions that its corners leave open: fewer than three of them."""
 

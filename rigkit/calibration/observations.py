@@ -13,8 +13,6 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
 
-__all__ = ["Observations", "median_of"]
-
 SIGMA_RANGE = 8.0
 """Corner sigmas are believed within this factor of their median: a predicted 0.001 px must not rule the solution."""
 

@@ -23,8 +23,6 @@ from rigkit.core.errors import DegenerateError
 from rigkit.core.findings import Finding, Severity
 from rigkit.geometry.rigid3 import Rigid3
 
-__all__ = ["posed_calibration"]
-
 START_MM = 1000.0
 MIN_KEPT_SHARE = 0.5
 """A view in which fewer of the corners fit the known lens is dropped."""

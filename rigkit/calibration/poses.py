@@ -17,8 +17,6 @@ from rigkit.geometry.rotation import exp_so3, nearest_rotation
 from rigkit.optim.batched import BatchedProblem, minimise_each
 from rigkit.optim.damping import Damping, Stop
 
-__all__ = ["find_poses", "refine_each", "refine_poses"]
-
 MAX_POSE_ITERATIONS = 40
 VIEW_TOLERANCE = 1e-10
 """Stop where a step promises less than this part of a view's cost,"""

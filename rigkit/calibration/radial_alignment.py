@@ -18,8 +18,6 @@ import numpy as np
 from rigkit.core.arrays import FloatArray
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 
-__all__ = ["Alignment", "align", "distortion_centre"]
-
 ALIGNMENT_ROUNDS = 4
 SUBSETS = 16
 SUBSET_SIZE = 7

@@ -9,8 +9,6 @@ from scipy.spatial import cKDTree
 
 from rigkit.core.arrays import FloatArray, IntArray, Pixels
 
-__all__ = ["cluster_numbers"]
-
 REPEATED_PX = 0.5
 """Boards whose corners have, in two images, the same centre and the same extents within this were not moved between."""
 

@@ -16,8 +16,6 @@ from rigkit.core.findings import Finding
 from rigkit.core.printing import drawn
 from rigkit.geometry.rigid3 import Rigid3
 
-__all__ = ["BoardShape", "Calibration", "Candidate", "Convergence", "Outlier", "ViewResult"]
-
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class ViewResult:

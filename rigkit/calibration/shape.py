@@ -15,9 +15,6 @@ import numpy as np
 from rigkit.calibration.observations import Observations
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
 
-__all__ = ["SHAPES", "ShapeModel", "often_seen", "released_groups", "released_sigma", "shape_model", "warp_groups"]
-__all__ += ["WARP_UNKNOWNS", "warp_of_board"]
-
 SHAPES = ("flat", "warp", "released")
 
 ASPECT_SIGMA = 3e-3

@@ -26,8 +26,6 @@ from rigkit.optim import levenberg_marquardt
 from rigkit.optim.damping import Damping, Stop, StopReason
 from rigkit.optim.levenberg_marquardt import LinearisedProblem
 
-__all__ = ["CameraSolution", "Linearised", "minimise", "solve", "with_priors"]
-
 S = TypeVar("S")
 
 MAX_SOLVER_ITERATIONS = 60

@@ -12,8 +12,6 @@ from rigkit.calibration.shape import ShapeModel, shape_model
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, IntArray, Mat3, Points
 
-__all__ = ["State", "evaluate", "lost_px"]
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class State:

@@ -27,9 +27,6 @@ from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, Points
 
-__all__ = ["Uncertainty", "projection_design", "projection_uncertainty", "uncertainty_at_corners", "uncertainty_map"]
-__all__ += ["worst_direction"]
-
 CORNERS = 400
 """So many corners, spread over all views, are enough to see how sure the projection is where the boards were."""
 

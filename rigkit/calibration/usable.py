@@ -16,8 +16,6 @@ from rigkit.core.identifiers import IDENTIFIER, MAX_IDENTIFIER
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.patterns.circles import Circles
 
-__all__ = ["MIN_CORNERS_OF_VIEW", "other_size", "usable_views", "views_of_image"]
-
 MIN_CORNERS_OF_VIEW = 6
 """A pose has six numbers: fewer than six corners leave hardly anything to check it by."""
 OFTEN = 3

@@ -19,8 +19,6 @@ from rigkit.cameras.base import image_center
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.findings import Finding, Severity, worst
 
-__all__ = ["judge", "judge_session", "with_headline"]
-
 CELLS = (4, 3)
 """The image in columns x rows of cells, for coverage."""
 CELL_CORNERS = 5

@@ -16,9 +16,6 @@ from numpy.typing import ArrayLike
 from rigkit.core.arrays import BoolArray, FloatArray, Pixels, Points, RayJacobians, Rays, as_array
 from rigkit.core.errors import InputError
 
-__all__ = ["Camera", "RadialCurve", "image_center"]
-
-
 MAX_SIDE_PX = 2**20
 """Some sixty times the longest line sensor: a larger image is a mistyped number."""
 MAX_PARAMETER = 1e15

@@ -15,8 +15,6 @@ from rigkit.cameras.monotone import first_root, horner
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import InputError
 
-__all__ = ["Brown"]
-
 FARTHEST = 50.0
 """Tangent of 88.9 degrees: no lens of this kind sees further."""
 KNOTS = 129

@@ -15,8 +15,6 @@ from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Pixels, as_array, as
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import exp_so3, nearest_rotation, rotation_angle, skew
 
-__all__ = ["CameraDifference", "compare_cameras", "grid_pixels"]
-
 MAX_ROTATION_STEPS = 20
 ROTATION_SETTLED_RAD = 1e-12
 """The fit of the rotation stops at steps that move no pixel by a millionth."""

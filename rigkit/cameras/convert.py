@@ -14,8 +14,6 @@ from rigkit.core.errors import InputError
 from rigkit.optim.damping import Damping, Stop
 from rigkit.optim.levenberg_marquardt import DenseStep, LinearisedProblem, damped_step, minimise
 
-__all__ = ["Conversion", "convert_camera", "fit_camera", "refit_camera"]
-
 CONVERT_GRID = (64, 48)
 """Pixels of the source at which the two cameras are held against each other."""
 MIN_COVERED_SAMPLES = 60

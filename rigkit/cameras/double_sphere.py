@@ -15,8 +15,6 @@ from rigkit.cameras.radial import FocalCamera, ScaleDerivatives, fit_shape
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import InputError
 
-__all__ = ["DoubleSphere"]
-
 DOUBLE_SPHERE_STARTS = ((0.0, 0.1), (0.0, 0.5), (0.0, 0.6), (0.0, 0.7), (-0.2, 0.6), (0.3, 0.6))
 """(xi, alpha) from a nearly perspective lens to a fisheye."""
 

@@ -16,8 +16,6 @@ from rigkit.cameras.radial import FocalCamera, ScaleDerivatives, fit_shape
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import InputError
 
-__all__ = ["EUCM"]
-
 EUCM_STARTS = ((0.1, 1.0), (0.5, 1.0), (0.6, 1.0), (0.7, 1.0))
 """(alpha, beta) from a nearly perspective lens to a fisheye."""
 

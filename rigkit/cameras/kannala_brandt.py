@@ -16,8 +16,6 @@ from rigkit.cameras.monotone import first_root, horner, invert_increasing
 from rigkit.cameras.radial import FocalCamera, ScaleDerivatives
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 
-__all__ = ["KannalaBrandt"]
-
 KNOTS = 129
 """Samples of the curve from which its inverse starts; Newton does the rest."""
 

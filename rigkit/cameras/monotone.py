@@ -9,8 +9,6 @@ import numpy as np
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.errors import InputError
 
-__all__ = ["first_root", "horner", "invert_increasing"]
-
 REAL_ROOT = 1e-7
 """A computed root whose imaginary part is below this share of its size is real: rounding splits a double root."""
 LAST_STEP_REL = 1e-9

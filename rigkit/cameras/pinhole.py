@@ -11,8 +11,6 @@ from rigkit.cameras.base import RadialCurve
 from rigkit.cameras.radial import FocalCamera, ScaleDerivatives
 from rigkit.core.arrays import BoolArray, FloatArray, Mat3
 
-__all__ = ["Pinhole"]
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Pinhole(FocalCamera):

@@ -19,8 +19,6 @@ from rigkit.core.errors import InputError
 from rigkit.optim.damping import Damping, Stop
 from rigkit.optim.levenberg_marquardt import DenseStep, LinearisedProblem, damped_step, minimise
 
-__all__ = ["FocalCamera", "RadialCamera", "ScaleDerivatives", "fit_shape"]
-
 FIT_STEPS = 40
 FIT_SETTLED = 1e-6
 """The descent stops where a step gains less than this share of the cost."""

@@ -12,8 +12,6 @@ from rigkit.cameras.scaramuzza import Scaramuzza
 from rigkit.cameras.ucm import UCM
 from rigkit.core.errors import InputError
 
-__all__ = ["MODELS", "camera_model", "check_order"]
-
 MODELS: dict[str, type[Camera]] = {
     cls.model: cls for cls in (Pinhole, Brown, KannalaBrandt, Scaramuzza, UCM, EUCM, DoubleSphere)
 }

@@ -18,8 +18,6 @@ from rigkit.cameras.radial import RadialCamera, ScaleDerivatives
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.errors import InputError
 
-__all__ = ["DEFAULT_DEGREE", "DEGREES", "Scaramuzza"]
-
 DEGREES = range(3, 11)
 DEFAULT_DEGREE = 6
 """Follows a lens of 185 degrees; degree 4 is enough to about 120, 200 degrees need 8."""

@@ -11,8 +11,6 @@ from typing import ClassVar
 
 from rigkit.cameras.eucm import EUCM
 
-__all__ = ["UCM"]
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class UCM(EUCM):

@@ -6,14 +6,13 @@ import argparse
 import time
 from typing import TYPE_CHECKING, Any
 
-from rigkit.cli.calibrate_arguments import add_arguments, calibrate_options, folder_options
+from rigkit.cli.calibrate_arguments import add_arguments as add_arguments
+from rigkit.cli.calibrate_arguments import calibrate_options, folder_options
 from rigkit.core.errors import ExitCode, InputError, RigkitError
 
 if TYPE_CHECKING:
     from rigkit.workflows.calibrate import SessionCalibration
     from rigkit.workflows.calibrate_rig import RigSessionCalibration
-
-__all__ = ["HELP", "add_arguments", "run"]
 
 HELP = "calibrate a camera, or several on one mount, from images of chessboards"
 

@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rigkit.calibration.result import Calibration
 
-__all__ = ["describe", "summary"]
-
 
 def summary(calibration: Calibration) -> dict[str, Any]:
     """Return the figures for programs."""

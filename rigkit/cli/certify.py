@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-__all__ = ["HELP", "add_arguments", "run"]
-
 HELP = "how wrong a length, depth, plane or angle may be that is measured with a calibration or a rig"
 
 

@@ -12,8 +12,6 @@ from rigkit.core.errors import ExitCode, InputError
 if TYPE_CHECKING:
     from rigkit.workflows.check import CheckedPictures
 
-__all__ = ["HELP", "add_arguments", "run"]
-
 HELP = "fresh pictures against a calibration or a rig: still holds, or what moved and by how much"
 
 

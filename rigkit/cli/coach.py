@@ -7,8 +7,6 @@ from pathlib import Path
 
 from rigkit.core.errors import ExitCode, InputError
 
-__all__ = ["HELP", "add_arguments", "run"]
-
 MAX_CAMERAS = 8
 """Of a browser: more streams than this no machine carries."""
 

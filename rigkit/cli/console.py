@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from rigkit.core.arrays import FloatArray
     from rigkit.geometry.rigid3 import Rigid3
 
-__all__ = ["note", "pose_in_words", "print_json", "progress_on_stderr"]
-
 REDRAW_S = 0.1
 BAR_WIDTH = 24
 

@@ -12,16 +12,6 @@ from rigkit.cli.console import note
 if TYPE_CHECKING:
     from rigkit.workflows.datasets import PairFailure
 
-__all__ = [
-    "add_dataset_arguments",
-    "add_direction_arguments",
-    "dataset_options",
-    "direction_options",
-    "exit_code_of",
-    "failed_pairs",
-    "results_folder",
-]
-
 
 def add_dataset_arguments(parser: argparse.ArgumentParser, *, optional: bool = False, several: bool = False) -> None:
     """Add what every verb on a data set takes; `optional`: the verb works on something else too; `several`: on many."""

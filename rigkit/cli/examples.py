@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["EXAMPLES", "FIRST_STEPS"]
-
 FIRST_STEPS = """first steps:
   rigkit board 9x6 --square-mm 25 -o board           print it true to scale, glue it to something flat
   rigkit calibrate photos --board 9x6x25 -r          a dozen pictures of it in a folder: calibration and page

@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-__all__ = ["HELP", "add_arguments", "run"]
-
 HELP = "public captures with measured truth: list them, or fetch one"
 
 

@@ -7,8 +7,6 @@ from pathlib import Path
 
 from rigkit.core.errors import ExitCode, printable
 
-__all__ = ["HELP", "add_arguments", "run"]
-
 HELP = "a register of checks over months: drift plots with control limits, one page"
 
 

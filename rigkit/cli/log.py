@@ -13,8 +13,6 @@ from pathlib import Path
 from rigkit.core.errors import InputError, printable
 from rigkit.io.reading import usable_path
 
-__all__ = ["add_log_arguments", "logged_run", "logging_to"]
-
 FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 LINE = re.compile(rb"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} [A-Z]+ rigkit")
 """How the first line of a log of ours begins."""

@@ -20,8 +20,6 @@ from rigkit.cli.log import add_log_arguments, logged_run, logging_to
 from rigkit.cli.surroundings import SURROUNDINGS, Terminated, open_streams, say, settle_stderr, signals_interrupt
 from rigkit.core.errors import ExitCode, RigkitError, printable
 
-__all__ = ["VERBS", "main"]
-
 VERBS: dict[str, tuple[str, str]] = {
     "demo": ("rigkit.cli.demo", "render a small fisheye capture and run the whole job on it; needs no data"),
     "board": ("rigkit.cli.board", "a board to print, true to scale"),

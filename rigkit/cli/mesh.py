@@ -8,8 +8,6 @@ from pathlib import Path
 from rigkit.cli.console import print_json, progress_on_stderr
 from rigkit.core.errors import ExitCode
 
-__all__ = ["HELP", "add_arguments", "run"]
-
 HELP = "a surface through an oriented cloud (screened Poisson), as a mesh"
 
 

@@ -12,8 +12,6 @@ from rigkit.core.errors import ExitCode, InputError
 if TYPE_CHECKING:
     from rigkit.workflows.plan import PlannedSession, PlanOptions
 
-__all__ = ["HELP", "add_arguments", "run"]
-
 
 HELP = "which pictures to take next, or what a lens, a board and so many pictures will reach"
 

@@ -10,8 +10,6 @@ from rigkit.cli.dataset_arguments import results_folder
 from rigkit.core.errors import ExitCode, InputError
 from rigkit.core.posetype import PoseType
 
-__all__ = ["add_scene_arguments", "is_scene", "run_scene"]
-
 
 def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("a textured scene without boards, instead of DATASET")

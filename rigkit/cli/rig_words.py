@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from rigkit.calibration.rig.result import RigCalibration
     from rigkit.validation.check import Check
 
-__all__ = ["describe", "summary"]
-
 
 def summary(rig: RigCalibration, checks: Sequence[Check]) -> dict[str, Any]:
     """Return the figures for programs."""

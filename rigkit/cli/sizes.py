@@ -6,8 +6,6 @@ import re
 
 from rigkit.core.errors import InputError
 
-__all__ = ["size_of_words"]
-
 IMAGE_SIZE = re.compile(r"([0-9]{1,6})[xX]([0-9]{1,6})")
 
 

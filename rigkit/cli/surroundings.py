@@ -13,8 +13,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-__all__ = ["SURROUNDINGS", "Terminated", "open_streams", "say", "settle_stderr", "signals_interrupt"]
-
 SURROUNDINGS = {
     getattr(errno, name, None) for name in ("ENOSPC", "EDQUOT", "EROFS", "EACCES", "EPERM", "EIO", "EMFILE", "ENFILE")
 } - {None}

@@ -19,8 +19,6 @@ from rigkit.core.errors import InputError
 from rigkit.io.image_size import announced_size
 from rigkit.io.images import quiet_opencv
 
-__all__ = ["Coach", "decoded"]
-
 MAX_PICTURE_PX = 12000
 """Of a picture that a page sends."""
 LOOK_S = 0.06

@@ -25,8 +25,6 @@ from rigkit.planning.information import CornerError, HeldBoards, Knowledge
 from rigkit.planning.plan import Plan, covariance_of, plan_views
 from rigkit.planning.words import placement
 
-__all__ = ["WORTH_TAKING", "Advice", "CaptureGuide", "GuideOptions", "held_view"]
-
 FIRST_FRAMES = 4
 """Before so many frames there is no calibration: the coach goes by a guess of the lens."""
 ENOUGH_FRAMES = 8

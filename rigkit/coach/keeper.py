@@ -17,8 +17,6 @@ from rigkit.io.files import write_atomic
 from rigkit.io.images import read_image
 from rigkit.io.reading import read_text
 
-__all__ = ["FRAME_FOLDER", "ONLY", "Keeper", "folder_of"]
-
 _log = logging.getLogger(__name__)
 
 FRAME_NAME = "frame-{:04d}.png"

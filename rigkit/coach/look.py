@@ -17,8 +17,6 @@ from rigkit.core.detections import BoardView
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import grey_image
 
-__all__ = ["Glance", "glance_at"]
-
 MAX_EDGE_PX = 4.0
 """Edges wider than this are blurred: by focus, or by a hand that moves."""
 STILL_SHARE = 0.0015

@@ -21,8 +21,6 @@ from rigkit.planning.information import HeldBoards
 from rigkit.planning.mounts import SharedViews, mean_motion, mount_error_px, mount_information
 from rigkit.planning.words import placement
 
-__all__ = ["RigAdvice", "RigGuide"]
-
 SHARED_FRAMES = 5
 """Fewer boards that two cameras see at once do not tell how these disagree."""
 MAX_MARKS = 1500

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from starlette.requests import Request
     from starlette.responses import Response
 
-__all__ = ["LOCAL", "MAX_UPLOAD_BYTES", "coach_app", "new_token", "own_address", "serve"]
-
 MAX_UPLOAD_BYTES = 64_000_000
 """A lossless picture of 20 megapixels."""
 HEADERS = {

@@ -16,8 +16,6 @@ from rigkit.core.errors import InputError
 from rigkit.io.images import read_image
 from rigkit.io.rig_session import frames_of_images
 
-__all__ = ["Frame", "device_frames", "video_frames", "watched_frames"]
-
 POLL_S = 0.3
 SETTLED_S = 0.2
 """A file that has not grown for so long is whole."""

@@ -13,27 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from rigkit.core.errors import InputError
 
-__all__ = [
-    "Affines",
-    "BoolArray",
-    "FloatArray",
-    "IntArray",
-    "Mat3",
-    "Normals",
-    "Pixels",
-    "Points",
-    "RayJacobians",
-    "Rays",
-    "as_array",
-    "as_covariance",
-    "as_floats",
-    "as_indices",
-    "as_mask",
-    "in_8_bits",
-    "upper_median",
-    "without_nan",
-]
-
 BRIGHT_SHARE = 0.999
 """Of the pixels; the rest may be brighter than the image's bits: hot, or a glint."""
 

@@ -12,8 +12,6 @@ from rigkit.core.identifiers import check_identifier
 from rigkit.core.patterns.base import Ink, Pattern
 from rigkit.core.patterns.chessboard import Chessboard
 
-__all__ = ["Board"]
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Board:

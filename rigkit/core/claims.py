@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["Comparison", "Verdict", "judge_claim"]
-
 
 @dataclass(frozen=True, slots=True)
 class Comparison:

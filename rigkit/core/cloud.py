@@ -11,8 +11,6 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Normals, Points,
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 
-__all__ = ["OrientedCloud"]
-
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class OrientedCloud:

@@ -12,8 +12,6 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 
-__all__ = ["BoardDetection", "BoardView", "common_corners", "grid_turned"]
-
 
 def grid_turned(grid: IntArray, size: tuple[int, int], quarter_turns: int) -> IntArray:
     """Return (column, row) (N, 2) of corners counted from the corner that lies `quarter_turns` x 90 degrees further.

@@ -4,17 +4,6 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-__all__ = [
-    "CheckFailed",
-    "DegenerateError",
-    "ExitCode",
-    "InputError",
-    "InstallationError",
-    "InternalError",
-    "RigkitError",
-    "printable",
-]
-
 
 class ExitCode(IntEnum):
     """What the command line returns."""

@@ -6,8 +6,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 
-__all__ = ["Finding", "Severity", "worst"]
-
 
 class Severity(StrEnum):
     """How grave a finding is."""

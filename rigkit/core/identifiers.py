@@ -6,8 +6,6 @@ import re
 
 from rigkit.core.errors import InputError
 
-__all__ = ["MAX_IDENTIFIER", "check_identifier"]
-
 MAX_IDENTIFIER = 60
 """Characters; file systems take 255 bytes, of which a letter may need four."""
 IDENTIFIER = re.compile(r"\w([\w .+()-]*[\w.+()-])?")

@@ -23,8 +23,6 @@ from rigkit.core.arrays import (
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 
-__all__ = ["CentralCamera", "DirectionPairs", "Matches"]
-
 
 class CentralCamera(Protocol):
     """What geometry asks of a camera (`rigkit.cameras.base.Camera` in full)."""

@@ -6,8 +6,6 @@ from enum import StrEnum
 
 from rigkit.core.errors import InputError
 
-__all__ = ["PoseType"]
-
 
 class PoseType(StrEnum):
     """The relative pose that a person declares for a pair.

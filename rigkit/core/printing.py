@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["brief", "drawn"]
-
 NOTEBOOK = "rigkit.report.notebook"
 """What draws results; it knows them, they know only its name, and a notebook alone asks for it."""
 

@@ -15,8 +15,6 @@ from typing import Any, ParamSpec, TypeVar
 
 from rigkit.core.errors import InputError
 
-__all__ = ["worker_pool"]
-
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 
 from rigkit.core.errors import InputError
 
-__all__ = ["Cell", "Column", "Table"]
-
 
 @dataclass(frozen=True, slots=True)
 class Column:

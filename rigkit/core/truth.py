@@ -10,8 +10,6 @@ import numpy as np
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 
-__all__ = ["Feature", "MeasuredAngle", "MeasuredDistance", "MeasuredLength", "PairTruth"]
-
 FEATURE = re.compile(r"^(?P<board>.+?)(?:\[\s*(?P<column>\d+)\s*,\s*(?P<row>\d+)\s*\]|(?P<centre>\.centre))?$")
 
 

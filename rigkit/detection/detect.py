@@ -18,8 +18,6 @@ from rigkit.detection.saddles.response import grey_image
 from rigkit.detection.targets.base import Search
 from rigkit.detection.targets.registry import FINDERS
 
-__all__ = ["detect_boards"]
-
 SAME_CORNER_PX = 2.0
 """Corners of two detections nearer than this are one corner."""
 

@@ -13,8 +13,6 @@ from rigkit.detection.saddles.mosaic import without_mosaic
 from rigkit.detection.saddles.response import grey_image
 from rigkit.detection.subpixel.subpixel import RefinedLattice, refine
 
-__all__ = ["doubtful_grid"]
-
 MIN_DOUBTFUL_CORNERS = 20
 """Chance makes smaller grids out of anything."""
 

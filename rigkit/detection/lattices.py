@@ -29,8 +29,6 @@ from rigkit.detection.saddles.response import GreyImage, Level, grey_image, pyra
 from rigkit.detection.saddles.saddle import find_corners
 from rigkit.detection.subpixel.subpixel import RefinedLattice, refine
 
-__all__ = ["MIN_BOARD_CORNERS", "candidates", "find_lattices", "fitted"]
-
 MIN_PART_CORNERS = 6
 """Corners of the smallest part of a board that something lies across."""
 

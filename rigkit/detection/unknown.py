@@ -15,8 +15,6 @@ from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.tags.unknown_charuco import MarkerSightings, guessed_charuco
 from rigkit.detection.tags.unknown_tags import TagSightings, guessed_grid
 
-__all__ = ["BoardGuess", "difference", "guess_board"]
-
 MIN_IMAGES_OF_GUESS = 2
 """A size of chessboards is told from so many images, or from the only one."""
 

@@ -18,16 +18,6 @@ from rigkit.geometry.rotation import exp_so3, nearest_rotation, skew
 from rigkit.optim.batched import BatchedProblem, minimise_each
 from rigkit.optim.damping import Damping, Stop
 
-__all__ = [
-    "BoardPose",
-    "board_pose",
-    "board_poses",
-    "moved_board_poses",
-    "point_residuals",
-    "ray_residuals",
-    "tangent_bases",
-]
-
 MIN_SPREAD = 1e-6
 """Points are collinear where their second principal extent is below this part of the first."""
 MIN_HOMOGRAPHY_GAP = 1e-9

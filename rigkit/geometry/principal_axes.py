@@ -6,8 +6,6 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray
 
-__all__ = ["principal_axes"]
-
 NEGLIGIBLE = 1e-12
 """Principal axes with less than this part of the largest variance (parameters scaled to one sigma) are left out."""
 

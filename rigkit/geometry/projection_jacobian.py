@@ -7,8 +7,6 @@ import numpy as np
 from rigkit.core.arrays import FloatArray, Points, RayJacobians, Rays
 from rigkit.geometry.rigid3 import Rigid3
 
-__all__ = ["pair_projection_jacobians", "projection_jacobian"]
-
 
 def projection_jacobian(rays: Rays, ray_jacobians: RayJacobians, ranges_mm: FloatArray) -> FloatArray:
     """Return d pixel / d point (..., 2, 3) in px/mm, in the camera's frame.

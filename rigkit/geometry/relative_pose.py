@@ -8,8 +8,6 @@ from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
 
-__all__ = ["relative_pose", "relative_pose_covariance"]
-
 
 def relative_pose(cam1_from_world: Rigid3, cam2_from_world: Rigid3) -> Rigid3:
     """Return cam2_from_cam1."""

@@ -11,8 +11,6 @@ from rigkit.core.arrays import FloatArray, Mat3, Points, as_array, as_floats
 from rigkit.core.errors import InputError
 from rigkit.geometry.rotation import nearest_rotation, unit
 
-__all__ = ["Rigid3", "cam_from_world_look_at"]
-
 ROTATION_TOLERANCE = 1e-4
 """A matrix further than this from orthonormal is a mistake (a scale, a transposed homogeneous matrix), not rounding."""
 

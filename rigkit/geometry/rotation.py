@@ -7,8 +7,6 @@ from numpy.typing import ArrayLike
 
 from rigkit.core.arrays import FloatArray, Mat3
 
-__all__ = ["angle_between", "cross", "exp_so3", "log_so3", "nearest_rotation", "rotation_angle", "skew", "unit"]
-
 
 def skew(v: FloatArray) -> Mat3:
     """Return the matrix [v]x with [v]x w = v x w. `v` (..., 3) -> (..., 3, 3)."""

@@ -13,8 +13,6 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray, Mat3, RayJacobians, Rays
 
-__all__ = ["epipolar_normals", "sampson_distances"]
-
 
 def epipolar_normals(
     E21: Mat3, rays1: Rays, rays2: Rays, jacobians1: RayJacobians, jacobians2: RayJacobians

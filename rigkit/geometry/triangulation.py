@@ -21,18 +21,6 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import cross, skew, unit
 from rigkit.geometry.sampson import epipolar_normals
 
-__all__ = [
-    "correct_hartley_sturm",
-    "correct_lindstrom",
-    "correct_rays",
-    "correct_rays_px",
-    "point_covariances",
-    "ray_ranges",
-    "triangulate_midpoint",
-    "triangulate_pixels",
-    "triangulate_rays",
-]
-
 MIN_PARALLAX_RAD = 1e-9
 """Below this angle between the rays the range is rounding error."""
 

@@ -19,8 +19,6 @@ from rigkit.identification.board_matches import BoardMatch, ImageObservations
 from rigkit.identification.joint_pose import JointPose, refine_joint
 from rigkit.identification.placements import BoardKind
 
-__all__ = ["Assignment", "forced_rms_px", "ranked_assignments"]
-
 SEED_GATE = 2.0
 """Squares by which a board may miss the prediction from one other board: its tilt is uncertain, its lever long."""
 REJOIN_GATE = 0.5

@@ -15,8 +15,6 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.identification.placements import BoardKind
 
-__all__ = ["BOARD_SIDES", "LocatedBoard", "assign_board_ids", "first_corner_turn"]
-
 BOARD_SIDES: Mapping[str, tuple[float, float, float]] = {
     "left": (1.0, 0.0, 0.0),
     "right": (-1.0, 0.0, 0.0),

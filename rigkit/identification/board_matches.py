@@ -18,8 +18,6 @@ from rigkit.geometry.board_pose import board_poses, ray_residuals
 from rigkit.identification.joint_pose import BoardObservation
 from rigkit.identification.placements import BoardKind, Placement, describe, placements, possible_kinds
 
-__all__ = ["BoardMatch", "GridPoses", "ImageObservations", "matches_between"]
-
 GATE_SQUARES = 0.1
 GATE_PX = 2.0
 GATE_SMALL_SQUARES = 0.25

@@ -15,7 +15,7 @@ import numpy as np
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
-from rigkit.core.detections import BoardDetection, common_corners
+from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.truth import MeasuredAngle
 from rigkit.geometry.rigid3 import Rigid3
@@ -26,8 +26,6 @@ from rigkit.identification.joint_pose import BoardObservation, JointPose, refine
 from rigkit.identification.measured_angles import ids_by_angles
 from rigkit.identification.pair_identity import PairIdentity
 from rigkit.identification.placements import BoardKind, Placement, board_kinds, describe, placements
-
-__all__ = ["PairIdentity", "common_corners", "identify_pair"]
 
 LOG_ODDS = float(np.log(1000.0))
 """Odds of a thousand to one decide between two assignments; below, the geometry leaves a tie."""

@@ -15,8 +15,6 @@ from rigkit.geometry.rotation import exp_so3, skew
 from rigkit.optim.damping import Damping, Stop
 from rigkit.optim.levenberg_marquardt import DenseProblem, DenseStep, minimise
 
-__all__ = ["BoardObservation", "JointPose", "refine_joint"]
-
 MAX_JOINT_STEPS = 30
 JOINT_DAMPING = Damping(start=1e-6, floor=1e-9, refused_floor=1e-4, ceiling=1e4)
 

@@ -14,8 +14,6 @@ from rigkit.geometry.rotation import angle_between
 from rigkit.identification.pair_identity import PairIdentity
 from rigkit.identification.placements import board_kinds
 
-__all__ = ["ids_by_angles"]
-
 POSED_SIGMA_DEG = 0.3
 """Largest standard deviation of the angle between two boards as their poses in a pair show it."""
 

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from rigkit.core.detections import BoardDetection
 from rigkit.geometry.rigid3 import Rigid3
 
-__all__ = ["PairIdentity"]
-
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class PairIdentity:

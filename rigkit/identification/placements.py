@@ -15,8 +15,6 @@ from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection, grid_turned
 
-__all__ = ["BoardKind", "Placement", "board_kinds", "describe", "placements", "possible_kinds"]
-
 SAME_SQUARE_REL = 0.03
 """Squares that differ by less are not told apart by their size."""
 

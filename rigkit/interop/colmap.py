@@ -17,8 +17,6 @@ from rigkit.core.errors import DegenerateError
 from rigkit.geometry.relative_pose import relative_pose, relative_pose_covariance
 from rigkit.geometry.rigid3 import Rigid3
 
-__all__ = ["ColmapPair", "ColmapResult", "colmap_pair", "solve_pair"]
-
 HALF_PIXEL = 0.5
 NATIVE = {"pinhole": "PINHOLE", "brown": "FULL_OPENCV", "kannala_brandt": "OPENCV_FISHEYE"}
 """Our model -> COLMAP's with the same equations and order of parameters."""

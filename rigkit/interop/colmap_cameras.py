@@ -12,8 +12,6 @@ from rigkit.core.errors import InputError
 from rigkit.interop.colmap import HALF_PIXEL
 from rigkit.interop.exchange import Accepted, Written, best_accepted, camera_of, image_size
 
-__all__ = ["read_colmap_cameras", "write_colmap_cameras"]
-
 COLMAP_ACCEPTS = (
     Accepted("pinhole"),
     Accepted("brown", 4),

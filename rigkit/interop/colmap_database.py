@@ -13,8 +13,6 @@ from rigkit.core.arrays import Affines, FloatArray, IntArray, Pixels
 from rigkit.core.errors import InputError
 from rigkit.interop.colmap import HALF_PIXEL
 
-__all__ = ["DatabaseMatches", "is_colmap_database", "read_colmap_matches"]
-
 SQLITE = b"SQLite format 3\x00"
 MAX_IMAGES = 2147483647
 """COLMAP's pair_id is this times the smaller image_id, and the larger one."""

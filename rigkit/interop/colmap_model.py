@@ -14,8 +14,6 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.interop.colmap import HALF_PIXEL
 from rigkit.interop.colmap_cameras import write_colmap_cameras
 
-__all__ = ["colmap_model"]
-
 
 def colmap_model(
     cameras: tuple[Camera, Camera],

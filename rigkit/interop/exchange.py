@@ -14,18 +14,6 @@ from rigkit.cameras.registry import camera_model
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 
-__all__ = [
-    "Accepted",
-    "Written",
-    "best_accepted",
-    "camera_of",
-    "field",
-    "image_size",
-    "numbers",
-    "unified_from_xi",
-    "unified_with_xi",
-]
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Accepted:

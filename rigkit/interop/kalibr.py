@@ -26,8 +26,6 @@ from rigkit.interop.exchange import (
 )
 from rigkit.interop.yaml_text import flow, parse_yaml
 
-__all__ = ["KalibrChain", "read_kalibr", "write_kalibr"]
-
 KALIBR_ACCEPTS = (
     Accepted("pinhole"),
     Accepted("brown", 4),

@@ -22,8 +22,6 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
 from rigkit.interop.exchange import Accepted, Written, best_accepted, camera_of, field, image_size, numbers
 
-__all__ = ["read_cameramodel", "write_cameramodel"]
-
 MRCAL_ACCEPTS = (Accepted("pinhole"), Accepted("brown", 4), Accepted("brown", 5), Accepted("brown", 8))
 SPLINED = re.compile(
     r"^LENSMODEL_SPLINED_STEREOGRAPHIC_(?:spline_)?order=(?P<order>\d)_Nx=(?P<nx>\d{1,4})_Ny=(?P<ny>\d{1,4})_fov_x_deg=(?P<fov>\d{1,3})$"

@@ -17,8 +17,6 @@ from rigkit.core.arrays import FloatArray, Mat3
 from rigkit.core.errors import InputError
 from rigkit.interop.exchange import Accepted, Chosen, Written, best_accepted, image_size, numbers
 
-__all__ = ["read_ocamcalib", "read_py_ocamcalib", "write_ocamcalib"]
-
 ENOUGH_PX = 0.02
 """A polynomial of a higher degree is taken only where the lower one is off by more."""
 INVERSE_ENOUGH_PX = 1e-3

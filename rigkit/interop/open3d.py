@@ -11,8 +11,6 @@ from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Normals, Points, as_
 from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import DegenerateError
 
-__all__ = ["Mesh", "mean_and_covariance", "plane_inliers", "poisson_mesh", "to_open3d"]
-
 
 def to_open3d(cloud: OrientedCloud) -> Any:
     """Return an `open3d.geometry.PointCloud` with points (mm), normals and colours."""

@@ -25,15 +25,6 @@ from rigkit.interop.exchange import (
 )
 from rigkit.interop.yaml_text import parse_yaml
 
-__all__ = [
-    "camera_from_arrays",
-    "opencv_arrays",
-    "opencv_matrix",
-    "read_opencv",
-    "read_opencv_matrix",
-    "write_opencv",
-]
-
 OPENCV_ACCEPTS = (
     Accepted("pinhole"),
     Accepted("brown", 4),

@@ -22,8 +22,6 @@ from rigkit.interop.exchange import Accepted, Chosen, best_accepted, field, imag
 from rigkit.interop.opencv import camera_from_arrays, opencv_arrays, opencv_matrix, read_opencv_matrix
 from rigkit.interop.yaml_text import parse_yaml
 
-__all__ = ["OpenCVStereo", "opencv_stereo", "read_opencv_stereo"]
-
 FAMILIES = (
     (Accepted("pinhole"), Accepted("brown", 4), Accepted("brown", 5), Accepted("brown", 8)),
     (Accepted("kannala_brandt"),),

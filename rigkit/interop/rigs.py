@@ -17,8 +17,6 @@ from rigkit.interop.mrcal import write_cameramodel
 from rigkit.interop.opencv_stereo import opencv_stereo
 from rigkit.interop.ros import write_camera_info
 
-__all__ = ["RIG_FORMATS", "ForeignRig", "Rig", "RigFormat", "write_rig"]
-
 Rig = Mapping[str, tuple[Camera, Rigid3]]
 """Camera and cam_from_rig (mm) by name."""
 MM_PER_M = 1000.0

@@ -14,8 +14,6 @@ from rigkit.core.errors import InputError
 from rigkit.interop.exchange import Accepted, Written, best_accepted, camera_of, field, image_size, numbers
 from rigkit.interop.yaml_text import flow, parse_yaml
 
-__all__ = ["Rectification", "read_camera_info", "write_camera_info"]
-
 Rectification = tuple[Mat3, FloatArray]
 """Rotation from the camera into the rectified view (3, 3), and the rectified view's projection matrix (3, 4), whose
 last column is in pixels times metres."""

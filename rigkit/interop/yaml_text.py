@@ -13,8 +13,6 @@ from typing import Any
 
 from rigkit.core.errors import InputError
 
-__all__ = ["flow", "parse_yaml"]
-
 MAX_CHARACTERS = 1_000_000
 """A camchain has two thousand; OpenCV's own samples write all corners of all views into the file."""
 MAX_DEPTH = 20

@@ -6,8 +6,6 @@ data. WebP: ANMF chunks in the RIFF container.
 
 from __future__ import annotations
 
-__all__ = ["frame_count"]
-
 GIF_STARTS = (b"GIF87a", b"GIF89a")
 PNG_START = b"\x89PNG\r\n\x1a\n"
 GIF_EXTENSION, GIF_IMAGE, GIF_END = 0x21, 0x2C, 0x3B

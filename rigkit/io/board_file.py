@@ -48,8 +48,6 @@ from rigkit.core.patterns.registry import PATTERNS
 from rigkit.io.foreign_boards import foreign_board
 from rigkit.io.toml_reader import TomlTable, read_toml
 
-__all__ = ["BOARD_SCHEMA", "board_from_table", "board_text", "load_board", "load_layout"]
-
 BOARD_SCHEMA = "rigkit.board/1"
 MAX_CORNERS = 1000
 """Along one side: no image resolves more."""

@@ -14,8 +14,6 @@ from rigkit.io.board_file import board_from_table, load_board
 from rigkit.io.foreign_boards import FOREIGN_SUFFIXES
 from rigkit.io.toml_reader import TomlTable
 
-__all__ = ["WORDS_HELP", "board_in_words", "board_of_words", "words_of_board"]
-
 BOARD_WORDS = re.compile(
     r"^(?:(?P<type>[a-z]+):)?(?P<columns>\d{1,4})[xX](?P<rows>\d{1,4})"
     r"(?:[xX]|, ?)(?P<mm>\d{1,4}(?:\.\d{1,4})?)(?: ?mm)?(?P<keys>(?:,\w+=[\w.+-]+)*)$"

@@ -28,23 +28,6 @@ from rigkit.io.json_reader import read_json, real, whole
 from rigkit.io.reading import usable_path
 from rigkit.io.schema_calibration import CALIBRATION_FILE, keys_of
 
-__all__ = [
-    "CALIBRATION_SCHEMA",
-    "Made",
-    "calibration_text",
-    "camera_from_json",
-    "camera_to_json",
-    "damage_named",
-    "findings_from_json",
-    "findings_to_json",
-    "is_calibration",
-    "load_calibration",
-    "load_camera",
-    "refuse_mirrored",
-    "save_calibration",
-    "save_camera",
-]
-
 CALIBRATION_SCHEMA = "rigkit.calibration/1"
 CAMERA_KEYS = keys_of(CALIBRATION_FILE, "camera")
 CALIBRATION_KEYS = keys_of(CALIBRATION_FILE)

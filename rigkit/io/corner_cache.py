@@ -26,8 +26,6 @@ from rigkit.io.json_reader import parse_json
 from rigkit.io.reading import read_bytes, read_text
 from rigkit.io.sources import source_hash
 
-__all__ = ["CornerCache", "FoundCorners", "image_hash", "kept_corners", "lens_key"]
-
 CORNERS_SCHEMA = "rigkit.corners/2"
 MARK = re.compile(rb'^\s*\{\s*"schema":\s*"rigkit\.corners/')
 """How such a file begins, of any version, even if the rest of it is damaged."""

@@ -25,8 +25,6 @@ from rigkit.io.files import write_atomic
 from rigkit.io.json_reader import parse_json
 from rigkit.io.reading import csv_rows, read_text
 
-__all__ = ["COLUMNS", "corners_text", "read_corners", "write_corners"]
-
 COLUMNS = ("image", "board", "column", "row", "u_px", "v_px", "sigma_px")
 
 LEVEL_0_SIGMA_PX = 0.1

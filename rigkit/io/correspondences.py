@@ -36,8 +36,6 @@ from rigkit.io.matcher_arrays import from_matcher
 from rigkit.io.numbers import MAX_NUMBER
 from rigkit.io.reading import csv_rows, read_bytes
 
-__all__ = ["correspondences_text", "read_correspondences", "write_correspondences"]
-
 POINT_COLUMNS = ("u1_px", "v1_px", "u2_px", "v2_px")
 AFFINE = ("a11", "a12", "a21", "a22")
 SIGMA_COLUMNS = ("sigma_px", "sigma_A")

@@ -11,8 +11,6 @@ from pathlib import Path
 from rigkit.core.errors import InputError
 from rigkit.io.reading import usable_path
 
-__all__ = ["FORCE", "ensure_folder_writable", "ensure_writable", "write_atomic", "write_together"]
-
 FORCE = "use --force (force=True in Python)"
 """What replaces files."""
 

@@ -13,8 +13,6 @@ from rigkit.core.errors import InputError
 from rigkit.interop.yaml_text import parse_yaml
 from rigkit.io.reading import read_text
 
-__all__ = ["FOREIGN_SUFFIXES", "foreign_board"]
-
 FOREIGN_SUFFIXES = (".yaml", ".yml", ".xml")
 """Of files that are no board files of rigkit's."""
 

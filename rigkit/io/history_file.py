@@ -18,8 +18,6 @@ from rigkit.io.json_reader import parse_json, real, whole
 from rigkit.io.reading import read_text
 from rigkit.validation.sentinel.judge import SentinelCheck
 
-__all__ = ["HISTORY_SCHEMA", "HistoryEntry", "add_entry", "ensure_register", "load_history"]
-
 HISTORY_SCHEMA = "rigkit.history/1"
 
 

@@ -12,8 +12,6 @@ from collections.abc import Callable
 
 from rigkit.io.tiff import page_sizes
 
-__all__ = ["announced_size"]
-
 Size = tuple[int, int]
 
 JPEG_SEGMENT = re.compile(rb"\xff([\x01-\xfe])")

@@ -23,8 +23,6 @@ from rigkit.io.image_size import announced_size
 from rigkit.io.reading import read_bytes
 from rigkit.io.tiff import as_stored, page_count
 
-__all__ = ["MAX_PIXELS", "Image", "quiet_opencv", "read_image", "require_pixels", "to_grey", "unread_format"]
-
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 """(H, W) grey or (H, W, 3) red green blue."""
 

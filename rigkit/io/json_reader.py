@@ -12,8 +12,6 @@ from rigkit.core.errors import InputError
 from rigkit.io.numbers import MAX_NUMBER
 from rigkit.io.reading import read_text
 
-__all__ = ["json_schema", "parse_json", "read_json", "real", "whole"]
-
 MAX_JSON_DIGITS = 18
 """Of a whole number: what 64 bits hold."""
 

@@ -20,8 +20,6 @@ from rigkit.io.toml_reader import TomlTable, read_toml
 from rigkit.io.truth_csv import load_truth_csv
 from rigkit.io.truth_file import truth_from_table
 
-__all__ = ["DATASET_SCHEMA", "CameraEntry", "Dataset", "Pair", "load_dataset"]
-
 DATASET_SCHEMA = "rigkit.dataset/1"
 MANIFEST = "dataset.toml"
 SESSION = "session.toml"

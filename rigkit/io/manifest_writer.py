@@ -14,8 +14,6 @@ from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
 from rigkit.io.manifest import DATASET_SCHEMA
 
-__all__ = ["FoundPair", "ImageBoards", "board_sizes", "find_images", "group_pairs", "manifest_text"]
-
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"}
 
 SIDES = (

@@ -12,8 +12,6 @@ import numpy as np
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.errors import InputError
 
-__all__ = ["from_matcher"]
-
 POINTS = (("mkpts0", "mkpts1"), ("kpts0", "kpts1"), ("keypoints0", "keypoints1"), ("lafs0", "lafs1"))
 
 

@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from rigkit.core.arrays import Normals, Points
 
-__all__ = ["mesh_bytes"]
-
 
 def mesh_bytes(points: Points, normals: Normals, colours: NDArray[np.uint8], triangles: NDArray[np.int32]) -> bytes:
     """Return the PLY of vertices (V, 3) with normals and colours, single precision, and triangles (T, 3)."""

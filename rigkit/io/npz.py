@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from rigkit.reconstruction.reconstruct import Reconstruction
 
-__all__ = ["cloud_npz", "npz_bytes"]
-
 
 def cloud_npz(reconstruction: Reconstruction) -> bytes:
     """Return an npz file: points, normals, sigmas, corners, affinities and the relative pose, units in the names."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["MAX_NUMBER", "MIN_POSITIVE", "fault_of_number"]
-
 MAX_NUMBER = 1e9
 """A thousand kilometres in mm."""
 MIN_POSITIVE = 1e-9

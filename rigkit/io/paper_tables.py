@@ -10,8 +10,6 @@ from rigkit.core.errors import InputError
 from rigkit.io.reading import read_text
 from rigkit.validation.tables import PaperTables
 
-__all__ = ["load_paper_tables"]
-
 PLANES_FILE = "planes.csv"
 BASELINES = "baselines.csv"
 

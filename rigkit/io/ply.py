@@ -18,8 +18,6 @@ from rigkit.core.errors import InputError
 from rigkit.io.files import write_atomic
 from rigkit.io.reading import read_bytes
 
-__all__ = ["ply_bytes", "read_ply", "write_ply"]
-
 PLY_TYPES = {
     "char": "i1",
     "int8": "i1",

@@ -42,8 +42,6 @@ from rigkit.core.errors import InputError
 from rigkit.io.board_file import board_from_table
 from rigkit.io.toml_reader import TomlTable, read_toml
 
-__all__ = ["PUBLIC_SCHEMA", "PublicMeasurement", "PublicSet", "load_public_set"]
-
 PUBLIC_SCHEMA = "rigkit.public/1"
 MEASURED_UNITS = ("mm", "deg", "px")
 URL = re.compile(r"^(https?|file)://\S+$")

@@ -12,8 +12,6 @@ from pathlib import Path
 
 from rigkit.core.errors import InputError, InstallationError, RigkitError
 
-__all__ = ["MAX_BINARY_BYTES", "MAX_TEXT_BYTES", "about", "csv_rows", "read_bytes", "read_text", "usable_path"]
-
 MAX_TEXT_BYTES = 64_000_000
 """The corners of ten thousand images."""
 MAX_BINARY_BYTES = 1_000_000_000

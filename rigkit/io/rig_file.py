@@ -25,9 +25,6 @@ from rigkit.io.calibration_file import Made, camera_from_json, camera_to_json, d
 from rigkit.io.json_reader import json_schema, read_json, real, whole
 from rigkit.io.schema_calibration import BOARD_RIG_FILE, RIG_FILE, keys_of
 
-__all__ = ["BOARDS_SCHEMA", "RIG_SCHEMA", "SavedRig", "board_rigs_text", "is_rig_file", "load_board_rigs", "load_rig"]
-__all__ += ["load_saved_rig", "rig_text"]
-
 RIG_SCHEMA = "rigkit.rig/1"
 BOARDS_SCHEMA = "rigkit.board_rig/1"
 RIG_KEYS = keys_of(RIG_FILE)

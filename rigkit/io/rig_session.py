@@ -54,17 +54,6 @@ from rigkit.io.session import SESSION_SCHEMA, Session, beside_session, boards_of
 from rigkit.io.toml_reader import TomlTable, read_toml
 from rigkit.io.truth_file import truth_from_table
 
-__all__ = [
-    "FRAMES",
-    "ONE",
-    "MeasuredBaseline",
-    "RigSession",
-    "RigidBoards",
-    "frames_of_images",
-    "is_rig_session",
-    "load_rig_session",
-]
-
 FRAMES = ("name", "number", "order")
 HINT_ID = 'id = "left"'
 HINT_RIGID = 'boards = ["left", "floor", "right"]'

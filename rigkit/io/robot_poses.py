@@ -21,8 +21,6 @@ from rigkit.geometry.rotation import exp_so3
 from rigkit.io.numbers import MAX_NUMBER
 from rigkit.io.reading import csv_rows
 
-__all__ = ["read_robot_poses"]
-
 LENGTHS = {"mm": 1.0, "m": 1000.0}
 TURNS = {"rad": 1.0, "deg": np.pi / 180.0}
 QUATERNION = ("qx", "qy", "qz", "qw")

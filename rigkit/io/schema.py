@@ -9,13 +9,11 @@ from rigkit.core.errors import InputError
 from rigkit.io import schema_calibration, schema_results, schema_toml
 from rigkit.io.schema_words import ANY_OF, Schema
 
-__all__ = ["SCHEMAS", "key_rows", "schema_named", "schema_text"]
-
 SCHEMAS: dict[str, Schema] = {
     str(schema["properties"]["schema"]["const"]).removeprefix("rigkit.").partition("/")[0]: schema
     for module in (schema_toml, schema_calibration, schema_results)
-    for schema in (getattr(module, name) for name in module.__all__)
-    if isinstance(schema, dict)
+    for name, schema in sorted(vars(module).items())
+    if name.endswith("_FILE")
 }
 """By name, such as "session" or "calibration"."""
 _KIND_WORDS = {"string": "text", "object": "table", "boolean": "true or false", "integer": "whole number"}

@@ -27,8 +27,6 @@ from rigkit.io.schema_words import (
     table,
 )
 
-__all__ = ["BOARD_RIG_FILE", "CALIBRATION_FILE", "CORNERS_FILE", "RIG_FILE", "keys_of"]
-
 _POSE = said(matrix(3, 4), "3 x 4, rotation and translation (mm)")
 _CAMERA = obj(
     {

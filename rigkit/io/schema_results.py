@@ -28,16 +28,6 @@ from rigkit.validation.check import Check
 from rigkit.validation.checks import AngleResult, ValidationReport
 from rigkit.validation.planes import NormalErrors
 
-__all__ = [
-    "CERTIFICATE_FILE",
-    "CROSSCHECK_FILE",
-    "HAND_EYE_FILE",
-    "HISTORY_FILE",
-    "STUDY_RESULT_FILE",
-    "TABLES_FILE",
-    "VALIDATION_FILE",
-]
-
 _VALUE = nullable(NUMBER)
 _CHECKS = said(array(of_dataclass(Check)), "every quantity measured beside ours")
 _ANGLE = of_dataclass(AngleResult)

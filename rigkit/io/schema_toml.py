@@ -33,8 +33,6 @@ from rigkit.io.schema_words import (
 from rigkit.study.study import NOISE_KINDS
 from rigkit.synthetic.noise import NoisyImages
 
-__all__ = ["BOARD_FILE", "DATASET_FILE", "PUBLIC_FILE", "SESSION_FILE", "STUDY_FILE"]
-
 _COUNT: Schema = {"type": "integer", "minimum": 1}
 _SIZE_WORDS = tuple(dict.fromkeys(pattern.size_word for pattern in PATTERNS.values()))
 

@@ -9,9 +9,6 @@ from collections.abc import Mapping, Sequence
 from inspect import cleandoc
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-__all__ = ["ANY_OF", "array", "choice", "file", "matrix", "nullable", "obj", "of_dataclass", "optional"]
-__all__ += ["BOOLEAN", "INTEGER", "NUMBER", "POSITIVE", "TEXT", "Schema", "row", "rows", "said", "table"]
-
 Schema = dict[str, Any]
 ANY_OF = "anyOf"
 TEXT: Schema = {"type": "string"}

@@ -26,17 +26,6 @@ from rigkit.core.printing import brief
 from rigkit.io.board_file import load_board
 from rigkit.io.toml_reader import TomlTable, named_path, read_toml
 
-__all__ = [
-    "SESSION_SCHEMA",
-    "Session",
-    "beside_session",
-    "boards_of",
-    "files_of_session",
-    "images_of",
-    "load_session",
-    "options_of",
-]
-
 SESSION_SCHEMA = "rigkit.session/1"
 HINT_BOARD = 'board = "board.toml" (or boards = ["a.toml", "b.toml"])'
 

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import rigkit
 
-__all__ = ["source_hash"]
-
 SOURCE_SUFFIXES = {".py", ".c", ".h"}
 
 

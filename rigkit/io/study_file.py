@@ -13,8 +13,6 @@ from rigkit.study.study import NOISE_KINDS, Claim, Study, Variant
 from rigkit.study.table import CELL_KEYS
 from rigkit.synthetic.noise import NoisyImages
 
-__all__ = ["STUDY_SCHEMA", "load_study"]
-
 STUDY_SCHEMA = "rigkit.study/1"
 KNOWN_POSE_TYPES = tuple(str(p) for p in PoseType if p is not PoseType.AUTO)
 

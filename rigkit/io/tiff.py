@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
-__all__ = ["as_stored", "page_count", "page_sizes"]
-
 NEW_SUBFILE_TYPE, WIDTH, HEIGHT, ORIENTATION = 254, 256, 257, 274
 REDUCED_OR_MASK = 1 | 4
 """Bits of NewSubfileType: a smaller copy of another page, or its transparency."""

@@ -18,9 +18,6 @@ from rigkit.core.identifiers import check_identifier
 from rigkit.io.numbers import fault_of_number
 from rigkit.io.reading import read_text, usable_path
 
-__all__ = ["TomlTable", "named_path", "read_toml"]
-
-
 MAX_TOML_BYTES = 4_000_000
 """People write these files; the reader takes a second for each million."""
 MAX_INTEGER = 10**12

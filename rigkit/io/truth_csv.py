@@ -24,8 +24,6 @@ from rigkit.io.numbers import fault_of_number
 from rigkit.io.reading import csv_rows, read_text
 from rigkit.io.truth_file import make_angle, make_distance
 
-__all__ = ["load_truth_csv"]
-
 TO_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 TO_DEG = {"deg": 1.0}
 PLAIN = ("pair", "quantity", "a", "b", "how")

@@ -9,8 +9,6 @@ from rigkit.core.errors import InputError
 from rigkit.core.truth import Feature, MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
 from rigkit.io.toml_reader import TomlTable
 
-__all__ = ["truth_from_table"]
-
 HINT_BASELINE = 'baseline = { value_mm = 300.0, sigma_mm = 2.0, how = "steel rule" }'
 HINT_ANGLES = 'angles = [ { a = "plane1", b = "plane2", value_deg = 90.0, sigma_deg = 0.3, how = "set square" } ]'
 HINT_DISTANCES = (

@@ -19,8 +19,6 @@ from rigkit.core.errors import InputError
 from rigkit.io.images import Image, quiet_opencv, require_pixels
 from rigkit.io.reading import csv_rows
 
-__all__ = ["VIDEO_ENDINGS", "Video", "is_video", "read_timestamps"]
-
 _log = logging.getLogger(__name__)
 
 VIDEO_ENDINGS = frozenset({".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv"})

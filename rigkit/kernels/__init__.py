@@ -16,8 +16,6 @@ from typing import Any
 from rigkit.core.errors import InstallationError
 from rigkit.kernels.building import library_name, mismatch, source_hash
 
-__all__ = ["Kernels", "about", "kernels"]
-
 FOLDER = Path(__file__).parent
 
 

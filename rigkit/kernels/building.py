@@ -10,8 +10,6 @@ import json
 import sys
 from pathlib import Path
 
-__all__ = ["FLAGS", "library_name", "mismatch", "source_hash", "sources", "write_record"]
-
 FLAGS = (
     *("-O3", "-std=c11", "-g0", "-fvisibility=hidden", "-Wall", "-Wno-unknown-pragmas"),
     # Nothing here reads errno or the flags of floating-point exceptions.

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from rigkit.kernels.declarations import SCALARS, Declaration, header
 
-__all__ = ["Kernel", "Struct", "address", "structure"]
-
 STRUCTURES: dict[str, type[Struct]] = {}
 """By their names in api.h; a structure stands there before those that it is part of."""
 

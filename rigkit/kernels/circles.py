@@ -10,8 +10,6 @@ from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header
 
-__all__ = ["CircleRules", "fit_circles"]
-
 CIRCLE_OUTCOMES, SPOT = (header().constants[name] for name in ("CIRCLE_OUTCOMES", "SPOT"))
 
 

@@ -14,8 +14,6 @@ from types import CodeType
 
 import numpy as np
 
-__all__ = ["Array", "Declaration", "Header", "header"]
-
 SCALARS: dict[str, type[ctypes.c_int64] | type[ctypes.c_double] | type[ctypes.c_float]] = {
     "int64_t": ctypes.c_int64,
     "double": ctypes.c_double,

@@ -10,8 +10,6 @@ from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header
 
-__all__ = ["LAGS", "OUTCOMES", "BendRules", "Rules", "fit_corners", "line_bends"]
-
 LAG, OUTCOMES = (header().constants[name] for name in ("LAG", "OUTCOMES"))
 
 LAGS = tuple((-up, right) for up in range(LAG + 1) for right in range(-LAG, LAG + 1) if up or right >= 0)

@@ -10,8 +10,6 @@ from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header
 
-__all__ = ["LinkRules", "RingRules", "corners", "links", "near_any", "peaks", "shrunk", "smoothed", "typical"]
-
 STRIP, HALF = (header().constants[name] for name in ("STRIP", "HALF"))
 
 WHOLE = 16.0

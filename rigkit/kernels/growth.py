@@ -12,8 +12,6 @@ from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header
 from rigkit.kernels.front import ImageOf, RingRules
 
-__all__ = ["FitRules", "GrowthRules", "Squares", "components_of", "fit", "grown"]
-
 FIT_COLUMNS = header().constants["FIT_COLUMNS"]
 
 

@@ -12,8 +12,6 @@ from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.front import ImageOf
 
-__all__ = ["ScatterRules", "excess_scatter", "shifts_of_edges", "uneven_steps"]
-
 ROOM_FOR_SCATTER = 7
 """Numbers that lattice.c keeps for each corner."""
 

@@ -8,8 +8,6 @@ from rigkit.core.arrays import FloatArray, Mat3
 from rigkit.kernels import kernels
 from rigkit.kernels.declarations import header
 
-__all__ = ["five_rows", "six_rows"]
-
 MOST_ROOTS = header().constants["MOST_ROOTS"]
 
 

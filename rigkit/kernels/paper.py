@@ -9,8 +9,6 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, structure
 
-__all__ = ["PaperRules", "find_paper"]
-
 
 @structure("paper_rules_t")
 class PaperRules(Struct):

@@ -14,8 +14,6 @@ from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header
 from rigkit.kernels.front import ImageOf
 
-__all__ = ["EpipolarKnowledge", "PatchRules", "PatchTable", "Pyramid", "aligned", "grown", "starts_of"]
-
 MOST_LEVELS = header().constants["MOST_LEVELS"]
 PATCH_COLUMNS = header().constants["PATCH_COLUMNS"]
 UPPER = np.triu_indices(6)

@@ -8,8 +8,6 @@ from rigkit.core.arrays import FloatArray
 from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, structure
 
-__all__ = ["fitted_planes"]
-
 
 @structure("plane_grid_t")
 class _PlaneGrid(Struct):

@@ -9,8 +9,6 @@ from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header
 
-__all__ = ["improve", "minimise", "qualities", "qualities_ahead", "residuals"]
-
 NO_MEMORY = header().constants["NO_MEMORY"]
 
 

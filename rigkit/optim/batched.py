@@ -10,8 +10,6 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.optim.damping import Damping, Stop
 
-__all__ = ["BatchedProblem", "minimise_each"]
-
 State = tuple[FloatArray, ...]
 """Arrays whose first axis is that of the problems."""
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
-__all__ = ["Damping", "Stop", "StopReason"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Damping:

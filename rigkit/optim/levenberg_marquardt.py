@@ -18,8 +18,6 @@ import numpy as np
 from rigkit.core.arrays import FloatArray
 from rigkit.optim.damping import Damping, Stop, StopReason
 
-__all__ = ["DenseProblem", "DenseStep", "LinearisedProblem", "Minimum", "Step", "damped_step", "minimise"]
-
 
 class Step(Protocol):
     """A proposed step."""

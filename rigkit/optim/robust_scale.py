@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["MEDIAN_OF_CHI_SQUARE_3", "MEDIAN_OF_NORMAL", "MEDIAN_OF_RAYLEIGH", "SIGMA_OF_MEDIAN"]
-
 MEDIAN_OF_NORMAL = 0.6745
 """Median of |x| of a Gaussian x of standard deviation 1, to four digits."""
 SIGMA_OF_MEDIAN = 1.4826

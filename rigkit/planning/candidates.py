@@ -13,8 +13,6 @@ from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rotation import exp_so3, unit
 from rigkit.planning.information import HeldBoards
 
-__all__ = ["Reach", "held_boards", "outline_mm"]
-
 DRAWN, KEPT = 2400, 900
 """Poses tried, and so many at the most of those that can be held: both fill place, tilt and size evenly."""
 TILT_DEG = (15.0, 60.0)

@@ -12,8 +12,6 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import FloatArray, Pixels, Rays
 
-__all__ = ["GOAL_GRID", "Goal", "projection_goal", "rays_within", "turned_design"]
-
 GOAL_GRID = (24, 18)
 """Columns and rows of the pixels that the goal averages over."""
 

@@ -8,8 +8,6 @@ from rigkit.cameras.base import Camera, RadialCurve, image_center
 from rigkit.cameras.registry import camera_model
 from rigkit.core.errors import InputError
 
-__all__ = ["guessed_camera"]
-
 PERSPECTIVE_DEG = 100.0
 """Lenses that see less across the image's width mostly draw straight lines straight; wider ones are fisheyes."""
 SAMPLES = 64

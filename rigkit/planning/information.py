@@ -27,9 +27,6 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
 from rigkit.core.boards import Board
 from rigkit.geometry.rigid3 import Rigid3
 
-__all__ = ["CornerError", "HeldBoards", "Knowledge", "board_of_shape", "lens_prior", "pose_information"]
-__all__ += ["view_information"]
-
 LENS_UNKNOWN = 0.1
 """A lens that is only guessed shows things this part of half the image's diagonal from where it is thought to."""
 PRIOR_GRID = (12, 9)

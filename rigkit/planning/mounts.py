@@ -16,8 +16,6 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3, skew
 from rigkit.planning.information import CornerError, HeldBoards, pose_information
 
-__all__ = ["SharedViews", "mean_motion", "mount_error_px", "mount_information"]
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SharedViews:

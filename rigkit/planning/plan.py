@@ -15,8 +15,6 @@ from rigkit.planning.candidates import Reach, held_boards
 from rigkit.planning.goal import Goal
 from rigkit.planning.information import Knowledge
 
-__all__ = ["Plan", "Proposal", "choose_views", "covariance_of", "exchanged_views", "plan_views"]
-
 NEARLY = 0.03
 """Of views whose gain is within this part of the best one's, the one nearest to the last pose is taken."""
 

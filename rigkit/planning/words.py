@@ -14,8 +14,6 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import unit
 from rigkit.planning.candidates import outline_mm
 
-__all__ = ["BoardInView", "placement"]
-
 MIDDLE_THIRD = (0.38, 0.62)
 FACING_DEG = 8.0
 NEARER_SIDES = ("right side", "lower right corner", "lower side", "lower left corner", "left side", "upper left corner",

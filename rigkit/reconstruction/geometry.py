@@ -26,8 +26,6 @@ from rigkit.relative_pose.solvers.registry import fundamental_for
 if TYPE_CHECKING:
     from rigkit.reconstruction.pairing import MatchedPair
 
-__all__ = ["PairGeometry", "PoseTypeDecision", "decide_pose_type", "pair_geometry"]
-
 MAX_BASELINE_SIGMA = 0.2
 """A baseline known to no better than a fifth of itself is no baseline: whatever is built on it is noise."""
 

@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from rigkit.reconstruction.geometry import PairGeometry
     from rigkit.reconstruction.pairing import MatchedPair
 
-__all__ = ["LatticePlanes", "lattice_planes"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LatticePlanes:

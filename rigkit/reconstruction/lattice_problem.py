@@ -12,16 +12,6 @@ from rigkit.geometry.board_pose import point_residuals
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, skew
 
-__all__ = [
-    "MIN_CORNERS_OF_BOARD",
-    "LatticeView",
-    "PlacedLattices",
-    "all_residuals",
-    "fit_without_outliers",
-    "free_parameters",
-    "residuals_of",
-]
-
 MIN_CORNERS_OF_BOARD = 8
 """A board with fewer corners in a view has no pose there worth the name."""
 GROSS = 8.0

@@ -17,8 +17,6 @@ from rigkit.geometry.triangulation import point_covariances, triangulate_rays
 from rigkit.reconstruction.scale import scale_and_gradient
 from rigkit.relative_pose.solvers.pose import translation_basis
 
-__all__ = ["MetricPose", "TriangulatedPoints", "metric_pose", "triangulate_matches"]
-
 POSE_STEP_RAD = 1e-5
 """For central differences: far above rounding, far below where the scale bends."""
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["variance_factor"]
-
 STATED_RESIDUALS = 2.0
 """The stated sigmas count as much as one more corner in one image: a unit-information prior (Kass and Wasserman, J. Am.
 Stat. Assoc. 90, 1995) on the variance, conjugate as a scaled inverse chi-square. A handful of residuals that happen to

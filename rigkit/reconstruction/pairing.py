@@ -23,8 +23,6 @@ from rigkit.core.truth import MeasuredAngle
 from rigkit.identification.identify import identify_pair
 from rigkit.identification.pair_identity import PairIdentity
 
-__all__ = ["Chain", "MatchedPair", "match_pair"]
-
 Chain = Literal["raw", "rectified"]
 
 MAX_RECTIFIED_RAD = np.deg2rad(75.0)

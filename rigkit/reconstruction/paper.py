@@ -31,8 +31,6 @@ from rigkit.reconstruction.scale import metric_scale
 from rigkit.relative_pose.solvers.pose import choose_pose
 from rigkit.relative_pose.solvers.registry import fundamental_for
 
-__all__ = ["MOTIONS", "OWN_MOTIONS", "reconstruct_as_paper"]
-
 MOTIONS: Mapping[PoseType, str] = {
     PoseType.GENERAL: "general",
     PoseType.PLANAR: "planar",

@@ -36,17 +36,6 @@ from rigkit.relative_pose.solvers.pose import essential_from_pose
 if TYPE_CHECKING:
     from rigkit.reconstruction.pairing import MatchedPair
 
-__all__ = [
-    "PLANE_CHOICES",
-    "Planes",
-    "Reconstruction",
-    "colours_at",
-    "on_lattice",
-    "oriented_cloud",
-    "reconstruct_from",
-    "reconstruct_pair",
-]
-
 GREY = 160
 Planes = Literal["free", "lattice"]
 """What points and normals of a cloud are: each by itself, or those of the boards' known lattices."""

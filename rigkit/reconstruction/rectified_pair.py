@@ -10,8 +10,6 @@ from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.relative_pose.refinement.select import pose_type_evidence
 
-__all__ = ["RECTIFIED_NOTE", "are_rectified", "seen_as_rectified"]
-
 SAME_ROW = 1e-9
 """Tangents of rows of two rectified images agree to rounding: they are computed, not measured."""
 PIXELS_A_SIDE = 9

@@ -17,8 +17,6 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import exp_so3, nearest_rotation, skew
 from rigkit.optim.robust_scale import MEDIAN_OF_CHI_SQUARE_3
 
-__all__ = ["board_scales", "metric_scale", "scale_and_gradient"]
-
 MIN_CORNERS_FOR_SCALE = 4
 OUTLIER_SQUARE = 14.2
 """Squared distance in sigmas (three components) from which a corner loses weight: one in 400 Gaussian ones does."""

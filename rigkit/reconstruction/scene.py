@@ -31,8 +31,6 @@ from rigkit.reconstruction.scene_pose import MIN_MATCHES, KnownPose, ScenePose, 
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 from rigkit.relative_pose.solvers.weights import usable_affinities
 
-__all__ = ["MAX_RANGE_SIGMA", "SceneReconstruction", "in_unit", "reconstruct_scene"]
-
 MAX_RANGE_SIGMA = 0.3
 """A point whose distance is known no better than this share of it is left out: it could be anywhere along its ray."""
 

@@ -16,15 +16,14 @@ from rigkit.geometry.sampson import sampson_distances
 from rigkit.optim.robust_scale import MEDIAN_OF_NORMAL, MEDIAN_OF_RAYLEIGH
 from rigkit.reconstruction.geometry import decide_pose_type
 from rigkit.relative_pose.refinement.marginal import QUANTILE, marginal_quality
-from rigkit.relative_pose.refinement.refine import RefinedPose, cauchy_weights, refine_pose
+from rigkit.relative_pose.refinement.pose_problem import cauchy_weights
+from rigkit.relative_pose.refinement.refine import RefinedPose, refine_pose
 from rigkit.relative_pose.robust.a_contrario import log_false_alarms
 from rigkit.relative_pose.robust.robust import RobustPose, Sample, robust_pose
 from rigkit.relative_pose.solvers.estimate import check_baseline
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 from rigkit.relative_pose.solvers.registry import fundamental_for
 from rigkit.relative_pose.solvers.weights import affinity_distances, affinity_residuals, usable_affinities
-
-__all__ = ["MIN_MATCHES", "KnownPose", "ScenePose", "fit_scene_pose", "known_scene_pose"]
 
 MIN_MATCHES = 8
 """Fewer that agree are chance among many that do not."""

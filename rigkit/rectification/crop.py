@@ -11,8 +11,6 @@ from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import DegenerateError
 from rigkit.rectification.rectify import RectifyMap
 
-__all__ = ["cropped", "largest_rectangle"]
-
 COARSE = 300
 """The rectangle is found on so many cells a side that are seen as a whole, then grown by pixels."""
 

@@ -17,8 +17,6 @@ from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import InputError
 
-__all__ = ["Cylindrical", "EpipolarCylindrical", "EpipolarEquirectangular", "Equirectangular", "Panorama"]
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Panorama(Camera):

@@ -15,8 +15,6 @@ from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Pixels, as_array
 from rigkit.core.errors import InputError
 from rigkit.geometry.rotation import nearest_rotation
 
-__all__ = ["Interpolation", "RectifyMap", "rectify_map", "rotation_from_view_angles"]
-
 Interpolation = Literal["spline", "lanczos", "linear", "nearest"]
 
 ROTATION_INPUT_TOLERANCE = 1e-6

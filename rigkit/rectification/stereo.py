@@ -21,8 +21,6 @@ from rigkit.geometry.rotation import angle_between, unit
 from rigkit.rectification.panorama import EpipolarCylindrical, EpipolarEquirectangular
 from rigkit.rectification.rectify import RectifyMap, rectify_map
 
-__all__ = ["StereoProjection", "StereoRectification", "rectify_pair"]
-
 StereoProjection = Literal["perspective", "cylindrical", "equirectangular"]
 
 _TARGETS: dict[str, type[Camera]] = {

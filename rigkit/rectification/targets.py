@@ -11,8 +11,6 @@ from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.errors import InputError
 from rigkit.rectification.panorama import Cylindrical, Equirectangular
 
-__all__ = ["PROJECTIONS", "Projection", "field_across", "target_camera"]
-
 Projection = Literal["perspective", "cylindrical", "equirectangular"]
 PROJECTIONS: tuple[Projection, ...] = ("perspective", "cylindrical", "equirectangular")
 

@@ -17,8 +17,6 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.patterns.base import Ink
 
-__all__ = ["PAPERS", "PrintedSheet", "board_sheet", "pdf_bytes", "svg_text"]
-
 PAPERS = {
     "a4": (210.0, 297.0),
     "a3": (297.0, 420.0),

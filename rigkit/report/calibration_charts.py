@@ -12,8 +12,6 @@ from rigkit.calibration.uncertainty import projection_uncertainty
 from rigkit.core.arrays import FloatArray
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 
-__all__ = ["histogram_svg", "images_svg", "lens_svg", "radius_svg"]
-
 WIDTH, HEIGHT = 600.0, 330.0
 LEFT, RIGHT, TOP, BOTTOM = 70.0, 24.0, 12.0, 46.0
 INK, MARK, SOFT, WORDS, FAINT_WORDS = "#1f4e8c", "#c2410c", "#8a94a3", "#333", "#5b6575"

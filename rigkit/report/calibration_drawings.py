@@ -14,8 +14,6 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import projection_uncertainty, uncertainty_map
 from rigkit.core.arrays import FloatArray, Pixels
 
-__all__ = ["MAP_GRID", "coverage_svg", "pattern_svg", "residuals_svg", "uncertainty_svg"]
-
 WIDTH = 600.0
 """Width of the drawn image, in units of the drawing."""
 FOOT = 24.0

@@ -28,8 +28,6 @@ from rigkit.report.scene_view import boards_scene, rig_scene
 from rigkit.report.tables import rounded_words
 from rigkit.validation.check import Check
 
-__all__ = ["CalibrationSection", "build_calibration_page", "thumbnail_jpeg"]
-
 THUMBNAILS_PX = (640, 320)
 """Width of the thumbnails: large ones can be enlarged, small ones are twice what the page shows, for dense screens."""
 MAX_LARGE = 40

@@ -14,8 +14,6 @@ from rigkit.validation.certificate.contracts import Certificate
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["bound_figure", "sheet_pdf"]
-
 A4_INCHES = (8.27, 11.69)
 LEVELS = 8
 """Contours of the bound."""

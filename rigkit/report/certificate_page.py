@@ -14,8 +14,6 @@ from rigkit.report.facts_page import build_facts_page
 from rigkit.report.figures import as_png
 from rigkit.validation.certificate.contracts import Certificate, Quantity
 
-__all__ = ["CertificateWords", "causes_table", "certificate_page", "certificate_pdf", "in_words"]
-
 WHAT = {
     Quantity.LENGTH: "A length of {size} mm across the line of sight",
     Quantity.DEPTH: "A depth of {size} mm along the line of sight",

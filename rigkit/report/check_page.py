@@ -15,8 +15,6 @@ from rigkit.io.history_file import HistoryEntry
 from rigkit.report.facts_page import build_facts_page
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, SentinelCheck
 
-__all__ = ["CheckWords", "check_page", "check_table", "check_words", "drift_svg", "history_page"]
-
 DRAWN_WIDTH, DRIFT_HEIGHT, MARGIN = 600.0, 190.0, 56.0
 ARROWS = (21, 16)
 ARROW_LENGTH = 0.05

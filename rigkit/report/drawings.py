@@ -14,8 +14,6 @@ from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.report.figures import board_colour
 from rigkit.validation.checks import ValidationReport
 
-__all__ = ["boxplot_svg", "normal_errors_svg", "residuals_svg"]
-
 WHISKER = 1.5
 """Whiskers reach to the last value within this many interquartile ranges, as in the paper's figures."""
 

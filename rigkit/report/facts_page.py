@@ -7,8 +7,6 @@ from collections.abc import Mapping, Sequence
 from rigkit.core.tables import Table
 from rigkit.report.render import data_uri, drawing, render, shown_table
 
-__all__ = ["build_facts_page"]
-
 BADGES = {None: "look", True: "pass", False: "fail"}
 
 

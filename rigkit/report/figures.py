@@ -21,23 +21,6 @@ from rigkit.reconstruction.reconstruct import Reconstruction
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = [
-    "BOARD_COLOURS",
-    "as_jpeg",
-    "as_pdf",
-    "as_png",
-    "board_colour",
-    "cloud_figure",
-    "cloud_png",
-    "corners_figure",
-    "corners_png",
-    "difference_png",
-    "epipolar_curves",
-    "epipolar_figure",
-    "epipolar_png",
-    "pair_axes",
-]
-
 BOARD_COLOURS = ("#e6550d", "#1f77b4", "#2ca02c", "#9467bd", "#d6b300", "#17becf", "#e377c2", "#7f7f7f")
 """One colour a board, the same in every picture; readable on dark and light images."""
 

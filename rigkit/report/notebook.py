@@ -22,8 +22,6 @@ from rigkit.report.rig_tables import rig_reach
 from rigkit.report.scene_view import boards_scene, rig_scene
 from rigkit.report.tables import measured_words
 
-__all__ = ["html_of", "notebook_progress", "scene_svg"]
-
 WIDTH, HEIGHT, RIM = 420.0, 300.0, 14.0
 MAX_DRAWN_POINTS = 600
 """Points drawn; of more, every second, third, ..."""

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from rigkit.core.detections import BoardDetection
 
-__all__ = ["draw_boards"]
-
 OVERLAY_COLOURS = ((230, 60, 50), (40, 160, 70), (50, 90, 230), (230, 150, 20), (160, 60, 200), (20, 170, 190))
 """Red, green, blue of the boards in turn."""
 

@@ -16,8 +16,6 @@ from rigkit.report.render import data_uri, render, shown_table
 from rigkit.report.scene_view import DEPTH, camera_pyramid, rounded
 from rigkit.report.validation_verdict import ValidationVerdict
 
-__all__ = ["PairSection", "build_page", "scene_of"]
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PairSection:

@@ -17,8 +17,6 @@ from rigkit.planning.plan import Plan
 from rigkit.planning.words import placement
 from rigkit.report.render import drawing, render, shown_table
 
-__all__ = ["plan_page", "plan_table", "plan_to_dict", "plan_words", "printed_outlines", "shown_views", "view_svg"]
-
 VIEW_WIDTH = 320.0
 """Width of a drawn view, in units of the drawing."""
 PAPER, SEEN, FRAME = "#e6550d", "#1f4e8c", "#b8c0cc"

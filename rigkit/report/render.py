@@ -15,8 +15,6 @@ from rigkit.report.tables import below, column_label, measured_words
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-__all__ = ["data_uri", "drawing", "render", "shown_table", "table_html"]
-
 
 def render(template: str, **context: Any) -> str:
     """Return `template`, a file of rigkit/report/templates, filled with `context`."""

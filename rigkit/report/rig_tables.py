@@ -16,8 +16,6 @@ from rigkit.geometry.rotation import log_so3
 from rigkit.report.tables import rounded_words
 from rigkit.validation.check import Check
 
-__all__ = ["rig_basis", "rig_reach", "rig_tables"]
-
 
 def rig_tables(rig: RigCalibration, checks: Sequence[Check]) -> tuple[Table, ...]:
     """Return the tables that stand first on the page of a rig."""

@@ -11,8 +11,6 @@ from rigkit.affine.correspondences import Correspondences
 from rigkit.reconstruction.scene import SceneReconstruction
 from rigkit.report.figures import as_png, pair_axes
 
-__all__ = ["normals_png"]
-
 
 def normals_png(
     scene: SceneReconstruction, found: Correspondences, image1: NDArray[Any], image2: NDArray[Any]

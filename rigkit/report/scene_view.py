@@ -12,8 +12,6 @@ from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rigid3 import Rigid3
 
-__all__ = ["DEPTH", "boards_scene", "camera_pyramid", "rig_scene", "rounded"]
-
 MAX_BOARDS = 400
 """More boards hide each other; of more, every second, third, ... is drawn."""
 DEPTH = 0.15

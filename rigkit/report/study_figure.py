@@ -10,8 +10,6 @@ import numpy as np
 from rigkit.study.study import STUDY_PLANES
 from rigkit.study.table import ALL_PLANES, StudyCell, StudyTable
 
-__all__ = ["study_figure"]
-
 METHOD_COLOURS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee")
 FORMATS = ("png", "pdf", "svg")
 

@@ -9,8 +9,6 @@ from rigkit.report.study_figure import study_figure
 from rigkit.report.study_tables import study_setup, study_tables
 from rigkit.study.table import StudyTable
 
-__all__ = ["study_page"]
-
 
 def study_page(found: StudyTable, provenance: Mapping[str, str]) -> str:
     """Return the study as an HTML page that needs no other file."""

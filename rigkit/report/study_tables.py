@@ -6,8 +6,6 @@ from rigkit.core.tables import Cell, Column, Table
 from rigkit.study.study import STUDY_PLANES, Study
 from rigkit.study.table import ALL_PLANES, StudyCell, StudyTable
 
-__all__ = ["cell_table", "study_setup", "study_tables"]
-
 
 def study_tables(found: StudyTable) -> tuple[Table, ...]:
     """Return a table a pose type (rows: noise and plane, columns: methods; medians and quartiles) and the verdicts."""

@@ -13,18 +13,6 @@ import numpy as np
 
 from rigkit.core.tables import Cell, Column, Table
 
-__all__ = [
-    "below",
-    "column_label",
-    "measured_words",
-    "rounded_words",
-    "tables_to_csv",
-    "tables_to_json",
-    "tables_to_latex",
-    "tables_to_markdown",
-    "tables_to_text",
-]
-
 MAX_DECIMALS = 6
 """Of a value with its sigma: nanometres."""
 

@@ -17,9 +17,6 @@ from rigkit.validation.checks import ValidationReport
 from rigkit.validation.crosscheck import CrossCheckReport
 from rigkit.validation.tables import check_table, mean_normal_error
 
-__all__ = ["SUMMARY_WORDS", "camera_remarks", "camera_table", "crosscheck_table", "pair_section", "summary_table"]
-
-
 SUMMARY_WORDS = (
     "Estimator: of the affine transformation at each corner, from the directions of its edges (F2UDIR, F3UDIR, "
     "DET3UDIR, 2SDIR, 3SDIR: L. Hajder, Affine Correspondences in Stereo Vision: Theory, Practice, and Limitations); "

@@ -10,8 +10,6 @@ from rigkit.validation.check import Check
 from rigkit.validation.checks import ValidationReport
 from rigkit.validation.crosscheck import CrossCheckReport
 
-__all__ = ["FailedFact", "ValidationVerdict", "failed_facts", "verdict_of"]
-
 FINER = 4.0
 """Where the ruler is so many times less certain than we are, it decides nothing finer."""
 

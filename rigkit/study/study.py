@@ -30,8 +30,6 @@ from rigkit.synthetic.lattice import chord_directions, harmonic_directions
 from rigkit.synthetic.noise import NoisyImages, corner_noise, rotate_directions
 from rigkit.synthetic.poses import PairBatch, general_pairs, special_pairs
 
-__all__ = ["CHUNK_TRIALS", "STUDY_PLANES", "Claim", "Study", "Variant", "chunk_count", "run_chunk"]
-
 CHUNK_TRIALS = 50
 """Trials that share a random generator. Changing it changes the numbers of every study."""
 STUDY_PLANES = 3

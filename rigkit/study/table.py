@@ -13,8 +13,6 @@ from rigkit.core.claims import Comparison, Verdict, judge_claim
 from rigkit.core.errors import InputError
 from rigkit.study.study import STUDY_PLANES, Claim, Study
 
-__all__ = ["ALL_PLANES", "CELL_KEYS", "StudyCell", "StudyTable", "tabulate"]
-
 ALL_PLANES = 0
 """`StudyCell.plane` of the cell over all planes together."""
 WHISKER_IQR = 1.5

@@ -29,8 +29,6 @@ from rigkit.synthetic.placing import place_board, sees_paper
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
 
-__all__ = ["build_demo", "demo_camera"]
-
 SIZE_PX = (960, 720)
 FIELD_DEG = 180.0
 DEMO_PLANES = (Board("plane1", 8, 6, 50.0, 50.0), Board("plane2", 7, 6, 50.0, 50.0), Board("plane3", 6, 9, 50.0, 50.0))

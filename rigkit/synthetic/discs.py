@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from rigkit.core.arrays import FloatArray
 
-__all__ = ["MAX_CELL", "MIN_CELL", "covered_shares"]
-
 Float32 = NDArray[np.float32]
 
 MIN_CELL, MAX_CELL = 1e-6, 2.0

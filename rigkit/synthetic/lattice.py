@@ -6,8 +6,6 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray, Pixels
 
-__all__ = ["chord_directions", "harmonic_directions"]
-
 
 def chord_directions(lattice: Pixels) -> FloatArray:
     """Return the chords to the neighbour along the columns, the rows and the diagonal, (..., rows, columns, 3, 2).

@@ -9,8 +9,6 @@ import numpy as np
 from rigkit.core.arrays import FloatArray, Pixels
 from rigkit.core.matches import DirectionPairs
 
-__all__ = ["NoisyImages", "corner_noise", "rotate_directions", "turn"]
-
 
 class NoisyImages(StrEnum):
     """Which image of a pair is noisy. The paper does not say; `BOTH` is what a camera does."""

@@ -20,8 +20,6 @@ from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import Panel, PlacedBoard, exact_detection, room_walls, trihedral
 
-__all__ = ["StereoScene", "random_pair", "relative_pose", "trihedral_pair"]
-
 RANDOM_PAIR_TRIES = 2000
 MIN_PAIR_INCIDENCE = 0.2
 """Smallest |cosine| between viewing ray and board normal, at every corner of every board in both views."""

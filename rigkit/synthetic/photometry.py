@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 
-__all__ = ["Photometry", "Shadow", "develop"]
-
 SHARPEN_SIGMA_PX = 1.0
 """Blur of the unsharp mask, as camera firmware does it."""
 

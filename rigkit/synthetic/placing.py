@@ -11,8 +11,6 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit
 from rigkit.synthetic.scene import PlacedBoard
 
-__all__ = ["place_board", "sees_paper"]
-
 
 def place_board(
     board: Board,

@@ -15,8 +15,6 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rotation import exp_so3, unit
 
-__all__ = ["PairBatch", "general_pairs", "special_pairs"]
-
 CAMERA_RANGE_MM = (900.0, 1300.0)
 """Distance of the cameras of general pairs from the corner of the room."""
 MIN_INCIDENCE = 0.35

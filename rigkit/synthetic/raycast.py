@@ -13,8 +13,6 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.synthetic.discs import MAX_CELL, MIN_CELL, covered_shares
 from rigkit.synthetic.scene import Panel, PlacedBoard
 
-__all__ = ["FULL", "NONE", "PART", "Chart", "Float32", "Surface", "board_surface", "paint", "panel_surface"]
-
 Float32 = NDArray[np.float32]
 
 NODES = 9

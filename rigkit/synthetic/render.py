@@ -29,8 +29,6 @@ from rigkit.synthetic.photometry import Photometry, develop
 from rigkit.synthetic.raycast import FULL, PART, Chart, Float32, Surface, board_surface, paint, panel_surface
 from rigkit.synthetic.scene import Panel, PlacedBoard
 
-__all__ = ["Optics", "radiance", "render"]
-
 TILE = 64
 """Side of a tile, px."""
 KERNEL_SIGMAS = 4.0

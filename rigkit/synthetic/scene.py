@@ -20,8 +20,6 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import unit
 
-__all__ = ["Panel", "PlacedBoard", "exact_detection", "exact_view", "room_walls", "trihedral"]
-
 BOARD_CLEARANCE_MM = 3.0
 """Gap between the paper's edge and the seam of two walls: boards that touch would hide each other's edge."""
 SEAM_ROUNDING_MM = 1e-6

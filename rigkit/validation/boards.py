@@ -12,8 +12,6 @@ from rigkit.core.errors import DegenerateError
 from rigkit.core.truth import Feature
 from rigkit.validation.planes import NormalErrors, Plane, fit_moved, fit_plane, normal_errors
 
-__all__ = ["BoardGrid", "BoardResult", "Placed", "fit_lattice", "measure_board", "place_moved"]
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BoardGrid:

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["Check", "compare"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Check:

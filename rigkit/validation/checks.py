@@ -28,14 +28,6 @@ from rigkit.validation.intrinsics import CalibrationShifts
 from rigkit.validation.measure import Measured, measure
 from rigkit.validation.planes import NormalErrors, normal_errors
 
-__all__ = [
-    "COVERAGE",
-    "AngleResult",
-    "ValidationReport",
-    "validate",
-    "validate_each",
-]
-
 COVERAGE = 2.0
 
 

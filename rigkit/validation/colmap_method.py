@@ -14,8 +14,6 @@ from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.reconstruction.scale import scale_and_gradient
 from rigkit.validation.measure import points_by_pose
 
-__all__ = ["colmap_reconstruction"]
-
 BEST_CORNER_PX = 1e-3
 """No corner is known better than this, however well a few of them happen to fit."""
 PER_POINT = ("normals", "colours", "board_index", "grid", "sigma_mm", "normal_sigma_rad")

@@ -30,8 +30,6 @@ from rigkit.validation.measure import Measured, measure
 from rigkit.validation.planes import face_angle, fit_moved
 from rigkit.validation.pnp import AnglesDeg, moved_pnp, planar_pnp
 
-__all__ = ["CrossCheckReport", "IndependentMethod", "compare_chains", "crosscheck", "sigma_of_difference"]
-
 TWO_VIEW = "pycolmap two-view"
 ADJUSTED = "pycolmap bundle adjustment"
 PNP = "planar PnP"

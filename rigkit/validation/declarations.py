@@ -19,8 +19,6 @@ from rigkit.relative_pose.refinement.select import CONTRADICTION_P, TypeEvidence
 from rigkit.validation.boards import BoardResult
 from rigkit.validation.check import Check, compare
 
-__all__ = ["DECLARED", "contradicted_boards", "declaration_checks"]
-
 DECLARED = ("pose type", "level", "board size", "layout")
 """Kinds of checks that are about a declaration, not about a measured quantity."""
 MAX_TOLD_SIGMAS = 38.0

@@ -15,8 +15,6 @@ from rigkit.geometry.board_pose import board_pose
 from rigkit.validation.check import Check
 from rigkit.validation.checks import ValidationReport
 
-__all__ = ["camera_fit", "diagnose", "diagnose_cameras"]
-
 CLEARLY_BETTER = 4.0
 """Another calibration fits clearly better if it leaves this many times less. Two calibrations of one lens differ by far
 less, two lenses by far more."""

@@ -29,8 +29,6 @@ from rigkit.reconstruction.scale import metric_scale
 from rigkit.relative_pose.refinement.refine import refine_pose
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 
-__all__ = ["CalibrationShifts", "calibration_shifts", "with_calibrations"]
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CalibrationShifts:

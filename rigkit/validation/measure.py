@@ -25,8 +25,6 @@ from rigkit.validation.boards import BoardResult, Placed, measure_board, place_m
 from rigkit.validation.intrinsics import CalibrationShifts
 from rigkit.validation.planes import angle_jacobian, face_angle, normal_errors
 
-__all__ = ["Measured", "measure", "points_by_pose"]
-
 ROTATION_STEP_RAD = 1e-5
 TRANSLATION_STEP = 1e-5
 """Of the baseline. Central differences are then right to about 1e-9, far below any sigma's own accuracy."""

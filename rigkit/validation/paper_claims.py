@@ -19,8 +19,6 @@ from rigkit.core.tables import Cell, Column, Table
 from rigkit.validation.checks import ValidationReport
 from rigkit.validation.tables import PaperTables, mean_normal_error
 
-__all__ = ["claim_table", "estimator_order_table"]
-
 SCALED = ("2SDIR", "3SDIR")
 UNSCALED = ("F2UDIR", "F3UDIR", "DET3UDIR")
 WORST = "DET3UDIR"

@@ -21,8 +21,6 @@ from rigkit.geometry.rotation import angle_between
 from rigkit.interop.open3d import mean_and_covariance, plane_inliers
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 
-__all__ = ["NormalErrors", "Plane", "angle_jacobian", "face_angle", "fit_moved", "fit_plane", "normal_errors"]
-
 MIN_POINTS = 4
 """Three points always lie in a plane and say nothing about how flat it is."""
 MIN_WIDTH = 1e-3

@@ -16,8 +16,6 @@ from rigkit.geometry.rotation import exp_so3, log_so3, skew
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.validation.planes import angle_jacobian, face_angle
 
-__all__ = ["AnglesDeg", "PnpResult", "moved_pnp", "planar_pnp"]
-
 MIN_CORNERS_FOR_PNP = 8
 
 AnglesDeg = dict[tuple[str, str], tuple[float, float]]

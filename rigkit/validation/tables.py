@@ -16,21 +16,6 @@ from rigkit.core.errors import InputError
 from rigkit.core.tables import Cell, Column, Table
 from rigkit.validation.checks import ValidationReport
 
-__all__ = [
-    "PaperTables",
-    "angle_table",
-    "average_table",
-    "baseline_table",
-    "best_method",
-    "best_of",
-    "best_report",
-    "build_tables",
-    "check_table",
-    "estimator_table",
-    "mean_normal_error",
-    "plane_table",
-]
-
 TIE_MM = 1e-3
 """Baselines closer than this are the same: less than the table shows."""
 

@@ -24,15 +24,6 @@ from rigkit.workflows.given_corners import given_corners
 from rigkit.workflows.provenance import made
 from rigkit.workflows.session_page import session_page
 
-__all__ = [
-    "CalibrateOptions",
-    "SessionCalibration",
-    "calibrate_session",
-    "calibration_from",
-    "corners_of",
-    "session_inputs",
-]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrateOptions:

@@ -22,8 +22,6 @@ from rigkit.workflows.detect import IMAGE_ENDINGS
 from rigkit.workflows.folder_session import session_of_folders
 from rigkit.workflows.frames import frames_folder, frames_of_video, frames_of_videos, timestamps_beside, with_frames
 
-__all__ = ["FolderOptions", "calibrate_folders", "calibrate_session_file", "calibrate_sources", "default_output"]
-
 SESSION_NAME = "session.toml"
 """The session that is kept in a folder of images for the next time."""
 

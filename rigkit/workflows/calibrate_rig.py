@@ -28,15 +28,6 @@ from rigkit.workflows.provenance import made
 from rigkit.workflows.rigid_boards import named_as_listed, named_by_rule, require_distinct
 from rigkit.workflows.session_page import rig_page
 
-__all__ = [
-    "RigSessionCalibration",
-    "calibrate_camera",
-    "calibrate_rig_session",
-    "measured_checks",
-    "rig_corners",
-    "rig_from",
-]
-
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class RigSessionCalibration:

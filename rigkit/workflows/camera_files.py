@@ -21,8 +21,6 @@ from rigkit.io.reading import read_text
 from rigkit.io.rig_file import is_rig_file, load_rig
 from rigkit.workflows.formats import READ_FORMATS
 
-__all__ = ["camera_format", "import_camera", "import_rig", "is_ours", "is_rig"]
-
 SIGNS = (
     ("mrcal", re.compile(r"['\"]lens_?model['\"]\s*:")),
     ("py-ocamcalib", re.compile(r'\A\s*\{.*"taylor_coefficient"\s*:', re.DOTALL)),

@@ -19,8 +19,6 @@ from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.contracts import Certificate, Instrument, Task, instrument_of_rig
 from rigkit.workflows.provenance import digest_line, software_facts
 
-__all__ = ["CertifiedFile", "CertifyOptions", "certify_file", "load_instrument"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CertifyOptions:

@@ -38,8 +38,6 @@ from rigkit.workflows.detect import images_in
 from rigkit.workflows.next_views import goal_of
 from rigkit.workflows.provenance import digest_line, software_facts
 
-__all__ = ["CheckOptions", "CheckedPictures", "check_pictures", "load_watched"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CheckOptions:

@@ -29,8 +29,6 @@ from rigkit.workflows.corners import Cache
 from rigkit.workflows.folder_session import session_to_come
 from rigkit.workflows.next_views import goal_of
 
-__all__ = ["CoachOptions", "coach_frames", "open_coach", "run_coach"]
-
 SESSION = "session.toml"
 LOCALHOST, EVERYWHERE = "127.0.0.1", "0.0.0.0"
 LAN_WARNING = (

@@ -23,8 +23,6 @@ from rigkit.io.images import read_image
 from rigkit.io.session import Session
 from rigkit.workflows.identify_board import explained
 
-__all__ = ["Cache", "SessionCorners", "first_camera", "image_names", "session_corners", "session_views"]
-
 ODD_SIZES = 3
 """A few images of another size are left out; where they are this part of all, which of the sizes is meant?"""
 LOOSE = 1.5

@@ -24,8 +24,6 @@ from rigkit.workflows.datasets import (
 from rigkit.workflows.pairs import match_images, reconstruct_other_chain, reconstruct_with, shifts_of
 from rigkit.workflows.results import require_folder, write_results
 
-__all__ = ["DatasetCrossCheck", "crosscheck_dataset"]
-
 MARKDOWN, JSON = "crosscheck.md", "crosscheck.json"
 
 

@@ -29,16 +29,6 @@ from rigkit.io.manifest import CameraEntry, Dataset, Pair, load_dataset
 from rigkit.workflows.calibrate_rig import calibrate_camera
 from rigkit.workflows.results import CALIBRATIONS
 
-__all__ = [
-    "DatasetOptions",
-    "LoadedCamera",
-    "LoadedCameras",
-    "PairFailure",
-    "load_cameras",
-    "over_pairs",
-    "ready_dataset",
-]
-
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 

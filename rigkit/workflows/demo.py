@@ -18,8 +18,6 @@ from rigkit.workflows.calibrate import CalibrateOptions, calibrate_session
 from rigkit.workflows.corners import Cache
 from rigkit.workflows.validate import DatasetValidation, ValidateOptions, validate_dataset
 
-__all__ = ["DemoOptions", "DemoResult", "run_demo"]
-
 _log = logging.getLogger(__name__)
 
 

@@ -32,8 +32,6 @@ from rigkit.report.overlay import draw_boards
 from rigkit.workflows.camera_files import import_camera
 from rigkit.workflows.frames import VideoFrames, frames_folder, frames_of_video
 
-__all__ = ["DetectOptions", "DetectionResult", "detect_in_images", "images_in"]
-
 IMAGE_ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
 
 

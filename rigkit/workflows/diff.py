@@ -18,8 +18,6 @@ from rigkit.io.rig_file import SavedRig, is_board_rigs_file, is_rig_file, load_b
 from rigkit.report.figures import difference_png
 from rigkit.workflows.camera_files import import_camera, import_rig, is_ours, is_rig
 
-__all__ = ["BoardsPair", "CameraPair", "DiffOptions", "RigPair", "diff"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiffOptions:

@@ -16,8 +16,6 @@ from rigkit.report.figures import difference_png
 from rigkit.workflows.diff import BoardsPair, CameraPair, RigPair
 from rigkit.workflows.provenance import digest_line, software_facts
 
-__all__ = ["figures_of", "words_of", "write_diff_page"]
-
 Pair = CameraPair | RigPair | BoardsPair
 
 

@@ -23,18 +23,6 @@ from rigkit.io.reading import about
 from rigkit.workflows.camera_files import import_camera, import_rig
 from rigkit.workflows.formats import CAMERA_FORMATS, FOREIGN_ENDINGS
 
-__all__ = [
-    "ExportCameraOptions",
-    "ExportedCamera",
-    "ExportedRig",
-    "export_camera",
-    "export_rig",
-    "foreign_files",
-    "foreign_paths",
-    "foreign_rig_files",
-    "foreign_rig_paths",
-]
-
 RIG_ENDINGS = {"colmap": ".json"}
 """Where the file of a rig ends otherwise than that of a camera."""
 

@@ -18,8 +18,6 @@ from rigkit.workflows.datasets import load_cameras
 from rigkit.workflows.pairs import match_images, reconstruct_with
 from rigkit.workflows.results import write_results
 
-__all__ = ["ExportCloudOptions", "export_cloud"]
-
 _log = logging.getLogger(__name__)
 
 

@@ -18,8 +18,6 @@ from rigkit.io.session import SESSION_SCHEMA
 from rigkit.workflows.detect import IMAGE_ENDINGS
 from rigkit.workflows.identify_board import suggested_words
 
-__all__ = ["FolderSession", "Known", "board_of_words", "cameras_in", "session_of_folders", "session_to_come"]
-
 SIDE = r"left|right|cam(?:era)?[_-]?\d{1,3}"
 """How people call the cameras of a rig."""
 NAMED_FIRST = re.compile(rf"(?P<side>{SIDE})(?P<gap>[_-]?)(?P<number>\d+)", re.IGNORECASE)

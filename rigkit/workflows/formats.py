@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["CAMERA_FORMATS", "CLOUD_FORMATS", "FOREIGN_ENDINGS", "READ_FORMATS"]
-
 FOREIGN_ENDINGS = {
     "opencv": ".yaml",
     "kalibr": ".yaml",

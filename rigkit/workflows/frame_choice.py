@@ -16,8 +16,6 @@ import numpy as np
 from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardDetection
 
-__all__ = ["FrameChoice", "KeptFrame", "describe"]
-
 DIRECTIONS: FloatArray = np.stack([f(np.arange(8) * (np.pi / 4.0)) for f in (np.cos, np.sin)], axis=-1)
 
 SAME_VIEW = 0.015

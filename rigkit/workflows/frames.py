@@ -29,16 +29,6 @@ from rigkit.io.session import Session, beside_session
 from rigkit.io.video import Video, is_video, read_timestamps
 from rigkit.workflows.frame_choice import FrameChoice, KeptFrame, describe
 
-__all__ = [
-    "MAX_FRAMES",
-    "VideoFrames",
-    "frames_folder",
-    "frames_of_video",
-    "frames_of_videos",
-    "timestamps_beside",
-    "with_frames",
-]
-
 MAX_FRAMES = 40
 """Frames kept of a video: a calibration gains little from more that are spread as well."""
 

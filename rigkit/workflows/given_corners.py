@@ -15,8 +15,6 @@ from rigkit.io.images import read_image
 from rigkit.io.session import Session
 from rigkit.workflows.corners import SessionCorners, image_names
 
-__all__ = ["given_corners"]
-
 _log = logging.getLogger(__name__)
 
 

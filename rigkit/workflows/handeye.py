@@ -26,15 +26,6 @@ from rigkit.io.robot_poses import read_robot_poses
 from rigkit.workflows.camera_files import import_camera
 from rigkit.workflows.detect import images_in
 
-__all__ = [
-    "POSE_NAMES",
-    "HandEyeCalibration",
-    "HandEyeOptions",
-    "PlacedCamera",
-    "calibrate_hand_eye",
-    "camera_on_board",
-]
-
 HAND_EYE_SCHEMA = "rigkit.hand_eye/1"
 POSE_NAMES = (("cam_from_hand", "base_from_board"), ("cam_from_base", "hand_from_board"))
 """What the two poses are called where the hand carries the camera, and where it carries the board."""

@@ -19,8 +19,6 @@ from rigkit.validation.sentinel.judge import judge_evidence
 from rigkit.validation.sentinel.watch import watched_camera
 from rigkit.workflows.provenance import digest_line, software_facts
 
-__all__ = ["add_calibration", "show_history"]
-
 RECALIBRATION_GRID = (40, 30)
 
 

@@ -14,8 +14,6 @@ from rigkit.detection.unknown import BoardGuess, difference, guess_board
 from rigkit.io.board_words import words_of_board
 from rigkit.io.images import read_image
 
-__all__ = ["IdentifiedBoard", "explained", "identify_board", "suggested_words"]
-
 ENOUGH_IMAGES = 12
 """Images that are looked at, evenly spread: what more of them show is the same board."""
 

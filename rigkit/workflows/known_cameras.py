@@ -19,8 +19,6 @@ from rigkit.io.rig_session import RigSession
 from rigkit.workflows.camera_files import import_camera, import_rig, is_ours, is_rig
 from rigkit.workflows.folder_session import Known
 
-__all__ = ["known_cameras", "with_known", "with_known_first"]
-
 
 def with_known(session: RigSession, known: Known) -> RigSession:
     """Return the session with what files tell; what it says itself of them is replaced.

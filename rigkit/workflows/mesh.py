@@ -13,8 +13,6 @@ from rigkit.io.mesh_file import mesh_bytes
 from rigkit.io.ply import read_ply
 from rigkit.io.reading import about
 
-__all__ = ["MeshOptions", "mesh_cloud"]
-
 MAX_OCTREE_DEPTH = 12
 """Each level more takes four times the memory: of this one, several GB."""
 

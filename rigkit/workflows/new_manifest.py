@@ -16,8 +16,6 @@ from rigkit.io.images import read_image, to_grey
 from rigkit.io.manifest import load_dataset
 from rigkit.io.manifest_writer import FoundPair, ImageBoards, board_sizes, group_pairs, manifest_text
 
-__all__ = ["FoundPairs", "NewManifest", "find_pairs", "write_manifest"]
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FoundPairs:

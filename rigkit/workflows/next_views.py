@@ -18,8 +18,6 @@ from rigkit.planning.plan import Plan, plan_views
 from rigkit.validation.certificate.contracts import Instrument, Quantity, Task
 from rigkit.validation.certificate.propagation import gradients, measured_points
 
-__all__ = ["NEXT_VIEWS", "goal_of", "next_views"]
-
 NEXT_VIEWS = 3
 TASK_CELLS = (13, 10)
 """Columns and rows of the places at which a length is measured."""

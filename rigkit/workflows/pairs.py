@@ -24,19 +24,6 @@ from rigkit.relative_pose.refinement.level_frames import LevelFrames
 from rigkit.validation.intrinsics import CalibrationShifts, calibration_shifts
 from rigkit.workflows.datasets import LoadedCamera
 
-__all__ = [
-    "find_boards",
-    "geometry_of",
-    "lattice_of",
-    "match_found",
-    "match_images",
-    "read_for",
-    "reconstruct_on_lattice",
-    "reconstruct_other_chain",
-    "reconstruct_with",
-    "shifts_of",
-]
-
 Detections: TypeAlias = tuple[BoardDetection, ...]
 Image: TypeAlias = NDArray[Any]
 

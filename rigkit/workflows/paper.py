@@ -36,8 +36,6 @@ from rigkit.workflows.datasets import (
 from rigkit.workflows.pairs import match_images
 from rigkit.workflows.results import require_folder, write_results
 
-__all__ = ["PaperOptions", "PaperValidation", "validate_as_paper"]
-
 PAPER = "hajder2021"
 """Folder with the paper's tables, beside the data set."""
 

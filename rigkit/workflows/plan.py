@@ -27,8 +27,6 @@ from rigkit.workflows.corners import Cache
 from rigkit.workflows.next_views import NEXT_VIEWS, goal_of, next_views
 from rigkit.workflows.provenance import digest_line, software_facts
 
-__all__ = ["LensOptions", "PlanOptions", "PlannedSession", "plan_lens", "plan_session"]
-
 USUAL_SIGMA_PX = 0.15
 USUAL_RHO = 0.05
 """What corners of real boards have: so much scatter, and this part of its variance in common in a view (50 corners then

@@ -13,8 +13,6 @@ from rigkit.io.files import write_atomic, write_together
 from rigkit.io.reading import about
 from rigkit.report.board_sheet import board_sheet, pdf_bytes, svg_text
 
-__all__ = ["MeasuredPrint", "PrintOptions", "print_board", "store_measured_print"]
-
 MAX_UNEVEN = 1.05
 """Ratio of the stretches along and across a sheet: printers are a per cent apart, misread rulers more."""
 MAX_STRETCH = 2.0

@@ -12,8 +12,6 @@ from typing import Any
 
 from rigkit.io.corner_cache import image_hash
 
-__all__ = ["digest_line", "digest_of_many", "made", "software_facts"]
-
 PACKAGES = ("numpy", "opencv-contrib-python-headless")
 """Whose versions every result depends on."""
 

@@ -17,8 +17,6 @@ from rigkit.workflows.datasets import DatasetOptions, LoadedCamera, PairFailure,
 from rigkit.workflows.pairs import match_images, reconstruct_on_lattice, reconstruct_with, shifts_of
 from rigkit.workflows.results import require_folder, write_results
 
-__all__ = ["DatasetReconstruction", "PairReconstruction", "ReconstructOptions", "reconstruct_dataset"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReconstructOptions(DatasetOptions):

@@ -27,8 +27,6 @@ from rigkit.workflows.camera_files import import_rig
 from rigkit.workflows.pairs import read_for
 from rigkit.workflows.results import require_folder, write_results
 
-__all__ = ["RigScene", "RigSceneOptions", "reconstruct_rig_views"]
-
 CLOUD = "scene.ply"
 PARTNERS = 3
 """Views nearest to each that it is paired with."""

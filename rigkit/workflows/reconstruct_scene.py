@@ -32,8 +32,6 @@ from rigkit.workflows.camera_files import import_camera, import_rig
 from rigkit.workflows.pairs import read_for
 from rigkit.workflows.results import require_folder, write_results
 
-__all__ = ["CLOUD", "SceneOptions", "SceneResult", "reconstruct_views"]
-
 CLOUD = "scene.ply"
 MAPS = "maps.npz"
 """Depth, range and normals at pixels of the first image."""

@@ -24,8 +24,6 @@ from rigkit.rectification.targets import target_camera
 from rigkit.workflows.camera_files import import_camera, import_rig
 from rigkit.workflows.detect import IMAGE_ENDINGS
 
-__all__ = ["RectificationResult", "RectifiedImage", "RectifyOptions", "rectify_image", "rectify_stereo_images"]
-
 EIGHT_BIT = (".jpg", ".jpeg", ".bmp", ".webp")
 
 

@@ -9,8 +9,6 @@ from pathlib import Path
 from rigkit.core.errors import InputError
 from rigkit.io.files import FORCE, ensure_folder_writable, ensure_writable, write_together
 
-__all__ = ["CALIBRATIONS", "free_folder", "require_folder", "write_results"]
-
 CALIBRATIONS = "calibrations"
 """Folder of results for cameras that were calibrated on the way."""
 

@@ -15,8 +15,6 @@ from rigkit.identification.placements import board_kinds
 from rigkit.io.corner_cache import FoundCorners
 from rigkit.io.rig_session import RigSession
 
-__all__ = ["named_as_listed", "named_by_rule", "require_distinct"]
-
 
 def require_distinct(session: RigSession) -> None:
     """Raise InputError where a rig of cameras has boards that nothing tells apart: alike, and not on one mount."""

@@ -19,8 +19,6 @@ from rigkit.workflows.corners import SessionCorners, image_names
 from rigkit.workflows.next_views import next_views
 from rigkit.workflows.provenance import digest_line, digest_of_many, software_facts
 
-__all__ = ["rig_page", "session_page"]
-
 
 def session_page(session: Session, calibration: Calibration, corners: SessionCorners, files: Mapping[Path, str]) -> str:
     """Return the page of a session's calibration, which is written to `files` (path -> content) beside it."""

@@ -11,8 +11,6 @@ from typing import Any, TypeVar
 from rigkit.core.errors import InputError
 from rigkit.core.processes import worker_pool
 
-__all__ = ["over_items"]
-
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
 

@@ -30,8 +30,6 @@ from rigkit.study.table import StudyTable, tabulate
 from rigkit.workflows.provenance import software_facts
 from rigkit.workflows.spread import over_items
 
-__all__ = ["StudyOptions", "StudyResult", "run_studies", "run_study", "study_key"]
-
 Errors = NDArray[np.float32]
 
 

@@ -12,8 +12,6 @@ from rigkit.core.progress import Progress, silent
 from rigkit.io.files import ensure_folder_writable
 from rigkit.io.public_set import PublicSet, load_public_set
 
-__all__ = ["FetchedSet", "fetch_public_set", "public_sets", "set_folder"]
-
 CATALOGUE = "datasets/public"
 """Where the descriptions are, from the folder of the project or any folder below it."""
 PLACE = "RIGKIT_DATA"

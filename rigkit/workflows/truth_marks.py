@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from rigkit.core.arrays import FloatArray, Mat3, Pixels, Points
 from rigkit.core.errors import DegenerateError
 
-__all__ = ["Similarity", "fit_similarity", "lattice_affinities", "mark_lattice"]
-
 MIN_MARK_PX = 6.0
 """Smaller than this along their shorter side marks are specks."""
 MIN_FILLED = 0.6

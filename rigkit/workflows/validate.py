@@ -48,8 +48,6 @@ from rigkit.workflows.pairs import (
 from rigkit.workflows.results import require_folder, write_results
 from rigkit.workflows.validation_files import RESERVED, PairValidation, validation_files
 
-__all__ = ["DatasetValidation", "PairValidation", "ValidateOptions", "validate_dataset"]
-
 PAPER = "hajder2021"
 """Folder with the paper's tables, beside the data set."""
 

@@ -22,8 +22,6 @@ from rigkit.workflows.results import require_folder, write_results
 from rigkit.workflows.spread import over_items
 from rigkit.workflows.validate import ValidateOptions, validate_dataset
 
-__all__ = ["ManyValidation", "SetOutcome", "validate_datasets"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetOutcome:

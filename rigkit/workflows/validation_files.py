@@ -17,8 +17,6 @@ from rigkit.validation.tables import PaperTables, build_tables
 from rigkit.workflows.datasets import DatasetOptions, LoadedCameras, PairFailure
 from rigkit.workflows.provenance import digest_line, software_facts
 
-__all__ = ["RESERVED", "PairValidation", "validation_files"]
-
 PAGE = "report.html"
 RESERVED = ("tables.md", "tables.csv", "tables.tex", "tables.json", PAGE)
 """Names of files of results, which no pair can have."""

@@ -24,11 +24,12 @@ from helpers.data import shared_data
 
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.boards import Board
-from rigkit.core.detections import BoardDetection
+from rigkit.core.detections import BoardDetection, common_corners
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, rotation_angle
-from rigkit.identification.identify import PairIdentity, common_corners, identify_pair
+from rigkit.identification.identify import identify_pair
+from rigkit.identification.pair_identity import PairIdentity
 
 POSE_RAD = 2e-3
 """0.05 px at 1356 px over three boards gives about 1e-4 rad; a wrong assignment is off by tens of degrees."""

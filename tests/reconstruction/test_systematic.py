@@ -10,7 +10,8 @@ from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import log_so3, unit
 from rigkit.reconstruction.growing.systematic import pose_with_field
-from rigkit.relative_pose.refinement.refine import cauchy_weights, refine_pose
+from rigkit.relative_pose.refinement.pose_problem import cauchy_weights
+from rigkit.relative_pose.refinement.refine import refine_pose
 from rigkit.relative_pose.solvers.pose import translation_basis
 
 NOISE_PX = 0.1

@@ -22,7 +22,8 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import Matches
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3, unit
-from rigkit.relative_pose.refinement.refine import cauchy_weights, estimate_pose, project_to_type, refine_pose
+from rigkit.relative_pose.refinement.pose_problem import cauchy_weights
+from rigkit.relative_pose.refinement.refine import estimate_pose, project_to_type, refine_pose
 from rigkit.relative_pose.refinement.residuals import affinity_terms, level_terms, point_terms
 from rigkit.relative_pose.solvers.pose import translation_basis
 

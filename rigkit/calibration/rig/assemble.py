@@ -23,8 +23,6 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 
-__all__ = ["assemble_rig", "residual_sigma"]
-
 
 def assemble_rig(
     names: Sequence[str],

@@ -9,8 +9,6 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.board_rig import BoardRig
 from rigkit.calibration.rig.result import RigCalibration, RigCamera
 
-__all__ = ["renamed"]
-
 
 def renamed(rig: RigCalibration, names: Mapping[str, str]) -> RigCalibration:
     """Return the rig with boards called otherwise, `names` from old to new; they must be of one size and squares."""

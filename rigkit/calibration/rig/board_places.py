@@ -22,8 +22,6 @@ from rigkit.core.findings import Finding, Severity
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import nearest_rotation
 
-__all__ = ["board_places"]
-
 REFERENCES = 5
 """Scenes tried as the reference: a bad one explains the others badly."""
 RIVAL = 3.0

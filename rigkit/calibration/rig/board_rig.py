@@ -13,8 +13,6 @@ from rigkit.core.truth import Feature
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, skew
 
-__all__ = ["BoardRig", "MountedBoard"]
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MountedBoard:

@@ -15,8 +15,6 @@ from rigkit.core.errors import RigkitError
 from rigkit.core.findings import Finding, Severity
 from rigkit.core.progress import silent
 
-__all__ = ["suggest_ties"]
-
 MIN_IMAGES_OF_TIE = 3
 """Two images can agree by chance; boards that keep their places in three are mounted."""
 TIED_SIGMAS = 10.0

@@ -28,8 +28,6 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding
 from rigkit.core.progress import Progress, silent
 
-__all__ = ["calibrate_rig"]
-
 Views = Mapping[str, Sequence[tuple[str, BoardView]]]
 
 

@@ -18,8 +18,6 @@ from rigkit.calibration.rig.solver import pose_jacobians, with_rig_priors
 from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.core.arrays import FloatArray, IntArray
 
-__all__ = ["clustered_by_frame"]
-
 
 def clustered_by_frame(
     observations: RigObservations,

@@ -28,8 +28,6 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import log_so3, skew
 
-__all__ = ["MountDifference", "Mounted", "RigDifference", "compare_board_rigs", "compare_mounts"]
-
 SAME_CHANCE = 0.01
 """Mounts this unlikely to be one and the same rig's are another rig's, or a rig's that was bent."""
 LENS_GRID = (24, 18)

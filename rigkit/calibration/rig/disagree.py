@@ -19,9 +19,6 @@ from rigkit.calibration.rig.observations import FrameObservations
 from rigkit.calibration.rig.solver import RigSolution
 from rigkit.calibration.rig.state import Key, RigObservations
 
-__all__ = ["DISAGREES", "FAR_APART", "MIN_PX", "bad_ones", "cost_of_sharing", "masked", "part", "part_far"]
-__all__ += ["shared_keys", "usual_cost", "usual_distance_px", "why"]
-
 FAR_APART = 12.0
 """Before the joint solve a board's pose in one image may be off by some pixels in the other: only more than this many
 times the usual distance is a board that moved. Less is left to the joint solve, which sees it better."""

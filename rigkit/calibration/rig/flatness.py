@@ -15,8 +15,6 @@ from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.calibration.shape import SHAPES, shape_model
 from rigkit.core.arrays import FloatArray
 
-__all__ = ["shape_error"]
-
 CHANCE_SIGMAS = 3.0
 """Boards depart from their shape where a richer one takes this many standard deviations more off the cost than chance
 does."""

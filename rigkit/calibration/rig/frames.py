@@ -21,8 +21,6 @@ from rigkit.core.findings import Finding, Severity
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import nearest_rotation, rotation_angle
 
-__all__ = ["apart", "first_frames", "mounts_of", "turned_alike"]
-
 MAX_TRIED = 64
 """Mounts tried. One of a good target counted rightly is enough: of boards with four ways to count, half of them at
 another moment, 64 tries miss all good ones once in 5000 times."""

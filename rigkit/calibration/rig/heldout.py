@@ -9,8 +9,6 @@ from rigkit.calibration.rig.solver import refine_frames, solve_rig
 from rigkit.calibration.rig.state import RigObservations
 from rigkit.calibration.state import evaluate
 
-__all__ = ["heldout_rms"]
-
 FOLD_TOLERANCE = 1e-6
 """A fold begins at the solution of all frames: a step that promises less of the cost changes no digit shown."""
 

@@ -34,8 +34,6 @@ from rigkit.core.findings import Finding, Severity
 from rigkit.core.progress import Progress
 from rigkit.geometry.rigid3 import Rigid3
 
-__all__ = ["JointRig", "solve_jointly"]
-
 NOTHING_IN_COMMON = 0.1
 """Where corners that views share are usually so far apart, as a part of the boards' size in the images, the cameras do
 not see the same. A board that moves while cameras without a common trigger look at it is a pixel or two apart, 1 or 2 %

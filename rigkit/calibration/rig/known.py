@@ -18,8 +18,6 @@ from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 
-__all__ = ["KnownCameras"]
-
 HOLD = 1e10
 """So many times the information of its corners holds what is known: it moves by 1e-10 of what they would move it."""
 

@@ -15,8 +15,6 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView, grid_turned
 from rigkit.geometry.rigid3 import Rigid3
 
-__all__ = ["FrameObservations", "Observation", "Places", "frame_observations", "outer_corners", "turns_of"]
-
 Places = Mapping[str, tuple[str, Rigid3]]
 """Board -> its target and target_from_board, of the boards that are mounted to others."""
 

@@ -16,8 +16,6 @@ from rigkit.core.printing import drawn
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
 
-__all__ = ["RigCalibration", "RigCamera"]
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RigCamera:

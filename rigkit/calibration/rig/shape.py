@@ -12,8 +12,6 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.shape import SHAPES, ShapeModel, released_groups, shape_model, warp_groups
 from rigkit.core.arrays import FloatArray, Points
 
-__all__ = ["common_shape"]
-
 MIN_SIZE = 1e-4
 """A prior falls to no less than this part of the usual one: on exact data it would fall to nothing."""
 

@@ -24,16 +24,6 @@ from rigkit.calibration.solver import COST_TOLERANCE, Linearised, minimise
 from rigkit.core.arrays import FloatArray, IntArray, Mat3, Points
 from rigkit.geometry.rotation import log_so3, skew
 
-__all__ = [
-    "PoseJacobians",
-    "RigSolution",
-    "pose_jacobians",
-    "refine_frames",
-    "rig_normal",
-    "solve_rig",
-    "with_rig_priors",
-]
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PoseJacobians:

@@ -23,8 +23,6 @@ from rigkit.core.errors import RigkitError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 
-__all__ = ["Key", "Layout", "RigObservations", "RigState"]
-
 Key = tuple[str, str]
 """(frame, target): views that have a key in common see the same target in the same place."""
 

@@ -20,8 +20,6 @@ from rigkit.calibration.uncertainty import worst_direction
 from rigkit.core.arrays import BoolArray, FloatArray, Points
 from rigkit.geometry.rotation import skew
 
-__all__ = ["Transfer", "transfer_covariance", "transfer_uncertainty"]
-
 TRANSFER_POINTS = 40
 """So many corners, spread over all views, are enough to see how sure the transfer is where the boards were."""
 

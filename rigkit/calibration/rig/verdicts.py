@@ -13,8 +13,6 @@ from rigkit.calibration.uncertainty import uncertainty_at_corners
 from rigkit.calibration.verdicts import with_headline
 from rigkit.core.findings import Finding, Severity
 
-__all__ = ["judge_rig"]
-
 FEW_SHARED = 5
 """A mount has six numbers: fewer shared boards leave hardly anything to check it by."""
 UNSURE_PX = 1.0

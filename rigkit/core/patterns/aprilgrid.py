@@ -12,8 +12,6 @@ from rigkit.core.errors import InputError
 from rigkit.core.patterns.aruco import dictionary_modules
 from rigkit.core.patterns.base import Ink, Key, Pattern, filled_modules
 
-__all__ = ["NUMBERINGS", "TAG_FAMILIES", "AprilGrid"]
-
 TAG_FAMILIES: dict[str, str] = {
     "tag36h11": "DICT_APRILTAG_36h11",
     "tag36h10": "DICT_APRILTAG_36h10",

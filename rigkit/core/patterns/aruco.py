@@ -9,8 +9,6 @@ import numpy as np
 from rigkit.core.arrays import BoolArray
 from rigkit.core.errors import InputError
 
-__all__ = ["dictionary_modules", "marker_count"]
-
 
 @functools.cache
 def dictionary_modules(name: str) -> BoolArray:

@@ -17,8 +17,6 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import InputError
 
-__all__ = ["Ink", "Key", "Pattern", "Value", "filled_modules"]
-
 Value: TypeAlias = str | int | float | bool
 
 

@@ -12,8 +12,6 @@ from rigkit.core.errors import InputError
 from rigkit.core.patterns.aruco import dictionary_modules
 from rigkit.core.patterns.base import Ink, Key, Pattern, filled_modules
 
-__all__ = ["Charuco"]
-
 
 @dataclass(frozen=True, slots=True)
 class Charuco(Pattern):

@@ -7,8 +7,6 @@ from typing import ClassVar
 
 from rigkit.core.patterns.base import Ink, Pattern
 
-__all__ = ["Chessboard"]
-
 
 @dataclass(frozen=True, slots=True)
 class Chessboard(Pattern):

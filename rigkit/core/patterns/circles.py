@@ -12,8 +12,6 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 from rigkit.core.patterns.base import Ink, Key, Pattern, Value
 
-__all__ = ["Circles"]
-
 ROW_STEPS = {"regular": 1.0, "asymmetric": 0.5, "hexagonal": float(np.sqrt(0.75))}
 """Distance of two rows, in distances of two circles of a row."""
 NEIGHBOUR_DISTANCES = {"regular": 1.0, "asymmetric": float(np.sqrt(0.5)), "hexagonal": 1.0}

@@ -9,8 +9,6 @@ from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.patterns.circles import Circles
 
-__all__ = ["PATTERNS", "pattern_type"]
-
 PATTERNS: dict[str, type[Pattern]] = {cls.type: cls for cls in (Chessboard, Charuco, AprilGrid, Circles)}
 
 

@@ -21,8 +21,6 @@ from rigkit.detection.lattice.local_fit import LocalFit, fit_cells
 from rigkit.detection.saddles.response import GreyImage, sample
 from rigkit.detection.subpixel.subpixel import RefinedLattice
 
-__all__ = ["Side", "place_part", "sides"]
-
 MIN_CELL_PX = 6.0
 """In smaller squares a quarter of one is not told from its edges."""
 

@@ -17,8 +17,6 @@ from rigkit.detection.checks.validate import stray_row
 from rigkit.detection.lattice.local_fit import PLIANT, STIFF, fit_cells
 from rigkit.detection.subpixel.subpixel import RefinedLattice
 
-__all__ = ["may_be_discontinuous", "split_at_discontinuities", "without_outliers"]
-
 SUSPECT_FACTOR = 2.0
 """A corner whose residual, relative to its contrast, exceeds the typical one of the board by this factor is suspect:
 chance makes 1.15, the rim of a fisheye at most 3; squares that are not one board's make 2 to 20."""

@@ -18,8 +18,6 @@ from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.lattice.spacing import spacing_changes
 from rigkit.detection.subpixel.subpixel import RefinedLattice
 
-__all__ = ["Evidence"]
-
 MIN_MISFIT, MIN_SPACING_CHANGE, MIN_BLUR = 0.03, 0.03, 0.03
 """Smaller values are those of any sharp board seen straight on, and speak no further for it."""
 

@@ -16,19 +16,6 @@ from rigkit.detection.saddles.response import Level
 from rigkit.detection.subpixel.subpixel import RefinedLattice
 from rigkit.kernels import lattice as native
 
-__all__ = [
-    "compact",
-    "has_edge_offset",
-    "known_part",
-    "large",
-    "sample_of",
-    "separate",
-    "stray_row",
-    "tidy",
-    "too_large",
-    "trustworthy",
-]
-
 STRAY_ROW = 2
 """An outer row of so many corners or fewer, most of whose other corners should be in view too, is not of the board."""
 

@@ -15,8 +15,6 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.saddles.response import BASE_PIXELS, FloatImage, GreyImage
 
-__all__ = ["Blobs", "find_blobs"]
-
 WINDOW_PX = 31
 """Side of the square of the local mean, in pixels of a level."""
 BLOB_AREAS = (12.0, 500.0)

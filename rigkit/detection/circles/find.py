@@ -14,8 +14,6 @@ from rigkit.detection.circles.lattices import LabelledBlobs, blob_lattices
 from rigkit.detection.circles.local_map import PlaneMap, local_maps
 from rigkit.detection.saddles.response import GreyImage
 
-__all__ = ["CircleGrid", "GridEvidence", "edge_reach", "find_grids", "like_contrast", "seen_grids"]
-
 Rows = TypeVar("Rows", CircleFit, PlaneMap)
 
 FIRST_EDGE_BLUR = 0.8

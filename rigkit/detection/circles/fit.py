@@ -16,8 +16,6 @@ from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.kernels import circles as kernel
 
-__all__ = ["CircleFit", "fit_circles"]
-
 RULES = kernel.CircleRules.of(
     near_sigmas=4.0,
     near_px=3.0,

@@ -17,8 +17,6 @@ from scipy.spatial import cKDTree
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.circles.blobs import Blobs
 
-__all__ = ["LabelledBlobs", "blob_lattices"]
-
 NEAREST_BLOBS = 16
 """Nearest blobs that are looked at: at 75 degrees of slant nine others lie nearer than the next one uphill."""
 PITCHES = (2.02, 9.0)

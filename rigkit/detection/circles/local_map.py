@@ -9,8 +9,6 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 
-__all__ = ["HEXAGONAL_BASIS", "NEXT", "SQUARE_BASIS", "PlaneMap", "local_maps", "plane_basis"]
-
 SQUARE_BASIS = np.eye(2)
 HEXAGONAL_BASIS = np.array([[1.0, 0.5], [0.0, np.sqrt(0.75)]])
 """Steps of a lattice in its plane, in distances of neighbours, as columns."""

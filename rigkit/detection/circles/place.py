@@ -18,8 +18,6 @@ from rigkit.core.detections import BoardDetection, grid_turned
 from rigkit.core.patterns.circles import Circles
 from rigkit.detection.circles.find import CircleGrid
 
-__all__ = ["lone_part", "placed_on"]
-
 TELLING = 2
 """A place in the board is preferred to another that leaves more than so many more places empty."""
 MAX_EMPTY = 0.2

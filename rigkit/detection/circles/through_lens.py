@@ -29,8 +29,6 @@ from rigkit.detection.saddles.response import GreyImage
 from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.rigid3 import Rigid3
 
-__all__ = ["seen_through"]
-
 MIN_POSE_CIRCLES = 12
 """Circles found that tell the pose of a board."""
 MISSED_DISTANCES = 0.1

@@ -14,8 +14,6 @@ from rigkit.detection.circles.find import CircleGrid, find_grids
 from rigkit.detection.circles.place import placed_on
 from rigkit.detection.saddles.response import GreyImage
 
-__all__ = ["CircleSightings", "guessed_circles"]
-
 MIN_SIDE_CIRCLES = 3
 """Rows and columns of the smallest grid that is told."""
 

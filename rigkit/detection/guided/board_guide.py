@@ -21,8 +21,6 @@ from rigkit.geometry.board_pose import board_poses, ray_residuals
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 
-__all__ = ["MIN_GUIDE_CORNERS", "UNSOUND", "BoardState", "Guide"]
-
 HALF_STEP = 0.4
 """Derivatives of the projection are chords of this many squares to either side: as far as the window reaches."""
 

@@ -29,8 +29,6 @@ from rigkit.detection.subpixel.edge_model import NEAR_PX, NEAR_SIGMAS, Geometry,
 from rigkit.detection.subpixel.scatter import UNEXPLAINED
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
-__all__ = ["complete_boards", "completed", "fit_corners"]
-
 RADIUS_PX, FIT_STEPS = 18.0, 8
 """Radius of the window and Gauss-Newton steps, as in the last pass of `rigkit.detection.subpixel.subpixel`."""
 

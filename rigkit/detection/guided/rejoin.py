@@ -19,8 +19,6 @@ from rigkit.detection.subpixel.subpixel import RefinedLattice
 from rigkit.geometry.board_pose import board_poses
 from rigkit.geometry.rigid3 import Rigid3
 
-__all__ = ["rejoined"]
-
 MIN_REJOINED_CORNERS = 12
 """Corners from which on a part has a pose that says where the rest of its board is."""
 

@@ -28,8 +28,6 @@ from rigkit.detection.saddles.ring import ring_rules
 from rigkit.detection.saddles.saddle import Saddles
 from rigkit.kernels.growth import FitRules, GrowthRules, Squares, grown
 
-__all__ = ["grow_all"]
-
 MAX_RINGS = 60
 """More rings than any board has rows or columns."""
 

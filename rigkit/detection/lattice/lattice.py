@@ -19,8 +19,6 @@ from rigkit.detection.lattice.links import Links
 from rigkit.detection.saddles.saddle import Corners
 from rigkit.kernels.growth import components_of
 
-__all__ = ["MANY", "Lattice", "LatticeStack", "build_lattices", "margins", "padded"]
-
 MANY = 200
 """Lattices of so many corners are judged by a part of them before anything else is done with them."""
 

@@ -18,8 +18,6 @@ from rigkit.detection.saddles.ring import arm_vectors
 from rigkit.detection.saddles.saddle import Corners
 from rigkit.kernels import front
 
-__all__ = ["Links", "find_links"]
-
 NEIGHBOURS = 48
 """Nearest corners looked at: enough to reach across a board that is foreshortened four times, past those that noise
 adds along its narrow squares."""

@@ -10,8 +10,6 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.kernels.growth import FitRules, fit
 
-__all__ = ["PLIANT", "STIFF", "LocalFit", "Prediction", "fit_cells"]
-
 
 class Prediction(NamedTuple):
     """How a corner is foretold from those around it.

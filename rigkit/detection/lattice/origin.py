@@ -16,8 +16,6 @@ import numpy as np
 from rigkit.core.arrays import FloatArray
 from rigkit.detection.lattice.lattice import Lattice
 
-__all__ = ["quarter_turns"]
-
 
 def quarter_turns(lattice: Lattice, sizes: Sequence[tuple[int, int]] = ()) -> int:
     """Return by how many quarter turns `lattice` follows the convention; `sizes` are the known (columns, rows)."""

@@ -7,8 +7,6 @@ from typing import NamedTuple
 from rigkit.core.arrays import FloatArray
 from rigkit.kernels import lattice as native
 
-__all__ = ["SpacingChange", "spacing_changes"]
-
 
 class SpacingChange(NamedTuple):
     """How the steps before and after the inner corners of the rows differ, relative to the shorter step.

@@ -20,8 +20,6 @@ from rigkit.detection.lattice.lattice import Lattice, margins
 from rigkit.detection.lattice.local_fit import PLIANT, STIFF, fit_cells
 from rigkit.detection.lattice.spacing import SpacingChange, spacing_changes
 
-__all__ = ["join_parts", "split_at_turns", "split_necks"]
-
 MIN_TURN = 0.16
 TURN_FACTOR = 3.5
 """A lattice folds at a row or column where neighbouring steps differ by more than this (relative to the step), and by

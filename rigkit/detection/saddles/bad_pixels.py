@@ -12,8 +12,6 @@ import numpy as np
 from rigkit.core.arrays import IntArray
 from rigkit.detection.saddles.response import GreyImage
 
-__all__ = ["without_bad_pixels"]
-
 LOOKED_AT = 6000
 """Pixels of the sparse look, in whole rows."""
 

@@ -13,8 +13,6 @@ import numpy as np
 from rigkit.core.arrays import FloatArray
 from rigkit.detection.saddles.response import FloatImage, GreyImage, sample
 
-__all__ = ["equalised", "stretched"]
-
 WINDOW_PART = 1.0 / 16.0
 """Standard deviation of the window, as a part of the image's shorter side: boards with squares of a fortieth to a sixth
 of it keep their contrast."""

@@ -11,8 +11,6 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.detection.saddles.response import FloatImage, GreyImage
 
-__all__ = ["without_mosaic"]
-
 GLANCE, LOOK = 1500, 20000
 """Squares of 2 x 2 pixels that tell whether there is a mosaic, and those that tell its scales."""
 

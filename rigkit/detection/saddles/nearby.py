@@ -7,8 +7,6 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.kernels import front
 
-__all__ = ["near_any"]
-
 
 def near_any(points: FloatArray, others: FloatArray, reach_px: float) -> BoolArray:
     """Return which of `points` (N, 2) lie within `reach_px` of any of `others` (M, 2), in the same pixels."""

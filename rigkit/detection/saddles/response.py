@@ -18,8 +18,6 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 from rigkit.kernels import front
 
-__all__ = ["FloatImage", "GreyImage", "Level", "grey_image", "peaks", "pyramid", "sample"]
-
 FloatImage = NDArray[np.float32]
 
 GreyImage = NDArray[np.uint8] | NDArray[np.float32]

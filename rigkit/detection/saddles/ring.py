@@ -24,8 +24,6 @@ import numpy as np
 from rigkit.core.arrays import FloatArray
 from rigkit.kernels.front import HALF, RingRules
 
-__all__ = ["arm_vectors", "ring_rules"]
-
 CIRCLE = np.stack([f(np.arange(2 * HALF) * (np.pi / HALF)) for f in (np.cos, np.sin)], axis=-1).astype(np.float32)
 """Where they lie on a ring of radius 1, (2 HALF, 2)."""
 

@@ -12,8 +12,6 @@ from rigkit.detection.saddles.response import Level, peaks
 from rigkit.detection.saddles.ring import ring_rules
 from rigkit.kernels import front
 
-__all__ = ["Corners", "Saddles", "find_corners"]
-
 RING_RADIUS = 2.6
 """Of the ring, in pixels of the level: fits squares of 6 px, and 5 where they are seen straight on."""
 

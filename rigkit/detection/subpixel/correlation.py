@@ -19,8 +19,6 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit
 from rigkit.kernels.edges import LAGS
 
-__all__ = ["sigma_factors"]
-
 LIGHT_SHARE = 0.16
 """So much of a shift of the corner looks like a gradient of the light, which is fitted, too: 0.13 to 0.18 for edges of
 s from 0.4 to 2 px and squares of 25 and 50 px."""

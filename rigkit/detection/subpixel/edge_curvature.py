@@ -14,8 +14,6 @@ from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.detection.lattice.lattice import LatticeStack
 from rigkit.kernels.edges import BendRules, line_bends
 
-__all__ = ["line_curvature"]
-
 DECAY = 0.1
 """Boards under strong perspective and in fisheyes have coefficients up to this^k, in sides of the cell."""
 

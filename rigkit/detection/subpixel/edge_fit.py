@@ -29,8 +29,6 @@ from rigkit.detection.subpixel.edge_model import (
 )
 from rigkit.kernels.edges import LAGS, Rules, fit_corners
 
-__all__ = ["BLUR_RANGE", "EdgeFit", "fit_edges"]
-
 BLUR_RANGE = (0.28, 5.0)
 """s of a perfectly sharp image is the pixel's own 0.29; above 5 px there is no edge to speak of."""
 

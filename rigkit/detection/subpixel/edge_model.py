@@ -22,21 +22,6 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray
 
-__all__ = [
-    "END_SIGMAS",
-    "MIN_REACH",
-    "NEAR_PX",
-    "NEAR_SIGMAS",
-    "PAPER_SIGMAS",
-    "PIXEL_KURTOSIS",
-    "SHARP_BLUR_PX",
-    "TAIL_SIGMAS",
-    "WINDOW_REACH",
-    "Geometry",
-    "ends_of",
-    "tilted",
-]
-
 TAIL_SIGMAS = 3.0
 """An edge is felt so far away, s: the edges of the neighbouring lines are reckoned with where they are nearer."""
 

@@ -19,8 +19,6 @@ from rigkit.detection.subpixel.edge_fit import EdgeFit
 from rigkit.detection.subpixel.edge_model import TAIL_SIGMAS, WINDOW_REACH, Geometry
 from rigkit.kernels.paper import PaperRules, find_paper
 
-__all__ = ["beside_paper", "with_paper"]
-
 MIN_PAPER_BLUR = 1.0
 """In a sharper image, px, what lies beyond the outermost squares moves corners by less than half their sigma, even of
 boards with cut squares (10 real images: 0.018 px; with blur 1.5 px it is 0.055 px, 1.1 sigmas)."""

@@ -13,8 +13,6 @@ from rigkit.detection.lattice.spacing import spacing_changes
 from rigkit.kernels import lattice as native
 from rigkit.optim.robust_scale import MEDIAN_OF_NORMAL
 
-__all__ = ["UNEXPLAINED", "excess_scatter", "scatter_factors"]
-
 DIFFERENCES = (5, 6)
 MIN_SCATTER_CORNERS, MIN_DIFFERENCES = 12, 16
 """Orders of the differences along rows and columns, and how many corners and differences there must be."""

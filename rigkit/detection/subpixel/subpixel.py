@@ -23,8 +23,6 @@ from rigkit.detection.subpixel.edge_model import TAIL_SIGMAS, WINDOW_REACH, Geom
 from rigkit.detection.subpixel.outer_squares import beside_paper, with_paper
 from rigkit.detection.subpixel.scatter import scatter_factors
 
-__all__ = ["RefinedLattice", "refine"]
-
 Part = tuple[slice, slice]
 
 FIRST_BLUR = 1.0

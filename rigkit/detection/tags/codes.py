@@ -16,8 +16,6 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.detection.saddles.response import GreyImage, sample
 
-__all__ = ["MIN_LIKENESS", "Codes", "TagCode", "homographies", "read_tags", "transferred"]
-
 MIN_LIKENESS = 0.7
 """Correlation of a tag with its code at least. Of a code of 36 bits, bits at random reach 0.7 with one of 600 tags once
 in some thousand squares; blur as wide as a module still leaves 0.8."""

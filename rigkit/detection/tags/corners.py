@@ -37,8 +37,6 @@ from rigkit.detection.tags.placing import TagBoard
 from rigkit.detection.tags.surface import SmoothMap, TagSurface, seen_surface
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
-__all__ = ["tag_corners"]
-
 MIN_TAG_CORNERS = 4
 """One tag."""
 

@@ -15,8 +15,6 @@ from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.tags.codes import Codes, read_tags
 
-__all__ = ["MIN_BITS", "TagBoard", "placed_lattices"]
-
 MIN_BITS = 30
 """Bits, in all agreeing tags together, that say where a lattice lies: one tag of 36, two of 25 or 16."""
 

@@ -11,8 +11,6 @@ from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.tags.codes import homographies, read_tags, transferred
 from rigkit.detection.tags.placing import MIN_BITS, TagBoard
 
-__all__ = ["placed_tags"]
-
 MIN_PERIMETER = 0.015
 """Of a quadrilateral, in widths of the image: tags of 8 px in 2000."""
 

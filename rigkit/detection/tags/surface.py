@@ -16,8 +16,6 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.geometry.rigid3 import Rigid3
 
-__all__ = ["SmoothMap", "TagSurface", "seen_surface"]
-
 MOST_DEGREE = 8
 """Of the polynomial that a lens adds to a perspective: a board that fills a fisheye of 180 degrees takes 7."""
 

@@ -16,8 +16,6 @@ from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.tags.codes import homographies
 
-__all__ = ["MarkerSightings", "guessed_charuco"]
-
 DICTIONARIES = (
     *(f"DICT_{n}X{n}_1000" for n in (4, 5, 6, 7)),
     "DICT_ARUCO_ORIGINAL",

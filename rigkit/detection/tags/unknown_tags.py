@@ -18,8 +18,6 @@ from rigkit.detection.saddles.response import GreyImage, pyramid
 from rigkit.detection.saddles.saddle import find_corners
 from rigkit.detection.tags.codes import Codes, TagCode, homographies, read_tags
 
-__all__ = ["TagSightings", "guessed_grid"]
-
 WIDEST_RATIO = 8.0
 """A tag's side over the gap, or the other way round, at most."""
 

@@ -21,8 +21,6 @@ from rigkit.detection.tags.placing import TagBoard, placed_lattices
 from rigkit.detection.tags.quads import placed_tags
 from rigkit.detection.targets.base import Finder, Search
 
-__all__ = ["AprilGridFinder"]
-
 
 class AprilGridFinder(Finder):
     """Corners of tags are linked as those of chessboards are, only that opposite neighbours may lie further apart."""

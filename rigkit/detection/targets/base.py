@@ -16,8 +16,6 @@ from rigkit.detection.saddles.local_contrast import equalised, stretched
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.subpixel import RefinedLattice
 
-__all__ = ["Finder", "Search"]
-
 
 class Search:
     """An image that is searched, and what more than one kind of target needs of it.

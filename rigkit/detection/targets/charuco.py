@@ -25,8 +25,6 @@ from rigkit.detection.subpixel.subpixel import RefinedLattice, refine
 from rigkit.detection.tags.codes import homographies, transferred
 from rigkit.detection.targets.base import Finder, Search
 
-__all__ = ["CharucoFinder"]
-
 SAME_CELLS = 0.2
 """A marker's corner and a corner of a lattice are one within so many sides of a cell."""
 

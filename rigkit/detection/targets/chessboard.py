@@ -19,8 +19,6 @@ from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.subpixel import RefinedLattice
 from rigkit.detection.targets.base import Finder, Search
 
-__all__ = ["ChessboardFinder"]
-
 
 class ChessboardFinder(Finder):
     """All lattices that no other target has taken, whatever their size."""

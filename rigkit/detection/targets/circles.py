@@ -12,8 +12,6 @@ from rigkit.detection.circles.place import lone_part, placed_on
 from rigkit.detection.circles.through_lens import seen_through
 from rigkit.detection.targets.base import Finder, Search
 
-__all__ = ["CirclesFinder"]
-
 
 class CirclesFinder(Finder):
     """Grids with a place in one board are named after it, if no other board and no other grid can be meant."""

@@ -12,8 +12,6 @@ from rigkit.detection.targets.charuco import CharucoFinder
 from rigkit.detection.targets.chessboard import ChessboardFinder
 from rigkit.detection.targets.circles import CirclesFinder
 
-__all__ = ["FINDERS"]
-
 FINDERS: dict[str, Finder] = {
     AprilGrid.type: AprilGridFinder(),
     Charuco.type: CharucoFinder(),

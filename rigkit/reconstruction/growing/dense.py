@@ -28,8 +28,6 @@ from rigkit.reconstruction.scene_pose import KnownPose, fit_scene_pose, known_sc
 from rigkit.relative_pose.solvers.pose import essential_from_pose, translation_basis
 from rigkit.relative_pose.solvers.weights import affinity_residuals
 
-__all__ = ["DenseScene", "grow_scene"]
-
 POSE_STEP = 8
 """Nodes of the pairs that the pose is estimated from, px: spread evenly, unlike features."""
 CLOUD_STEP = 3

@@ -22,8 +22,6 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import unit
 from rigkit.reconstruction.growing.dense import DenseScene
 
-__all__ = ["FusedCloud", "PosedCloud", "fuse_clouds"]
-
 GATE = 3.3
 """In standard deviations: one good point in a thousand is not merged."""
 MAX_TURN_DEG = 45.0

@@ -19,8 +19,6 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import Affines, BoolArray, FloatArray, Mat3, Pixels
 from rigkit.kernels.patches import EpipolarKnowledge, Pyramid, grown, starts_of
 
-__all__ = ["GrowingView", "GrownPatches", "LineKnowledge", "grow"]
-
 HALF_WIDTH = 7
 """Half side of a patch in px: larger ones reach over edges of surfaces, smaller ones have too little texture."""
 COARSEST = 2

@@ -24,8 +24,6 @@ from rigkit.kernels.planes import fitted_planes
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 from rigkit.reconstruction.growing.grow import GrownPatches
 
-__all__ = ["GrownSurface", "NodeMeasurements", "fit_surface", "measure"]
-
 PLANE_REACH_PX = 9.0
 """To either side, of the nodes that a plane is fitted to."""
 PLANE_ROUNDS = 5

@@ -22,8 +22,6 @@ from rigkit.relative_pose.refinement.pose_problem import cauchy_weights
 from rigkit.relative_pose.refinement.residuals import level_terms, point_terms
 from rigkit.relative_pose.solvers.pose import free_directions, translation_basis
 
-__all__ = ["SystematicPose", "pose_with_field"]
-
 MAX_WAVES = 10
 """Half waves over the image, both ways together: less than a tenth of the image wide, it is noise to a pose."""
 AMPLITUDES_PX = tuple(np.geomspace(0.03, 1.0, 14))

@@ -14,8 +14,6 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.relative_pose.solvers.planar import rotated_matches
 
-__all__ = ["LevelFrames"]
-
 UPSIDE_DOWN = 1e-6
 """Sine of the angle below which a camera hangs upside down, and any axis turns it upright."""
 

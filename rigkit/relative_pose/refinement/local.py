@@ -17,8 +17,6 @@ from rigkit.geometry.rotation import skew
 from rigkit.kernels import pose as kernel
 from rigkit.relative_pose.solvers.pose import free_directions, rotations_and_direction
 
-__all__ = ["SampsonRows"]
-
 MAX_LOCAL_STEPS = 15
 LOCAL_SETTLED_RAD = 1e-5
 """A shorter step changes no residual by a tenth of its sigma: enough to choose by."""

@@ -12,8 +12,6 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray
 
-__all__ = ["QUANTILE", "MarginalLoss", "marginal_quality", "marginal_weights"]
-
 QUANTILE = 2.576
 """Of |r| for a normal r: 99 %. As in kernels/pose.c."""
 

@@ -20,8 +20,6 @@ from rigkit.relative_pose.refinement.marginal import MarginalLoss
 from rigkit.relative_pose.refinement.residuals import affinity_terms, level_terms, point_terms, whitened_affinities
 from rigkit.relative_pose.solvers.pose import free_directions, translation_basis
 
-__all__ = ["PoseMinimum", "PoseProblem", "RobustWeights", "cauchy_weights"]
-
 MAX_REFINEMENTS = 60
 STEP_TOLERANCE = 1e-10
 DAMPING_OF_POSE = Damping(start=1e-6, ceiling=1e8, floor=1e-12)

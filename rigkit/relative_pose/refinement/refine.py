@@ -20,7 +20,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit
 from rigkit.geometry.sampson import epipolar_normals, sampson_distances
 from rigkit.relative_pose.refinement.level_frames import LevelFrames
-from rigkit.relative_pose.refinement.pose_problem import PoseMinimum, PoseProblem, RobustWeights, cauchy_weights
+from rigkit.relative_pose.refinement.pose_problem import PoseMinimum, PoseProblem, RobustWeights
 from rigkit.relative_pose.refinement.residuals import whitened_affinities
 from rigkit.relative_pose.solvers.planar_ambiguity import ambiguous_poses, compare_poses
 from rigkit.relative_pose.solvers.pose import cheirality_margin, choose_pose, essential_from_pose, translation_basis
@@ -32,16 +32,6 @@ from rigkit.relative_pose.solvers.weights import (
     estimate_sigma_A,
     usable_affinities,
 )
-
-__all__ = [
-    "SIGNIFICANT",
-    "RefinedPose",
-    "cauchy_weights",
-    "estimate_pose",
-    "project_to_type",
-    "refine_pose",
-    "rules_out",
-]
 
 SIGNIFICANT = 3.0
 """Standard deviations by which a pose must explain the matches worse than another one to be ruled out."""

@@ -22,8 +22,6 @@ from rigkit.geometry.sampson import epipolar_normals
 from rigkit.geometry.triangulation import correct_rays_px
 from rigkit.relative_pose.solvers.weights import pixel_share, usable_affinities
 
-__all__ = ["affinity_terms", "level_terms", "point_terms", "whitened_affinities"]
-
 
 def point_terms(matches: Matches, R: FloatArray, t: FloatArray, basis: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the signed reprojection distances (N,) in sigmas and their Jacobian (N, 5)."""

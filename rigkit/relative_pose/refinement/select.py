@@ -23,15 +23,6 @@ from rigkit.relative_pose.refinement.refine import RefinedPose, estimate_pose, r
 from rigkit.relative_pose.refinement.residuals import level_terms
 from rigkit.relative_pose.solvers.pose import translation_basis
 
-__all__ = [
-    "CONTRADICTION_P",
-    "DEFAULT_LEVEL_RAD",
-    "PoseTypeEvidence",
-    "TypeEvidence",
-    "pose_type_evidence",
-    "type_deviation_rad",
-]
-
 DEFAULT_LEVEL_RAD = float(np.radians(0.2))
 """What a carefully set spirit level on a tripod holds to, where nobody says."""
 

@@ -13,8 +13,6 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.sampson import sampson_distances
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 
-__all__ = ["log_false_alarms"]
-
 SHIFTS = 40
 """Wrong partners tried for every point: the chance of a fit becomes known to a few per cent."""
 

@@ -31,8 +31,6 @@ from rigkit.relative_pose.solvers.registry import fundamental_for
 from rigkit.relative_pose.solvers.rows import PLANAR_ENTRIES, affinity_rows, essential_from_planar, point_rows
 from rigkit.relative_pose.solvers.weights import affinity_distances, usable_affinities
 
-__all__ = ["RobustPose", "Sample", "robust_pose"]
-
 Sample = Literal["points", "affine", "mixed"]
 """What minimal samples consist of: points only; affine correspondences only; one affine correspondence and points."""
 

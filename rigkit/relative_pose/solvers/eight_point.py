@@ -14,8 +14,6 @@ from rigkit.core.matches import Matches
 from rigkit.relative_pose.solvers.rows import affinity_rows, point_rows, right_singular
 from rigkit.relative_pose.solvers.weights import RowWeights
 
-__all__ = ["NormalisedRows", "essential_nearest", "linear_epipolar"]
-
 
 class NormalisedRows:
     """The rows of all matches in normalised coordinates; the weights come later."""

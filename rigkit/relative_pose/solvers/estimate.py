@@ -25,8 +25,6 @@ from rigkit.relative_pose.solvers.weights import (
     usable_affinities,
 )
 
-__all__ = ["EpipolarEstimate", "FundamentalSolver", "check_baseline", "finish", "reweighted", "transfer_error"]
-
 REWEIGHTINGS = 3
 """The weights depend on the geometry only weakly: the third repetition changes E by less than 1e-3 of its error."""
 ROTATION_SIGMAS = 4.0

@@ -16,8 +16,6 @@ from rigkit.geometry.rotation import skew
 from rigkit.relative_pose.solvers.estimate import EpipolarEstimate, check_baseline, finish, reweighted
 from rigkit.relative_pose.solvers.weights import RowWeights, WeightRule
 
-__all__ = ["FixedSolver"]
-
 
 @dataclass(frozen=True, slots=True)
 class FixedSolver:

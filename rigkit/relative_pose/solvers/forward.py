@@ -22,8 +22,6 @@ from rigkit.relative_pose.solvers.estimate import EpipolarEstimate, check_baseli
 from rigkit.relative_pose.solvers.rows import affinity_rows, point_rows, right_singular
 from rigkit.relative_pose.solvers.weights import RowWeights, WeightRule
 
-__all__ = ["ForwardRollSolver"]
-
 BASIS = np.array([[1.0, 0, 0, 0, 1, 0, 0, 0, 0], [0, 1.0, 0, -1, 0, 0, 0, 0, 0]])
 """vec(E) = (a, b) BASIS, row-major."""
 MIN_OFF_AXIS = 1e-12

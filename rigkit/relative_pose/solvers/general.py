@@ -15,8 +15,6 @@ from rigkit.relative_pose.solvers.estimate import EpipolarEstimate, check_baseli
 from rigkit.relative_pose.solvers.planar_ambiguity import refuse_planar_ambiguity
 from rigkit.relative_pose.solvers.weights import RowWeights, WeightRule
 
-__all__ = ["GeneralSolver"]
-
 
 @dataclass(frozen=True, slots=True)
 class GeneralSolver:

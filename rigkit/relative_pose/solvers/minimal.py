@@ -18,13 +18,6 @@ from rigkit.core.arrays import BoolArray, FloatArray, Mat3
 from rigkit.kernels.minimal import five_rows, six_rows
 from rigkit.relative_pose.solvers.rows import essential_from_planar
 
-__all__ = [
-    "essential_from_five_rows",
-    "essential_from_six_rows",
-    "fundamental_from_seven_rows",
-    "planar_from_two_rows",
-]
-
 REAL = 1e-8
 """An eigenvalue or root with a larger imaginary part (relative) is complex."""
 

@@ -23,8 +23,6 @@ from rigkit.relative_pose.solvers.estimate import EpipolarEstimate, check_baseli
 from rigkit.relative_pose.solvers.rows import PLANAR_ENTRIES, affinity_rows, essential_from_planar, point_rows
 from rigkit.relative_pose.solvers.weights import RowWeights, WeightRule
 
-__all__ = ["PlanarSolver", "rotated_matches", "solve_planar_batch"]
-
 J_SIGN = np.array([1.0, -1.0, -1.0, 1.0])
 NEWTON_STEPS = 12
 BISECTIONS = 50

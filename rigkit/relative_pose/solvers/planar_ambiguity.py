@@ -21,15 +21,6 @@ from rigkit.relative_pose.solvers.pose import parallax_noise
 from rigkit.relative_pose.solvers.rows import right_singular
 from rigkit.relative_pose.solvers.weights import RowWeights
 
-__all__ = [
-    "ambiguous_poses",
-    "compare_poses",
-    "decompose_homography",
-    "homography_of_rays",
-    "other_ambiguous_poses",
-    "refuse_planar_ambiguity",
-]
-
 SAME_POSE = 5e-3
 """Two poses nearer than this (rad, and share of the baseline) mislead nobody."""
 ONE_PLANE_MAX_SIGMAS = 3.0

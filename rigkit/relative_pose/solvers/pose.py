@@ -13,18 +13,6 @@ from rigkit.geometry.rotation import cross, log_so3, skew
 from rigkit.geometry.triangulation import ray_ranges
 from rigkit.relative_pose.solvers.eight_point import essential_nearest
 
-__all__ = [
-    "cheirality_margin",
-    "choose_pose",
-    "decompose_essential",
-    "essential_from_pose",
-    "free_directions",
-    "hypothesis_poses",
-    "parallax_noise",
-    "rotations_and_direction",
-    "translation_basis",
-]
-
 
 def essential_from_pose(cam2_from_cam1: Rigid3) -> Mat3:
     """Return E21 = [t]x R with unit Frobenius norm; raises DegenerateError without a baseline."""

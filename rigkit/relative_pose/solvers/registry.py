@@ -11,8 +11,6 @@ from rigkit.relative_pose.solvers.planar import PlanarSolver
 from rigkit.relative_pose.solvers.standard import RowsSolver
 from rigkit.relative_pose.solvers.translation import TranslationSolver
 
-__all__ = ["SOLVERS", "fundamental_for"]
-
 SOLVERS: dict[str, FundamentalSolver] = {
     "general": GeneralSolver(),
     "planar": PlanarSolver(),

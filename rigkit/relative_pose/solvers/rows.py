@@ -20,8 +20,6 @@ import numpy as np
 
 from rigkit.core.arrays import Affines, FloatArray, RayJacobians, Rays
 
-__all__ = ["PLANAR_ENTRIES", "affinity_rows", "essential_from_planar", "planar_angles", "point_rows", "right_singular"]
-
 PLANAR_ENTRIES = (1, 3, 5, 7)
 """Entries of the row-major E that planar motion leaves: E = [[0, e1, 0], [e2, 0, e3], [0, e4, 0]]."""
 

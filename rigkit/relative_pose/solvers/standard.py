@@ -22,8 +22,6 @@ from rigkit.relative_pose.solvers.estimate import EpipolarEstimate, check_baseli
 from rigkit.relative_pose.solvers.rows import right_singular
 from rigkit.relative_pose.solvers.weights import RowWeights, WeightRule
 
-__all__ = ["RowsSolver"]
-
 ONE_ROW_RAD = 1e-12
 """Rows that scatter by less are one row, and its rounding."""
 UNDETERMINED = 1e-12

@@ -18,8 +18,6 @@ from rigkit.relative_pose.solvers.estimate import EpipolarEstimate, check_baseli
 from rigkit.relative_pose.solvers.rows import right_singular
 from rigkit.relative_pose.solvers.weights import RowWeights, WeightRule
 
-__all__ = ["TranslationSolver"]
-
 
 @dataclass(frozen=True, slots=True)
 class TranslationSolver:

@@ -22,19 +22,6 @@ from rigkit.core.matches import Matches
 from rigkit.geometry.sampson import epipolar_normals
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 
-__all__ = [
-    "MIN_SIGMA_A",
-    "RowWeights",
-    "WeightRule",
-    "affinity_distances",
-    "affinity_residuals",
-    "estimate_sigma_A",
-    "initial_weights",
-    "noise_weights",
-    "pixel_share",
-    "usable_affinities",
-]
-
 WeightRule = Literal["noise", "auto", "equal", "points"]
 """noise: from the sigmas of the matches (affinities without a sigma_A are ignored); auto: sigma_A estimated from the
 data; equal: every row counts the same in normalised coordinates; points: affinities ignored."""

@@ -28,8 +28,6 @@ from rigkit.validation.certificate.propagation import (
     variances,
 )
 
-__all__ = ["certify"]
-
 MAP_CELLS = (33, 25)
 """Columns and rows of places at which the bound is evaluated."""
 MAX_SHARE = 0.1

@@ -15,8 +15,6 @@ from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
 from rigkit.geometry.rigid3 import Rigid3
 
-__all__ = ["Certificate", "Instrument", "Quantity", "Task", "instrument_of_rig"]
-
 
 class Quantity(StrEnum):
     """What is measured."""

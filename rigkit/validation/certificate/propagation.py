@@ -19,8 +19,6 @@ from rigkit.core.arrays import BoolArray, FloatArray, Points, Rays
 from rigkit.geometry.rotation import skew
 from rigkit.validation.certificate.contracts import Instrument, Quantity, Task
 
-__all__ = ["CORNERS", "DISTANCE", "LENSES", "MOUNTS", "SCALE", "gradients", "measured_points", "variances"]
-
 PLANE_POINTS = 5
 """A plane is measured at so many points along either side."""
 CORNERS, LENSES, MOUNTS, SCALE, DISTANCE = "corners", "lenses", "mounts", "board scale", "distance"

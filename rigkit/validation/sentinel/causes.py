@@ -14,8 +14,6 @@ from rigkit.geometry.rotation import skew
 from rigkit.planning.goal import Goal, projection_goal
 from rigkit.validation.sentinel.evidence import Watched
 
-__all__ = ["Cause", "causes_of", "lens_goals"]
-
 FIELD_GRID = (24, 18)
 FIT_RANK = 1e-9
 

@@ -24,8 +24,6 @@ from rigkit.planning.goal import Goal
 from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
 from rigkit.validation.sentinel.judge import SentinelCheck, judge_evidence
 
-__all__ = ["PairMatches", "check_matches", "check_scene"]
-
 FEATURES = 2500
 MIN_FRAME_MATCHES = 40
 """Fewer matches of a frame may be of one surface, or wrong."""

@@ -26,8 +26,6 @@ from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, skew
 
-__all__ = ["FreshEvidence", "FreshView", "Watched", "evidence_of"]
-
 MIN_SIGMA_PX = 0.02
 """No corner is better than this: of exact ones everything would be a change."""
 SAME_BOARD = 0.02

@@ -24,8 +24,6 @@ from rigkit.planning.goal import GOAL_GRID, Goal
 from rigkit.validation.sentinel.causes import Cause, causes_of, lens_goals
 from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched, evidence_of
 
-__all__ = ["Change", "Look", "SentinelCheck", "check_views", "judge_evidence"]
-
 Look: TypeAlias = Callable[[Watched], FreshEvidence]
 """What fresh frames say, given cameras and mounts."""
 

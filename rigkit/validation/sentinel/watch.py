@@ -6,8 +6,6 @@ from rigkit.calibration.result import Calibration
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.validation.sentinel.evidence import Watched
 
-__all__ = ["watched_camera"]
-
 
 def watched_camera(calibration: Calibration, name: str) -> Watched:
     """Return a camera as it was calibrated."""
