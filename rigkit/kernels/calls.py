@@ -1,10 +1,14 @@
-"""Calls of the kernels with their arguments checked: type, shape and C-contiguity of every array, as api.h says."""
+"""Calls of the kernels with their arguments checked: type, shape and C-contiguity of every array, as api.h says.
+
+A detection makes sixty calls, some of functions that take ten microseconds: so the checks of each are compiled once,
+into one expression. What that refuses is looked at again, array by array, to say what is wrong.
+"""
 
 from __future__ import annotations
 
 import ctypes
-from types import CodeType
-from typing import Any, Self, TypeVar
+from collections.abc import Callable
+from typing import Any, Self, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +18,7 @@ from rigkit.kernels.declarations import SCALARS, Declaration, header
 STRUCTURES: dict[str, type[Struct]] = {}
 """By their names in api.h; a structure stands there before those that it is part of."""
 
-NAMES_IN_SIZES: dict[str, Any] = {"__builtins__": {}, **header().constants}
+NAMES_IN_SIZES: dict[str, Any] = dict(header().constants)
 """What sizes of arrays may be made of, beside other arguments: the constants, and the kernels once they are loaded."""
 
 AnyStruct = TypeVar("AnyStruct", bound="Struct")
@@ -39,40 +43,73 @@ def address(array: NDArray[Any]) -> int:
 class _Checks:
     """The arrays among the parameters of a function or the members of a structure, and what they must be."""
 
-    def __init__(self, owner: str, declarations: list[Declaration]) -> None:
+    def __init__(self, owner: str, declarations: list[Declaration], pointed: frozenset[str] = frozenset()) -> None:
         self.owner = owner
-        self.arrays = [
-            (place, one.name, one.array.dtype) for place, one in enumerate(declarations) if one.array is not None
-        ]
-        shapes = "".join(f"{one.array.shape}," for one in declarations if one.array is not None)
-        self.shapes: CodeType = compile(f"({shapes})", "api.h", "eval")
+        self.names = tuple(one.name for one in declarations)
+        self._pointed = pointed
+        self._arrays = {one.name: one.array for one in declarations if one.array is not None}
 
-    def addresses(self, values: dict[str, Any]) -> list[tuple[int, int]]:
-        """Return place and address of each of the arrays in `values`; raises TypeError where one is not as declared."""
-        out = []
-        for (place, name, dtype), shape in zip(self.arrays, eval(self.shapes, NAMES_IN_SIZES, values), strict=True):
-            array = values[name]
-            # Bytes and truth values lie alike in memory.
-            if array.shape != shape or (array.dtype != dtype and dtype is not None and not _alike(array.dtype, dtype)):
-                raise TypeError(
-                    f"{self.owner}: '{name}' is {array.dtype} {array.shape}, wants {dtype or 'any type'} {shape}"
-                )
-            try:
-                out.append((place, address(array)))
-            except ValueError as error:
-                raise TypeError(f"{self.owner}: '{name}' is {error}") from None
-        return out
+    def calling(self, target: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a function of the parameters, in their order, that calls `target` with addresses for the arrays.
+
+        It raises TypeError where one is not as declared. What sizes are made of must be loaded.
+        """
+        tests = [f"{name}.shape == {array.shape}" for name, array in self._arrays.items()]
+        # A type is one object, but for those of another order of bytes.
+        tests += [_is_of(name, array.dtype) for name, array in self._arrays.items() if array.dtype is not None]
+        passed = [self._passed(name, "_addressof(_from_buffer({}))") for name in self.names]
+        checked = [self._passed(name, f"_checked('{name}', {{}}, {self._shape(name)})") for name in self.names]
+        code = f"""
+def call({", ".join(self.names)}):
+    if {" and ".join(tests) or "True"}:
+        try:
+            return _target({", ".join(passed)})
+        except (TypeError, ValueError, BufferError):
+            pass
+    return _target({", ".join(checked)})
+"""
+        scope: dict[str, Any] = dict(NAMES_IN_SIZES)
+        scope |= {f"_{array.dtype}": array.dtype for array in self._arrays.values()}
+        scope |= {"_bool": np.dtype(np.bool_), "_pointer": ctypes.pointer, "_target": target, "_checked": self._checked}
+        scope |= {"_addressof": ctypes.addressof, "_from_buffer": ctypes.c_char.from_buffer}
+        exec(compile(code, f"api.h: {self.owner}", "exec"), scope)
+        return cast("Callable[..., Any]", scope["call"])
+
+    def _passed(self, name: str, of_array: str) -> str:
+        """Return the expression for what is passed for a parameter: `of_array` with its name where it is one."""
+        if name in self._arrays:
+            return of_array.format(name)
+        return f"_pointer({name})" if name in self._pointed else name
+
+    def _shape(self, name: str) -> str:
+        return self._arrays[name].shape if name in self._arrays else ""
+
+    def _checked(self, name: str, array: NDArray[Any], shape: tuple[int, ...]) -> int:
+        """Return the address of an array; raises TypeError where it is not as declared."""
+        dtype = self._arrays[name].dtype
+        same = dtype is None or array.dtype == dtype or (dtype == np.uint8 and array.dtype == np.bool_)
+        if array.shape != shape or not same:
+            raise TypeError(
+                f"{self.owner}: '{name}' is {array.dtype} {array.shape}, wants {dtype or 'any type'} {shape}"
+            )
+        try:
+            return address(array)
+        except ValueError as error:
+            raise TypeError(f"{self.owner}: '{name}' is {error}") from None
 
 
-def _alike(given: np.dtype[Any], wanted: np.dtype[Any]) -> bool:
-    return given == np.bool_ and wanted == np.uint8
+def _is_of(name: str, dtype: np.dtype[Any]) -> str:
+    """Return the test of an array's type; bytes and truth values lie alike in memory."""
+    test = f"{name}.dtype is _{dtype}"
+    return f"({test} or {name}.dtype is _bool)" if dtype == np.uint8 else test
 
 
 class Struct(ctypes.Structure):
     """A structure of api.h, its members filled in by `structure`; one without arrays is made like any of ctypes."""
 
     _checks: _Checks
-    _pointed: frozenset[str]
+    _names: frozenset[str]
+    _make: Callable[..., Self] | None
     _kept: dict[str, Any]
 
     @classmethod
@@ -81,13 +118,12 @@ class Struct(ctypes.Structure):
 
         Raises TypeError where a member is missing or an array is not as api.h says.
         """
-        names = [field[0] for field in cls._fields_]
-        if set(names) != values.keys():
+        names = cls._checks.names
+        if values.keys() != cls._names:
             raise TypeError(f"{cls.__name__}: wants {', '.join(names)}; was given {', '.join(values)}")
-        members = [ctypes.pointer(values[name]) if name in cls._pointed else values[name] for name in names]
-        for place, at in cls._checks.addresses(values):
-            members[place] = at
-        out = cls(*members)
+        if cls._make is None:
+            cls._make = staticmethod(cls._checks.calling(cls))
+        out = cls._make(**values)
         out._kept = values
         return out
 
@@ -97,8 +133,9 @@ def structure(name: str) -> Any:
 
     def fill(cls: type[AnyStruct]) -> type[AnyStruct]:
         members = header().structures[name]
-        cls._checks = _Checks(name, members)
-        cls._pointed = frozenset(one.name for one in members if one.pointer and one.type in STRUCTURES)
+        pointed = frozenset(one.name for one in members if one.pointer and one.type in STRUCTURES)
+        cls._checks = _Checks(name, members, pointed)
+        cls._names, cls._make = frozenset(cls._checks.names), None
         cls._fields_ = [(one.name, _ctype(one)) for one in members]
         STRUCTURES[name] = cls
         return cls
@@ -124,22 +161,19 @@ class Kernel:
     def __init__(self, name: str, library: ctypes.CDLL) -> None:
         self.name = name
         self._function = getattr(library, name)
-        self._names = tuple(one.name for one in header().functions[name])
-        self._checks: _Checks | None = None
+        self._checks = _Checks(name, header().functions[name])
+        self._call: Callable[..., Any] | None = None
 
-    def _declare(self) -> _Checks:
+    def _declare(self) -> Callable[..., Any]:
         """Declare the arguments, at the first call: by then the caller has declared the structures among them."""
         parameters, result = header().functions[self.name], header().results[self.name]
         self._function.argtypes = [_ctype(one) for one in parameters]
         self._function.restype = None if result.type == "void" else _ctype(result)
-        self._checks = _Checks(self.name, parameters)
-        return self._checks
+        self._call = self._checks.calling(self._function)
+        return self._call
 
     def __call__(self, *arguments: Any) -> Any:
         """Call it; raises TypeError where an argument is missing or an array is not as declared."""
-        if len(arguments) != len(self._names):
-            raise TypeError(f"{self.name}: wants {', '.join(self._names)}; was given {len(arguments)}")
-        checks, given = self._checks or self._declare(), list(arguments)
-        for place, at in checks.addresses(dict(zip(self._names, arguments, strict=True))):
-            given[place] = at
-        return self._function(*given)
+        if len(arguments) != len(self._checks.names):
+            raise TypeError(f"{self.name}: wants {', '.join(self._checks.names)}; was given {len(arguments)}")
+        return (self._call or self._declare())(*arguments)

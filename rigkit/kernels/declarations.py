@@ -10,7 +10,6 @@ import functools
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from types import CodeType
 
 import numpy as np
 
@@ -38,9 +37,6 @@ class Array:
 
     dtype: np.dtype[np.generic] | None
     shape: str
-
-    def code(self) -> CodeType:
-        return compile(self.shape, "api.h", "eval")
 
 
 @dataclass(frozen=True, slots=True)
