@@ -34,6 +34,16 @@ def _video(name: str) -> Kind:
     return Kind(name, (("fuzz_readers:read_frames", "{case}"), ("fuzz_readers:coach_video", "{case}"), read))
 
 
+def _found_board(name: str, picture: str) -> Kind:
+    return Kind(name, (("detect", "-j", "1", "--board", "{case}", picture, "-o", "{out}/new.csv"),))
+
+
+MATCHES = (
+    ("rigkit.io.correspondences:read_correspondences", "{case}"),
+    ("reconstruct", "--correspondences", "{case}", "--rig", "rig.json", "--images", "scene1.png", "scene2.png", "-o",
+     "{out}/new", "--sparse", "--no-pictures"),
+)  # fmt: skip
+
 KINDS: dict[str, Kind] = {
     "png": Kind(
         "image.png",
@@ -67,6 +77,7 @@ KINDS: dict[str, Kind] = {
             ("certify", "{case}", "--length", "200", "--distance", "900"),
             ("export", "{case}", "--to", "opencv", "-o", "{out}/new.yaml"),
             ("rectify", "image.png", "--camera", "{case}", "-o", "{out}/new.png"),
+            ("rectify", "image.png", "--camera", "{case}", "-o", "{out}/new.png", "--crop", "--hfov-deg", "60"),
         ),
     ),
     "rig": Kind(
@@ -78,6 +89,7 @@ KINDS: dict[str, Kind] = {
             ("export", "{case}", "--to", "kalibr", "-o", "{out}/new.yaml"),
             ("export", "{case}", "--to", "opencv", "-o", "{out}/new.yaml"),
             ("rectify", "image.png", "image.jpg", "--rig", "{case}", "-o", "{out}/new.png"),
+            ("rectify", "image.png", "image.jpg", "--rig", "{case}", "-o", "{out}/new.png", "--crop", "--json"),
         ),
     ),
     "board-rigs": Kind("board-rigs.json", (("rigkit.io.rig_file:load_board_rigs", "{case}"),)),
@@ -112,6 +124,58 @@ KINDS: dict[str, Kind] = {
         (("check", "calibration.json", "{case}", "--board", "floor.toml", "--fix", "{out}/new.json"),),
         judged=True,
     ),
+    "tags-alone": _found_board("alone.toml", "tags.png"),
+    "circles-found": _found_board("hexagonal.toml", "dots.png"),
+    "boofcv-hexagonal": _board_file("hexagonal.yaml"),
+    "known-session": Kind(
+        "known.toml",
+        (
+            ("rigkit.io.rig_session:load_rig_session", "{case}"),
+            ("calibrate", "{case}", "--no-cache", "-o", "{out}/new.json"),
+        ),
+        judged=True,
+    ),
+    "added-session": Kind("added.toml", (("calibrate", "{case}", "--no-cache", "-o", "{out}/new.json"),), judged=True),
+    "known-lens": Kind(
+        "calibration.json",
+        (("calibrate", "known.toml", "--no-cache", "--only-extrinsics", "{case}", "-o", "{out}/new.json", "--force"),),
+        names_file=False,
+        judged=True,
+    ),
+    "known-rig": Kind(
+        "rig.json",
+        (
+            ("calibrate", "added.toml", "--no-cache", "--add-camera", "{case}", "-o", "{out}/new.json"),
+            ("calibrate", "known.toml", "--no-cache", "--only-extrinsics", "{case}", "-o", "{out}/new.json"),
+        ),
+        names_file=False,
+        judged=True,
+    ),
+    "scene-rig": Kind(
+        "rig.json",
+        (
+            (
+                "reconstruct",
+                "--images",
+                "scene1.png",
+                "scene2.png",
+                "--rig",
+                "{case}",
+                "-o",
+                "{out}/new",
+                "--no-pictures",
+            ),
+        ),
+        judged=True,
+    ),
+    "scene-image": Kind(
+        "scene2.png",
+        (("reconstruct", "--images", "scene1.png", "{case}", "--rig", "rig.json", "-o", "{out}/new", "--no-pictures"),),
+        judged=True,
+    ),
+    "matches-npz": Kind("lightglue.npz", MATCHES),
+    "frames-npz": Kind("lafs.npz", MATCHES),
+    "colmap-database": Kind("matches.db", (("fuzz_readers:read_database", "{case}"), *MATCHES[1:])),
     "poses": Kind("poses.csv", (("rigkit.io.robot_poses:read_robot_poses", "{case}"),)),
     "poses-turned": Kind("turns.csv", (("rigkit.io.robot_poses:read_robot_poses", "{case}"),)),
     "pose": Kind("pose.txt", (("rigkit.workflows.reconstruct_scene:_read_pose", "{case}"),)),

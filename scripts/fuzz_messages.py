@@ -8,7 +8,7 @@ from pathlib import PurePath
 
 VERBS = (
     "add|ask|calibrate|change|check|choose|compare|convert|copy|correct|count|create|describe|detect|export|get|give|increase|"
-    "install|keep|leave|list|lower|make|mark|measure|move|name|pip|put|raise|remove|rename|repeat|run|save|see|select|"
+    "install|keep|leave|list|lower|make|mark|match|measure|extract|move|name|pip|put|raise|remove|rename|repeat|run|save|see|select|"
     "set|shorten|show|split|start|take|turn|update|use|wait|write|look|print|restore|say|send|decide|rectify|recalibrate|another"
 )
 REMEDY = re.compile(

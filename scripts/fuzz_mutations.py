@@ -6,7 +6,9 @@ import io
 import json
 import random
 import re
+import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from typing import Any
 
 import numpy as np
@@ -35,6 +37,11 @@ JSON_VALUES: tuple[Any, ...] = (
     None, True, -1, 0, 1e300, 10**400, 1e-320, "", "x", "nan", [], {}, [[]], [1, [2]], float("nan"), float("inf"),
     "a\nb", "\u0000", "\ud800", 0.5, [None], {"a": 1},
 )  # fmt: skip
+SQL_VALUES: tuple[Any, ...] = (
+    None, -1, 0, 1, 2, 2**62, -(2**62), 0.5, float("inf"), "", "x", "abc\udcff".encode("utf-8", "surrogateescape"), b"",
+    b"\x00" * 16, b"\xff" * 1760, b"\x00\x00\xc0\x7f" * 440,
+)  # fmt: skip
+"""In place of a value of a database; the last are whole numbers beyond all, and floats that are none."""
 MAX_DEPTH = 5000
 """Of the nests that are put in: deeper than Python's stack."""
 
@@ -50,6 +57,8 @@ def mutated(data: bytes, name: str, rng: random.Random) -> bytes:
         ways += [_json] * 4
     if name.endswith(".npz"):
         ways = [_bytes, _npz, _npz]
+    if name.endswith(".db"):
+        ways = [_bytes, _database, _database]
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         data = rng.choice(ways)(data, rng)
     return data
@@ -186,6 +195,30 @@ def _npz(data: bytes, rng: random.Random) -> bytes:
     stream = io.BytesIO()
     np.savez(stream, **arrays)
     return stream.getvalue()
+
+
+def _database(data: bytes, rng: random.Random) -> bytes:
+    """Return the SQLite database with one value, table or column changed."""
+    with closing(sqlite3.connect(":memory:")) as database:
+        database.deserialize(data)
+        try:
+            names = [name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+            table = rng.choice(names)
+            columns = [row[1] for row in database.execute(f"PRAGMA table_info({table})")]
+            column, way = rng.choice(columns), rng.randrange(6)
+            if way == 0:
+                database.execute(f"DROP TABLE {table}")
+            elif way == 1:
+                database.execute(f"ALTER TABLE {table} RENAME COLUMN {column} TO x")
+            elif way == 2:
+                database.execute(f"INSERT INTO {table} SELECT * FROM {table} LIMIT 1")
+            else:
+                row = rng.choice(["1", "rowid = 1"])
+                database.execute(f"UPDATE {table} SET {column} = ? WHERE {row}", (rng.choice(SQL_VALUES),))
+            database.commit()
+        except (sqlite3.Error, IndexError):
+            return _bytes(data, rng)
+        return database.serialize()
 
 
 def strange_arrays(value: Any) -> list[Any]:

@@ -12,6 +12,7 @@ from rigkit.core.boards import Board
 from rigkit.interop.ocamcalib import read_py_ocamcalib
 from rigkit.io.corner_cache import CornerCache
 from rigkit.io.corners_file import read_corners
+from rigkit.io.correspondences import read_correspondences
 from rigkit.io.reading import read_text
 from rigkit.io.truth_csv import load_truth_csv
 from rigkit.io.video import read_timestamps
@@ -54,6 +55,11 @@ def read_record(path: Path) -> None:
     Path("out/frames").mkdir()
     shutil.copy(path, "out/frames/frames.json")
     frames_of_video(Path("film.avi"), Path("out/frames"), [SMALL], most=4)
+
+
+def read_database(path: Path) -> None:
+    """Read the matches of two images from a database of COLMAP's."""
+    read_correspondences(path, ("scene1.png", "scene2.png"))
 
 
 def read_times(path: Path) -> None:

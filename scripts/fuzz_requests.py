@@ -15,7 +15,7 @@ import fuzz_seeds
 from fuzz_mutations import mutated
 
 from rigkit.coach.guide import GuideOptions
-from rigkit.coach.server import MAX_UPLOAD_BYTES, coach_app
+from rigkit.coach.server import LOCAL, MAX_UPLOAD_BYTES, coach_app
 from rigkit.core.boards import Board
 from rigkit.workflows.coach import CoachOptions, open_coach
 
@@ -36,11 +36,21 @@ TOKENS = (
     "\x00",
 )
 ACTIONS = (
-    "look", "look", "take", "take", "undo", "finish", "state", "", "frame.jpg", "../../etc/passwd", "..%2f..%2fetc",
+    "look", "look", "take", "take", "photo", "undo",
+    "frame0.jpg", "frame1.jpg", "frame-1.jpg", "frame" + "9" * 400 + ".jpg",
+    "finish", "state", "", "frame.jpg", "../../etc/passwd", "..%2f..%2fetc",
     "look/", "LOOK", "%6cook", "x" * 5000, "caf\u00e9", "a\nb", "\x00", "frame.jpg/..",
 )  # fmt: skip
+SIZES = (
+    None, None, None, "sizes=HALF,HALF", "sizes=HALF,HALF", "sizes=ALL", "sizes=", "sizes=1", "sizes=-1,1", "sizes=a,b",
+    "sizes=\xb2", "sizes=" + "9" * 400, "sizes=0,ALL", "sizes=" + 300 * "0," + "ALL", "sizes", "x=1", "%zz", "\x00",
+)  # fmt: skip
+"""What is said of the pictures in a request; HALF and ALL are its true lengths."""
+NETWORK = "192.168.7.9"
+"""The address of this machine in a network, where others may ask too."""
 METHODS = ("POST", "POST", "POST", "POST", "GET", "PUT", "DELETE", "HEAD", "OPTIONS", "PATCH", "FOO", "")
-HOSTS = (HOST, HOST, HOST, "localhost:1", "[::1]:80", "evil.example", "127.0.0.1.evil.example", "", "[", "[::1",
+HOSTS = (HOST, HOST, HOST, NETWORK, "localhost:1",
+         "[::1]:80", "evil.example", "127.0.0.1.evil.example", "", "[", "[::1",
          "a:b:c", "\xff", "127.0.0.1:99999999", "//", "@127.0.0.1", "127.0.0.1@evil.example")  # fmt: skip
 ORIGINS = (f"http://{HOST}", f"http://{HOST}", f"http://{HOST}", None, "null", "http://evil.example", "", "[",
            "http://[", f"http://{HOST}/../x", f"http://user@{HOST}", "\xff")  # fmt: skip
@@ -66,13 +76,15 @@ def run_case(seed: int, number: int) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "session"
         guide = GuideOptions(boards=(Board("small", 5, 4, 30.0, 30.0),))
-        coach = open_coach(CoachOptions(folder=folder, boards=("5x4x30",), guide=guide))
-        app = coach_app(coach, TOKEN, camera=rng.choice(("page", "server")))
+        cameras = rng.choice((1, 1, 2))
+        coach = open_coach(CoachOptions(folder=folder, boards=("5x4x30",), guide=guide, cameras=cameras))
+        hosts = rng.choice((LOCAL, (NETWORK, *LOCAL)))
+        app = coach_app(coach, TOKEN, hosts, camera=rng.choice(("page", "server")))
         for _ in range(rng.randrange(3, 7)):
             _checked(app, rng)
         outside = [path for path in Path(name).iterdir() if path != folder]
         assert not outside, f"written outside of the session: {outside}"
-        for path in (folder / "images").iterdir():
+        for path in (path for path in (folder / "images").rglob("*") if path.is_file()):
             whole = cv2.imread(str(path)) if path.suffix == ".png" else path.suffix == ".dropped" or None
             assert whole is not None, f"a frame that is none was kept: {path.name}"
 
@@ -88,9 +100,15 @@ def _checked(app: Any, rng: random.Random) -> None:
     if rng.random() < 0.5:
         # Only what is sent is wrong.
         token, method, host, origin, length = TOKEN, "POST", HOST, f"http://{HOST}", None
+    sizes = rng.choice(SIZES)
+    if sizes is not None and "HALF" in sizes:
+        body *= 2
+    query = (sizes or "").replace("HALF", str(len(body) // 2)).replace("ALL", str(len(body)))
     headers = {"host": host, "origin": origin, "content-length": length}
-    shown = f"{method} /{token[:60]}/{action[:60]} {json.dumps(headers)[:200]} and {len(body)} bytes like {name}"
-    status, answer = asyncio.run(_answered(app, method, f"/{token}/{action}", headers, body, rng.randrange(1, 4)))
+    shown = f"{method} /{token[:60]}/{action[:60]}?{query[:60]} {json.dumps(headers)[:200]} and {len(body)} bytes"
+    status, answer = asyncio.run(
+        _answered(app, method, (f"/{token}/{action}", query), headers, body, rng.randrange(1, 4))
+    )
     assert status in ANSWERS, f"{shown}: {status}"
     assert status != 200 or token == TOKEN, f"{shown}: answered without the token"
     if status == 200 and method == "POST":
@@ -107,13 +125,16 @@ def _no_constant(word: str) -> float:
 
 
 async def _answered(
-    app: Any, method: str, path: str, headers: dict[str, str | None], body: bytes, parts: int
+    app: Any, method: str, address: tuple[str, str], headers: dict[str, str | None], body: bytes, parts: int
 ) -> tuple[int, bytes]:
-    """Return status and body of what the application answers to one request, whose body comes in parts."""
+    """Return status and body of what the application answers to one request to (path, query), whose body comes in
+    parts."""
+    path, query = address
     given = [(k.encode(), v.encode("utf-8", "surrogateescape")) for k, v in headers.items() if v is not None]
     scope = {
         "type": "http", "http_version": "1.1", "method": method, "path": path, "root_path": "", "scheme": "http",
-        "raw_path": path.encode("utf-8", "surrogateescape"), "query_string": b"", "headers": given,
+        "raw_path": path.encode("utf-8", "surrogateescape"), "query_string": query.encode("utf-8", "surrogateescape"),
+        "headers": given,
         "client": ("127.0.0.1", 5000), "server": ("127.0.0.1", 8137),
     }  # fmt: skip
     step = max(1, -(-len(body) // parts))

@@ -45,8 +45,8 @@ def read_colmap_matches(path: Path, images: Sequence[str]) -> DatabaseMatches:
             if not len(pairs):
                 raise InputError(f"'{path}': no matches of '{images[0]}' and '{images[1]}'; match them in COLMAP first")
             frames = [_keypoints(database, path, i) for i in ids]
-    except (sqlite3.Error, ValueError) as error:
-        raise InputError(f"'{path}': no database of COLMAP's, or damaged ({error})") from error
+    except (sqlite3.Error, ValueError, TypeError, OverflowError) as error:
+        raise InputError(f"'{path}': no database of COLMAP's, or damaged ({error}); write it again") from error
     if any(pairs[:, k].max() >= len(frames[k]) for k in (0, 1)):
         raise InputError(f"'{path}': matches of keypoints that are not there; extract and match again")
     first, second = frames[0][pairs[:, 0]], frames[1][pairs[:, 1]]
@@ -67,7 +67,9 @@ def _image_ids(database: sqlite3.Connection, path: Path, images: Sequence[str]) 
         ids = [int(i) for i, other in rows if Path(str(other)).name == Path(name).name]
         if len(ids) != 1:
             there = ", ".join(str(other) for _, other in rows[:10])
-            raise InputError(f"'{path}': {len(ids)} images called '{Path(name).name}'; it has {there}")
+            raise InputError(
+                f"'{path}': {len(ids)} images called '{Path(name).name}', one is needed; it has {there or 'none'}"
+            )
         found.append(ids[0])
     return found[0], found[1]
 
@@ -86,7 +88,7 @@ def _index_pairs(database: sqlite3.Connection, ids: tuple[int, int]) -> IntArray
 def _keypoints(database: sqlite3.Connection, path: Path, image_id: int) -> FloatArray:
     row = database.execute("SELECT rows, cols, data FROM keypoints WHERE image_id = ?", (image_id,)).fetchone()
     if not row or int(row[1]) not in (POSITION, SIMILARITY, AFFINITY):
-        raise InputError(f"'{path}': no keypoints of image {image_id}, or of an unknown kind")
+        raise InputError(f"'{path}': no keypoints of image {image_id}, or of an unknown kind; extract them in COLMAP")
     return np.frombuffer(row[2], np.float32).reshape(int(row[0]), int(row[1])).astype(np.float64)
 
 

@@ -30,7 +30,7 @@ def from_matcher(table: dict[str, FloatArray]) -> dict[str, FloatArray] | None:
     if rank == 2:
         return {"pixels1": first, "pixels2": second}
     if first.shape[1:] != (2, 3) or second.shape[1:] != (2, 3):
-        raise InputError(f"{names[0]}: local affine frames are Nx2x3, got {first.shape}")
+        raise InputError(f"{names[0]}: local affine frames must be Nx2x3, got {first.shape}")
     flat = np.abs(np.linalg.det(first[..., :2])) > 0.0
     A21 = np.full((len(first), 2, 2), np.nan)
     A21[flat] = second[flat][..., :2] @ np.linalg.inv(first[flat][..., :2])

@@ -69,7 +69,9 @@ def read_text(path: str | Path, what: str = "", *, max_bytes: int = MAX_TEXT_BYT
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{_named(path, what)} cannot be read: not UTF-8 text; save it as UTF-8") from error
+        raise InputError(
+            f"{_named(path, what)} cannot be read: not UTF-8 text; save it as UTF-8, or give another"
+        ) from error
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 

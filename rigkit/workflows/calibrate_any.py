@@ -50,7 +50,8 @@ def calibrate_sources(
     is_told = bool(folder_options.boards) or folder_options.model is not None
     if len(sources) == 1 and not is_told and (first / SESSION_NAME).is_file():
         first = first / SESSION_NAME
-    if len(sources) > 1 or first.is_dir() or is_video(first):
+    # An image alone is told what would do instead.
+    if len(sources) > 1 or first.is_dir() or is_video(first) or first.suffix.lower() in IMAGE_ENDINGS:
         return calibrate_folders(sources, folder_options, options, progress=progress)
     if is_told:
         raise InputError(f"calibrate: '{first}' says itself what board and model it has; leave out --board and --model")

@@ -15,6 +15,7 @@ from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.calibration_file import calibration_text
 from rigkit.io.files import ensure_writable, write_together
+from rigkit.io.reading import about
 from rigkit.io.rig_file import board_rigs_text, rig_text
 from rigkit.io.rig_session import RigSession, frames_of_images, is_rig_session, load_rig_session
 from rigkit.io.session import load_session
@@ -73,23 +74,25 @@ def calibrate_rig_session(
     if not isinstance(session, RigSession):
         session = load_rig_session(session)
     session = with_known_first(with_known(session, options.known))
-    known_cameras(session)  # complaints before the work
+    with about(session.path):
+        known_cameras(session)  # complaints before the work
+        require_distinct(session)
     targets = _targets(session, options)
     ensure_writable(targets, force=options.force, inputs=session_inputs(session, options))
-    require_distinct(session)
     corners = {name: corners_of(own, options, progress=progress) for name, own in session.cameras.items()}
-    rig = rig_from(session, corners, progress=progress)
-    checks = measured_checks(session, rig)
+    with about(session.path):
+        rig = rig_from(session, corners, progress=progress)
+        checks = measured_checks(session, rig)
     files: dict[Path, str] = {}
     if options.output is not None:
-        about = made(session.path, {name: own.images for name, own in session.cameras.items()})
+        origin = made(session.path, {name: own.images for name, own in session.cameras.items()})
         if len(session.cameras) > 1:
-            files[options.output] = rig_text(rig, about)
+            files[options.output] = rig_text(rig, origin)
             mounted = {c.name: (c.camera, c.cam_from_rig) for c in rig.cameras}
             files |= foreign_rig_files(mounted, options.output, options.exports)
         for camera in rig.cameras:
             own = _beside(session, options.output, camera.name)
-            files[own] = calibration_text(judged(camera.calibration), about)
+            files[own] = calibration_text(judged(camera.calibration), origin)
             files |= foreign_files(camera.camera, own, options.exports)
         if session.rigid_boards:
             files[_boards_file(options.output)] = board_rigs_text(rig.board_rigs)

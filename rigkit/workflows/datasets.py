@@ -26,6 +26,7 @@ from rigkit.core.processes import worker_pool
 from rigkit.core.progress import Progress, silent
 from rigkit.io.calibration_file import calibration_text, is_calibration, load_calibration, load_camera
 from rigkit.io.manifest import CameraEntry, Dataset, Pair, load_dataset
+from rigkit.io.reading import about
 from rigkit.workflows.calibrate_rig import calibrate_camera
 from rigkit.workflows.results import CALIBRATIONS
 
@@ -144,7 +145,8 @@ def load_cameras(dataset: Dataset, *, recalibrate: bool = False, progress: Progr
             if entry.calibration.is_file() and (name not in used or not recalibrate):
                 known[name], sources[name] = _load(entry.calibration), entry.calibration
             elif name in used:
-                calibration = _calibrate(dataset, entry, progress)
+                with about(dataset.manifest):
+                    calibration = _calibrate(dataset, entry, progress)
                 known[name] = LoadedCamera(calibration.camera, calibration)
                 sources[name] = files[_file_of(name, index)] = calibration_text(calibration)
                 _log.info(

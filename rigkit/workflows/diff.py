@@ -91,12 +91,15 @@ def diff(a: Path, b: Path, options: DiffOptions | None = None) -> CameraPair | R
                 "give two such files"
             )
         if options.output is not None:
-            raise InputError("diff: a map is of two cameras, not of boards; leave out -o")
+            raise InputError(f"diff: a map is of two cameras, '{a}' and '{b}' are boards; leave out -o")
         return _boards(a, b)
     rigs = [is_rig(path) for path in (a, b)]
     if all(rigs):
         if options.output is not None:
-            raise InputError("diff: a map is of two cameras; give the calibrations beside the rigs, rig-CAMERA.json")
+            raise InputError(
+                f"diff: a map is of two cameras, '{a}' and '{b}' are rigs; give the calibrations beside them, "
+                "rig-CAMERA.json"
+            )
         return _rigs(a, b)
     if any(rigs):
         other = b if rigs[0] else a

@@ -22,7 +22,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.correspondences import correspondences_text, read_correspondences
 from rigkit.io.npz import npz_bytes
 from rigkit.io.ply import ply_bytes
-from rigkit.io.reading import read_text
+from rigkit.io.reading import about, read_text
 from rigkit.reconstruction.growing.dense import grow_scene
 from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
@@ -235,10 +235,11 @@ def _sparse(
         )
 
     if options.correspondences:
-        found = read_correspondences(options.correspondences, [path.name for path in options.images or ()])
-        if images and are_rough(found):
-            found = with_affinities(found, *images)
-        return scene_of(found), found
+        with about(options.correspondences):
+            found = read_correspondences(options.correspondences, [path.name for path in options.images or ()])
+            if images and are_rough(found):
+                found = with_affinities(found, *images)
+            return scene_of(found), found
     assert images is not None
     for k, tilts in enumerate((None, TILTS)):
         progress("matching affine features", 0, 1)

@@ -183,7 +183,10 @@ def _boards(views: Views, groups: Sequence[Sequence[str]]) -> dict[str, Board]:
     boards = {view.board.board_id: view.board for own in views.values() for _, view in own}
     for name in (name for group in groups for name in group):
         if name not in boards:
-            raise InputError(f"rigid boards: no image shows board '{name}'; known are {', '.join(sorted(boards))}")
+            raise InputError(
+                f"rigid boards: no image shows board '{name}', only {', '.join(sorted(boards))}; add images of it, or "
+                "leave it out of [[rigid_boards]]"
+            )
     return boards
 
 
