@@ -77,7 +77,7 @@ KINDS: dict[str, Kind] = {
             ("certify", "{case}", "--length", "200", "--distance", "900"),
             ("export", "{case}", "--to", "opencv", "-o", "{out}/new.yaml"),
             ("rectify", "image.png", "--camera", "{case}", "-o", "{out}/new.png"),
-            ("rectify", "image.png", "--camera", "{case}", "-o", "{out}/new.png", "--crop", "--hfov-deg", "60"),
+            ("rectify", "image.png", "--camera", "{case}", "-o", "{out}/cut.png", "--crop", "--hfov-deg", "60"),
         ),
     ),
     "rig": Kind(
@@ -89,7 +89,7 @@ KINDS: dict[str, Kind] = {
             ("export", "{case}", "--to", "kalibr", "-o", "{out}/new.yaml"),
             ("export", "{case}", "--to", "opencv", "-o", "{out}/new.yaml"),
             ("rectify", "image.png", "image.jpg", "--rig", "{case}", "-o", "{out}/new.png"),
-            ("rectify", "image.png", "image.jpg", "--rig", "{case}", "-o", "{out}/new.png", "--crop", "--json"),
+            ("rectify", "image.png", "image.jpg", "--rig", "{case}", "-o", "{out}/cut.png", "--crop", "--json"),
         ),
     ),
     "board-rigs": Kind("board-rigs.json", (("rigkit.io.rig_file:load_board_rigs", "{case}"),)),

@@ -113,10 +113,11 @@ def _drawn(path: Path) -> NDArray[np.uint8]:
     start = 15.0 * FINER
     for x, y, w, h in ink.rectangles:
         corners = start + px_per_mm * (np.array([[x, y], [x + w, y + h]]) - low)
-        cv2.rectangle(large, *map(tuple, np.rint(corners).astype(int)), 30, -1)
+        (left, top), (right, bottom) = np.rint(corners).astype(int).tolist()
+        large[top:bottom, left:right] = 30
     for x, y, radius in ink.circles:
         place = np.rint(start + px_per_mm * (np.array([x, y]) - low)).astype(int)
-        cv2.circle(large, tuple(place), round(px_per_mm * radius), 30, -1, cv2.LINE_AA)
+        cv2.circle(large, (int(place[0]), int(place[1])), round(px_per_mm * radius), 30, -1, cv2.LINE_AA)
     grey = cv2.GaussianBlur(cv2.resize(large, SIZE_PX, interpolation=cv2.INTER_AREA), (0, 0), 0.7).astype(float)
     grey += np.random.default_rng(0).normal(0.0, 2.0, grey.shape)
     return np.clip(grey, 0, 255).astype(np.uint8)

@@ -13,6 +13,7 @@ from rigkit.core.errors import InputError
 from rigkit.core.progress import Progress, silent
 from rigkit.io.calibration_file import load_calibration
 from rigkit.io.files import ensure_writable, write_atomic
+from rigkit.io.reading import about
 from rigkit.io.rig_file import is_rig_file
 from rigkit.io.rig_session import is_rig_session
 from rigkit.io.session import load_session
@@ -104,7 +105,8 @@ def plan_session(
     else:
         calibration = load_calibration(source)
         boards = tuple(board_of_shape(shape.board_id, shape.points_mm) for shape in calibration.boards)
-    plan = next_views(calibration, boards, options.count, length=options.length, reach=options.reach)
+    with about(source):
+        plan = next_views(calibration, boards, options.count, length=options.length, reach=options.reach)
     taken = np.concatenate([view.pixels[view.kept] for view in calibration.views])
     title = f"Next pictures for {source.name}"
     return PlannedSession(plan=plan, taken=taken, written=_written(plan, options, title, source, inputs, taken))
