@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -17,6 +17,7 @@ from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.files import ensure_writable, write_atomic, write_together
 from rigkit.io.images import quiet_opencv, read_image, require_pixels
+from rigkit.io.reading import about
 from rigkit.rectification.crop import cropped
 from rigkit.rectification.rectify import RectifyMap, rectify_map, rotation_from_view_angles
 from rigkit.rectification.stereo import StereoRectification, rectify_pair
@@ -24,6 +25,8 @@ from rigkit.rectification.targets import target_camera
 from rigkit.workflows.camera_files import import_camera, import_rig
 from rigkit.workflows.detect import IMAGE_ENDINGS
 
+Jobs = list[tuple[list[tuple[Path, Path]], RectifyMap]]
+"""Of each map: the images, and where they go."""
 EIGHT_BIT = (".jpg", ".jpeg", ".bmp", ".webp")
 
 
@@ -87,12 +90,14 @@ def rectify_image(
     _ensure_all([out for _, out in jobs], options, (*(source for source, _ in jobs), camera))
     source = import_camera(camera)
     hfov_rad = None if options.hfov_deg is None else np.radians(options.hfov_deg)
-    target = target_camera(source, options.projection, hfov_rad=hfov_rad, size_px=options.size_px)
-    rotation = rotation_from_view_angles(*np.radians(options.angles_deg))
-    remap = rectify_map(source, target, target_from_cam=rotation)
-    if options.crop:
-        (remap,) = cropped([remap])
-    done = _write([(jobs, remap)], options, progress)
+    with about(camera):
+        target = target_camera(source, options.projection, hfov_rad=hfov_rad, size_px=options.size_px)
+        rotation = rotation_from_view_angles(*np.radians(options.angles_deg))
+        remap = rectify_map(source, target, target_from_cam=rotation)
+        if options.crop:
+            (remap,) = cropped([remap])
+        covered = _coverage([(jobs, remap)])
+    done = _write([(jobs, remap)], covered, options, progress)
     _write_maps([remap], None, options)
     return RectificationResult(*done)
 
@@ -129,11 +134,14 @@ def rectify_stereo_images(
     else:
         jobs = [[(Path(one), out.with_name(f"{out.stem}-{i}{out.suffix}"))] for i, one in enumerate(images, start=1)]
     _ensure_all([to for job in jobs for _, to in job], options, (*(source for job in jobs for source, _ in job), rig))
-    pair = rectify_pair(camera1, camera2, cam2_from_rig @ cam1_from_rig.inverse(), projection=options.projection)
-    if options.crop:
-        map1, map2 = cropped([pair.map1, pair.map2])
-        pair = replace(pair, map1=map1, map2=map2)
-    done = _write(list(zip(jobs, (pair.map1, pair.map2), strict=True)), options, progress)
+    with about(rig):
+        pair = rectify_pair(camera1, camera2, cam2_from_rig @ cam1_from_rig.inverse(), projection=options.projection)
+        if options.crop:
+            map1, map2 = cropped([pair.map1, pair.map2])
+            pair = replace(pair, map1=map1, map2=map2)
+        both_jobs = list(zip(jobs, (pair.map1, pair.map2), strict=True))
+        covered = _coverage(both_jobs)
+    done = _write(both_jobs, covered, options, progress)
     _write_maps([pair.map1, pair.map2], pair, options)
     return RectificationResult(*done, pair)
 
@@ -159,15 +167,20 @@ def _ensure_all(outputs: list[Path], options: RectifyOptions, inputs: tuple[str 
     ensure_writable([*outputs, *maps], force=options.force, inputs=inputs)
 
 
-def _write(
-    jobs: list[tuple[list[tuple[Path, Path]], RectifyMap]], options: RectifyOptions, progress: Progress
-) -> tuple[tuple[RectifiedImage, ...], dict[str, InputError]]:
-    """Resample and write the images of each map, one after the other; two images of a pair come together or not."""
+def _coverage(jobs: Jobs) -> list[float]:
+    """Return the part of each map that its camera sees; raises InputError for too large images and views of nothing."""
     for job, remap in jobs:
         require_pixels(remap.target.size_px, f"rectified image '{job[0][1]}' (--size)")
     covered = [float(remap.coverage().mean()) for _, remap in jobs]
     if min(covered) == 0.0:
         raise InputError("rectify: the camera sees nothing of this view; change --yaw-deg, --pitch-deg or --hfov-deg")
+    return covered
+
+
+def _write(
+    jobs: Jobs, covered: Sequence[float], options: RectifyOptions, progress: Progress
+) -> tuple[tuple[RectifiedImage, ...], dict[str, InputError]]:
+    """Resample and write the images of each map, one after the other; two images of a pair come together or not."""
     total, done, failures = len(jobs[0][0]), [], {}
     resamplers = [remap.resampler(interpolation=options.interpolation) for _, remap in jobs]
     for i in range(total):
