@@ -190,7 +190,7 @@ def _linear(seen: Sequence[Rigid3], robot: Sequence[Rigid3]) -> tuple[Rigid3, Ri
         for cam, arm in zip(seen, robot, strict=True)
     ]
     # Row by row: vec(R_x^T R_cam) = (I kron R_cam^T) vec(R_x^T), vec(R_robot R_z) = (R_robot kron I) vec(R_z).
-    solution = np.linalg.svd(np.concatenate(rows))[2][-1]
+    solution = np.linalg.svd(np.concatenate(rows), full_matrices=False)[2][-1]
     first, second = solution[:9].reshape(3, 3), solution[9:].reshape(3, 3)
     sign = np.sign(np.linalg.det(first))
     Rx, Rz = nearest_rotation(sign * first).T, nearest_rotation(sign * second)
