@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from coach.test_coach import BOARD, CAMERA, SIZE, ask, options, picture
 
+from rigkit.calibration.result import Calibration
 from rigkit.coach.coach import Coach
 from rigkit.coach.guide import GuideOptions
 from rigkit.coach.look import Glance, glance_at
@@ -20,11 +21,13 @@ from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
 from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3, log_so3
+from rigkit.geometry.rotation import angle_between, exp_so3, log_so3, unit
 from rigkit.io.rig_session import load_rig_session
 from rigkit.planning.candidates import Reach, held_boards
-from rigkit.planning.information import CornerError, HeldBoards
+from rigkit.planning.information import CornerError, HeldBoards, Knowledge
 from rigkit.planning.mounts import SharedViews, mean_motion, mount_error_px, mount_information
+from rigkit.planning.plan import covariance_of
+from rigkit.validation.certificate.contracts import Quantity, Task
 from rigkit.workflows.coach import CoachOptions, open_coach
 
 MOUNT = Rigid3(exp_so3(np.array([0.0, 0.06, 0.01])), [-60.0, 1.0, 2.0])
@@ -177,9 +180,28 @@ def test_a_look_at_a_smaller_picture_shows_the_same(pairs: Sequence[list[np.ndar
     assert half.as_photo().still and not half.still
 
 
-def test_the_goal_may_be_a_length_in_mm(tmp_path: Path, rng: np.random.Generator) -> None:
-    from rigkit.validation.certificate.contracts import Quantity, Task
+def length_error_mm(calibration: Calibration, length: Task) -> float:
+    """By how much lengths across the image, level and upright, are measured wrongly by lenses that are one standard
+    deviation off in each independent direction: root of the squares' sum, of which the mean over the image is taken."""
+    camera, covariance = calibration.camera, covariance_of(Knowledge.of(calibration).information)
+    count = camera.parameters.size
+    u, v = np.meshgrid(np.linspace(0.0, SIZE[0] - 1.0, 13), np.linspace(0.0, SIZE[1] - 1.0, 10))
+    middle, valid = camera.unproject(np.stack([u, v], axis=-1).reshape(-1, 2))
+    middle, squared = middle[valid], 0.0
+    level = unit(np.cross([0.0, 1.0, 0.0], middle))
+    half, far = 0.5 * length.size_mm, length.distance_mm
+    ways = [(far * middle - half * way, far * middle + half * way) for way in (level, np.cross(middle, level))]
+    ends = [[camera.project(end)[0] for end in way] for way in ways]
+    seen = np.all([camera.on_image(end) for way in ends for end in way], axis=0)
+    for error in np.linalg.cholesky(covariance[:count, :count]).T:
+        wrong = camera.with_parameters(camera.parameters + error)
+        for one, other in ends:
+            angle = angle_between(wrong.unproject(one[seen])[0], wrong.unproject(other[seen])[0])
+            squared += float(((2.0 * far * np.tan(0.5 * angle) - length.size_mm) ** 2).mean()) / len(ways)
+    return float(np.sqrt(squared))
 
+
+def test_the_goal_may_be_a_length_in_mm(tmp_path: Path, rng: np.random.Generator) -> None:
     guide = GuideOptions(boards=(BOARD,), hfov_deg=52.0, goal_mm=0.2, reach=REACH)
     length = Task(quantity=Quantity.LENGTH, size_mm=100.0, distance_mm=500.0)
     coach = open_coach(CoachOptions(folder=tmp_path, boards=("9x6x25",), guide=guide, length=length))
@@ -187,8 +209,9 @@ def test_the_goal_may_be_a_length_in_mm(tmp_path: Path, rng: np.random.Generator
     for k in range(0, 120, 10):
         coach.guide.add([glance(held.pose(k), rng, f"{k}")])
     advice = coach.guide.advise([glance(held.pose(7), rng, "x")])
-    lens = advice.lenses[0]
-    assert lens.unit == "mm" and lens.error is not None and lens.error_px is not None
-    # A pixel is about 0.8 mm there.
-    assert 0.02 * lens.error_px < lens.error < 5.0 * lens.error_px
-    assert advice.enough == (lens.error <= 0.2 or (lens.more_percent or 0.0) < 5.0)
+    (lens,) = advice.lenses
+    assert lens.unit == "mm" and lens.error is not None
+    calibration = coach.guide.lenses[0].calibration
+    assert calibration is not None
+    assert lens.error == pytest.approx(length_error_mm(calibration, length), rel=0.005)
+    assert lens.error <= 0.2 and advice.enough

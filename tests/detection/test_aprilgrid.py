@@ -72,7 +72,9 @@ def test_every_corner_has_its_own_number(lens: str, pattern: AprilGrid, rng: np.
     assert found.board_id == "k"
     assert len(found.grid) >= 78
     off = errors(found, scene.truth()[0])
-    assert (np.abs(off) < np.maximum(0.3, 5.0 * found.sigma_px[:, None])).all()
+    # At the rim of a fisheye, tags alone leave a few corners a quarter of a pixel open, and say so.
+    assert (np.abs(off) < 5.0 * found.sigma_px[:, None]).all()
+    assert np.sqrt((off**2).mean()) < (0.03 if pattern.corner_squares else 0.1)
     assert 0.7 < np.sqrt(((off / found.sigma_px[:, None]) ** 2).mean()) < 1.3
 
 

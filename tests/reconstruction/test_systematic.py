@@ -63,8 +63,9 @@ def test_a_smooth_field_is_told_from_noise(rng: np.random.Generator) -> None:
 
 def test_without_a_field_nothing_is_lost(rng: np.random.Generator) -> None:
     _, fitted, plain_error, fitted_error = errors(rng, 0.0)
-    # The least field is allowed for even here: what is stated is a little too large.
-    assert 0.5 < np.sqrt(np.mean(np.square(fitted))) < 1.3
+    # The least field is allowed for even here: what is stated is 1.5 times too large, and no more. Sixty numbers tell
+    # the mean of 0.68 to 0.06; three of that.
+    assert 0.5 < np.sqrt(np.mean(np.square(fitted))) < 0.87
     assert np.median(fitted_error) < 1.15 * np.median(plain_error)
 
 
@@ -79,7 +80,8 @@ def test_noise_that_neighbours_share_is_not_a_field(rng: np.random.Generator) ->
         np.testing.assert_allclose(found.covariance, once.covariance, rtol=1e-6, atol=1e-18)
         assert max(pose_errors_deg(found.cam2_from_cam1, once.cam2_from_cam1)) < 1e-6
         distances.append(distance(found.cam2_from_cam1, found.covariance, pose))
-    assert 0.5 < np.sqrt(np.mean(np.square(distances))) < 1.3
+    # Of 0.8, as before: fewer corners are less sure themselves, beside the least field.
+    assert 0.58 < np.sqrt(np.mean(np.square(distances))) < 1.02
 
 
 def test_a_pose_without_freedom_stays(rng: np.random.Generator) -> None:
