@@ -34,6 +34,8 @@ from rigkit.core.posetype import PoseType
 from rigkit.detection.detect import detect_boards
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between
+from rigkit.reconstruction.board_planes import BoardPlanes
+from rigkit.reconstruction.coplanar_planes import coplanar_planes
 from rigkit.reconstruction.geometry import PairGeometry, pair_geometry
 from rigkit.reconstruction.lattice_planes import lattice_planes
 from rigkit.reconstruction.pairing import match_pair
@@ -144,26 +146,31 @@ def in_sigmas(scene: StereoScene, geometry: PairGeometry, found: Calibration) ->
     level = reconstruction.level_sigma_rad
     shifts = calibration_shifts(reconstruction, found.covariance, level_sigma_rad=level)
     measured = measure(reconstruction, shifts)
-    lattice = lattice_planes(geometry, found.covariance, one_camera=True)
+    fitted: dict[str, BoardPlanes] = {
+        "coplanar": coplanar_planes(geometry, found.covariance, one_camera=True),
+        "lattice": lattice_planes(geometry, found.covariance, one_camera=True),
+    }
     truth = scene.normals_in_cam1()
     for a, b in FACES:
         names = PLANES[a].board_id, PLANES[b].board_id
-        for what, (value, sigma) in (
-            ("angles", measured.angle_deg(*names)),
-            ("angles, lattice", lattice.angle_deg(*names)),
-        ):
-            yield what, (value - 90.0) / sigma
+        value, sigma = measured.angle_deg(*names)
+        yield "angles", (value - 90.0) / sigma
+        for kind, planes in fitted.items():
+            value, sigma = planes.angle_deg(*names)
+            yield f"angles, {kind}", (value - 90.0) / sigma
     free = float(np.hypot(reconstruction.baseline_sigma_mm, np.sqrt(shifts.variance(lambda r: r.baseline_mm))))
     yield "baselines", (reconstruction.baseline_mm - scene.baseline_mm) / free
-    length, sigma = lattice.baseline_mm()
-    yield "baselines, lattice", (length - scene.baseline_mm) / sigma
+    for kind, planes in fitted.items():
+        length, sigma = planes.baseline_mm()
+        yield f"baselines, {kind}", (length - scene.baseline_mm) / sigma
     yield from (("normals", k) for k in normals_in_sigmas(measured, truth))
     cloud = reconstruction.cloud
     for n, (board, true) in enumerate(zip(PLANES, truth, strict=True)):
-        covariance = lattice.normal_covariance(board.board_id)
         across = np.linalg.svd(np.outer(true, true))[0][:, 1:]
-        off = lattice.normal(board.board_id) @ across
-        yield from (("normals, lattice", k) for k in off / np.sqrt(np.diag(across.T @ covariance @ across)))
+        for kind, planes in fitted.items():
+            covariance = planes.normal_covariance(board.board_id)
+            off = planes.normal(board.board_id) @ across
+            yield from ((f"normals, {kind}", k) for k in off / np.sqrt(np.diag(across.T @ covariance @ across)))
         own = cloud.board_index == n
         # Stated is the rms angle; of errors alike in both directions 63 and 98 % lie within one and two of it.
         each = angle_between(cloud.normals[own], true) / cloud.normal_sigma_rad[own]

@@ -44,6 +44,16 @@ def add_direction_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_planes_argument(parser: argparse.ArgumentParser, what: str) -> None:
+    """Add what is known of the boards' points, with a word on `what` that decides."""
+    parser.add_argument(
+        "--planes",
+        choices=("free", "coplanar", "lattice"),
+        help=f"{what}: each point by itself (free, unless the manifest says otherwise), the points of a board in one "
+        "plane, or on its known lattice; the latter two are fitted to both images at once",
+    )
+
+
 def results_folder(args: argparse.Namespace, name: str) -> Path:
     """Return the folder asked for, or a new one of that name."""
     from rigkit.workflows.results import free_folder

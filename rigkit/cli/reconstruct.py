@@ -9,6 +9,7 @@ from rigkit.cli.console import note, print_json, progress_on_stderr
 from rigkit.cli.dataset_arguments import (
     add_dataset_arguments,
     add_direction_arguments,
+    add_planes_argument,
     dataset_options,
     direction_options,
     exit_code_of,
@@ -30,18 +31,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_direction_arguments(parser)
     add_scene_arguments(parser)
     parser.add_argument("--method", choices=METHODS, default="3SDIR", help="affine estimator (default 3SDIR)")
-    parser.add_argument(
-        "--planes",
-        choices=("free", "lattice"),
-        default="free",
-        help="each point and normal by itself (default), or on the boards' known lattices, fitted to both images",
-    )
+    add_planes_argument(parser, "points and normals")
     parser.add_argument("--no-pictures", action="store_true", help="leave out PNG pictures")
 
 
 def run(args: argparse.Namespace) -> int:
     if is_scene(args):
-        if args.planes != "free":
+        if args.planes is not None:
             raise InputError("reconstruct: --planes is about boards, and a scene has none")
         if direction_options(args):
             raise InputError("reconstruct: --directions and --det-scale are about boards, and a scene has none")

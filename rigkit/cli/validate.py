@@ -9,6 +9,7 @@ from rigkit.cli.console import note, print_json, progress_on_stderr
 from rigkit.cli.dataset_arguments import (
     add_dataset_arguments,
     add_direction_arguments,
+    add_planes_argument,
     dataset_options,
     direction_options,
     exit_code_of,
@@ -31,6 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--cluster", metavar="ADDRESS", help="of several data sets: a Dask scheduler to use instead of processes"
     )
     add_direction_arguments(parser)
+    add_planes_argument(parser, "planes that angles, normals and the baseline are judged by")
     parser.add_argument("--no-pictures", action="store_true", help="leave out PNG pictures and the HTML report")
     parser.add_argument(
         "--figures", choices=("png", "pdf"), default="png", help="pdf: the pictures for a paper as well (vectors)"
@@ -62,6 +64,8 @@ def run(args: argparse.Namespace) -> int:
     common = dataset_options(args, dataset.name)
     if args.paper and direction_options(args):
         raise InputError("--paper has directions and a scale of its own; leave --directions and --det-scale out")
+    if args.paper and args.planes is not None:
+        raise InputError("--paper takes the principal planes of the points; leave --planes out")
     if args.paper:
         return _as_paper(dataset, PaperOptions(**common, own_solvers=args.own_solvers), json=args.json)
     if args.own_solvers:
@@ -76,6 +80,7 @@ def _options(args: argparse.Namespace, common: dict[str, Any]) -> ValidateOption
     return ValidateOptions(
         **common,
         **direction_options(args),
+        planes=args.planes,
         pictures=not args.no_pictures,
         pdf=args.figures == "pdf",
         crosscheck=not args.no_crosscheck,

@@ -9,6 +9,7 @@ from typing import TypeVar
 
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
+from rigkit.core.planes import PLANE_CHOICES, Planes
 from rigkit.core.posetype import PoseType
 from rigkit.core.printing import brief
 from rigkit.core.truth import PairTruth
@@ -57,6 +58,7 @@ class Pair:
     boards : the boards that stand there.
     truth : what a person measured.
     layout : board id -> "left", "right", "floor", "ceiling" or "back", as seen from camera 1; empty where not stated.
+    planes : what is known of a board's points, see `Planes`.
     down : which way is down in the frames of camera 1 and 2, for planar motion of cameras that are not level; or None.
     """
 
@@ -70,6 +72,7 @@ class Pair:
     boards: tuple[Board, ...]
     truth: PairTruth
     layout: dict[str, str]
+    planes: Planes = "free"
     down: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     @property
@@ -150,7 +153,8 @@ def load_dataset(path: str | Path) -> Dataset:
     cameras = tuple(_camera(t) for t in top.tables("cameras", hint='[[cameras]] with id = "left" and calibration'))
     _refuse_twice(top, "boards", [b.board_id for b in boards])
     _refuse_twice(top, "cameras", [c.camera_id for c in cameras])
-    pairs = tuple(_pair(t, boards, cameras) for t in top.tables("pairs", hint='[[pairs]] with id = "first"'))
+    planes = _planes(top) if top.has("planes") else "free"
+    pairs = tuple(_pair(t, boards, cameras, planes) for t in top.tables("pairs", hint='[[pairs]] with id = "first"'))
     _refuse_twice(top, "pairs", [p.pair_id for p in pairs])
     if top.has("truth_table"):
         pairs = _with_table(top, pairs)
@@ -208,7 +212,12 @@ def _camera(table: TomlTable) -> CameraEntry:
     return CameraEntry(camera_id, calibration, session)
 
 
-def _pair(table: TomlTable, boards: Sequence[Board], cameras: Sequence[CameraEntry]) -> Pair:
+def _planes(table: TomlTable) -> Planes:
+    given = table.text("planes", hint='planes = "coplanar"', choices=PLANE_CHOICES)
+    return next(choice for choice in PLANE_CHOICES if choice == given)
+
+
+def _pair(table: TomlTable, boards: Sequence[Board], cameras: Sequence[CameraEntry], default_planes: Planes) -> Pair:
     pair_id = table.identifier("id", hint='id = "left-right"')
     by_camera = {c.camera_id: c for c in cameras}
     by_board = {b.board_id: b for b in boards}
@@ -230,6 +239,7 @@ def _pair(table: TomlTable, boards: Sequence[Board], cameras: Sequence[CameraEnt
     if table.has("truth"):
         truth = truth_from_table(table.table("truth", hint="[pairs.truth]"), chosen)
     layout = _layout(table, names) if table.has("layout") else {}
+    planes = _planes(table) if table.has("planes") else default_planes
     table.done()
     return Pair(
         pair_id=pair_id,
@@ -242,6 +252,7 @@ def _pair(table: TomlTable, boards: Sequence[Board], cameras: Sequence[CameraEnt
         boards=chosen,
         truth=truth,
         layout=layout,
+        planes=planes,
         down=down,
     )
 

@@ -25,13 +25,14 @@ from rigkit.io.schema_words import (
 )
 from rigkit.study.table import StudyCell
 from rigkit.validation.check import Check
-from rigkit.validation.checks import AngleResult, ValidationReport
+from rigkit.validation.checks import ANGLE_ERRORS, ValidationReport
+from rigkit.validation.fitted_planes import AngleResult
 from rigkit.validation.planes import NormalErrors
 
 _VALUE = nullable(NUMBER)
 _CHECKS = said(array(of_dataclass(Check)), "every quantity measured beside ours")
 _ANGLE = of_dataclass(AngleResult)
-_ANGLE["properties"] |= {"error_deg": _VALUE, "lattice_error_deg": _VALUE}
+_ANGLE["properties"] |= dict.fromkeys(ANGLE_ERRORS, _VALUE)
 _NORMALS = of_dataclass(NormalErrors)
 _BOARD_RESULT = obj(
     {
@@ -43,6 +44,7 @@ _BOARD_RESULT = obj(
         "flatness_rms_mm?": NUMBER,
         "flatness_peak_mm?": NUMBER,
         "normal_errors": said(_NORMALS, "of the estimated normals against the plane"),
+        "coplanar_normal_errors?": said(nullable(_NORMALS), "against the plane of coplanar points"),
         "lattice_normal_errors?": said(nullable(_NORMALS), "against the plane of the board's known lattice"),
         "square_x_ratio?": NUMBER,
         "square_y_ratio?": NUMBER,
@@ -50,7 +52,9 @@ _BOARD_RESULT = obj(
         "right_handed?": BOOLEAN,
     }
 )
-_OF_REPORT = of_dataclass(ValidationReport, only=("pose_type", "affine_method", "baseline_mm", "baseline_sigma_mm"))
+_OF_REPORT = of_dataclass(
+    ValidationReport, only=("pose_type", "affine_method", "baseline_mm", "baseline_sigma_mm", "planes")
+)
 VALIDATION_FILE = file(
     "rigkit.validation/1",
     "The verdict on one pair by one estimator",

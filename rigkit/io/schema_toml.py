@@ -9,6 +9,7 @@ from rigkit.affine.registry import AFFINE_METHODS
 from rigkit.calibration.shape import SHAPES
 from rigkit.cameras.registry import MODELS
 from rigkit.core.patterns.registry import PATTERNS
+from rigkit.core.planes import PLANE_CHOICES
 from rigkit.core.posetype import PoseType
 from rigkit.identification.board_ids import BOARD_SIDES
 from rigkit.io.schema_words import (
@@ -187,6 +188,7 @@ DATASET_FILE = file(
                     "the spirit level; by default a carefully set one",
                 ),
                 "layout?": said(table(choice(*BOARD_SIDES)), "where boards that look alike stand, from camera 1"),
+                "planes?": said(choice(*PLANE_CHOICES), "of this pair, where it differs"),
                 "truth?": obj(
                     {"baseline?": obj(_measured("mm"), "distance of the two lenses"), **_TRUTH},
                     "what a person measured",
@@ -196,6 +198,11 @@ DATASET_FILE = file(
             least=1,
         ),
         "images?": said(choice("real", "rendered"), "what they are: stands beside ratios to the paper's results"),
+        "planes?": said(
+            choice(*PLANE_CHOICES),
+            "what planes, angles and clouds are built on: each point by itself (free, the default), the points of a "
+            "board in one plane, or on its known lattice",
+        ),
         "truth_table?": said(TEXT, "a CSV file with what was measured, kept in a spreadsheet"),
     },
 )

@@ -10,20 +10,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray, Mat3, Points
+from rigkit.core.arrays import BoolArray, FloatArray, Points
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
-from rigkit.geometry.principal_axes import principal_axes
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import angle_between, skew
-from rigkit.reconstruction.lattice_problem import (
+from rigkit.geometry.rotation import skew
+from rigkit.reconstruction.board_planes import (
     MIN_CORNERS_OF_BOARD,
+    BoardPlanes,
+    inverse_information,
+    moved_cameras,
+)
+from rigkit.reconstruction.lattice_problem import (
     LatticeView,
     PlacedLattices,
     all_residuals,
@@ -35,41 +38,20 @@ from rigkit.reconstruction.noise_level import variance_factor
 
 if TYPE_CHECKING:
     from rigkit.reconstruction.geometry import PairGeometry
-    from rigkit.reconstruction.pairing import MatchedPair
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class LatticePlanes:
+class LatticePlanes(BoardPlanes):
     """Relative pose and boards' poses of maximum likelihood, with the boards' lattices known.
+
+    The last parameters are the logarithms of the boards' sizes; corners of both views count each.
 
     Attributes
     ----------
-    board_ids : in the order of the parameters.
-    cam2_from_cam1 : relative pose, mm.
     cam1_from_board : by id, mm.
-    covariance : (P, P) of the parameters from the corners' noise: (rotation rad, translation mm) of the relative pose,
-        then of every board, each as a left perturbation; then the logarithms of the boards' sizes.
-    calibration_moves : (A, P) what one standard deviation along each principal axis of the calibrations' covariance
-        changes in the parameters; A = 0 where that is not known.
-    variance_factor : observed over stated variance of the corners, as used in `covariance`.
-    rms_sigmas : root mean square residual of the corners per axis, in their stated sigmas.
-    count, gross : corners of both views that take part, and that were left out as gross outliers.
     """
 
-    board_ids: tuple[str, ...]
-    cam2_from_cam1: Rigid3
     cam1_from_board: Mapping[str, Rigid3]
-    covariance: FloatArray
-    calibration_moves: FloatArray
-    variance_factor: float
-    rms_sigmas: float
-    count: int
-    gross: int
-
-    @cached_property
-    def full_covariance(self) -> FloatArray:
-        """(P, P), with the calibrations' share."""
-        return np.asarray(self.covariance + self.calibration_moves.T @ self.calibration_moves)
 
     def normal(self, board_id: str) -> FloatArray:
         """Return the unit normal (3,) of a board, facing camera 1."""
@@ -81,44 +63,19 @@ class LatticePlanes:
         """Return n . x of the board's points."""
         return float(self.normal(board_id) @ self.cam1_from_board[board_id].translation_mm)
 
-    def normal_covariance(self, board_id: str) -> Mat3:
-        """Return the covariance (3, 3) of a board's normal, rad^2, the calibrations' share included."""
-        by_turn = np.zeros((3, len(self.covariance)))
-        by_turn[:, self._rotation_of(board_id)] = -skew(self.normal(board_id))
-        return np.asarray(by_turn @ self.full_covariance @ by_turn.T)
-
-    def angle_deg(self, a: str, b: str) -> tuple[float, float]:
-        """Return the angle between two faces as a protractor across them shows it, and its sigma, degrees."""
-        one, two = self.normal(a), self.normal(b)
-        sine = float(np.linalg.norm(np.cross(one, two)))
-        # d angle / d turn of a: along the axis that both normals turn about; parallel faces have no such axis.
-        axis = np.cross(one, two) / sine if sine > 1e-12 else np.zeros(3)
-        row = np.zeros(len(self.covariance))
-        row[self._rotation_of(a)], row[self._rotation_of(b)] = axis, -axis
-        sigma = float(np.sqrt(row @ self.full_covariance @ row))
-        return 180.0 - float(np.rad2deg(angle_between(one, two))), float(np.rad2deg(sigma))
-
-    def baseline_mm(self) -> tuple[float, float]:
-        """Return the length of the baseline and its sigma, mm."""
-        t = self.cam2_from_cam1.translation_mm
-        length = float(np.linalg.norm(t))
-        row = np.zeros(len(self.covariance))
-        row[3:6] = t / length
-        return length, float(np.sqrt(row @ self.full_covariance @ row))
+    def has_points(self, board: Board, grid: FloatArray) -> BoolArray:
+        """Return which of the corners `grid` (N, 2) of a board are known: all, or none of a board that is not."""
+        return np.full(len(grid), board.board_id in self.board_ids)
 
     def points(self, board: Board, grid: FloatArray) -> tuple[Points, FloatArray]:
         """Return the lattice points at `grid` (N, 2) in camera 1, mm, and their covariances (N, 3, 3)."""
         pose = self.cam1_from_board[board.board_id]
         turned = board.points(np.asarray(grid, dtype=np.int64)) @ pose.rotation.T
         by = np.zeros((len(turned), 3, len(self.covariance)))
-        start = self._rotation_of(board.board_id).start
+        start = self.rotation_of(board.board_id).start
         by[:, :, start : start + 3], by[:, :, start + 3 : start + 6] = -skew(turned), np.eye(3)
         by[:, :, 6 * (len(self.board_ids) + 1) + self.board_ids.index(board.board_id)] = turned
         return turned + pose.translation_mm, by @ self.full_covariance @ np.swapaxes(by, 1, 2)
-
-    def _rotation_of(self, board_id: str) -> slice:
-        start = 6 * (1 + self.board_ids.index(board_id))
-        return slice(start, start + 3)
 
 
 def lattice_planes(
@@ -148,7 +105,7 @@ def lattice_planes(
     axis changes the residuals by dr and the parameters by -(J^T J)^-1 J^T dr.
     """
     pair = geometry.pair
-    moved = _moved_cameras(pair, covariance1, covariance2, one_camera)
+    moved = moved_cameras(pair, covariance1, covariance2, one_camera)
     views, boards = _views(geometry, moved)
     if not boards:
         raise DegenerateError(
@@ -181,7 +138,7 @@ def _result(
     factor = variance_factor(float(data @ data), 2 * count - 6 * (len(boards) + 1))
     # The sizes' prior is no noise of the corners: its variance stays what a person said.
     scaled = J[:, free] / np.sqrt(np.where(np.arange(len(J)) < len(data), factor, 1.0))[:, None]
-    information = _inverse(scaled.T @ scaled, pair_id)
+    information = inverse_information(scaled.T @ scaled, pair_id)
     covariance = np.zeros((J.shape[1], J.shape[1]))
     covariance[np.ix_(free, free)] = information
     moves = np.zeros((len(moved), J.shape[1]))
@@ -223,30 +180,6 @@ def _views(geometry: PairGeometry, moved: list[tuple[Camera, Camera]]) -> tuple[
             views += both
             boards.append(board)
     return views, boards
-
-
-def _inverse(gram: FloatArray, pair_id: str) -> FloatArray:
-    scale = np.sqrt(np.diag(gram))
-    values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
-    if not values[0] > 1e-14:
-        raise DegenerateError(f"pair '{pair_id}': the corners leave the boards' poses open; more of them must be seen")
-    return np.asarray((vectors / values) @ vectors.T / np.outer(scale, scale))
-
-
-def _moved_cameras(
-    pair: MatchedPair, covariance1: FloatArray | None, covariance2: FloatArray | None, one_camera: bool
-) -> list[tuple[Camera, Camera]]:
-    """Return the cameras moved by one sigma along each principal axis of the calibrations; none where one is exact."""
-    one, two = pair.camera1, pair.camera2
-    if covariance1 is None or (covariance2 is None and not one_camera):
-        return []
-    out = []
-    for axis in principal_axes(covariance1):
-        moved = one.with_parameters(one.parameters + axis)
-        out.append((moved, moved if one_camera else two))
-    if covariance2 is not None and not one_camera:
-        out += [(one, two.with_parameters(two.parameters + axis)) for axis in principal_axes(covariance2)]
-    return out
 
 
 def _residual_changes(

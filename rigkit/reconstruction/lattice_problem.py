@@ -11,11 +11,8 @@ from rigkit.core.arrays import BoolArray, FloatArray, Points, Rays
 from rigkit.geometry.board_pose import point_residuals
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, skew
+from rigkit.reconstruction.board_planes import MIN_CORNERS_OF_BOARD, near_the_rest
 
-MIN_CORNERS_OF_BOARD = 8
-"""A board with fewer corners in a view has no pose there worth the name."""
-GROSS = 8.0
-"""A corner this many standard deviations off is no corner of the lattice: something stands in front of it."""
 OUTLIER_ROUNDS = 3
 MAX_LATTICE_STEPS = 40
 LATTICE_STEP_TOLERANCE = 1e-10
@@ -160,8 +157,6 @@ def fit_without_outliers(
 def _near(views: list[LatticeView], state: PlacedLattices) -> list[BoolArray]:
     """Return which corners of each view are no gross outliers, by the median of all residuals."""
     off = [np.linalg.norm(residuals_of(view, state)[0], axis=1) for view in views]
-    # The median length of two normal residuals is 1.1774 of their sigma.
-    sigma = max(float(np.median(np.concatenate(off))) / 1.1774, 1e-9)
-    near = [np.asarray(one <= GROSS * sigma) for one in off]
+    near = np.split(near_the_rest(np.concatenate(off)), np.cumsum([len(one) for one in off])[:-1])
     enough = all(which.sum() >= MIN_CORNERS_OF_BOARD for which in near)
     return near if enough else [np.ones(len(one), dtype=bool) for one in off]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +23,16 @@ from rigkit.core.boards import Board
 from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import Matches
+from rigkit.core.planes import PLANE_CHOICES, Planes
 from rigkit.core.posetype import PoseType
 from rigkit.core.printing import brief, drawn
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.sampson import sampson_distances
+from rigkit.reconstruction.board_planes import BoardPlanes
+from rigkit.reconstruction.coplanar_planes import coplanar_planes
 from rigkit.reconstruction.geometry import PairGeometry, pair_geometry
-from rigkit.reconstruction.lattice_planes import LatticePlanes, lattice_planes
+from rigkit.reconstruction.lattice_planes import lattice_planes
 from rigkit.reconstruction.metric import TriangulatedPoints
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 
@@ -37,9 +40,6 @@ if TYPE_CHECKING:
     from rigkit.reconstruction.pairing import MatchedPair
 
 GREY = 160
-Planes = Literal["free", "lattice"]
-"""What points and normals of a cloud are: each by itself, or those of the boards' known lattices."""
-PLANE_CHOICES: tuple[Planes, ...] = get_args(Planes)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -110,14 +110,14 @@ def reconstruct_pair(
 ) -> Reconstruction:
     """Reconstruct one pair with one affine estimator: `pair_geometry`, then `reconstruct_from`.
 
-    Parameters, errors : of those two. For several estimators compute the geometry once. With `planes` "lattice" the
-    points and normals are those of the boards' known lattices (`on_lattice`), the intrinsics exact.
+    Parameters, errors : of those two. For several estimators compute the geometry once. With other `planes`
+    than "free" the points and normals are those of the boards' planes (`on_planes`), the intrinsics exact.
     """
     if planes not in PLANE_CHOICES:
         raise InputError(f"planes: '{planes}' is unknown; known: {', '.join(PLANE_CHOICES)}")
     geometry = pair_geometry(pair, pose_type=pose_type, level_sigma_rad=level_sigma_rad)
     free = reconstruct_from(geometry, affine_method=affine_method, scale=scale, image1=image1)
-    return free if planes == "free" else on_lattice(free, lattice_planes(geometry))
+    return free if planes == "free" else on_planes(free, fit_planes(geometry, planes))
 
 
 def reconstruct_from(
@@ -199,29 +199,48 @@ def _cloud(
         raise DegenerateError(f"pair '{pair.pair_id}': {error}") from error
 
 
-def on_lattice(reconstruction: Reconstruction, planes: LatticePlanes) -> Reconstruction:
-    """Return the reconstruction with the points, normals and pose that the boards' lattices give.
+def fit_planes(
+    geometry: PairGeometry,
+    planes: Planes,
+    covariance1: FloatArray | None = None,
+    covariance2: FloatArray | None = None,
+    *,
+    one_camera: bool = False,
+) -> BoardPlanes:
+    """Return the boards' planes, "coplanar" or "lattice"; parameters and errors as of `lattice_planes`."""
+    if planes not in ("coplanar", "lattice"):
+        raise InputError(f"planes: '{planes}' are not fitted to both images; coplanar and lattice are")
+    fit = lattice_planes if planes == "lattice" else coplanar_planes
+    return fit(geometry, covariance1, covariance2, one_camera=one_camera)
+
+
+def on_planes(reconstruction: Reconstruction, planes: BoardPlanes) -> Reconstruction:
+    """Return the reconstruction with the points, normals and pose that planes fitted to both images give.
 
     Points of one board share the errors of its pose: their sigmas are each point's own, and planes fitted to them look
-    more certain than they are. `planes` says how certain the boards' planes are. Points of boards that are not in
-    `planes` are left out, and a note says so.
+    more certain than they are. `planes` says how certain the boards' planes are. Points that are not on `planes` are
+    left out, and a note says so.
 
     Raises
     ------
     DegenerateError
         No point is on a board of `planes`.
     """
-    cloud, names = reconstruction.cloud, reconstruction.cloud.board_ids
-    known = np.array([name in planes.board_ids for name in names])
-    placed = (cloud.board_index >= 0) & known[cloud.board_index]
+    cloud = reconstruction.cloud
+    placed = np.zeros(len(cloud), dtype=bool)
+    for k, board in enumerate(reconstruction.boards):
+        own = cloud.board_index == k
+        placed[own] = planes.has_points(board, cloud.grid[own])
     if not placed.any():
         raise DegenerateError(
-            f"pair '{reconstruction.pair_id}': no point is on a board whose lattice was fitted; "
+            f"pair '{reconstruction.pair_id}': no point is on a board whose plane was fitted; "
             "take images that show whole boards"
         )
     baseline_mm, baseline_sigma_mm = planes.baseline_mm()
-    lost = [name for name, fitted in zip(names, known, strict=True) if not fitted]
-    told = f"left out, for their lattices could not be fitted: {', '.join(lost)}"
+    lost = [b.board_id for b in reconstruction.boards if b.board_id not in planes.board_ids]
+    told = [f"left out, for their planes could not be fitted: {', '.join(lost)}"] if lost else []
+    if planes.gross:
+        told.append(f"{planes.gross} corners lie far off the boards' planes and were left out")
     pixels1, pixels2 = reconstruction.pixels1[placed], reconstruction.pixels2[placed]
     m = Matches.from_cameras(reconstruction.camera1, reconstruction.camera2, pixels1, pixels2)
     E21 = essential_from_pose(planes.cam2_from_cam1)
@@ -235,16 +254,16 @@ def on_lattice(reconstruction: Reconstruction, planes: LatticePlanes) -> Reconst
         pose_covariance=planes.full_covariance[:6, :6],
         E21=E21,
         sampson_rms_px=float(np.sqrt(np.mean(distances**2))),
-        cloud=_cloud_on_lattice(reconstruction, planes, placed),
+        cloud=_cloud_on_planes(reconstruction, planes, placed),
         baseline_mm=baseline_mm,
         baseline_sigma_mm=baseline_sigma_mm,
-        notes=(*reconstruction.notes, told) if lost else reconstruction.notes,
+        notes=(*reconstruction.notes, *told),
         kept=None,
     )
 
 
-def _cloud_on_lattice(reconstruction: Reconstruction, planes: LatticePlanes, placed: BoolArray) -> OrientedCloud:
-    """Return the points `placed` (N,) as the boards' lattices have them."""
+def _cloud_on_planes(reconstruction: Reconstruction, planes: BoardPlanes, placed: BoolArray) -> OrientedCloud:
+    """Return the points `placed` (N,) as the boards' planes have them."""
     cloud = reconstruction.cloud
     points_mm, normals = np.array(cloud.points_mm), np.array(cloud.normals)
     sigma_mm, normal_sigma_rad = np.array(cloud.sigma_mm), np.array(cloud.normal_sigma_rad)

@@ -66,19 +66,37 @@ def scale_and_gradient(
     The derivative is that of the least-squares problem with the weights as they ended: zero for points that took no
     part, and for those that lost all their weight.
     """
-    scales, sigmas, slopes = _fit_boards(points_unit, board_index, grid, boards, covariances)
+    scales, variance, slopes = board_scales_and_gradients(points_unit, board_index, grid, boards, covariances)
     known = np.isfinite(scales)
-    if not known.any():
-        raise DegenerateError(
-            f"no scale: none of {len(boards)} boards has {MIN_CORNERS_FOR_SCALE} triangulated corners that span it; "
-            "take images in which both cameras see one whole"
-        )
-    square = [(board.square_sigma_mm or 0.0) / min(board.square_x_mm, board.square_y_mm) for board in boards]
-    variance = sigmas**2 + (scales * np.array(square)) ** 2
     weights = np.where(known, 1.0 / np.maximum(np.where(known, variance, 1.0), 1e-300), 0.0)
     total = weights.sum()
     gradient = np.einsum("b,bni->ni", weights, slopes) / total
     return float(np.sum(weights * np.where(known, scales, 0.0)) / total), float(total**-0.5), gradient
+
+
+def board_scales_and_gradients(
+    points_unit: Points,
+    board_index: IntArray,
+    grid: IntArray,
+    boards: Sequence[Board],
+    covariances: FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return every board's scale, its variance (B,) with the squares' own, and how it moves with the points.
+
+    The gradients are (B, N, 3); scales that nothing tells are NaN. Parameters, errors as of `metric_scale`.
+    """
+    scales, sigmas, slopes = _fit_boards(points_unit, board_index, grid, boards, covariances)
+    if not np.isfinite(scales).any():
+        raise DegenerateError(
+            f"no scale: none of {len(boards)} boards has {MIN_CORNERS_FOR_SCALE} triangulated corners that span it; "
+            "take images in which both cameras see one whole"
+        )
+    return scales, sigmas**2 + (scales * square_sigmas(boards)) ** 2, slopes
+
+
+def square_sigmas(boards: Sequence[Board]) -> FloatArray:
+    """Return the standard deviations (B,) of the squares as parts of them; 0 where none is stated."""
+    return np.array([(b.square_sigma_mm or 0.0) / min(b.square_x_mm, b.square_y_mm) for b in boards])
 
 
 def board_scales(

@@ -9,55 +9,28 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 
-from rigkit.core.arrays import without_nan
+from rigkit.core.arrays import FloatArray, without_nan
 from rigkit.core.errors import InputError
+from rigkit.core.planes import Planes
 from rigkit.core.printing import brief
 from rigkit.core.truth import PairTruth
-from rigkit.reconstruction.lattice_planes import LatticePlanes
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.validation.boards import BoardResult
 from rigkit.validation.check import Check, compare
 from rigkit.validation.declarations import DECLARED, contradicted_boards, declaration_checks
+from rigkit.validation.fitted_planes import AngleResult, FittedPlanes, normal_errors_against
 from rigkit.validation.intrinsics import CalibrationShifts
 from rigkit.validation.measure import Measured, measure
-from rigkit.validation.planes import NormalErrors, normal_errors
+from rigkit.validation.planes import NormalErrors
 
 COVERAGE = 2.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AngleResult:
-    """The angle between two boards' faces, degrees, its sigma, and the measured angle where there is one.
-
-    `angle_deg` is that of planes through the triangulated points; `lattice_deg` and `lattice_sigma_deg` of the planes
-    that the boards' known lattices give, where they were computed.
-    """
-
-    a: str
-    b: str
-    angle_deg: float
-    sigma_deg: float
-    measured_deg: float | None
-    lattice_deg: float | None = None
-    lattice_sigma_deg: float | None = None
-
-    @property
-    def error_deg(self) -> float | None:
-        """|angle - measured|: the orthogonality error where a right angle was measured; None where nothing was."""
-        return None if self.measured_deg is None else abs(self.angle_deg - self.measured_deg)
-
-    @property
-    def lattice_error_deg(self) -> float | None:
-        """|lattice angle - measured|; None where one of them is not known."""
-        if self.measured_deg is None or self.lattice_deg is None:
-            return None
-        return abs(self.lattice_deg - self.measured_deg)
+ANGLE_ERRORS = ("error_deg", "coplanar_error_deg", "lattice_error_deg")
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -73,7 +46,10 @@ class ValidationReport:
     angles : between each two boards.
     baseline_mm, baseline_sigma_mm, sampson_rms_px, count : of the reconstruction.
     notes : the reconstruction's notes, and boards with gross outliers.
-    lattice_normal_errors : of the estimated normals against the planes of the boards' known lattices, by board.
+    planes : what is known of the boards' points by which angles, normals and the baseline are judged.
+    judged_normals : of the boards, where they are not those of the planes through the points.
+    coplanar_normal_errors, lattice_normal_errors : of the estimated normals against the planes that were fitted to both
+        images, by board.
     """
 
     pair_id: str
@@ -88,6 +64,9 @@ class ValidationReport:
     sampson_rms_px: float
     count: int
     notes: tuple[str, ...] = ()
+    planes: Planes = "free"
+    judged_normals: Mapping[str, FloatArray] = field(default_factory=dict)
+    coplanar_normal_errors: Mapping[str, NormalErrors] = field(default_factory=dict)
     lattice_normal_errors: Mapping[str, NormalErrors] = field(default_factory=dict)
 
     __repr__ = brief
@@ -120,21 +99,38 @@ class ValidationReport:
             "pose_type": self.pose_type,
             "affine_method": self.affine_method,
             "passed": self.passed,
+            "planes": self.planes,
             "points": self.count,
             "baseline_mm": self.baseline_mm,
             "baseline_sigma_mm": self.baseline_sigma_mm,
             "sampson_rms_px": self.sampson_rms_px,
             "checks": [asdict(check) for check in self.checks],
             "unchecked": list(self.unchecked),
-            "angles": [
-                asdict(angle) | {"error_deg": angle.error_deg, "lattice_error_deg": angle.lattice_error_deg}
-                for angle in self.angles
-            ],
-            "boards": [_board_dict(board, self.lattice_normal_errors) for board in self.boards],
+            "angles": [asdict(angle) | {name: getattr(angle, name) for name in ANGLE_ERRORS} for angle in self.angles],
+            "boards": [self._board_dict(board) for board in self.boards],
             "notes": list(self.notes),
         }
         cleaned: dict[str, Any] = without_nan(out)
         return cleaned
+
+    def _board_dict(self, result: BoardResult) -> dict[str, Any]:
+        plane, board_id = result.plane, result.board.board_id
+        return {
+            "board": board_id,
+            "points": plane.count,
+            "normal": plane.normal.tolist(),
+            "offset_mm": plane.offset_mm,
+            "normal_sigma_deg": float(np.rad2deg(plane.sigma_rad)),
+            "flatness_rms_mm": plane.rms_mm,
+            "flatness_peak_mm": plane.peak_mm,
+            "normal_errors": asdict(result.normal_errors),
+            "coplanar_normal_errors": _plain(self.coplanar_normal_errors.get(board_id)),
+            "lattice_normal_errors": _plain(self.lattice_normal_errors.get(board_id)),
+            "square_x_ratio": result.square_x_ratio,
+            "square_y_ratio": result.square_y_ratio,
+            "skew_deg": result.skew_deg,
+            "right_handed": result.right_handed,
+        }
 
     def to_json(self) -> str:
         """Return `to_dict()` as JSON text."""
@@ -146,7 +142,7 @@ def validate(
     truth: PairTruth | None,
     *,
     shifts: CalibrationShifts | None = None,
-    lattice: LatticePlanes | None = None,
+    fitted: FittedPlanes | None = None,
     coverage: float = COVERAGE,
     weighted: bool = True,
 ) -> ValidationReport:
@@ -157,7 +153,7 @@ def validate(
     reconstruction : of one pair.
     truth : what a person measured of that pair; None, as of a pair of which nothing was measured, is refused.
     shifts : from `calibration_shifts`: what the calibrations' uncertainty adds to every sigma; None: exact intrinsics.
-    lattice : the boards' planes by their known lattices, to stand beside those of the points.
+    fitted : planes fitted to both images, to stand beside those of the points, or to be judged in their place.
     coverage : largest |difference| / combined sigma that passes.
     weighted : planes by what is known of each point's noise; else by principal components of the points, all alike.
 
@@ -171,14 +167,14 @@ def validate(
     if truth is None:
         raise InputError("validate: nothing was measured of this pair, so nothing can be checked; give its PairTruth")
     measured = measure(reconstruction, shifts, weighted=weighted)
-    return _report(reconstruction, measured, truth, shifts, lattice, coverage)
+    return _report(reconstruction, measured, truth, shifts, fitted or FittedPlanes(), coverage)
 
 
 def validate_each(
     reconstructions: Sequence[Reconstruction],
     truth: PairTruth,
     shifts: Sequence[CalibrationShifts | None],
-    lattice: LatticePlanes | None = None,
+    fitted: FittedPlanes | None = None,
     layout: Mapping[str, str] | None = None,
 ) -> tuple[ValidationReport, ...]:
     """Return `validate` of reconstructions of one pair by several estimators, each with its shifts.
@@ -194,7 +190,7 @@ def validate_each(
             measured = measure(reconstruction, moved)
             known.append((reconstruction, moved, measured))
         own = measured.with_normals(reconstruction)
-        reports.append(_report(reconstruction, own, truth, moved, lattice, COVERAGE, layout))
+        reports.append(_report(reconstruction, own, truth, moved, fitted or FittedPlanes(), COVERAGE, layout))
     return tuple(reports)
 
 
@@ -203,29 +199,67 @@ def _report(
     measured: Measured,
     truth: PairTruth,
     shifts: CalibrationShifts | None,
-    lattice: LatticePlanes | None,
+    fitted: FittedPlanes,
     coverage: float,
     layout: Mapping[str, str] | None = None,
 ) -> ValidationReport:
-    baseline_sigma_mm = reconstruction.baseline_sigma_mm
-    if shifts is not None:
-        baseline_sigma_mm = float(np.hypot(baseline_sigma_mm, np.sqrt(shifts.variance(lambda r: r.baseline_mm))))
+    baseline = _baseline(reconstruction, shifts, fitted)
     cloud = reconstruction.cloud
+    angles = {frozenset(two): measured.angle_deg(*two) for two in combinations(measured.boards, 2)}
     checks: list[Check] = []
-    unchecked: list[str] = []
-    held, unheld = declaration_checks(reconstruction)
     if truth.baseline is not None:
         known = (truth.baseline.value_mm, truth.baseline.sigma_mm, truth.baseline.how)
-        ours = (reconstruction.baseline_mm, baseline_sigma_mm)
-        checks.append(compare("baseline", "baseline", "mm", known, ours, coverage, len(cloud)))
-    angles = {frozenset(two): measured.angle_deg(*two) for two in combinations(measured.boards, 2)}
+        checks.append(compare("baseline", "baseline", "mm", known, baseline, coverage, len(cloud)))
+    of_boards, unchecked = _checks_of_boards(measured, truth, angles, fitted, coverage)
+    held, unheld = declaration_checks(reconstruction)
+    checks += [*of_boards, *held, *contradicted_boards(measured.boards, layout or {})]
+    unchecked += unheld
+    against = normal_errors_against(reconstruction, fitted.judge)
+    stated = {frozenset((angle.a, angle.b)): angle.value_deg for angle in truth.angles}
+    return ValidationReport(
+        pair_id=reconstruction.pair_id,
+        pose_type=str(reconstruction.pose_type),
+        affine_method=reconstruction.affine_method,
+        checks=tuple(checks),
+        unchecked=tuple(unchecked),
+        boards=tuple(replace(b, normal_errors=against.get(n, b.normal_errors)) for n, b in measured.boards.items()),
+        angles=tuple(
+            fitted.angle(a, b, angles[frozenset((a, b))], stated.get(frozenset((a, b))))
+            for a, b in combinations(measured.boards, 2)
+        ),
+        baseline_mm=baseline[0],
+        baseline_sigma_mm=baseline[1],
+        sampson_rms_px=reconstruction.sampson_rms_px,
+        count=len(cloud),
+        notes=(*reconstruction.notes, *_outlier_notes(measured.boards.values())),
+        planes=fitted.planes,
+        judged_normals=fitted.judged_normals(),
+        coplanar_normal_errors=normal_errors_against(reconstruction, fitted.coplanar),
+        lattice_normal_errors=normal_errors_against(reconstruction, fitted.lattice),
+    )
+
+
+def _checks_of_boards(
+    measured: Measured,
+    truth: PairTruth,
+    angles: Mapping[frozenset[str], tuple[float, float]],
+    fitted: FittedPlanes,
+    coverage: float,
+) -> tuple[list[Check], list[str]]:
+    """Return the checks of measured angles and distances, and in words which could not be made."""
+    checks: list[Check] = []
+    unchecked: list[str] = []
     for angle in truth.angles:
         name, both = f"angle {angle.a}-{angle.b}", (angle.a, angle.b)
         if measured.absent(*both):
             unchecked.append(f"{name}: {measured.absent(*both)}")
             continue
+        judged = fitted.judged_angle(*both, angles[frozenset(both)])
+        if judged is None:
+            unchecked.append(f"{name}: too few corners in both images for {fitted.planes} planes")
+            continue
         known = (angle.value_deg, angle.sigma_deg, angle.how)
-        checks.append(compare(name, "angle", "deg", known, angles[frozenset(both)], coverage, measured.count(*both)))
+        checks.append(compare(name, "angle", "deg", known, judged, coverage, measured.count(*both)))
     for distance in truth.distances:
         name, ends = f"distance {distance.a} to {distance.b}", (distance.a.board_id, distance.b.board_id)
         if measured.absent(*ends):
@@ -235,49 +269,18 @@ def _report(
         checks.append(
             compare(name, "distance", "mm", known, measured.distance_mm(distance), coverage, measured.count(*ends))
         )
-    checks += [*held, *contradicted_boards(measured.boards, layout or {})]
-    unchecked += unheld
-    stated = {frozenset((angle.a, angle.b)): angle.value_deg for angle in truth.angles}
-    return ValidationReport(
-        pair_id=reconstruction.pair_id,
-        pose_type=str(reconstruction.pose_type),
-        affine_method=reconstruction.affine_method,
-        checks=tuple(checks),
-        unchecked=tuple(unchecked),
-        boards=tuple(measured.boards.values()),
-        angles=tuple(
-            _angle_result(a, b, angles[frozenset((a, b))], stated.get(frozenset((a, b))), lattice)
-            for a, b in combinations(measured.boards, 2)
-        ),
-        baseline_mm=reconstruction.baseline_mm,
-        baseline_sigma_mm=baseline_sigma_mm,
-        sampson_rms_px=reconstruction.sampson_rms_px,
-        count=len(cloud),
-        notes=(*reconstruction.notes, *_outlier_notes(measured.boards.values())),
-        lattice_normal_errors={} if lattice is None else _lattice_normal_errors(reconstruction, lattice),
-    )
+    return checks, unchecked
 
 
-def _angle_result(
-    a: str, b: str, found: tuple[float, float], stated: float | None, lattice: LatticePlanes | None
-) -> AngleResult:
-    known = lattice is not None and {a, b} <= set(lattice.board_ids)
-    by_lattice = lattice.angle_deg(a, b) if known and lattice is not None else (None, None)
-    return AngleResult(
-        a=a,
-        b=b,
-        angle_deg=found[0],
-        sigma_deg=found[1],
-        measured_deg=stated,
-        lattice_deg=by_lattice[0],
-        lattice_sigma_deg=by_lattice[1],
-    )
-
-
-def _lattice_normal_errors(reconstruction: Reconstruction, lattice: LatticePlanes) -> dict[str, NormalErrors]:
-    cloud = reconstruction.cloud
-    of = {board.board_id: cloud.normals[cloud.board_index == n] for n, board in enumerate(reconstruction.boards)}
-    return {name: normal_errors(of[name], lattice.normal(name)) for name in lattice.board_ids if len(of.get(name, ()))}
+def _baseline(
+    reconstruction: Reconstruction, shifts: CalibrationShifts | None, fitted: FittedPlanes
+) -> tuple[float, float]:
+    """Return the baseline that is judged, and its sigma with the calibrations' share, mm."""
+    if fitted.judge is not None:
+        return fitted.judge.baseline_mm()
+    sigma = reconstruction.baseline_sigma_mm
+    share = 0.0 if shifts is None else shifts.variance(lambda r: r.baseline_mm)
+    return reconstruction.baseline_mm, float(np.hypot(sigma, np.sqrt(share)))
 
 
 def _outlier_notes(boards: Iterable[BoardResult]) -> list[str]:
@@ -289,20 +292,5 @@ def _outlier_notes(boards: Iterable[BoardResult]) -> list[str]:
     ]
 
 
-def _board_dict(result: BoardResult, by_lattice: Mapping[str, NormalErrors]) -> dict[str, Any]:
-    plane, board_id = result.plane, result.board.board_id
-    return {
-        "board": board_id,
-        "points": plane.count,
-        "normal": plane.normal.tolist(),
-        "offset_mm": plane.offset_mm,
-        "normal_sigma_deg": float(np.rad2deg(plane.sigma_rad)),
-        "flatness_rms_mm": plane.rms_mm,
-        "flatness_peak_mm": plane.peak_mm,
-        "normal_errors": asdict(result.normal_errors),
-        "lattice_normal_errors": asdict(by_lattice[board_id]) if board_id in by_lattice else None,
-        "square_x_ratio": result.square_x_ratio,
-        "square_y_ratio": result.square_y_ratio,
-        "skew_deg": result.skew_deg,
-        "right_handed": result.right_handed,
-    }
+def _plain(errors: NormalErrors | None) -> dict[str, Any] | None:
+    return None if errors is None else asdict(errors)

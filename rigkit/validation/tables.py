@@ -126,21 +126,23 @@ def plane_table(reports: Sequence[ValidationReport], method: str, paper: PaperTa
 
 
 def angle_table(reports: Sequence[ValidationReport]) -> Table | None:
-    """Return the angles between boards by planes through the points and by known lattices, one report a pair.
+    """Return the angles between boards by planes through the points and by those fitted to both images, one report a
+    pair.
 
-    None where no lattice planes were computed.
+    None where no planes were fitted to both images.
     """
     rows: list[tuple[Cell, ...]] = []
     for report in reports:
         for angle in report.angles:
-            if angle.lattice_deg is None:
+            if angle.lattice_deg is None and angle.coplanar_deg is None:
                 continue
             free = (Cell(angle.angle_deg, sigma=angle.sigma_deg), Cell(angle.error_deg))
+            coplanar = (Cell(angle.coplanar_deg, sigma=angle.coplanar_sigma_deg), Cell(angle.coplanar_error_deg))
             lattice = (Cell(angle.lattice_deg, sigma=angle.lattice_sigma_deg), Cell(angle.lattice_error_deg))
             normals = [report.lattice_normal_errors.get(name) for name in (angle.a, angle.b)]
             means = [Cell(None if errors is None else errors.mean_deg) for errors in normals]
             head = (Cell(report.pair_id), Cell(f"{angle.a}, {angle.b}"), Cell(angle.measured_deg))
-            rows.append((*head, *free, *lattice, *means))
+            rows.append((*head, *free, *coplanar, *lattice, *means))
     if not rows:
         return None
     columns = (
@@ -149,16 +151,19 @@ def angle_table(reports: Sequence[ValidationReport]) -> Table | None:
         Column("measured", "deg", 2),
         Column("points' planes", "deg", 4),
         Column("error", "deg", 4),
+        Column("coplanar points", "deg", 4),
+        Column("error, coplanar", "deg", 4),
         Column("lattice planes", "deg", 4),
         Column("error, lattice", "deg", 4),
         Column("mean normal error to lattice, first", "deg", 4),
         Column("second", "deg", 4),
     )
     note = (
-        "Points' planes: fitted to the triangulated corners. Lattice planes: maximum likelihood of relative pose and "
-        "boards' poses from all corners of both views, the boards' squares known; sigmas include the calibrations."
+        "Points' planes: fitted to the triangulated corners. Coplanar points: maximum likelihood of relative pose and "
+        "planes from the corners that both views show, those of a board in one plane. Lattice planes: of relative pose "
+        "and boards' poses from all corners of both views, the boards' squares known. Sigmas include the calibrations."
     )
-    return Table("angles", "Angles between boards by free and by lattice planes", columns, tuple(rows), note)
+    return Table("angles", "Angles between boards by free, coplanar and lattice planes", columns, tuple(rows), note)
 
 
 def baseline_table(reports: Sequence[ValidationReport], paper: PaperTables) -> Table:

@@ -13,13 +13,14 @@ from rigkit.affine.directions import Support
 from rigkit.cameras.base import Camera
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.planes import Planes
 from rigkit.detection.detect import detect_boards
 from rigkit.io.images import read_image, to_grey
 from rigkit.io.manifest import Pair
+from rigkit.reconstruction.board_planes import BoardPlanes
 from rigkit.reconstruction.geometry import PairGeometry, pair_geometry
-from rigkit.reconstruction.lattice_planes import LatticePlanes, lattice_planes
 from rigkit.reconstruction.pairing import MatchedPair, match_pair
-from rigkit.reconstruction.reconstruct import Reconstruction, on_lattice, reconstruct_from
+from rigkit.reconstruction.reconstruct import Reconstruction, fit_planes, on_planes, reconstruct_from
 from rigkit.relative_pose.refinement.level_frames import LevelFrames
 from rigkit.validation.intrinsics import CalibrationShifts, calibration_shifts
 from rigkit.workflows.datasets import LoadedCamera
@@ -119,26 +120,25 @@ def shifts_of(reconstruction: Reconstruction, camera1: LoadedCamera, camera2: Lo
     )
 
 
-def lattice_of(geometry: PairGeometry, camera1: LoadedCamera, camera2: LoadedCamera) -> LatticePlanes | None:
-    """Return the boards' planes by their known lattices; None where too few corners are seen."""
-    try:
-        return lattice_planes(geometry, camera1.covariance, camera2.covariance, one_camera=camera1 is camera2)
-    except DegenerateError:
-        return None
+def planes_of(geometry: PairGeometry, planes: Planes, camera1: LoadedCamera, camera2: LoadedCamera) -> BoardPlanes:
+    """Return the boards' planes, fitted to both images, with the calibrations' share in their sigmas.
+
+    Raises DegenerateError where too few corners are seen.
+    """
+    covariances = (camera1.covariance, camera2.covariance)
+    return fit_planes(geometry, planes, *covariances, one_camera=camera1 is camera2)
 
 
-def reconstruct_on_lattice(
-    reconstruction: Reconstruction, camera1: LoadedCamera, camera2: LoadedCamera
+def reconstruct_on_planes(
+    reconstruction: Reconstruction, planes: Planes, camera1: LoadedCamera, camera2: LoadedCamera
 ) -> Reconstruction:
-    """Return a pair's reconstruction on the boards' known lattices, with the calibrations' share in its sigmas.
+    """Return a pair's reconstruction on the boards' planes, with the calibrations' share in its sigmas.
 
     Raises DegenerateError where too few corners are seen.
     """
     if reconstruction.geometry is None:
-        raise InputError(f"pair '{reconstruction.pair_id}': lattices are fitted to boards, and there are none")
-    covariances = (camera1.covariance, camera2.covariance)
-    planes = lattice_planes(reconstruction.geometry, *covariances, one_camera=camera1 is camera2)
-    return on_lattice(reconstruction, planes)
+        raise InputError(f"pair '{reconstruction.pair_id}': planes are fitted to boards, and there are none")
+    return on_planes(reconstruction, planes_of(reconstruction.geometry, planes, camera1, camera2))
 
 
 def reconstruct_other_chain(matched: MatchedPair, pair: Pair) -> Reconstruction | None:

@@ -6,15 +6,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from rigkit.core.planes import Planes
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.manifest import Dataset, Pair
 from rigkit.io.ply import ply_bytes
-from rigkit.reconstruction.reconstruct import Planes, Reconstruction
+from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.report.figures import cloud_png, corners_png, epipolar_png
 from rigkit.validation.intrinsics import with_calibrations
 from rigkit.workflows.datasets import DatasetOptions, LoadedCamera, PairFailure, load_cameras, over_pairs, ready_dataset
-from rigkit.workflows.pairs import match_images, reconstruct_on_lattice, reconstruct_with, shifts_of
+from rigkit.workflows.pairs import match_images, reconstruct_on_planes, reconstruct_with, shifts_of
 from rigkit.workflows.results import require_folder, write_results
 
 
@@ -24,8 +25,9 @@ class ReconstructOptions(DatasetOptions):
 
     method: str = "3SDIR"
     """Affine estimator of the normals."""
-    planes: Planes = "free"
-    """Points and normals: each by itself, or on the boards' known lattices (then whatever the estimator)."""
+    planes: Planes | None = None
+    """Points and normals: each by itself ("free"), or on the boards' planes (then whatever the estimator); None: as the
+    manifest says of each pair."""
     pictures: bool = True
     """Draw corners, epipolar curves and the cloud."""
 
@@ -99,11 +101,12 @@ def _reconstruct(job: _ReconstructJob) -> PairReconstruction:
     pair, options = job.pair, job.options
     matched, image1, image2 = match_images(pair, job.camera1.camera, job.camera2.camera, options.chain, options.support)
     r = reconstruct_with(matched, pair, options.method, image1, det_scale=options.det_scale)
-    if options.planes == "lattice":
-        r = reconstruct_on_lattice(r, job.camera1, job.camera2)
+    planes = options.planes or pair.planes
+    if planes != "free":
+        r = reconstruct_on_planes(r, planes, job.camera1, job.camera2)
     elif (shifts := shifts_of(r, job.camera1, job.camera2)) is not None:
         r = with_calibrations(r, shifts)
-    ply = f"{pair.pair_id}/{options.method if options.planes == 'free' else options.planes}.ply"
+    ply = f"{pair.pair_id}/{options.method if planes == 'free' else planes}.ply"
     files = {ply: ply_bytes(r.cloud)}
     if options.pictures:
         files[f"{pair.pair_id}/corners.png"] = corners_png(r, image1, image2)

@@ -11,15 +11,18 @@ from typing import Any
 from numpy.typing import NDArray
 
 from rigkit.affine.registry import AFFINE_METHODS
-from rigkit.core.errors import InputError, RigkitError
+from rigkit.core.errors import DegenerateError, InputError, RigkitError
 from rigkit.core.findings import Finding, Severity
+from rigkit.core.planes import PLANE_CHOICES, Planes
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.manifest import Dataset, Pair
 from rigkit.io.paper_tables import load_paper_tables
 from rigkit.io.ply import ply_bytes
+from rigkit.reconstruction.board_planes import BoardPlanes
+from rigkit.reconstruction.geometry import PairGeometry
 from rigkit.reconstruction.pairing import MatchedPair
-from rigkit.reconstruction.reconstruct import Reconstruction, reconstruct_from
+from rigkit.reconstruction.reconstruct import Reconstruction, on_planes, reconstruct_from
 from rigkit.report.drawings import normal_errors_svg, residuals_svg
 from rigkit.report.figures import as_jpeg, as_pdf, as_png, cloud_figure, corners_figure, epipolar_figure
 from rigkit.report.page import PairSection
@@ -27,6 +30,7 @@ from rigkit.report.validation_page import crosscheck_table, pair_section
 from rigkit.validation.checks import ValidationReport, validate_each
 from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
 from rigkit.validation.diagnose import diagnose, diagnose_cameras
+from rigkit.validation.fitted_planes import FittedPlanes
 from rigkit.validation.intrinsics import CalibrationShifts, with_calibrations
 from rigkit.validation.tables import PaperTables, best_report
 from rigkit.workflows.datasets import (
@@ -40,8 +44,8 @@ from rigkit.workflows.datasets import (
 from rigkit.workflows.pairs import (
     find_boards,
     geometry_of,
-    lattice_of,
     match_found,
+    planes_of,
     reconstruct_other_chain,
     shifts_of,
 )
@@ -60,6 +64,8 @@ class ValidateOptions(DatasetOptions):
     """Draw each pair, and make the page."""
     pdf: bool = False
     """The pictures as vectors too, for a paper."""
+    planes: Planes | None = None
+    """By which planes angles, normals and the baseline are judged; None: as the manifest says of each pair."""
     crosscheck: bool = True
     """Compare with independent methods."""
 
@@ -195,15 +201,17 @@ def _judge(
         m: reconstruct_from(geometry, affine_method=m, scale=scale, image1=image1) for m in AFFINE_METHODS
     }
     shifts = _shifts(reconstructions, job)
-    lattice = lattice_of(geometry, *job.cameras.of(pair))
+    fitted = _fitted(geometry, job)
     known = [shifts[m] for m in reconstructions]
-    reports = validate_each(list(reconstructions.values()), pair.truth, known, lattice, pair.layout)
+    reports = validate_each(list(reconstructions.values()), pair.truth, known, fitted, pair.layout)
     best = best_report(reports)
     files: dict[str, bytes] = {
         f"{pair.pair_id}/{method}.ply": ply_bytes(_with_sigmas(r, shifts[method]).cloud)
         for method, r in reconstructions.items()
     }
     shown = reconstructions[best.affine_method]
+    if fitted.judge is not None:
+        files[f"{pair.pair_id}/{fitted.planes}.ply"] = ply_bytes(on_planes(shown, fitted.judge).cloud)
     compared = None
     if job.options.crosscheck:
         other = reconstruct_other_chain(matched, pair)
@@ -222,6 +230,19 @@ def _judge(
         files=files,
         section=section,
     )
+
+
+def _fitted(geometry: PairGeometry, job: _ValidateJob) -> FittedPlanes:
+    """Return the boards' planes by both images; those that nothing is judged by may be missing."""
+    judging = job.options.planes or job.pair.planes
+    found: dict[Planes, BoardPlanes] = {}
+    for planes in PLANE_CHOICES[1:]:
+        try:
+            found[planes] = planes_of(geometry, planes, *job.cameras.of(job.pair))
+        except DegenerateError:
+            if planes == judging:
+                raise
+    return FittedPlanes(found.get("coplanar"), found.get("lattice"), judging)
 
 
 def _with_sigmas(reconstruction: Reconstruction, shifts: CalibrationShifts | None) -> Reconstruction:

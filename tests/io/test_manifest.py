@@ -199,3 +199,13 @@ def test_lab_a_is_what_its_makers_measured() -> None:
         "regular-forward",
         "fisheye-planar",
     ]
+
+
+def test_planes_are_of_all_pairs_or_of_one(tmp_path: Path) -> None:
+    assert load_dataset(write(tmp_path, TEXT)).pairs[0].planes == "free"
+    whole = TEXT.replace('name = "', 'planes = "coplanar"\nname = "', 1)
+    assert load_dataset(write(tmp_path, whole)).pairs[0].planes == "coplanar"
+    own = whole.replace("pose_type =", 'planes = "lattice"\npose_type =', 1)
+    assert load_dataset(write(tmp_path, own)).pairs[0].planes == "lattice"
+    with pytest.raises(InputError, match="free, coplanar, lattice"):
+        load_dataset(write(tmp_path, whole.replace('"coplanar"', '"flat"')))

@@ -20,7 +20,7 @@ from rigkit.io.ply import read_ply, write_ply
 from rigkit.reconstruction.geometry import PairGeometry, pair_geometry
 from rigkit.reconstruction.lattice_planes import LatticePlanes, lattice_planes
 from rigkit.reconstruction.pairing import match_pair
-from rigkit.reconstruction.reconstruct import on_lattice, reconstruct_from
+from rigkit.reconstruction.reconstruct import on_planes, reconstruct_from
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
 
@@ -143,7 +143,7 @@ def test_a_cloud_on_the_lattices_is_where_its_sigmas_say(rng: np.random.Generato
         scene = scene_of(fisheye_camera(), PoseType.GENERAL, rng)
         free = reconstruct_from(geometry_of(scene, rng))
         assert free.geometry is not None
-        made = on_lattice(free, lattice_planes(free.geometry))
+        made = on_planes(free, lattice_planes(free.geometry))
         assert pytest.approx(essential_from_pose(made.cam2_from_cam1)) == made.E21
         # Boards look alike and may be counted from either end: the nearest true corner is the one meant.
         poses = [scene.cam1_from_world @ placed.world_from_board for placed in scene.boards]
@@ -169,7 +169,7 @@ def test_a_cloud_on_the_lattices_says_what_its_sigmas_include(rng: np.random.Gen
     assert free.geometry is not None
     step = 1e-3 * np.abs(scene.camera1.parameters)
     planes = [lattice_planes(free.geometry, c, one_camera=True) for c in (None, np.outer(step, step))]
-    exact, whole = (on_lattice(free, one).cloud for one in planes)
+    exact, whole = (on_planes(free, one).cloud for one in planes)
     assert (whole.sigma_mm > exact.sigma_mm).all()
     assert (whole.normal_sigma_rad > exact.normal_sigma_rad).all()
     for name, cloud, told in (("exact", exact, False), ("whole", whole, True)):
@@ -183,8 +183,8 @@ def test_points_of_boards_without_a_fit_are_left_out(rng: np.random.Generator) -
     free = reconstruct_from(geometry_of(scene_of(regular_camera(), PoseType.GENERAL, rng), rng))
     assert free.geometry is not None
     planes = lattice_planes(free.geometry)
-    part = on_lattice(free, replace(planes, board_ids=("plane1", "other", "more")))
+    part = on_planes(free, replace(planes, board_ids=("plane1", "other", "more")))
     assert len(part.cloud) == len(part.matches) == len(part.pixels1) == (free.cloud.board_index == 0).sum()
     assert "plane2, plane3" in part.notes[-1]
     with pytest.raises(DegenerateError, match="no point is on a board"):
-        on_lattice(free, replace(planes, board_ids=("x", "y", "z")))
+        on_planes(free, replace(planes, board_ids=("x", "y", "z")))

@@ -9,14 +9,18 @@ import numpy as np
 import pytest
 from helpers.reconstructions import BOARDS, CAM2_FROM_CAM1, make_reconstruction
 
+from rigkit.core.arrays import BoolArray, FloatArray, Points
+from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.truth import Feature, MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.triangulation import triangulate_rays
+from rigkit.reconstruction.board_planes import BoardPlanes
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.validation.check import compare
 from rigkit.validation.checks import validate, validate_each
+from rigkit.validation.fitted_planes import FittedPlanes
 from rigkit.validation.measure import Measured, measure
 
 BASELINE_MM = float(np.linalg.norm(CAM2_FROM_CAM1.translation_mm))
@@ -207,3 +211,59 @@ def test_scatter_of_the_corners_is_carried_into_angles_and_distances(rng: np.ran
 def test_a_pair_of_which_nothing_was_measured_is_not_checked() -> None:
     with pytest.raises(InputError, match="nothing was measured"):
         validate(make_reconstruction(), None)
+
+
+class Askew(BoardPlanes):
+    """Planes that were fitted otherwise: plane1 turned by a degree about plane2's normal, the baseline 1 mm longer."""
+
+    def normal(self, board_id: str) -> FloatArray:
+        turn = exp_so3(np.radians(1.0) * FACES["plane2"]) if board_id == "plane1" else np.eye(3)
+        return np.asarray(turn @ FACES[board_id])
+
+    def offset_mm(self, board_id: str) -> float:
+        raise NotImplementedError
+
+    def has_points(self, board: Board, grid: FloatArray) -> BoolArray:
+        raise NotImplementedError
+
+    def points(self, board: Board, grid: FloatArray) -> tuple[Points, FloatArray]:
+        raise NotImplementedError
+
+
+FACES = {b.board.board_id: b.plane.normal for b in measure(make_reconstruction()).boards.values()}
+
+
+def test_fitted_planes_stand_beside_the_free_ones_or_judge_in_their_place() -> None:
+    t = CAM2_FROM_CAM1.translation_mm
+    planes = Askew(
+        board_ids=tuple(FACES),
+        cam2_from_cam1=Rigid3(CAM2_FROM_CAM1.rotation, t * (1.0 + 1.0 / BASELINE_MM)),
+        covariance=np.diag(np.full(24, 1e-6)),
+        calibration_moves=np.zeros((0, 24)),
+        variance_factor=1.0,
+        rms_sigmas=1.0,
+        count=144,
+        gross=0,
+    )
+    reconstruction = make_reconstruction()
+    beside = validate(reconstruction, truth(), fitted=FittedPlanes(planes, None))
+    assert beside.planes == "free"
+    assert beside.check("angle plane1-plane3").ours == pytest.approx(90.0, abs=EXACT)
+    angle = next(a for a in beside.angles if (a.a, a.b) == ("plane1", "plane3"))
+    assert angle.coplanar_error_deg == pytest.approx(1.0, abs=1e-6)
+    assert angle.lattice_deg is None and angle.lattice_error_deg is None
+    assert beside.coplanar_normal_errors["plane1"].mean_deg == pytest.approx(1.0, abs=1e-6)
+    judged = validate(reconstruction, truth(), fitted=FittedPlanes(planes, None, "coplanar"))
+    assert abs(judged.check("angle plane1-plane3").difference) == pytest.approx(1.0, abs=1e-6)
+    assert {c.name for c in judged.checks if not c.passed} == {"angle plane1-plane3"}
+    assert judged.check("baseline").ours == judged.baseline_mm == pytest.approx(BASELINE_MM + 1.0)
+    assert next(b for b in judged.boards if b.board.board_id == "plane1").normal_errors.mean_deg > 0.99
+    told = json.loads(judged.to_json())
+    assert told["planes"] == "coplanar"
+    assert told["boards"][0]["lattice_normal_errors"] is None
+    part = validate(
+        reconstruction, truth(), fitted=FittedPlanes(replace(planes, board_ids=("plane1", "plane2")), None, "coplanar")
+    )
+    assert not part.passed and any("too few corners" in words for words in part.unchecked)
+    with pytest.raises(InputError, match="lattice planes were not fitted"):
+        FittedPlanes(planes, None, "lattice")

@@ -1,0 +1,135 @@
+"""Planes of boards that were fitted to both images at once: normals, angles, the baseline, and how certain they are."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Points
+from rigkit.core.boards import Board
+from rigkit.core.errors import DegenerateError
+from rigkit.geometry.principal_axes import principal_axes
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import angle_between, skew
+
+if TYPE_CHECKING:
+    from rigkit.reconstruction.pairing import MatchedPair
+
+MIN_CORNERS_OF_BOARD = 8
+"""A board with fewer corners in a view has no pose there worth the name."""
+GROSS = 8.0
+"""A corner this many standard deviations off is no corner of the board: something stands in front of it."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BoardPlanes(ABC):
+    """Relative pose and planes of boards, of maximum likelihood.
+
+    Attributes
+    ----------
+    board_ids : in the order of the parameters.
+    cam2_from_cam1 : relative pose, mm.
+    covariance : (P, P) of the parameters from the corners' noise: (rotation rad, translation mm) of the relative pose,
+        then of every board, each as a left perturbation; then others of the kind of fit.
+    calibration_moves : (A, P) what one standard deviation along each principal axis of the calibrations' covariance
+        changes in the parameters; A = 0 where that is not known.
+    variance_factor : observed over stated variance of the corners, as used in `covariance`.
+    rms_sigmas : root mean square residual of the corners per axis, in their stated sigmas.
+    count, gross : corners that take part, and that were left out as gross outliers.
+    """
+
+    board_ids: tuple[str, ...]
+    cam2_from_cam1: Rigid3
+    covariance: FloatArray
+    calibration_moves: FloatArray
+    variance_factor: float
+    rms_sigmas: float
+    count: int
+    gross: int
+
+    @abstractmethod
+    def normal(self, board_id: str) -> FloatArray:
+        """Return the unit normal (3,) of a board, facing camera 1."""
+
+    @abstractmethod
+    def offset_mm(self, board_id: str) -> float:
+        """Return n . x of the board's points."""
+
+    @abstractmethod
+    def has_points(self, board: Board, grid: FloatArray) -> BoolArray:
+        """Return which of the corners `grid` (N, 2) of a board `points` knows."""
+
+    @abstractmethod
+    def points(self, board: Board, grid: FloatArray) -> tuple[Points, FloatArray]:
+        """Return a board's corners `grid` (N, 2) in camera 1, mm, and their covariances (N, 3, 3)."""
+
+    @cached_property
+    def full_covariance(self) -> FloatArray:
+        """(P, P), with the calibrations' share."""
+        return np.asarray(self.covariance + self.calibration_moves.T @ self.calibration_moves)
+
+    def normal_covariance(self, board_id: str) -> Mat3:
+        """Return the covariance (3, 3) of a board's normal, rad^2, the calibrations' share included."""
+        by_turn = np.zeros((3, len(self.covariance)))
+        by_turn[:, self.rotation_of(board_id)] = -skew(self.normal(board_id))
+        return np.asarray(by_turn @ self.full_covariance @ by_turn.T)
+
+    def angle_deg(self, a: str, b: str) -> tuple[float, float]:
+        """Return the angle between two faces as a protractor across them shows it, and its sigma, degrees."""
+        one, two = self.normal(a), self.normal(b)
+        sine = float(np.linalg.norm(np.cross(one, two)))
+        # d angle / d turn of a: along the axis that both normals turn about; parallel faces have no such axis.
+        axis = np.cross(one, two) / sine if sine > 1e-12 else np.zeros(3)
+        row = np.zeros(len(self.covariance))
+        row[self.rotation_of(a)], row[self.rotation_of(b)] = axis, -axis
+        sigma = float(np.sqrt(row @ self.full_covariance @ row))
+        return 180.0 - float(np.rad2deg(angle_between(one, two))), float(np.rad2deg(sigma))
+
+    def baseline_mm(self) -> tuple[float, float]:
+        """Return the length of the baseline and its sigma, mm."""
+        t = self.cam2_from_cam1.translation_mm
+        length = float(np.linalg.norm(t))
+        row = np.zeros(len(self.covariance))
+        row[3:6] = t / length
+        return length, float(np.sqrt(row @ self.full_covariance @ row))
+
+    def rotation_of(self, board_id: str) -> slice:
+        """Return where among the parameters a board's turn is."""
+        start = 6 * (1 + self.board_ids.index(board_id))
+        return slice(start, start + 3)
+
+
+def moved_cameras(
+    pair: MatchedPair, covariance1: FloatArray | None, covariance2: FloatArray | None, one_camera: bool
+) -> list[tuple[Camera, Camera]]:
+    """Return the cameras moved by one sigma along each principal axis of the calibrations; none where one is exact."""
+    one, two = pair.camera1, pair.camera2
+    if covariance1 is None or (covariance2 is None and not one_camera):
+        return []
+    out = []
+    for axis in principal_axes(covariance1):
+        moved = one.with_parameters(one.parameters + axis)
+        out.append((moved, moved if one_camera else two))
+    if covariance2 is not None and not one_camera:
+        out += [(one, two.with_parameters(two.parameters + axis)) for axis in principal_axes(covariance2)]
+    return out
+
+
+def near_the_rest(lengths: FloatArray) -> BoolArray:
+    """Return which corners (N,), whose residuals have these lengths, are no gross outliers by the median of all."""
+    # The median length of two normal residuals is 1.1774 of their sigma.
+    return np.asarray(lengths <= GROSS * max(float(np.median(lengths)) / 1.1774, 1e-9))
+
+
+def inverse_information(gram: FloatArray, pair_id: str) -> FloatArray:
+    """Return the inverse of an information matrix; raises DegenerateError where it has none."""
+    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
+    if not values[0] > 1e-14:
+        raise DegenerateError(f"pair '{pair_id}': the corners leave the boards' poses open; more of them must be seen")
+    return np.asarray((vectors / values) @ vectors.T / np.outer(scale, scale))
