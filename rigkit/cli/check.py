@@ -4,6 +4,7 @@ where it does, but an image could not be read."""
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -99,6 +100,18 @@ def _summary(done: CheckedPictures) -> dict[str, Any]:
         "rms_px": check.rms_px,
         "rms_fixed_px": check.rms_fixed_px,
         "expected_px": check.expected_px,
+        "powers": [
+            {
+                "kind": power.kind,
+                "camera": power.camera,
+                "size": power.size,
+                "unit": power.unit,
+                "chance": power.chance,
+                "found_from": power.found_from if math.isfinite(power.found_from) else None,
+                "frames": power.frames,
+            }
+            for power in check.powers
+        ],
         "left_out": [list(entry) for entry in done.left_out],
         "unreadable": list(done.unreadable),
     }

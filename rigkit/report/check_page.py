@@ -14,6 +14,7 @@ from rigkit.core.tables import Cell, Column, Table
 from rigkit.io.history_file import HistoryEntry
 from rigkit.report.facts_page import build_facts_page
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, SentinelCheck
+from rigkit.validation.sentinel.power import FOUND, Power
 
 DRAWN_WIDTH, DRIFT_HEIGHT, MARGIN = 600.0, 190.0, 56.0
 ARROWS = (21, 16)
@@ -60,9 +61,49 @@ def check_words(check: SentinelCheck) -> CheckWords:
             f"It moves the projection by {change.size_px:.3f} px rms; after the correction {check.rms_fixed_px:.3f} px "
             "are left."
         )
+    if check.holds and check.powers:
+        sentences.append(_could_have_found(min(check.powers, key=lambda power: power.chance)))
     if change is not None and not check.holds and check.cost_unit != "px":
         sentences.append(f"In the length it makes an error of {check.cost:.3g} {check.cost_unit} rms.")
     return CheckWords(headline, tuple(sentences))
+
+
+def _could_have_found(power: Power) -> str:
+    """Return what the change that is seen worst would have needed."""
+    whose = "" if power.camera is None else f" of camera '{power.camera}'"
+    size = f"{power.size:g} {power.unit}"
+    seen = f"A change of {size} rms" if power.unit == "px" else f"A turn of {size}"
+    said = f"{seen} would have been found with chance {power.chance:.2f} ({power.kind}{whose}, what is seen worst"
+    if np.isfinite(power.found_from):
+        said += f"; {FOUND:.0%} of the time from {power.found_from:.2g} {power.unit} on"
+    if power.chance >= FOUND:
+        return f"{said})."
+    if power.frames is None:
+        return f"{said}); more pictures like these would not find it, for the calibration is not so sure itself."
+    return f"{said}); {power.frames} pictures like these would find it {FOUND:.0%} of the time."
+
+
+def power_table(check: SentinelCheck) -> Table:
+    """Return how well changes would have been seen."""
+    columns = (
+        Column("change"),
+        Column("of"),
+        Column("found with chance", "", 2),
+        Column(f"{FOUND:.0%} found from"),
+        Column(f"frames for {FOUND:.0%}"),
+    )
+    rows = tuple(
+        (
+            Cell(power.kind if power.camera is None else f"{power.kind} of {power.camera}"),
+            Cell(f"{power.size:g} {power.unit}"),
+            Cell(power.chance),
+            Cell(f"{power.found_from:.2g} {power.unit}" if np.isfinite(power.found_from) else "not seen"),
+            Cell("calibration not sure enough" if power.frames is None else f"{power.frames}"),
+        )
+        for power in check.powers
+    )
+    none = (Cell("none can be told from these pictures"), Cell(""), Cell(None), Cell(""), Cell(""))
+    return Table("powers", "What these pictures would have found", columns, rows or (none,))
 
 
 def check_table(check: SentinelCheck) -> Table:
@@ -95,7 +136,7 @@ def check_page(check: SentinelCheck, title: str, provenance: Mapping[str, str]) 
     return build_facts_page(
         title,
         words.headline,
-        [check_table(check)],
+        [check_table(check), power_table(check)],
         provenance,
         badge="holds" if check.holds else "does not hold",
         passed=check.holds,

@@ -28,7 +28,8 @@ from rigkit.planning.plan import plan_views
 from rigkit.report.check_page import check_page, check_words, history_page
 from rigkit.validation.sentinel.epipolar import PairMatches, check_matches
 from rigkit.validation.sentinel.evidence import FreshView, Watched
-from rigkit.validation.sentinel.judge import SentinelCheck, check_views
+from rigkit.validation.sentinel.judge import ALARM_CHANCE, SentinelCheck, check_views
+from rigkit.validation.sentinel.power import FOUND
 from rigkit.validation.sentinel.watch import watched_camera
 from rigkit.workflows.check import fixed_text
 from rigkit.workflows.history import add_calibration
@@ -37,6 +38,9 @@ NOISE_PX = 0.03
 CHANGED_PX = 0.25
 """Change of the projection, rms after the best rotation: what three views show beyond doubt."""
 MATCH_NOISE_PX = 0.3
+POWER_DRAWS, POWER_NOISE_PX = 30, 0.025
+POWER_WITHIN = 0.27
+"""Three standard deviations of the share of 30 that is found one time in two."""
 
 
 def _held(camera: Camera, count: int, reach: Reach | None = None) -> list[Rigid3]:
@@ -45,11 +49,11 @@ def _held(camera: Camera, count: int, reach: Reach | None = None) -> list[Rigid3
     return [view.cam_from_board for view in plan.views]
 
 
-def _view(camera: Camera, pose: Rigid3, name: str, rng: np.random.Generator) -> BoardView:
+def _view(camera: Camera, pose: Rigid3, name: str, rng: np.random.Generator, noise_px: float = NOISE_PX) -> BoardView:
     pixels, valid = camera.project(pose.apply(BOARD.points()))
     valid &= camera.on_image(pixels)
-    noisy = np.clip(pixels[valid] + NOISE_PX * rng.standard_normal((int(valid.sum()), 2)), 0.0, None)
-    return BoardView(name, BOARD, BOARD.grid()[valid], noisy, np.full(len(noisy), NOISE_PX))
+    noisy = np.clip(pixels[valid] + noise_px * rng.standard_normal((int(valid.sum()), 2)), 0.0, None)
+    return BoardView(name, BOARD, BOARD.grid()[valid], noisy, np.full(len(noisy), noise_px))
 
 
 @pytest.fixture(scope="module")
@@ -100,6 +104,44 @@ def test_what_changed_is_found_named_and_undone(
     assert goal.weight @ after @ after < 0.25 * (goal.weight @ before @ before)
     assert check.rms_fixed_px < check.rms_px
     assert kind.split()[0] in check_page(check, "t", {})
+
+
+def test_changes_are_found_as_often_as_the_check_says() -> None:
+    camera, found, said = lens("reg"), [], []
+    poses, fresh = _held(camera, 10), _held(camera, 3)
+    focus = camera.parameters * [1, 1, 0, 0, 0, 0, 0, 0, 0]
+    for seed in range(POWER_DRAWS):
+        rng = np.random.default_rng(seed)
+        views = [_view(camera, pose, f"{k}", rng, POWER_NOISE_PX) for k, pose in enumerate(poses)]
+        known = calibrate(views, camera.size_px, model="brown", degree=5, board="flat", folds=0)
+        changed = camera.with_parameters(
+            camera.parameters + focus * 0.15 / np.sqrt(focus @ projection_goal(camera).weight @ focus)
+        )
+        seen = [FreshView(f"{k}", 0, _view(changed, pose, f"{k}", rng, POWER_NOISE_PX)) for k, pose in enumerate(fresh)]
+        check = check_views(watched_camera(known, "cam"), seen)
+        (power,) = (p for p in check.powers if p.kind == "focus")
+        assert power.size == 0.15
+        said.append(power.chance)
+        (change,) = (c for c in check.tried if c.cause.kind == "focus")
+        found.append(change.chance < ALARM_CHANCE / len(check.tried))
+    assert 0.2 < np.mean(said) < 0.8
+    assert np.mean(found) == pytest.approx(np.mean(said), abs=POWER_WITHIN)
+
+
+def test_a_check_that_holds_says_what_it_could_have_missed(calibration: Calibration) -> None:
+    check = _checked(calibration, lens("reg"), np.random.default_rng(0))
+    powers = {p.kind: p for p in check.powers}
+    assert set(powers) == {"focus", "principal point", "distortion"}
+    for power in powers.values():
+        assert (power.found_from < power.size) == (power.chance > FOUND) == (power.frames == 3)
+    # A narrow lens shows where its axis is, better than its focus.
+    assert powers["principal point"].chance > FOUND > powers["focus"].chance
+    assert "would have been found with chance" in check_words(check).sentences[-1]
+    # A calibration that is no surer finds no more with any number of pictures.
+    vague = replace(calibration, covariance=1e4 * calibration.covariance)
+    said = _checked(vague, lens("reg"), np.random.default_rng(0))
+    assert all(p.frames is None and p.chance < 0.5 for p in said.powers)
+    assert "not so sure itself" in check_words(said).sentences[-1]
 
 
 def test_another_camera_is_explained_by_nothing(calibration: Calibration, rng: np.random.Generator) -> None:

@@ -23,23 +23,20 @@ from rigkit.core.arrays import FloatArray
 from rigkit.planning.goal import GOAL_GRID, Goal
 from rigkit.validation.sentinel.causes import Cause, causes_of, lens_goals
 from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched, evidence_of
+from rigkit.validation.sentinel.power import Power, powers_of
+from rigkit.validation.sentinel.whitened import LARGE_FREEDOM, NULL_RANK, Whitened
 
 Look: TypeAlias = Callable[[Watched], FreshEvidence]
 """What fresh frames say, given cameras and mounts."""
 
 ALARM_CHANCE = 0.01
 """Fresh pictures that unchanged cameras would show more rarely raise an alarm."""
-COMMON_FREEDOM = 10.0
-"""By how much more images disagree than independent corners would is one number, the mean over all directions: lens and
-board bend in some ways more than in others. Where measured, the variances of directions scatter around their mean by
-about half of it, as a mean square of so many values does."""
 ALARM_PX = 0.07
 """What moves the projection by less is of no importance, however surely it is there."""
 FIX_ROUNDS = 3
 """Times that a change is linearised anew where it was found."""
 WILD = 3.0
 """Corners that scatter so many times as much as the calibration's after every explanation are explained by none."""
-NULL_RANK = 1e-9
 MAX_SIGMA = 100.0
 """Percent, pixels, degrees, millimetres: what is known no better is not seen at all."""
 RARE = {"lens": 6.0, "moved": 6.0}
@@ -48,8 +45,6 @@ RARE_IN_RIGS = {"principal point": 6.0}
 """Mounts turn, by what looks nearly the same, much more often than the glass moves in its barrel."""
 DRAWS, FEW_DRAWS = 4000, 8
 """Of what unchanged cameras show; fewer than so many tell no chance."""
-LARGE_FREEDOM = 1e6
-"""As good as infinite, which the F distribution does not take."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -92,6 +87,7 @@ class SentinelCheck:
     expected_px : rms that corners should have.
     frames, corners : how many there were.
     tried : every cause by itself, the simplest first.
+    powers : how well changes of lenses and turns of mounts would have been seen; what is missing was not seen at all.
     cost : error that the change makes in the user's measurement (rms over the image), in `cost_unit`.
     """
 
@@ -107,6 +103,7 @@ class SentinelCheck:
     frames: int
     corners: int
     tried: tuple[Change, ...] = ()
+    powers: tuple[Power, ...] = ()
     cost: float = 0.0
     cost_unit: str = "px"
 
@@ -135,7 +132,7 @@ def check_views(watched: Watched, views: Sequence[FreshView], cost: Goal | None 
 def judge_evidence(watched: Watched, look: Look, cost: Goal | None = None) -> SentinelCheck:
     """Return the verdict on what `look` finds in fresh frames."""
     evidence = look(watched)
-    whitened = _Whitened.of(watched, evidence)
+    whitened = Whitened.of(watched, evidence)
     known = [c for c in (_fitted(whitened, cause) for cause in causes_of(watched)) if c is not None]
     step, covariance, change, chance = np.zeros(watched.size), watched.covariance, None, 1.0
     fixed, after = watched, evidence
@@ -161,12 +158,13 @@ def judge_evidence(watched: Watched, look: Look, cost: Goal | None = None) -> Se
         frames=len(evidence.score),
         corners=evidence.corners,
         tried=tuple(known),
+        powers=powers_of(watched, evidence, [c.cause for c in known], ALARM_CHANCE),
         cost=float(np.sqrt(max([0.0, *(float(step @ g.weight @ step) for g in goals)]))),
         cost_unit=goals[0].unit,
     )
 
 
-def _chance_of_any(whitened: _Whitened, known: Sequence[Change]) -> float:
+def _chance_of_any(whitened: Whitened, known: Sequence[Change]) -> float:
     """Return the probability that unchanged cameras show as much of any cause as they show of the likeliest. Causes
     overlap, so that it is less than the sum of their chances: drawn, as long as draws tell; else Bonferroni's bound."""
     best = min(c.chance for c in known)
@@ -201,7 +199,7 @@ def _refined(watched: Watched, look: Look, change: Change) -> tuple[FloatArray, 
     fixed = watched.changed(change.cause.directions @ amounts)
     after = look(fixed)
     for _ in range(FIX_ROUNDS):
-        again = _fitted(_Whitened.of(fixed, after), change.cause)
+        again = _fitted(Whitened.of(fixed, after), change.cause)
         if again is None:
             break
         closer = watched.changed(change.cause.directions @ (amounts + again.amounts))
@@ -212,40 +210,7 @@ def _refined(watched: Watched, look: Look, change: Change) -> tuple[FloatArray, 
     return amounts, fixed, after
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Whitened:
-    """Scores w (R,), their covariance (R, R) where nothing changed, and how a change of theta moves them (R, T)."""
-
-    score: FloatArray
-    covariance: FloatArray
-    by_theta: FloatArray
-    freedom: float
-
-    @classmethod
-    def of(cls, watched: Watched, evidence: FreshEvidence) -> _Whitened:
-        information = evidence.information.sum(axis=0) / evidence.variance_px2
-        score = evidence.score.sum(axis=0) / evidence.variance_px2
-        # Scaled to a unit diagonal: parameters differ by many powers of ten.
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
-        values, vectors = np.linalg.eigh(information * scale[:, None] * scale)
-        seen = values > NULL_RANK * values[-1]
-        root = np.sqrt(values[seen])
-        left = vectors[:, seen] * root / scale[:, None]
-        own = (vectors[:, seen] * scale[:, None]).T @ score / root
-        covariance = np.eye(len(own)) + left.T @ watched.covariance @ left
-        return cls(own, covariance, left.T, _freedom(watched, len(own)))
-
-
-def _freedom(watched: Watched, directions: int) -> float:
-    """Return the degrees of freedom of the variance in one direction (Satterthwaite): what corners scatter is known
-    from all directions of all images; of what images disagree beyond it, only the mean over the directions is."""
-    beyond = max(0.0, 1.0 - 1.0 / watched.overdispersion**2) if watched.overdispersion > 0.0 else 0.0
-    unsure = beyond**2 * (1.0 / watched.freedom + 1.0 / COMMON_FREEDOM)
-    unsure += (1.0 - beyond) ** 2 / (watched.freedom * directions)
-    return min(1.0 / max(unsure, 1.0 / LARGE_FREEDOM), LARGE_FREEDOM)
-
-
-def _fitted(whitened: _Whitened, cause: Cause) -> Change | None:
+def _fitted(whitened: Whitened, cause: Cause) -> Change | None:
     """Return what a cause would have to be; None where the frames do not show it."""
     by_amount = whitened.by_theta @ cause.directions
     weighed = np.linalg.solve(whitened.covariance, np.column_stack([by_amount, whitened.score]))

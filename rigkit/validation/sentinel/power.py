@@ -1,0 +1,133 @@
+"""What fresh frames would have found: the chance that a change raises the alarm, and how many frames it takes.
+
+A change a of a cause adds a^T N a, N its normal matrix in whitened scores, to the mean of the statistic: F becomes the
+noncentral F distribution. The limit is that of one of all causes tried (Bonferroni), and a change is looked for by its
+own cause only: the chances stated are rather too small. The covariance of the calibration does not shrink with the
+fresh frames: where no number of them is enough, the calibration is what is not sure.
+
+Reference: G. A. F. Seber, A. J. Lee, "Linear Regression Analysis" (2003), section 4.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import chndtr
+from scipy.stats import chi2
+from scipy.stats import f as f_distribution
+
+from rigkit.core.arrays import FloatArray
+from rigkit.validation.sentinel.causes import Cause, lens_goals
+from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
+from rigkit.validation.sentinel.whitened import NULL_RANK, Whitened
+
+__all__ = ["FOUND", "Power", "powers_of"]
+
+CHANGED_PX, TURNED_DEG = 0.15, 0.02
+"""Changes of which the chance is told: of a lens, rms over the image after the best rotation; of a mount."""
+FOUND = 0.9
+"""A change that is found so often is said to be found."""
+TIMES = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 20)
+"""Frames like these that are thought of: so many times as many."""
+PARTS = np.geomspace(1e-2, 1e2, 33)
+"""Sizes that are looked at, as parts of the one told of."""
+SURE = 1e3
+"""Noncentrality with which everything is found."""
+QUANTILES = (np.arange(16) + 0.5) / 16
+"""Of what the variance may be, given how well it is known."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Power:
+    """How well a change would have been seen.
+
+    Attributes
+    ----------
+    kind, camera : of the cause.
+    size, unit : a change of this size (px rms over the image, or degrees of a mount)
+    chance : is found with this probability, in a direction as any other.
+    found_from : the size that is found nine times in ten; infinite where these frames do not show it.
+    frames : like these that find `size` nine times in ten; None where no number does: the calibration is not sure.
+    """
+
+    kind: str
+    camera: str | None
+    size: float
+    unit: str
+    chance: float
+    found_from: float
+    frames: int | None
+
+
+def powers_of(
+    watched: Watched, evidence: FreshEvidence, causes: Iterable[Cause], alarm_chance: float
+) -> tuple[Power, ...]:
+    """Return how well changes of each lens, and turns of mounts, would have been seen by frames like these, where a
+    chance below `alarm_chance` of any of the causes is an alarm."""
+    causes = list(causes)
+    several = [Whitened.of(watched, _repeated(evidence, times)) for times in TIMES]
+    goals = dict(zip(watched.names, lens_goals(watched), strict=True))
+    out = []
+    for cause in causes:
+        if cause.kind in ("focus", "principal point", "distortion"):
+            weight = goals[cause.camera or watched.names[0]].weight
+            metric, size, unit = cause.directions.T @ weight @ cause.directions, CHANGED_PX, "px"
+        elif cause.kind == "rotation":
+            metric, size, unit = np.eye(3), TURNED_DEG, "deg"
+        else:
+            continue
+        alone = alarm_chance / len(causes)
+        shown = [_Shown.of(whitened, cause, metric, alone) for whitened in several]
+        chances = [float(s.chance(np.array([size]))[0]) for s in shown]
+        enough = next((t for t, chance in zip(TIMES, chances, strict=True) if chance >= FOUND), None)
+        out.append(
+            Power(
+                kind=cause.kind,
+                camera=cause.camera,
+                size=size,
+                unit=unit,
+                chance=chances[0],
+                found_from=shown[0].found_from(size),
+                frames=None if enough is None else enough * len(evidence.score),
+            )
+        )
+    return tuple(out)
+
+
+def _repeated(evidence: FreshEvidence, times: int) -> FreshEvidence:
+    return replace(evidence, information=times * evidence.information, score=times * evidence.score)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Shown:
+    """Noncentrality (m,) of a change of unit size along each of its axes, and the limits (K,) of chi-squared for what
+    the variance may be."""
+
+    by_axis: FloatArray
+    limits: FloatArray
+
+    @classmethod
+    def of(cls, whitened: Whitened, cause: Cause, metric: FloatArray, alarm_chance: float) -> _Shown:
+        by_amount = whitened.by_theta @ cause.directions
+        normal = by_amount.T @ np.linalg.solve(whitened.covariance, by_amount)
+        size, axes = np.linalg.eigh(metric)
+        seen = size > NULL_RANK * size[-1]
+        root = axes[:, seen] / np.sqrt(size[seen])
+        by_axis = np.maximum(np.linalg.eigvalsh(root.T @ normal @ root), 0.0)
+        m = len(metric)
+        limit = m * f_distribution.isf(alarm_chance, m, whitened.freedom)
+        return cls(by_axis, limit * chi2.ppf(QUANTILES, whitened.freedom) / whitened.freedom)
+
+    def chance(self, size: FloatArray) -> FloatArray:
+        """Return how often changes of `size` (K,) are found, the mean over their axes, (K,)."""
+        noncentrality = np.minimum(self.by_axis * np.square(size)[:, None], SURE)
+        return np.asarray(1.0 - chndtr(self.limits, len(self.by_axis), noncentrality[..., None]).mean(axis=(1, 2)))
+
+    def found_from(self, size: float) -> float:
+        """Return the size that is found often enough, to be looked for around `size`; infinite where none is."""
+        found = self.chance(size * PARTS)
+        if found[-1] < FOUND:
+            return float("inf")
+        return size * float(np.exp(np.interp(FOUND, found, np.log(PARTS))))

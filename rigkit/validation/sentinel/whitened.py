@@ -1,0 +1,58 @@
+"""Scores of fresh frames in units of their own scatter, and what unchanged cameras would show.
+
+With A the frames' information over their variance, A = L L^T, and C the covariance of theta, w = L^+ score has the
+covariance I + L^T C L where nothing changed (the frames scatter, and the calibration was a little off from the start),
+and a change d of theta moves it by L^T d.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.core.arrays import FloatArray
+from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
+
+__all__ = ["LARGE_FREEDOM", "NULL_RANK", "Whitened"]
+
+COMMON_FREEDOM = 10.0
+"""By how much more images disagree than independent corners would is one number, the mean over all directions: lens and
+board bend in some ways more than in others. Where measured, the variances of directions scatter around their mean by
+about half of it, as a mean square of so many values does."""
+NULL_RANK = 1e-9
+LARGE_FREEDOM = 1e6
+"""As good as infinite, which the F distribution does not take."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Whitened:
+    """Scores w (R,), their covariance (R, R) where nothing changed, and how a change of theta moves them (R, T)."""
+
+    score: FloatArray
+    covariance: FloatArray
+    by_theta: FloatArray
+    freedom: float
+
+    @classmethod
+    def of(cls, watched: Watched, evidence: FreshEvidence) -> Whitened:
+        information = evidence.information.sum(axis=0) / evidence.variance_px2
+        score = evidence.score.sum(axis=0) / evidence.variance_px2
+        # Scaled to a unit diagonal: parameters differ by many powers of ten.
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+        values, vectors = np.linalg.eigh(information * scale[:, None] * scale)
+        seen = values > NULL_RANK * values[-1]
+        root = np.sqrt(values[seen])
+        left = vectors[:, seen] * root / scale[:, None]
+        own = (vectors[:, seen] * scale[:, None]).T @ score / root
+        covariance = np.eye(len(own)) + left.T @ watched.covariance @ left
+        return cls(own, covariance, left.T, _freedom(watched, len(own)))
+
+
+def _freedom(watched: Watched, directions: int) -> float:
+    """Return the degrees of freedom of the variance in one direction (Satterthwaite): what corners scatter is known
+    from all directions of all images; of what images disagree beyond it, only the mean over the directions is."""
+    beyond = max(0.0, 1.0 - 1.0 / watched.overdispersion**2) if watched.overdispersion > 0.0 else 0.0
+    unsure = beyond**2 * (1.0 / watched.freedom + 1.0 / COMMON_FREEDOM)
+    unsure += (1.0 - beyond) ** 2 / (watched.freedom * directions)
+    return min(1.0 / max(unsure, 1.0 / LARGE_FREEDOM), LARGE_FREEDOM)
