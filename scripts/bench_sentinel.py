@@ -292,7 +292,7 @@ def touched(full: Calibration, what: str, rng: np.random.Generator) -> Camera:
     """Return a calibrated camera of any model after a change that leaves 0.15 px rms after the best rotation."""
     watched = watched_camera(full, "camera")
     (cause,) = (c for c in causes_of(watched) if c.kind == what)
-    amount = rng.standard_normal(cause.directions.shape[1])
+    amount = rng.standard_normal((cause.directions.shape[1],))
     if what == "distortion":
         amount[1:] = 0.0
     step = cause.directions @ amount

@@ -233,9 +233,11 @@ def _views(
                 left_out.append((str(path), reason))
     progress("corners", total, total)
     if not out:
-        reason = next(iter([*(reason for _, reason in left_out), *unreadable]))
+        if not left_out:
+            raise InputError(f"check: {unreadable[0]}")
+        where = "the image" if total == 1 else f"any of {total} images"
         raise InputError(
-            f"check: no board was found in {total} images: {reason}; take sharp pictures of the whole board"
+            f"check: no board was found in {where}: {left_out[0][1]}; take sharp pictures of the whole board"
         )
     return out
 
