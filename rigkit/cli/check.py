@@ -109,6 +109,7 @@ def _summary(done: CheckedPictures) -> dict[str, Any]:
                 "chance": power.chance,
                 "found_from": power.found_from if math.isfinite(power.found_from) else None,
                 "frames": power.frames,
+                "both": power.both,
             }
             for power in check.powers
         ],

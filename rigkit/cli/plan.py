@@ -16,6 +16,10 @@ if TYPE_CHECKING:
 HELP = "which pictures to take next, or what a lens, a board and so many pictures will reach"
 
 
+MAX_VIEWS = 100
+"""Nobody takes more by a plan."""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "source", nargs="?", type=Path, metavar="CALIBRATION|SESSION.toml", help="what there is so far; or give --lens"
@@ -98,8 +102,8 @@ def _options(args: argparse.Namespace, count: int) -> PlanOptions:
 
     if (args.length is None) != (args.distance is None):
         raise InputError("plan: --length and --distance belong together")
-    if args.views is not None and args.views < 1:
-        raise InputError(f"--views {args.views}: at least one")
+    if args.views is not None and not 1 <= args.views <= MAX_VIEWS:
+        raise InputError(f"--views {args.views}: 1 to {MAX_VIEWS}")
     length = None
     if args.length is not None:
         length = Task(quantity=Quantity.LENGTH, size_mm=args.length, distance_mm=args.distance)

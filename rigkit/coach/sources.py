@@ -27,14 +27,19 @@ _log = logging.getLogger(__name__)
 
 
 def watched_frames(folders: Sequence[Path], *, until_idle_s: float = float("inf")) -> Iterator[Frame]:
-    """Yield every picture in a folder, those to come as well, by name; of several folders, one a camera, those of one
+    """Return every picture in a folder, those to come as well, by name; of several folders, one a camera, those of one
     name, or of one number, as soon as all are there. Ends when none has come for `until_idle_s`.
 
-    Raises InputError where there is no such folder, or it is gone. A picture that cannot be read is told of.
+    Raises InputError at once where there is no such folder, later where it is gone. A picture that cannot be read is
+    told of.
     """
     for folder in folders:
         if not folder.is_dir():
             raise InputError(f"coach: '{folder}' is not a folder; give one in which pictures will appear")
+    return _watched(folders, until_idle_s)
+
+
+def _watched(folders: Sequence[Path], until_idle_s: float) -> Iterator[Frame]:
     seen: set[str] = set()
     last = time.monotonic()
     while time.monotonic() - last < until_idle_s:
@@ -84,29 +89,45 @@ def _moments(folders: Sequence[Path]) -> dict[str, list[Path]]:
 
 
 def video_frames(paths: Sequence[Path]) -> Iterator[Frame]:
-    """Yield every frame of a video, or of several that run together; raises InputError where one cannot be read."""
-    yield from _captured([cv2.VideoCapture(str(path)) for path in paths], [f"video '{path}'" for path in paths])
+    """Return every frame of a video, or of several that run together; raises InputError where one cannot be read."""
+    return _captured([cv2.VideoCapture(str(path)) for path in paths], [f"video '{path}'" for path in paths])
 
 
 def device_frames(numbers: Sequence[int]) -> Iterator[Frame]:
-    """Yield frames of cameras of this machine, the newest each time; raises InputError where there is none."""
-    yield from _captured([cv2.VideoCapture(number) for number in numbers], [f"camera {number}" for number in numbers])
+    """Return frames of cameras of this machine, the newest each time; raises InputError where there is none."""
+    return _captured([cv2.VideoCapture(number) for number in numbers], [f"camera {number}" for number in numbers])
 
 
 def _captured(sources: Sequence[cv2.VideoCapture], names: Sequence[str]) -> Iterator[Frame]:
+    """Return the frames of all sources; the first is fetched at once, so that one that gives none is told of."""
+    first = _moment(sources)
+    bad = [name for name, frame in zip(names, first, strict=True) if frame is None]
+    if bad:
+        _release(sources)
+        raise InputError(f"coach: {bad[0]} gives no picture; check the path, or that no other program has it")
+    return _going_on([frame for frame in first if frame is not None], sources)
+
+
+def _going_on(frames: Frame, sources: Sequence[cv2.VideoCapture]) -> Iterator[Frame]:
     try:
-        first = True
-        while True:
-            # All are told to take theirs before any is fetched, so that they are of one moment.
-            grabbed = [source.grab() for source in sources]
-            read = [source.retrieve() for source in sources]
-            bad = [n for n, good, (got, _) in zip(names, grabbed, read, strict=True) if not (good and got)]
-            if bad and first:
-                raise InputError(f"coach: {bad[0]} gives no picture; check the path, or that no other program has it")
-            if bad:
-                return
-            first = False
-            yield [np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)) for _, frame in read]
+        while len(frames) == len(sources):
+            yield frames
+            frames = [frame for frame in _moment(sources) if frame is not None]
     finally:
-        for source in sources:
-            source.release()
+        _release(sources)
+
+
+def _moment(sources: Sequence[cv2.VideoCapture]) -> list[NDArray[Any] | None]:
+    """Return an image of each, None where there is none any more."""
+    # All are told to take theirs before any is fetched, so that they are of one moment.
+    grabbed = [source.grab() for source in sources]
+    read = [source.retrieve() for source in sources]
+    return [
+        np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)) if good and got else None
+        for good, (got, frame) in zip(grabbed, read, strict=True)
+    ]
+
+
+def _release(sources: Sequence[cv2.VideoCapture]) -> None:
+    for source in sources:
+        source.release()

@@ -14,7 +14,7 @@ from rigkit.core.tables import Cell, Column, Table
 from rigkit.io.history_file import HistoryEntry
 from rigkit.report.facts_page import build_facts_page
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, SentinelCheck
-from rigkit.validation.sentinel.power import FOUND, Power
+from rigkit.validation.sentinel.power import FOUND, TIMES, Power
 
 DRAWN_WIDTH, DRIFT_HEIGHT, MARGIN = 600.0, 190.0, 56.0
 ARROWS = (21, 16)
@@ -79,8 +79,17 @@ def _could_have_found(power: Power) -> str:
     if power.chance >= FOUND:
         return f"{said})."
     if power.frames is None:
-        return f"{said}); more pictures like these would not find it, for the calibration is not so sure itself."
+        told = "far from so sure" if power.both is None else "not so sure itself"
+        more = "" if power.both is None else f": it takes about {power.both} times as many, in both"
+        return f"{said}); more pictures like these alone would not find it, for the calibration is {told}{more}."
     return f"{said}); {power.frames} pictures like these would find it {FOUND:.0%} of the time."
+
+
+def _frames_needed(power: Power) -> str:
+    if power.frames is not None:
+        return f"{power.frames}"
+    many = f"more than {TIMES[-1]}" if power.both is None else f"{power.both}"
+    return f"{many} times as many, in the calibration too"
 
 
 def power_table(check: SentinelCheck) -> Table:
@@ -98,7 +107,7 @@ def power_table(check: SentinelCheck) -> Table:
             Cell(f"{power.size:g} {power.unit}"),
             Cell(power.chance),
             Cell(f"{power.found_from:.2g} {power.unit}" if np.isfinite(power.found_from) else "not seen"),
-            Cell("calibration not sure enough" if power.frames is None else f"{power.frames}"),
+            Cell(_frames_needed(power)),
         )
         for power in check.powers
     )
@@ -110,9 +119,9 @@ def check_table(check: SentinelCheck) -> Table:
     """Return everything that may have happened, each as if it alone had."""
     columns = (
         Column("if this alone happened"),
-        Column("amount"),
         Column("chance without it"),
         Column("explains", "", 1),
+        Column("amount"),
     )
     rows = []
     for change in check.tried:
@@ -122,9 +131,9 @@ def check_table(check: SentinelCheck) -> Table:
         )
         named = check.change is not None and change.cause is check.change.cause
         rows.append(
-            (Cell(change.cause.words), Cell(amounts), Cell(f"{change.chance:.2g}"), Cell(change.gain, best=named))
+            (Cell(change.cause.words), Cell(f"{change.chance:.2g}"), Cell(change.gain, best=named), Cell(amounts))
         )
-    none = (Cell("nothing can be told from these pictures"), Cell(""), Cell(""), Cell(None))
+    none = (Cell("nothing can be told from these pictures"), Cell(""), Cell(None), Cell(""))
     return Table("causes", "What may have happened", columns, tuple(rows) or (none,))
 
 

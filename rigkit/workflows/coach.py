@@ -21,6 +21,7 @@ from rigkit.coach.server import LOCAL, coach_app, new_token, own_address, serve
 from rigkit.coach.sources import Frame, device_frames, video_frames, watched_frames
 from rigkit.core.errors import InputError, RigkitError
 from rigkit.core.findings import worst
+from rigkit.io.files import ensure_folder_writable
 from rigkit.planning.goal import Goal
 from rigkit.validation.certificate.contracts import Task
 from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration
@@ -65,8 +66,9 @@ class CoachOptions:
 def open_coach(options: CoachOptions) -> Coach:
     """Return the coach of a session's folder, which is made, or gone on with.
 
-    Raises InputError where the folder holds another session.
+    Raises InputError where the folder holds another session, or cannot be one.
     """
+    ensure_folder_writable(options.folder)
     options.folder.mkdir(parents=True, exist_ok=True)
     names = _names(options)
     patterns = {name: f"{folder_of(name, len(names))}/*.png" for name in names}
@@ -141,8 +143,8 @@ def run_coach(options: CoachOptions, told: Callable[[str], None]) -> None:
 
     Raises InputError for a folder or source that cannot be used, InstallationError without the extra `coach`.
     """
-    coach = open_coach(options)
     frames = _frames(options)
+    coach = open_coach(options)
     token = new_token()
     host = own_address() if options.lan else LOCALHOST
     app = coach_app(coach, token, (host, *LOCAL), camera="page" if frames is None else "server")

@@ -17,7 +17,7 @@ from rigkit.coach.coach import Coach
 from rigkit.coach.guide import CaptureGuide, GuideOptions
 from rigkit.coach.look import glance_at
 from rigkit.coach.server import LOCAL, MAX_UPLOAD_BYTES
-from rigkit.coach.sources import watched_frames
+from rigkit.coach.sources import video_frames, watched_frames
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
@@ -99,6 +99,16 @@ def test_a_watched_folder_makes_a_session_that_matches_the_truth(pictures: list[
     error = compare_cameras(CAMERA, found.camera).rms_px
     stated = float(projection_goal(found.camera).error(found.covariance))
     assert error < max(4.0 * stated, 0.15)
+
+
+def test_what_gives_no_frames_is_refused_at_once(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="not a folder"):
+        watched_frames([tmp_path / "none"])
+    with pytest.raises(InputError, match="gives no picture"):
+        video_frames([tmp_path / "none.mp4"])
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="is a file, not a folder"):
+        open_coach(options(tmp_path / "file"))
 
 
 def test_killed_and_started_again_nothing_is_lost(pictures: list[np.ndarray], tmp_path: Path) -> None:

@@ -39,6 +39,7 @@ CHANGED_PX = 0.25
 """Change of the projection, rms after the best rotation: what three views show beyond doubt."""
 MATCH_NOISE_PX = 0.3
 POWER_DRAWS, POWER_NOISE_PX = 30, 0.025
+UNSURE = 16.0
 POWER_WITHIN = 0.27
 """Three standard deviations of the share of 30 that is found one time in two."""
 
@@ -141,7 +142,13 @@ def test_a_check_that_holds_says_what_it_could_have_missed(calibration: Calibrat
     vague = replace(calibration, covariance=1e4 * calibration.covariance)
     said = _checked(vague, lens("reg"), np.random.default_rng(0))
     assert all(p.frames is None and p.chance < 0.5 for p in said.powers)
-    assert "not so sure itself" in check_words(said).sentences[-1]
+    assert "the calibration is" in check_words(said).sentences[-1]
+    # One from many times as many pictures would, with as many fresh ones.
+    unsure = replace(calibration, covariance=UNSURE * calibration.covariance)
+    powers = {p.kind: p for p in _checked(unsure, lens("reg"), np.random.default_rng(0)).powers}
+    focus = powers["focus"]
+    assert focus.frames is None and focus.both is not None and 1 < focus.both <= UNSURE * 4
+    assert "times as many, in the calibration too" in check_page(said, "t", {})
 
 
 def test_another_camera_is_explained_by_nothing(calibration: Calibration, rng: np.random.Generator) -> None:

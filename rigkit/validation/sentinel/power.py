@@ -31,10 +31,10 @@ FOUND = 0.9
 """A change that is found so often is said to be found."""
 TIMES = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 20)
 """Frames like these that are thought of: so many times as many."""
-PARTS = np.geomspace(1e-2, 1e2, 33)
+SIZE_PARTS = np.geomspace(1e-2, 1e2, 33)
 """Sizes that are looked at, as parts of the one told of."""
-SURE = 1e3
-"""Noncentrality with which everything is found."""
+MAX_NONCENTRALITY = 1e3
+"""With it everything is found."""
 QUANTILES = (np.arange(16) + 0.5) / 16
 """Of what the variance may be, given how well it is known."""
 
@@ -50,6 +50,7 @@ class Power:
     chance : is found with this probability, in a direction as any other.
     found_from : the size that is found nine times in ten; infinite where these frames do not show it.
     frames : like these that find `size` nine times in ten; None where no number does: the calibration is not sure.
+    both : so many times as many frames, in the calibration as in the check, find it; None where that is not enough.
     """
 
     kind: str
@@ -59,6 +60,7 @@ class Power:
     chance: float
     found_from: float
     frames: int | None
+    both: int | None
 
 
 def powers_of(
@@ -68,6 +70,10 @@ def powers_of(
     chance below `alarm_chance` of any of the causes is an alarm."""
     causes = list(causes)
     several = [Whitened.of(watched, _repeated(evidence, times)) for times in TIMES]
+    surer = [
+        Whitened.of(replace(watched, covariance=watched.covariance / times), _repeated(evidence, times))
+        for times in TIMES
+    ]
     goals = dict(zip(watched.names, lens_goals(watched), strict=True))
     out = []
     for cause in causes:
@@ -79,18 +85,23 @@ def powers_of(
         else:
             continue
         alone = alarm_chance / len(causes)
-        shown = [_Shown.of(whitened, cause, metric, alone) for whitened in several]
-        chances = [float(s.chance(np.array([size]))[0]) for s in shown]
-        enough = next((t for t, chance in zip(TIMES, chances, strict=True) if chance >= FOUND), None)
+        now = _Shown.of(several[0], cause, metric, alone)
+        enough, both = (
+            next(
+                (t for t, w in zip(TIMES, thought, strict=True) if _Shown.of(w, cause, metric, alone).finds(size)), None
+            )
+            for thought in (several, surer)
+        )
         out.append(
             Power(
                 kind=cause.kind,
                 camera=cause.camera,
                 size=size,
                 unit=unit,
-                chance=chances[0],
-                found_from=shown[0].found_from(size),
+                chance=float(now.chance(np.array([size]))[0]),
+                found_from=now.found_from(size),
                 frames=None if enough is None else enough * len(evidence.score),
+                both=both,
             )
         )
     return tuple(out)
@@ -122,12 +133,16 @@ class _Shown:
 
     def chance(self, size: FloatArray) -> FloatArray:
         """Return how often changes of `size` (K,) are found, the mean over their axes, (K,)."""
-        noncentrality = np.minimum(self.by_axis * np.square(size)[:, None], SURE)
+        noncentrality = np.minimum(self.by_axis * np.square(size)[:, None], MAX_NONCENTRALITY)
         return np.asarray(1.0 - chndtr(self.limits, len(self.by_axis), noncentrality[..., None]).mean(axis=(1, 2)))
+
+    def finds(self, size: float) -> bool:
+        """Say whether a change of `size` is found often enough."""
+        return bool(self.chance(np.array([size]))[0] >= FOUND)
 
     def found_from(self, size: float) -> float:
         """Return the size that is found often enough, to be looked for around `size`; infinite where none is."""
-        found = self.chance(size * PARTS)
+        found = self.chance(size * SIZE_PARTS)
         if found[-1] < FOUND:
             return float("inf")
-        return size * float(np.exp(np.interp(FOUND, found, np.log(PARTS))))
+        return size * float(np.exp(np.interp(FOUND, found, np.log(SIZE_PARTS))))
