@@ -50,7 +50,7 @@ def _one(args: argparse.Namespace) -> int:
 
     started = time.monotonic()
     done = _calibrated(args)
-    summary, words, passed = _said(done)
+    summary, words, passed = _said(done, json=args.json)
     note(f"{', '.join(str(p) for p in done.written)} written, {time.monotonic() - started:.1f} s")
     print_json(summary) if args.json else print(words)
     for reason in done.unreadable.values():
@@ -67,11 +67,20 @@ def _calibrated(args: argparse.Namespace) -> SessionCalibration | RigSessionCali
     return calibrate_sources(args.source, folder_options(args), calibrate_options(args), progress=progress_on_stderr())
 
 
-def _said(done: SessionCalibration | RigSessionCalibration) -> tuple[dict[str, Any], str, bool]:
-    """Return the figures for programs, the words for a person, and whether everything measured agrees."""
+def _said(done: SessionCalibration | RigSessionCalibration, *, json: bool) -> tuple[dict[str, Any], str, bool]:
+    """Return the figures for `json` programs, the words for a person, and whether everything measured agrees."""
     from rigkit.cli import calibration_words, rig_words
     from rigkit.workflows.calibrate import SessionCalibration
 
     if isinstance(done, SessionCalibration):
-        return calibration_words.summary(done.calibration), calibration_words.describe(done.calibration), True
-    return rig_words.summary(done.rig, done.checks), rig_words.describe(done.rig, done.checks), done.passed
+        words = calibration_words.describe(done.calibration)
+        if not json:
+            return {}, words, True
+        page = calibration_words.page(done.calibration, done.session.boards)
+        return calibration_words.summary(done.calibration) | {"page": page.to_dict()}, words, True
+    words = rig_words.describe(done.rig, done.checks)
+    if not json:
+        return {}, words, done.passed
+    boards = {name: session.boards for name, session in done.session.cameras.items()}
+    page = rig_words.page(done.rig, done.checks, boards)
+    return rig_words.summary(done.rig, done.checks) | {"page": page.to_dict()}, words, done.passed

@@ -3,19 +3,37 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
+
+from rigkit.core.errors import RigkitError
 
 if TYPE_CHECKING:
     from rigkit.calibration.result import Calibration
+    from rigkit.core.boards import Board
+    from rigkit.report.page_facts import PageFacts
+
+
+def page(calibration: Calibration, boards: Sequence[Board]) -> PageFacts:
+    """Return what the page says of one camera, with the pictures of `boards` to take next where any are to be found."""
+    from rigkit.report.calibration_facts import camera_facts
+    from rigkit.workflows.next_views import next_views
+
+    try:
+        return camera_facts(calibration, next_views(calibration, boards))
+    except RigkitError:
+        return camera_facts(calibration)
 
 
 def summary(calibration: Calibration) -> dict[str, Any]:
     """Return the figures for programs."""
     camera = calibration.camera
+    names = camera.parameter_names()
     return {
         "model": camera.model,
         "size_px": list(camera.size_px),
-        "parameters": dict(zip(camera.parameter_names(), camera.parameters.tolist(), strict=True)),
+        "parameters": dict(zip(names, camera.parameters.tolist(), strict=True)),
+        "sigmas": dict(zip(names, calibration.parameter_sigmas.tolist(), strict=True)),
         "heldout_rms_px": calibration.heldout_rms_px,
         "rms_px": calibration.rms_px,
         "sigma_px": calibration.sigma_px,

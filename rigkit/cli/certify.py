@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import note, print_json
     from rigkit.core.errors import ExitCode, InputError
-    from rigkit.report.certificate_page import causes_table
+    from rigkit.report.certificate_page import basis, causes_table, certificate_facts
     from rigkit.report.tables import tables_to_text
     from rigkit.validation.certificate.contracts import Quantity, Task
     from rigkit.workflows.certify import CertifyOptions, certify_file
@@ -60,7 +60,8 @@ def run(args: argparse.Namespace) -> int:
     done = certify_file(args.calibration, task, options)
     certificate, words = done.certificate, done.words
     if args.json:
-        print_json(certificate.to_dict() | {"passed": words.passed, "statement": words.headline})
+        told = {"passed": words.passed, "statement": words.headline, "basis": basis(certificate)}
+        print_json(certificate.to_dict() | told | {"page": certificate_facts(certificate, args.limit).to_dict()})
     else:
         print(words.headline)
         for sentence in words.sentences:

@@ -84,6 +84,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _summary(done: CheckedPictures) -> dict[str, Any]:
+    from rigkit.report.check_page import check_facts
+
     check, change = done.check, done.check.change
     return {
         "holds": check.holds,
@@ -113,6 +115,7 @@ def _summary(done: CheckedPictures) -> dict[str, Any]:
             }
             for power in check.powers
         ],
+        "page": check_facts(check).to_dict(),
         "left_out": [list(entry) for entry in done.left_out],
         "unreadable": list(done.unreadable),
     }

@@ -22,11 +22,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import print_json
     from rigkit.workflows.diff import DiffOptions, diff
-    from rigkit.workflows.diff_words import figures_of, words_of, write_diff_page
+    from rigkit.workflows.diff_words import facts_of, figures_of, words_of, write_diff_page
 
     options = DiffOptions(output=args.output, force=args.force, report=args.report)
     done = diff(args.a, args.b, options)
     if args.report is not None:
         write_diff_page(args.report, done, (args.a, args.b), force=args.force)
-    print_json(figures_of(done)) if args.json else print("\n".join(words_of(done)))
+    if args.json:
+        print_json(figures_of(done) | {"page": facts_of(done).to_dict()})
+    else:
+        print("\n".join(words_of(done)))
     return ExitCode.CHECK_FAILED if done.same is False else ExitCode.WELL

@@ -45,12 +45,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import note, print_json
-    from rigkit.report.plan_page import plan_to_dict, plan_words
+    from rigkit.report.plan_page import plan_facts, plan_to_dict, plan_words
 
     done = _planned(args)
     plan = done.plan
     if args.json:
-        print_json(plan_to_dict(plan))
+        print_json(plan_to_dict(plan) | {"page": plan_facts(plan).to_dict()})
     else:
         print(f"{plan.goal.what}: {plan.error:.3g} {plan.goal.unit} now, {plan.views[-1].error:.3g} then")
         print("\n".join(f"  {line}" for line in plan_words(plan)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +10,18 @@ from rigkit.cli import calibration_words
 
 if TYPE_CHECKING:
     from rigkit.calibration.rig.result import RigCalibration
+    from rigkit.core.boards import Board
+    from rigkit.report.page_facts import PageFacts
     from rigkit.validation.check import Check
+
+
+def page(rig: RigCalibration, checks: Sequence[Check], boards: Mapping[str, Sequence[Board]]) -> PageFacts:
+    """Return what the page says of a rig, and of each camera, before which there were `boards`."""
+    from rigkit.report.calibration_facts import rig_facts
+    from rigkit.workflows.calibrate_rig import shown_cameras
+
+    cameras = {name: calibration_words.page(c, boards[name]) for name, c in shown_cameras(rig).items()}
+    return rig_facts(rig, checks, cameras)
 
 
 def summary(rig: RigCalibration, checks: Sequence[Check]) -> dict[str, Any]:

@@ -28,6 +28,7 @@ def show(done: DatasetValidation, out: Path, *, json: bool) -> int:
             "output": str(out),
             "causes": [cause.text for cause in done.causes],
             "reports": [report.to_dict() for report in done.reports],
+            "page": done.page.to_dict(),
         }
         print_json(result | failed_pairs(done.failures))
     else:

@@ -111,20 +111,28 @@ _CELL: Schema = {
         ),
     ]
 }
-TABLES_FILE = file(
-    "rigkit.tables/1",
-    "Tables of a result",
+_TABLES = rows(
     {
-        "tables": rows(
-            {
-                "key": TEXT,
-                "title": TEXT,
-                "note?": TEXT,
-                "units?": said(table(TEXT), "by column"),
-                "rows": said(array(table(_CELL)), "by column"),
-            }
-        )
-    },
+        "key": TEXT,
+        "title": TEXT,
+        "note?": TEXT,
+        "units?": said(table(TEXT), "by column"),
+        "rows": said(array(table(_CELL)), "by column"),
+    }
+)
+TABLES_FILE = file("rigkit.tables/1", "Tables of a result", {"tables": _TABLES})
+_PAGE = {
+    "headline": said(TEXT, "the result in the user's units"),
+    "badge": said(TEXT, "the verdict in a word or two; empty: none"),
+    "passed": said(nullable(BOOLEAN), "null: neither good nor bad"),
+    "sentences": said(array(TEXT), "below the headline"),
+    "basis": said(TEXT, "what the result rests on"),
+    "tables": said(_TABLES, "every table of the page"),
+}
+PAGE_FILE = file(
+    "rigkit.page/1",
+    "What a page says, the `page` of `--json`",
+    {**_PAGE, "parts": said(table(obj(_PAGE)), "the same of each camera or pair, by name")},
 )
 _GRID = array(array(_VALUE))
 CERTIFICATE_FILE = file(

@@ -12,6 +12,7 @@ from rigkit.core.tables import Cell, Column, Table
 from rigkit.report.certificate_figure import bound_figure, sheet_pdf
 from rigkit.report.facts_page import build_facts_page
 from rigkit.report.figures import as_png
+from rigkit.report.page_facts import PageFacts
 from rigkit.validation.certificate.contracts import Certificate, Quantity
 
 WHAT = {
@@ -74,19 +75,26 @@ def causes_table(certificate: Certificate) -> Table:
     return Table("causes", "What the error is made of", columns, rows)
 
 
+def certificate_facts(certificate: Certificate, limit: float | None = None) -> PageFacts:
+    """Return what the certificate's page says."""
+    words = in_words(certificate, limit)
+    return PageFacts(
+        headline=words.headline,
+        badge={None: "no limit given", True: "within the limit", False: "beyond the limit"}[words.passed],
+        passed=words.passed,
+        sentences=words.sentences,
+        tables=(causes_table(certificate),),
+    )
+
+
 def certificate_page(
     certificate: Certificate, title: str, provenance: Mapping[str, str], limit: float | None = None
 ) -> str:
     """Return the certificate as an HTML page that needs no other file."""
-    words = in_words(certificate, limit)
     return build_facts_page(
         title,
-        words.headline,
-        [causes_table(certificate)],
-        {**_facts(certificate), **provenance},
-        badge={None: "no limit given", True: "within the limit", False: "beyond the limit"}[words.passed],
-        passed=words.passed,
-        sentences=words.sentences,
+        certificate_facts(certificate, limit),
+        {**basis(certificate), **provenance},
         pictures=[("The bound over the image and its causes", "image/png", as_png(bound_figure(certificate)))],
         signed=True,
     )
@@ -98,11 +106,12 @@ def certificate_pdf(
     """Return the certificate as one sheet of A4 with room for a signature."""
     words = in_words(certificate, limit)
     verdict = {None: "", True: "WITHIN THE LIMIT. ", False: "BEYOND THE LIMIT. "}[words.passed]
-    facts = [f"{name}: {fact}" for name, fact in {**_facts(certificate), **provenance}.items()]
+    facts = [f"{name}: {fact}" for name, fact in {**basis(certificate), **provenance}.items()]
     return sheet_pdf(certificate, title, [f"{verdict}{words.headline}.", *words.sentences], facts)
 
 
-def _facts(certificate: Certificate) -> dict[str, str]:
+def basis(certificate: Certificate) -> dict[str, str]:
+    """Return what the certificate rests on, in words."""
     i = certificate.instrument
     cameras = "; ".join(
         f"'{name}', {camera.model}, {camera.size_px[0]}x{camera.size_px[1]} px"

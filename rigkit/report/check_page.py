@@ -13,6 +13,7 @@ from rigkit.cameras.compare import grid_pixels
 from rigkit.core.tables import Cell, Column, Table
 from rigkit.io.history_file import HistoryEntry
 from rigkit.report.facts_page import build_facts_page
+from rigkit.report.page_facts import PageFacts
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, SentinelCheck
 from rigkit.validation.sentinel.power import FOUND, TIMES, Power
 
@@ -137,19 +138,26 @@ def check_table(check: SentinelCheck) -> Table:
     return Table("causes", "What may have happened", columns, tuple(rows) or (none,))
 
 
+def check_facts(check: SentinelCheck) -> PageFacts:
+    """Return what the page of a check says."""
+    words = check_words(check)
+    return PageFacts(
+        headline=words.headline,
+        badge="holds" if check.holds else "does not hold",
+        passed=check.holds,
+        sentences=words.sentences,
+        tables=(check_table(check), power_table(check)),
+    )
+
+
 def check_page(check: SentinelCheck, title: str, provenance: Mapping[str, str]) -> str:
     """Return the check as an HTML page that needs no other file."""
-    words = check_words(check)
     chance = check.holds and check.chance >= ALARM_CHANCE
     moves = "no more than chance; magnified" if chance else "how the best explanation moves what it sees"
     return build_facts_page(
         title,
-        words.headline,
-        [check_table(check), power_table(check)],
+        check_facts(check),
         provenance,
-        badge="holds" if check.holds else "does not hold",
-        passed=check.holds,
-        sentences=words.sentences,
         drawings=[(f"{name}: {moves}", change_svg(check, c)) for c, name in enumerate(check.watched.names)],
     )
 
@@ -181,26 +189,29 @@ def change_svg(check: SentinelCheck, c: int) -> str:
     )
 
 
-def history_page(entries: Sequence[HistoryEntry], title: str, provenance: Mapping[str, str]) -> str:
-    """Return the register as a page: one drift plot for each thing that may change, then every entry."""
-    names = list(dict.fromkeys(name for entry in entries for name in entry.amounts))
+def history_facts(entries: Sequence[HistoryEntry]) -> PageFacts:
+    """Return what the page of a register says."""
     alarms = sum(not entry.holds for entry in entries)
     told = {0: "none an alarm", 1: "one an alarm"}.get(alarms, f"{alarms} of them alarms")
     count = "one entry" if len(entries) == 1 else f"{len(entries)} entries, {told}"
     lead = f"{count}, from {entries[0].date[:10]} to {entries[-1].date[:10]}."
-    return build_facts_page(
-        title,
-        f"The last entry {'holds' if entries[-1].holds else 'is an alarm'}; {lead}",
-        [_history_table(entries)],
-        provenance,
+    return PageFacts(
+        headline=f"The last entry {'holds' if entries[-1].holds else 'is an alarm'}; {lead}",
         badge="holds" if entries[-1].holds else "does not hold",
         passed=entries[-1].holds,
-        sentences=[
+        sentences=(
             "Each amount as if it alone had changed since the calibration, with its standard deviation. Dashed: "
-            "control limits, three standard deviations of a usual check. Red: entries that raised an alarm."
-        ],
-        drawings=[(name, drift_svg(entries, name)) for name in names],
+            "control limits, three standard deviations of a usual check. Red: entries that raised an alarm.",
+        ),
+        tables=(_history_table(entries),),
     )
+
+
+def history_page(entries: Sequence[HistoryEntry], title: str, provenance: Mapping[str, str]) -> str:
+    """Return the register as a page: one drift plot for each thing that may change, then every entry."""
+    names = list(dict.fromkeys(name for entry in entries for name in entry.amounts))
+    drawings = [(name, drift_svg(entries, name)) for name in names]
+    return build_facts_page(title, history_facts(entries), provenance, drawings=drawings)
 
 
 def drift_svg(entries: Sequence[HistoryEntry], name: str) -> str:

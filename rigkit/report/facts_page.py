@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from rigkit.core.tables import Table
+from rigkit.report.page_facts import PageFacts
 from rigkit.report.render import data_uri, drawing, render, shown_table
 
 BADGES = {None: "look", True: "pass", False: "fail"}
@@ -12,13 +12,9 @@ BADGES = {None: "look", True: "pass", False: "fail"}
 
 def build_facts_page(
     title: str,
-    headline: str,
-    tables: Sequence[Table],
+    facts: PageFacts,
     provenance: Mapping[str, str],
     *,
-    badge: str = "",
-    passed: bool | None = None,
-    sentences: Sequence[str] = (),
     links: Sequence[tuple[str, str]] = (),
     pictures: Sequence[tuple[str, str, bytes]] = (),
     drawings: Sequence[tuple[str, str]] = (),
@@ -28,10 +24,8 @@ def build_facts_page(
 
     Parameters
     ----------
-    title, headline, tables, provenance : what every page has; the headline is the result in the user's units.
-    badge, passed : the verdict in a word or two ("": none), and its colour: good, bad, or (None) neither.
-    sentences : below the headline.
-    links : (words, page) beside them.
+    title, facts, provenance : what every page has.
+    links : (words, page) below the sentences.
     pictures : (words for those who cannot see them, MIME type, bytes).
     drawings : (heading, SVG of rigkit itself).
     signed : whether it ends in lines for date, name and signature.
@@ -40,12 +34,12 @@ def build_facts_page(
         "facts.html",
         title=title,
         lead="",
-        told={"words": badge, "colour": BADGES[passed], "headline": headline},
-        sentences=sentences,
+        told={"words": facts.badge, "colour": BADGES[facts.passed], "headline": facts.headline},
+        sentences=facts.sentences,
         links=links,
         pictures=[(words, data_uri(mime, data)) for words, mime, data in pictures],
         drawings=[(name, drawing(svg)) for name, svg in drawings],
-        tables=[shown_table(table) for table in tables],
+        tables=[shown_table(table) for table in facts.tables],
         signed=signed,
         provenance=provenance,
     )

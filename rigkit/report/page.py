@@ -12,6 +12,7 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.tables import Table
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.reconstruct import Reconstruction
+from rigkit.report.page_facts import PageFacts
 from rigkit.report.render import data_uri, render, shown_table
 from rigkit.report.scene_view import DEPTH, camera_pyramid, rounded
 from rigkit.report.validation_verdict import ValidationVerdict
@@ -65,12 +66,31 @@ def build_page(
     )
 
 
+def validation_facts(
+    lead: str,
+    verdict: ValidationVerdict,
+    summary: Sequence[Table],
+    pairs: Sequence[PairSection],
+    remarks: Sequence[str] = (),
+) -> PageFacts:
+    """Return what the page of a validation says."""
+    return PageFacts(
+        headline=verdict.headline,
+        badge=verdict.badge,
+        passed=verdict.passed,
+        sentences=(*verdict.sentences, *remarks),
+        basis=lead,
+        tables=tuple(summary),
+        parts={p.pair_id: PageFacts(headline=p.lead, sentences=p.notes, tables=p.tables) for p in pairs},
+    )
+
+
 def _first_screen(verdict: ValidationVerdict, pairs: Sequence[PairSection]) -> dict[str, Any]:
     failed = {fact.pair_id for fact in verdict.failed}
     seen = [pair for pair in pairs if pair.scene is not None]
     shown = next((pair for pair in seen if pair.pair_id in failed), seen[0] if seen else None)
     return {
-        "words": "all checks passed" if verdict.passed else "a check failed" if verdict.failed else "not complete",
+        "words": verdict.badge,
         "colour": "pass" if verdict.passed else "fail",
         "headline": verdict.headline,
         "fineness": verdict.fineness,

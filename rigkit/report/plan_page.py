@@ -15,6 +15,7 @@ from rigkit.core.tables import Cell, Column, Table
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.plan import Plan
 from rigkit.planning.words import placement
+from rigkit.report.page_facts import PageFacts
 from rigkit.report.render import drawing, render, shown_table
 
 VIEW_WIDTH = 320.0
@@ -125,15 +126,23 @@ def _path(pixels: Pixels) -> str:
     return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in seen)
 
 
-def plan_page(plan: Plan, title: str, lead: str, provenance: Mapping[str, str], taken: Pixels | None = None) -> str:
+def plan_facts(plan: Plan) -> PageFacts:
+    """Return what the page of a plan says."""
+    lead = f"{plan.goal.what}: {plan.error:.3g} {plan.goal.unit} now, {plan.views[-1].error:.3g} after these pictures."
+    headline = lead[0].upper() + lead[1:]
+    return PageFacts(headline=headline, sentences=tuple(plan_words(plan)), tables=(plan_table(plan),))
+
+
+def plan_page(plan: Plan, title: str, provenance: Mapping[str, str], taken: Pixels | None = None) -> str:
     """Return the plan as an HTML page that needs no other file."""
+    facts = plan_facts(plan)
     return render(
         "plan.html",
         title=title,
         lead="",
-        told={"words": "", "colour": "", "headline": lead},
+        told={"words": "", "colour": "", "headline": facts.headline},
         views=shown_views(plan, taken),
-        tables=[shown_table(plan_table(plan))],
+        tables=[shown_table(table) for table in facts.tables],
         provenance=provenance,
     )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import functools
+from collections.abc import Sequence
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,9 @@ from rigkit.report.tables import below, column_label, measured_words
 
 if TYPE_CHECKING:
     from jinja2 import Environment
+
+LONG_WORDS = 60
+"""Longer words of a cell are set in several lines."""
 
 
 def render(template: str, **context: Any) -> str:
@@ -38,20 +42,22 @@ def table_html(table: Table) -> str:
     return render("table.html", table=shown_table(table))
 
 
-def shown_table(table: Table) -> dict[str, Any]:
-    """Return a table in words, as the template `table.html` shows it."""
+def shown_table(table: Table, pictures: Sequence[str | None] = ()) -> dict[str, Any]:
+    """Return a table in words, as the template `table.html` shows it; `pictures`: a source for each row, or none."""
     words = [any(isinstance(row[j].value, str) for row in table.rows) for j in range(len(table.columns))]
     return {
         "title": table.title,
         "head": [(column_label(column), text) for column, text in zip(table.columns, words, strict=True)],
         "rows": [[_shown_cell(c, column) for c, column in zip(row, table.columns, strict=True)] for row in table.rows],
+        "pictures": list(pictures) if any(pictures) else [],
         "below": below(table),
     }
 
 
 def _shown_cell(cell: Cell, column: Column) -> dict[str, Any]:
     if isinstance(cell.value, str):
-        kind = "fail" if cell.failed else "pass" if cell.value == "pass" else "text"
+        text = "text words" if len(cell.value) > LONG_WORDS else "text"
+        kind = "fail" if cell.failed else "pass" if cell.value == "pass" else text
         return {"words": cell.value, "kind": kind, "best": False, "paper": None}
     words = "–"
     if cell.value is not None and np.isfinite(cell.value):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from rigkit.report.facts_page import build_facts_page
+from rigkit.report.page_facts import PageFacts
 from rigkit.report.study_figure import study_figure
 from rigkit.report.study_tables import study_setup, study_tables
 from rigkit.study.table import StudyTable
@@ -17,11 +18,13 @@ def study_page(found: StudyTable, provenance: Mapping[str, str]) -> str:
     headline = f"{held} of {count} statements of this study hold" if count else "A study without statements to judge"
     return build_facts_page(
         f"rigkit study: {found.study.title}",
-        headline,
-        study_tables(found),
+        PageFacts(
+            headline=headline,
+            badge="" if not count else "all hold" if held == count else "not all hold",
+            passed=held == count if count else None,
+            sentences=(study_setup(found.study).capitalize() + ".",),
+            tables=tuple(study_tables(found)),
+        ),
         provenance,
-        badge="" if not count else "all hold" if held == count else "not all hold",
-        passed=held == count if count else None,
-        sentences=[study_setup(found.study).capitalize() + "."],
         pictures=[(f"Normal errors: {found.study.title}", "image/png", study_figure(found))],
     )

@@ -121,16 +121,21 @@ def tables_to_latex(tables: Sequence[Table]) -> str:
 
 
 def tables_to_json(tables: Sequence[Table]) -> str:
-    """Return all tables as JSON: a list of rows each, every cell with what it has of value, sigma, paper and marks."""
-    out: dict[str, Any] = {"schema": "rigkit.tables/1", "tables": []}
+    """Return all tables as a JSON document."""
+    return json.dumps({"schema": "rigkit.tables/1", "tables": tables_to_list(tables)}, indent=1, allow_nan=False)
+
+
+def tables_to_list(tables: Sequence[Table]) -> list[dict[str, Any]]:
+    """Return all tables for JSON: a list of rows each, every cell with what it has of value, sigma, paper and marks."""
+    out = []
     for table in tables:
         rows = [
             {column.label: _cell_dict(cell) for cell, column in zip(row, table.columns, strict=True)}
             for row in table.rows
         ]
         units = {column.label: column.unit for column in table.columns if column.unit}
-        out["tables"].append({"key": table.key, "title": table.title, "note": table.note, "units": units, "rows": rows})
-    return json.dumps(out, indent=1, allow_nan=False)
+        out.append({"key": table.key, "title": table.title, "note": table.note, "units": units, "rows": rows})
+    return out
 
 
 def tables_to_text(tables: Sequence[Table]) -> str:

@@ -10,6 +10,8 @@ from rigkit.validation.check import Check
 from rigkit.validation.checks import ValidationReport
 from rigkit.validation.crosscheck import CrossCheckReport
 
+BY_OTHERS = "DISAGREES"
+"""Said of what an independent method finds otherwise."""
 FINER = 4.0
 """Where the ruler is so many times less certain than we are, it decides nothing finer."""
 
@@ -35,6 +37,27 @@ class ValidationVerdict:
     fineness: str
     failed: tuple[FailedFact, ...]
     causes: tuple[str, ...]
+
+    @property
+    def badge(self) -> str:
+        """The verdict in a word or two."""
+        return "all checks passed" if self.passed else "a check failed" if self.failed else "not complete"
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What does not hold, probably why, what other methods say of the same images, and how fine the ruler is."""
+
+        def told(facts: Sequence[FailedFact]) -> list[str]:
+            return [f"{fact.what.lower()}: {fact.pair_id}: {fact.words}" for fact in facts]
+
+        cause = "to look at" if self.passed else "probable cause"
+        own, others = ([f for f in self.failed if (f.what == BY_OTHERS) == other] for other in (False, True))
+        return (
+            *told(own),
+            *(f"{cause}: {words}" for words in self.causes),
+            *told(others),
+            *filter(None, [self.fineness]),
+        )
 
 
 def verdict_of(
@@ -80,7 +103,7 @@ def failed_facts(
         for c in other.checks:
             if not c.passed:
                 words = f"{c.name}: {c.ours:.4f} {c.unit}, {c.how} {c.measured:.4f}, {c.k:.1f} combined sigmas apart"
-                facts.append(FailedFact(what="DISAGREES", pair_id=other.pair_id, methods=(), words=words))
+                facts.append(FailedFact(what=BY_OTHERS, pair_id=other.pair_id, methods=(), words=words))
     return tuple(facts)
 
 

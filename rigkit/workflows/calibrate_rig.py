@@ -97,11 +97,7 @@ def calibrate_rig_session(
         if session.rigid_boards:
             files[_boards_file(options.output)] = board_rigs_text(rig.board_rigs)
     if options.report is not None:
-        # One camera is shown as its boards on one mount have it: that is what its file says.
-        alone = dict(zip(session.cameras, rig.single, strict=True))
-        if len(rig.cameras) == 1:
-            alone = dict.fromkeys(session.cameras, judged(rig.cameras[0].calibration))
-        files[options.report] = rig_page(session, rig, alone, checks, corners, files)
+        files[options.report] = rig_page(session, rig, shown_cameras(rig), checks, corners, files)
     if files:
         write_together(files, force=options.force)
     unreadable = {image: reason for one in corners.values() for image, reason in one.unreadable.items()}
@@ -145,6 +141,14 @@ def calibrate_camera(path: Path, *, cache: Cache = Cache.READ, progress: Progres
         return calibration_from(own, session_corners(own, cache=cache, progress=progress), progress=progress)
     corners = rig_corners(session, cache=cache, progress=progress)
     return judged(rig_from(session, corners, progress=progress).cameras[0].calibration)
+
+
+def shown_cameras(rig: RigCalibration) -> dict[str, Calibration]:
+    """Return each camera as the page shows it: as calibrated alone, but one camera as its boards on one mount have it,
+    which is what its file says."""
+    if len(rig.cameras) == 1:
+        return {rig.cameras[0].name: judged(rig.cameras[0].calibration)}
+    return {camera.name: alone for camera, alone in zip(rig.cameras, rig.single, strict=True)}
 
 
 def judged(calibration: Calibration) -> Calibration:

@@ -13,6 +13,7 @@ from rigkit.core.tables import Cell, Column, Table
 from rigkit.io.files import write_atomic
 from rigkit.report.facts_page import build_facts_page
 from rigkit.report.figures import difference_png
+from rigkit.report.page_facts import PageFacts
 from rigkit.workflows.diff import BoardsPair, CameraPair, RigPair
 from rigkit.workflows.provenance import digest_line, software_facts
 
@@ -35,33 +36,43 @@ def words_of(pair: Pair) -> list[str]:
     return _camera_in_words(_camera_figures(pair)).split("\n")
 
 
-def write_diff_page(path: Path, pair: Pair, files: tuple[Path, Path], *, force: bool) -> None:
-    """Write the difference of two `files` as a page; its place was looked at by `diff`."""
+def facts_of(pair: Pair) -> PageFacts:
+    """Return what the page of a difference says."""
     *sentences, verdict = words_of(pair)
-    badge = {True: "no contradiction", False: "not the same", None: "no verdict"}[pair.same]
-    cameras: Mapping[str, CameraPair] = (
-        {"": pair} if isinstance(pair, CameraPair) else pair.cameras if isinstance(pair, RigPair) else {}
-    )
-    pictures = [
-        (f"{name} difference over the image".strip(), "image/png", difference_png(own.difference))
-        for name, own in cameras.items()
-    ]
+    cameras = _cameras_of(pair)
     tables = [_camera_table(cameras)] if cameras else []
     if isinstance(pair, RigPair) and pair.mounts.mounts:
         tables.append(_mount_table("Mounts", pair.mounts))
     if isinstance(pair, BoardsPair):
         tables += [_mount_table(f"Boards with {name}", target) for name, target in pair.targets.items()]
-    facts = software_facts() | {f"{which} {p.name}": digest_line(p) for which, p in zip("AB", files, strict=True)}
-    title = f"rigkit diff: {files[0].name} and {files[1].name}"
     sentences = [line[0].upper() + line[1:] + "." for line in sentences]
     if isinstance(pair, CameraPair):
         # The verdict's own figures first: how much, and how much is usual.
         verdict, sentences = f"{sentences[0][:-1]}; {verdict}", []
-    headline = verdict[0].upper() + verdict[1:] + "."
-    page = build_facts_page(
-        title, headline, tables, facts, badge=badge, passed=pair.same, sentences=sentences, pictures=pictures
+    return PageFacts(
+        headline=verdict[0].upper() + verdict[1:] + ".",
+        badge={True: "no contradiction", False: "not the same", None: "no verdict"}[pair.same],
+        passed=pair.same,
+        sentences=tuple(sentences),
+        tables=tuple(tables),
     )
-    write_atomic(path, page, force=force)
+
+
+def write_diff_page(path: Path, pair: Pair, files: tuple[Path, Path], *, force: bool) -> None:
+    """Write the difference of two `files` as a page; its place was looked at by `diff`."""
+    pictures = [
+        (f"{name} difference over the image".strip(), "image/png", difference_png(own.difference))
+        for name, own in _cameras_of(pair).items()
+    ]
+    provenance = software_facts() | {f"{which} {p.name}": digest_line(p) for which, p in zip("AB", files, strict=True)}
+    title = f"rigkit diff: {files[0].name} and {files[1].name}"
+    write_atomic(path, build_facts_page(title, facts_of(pair), provenance, pictures=pictures), force=force)
+
+
+def _cameras_of(pair: Pair) -> Mapping[str, CameraPair]:
+    if isinstance(pair, CameraPair):
+        return {"": pair}
+    return pair.cameras if isinstance(pair, RigPair) else {}
 
 
 def _camera_table(cameras: Mapping[str, CameraPair]) -> Table:

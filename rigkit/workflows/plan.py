@@ -133,7 +133,5 @@ def _written(
         return ()
     ensure_writable([options.report], force=options.force, inputs=inputs)
     facts = software_facts() | ({source.name: digest_line(source)} if source is not None else {})
-    lead = f"{plan.goal.what}: {plan.error:.3g} {plan.goal.unit} now, {plan.views[-1].error:.3g} after these pictures."
-    lead = lead[0].upper() + lead[1:]
-    write_atomic(options.report, plan_page(plan, title, lead, facts, taken), force=options.force)
+    write_atomic(options.report, plan_page(plan, title, facts, taken), force=options.force)
     return (options.report,)

@@ -26,6 +26,7 @@ from rigkit.reconstruction.reconstruct import Reconstruction, on_planes, reconst
 from rigkit.report.drawings import normal_errors_svg, residuals_svg
 from rigkit.report.figures import as_jpeg, as_pdf, as_png, cloud_figure, corners_figure, epipolar_figure
 from rigkit.report.page import PairSection
+from rigkit.report.page_facts import PageFacts
 from rigkit.report.validation_page import crosscheck_table, pair_section
 from rigkit.validation.checks import ValidationReport, validate_each
 from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
@@ -79,6 +80,7 @@ class DatasetValidation:
     pairs : those that could be reconstructed.
     failures : the others.
     causes : what explains checks that fail, gravest where one does fail.
+    page : what its page says.
     files : relative path -> content of everything, whether it was written or not.
     seconds : how long it took.
     """
@@ -86,6 +88,7 @@ class DatasetValidation:
     pairs: tuple[PairValidation, ...]
     failures: tuple[PairFailure, ...]
     causes: tuple[Finding, ...]
+    page: PageFacts
     files: Mapping[str, str | bytes]
     seconds: float
 
@@ -156,13 +159,16 @@ def validate_dataset(
     # Where everything passed they explain nothing, but a person should know.
     severity = Severity.LOOK if passed else Severity.BAD
     seconds = time.monotonic() - started
-    files = validation_files(known, cameras, pairs, failures, paper, causes=causes, options=options, seconds=seconds)
+    page, files = validation_files(
+        known, cameras, pairs, failures, paper, causes=causes, options=options, seconds=seconds
+    )
     if options.output is not None:
         write_results(options.output, files, force=options.force, inputs=known.inputs)
     return DatasetValidation(
         pairs=tuple(pairs),
         failures=failures,
         causes=tuple(Finding(severity=severity, message=cause) for cause in causes),
+        page=page,
         files=files,
         seconds=time.monotonic() - started,
     )

@@ -15,6 +15,7 @@ from rigkit.core.progress import Progress, silent
 from rigkit.core.tables import Cell, Column, Table
 from rigkit.io.manifest import load_dataset
 from rigkit.report.facts_page import build_facts_page
+from rigkit.report.page_facts import PageFacts
 from rigkit.report.tables import tables_to_csv, tables_to_json, tables_to_markdown
 from rigkit.validation.tables import mean_normal_error
 from rigkit.workflows.provenance import software_facts
@@ -174,10 +175,12 @@ def _page(outcomes: Sequence[SetOutcome], table: Table) -> str:
     passed = sum(outcome.code == ExitCode.WELL for outcome in outcomes)
     return build_facts_page(
         "rigkit validation: many data sets",
-        f"{passed} of {len(outcomes)} data sets pass",
-        [table],
+        PageFacts(
+            headline=f"{passed} of {len(outcomes)} data sets pass",
+            badge="all checks passed" if passed == len(outcomes) else "not all is well",
+            passed=passed == len(outcomes),
+            tables=(table,),
+        ),
         software_facts(),
-        badge="all checks passed" if passed == len(outcomes) else "not all is well",
-        passed=passed == len(outcomes),
         links=[(o.name, f"{o.name}/report.html") for o in outcomes if o.pairs],
     )

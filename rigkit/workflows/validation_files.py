@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 from rigkit.calibration.result import Calibration
 from rigkit.io.manifest import Dataset
-from rigkit.report.page import PairSection, build_page
+from rigkit.report.page import PairSection, build_page, validation_facts
+from rigkit.report.page_facts import PageFacts
 from rigkit.report.tables import tables_to_csv, tables_to_json, tables_to_latex, tables_to_markdown
 from rigkit.report.validation_page import SUMMARY_WORDS, camera_remarks, camera_table, crosscheck_table, summary_table
 from rigkit.report.validation_verdict import verdict_of
@@ -56,8 +57,9 @@ def validation_files(
     causes: Sequence[str],
     options: DatasetOptions,
     seconds: float,
-) -> dict[str, str | bytes]:
-    """Return everything that a validation came to, relative path -> content; the page where there are pictures."""
+) -> tuple[PageFacts, dict[str, str | bytes]]:
+    """Return what the page says, and everything that a validation came to, relative path -> content, the page too where
+    there are pictures."""
     reports = [report for pair in pairs for report in pair.reports]
     compared = [pair.crosscheck for pair in pairs if pair.crosscheck is not None]
     summary = replace(summary_table([pair.best for pair in pairs]), note=SUMMARY_WORDS)
@@ -74,20 +76,20 @@ def validation_files(
     for pair in pairs:
         files |= pair.files
     sections = [pair.section for pair in pairs if pair.section is not None]
+    verdict = verdict_of([pair.best for pair in pairs], reports, compared, causes, complete=not failures)
+    lead = f"{len(pairs)} {'pair' if len(pairs) == 1 else 'pairs'}, each by {len(pairs[0].reports)} estimators of "
+    lead += f"affine transformations, {seconds:.0f} s"
+    lead += "".join(f"; not validated: {failure}" for failure in failures)
+    # What stands with the pairs is not said twice.
+    apart = ("checks", "estimators") if sections else ()
+    shown = [table for table in tables if table.key not in apart]
+    known = _calibrations(dataset, cameras)
+    shown += [camera_table(known)] if known else []
+    remarks = camera_remarks(known)
     if sections:
-        best = [pair.best for pair in pairs]
-        verdict = verdict_of(best, reports, compared, causes, complete=not failures)
-        lead = f"{len(pairs)} {'pair' if len(pairs) == 1 else 'pairs'}, each by {len(pairs[0].reports)} estimators of "
-        lead += f"affine transformations, {seconds:.0f} s"
-        lead += "".join(f"; not validated: {failure}" for failure in failures)
-        shown = [table for table in tables if table.key not in ("checks", "estimators")]
-        known = _calibrations(dataset, cameras)
-        shown += [camera_table(known)] if known else []
-        title = f"rigkit validation: {dataset.name}"
-        files[PAGE] = build_page(
-            title, lead, verdict, shown, sections, _facts(dataset, cameras, options), camera_remarks(known)
-        )
-    return files
+        title, facts = f"rigkit validation: {dataset.name}", _facts(dataset, cameras, options)
+        files[PAGE] = build_page(title, lead, verdict, shown, sections, facts, remarks)
+    return validation_facts(lead, verdict, shown, sections, remarks), files
 
 
 def _calibrations(dataset: Dataset, cameras: LoadedCameras) -> dict[str, Calibration]:

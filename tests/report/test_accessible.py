@@ -27,6 +27,7 @@ from rigkit.core.tables import Cell, Column, Table
 from rigkit.report.calibration_charts import images_svg
 from rigkit.report.calibration_page import CalibrationSection, build_calibration_page
 from rigkit.report.facts_page import build_facts_page
+from rigkit.report.page_facts import PageFacts
 
 SCHEMES = {"light": "--blink-settings=preferredColorScheme=1", "dark": "--blink-settings=preferredColorScheme=0"}
 RUN = """<script>%s</script><script>
@@ -68,11 +69,13 @@ def facts_page() -> str:
     table = Table("t", "A table", (Column("what"), Column("how much", "mm")), ((Cell("a length"), Cell(3.2)),))
     return build_facts_page(
         "Facts",
-        "A length: 95 % of errors within 0.3 mm",
-        [table],
+        PageFacts(
+            headline="A length: 95 % of errors within 0.3 mm",
+            badge="no limit given",
+            sentences=("Half of the view keeps 0.2 mm.",),
+            tables=(table,),
+        ),
         {"rigkit": "x"},
-        badge="no limit given",
-        sentences=["Half of the view keeps 0.2 mm."],
         links=[("one", "one/report.html")],
         drawings=[("by image", images_svg(rig.cameras[0].calibration))],
     )

@@ -1,0 +1,170 @@
+"""What the page of a calibration says: of one camera, and of the cameras of a rig."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from rigkit.calibration.coverage import covered_by_boards
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.rig.result import RigCalibration
+from rigkit.calibration.uncertainty import uncertainty_map
+from rigkit.core.arrays import FloatArray
+from rigkit.core.findings import Severity, worst
+from rigkit.core.tables import Cell, Column, Table
+from rigkit.planning.plan import Plan
+from rigkit.report.calibration_drawings import MAP_GRID
+from rigkit.report.page_facts import PageFacts
+from rigkit.report.plan_page import plan_table, plan_words
+from rigkit.report.rig_tables import rig_basis, rig_reach, rig_tables
+from rigkit.report.tables import rounded_words
+from rigkit.validation.check import Check
+
+IN_PX = ("fx", "fy", "cx", "cy")
+MAX_RATIO_BEYOND = 3.0
+"""Where the projection is no worse than so many times the worst place that boards reached, all of the image serves."""
+BADGE_WORDS = {"good": "good", "look": "usable, with care", "bad": "do not use"}
+PASSED = {Severity.GOOD: True, Severity.LOOK: None, Severity.BAD: False}
+IMAGES, LEFT_OUT, NEXT = "images", "left-out", "plan"
+"""Keys of tables that the page shows with pictures."""
+
+
+def camera_facts(c: Calibration, plan: Plan | None = None) -> PageFacts:
+    """Return what the page says of one camera; `plan`: the pictures that would help most next."""
+    tables = [_parameters(c), _candidates(c), _boards(c), _images(c)]
+    if c.dropped:
+        rows = tuple((Cell(image), Cell(reason)) for image, reason in c.dropped)
+        tables.append(Table(LEFT_OUT, "Left out", (Column("image"), Column("why")), rows))
+    sentences = [*map(str, c.verdicts)]
+    if plan is not None:
+        sentences += [next_words(plan), *plan_words(plan)]
+        tables.append(plan_table(plan))
+    severity = worst(c.verdicts)
+    return PageFacts(
+        headline=_reach(c),
+        badge=BADGE_WORDS[severity],
+        passed=PASSED[severity],
+        sentences=tuple(sentences),
+        basis=_basis(c),
+        tables=tuple(tables),
+    )
+
+
+def rig_facts(rig: RigCalibration, checks: Sequence[Check], cameras: Mapping[str, PageFacts]) -> PageFacts:
+    """Return what the page says of a rig, of which it says `cameras` one by one."""
+    severity = worst(rig.verdicts)
+    return PageFacts(
+        headline=rig_reach(rig, checks),
+        badge=BADGE_WORDS[severity],
+        passed=PASSED[severity],
+        sentences=tuple(map(str, rig.verdicts)),
+        basis=rig_basis(rig),
+        tables=rig_tables(rig, checks),
+        parts=cameras,
+    )
+
+
+def next_words(plan: Plan) -> str:
+    """Return the heading of the pictures to take next."""
+    return f"Take these {len(plan.views)} next: they would bring {100.0 * plan.gain:.0f} %"
+
+
+def _basis(c: Calibration) -> str:
+    width, height = c.camera.size_px
+    return (
+        f"{c.camera.model} camera, {width} x {height} px, {c.corner_count} corners in {len(c.views)} views "
+        f"of {len({v.image for v in c.views})} images, {len(c.outliers)} corners and {len(c.dropped)} images left out; "
+        f"a corner scatters by {c.sigma_px:.3f} px per axis; solver: {c.convergence.reason} after "
+        f"{c.convergence.iterations} steps."
+    )
+
+
+def _reach(c: Calibration) -> str:
+    """Say how sure the projection is where boards were and beyond, in pixels."""
+    grid = uncertainty_map(c, grid=MAP_GRID)
+    known = np.isfinite(grid.worst_px)
+    inside = covered_by_boards(c, grid.pixels) & known
+    if not inside.any():
+        return ""
+    within, beyond = grid.worst_px[inside], grid.worst_px[known & ~inside]
+    words = (
+        f"A far point is projected to ±{np.median(within):.2g} px where boards were (±{within.max():.2g} px at worst; "
+        "one standard deviation)"
+    )
+    if not beyond.size:
+        return words + "."
+    worst = float(beyond.max())
+    if worst < MAX_RATIO_BEYOND * within.max():
+        return words + f", and to ±{worst:.2g} px at worst outside: use the whole image."
+    return words + (
+        f", and to ±{worst:.2g} px at worst outside: use the part inside the dashed line only, or add pictures with "
+        "the board at the border, tilted by 30 degrees."
+    )
+
+
+def _parameters(c: Calibration) -> Table:
+    rows = tuple(
+        (Cell(name), Cell(rounded_words(float(value), float(sigma))), Cell("px" if name in IN_PX else ""))
+        for name, value, sigma in zip(c.camera.parameter_names(), c.camera.parameters, c.parameter_sigmas, strict=True)
+    )
+    columns = (Column("name"), Column("value and standard deviation"), Column("unit"))
+    return Table("parameters", "Parameters", columns, rows, "The file has every digit.")
+
+
+def _candidates(c: Calibration) -> Table:
+    columns = (
+        Column("tried"),
+        Column("numbers", "", 0),
+        Column("held-out RMS", "px", 4),
+        Column("training RMS", "px", 4),
+        Column("taken"),
+        Column("why"),
+    )
+    rows = tuple(
+        (
+            Cell(option.name),
+            Cell(float(option.parameter_count) if option.parameter_count else None),
+            Cell(option.heldout_rms_px, best=option.chosen),
+            Cell(option.rms_px),
+            Cell("taken" if option.chosen else ""),
+            Cell(option.reason),
+        )
+        for option in c.candidates
+    )
+    none = (Cell("nothing but what was asked for"), *[Cell(None)] * 3, Cell(""), Cell(""))
+    return Table("candidates", "Models and board shapes tried", columns, rows or (none,))
+
+
+def _boards(c: Calibration) -> Table:
+    columns = (Column("board"), Column("shape"), Column("off a plane by", "mm"), Column("x longer than y by", "%"))
+    rows = tuple((Cell(b.board_id), Cell(b.kind), Cell(b.bow_mm), Cell(100.0 * b.aspect)) for b in c.boards)
+    return Table("boards", "Boards as the solution has them", columns, rows)
+
+
+def _images(c: Calibration) -> Table:
+    """Return every view: where the board was, and how well it is shown."""
+    middle_mm = {board.board_id: board.points_mm.mean(axis=0) for board in c.boards}
+    columns = (
+        Column("image"),
+        Column("board"),
+        Column("RMS", "px"),
+        Column("corners used", "", 0),
+        Column("left out", "", 0),
+        Column("distance", "mm", 0),
+        Column("tilt", "deg", 0),
+        Column("remark"),
+    )
+    rows = []
+    for view in c.views:
+        remarks = " ".join(found.text for found in c.verdicts if found.image == view.image)
+        upright = float(np.clip(abs(view.cam_from_board.rotation[2, 2]), 0.0, 1.0))
+        far: FloatArray = view.cam_from_board.apply(middle_mm[view.board_id])
+        figures = (float(view.kept.sum()), float((~view.kept).sum()), float(np.linalg.norm(far)))
+        cells = (
+            Cell(view.rms_px, failed=bool(remarks)),
+            *map(Cell, figures),
+            Cell(float(np.degrees(np.arccos(upright)))),
+        )
+        rows.append((Cell(view.image), Cell(view.board_id), *cells, Cell(remarks)))
+    return Table(IMAGES, "Images", columns, tuple(rows), "Tilt: between the board and the image plane.")

@@ -1,0 +1,84 @@
+"""`--json` gives everything that the pages show."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cli.test_calibrate_folder import of_one_camera, pictures
+from helpers.pages import assert_all_is_in
+from helpers.reconstructions import make_reconstruction
+from helpers.schemas import faults
+from report.test_first_screen import reported
+
+from rigkit.cli.main import main
+from rigkit.report.page import build_page, validation_facts
+from rigkit.report.validation_page import pair_section, summary_table
+from rigkit.report.validation_verdict import verdict_of
+from rigkit.validation.diagnose import diagnose
+
+__all__ = ["pictures"]
+
+REPEATS = ("held-out RMS",)
+"""Figures that the JSON has by name."""
+
+
+@pytest.fixture(scope="module")
+def calibrated(pictures: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = of_one_camera(pictures, tmp_path_factory.mktemp("one") / "photos")
+    assert main(["calibrate", str(folder), "--board", "9x6x30", "--model", "brown"]) == 0
+    return folder
+
+
+def run(arguments: list[str], page: Path, capsys: pytest.CaptureFixture[str], code: int = 0) -> tuple[str, Any]:
+    """Return the page that a command writes, and what it prints for programs."""
+    capsys.readouterr()
+    assert main([*arguments, "-r", str(page), "--json"]) == code
+    told = json.loads(capsys.readouterr().out)
+    assert faults(told["page"]) == []
+    return page.read_text(encoding="utf-8"), told
+
+
+def test_one_camera(calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    session, out = str(calibrated / "session.toml"), str(tmp_path / "c.json")
+    html, told = run(["calibrate", session, "-o", out], tmp_path / "c.html", capsys)
+    assert_all_is_in(html, told["page"], REPEATS)
+    keys = {table["key"] for table in told["page"]["tables"]}
+    assert {"parameters", "candidates", "boards", "images", "plan"} <= keys
+    assert f"{told['heldout_rms_px']:.3f} px" in html and f"{told['rms_px']:.3f} px" in html
+    assert set(told["sigmas"]) == set(told["parameters"])
+
+
+def test_a_rig(pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["calibrate", str(pictures), "--board", "9x6x30", "--model", "brown", "-o", str(tmp_path / "rig.json")]
+    html, told = run(command, tmp_path / "rig.html", capsys)
+    assert_all_is_in(html, told["page"], REPEATS)
+    assert set(told["page"]["parts"]) == {"left", "right"}
+
+
+def test_diff_certify_check_and_plan(calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    known = str(calibrated / "calibration.json")
+    images = [str(path) for path in sorted(calibrated.glob("*.JPG"))[:2]]
+    commands = {
+        "diff": ["diff", known, known],
+        "certify": ["certify", known, "--length", "50", "--distance", "400"],
+        "check": ["check", known, *images],
+        "plan": ["plan", known],
+    }
+    for name, command in commands.items():
+        html, told = run(command, tmp_path / f"{name}.html", capsys)
+        assert_all_is_in(html, told["page"], ("Blue dots",))
+
+
+def test_a_validation_that_fails() -> None:
+    report = reported(88.0)
+    verdict = verdict_of([report], [report], causes=diagnose([report]))
+    section = pair_section(make_reconstruction(), [report], [])
+    tables = [summary_table([report])]
+    facts = validation_facts("lead", verdict, tables, [section], ["a remark"])
+    html = build_page("title", "lead", verdict, tables, [section], {"rigkit": "x"}, ["a remark"])
+    assert faults(facts.to_dict()) == []
+    assert facts.badge == "a check failed" and "a remark" in facts.sentences
+    assert_all_is_in(html, json.loads(json.dumps(facts.to_dict())), ("The view:",))

@@ -1,0 +1,111 @@
+"""What a page says, read back from its HTML, against what `--json` has of it."""
+
+from __future__ import annotations
+
+import re
+from html.parser import HTMLParser
+from typing import Any
+
+import pytest
+
+SKIPPED = ("script", "style", "svg", "nav", "button")
+
+
+class Page(HTMLParser):
+    """The words of the first screens, and every table with its title."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.said: list[str] = []
+        self.tables: list[tuple[str, list[list[str]]]] = []
+        self._open: list[str] = []
+        self._first = 0
+        self._title, self._words = "", ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag in ("img", "br", "meta", "link", "input", "hr"):
+            return
+        self._open.append(tag)
+        kind = dict(attrs).get("class") or ""
+        self._first += self._first > 0 or (tag == "div" and kind.split()[:1] == ["first"])
+        if tag in ("h2", "h3", "p", "td", "th"):
+            self._words = ""
+        if tag == "table":
+            self.tables.append((self._title, []))
+        if tag == "tr":
+            self.tables[-1][1].append([])
+
+    def handle_endtag(self, tag: str) -> None:
+        while self._open and self._open.pop() != tag:
+            self._first -= self._first > 0
+        words = re.sub(r"\s+", " ", self._words).strip()
+        if tag in ("h2", "h3"):
+            self._title = words
+        if tag in ("td", "th"):
+            self.tables[-1][1][-1].append(words)
+        if tag == "p" and self._first:
+            self.said.append(words)
+        if tag in ("h3", "p", "td", "th"):
+            self._words = ""
+        self._first -= self._first > 0
+
+    def handle_data(self, data: str) -> None:
+        if not any(tag in self._open for tag in SKIPPED):
+            self._words += data
+
+
+def plain(words: str) -> str:
+    """Return words without what is punctuation between a badge and its sentence."""
+    return re.sub(r"[\s:]+", " ", words).strip().lower()
+
+
+def facts_of(page: dict[str, Any]) -> tuple[list[str], list[dict[str, Any]]]:
+    """Return all words and all tables of a page's facts, those of its parts too."""
+    parts = [page, *page["parts"].values()]
+    words = [w for p in parts for w in (f"{p['badge']} {p['headline']}", *p["sentences"], p["basis"])]
+    return words, [table for p in parts for table in p["tables"]]
+
+
+def assert_all_is_in(html: str, page: dict[str, Any], also: tuple[str, ...] = ()) -> None:
+    """Every sentence of the first screens, and every cell of every table, is in the JSON too, as a number to the digits
+    shown; `also`: how paragraphs begin that repeat figures or explain a word."""
+    read = Page(html)
+    words, tables = facts_of(page)
+    known = [plain(w) for w in words]
+    assert read.said
+    for said in read.said:
+        if said and not said.startswith(also):
+            assert any(plain(said) in w or (w and w in plain(said)) for w in known), said
+    shown = [(title, rows) for title, rows in read.tables if title != "Provenance"]
+    assert shown
+    cells = 0
+    for title, (head, *rows) in shown:
+        of_title = [table for table in tables if table["title"] == title]
+        assert of_title, title
+        assert any(_same(head, rows, table) for table in of_title), (title, rows[0], of_title[0]["rows"][0])
+        cells += sum(map(len, rows))
+    assert cells
+
+
+def _same(head: list[str], rows: list[list[str]], table: dict[str, Any]) -> bool:
+    if len(rows) != len(table["rows"]):
+        return False
+    for row, known in zip(rows, table["rows"], strict=True):
+        # Pictures stand in a column of their own.
+        shown = row[len(row) - len(known) :]
+        if not all(_as_shown(text, value) for text, value in zip(shown, known.values(), strict=True)):
+            return False
+    return len(head) == len(rows[0])
+
+
+def _as_shown(text: str, cell: Any) -> bool:
+    """Say whether a cell's text is the value, to its digits."""
+    value = cell["value"] if isinstance(cell, dict) else cell
+    if isinstance(value, str):
+        return text == re.sub(r"\s+", " ", value).strip()
+    if value is None:
+        return text == "–"
+    first = text.split(" ")[0]
+    digits = len(first.partition(".")[2])
+    return float(first) == pytest.approx(value, abs=0.51 * 10.0**-digits)
