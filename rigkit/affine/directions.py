@@ -19,6 +19,7 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
+from rigkit.core.patterns.base import Pattern
 
 Support = Literal["chord", "neighbours", "line", "patch"]
 SUPPORTS: tuple[Support, ...] = get_args(Support)
@@ -58,12 +59,18 @@ class DirectionField:
 
 
 def direction_field(
-    detection: BoardDetection, view: Camera, *, support: Support = "patch", window: int | None = 2
+    detection: BoardDetection,
+    view: Camera,
+    *,
+    support: Support = "patch",
+    window: int | None = 2,
+    pattern: Pattern | None = None,
 ) -> DirectionField:
     """Return the directions at every corner of one detection.
 
     Parameters
     ----------
+    pattern : of the board, whose grid the detection has; None, and for chessboards: corners are one square apart.
     support : what a direction is estimated from.
         "chord": the chord to the next corner, at the far border from the one before (the paper's directions): the
         angle is exact, the length is not.
@@ -77,7 +84,7 @@ def direction_field(
     Raises
     ------
     InputError
-        Unknown support, or a window below 1.
+        Unknown support, a window below 1, or anything but patches on a board whose points are not one square apart.
 
     Notes
     -----
@@ -89,6 +96,12 @@ def direction_field(
     """
     if window is not None and window < 1:
         raise InputError(f"directions: the window must be at least 1 square, got {window}")
+    uneven = pattern is not None and not pattern.even_steps
+    if uneven and support in ("chord", "neighbours", "line"):
+        raise InputError(
+            f"directions: the points of this board are not one square apart along straight rows and columns, as "
+            f"support '{support}' takes them to be; use 'patch'"
+        )
     tangent = _Tangent.build(detection, view)
     if support == "chord":
         return _next_chords(tangent, detection)
@@ -98,7 +111,8 @@ def direction_field(
         fits = [_line_fit(tangent, detection, axis, window) for axis in (0, 1)]
         return _along_both(*fits)
     if support == "patch":
-        return _patch_fit(tangent, detection, window)
+        places = detection.grid.astype(np.float64)
+        return _patch_fit(tangent, detection, places if pattern is None else pattern.positions(places), window)
     raise InputError(f"directions: support '{support}' is unknown; known: {', '.join(SUPPORTS)}")
 
 
@@ -255,16 +269,16 @@ def _line_fit(
     return vectors[:, 0], covariance[:, 0, :, 0, :]
 
 
-def _patch_fit(tangent: _Tangent, detection: BoardDetection, window: int | None) -> DirectionField:
-    """Return all three directions by a homography through the corners around each corner."""
+def _patch_fit(tangent: _Tangent, detection: BoardDetection, places: FloatArray, window: int | None) -> DirectionField:
+    """Return all three directions by a homography through the corners around each corner; `places` (N, 2) are theirs
+    on the board, in squares."""
     lattice = _index_map(detection)
     columns = _span(detection.grid[:, 0], detection.columns, window)
     rows = _span(detection.grid[:, 1], detection.rows, window)
     n = len(columns)
     index = lattice[rows[:, :, None], columns[:, None, :]].reshape(n, -1)
-    dx, dy = columns - detection.grid[:, :1], rows - detection.grid[:, 1:]
-    steps = np.stack(np.broadcast_arrays(dx[:, None, :], dy[:, :, None]), axis=-1).reshape(n, -1, 2)
-    vectors, covariance = _projective_fit(tangent, index, steps.astype(np.float64))
+    # What was not found (-1) has any place: it takes no part.
+    vectors, covariance = _projective_fit(tangent, index, places[index] - places[:, None])
     joint = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
     all_vectors = joint @ vectors
     all_covariance = np.einsum("ka,naibj,kb->nkij", joint, covariance, joint)

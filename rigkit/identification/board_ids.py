@@ -95,20 +95,17 @@ def first_corner_turn(item: LocatedBoard, kind: BoardKind, board: Board, others:
     centres of the `others` (3,), mm; without others, the one from which the columns run most nearly to the right in
     camera 1. Where it does not, the colours or the marks have told the first corner already.
     """
-    turns: tuple[int, ...] = (0, 2) if kind.board.size == board.size else (1, 3)
-    if kind.board.columns == kind.board.rows and kind.board.square_x_mm == kind.board.square_y_mm:
-        turns = (0, 2) if kind.board.columns % 2 == 0 else (0, 1, 2, 3)
+    turns: tuple[int, ...] = (0, *board.turns) if kind.board.size == board.size else (1, 3)
     if not board.turns:
         return turns[0]
     columns, rows = kind.board.columns - 1, kind.board.rows - 1
     # The corner that `BoardDetection.turned` makes the first, and the direction of the columns from there.
-    first = {0: (0, 0), 1: (0, rows), 2: (columns, rows), 3: (columns, 0)}
+    first = kind.board.points(np.array([(0, 0), (0, rows), (columns, rows), (columns, 0)]))
     along = {0: (1, 0), 1: (0, -1), 2: (-1, 0), 3: (0, 1)}
-    squares = np.array([kind.board.square_x_mm, kind.board.square_y_mm])
 
     def badness(turn: int) -> float:
         if others:
-            corner = item.cam1_from_board[:3, :2] @ (first[turn] * squares) + item.cam1_from_board[:3, 3]
+            corner = item.cam1_from_board[:3, :3] @ first[turn] + item.cam1_from_board[:3, 3]
             return float(np.linalg.norm(corner - np.mean(others, axis=0)))
         return -float(item.cam1_from_board[0, :2] @ np.array(along[turn]))
 

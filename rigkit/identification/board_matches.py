@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import FloatArray, Points
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.board_pose import board_poses, ray_residuals
@@ -118,41 +119,50 @@ def _spacing(detection: BoardDetection) -> float:
     return min(medians) if medians else float(np.ptp(detection.pixels, axis=0).max())
 
 
+Tilts: TypeAlias = list[tuple[FloatArray, float]]
+"""[(cam_from_grid (4, 4), chi2)] of the plausible tilts, best first; none where degenerate."""
+
+
 class GridPoses:
-    """Poses of detections in the frame of their own grid, each computed once."""
+    """Poses of detections, each computed once: in the frame of their own grid, which any shift on a board of even steps
+    has in common, else in that of the board."""
 
     def __init__(self, view: ImageObservations) -> None:
         self.view = view
-        self.known: dict[tuple[int, float, float], list[tuple[FloatArray, float]]] = {}
+        self.known: dict[tuple[int, tuple[float, float] | tuple[str, Placement]], Tilts] = {}
 
-    def of(self, index: int, step_x_mm: float, step_y_mm: float) -> list[tuple[FloatArray, float]]:
-        """Return [(cam_from_grid (4, 4), chi2)] of the plausible tilts, best first; none where degenerate."""
-        name = (index, step_x_mm, step_y_mm)
-        if name not in self.known:
-            detection, observation = self.view.detections[index], self.view.observations[index]
-            points = np.column_stack([detection.grid * [step_x_mm, step_y_mm], np.zeros(len(detection.grid))])
-            try:
-                found = board_poses(observation.rays, points, observation.sigma_px, bases=observation.bases)
-            except DegenerateError:
-                found = ()
-            limit = max(TILT_RMS_RATIO * found[0].rms_rad, TILT_RMS_PX) if found else 0.0
-            self.known[name] = []
-            for pose in (p for p in found if p.rms_rad <= limit):
-                rigid = pose.cam_from_board
-                residual, _ = ray_residuals(
-                    observation.rays, observation.bases, points, rigid.rotation, rigid.translation_mm
-                )
-                chi2 = float(((residual / observation.sigma_px[:, None]) ** 2).sum())
-                self.known[name].append((rigid.matrix(), chi2))
-        return self.known[name]
-
-    def placed(self, index: int, kind: BoardKind, placement: Placement) -> list[tuple[FloatArray, float]]:
+    def placed(self, index: int, kind: BoardKind, placement: Placement) -> Tilts:
         """Return [(cam_from_board (4, 4), chi2)] of a detection placed on a board."""
-        board = kind.board
-        steps = (board.square_x_mm, board.square_y_mm)
-        steps = steps if placement.quarter_turns % 2 == 0 else steps[::-1]
-        grid_from_board = np.linalg.inv(placement.board_from_grid(self.view.detections[index], board))
-        return [(pose @ grid_from_board, chi2) for pose, chi2 in self.of(index, *steps)]
+        board, detection = kind.board, self.view.detections[index]
+        if not board.pattern.even_steps:
+            name = (index, (board.board_id, placement))
+            if name not in self.known:
+                self.known[name] = self._tilts(index, board.points(placement.grid_of(detection)))
+            return self.known[name]
+        x_mm, y_mm = board.squares_mm
+        steps = (x_mm, y_mm) if placement.quarter_turns % 2 == 0 else (y_mm, x_mm)
+        if (index, steps) not in self.known:
+            points = np.column_stack([detection.grid * steps, np.zeros(len(detection.grid))])
+            self.known[index, steps] = self._tilts(index, points)
+        grid_from_board = np.linalg.inv(placement.board_from_grid(detection, board))
+        return [(pose @ grid_from_board, chi2) for pose, chi2 in self.known[index, steps]]
+
+    def _tilts(self, index: int, points: Points) -> Tilts:
+        """Return the poses of a detection with its corners at `points` (N, 3) mm."""
+        observation = self.view.observations[index]
+        try:
+            found = board_poses(observation.rays, points, observation.sigma_px, bases=observation.bases)
+        except DegenerateError:
+            found = ()
+        limit = max(TILT_RMS_RATIO * found[0].rms_rad, TILT_RMS_PX) if found else 0.0
+        out = []
+        for pose in (p for p in found if p.rms_rad <= limit):
+            rigid = pose.cam_from_board
+            residual, _ = ray_residuals(
+                observation.rays, observation.bases, points, rigid.rotation, rigid.translation_mm
+            )
+            out.append((rigid.matrix(), float(((residual / observation.sigma_px[:, None]) ** 2).sum())))
+        return out
 
 
 def matches_between(
@@ -170,7 +180,7 @@ def matches_between(
     free = []
     for view, poses in ((view1, poses1), (view2, poses2)):
         best = np.full(len(view.detections), np.nan)
-        for (index, _, _), found in poses.known.items():
+        for (index, _), found in poses.known.items():
             for _, chi2 in found:
                 best[index] = np.fmin(best[index], chi2)
         free.append(best)

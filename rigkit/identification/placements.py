@@ -14,7 +14,10 @@ import numpy as np
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection, grid_turned
+from rigkit.core.patterns.base import Pattern
 
+SAME_PLACE = 1e-6
+"""Positions in squares that differ by less differ by rounding."""
 SAME_SQUARE_REL = 0.03
 """Squares that differ by less are not told apart by their size."""
 
@@ -96,7 +99,7 @@ def _alike(a: Board, b: Board) -> bool:
 
     same = a.size == b.size and close(a.square_x_mm, b.square_x_mm) and close(a.square_y_mm, b.square_y_mm)
     turned = a.size == b.size[::-1] and close(a.square_x_mm, b.square_y_mm) and close(a.square_y_mm, b.square_x_mm)
-    return same or turned
+    return same or (turned and a.pattern.even_steps)
 
 
 def possible_kinds(detections: Sequence[BoardDetection], kinds: Sequence[BoardKind]) -> list[list[int]]:
@@ -140,7 +143,18 @@ def placements(detection: BoardDetection, kind: BoardKind) -> list[Placement]:
         out += [
             Placement(turn, right, down) for down in range(rows - size[1] + 1) for right in range(columns - size[0] + 1)
         ]
-    return out
+    pattern = kind.board.pattern
+    return out if pattern.even_steps else [place for place in out if _same_form(detection, place, pattern)]
+
+
+def _same_form(detection: BoardDetection, placement: Placement, pattern: Pattern) -> bool:
+    """Say whether corners stand to each other on the board as they do on the grid of the detection, counted from a
+    corner of its own: staggered rows do not after every shift and turn."""
+    own = pattern.positions(detection.grid.astype(np.float64))
+    there = pattern.positions(placement.grid_of(detection).astype(np.float64))
+    for _ in range(placement.quarter_turns):
+        own = np.stack([-own[:, 1], own[:, 0]], axis=-1)
+    return bool(np.ptp(there - own, axis=0).max() < SAME_PLACE)
 
 
 def describe(detection: BoardDetection) -> str:

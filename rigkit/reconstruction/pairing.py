@@ -18,6 +18,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection, common_corners
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import DirectionPairs, Matches
+from rigkit.core.patterns.base import Pattern
 from rigkit.core.printing import brief
 from rigkit.core.truth import MeasuredAngle
 from rigkit.identification.identify import identify_pair
@@ -139,7 +140,8 @@ def _matched(
         view1, view2 = _axis_view(camera1, captured.rays1, pair_id), _axis_view(camera2, captured.rays2, pair_id)
         viewed = tuple((_in_view(a, camera1, view1), _in_view(b, camera2, view2)) for a, b in pairs)
     matches = captured if chain == "raw" else _gather(view1, view2, viewed)
-    directions, noise = _directions(viewed, view1, view2, support, window, matches)
+    patterns = [board.pattern for board in used]
+    directions, noise = _directions(viewed, patterns, view1, view2, support, window, matches)
     notes = [f"board '{name}': {why}" for name, why in identity.missing.items()]
     if unseen:
         notes.append(f"{unseen} corners lie outside the calibrated field of view and were left out")
@@ -211,6 +213,7 @@ def _gather(camera1: Camera, camera2: Camera, pairs: Sequence[tuple[BoardDetecti
 
 def _directions(
     pairs: Sequence[tuple[BoardDetection, BoardDetection]],
+    patterns: Sequence[Pattern],
     view1: Camera,
     view2: Camera,
     support: Support,
@@ -221,10 +224,10 @@ def _directions(
     covariances: tuple[list[FloatArray], list[FloatArray]] = ([], [])
     shared: tuple[list[FloatArray], list[FloatArray]] = ([], [])
     valid = []
-    for first, second in pairs:
+    for (first, second), pattern in zip(pairs, patterns, strict=True):
         _, i, j = common_corners(first, second)
-        field1 = direction_field(first, view1, support=support, window=window)
-        field2 = direction_field(second, view2, support=support, window=window)
+        field1 = direction_field(first, view1, support=support, window=window, pattern=pattern)
+        field2 = direction_field(second, view2, support=support, window=window, pattern=pattern)
         for k, (field, index) in enumerate(((field1, i), (field2, j))):
             vectors[k].append(field.vectors[index])
             covariances[k].append(field.covariance[index])

@@ -15,13 +15,13 @@ from rigkit.validation.planes import NormalErrors, Plane, fit_moved, fit_plane, 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BoardGrid:
-    """x = origin + column * step_x + row * step_y, fitted to the corners by least squares.
+    """x = origin + across * step_x + down * step_y at places in squares, fitted to the corners by least squares.
 
     Attributes
     ----------
-    steps_mm : (3, 3), rows: origin, step along the columns, step along the rows.
+    steps_mm : (3, 3), rows: origin, a square along the columns, a square along the rows.
     scatter_mm2 : (3, 3) covariance of one corner about the lattice.
-    cofactor : (3, 3) inverse normal matrix of (1, column, row): leverage of a place on the board.
+    cofactor : (3, 3) inverse normal matrix of (1, across, down): leverage of a place on the board.
     """
 
     steps_mm: Mat3
@@ -29,7 +29,7 @@ class BoardGrid:
     cofactor: Mat3
 
     def at(self, place: FloatArray) -> tuple[FloatArray, Mat3]:
-        """Return the point (3,) at (column, row), mm, and its covariance (3, 3)."""
+        """Return the point (3,) at a place, mm, and its covariance (3, 3)."""
         row = np.array([1.0, *np.asarray(place, dtype=np.float64)])
         return row @ self.steps_mm, self.scatter_mm2 * float(row @ self.cofactor @ row)
 
@@ -49,7 +49,7 @@ class Placed:
     steps_mm: Mat3
 
     def at(self, place: FloatArray) -> Points:
-        """Return the points (..., 3) at (column, row), mm."""
+        """Return the points (..., 3) at a place, mm."""
         return np.asarray(np.array([1.0, *place]) @ self.steps_mm)
 
     def distances(self, points: Points) -> FloatArray:
@@ -91,35 +91,42 @@ class BoardResult:
         return self.lattice.at(self.place(feature))
 
     def place(self, feature: Feature) -> FloatArray:
-        """Return (column, row) of a corner or of the centre, as floats."""
+        """Return where on the board a corner or the centre is, (2,) in squares from the first corner."""
         if feature.grid is not None:
-            return np.array(feature.grid, dtype=np.float64)
-        return np.array([self.board.columns - 1, self.board.rows - 1]) / 2.0
+            return np.asarray(places_on(self.board, np.array([feature.grid]))[0])
+        places = places_on(self.board, self.board.grid())
+        return np.asarray(0.5 * (places.min(axis=0) + places.max(axis=0)))
 
 
-def fit_lattice(points_mm: Points, grid: IntArray) -> BoardGrid:
-    """Fit the lattice to points (N, 3) with (column, row) `grid` (N, 2).
+def places_on(board: Board, grid: IntArray) -> FloatArray:
+    """Return where the corners `grid` (N, 2) lie on a board, (N, 2) in squares from the first corner."""
+    return board.pattern.positions(np.asarray(grid, dtype=np.float64))
+
+
+def fit_lattice(points_mm: Points, places: FloatArray) -> BoardGrid:
+    """Fit the lattice to points (N, 3) at `places` (N, 2) on the board, in squares.
 
     Raises DegenerateError where the corners lie in one row or column, or are fewer than four.
     """
-    design = _design(grid)
-    if len(grid) < 4 or np.linalg.matrix_rank(design) < 3:
-        raise DegenerateError(f"board: {len(grid)} corners in one line do not fix its frame; more of it must be seen")
+    design = _design(places)
+    if len(places) < 4 or np.linalg.matrix_rank(design) < 3:
+        raise DegenerateError(f"board: {len(places)} corners in one line do not fix its frame; more of it must be seen")
     steps, *_ = np.linalg.lstsq(design, points_mm, rcond=None)
     residuals = points_mm - design @ steps
-    scatter = np.asarray(residuals.T @ residuals / (len(grid) - 3))
+    scatter = np.asarray(residuals.T @ residuals / (len(places) - 3))
     return BoardGrid(np.asarray(steps), scatter, np.asarray(np.linalg.inv(design.T @ design)))
 
 
-def _design(grid: IntArray) -> FloatArray:
-    return np.concatenate([np.ones((len(grid), 1)), grid], axis=1)
+def _design(places: FloatArray) -> FloatArray:
+    return np.concatenate([np.ones((len(places), 1)), places], axis=1)
 
 
-def place_moved(points_mm: Points, grid: IntArray, like: Plane) -> Placed:
-    """Return where a board is for points (M, N, 3): M times those that `like` was fitted to, moved a little."""
+def place_moved(points_mm: Points, places: FloatArray, like: Plane) -> Placed:
+    """Return where a board is for points (M, N, 3) at `places` (N, 2) on it, in squares: M times those that `like` was
+    fitted to, moved a little."""
     used = points_mm[:, like.used]
     many = np.swapaxes(used, 0, 1).reshape(used.shape[1], -1)
-    steps, *_ = np.linalg.lstsq(_design(grid[like.used]), many, rcond=None)
+    steps, *_ = np.linalg.lstsq(_design(places[like.used]), many, rcond=None)
     return Placed(*fit_moved(points_mm, like), np.swapaxes(steps.reshape(3, len(used), 3), 0, 1))
 
 
@@ -140,7 +147,7 @@ def measure_board(
     """
     try:
         plane = fit_plane(points_mm, covariance_mm2, common_mm)
-        lattice = fit_lattice(points_mm[plane.used], grid[plane.used])
+        lattice = fit_lattice(points_mm[plane.used], places_on(board, grid[plane.used]))
     except DegenerateError as error:
         raise DegenerateError(f"board '{board.board_id}': {error}") from error
     _, along, down = lattice.steps_mm

@@ -21,7 +21,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.triangulation import point_covariances, triangulate_rays
 from rigkit.reconstruction.reconstruct import Reconstruction
-from rigkit.validation.boards import BoardResult, Placed, measure_board, place_moved
+from rigkit.validation.boards import BoardResult, Placed, measure_board, place_moved, places_on
 from rigkit.validation.intrinsics import CalibrationShifts
 from rigkit.validation.planes import angle_jacobian, face_angle, normal_errors
 
@@ -132,7 +132,7 @@ def measure(
             seen = (cloud.points_mm[on], cloud.normals[on], cloud.grid[on])
             found = measure_board(board, *seen, covariance[on] if usable else None, common[:, on])
             boards[board.board_id] = found
-            moved[board.board_id] = place_moved(points[:, on], cloud.grid[on], found.plane)
+            moved[board.board_id] = place_moved(points[:, on], places_on(board, cloud.grid[on]), found.plane)
     return Measured(boards, moved, np.array([step for _, step in by_pose]), reconstruction.pose_covariance)
 
 

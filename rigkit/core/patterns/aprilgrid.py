@@ -88,6 +88,10 @@ class AprilGrid(Pattern):
         if self.first_tag < 0 or last >= count:
             raise InputError(f"tags {self.first_tag} to {last} are needed, {self.family} has 0 to {count - 1}")
 
+    @property
+    def even_steps(self) -> bool:
+        return False
+
     def positions(self, grid: FloatArray) -> FloatArray:
         # Between whole points straight on, so that halves lie in the middle of tags and gaps.
         tag, within = np.divmod(np.asarray(grid, dtype=np.float64), 2.0)

@@ -97,6 +97,11 @@ class Pattern(ABC):
         """Raise InputError where no board of so many points and such squares can have this pattern."""
         return
 
+    @property
+    def even_steps(self) -> bool:
+        """Whether `positions` is the grid itself: straight rows and columns, one square apart."""
+        return True
+
     def positions(self, grid: FloatArray) -> FloatArray:
         """Return where points (column, row) (N, 2), also between whole ones, lie in squares from the first (N, 2)."""
         return np.asarray(grid, dtype=np.float64)

@@ -70,6 +70,10 @@ class Circles(Pattern):
     def staggered(self) -> bool:
         return self.layout != "regular"
 
+    @property
+    def even_steps(self) -> bool:
+        return not self.staggered
+
     def check(self, columns: int, rows: int, squares_mm: tuple[float, float]) -> None:
         nearest = self.nearest_mm(squares_mm)
         if self.diameter_mm is not None and not 0.0 < self.diameter_mm < nearest:
