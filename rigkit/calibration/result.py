@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -149,6 +149,7 @@ class BoardShape:
     points_mm : (columns * rows, 3) corners in the board frame, row by row.
     bow_mm : largest departure from a plane.
     aspect : how much longer the squares are along x than stated, against y (0.001: by 0.1 %).
+    declared : the board as it was declared; None in a calibration read from a file of before files said so.
     """
 
     board_id: str
@@ -156,9 +157,14 @@ class BoardShape:
     points_mm: Points
     bow_mm: float = 0.0
     aspect: float = 0.0
+    declared: Board | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points_mm", as_array(self.points_mm, (None, 3), "points_mm"))
+        if self.declared is not None and self.declared.corner_count != len(self.points_mm):
+            raise InputError(
+                f"board '{self.board_id}': {len(self.points_mm)} corners, but {self.declared.corner_count} are declared"
+            )
 
     def __repr__(self) -> str:
         return (
@@ -170,13 +176,40 @@ class BoardShape:
     def of(cls, board: Board, kind: str, points_mm: Points) -> BoardShape:
         """Return the shape of `board` with its corners at `points_mm`, bow and aspect from them."""
         if kind == "flat":
-            return cls(board.board_id, kind, points_mm)
+            return cls(board.board_id, kind, points_mm, declared=board)
         centred = points_mm - points_mm.mean(axis=0)
         normal = np.linalg.svd(centred, full_matrices=False)[2][2]
-        flat = board.points() - board.points().mean(axis=0)
-        scale = (flat * centred).sum(axis=0)[:2] / (flat**2).sum(axis=0)[:2]
         bow = float(np.abs(centred @ normal).max())
-        return cls(board.board_id, kind, points_mm, bow, float(scale[0] / scale[1] - 1.0))
+        along_x, along_y = _stretch(board, points_mm)
+        return cls(board.board_id, kind, points_mm, bow, along_x / along_y - 1.0, board)
+
+    @property
+    def board(self) -> Board:
+        """The flat board nearest to the corners as the solution has them. Of one that no file declares it is known that
+        its corners stand row by row, and no more: a chessboard."""
+        if self.declared is None:
+            return _chessboard_of(self.board_id, self.points_mm)
+        named = replace(self.declared, board_id=self.board_id)
+        if self.kind == "flat":
+            return named
+        along_x, along_y = _stretch(named, self.points_mm)
+        return named.with_squares(along_x * named.square_x_mm, along_y * named.square_y_mm)
+
+
+def _stretch(board: Board, points_mm: Points) -> tuple[float, float]:
+    """Return how much longer a board with its points at (N, 3) mm is than stated, along x and along y."""
+    centred = points_mm - points_mm.mean(axis=0)
+    flat = board.points() - board.points().mean(axis=0)
+    along_x, along_y = (flat * centred).sum(axis=0)[:2] / (flat**2).sum(axis=0)[:2]
+    return float(along_x), float(along_y)
+
+
+def _chessboard_of(board_id: str, points_mm: Points) -> Board:
+    back = np.flatnonzero(np.diff(points_mm[:, 0]) < 0.0)
+    columns = int(back[0]) + 1 if len(back) else len(points_mm)
+    lattice = points_mm.reshape(len(points_mm) // columns, columns, 3)
+    across, down = (float(np.linalg.norm(np.diff(lattice, axis=axis), axis=-1).mean()) for axis in (1, 0))
+    return Board(board_id, columns, len(lattice), across, down)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

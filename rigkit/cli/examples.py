@@ -107,6 +107,7 @@ EXAMPLES: dict[str, str] = {
   rigkit init lab --square-mm 50 --calibration left.json --calibration right.json --pose-type standard
   rigkit init lab --square-mm 50 --calibration wide=w.json --calibration tele=t.json \\
       --cameras 'w-*=wide,wide' --cameras 't-*=tele,tele' --pose-type 'w-*=forward' --pose-type general
+  rigkit init lab --board aprilgrid:6x6x88,spacing=0.3 --calibration camera.json --pose-type general
   rigkit init photos --session --board 9x6x25        a session for rigkit calibrate, of one camera or several
 """,
     "export": """\

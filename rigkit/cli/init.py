@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rigkit.cli.console import note, progress_on_stderr
 from rigkit.cli.manifest_words import (
@@ -20,6 +22,9 @@ from rigkit.cli.manifest_words import (
 )
 from rigkit.core.errors import ExitCode, InputError
 from rigkit.io.reading import usable_path
+
+if TYPE_CHECKING:
+    from rigkit.io.manifest_writer import ToldBoard
 
 HELP = "write a manifest of pairs to validate, or a session to calibrate, from a folder of images"
 
@@ -57,9 +62,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("-o", "--output", type=Path, help="default: dataset.toml (session.toml) in the folder")
     parser.add_argument("--force", action="store_true", help="replace an existing file")
+    parser.add_argument(
+        "--board",
+        **repeatable,
+        metavar="CxRxMM|BOARD.toml",
+        help="such as 9x6x25 (repeatable; of a manifest instead of --square-mm)",
+    )
     session = parser.add_argument_group("sessions")
     session.add_argument("--session", action="store_true", help="a session for rigkit calibrate instead")
-    session.add_argument("--board", **repeatable, metavar="CxRxMM|BOARD.toml", help="such as 9x6x25 (repeatable)")
     session.add_argument("--model", help="camera model (default: auto, the one that predicts best)")
 
 
@@ -81,13 +91,32 @@ def _session(args: argparse.Namespace) -> int:
     return ExitCode.WELL
 
 
+def _told_boards(words: Sequence[str]) -> list[ToldBoard]:
+    """Return the boards that are told: files keep their names, words are called plane1, plane2, ... in their order."""
+    from rigkit.io.board_file import load_board
+    from rigkit.io.board_words import board_in_words
+    from rigkit.io.manifest_writer import ToldBoard
+
+    out = []
+    for number, text in enumerate(words, start=1):
+        board = board_in_words(text)
+        if board is None:
+            out.append(ToldBoard(load_board(text), Path(text)))
+        else:
+            out.append(ToldBoard(replace(board, board_id=f"plane{number}")))
+    return out
+
+
 def _manifest(args: argparse.Namespace) -> int:
     from rigkit.io.files import ensure_writable
     from rigkit.io.manifest_writer import find_images
     from rigkit.workflows.new_manifest import NewManifest, find_pairs, write_manifest
 
-    if args.board or args.model:
-        raise InputError("init: --board and --model are of --session; a manifest takes --square-mm")
+    if args.model:
+        raise InputError("init: --model is of --session")
+    if args.board and args.square_mm is not None:
+        raise InputError("init: --board says how large squares are; leave --square-mm out")
+    told = _told_boards(args.board)
     if args.square_mm is not None:
         told_length("--square-mm", args.square_mm)
     poses_told = told_poses(args.pose_type)
@@ -98,13 +127,13 @@ def _manifest(args: argparse.Namespace) -> int:
     read = [*images, *(target.parent / path for path in calibrations.values())]
     ensure_writable(target, force=args.force, inputs=read)
     require_told(args)
-    found = find_pairs(root, images, on_progress=progress_on_stderr())
+    found = find_pairs(root, images, [one.board for one in told], on_progress=progress_on_stderr())
     for error in found.unreadable:
         note(f"left out: {error}")
     names = [pair.name for pair in found.pairs]
     for pair in found.pairs:
         note(f"pair '{pair.name}': {pair.first.image.name}, {pair.second.image.name}")
-    square_mm = args.square_mm or told_length("--square-mm", ask("side of a square, mm"))
+    squares_mm = 0.0 if told else args.square_mm or told_length("--square-mm", ask("side of a square, mm"))
     if not calibrations:
         calibrations = told_calibrations([ask("path of calibration.json")], target.parent)
     cameras = cameras_of(names, calibrations, args.cameras)
@@ -113,7 +142,7 @@ def _manifest(args: argparse.Namespace) -> int:
         root=root,
         name=args.name,
         pairs=found.pairs,
-        square_mm=square_mm,
+        told=told or squares_mm,
         calibrations=calibrations,
         cameras=cameras,
         pose_types=poses,

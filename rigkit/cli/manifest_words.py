@@ -21,7 +21,7 @@ ONE_CAMERA, TWO_CAMERAS = ("camera",), ("camera1", "camera2")
 def require_told(args: argparse.Namespace) -> None:
     """Raise InputError that names everything that nobody has said and that, without a terminal, nobody can be asked."""
     needed = {
-        "--square-mm": ("side of a square, mm", args.square_mm),
+        "--square-mm": ("side of a square, mm", args.square_mm or args.board or None),
         "--calibration": ("camera's calibration.json", args.calibration or None),
         "--pose-type": (f"pose type of the pairs ({', '.join(POSE_TYPES)})", args.pose_type or None),
     }

@@ -37,15 +37,18 @@ An AprilGrid::
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.patterns.base import Key, Pattern, Value
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
-from rigkit.core.patterns.registry import PATTERNS
+from rigkit.core.patterns.registry import PATTERNS, pattern_type
 from rigkit.io.foreign_boards import foreign_board
+from rigkit.io.json_reader import real, whole
 from rigkit.io.toml_reader import TomlTable, read_toml
 
 BOARD_SCHEMA = "rigkit.board/1"
@@ -142,6 +145,36 @@ def _value(table: TomlTable, key: Key) -> Value:
     if key.kind is float:
         return table.number(key.name, hint=key.hint)
     return table.text(key.name, hint=key.hint)
+
+
+def board_values(board: Board) -> dict[str, Value]:
+    """Return the keys of a board's file, without its name, as another file holds them: exactly, and all of them."""
+    pattern, word = board.pattern, board.pattern.size_word
+    per = pattern.points_per_count
+    values: dict[str, Value] = {"type": pattern.type, "columns": board.columns // per, "rows": board.rows // per}
+    values |= {f"{word}_x_mm": board.square_x_mm, f"{word}_y_mm": board.square_y_mm}
+    if board.square_sigma_mm is not None:
+        values[f"{word}_sigma_mm"] = board.square_sigma_mm
+    return {**values, **pattern.key_values()}
+
+
+def board_of_values(values: Mapping[str, Any], board_id: str) -> Board:
+    """Return the board of `board_values`; raises InputError, KeyError, TypeError or ValueError for others."""
+    kind = pattern_type(str(values["type"]))
+    given = {key.name: values[key.name] for key in kind.keys if key.name in values}
+    known = {"type", "columns", "rows", *given, *(f"{kind.size_word}_{end}_mm" for end in ("x", "y", "sigma"))}
+    if unknown := sorted(set(values) - known):
+        raise InputError(f"a board of type {kind.type} has no {', '.join(unknown)}")
+    for key in kind.keys:
+        if key.name in given and key.kind is not float and type(given[key.name]) is not key.kind:
+            raise TypeError(f"'{key.name}' is {given[key.name]!r}, not {key.kind.__name__}")
+        if key.name in given and key.kind is float:
+            given[key.name] = real(given[key.name])
+    pattern = kind.from_keys(given)
+    columns, rows = (pattern.points_per_count * whole(values[name]) for name in ("columns", "rows"))
+    x, y = (real(values[f"{kind.size_word}_{axis}_mm"]) for axis in "xy")
+    sigma = values.get(f"{kind.size_word}_sigma_mm")
+    return Board(board_id, columns, rows, x, y, square_sigma_mm=None if sigma is None else real(sigma), pattern=pattern)
 
 
 def board_text(board: Board, comment: str, path: Path, *, layout: Board | None = None) -> str:

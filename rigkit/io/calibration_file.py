@@ -23,6 +23,7 @@ from rigkit.core.arrays import FloatArray, as_covariance, without_nan
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding, Severity
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.io.board_file import board_of_values, board_values
 from rigkit.io.files import write_atomic
 from rigkit.io.json_reader import read_json, real, whole
 from rigkit.io.reading import usable_path
@@ -68,6 +69,7 @@ def calibration_text(calibration: Calibration, made: Made | None = None) -> str:
                 "bow_mm": b.bow_mm,
                 "aspect": b.aspect,
                 "points_mm": b.points_mm.tolist(),
+                **({} if b.declared is None else {"target": board_values(b.declared)}),
             }
             for b in c.boards
         ],
@@ -116,7 +118,7 @@ def load_calibration(path: str | Path) -> Calibration:
             outliers=tuple(_entry(Outlier, _finite(v)) for v in data["outliers"]),
             candidates=tuple(_entry(Candidate, _finite(v, ("rms_px",))) for v in data["candidates"]),
             convergence=_entry(Convergence, data["convergence"]),
-            boards=tuple(_entry(BoardShape, v) for v in data["boards"]),
+            boards=tuple(_shape_in(v) for v in data["boards"]),
             verdicts=findings_from_json(data["verdicts"]),
             overdispersion=float(data.get("overdispersion", 1.0)),
             freedom=float(data.get("freedom") or math.inf),
@@ -227,6 +229,11 @@ def _view_in(data: dict[str, Any]) -> ViewResult:
         residuals_px=_array(data["residuals_px"]),
         kept=np.array(data["kept"], dtype=bool),
     )
+
+
+def _shape_in(data: dict[str, Any]) -> BoardShape:
+    declared = board_of_values(data["target"], data["board_id"]) if "target" in data else None
+    return _entry(BoardShape, {**{k: v for k, v in data.items() if k != "target"}, "declared": declared})
 
 
 def _array(value: Any) -> FloatArray:

@@ -10,8 +10,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
+from rigkit.io.board_file import board_values
 from rigkit.io.manifest import DATASET_SCHEMA
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"}
@@ -36,6 +38,22 @@ class ImageBoards:
     image: Path
     size_px: tuple[int, int]
     boards: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ToldBoard:
+    """A board that somebody declared: in a file, or in words that make its keys."""
+
+    board: Board
+    file: Path | None = None
+
+    def lines(self, root: Path) -> list[str]:
+        """Return the board as it stands in a manifest in the folder `root`."""
+        named = ["[[boards]]", f"id = {_quoted(self.board.board_id)}"]
+        if self.file is not None:
+            return [*named, f"file = {_quoted(_relative(self.file.resolve(), root))}", ""]
+        values = board_values(self.board)
+        return [*named, *(f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in values.items()), ""]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +81,10 @@ def find_images(folder: Path) -> list[Path]:
 
 
 def board_sizes(detections: Sequence[BoardDetection]) -> tuple[tuple[int, int], ...]:
-    """Return the sizes of complete boards, wider than high: which way round a board hangs is not a fact about it."""
-    sizes = [(max(d.columns, d.rows), min(d.columns, d.rows)) for d in detections if d.complete]
+    """Return the sizes of boards that are complete, or known by name, wider than high: which way round a board hangs is
+    not a fact about it."""
+    whole = [d for d in detections if d.complete or d.board_id is not None]
+    sizes = [(max(d.columns, d.rows), min(d.columns, d.rows)) for d in whole]
     return tuple(sorted(sizes, reverse=True))
 
 
@@ -120,7 +140,7 @@ def manifest_text(
     name: str,
     root: Path,
     pairs: Sequence[FoundPair],
-    square_mm: float,
+    told: Sequence[ToldBoard] | float,
     calibrations: Mapping[str, str],
     cameras: Mapping[str, tuple[str, str]],
     pose_types: Mapping[str, str],
@@ -133,7 +153,7 @@ def manifest_text(
     name : of the data set.
     root : folder of the manifest; images are named relative to it.
     pairs : at least one.
-    square_mm : side of a square of all boards, as a person measured it.
+    told : the boards, or the side of a square of all chessboards that are found, as a person measured it.
     calibrations : camera -> path of its calibration file, as it shall stand in the manifest.
     cameras : pair -> the cameras of its two images.
     pose_types : pair -> pose type.
@@ -144,20 +164,22 @@ def manifest_text(
             "init: no two images look like a pair; name them ...left/...right or view1/view2, put them into folders "
             "named so, or each pair into a folder of its own"
         )
-    most = max((s.boards for pair in pairs for s in (pair.first, pair.second)), key=len)
-    counts = Counter(most)
     out = [
         "# Started by `rigkit init`; what a person measured is for a person to check.",
         f'schema = "{DATASET_SCHEMA}"',
     ]
-    out += [
-        f"name = {_quoted(name)}",
-        "",
-        f"# Most boards in one image: {', '.join(f'{n} of {c}x{r}' for (c, r), n in counts.items())}.",
-    ]
-    for number, (columns, rows) in enumerate(most, start=1):
-        out += ["[[boards]]", f'id = "plane{number}"', f"columns = {columns}", f"rows = {rows}"]
-        out += [f"square_mm = {square_mm:g}", ""]
+    most = max((s.boards for pair in pairs for s in (pair.first, pair.second)), key=len)
+    out += [f"name = {_quoted(name)}", ""]
+    if isinstance(told, float):
+        counts = ", ".join(f"{n} of {c}x{r}" for (c, r), n in Counter(most).items())
+        out.append(f"# Most boards in one image: {counts}.")
+        for number, (columns, rows) in enumerate(most, start=1):
+            out += ["[[boards]]", f'id = "plane{number}"', f"columns = {columns}", f"rows = {rows}"]
+            out += [f"square_mm = {told:g}", ""]
+        ids = [f"plane{number}" for number in range(1, len(most) + 1)]
+    else:
+        out += [line for board in told for line in board.lines(root)]
+        ids = [board.board.board_id for board in told]
     size = pairs[0].first.size_px
     out.append(f"# Images are {size[0]}x{size[1]} px.")
     if len(calibrations) == 1:
@@ -165,7 +187,7 @@ def manifest_text(
         out += ["# with its own calibration, and name it in camera2 below."]
     for camera, calibration in calibrations.items():
         out += ["[[cameras]]", f"id = {_quoted(camera)}", f"calibration = {_quoted(calibration)}", ""]
-    boards = ", ".join(f'"plane{n}"' for n in range(1, len(most) + 1))
+    boards = ", ".join(_quoted(board_id) for board_id in ids)
     for pair in pairs:
         out += _pair_lines(pair, root, cameras[pair.name], pose_types[pair.name], boards, baselines.get(pair.name))
     return "\n".join(out)

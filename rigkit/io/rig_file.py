@@ -21,6 +21,7 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.io.board_file import board_of_values, board_values
 from rigkit.io.calibration_file import Made, camera_from_json, camera_to_json, damage_named, findings_to_json
 from rigkit.io.json_reader import json_schema, read_json, real, whole
 from rigkit.io.schema_calibration import BOARD_RIG_FILE, RIG_FILE, keys_of
@@ -37,7 +38,8 @@ class SavedRig:
     """What a rig file says: cameras and cam_from_rig by name, the covariance of all intrinsics and of the mounts of all
     cameras but the first, and the corners' sigma; None in a file that does not say (another tool's rig). `scale_sigma`
     is how well all lengths are known from the boards' squares, relative; 0 where nobody stated it. `freedom` are the
-    degrees of freedom of the covariance, `overdispersion` is by how much more frames disagree than corners."""
+    degrees of freedom of the covariance, `overdispersion` is by how much more frames disagree than corners; `boards`
+    are those it was calibrated with, none in a file that does not say."""
 
     cameras: dict[str, tuple[Camera, Rigid3]]
     covariance: FloatArray | None
@@ -45,6 +47,7 @@ class SavedRig:
     scale_sigma: float = 0.0
     freedom: float = math.inf
     overdispersion: float = 1.0
+    boards: tuple[Board, ...] = ()
 
 
 def rig_text(rig: RigCalibration, made: Made | None = None) -> str:
@@ -71,8 +74,15 @@ def rig_text(rig: RigCalibration, made: Made | None = None) -> str:
             for c in rig.cameras
         ],
         "covariance": rig.covariance.tolist(),
+        "boards": [{"board_id": b.board_id, "target": board_values(b)} for b in _boards_of(rig)],
     }
     return json.dumps(data, indent=1, allow_nan=False) + "\n"
+
+
+def _boards_of(rig: RigCalibration) -> tuple[Board, ...]:
+    """Return the boards that its cameras have seen, each as the first of them has it."""
+    shapes = [shape for camera in rig.cameras for shape in camera.calibration.boards if shape.declared is not None]
+    return tuple({shape.board_id: shape.board for shape in reversed(shapes)}.values())
 
 
 def load_rig(path: str | Path) -> dict[str, tuple[Camera, Rigid3]]:
@@ -108,6 +118,7 @@ def load_saved_rig(path: str | Path) -> SavedRig:
         scale_sigma = real(data.get("scale_sigma", 0.0))
         freedom = math.inf if data.get("freedom") is None else real(data["freedom"])
         overdispersion = real(data.get("overdispersion", data.get("spread", 1.0)))
+        boards = tuple(board_of_values(entry["target"], entry["board_id"]) for entry in data.get("boards", ()))
     return SavedRig(
         cameras,
         covariance,
@@ -115,6 +126,7 @@ def load_saved_rig(path: str | Path) -> SavedRig:
         scale_sigma=scale_sigma,
         freedom=freedom,
         overdispersion=overdispersion,
+        boards=boards,
     )
 
 
@@ -149,6 +161,7 @@ def board_rigs_text(rigs: Sequence[BoardRig]) -> str:
                         "square_sigma_mm": placed.board.square_sigma_mm,
                         "target_from_board": placed.target_from_board.matrix()[:3].tolist(),
                         "points_mm": placed.points_mm.tolist(),
+                        "target": board_values(placed.board),
                     }
                     for placed in rig.boards
                 ],
@@ -176,12 +189,15 @@ def load_board_rigs(path: str | Path) -> tuple[BoardRig, ...]:
 
 
 def _placed(entry: dict[str, Any], path: str | Path) -> MountedBoard:
-    if set(entry) != BOARD_KEYS:
+    if set(entry) | {"target"} != BOARD_KEYS:
         raise InputError(f"'{path}': a board must have the keys {', '.join(sorted(BOARD_KEYS))}, and no others")
-    (columns, rows), (along_x, along_y), sigma = entry["size"], entry["square_mm"], entry["square_sigma_mm"]
-    known = None if sigma is None else real(sigma)
-    size = whole(columns), whole(rows)
-    board = Board(str(entry["board_id"]), *size, real(along_x), real(along_y), square_sigma_mm=known)
+    if "target" in entry:
+        board = board_of_values(entry["target"], str(entry["board_id"]))
+    else:
+        (columns, rows), (along_x, along_y), sigma = entry["size"], entry["square_mm"], entry["square_sigma_mm"]
+        known = None if sigma is None else real(sigma)
+        size = whole(columns), whole(rows)
+        board = Board(str(entry["board_id"]), *size, real(along_x), real(along_y), square_sigma_mm=known)
     return MountedBoard(board, np.array(entry["points_mm"]), Rigid3.from_matrix(entry["target_from_board"]))
 
 

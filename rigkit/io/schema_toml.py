@@ -61,7 +61,7 @@ def _sizes() -> dict[str, Schema]:
     return out
 
 
-_BOARD_KEYS: Mapping[str, Schema] = {
+BOARD_KEYS: Mapping[str, Schema] = {
     "type?": said(choice(*PATTERNS), "what is printed; by default chessboard, with a dictionary charuco"),
     "columns": said(_COUNT, "inner corners along x; of an AprilGrid tags, of a circle grid circles"),
     "rows": said(_COUNT, "the same along y"),
@@ -73,7 +73,7 @@ _BOARD_KEYS: Mapping[str, Schema] = {
 BOARD_FILE = file(
     "rigkit.board/1",
     "A board as a person measured it",
-    {"id?": said(TEXT, "its name; by default the file's"), **_BOARD_KEYS},
+    {"id?": said(TEXT, "its name; by default the file's"), **BOARD_KEYS},
 )
 
 _PATTERNS_OF_FILES = {ANY_OF: [TEXT, array(TEXT, 1)]}
@@ -152,7 +152,7 @@ DATASET_FILE = file(
             {
                 "id": said(TEXT, "its name"),
                 "file?": said(TEXT, "of the board, or its keys here"),
-                **optional(_BOARD_KEYS),
+                **optional(BOARD_KEYS),
             },
             "the boards that stand there",
             least=1,
@@ -284,7 +284,7 @@ PUBLIC_FILE = file(
         "licence": said(TEXT, "of its files"),
         "rendered": said(BOOLEAN, "images of a computer, not of a camera"),
         "folder": said(TEXT, "where its files are in a folder of captures"),
-        "boards?": rows({"id?": said(TEXT, "its name"), **_BOARD_KEYS}, "boards in its images"),
+        "boards?": rows({"id?": said(TEXT, "its name"), **BOARD_KEYS}, "boards in its images"),
         "measured?": rows(
             {
                 "id": said(TEXT, "what was measured"),

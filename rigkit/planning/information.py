@@ -24,7 +24,6 @@ from rigkit.calibration.uncertainty import projection_design
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
-from rigkit.core.boards import Board
 from rigkit.geometry.rigid3 import Rigid3
 
 LENS_UNKNOWN = 0.1
@@ -118,10 +117,9 @@ class Knowledge:
         known = cls.unseen(calibration)
         for shape in calibration.boards:
             views = [v for v in calibration.views if v.board_id == shape.board_id and v.kept.any()]
-            columns = board_of_shape(shape.board_id, shape.points_mm).columns
-            seen = np.zeros((len(views), len(shape.points_mm)), dtype=bool)
+            board, seen = shape.board, np.zeros((len(views), len(shape.points_mm)), dtype=bool)
             for row, view in zip(seen, views, strict=True):
-                row[(view.grid[:, 1] * columns + view.grid[:, 0])[view.kept]] = True
+                row[board.index(view.grid)[view.kept]] = True
             poses = [view.cam_from_board for view in views]
             held = HeldBoards(
                 shape.points_mm,
@@ -149,17 +147,6 @@ class Knowledge:
     def with_views(self, held: HeldBoards, board_id: str = "") -> Knowledge:
         """Return what is known once these views are taken."""
         return replace(self, information=self.information + self.of_views(held, board_id).sum(axis=0))
-
-
-def board_of_shape(board_id: str, points_mm: Points) -> Board:
-    """Return the flat board nearest to corners (N, 3) that stand row by row, as a calibration's file has them."""
-    back = np.flatnonzero(np.diff(points_mm[:, 0]) < 0.0)
-    columns = int(back[0]) + 1 if len(back) else len(points_mm)
-    rows = len(points_mm) // columns
-    lattice = points_mm.reshape(rows, columns, 3)
-    across = float(np.linalg.norm(np.diff(lattice, axis=1), axis=-1).mean())
-    down = float(np.linalg.norm(np.diff(lattice, axis=0), axis=-1).mean())
-    return Board(board_id, columns, rows, across, down)
 
 
 def view_information(camera: Camera, held: HeldBoards, error: CornerError) -> FloatArray:

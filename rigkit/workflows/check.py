@@ -27,7 +27,6 @@ from rigkit.io.images import read_image
 from rigkit.io.rig_file import is_rig_file, load_saved_rig
 from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import Goal
-from rigkit.planning.information import board_of_shape
 from rigkit.report.check_page import CheckWords, check_page, check_words
 from rigkit.validation.certificate.contracts import Task
 from rigkit.validation.sentinel.epipolar import check_scene
@@ -112,7 +111,7 @@ def check_pictures(
     else:
         boards = options.boards or known
         if not boards:
-            raise InputError("check: a rig's file does not say what boards there are; give --board 9x6x25")
+            raise InputError(f"check: '{source}' does not say what boards there are; give --board 9x6x25")
         views = _views(watched, frames, boards, left_out, unreadable, progress)
         check = check_views(watched, views, cost)
     words = check_words(check)
@@ -140,7 +139,7 @@ def load_watched(source: Path) -> tuple[Watched, tuple[Board, ...]]:
     """
     if not is_rig_file(source):
         calibration = load_calibration(source)
-        boards = tuple(board_of_shape(shape.board_id, shape.points_mm) for shape in calibration.boards)
+        boards = tuple(shape.board for shape in calibration.boards)
         return watched_camera(calibration, source.stem), boards
     rig = load_saved_rig(source)
     if rig.covariance is None or rig.sigma_px is None:
@@ -153,7 +152,7 @@ def load_watched(source: Path) -> tuple[Watched, tuple[Board, ...]]:
         sigma_px=rig.sigma_px,
         overdispersion=rig.overdispersion,
         freedom=rig.freedom,
-    ), ()
+    ), rig.boards
 
 
 def _frames(watched: Watched, sources: Sequence[Path]) -> list[list[Path]]:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import MAX_IDENTIFIER
 from rigkit.core.progress import Progress, silent
@@ -14,7 +15,8 @@ from rigkit.detection.detect import detect_boards
 from rigkit.io.files import write_atomic
 from rigkit.io.images import read_image, to_grey
 from rigkit.io.manifest import load_dataset
-from rigkit.io.manifest_writer import FoundPair, ImageBoards, board_sizes, group_pairs, manifest_text
+from rigkit.io.manifest_writer import FoundPair, ImageBoards, ToldBoard, board_sizes, group_pairs, manifest_text
+from rigkit.workflows.identify_board import suggested_words
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -29,14 +31,15 @@ class FoundPairs:
 class NewManifest:
     """What a manifest says.
 
-    `root` is the folder of the images; `name` defaults to its name. `calibrations` maps a camera to the path of its
+    `root` is the folder of the images; `name` defaults to its name. `told` are the boards, or the side of a square of
+    all chessboards found, mm. `calibrations` maps a camera to the path of its
     file, absolute or from the folder of the manifest. `cameras`, `pose_types` and `baselines` (mm, sigma mm) go by the
     names of the pairs.
     """
 
     root: Path
     pairs: Sequence[FoundPair]
-    square_mm: float
+    told: Sequence[ToldBoard] | float
     calibrations: Mapping[str, str]
     cameras: Mapping[str, tuple[str, str]]
     pose_types: Mapping[str, str]
@@ -44,20 +47,30 @@ class NewManifest:
     name: str | None = None
 
 
-def find_pairs(root: Path, images: Sequence[Path], *, on_progress: Progress = silent) -> FoundPairs:
-    """Return the pairs among `images`, which lie below `root`. Raises InputError where no image can be read."""
+def find_pairs(
+    root: Path, images: Sequence[Path], boards: Sequence[Board] = (), *, on_progress: Progress = silent
+) -> FoundPairs:
+    """Return the pairs among `images`, which lie below `root`, that show `boards`, or any chessboards.
+
+    Raises InputError where no image can be read, or none shows a board that was looked for.
+    """
     shown: list[ImageBoards] = []
     unreadable: list[InputError] = []
     for done, path in enumerate(images, start=1):
         try:
             image = read_image(path)
-            sizes = board_sizes(detect_boards(to_grey(image)))
+            sizes = board_sizes(detect_boards(to_grey(image), boards or None))
             shown.append(ImageBoards(path, (image.shape[1], image.shape[0]), sizes))
         except InputError as error:
             unreadable.append(error)
         on_progress("looking for boards", done, len(images))
     if not shown and unreadable:
         raise unreadable[0]
+    if not any(image.boards for image in shown):
+        what = "of the boards told is" if boards else "chessboard is"
+        seen = suggested_words(images)
+        such = f"they show --board {seen}, with MM measured" if seen else "other boards must be told: --board"
+        raise InputError(f"init: no {what} found in {len(shown)} images; {such}")
     return FoundPairs(tuple(group_pairs(shown, root)), tuple(unreadable))
 
 
@@ -70,7 +83,7 @@ def write_manifest(new: NewManifest, path: Path, *, force: bool = False) -> Inpu
         new.name or _name_of(new.root),
         path.parent.resolve(),
         new.pairs,
-        new.square_mm,
+        new.told,
         new.calibrations,
         new.cameras,
         new.pose_types,

@@ -19,7 +19,7 @@ from rigkit.io.rig_session import is_rig_session
 from rigkit.io.session import load_session
 from rigkit.planning.candidates import Reach
 from rigkit.planning.guess import guessed_camera
-from rigkit.planning.information import CornerError, Knowledge, board_of_shape
+from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import Plan, plan_views
 from rigkit.report.plan_page import plan_page
 from rigkit.validation.certificate.contracts import Task
@@ -104,7 +104,7 @@ def plan_session(
         boards = session.boards
     else:
         calibration = load_calibration(source)
-        boards = tuple(board_of_shape(shape.board_id, shape.points_mm) for shape in calibration.boards)
+        boards = tuple(shape.board for shape in calibration.boards)
     with about(source):
         plan = next_views(calibration, boards, options.count, length=options.length, reach=options.reach)
     taken = np.concatenate([view.pixels[view.kept] for view in calibration.views])

@@ -51,7 +51,7 @@ def test_the_pair_is_exact_and_so_are_its_directions(kind: str, fisheye: bool) -
         found = [[replace(d, board_id=None) for d in own] for own in found]
         found[1] = [d.turned(2) if d.rows % 2 == 0 else d for d in found[1]]
     listed = boards(kind)
-    pair = match_pair("pair", scene.camera1, scene.camera2, *found, listed)
+    pair = match_pair("pair", scene.camera1, scene.camera2, found[0], found[1], listed)
     assert [board.board_id for board in pair.boards] == [board.board_id for board in listed]
     assert not pair.identity.ambiguous
     assert pair.identity.residual_px < 1e-6
@@ -76,4 +76,5 @@ def test_the_pair_is_exact_and_so_are_its_directions(kind: str, fisheye: bool) -
 def test_an_uneven_board_has_no_directions_from_neighbours() -> None:
     scene = scene_of("asymmetric", fisheye=False)
     with pytest.raises(InputError, match="use 'patch'"):
-        match_pair("pair", scene.camera1, scene.camera2, *scene.detections(), boards("asymmetric"), support="line")
+        first, second = scene.detections()
+        match_pair("pair", scene.camera1, scene.camera2, first, second, boards("asymmetric"), support="line")

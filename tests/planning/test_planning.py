@@ -20,7 +20,7 @@ from rigkit.geometry.rotation import exp_so3
 from rigkit.planning.candidates import MAX_SLANT_DEG, TILT_DEG, Reach, held_boards, outline_mm
 from rigkit.planning.goal import Goal, projection_goal
 from rigkit.planning.guess import guessed_camera
-from rigkit.planning.information import CornerError, HeldBoards, Knowledge, board_of_shape
+from rigkit.planning.information import CornerError, HeldBoards, Knowledge
 from rigkit.planning.plan import choose_views, covariance_of, exchanged_views, plan_views
 from rigkit.planning.words import placement
 
@@ -66,7 +66,7 @@ def test_a_calibration_is_known_as_its_own_views_say(rng: np.random.Generator) -
     stated, own = goal.error(calibration.covariance), goal.error(covariance_of(known.information))
     assert own == pytest.approx(float(stated), rel=0.5)
     (shape,) = calibration.boards
-    board = board_of_shape(shape.board_id, shape.points_mm)
+    board = shape.board
     assert board.size == BOARD.size
     assert board.square_x_mm == pytest.approx(30.0) and board.square_y_mm == pytest.approx(30.0)
 

@@ -10,7 +10,7 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import angle_between, exp_so3
 from rigkit.interop.open3d import mean_and_covariance, plane_inliers, to_open3d
-from rigkit.validation.boards import fit_lattice, measure_board
+from rigkit.validation.boards import fit_lattice, measure_board, places_on
 from rigkit.validation.planes import face_angle, fit_moved, fit_plane, normal_errors
 
 EXACT_RAD = 1e-9
@@ -131,7 +131,7 @@ def test_lattice_finds_square_sizes_order_and_handedness() -> None:
 def test_lattice_places_a_corner_that_was_not_seen(rng: np.random.Generator) -> None:
     points, _ = board_points()
     seen = rng.permutation(48)[:30]
-    place, _ = fit_lattice(points[seen], BOARDS[0].grid()[seen]).at(np.array([7.0, 5.0]))
+    place, _ = fit_lattice(points[seen], places_on(BOARDS[0], BOARDS[0].grid()[seen])).at(np.array([7.0, 5.0]))
     assert place == pytest.approx(points[47], abs=1e-9)
 
 
