@@ -92,7 +92,9 @@ def _identify(args: argparse.Namespace) -> int:
     board = found.board
     print(f"{board.pattern.type}: {board.describe()}".replace("s 1 x 1 mm", "s of unknown size"))
     print(f"seen in {len(found.seen)} of {len(found.looked_at)} images")
-    print(f"--board {found.words}   (MM: the side of a {board.pattern.size_word}, measured with a rule)")
+    print(f"--board {found.words}   (MM: {board.pattern.size_meaning}, measured with a rule)")
+    if found.beside:
+        print(f"beside it: {', '.join(f'--board {words}' for words in found.beside)}")
     if path is not None:
         text = board_text(board.with_squares(args.square_mm, args.square_mm), "as seen in images", path)
         write_atomic(path, text, force=args.force)

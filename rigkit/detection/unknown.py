@@ -13,7 +13,7 @@ from rigkit.detection.circles.unknown import CircleSightings, guessed_circles
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.tags.unknown_charuco import MarkerSightings, guessed_charuco
-from rigkit.detection.tags.unknown_tags import TagSightings, guessed_grid
+from rigkit.detection.tags.unknown_tags import TagSightings, guessed_grids
 
 MIN_IMAGES_OF_GUESS = 2
 """A size of chessboards is told from so many images, or from the only one."""
@@ -27,10 +27,12 @@ class BoardGuess:
     ----------
     board : with squares, or tags, of 1 mm.
     images : indices of the images that show it.
+    beside : other boards that images show.
     """
 
     board: Board
     images: tuple[int, ...]
+    beside: tuple[Board, ...] = ()
 
 
 def guess_board(images: Sequence[GreyImage]) -> BoardGuess | None:
@@ -44,9 +46,12 @@ def guess_board(images: Sequence[GreyImage]) -> BoardGuess | None:
         # Many dictionaries take a second a picture: a board without markers is not asked for ever.
         if not tags.look(k, image) and (markers.images or k < MARKER_TRIES):
             markers.look(k, image)
-    for board, seen in ((guessed_grid(tags), tags.images), (guessed_charuco(markers), markers.images)):
-        if board is not None:
-            return BoardGuess(board, tuple(seen))
+    grids = guessed_grids(tags)
+    if grids:
+        return BoardGuess(*grids[0], tuple(board for board, _ in grids[1:]))
+    charuco = guessed_charuco(markers)
+    if charuco is not None:
+        return BoardGuess(charuco, tuple(markers.images))
     sizes: dict[int, tuple[int, int]] = {}
     circles = CircleSightings()
     for k, image in enumerate(images):

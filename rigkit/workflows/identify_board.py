@@ -30,6 +30,7 @@ class IdentifiedBoard:
     board : with squares, or tags, of 1 mm.
     seen, looked_at : names of the images that show it, and of all looked at.
     words : as `--board` takes them, but for the length: "aprilgrid:6x6xMM,spacing=0.3".
+    beside : the words of other boards that the images show.
     unreadable : why other images could not be read.
     """
 
@@ -37,6 +38,7 @@ class IdentifiedBoard:
     seen: tuple[str, ...]
     looked_at: tuple[str, ...]
     words: str
+    beside: tuple[str, ...] = ()
     unreadable: tuple[InputError, ...] = ()
 
 
@@ -73,7 +75,12 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
             f"no board is seen in {len(names)} images: no chessboard, ChArUco board, AprilGrid or grid of circles"
         )
     return IdentifiedBoard(
-        guess.board, tuple(names[k] for k in guess.images), names, words_of_board(guess.board), tuple(unreadable)
+        board=guess.board,
+        seen=tuple(names[k] for k in guess.images),
+        looked_at=names,
+        words=words_of_board(guess.board),
+        beside=tuple(words_of_board(board) for board in guess.beside),
+        unreadable=tuple(unreadable),
     )
 
 
@@ -82,7 +89,7 @@ def explained(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     guess = _guess(paths)
     if guess is None:
         return None
-    words = [difference(guess.board, board) for board in boards]
+    words = [difference(seen, board) for board in boards for seen in (guess.board, *guess.beside)]
     if None in words or not words:
         return None
     return f"{guess.board.describe().split(', ')[0]} seen in {len(guess.images)} images; {words[0]}"
@@ -91,7 +98,7 @@ def explained(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
 def suggested_words(paths: Sequence[Path]) -> str | None:
     """Return the board that images show as `--board` takes it; None where none is seen."""
     guess = _guess(paths)
-    return None if guess is None else words_of_board(guess.board)
+    return None if guess is None else " --board ".join(words_of_board(board) for board in (guess.board, *guess.beside))
 
 
 def _guess(paths: Sequence[Path]) -> BoardGuess | None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from rigkit.benchmark.scenes import one_board
+from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.boards import Board
 from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.base import Pattern
@@ -14,7 +15,9 @@ from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.patterns.circles import Circles
 from rigkit.detection.saddles.response import grey_image
 from rigkit.detection.unknown import difference, guess_board
-from rigkit.synthetic.render import Optics
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.synthetic.render import Optics, render
+from rigkit.synthetic.scene import PlacedBoard
 
 PLACES = (0.01, 0.02)
 """How well spacing and side of markers are read, in tags and squares."""
@@ -25,6 +28,7 @@ PLACES = (0.01, 0.02)
     [
         ((10, 8), AprilGrid(0.25)),
         ((8, 6), AprilGrid(0.5, "tag25h9", 1, 4, "opencv")),
+        ((8, 6), AprilGrid(0.4, corner_squares=False)),
         ((8, 5), Charuco("DICT_5X5_50", 45.0)),
         ((8, 5), Charuco("DICT_4X4_50", 45.0, legacy=True)),
         ((8, 6), Chessboard()),
@@ -32,7 +36,7 @@ PLACES = (0.01, 0.02)
         ((4, 11), Circles("asymmetric", diameter_mm=24.0)),
         ((8, 7), Circles("hexagonal", diameter_mm=30.0, inverted=True)),
     ],
-    ids=["kalibr", "opencv", "charuco", "legacy", "chessboard", "circles", "asymmetric", "hexagonal"],
+    ids=["kalibr", "opencv", "alone", "charuco", "legacy", "chessboard", "circles", "asymmetric", "hexagonal"],
 )
 def test_everything_but_the_scale_is_told(size: tuple[int, int], pattern: Pattern) -> None:
     board = Board("b", *size, 60.0, 60.0, pattern=pattern)
@@ -50,6 +54,7 @@ def test_everything_but_the_scale_is_told(size: tuple[int, int], pattern: Patter
         assert isinstance(found, AprilGrid)
         assert abs(found.spacing - pattern.spacing) <= PLACES[0] + 1e-9
         assert (found.family, found.border, found.numbering) == (pattern.family, pattern.border, pattern.numbering)
+        assert (found.corner_squares, found.first_tag) == (pattern.corner_squares, pattern.first_tag)
     elif isinstance(pattern, Charuco):
         assert isinstance(found, Charuco)
         assert abs(found.marker_mm - 0.75) <= PLACES[1] + 1e-9
@@ -60,6 +65,19 @@ def test_everything_but_the_scale_is_told(size: tuple[int, int], pattern: Patter
         assert found.diameter_mm == pytest.approx((pattern.diameter_mm or 0.0) / 60.0, abs=PLACES[1])
     else:
         assert found == pattern
+
+
+def test_two_aprilgrids_beside_each_other_are_two() -> None:
+    boards = [Board("a", 8, 6, 40.0, 40.0, pattern=AprilGrid(0.3))]
+    boards.append(Board("b", 6, 8, 40.0, 40.0, pattern=AprilGrid(0.3, first_tag=20)))
+    camera = Pinhole((900, 600), np.array([800.0, 800.0, 449.5, 299.5]))
+    facing = [Rigid3(np.eye(3), np.array([x, -100.0, 520.0])) for x in (-270.0, 30.0)]
+    placed = [PlacedBoard(board, pose) for board, pose in zip(boards, facing, strict=True)]
+    image = render(placed, camera, Rigid3.identity(), optics=Optics(0.5))
+    guess = guess_board([grey_image(image)])
+    assert guess is not None
+    found = {board.pattern.first_tag: board.size for board in (guess.board, *guess.beside)}  # type: ignore[attr-defined]
+    assert found == {0: (8, 6), 20: (6, 8)}
 
 
 def test_what_is_wrong_with_a_board_is_said() -> None:

@@ -43,6 +43,7 @@ class AprilGrid(Pattern):
 
     type: ClassVar[str] = "aprilgrid"
     size_word: ClassVar[str] = "tag"
+    size_meaning: ClassVar[str] = "the side of a tag with its black border"
     point_word: ClassVar[str] = "corners of tags"
     count_word: ClassVar[str] = "tags"
     identified: ClassVar[bool] = True

@@ -69,7 +69,9 @@ class Pattern(ABC):
     type: ClassVar[str]
     """Name in the registry and in board files."""
     size_word: ClassVar[str] = "square"
-    """What the measured length is the side of: board files write it as `<word>_mm`."""
+    """The measured length in a word: board files write it as `<word>_mm`."""
+    size_meaning: ClassVar[str] = "the side of a square"
+    """The measured length in words."""
     point_word: ClassVar[str] = "inner corners"
     """What a board's points are called."""
     count_word: ClassVar[str] = "inner corners"

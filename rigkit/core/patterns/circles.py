@@ -39,6 +39,7 @@ class Circles(Pattern):
 
     type: ClassVar[str] = "circles"
     size_word: ClassVar[str] = "distance"
+    size_meaning: ClassVar[str] = "the distance of two circles in a row"
     point_word: ClassVar[str] = "circles"
     count_word: ClassVar[str] = "circles"
     keys: ClassVar[tuple[Key, ...]] = (

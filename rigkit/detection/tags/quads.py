@@ -23,7 +23,7 @@ def placed_tags(image: GreyImage, board: TagBoard) -> FloatArray:
     """Return the rough corners (R, C, 2) of the tags of `board` in an image, NaN where none is seen."""
     columns, rows = board.board.size
     pixels = np.full((rows, columns, 2), np.nan)
-    quads = _quadrilaterals(image)
+    quads = quadrilaterals(image)
     tags = read_tags(image, quads, board.codes)
     # The same tag is seen several times: at the outer and at the inner border.
     order = np.flatnonzero(tags.read)[np.argsort(-tags.likeness[tags.read], kind="stable")]
@@ -42,7 +42,7 @@ def placed_tags(image: GreyImage, board: TagBoard) -> FloatArray:
     return pixels
 
 
-def _quadrilaterals(image: GreyImage) -> FloatArray:
+def quadrilaterals(image: GreyImage) -> FloatArray:
     """Return quadrilaterals (N, 4, 2) of an image that may be tags, corners in order of growing angle from u to v."""
     grey = np.clip(np.rint(image), 0, 255).astype(np.uint8)
     parameters = cv2.aruco.DetectorParameters()
@@ -56,7 +56,11 @@ def _quadrilaterals(image: GreyImage) -> FloatArray:
     quads = np.array(every, dtype=np.float64).reshape(-1, 4, 2)
     one, other = quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1]
     backwards = one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0] < 0.0
-    return np.asarray(np.where(backwards[:, None, None], quads[:, ::-1], quads))
+    quads = np.where(backwards[:, None, None], quads[:, ::-1], quads)
+    # Contours run through the middles of the outermost dark pixels, half a pixel inside the edge.
+    away = [quads - np.roll(quads, way, axis=1) for way in (1, -1)]
+    lengths = [np.maximum(np.linalg.norm(side, axis=2, keepdims=True), 1e-9) for side in away]
+    return np.asarray(quads + 0.5 * (away[0] / lengths[0] + away[1] / lengths[1]))
 
 
 def _agreeing(corners: FloatArray, place: IntArray, step: float) -> BoolArray:

@@ -1,9 +1,15 @@
-"""AprilGrids that nobody has described: family, border, numbering, counts and spacing from what is read."""
+"""AprilGrids that nobody has described: family, border, numbering, counts and spacing from what is read.
+
+Tags are read in the squares of lattices of corners, and, where an image shows no such lattice, as quadrilaterals that
+stand alone. Several boards are told apart by their numbers: those of one lattice are of one board.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
 
@@ -16,7 +22,8 @@ from rigkit.detection.lattice.lattice import Lattice, build_lattices
 from rigkit.detection.lattice.links import LENGTH_RATIO, find_links
 from rigkit.detection.saddles.response import GreyImage, pyramid
 from rigkit.detection.saddles.saddle import find_corners
-from rigkit.detection.tags.codes import Codes, TagCode, homographies, read_tags
+from rigkit.detection.tags.codes import Codes, TagCode, homographies, read_tags, transferred
+from rigkit.detection.tags.quads import quadrilaterals
 
 WIDEST_RATIO = 8.0
 """A tag's side over the gap, or the other way round, at most."""
@@ -24,102 +31,238 @@ WIDEST_RATIO = 8.0
 MIN_TAGS_READ = 3
 """Tags of one family in a lattice: one may be chance among thousands of codes."""
 
+MAX_LONE_STEP = 3.0
+"""From one lone tag to the next, in sides of a tag: `AprilGrid.spacing` is at most 2."""
 
-@dataclass(eq=False, slots=True)
-class TagSightings:
-    """The tags of all images.
+OFF_PLACE = 0.2
+"""A tag beside another lies within so many steps of its place, as the other has it."""
+
+Kind: TypeAlias = tuple[str, int, bool]
+"""Family, modules of the border, whether tags stand alone."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _SeenTags:
+    """Tags of one lattice, or lone ones beside each other.
 
     Attributes
     ----------
-    images : indices of those that show tags.
-    kinds : (family, border) -> sum of likenesses.
-    tags : of each lattice with tags the kind, number (N,), place (N, 2) in tags with the tags upright as OpenCV has
-        them, and how far a neighbour's first corner lies, in sides of a tag.
+    image : its index.
+    numbers : (N,)
+    places : (N, 2) in tags from any of them, with the tags upright as OpenCV has them.
+    steps : (K,) from a tag to the one beside it, in sides of a tag, as often as that is seen.
     """
 
+    image: int
+    kind: Kind
+    numbers: IntArray
+    places: IntArray
+    steps: FloatArray
+
+    def counted(self) -> tuple[int, int, IntArray] | None:
+        """Return by how much numbers grow along a row and down a column, and which tags (N,) follow that; None where
+        tags beside each other do not say."""
+        across, down = Counter[int](), Counter[int]()
+        at = {tuple(place): int(number) for place, number in zip(self.places.tolist(), self.numbers, strict=True)}
+        for (column, row), number in at.items():
+            for beside, votes in (((column + 1, row), across), ((column, row + 1), down)):
+                if beside in at:
+                    votes[at[beside] - number] += 1
+        if not across or not down:
+            return None
+        step, line = across.most_common(1)[0][0], down.most_common(1)[0][0]
+        # Upright as OpenCV draws tags, Kalibr's boards stand on their heads: numbers grow to the left, and down too.
+        if abs(step) != 1 or line < 1:
+            return None
+        first = self.numbers - step * self.places[:, 0] - line * self.places[:, 1]
+        values, votes_of = np.unique(first, return_counts=True)
+        return step, line, np.flatnonzero(first == values[votes_of.argmax()])
+
+
+@dataclass(eq=False, slots=True)
+class TagSightings:
+    """The tags of all images: indices of the `images` that show some, and the tags as `seen`; `kinds` has the sum of
+    likenesses of each kind."""
+
     images: list[int] = field(default_factory=list)
-    kinds: Counter[tuple[str, int]] = field(default_factory=Counter)
-    tags: list[tuple[tuple[str, int], IntArray, IntArray, FloatArray]] = field(default_factory=list)
+    kinds: Counter[Kind] = field(default_factory=Counter)
+    seen: list[_SeenTags] = field(default_factory=list)
 
     def look(self, index: int, image: GreyImage) -> bool:
         """Read the tags of an image; say whether there are some."""
         levels = pyramid(image)
         corners, _ = find_corners(levels)
         lattices = build_lattices(corners, find_links(corners, levels[0], LENGTH_RATIO * WIDEST_RATIO))
-        seen = [self._read(image, lattice) for lattice in lattices if lattice.count >= 4 * MIN_TAGS_READ]
-        if any(seen):
+        found = [self._read(index, image, lattice) for lattice in lattices if lattice.count >= 4 * MIN_TAGS_READ]
+        shown = any(found) or self._read_alone(index, image)
+        if shown:
             self.images.append(index)
-        return any(seen)
+        return shown
 
-    def _read(self, image: GreyImage, lattice: Lattice) -> bool:
+    def _read(self, index: int, image: GreyImage, lattice: Lattice) -> bool:
         corners = lattice.pixels
         quads = np.stack([corners[:-1, :-1], corners[:-1, 1:], corners[1:, 1:], corners[1:, :-1]], axis=2)
         row, column = np.nonzero(np.isfinite(quads).all(axis=(2, 3)) & (lattice.signs()[:-1, :-1] < 0.0))
         quads = quads[row, column]
-        best: tuple[float, tuple[str, int], TagCode] | None = None
-        for family, dictionary in TAG_FAMILIES.items():
-            every = np.arange(marker_count(dictionary))
-            for border in range(1, MAX_BORDER + 1):
-                codes = read_tags(image, quads, Codes.of(AprilGrid(1.0, family, border, numbering="opencv"), every))
-                total = float(codes.likeness[codes.read].sum())
-                if np.count_nonzero(codes.read) >= MIN_TAGS_READ and (best is None or total > best[0]):
-                    best = total, (family, border), codes
+        best = _best_read(image, quads)
         if best is None:
             return False
-        total, kind, codes = best
+        total, (family, border), codes = best
         turn = int(np.bincount(codes.turns[codes.read], minlength=4).argmax())
         own = codes.read & (codes.turns == turn)
         if np.count_nonzero(own) < MIN_TAGS_READ:
             return False
         columns, rows = lattice.size
         cells = grid_turned(np.stack([column, row], axis=-1)[own], (columns - 1, rows - 1), -turn)
+        upright, places = np.roll(quads[own], -turn, axis=1), cells // 2
+        kind = (family, border, False)
         self.kinds[kind] += total  # type: ignore[assignment]
-        self.tags.append((kind, codes.number[own], cells // 2, _steps(quads[own], np.stack([column, row], -1)[own])))
+        self.seen.append(_SeenTags(index, kind, codes.number[own], places, _steps(upright, places)))
         return True
 
+    def _read_alone(self, index: int, image: GreyImage) -> bool:
+        quads = quadrilaterals(image)
+        best = _best_read(image, quads)
+        if best is None:
+            return False
+        total, (family, border), codes = best
+        # The same tag is seen several times: at the outer and at the inner border.
+        order = np.flatnonzero(codes.read)[np.argsort(-codes.likeness[codes.read], kind="stable")]
+        own = order[np.unique(codes.number[order], return_index=True)[1]]
+        upright = quads[own[:, None], (codes.turns[own, None] + np.arange(4)) % 4]
+        kind, shown = (family, border, True), False
+        for members, places in _beside_each_other(upright):
+            steps = _steps(upright[members], places)
+            seen = _SeenTags(index, kind, codes.number[own[members]], places, steps)
+            counted = seen.counted()
+            # Chance reads codes, but does not count with them.
+            if counted is not None and len(counted[2]) >= MIN_TAGS_READ:
+                self.kinds[kind] += total  # type: ignore[assignment]
+                self.seen.append(seen)
+                shown = True
+        return shown
 
-def _steps(quads: FloatArray, cells: IntArray) -> FloatArray:
-    """Return how far along its row the first corner of the tag beside each lies, in sides of a tag (K,)."""
-    place = {tuple(cell): k for k, cell in enumerate(cells.tolist())}
-    inverse = np.linalg.inv(homographies(quads))
+
+def _best_read(image: GreyImage, quads: FloatArray) -> tuple[float, tuple[str, int], TagCode] | None:
+    """Return the sum of likenesses, family and border, and codes of the kind of tags that quadrilaterals are most
+    like; None for none."""
+    best: tuple[float, tuple[str, int], TagCode] | None = None
+    for family, dictionary in TAG_FAMILIES.items():
+        every = np.arange(marker_count(dictionary))
+        for border in range(1, MAX_BORDER + 1):
+            codes = read_tags(image, quads, Codes.of(AprilGrid(1.0, family, border, numbering="opencv"), every))
+            total = float(codes.likeness[codes.read].sum())
+            if np.count_nonzero(codes.read) >= MIN_TAGS_READ and (best is None or total > best[0]):
+                best = total, (family, border), codes
+    return best
+
+
+def _steps(upright: FloatArray, places: IntArray) -> FloatArray:
+    """Return the steps between tags with corners (N, 4, 2) at `places` (N, 2), in sides of a tag (K,).
+
+    The cross-ratio of the four corners on a line of two tags, with a step of t sides, is t^2 / (t^2 - 1): it needs no
+    homography of a small tag to reach the next one.
+    """
+    at = {tuple(place): k for k, place in enumerate(places.tolist())}
+    lines = []
+    for (column, row), k in at.items():
+        # Corners are those at (0,0) (1,0) (1,1) (0,1).
+        for beside, edges in (((column + 1, row), ((0, 1), (3, 2))), ((column, row + 1), ((0, 3), (1, 2)))):
+            if beside in at:
+                lines += [upright[[k, k, at[beside], at[beside]], [*edge, *edge]] for edge in edges]
+    if not lines:
+        return np.zeros(0)
+    a, b, c, d = np.array(lines).transpose(1, 0, 2)
+
+    def length(one: FloatArray, other: FloatArray) -> FloatArray:
+        return np.asarray(np.linalg.norm(one - other, axis=1))
+
+    ratio = length(a, c) * length(b, d) / np.maximum(length(b, c) * length(a, d), 1e-9)
+    ratio = ratio[ratio > 1.0]
+    return np.sqrt(ratio / (ratio - 1.0))
+
+
+def _beside_each_other(quads: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
+    """Yield groups of upright tags with corners (N, 4, 2) that stand in rows and columns: which (M,), and their places
+    (M, 2) in steps."""
+    inverse = np.asarray(np.linalg.inv(homographies(quads)), np.float64)
+    middle = quads.mean(axis=1)
+    offset = np.stack([transferred(inverse[k : k + 1], middle)[0] for k in range(len(quads))]) - 0.5
+    # As two tags have each other: perspective beyond the homography of either cancels.
+    offset = 0.5 * (offset - np.swapaxes(offset, 0, 1))
+    distance = np.linalg.norm(offset, axis=2) + np.where(np.eye(len(quads)) > 0.0, np.inf, 0.0)
+    step = float(np.median(distance.min(axis=1)))
+    if not 1.0 < step < MAX_LONE_STEP:
+        return
+    place = np.rint(offset / step).astype(np.int64)
+    near = (np.abs(offset / step - place) < OFF_PLACE).all(axis=2) & (np.abs(place).sum(axis=2) == 1)
+    left = set(range(len(quads)))
+    while left:
+        first = left.pop()
+        at, due = {first: (0, 0)}, [first]
+        while due:
+            k = due.pop()
+            for other in np.flatnonzero(near[k]).tolist():
+                if other not in at:
+                    at[other] = (at[k][0] + int(place[k, other, 0]), at[k][1] + int(place[k, other, 1]))
+                    due.append(other)
+        left -= set(at)
+        own = np.array(list(at))
+        yield own, np.array([at[k] for k in own.tolist()])
+
+
+def guessed_grids(seen: TagSightings) -> list[tuple[Board, tuple[int, ...]]]:
+    """Return the AprilGrids of the kind that most tags are of, with tags of 1 mm, and the images that show each; those
+    that most tags are of come first."""
+    if not seen.seen:
+        return []
+    kind = seen.kinds.most_common(1)[0][0]
+    groups: list[tuple[_SeenTags, int, int, IntArray]] = []
+    for item in seen.seen:
+        counted = item.counted() if item.kind == kind else None
+        if counted is not None and len(counted[2]) >= MIN_TAGS_READ:
+            groups.append((item, *counted))
     out = []
-    for (column, row), k in place.items():
-        other = place.get((column + 2, row))
-        if other is not None:
-            # Seen from both tags, perspective beyond the homography of either cancels.
-            there = inverse[k] @ [*quads[other][0], 1.0]
-            back = inverse[other] @ [*quads[k][0], 1.0]
-            out.append(0.5 * (there[0] / there[2] - back[0] / back[2]))
-    return np.array(out)
+    for cluster in _of_one_board(groups):
+        board = _board_of(cluster, kind)
+        if board is not None:
+            tags = sum(len(own) for *_, own in cluster)
+            out.append((tags, board, tuple(sorted({item.image for item, *_ in cluster}))))
+    return [(board, images) for _, board, images in sorted(out, key=lambda found: -found[0])]
 
 
-def guessed_grid(seen: TagSightings) -> Board | None:
-    """Return the AprilGrid that most tags are of, with tags of 1 mm; None where none is told."""
-    if not seen.tags:
-        return None
-    family, border = seen.kinds.most_common(1)[0][0]
-    own = [(numbers, cells, steps) for kind, numbers, cells, steps in seen.tags if kind == (family, border)]
-    across, down = Counter[int](), Counter[int]()
-    for numbers, cells, _ in own:
-        at = {tuple(cell): int(number) for cell, number in zip(cells.tolist(), numbers, strict=True)}
-        for (column, row), number in at.items():
-            for step, votes in (((1, 0), across), ((0, 1), down)):
-                other = at.get((column + step[0], row + step[1]))
-                if other is not None:
-                    votes[other - number] += 1
-    if not across or not down:
-        return None
-    columns = abs(down.most_common(1)[0][0])
-    # Upright as OpenCV draws tags, Kalibr's boards stand on their heads.
-    numbering = "opencv" if across.most_common(1)[0][0] > 0 else "kalibr"
-    every = np.unique(np.concatenate([numbers for numbers, _, _ in own]))
-    if columns < 1:
-        return None
-    # Boards are numbered from 0, or one after the other.
-    first = int(every[0]) // columns * columns
-    rows = (int(every[-1]) - first) // columns + 1
-    spacing = round(float(np.median(np.concatenate([steps for _, _, steps in own]))) - 1.0, 2)
+Counted: TypeAlias = tuple[_SeenTags, int, int, IntArray]
+
+
+def _of_one_board(groups: Sequence[Counted]) -> list[list[Counted]]:
+    """Return the groups of tags by boards: from the least to the largest number of a group all are of one board."""
+    clusters: list[tuple[int, list[Counted]]] = []
+    for group in sorted(groups, key=lambda group: int(group[0].numbers[group[3]].min())):
+        numbers = group[0].numbers[group[3]]
+        if clusters and int(numbers.min()) <= clusters[-1][0]:
+            last, members = clusters.pop()
+            clusters.append((max(last, int(numbers.max())), [*members, group]))
+        else:
+            clusters.append((int(numbers.max()), [group]))
+    return [members for _, members in clusters]
+
+
+def _board_of(cluster: Sequence[Counted], kind: Kind) -> Board | None:
+    """Return the board, with tags of 1 mm, that groups of its tags show; None where they do not tell its spacing."""
+    family, border, alone = kind
+    (step, line), _ = Counter((step, line) for _, step, line, _ in cluster).most_common(1)[0]
+    columns = line
+    own = [(item.numbers[which], item.places[which]) for item, a, b, which in cluster if (a, b) == (step, line)]
+    # The number that a first column has, modulo the columns, is seen where a group is as wide as the board.
+    wide = [(n, p) for n, p in own if np.ptp(p[:, 0]) + 1 == columns]
+    firsts = Counter(int((n - (step * p[:, 0] - (step * p[:, 0]).min()))[0]) % columns for n, p in wide)
+    remainder = firsts.most_common(1)[0][0] if firsts else 0
+    least, most = (int(f([f(n) for n, _ in own])) for f in (np.min, np.max))
+    first = max(least - (least - remainder) % columns, 0)
+    steps = np.concatenate([item.steps for item, *_ in cluster])
+    spacing = round(float(np.median(steps)) - 1.0, 2) if len(steps) else 0.0
     if spacing <= 0.0:
         return None
-    pattern = AprilGrid(spacing, family, border, first, numbering)
-    return Board("board", 2 * columns, 2 * rows, 1.0, 1.0, pattern=pattern)
+    numbering = "opencv" if step > 0 else "kalibr"
+    pattern = AprilGrid(spacing, family, border, first, numbering, not alone)
+    return Board("board", 2 * columns, 2 * ((most - first) // columns + 1), 1.0, 1.0, pattern=pattern)
