@@ -16,7 +16,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection, grid_turned
 from rigkit.core.patterns.base import Pattern
 
-SAME_PLACE = 1e-6
+PLACE_ROUNDING = 1e-6
 """Positions in squares that differ by less differ by rounding."""
 SAME_SQUARE_REL = 0.03
 """Squares that differ by less are not told apart by their size."""
@@ -154,7 +154,7 @@ def _same_form(detection: BoardDetection, placement: Placement, pattern: Pattern
     there = pattern.positions(placement.grid_of(detection).astype(np.float64))
     for _ in range(placement.quarter_turns):
         own = np.stack([-own[:, 1], own[:, 0]], axis=-1)
-    return bool(np.ptp(there - own, axis=0).max() < SAME_PLACE)
+    return bool(np.ptp(there - own, axis=0).max() < PLACE_ROUNDING)
 
 
 def describe(detection: BoardDetection) -> str:

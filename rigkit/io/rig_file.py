@@ -30,10 +30,10 @@ RIG_SCHEMA = "rigkit.rig/1"
 BOARDS_SCHEMA = "rigkit.board_rig/1"
 RIG_KEYS = keys_of(RIG_FILE)
 RIG_CAMERA_KEYS = keys_of(RIG_FILE, "cameras")
-BOARD_KEYS = keys_of(BOARD_RIG_FILE, "rigs", "boards")
+PLACED_KEYS = keys_of(BOARD_RIG_FILE, "rigs", "boards")
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class SavedRig:
     """What a rig file says: cameras and cam_from_rig by name, the covariance of all intrinsics and of the mounts of all
     cameras but the first, and the corners' sigma; None in a file that does not say (another tool's rig). `scale_sigma`
@@ -120,9 +120,9 @@ def load_saved_rig(path: str | Path) -> SavedRig:
         overdispersion = real(data.get("overdispersion", data.get("spread", 1.0)))
         boards = tuple(board_of_values(entry["target"], entry["board_id"]) for entry in data.get("boards", ()))
     return SavedRig(
-        cameras,
-        covariance,
-        sigma_px,
+        cameras=cameras,
+        covariance=covariance,
+        sigma_px=sigma_px,
         scale_sigma=scale_sigma,
         freedom=freedom,
         overdispersion=overdispersion,
@@ -189,8 +189,8 @@ def load_board_rigs(path: str | Path) -> tuple[BoardRig, ...]:
 
 
 def _placed(entry: dict[str, Any], path: str | Path) -> MountedBoard:
-    if set(entry) | {"target"} != BOARD_KEYS:
-        raise InputError(f"'{path}': a board must have the keys {', '.join(sorted(BOARD_KEYS))}, and no others")
+    if set(entry) | {"target"} != PLACED_KEYS:
+        raise InputError(f"'{path}': a board must have the keys {', '.join(sorted(PLACED_KEYS))}, and no others")
     if "target" in entry:
         board = board_of_values(entry["target"], str(entry["board_id"]))
     else:

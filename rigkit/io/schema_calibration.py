@@ -74,7 +74,7 @@ _VIEW = obj(
         "kept": said(array(BOOLEAN), "false for outliers"),
     }
 )
-TARGET = obj(BOARD_KEYS, "the board as declared, by the keys of board files")
+DECLARED_BOARD = obj(BOARD_KEYS, "the board as declared, by the keys of board files")
 _SHAPE = obj(
     {
         "board_id": said(TEXT, "which board"),
@@ -82,7 +82,7 @@ _SHAPE = obj(
         "points_mm": said(matrix(columns=3), "its corners, row by row"),
         "bow_mm?": said(NUMBER, "largest departure from a plane"),
         "aspect?": said(NUMBER, "how much longer its squares are along x than stated, against y"),
-        "target?": TARGET,
+        "target?": DECLARED_BOARD,
     }
 )
 CALIBRATION_FILE = file(
@@ -129,7 +129,7 @@ RIG_FILE = file(
         "covariance?": said(
             matrix(), "of all parameters, camera by camera, then of the mounts of all but the first (rad, mm)"
         ),
-        "boards?": rows({"board_id": said(TEXT, "its name"), "target": TARGET}, "what was calibrated with"),
+        "boards?": rows({"board_id": said(TEXT, "its name"), "target": DECLARED_BOARD}, "what was calibrated with"),
         "baselines?": rows(
             {"from": TEXT, "to": TEXT, "value_mm": NUMBER, "sigma_mm": NUMBER}, "distances between cameras"
         ),
@@ -154,7 +154,7 @@ BOARD_RIG_FILE = file(
                         "square_sigma_mm": nullable(NUMBER),
                         "target_from_board": _POSE,
                         "points_mm": said(matrix(columns=3), "corners, row by row"),
-                        "target?": TARGET,
+                        "target?": DECLARED_BOARD,
                     },
                     "the first is the target's frame",
                 ),

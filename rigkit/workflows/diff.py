@@ -157,4 +157,4 @@ def _named_like(rig: SavedRig, other: SavedRig, path: Path) -> SavedRig:
 
 def _saved(path: Path) -> SavedRig:
     """Return a rig of ours, or another tool's, which has no covariance."""
-    return load_saved_rig(path) if is_rig_file(path) else SavedRig(import_rig(path), None)
+    return load_saved_rig(path) if is_rig_file(path) else SavedRig(cameras=import_rig(path), covariance=None)

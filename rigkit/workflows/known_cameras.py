@@ -49,7 +49,7 @@ def known_cameras(session: RigSession) -> KnownCameras | None:
     if session.known_rig is None and not session.lenses:
         return None
     names = list(session.cameras)
-    rig = SavedRig({}, None) if session.known_rig is None else _saved(session.known_rig, names)
+    rig = SavedRig(cameras={}, covariance=None) if session.known_rig is None else _saved(session.known_rig, names)
     mounted = [name for name in rig.cameras if name in names]
     if rig.cameras:
         first = next(iter(rig.cameras))
@@ -114,7 +114,7 @@ def _saved(path: Path, names: Sequence[str]) -> SavedRig:
     cameras = import_rig(path)
     if not set(cameras) & set(names):
         cameras = dict(zip(names, cameras.values(), strict=False))
-    return SavedRig(cameras, None)
+    return SavedRig(cameras=cameras, covariance=None)
 
 
 def _lens(path: Path, name: str, names: Sequence[str]) -> tuple[Camera, FloatArray | None]:

@@ -34,7 +34,7 @@ MIN_TAGS_READ = 3
 MAX_LONE_STEP = 3.0
 """From one lone tag to the next, in sides of a tag: `AprilGrid.spacing` is at most 2."""
 
-OFF_PLACE = 0.2
+OFF_TAG_PLACE = 0.2
 """A tag beside another lies within so many steps of its place, as the other has it."""
 
 Kind: TypeAlias = tuple[str, int, bool]
@@ -195,7 +195,7 @@ def _beside_each_other(quads: FloatArray) -> Iterator[tuple[IntArray, IntArray]]
     if not 1.0 < step < MAX_LONE_STEP:
         return
     place = np.rint(offset / step).astype(np.int64)
-    near = (np.abs(offset / step - place) < OFF_PLACE).all(axis=2) & (np.abs(place).sum(axis=2) == 1)
+    near = (np.abs(offset / step - place) < OFF_TAG_PLACE).all(axis=2) & (np.abs(place).sum(axis=2) == 1)
     left = set(range(len(quads)))
     while left:
         first = left.pop()
