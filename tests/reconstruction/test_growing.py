@@ -9,12 +9,14 @@ import pytest
 from helpers.epipolar_scenes import pose_errors_deg
 from helpers.textured_scene import Corner
 
+from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.features import TILTS, match_affine_features
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, exp_so3
 from rigkit.reconstruction.growing.dense import DenseScene, grow_scene
+from rigkit.reconstruction.growing.grow import GrowingView, LineKnowledge, grow, grow_both_ways
 from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene
 
 SIZE = (480, 360)
@@ -82,3 +84,24 @@ def test_grown_pairs_do_not_cross_to_another_surface(lens: str) -> None:
     assert seen.all()
     assert np.median(off) < 0.1
     assert np.mean(off > 1.0) < 0.01
+
+
+def test_no_place_of_image_2_is_grown_from_two_places_of_image_1() -> None:
+    """A texture that image 1 shows twice and image 2 once: growing one way takes both, both ways one of them."""
+    rng = np.random.default_rng(3)
+    block = rng.uniform(0.0, 255.0, (90, 90))
+    image1, image2 = rng.uniform(0.0, 255.0, (2, 150, 300))
+    image1[30:120, 20:110] = image1[30:120, 180:270] = image2[30:120, 170:260] = block
+    camera = Pinhole((300, 150), np.array([300.0, 300.0, 149.5, 74.5]))
+    views = [GrowingView.of(image, camera) for image in (image1, image2)]
+    seeds = Correspondences(
+        np.array([[65.0, 75.0], [225.0, 75.0]]), np.full((2, 2), [215.0, 75.0]), np.broadcast_to(np.eye(2), (2, 2, 2))
+    )
+    anywhere = LineKnowledge(np.zeros((3, 3)), np.inf)
+    twice = grow(*views, seeds, step=3, known=anywhere)
+    once = grow_both_ways(*views, seeds, step=3, known=anywhere)
+    assert len(twice) > 1000
+    assert 0.45 < len(once) / len(twice) < 0.55
+    places = once.pixels2[once.valid]
+    apart = np.linalg.norm(places[:, None] - places[None], axis=-1)
+    assert apart[~np.eye(len(places), dtype=bool)].min() > 1.5

@@ -19,7 +19,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, rotation_angle, unit
 from rigkit.geometry.sampson import sampson_distances
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
-from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKnowledge, grow
+from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKnowledge, grow, grow_both_ways
 from rigkit.reconstruction.growing.surface import GrownSurface, fit_surface, measure
 from rigkit.reconstruction.growing.systematic import SystematicPose, pose_with_field
 from rigkit.reconstruction.reconstruct import Reconstruction, colours_at
@@ -117,7 +117,7 @@ def grow_scene(
     pose, covariance = in_unit(even.pose.cam2_from_cam1, even.pose.covariance, r.baseline_mm)
     known = _knowledge(even.matches, pose)
     step = max(CLOUD_STEP, round(float(np.sqrt(np.prod(view1.size_px) / CLOUD_NODES))))
-    grown = grow(view1, view2, agreeing, step=step, known=known).centred()
+    grown = grow_both_ways(view1, view2, agreeing, step=step, known=known).centred()
     if not len(grown):
         raise DegenerateError(
             f"no surface grows from {len(agreeing)} correspondences; check that the images are sharp and "

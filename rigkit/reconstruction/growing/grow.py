@@ -30,6 +30,8 @@ MAX_SIGMA_PX = 0.15
 """Along the axis of which least is known; beyond, a patch slides along an edge."""
 MAX_TRIES = 3
 """Of a node, from different neighbours."""
+MAX_RETURN_PX = 1.0
+"""By which a pair may miss where it began when it is grown back from the other image: the usual check of stereo."""
 RAY_SPACING_PX = 8.0
 """Rays are interpolated in between by cubics: to 1e-4 px even for strong fisheyes."""
 
@@ -75,6 +77,10 @@ class LineKnowledge:
     max_distance_px: float
     sigma_px: float = np.inf
     sigma_A: float = np.inf
+
+    def swapped(self) -> LineKnowledge:
+        """Return the same of the images in the other order."""
+        return replace(self, E21=self.E21.T)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -128,6 +134,21 @@ class GrownPatches:
         spread[at] = moved @ covariance @ np.swapaxes(moved, 1, 2)
         return replace(self, pixels1=pixels1, pixels2=pixels2, covariance=spread)
 
+    def where(self, keep: BoolArray) -> GrownPatches:
+        """Return the pairs of the nodes `keep` (R, C) alone."""
+
+        def kept(values: FloatArray) -> FloatArray:
+            return np.where(keep.reshape(*keep.shape, *(1,) * (values.ndim - 2)), values, np.nan)
+
+        return replace(
+            self,
+            pixels2=kept(self.pixels2),
+            A21=kept(self.A21),
+            correlation=kept(self.correlation),
+            coarser=kept(self.coarser),
+            covariance=kept(self.covariance),
+        )
+
     def correspondences(self) -> Correspondences:
         """Return the pairs in the order of their nodes, row by row."""
         at = self.valid
@@ -180,3 +201,25 @@ def grow(
         coarser=found.coarser.reshape(shape),
         covariance=found.covariance.reshape(*shape, 6, 6),
     )
+
+
+def grow_both_ways(
+    view1: GrowingView, view2: GrowingView, seeds: Correspondences, *, step: int, known: LineKnowledge
+) -> GrownPatches:
+    """Return the pairs that grow from `seeds`, which lead back to their nodes when they are grown from image 2.
+
+    What image 2 does not see, and what looks the same in several places, mostly leads elsewhere, or nowhere.
+    """
+    there = grow(view1, view2, seeds, step=step, known=known)
+    at = there.valid
+    pixels2 = there.pixels2[at]
+    ends = Correspondences(pixels2, there.pixels1[at], np.linalg.inv(there.A21[at]), None, None, None)
+    back = grow(view2, view1, ends, step=step, known=known.swapped())
+    rows, columns = back.valid.shape
+    column, row = np.rint(pixels2 / step).astype(np.int64).T
+    node = np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)
+    found = back.pixels2[node] + np.einsum("nij,nj->ni", back.A21[node], pixels2 - back.pixels1[node])
+    keep = at.copy()
+    # Where nothing grows back that distance is NaN, and no return.
+    keep[at] = np.linalg.norm(found - there.pixels1[at], axis=1) < MAX_RETURN_PX
+    return there.where(keep)
