@@ -19,11 +19,13 @@ import numpy as np
 from rigkit.affine.features import grey_of, match_affine_features
 from rigkit.cameras.base import Camera
 from rigkit.cameras.registry import camera_model
+from rigkit.core.cloud import OrientedCloud
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, log_so3, rotation_angle, unit
 from rigkit.interop.open3d import poisson_mesh
 from rigkit.io.images import read_image
 from rigkit.reconstruction.growing.dense import DenseScene, grow_scene
+from rigkit.reconstruction.lines_of_sight import with_lines_of_sight
 from rigkit.reconstruction.scene import reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.relative_pose.solvers.pose import translation_basis
@@ -143,11 +145,11 @@ def against_truth(
     return f"{len(points)} points, depth {100 * np.median(off):.3f} %, normals {np.median(angle):.2f} deg"
 
 
-def mesh_share(dense: DenseScene, camera: Camera, depth: np.ndarray) -> float:
+def mesh_share(cloud: OrientedCloud, camera: Camera, depth: np.ndarray) -> float:
     """Return the share of the true pixels that the Poisson mesh of the cloud is within NEAR_REL of."""
     import open3d
 
-    mesh = poisson_mesh(dense.scene.reconstruction.cloud, depth=9, cut=0.0)
+    mesh = poisson_mesh(cloud, depth=9, cut=0.0)
     tensor: Any = open3d.core.Tensor
     scene = open3d.t.geometry.RaycastingScene()
     scene.add_triangles(tensor(mesh.points.astype(np.float32)), tensor(mesh.triangles.astype(np.uint32)))
@@ -199,8 +201,11 @@ def main() -> None:
                 f"  rigkit: {against_truth(cloud.points_mm, cloud.normals, dense.scene.reconstruction.pixels1, truth)}"
             )
             print(f"  StereoSGBM on the rectified pair: {against_truth(*semi_global(case), truth)}")
-            share = mesh_share(dense, case.cameras[0], truth[0])
-            print(f"  Poisson within {100 * NEAR_REL:.0f} %: {100 * share:.0f} % of true pixels")
+            shares = [mesh_share(c, case.cameras[0], truth[0]) for c in (cloud, with_lines_of_sight(cloud))]
+            print(
+                f"  Poisson within {100 * NEAR_REL:.0f} %: {100 * shares[0]:.0f} % of true pixels, "
+                f"{100 * shares[1]:.0f} % with lines of sight (--one-view)"
+            )
     areas = [f"{100 * np.mean(np.maximum(1.0 - np.array(errors) / limit, 0.0)):.1f}" for limit in AUC_DEG]
     # A pose that is exact has no sigmas.
     squares = np.square([d for d in distances if np.isfinite(d)])

@@ -18,6 +18,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--cut", type=float, default=0.02, metavar="SHARE", help="of the surface, where points are fewest (default .02)"
     )
+    parser.add_argument(
+        "--one-view",
+        action="store_true",
+        help="all was seen from the origin, as from a pair of images: nothing hangs between near and far",
+    )
     parser.add_argument("--force", action="store_true", help="replace an existing file")
     parser.add_argument("--json", action="store_true", help="print the result for programs")
 
@@ -26,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     from rigkit.workflows.mesh import MeshOptions, mesh_cloud
 
     output = args.output or args.cloud.with_name(f"{args.cloud.stem}-mesh.ply")
-    options = MeshOptions(output=output, depth=args.depth, cut=args.cut, force=args.force)
+    options = MeshOptions(output=output, depth=args.depth, cut=args.cut, one_view=args.one_view, force=args.force)
     mesh = mesh_cloud(args.cloud, options, progress=progress_on_stderr())
     if args.json:
         print_json({"mesh": str(output), "vertices": len(mesh.points), "triangles": len(mesh.triangles)})

@@ -12,6 +12,7 @@ from rigkit.io.files import ensure_writable, write_atomic
 from rigkit.io.mesh_file import mesh_bytes
 from rigkit.io.ply import read_ply
 from rigkit.io.reading import about
+from rigkit.reconstruction.lines_of_sight import with_lines_of_sight
 
 MAX_OCTREE_DEPTH = 12
 """Each level more takes four times the memory: of this one, several GB."""
@@ -27,6 +28,9 @@ class MeshOptions:
     """Of the octree: 2^depth cells along the longest side."""
     cut: float = 0.02
     """Share of the vertices, those with the fewest points near, that is cut off."""
+    one_view: bool = False
+    """All of the cloud was seen from its origin, as that of one pair of images: where near and far points meet in the
+    picture, the surface is a line of sight."""
     force: bool = False
     """Replace an existing file; the cloud is never replaced."""
 
@@ -47,6 +51,8 @@ def mesh_cloud(cloud: str | Path, options: MeshOptions, *, progress: Progress = 
         raise InputError(f"mesh: the share that is cut off must be from 0 to below 1, got {options.cut}")
     ensure_writable(options.output, force=options.force, inputs=[Path(cloud)])
     points = read_ply(cloud)
+    if options.one_view:
+        points = with_lines_of_sight(points)
     progress("fitting the surface", 0, 1)
     with about(cloud):
         mesh = poisson_mesh(points, depth=options.depth, cut=options.cut)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.depth_edge import square_before_wall
 from helpers.reconstructions import make_reconstruction
 
 from rigkit.cli.main import main
@@ -33,6 +34,15 @@ def test_the_surface_goes_through_the_points(tmp_path: Path, capsys: pytest.Capt
     surface = np.asarray(mesh.sample_points_uniformly(50_000).points)
     nearest = np.array([np.linalg.norm(surface - p, axis=1).min() for p in cloud.points_mm])
     assert np.median(nearest) < 0.25 * SQUARE_MM
+
+
+def test_a_cloud_of_one_view_is_closed_along_lines_of_sight(tmp_path: Path) -> None:
+    write_ply(tmp_path / "cloud.ply", square_before_wall())
+    vertices = []
+    for options in ([], ["--one-view"]):
+        assert main(["mesh", str(tmp_path / "cloud.ply"), "--depth", "5", "--cut", "0", "--force", *options]) == 0
+        vertices.append((tmp_path / "cloud-mesh.ply").read_bytes())
+    assert vertices[0] != vertices[1]
 
 
 def test_what_cannot_be_meshed_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -93,7 +93,7 @@ def test_no_place_of_image_2_is_grown_from_two_places_of_image_1() -> None:
     image1, image2 = rng.uniform(0.0, 255.0, (2, 150, 300))
     image1[30:120, 20:110] = image1[30:120, 180:270] = image2[30:120, 170:260] = block
     camera = Pinhole((300, 150), np.array([300.0, 300.0, 149.5, 74.5]))
-    views = [GrowingView.of(image, camera) for image in (image1, image2)]
+    views = GrowingView.of(image1, camera), GrowingView.of(image2, camera)
     seeds = Correspondences(
         np.array([[65.0, 75.0], [225.0, 75.0]]), np.full((2, 2), [215.0, 75.0]), np.broadcast_to(np.eye(2), (2, 2, 2))
     )

@@ -213,7 +213,8 @@ def grow_both_ways(
     there = grow(view1, view2, seeds, step=step, known=known)
     at = there.valid
     pixels2 = there.pixels2[at]
-    ends = Correspondences(pixels2, there.pixels1[at], np.linalg.inv(there.A21[at]), None, None, None)
+    A12 = np.asarray(np.linalg.inv(there.A21[at]), dtype=np.float64)
+    ends = Correspondences(pixels2, there.pixels1[at], A12, None, None, None)
     back = grow(view2, view1, ends, step=step, known=known.swapped())
     rows, columns = back.valid.shape
     column, row = np.rint(pixels2 / step).astype(np.int64).T
