@@ -10,9 +10,10 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import combinations
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -21,13 +22,13 @@ from rigkit.cameras.base import Camera
 from rigkit.cli.console import progress_on_stderr
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, nearest_rotation, rotation_angle
-from rigkit.io.manifest import Pair, load_dataset
+from rigkit.io.manifest import load_dataset
 from rigkit.io.paper_tables import load_paper_tables
 from rigkit.reconstruction.pairing import MatchedPair
 from rigkit.reconstruction.reconstruct import reconstruct_from
 from rigkit.validation.planes import fit_plane, normal_errors
 from rigkit.validation.tables import best_of
-from rigkit.workflows.datasets import load_cameras, over_pairs
+from rigkit.workflows.datasets import DatasetOptions, PairJob, load_cameras, over_pairs
 from rigkit.workflows.pairs import geometry_of, match_images
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -67,20 +68,13 @@ def corner_figures(matched: MatchedPair, truth: Mapping[str, Any]) -> dict[str, 
     }
 
 
-class PairJob(NamedTuple):
-    pair: Pair
-    camera1: Camera
-    camera2: Camera
-    folder: Path
-    chain: str
-
-
-def measure_pair(job: PairJob) -> dict[str, Any]:
+def measure_pair(captures: Path, job: PairJob[DatasetOptions]) -> dict[str, Any]:
     """All figures of one pair."""
-    pair, camera1, camera2, folder, chain = job
-    truth = json.loads((folder / "truth.json").read_text())
+    pair = job.pair
+    camera1, camera2 = (loaded.camera for loaded in job.cameras.of(pair))
+    truth = json.loads((captures / pair.pair_id / "truth.json").read_text())
     true_pose = Rigid3.from_matrix(truth["cam2_from_cam1"])
-    matched, _, _ = match_images(pair, camera1, camera2, chain)
+    matched, _, _ = match_images(pair, camera1, camera2, job.options.chain)
     out: dict[str, Any] = {"pair": pair.pair_id, **corner_figures(matched, truth), "methods": {}}
     geometry = geometry_of(matched, pair)
     for method in AFFINE_METHODS:
@@ -138,14 +132,9 @@ def measure(folder: Path, *, pairs: Sequence[str] = (), chain: str = "raw", jobs
     dataset = load_dataset(ROOT / "datasets" / "lab-a").select(pairs)
     loaded = load_cameras(dataset, progress=progress)
     cameras = {name: camera.camera for name, camera in loaded.known.items()}
-
-    def job_of(pair: Pair) -> PairJob:
-        camera1, camera2 = loaded.of(pair)
-        return PairJob(pair, camera1.camera, camera2.camera, folder / "captures" / pair.pair_id, chain)
-
-    results, failures = over_pairs(
-        measure_pair, dataset.pairs, job_of, jobs=jobs, what="pairs against truth", progress=progress
-    )
+    options = DatasetOptions(chain="rectified" if chain == "rectified" else "raw", jobs=jobs)
+    work = partial(measure_pair, folder / "captures")
+    results, failures = over_pairs(work, dataset.pairs, loaded, options, what="pairs against truth", progress=progress)
     if failures:
         raise failures[0].error
     lenses = {}

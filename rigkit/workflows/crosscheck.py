@@ -9,20 +9,20 @@ from pathlib import Path
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.core.tables import Table
-from rigkit.io.manifest import Dataset, Pair
+from rigkit.io.manifest import Dataset
 from rigkit.report.tables import tables_to_json, tables_to_markdown
 from rigkit.report.validation_page import crosscheck_table
 from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
 from rigkit.workflows.datasets import (
     DatasetOptions,
-    LoadedCamera,
     PairFailure,
+    PairJob,
     load_cameras,
     over_pairs,
     ready_dataset,
+    write_for,
 )
 from rigkit.workflows.pairs import match_images, reconstruct_other_chain, reconstruct_with, shifts_of
-from rigkit.workflows.results import require_folder, write_results
 
 MARKDOWN, JSON = "crosscheck.md", "crosscheck.json"
 
@@ -52,16 +52,6 @@ class DatasetCrossCheck:
         return not self.failures and all(report.passed for report in self.reports)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _CrosscheckJob:
-    """What one process needs to know of one pair."""
-
-    pair: Pair
-    camera1: LoadedCamera
-    camera2: LoadedCamera
-    chain: str
-
-
 def crosscheck_dataset(
     dataset: Dataset | str | Path, options: DatasetOptions | None = None, *, progress: Progress = silent
 ) -> DatasetCrossCheck:
@@ -71,27 +61,20 @@ def crosscheck_dataset(
     """
     options = options or DatasetOptions()
     known = ready_dataset(dataset, options, reserved=(MARKDOWN, JSON))
-    if options.output is not None:
-        require_folder(options.output, force=options.force)
     cameras = load_cameras(known, recalibrate=options.recalibrate, progress=progress)
     reports, failures = over_pairs(
-        _crosscheck,
-        known.pairs,
-        lambda pair: _CrosscheckJob(pair, *cameras.of(pair), options.chain),
-        jobs=options.jobs,
-        what="cross-checking pairs",
-        progress=progress,
+        _crosscheck, known.pairs, cameras, options, what="cross-checking pairs", progress=progress
     )
     table = crosscheck_table(reports)
     files = {**cameras.files, MARKDOWN: tables_to_markdown([table]), JSON: tables_to_json([table])}
-    if options.output is not None:
-        write_results(options.output, files, force=options.force, inputs=known.inputs)
+    write_for(known, options, files)
     return DatasetCrossCheck(reports=tuple(reports), failures=failures, table=table, files=files)
 
 
-def _crosscheck(job: _CrosscheckJob) -> CrossCheckReport:
+def _crosscheck(job: PairJob[DatasetOptions]) -> CrossCheckReport:
     """Reconstruct one pair and compare it with every independent method."""
-    matched, _, _ = match_images(job.pair, job.camera1.camera, job.camera2.camera, job.chain)
+    camera1, camera2 = job.cameras.of(job.pair)
+    matched, _, _ = match_images(job.pair, camera1.camera, camera2.camera, job.options.chain)
     other = reconstruct_other_chain(matched, job.pair)
     ours = reconstruct_with(matched, job.pair, "3SDIR")
-    return crosscheck(ours, other_chain=other, shifts=shifts_of(ours, job.camera1, job.camera2))
+    return crosscheck(ours, other_chain=other, shifts=shifts_of(ours, camera1, camera2))

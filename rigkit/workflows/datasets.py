@@ -15,7 +15,7 @@ import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Generic, Literal, TypeVar
 
 from rigkit.affine.directions import Support
 from rigkit.calibration.result import Calibration
@@ -28,9 +28,8 @@ from rigkit.io.calibration_file import calibration_text, is_calibration, load_ca
 from rigkit.io.manifest import CameraEntry, Dataset, Pair, load_dataset
 from rigkit.io.reading import about
 from rigkit.workflows.calibrate_rig import calibrate_camera
-from rigkit.workflows.results import CALIBRATIONS
+from rigkit.workflows.results import CALIBRATIONS, require_folder, write_results
 
-Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 MAX_NAME_BYTES = 200
@@ -61,11 +60,17 @@ class DatasetOptions:
     """Processes; None: one a core."""
 
 
-def ready_dataset(dataset: Dataset | str | Path, options: DatasetOptions, reserved: Iterable[str] = ()) -> Dataset:
+Options = TypeVar("Options", bound=DatasetOptions)
+
+
+def ready_dataset(
+    dataset: Dataset | str | Path, options: DatasetOptions, reserved: Iterable[str] = (), *, measured: bool = False
+) -> Dataset:
     """Return the pairs asked for of a data set, given its folder or manifest or the data set as loaded.
 
     Raises InputError for what can be known before the work: no such pair, no image of any pair, fewer than one process,
-    a pair's name that cannot be a folder beside the files called `reserved`.
+    a pair's name that cannot be a folder beside the files called `reserved`, a folder that results cannot go to, and
+    with `measured` that nothing was measured of any pair.
     """
     if options.jobs is not None and options.jobs < 1:
         raise InputError(f"--jobs {options.jobs}: at least one process is needed")
@@ -86,7 +91,19 @@ def ready_dataset(dataset: Dataset | str | Path, options: DatasetOptions, reserv
             missing.append(error)
     if missing and len(missing) == len(known.pairs):
         raise missing[0]
+    if options.output is not None:
+        require_folder(options.output, force=options.force)
+    if measured and not any(pair.truth.count for pair in known.pairs):
+        raise InputError(
+            f"{known.manifest}: nothing was measured of these pairs; add a baseline or angles under [pairs.truth]"
+        )
     return known
+
+
+def write_for(dataset: Dataset, options: DatasetOptions, files: Mapping[str, str | bytes]) -> None:
+    """Write the results (relative path -> content) where `options` say, if they say so."""
+    if options.output is not None:
+        write_results(options.output, files, force=options.force, inputs=dataset.inputs)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -199,29 +216,39 @@ class PairFailure:
         return words if f"'{self.pair_id}'" in words else f"pair '{self.pair_id}': {words}"
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class PairJob(Generic[Options]):
+    """What one process needs to know of one pair."""
+
+    pair: Pair
+    cameras: LoadedCameras
+    options: Options
+
+
 def over_pairs(
-    work: Callable[[Job], Result],
+    work: Callable[[PairJob[Options]], Result],
     pairs: Sequence[Pair],
-    job_of: Callable[[Pair], Job],
+    cameras: LoadedCameras,
+    options: Options,
     *,
-    jobs: int | None = None,
-    what: str = "pairs",
+    what: str,
     progress: Progress = silent,
 ) -> tuple[list[Result], tuple[PairFailure, ...]]:
-    """Return `work(job_of(pair))` of every pair, in their order, and the pairs that came to nothing.
+    """Return what `work` makes of every pair, in their order, and the pairs that came to nothing.
 
     Several processes work where that helps; `work` is a function of a module. A pair that cannot be done does not take
     the others with it; only if there is no result at all is the first pair's error raised.
     """
     outcomes: dict[str, Result | RigkitError] = {}
-    waiting: dict[str, Job] = {}
+    waiting: dict[str, PairJob[Options]] = {}
     for pair in pairs:
         try:
             pair.require_images()
-            waiting[pair.pair_id] = job_of(pair)
+            cameras.of(pair)
+            waiting[pair.pair_id] = PairJob(pair, cameras, options)
         except RigkitError as error:
             outcomes[pair.pair_id] = error
-    count = min(len(waiting), jobs or os.cpu_count() or 1)
+    count = min(len(waiting), options.jobs or os.cpu_count() or 1)
     progress(what, 0, len(waiting))
     with contextlib.ExitStack() as stack:
         attempt = functools.partial(_attempt, work)
@@ -239,7 +266,7 @@ def over_pairs(
     return [outcome for _, outcome in ordered if not isinstance(outcome, RigkitError)], failures
 
 
-def _attempt(work: Callable[[Job], Result], job: Job) -> Result | RigkitError:
+def _attempt(work: Callable[[PairJob[Options]], Result], job: PairJob[Options]) -> Result | RigkitError:
     try:
         return work(job)
     except RigkitError as error:

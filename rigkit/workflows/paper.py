@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rigkit.affine.registry import AFFINE_METHODS
-from rigkit.core.errors import InputError, RigkitError
+from rigkit.core.errors import RigkitError
 from rigkit.core.progress import Progress, silent
 from rigkit.core.tables import Table
-from rigkit.io.manifest import Dataset, Pair
+from rigkit.io.manifest import Dataset
 from rigkit.io.paper_tables import load_paper_tables
 from rigkit.reconstruction.paper import MOTIONS, OWN_MOTIONS, reconstruct_as_paper
 from rigkit.report.tables import tables_to_csv, tables_to_json, tables_to_latex, tables_to_markdown
@@ -27,14 +27,14 @@ from rigkit.validation.tables import (
 )
 from rigkit.workflows.datasets import (
     DatasetOptions,
-    LoadedCameras,
     PairFailure,
+    PairJob,
     load_cameras,
     over_pairs,
     ready_dataset,
+    write_for,
 )
 from rigkit.workflows.pairs import match_images
-from rigkit.workflows.results import require_folder, write_results
 
 PAPER = "hajder2021"
 """Folder with the paper's tables, beside the data set."""
@@ -68,15 +68,6 @@ class PaperValidation:
     files: Mapping[str, str]
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _PaperJob:
-    """What one process needs to know of one pair."""
-
-    pair: Pair
-    cameras: LoadedCameras
-    options: PaperOptions
-
-
 def validate_as_paper(
     dataset: Dataset | str | Path, options: PaperOptions | None = None, *, progress: Progress = silent
 ) -> PaperValidation:
@@ -90,23 +81,11 @@ def validate_as_paper(
         No pair could be reconstructed; a pair that could not is else among the failures.
     """
     options = options or PaperOptions()
-    known = ready_dataset(dataset, options)
-    if options.output is not None:
-        require_folder(options.output, force=options.force)
-    if not any(pair.truth.count for pair in known.pairs):
-        raise InputError(
-            f"{known.manifest}: nothing was measured of these pairs; add a baseline or angles under [pairs.truth]"
-        )
-    folder = known.root.parent / PAPER
-    printed = load_paper_tables(folder) if folder.is_dir() else PaperTables()
+    known = ready_dataset(dataset, options, measured=True)
+    printed = printed_tables(known) or PaperTables()
     cameras = load_cameras(known, recalibrate=options.recalibrate, progress=progress)
-
-    def job_of(pair: Pair) -> _PaperJob:
-        cameras.of(pair)
-        return _PaperJob(pair, cameras, options)
-
     found, failures = over_pairs(
-        _repeat, known.pairs, job_of, jobs=options.jobs, what="repeating the paper on pairs", progress=progress
+        _repeat, known.pairs, cameras, options, what="repeating the paper on pairs", progress=progress
     )
     reports = tuple(report for of_pair in found for report in of_pair)
     tables = _tables(reports, printed, known.images)
@@ -117,12 +96,17 @@ def validate_as_paper(
         "tables.json": tables_to_json(tables),
     }
     files |= cameras.files
-    if options.output is not None:
-        write_results(options.output, files, force=options.force, inputs=known.inputs)
+    write_for(known, options, files)
     return PaperValidation(reports=reports, tables=tables, failures=failures, files=files)
 
 
-def _repeat(job: _PaperJob) -> tuple[ValidationReport, ...]:
+def printed_tables(dataset: Dataset) -> PaperTables | None:
+    """Return the paper's tables where they lie beside the data set."""
+    folder = dataset.root.parent / PAPER
+    return load_paper_tables(folder) if folder.is_dir() else None
+
+
+def _repeat(job: PairJob[PaperOptions]) -> tuple[ValidationReport, ...]:
     """Return the reports of one pair, an estimator that fails on it left out and said."""
     pair = job.pair
     camera1, camera2 = (loaded.camera for loaded in job.cameras.of(pair))

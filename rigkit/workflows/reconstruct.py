@@ -9,14 +9,21 @@ from pathlib import Path
 from rigkit.core.planes import Planes
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
-from rigkit.io.manifest import Dataset, Pair
+from rigkit.io.manifest import Dataset
 from rigkit.io.ply import ply_bytes
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.report.figures import cloud_png, corners_png, epipolar_png
 from rigkit.validation.intrinsics import with_calibrations
-from rigkit.workflows.datasets import DatasetOptions, LoadedCamera, PairFailure, load_cameras, over_pairs, ready_dataset
+from rigkit.workflows.datasets import (
+    DatasetOptions,
+    PairFailure,
+    PairJob,
+    load_cameras,
+    over_pairs,
+    ready_dataset,
+    write_for,
+)
 from rigkit.workflows.pairs import match_images, reconstruct_on_planes, reconstruct_with, shifts_of
-from rigkit.workflows.results import require_folder, write_results
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,16 +66,6 @@ class DatasetReconstruction:
     __repr__ = brief
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _ReconstructJob:
-    """What one process needs to know of one pair."""
-
-    pair: Pair
-    camera1: LoadedCamera
-    camera2: LoadedCamera
-    options: ReconstructOptions
-
-
 def reconstruct_dataset(
     dataset: Dataset | str | Path, options: ReconstructOptions | None = None, *, progress: Progress = silent
 ) -> DatasetReconstruction:
@@ -78,33 +75,27 @@ def reconstruct_dataset(
     """
     options = options or ReconstructOptions()
     known = ready_dataset(dataset, options)
-    if options.output is not None:
-        require_folder(options.output, force=options.force)
     cameras = load_cameras(known, recalibrate=options.recalibrate, progress=progress)
-
-    def job_of(pair: Pair) -> _ReconstructJob:
-        return _ReconstructJob(pair, *cameras.of(pair), options)
-
     outcomes, failures = over_pairs(
-        _reconstruct, known.pairs, job_of, jobs=options.jobs, what="reconstructing pairs", progress=progress
+        _reconstruct, known.pairs, cameras, options, what="reconstructing pairs", progress=progress
     )
     files: dict[str, str | bytes] = dict(cameras.files)
     for outcome in outcomes:
         files |= outcome.files
-    if options.output is not None:
-        write_results(options.output, files, force=options.force, inputs=known.inputs)
+    write_for(known, options, files)
     return DatasetReconstruction(pairs=tuple(outcomes), failures=failures, files=files)
 
 
-def _reconstruct(job: _ReconstructJob) -> PairReconstruction:
+def _reconstruct(job: PairJob[ReconstructOptions]) -> PairReconstruction:
     """Reconstruct one pair and render its files."""
     pair, options = job.pair, job.options
-    matched, image1, image2 = match_images(pair, job.camera1.camera, job.camera2.camera, options.chain, options.support)
+    camera1, camera2 = job.cameras.of(pair)
+    matched, image1, image2 = match_images(pair, camera1.camera, camera2.camera, options.chain, options.support)
     r = reconstruct_with(matched, pair, options.method, image1, det_scale=options.det_scale)
     planes = options.planes or pair.planes
     if planes != "free":
-        r = reconstruct_on_planes(r, planes, job.camera1, job.camera2)
-    elif (shifts := shifts_of(r, job.camera1, job.camera2)) is not None:
+        r = reconstruct_on_planes(r, planes, camera1, camera2)
+    elif (shifts := shifts_of(r, camera1, camera2)) is not None:
         r = with_calibrations(r, shifts)
     ply = f"{pair.pair_id}/{options.method if planes == 'free' else planes}.ply"
     files = {ply: ply_bytes(r.cloud)}

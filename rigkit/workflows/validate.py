@@ -11,13 +11,12 @@ from typing import Any
 from numpy.typing import NDArray
 
 from rigkit.affine.registry import AFFINE_METHODS
-from rigkit.core.errors import DegenerateError, InputError, RigkitError
+from rigkit.core.errors import DegenerateError, RigkitError
 from rigkit.core.findings import Finding, Severity
 from rigkit.core.planes import PLANE_CHOICES, Planes
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
-from rigkit.io.manifest import Dataset, Pair
-from rigkit.io.paper_tables import load_paper_tables
+from rigkit.io.manifest import Dataset
 from rigkit.io.ply import ply_bytes
 from rigkit.reconstruction.board_planes import BoardPlanes
 from rigkit.reconstruction.geometry import PairGeometry
@@ -33,14 +32,15 @@ from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
 from rigkit.validation.diagnose import diagnose, diagnose_cameras
 from rigkit.validation.fitted_planes import FittedPlanes
 from rigkit.validation.intrinsics import CalibrationShifts, with_calibrations
-from rigkit.validation.tables import PaperTables, best_report
+from rigkit.validation.tables import best_report
 from rigkit.workflows.datasets import (
     DatasetOptions,
-    LoadedCameras,
     PairFailure,
+    PairJob,
     load_cameras,
     over_pairs,
     ready_dataset,
+    write_for,
 )
 from rigkit.workflows.pairs import (
     find_boards,
@@ -50,11 +50,8 @@ from rigkit.workflows.pairs import (
     reconstruct_other_chain,
     shifts_of,
 )
-from rigkit.workflows.results import require_folder, write_results
+from rigkit.workflows.paper import printed_tables
 from rigkit.workflows.validation_files import RESERVED, PairValidation, validation_files
-
-PAPER = "hajder2021"
-"""Folder with the paper's tables, beside the data set."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,15 +108,6 @@ class DatasetValidation:
         return checked and not self.failures
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _ValidateJob:
-    """What one process needs to know of one pair."""
-
-    pair: Pair
-    cameras: LoadedCameras
-    options: ValidateOptions
-
-
 def validate_dataset(
     dataset: Dataset | str | Path, options: ValidateOptions | None = None, *, progress: Progress = silent
 ) -> DatasetValidation:
@@ -134,22 +122,11 @@ def validate_dataset(
     """
     started = time.monotonic()
     options = options or ValidateOptions()
-    known = ready_dataset(dataset, options, reserved=RESERVED)
-    if options.output is not None:
-        require_folder(options.output, force=options.force)
-    if not any(pair.truth.count for pair in known.pairs):
-        raise InputError(
-            f"{known.manifest}: nothing was measured of these pairs; add a baseline or angles under [pairs.truth]"
-        )
-    paper = _paper_tables(known)
+    known = ready_dataset(dataset, options, RESERVED, measured=True)
+    paper = printed_tables(known)
     cameras = load_cameras(known, recalibrate=options.recalibrate, progress=progress)
-
-    def job_of(pair: Pair) -> _ValidateJob:
-        cameras.of(pair)
-        return _ValidateJob(pair, cameras, options)
-
     pairs, failures = over_pairs(
-        _validate, known.pairs, job_of, jobs=options.jobs, what="reconstructing and validating pairs", progress=progress
+        _validate, known.pairs, cameras, options, what="reconstructing and validating pairs", progress=progress
     )
     compared = [pair.crosscheck for pair in pairs if pair.crosscheck is not None]
     passed = not failures and all(r.passed for pair in pairs for r in pair.reports) and all(r.passed for r in compared)
@@ -162,8 +139,7 @@ def validate_dataset(
     page, files = validation_files(
         known, cameras, pairs, failures, paper, causes=causes, options=options, seconds=seconds
     )
-    if options.output is not None:
-        write_results(options.output, files, force=options.force, inputs=known.inputs)
+    write_for(known, options, files)
     return DatasetValidation(
         pairs=tuple(pairs),
         failures=failures,
@@ -174,13 +150,7 @@ def validate_dataset(
     )
 
 
-def _paper_tables(dataset: Dataset) -> PaperTables | None:
-    """Return the paper's tables where they lie beside the data set."""
-    folder = dataset.root.parent / PAPER
-    return load_paper_tables(folder) if folder.is_dir() else None
-
-
-def _validate(job: _ValidateJob) -> PairValidation:
+def _validate(job: PairJob[ValidateOptions]) -> PairValidation:
     """Reconstruct one pair with every estimator and judge each."""
     pair = job.pair
     names = (pair.camera1.camera_id, pair.camera2.camera_id)
@@ -198,7 +168,11 @@ def _validate(job: _ValidateJob) -> PairValidation:
 
 
 def _judge(
-    job: _ValidateJob, matched: MatchedPair, image1: NDArray[Any], image2: NDArray[Any], causes: tuple[str, ...]
+    job: PairJob[ValidateOptions],
+    matched: MatchedPair,
+    image1: NDArray[Any],
+    image2: NDArray[Any],
+    causes: tuple[str, ...],
 ) -> PairValidation:
     pair = job.pair
     geometry = geometry_of(matched, pair)
@@ -238,7 +212,7 @@ def _judge(
     )
 
 
-def _fitted(geometry: PairGeometry, job: _ValidateJob) -> FittedPlanes:
+def _fitted(geometry: PairGeometry, job: PairJob[ValidateOptions]) -> FittedPlanes:
     """Return the boards' planes by both images; those that nothing is judged by may be missing."""
     judging = job.options.planes or job.pair.planes
     found: dict[Planes, BoardPlanes] = {}
@@ -256,7 +230,9 @@ def _with_sigmas(reconstruction: Reconstruction, shifts: CalibrationShifts | Non
     return reconstruction if shifts is None else with_calibrations(reconstruction, shifts)
 
 
-def _shifts(reconstructions: Mapping[str, Reconstruction], job: _ValidateJob) -> dict[str, CalibrationShifts | None]:
+def _shifts(
+    reconstructions: Mapping[str, Reconstruction], job: PairJob[ValidateOptions]
+) -> dict[str, CalibrationShifts | None]:
     """Return what the calibrations' uncertainty does to each reconstruction, by estimator.
 
     The likelihood sees the corners, not the affinities: estimators that kept the same corners share the answer.
