@@ -79,7 +79,7 @@ def geometry_covariance(
         steps = np.repeat([STEP_RAD, BASELINE_STEP * np.linalg.norm(cam2_from_cam1.translation_mm)], 3)
         columns = []
         for step in np.diag(steps):
-            plus, minus = (normals(still, still, _perturbed(cam2_from_cam1, s * step)) for s in (1.0, -1.0))
+            plus, minus = (normals(still, still, cam2_from_cam1.moved(s * step)) for s in (1.0, -1.0))
             columns.append((plus - minus) / (2.0 * step.sum()))
         by_pose = np.stack(columns, axis=-1)
         total += by_pose @ pose_covariance @ np.swapaxes(by_pose, -1, -2)
@@ -97,7 +97,3 @@ def _moved(rays: Rays, jacobians: RayJacobians, step_px: FloatArray) -> tuple[Ra
     moved = unit(rays + jacobians @ step_px)
     turn = exp_so3(np.cross(rays, moved))
     return moved, turn @ jacobians
-
-
-def _perturbed(pose: Rigid3, change: FloatArray) -> Rigid3:
-    return Rigid3(exp_so3(change[:3]) @ pose.rotation, pose.translation_mm + change[3:])

@@ -14,7 +14,6 @@ pose among them. What is left are the errors of the print and bends of higher or
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 
@@ -39,7 +38,6 @@ def same_looks(board: Board) -> tuple[int, ...]:
     return (0, *board.turns)
 
 
-@lru_cache(maxsize=256)
 def board_turn(board: Board, quarter_turns: int) -> Rigid3:
     """Return counted_from_old: the frame of a board whose corners are counted from another corner, from the old one."""
     angle = 0.5 * np.pi * quarter_turns

@@ -6,12 +6,10 @@ millionth of that). One or two views do not determine a lens by themselves: thes
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 
 from rigkit.cameras.base import Camera, image_center
-from rigkit.core.arrays import FloatArray, IntArray
+from rigkit.core.arrays import FloatArray
 
 CENTRE_SIGMA = 0.15
 """Of the distance from the middle of the image to the optical axis, as a part of the image's longer side."""
@@ -25,27 +23,9 @@ DENOMINATOR_SIGMA = 1.0
 
 def camera_prior(camera: Camera) -> tuple[FloatArray, FloatArray]:
     """Return d r / d parameters (m, P) and r (m,): departures from what is expected, in standard deviations."""
-    fixed, index, mean, sigma, focal = _layout(camera.parameter_names(), camera.size_px)
-    values = camera.parameters
-    rows, residuals = fixed.copy(), np.empty(len(fixed))
-    residuals[: len(index)] = (values[index] - mean) / sigma
-    if focal is not None:
-        x, y = focal
-        fx, fy = float(values[x]), float(values[y])
-        size = SQUARE_SIGMA * 0.5 * (abs(fx) + abs(fy))
-        rows[-1, x], rows[-1, y], residuals[-1] = 1.0 / size, -1.0 / size, (fx - fy) / size
-    return rows, residuals
-
-
-@lru_cache(maxsize=32)
-def _layout(
-    names: tuple[str, ...], size_px: tuple[int, int]
-) -> tuple[FloatArray, IntArray, FloatArray, FloatArray, tuple[int, int] | None]:
-    """Return the rows of the prior that are the same for every camera with these parameters (and a row of zeros for the
-    ratio of the focal lengths where there are two), the parameters that they are about, with means and standard
-    deviations, and the places of the focal lengths."""
-    middle = image_center(size_px).tolist()
-    reach = CENTRE_SIGMA * max(size_px)
+    names, values = camera.parameter_names(), camera.parameters
+    middle = image_center(camera.size_px).tolist()
+    reach = CENTRE_SIGMA * max(camera.size_px)
     expected = {
         "cx": (middle[0], reach),
         "cy": (middle[1], reach),
@@ -57,7 +37,14 @@ def _layout(
     known = [name for name in expected if name in names]
     index = np.array([names.index(name) for name in known], dtype=np.int64)
     mean, sigma = np.array([expected[name] for name in known]).reshape(-1, 2).T
-    focal = (names.index("fx"), names.index("fy")) if "fx" in names and "fy" in names else None
-    rows = np.zeros((len(known) + (focal is not None), len(names)))
+    has_two_focals = "fx" in names and "fy" in names
+    rows = np.zeros((len(known) + has_two_focals, len(names)))
+    residuals = np.empty(len(rows))
     rows[np.arange(len(known)), index] = 1.0 / sigma
-    return rows, index, mean, sigma, focal
+    residuals[: len(index)] = (values[index] - mean) / sigma
+    if has_two_focals:
+        x, y = names.index("fx"), names.index("fy")
+        fx, fy = float(values[x]), float(values[y])
+        size = SQUARE_SIGMA * 0.5 * (abs(fx) + abs(fy))
+        rows[-1, x], rows[-1, y], residuals[-1] = 1.0 / size, -1.0 / size, (fx - fy) / size
+    return rows, residuals

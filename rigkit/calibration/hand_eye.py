@@ -23,7 +23,7 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.printing import brief
 from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3, log_so3, nearest_rotation, rotation_angle, skew
+from rigkit.geometry.rotation import log_so3, nearest_rotation, rotation_angle, skew
 from rigkit.optim.damping import Damping, Stop
 from rigkit.optim.levenberg_marquardt import DenseProblem, DenseStep, minimise
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
@@ -146,12 +146,7 @@ class _AllCorners:
 
 
 def _moved(state: tuple[Rigid3, Rigid3], step: DenseStep) -> tuple[Rigid3, Rigid3]:
-    first, second = state
-    w1, v1, w2, v2 = step.change.reshape(4, 3)
-    return (
-        Rigid3(exp_so3(w1) @ first.rotation, first.translation_mm + v1),
-        Rigid3(exp_so3(w2) @ second.rotation, second.translation_mm + v2),
-    )
+    return state[0].moved(step.change[:6]), state[1].moved(step.change[6:])
 
 
 def _pose(camera: Camera, view: BoardView) -> Rigid3:

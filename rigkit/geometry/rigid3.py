@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from rigkit.core.arrays import FloatArray, Mat3, Points, as_array, as_floats
 from rigkit.core.errors import InputError
-from rigkit.geometry.rotation import nearest_rotation, unit
+from rigkit.geometry.rotation import exp_so3, nearest_rotation, unit
 
 ROTATION_TOLERANCE = 1e-4
 """A matrix further than this from orthonormal is a mistake (a scale, a transposed homogeneous matrix), not rounding."""
@@ -76,6 +76,13 @@ class Rigid3:
     def apply(self, points: Points) -> Points:
         """Map points (..., 3) from the source frame to the target frame."""
         return as_floats(points, (3,), "points") @ self.rotation.T + self.translation_mm
+
+    def moved(self, step: FloatArray) -> Rigid3:
+        """Return the motion after a small change (6,): exp of the rotation vector (rad) from the left, mm added.
+
+        Every covariance of a pose in the package is of such a step.
+        """
+        return Rigid3(exp_so3(step[:3]) @ self.rotation, self.translation_mm + step[3:])
 
     def inverse(self) -> Rigid3:
         return Rigid3(self.rotation.T, -self.rotation.T @ self.translation_mm)

@@ -10,7 +10,7 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, Points, Rays
 from rigkit.geometry.board_pose import point_residuals
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3, skew
+from rigkit.geometry.rotation import skew
 from rigkit.reconstruction.board_planes import MIN_CORNERS_OF_BOARD, near_the_rest
 
 OUTLIER_ROUNDS = 3
@@ -74,12 +74,8 @@ class PlacedLattices:
     def moved(self, step: FloatArray) -> PlacedLattices:
         count = len(self.boards)
         by_pose, *by_board = step[: 6 * (count + 1)].reshape(-1, 6)
-        boards = tuple(moved_pose(board, part) for board, part in zip(self.boards, by_board, strict=True))
-        return PlacedLattices(moved_pose(self.pose, by_pose), boards, self.log_sizes + step[6 * (count + 1) :])
-
-
-def moved_pose(pose: Rigid3, step: FloatArray) -> Rigid3:
-    return Rigid3(exp_so3(step[:3]) @ pose.rotation, pose.translation_mm + step[3:])
+        boards = tuple(board.moved(part) for board, part in zip(self.boards, by_board, strict=True))
+        return PlacedLattices(self.pose.moved(by_pose), boards, self.log_sizes + step[6 * (count + 1) :])
 
 
 def free_parameters(sigma: FloatArray) -> BoolArray:

@@ -17,8 +17,6 @@ import numpy as np
 from rigkit.core.arrays import FloatArray, Points
 from rigkit.core.truth import MeasuredDistance
 from rigkit.geometry.principal_axes import principal_axes
-from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.triangulation import point_covariances, triangulate_rays
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.validation.boards import BoardResult, Placed, measure_board, place_moved, places_on
@@ -153,8 +151,7 @@ def points_by_pose(reconstruction: Reconstruction) -> tuple[tuple[FloatArray, fl
         step = ROTATION_STEP_RAD if axis[:3].any() else TRANSLATION_STEP * length
 
         def points(sign: float, move: FloatArray = axis * step) -> Points:
-            turned = exp_so3(sign * move[:3]) @ pose.rotation
-            shifted = Rigid3(turned, pose.translation_mm + sign * move[3:])
+            shifted = pose.moved(sign * move)
             found, _ = triangulate_rays(rays1, rays2, shifted, jacobians1=jacobians[0], jacobians2=jacobians[1])
             return found
 

@@ -134,16 +134,10 @@ def _empty_line(at: IntArray, empty: IntArray, there: BoolArray) -> bool:
     return False
 
 
-def _key(grid: IntArray, board: Board) -> bytes:
-    """Return what is the same for all places that look the same when the board is turned."""
-    taken: BoolArray = np.zeros((board.rows, board.columns), bool)
-    keys = []
-    for turns in (0, *board.turns):
-        cells = grid_turned(grid, board.size, turns)
-        taken[:] = False
-        taken[cells[:, 1], cells[:, 0]] = True
-        keys.append(taken.tobytes())
-    return min(keys)
+def _key(grid: IntArray, board: Board) -> tuple[int, ...]:
+    """Return what is the same for all places that look the same when the board is turned: which cells are taken."""
+    turned = (grid_turned(grid, board.size, turns) for turns in (0, *board.turns))
+    return min(tuple(np.sort(cells @ [1, board.columns]).tolist()) for cells in turned)
 
 
 def _upright(grid: IntArray, pixels: FloatArray) -> float:

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import IntArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.detection.checks.border import place_part
@@ -45,19 +44,7 @@ def _placed(
 
 
 def _detection(refined: RefinedLattice, sizes: Sequence[tuple[int, int]]) -> BoardDetection:
-    lattice, turns = refined.lattice, quarter_turns(refined.lattice, sizes)
-    # The corners row by row as they will be counted.
-    columns, rows = lattice.size
-    cells: IntArray = np.rot90(np.arange(rows * columns).reshape(rows, columns), -turns)
-    row, column = np.nonzero(lattice.known.ravel()[cells])
-    order = cells[row, column]
-    if turns % 2 == 1:
-        columns, rows = rows, columns
-    return BoardDetection(
-        None,
-        columns,
-        rows,
-        np.stack([column, row], axis=-1),
-        lattice.pixels.reshape(-1, 2)[order],
-        refined.sigma_px.ravel()[order],
-    )
+    found = refined.turned(quarter_turns(refined.lattice, sizes))
+    known = found.lattice.known
+    grid = np.argwhere(known)[:, ::-1]
+    return BoardDetection(None, *found.lattice.size, grid, found.lattice.pixels[known], found.sigma_px[known])

@@ -90,11 +90,9 @@ class Watched:
     def changed(self, change: FloatArray) -> Watched:
         """Return cameras and mounts after a change (T,) of theta."""
         cameras = [c.with_parameters(c.parameters + change[self.lens(k)]) for k, c in enumerate(self.cameras)]
-        mounts = [self.cam_from_rig[0]]
-        for k, pose in enumerate(self.cam_from_rig[1:], start=1):
-            w, v = change[self.mount(k)].reshape(2, 3)
-            mounts.append(Rigid3(exp_so3(w) @ pose.rotation, pose.translation_mm + v))
-        return replace(self, cameras=tuple(cameras), cam_from_rig=tuple(mounts))
+        first, *others = self.cam_from_rig
+        mounts = (first, *(pose.moved(change[self.mount(k)]) for k, pose in enumerate(others, start=1)))
+        return replace(self, cameras=tuple(cameras), cam_from_rig=mounts)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
