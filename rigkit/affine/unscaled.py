@@ -265,9 +265,9 @@ def determinant_sensitivity(
         right2[:, 4] = d2
         right1[:, 4] = -np.einsum("nki,nij->nkj", d2, A21)
     else:
-        counted = use if scale == "sqmean" else last_of(use.T).T
-        ratio = np.where(counted, length2 / length1, 0.0)
-        gain = np.where(counted, (2.0 * ratio.sum(1) / counted.sum(1) ** 2)[:, None], 0.0)
+        used = use if scale == "sqmean" else last_of(use.T).T
+        ratio = np.where(used, length2 / length1, 0.0)
+        gain = np.where(used, (2.0 * ratio.sum(1) / used.sum(1) ** 2)[:, None], 0.0)
         right2[:, 4] = (gain / (length1 * length2))[..., None] * d2
         right1[:, 4] = -(gain * ratio / length1**2)[..., None] * d1
     system = np.zeros((n, 5, 5))

@@ -4,7 +4,7 @@ No image tells its first corner, and a flat board does not care. Where corners a
 them, a view that counts from the other end shows them elsewhere. Of the departure, what stays the same under the turn
 says nothing; the rest changes its sign. So every view has a sign, and the signs under which the views agree best on one
 departure are sought (the largest s^T K s, with K from what each view says alone). Then each view is judged by the
-others: is the departure that they have in common found in it as counted, or turned?
+others: is the departure that they have in common found in it as it is numbered, or turned?
 
 A lens that is not quite its model, or a sheet bent differently from view to view, displaces neighbours alike. It must
 not pass for the board: from each view every displacement that is a quadratic field over the board is taken out, its
@@ -27,7 +27,7 @@ from rigkit.core.detections import grid_turned
 from rigkit.geometry.rigid3 import Rigid3
 
 SURE = 10.0
-"""Log odds from which a view is turned: 20000 to 1, as most views are counted alike to begin with. Measured on boards
+"""Log odds from which a view is turned: 20000 to 1, as most views are numbered alike to begin with. Measured on boards
 whose first corner is known: up to 4.3 for the wrong end, 8 to 70 for views that were turned."""
 KNOWN = 0.5
 """A departure that this part of the views does not show for sure is none: its signs are those of chance."""
@@ -39,7 +39,7 @@ def same_looks(board: Board) -> tuple[int, ...]:
 
 
 def board_turn(board: Board, quarter_turns: int) -> Rigid3:
-    """Return counted_from_old: the frame of a board whose corners are counted from another corner, from the old one."""
+    """Return numbered_from_old: the frame of a board numbered from another corner, from the old frame."""
     angle = 0.5 * np.pi * quarter_turns
     turn = np.rint([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
     corners = board.points(np.array([[0, 0], [board.columns - 1, board.rows - 1]]))
@@ -50,7 +50,7 @@ def board_turn(board: Board, quarter_turns: int) -> Rigid3:
 def with_views_turned(
     observations: Observations, state: State, views: BoolArray, quarter_turns: int
 ) -> tuple[Observations, State]:
-    """Return the same with the boards of the chosen `views` (V,) counted from another end. Residuals of flat boards do
+    """Return the same with the boards of the chosen `views` (V,) numbered from another end. Residuals of flat boards do
     not change."""
     rotation, translation, corner = state.rotation.copy(), state.translation_mm.copy(), observations.corner.copy()
     turned = list(observations.views)
@@ -174,7 +174,7 @@ class _Patterns:
         )
 
     def log_odds(self) -> FloatArray:
-        """Return for each view (V,) the log odds that it is counted as the others are, rather than turned."""
+        """Return for each view (V,) the log odds that it is numbered as the others are, rather than turned."""
         views = len(self.left)
         prior = self.prior * np.eye(3)
         total = self.information.sum(axis=0) + prior
@@ -187,7 +187,7 @@ class _Patterns:
         expected = (self.by_board * here).sum(axis=-1)
         expected = expected - _within(self.fields, expected)
         size = np.maximum(np.linalg.norm(expected, axis=1), np.finfo(float).tiny)
-        # Of a view that is counted like the others, `size` on average, with a spread of one if the others are right.
+        # Of a view that is numbered like the others, `size` on average, with a spread of one if the others are right.
         found = (self.left * expected).sum(axis=1) / size
         spread = max(1.0, float(((np.abs(found) - size) ** 2).mean()))
         return np.asarray(2.0 * found * size / spread)

@@ -349,7 +349,7 @@ def _compared(observations: Observations, options: list[Option], folds: int, pro
 
 
 def _fit_shapes(observations: Observations, flat: Option, board: str) -> tuple[Observations, Option, dict[str, Fit]]:
-    """Return the shapes fitted, and views and flat boards with every board that looks the same turned counted from the
+    """Return the shapes fitted, and views and flat boards with every board that looks the same turned numbered from the
     same end, where the shapes tell."""
     fits = fit_shapes(observations, flat.fit, board)
     for quarter_turns in (1, 2):

@@ -38,7 +38,7 @@ FALLBACK_FOV_RAD = (0.7, 1.4, 2.1, 3.1)
 RADIUS_SAMPLES = 96
 ORTHONORMAL = 1e-12
 """Departure from a rotation that is rounding."""
-COUNTED = 0.1
+MIN_ALIGNMENT_WEIGHT = 0.1
 """Corners of less weight are outliers: they do not say how far out the image was seen."""
 ON_AXIS, NEAR_AXIS = 1e-4, 1e-3
 """Radii, as shares of the largest: kept off zero, where they divide; and up to which a corner says nothing of depth."""
@@ -89,7 +89,7 @@ def _starts(
     offset = pixels - centre[:, None]
     alignment = align(offset, board, observations.weight)
     rho = np.sqrt(offset[:, 0] ** 2 + offset[:, 1] ** 2)
-    rho_max = float(rho[alignment.weight > COUNTED].max())
+    rho_max = float(rho[alignment.weight > MIN_ALIGNMENT_WEIGHT].max())
     depths = _Depths(alignment, offset, rho / rho_max, board)
     tried = (depths.curve(exponents) for exponents in EXPONENTS)
     curve = next((c for c in tried if c is not None), None)

@@ -126,7 +126,7 @@ def views_of_image(
             continue
         name = _part_name(parent.board_id, image, k + 1 if len(detections) > 1 else None)
         sides = parent.square_x_mm, parent.square_y_mm
-        # Rows of circles keep their stagger, which a part is counted by; all else needs a place on the board.
+        # Rows of circles keep their stagger, which a part is numbered by; all else needs a place on the board.
         pattern = parent.pattern if isinstance(parent.pattern, Circles) else Chessboard()
         sigma_mm = parent.square_sigma_mm
         part = Board(name, turned.columns, turned.rows, *sides, square_sigma_mm=sigma_mm, pattern=pattern)

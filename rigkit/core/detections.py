@@ -14,7 +14,7 @@ from rigkit.core.printing import brief
 
 
 def grid_turned(grid: IntArray, size: tuple[int, int], quarter_turns: int) -> IntArray:
-    """Return (column, row) (N, 2) of corners counted from the corner that lies `quarter_turns` x 90 degrees further.
+    """Return (column, row) (N, 2) of corners numbered from the corner that lies `quarter_turns` x 90 degrees further.
 
     One turn makes (column, row) into (rows - 1 - row, column), right-handed as before. `size` : (columns, rows) of the
     grid before the turn.

@@ -86,7 +86,7 @@ def fitted(
         if len(parts) == 1:
             out += [own] if large(own.lattice, min_corners) else []
             continue
-        # The edges on the other side of a seam had a say in these corners.
+        # The edges on the other side of a discontinuity had a say in these corners.
         alone = [part.lattice.trimmed() for part in parts]
         out += fitted(grey, [part for part in alone if large(part, min_corners)], min_corners, sizes)
     return out

@@ -166,7 +166,7 @@ BOARD_RIG_FILE = file(
 )
 _FOUND = rows(
     {
-        "board_id": said(nullable(TEXT), "null: boards of this size cannot be told apart"),
+        "board_id": said(nullable(TEXT), "null: boards of this size look alike"),
         "columns": INTEGER,
         "rows": INTEGER,
         "grid": said(array(row(2, {"type": "integer"})), "column and row of each corner"),

@@ -152,7 +152,7 @@ def _likeliest_pose(pair: MatchedPair, decision: PoseTypeDecision) -> RefinedPos
     """Return the pose of maximum likelihood among the ends of the refinement from every start there is.
 
     The linear solution of a pose type holds it exactly: where a level is off by half a degree and the corners are good,
-    it can land in another valley. The general solution and the pose by which the boards were told apart cannot. Points
+    it can land in another valley. The general solution and the pose by which the boards were identified cannot. Points
     of one plane are explained by two poses: that of the board, whose shape is known, stands unless they rule it out.
     """
     kind, level, frames = decision.pose_type, decision.level_sigma_rad, decision.level_frames

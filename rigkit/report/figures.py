@@ -31,7 +31,7 @@ NORMAL_LENGTH_SQUARES = 0.8
 BARE_NORMAL = 0.08
 """Length of a drawn normal where there are no squares, relative to the median distance of the points."""
 BARE_POINT = 1.5
-MOST_NORMALS = 300
+MAX_NORMALS = 300
 """Of a cloud without boards: more are not drawn."""
 NORMAL_COLOUR = "#1f6fd0"
 PYRAMID_DEPTH_IN_FIGURE = 0.18
@@ -154,7 +154,7 @@ def cloud_figure(reconstruction: Reconstruction, *, unit: str = "mm") -> Figure:
             if not reconstruction.boards:
                 # As photographed; thousands of normals would hide it.
                 axis.scatter(*p.T, s=BARE_POINT, c=cloud.colours[on] / 255.0, depthshade=False, linewidths=0)
-                some = np.s_[:: max(1, len(p) // MOST_NORMALS)]
+                some = np.s_[:: max(1, len(p) // MAX_NORMALS)]
                 axis.quiver(*p[some].T, *n[some].T, color=NORMAL_COLOUR, linewidth=0.5, arrow_length_ratio=0.0)
                 continue
             colour = board_colour(index)

@@ -65,7 +65,7 @@ def calibrate_rig_session(
     Raises
     ------
     InputError
-        A camera's images show no board, nothing says which were taken together, boards cannot be told apart, or a file
+        A camera's images show no board, nothing says which were taken together, boards cannot be identified, or a file
         cannot be written (said before the work).
     DegenerateError
         The views do not determine a camera.
@@ -160,7 +160,7 @@ def judged(calibration: Calibration) -> Calibration:
 def rig_corners(
     session: RigSession, *, cache: Cache = Cache.READ, progress: Progress = silent
 ) -> dict[str, SessionCorners]:
-    """Return the corners of every camera of a rig; raises InputError where its boards cannot be told apart."""
+    """Return the corners of every camera of a rig; raises InputError where its boards cannot be identified."""
     require_distinct(session)
     return {name: session_corners(own, cache=cache, progress=progress) for name, own in session.cameras.items()}
 

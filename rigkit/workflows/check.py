@@ -242,7 +242,7 @@ def _views(
 
 
 def _counted_alike(watched: Watched, c: int, view: BoardView, frame: str, before: Sequence[FreshView]) -> BoardView:
-    """Return a view of a board that looks the same turned, counted from the end from which another camera did."""
+    """Return a view of a board that looks the same turned, numbered from the end from which another camera did."""
     same = [v for v in before if v.frame == frame and v.view.board.board_id == view.board.board_id and v.camera != c]
     if not same or not view.board.looks_same_turned:
         return view

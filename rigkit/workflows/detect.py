@@ -99,7 +99,7 @@ def detect_in_images(
     options = options or DetectOptions()
     if options.min_corners < MIN_BOARD_CORNERS:
         raise InputError(
-            f"--min-corners {options.min_corners}: a chessboard of less than 3x3 corners cannot be told apart"
+            f"--min-corners {options.min_corners}: a chessboard of less than 3x3 corners cannot be recognised"
         )
     if options.jobs is not None and options.jobs < 1:
         raise InputError(f"--jobs {options.jobs}: at least one process is needed")

@@ -2,7 +2,7 @@
 
 Boards that look alike, or that look the same turned, have no name and no first corner of their own; their arrangement
 gives them both. One scene (an image, or a frame of several cameras) that shows most of them is the reference; in every
-other scene all ways of naming and counting one board are tried, each fixes the target, and the one that puts the other
+other scene all names and orientations of one board are tried, each fixes the target, and the one that puts the other
 boards of the scene where they are seen wins.
 """
 
@@ -33,8 +33,8 @@ FLOOR = 1e-6
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Way:
-    """One way of naming and counting a board seen, with its outer corners there, (4, 3) mm."""
+class _Label:
+    """An id and orientation that a board seen may have, with its outer corners there, (4, 3) mm."""
 
     seen: Observation
     corners: FloatArray
@@ -42,19 +42,19 @@ class _Way:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _BoardSeen:
-    """A board of a scene: its camera, its key there, the ways to read it, and its distance."""
+    """A board of a scene: its camera, its key there, the labels that it may have, and its distance."""
 
     camera: int
     key: tuple[str, str]
-    ways: tuple[_Way, ...]
+    labels: tuple[_Label, ...]
     distance_mm: float
 
 
 def board_places(
     groups: Sequence[Sequence[str]], seen: Sequence[FrameObservations], boards: Mapping[str, Board]
 ) -> tuple[list[FrameObservations], Places, tuple[Finding, ...]]:
-    """Return the views with the boards of every group named and counted alike and given the key of their target, the
-    places of the boards, and what could not be tied.
+    """Return the views with the boards of every group identified, oriented alike and given the key of their target,
+    the places of the boards, and what could not be tied.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def board_places(
     Raises
     ------
     InputError
-        A board of a group is never seen together with the others, or they cannot be told apart.
+        A board of a group is never seen together with the others, or they cannot be identified.
     """
     out = [dict(own) for own in seen]
     places: dict[str, tuple[str, Rigid3]] = {}
@@ -108,9 +108,9 @@ def _rename(own: FrameObservations, scene: Sequence[_BoardSeen], reading: Readin
     old = [own.pop(entry.key) for entry in scene]
     for k, (entry, before) in enumerate(zip(scene, old, strict=True)):
         frame, board_id = before.frame, entry.key[1]
-        way = None if reading is None else reading.get(k)
-        if way is not None:
-            own[(frame, way.board_id)] = replace(way, key=(frame, target))
+        label = None if reading is None else reading.get(k)
+        if label is not None:
+            own[(frame, label.board_id)] = replace(label, key=(frame, target))
             continue
         # Its place on the target is not known: it stays a view of a board of its own.
         alone = f"{frame}, camera {entry.camera + 1} alone"
@@ -139,14 +139,14 @@ def _scenes(seen: Sequence[FrameObservations], members: Sequence[Board]) -> list
     for c, own in enumerate(seen):
         for key, entry in own.items():
             if entry.board_id in names:
-                ways = tuple(_ways(entry, members))
-                distance = float(np.linalg.norm(ways[0].corners.mean(axis=0)))
-                scenes.setdefault((c, entry.frame), []).append(_BoardSeen(c, key, ways, distance))
+                labels = tuple(_labels(entry, members))
+                distance = float(np.linalg.norm(labels[0].corners.mean(axis=0)))
+                scenes.setdefault((c, entry.frame), []).append(_BoardSeen(c, key, labels, distance))
     return list(scenes.values())
 
 
-def _ways(entry: Observation, members: Sequence[Board]) -> list[_Way]:
-    """Return every way to name and count the board; the one given comes first."""
+def _labels(entry: Observation, members: Sequence[Board]) -> list[_Label]:
+    """Return every label that the board may have; the one given comes first."""
     own = entry.view.board
     found = []
     for board in sorted(members, key=lambda b: b.board_id != own.board_id):
@@ -158,7 +158,7 @@ def _ways(entry: Observation, members: Sequence[Board]) -> list[_Way]:
         turns = [*(same_looks(own) if straight else ()), *((1, 3) if across and own.columns != own.rows else ())]
         for count in turns:
             seen = entry.turned(count, board)
-            found.append(_Way(seen, seen.cam_from_board.apply(outer_corners(board))))
+            found.append(_Label(seen, seen.cam_from_board.apply(outer_corners(board))))
     return found
 
 
@@ -187,9 +187,9 @@ def _read(
     far = {b.board_id: outer_corners(b) for b in members}
     known: dict[str, Rigid3] = {}
     for entry in reference:
-        way = next((w.seen for w in entry.ways if w.seen.board_id not in known), None)
-        if way is not None:
-            known[way.board_id] = way.cam_from_board
+        label = next((w.seen for w in entry.labels if w.seen.board_id not in known), None)
+        if label is not None:
+            known[label.board_id] = label.cam_from_board
     readings: dict[int, Reading | None] = {}
     misfits: list[float] = []
     # Scenes that add a board to those known are read before the ones that need it.
@@ -216,7 +216,7 @@ def _named(
     `known` where the others fix the target."""
     names = list(known)
     ends = np.array([known[name].apply(far[name]) for name in names])
-    flat = [(k, w) for k, entry in enumerate(scene) for w in entry.ways]
+    flat = [(k, w) for k, entry in enumerate(scene) for w in entry.labels]
     corners = np.array([w.corners for _, w in flat])
     reach = np.array([scene[k].distance_mm for k, _ in flat])
     owner = np.array([k for k, _ in flat])
@@ -224,10 +224,10 @@ def _named(
     if len(scene) == 1 and len(flat) > 1:
         return None, np.inf
     tried: list[tuple[float, dict[int, int], Rigid3]] = []
-    for h, (_, way) in enumerate(flat):
+    for h, (_, label) in enumerate(flat):
         if index[h] < 0:
             continue
-        scene_from_target = way.seen.cam_from_board @ known[way.seen.board_id].inverse()
+        scene_from_target = label.seen.cam_from_board @ known[label.seen.board_id].inverse()
         expected = scene_from_target.apply(ends)
         off = np.linalg.norm(corners - expected[np.maximum(index, 0)], axis=-1).mean(axis=-1) / reach
         off[index < 0] = np.inf
@@ -254,7 +254,7 @@ def _named(
     reading = {k: flat[m][1].seen for k, m in chosen.items()}
     back = scene_from_target.inverse()
     for k, entry in enumerate(scene):
-        vacant = [w.seen for w in entry.ways if w.seen.board_id not in known]
+        vacant = [w.seen for w in entry.labels if w.seen.board_id not in known]
         if k not in reading and vacant:
             reading[k] = vacant[0]
             known[vacant[0].board_id] = back @ vacant[0].cam_from_board

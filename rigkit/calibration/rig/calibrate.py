@@ -53,7 +53,7 @@ def calibrate_rig(
     board : as for `calibrate`; where a camera alone finds boards that are warped or released, their shape is part of
         the joint solution, one for all cameras.
     rigid_boards : groups of ids of boards that are mounted to each other. Boards of a group that look alike may be
-        named and counted in any way; their arrangement sorts that out.
+        identified and oriented in any way; their arrangement sorts that out.
     known : lenses, or lenses and mounts, that stay as they are; what is not sure of them is in all covariances.
     folds : of the cross-validations, of each camera alone and of the rig; 0 for none.
 

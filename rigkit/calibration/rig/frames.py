@@ -22,24 +22,24 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import nearest_rotation, rotation_angle
 
 MAX_TRIED = 64
-"""Mounts tried. One of a good target counted rightly is enough: of boards with four ways to count, half of them at
-another moment, 64 tries miss all good ones once in 5000 times."""
+"""Mounts tried. One of a good target of the right orientation is enough: of boards with four, half of them at another
+moment, 64 tries miss all good ones once in 5000 times."""
 AGREE = 4.0
 """Frames whose target lies within this many times the typical distance make the first mount."""
 RIVAL = 3.0
 """A mount on which the frames agree nearly as well, within this factor, is a rival where it is another one ..."""
 OTHER_RAD = 0.5
-"""... by this angle: boards counted the other way turn the mount by half a turn or lay it over by twice their tilt."""
+"""... by this angle: a board of the other orientation turns the mount half round or lays it over by twice its tilt."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Target:
-    """A target before a camera: its pose, points on it to compare by, (4, 3) mm, and the ways to count it."""
+    """A target before a camera: its pose, points on it to compare by, (4, 3) mm, and its possible orientations."""
 
     rotation: Mat3
     translation_mm: FloatArray
     points: Points
-    ways: tuple[Rigid3, ...]
+    orientations: tuple[Rigid3, ...]
 
 
 def _stack(motions: Sequence[Rigid3]) -> tuple[Mat3, Points]:
@@ -128,13 +128,13 @@ def mounts_of(
 
 
 def _motion(pairs: Sequence[tuple[_Target, _Target]]) -> tuple[Rigid3, Rigid3 | None]:
-    """Return cam2_from_cam1: of the motions of the single targets, counted in all ways that look the same, the one that
-    most targets agree on, and then the middle of those that do; and another one that they agree on as well."""
-    owner = [k for k, (_, b) in enumerate(pairs) for _ in b.ways]
-    ways, levers = _stack([way for _, b in pairs for way in b.ways])
+    """Return cam2_from_cam1: of the motions of the single targets, in all orientations that look the same, the one
+    that most targets agree on, and then the middle of those that do; and another one that they agree on as well."""
+    owner = [k for k, (_, b) in enumerate(pairs) for _ in b.orientations]
+    orientations, levers = _stack([turn for _, b in pairs for turn in b.orientations])
     r1, r2 = (np.array([pairs[k][i].rotation for k in owner]) for i in (0, 1))
     t1, t2 = (np.array([pairs[k][i].translation_mm for k in owner]) for i in (0, 1))
-    r2 = r2 @ np.swapaxes(ways, -1, -2)
+    r2 = r2 @ np.swapaxes(orientations, -1, -2)
     t2 = t2 - np.einsum("nij,nj->ni", r2, levers)
     rotation = r2 @ np.swapaxes(r1, -1, -2)
     shift = t2 - np.einsum("nij,nj->ni", rotation, t1)
@@ -152,7 +152,7 @@ def _motion(pairs: Sequence[tuple[_Target, _Target]]) -> tuple[Rigid3, Rigid3 | 
     alike = np.flatnonzero(usual <= RIVAL * usual[best] + 1e-9)
     turned = rotation_angle(rotation[tried[alike]] @ rotation[tried[best]].T)
     rivals = alike[turned > OTHER_RAD]
-    ambiguous = len(rivals) > 0 and any(len(b.ways) > 1 for _, b in pairs)
+    ambiguous = len(rivals) > 0 and any(len(b.orientations) > 1 for _, b in pairs)
     if ambiguous:
         best = int(min([best, *rivals.tolist()], key=lambda m: angle[m]))
     near = offs[best] <= AGREE * usual[best] + 1e-12
@@ -178,9 +178,9 @@ def turned_alike(
                 continue
             expected = mounts[k] @ mounts[before].inverse() @ out[before][key].cam_from_board
             points = entry.view.board.points()
-            ways = [entry.turned(turns) for turns in looks]
-            off = [float(np.linalg.norm(w.cam_from_board.apply(points) - expected.apply(points))) for w in ways]
-            mine[key] = ways[int(np.argmin(off))]
+            orientations = [entry.turned(turns) for turns in looks]
+            off = [float(np.linalg.norm(w.cam_from_board.apply(points) - expected.apply(points))) for w in orientations]
+            mine[key] = orientations[int(np.argmin(off))]
         out.append(mine)
     return out
 

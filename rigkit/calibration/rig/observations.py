@@ -1,4 +1,4 @@
-"""A board as a camera of a rig saw it, and the ways in which a board that looks the same turned can be counted."""
+"""A board as a camera of a rig saw it, and the orientations that a board which looks the same turned can have."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Observation:
         return self.view.board.board_id
 
     def turned(self, quarter_turns: int, board: Board | None = None) -> Observation:
-        """Return the same with the corners counted from another corner, as those of `board` where one is given (of the
+        """Return the same with the corners numbered from another corner, as those of `board` where one is given (of the
         same size, turned likewise)."""
         if quarter_turns == 0 and board is None:
             return self
@@ -67,12 +67,12 @@ def outer_corners(board: Board) -> Points:
 
 
 def turns_of(board: Board) -> tuple[Rigid3, ...]:
-    """Return counted_from_old of every way in which the board can be counted."""
+    """Return numbered_from_old of every orientation that the board can have."""
     return tuple(board_turn(board, turns) for turns in same_looks(board))
 
 
 def frame_observations(own: Sequence[tuple[str, BoardView]], result: Calibration) -> FrameObservations:
-    """Return the views that the camera's own calibration used, counted as it counts them; every board is a target of
+    """Return the views that the camera's own calibration used, numbered as it numbers them; every board is a target of
     its own."""
     used = {(v.image, v.board_id): v for v in result.views}
     out = {}

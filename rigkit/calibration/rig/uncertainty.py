@@ -60,19 +60,21 @@ def transfer_covariance(rig: RigCalibration, a: str, b: str, points: Points) -> 
     first, second = rig.cameras[i], rig.cameras[j]
     motion = rig.cam2_from_cam1(a, b)
     there = motion.apply(points)
-    _, seen1, by_point1, by_camera1 = first.camera.project_with_jacobians(points)
-    pixels, seen2, by_point2, by_camera2 = second.camera.project_with_jacobians(there)
+    _, seen1, d_pixels1_d_point, d_pixels1_d_parameters = first.camera.project_with_jacobians(points)
+    pixels, seen2, d_pixels2_d_point, d_pixels2_d_parameters = second.camera.project_with_jacobians(there)
     rays = points / np.linalg.norm(points, axis=-1, keepdims=True)
     # Across the ray: the distance is given, so the third row keeps it.
-    system = np.concatenate([by_point1, rays[:, None, :]], axis=1)
-    held = np.concatenate([-by_camera1, np.zeros((len(points), 1, by_camera1.shape[-1]))], axis=1)
+    system = np.concatenate([d_pixels1_d_point, rays[:, None, :]], axis=1)
+    held = np.concatenate(
+        [-d_pixels1_d_parameters, np.zeros((len(points), 1, d_pixels1_d_parameters.shape[-1]))], axis=1
+    )
     by_own = np.linalg.solve(system, held)
     ends = np.cumsum([0, *(c.camera.parameters.size for c in rig.cameras)])
     design = np.zeros((len(points), 2, len(rig.covariance)))
-    turned = by_point2 @ motion.rotation
+    turned = d_pixels2_d_point @ motion.rotation
     design[:, :, ends[i] : ends[i + 1]] += turned @ by_own
-    design[:, :, ends[j] : ends[j + 1]] += by_camera2
-    for k, x, by_x, sign in ((i, points, turned, -1.0), (j, there, by_point2, 1.0)):
+    design[:, :, ends[j] : ends[j + 1]] += d_pixels2_d_parameters
+    for k, x, by_x, sign in ((i, points, turned, -1.0), (j, there, d_pixels2_d_point, 1.0)):
         if k > 0:
             lever = skew(x - rig.cameras[k].cam_from_rig.translation_mm)
             run = rig.mount(k)

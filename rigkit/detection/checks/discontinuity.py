@@ -40,13 +40,13 @@ MIN_JUDGES = 8
 """Corners behind a prediction that convicts."""
 
 UNUSUAL, MIN_UNUSUAL = 1.3, 3
-"""A seam shows: so many corners have residuals beyond this times the typical one."""
+"""A discontinuity shows: so many corners have residuals beyond this times the typical one."""
 
 WINDOW = 5
-"""Columns to either side of a seam that are looked at."""
+"""Columns to either side of a discontinuity that are looked at."""
 
 WIDTHS = (1, 0, 2)
-"""Columns on the seam, of neither side: where boards touch there is one. The first shows every seam, the others
+"""Columns on the discontinuity, of neither side: where boards touch there is one. The first shows every one, the others
 where it is."""
 
 TWO_SURFACES = 2.5
@@ -54,17 +54,17 @@ TWO_SURFACES = 2.5
 two boards. In 248 lattices of single boards, up to the rims of fisheyes, at most 1.8 times."""
 
 JUMP, MEETING = 0.02, np.linspace(0.0, 1.0, 5)
-"""Seen from both sides the seam is so far apart, in cells: at a crease of the paper the sides meet. It is anywhere
+"""Seen from both sides the discontinuity is so wide, in cells: at a crease of the paper the sides meet. It is anywhere
 between the columns, and looked for in these parts of the way."""
 
 FLOOR_CELLS = 1e-3
 """No printed board is truer than this."""
 
 MIN_BESIDE, MIN_FREE = 5, 6
-"""Corners on each side of a seam, and in all beyond what the surfaces take up."""
+"""Corners on each side of a discontinuity, and in all beyond what the surfaces take up."""
 
 AS_SMOOTH = 1.3
-"""What the two sides leave at the clearest seam and, at most, at a narrower one that is taken for it."""
+"""What the two sides leave at the clearest discontinuity and, at most, at a narrower one that is taken for it."""
 
 SURFACE_RIDGE = 1e-9
 """On normal equations of terms of about 1: what too few columns leave open stays 0."""
@@ -77,10 +77,10 @@ DETERMINED_TERMS = np.array([0, 3, 5, 6])
 
 
 def may_be_discontinuous(item: RefinedLattice, size_px: tuple[int, int]) -> bool:
-    """Return whether `item` may have a seam; a quick look. `size_px` is the (width, height) of the image.
+    """Return whether `item` may have a discontinuity; a quick look. `size_px` is the (width, height) of the image.
 
-    Corners on a seam fit badly, and where boards are not side by side, corners are missing that the frame does not cut
-    off.
+    Corners on a discontinuity fit badly, and where boards are not side by side, corners are missing that the frame
+    does not cut off.
     """
     known = item.lattice.known
     relative = np.sort(item.residual[known] / item.lattice.contrast[known])
@@ -123,14 +123,14 @@ def _without_astray(item: RefinedLattice) -> RefinedLattice:
     pixels = item.lattice.without(suspect).pixels
     usual = fit_cells(pixels, judges, leave_out=True)
     expected = upper_median(np.hypot(*(usual.pixels - pixels[judges]).T) / usual.cell_px())
-    astray, in_place = _judged(item, suspect, expected)
+    outlying, in_place = _judged(item, suspect, expected)
     # Under the edge of a shadow whole rows are suspect: those that are in place say where the rows beyond them are.
-    while astray.any() and in_place.any():
+    while outlying.any() and in_place.any():
         suspect = suspect & ~in_place
-        astray, in_place = _judged(item, suspect, expected)
-    if not astray.any():
+        outlying, in_place = _judged(item, suspect, expected)
+    if not outlying.any():
         return item
-    item = item.without(astray)
+    item = item.without(outlying)
     return item.cut(*item.lattice.extent)
 
 
@@ -140,31 +140,31 @@ def _judged(item: RefinedLattice, suspect: BoolArray, expected: float) -> tuple[
     The others are mostly as good as `expected`, in cells.
     """
     pixels = item.lattice.without(suspect).pixels
-    astray, in_place = np.zeros((2, *suspect.shape), np.bool_)
-    astray[suspect] = True
+    outlying, in_place = np.zeros((2, *suspect.shape), np.bool_)
+    outlying[suspect] = True
     # Both must agree.
     for degree, ridge in (STIFF, PLIANT):
         shape = fit_cells(pixels, suspect, degree=degree, ridge=ridge)
         off = np.hypot(*(shape.pixels - item.lattice.pixels[suspect]).T)
         good = expected * np.hypot(1.0, shape.gain) * shape.cell_px()
         judged = shape.support >= MIN_JUDGES
-        astray[suspect] &= judged & (
+        outlying[suspect] &= judged & (
             off > np.maximum(OUTLIER_FACTOR * good, MIN_OUTLIER_SIGMAS * item.sigma_px[suspect])
         )
         in_place[suspect] |= judged & (off < IN_PLACE * good)
-    return astray, in_place
+    return outlying, in_place
 
 
 def split_at_discontinuities(item: RefinedLattice, *, several: bool = False) -> list[RefinedLattice]:
-    """Return the boards that `item` is made of, without the corners on their seams.
+    """Return the boards that `item` is made of, without the corners where they touch.
 
-    several : it is known to be more than one, so the clearest seam is one, however well the two go together.
+    several : it is known to be more than one, so the clearest discontinuity is one, however well the two go together.
     """
     if item.lattice.count < 2 * MIN_BESIDE + MIN_FREE:
         return [item]
     across = _clearest_split(item.lattice.pixels, item.sigma_px, several)
     down = _clearest_split(item.lattice.pixels.swapaxes(0, 1), item.sigma_px.T, several)
-    every, best = slice(0, None), max(across, down, key=lambda seam: seam.ratio)
+    every, best = slice(0, None), max(across, down, key=lambda split: split.ratio)
     if best.ratio == 0.0:
         return [item]
     sides = (slice(0, best.start), slice(best.end, None))
@@ -183,21 +183,21 @@ class _Split(NamedTuple):
 
 
 def _clearest_split(pixels: FloatArray, sigma_px: FloatArray, several: bool) -> _Split:
-    """Return the clearest seam between columns of `pixels` (R, C, 2), of ratio 0 if there is none."""
+    """Return the clearest discontinuity between columns of `pixels` (R, C, 2), of ratio 0 if there is none."""
     sums = _Sums.of(pixels, sigma_px)
     found: list[_Split] = []
     for wide in WIDTHS:
         found += _splits(sums, wide, several)
         if not found:
             break
-    clearest = max(found, key=lambda seam: seam.ratio, default=_Split(0.0, 0, 0))
-    # Corners that either side is as smooth with are not on the seam.
-    as_good = [seam for seam in found if seam.alone <= AS_SMOOTH * clearest.alone]
-    return min(as_good, key=lambda seam: (seam.end - seam.start, -seam.ratio), default=clearest)
+    clearest = max(found, key=lambda split: split.ratio, default=_Split(0.0, 0, 0))
+    # Corners that either side is as smooth with are not on the discontinuity.
+    as_good = [split for split in found if split.alone <= AS_SMOOTH * clearest.alone]
+    return min(as_good, key=lambda split: (split.end - split.start, -split.ratio), default=clearest)
 
 
 def _splits(sums: _Sums, wide: int, several: bool) -> list[_Split]:
-    """Return the seams that `wide` columns may lie on; `sums` are over the first columns."""
+    """Return the discontinuities that `wide` columns may lie on; `sums` are over the first columns."""
     columns, rows = len(sums.columns) - 1, sums.in_row.shape[1]
     start = np.arange(1, columns - wide)
     end = start + wide

@@ -26,8 +26,8 @@ SHARED_PX = 2.0
 """Corners of two lattices nearer than this are the same."""
 
 MAX_SHARED = 0.25
-"""Largest part of a lattice's corners that larger ones may have, too: of what grows over a seam, the row on it and the
-one beyond; of a board found twice, on two levels of the pyramid, nearly all."""
+"""Largest part of a lattice's corners that larger ones may have, too: of what grows over a discontinuity, the row
+on it and the one beyond; of a board found twice, on two levels of the pyramid, nearly all."""
 
 MAX_LOST = 0.4
 """Largest part of a lattice's corners that the sub-pixel fit may refuse: beside what covers a board there are many."""
@@ -106,7 +106,7 @@ def separate(lattices: Sequence[Lattice], least: int) -> list[Lattice]:
     """Return those of `lattices` that are `large` enough, without the corners that they share with larger ones.
 
     What has most of its corners in common with larger ones is the same board again, and left out. A lattice that grew
-    over the seam to another board keeps its own corners.
+    over the edge to another board keeps its own corners.
     """
     candidates = sorted((item for item in lattices if large(item, least)), key=lambda item: -item.count)
     corners = [item.pixels[item.known] for item in candidates]

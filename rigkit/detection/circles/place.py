@@ -1,6 +1,6 @@
 """Where in a board the circles of a lattice lie: by the board's size, and by what is seen beside them to be paper.
 
-A lattice may be counted from several ends: four of a square one, six of a hexagonal one. Of all the places that it can
+A lattice may be numbered from several ends: four of a square one, six of a hexagonal one. Of all the places that it can
 have in the board those are right that leave no place of the board empty which the image shows. A whole board has one
 such place (or several that look the same), a part as many as its own borders leave open.
 """
@@ -99,7 +99,7 @@ def _cells(circles: IntArray, pattern: Circles) -> IntArray:
 
 
 def _places(circles: IntArray, empty: IntArray, board: Board) -> Iterator[_Place]:
-    """Yield the places in the board that circles, counted in one way, can have."""
+    """Yield the places in the board that circles of one numbering can have."""
     pattern = board.pattern
     staggered = isinstance(pattern, Circles) and pattern.staggered
     columns, rows = board.size

@@ -306,10 +306,10 @@ def _unanimous(guide: Guide, state: BoardState) -> BoardState:
     rest = state
     for _ in range(MAX_GUIDE_ROUNDS):
         share = _contradiction(guide, rest, rest)
-        astray = (share > 1.0) & (share >= cv2.dilate(share, np.ones((5, 5))))
-        if not astray.any():
+        outlying = (share > 1.0) & (share >= cv2.dilate(share, np.ones((5, 5))))
+        if not outlying.any():
             break
-        rest = rest.without(astray)
+        rest = rest.without(outlying)
         guide = guide.by(rest)
     return state.without(_contradiction(guide, state, rest) > 1.0)
 

@@ -1,7 +1,7 @@
 """Where one lattice is really several boards, and where several lattices are really one board.
 
-Boards whose squares meet at a seam grow together into one lattice that folds there: it is cut. A ruler across a board
-cuts its lattice in two that continue each other: they are joined.
+Boards whose squares touch grow together into one lattice with a discontinuity there: it is split. A ruler across a
+board cuts its lattice in two that continue each other: they are joined.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from rigkit.detection.lattice.spacing import SpacingChange, spacing_changes
 MIN_TURN = 0.16
 TURN_FACTOR = 3.5
 """A lattice folds at a row or column where neighbouring steps differ by more than this (relative to the step), and by
-more than this factor times what is typical of it: perspective and fisheyes bend everywhere, a seam bends once."""
+more than this factor times what is typical of it: perspective and fisheyes bend everywhere, a discontinuity once."""
 
 MIN_FOR_TYPICAL = 5
 """Columns or rows needed to say what is typical."""
@@ -73,7 +73,7 @@ def split_at_turns(lattice: Lattice) -> list[Lattice]:
         return [part for half in _halves(lattice, at) for part in split_at_turns(half)]
     at = _sharpest_turn(columns, along_columns)
     if at is not None:
-        # A quarter turn makes the row into a column, counted from the other end.
+        # A quarter turn makes the row into a column, numbered from the other end.
         halves = _halves(lattice.turned(1), rows - 1 - at)
         return [part.turned(3) for half in halves for part in split_at_turns(half)]
     return [lattice]
@@ -82,7 +82,7 @@ def split_at_turns(lattice: Lattice) -> list[Lattice]:
 def _halves(lattice: Lattice, at: int) -> tuple[Lattice, Lattice]:
     """Return what lies on either side of the column `at`, which goes with the one side whose rows it continues.
 
-    A column on the seam itself continues both, and is dropped.
+    A column on the discontinuity itself continues both, and is dropped.
     """
     columns, rows = lattice.size
     every = slice(0, rows)

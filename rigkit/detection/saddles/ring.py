@@ -2,7 +2,7 @@
 
 Around a corner the brightness is the same on opposite sides and changes exactly twice in half a turn, and the corner
 itself is as bright as the ring on average, whatever the angles, the blur and the slope of the light. Where it rises
-(angle counted from u to v) lies line A, where it falls line B; so the ring gives the two line directions and the
+(angle from u to v) lies line A, where it falls line B; so the ring gives the two line directions and the
 polarity: which quadrants are bright.
 
 Blur bends the borders of the quadrants near the corner, up to right angles in its middle, so the places where the ring

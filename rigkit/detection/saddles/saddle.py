@@ -24,7 +24,7 @@ KNOWN_PX = 2.0
 """A corner this near to one of a finer level is the same, in pixels of its own level."""
 
 MAX_STEP = 1.5
-"""A Newton step to the saddle that leads further than this from the peak of the response went astray, level px."""
+"""A Newton step to the saddle that leads further than this from the peak of the response went wrong, level px."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -115,7 +115,7 @@ class RefinedLattice:
         return _refined(self.lattice.padded(rows, columns), rest, self.scatter)
 
     def turned(self, quarter_turns: int) -> RefinedLattice:
-        """Return this counted from another corner, as `Lattice.turned`."""
+        """Return this numbered from another corner, as `Lattice.turned`."""
         rest = (np.rot90(values, -quarter_turns) for values in self._values())
         return _refined(self.lattice.turned(quarter_turns), rest, self.scatter)
 
@@ -353,7 +353,7 @@ def _checked(item: RefinedLattice, parts: Sequence[Part]) -> RefinedLattice:
             continue
         typical = upper_median(cells[part][sure])
         usual = upper_median(relative[part][here])
-        astray = (cells[part] > max(DISPLACED_CELLS, DISPLACED_SIGMAS * typical)) & (excess[part] > DISPLACED_SIGMAS)
+        outlying = (cells[part] > max(DISPLACED_CELLS, DISPLACED_SIGMAS * typical)) & (excess[part] > DISPLACED_SIGMAS)
         covered = relative[part] > max(COVERED_NOISE, COVERED_FACTOR * usual)
-        drop[part] = sure & (astray | (covered & (cells[part] > COVERED_OFF * typical)))
+        drop[part] = sure & (outlying | (covered & (cells[part] > COVERED_OFF * typical)))
     return item.without(drop) if drop.any() else item

@@ -81,11 +81,11 @@ def refuse_planar_ambiguity(matches: Matches, weights: RowWeights) -> None:
     -----
     On a plane F = [t]_x H fits for every t: a linear solver returns one that the noise has chosen.
     """
-    counted, also = weights.points > 0.0, weights.affinities > 0.0
-    freedom = 2 * int(counted.sum()) + 4 * int(also.sum()) - HOMOGRAPHY_FREEDOM
-    if counted.sum() < 4 or freedom <= 0 or not np.isfinite(weights.sigma_A[also]).all():
+    with_point, with_affinity = weights.points > 0.0, weights.affinities > 0.0
+    freedom = 2 * int(with_point.sum()) + 4 * int(with_affinity.sum()) - HOMOGRAPHY_FREEDOM
+    if with_point.sum() < 4 or freedom <= 0 or not np.isfinite(weights.sigma_A[with_affinity]).all():
         return
-    points = matches.select(counted)
+    points = matches.select(with_point)
     H21 = homography_of_rays(points)
     A = _affinities_of(points, H21)
     sigma1, sigma2 = points.sigma1_px[:, None, None], points.sigma2_px[:, None, None]
@@ -93,11 +93,11 @@ def refuse_planar_ambiguity(matches: Matches, weights: RowWeights) -> None:
     off = transfer_error(points, H21)
     chi2 = float(np.sum(off * np.linalg.solve(covariance, off[..., None])[..., 0]))
     if matches.A21 is not None:
-        by_affinity = matches.A21[also] - _affinities_of(matches.select(also), H21)
-        chi2 += float(np.sum((by_affinity / weights.sigma_A[also, None, None]) ** 2))
+        by_affinity = matches.A21[with_affinity] - _affinities_of(matches.select(with_affinity), H21)
+        chi2 += float(np.sum((by_affinity / weights.sigma_A[with_affinity, None, None]) ** 2))
     if chi2 < freedom + PLANE_EXPLAINS_SIGMAS * np.sqrt(2.0 * freedom):
         raise DegenerateError(
-            f"the {int(counted.sum())} matches lie on one plane to within their noise, which leaves a general epipolar "
+            f"the {len(points)} matches lie on one plane to within their noise, which leaves a general epipolar "
             "geometry open; add points off that plane or declare the pose type"
         )
 
