@@ -12,9 +12,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import round_trips
 
 import rigkit
+from rigkit.cameras.pinhole import Pinhole
+from rigkit.geometry.rotation import exp_so3
+from rigkit.geometry.sampson import epipolar_normals
 from rigkit.io.schema import SCHEMAS, key_rows, schema_text
 from rigkit.report.calibration_drawings import uncertainty_svg
 
@@ -22,10 +26,11 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGES = ROOT / "docs" / "pages"
 MADE = PAGES / "made"
 
-FRAMES = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 640 240" font-family="sans-serif" font-size="14">
-<rect width="640" height="240" fill="#fff"/>
-<defs><marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">
-<path d="M0 0L8 4L0 8z"/></marker></defs>
+ARROW = """<defs><marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">
+<path d="M0 0L8 4L0 8z"/></marker></defs>"""
+FRAMES = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 740 240" font-family="sans-serif" font-size="14">
+<rect width="740" height="240" fill="#fff"/>
+ARROW
 <g stroke="#333" fill="none"><path d="M110 120L40 70V170zM110 120L40 70M110 120L40 170"/></g>
 <g stroke="#000" stroke-width="2" marker-end="url(#tip)"><path d="M110 120H230"/><path d="M110 120V215"/>
 <path d="M110 120L165 85"/></g>
@@ -39,8 +44,8 @@ FRAMES = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 640 240" font-f
 """
 
 
-PIXELS = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 640 200" font-family="sans-serif" font-size="14">
-<rect width="640" height="200" fill="#fff"/><g stroke="#888" fill="none">GRID</g>
+PIXELS = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 740 200" font-family="sans-serif" font-size="14">
+<rect width="740" height="200" fill="#fff"/><g stroke="#888" fill="none">GRID</g>
 <circle cx="80" cy="70" r="4"/><text x="92" y="66">(0, 0): the centre of the first pixel</text>
 <circle cx="50" cy="40" r="4" fill="#b3261e"/>
 <text x="62" y="30" fill="#b3261e">(-0.5, -0.5): the corner of the image</text>
@@ -69,6 +74,61 @@ def poses_svg() -> str:
     return "".join([*out, "</svg>\n"])
 
 
+def two_views_svg() -> str:
+    """Draw a board in two views: a corner with the normals of its epipolar lines, and the board's edges as directions,
+    the second ones as A21 maps the first."""
+    board = rigkit.Board("board", 6, 4, 40.0, 40.0)
+    lens = Pinhole((360, 260), np.array([330.0, 330.0, 179.5, 129.5]))
+    turn = exp_so3(np.array([0.35, 0.45, 0.1]))
+    cam1_from_board = rigkit.Rigid3(turn, np.array([0.0, 0.0, 420.0]) - turn @ np.array([100.0, 60.0, 0.0]))
+    cam2_from_cam1 = rigkit.Rigid3(exp_so3(np.array([-0.1, 0.35, 0.05])), [-150.0, 15.0, 20.0])
+    lattice, at = board.points(), np.array([80.0, 40.0, 0.0])
+    poses = (cam1_from_board, cam2_from_cam1 @ cam1_from_board)
+    seen = [lens.project(pose.apply(lattice))[0] for pose in poses]
+    q1, q2 = (lens.project(pose.apply(at[None]))[0] for pose in poses)
+    rays, jacobians = zip(*((lens.unproject(q)[0], lens.ray_jacobian(q)) for q in (q1, q2)), strict=True)
+    t = cam2_from_cam1.translation_mm
+    E21 = np.cross(t, cam2_from_cam1.rotation, axisb=0, axisc=0)
+    _, n1, n2 = epipolar_normals(E21, *rays, *jacobians)
+    step = 1e-3 * np.eye(3)[:2]
+    d1, d2 = (
+        40.0 * 1e3 * (lens.project(pose.apply(at + step))[0] - q) for pose, q in zip(poses, (q1, q2), strict=True)
+    )
+    A21 = d2.T @ np.linalg.inv(d1.T)
+    assert np.allclose(A21.T @ n2[0] + n1[0], 0.0, atol=1e-3 * np.linalg.norm(n1))
+    out = [
+        '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 760 300" font-family="sans-serif" font-size="14">'
+        '<rect width="760" height="300" fill="#fff"/>' + ARROW
+    ]
+    names = (("q1", "n1", "d1", "image 1"), ("q2", "n2", "d2 = A21 d1", "image 2"))
+    for k, (corners, q, n, d, words) in enumerate(
+        zip(seen, (q1[0], q2[0]), (n1[0], n2[0]), (d1, d2), names, strict=True)
+    ):
+        out.append(
+            f'<g transform="translate({10 + 380 * k} 10)"><rect width="360" height="260" fill="#fbfcfd" stroke="#888"/>'
+        )
+        out += [f'<circle cx="{u:.1f}" cy="{v:.1f}" r="2.5" fill="#1f4e8c"/>' for u, v in corners]
+        normal = n / np.linalg.norm(n)
+        along = np.array([-normal[1], normal[0]])
+        ends = np.array([q + s * along for s in np.linspace(-400.0, 400.0, 2001)])
+        inside = ends[((ends >= 0.0) & (ends <= [360.0, 260.0])).all(axis=1)]
+        (a, b), (c, e) = inside[0], inside[-1]
+        out.append(f'<path d="M{a:.1f} {b:.1f}L{c:.1f} {e:.1f}" stroke="#e6550d" stroke-width="1.5"/>')
+        tips = [
+            (q + 45.0 * normal, words[1], "#e6550d"),
+            (q + d[0], words[2], "#000"),
+            (q + d[1], "", "#000"),
+        ]
+        for tip, name, colour in tips:
+            out.append(
+                f'<path d="M{q[0]:.1f} {q[1]:.1f}L{tip[0]:.1f} {tip[1]:.1f}" stroke="{colour}" stroke-width="2" '
+                f'marker-end="url(#tip)"/><text x="{tip[0] + 6:.1f}" y="{tip[1] + 4:.1f}">{name}</text>'
+            )
+        out.append(f'<text x="{q[0] + 6:.1f}" y="{q[1] - 8:.1f}">{words[0]}</text>')
+        out.append(f'<text x="8" y="20">{words[3]}</text></g>')
+    return "".join([*out, '<text x="10" y="292" fill="#e6550d">epipolar lines with their normals</text></svg>\n'])
+
+
 def keys_page() -> str:
     """Return the page with every key of every file."""
     parts = ["# All keys\n\nMade of the definitions that `rigkit schema` prints and that readers are held against.\n"]
@@ -93,10 +153,12 @@ def made_pictures() -> None:
     (MADE / "pixels.svg").write_text(PIXELS.replace("GRID", grid), encoding="utf-8")
     (MADE / "poses.svg").write_text(poses_svg(), encoding="utf-8")
     (MADE / "round-trips.md").write_text(round_trips.table(), encoding="utf-8")
+    (MADE / "rig-round-trips.md").write_text(round_trips.rigs_table(), encoding="utf-8")
+    (MADE / "two-views.svg").write_text(two_views_svg(), encoding="utf-8")
     for name in SCHEMAS:
         (MADE / f"{name}.json").write_text(schema_text(name), encoding="utf-8")
     squares = "".join(f'<path d="M{400 + 30 * k} 50V200M400 {50 + 30 * k}H{580}"/>' for k in range(6))
-    (MADE / "frames.svg").write_text(FRAMES.replace("BOARD", squares), encoding="utf-8")
+    (MADE / "frames.svg").write_text(FRAMES.replace("ARROW", ARROW).replace("BOARD", squares), encoding="utf-8")
 
 
 def api_page() -> str:
