@@ -73,7 +73,7 @@ def _could_have_found(power: Power) -> str:
     """Return what the change that is seen worst would have needed."""
     whose = "" if power.camera is None else f" of camera '{power.camera}'"
     size = f"{power.size:g} {power.unit}"
-    seen = f"A change of {size} rms" if power.unit == "px" else f"A turn of {size}"
+    seen = f"A change of {size} rms over the image" if power.unit == "px" else f"A turn of {size}"
     said = f"{seen} would have been found with chance {power.chance:.2f} ({power.kind}{whose}, what is seen worst"
     if np.isfinite(power.found_from):
         said += f"; {FOUND:.0%} of the time from {power.found_from:.2g} {power.unit} on"
@@ -194,7 +194,8 @@ def history_facts(entries: Sequence[HistoryEntry]) -> PageFacts:
     alarms = sum(not entry.holds for entry in entries)
     told = {0: "none an alarm", 1: "one an alarm"}.get(alarms, f"{alarms} of them alarms")
     count = "one entry" if len(entries) == 1 else f"{len(entries)} entries, {told}"
-    lead = f"{count}, from {entries[0].date[:10]} to {entries[-1].date[:10]}."
+    first, last = entries[0].date[:10], entries[-1].date[:10]
+    lead = f"{count}, of {last}." if first == last else f"{count}, from {first} to {last}."
     return PageFacts(
         headline=f"The last entry {'holds' if entries[-1].holds else 'is an alarm'}; {lead}",
         badge="holds" if entries[-1].holds else "does not hold",
