@@ -19,8 +19,9 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, rotation_angle, unit
 from rigkit.geometry.sampson import sampson_distances
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
+from rigkit.reconstruction.growing.curvature import without_curvature
 from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKnowledge, grow, grow_both_ways
-from rigkit.reconstruction.growing.surface import GrownSurface, fit_surface, measure
+from rigkit.reconstruction.growing.surface import GrownSurface, fit_surface, measure, own_planes
 from rigkit.reconstruction.growing.systematic import SystematicPose, pose_with_field
 from rigkit.reconstruction.reconstruct import Reconstruction, colours_at
 from rigkit.reconstruction.scene import MAX_RANGE_SIGMA, SceneReconstruction, in_unit
@@ -118,6 +119,7 @@ def grow_scene(
     known = _knowledge(even.matches, pose)
     step = max(CLOUD_STEP, round(float(np.sqrt(np.prod(view1.size_px) / CLOUD_NODES))))
     grown = grow_both_ways(view1, view2, agreeing, step=step, known=known).centred()
+    grown = without_curvature(grown, r.camera1, r.camera2, pose)
     if not len(grown):
         raise DegenerateError(
             f"no surface grows from {len(agreeing)} correspondences; check that the images are sharp and "
@@ -165,7 +167,8 @@ def _pose_from_grown(
     gate = max(MAX_DISTANCE_PX, GATE * sparse.sigma_px)
     for k in range(MAX_GROWTHS):
         known = LineKnowledge(essential_from_pose(pose), gate)
-        pairs = grow(view1, view2, seeds, step=POSE_STEP, known=known).centred().correspondences()
+        grown = grow(view1, view2, seeds, step=POSE_STEP, known=known).centred()
+        pairs = without_curvature(grown, view1.camera, view2.camera, pose).correspondences()
         matches, _ = pairs.matches(view1.camera, view2.camera)
         if len(matches) < MIN_GROWN:
             raise DegenerateError(
@@ -225,11 +228,7 @@ def _moved_planes(
 
     def planes(step: FloatArray) -> FloatArray:
         there = Rigid3(exp_so3(step[:3]) @ pose.rotation, length * unit(t + step[3:]))
-        own = measure(grown, r.camera1, r.camera2, there)
-        out = np.full(own.z.shape, np.nan)
-        good = np.isfinite(own.z[..., 0])
-        out[good] = np.linalg.solve(own.frame[good], own.z[good][..., None])[..., 0]
-        return out
+        return own_planes(measure(grown, r.camera1, r.camera2, there))
 
     each = [(planes(POSE_STEP_RAD * d) - planes(-POSE_STEP_RAD * d)) / (2.0 * POSE_STEP_RAD) for d in directions]
     to_five = directions / np.array([1.0, 1.0, 1.0, length, length, length])

@@ -113,6 +113,14 @@ def measure(grown: GrownPatches, camera1: Camera, camera2: Camera, cam2_from_cam
     return NodeMeasurements(z=spread(z), covariance=spread(covariance), frame=spread(frame), slope=spread(slope))
 
 
+def own_planes(measured: NodeMeasurements) -> FloatArray:
+    """Return m (R, C, 3) of the planes m . X = 1 that the nodes say by themselves; NaN where they say nothing."""
+    out = np.full(measured.z.shape, np.nan)
+    good = np.isfinite(measured.z[..., 0])
+    out[good] = np.linalg.solve(measured.frame[good], measured.z[good][..., None])[..., 0]
+    return out
+
+
 def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -> GrownSurface:
     """Return the planes around all nodes, which are `step` px apart.
 
