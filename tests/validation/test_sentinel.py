@@ -164,6 +164,7 @@ def test_nothing_to_look_at_is_refused(calibration: Calibration) -> None:
 
 
 MOUNT = Rigid3(exp_so3(np.array([0.01, -0.08, 0.02])), [-120.0, 2.0, 3.0])
+TURN_DEG = [0.02, -0.015, 0.03]
 LENS_SIGMAS = [0.1, 0.1, 0.1, 0.1, 2e-5, 2e-5, 2e-5, 2e-5]
 
 
@@ -190,10 +191,18 @@ def _rig_check(pose: Rigid3, second: Camera, rng: np.random.Generator) -> Sentin
 def test_a_rig_that_nobody_touched_holds() -> None:
     checks = [_rig_check(MOUNT, lens("wide"), np.random.default_rng(seed)) for seed in range(8)]
     assert all(check.holds for check in checks)
+    powers = {(p.kind, p.camera): p for p in checks[0].powers}
+    assert set(powers) == {(k, c) for k in ("focus", "principal point", "distortion") for c in ("left", "right")} | {
+        ("rotation", "right")
+    }
+    # The turn that is found below is one that is said to be found.
+    assert powers["rotation", "right"].unit == "deg" and powers["rotation", "right"].found_from < np.linalg.norm(
+        TURN_DEG
+    )
 
 
 def test_a_camera_that_turned_is_found_to_a_hundredth_of_a_degree(rng: np.random.Generator) -> None:
-    turn = np.radians([0.02, -0.015, 0.03])
+    turn = np.radians(TURN_DEG)
     moved = Rigid3(exp_so3(turn) @ MOUNT.rotation, exp_so3(turn) @ MOUNT.translation_mm)
     check = _rig_check(moved, lens("wide"), rng)
     assert not check.holds and check.change is not None

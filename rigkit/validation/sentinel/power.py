@@ -33,7 +33,7 @@ TIMES = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 20)
 """Frames like these that are thought of: so many times as many."""
 SIZE_PARTS = np.geomspace(1e-2, 1e2, 33)
 """Sizes that are looked at, as parts of the one told of."""
-MAX_NONCENTRALITY = 1e3
+MAX_NONCENTRALITY = 1e5
 """With it everything is found."""
 QUANTILES = (np.arange(16) + 0.5) / 16
 """Of what the variance may be, given how well it is known."""
@@ -113,10 +113,11 @@ def _repeated(evidence: FreshEvidence, times: int) -> FreshEvidence:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Shown:
-    """Noncentrality (m,) of a change of unit size along each of its axes, and the limits (K,) of chi-squared for what
-    the variance may be."""
+    """Noncentrality of a change of unit size along each axis on which it moves anything, how many `amounts` it has, and
+    the limits (K,) of chi-squared for what the variance may be."""
 
     by_axis: FloatArray
+    amounts: int
     limits: FloatArray
 
     @classmethod
@@ -129,12 +130,12 @@ class _Shown:
         by_axis = np.maximum(np.linalg.eigvalsh(root.T @ normal @ root), 0.0)
         m = len(metric)
         limit = m * f_distribution.isf(alarm_chance, m, whitened.freedom)
-        return cls(by_axis, limit * chi2.ppf(QUANTILES, whitened.freedom) / whitened.freedom)
+        return cls(by_axis, m, limit * chi2.ppf(QUANTILES, whitened.freedom) / whitened.freedom)
 
     def chance(self, size: FloatArray) -> FloatArray:
         """Return how often changes of `size` (K,) are found, the mean over their axes, (K,)."""
         noncentrality = np.minimum(self.by_axis * np.square(size)[:, None], MAX_NONCENTRALITY)
-        return np.asarray(1.0 - chndtr(self.limits, len(self.by_axis), noncentrality[..., None]).mean(axis=(1, 2)))
+        return np.asarray(1.0 - chndtr(self.limits, self.amounts, noncentrality[..., None]).mean(axis=(1, 2)))
 
     def finds(self, size: float) -> bool:
         """Say whether a change of `size` is found often enough."""
