@@ -44,12 +44,14 @@ def first_root(coefficients: FloatArray, limit: float) -> float:
     # Scaled to x in (0, 1] so that coefficients of high powers of pixels are not lost beside the others.
     degree = coefficients.shape[-1] - 1
     scaled = coefficients * limit ** np.arange(degree + 1.0)
-    if not np.isfinite(scaled).all():
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        last_row = scaled[..., 1:] / -scaled[..., :1]
+    if not np.isfinite(last_row).all():
         raise InputError("lens polynomial: its coefficients are too large for any lens; calibrate again")
     # Eigenvalues of this companion matrix are 1 / x: a leading coefficient of zero is no special case.
     companion = np.zeros((*coefficients.shape[:-1], degree, degree))
     companion.reshape(-1, degree * degree)[:, degree :: degree + 1] = 1.0
-    companion[..., 0, :] = scaled[..., 1:] / -scaled[..., :1]
+    companion[..., 0, :] = last_row
     inverse = np.linalg.eigvals(companion)
     real = inverse.real[np.abs(inverse.imag) <= REAL_ROOT * np.abs(inverse)]
     return float(limit / real.max(initial=1.0))

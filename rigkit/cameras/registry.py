@@ -20,7 +20,7 @@ MODELS: dict[str, type[Camera]] = {
 def camera_model(name: str) -> type[Camera]:
     """Return the camera class called `name`; raises InputError that lists the known ones."""
     if name not in MODELS:
-        raise InputError(f"camera model '{name}' is unknown; known: {', '.join(sorted(MODELS))}")
+        raise InputError(f"camera model '{name[:40]}' is unknown; known: {', '.join(sorted(MODELS))}")
     return MODELS[name]
 
 

@@ -41,7 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import note, print_json, progress_on_stderr
-    from rigkit.io.board_words import board_of_words
+    from rigkit.io.board_words import board_files, board_of_words
+    from rigkit.io.files import ensure_writable
     from rigkit.report.check_page import check_table
     from rigkit.report.tables import tables_to_text
     from rigkit.validation.certificate.contracts import Quantity, Task
@@ -52,6 +53,8 @@ def run(args: argparse.Namespace) -> int:
     length = None
     if args.length is not None:
         length = Task(quantity=Quantity.LENGTH, size_mm=args.length, distance_mm=args.distance)
+    results = [path for path in (args.fix, args.report) if path is not None]
+    ensure_writable(results, force=args.force, inputs=board_files(args.board))
     options = CheckOptions(
         boards=tuple(board_of_words(words) for words in args.board),
         scene=args.scene,

@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _planned(args: argparse.Namespace) -> PlannedSession:
     from rigkit.cli.console import progress_on_stderr
-    from rigkit.io.board_words import board_of_words
+    from rigkit.io.board_words import board_files, board_of_words
     from rigkit.io.files import ensure_writable
     from rigkit.workflows.plan import USUAL_SIGMA_PX, LensOptions, plan_lens, plan_session
 
@@ -79,9 +79,7 @@ def _planned(args: argparse.Namespace) -> PlannedSession:
         raise InputError("plan: --lens needs --size 1280x960 and --board 9x6x25")
     size_px = size_of_words(args.size)
     if args.report is not None:
-        ensure_writable(
-            args.report, force=args.force, inputs=[words for words in args.board if words.endswith(".toml")]
-        )
+        ensure_writable(args.report, force=args.force, inputs=board_files(args.board))
     sigma = USUAL_SIGMA_PX if args.sigma_px is None else args.sigma_px
     if not 0.0 < sigma < float("inf"):
         raise InputError(f"--sigma-px {sigma}: it must be positive")

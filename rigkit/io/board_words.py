@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
 
@@ -64,6 +65,11 @@ def board_of_words(words: str) -> Board:
             raise InputError(f"--board {words}: say how large a square is as well: {words}x25 where its side is 25 mm")
         raise InputError(f"--board {words}: write {WORDS_HELP}, or a board file")
     return load_board(words)
+
+
+def board_files(words: Iterable[str]) -> list[Path]:
+    """Return the files among what tells boards: they are read, so nothing is written over them."""
+    return [Path(one) for one in words if board_in_words(one) is None]
 
 
 def words_of_board(board: Board) -> str:

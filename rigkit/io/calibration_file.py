@@ -131,7 +131,9 @@ def damage_named(path: str | Path) -> Iterator[None]:
     try:
         yield
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, InputError) as error:
-        words = " ".join(str(error).split())[:200]
+        words = " ".join(str(error).split())
+        # What we say ends with what to do.
+        words = words if isinstance(error, InputError) else words[:200]
         raise InputError(words if str(path) in words else f"'{path}': damaged ({words}); calibrate again") from error
 
 

@@ -16,7 +16,7 @@ from rigkit.io.reading import about, read_bytes, usable_path
 from rigkit.io.rig_session import RigSession, is_rig_session, load_rig_session
 from rigkit.io.session import Session, load_session
 from rigkit.io.video import VIDEO_ENDINGS, is_video
-from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration, calibrate_session
+from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration, calibrate_session, session_inputs
 from rigkit.workflows.calibrate_rig import RigSessionCalibration, calibrate_rig_session
 from rigkit.workflows.detect import IMAGE_ENDINGS
 from rigkit.workflows.folder_session import session_of_folders
@@ -66,10 +66,15 @@ def calibrate_session_file(
 
     Raises as `calibrate_session` and `calibrate_rig_session` do.
     """
-    session = with_frames(load_rig_session(path) if is_rig_session(path) else load_session(path), progress)
+    listed = load_rig_session(path) if is_rig_session(path) else load_session(path)
+    session = with_frames(listed, progress)
     output = options.output or default_output(session)
     report = output.with_suffix(".html") if options.report == Path() else options.report
     options = replace(options, output=output, report=report)
+    if session is not listed:
+        # The videos are read as well as the frames in their place.
+        results = [file for file in (output, report) if file is not None]
+        ensure_writable(results, force=options.force, inputs=session_inputs(listed, options))
     if isinstance(session, RigSession):
         return calibrate_rig_session(session, options, progress=progress)
     if options.known.files:
@@ -113,7 +118,8 @@ def calibrate_folders(
     )
     new = {path: text for path, text in wanted.files.items() if not _says(path, text)}
     results = [path for path in (options.output, options.report) if path not in (None, Path())]
-    ensure_writable([*new, *results], force=options.force, inputs=set(wanted.files) - set(new))
+    told = [*folders, *([folder_options.timestamps] if folder_options.timestamps else [])]
+    ensure_writable([*new, *results], force=options.force, inputs=[*(set(wanted.files) - set(new)), *told])
     before = {path: read_bytes(path, "session") for path in new if path.exists()}
     if new:
         write_together(dict(new), force=options.force)

@@ -73,8 +73,8 @@ def calibrate_rig_session(
     options = options or CalibrateOptions()
     if not isinstance(session, RigSession):
         session = load_rig_session(session)
-    session = with_known_first(with_known(session, options.known))
     with about(session.path):
+        session = with_known_first(with_known(session, options.known))
         known_cameras(session)  # complaints before the work
         require_distinct(session)
     targets = _targets(session, options)

@@ -152,7 +152,9 @@ def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> 
                 f"images A '{a}' and B '{b}' are the same picture to the last pixel: no baseline; give two images "
                 "taken from different places"
             )
-    scene, found = _sparse(options, (camera1, camera2), known_pose, images, progress)
+    told = (options.correspondences, options.rig, options.camera, options.camera2)
+    with about(*(path for path in told if path is not None)):
+        scene, found = _sparse(options, (camera1, camera2), known_pose, images, progress)
     maps: Mapping[str, NDArray[Any]] = {}
     if images and options.grow:
         scene, found, maps = _grown(scene, found, images, progress, pose_is_known=known_pose is not None)
@@ -235,11 +237,10 @@ def _sparse(
         )
 
     if options.correspondences:
-        with about(options.correspondences):
-            found = read_correspondences(options.correspondences, [path.name for path in options.images or ()])
-            if images and are_rough(found):
-                found = with_affinities(found, *images)
-            return scene_of(found), found
+        found = read_correspondences(options.correspondences, [path.name for path in options.images or ()])
+        if images and are_rough(found):
+            found = with_affinities(found, *images)
+        return scene_of(found), found
     assert images is not None
     for k, tilts in enumerate((None, TILTS)):
         progress("matching affine features", 0, 1)

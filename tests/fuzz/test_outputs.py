@@ -39,6 +39,19 @@ WRITES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("plan calibration.json -n 1", "-r", ("calibration.json",)),
     ("plan --lens 60 --size 320x240 --board board.toml --views 4", "-r", ("board.toml",)),
     (INIT, "-o", ("calibration.json", *IMAGES)),
+    ("check calibration.json image.png --board floor.toml", "--fix", ("calibration.json", "image.png", "floor.toml")),
+    ("check calibration.json image.png --board floor.toml", "-r", ("floor.toml",)),
+    ("plan --lens 60 --size 320x240 --board target.yaml --views 4", "-r", ("target.yaml",)),
+    ("calibrate film.avi --board 5x4x30 --model pinhole", "-o", ("film.avi",)),
+    ("calibrate film.toml", "-o", ("film.avi", "floor.toml")),
+    ("handeye poses.csv pairs --camera calibration.json --board floor.toml", "-o",
+     ("poses.csv", "calibration.json", "floor.toml", *IMAGES)),
+    ("history history.jsonl", "-r", ("history.jsonl",)),
+    ("mesh cloud.ply --depth 3", "-o", ("cloud.ply",)),
+    ("calibrate known.toml --no-cache --only-extrinsics calibration.json", "-o", ("known.toml", "calibration.json")),
+    ("calibrate added.toml --no-cache --add-camera rig.json", "-o", ("added.toml", "rig.json", "floor.toml")),
+    ("rectify image.png --camera calibration.json -o new.png", "--maps", ("image.png", "calibration.json")),
+    ("diff rig.json rig.json", "-r", ("rig.json",)),
 )  # fmt: skip
 """Commands, the option that names what they write, and what they read."""
 COMMANDS = [pytest.param(words, option, id=f"{words.split()[0]} {option}") for words, option, _ in WRITES]
@@ -46,7 +59,9 @@ PLACES = ("loop", "pipe", "folder", "image.bmp/below.json", "x" * 300, "/dev/nul
 
 
 def content(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+    """Return what the files hold, but for frames that are kept of a video."""
+    files = (p.relative_to(folder) for p in sorted(folder.rglob("*")) if p.is_file())
+    return {str(p): (folder / p).read_bytes() for p in files if not p.parts[0].endswith("frames")}
 
 
 def refused(words: str, capsys: pytest.CaptureFixture[str]) -> str:
@@ -63,12 +78,19 @@ def refused(words: str, capsys: pytest.CaptureFixture[str]) -> str:
 def test_what_a_command_reads_is_never_written(
     words: str, option: str, read: str, place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    _film_session(place)
     before = content(place)
     assert "it would be lost" in refused(f"{words} {option} {read} --force", capsys)
     (place / "link.png").symlink_to(read)
     assert "it would be lost" in refused(f"{words} {option} link.png --force", capsys)
     (place / "link.png").unlink()
     assert content(place) == before
+
+
+def _film_session(place: Path) -> None:
+    """A session of which the images are a video's."""
+    text = (place / "session.toml").read_text()
+    (place / "film.toml").write_text(text.replace("image*.png", "film.avi").replace("board.toml", "floor.toml"))
 
 
 @pytest.mark.parametrize("name", PLACES)
@@ -78,6 +100,7 @@ def test_names_that_cannot_be_written(
 ) -> None:
     """A link to itself, a pipe, a folder, a file as folder, a name too long, and a device, which a rename replaces."""
     ending = ".png" if words.startswith("rectify") else ""
+    _film_session(place)
     os.mkfifo(place / f"pipe{ending}")
     (place / f"folder{ending}").mkdir()
     (place / f"loop{ending}").symlink_to(f"loop{ending}")
