@@ -8,8 +8,8 @@ comes from each place on to the next one, so that the same image is the end of o
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
+from rigkit.calibration.repeats import close_pairs
 from rigkit.calibration.result import Calibration
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.findings import Finding, Severity
@@ -84,19 +84,17 @@ def _partners(
     # The motion of the one that lies in the middle of those.
     middle = best[int(np.argmin(np.linalg.norm(ends[best] - np.median(ends[best], axis=0), axis=(1, 2))))]
     landed = np.einsum("ij,npj->npi", turn[middle], points) + shift[middle]
-    apart, end = cKDTree(points.reshape(-1, 12)).query(landed.reshape(-1, 12), distance_upper_bound=reach)
-    found = np.flatnonzero(np.isfinite(apart))
+    squared = np.zeros((len(points), len(points)))
+    for one, other in zip(landed.reshape(-1, 12).T, points.reshape(-1, 12).T, strict=True):
+        squared += (one[:, None] - other) ** 2
+    end = squared.argmin(axis=1)
+    found = np.flatnonzero(squared.min(axis=1) < reach**2)
     found = found[(boards[found] == boards[end[found]]) & (number[found] != number[end[found]])]
-    return found, end[found].astype(np.int64)
+    return found, end[found]
 
 
 def _neighbours(points: FloatArray, reach: float) -> IntArray:
-    """Return how many of the points (N, 12) lie within `reach` of each (N,), itself too.
-
-    A tree of twelve dimensions tells hardly anything apart: only points with a neighbour in the first three are asked.
-    """
-    count = np.asarray(cKDTree(points[:, :3]).query_ball_point(points[:, :3], reach, return_length=True))
-    some = np.flatnonzero(count > 1)
-    if some.size:
-        count[some] = cKDTree(points[some]).query_ball_point(points[some], reach, return_length=True)
-    return count
+    """Return how many of the points (N, 12) lie within `reach` of each (N,), itself too."""
+    i, j = close_pairs(points, reach)
+    near = np.linalg.norm(points[i] - points[j], axis=1) <= reach
+    return np.asarray(1 + np.bincount(np.concatenate([i[near], j[near]]), minlength=len(points)))

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from rigkit.core.arrays import FloatArray, IntArray, Pixels
 
 REPEATED_PX = 0.5
 """Boards whose corners have, in two images, the same centre and the same extents within this were not moved between."""
+PAIRS_AT_A_TIME = 2**18
+"""Keeps the memory small."""
 
 
 def cluster_numbers(images: Sequence[str], boards: Sequence[str], pixels: Sequence[Pixels]) -> IntArray:
@@ -33,12 +34,31 @@ def cluster_numbers(images: Sequence[str], boards: Sequence[str], pixels: Sequen
         alike.setdefault(tuple(board for board, _ in ordered), []).append((image, places))
     number = {image: i for i, image in enumerate(shown)}
     for group in alike.values():
-        tree = cKDTree([places for _, places in group])
-        for earlier, later in sorted(tree.query_pairs(REPEATED_PX, p=np.inf), key=lambda pair: pair[::-1]):
+        one, other = close_pairs(np.array([places for _, places in group]), REPEATED_PX)
+        for earlier, later in sorted(zip(one.tolist(), other.tolist(), strict=True), key=lambda pair: pair[::-1]):
             names = group[earlier][0], group[later][0]
             number[names[1]] = min(number[names[0]], number[names[1]])
     _, dense = np.unique([number[name] for name in images], return_inverse=True)
     return dense.astype(np.int64)
+
+
+def close_pairs(points: FloatArray, reach: float) -> tuple[IntArray, IntArray]:
+    """Return which of the points (N, D) are within `reach` of each other along every axis: i and j (P,), i < j."""
+    axis = int(np.argmax(np.ptp(points, axis=0)))
+    order = np.argsort(points[:, axis], kind="stable")
+    sorted_points = points[order]
+    along = sorted_points[:, axis]
+    # Every point with those that follow it along the axis in which they are the furthest apart.
+    ahead = np.searchsorted(along, along + reach, side="right") - np.arange(len(order)) - 1
+    found = [np.zeros((2, 0), np.int64)]
+    for block in np.array_split(np.arange(len(order)), 1 + int(ahead.sum()) // PAIRS_AT_A_TIME):
+        count = ahead[block]
+        first = np.repeat(block, count)
+        second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(count) - count, count)
+        close = (np.abs(sorted_points[first] - sorted_points[second]) <= reach).all(axis=1)
+        found.append(order[np.stack([first, second])[:, close]])
+    pairs = np.sort(np.concatenate(found, axis=1), axis=0)
+    return pairs[0], pairs[1]
 
 
 def _places(pixels: Sequence[Pixels]) -> FloatArray:

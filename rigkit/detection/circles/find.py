@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.circles.blobs import Blobs, find_blobs
 from rigkit.detection.circles.fit import CircleFit, fit_circles
-from rigkit.detection.circles.lattices import LabelledBlobs, blob_lattices
 from rigkit.detection.circles.local_map import PlaneMap, local_maps
 from rigkit.detection.saddles.response import GreyImage
+
+if TYPE_CHECKING:
+    from rigkit.detection.circles.lattices import LabelledBlobs
 
 Rows = TypeVar("Rows", CircleFit, PlaneMap)
 
@@ -116,6 +118,9 @@ def find_grids(grey: GreyImage, min_circles: int = MIN_CIRCLES) -> list[CircleGr
 
 def seen_grids(grey: GreyImage) -> list[CircleGrid]:
     """Return all lattices of `grey` that may be grids, with what speaks for them."""
+    # The graphs of scipy: starting rigkit takes a quarter longer with them.
+    from rigkit.detection.circles.lattices import blob_lattices
+
     blobs = find_blobs(grey)
     out = []
     for found in blob_lattices(blobs):
