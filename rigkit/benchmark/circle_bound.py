@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.benchmark.corner_bound import BLUR_STEP_PX, SHIFT_PX, noise_free_levels, pixels_around, shifted_scene
+from rigkit.benchmark.corner_bound import changing_pictures, pixels_around
 from rigkit.benchmark.scenes import BenchScene
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.errors import InputError
@@ -33,12 +33,7 @@ def circle_information(scene: BenchScene, blur_px: float) -> FloatArray:
     pattern = placed.board.pattern
     if not isinstance(pattern, Circles):
         raise InputError(f"circle bound: board '{placed.board.board_id}' has no circles")
-    slopes = []
-    for axis in (0, 1):
-        before, after = (noise_free_levels(shifted_scene(scene, axis, sign * SHIFT_PX), blur_px) for sign in (-1, 1))
-        slopes.append((after - before) / (2.0 * SHIFT_PX))
-    sharper, wider = (noise_free_levels(scene, blur_px + sign * BLUR_STEP_PX) for sign in (-1, 1))
-    pictures = np.stack([*slopes, (wider - sharper) / (2.0 * BLUR_STEP_PX), 0.5 * (wider + sharper)])
+    pictures = changing_pictures(scene, blur_px)
     truth = scene.truth()[0]
     half_mm = 0.5 * pattern.nearest_mm(placed.board.squares_mm)
     sides = _sides(scene, placed, truth.grid, half_mm)

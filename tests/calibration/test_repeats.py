@@ -7,6 +7,7 @@ import pytest
 
 import rigkit.calibration.repeats as repeats
 from rigkit.calibration.repeats import close_pairs
+from rigkit.core.arrays import FloatArray
 
 
 @pytest.mark.parametrize("count", [1, 2, 300])
@@ -15,9 +16,9 @@ def test_close_pairs_are_those_of_all_with_all(
     count: int, at_a_time: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(repeats, "PAIRS_AT_A_TIME", at_a_time)
-    points = rng.integers(0, 40, (count, 3)) * 0.25
-    apart = np.abs(points[:, None] - points).max(axis=2, initial=0.0)
+    points: FloatArray = rng.integers(0, 40, (count, 3)).astype(np.float64) * 0.25
+    apart = np.abs(points[:, None] - points).max(axis=2)
     expected = np.argwhere(np.triu(apart <= 0.5, 1))
-    found = np.stack(close_pairs(points.reshape(-1, 3), 0.5), axis=1)
+    found = np.stack(close_pairs(points, 0.5), axis=1)
     assert count < 300 or len(expected) > 50
     assert np.array_equal(found[np.lexsort(found.T[::-1])], expected)

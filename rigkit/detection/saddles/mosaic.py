@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray, upper_median
 from rigkit.detection.saddles.response import FloatImage, GreyImage
 
 GLANCE, LOOK = 1500, 20000
@@ -30,11 +30,12 @@ def without_mosaic(grey: GreyImage) -> GreyImage:
     """Return `grey` with the four places of its squares of 2 x 2 pixels on one scale; as it is where they are so."""
     values = _squares(grey, GLANCE)
     mean = values.mean(axis=0)
-    bright = mean > max(float(np.median(mean)), MIN_LEVELS)
-    if (
-        not bright.any()
-        or float(np.abs(np.median(values[:, bright] / mean[bright], axis=1) - 1.0).max()) < MOSAIC_SHARE
-    ):
+    bright = mean > max(upper_median(mean), MIN_LEVELS)
+    if not bright.any():
+        return grey
+    ratio = values[:, bright] / mean[bright]
+    middle = ratio.shape[1] // 2
+    if float(np.abs(np.partition(ratio, middle, axis=1)[:, middle] - 1.0).max()) < MOSAIC_SHARE:
         return grey
     values = _squares(grey, LOOK)
     mean = values.mean(axis=0)
