@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
-from scipy.special import fdtrc
+from scipy.stats import f as f_distribution
 
 from rigkit.calibration.uncertainty import projection_design
 from rigkit.cameras.base import Camera
@@ -181,7 +181,7 @@ def _chance_of_any(whitened: Whitened, known: Sequence[Change]) -> float:
         basis = np.linalg.qr(root.T @ whitened.by_theta @ change.cause.directions)[0]
         m = basis.shape[1]
         gain = ((basis.T @ drawn) ** 2).sum(axis=0) / scale
-        least = np.minimum(least, fdtrc(m, whitened.freedom, gain / m))
+        least = np.minimum(least, f_distribution.sf(gain / m, m, whitened.freedom))
     return float(min(bound, (1.0 + np.count_nonzero(least <= best)) / (DRAWS + 1.0)))
 
 
@@ -224,7 +224,7 @@ def _fitted(whitened: Whitened, cause: Cause) -> Change | None:
     amounts = covariance @ right
     gain = float(right @ amounts)
     m = len(amounts)
-    chance = float(fdtrc(m, whitened.freedom, max(gain, 0.0) / m))
+    chance = float(f_distribution.sf(gain / m, m, whitened.freedom))
     return Change(cause, amounts, covariance, chance, 0.0, gain)
 
 
