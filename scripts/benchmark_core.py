@@ -24,16 +24,16 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import cv2
 import numpy as np
+from core_loops import loop_affine, loop_normal, loop_planar
+from core_peers import colmap_robust, opencv_robust, optional, poselib_refine, poselib_robust
+from core_scenes import CAMERA, CONDITIONS, NOISE_PX, POSE, SIGMA_A, contaminated, jacobians, scene
 
 from rigkit.affine.affinities import EpipolarNormals
 from rigkit.affine.normal import normals_from_affines
 from rigkit.affine.registry import AFFINE_METHODS, affines_from_directions
-from rigkit.affine.surface import affines_from_normals
-from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.matches import DirectionPairs, Matches
-from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import angle_between, exp_so3, rotation_angle, unit
+from rigkit.geometry.rotation import angle_between, rotation_angle
 from rigkit.geometry.triangulation import correct_hartley_sturm, correct_lindstrom, triangulate_rays
 from rigkit.relative_pose.refinement.refine import estimate_pose, refine_pose
 from rigkit.relative_pose.robust.robust import robust_pose
@@ -47,9 +47,6 @@ from rigkit.relative_pose.solvers.pose import essential_from_pose
 from rigkit.relative_pose.solvers.registry import fundamental_for
 from rigkit.relative_pose.solvers.rows import PLANAR_ENTRIES, affinity_rows, point_rows
 
-CAMERA = Pinhole((1624, 1240), np.array([1350.0, 1350.0, 800.0, 620.0]))
-POSE = Rigid3(exp_so3(np.array([0.0, 0.1, 0.0])), [-290.0, 0.0, -70.0])
-NOISE_PX, SIGMA_A = 0.3, 0.02
 DIRECTION_NOISE_RAD = np.radians(0.3)
 REPEATS = 3
 LOOPED = 300
@@ -82,62 +79,6 @@ def row(name: str, count: int, run: Callable[[], object], remark: str = "", **ot
     own = rate(count, run)
     ratios = {label.replace("_", " "): own / rate(*rival) for label, rival in others.items() if rival is not None}
     return Row(name, own, ratios, remark)
-
-
-@dataclass(frozen=True)
-class Condition:
-    """What a scene for the robust pose is like; `understated` is the actual noise over the stated one."""
-
-    name: str
-    outliers: float = 0.4
-    noise_px: float = NOISE_PX
-    understated: float = 1.0
-    count: int = 300
-    pose: Rigid3 = POSE
-    flat: bool = False
-
-
-PLAIN = Condition("40% wrong")
-CONDITIONS = (
-    PLAIN,
-    *(Condition(f"{share:.0%} wrong", outliers=share) for share in (0.0, 0.2, 0.6, 0.8)),
-    *(Condition(f"40% wrong, noise {noise} px", noise_px=noise) for noise in (0.1, 1.0, 2.0)),
-    Condition("40% wrong, noise 3 times the stated", understated=3.0),
-    Condition("40% wrong, one slanted plane", flat=True),
-    Condition("40% wrong, forward motion", pose=Rigid3(np.eye(3), [0.0, 0.0, -150.0])),
-    Condition(
-        "40% wrong, baseline 2% of the depth", pose=Rigid3(exp_so3(np.array([0.0, 0.02, 0.0])), [-27.0, 0.0, 0.0])
-    ),
-    Condition("40% wrong, 60 matches", count=60),
-    Condition("40% wrong, 2000 matches", count=2000),
-)
-
-
-def scene(rng: np.random.Generator, count: int, like: Condition = PLAIN) -> Matches:
-    """Return matches in view of both cameras with noisy affinities of random facets."""
-    X = rng.uniform([-350, -300, 900], [350, 300, 1800], (count, 3))
-    if like.flat:
-        X[:, 2] = 1300.0 + 0.8 * X[:, 0] + 0.3 * X[:, 1]
-    q1, q2 = CAMERA.project(X)[0], CAMERA.project(like.pose.apply(X))[0]
-    exact = Matches.from_cameras(CAMERA, CAMERA, q1, q2)
-    facets = unit(-unit(X) + 0.4 * rng.normal(size=X.shape))
-    A21 = affines_from_normals(*jacobians(exact, X, like.pose), facets)[0] + rng.normal(size=(count, 2, 2)) * SIGMA_A
-    noise1, noise2 = (rng.normal(size=q1.shape) * like.noise_px * like.understated for _ in range(2))
-    sigma = np.full(count, like.noise_px)
-    return Matches.from_cameras(
-        CAMERA,
-        CAMERA,
-        q1 + noise1,
-        q2 + noise2,
-        sigma1_px=sigma,
-        sigma2_px=sigma,
-        A21=A21,
-        sigma_A=np.full(count, SIGMA_A),
-    )
-
-
-def jacobians(m: Matches, points: np.ndarray, pose: Rigid3 = POSE) -> tuple[np.ndarray, np.ndarray]:
-    return pair_projection_jacobians(points, m.rays1, m.jacobians1, m.rays2, m.jacobians2, pose)
 
 
 def noisy_directions(rng: np.random.Generator, A21: np.ndarray, count: int) -> DirectionPairs:
@@ -189,42 +130,6 @@ def affine_rows(corners: int) -> Iterator[Row]:
     )
 
 
-def loop_affine(method: str, d1: np.ndarray, d2: np.ndarray, n1: np.ndarray, n2: np.ndarray) -> np.ndarray:
-    """One corner as one would write it from the paper, with numpy's dense solvers."""
-    if method in ("2SDIR", "3SDIR"):
-        k = 2 if method == "2SDIR" else len(d1)
-        return np.linalg.lstsq(d1[:k], d2[:k], rcond=None)[0].T
-    rows = np.array(
-        [np.outer([-b[1], b[0]], a).ravel() / np.hypot(*a) / np.hypot(*b) for a, b in zip(d1, d2, strict=True)]
-    )
-    if method == "DET3UDIR":
-        B = np.fliplr(np.diag([1.0, -1.0, -1.0, 1.0]))
-        values, vectors = np.linalg.eig(B @ (rows.T @ rows))
-        shapes = np.real(vectors).T.reshape(-1, 2, 2)
-        determinants = np.linalg.det(shapes)
-        best = min((v, i) for i, v in enumerate(np.real(values)) if determinants[i] > 0.0)[1]
-        area = np.linalg.det(d2[:2]) / np.linalg.det(d1[:2])
-        # Noise can reverse the order of two directions; then there is no scale, here as in rigkit.
-        A = shapes[best] * np.sqrt(area / determinants[best] if area > 0.0 else np.nan)
-        return A * np.sign(np.sum(d2 * (d1 @ A.T)))
-    k = 2 if method == "F2UDIR" else len(d1)
-    A0 = -np.outer(n2, n1) / (n2 @ n2)
-    m = np.array([-n2[1], n2[0]]) / np.hypot(*n2)
-    free = np.stack([np.outer(m, [1.0, 0.0]).ravel(), np.outer(m, [0.0, 1.0]).ravel()], axis=1)
-    y = np.linalg.lstsq(rows[:k] @ free, -rows[:k] @ A0.ravel(), rcond=None)[0]
-    return A0 + np.outer(m, y)
-
-
-def loop_normal(J1: np.ndarray, J2: np.ndarray, A: np.ndarray) -> np.ndarray:
-    """One normal with numpy's dense solvers."""
-    d = np.cross(J1[0], J1[1])
-    d /= np.linalg.norm(d)
-    h = J2 @ d
-    y = (J2 @ np.linalg.pinv(J1) - A).T @ h / (h @ h)
-    n = -(J1.T @ y + d)
-    return n / np.linalg.norm(n)
-
-
 def epipolar_rows() -> Iterator[Row]:
     """Planar and minimal solvers, poses, corrections and triangulation."""
     rng = np.random.default_rng(0)
@@ -273,21 +178,6 @@ def planar_rows(rng: np.random.Generator, problems: int = 20000, each: int = 10)
         f"planar, {each} correspondences", problems, lambda: solve_planar_batch(made), remark, loop=(LOOPED, loop)
     )
     yield row("the same with making the equations", problems, lambda: solve_planar_batch(grams()))
-
-
-def loop_planar(gram: np.ndarray) -> np.ndarray:
-    """One planar problem: the concave dual by golden section, then both pairs of entries scaled to length one."""
-    J = np.diag([1.0, -1.0, -1.0, 1.0])
-    low, high = -2.0 * np.trace(gram), 2.0 * np.trace(gram)
-    golden = (np.sqrt(5.0) - 1.0) / 2.0
-    for _ in range(60):
-        a, b = high - golden * (high - low), low + golden * (high - low)
-        if np.linalg.eigvalsh(gram + a * J)[0] < np.linalg.eigvalsh(gram + b * J)[0]:
-            low = a
-        else:
-            high = b
-    e = np.linalg.eigh(gram + 0.5 * (low + high) * J)[1][:, 0]
-    return e / np.sqrt([e[0] ** 2 + e[3] ** 2, e[1] ** 2 + e[2] ** 2, e[1] ** 2 + e[2] ** 2, e[0] ** 2 + e[3] ** 2])
 
 
 def minimal_rows(rng: np.random.Generator, problems: int = 2000) -> Iterator[Row]:
@@ -382,84 +272,9 @@ def robust_rows() -> Iterator[Row]:
             yield Row(f"robust pose, {like.name}: {name}", rates[name], ratios, remark)
 
 
-def contaminated(rng: np.random.Generator, like: Condition = PLAIN) -> Matches:
-    m = scene(rng, like.count, like)
-    wrong = rng.random(like.count) < like.outliers
-    q2, A21 = np.array(m.pixels2), np.array(m.A21)
-    q2[wrong] = rng.uniform([0, 0], CAMERA.size_px, (wrong.sum(), 2))
-    A21[wrong] = np.eye(2) + 0.4 * rng.normal(size=(wrong.sum(), 2, 2))
-    sigma = m.sigma1_px
-    return Matches.from_cameras(
-        CAMERA, CAMERA, m.pixels1, q2, sigma1_px=sigma, sigma2_px=sigma, A21=A21, sigma_A=m.sigma_A
-    )
-
-
 def pose_errors(pose: Rigid3, true: Rigid3) -> tuple[float, float]:
     turn = float(rotation_angle(pose.rotation @ true.rotation.T))
     return turn, float(angle_between(pose.translation_mm, true.translation_mm))
-
-
-def opencv_robust(m: Matches) -> Rigid3:
-    E21, mask = cv2.findEssentialMat(
-        m.pixels1, m.pixels2, CAMERA.K, method=cv2.USAC_MAGSAC, prob=0.999, threshold=3.0 * m.sigma1_px[0]
-    )
-    _, R, t, _ = cv2.recoverPose(E21, m.pixels1, m.pixels2, CAMERA.K, mask=mask)
-    return Rigid3(R, t[:, 0])
-
-
-def colmap_robust(m: Matches) -> Rigid3 | None:
-    pycolmap = optional("pycolmap")
-    if pycolmap is None:
-        return None
-    fx, fy, cx, cy = CAMERA.parameters
-    # COLMAP puts (0.5, 0.5) at the centre of the first pixel.
-    size = dict(zip(("width", "height"), CAMERA.size_px, strict=True))
-    camera = pycolmap.Camera(model="PINHOLE", params=[fx, fy, cx + 0.5, cy + 0.5], **size)
-    options = pycolmap.TwoViewGeometryOptions()
-    options.compute_relative_pose = True
-    options.ransac.random_seed = 0
-    options.ransac.max_error = 3.0 * m.sigma1_px[0]
-    pairs = np.repeat(np.arange(len(m), dtype=np.uint32)[:, None], 2, axis=1)
-    found = pycolmap.estimate_calibrated_two_view_geometry(
-        camera, m.pixels1 + 0.5, camera, m.pixels2 + 0.5, pairs, options
-    )
-    return Rigid3.from_matrix(found.cam2_from_cam1.matrix())
-
-
-def poselib_robust(m: Matches) -> Rigid3 | None:
-    poselib = optional("poselib")
-    if poselib is None:
-        return None
-    options = {"max_epipolar_error": 3.0 * m.sigma1_px[0], "seed": 0}
-    pose, _ = poselib.estimate_relative_pose(m.pixels1, m.pixels2, poselib_camera(), poselib_camera(), options)
-    return Rigid3(pose.R, pose.t)
-
-
-def poselib_refine(m: Matches) -> tuple[int, Callable[[], object]] | None:
-    poselib = optional("poselib")
-    if poselib is None:
-        return None
-    start = poselib.CameraPose()
-    start.R, start.t = POSE.rotation, unit(POSE.translation_mm)
-    camera = poselib_camera()
-    return 1, lambda: poselib.refine_relative_pose(m.pixels1, m.pixels2, start, camera, camera)
-
-
-def poselib_camera() -> dict[str, Any]:
-    return {
-        "model": "PINHOLE",
-        "width": CAMERA.size_px[0],
-        "height": CAMERA.size_px[1],
-        "params": CAMERA.parameters.tolist(),
-    }
-
-
-def optional(name: str) -> Any:
-    """Return a module, or None where it is not installed."""
-    try:
-        return __import__(name)
-    except ImportError:
-        return None
 
 
 def main() -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import sys
 from typing import Any
 
@@ -24,13 +24,8 @@ LOOP_ABS = 1e-8
 
 @pytest.fixture(scope="module")
 def core() -> Any:
-    spec = importlib.util.spec_from_file_location("benchmark_core", REPOSITORY / "scripts" / "benchmark_core.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["benchmark_core"] = module
-    spec.loader.exec_module(module)
-    return module
+    sys.path.insert(0, str(REPOSITORY / "scripts"))
+    return importlib.import_module("benchmark_core")
 
 
 @pytest.mark.parametrize("count", [3, 6])

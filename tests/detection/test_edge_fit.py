@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from kernels.reference.edges import PARAMETERS, _edge, collect, linearise, pattern_of
+from kernels.reference.edge_model import PARAMETERS, _edge, collect, linearise, pattern_of
 
 from rigkit.detection.subpixel.edge_fit import fit_edges
 from rigkit.detection.subpixel.edge_model import PIXEL_KURTOSIS, Geometry

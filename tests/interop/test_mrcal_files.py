@@ -1,0 +1,66 @@
+"""Files of mrcal: splines of fisheyes, what mrcal itself projects, poses in metres."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.cameras import sample_cameras
+
+from rigkit.cameras.compare import compare_cameras
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
+from rigkit.interop.mrcal import _spline_project, read_cameramodel, write_cameramodel
+
+CAMERAS = sample_cameras()
+SAME_PX = 1e-9
+"""As mrcal prints every digit of a double."""
+SPLINE_PX = 0.01
+"""A lens without a fold in its image is followed by knots 30 px apart to thousandths of a pixel."""
+
+SPLINE_FOLD_PX = 0.5
+"""Where the image reaches the fold, d pixel / d angle goes to zero and the spline in the angle misses a little."""
+
+BETWEEN_SAMPLES = 1.1
+"""The largest error stated is that of samples; at the very corner it may be a little larger."""
+
+
+@pytest.mark.parametrize(
+    ("label", "limit_px"),
+    [("kannala_brandt_folding", SPLINE_FOLD_PX), ("scaramuzza", SPLINE_PX), ("double_sphere", SPLINE_PX)],
+)
+def test_mrcal_spline_of_a_fisheye(label: str, limit_px: float) -> None:
+    """A fisheye goes into mrcal as a spline and comes back as a polynomial."""
+    camera = CAMERAS[label]
+    written = write_cameramodel(camera)
+    assert "SPLINED_STEREOGRAPHIC" in written.text
+    assert written.max_error_px < limit_px
+    assert written.covered > 0.99
+    again, pose, error_px = read_cameramodel(written.text)
+    assert pose.allclose(Rigid3.identity())
+    assert compare_cameras(camera, again, fit_rotation=False).max_px < BETWEEN_SAMPLES * error_px + limit_px
+
+
+def test_mrcal_spline_is_mrcals() -> None:
+    """Pixels as mrcal 2.2 itself projects these rays (mrcal.project), the third near the edge of the knots."""
+    lens = "LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_Nx=8_Ny=6_fov_x_deg=150"
+    intrinsics = np.concatenate([[300.0, 310.0, 640.0, 480.0], 0.05 * np.sin(np.arange(96))])
+    rays = np.array([[0.0, 0.0, 1.0], [0.5, -0.2, 1.0], [-1.5, 0.6, 1.0]])
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    pixels, inside = _spline_project(rays, lens, intrinsics)
+    theirs = [
+        [639.8924447898148, 480.6909602676],
+        [781.5908149961523, 420.9743781906921],
+        [331.82264976261104, 610.1345402377215],
+    ]
+    assert inside.all()
+    assert np.abs(pixels - theirs).max() < SAME_PX
+
+
+def test_mrcal_pose_is_in_metres() -> None:
+    pose = Rigid3(exp_so3(np.array([0.1, -0.2, 0.05])), [-300.0, 10.0, 5.0])
+    camera, again, error_px = read_cameramodel(write_cameramodel(CAMERAS["brown"], pose).text)
+    assert again.allclose(pose)
+    assert error_px == 0.0
+    assert camera.model == "brown"
+    newer = write_cameramodel(CAMERAS["brown"], pose).text.replace("'extrinsics'", "'rt_cam_ref'")
+    assert read_cameramodel(newer)[1].allclose(pose)
