@@ -24,11 +24,10 @@ from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, BenchScene
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
+from rigkit.detection.subpixel.edge_fit import ROUNDING_VARIANCE
 from rigkit.synthetic.photometry import develop
 from rigkit.synthetic.render import Optics
 
-ROUNDING_VARIANCE = 1.0 / 12.0
-"""Of rounding to whole grey levels, which is noise wherever brightness varies: it bounds noise-free images, too."""
 SHIFT_PX = 0.07
 """Half width of the differences: the third derivative of an edge of blur 0.3 adds less than one per cent."""
 BLUR_STEP_PX = 0.02

@@ -11,14 +11,12 @@ from typing import ClassVar, Self
 import numpy as np
 
 from rigkit.cameras.base import Camera, RadialCurve
-from rigkit.cameras.monotone import first_root, horner
+from rigkit.cameras.monotone import KNOTS, first_root, horner
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import InputError
 
 FARTHEST = 50.0
 """Tangent of 88.9 degrees: no lens of this kind sees further."""
-KNOTS = 129
-"""Samples of the radial curve from which its inverse starts."""
 MAX_INVERSE_STEPS = 30
 NEWTON_SETTLED = 1e-13
 """Newton in the plane stops where the next step would be this small, in units of the focal length."""

@@ -12,12 +12,9 @@ from typing import ClassVar, Self
 import numpy as np
 
 from rigkit.cameras.base import RadialCurve
-from rigkit.cameras.monotone import first_root, horner, invert_increasing
+from rigkit.cameras.monotone import KNOTS, first_root, horner, invert_increasing
 from rigkit.cameras.radial import FocalCamera, ScaleDerivatives
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
-
-KNOTS = 129
-"""Samples of the curve from which its inverse starts; Newton does the rest."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

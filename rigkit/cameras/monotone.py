@@ -21,6 +21,9 @@ MAX_BISECTIONS = 60
 CELLS_PER_KNOT = 4
 """The table is looked up in equal cells of the target, found by a division instead of a search."""
 
+KNOTS = 129
+"""Samples of a radial curve from which its inverse starts; Newton does the rest."""
+
 
 def horner(coefficients: FloatArray, x: FloatArray) -> FloatArray:
     """Return sum_k coefficients[k] x^k."""

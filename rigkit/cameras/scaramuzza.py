@@ -13,7 +13,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from rigkit.cameras.base import RadialCurve, image_center
-from rigkit.cameras.monotone import first_root, horner, invert_increasing
+from rigkit.cameras.monotone import KNOTS, first_root, horner, invert_increasing
 from rigkit.cameras.radial import RadialCamera, ScaleDerivatives
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.errors import InputError
@@ -23,8 +23,6 @@ DEFAULT_DEGREE = 6
 """Follows a lens of 185 degrees; degree 4 is enough to about 120, 200 degrees need 8."""
 BEYOND_CORNERS = 1.5
 """The polynomial is taken to hold out to this multiple of the distance to the farthest corner of the image."""
-KNOTS = 129
-"""Samples of angle(rho) from which the inverse starts; Newton does the rest."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -16,14 +16,13 @@ from rigkit.core.errors import InputError
 from rigkit.io.files import write_atomic
 from rigkit.io.images import read_image
 from rigkit.io.reading import read_text
+from rigkit.io.rig_session import ONE
 
 _log = logging.getLogger(__name__)
 
 FRAME_NAME = "frame-{:04d}.png"
 KEPT = re.compile(r"frame-(\d{4,6})\.png")
 FRAME_FOLDER = "images"
-ONLY = "camera"
-"""What a camera is called that is the only one."""
 
 
 def folder_of(name: str, count: int) -> str:
@@ -35,7 +34,7 @@ class Keeper:
     """A session's folder: `session.toml`, the boards' files, and `images/frame-0001.png` and on; of several cameras
     `images/NAME/frame-0001.png`."""
 
-    def __init__(self, folder: Path, files: dict[Path, str], names: Sequence[str] = (ONLY,)) -> None:
+    def __init__(self, folder: Path, files: dict[Path, str], names: Sequence[str] = (ONE,)) -> None:
         """Make the folder, or go on with it. `files` (path -> text) are the session and its boards, `names` those of
         the cameras.
 

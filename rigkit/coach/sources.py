@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.errors import InputError
-from rigkit.io.images import read_image
+from rigkit.io.images import IMAGE_ENDINGS, read_image
 from rigkit.io.rig_session import frames_of_images
 
 POLL_S = 0.3
 SETTLED_S = 0.2
 """A file that has not grown for so long is whole."""
-ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"}
 
 Frame = list[NDArray[Any]]
 """An image a camera, taken together."""
@@ -65,7 +64,7 @@ def _settled(path: Path) -> bool:
 
 def _pictures(folder: Path) -> list[Path]:
     try:
-        return sorted(path for path in folder.iterdir() if path.suffix.lower() in ENDINGS)
+        return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_ENDINGS)
     except OSError as error:
         raise InputError(f"coach: '{folder}' cannot be read any more: {error.strerror}; start again") from error
 

@@ -14,6 +14,8 @@ from rigkit.cameras.registry import camera_model
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 
+MM_PER_M = 1000.0
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Accepted:

@@ -14,6 +14,7 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.interop.exchange import (
+    MM_PER_M,
     Accepted,
     Written,
     best_accepted,
@@ -34,7 +35,6 @@ KALIBR_ACCEPTS = (
     Accepted("eucm"),
     Accepted("double_sphere"),
 )
-MM_PER_M = 1000.0
 CAMERA = re.compile(r"cam[0-9]{1,3}")
 
 

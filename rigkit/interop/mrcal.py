@@ -20,13 +20,12 @@ from rigkit.core.arrays import BoolArray, FloatArray, Pixels, Rays
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
-from rigkit.interop.exchange import Accepted, Written, best_accepted, camera_of, field, image_size, numbers
+from rigkit.interop.exchange import MM_PER_M, Accepted, Written, best_accepted, camera_of, field, image_size, numbers
 
 MRCAL_ACCEPTS = (Accepted("pinhole"), Accepted("brown", 4), Accepted("brown", 5), Accepted("brown", 8))
 SPLINED = re.compile(
     r"^LENSMODEL_SPLINED_STEREOGRAPHIC_(?:spline_)?order=(?P<order>\d)_Nx=(?P<nx>\d{1,4})_Ny=(?P<ny>\d{1,4})_fov_x_deg=(?P<fov>\d{1,3})$"
 )
-MM_PER_M = 1000.0
 KNOTS_X = 40
 MAX_KNOTS_Y = 160
 """An image that is four times as high as wide, in angle: damage rather than a lens, and 330 MB of equations."""

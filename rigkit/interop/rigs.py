@@ -12,6 +12,7 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.interop.colmap_cameras import write_colmap_cameras
 from rigkit.interop.colmap_model import quaternion_wxyz
+from rigkit.interop.exchange import MM_PER_M
 from rigkit.interop.kalibr import write_kalibr
 from rigkit.interop.mrcal import write_cameramodel
 from rigkit.interop.opencv_stereo import opencv_stereo
@@ -19,7 +20,6 @@ from rigkit.interop.ros import write_camera_info
 
 Rig = Mapping[str, tuple[Camera, Rigid3]]
 """Camera and cam_from_rig (mm) by name."""
-MM_PER_M = 1000.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.errors import InputError
-from rigkit.io.animation import frame_count
+from rigkit.io.animation import PNG_START, frame_count
 from rigkit.io.image_size import announced_size
 from rigkit.io.reading import read_bytes
 from rigkit.io.tiff import as_stored, page_count
@@ -26,6 +26,7 @@ from rigkit.io.tiff import as_stored, page_count
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 """(H, W) grey or (H, W, 3) red green blue."""
 
+IMAGE_ENDINGS = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp")
 MAX_PIXELS = 200_000_000
 """Of an image: the largest sensors have 150 million; with detection that is 4 GB."""
 JPEG_START = b"\xff\xd8"
@@ -34,7 +35,6 @@ JPEG_SCAN = 0xDA
 JPEG_STANDALONE = {0x01, *range(0xD0, 0xD8)}
 JPEG_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 """In entropy-coded data 0xff is followed by 0 (stuffing), a restart mark or 0xff (fill): else it is a marker."""
-PNG_START = b"\x89PNG\r\n\x1a\n"
 BMP_START = b"BM"
 
 

@@ -16,14 +16,13 @@ from rigkit.core.truth import PairTruth
 from rigkit.identification.board_ids import BOARD_SIDES
 from rigkit.io.board_file import board_from_table, load_board
 from rigkit.io.reading import usable_path
-from rigkit.io.session import files_of_session
+from rigkit.io.session import SESSION_NAME, files_of_session
 from rigkit.io.toml_reader import TomlTable, read_toml
 from rigkit.io.truth_csv import load_truth_csv
 from rigkit.io.truth_file import truth_from_table
 
 DATASET_SCHEMA = "rigkit.dataset/1"
 MANIFEST = "dataset.toml"
-SESSION = "session.toml"
 
 Entry = TypeVar("Entry")
 
@@ -197,7 +196,7 @@ def _board(table: TomlTable) -> Board:
 def _camera(table: TomlTable) -> CameraEntry:
     camera_id = table.identifier("id", hint='id = "left"')
     calibration = table.path_to("calibration", hint='calibration = "calibration.json"')
-    session: Path | None = calibration.with_name(SESSION)
+    session: Path | None = calibration.with_name(SESSION_NAME)
     if table.has("session"):
         session = table.path_to("session", hint='session = "session.toml"')
         if not session.is_file():
@@ -206,7 +205,8 @@ def _camera(table: TomlTable) -> CameraEntry:
         session = None
     if session is None and not calibration.is_file():
         raise table.error(
-            f"calibration '{calibration}' does not exist, nor a {SESSION} beside it to calibrate from; correct the path"
+            f"calibration '{calibration}' does not exist, nor a {SESSION_NAME} beside it to calibrate from; correct the "
+            "path"
         )
     table.done()
     return CameraEntry(camera_id, calibration, session)

@@ -14,9 +14,8 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
 from rigkit.io.board_file import board_values
+from rigkit.io.images import IMAGE_ENDINGS
 from rigkit.io.manifest import DATASET_SCHEMA
-
-IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"}
 
 SIDES = (
     (re.compile(r"(left|_l|-l|view1|cam1|_1|-1|a)$", re.IGNORECASE), 1),
@@ -69,9 +68,9 @@ def find_images(folder: Path) -> list[Path]:
     """Return all images below `folder`, sorted; raises InputError where there are none, or a name is no text."""
     if not folder.is_dir():
         raise InputError(f"init: '{folder}' is not a folder; give the folder that holds the images")
-    images = sorted(p for p in folder.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
+    images = sorted(p for p in folder.rglob("*") if p.suffix.lower() in IMAGE_ENDINGS and p.is_file())
     if not images:
-        raise InputError(f"init: no images ({', '.join(sorted(IMAGE_SUFFIXES))}) under '{folder}'")
+        raise InputError(f"init: no images ({', '.join(IMAGE_ENDINGS)}) under '{folder}'")
     unspeakable = [path for path in images if path.name != path.name.encode("utf-8", "ignore").decode()]
     if unspeakable:
         raise InputError(

@@ -27,6 +27,7 @@ from rigkit.io.board_file import load_board
 from rigkit.io.toml_reader import TomlTable, named_path, read_toml
 
 SESSION_SCHEMA = "rigkit.session/1"
+SESSION_NAME = "session.toml"
 HINT_BOARD = 'board = "board.toml" (or boards = ["a.toml", "b.toml"])'
 
 

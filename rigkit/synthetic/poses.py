@@ -14,6 +14,7 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rotation import exp_so3, unit
+from rigkit.synthetic.pairs import PLANAR_YAW_DEG
 
 CAMERA_RANGE_MM = (900.0, 1300.0)
 """Distance of the cameras of general pairs from the corner of the room."""
@@ -21,7 +22,6 @@ MIN_INCIDENCE = 0.35
 """Smallest |cosine| between a viewing ray and a board's normal."""
 ROLL_DEG = 30.0
 AIM_JITTER_DEG = 8.0
-PLANAR_YAW_DEG = 10.0
 DRAWS = 4000
 """Candidates drawn at a time by rejection sampling."""
 MAX_DRAWS = 200

@@ -12,18 +12,15 @@ from rigkit.core.errors import InputError, RigkitError
 from rigkit.core.progress import Progress, silent
 from rigkit.io.board_words import board_of_words
 from rigkit.io.files import ensure_writable, write_together
+from rigkit.io.images import IMAGE_ENDINGS
 from rigkit.io.reading import about, read_bytes, usable_path
 from rigkit.io.rig_session import RigSession, is_rig_session, load_rig_session
-from rigkit.io.session import Session, load_session
+from rigkit.io.session import SESSION_NAME, Session, load_session
 from rigkit.io.video import VIDEO_ENDINGS, is_video
 from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration, calibrate_session, session_inputs
 from rigkit.workflows.calibrate_rig import RigSessionCalibration, calibrate_rig_session
-from rigkit.workflows.detect import IMAGE_ENDINGS
 from rigkit.workflows.folder_session import session_of_folders
 from rigkit.workflows.frames import frames_folder, frames_of_video, frames_of_videos, timestamps_beside, with_frames
-
-SESSION_NAME = "session.toml"
-"""The session that is kept in a folder of images for the next time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -22,6 +22,7 @@ from rigkit.coach.sources import Frame, device_frames, video_frames, watched_fra
 from rigkit.core.errors import InputError, RigkitError
 from rigkit.core.findings import worst
 from rigkit.io.files import ensure_folder_writable
+from rigkit.io.session import SESSION_NAME
 from rigkit.planning.goal import Goal
 from rigkit.validation.certificate.contracts import Task
 from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration
@@ -30,7 +31,6 @@ from rigkit.workflows.corners import Cache
 from rigkit.workflows.folder_session import session_to_come
 from rigkit.workflows.next_views import goal_of
 
-SESSION = "session.toml"
 LOCALHOST, EVERYWHERE = "127.0.0.1", "0.0.0.0"
 LAN_WARNING = (
     "--lan: everybody in this network who has the address sees the pictures, and nothing is encrypted; the address "
@@ -100,7 +100,9 @@ def finished_words(folder: Path) -> str:
 
     Raises as `calibrate_session_file`.
     """
-    done = calibrate_session_file(folder / SESSION, CalibrateOptions(report=Path(), force=True, cache=Cache.UPDATE))
+    done = calibrate_session_file(
+        folder / SESSION_NAME, CalibrateOptions(report=Path(), force=True, cache=Cache.UPDATE)
+    )
     if isinstance(done, SessionCalibration):
         what, c = done.calibration.camera.model, done.calibration
         return _finished(what, c.rms_px, c.heldout_rms_px, worst(c.verdicts), done.written[0])

@@ -26,13 +26,11 @@ from rigkit.detection.lattices import MIN_BOARD_CORNERS
 from rigkit.io.board_words import board_of_words
 from rigkit.io.corners_file import write_corners
 from rigkit.io.files import ensure_writable, write_atomic
-from rigkit.io.images import read_image
+from rigkit.io.images import IMAGE_ENDINGS, read_image
 from rigkit.io.video import is_video
 from rigkit.report.overlay import draw_boards
 from rigkit.workflows.camera_files import import_camera
 from rigkit.workflows.frames import VideoFrames, frames_folder, frames_of_video
-
-IMAGE_ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -160,7 +158,7 @@ def images_in(paths: Sequence[Path]) -> Iterator[Path]:
         if path.is_dir():
             inside = sorted(p for p in path.iterdir() if p.suffix.lower() in IMAGE_ENDINGS)
             if not inside:
-                raise InputError(f"folder '{path}' has no images ({' '.join(sorted(IMAGE_ENDINGS))}); give another")
+                raise InputError(f"folder '{path}' has no images ({' '.join(IMAGE_ENDINGS)}); give another")
         elif not path.exists():
             raise InputError(f"image '{path}' does not exist; check the path")
         for image in inside:

@@ -14,8 +14,8 @@ from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier
 from rigkit.io.board_file import board_text
 from rigkit.io.board_words import WORDS_HELP, board_in_words, board_of_words
-from rigkit.io.session import SESSION_SCHEMA
-from rigkit.workflows.detect import IMAGE_ENDINGS
+from rigkit.io.images import IMAGE_ENDINGS
+from rigkit.io.session import SESSION_NAME, SESSION_SCHEMA
 from rigkit.workflows.identify_board import suggested_words
 
 SIDE = r"left|right|cam(?:era)?[_-]?\d{1,3}"
@@ -149,7 +149,7 @@ def session_to_come(patterns: Mapping[str, str], boards: Sequence[str], place: P
         for name, pattern in patterns.items():
             check_identifier(name, "camera")
             lines += ["", "[[cameras]]", f"id = {_quoted(name)}", f"images = {_quoted(pattern)}"]
-    path = place / "session.toml"
+    path = place / SESSION_NAME
     files[path] = "\n".join(lines) + "\n"
     return FolderSession(path, files)
 
@@ -182,7 +182,7 @@ def cameras_in(folders: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
     inside = [p for p in folder.iterdir() if p.is_dir() and SIDE_FOLDER.fullmatch(p.name) and _images(p)]
     if len(inside) < 2:
         raise InputError(
-            f"folder '{folder}' has no images ({' '.join(sorted(IMAGE_ENDINGS))}), nor folders left and right with "
+            f"folder '{folder}' has no images ({' '.join(IMAGE_ENDINGS)}), nor folders left and right with "
             "some; give the folder of a camera's images, or one folder a camera"
         )
     return _one_each(sorted(inside, key=lambda p: _natural(p.name)))
@@ -202,7 +202,7 @@ def _one_each(folders: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
             raise InputError(f"two folders are called '{name}', which names a camera; rename one")
         images = _images(folder)
         if not images:
-            raise InputError(f"folder '{folder}' has no images ({' '.join(sorted(IMAGE_ENDINGS))}); give another")
+            raise InputError(f"folder '{folder}' has no images ({' '.join(IMAGE_ENDINGS)}); give another")
         out[name] = [(folder, f"*{suffix}") for suffix in _suffixes(images)]
     return out
 

@@ -25,9 +25,9 @@ from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.report.figures import cloud_png
 from rigkit.workflows.camera_files import import_rig
 from rigkit.workflows.pairs import read_for
+from rigkit.workflows.reconstruct_scene import CLOUD
 from rigkit.workflows.results import require_folder, write_results
 
-CLOUD = "scene.ply"
 PARTNERS = 3
 """Views nearest to each that it is paired with."""
 MAX_AXES_DEG = 60.0

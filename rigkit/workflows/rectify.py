@@ -16,14 +16,13 @@ from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.files import ensure_writable, write_atomic, write_together
-from rigkit.io.images import quiet_opencv, read_image, require_pixels
+from rigkit.io.images import IMAGE_ENDINGS, quiet_opencv, read_image, require_pixels
 from rigkit.io.reading import about
 from rigkit.rectification.crop import cropped
 from rigkit.rectification.rectify import RectifyMap, rectify_map, rotation_from_view_angles
 from rigkit.rectification.stereo import StereoRectification, rectify_pair
 from rigkit.rectification.targets import target_camera
 from rigkit.workflows.camera_files import import_camera, import_rig
-from rigkit.workflows.detect import IMAGE_ENDINGS
 
 Jobs = list[tuple[list[tuple[Path, Path]], RectifyMap]]
 """Of each map: the images, and where they go."""
@@ -152,7 +151,7 @@ def _outputs(image: Path, output: Path) -> list[tuple[Path, Path]]:
         return [(image, output)]
     found = sorted(path for path in image.iterdir() if path.suffix.lower() in IMAGE_ENDINGS)
     if not found:
-        raise InputError(f"rectify: folder '{image}' has no images ({' '.join(sorted(IMAGE_ENDINGS))}); give another")
+        raise InputError(f"rectify: folder '{image}' has no images ({' '.join(IMAGE_ENDINGS)}); give another")
     if output.suffix:
         raise InputError(f"rectify: '{image}' is a folder, so -o must name one too, not '{output.name}'")
     return [(path, output / (path.name if cv2.haveImageWriter(path.name) else f"{path.stem}.png")) for path in found]

@@ -19,6 +19,7 @@ from itertools import pairwise
 import numpy as np
 
 from rigkit.calibration.clustered import drawn_errors
+from rigkit.calibration.compare import SAME_CHANCE
 from rigkit.calibration.rig.board_rig import BoardRig
 from rigkit.calibration.uncertainty import projection_design
 from rigkit.cameras.base import Camera
@@ -28,8 +29,6 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import log_so3, skew
 
-SAME_CHANCE = 0.01
-"""Mounts this unlikely to be one and the same rig's are another rig's, or a rig's that was bent."""
 LENS_GRID = (24, 18)
 """Pixels (columns, rows) at which the lenses are compared."""
 WEIGHT_FLOOR_PX = 1e-6

@@ -7,13 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from rigkit.calibration.evidence import MIN_SIZE
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.shape import SHAPES, ShapeModel, released_groups, shape_model, warp_groups
 from rigkit.core.arrays import FloatArray, Points
-
-MIN_SIZE = 1e-4
-"""A prior falls to no less than this part of the usual one: on exact data it would fall to nothing."""
 
 
 def common_shape(observations: Observations, single: Sequence[Calibration]) -> tuple[ShapeModel, FloatArray]:

@@ -10,13 +10,11 @@ import numpy as np
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.uncertainty import transfer_uncertainty
 from rigkit.calibration.uncertainty import uncertainty_at_corners
-from rigkit.calibration.verdicts import with_headline
+from rigkit.calibration.verdicts import UNSURE_PX, with_headline
 from rigkit.core.findings import Finding, Severity
 
 FEW_SHARED = 5
 """A mount has six numbers: fewer shared boards leave hardly anything to check it by."""
-UNSURE_PX = 1.0
-"""Standard deviation, in the worst direction, of a projection or of where another camera's point must appear."""
 OVERDISPERSED = 2.0
 """Frames that disagree by this many times what the corners' scatter explains have an error in common."""
 WORSE = 1.5

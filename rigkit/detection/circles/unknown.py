@@ -9,16 +9,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rigkit.core.boards import Board
-from rigkit.core.patterns.circles import STAGGERS, Circles
+from rigkit.core.patterns.circles import NEIGHBOUR_DISTANCES, STAGGERS, Circles
 from rigkit.detection.circles.find import CircleGrid, find_grids
 from rigkit.detection.circles.place import placed_on
 from rigkit.detection.saddles.response import GreyImage
 
 MIN_SIDE_CIRCLES = 3
 """Rows and columns of the smallest grid that is told."""
-
-NEIGHBOURS_APART = {"regular": 1.0, "asymmetric": float(np.sqrt(0.5)), "hexagonal": 1.0}
-"""Of circles, in distances of two in a row."""
 
 
 @dataclass(eq=False, slots=True)
@@ -83,5 +80,5 @@ def guessed_circles(seen: CircleSightings) -> tuple[Board, tuple[int, ...]] | No
     if not seen.boards:
         return None
     best = max(seen.boards, key=lambda kind: (seen.boards[kind], kind[0] == "regular", -STAGGERS.index(kind[3]), kind))
-    diameter = round(float(np.median(seen.diameters)) * NEIGHBOURS_APART[best[0]], 2)
+    diameter = round(float(np.median(seen.diameters)) * NEIGHBOUR_DISTANCES[best[0]], 2)
     return _board(best, diameter), tuple(index for index, fits in seen.shown if best in fits)

@@ -23,9 +23,10 @@ from rigkit.reconstruction.growing.curvature import without_curvature
 from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKnowledge, grow, grow_both_ways
 from rigkit.reconstruction.growing.surface import GrownSurface, fit_surface, measure, own_planes
 from rigkit.reconstruction.growing.systematic import SystematicPose, pose_with_field
+from rigkit.reconstruction.metric import POSE_STEP_RAD
 from rigkit.reconstruction.reconstruct import Reconstruction, colours_at
 from rigkit.reconstruction.scene import MAX_RANGE_SIGMA, SceneReconstruction, in_unit
-from rigkit.reconstruction.scene_pose import KnownPose, fit_scene_pose, known_scene_pose
+from rigkit.reconstruction.scene_pose import GATE, KnownPose, fit_scene_pose, known_scene_pose
 from rigkit.relative_pose.solvers.pose import essential_from_pose, translation_basis
 from rigkit.relative_pose.solvers.weights import affinity_residuals
 
@@ -36,8 +37,6 @@ CLOUD_NODES = 80_000
 """Nodes of a cloud beyond which they lie further apart: of images of more than 1 MP."""
 MAX_DISTANCE_PX = 0.7
 """From the epipolar line, of a pair that is taken; more where the correspondences show more noise."""
-GATE = 3.3
-"""In standard deviations: one good pair in a thousand is lost."""
 MIN_GROWN = 100
 """Pairs grown, from which on the pose is estimated from them."""
 MOVED_RAD = np.deg2rad(0.5)
@@ -47,8 +46,6 @@ SHARED_ERROR = 0.5
 """Of the errors of pairs, in their median: no pair is much better than the others (measured: by likelihood)."""
 OVERLAP = 3.5
 """Pairs on the nodes of a pose whose windows share their pixels: 4 pi 4.2^2 px^2 of a window to 64 px^2 of a node."""
-POSE_STEP_RAD = 1e-5
-"""For central differences: far above rounding, far below where a plane bends."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

@@ -21,9 +21,8 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import unit
 from rigkit.reconstruction.growing.dense import DenseScene
+from rigkit.reconstruction.scene_pose import GATE
 
-GATE = 3.3
-"""In standard deviations: one good point in a thousand is not merged."""
 MAX_TURN_DEG = 45.0
 """Between the normals of two points of one surface: both sides of a thin board are two surfaces."""
 REACH_STEPS = 1.0

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from rigkit.affine.features import match_affine_features
+from rigkit.calibration.fit import CAUCHY_SIGMAS
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels
 from rigkit.core.errors import DegenerateError
 from rigkit.core.progress import Progress, silent
@@ -23,16 +24,15 @@ from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 from rigkit.planning.goal import Goal
 from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
 from rigkit.validation.sentinel.judge import SentinelCheck, judge_evidence
+from rigkit.validation.sentinel.whitened import NULL_RANK
 
 FEATURES = 2500
 MIN_FRAME_MATCHES = 40
 """Fewer matches of a frame may be of one surface, or wrong."""
 PARTS = 4
 """Columns and rows of the parts of an image that are taken as independent."""
-CAUCHY_SIGMAS = 2.5
 REACH_SIGMAS = 0.2
 """Derivatives are differences over this part of the standard deviations of theta."""
-NULL_RANK = 1e-9
 
 
 @dataclass(frozen=True, eq=False, slots=True)
