@@ -37,17 +37,16 @@ ASKED_DEG = 95.0
 GRID = (16, 12)
 """Pixels (columns, rows) at which it is asked whether boards were there."""
 MIN_SHARE_COVERED = 2.0 / 3.0
-"""Where boards were in less of the image than this, how sure the rest is counts as well,"""
+"""Where boards were in less of the image than this, the projection's uncertainty in the rest is judged, too."""
 MAX_TIMES_ERROR = 2.0
-"""which is uncertain by at most so many times the error of the corners,"""
+"""It may be this many times the error of the corners ..."""
 SMALL_PX = 0.1
-"""or of what is a good corner on real images."""
+"""... or of a good corner on real images, where that is larger."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Extent:
-    """Where in the image boards were: `pixels` (N, 2) of a grid at which one is asked to hold one, and whether one was
-    there (N,)."""
+    """Where in the image boards were: `pixels` (N, 2) of a grid over what boards can reach, `covered` (N,) by one."""
 
     pixels: Pixels
     covered: BoolArray

@@ -205,8 +205,8 @@ def _camera(table: TomlTable) -> CameraEntry:
         session = None
     if session is None and not calibration.is_file():
         raise table.error(
-            f"calibration '{calibration}' does not exist, nor a {SESSION_NAME} beside it to calibrate from; correct the "
-            "path"
+            f"calibration '{calibration}' does not exist, nor a {SESSION_NAME} beside it to calibrate from; correct "
+            "the path"
         )
     table.done()
     return CameraEntry(camera_id, calibration, session)

@@ -1,5 +1,5 @@
-"""Tags that stand alone: OpenCV finds dark quadrilaterals, their codes say which tags they are, and the tags each other
-whether that is so."""
+"""Tags that stand alone: OpenCV finds dark quadrilaterals, their codes identify them, and a tag that does not lie where
+the others have it is dropped."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ MIN_PERIMETER = 0.015
 """Of a quadrilateral, in widths of the image: tags of 8 px in 2000."""
 
 NEAR_PLACE, AGREEING_OTHERS = 0.25, 0.4
-"""A tag has another where the board has it, within so much of the way there, which a lens may bend, and is where this
-part of the others have it: a code read by chance stands alone."""
+"""Two tags agree where they lie to each other as on the board, within this part of their distance, for lenses distort;
+a tag is kept where this part of the others agree with it: a code read by chance agrees with none."""
 
 
 def placed_tags(image: GreyImage, board: TagBoard) -> FloatArray:
