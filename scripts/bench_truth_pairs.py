@@ -11,6 +11,7 @@ import numpy as np
 from bench_truth_cameras import PEER_FAILURES, kept_views
 from bench_truth_colmap import colmap_pair, colmap_rig
 from bench_truth_table import COLMAP, MRCAL, OPENCV, RIGKIT, Bench, Row
+from truth_marks import fit_similarity, lattice_affinities, mark_lattice
 
 from rigkit.affine.correspondences import Correspondences
 from rigkit.calibration.rig.result import RigCalibration
@@ -22,7 +23,6 @@ from rigkit.io.calibration_file import save_camera
 from rigkit.io.correspondences import write_correspondences
 from rigkit.io.images import read_image
 from rigkit.workflows.reconstruct_scene import SceneOptions, reconstruct_views
-from rigkit.workflows.truth_marks import fit_similarity, lattice_affinities, mark_lattice
 from rigkit.workflows.validate import ValidateOptions, validate_dataset
 
 CYLINDER_SEEN = {"201": (1325.0, 455.0), "202": (1000.0, 418.0)}

@@ -15,15 +15,6 @@ from rigkit.core.arrays import Affines, BoolArray, FloatArray
 from rigkit.core.matches import DirectionPairs
 
 
-def epipolar_alignment(directions: DirectionPairs, epipolar: EpipolarNormals) -> FloatArray:
-    """Return |unit(d2) . unit(n2)|, (N, K): 0 where a direction lies along its epipolar line and tells nothing."""
-    d2, n2 = directions.image2, epipolar.n2[:, None, :]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(
-            np.abs((d2 * n2).sum(-1)) / (np.hypot(d2[..., 0], d2[..., 1]) * np.hypot(n2[..., 0], n2[..., 1]))
-        )
-
-
 def usable_directions(
     directions: PlanarDirections, n2: FloatArray, count: int | None, min_conditioning: float
 ) -> BoolArray:

@@ -27,11 +27,6 @@ def needs_epipolar(method: str) -> bool:
     return _known(method).startswith("F")
 
 
-def needs_lengths(method: str) -> bool:
-    """Say whether `method` uses the lengths of the directions."""
-    return not needs_epipolar(method)
-
-
 def affines_from_directions(
     directions: DirectionPairs,
     method: str,

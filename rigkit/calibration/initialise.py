@@ -19,7 +19,7 @@ import numpy as np
 
 from rigkit.calibration.observations import Observations, median_of
 from rigkit.calibration.radial_alignment import TURN_SIGMAS, Alignment, align, distortion_centre
-from rigkit.calibration.state import State, evaluate
+from rigkit.calibration.state import State
 from rigkit.cameras.base import Camera, RadialCurve, image_center
 from rigkit.core.arrays import FloatArray, Mat3, Points
 from rigkit.core.errors import InputError
@@ -68,12 +68,6 @@ def initialise(
     epipole = distortion_centre(pixels, board, observations.weight, middle)
     if (np.abs(epipole - middle) < 0.5 * np.array(size_px)).all():
         yield from _starts(observations, pixels, board, epipole, size_px, model, order)
-
-
-def start_error(state: State, observations: Observations) -> float:
-    """Return the median distance in px between measured and projected corners."""
-    norm = evaluate(state, observations).norm(observations)
-    return float(np.median(norm[observations.present]))
 
 
 def _starts(

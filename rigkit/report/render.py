@@ -37,11 +37,6 @@ def drawing(svg: str) -> Any:
     return Markup(svg)
 
 
-def table_html(table: Table) -> str:
-    """Return one table as HTML: sigmas after ±, the paper's number in brackets, verdicts in colour."""
-    return render("table.html", table=shown_table(table))
-
-
 def shown_table(table: Table, pictures: Sequence[str | None] = ()) -> dict[str, Any]:
     """Return a table in words, as the template `table.html` shows it; `pictures`: a source for each row, or none."""
     words = [any(isinstance(row[j].value, str) for row in table.rows) for j in range(len(table.columns))]

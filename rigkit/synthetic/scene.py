@@ -15,7 +15,7 @@ import numpy as np
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Pixels, Points, as_array
 from rigkit.core.boards import Board
-from rigkit.core.detections import BoardDetection, BoardView
+from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import unit
@@ -107,15 +107,6 @@ def exact_detection(
         board.grid()[valid],
         pixels[valid],
         np.full(int(valid.sum()), sigma_px),
-    )
-
-
-def exact_view(
-    image: str, placed: PlacedBoard, camera: Camera, cam_from_world: Rigid3, *, sigma_px: float = 0.01
-) -> BoardView:
-    """Return `exact_detection` with its object points, for calibration."""
-    return BoardView.from_detection(
-        image, exact_detection(placed, camera, cam_from_world, sigma_px=sigma_px), [placed.board]
     )
 
 

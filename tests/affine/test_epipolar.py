@@ -8,9 +8,9 @@ from helpers.affine_scenes import FISHEYE, REGULAR, Corners, angles_deg, see, sp
 from tolerances import EXACT_REL
 
 from rigkit.affine.affinities import EpipolarNormals
-from rigkit.affine.epipolar import epipolar_alignment
 from rigkit.affine.normal import normals_from_affines
 from rigkit.affine.registry import affines_from_directions
+from rigkit.core.arrays import FloatArray
 from rigkit.core.matches import DirectionPairs
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, skew, unit
@@ -20,6 +20,15 @@ POSE = Rigid3(exp_so3(np.array([0.1, -0.3, 0.15])), [-260.0, 60.0, 90.0])
 BOARD = Rigid3(exp_so3(np.array([0.5, -0.4, 0.3])), [-100.0, -140.0, 900.0])
 STANDARD = Rigid3(np.eye(3), [-300.0, 0.0, 0.0])
 FORWARD = Rigid3(np.eye(3), [0.0, 0.0, -300.0])
+
+
+def epipolar_alignment(directions: DirectionPairs, epipolar: EpipolarNormals) -> FloatArray:
+    """Return |unit(d2) . unit(n2)|, (N, K): 0 where a direction lies along its epipolar line and tells nothing."""
+    d2, n2 = directions.image2, epipolar.n2[:, None, :]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(
+            np.abs((d2 * n2).sum(-1)) / (np.hypot(d2[..., 0], d2[..., 1]) * np.hypot(n2[..., 0], n2[..., 1]))
+        )
 
 
 @pytest.fixture(params=[REGULAR, FISHEYE], ids=["pinhole", "fisheye"])

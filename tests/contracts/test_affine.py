@@ -8,7 +8,7 @@ from helpers.affine_scenes import FISHEYE, REGULAR, Corners, see, turned
 from tolerances import EXACT_REL
 
 from rigkit.affine.affinities import DirectionNoise, EpipolarNormals
-from rigkit.affine.registry import AFFINE_METHODS, affines_from_directions, needs_epipolar, needs_lengths
+from rigkit.affine.registry import AFFINE_METHODS, affines_from_directions, needs_epipolar
 from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
 from rigkit.geometry.rigid3 import Rigid3
@@ -82,7 +82,7 @@ def test_lengths_matter_only_where_they_should(method: str, corners: Corners, rn
     stretched = DirectionPairs(image1=directions.image1, image2=directions.image2 * factor, valid=directions.valid)
     before = affines_from_directions(directions, method, epipolar=corners.epipolar).A21
     after = affines_from_directions(stretched, method, epipolar=corners.epipolar).A21
-    if needs_lengths(method):
+    if not needs_epipolar(method):
         assert np.nanmedian(np.abs(before - after)) > 0.01
     else:
         np.testing.assert_allclose(after, before, rtol=1e-7)
@@ -264,4 +264,4 @@ def test_misuse_is_refused_in_words(corners: Corners) -> None:
 
 def test_the_registry_knows_what_each_needs() -> None:
     assert [m for m in AFFINE_METHODS if needs_epipolar(m)] == ["F2UDIR", "F3UDIR"]
-    assert [m for m in AFFINE_METHODS if needs_lengths(m)] == ["DET3UDIR", "2SDIR", "3SDIR"]
+    assert [m for m in AFFINE_METHODS if not needs_epipolar(m)] == ["DET3UDIR", "2SDIR", "3SDIR"]

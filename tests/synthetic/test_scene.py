@@ -14,7 +14,7 @@ from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3, cam_from_world_look_at
 from rigkit.geometry.rotation import log_so3, skew
 from rigkit.synthetic.pairs import relative_pose, trihedral_pair
-from rigkit.synthetic.scene import PlacedBoard, exact_view, room_walls, trihedral
+from rigkit.synthetic.scene import PlacedBoard, exact_detection, room_walls, trihedral
 
 BOARDS = (Board("plane1", 8, 6, 50.0, 50.0), Board("plane2", 7, 6, 40.0, 42.0), Board("plane3", 6, 9, 45.0, 45.0))
 CAMERA = Pinhole((1624, 1240), np.array([1350.0, 1352.0, 805.0, 622.0]))
@@ -56,11 +56,12 @@ def test_walls_lie_behind_the_boards() -> None:
 
 def test_corners_outside_the_image_or_seen_from_behind_are_left_out() -> None:
     placed = PlacedBoard(BOARDS[0], Rigid3(np.eye(3), [0.0, 0.0, 1000.0]))
-    view = exact_view("image", placed, CAMERA, Rigid3.identity())
+    view = exact_detection(placed, CAMERA, Rigid3.identity())
     assert len(view.grid) == 48
     pixels = CAMERA.project(placed.points())[0]
     np.testing.assert_allclose(view.pixels, pixels, rtol=EXACT_REL)
-    cut = exact_view("image", placed, CAMERA, Rigid3(np.eye(3), [300.0, 0.0, 0.0]))
+    aside = Rigid3(np.eye(3), [300.0, 0.0, 0.0])
+    cut = exact_detection(placed, CAMERA, aside)
     width = CAMERA.size_px[0]
     shifted = CAMERA.project(placed.points() + np.array([300.0, 0.0, 0.0]))[0]
     assert 0 < len(cut.grid) < 48

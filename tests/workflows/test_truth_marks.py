@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import sys
+
 import cv2
 import numpy as np
 import pytest
+from helpers.data import REPOSITORY
 
 from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rotation import exp_so3
-from rigkit.workflows.truth_marks import fit_similarity, lattice_affinities, mark_lattice
+
+sys.path.insert(0, str(REPOSITORY / "scripts"))
+
+from truth_marks import fit_similarity, lattice_affinities, mark_lattice
 
 ROWS, COLUMNS, STEP_PX, HALF_PX = 6, 5, 60.0, 9.0
 MAX_CENTRE_PX = 0.05
