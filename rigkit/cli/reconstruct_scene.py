@@ -101,7 +101,8 @@ def run_scene(args: argparse.Namespace) -> int:
 
 
 def _run_rig(args: argparse.Namespace) -> int:
-    from rigkit.workflows.reconstruct_rig import CLOUD, RigSceneOptions, reconstruct_rig_views
+    from rigkit.workflows.reconstruct_rig import RigSceneOptions, reconstruct_rig_views
+    from rigkit.workflows.reconstruct_scene import CLOUD
 
     if not args.rig:
         raise InputError(

@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 from rigkit.cameras.base import Camera
 from rigkit.coach.coach import Coach
 from rigkit.coach.guide import GuideOptions
-from rigkit.coach.keeper import ONLY, Keeper, folder_of
+from rigkit.coach.keeper import Keeper, folder_of
 from rigkit.coach.server import LOCAL, coach_app, new_token, own_address, serve
 from rigkit.coach.sources import Frame, device_frames, video_frames, watched_frames
 from rigkit.core.errors import InputError, RigkitError
 from rigkit.core.findings import worst
 from rigkit.io.files import ensure_folder_writable
+from rigkit.io.rig_session import ONE
 from rigkit.io.session import SESSION_NAME
 from rigkit.planning.goal import Goal
 from rigkit.validation.certificate.contracts import Task
@@ -89,7 +90,7 @@ def _names(options: CoachOptions) -> tuple[str, ...]:
     names = [path.stem for path in (*options.watch, *options.video)] or [f"camera{n}" for n in options.device]
     names = names or [f"camera{n}" for n in range(options.cameras)]
     if len(names) == 1:
-        return (ONLY,)
+        return (ONE,)
     if len(set(names)) < len(names):
         raise InputError(f"coach: folders and videos name the cameras, and two are called alike: {', '.join(names)}")
     return tuple(names)

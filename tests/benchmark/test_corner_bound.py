@@ -9,9 +9,10 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.special import erf
 
-from rigkit.benchmark.corner_bound import ROUNDING_VARIANCE, corner_information, position_bound
+from rigkit.benchmark.corner_bound import corner_information, position_bound
 from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, BenchScene, bench_camera, one_board
 from rigkit.core.boards import Board
+from rigkit.detection.subpixel.edge_fit import ROUNDING_VARIANCE
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.synthetic.photometry import develop
 from rigkit.synthetic.render import Optics
