@@ -19,13 +19,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--inverse", action="store_true", help="the poses are hand_from_base")
     parser.add_argument("-o", "--output", type=Path, metavar="FILE.json", help="write the result")
     parser.add_argument("--force", action="store_true", help="replace an existing file")
+    parser.add_argument("--json", action="store_true", help="print the result for programs, as its file has it")
 
 
 def run(args: argparse.Namespace) -> int:
     import numpy as np
 
     from rigkit.cli.console import note, pose_in_words, progress_on_stderr
-    from rigkit.workflows.handeye import POSE_NAMES, HandEyeOptions, calibrate_hand_eye
+    from rigkit.workflows.handeye import POSE_NAMES, HandEyeOptions, calibrate_hand_eye, hand_eye_text
 
     options = HandEyeOptions(
         camera=args.camera,
@@ -37,6 +38,12 @@ def run(args: argparse.Namespace) -> int:
     )
     done = calibrate_hand_eye(args.poses, args.images, options, progress=progress_on_stderr())
     result = done.result
+    for error in done.unreadable:
+        note(f"left out: {error}")
+    code = ExitCode.BAD_INPUT if done.unreadable else ExitCode.WELL
+    if args.json:
+        print(hand_eye_text(result, options), end="")
+        return code
     turns, moves = result.sigmas()
     first, second = POSE_NAMES[args.board_on_hand]
     print(pose_in_words(first, result.cam_from_mount, turns[0], moves[0]))
@@ -44,6 +51,4 @@ def run(args: argparse.Namespace) -> int:
     print(f"{len(result.image_rms_px)} images, RMS {result.rms_px:.3f} px")
     for image, mismatch in result.left_out.items():
         print(f"left out: '{image}' turned otherwise than the robot, by {np.degrees(mismatch):.1f} degrees")
-    for error in done.unreadable:
-        note(f"left out: {error}")
-    return ExitCode.BAD_INPUT if done.unreadable else ExitCode.WELL
+    return code

@@ -119,7 +119,7 @@ def calibrate_hand_eye(
     with about(poses):
         result = hand_eye(camera, views, stands)
     if options.output is not None:
-        write_atomic(options.output, _text(result, options), force=options.force)
+        write_atomic(options.output, hand_eye_text(result, options), force=options.force)
     return HandEyeCalibration(result, tuple(unreadable))
 
 
@@ -157,7 +157,8 @@ def _view(path: Path, board: Board, camera: Camera) -> BoardView | None:
     return BoardView.from_detection(path.name, max(found, key=lambda d: len(d.grid)), [board]) if found else None
 
 
-def _text(result: HandEye, options: HandEyeOptions) -> str:
+def hand_eye_text(result: HandEye, options: HandEyeOptions) -> str:
+    """Return the result as its file has it."""
     first, second = POSE_NAMES[options.board_on_hand]
     data = {
         "schema": HAND_EYE_SCHEMA,

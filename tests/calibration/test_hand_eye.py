@@ -122,6 +122,8 @@ def test_from_rendered_images_on_the_command_line(tmp_path: Path, capsys: pytest
     assert main([*command, "-o", str(out)]) == 0
     assert "cam_from_hand: rotation vector" in capsys.readouterr().out
     found = json.loads(out.read_text())
+    assert main([*command, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == found
     sigma = np.sqrt(np.diag(found["covariance"]))[3:6]
     assert np.all(np.abs(np.array(found["cam_from_hand"])[:, 3] - X.translation_mm) < 5.0 * sigma + 0.02)
     assert np.linalg.norm(sigma) < 2.0
