@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rigkit.calibration.changing import changing
 from rigkit.calibration.coverage import corner_ranges, covered_by_boards
 from rigkit.calibration.mixed import two_cameras
 from rigkit.calibration.repeats import cluster_numbers
@@ -73,6 +74,7 @@ def judge_capture(calibration: Calibration, extent: Extent) -> list[Finding]:
     number = clusters.tolist()
     return [
         *two_cameras(calibration, clusters),
+        *changing(calibration),
         *_repeated(images, number),
         *_too_few(images, number),
         *_tilts(calibration),

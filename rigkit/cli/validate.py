@@ -67,7 +67,9 @@ def run(args: argparse.Namespace) -> int:
     if args.paper and args.planes is not None:
         raise InputError("--paper takes the principal planes of the points; leave --planes out")
     if args.paper:
-        return _as_paper(dataset, PaperOptions(**common, own_solvers=args.own_solvers), json=args.json)
+        return _as_paper(
+            dataset, PaperOptions(**common, own_solvers=args.own_solvers, pictures=not args.no_pictures), json=args.json
+        )
     if args.own_solvers:
         raise InputError("--own-solvers is about --paper; add that, or leave it out")
     options = _options(args, common)

@@ -29,6 +29,8 @@ CLAIMS = (
     "Forward motion is the worst of the motions of a lens",
     "Standard stereo is the most accurate of the motions of a lens",
 )
+NOTHING_TO_COMPARE = "nothing to compare"
+"""What is said of a claim that no figures are about."""
 
 
 class Capture(NamedTuple):
@@ -165,7 +167,7 @@ def _baseline_errors(printed: PaperTables) -> Iterator[tuple[str, dict[str, floa
 
 
 def _words(verdict: Verdict | None) -> str:
-    return "nothing to compare" if verdict is None else verdict.words
+    return NOTHING_TO_COMPARE if verdict is None else verdict.words
 
 
 def _mean(values: Sequence[float]) -> float | None:

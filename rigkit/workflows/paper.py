@@ -14,6 +14,7 @@ from rigkit.core.tables import Table
 from rigkit.io.manifest import Dataset
 from rigkit.io.paper_tables import load_paper_tables
 from rigkit.reconstruction.paper import MOTIONS, OWN_MOTIONS, reconstruct_as_paper
+from rigkit.report.paper_page import paper_page
 from rigkit.report.tables import tables_to_csv, tables_to_json, tables_to_latex, tables_to_markdown
 from rigkit.validation.checks import ValidationReport, validate
 from rigkit.validation.paper_claims import claim_table, estimator_order_table
@@ -35,6 +36,7 @@ from rigkit.workflows.datasets import (
     write_for,
 )
 from rigkit.workflows.pairs import match_images
+from rigkit.workflows.provenance import software_facts
 
 PAPER = "hajder2021"
 """Folder with the paper's tables, beside the data set."""
@@ -46,6 +48,8 @@ _log = logging.getLogger(__name__)
 class PaperOptions(DatasetOptions):
     """How to repeat the paper on a data set."""
 
+    pictures: bool = True
+    """Make the page."""
     own_solvers: bool = False
     """Standard and forward pairs by their own constrained solvers; else by the planar one, as in the paper."""
 
@@ -96,6 +100,8 @@ def validate_as_paper(
         "tables.json": tables_to_json(tables),
     }
     files |= cameras.files
+    if options.pictures:
+        files["report.html"] = paper_page(known.name, known.images, tables, software_facts())
     write_for(known, options, files)
     return PaperValidation(reports=reports, tables=tables, failures=failures, files=files)
 

@@ -9,6 +9,7 @@ import pytest
 from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.changing import changing
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.cameras.base import Camera
@@ -181,3 +182,52 @@ def test_images_with_two_kinds_of_names_are_of_two_cameras(rng: np.random.Genera
     assert "those called like 'left000.png' and those called like 'right000.png'" in first(mixed)
     two_names = [replace(v, image=f"{'a' if k % 2 else 'b'}{v.image}") for k, v in enumerate(views)]
     assert "mixed" not in str(calibrate(two_names, SIZE, model="brown", board="flat").verdicts)
+
+
+def changed_views(way: str, rng: np.random.Generator) -> list[BoardView]:
+    """Return 20 views of which each is seen by the same lens but for what changes from image to image."""
+    camera, side = lens("reg"), BOARD.grid() / (np.array(BOARD.size) - 1.0) * 2.0 - 1.0
+    out = []
+    for k in range(20):
+        own, points = camera, BOARD.points()
+        if way == "focus":
+            own = camera.with_parameters(camera.parameters * np.array([*[1.0 + 0.004 * rng.normal()] * 2, *[1.0] * 7]))
+        if way == "bend":
+            bow = rng.normal(size=2)
+            points[:, 2] += bow[0] * (1.0 - side[:, 0] ** 2) + bow[1] * side[:, 0] * side[:, 1]
+        view = random_views(own, 1, rng, reach_deg=33.0, noise_px=0.05, points_mm=points)[0][0]
+        pixels = np.array(view.pixels)
+        if way == "shift":
+            pixels += 5.0 * rng.normal(size=2)
+        if way == "rows":
+            velocity, spin = 2.0 * rng.normal(size=2), 0.005 * rng.normal()
+            off = pixels - pixels.mean(axis=0)
+            pixels += pixels[:, 1:] / SIZE[1] * (velocity + spin * off[:, ::-1] * [-1.0, 1.0])
+        pixels = np.clip(pixels, -0.5, np.array(SIZE) - 0.5)
+        out.append(replace(view, image=f"{k:03d}.png", pixels=pixels))
+    return out
+
+
+@pytest.mark.parametrize(
+    ("way", "words"),
+    [
+        ("focus", "the focal length differs from image to image"),
+        ("shift", "the picture is shifted on the sensor"),
+        ("rows", "row by row (rolling shutter)"),
+        ("bend", "the board is bent otherwise in every image"),
+    ],
+)
+def test_what_changes_from_image_to_image(way: str, words: str, rng: np.random.Generator) -> None:
+    assert words in first(calibrate(changed_views(way, rng), SIZE, model="brown", board="flat"))
+
+
+def test_what_is_wrong_in_all_images_alike_changes_in_none(rng: np.random.Generator) -> None:
+    """A lens of another kind than the model, and a bent board, are no change from image to image."""
+    same = changed_views("nothing", rng)
+    assert changing(calibrate(same, SIZE, model="brown", board="flat")) == []
+    assert changing(calibrate(same, SIZE, model="ucm", board="flat")) == []
+    bent = BOARD.points()
+    bent[:, 2] += 1.5 * (1.0 - (BOARD.grid()[:, 0] / 4.0 - 1.0) ** 2)
+    views = random_views(lens("reg"), 20, rng, reach_deg=33.0, noise_px=0.05, points_mm=bent)[0]
+    for shape in ("flat", "warp"):
+        assert changing(calibrate(views, SIZE, model="brown", board=shape)) == []

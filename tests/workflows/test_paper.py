@@ -46,6 +46,9 @@ def test_tables_have_the_printed_numbers_and_the_claims(repeated) -> None:
     cell = rows["mean normal error plane2"][columns.index("regular-forward")]
     assert cell.paper == "8.3326"
     assert (out / "tables.md").read_text() == done.files["tables.md"]
+    page = (out / "report.html").read_text()
+    assert "statements of the paper that this data set can test hold on it" in page
+    assert "DET3UDIR is the worst of the five" in page and "The images are rendered." in page
     verdicts = {str(row[0].value): str(row[1].value) for row in tables["claims"].rows}
     # Equal weights and the squared mean scale: on exact renders the scale's bias is the largest error there is.
     assert verdicts["DET3UDIR is the worst of the five"].startswith("holds (in all 8")

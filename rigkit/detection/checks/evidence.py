@@ -34,7 +34,7 @@ OFFSET = -30.2
 with a standard deviation of 70 over the root of the number of lattices, of measures of standard deviation 1; never
 positive, and that of raggedness not beyond -4, so that a hand may cover a third of a board.
 
-From 1545 lattices of boards of 24 real sets, four fifths of them blurred, noisy, compressed, sharpened, faint, shrunk,
+From 1545 lattices of boards of 27 real sets, four fifths of them blurred, noisy, compressed, sharpened, faint, shrunk,
 covered or cut, and 276 of other patterns. As taken, boards score 0.7 and more and all but one of the others -1.9 and
 less: a page of 1304 discs of 7 px that nearly touch, every second row moved by half a step, -0.6. With what was done to
 the images 10 boards are refused, smeared and shrunk ones, and no other pattern is taken for one."""
