@@ -127,8 +127,8 @@ def reconstruct_rig_views(options: RigSceneOptions, *, progress: Progress = sile
     progress("growing correspondences of pairs", len(pairs), len(pairs))
     if not grown:
         raise DegenerateError(
-            f"none of {len(pairs)} pairs of views gives a cloud; check which camera took which image (--names), and "
-            f"that the images are of one moment. The first: {notes[0]}"
+            f"'{options.rig}': none of {len(pairs)} pairs of views gives a cloud; check which camera took which image "
+            f"(--names), and that the images are of one moment. The first: {notes[0]}"
         )
     fused = fuse_clouds(tuple(grown.values()))
     files = _files(options, fused, first)
