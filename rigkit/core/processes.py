@@ -73,9 +73,10 @@ def worker_pool(count: int) -> Iterator[ProcessPoolExecutor]:
             "other reason too"
         ) from error
     except BaseException:
-        pool.shutdown(wait=False, cancel_futures=True)
         for process in set(multiprocessing.active_children()) - others:
             process.terminate()
+        # Until its thread has ended: Python, at its own end, would write to what that thread is closing.
+        pool.shutdown(cancel_futures=True)
         raise
     pool.shutdown()
 

@@ -24,6 +24,7 @@ from rigkit.io.calibration_file import camera_to_json, findings_to_json, load_ca
 from rigkit.io.files import ensure_writable, write_together
 from rigkit.io.history_file import HistoryEntry, add_entry, ensure_register
 from rigkit.io.images import read_image
+from rigkit.io.reading import about
 from rigkit.io.rig_file import is_rig_file, load_saved_rig
 from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import Goal
@@ -113,7 +114,8 @@ def check_pictures(
         if not boards:
             raise InputError(f"check: '{source}' does not say what boards there are; give --board 9x6x25")
         views = _views(watched, frames, boards, left_out, unreadable, progress)
-        check = check_views(watched, views, cost)
+        with about(source):
+            check = check_views(watched, views, cost)
     words = check_words(check)
     files: dict[Path, str | bytes] = {}
     if options.fix is not None and check.change is not None:

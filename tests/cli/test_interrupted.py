@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -136,3 +137,13 @@ def test_the_version_says_what_is_installed(capsys: pytest.CaptureFixture[str]) 
     assert first.startswith("rigkit ")
     assert second.split()[0] == "kernels" and len(second.split()[1].rstrip(",")) == 16
     assert "Python 3." in third
+
+
+def test_an_interrupted_pool_leaves_no_thread() -> None:
+    """Python itself stumbles at its end over the thread of a pool that closes just then."""
+    before = set(threading.enumerate())
+    with pytest.raises(KeyboardInterrupt), worker_pool(2) as pool:
+        waiting = [pool.submit(time.sleep, 600) for _ in range(8)]
+        raise KeyboardInterrupt
+    assert all(future.done() for future in waiting)
+    assert set(threading.enumerate()) == before
