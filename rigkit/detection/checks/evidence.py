@@ -9,6 +9,7 @@ rendered and real images and prints how far boards and other patterns lie from 0
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -95,4 +96,4 @@ class Evidence(NamedTuple):
             "raggedness": self.raggedness,
             "blur_cells": max(self.blur_cells, MIN_BLUR),
         }
-        return OFFSET + sum(weight * float(np.log(measures[name])) for name, weight in SCORE.items())
+        return OFFSET + sum(weight * math.log(measures[name]) for name, weight in SCORE.items())
