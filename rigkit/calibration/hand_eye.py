@@ -23,7 +23,7 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.printing import brief
 from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import log_so3, nearest_rotation, rotation_angle, skew
+from rigkit.geometry.rotation import nearest_rotation, rotation_angle, skew
 from rigkit.optim.damping import Damping, Stop
 from rigkit.optim.levenberg_marquardt import DenseProblem, DenseStep, minimise
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
@@ -31,8 +31,11 @@ from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 MIN_POSES = 3
 MAX_MISMATCH_RAD = np.radians(1.0)
 """Robots and boards tell a rotation to some hundredths of a degree: more is a picture of another pose."""
-MIN_SECOND_AXIS = np.sin(np.radians(10.0))
-"""Turns about axes within ten degrees of each other leave the place along that axis open."""
+MAX_SIGMA_OF_DISTANCE = 0.1
+"""A place known to no better than this part of the distance of the boards is none: turns about one axis leave it open
+along that axis. Turns about a second one, however few, count by how certain they make it."""
+OPEN_PART = 1e-12
+"""A direction of which the corners know this part of what they know of the best is open: it is rounding."""
 RESAMPLES = 300
 HAND_EYE_DAMPING = Damping(start=1e-4, ceiling=1e12)
 HAND_EYE_STOP = Stop(steps=60, promise=1e-14)
@@ -80,7 +83,7 @@ def hand_eye(
     InputError
         Unlike numbers of views and poses; turns that do not belong together; poses that are the wrong way round.
     DegenerateError
-        Fewer than three images, or turns about one axis only.
+        Fewer than three images, or turns about one axis only: the place along it is open.
     """
     if len(views) != len(mount_from_stand):
         raise InputError(f"hand-eye: {len(views)} views, but {len(mount_from_stand)} poses of the robot")
@@ -95,11 +98,12 @@ def hand_eye(
             f"hand-eye: the camera turned otherwise than the robot from image to image (by {worst:.1f} degrees in the "
             "median); are images and poses in the same order, and angles in the right unit?"
         )
-    _check_axes([seen[i] for i in use])
     problem = _AllCorners(camera, [views[i] for i in use], [mount_from_stand[i] for i in use])
     start = _linear([seen[i] for i in use], problem.robot)
     found = minimise(start, problem.at, _moved, HAND_EYE_DAMPING, HAND_EYE_STOP)
     _refuse_inverse(problem, [seen[i] for i in use], found.problem.cost)
+    covariance = _resampled(found.problem, problem.image, np.random.default_rng(seed))
+    _refuse_open(covariance, [seen[i] for i in use])
     squared = found.problem.residual.reshape(-1, 2) ** 2 * problem.sigma[:, None] ** 2
     by_image = {
         problem.views[i].image: float(np.sqrt(squared[problem.image == i].sum(axis=1).mean()))
@@ -108,7 +112,7 @@ def hand_eye(
     return HandEye(
         cam_from_mount=found.state[0],
         stand_from_board=found.state[1],
-        covariance=_resampled(found.problem, problem.image, np.random.default_rng(seed)),
+        covariance=covariance,
         rms_px=float(np.sqrt(squared.sum(axis=1).mean())),
         image_rms_px=by_image,
         left_out={views[i].image: float(mismatch[i]) for i in range(len(views)) if i not in use},
@@ -166,15 +170,18 @@ def _mismatch(seen: Sequence[Rigid3], robot: Sequence[Rigid3]) -> FloatArray:
     return np.asarray(np.median(np.abs(angles[0] - angles[1]), axis=1))
 
 
-def _check_axes(seen: Sequence[Rigid3]) -> None:
-    rotation = np.stack([pose.rotation for pose in seen])
-    i, j = np.triu_indices(len(seen), 1)
-    turns = log_so3(rotation[i] @ np.swapaxes(rotation[j], -1, -2))
-    # Rounding takes a sum of squares that is 0 below it.
-    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(turns.T @ turns)[::-1], 0.0))
-    if not spread[0] > 0.0 or spread[1] < MIN_SECOND_AXIS * spread[0]:
+def _refuse_open(covariance: FloatArray, seen: Sequence[Rigid3]) -> None:
+    """Raise DegenerateError where a place is as good as unknown."""
+    distance = float(np.mean([np.linalg.norm(pose.translation_mm) for pose in seen]))
+    blocks = [covariance[k : k + 3, k : k + 3] for k in (3, 9)]
+    worst = np.inf
+    if np.isfinite(covariance).all():
+        worst = max(float(np.linalg.eigvalsh(block)[-1]) for block in blocks) ** 0.5
+    if not worst <= MAX_SIGMA_OF_DISTANCE * distance:
+        told = f", known to {worst:.0f} mm only" if np.isfinite(worst) else ""
         raise DegenerateError(
-            "hand-eye: the hand turned about one axis only, which leaves the place along it open; turn it about two"
+            f"hand-eye: the hand turned about one axis only, which leaves the place along it open{told}; turn it about "
+            "two"
         )
 
 
@@ -212,7 +219,8 @@ def _refuse_inverse(problem: _AllCorners, seen: Sequence[Rigid3], cost: float) -
 
 def _resampled(problem: DenseProblem, image: IntArray, rng: np.random.Generator) -> FloatArray:
     """Return the covariance (12, 12) of the solution when images are drawn anew with replacement: one Gauss-Newton step
-    each from the sums of every image, enlarged by n / (n - 1) and by the unknowns that each image's share must give."""
+    each from the sums of every image, enlarged by n / (n - 1) and by the unknowns that each image's share must give.
+    Infinite where the corners leave an unknown open."""
     count = int(image.max()) + 1
     rows = problem.jacobian.reshape(-1, 2, UNKNOWNS)
     residual = problem.residual.reshape(-1, 2)
@@ -222,11 +230,14 @@ def _resampled(problem: DenseProblem, image: IntArray, rng: np.random.Generator)
     weights = rng.multinomial(count, np.full(count, 1.0 / count), RESAMPLES).astype(np.float64)
     # A draw of too few different images determines nothing: the whole holds it in place, as one image in all would.
     total = information.sum(axis=0)
+    scale = np.sqrt(np.maximum(np.diag(total), np.finfo(float).tiny))
+    if not np.linalg.eigvalsh(total / np.outer(scale, scale))[0] > OPEN_PART:
+        return np.diag(np.full(UNKNOWNS, np.inf))
     steps = -np.linalg.solve(
         np.einsum("rn,nab->rab", weights, information) + total / count, (weights @ score)[..., None]
     )[..., 0]
     centred = steps - np.median(steps, axis=0)
-    scale = SIGMA_OF_MEDIAN * np.median(np.abs(centred), axis=0)
-    kept = (np.abs(centred) <= 6.0 * np.maximum(scale, 1e-300)).all(axis=1)
+    spread = SIGMA_OF_MEDIAN * np.median(np.abs(centred), axis=0)
+    kept = (np.abs(centred) <= 6.0 * np.maximum(spread, 1e-300)).all(axis=1)
     freedom = max(count - UNKNOWNS / 6.0, 1.0)
     return np.asarray(np.cov(steps[kept].T) * count / freedom)

@@ -98,6 +98,30 @@ def test_what_cannot_be_solved_is_said(rng: np.random.Generator) -> None:
         hand_eye(lens("reg"), flat, [X.inverse() @ p @ Z.inverse() for p in centred])
 
 
+def test_a_second_axis_counts_by_how_certain_it_makes_the_place(rng: np.random.Generator) -> None:
+    """Turns mostly about one axis, four degrees about others: the place is known, less well, and its sigma says so."""
+    ratios, sigmas = [], []
+    camera = lens("reg")
+    middle = random_views(camera, 1, rng, reach_deg=10.0, noise_px=0.1)[0][0].board.points().mean(axis=0)
+    for _ in range(8):
+        views, told = [], []
+        for k in range(15):
+            turn = exp_so3(np.radians([*rng.normal(0.0, 2.5, 2), 0.0])) @ exp_so3(np.array([0.0, 0.0, 0.2 * k]))
+            place = np.array([*rng.uniform(-60.0, 60.0, 2), rng.uniform(600.0, 800.0)])
+            pose = Rigid3(turn, place - turn @ middle)
+            board = random_views(camera, 1, rng, reach_deg=10.0, noise_px=0.1)[0][0].board
+            pixels, _ = camera.project(pose.apply(board.points()))
+            noisy = pixels + 0.1 * rng.normal(size=pixels.shape)
+            views.append(BoardView(f"{k}.png", board, board.grid(), noisy, np.full(len(noisy), 0.1)))
+            true = X.inverse() @ pose @ Z.inverse()
+            told.append(Rigid3(exp_so3(rng.normal(0.0, ROBOT_TURN_RAD, 3)) @ true.rotation, true.translation_mm))
+        result = hand_eye(camera, views, told)
+        ratios.append(errors(result) / np.sqrt(np.diag(result.covariance)))
+        sigmas.append(np.linalg.norm(result.sigmas()[1][0]))
+    assert MAHALANOBIS[0] < float(np.sqrt(np.mean(np.square(ratios)))) < MAHALANOBIS[1]
+    assert 0.2 < np.median(sigmas) < 60.0
+
+
 def test_from_rendered_images_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rng = np.random.default_rng(5)
     (tmp_path / "images").mkdir()
