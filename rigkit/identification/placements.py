@@ -19,7 +19,7 @@ from rigkit.core.patterns.base import Pattern
 PLACE_ROUNDING = 1e-6
 """Positions in squares that differ by less differ by rounding."""
 SAME_SQUARE_REL = 0.03
-"""Squares that differ by less are not told apart by their size."""
+"""Squares that differ by less look alike."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

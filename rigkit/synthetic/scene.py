@@ -21,7 +21,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import unit
 
 BOARD_CLEARANCE_MM = 3.0
-"""Gap between the paper's edge and the seam of two walls: boards that touch would hide each other's edge."""
+"""Gap between the paper's edge and the edge where two walls meet: boards that touch would hide each other's edge."""
 SEAM_ROUNDING_MM = 1e-6
 """In a room of right angles a board's edge lies at the clearance to rounding, and stays there."""
 
@@ -141,21 +141,21 @@ def trihedral(
 ) -> tuple[PlacedBoard, PlacedBoard, PlacedBoard]:
     """Return three boards pushed into the corner of a room: front wall, floor, right wall.
 
-    Each lies against one seam; where the seams meet at less than a right angle it is moved along it until no part of it
+    Each lies against one edge; where the edges meet at less than a right angle it is moved along it until no part of it
     sticks through the third plane.
 
     Parameters
     ----------
     boards : three boards of any sizes.
     angles_deg : angles between planes 1-2, 1-3 and 2-3.
-    clearance_mm : from the paper's edges to the seams.
+    clearance_mm : from the paper's edges to those where walls meet.
     """
     if len(boards) != 3:
         raise InputError(f"trihedral: three boards expected, got {len(boards)}")
     # Which corner of the paper points into the corner of the room, in board axes (+1: the far end, -1: the near end).
     corner_side = ((1, 1), (1, -1), (-1, 1))
     walls = wall_axes(angles_deg)
-    # The board axis along the seam that it lies against, and the plane at the seam's end.
+    # The board axis along the edge that it lies against, and the plane at the end of that.
     along_seam = ((0, 2), (0, 2), (1, 1))
     out = []
     for board, axes, side, (axis, end) in zip(boards, walls, corner_side, along_seam, strict=True):

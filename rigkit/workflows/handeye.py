@@ -30,7 +30,7 @@ HAND_EYE_SCHEMA = "rigkit.hand_eye/1"
 POSE_NAMES = (("cam_from_hand", "base_from_board"), ("cam_from_base", "hand_from_board"))
 """What the two poses are called where the hand carries the camera, and where it carries the board."""
 PLANAR_AMBIGUITY = 1.5
-"""Two poses of one board whose errors differ by less than this factor cannot be told apart by them."""
+"""Two poses of one board whose errors differ by less than this factor are ambiguous."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -166,7 +166,7 @@ def _motion(pairs: Sequence[tuple[_Target, _Target]]) -> tuple[Rigid3, Rigid3 | 
 def turned_alike(
     seen: Sequence[FrameObservations], mounts: Sequence[Rigid3], places: Places
 ) -> list[FrameObservations]:
-    """Return the views with every board counted from the corner from which the first camera that sees it counts."""
+    """Return the views with every board numbered from the corner that the first camera to see it numbers from."""
     out: list[FrameObservations] = []
     for k, own in enumerate(seen):
         mine: FrameObservations = {}

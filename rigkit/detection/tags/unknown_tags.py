@@ -1,7 +1,7 @@
 """AprilGrids that nobody has described: family, border, numbering, counts and spacing from what is read.
 
 Tags are read in the squares of lattices of corners, and, where an image shows no such lattice, as quadrilaterals that
-stand alone. Several boards are told apart by their numbers: those of one lattice are of one board.
+stand alone. Several boards are identified by their numbers: those of one lattice are of one board.
 """
 
 from __future__ import annotations

@@ -23,8 +23,6 @@ from rigkit.validation.sentinel.causes import Cause, lens_goals
 from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
 from rigkit.validation.sentinel.whitened import NULL_RANK, Whitened
 
-__all__ = ["FOUND", "Power", "powers_of"]
-
 CHANGED_PX, TURNED_DEG = 0.15, 0.02
 """Changes of which the chance is told: of a lens, rms over the image after the best rotation; of a mount."""
 FOUND = 0.9

@@ -14,8 +14,6 @@ import numpy as np
 from rigkit.core.arrays import FloatArray
 from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
 
-__all__ = ["LARGE_FREEDOM", "NULL_RANK", "Whitened"]
-
 COMMON_FREEDOM = 10.0
 """By how much more images disagree than independent corners would is one number, the mean over all directions: lens and
 board bend in some ways more than in others. Where measured, the variances of directions scatter around their mean by
