@@ -87,9 +87,10 @@ def scene_svg(scene: Mapping[str, Any]) -> str:
         out.append(f'<path d="{path}" stroke="{SHADES[index % len(SHADES)]}" stroke-width="3" stroke-linecap="round"/>')
     for camera, corners in zip(scene["cameras"], cameras, strict=True):
         tip, *base = drawn(corners)
+        below = max(float(y) for _, y in (tip, *base)) + RIM - 3.0
         wire = _path(np.array(base)) + "Z" + "".join(_path(np.array([tip, corner])) for corner in base)
         out.append(f'<path d="{wire}" fill="none" stroke="#333"/>')
-        out.append(f'<text x="{tip[0] + 5:.1f}" y="{tip[1] + 4:.1f}" fill="#333">{escape(camera["name"])}</text>')
+        out.append(f'<text x="{tip[0]:.1f}" y="{below:.1f}" fill="#333">{escape(camera["name"])}</text>')
     return "".join([*out, "</svg>"])
 
 
