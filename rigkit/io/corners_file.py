@@ -1,5 +1,8 @@
 """Corners on disk: CSV with the columns image, board, column, row, u_px, v_px, sigma_px, one corner a line.
 
+Columns and rows count from the upper left as the board stands upright. Kalibr counts an AprilGrid's corners row by row
+from the lower left: there column c of row r, of C x R corners, has number (R - 1 - r) C + c.
+
 A board without a name is written as `?NUMBER:COLUMNSxROWS`, counted from 1 in each image, so that reading gives back
 what was found. Read are also the `corners.json` that calibrations keep, and the `corners.vnl` of mrgingham and mrcal:
 a line `# filename x y level`, then all corners of the one board in each image, row by row; '-' for what was not found.

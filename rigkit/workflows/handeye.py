@@ -145,8 +145,8 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
 def _one_way_up(board: Board) -> Board:
     if board.looks_same_turned:
         raise InputError(
-            f"board '{board.board_id}' looks the same turned by 180 degrees: take one with an odd and an even number "
-            "of corners, or with markers"
+            f"board '{board.board_id}' looks the same turned by 180 degrees: take {board.pattern.one_way_up}, or one "
+            "with markers"
         )
     return board
 

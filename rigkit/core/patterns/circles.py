@@ -40,6 +40,7 @@ class Circles(Pattern):
     type: ClassVar[str] = "circles"
     size_word: ClassVar[str] = "distance"
     size_meaning: ClassVar[str] = "the distance of two circles in a row"
+    one_way_up: ClassVar[str] = "an asymmetric or hexagonal one with an odd number of rows"
     point_word: ClassVar[str] = "circles"
     count_word: ClassVar[str] = "circles"
     keys: ClassVar[tuple[Key, ...]] = (

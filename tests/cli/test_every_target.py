@@ -1,0 +1,296 @@
+"""Every kind of board through every verb, by the command line, on rendered images with known truth."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rigkit.cameras.base import Camera
+from rigkit.cameras.pinhole import Pinhole
+from rigkit.cli.main import main
+from rigkit.coach.guide import GuideOptions
+from rigkit.core.boards import Board
+from rigkit.core.posetype import PoseType
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
+from rigkit.io.board_file import board_text
+from rigkit.io.calibration_file import load_calibration
+from rigkit.io.rig_file import load_board_rigs, load_saved_rig
+from rigkit.synthetic.pairs import StereoScene, trihedral_pair
+from rigkit.synthetic.photometry import Photometry
+from rigkit.synthetic.placing import place_board, sees_paper
+from rigkit.synthetic.render import Optics, render
+from rigkit.synthetic.scene import PlacedBoard
+from rigkit.workflows.coach import CoachOptions, open_coach
+from rigkit.workflows.folder_session import board_of_words
+
+SIZE = (640, 480)
+LEFT = Pinhole(SIZE, np.array([520.0, 520.0, 321.3, 236.1]))
+RIGHT = Pinhole(SIZE, np.array([524.0, 524.0, 317.3, 242.1]))
+RIGHT_FROM_LEFT = Rigid3(exp_so3(np.array([0.0, -0.08, 0.01])), np.array([-60.0, 0.0, 5.0]))
+CAM_FROM_HAND = Rigid3(exp_so3(np.array([0.1, -0.2, 0.3])), np.array([20.0, -30.0, 60.0]))
+BASE_FROM_BOARD = Rigid3(exp_so3(np.array([3.0, 0.2, 0.1])), np.array([600.0, 100.0, 0.0]))
+OPTICS, PHOTOMETRY = Optics(0.6), Photometry(exposure=0.95, noise_levels=1.5)
+VIEWS, FRESH, SCENES = 8, 2, 2
+
+MIN_COSINE = 0.4
+"""Of boards in a corner of a room, against the line of sight."""
+HELD_OUT_PX = 0.02
+"""Corners at noise 1.5 scatter by 0.003 to 0.008 px."""
+LENGTH_REL = 3e-4
+"""Of baselines: corners of 0.006 px at squares of 30 px."""
+HAND_MM = 0.3
+ANGLE_DEG = 0.1
+
+KINDS = {
+    "chessboard": ("9x6x30", ("8x6x50", "7x6x50", "6x9x50")),
+    "charuco": (
+        "charuco:9x6x30,dictionary=DICT_5X5_250,marker_mm=22",
+        tuple(
+            f"charuco:{size}x50,dictionary=DICT_5X5_250,marker_mm=38,first_marker={first}"
+            for size, first in (("8x6", 0), ("7x6", 60), ("6x9", 120))
+        ),
+    ),
+    "aprilgrid": (
+        "aprilgrid:5x4x42,spacing=0.3",
+        tuple(
+            f"aprilgrid:{size}x80,spacing=0.3,first_tag={first}"
+            for size, first in (("4x3", 0), ("4x3", 20), ("3x4", 40))
+        ),
+    ),
+    "circles": ("circles:9x6x30", ("circles:8x6x50", "circles:7x6x50", "circles:6x9x50")),
+    "asymmetric": (
+        "circles:4x11x60,layout=asymmetric",
+        tuple(f"circles:{size}x90,layout=asymmetric" for size in ("4x9", "5x7", "3x9")),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Lab:
+    """Images of a kind of board on disk, and what is true of them."""
+
+    kind: str
+    root: Path
+    board: Board
+    words: str
+    planes: tuple[str, ...]
+
+    @property
+    def target(self) -> str:
+        return str(self.root / "target.toml")
+
+    def path(self, name: str) -> str:
+        return str(self.root / name)
+
+
+def write(path: Path, image: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), image)
+
+
+def placed_before_both(board: Board, count: int, rng: np.random.Generator) -> list[PlacedBoard]:
+    out: list[PlacedBoard] = []
+    extent = float(np.ptp(board.points()[:, :2], axis=0).max()) / board.square_x_mm + 2.0
+    while len(out) < count:
+        spot = np.array(SIZE) * rng.uniform(0.25, 0.75, 2)
+        placed = place_board(board, LEFT, spot, rng.uniform(0.45, 0.85) * SIZE[1] / extent, 40.0, rng)
+        if placed is None or not sees_paper(placed, LEFT, (0.0, 0.0), SIZE):
+            continue
+        if sees_paper(beside(placed), RIGHT, (0.0, 0.0), SIZE):
+            out.append(placed)
+    return out
+
+
+def beside(placed: PlacedBoard) -> PlacedBoard:
+    return replace(placed, world_from_board=RIGHT_FROM_LEFT @ placed.world_from_board)
+
+
+def robot_line(name: str, cam_from_board: Rigid3) -> str:
+    base_from_hand = BASE_FROM_BOARD @ cam_from_board.inverse() @ CAM_FROM_HAND
+    x, y, z, w = quaternion(base_from_hand.rotation)
+    return ",".join([name, *(f"{v:.9f}" for v in (*base_from_hand.translation_mm, x, y, z, w))])
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """Return x, y, z, w: the eigenvector of the largest eigenvalue (Bar-Itzhack 2000)."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation
+    k = np.array([[a - e - i, b + d, c + g, h - f], [b + d, e - a - i, f + h, c - g], [c + g, f + h, i - a - e, d - b]])
+    k = np.vstack([k, [h - f, c - g, d - b, a + e + i]])
+    return np.asarray(np.linalg.eigh(k)[1][:, -1])
+
+
+def shot(placed: Sequence[PlacedBoard], camera: Camera, pose: Rigid3, rng: np.random.Generator) -> np.ndarray:
+    return np.asarray(render(placed, camera, pose, optics=OPTICS, photometry=PHOTOMETRY, rng=rng))
+
+
+def corner_of_a_room(walls: Sequence[Board], rng: np.random.Generator) -> StereoScene:
+    """Return a pair in which no board is seen so much from the side that its marks cannot be read."""
+    for _ in range(200):
+        scene = trihedral_pair(walls, LEFT, PoseType.GENERAL, rng, distance=(0.7, 1.1), parallax_deg=(10.0, 30.0))
+        poses = [
+            pose @ placed.world_from_board
+            for placed in scene.boards
+            for pose in (scene.cam1_from_world, scene.cam2_from_world)
+        ]
+        rays = [pose.apply(walls[0].points().mean(axis=0)) for pose in poses]
+        cosines = [
+            float(pose.rotation[:, 2] @ ray / np.linalg.norm(ray)) for pose, ray in zip(poses, rays, strict=True)
+        ]
+        if min(cosines) > MIN_COSINE:
+            return scene
+    raise AssertionError("no pair shows all boards from near enough to their fronts")
+
+
+@pytest.fixture(scope="module", params=sorted(KINDS))
+def lab(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Lab:
+    kind = str(request.param)
+    root, rng = tmp_path_factory.mktemp(kind), np.random.default_rng(5)
+    words, planes = KINDS[kind]
+    board = replace(board_of_words(words), board_id="target")
+    (root / "target.toml").write_text(board_text(board, "as designed", root / "target.toml"))
+    lines = ["image,x_mm,y_mm,z_mm,qx,qy,qz,qw"]
+    for n, placed in enumerate(placed_before_both(board, VIEWS + FRESH, rng)):
+        folder = root if n < VIEWS else root / "fresh"
+        write(folder / f"left/{n:02d}.png", shot([placed], LEFT, Rigid3.identity(), rng))
+        write(folder / f"right/{n:02d}.png", shot([placed], RIGHT, RIGHT_FROM_LEFT, rng))
+        if n < VIEWS:
+            lines.append(robot_line(f"{n:02d}.png", placed.world_from_board))
+    (root / "poses.csv").write_text("\n".join(lines) + "\n")
+    walls = [replace(board_of_words(text), board_id=f"plane{n}") for n, text in enumerate(planes, start=1)]
+    for n in range(SCENES):
+        scene = corner_of_a_room(walls, rng)
+        for side, image in enumerate(scene.images(optics=OPTICS, photometry=PHOTOMETRY, rng=rng), start=1):
+            write(root / f"set/pair{n}/view{side}.png", image)
+            write(root / f"mount/{n}{side}.png", image)
+    told = ["--board", str(root / "target.toml"), "--model", "pinhole", "-o", str(root / "calibration.json")]
+    assert main(["calibrate", str(root / "left"), *told]) == 0
+    return Lab(kind, root, board, words, planes)
+
+
+def test_it_is_printed(lab: Lab) -> None:
+    assert main(["board", lab.target, "--paper", "a1", "-o", lab.path("print")]) == 0
+    assert all(Path(lab.path(f"print.{end}")).stat().st_size > 0 for end in ("pdf", "svg"))
+
+
+def test_images_tell_it(lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["board", "identify", lab.path("left")]) == 0
+    said = capsys.readouterr().out
+    assert f"seen in {VIEWS} of {VIEWS} images" in said
+    kind, _, size = lab.words.split(",")[0].rpartition(":")
+    assert f"--board {f'{kind}:' if kind else ''}{size.rpartition('x')[0]}xMM" in said
+
+
+def test_one_camera(lab: Lab) -> None:
+    calibration = load_calibration(lab.path("calibration.json"))
+    assert calibration.heldout_rms_px is not None and calibration.heldout_rms_px < HELD_OUT_PX
+    assert not calibration.dropped and len(calibration.views) == VIEWS
+    (shape,) = calibration.boards
+    assert shape.declared is not None and shape.declared.pattern == lab.board.pattern
+    assert shape.board.size == lab.board.size
+
+
+def test_it_still_holds_without_a_board_told(lab: Lab, calibration: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", calibration, lab.path("fresh/left")]) == 0
+    assert "Still holds" in capsys.readouterr().out
+
+
+@pytest.fixture
+def calibration(lab: Lab) -> str:
+    return lab.path("calibration.json")
+
+
+def test_rig_and_its_check_and_certificate(lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = lab.path("rig.json")
+    both = [lab.path("left"), lab.path("right")]
+    assert main(["calibrate", *both, "--board", lab.target, "--model", "pinhole", "-o", rig, "--force"]) == 0
+    saved = load_saved_rig(rig)
+    assert [board.pattern for board in saved.boards] == [lab.board.pattern]
+    poses = [pose for _, pose in saved.cameras.values()]
+    found = (poses[1] @ poses[0].inverse()).translation_mm
+    true = RIGHT_FROM_LEFT.translation_mm
+    assert np.linalg.norm(found - true) < 10.0 * LENGTH_REL * float(np.linalg.norm(true)) + 0.05
+    assert main(["check", rig, lab.path("fresh/left"), lab.path("fresh/right")]) == 0
+    assert main(["certify", rig, "--length", "100", "--distance", "400"]) == 0
+    assert "95 %" in capsys.readouterr().out
+
+
+def test_plan_and_difference(lab: Lab, calibration: str) -> None:
+    assert main(["plan", calibration, "-n", "1"]) == 0
+    assert main(["plan", "--lens", "60", "--size", "640x480", "--board", lab.words, "-n", "2"]) == 0
+    assert main(["diff", calibration, calibration]) == 0
+
+
+def test_pose_and_hand(lab: Lab, calibration: str, capsys: pytest.CaptureFixture[str]) -> None:
+    known = ["--camera", calibration, "--board", lab.target]
+    told = ["handeye", lab.path("poses.csv"), lab.path("left"), *known, "-o", lab.path("hand.json"), "--force"]
+    if lab.board.looks_same_turned:
+        # Nobody can say which end of such a board is which, and it is said what to take.
+        assert main(told) == 2
+        assert "looks the same turned" in capsys.readouterr().err
+        return
+    assert main(["pose", *known, lab.path("left/00.png")]) == 0
+    assert main(told) == 0
+    result = json.loads(Path(lab.path("hand.json")).read_text())
+    moved = np.array(result["cam_from_hand"])[:3, 3] - CAM_FROM_HAND.translation_mm
+    assert np.linalg.norm(moved) < HAND_MM
+
+
+def test_pairs_from_a_folder_to_the_tables(lab: Lab, calibration: str, capsys: pytest.CaptureFixture[str]) -> None:
+    root = Path(lab.path("set"))
+    boards = [item for words in lab.planes for item in ("--board", words)]
+    made = ["init", str(root), *boards, "--calibration", calibration, "--pose-type", "general", "--force"]
+    assert main(made) == 0
+    manifest = root / "dataset.toml"
+    angles = ", ".join(
+        f'{{ a = "plane{a}", b = "plane{b}", value_deg = 90.0, sigma_deg = {ANGLE_DEG}, how = "as rendered" }}'
+        for a, b in ((1, 2), (1, 3), (2, 3))
+    )
+    text = manifest.read_text().replace("[pairs.truth]", f"[pairs.truth]\nangles = [ {angles} ]")
+    manifest.write_text(text)
+    out = lab.path("tables")
+    assert main(["validate", str(root), "-o", out, "--force", "--no-crosscheck", "--no-pictures", "-j", "1"]) == 0
+    assert "all checks passed" in capsys.readouterr().out
+
+
+def test_boards_on_one_mount(lab: Lab) -> None:
+    session = Path(lab.path("mount/session.toml"))
+    names = [f"plane{n}" for n in (1, 2, 3)]
+    for name, words in zip(names, lab.planes, strict=True):
+        path = session.with_name(f"{name}.toml")
+        path.write_text(board_text(replace(board_of_words(words), board_id=name), "as designed", path))
+    listed = ", ".join(f'"{name}.toml"' for name in names)
+    mounted = ", ".join(f'"{name}"' for name in names)
+    session.write_text(
+        f'schema = "rigkit.session/1"\nboards = [{listed}]\nimages = "*.png"\nmodel = "pinhole"\n'
+        f"[[rigid_boards]]\nboards = [{mounted}]\n"
+    )
+    assert main(["calibrate", str(session), "-o", lab.path("mount/rig.json"), "--force"]) == 0
+    (path,) = Path(lab.path("mount")).glob("rig*boards*.json")
+    (mount,) = load_board_rigs(path)
+    assert mount.image_count == 2 * SCENES
+    assert [placed.board.pattern.type for placed in mount.boards] == [
+        board_of_words(w).pattern.type for w in lab.planes
+    ]
+    assert abs(mount.angle_deg("plane1", "plane2")[0] - 90.0) < ANGLE_DEG
+
+
+def test_the_coach_takes_pictures_of_it(lab: Lab, tmp_path: Path) -> None:
+    options = CoachOptions(
+        folder=tmp_path / "coached",
+        boards=(lab.words,),
+        guide=GuideOptions(boards=(board_of_words(lab.words),), hfov_deg=63.0),
+    )
+    coach = open_coach(options)
+    for n in range(VIEWS):
+        grey = cv2.imread(lab.path(f"left/{n:02d}.png"), cv2.IMREAD_GRAYSCALE)
+        state = coach.look([np.repeat(grey[..., None], 3, axis=2)], take=True)
+        assert state["taken"] is not None
+    assert "px" in coach.finish()
+    assert (tmp_path / "coached" / "calibration.json").exists()
