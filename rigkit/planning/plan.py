@@ -49,10 +49,16 @@ class Plan:
 
 def covariance_of(information: FloatArray) -> FloatArray:
     """Return the inverses of information matrices (..., P, P), each scaled to a unit diagonal first: parameters differ
-    by many powers of ten."""
+    by many powers of ten. What nothing is known of, a parameter without effect, is as unsure as rounding tells."""
     scale = 1.0 / np.sqrt(np.einsum("...pp->...p", information))
     unit = information * scale[..., :, None] * scale[..., None, :]
-    return np.asarray(np.linalg.inv(unit) * scale[..., :, None] * scale[..., None, :])
+    try:
+        inverse = np.linalg.inv(unit)
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(unit)
+        values = np.maximum(values, unit.shape[-1] * np.finfo(np.float64).eps)
+        inverse = (vectors / values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return np.asarray(inverse * scale[..., :, None] * scale[..., None, :])
 
 
 def choose_views(

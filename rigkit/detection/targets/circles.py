@@ -22,6 +22,8 @@ class CirclesFinder(Finder):
         names: list[str | None] = []
         for grid in find_grids(search.grey, fewest):
             fits = [(board, placed) for board in boards if (placed := placed_on(grid, board)) is not None]
+            # A grid that is a whole board is that one, though a larger board may have room for it.
+            fits = [fit for fit in fits if fit[1].complete] or fits
             if fits:
                 board, placed = fits[0]
                 camera = search.camera
