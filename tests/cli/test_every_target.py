@@ -20,7 +20,9 @@ from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.io.board_file import board_text
+from rigkit.io.board_words import board_of_words
 from rigkit.io.calibration_file import load_calibration
+from rigkit.io.images import read_image, to_grey
 from rigkit.io.rig_file import load_board_rigs, load_saved_rig
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
 from rigkit.synthetic.photometry import Photometry
@@ -28,7 +30,6 @@ from rigkit.synthetic.placing import place_board, sees_paper
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
 from rigkit.workflows.coach import CoachOptions, open_coach
-from rigkit.workflows.folder_session import board_of_words
 
 SIZE = (640, 480)
 LEFT = Pinhole(SIZE, np.array([520.0, 520.0, 321.3, 236.1]))
@@ -289,7 +290,7 @@ def test_the_coach_takes_pictures_of_it(lab: Lab, tmp_path: Path) -> None:
     )
     coach = open_coach(options)
     for n in range(VIEWS):
-        grey = cv2.imread(lab.path(f"left/{n:02d}.png"), cv2.IMREAD_GRAYSCALE)
+        grey = to_grey(read_image(lab.path(f"left/{n:02d}.png")))
         state = coach.look([np.repeat(grey[..., None], 3, axis=2)], take=True)
         assert state["taken"] is not None
     assert "px" in coach.finish()
