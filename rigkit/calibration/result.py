@@ -207,6 +207,10 @@ def _stretch(board: Board, points_mm: Points) -> tuple[float, float]:
 def _chessboard_of(board_id: str, points_mm: Points) -> Board:
     back = np.flatnonzero(np.diff(points_mm[:, 0]) < 0.0)
     columns = int(back[0]) + 1 if len(back) else len(points_mm)
+    if len(points_mm) % columns:
+        raise InputError(
+            f"board '{board_id}': its {len(points_mm)} points are no grid of {columns} columns; calibrate again"
+        )
     lattice = points_mm.reshape(len(points_mm) // columns, columns, 3)
     across, down = (float(np.linalg.norm(np.diff(lattice, axis=axis), axis=-1).mean()) for axis in (1, 0))
     return Board(board_id, columns, len(lattice), across, down)

@@ -141,7 +141,8 @@ def load_watched(source: Path) -> tuple[Watched, tuple[Board, ...]]:
     """
     if not is_rig_file(source):
         calibration = load_calibration(source)
-        boards = tuple(shape.board for shape in calibration.boards)
+        with about(source):
+            boards = tuple(shape.board for shape in calibration.boards)
         return watched_camera(calibration, source.stem), boards
     rig = load_saved_rig(source)
     if rig.covariance is None or rig.sigma_px is None:

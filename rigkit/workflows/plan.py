@@ -104,7 +104,8 @@ def plan_session(
         boards = session.boards
     else:
         calibration = load_calibration(source)
-        boards = tuple(shape.board for shape in calibration.boards)
+        with about(source):
+            boards = tuple(shape.board for shape in calibration.boards)
     with about(source):
         plan = next_views(calibration, boards, options.count, length=options.length, reach=options.reach)
     taken = np.concatenate([view.pixels[view.kept] for view in calibration.views])
