@@ -14,8 +14,9 @@ from rigkit.calibration.result import BoardShape, Calibration, Candidate, Outlie
 from rigkit.calibration.shape import ShapeModel
 from rigkit.calibration.solver import with_priors
 from rigkit.calibration.state import State
+from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, IntArray, Points
-from rigkit.core.errors import DegenerateError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
 
@@ -131,6 +132,29 @@ def frame_covariance(normal: NormalEquations, state: State, count: int) -> Float
     out[p:, :p] = out[:p, p:].T
     out[p:, p:] = through @ globals_ @ through.T + spread
     return 0.5 * (out + out.T)
+
+
+def identifiable(fit: Fit) -> bool:
+    """Return whether the images tell the camera's parameters from each other, and each of them at all.
+
+    A parameter without effect at the solution, such as eucm's beta where alpha vanishes, may look told when its tiny
+    effects are compared with each other. Then its standard deviation leads out of the model on both sides.
+    """
+    normal = solution_normal(fit)
+    if not normal.identifiable:
+        return False
+    camera = fit.state.camera
+    sigma = fit.sigma_px * np.sqrt(np.diag(normal.covariance()[0])[: camera.parameters.size])
+    return all(_exists(camera, step) or _exists(camera, -step) for step in np.diag(sigma))
+
+
+def _exists(camera: Camera, step: FloatArray) -> bool:
+    """Return whether the model has a camera with parameters `step` (P,) further on."""
+    try:
+        camera.with_parameters(camera.parameters + step)
+    except InputError:
+        return False
+    return True
 
 
 def not_identifiable(model: str) -> DegenerateError:

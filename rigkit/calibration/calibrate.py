@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.assemble import assemble, not_identifiable, require_determined, solution_normal
+from rigkit.calibration.assemble import assemble, identifiable, not_identifiable, require_determined
 from rigkit.calibration.board_orientation import turned_views, with_views_turned
 from rigkit.calibration.choice import SURELY, Option, choose, described
 from rigkit.calibration.evidence import fit_shapes
@@ -234,7 +234,7 @@ def _fit_all(
         progress("models", i, len(wanted))
         try:
             fit = fit_model(observations, size_px, cls, order)
-            if not solution_normal(fit).identifiable:
+            if not identifiable(fit):
                 raise not_identifiable(name)
             options.append(Option(name, fit))
         except (DegenerateError, InputError) as caught:

@@ -54,15 +54,15 @@ def coach_app(coach: Coach, token: str, hosts: tuple[str, ...] = LOCAL, *, camer
         raise InstallationError('coach: needs a web server; install it with `pip install "rigkit[coach]"`') from error
 
     async def page(request: Request) -> Response:
-        no = _refused(request, token, hosts)
+        refusal = _refused(request, token, hosts)
         text = resources.files("rigkit.coach").joinpath("page.html").read_text(encoding="utf-8")
         names = html.escape(json.dumps(coach.keeper.names), quote=True)
-        return no or HTMLResponse(text.replace("{{camera}}", camera).replace("{{names}}", names), 200, HEADERS)
+        return refusal or HTMLResponse(text.replace("{{camera}}", camera).replace("{{names}}", names), 200, HEADERS)
 
     async def act(request: Request) -> Response:
-        no = _refused(request, token, hosts)
-        if no is not None:
-            return no
+        refusal = _refused(request, token, hosts)
+        if refusal is not None:
+            return refusal
         data = await _body_of(request)
         if data is None:
             return PlainTextResponse("too large", 413, HEADERS)
@@ -79,9 +79,9 @@ def coach_app(coach: Coach, token: str, hosts: tuple[str, ...] = LOCAL, *, camer
     async def preview(request: Request) -> Response:
         from starlette.responses import Response as Plain
 
-        no = _refused(request, token, hosts)
+        refusal = _refused(request, token, hosts)
         picture = coach_preview.get(request.path_params["camera"])
-        return no or Plain(picture or b"", 200 if picture else 404, {**HEADERS, "Content-Type": "image/jpeg"})
+        return refusal or Plain(picture or b"", 200 if picture else 404, {**HEADERS, "Content-Type": "image/jpeg"})
 
     coach_preview: dict[int, bytes] = {}
     app = Starlette(
@@ -107,12 +107,12 @@ def _refused(request: Request, token: str, hosts: tuple[str, ...]) -> Response |
     origin = request.headers.get("origin")
     try:
         host = urlsplit(f"//{request.headers.get('host', '')}").hostname or ""
-        stranger = origin is not None and urlsplit(origin).netloc != request.headers.get("host")
+        is_foreign = origin is not None and urlsplit(origin).netloc != request.headers.get("host")
     except ValueError:
         return PlainTextResponse("no address", 400, HEADERS)
     if (f"[{host}]" if ":" in host else host) not in hosts:
         return PlainTextResponse("wrong host", 403, HEADERS)
-    if stranger:
+    if is_foreign:
         return PlainTextResponse("wrong origin", 403, HEADERS)
     if request.method == "POST" and origin is None:
         return PlainTextResponse("no origin", 403, HEADERS)
@@ -161,13 +161,13 @@ def _done(coach: Coach, what: str, parts: list[bytes]) -> dict[str, Any] | None:
 
 def own_address() -> str:
     """Return the address of this machine in its network; nothing is sent. Raises InputError where it has none."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as way:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             # Any address beyond this network will do: which of our own would be asked for it?
-            way.connect(("192.0.2.1", 9))
+            probe.connect(("192.0.2.1", 9))
         except OSError as error:
             raise InputError("coach: --lan: this machine is in no network") from error
-        return str(way.getsockname()[0])
+        return str(probe.getsockname()[0])
 
 
 def serve(app: Starlette, host: str, port: int, ready: Callable[[int], None]) -> None:

@@ -88,7 +88,8 @@ def best_accepted(camera: Camera, accepted: Sequence[Accepted], format_name: str
             c = convert_camera(camera, kind.model, order=kind.order, fixed=kind.zero)
         except InputError:
             continue
-        lacks = f"{camera.model} model" + (" with these terms" if kind.model == camera.model else "")
+        fewer = any(k.model == camera.model for k in accepted)
+        lacks = f"{camera.model} model" + (" with these terms" if fewer else "")
         note = f"{format_name} has no {lacks}: refitted as {kind.model}, off by {c.max_px:.3g} px at most"
         if c.covered < 1.0:
             reach = min(np.degrees(c.reach_rad), np.degrees(c.camera.max_angle_rad))

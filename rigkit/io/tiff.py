@@ -1,4 +1,4 @@
-"""TIFF files as far as decoders go astray: an orientation that they apply unasked, pages that they leave out unsaid.
+"""What decoders get wrong in TIFF files: an orientation that they apply unasked, pages that they leave out unsaid.
 
 TIFF 6.0 and BigTIFF: a header of 8 (16) bytes, then a chain of directories, each a list of entries (tag, type, count,
 value).

@@ -159,8 +159,10 @@ def _diagnose_boards(report: ValidationReport) -> list[str]:
                 "(boards of this kind that stand there and are not listed?), or the pose is wrong"
             )
         elif abs(aspect) > ODD_BOARD:
+            longer, other = ("wider", "high") if aspect > 0.0 else ("higher", "wide")
+            longer_by = max(aspect, 1.0 / (1.0 + aspect) - 1.0)
             out.append(
-                f"board '{name}': its squares come out {100.0 * aspect:+.1f} % wider than high against what is "
+                f"board '{name}': its squares come out {100.0 * longer_by:.1f} % {longer} than {other} against what is "
                 "declared; measure square_x_mm and square_y_mm, or look at the calibration's aspect"
             )
     return out

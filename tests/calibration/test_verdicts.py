@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 
+from rigkit.calibration.assemble import identifiable
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.fit import fit_model
 from rigkit.calibration.linearise import normal_equations
 from rigkit.calibration.normal_equations import NormalEquations
 from rigkit.calibration.observations import Observations
@@ -165,6 +167,19 @@ def test_numbers_that_no_image_tells(alpha: float, rng: np.random.Generator) -> 
     state = State.start(camera, rotation, translation, observations)
     normal = with_priors(normal_equations(observations, state), state, 0.1)
     assert normal.identifiable == (alpha > 0.0)
+
+
+def test_numbers_without_effect_are_not_told_by_each_other(rng: np.random.Generator) -> None:
+    """Where alpha and beta both vanish, each has hardly an effect, but of one size: only the sigmas are absurd."""
+    views, _, _ = random_views(EUCM(SIZE, np.array([1364.0, 1365.0, 808.0, 615.0, 0.4, 1.0])), 15, rng, reach_deg=33.0)
+    observations = Observations.from_views(views)
+    fit = fit_model(observations, SIZE, EUCM, None)
+    assert identifiable(fit)
+    camera = EUCM(SIZE, np.array([*fit.state.camera.parameters[:4], 1e-5, 1e-4]))
+    state = replace(fit.state, camera=camera)
+    there = replace(fit, state=state, data=normal_equations(observations, state, fit.weight(observations)))
+    assert with_priors(there.data, state, fit.sigma_px).identifiable
+    assert not identifiable(there)
 
 
 def test_a_model_that_is_not_identifiable_is_not_taken(

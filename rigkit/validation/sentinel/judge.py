@@ -1,4 +1,4 @@
-"""Does it still hold, or what happened: the score of fresh frames against the covariance of the calibration.
+"""Whether a calibration still holds, and else what changed: fresh frames against its covariance.
 
 Scores of frames have, where nothing changed, the covariance A + A C A in units of the frames' own scatter, with A their
 information and C the covariance of theta: the frames scatter, and the calibration was a little off from the start. With
@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from rigkit.calibration.uncertainty import projection_design
 from rigkit.cameras.base import Camera
@@ -49,9 +49,16 @@ DRAWS, FEW_DRAWS = 4000, 8
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Change:
-    """What a cause would have to be: its amounts in `cause.units` and their covariance, its chance if nothing changed,
-    how large it is (the projection moves by `size_px` rms after the best rotation, or a mount by what shows), and by
-    how much it lowers the squared misfit."""
+    """A cause with the amounts that explain the frames best.
+
+    Attributes
+    ----------
+    cause : what changed.
+    amounts, covariance : (K,) and (K, K), in `cause.units`.
+    chance : probability that unchanged cameras show as much of it.
+    size_px : how far it moves the projection, rms after the best rotation; of a mount, how far what it shows moves.
+    gain : by how much it lowers the sum of squares.
+    """
 
     cause: Cause
     amounts: FloatArray
@@ -181,7 +188,7 @@ def _chance_of_any(whitened: Whitened, known: Sequence[Change]) -> float:
         basis = np.linalg.qr(root.T @ whitened.by_theta @ change.cause.directions)[0]
         m = basis.shape[1]
         gain = ((basis.T @ drawn) ** 2).sum(axis=0) / scale
-        least = np.minimum(least, f_distribution.sf(gain / m, m, whitened.freedom))
+        least = np.minimum(least, fdtrc(m, whitened.freedom, gain / m))
     return float(min(bound, (1.0 + np.count_nonzero(least <= best)) / (DRAWS + 1.0)))
 
 
@@ -224,7 +231,7 @@ def _fitted(whitened: Whitened, cause: Cause) -> Change | None:
     amounts = covariance @ right
     gain = float(right @ amounts)
     m = len(amounts)
-    chance = float(f_distribution.sf(gain / m, m, whitened.freedom))
+    chance = float(fdtrc(m, whitened.freedom, max(gain, 0.0) / m))
     return Change(cause, amounts, covariance, chance, 0.0, gain)
 
 
