@@ -117,7 +117,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return ExitCode.BAD_INPUT
         if isinstance(error, OSError) and error.errno in SURROUNDINGS:
             where = f"'{error.filename}': " if error.filename else ""
-            say(printable(f"{where}{error.strerror}; make room or choose another folder"))
+            say(printable(f"{where}{error.strerror}; {SURROUNDINGS[error.errno]}"))
             return ExitCode.BAD_INPUT
         say("this is a bug in rigkit; please report the lines above", before=traceback.format_exc())
         return ExitCode.BUG

@@ -13,6 +13,7 @@ from pathlib import Path
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier
 from rigkit.core.posetype import PoseType
+from rigkit.io.reading import usable_path
 
 POSE_TYPES = tuple(map(str, PoseType))
 ONE_CAMERA, TWO_CAMERAS = ("camera",), ("camera1", "camera2")
@@ -38,13 +39,13 @@ def told_calibrations(told: Sequence[str], folder: Path) -> dict[str, str]:
     out: dict[str, str] = {}
     for k, words in enumerate(told):
         name, found, path = words.partition("=")
-        if not found or Path(words).exists():
+        if not found or usable_path(words).exists():
             if len(told) > len(TWO_CAMERAS):
                 raise InputError(f"--calibration {words}: of more than two cameras name each, such as wide={words}")
             name, path = usual[k], words
         if check_identifier(name, "camera") in out:
             raise InputError(f"--calibration: two are called '{name}'; name each differently")
-        typed = Path(path)
+        typed = usable_path(path)
         if not typed.is_absolute() and typed.exists():
             path = Path(os.path.relpath(typed, folder)).as_posix()
         out[name] = path

@@ -13,10 +13,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+ROOM, PATH = "make room or choose another folder", "correct the path"
 SURROUNDINGS = {
-    getattr(errno, name, None) for name in ("ENOSPC", "EDQUOT", "EROFS", "EACCES", "EPERM", "EIO", "EMFILE", "ENFILE")
-} - {None}
-"""Errors of the system that are nobody's bug: a full disk, a folder that may not be written, too many open files."""
+    getattr(errno, name): remedy
+    for remedy, names in (
+        (ROOM, ("ENOSPC", "EDQUOT", "EROFS", "EACCES", "EPERM", "EIO", "EMFILE", "ENFILE")),
+        (PATH, ("ENAMETOOLONG", "ELOOP")),
+    )
+    for name in names
+    if hasattr(errno, name)
+}
+"""Errors of the system that are nobody's bug, and what to do: a full disk, a folder that may not be written, too many
+open files, a path that leads nowhere."""
 
 
 class Terminated(KeyboardInterrupt):

@@ -13,6 +13,7 @@ from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.patterns.registry import PATTERNS, pattern_type
 from rigkit.io.board_file import board_from_table, load_board
 from rigkit.io.foreign_boards import FOREIGN_SUFFIXES
+from rigkit.io.reading import usable_path
 from rigkit.io.toml_reader import TomlTable
 
 BOARD_WORDS = re.compile(
@@ -60,7 +61,7 @@ def board_of_words(words: str) -> Board:
     board = board_in_words(words)
     if board is not None:
         return board
-    if not words.endswith((".toml", *FOREIGN_SUFFIXES)) and not Path(words).is_file():
+    if not words.endswith((".toml", *FOREIGN_SUFFIXES)) and not usable_path(words).is_file():
         if COUNTS.fullmatch(words):
             raise InputError(f"--board {words}: say how large a square is as well: {words}x25 where its side is 25 mm")
         raise InputError(f"--board {words}: write {WORDS_HELP}, or a board file")

@@ -59,8 +59,10 @@ def build_demo(directory: str | Path, rng: np.random.Generator, progress: Progre
         The folder has something in it, or cannot be written (permission, full disk).
     """
     root = Path(directory)
-    if root.exists() and (not root.is_dir() or any(root.iterdir())):
+    if root.is_dir() and any(root.iterdir()):
         raise InputError(f"demo: '{root}' is not empty; give a new folder")
+    if root.exists() and not root.is_dir():
+        raise InputError(f"demo: '{root}' is a file; give a new folder")
     new = not root.exists()
     try:
         root.mkdir(parents=True, exist_ok=True)

@@ -13,6 +13,7 @@ import numpy as np
 from rigkit.core.errors import InputError
 from rigkit.core.progress import Progress, silent
 from rigkit.io.manifest import load_dataset
+from rigkit.io.reading import usable_path
 from rigkit.synthetic.demo import build_demo
 from rigkit.workflows.calibrate import CalibrateOptions, calibrate_session
 from rigkit.workflows.corners import Cache
@@ -52,7 +53,7 @@ def run_demo(options: DemoOptions | None = None, *, progress: Progress = silent)
         raise InputError(f"demo: --seed {options.seed}: a number from 0 upwards is needed")
     if options.jobs is not None and options.jobs < 1:
         raise InputError(f"--jobs {options.jobs}: at least one process is needed")
-    manifest = build_demo(options.output, np.random.default_rng(options.seed), progress)
+    manifest = build_demo(usable_path(options.output), np.random.default_rng(options.seed), progress)
     _log.info(
         f"capture written to {options.output}: images, boards, {manifest.name}; truth.json, which rigkit does not read"
     )

@@ -259,3 +259,52 @@ def test_unknown_verb_and_no_verb(capsys: pytest.CaptureFixture[str]) -> None:
     assert "usage: rigkit" in capsys.readouterr().err
     assert main([]) == 2
     assert "usage: rigkit" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "demo -o {long}",
+        "board 9x6 --square-mm 25 -o {long}",
+        "detect {long} --board 9x6x25",
+        "detect {image} --board {long}",
+        "detect {image} --board 9x6x25 -o {long}.csv",
+        "pose {image} --camera {camera} --board {long}",
+        "pose {image} --camera {long} --board 9x6x25",
+        "calibrate {long} --board 9x6x25",
+        "calibrate {images} --board {long}",
+        "init {long} --square-mm 25",
+        "init {images} --square-mm 25 --calibration {long}",
+        "init {images} --square-mm 25 --calibration camera={long}",
+        "plan {camera} --board {long}",
+        "plan {camera} -r {long}.html",
+        "check {camera} {long}",
+        "check {camera} {image} --board {long}",
+        "coach {long} --board 9x6x25",
+        "coach {long} --board 9x6x25 --video {image}",
+        "coach new --board 9x6x25 --watch {long}",
+        "export {camera} --to opencv -o {long}.yaml",
+        "rectify {image} --camera {camera} -o {long}.png",
+        "rectify {image} --camera {camera} -o out.png --maps {long}.npz",
+        "diff {camera} {long}",
+        "certify {camera} --length 800 --distance 1500 -r {long}.html",
+        "handeye {long} {image} --camera {camera} --board 9x6x25",
+        "reconstruct {long}",
+        "reconstruct --images {image} {long} --camera {camera}",
+        "reconstruct --images {image} {image} --rig {long}",
+        "validate {long}",
+        "mesh {long}",
+        "schema {long}",
+        "history {long}",
+        "simulate {long}",
+        "diff {camera} {camera} --log-file {long}",
+    ],
+)
+def test_names_that_no_file_system_takes(
+    words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    known = {"image": IMAGES / "view1.jpg", "images": IMAGES, "camera": CALIBRATION, "long": "9" * 600}
+    assert main([word.format(**known) for word in words.split()]) == 2
+    assert capsys.readouterr().err.splitlines()[-1].startswith("rigkit: ")
+    assert not any(tmp_path.iterdir())
