@@ -24,11 +24,15 @@ MIN_OWN_PART = 1e-6
 """A way to change that the pose, or the ways before, follow but for this part of it is none of its own."""
 MIN_VARIANCE_RATIO = 6.0
 """Variance along a way to change over that of the rest."""
-MIN_SHARE_EXPLAINED = 0.3
-"""A way to change that explains less of all squares does little harm, and may be a little of something else."""
+MIN_SHARE_EXPLAINED = 0.5
+"""The main part: a way to change that explains less of all squares may be a little of something else. A board held in
+hand before two cameras is bent by the residuals of one, sheared by those of the other, with a third of each."""
 MIN_LEAD_OF_CRITERION = 10.0
 """By so much its Bayesian information criterion must be below that of nothing and of every other way: very strong
 evidence (Kass and Raftery, "Bayes factors", J. Am. Stat. Assoc. 90, 1995)."""
+MIN_LEAD_OF_GAIN = 0.1
+"""And by this part of its own lead over nothing: ways to change that follow the same images nearly as well leave open
+which of them it was, however many corners there are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +80,7 @@ def changing(calibration: Calibration) -> list[Finding]:
         best not in WAYS
         or found.ratio < MIN_VARIANCE_RATIO
         or found.share < MIN_SHARE_EXPLAINED
-        or min(others) - found.criterion < MIN_LEAD_OF_CRITERION
+        or min(others) - found.criterion < max(MIN_LEAD_OF_CRITERION, -MIN_LEAD_OF_GAIN * found.criterion)
     ):
         return []
     message = f"{WAYS[best].message}: that explains {100.0 * found.share:.0f} % of the squares of all residuals"

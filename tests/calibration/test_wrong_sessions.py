@@ -191,14 +191,14 @@ def changed_views(way: str, rng: np.random.Generator) -> list[BoardView]:
     for k in range(20):
         own, points = camera, BOARD.points()
         if way == "focus":
-            own = camera.with_parameters(camera.parameters * np.array([*[1.0 + 0.004 * rng.normal()] * 2, *[1.0] * 7]))
+            own = camera.with_parameters(camera.parameters * np.array([*[1.0 + 0.01 * rng.normal()] * 2, *[1.0] * 7]))
         if way == "bend":
             bow = rng.normal(size=2)
             points[:, 2] += bow[0] * (1.0 - side[:, 0] ** 2) + bow[1] * side[:, 0] * side[:, 1]
         view = random_views(own, 1, rng, reach_deg=33.0, noise_px=0.05, points_mm=points)[0][0]
         pixels = np.array(view.pixels)
         if way == "shift":
-            pixels += 5.0 * rng.normal(size=2)
+            pixels += 12.0 * rng.normal(size=2)
         if way == "rows":
             velocity, spin = 2.0 * rng.normal(size=2), 0.005 * rng.normal()
             off = pixels - pixels.mean(axis=0)
@@ -218,7 +218,12 @@ def changed_views(way: str, rng: np.random.Generator) -> list[BoardView]:
     ],
 )
 def test_what_changes_from_image_to_image(way: str, words: str, rng: np.random.Generator) -> None:
-    assert words in first(calibrate(changed_views(way, rng), SIZE, model="brown", board="flat"))
+    """In most sessions; where two ways to change follow the images nearly as well, nothing is said rather than the
+    wrong one."""
+    results = [calibrate(changed_views(way, rng), SIZE, model="brown", board="flat") for _ in range(4)]
+    named = [result for result in results if changing(result)]
+    assert len(named) >= 3
+    assert all(words in str(result.verdicts) for result in named), [str(result.verdicts[0]) for result in named]
 
 
 def test_what_is_wrong_in_all_images_alike_changes_in_none(rng: np.random.Generator) -> None:

@@ -101,7 +101,9 @@ def grey_image(image: NDArray[np.generic]) -> GreyImage:
     if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] not in (3, 4)):
         raise InputError(f"image: expected (H, W) or (H, W, 3 or 4), got {array.shape}; pass one image at a time")
     if min(array.shape[:2]) < 16:
-        raise InputError(f"image: {array.shape[1]}x{array.shape[0]} pixels are too few to hold a chessboard")
+        raise InputError(
+            f"image: {array.shape[1]}x{array.shape[0]} pixels are too few to hold a chessboard; give a whole picture"
+        )
     # Files say in which order their bytes are; it is no other type.
     array = array.astype(array.dtype.newbyteorder("="), copy=False)
     if array.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
