@@ -54,7 +54,10 @@ def known_cameras(session: RigSession) -> KnownCameras | None:
     if rig.cameras:
         first = next(iter(rig.cameras))
         if first not in names:
-            raise InputError(f"'{session.known_rig}': its first camera, '{first}', is none of {', '.join(names)}")
+            raise InputError(
+                f"'{session.known_rig}': its first camera, '{first}', is none of {', '.join(names)}; give the one "
+                "that it is that id"
+            )
         if len(mounted) == len(names):
             raise InputError(
                 f"'{session.known_rig}' has all cameras already ({', '.join(names)}); there is none to add; "
