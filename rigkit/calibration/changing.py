@@ -114,7 +114,8 @@ def view_changes(calibration: Calibration) -> dict[str, ViewChange]:
     for view in calibration.views:
         if np.count_nonzero(view.kept) >= MIN_TELLING_CORNERS:
             points = shapes[view.board_id][view.grid[view.kept] @ [1, columns[view.board_id]]]
-            views.append(_OwnPart.of(calibration, view, points))
+            own = _OwnPart.of(calibration, view, points)
+            views += [] if own is None else [own]
     if len(views) < MIN_TELLING_VIEWS:
         return {}
     gram = np.sum([view.common.T @ view.common for view in views], axis=0)
@@ -155,12 +156,14 @@ class _OwnPart:
     ways: dict[str, FloatArray]
 
     @classmethod
-    def of(cls, calibration: Calibration, view: ViewResult, points: Points) -> _OwnPart:
+    def of(cls, calibration: Calibration, view: ViewResult, points: Points) -> _OwnPart | None:
+        """Return it for the `points` kept; None where a lens so far off has no pixels, or no slopes, for them."""
         rotation = view.cam_from_board.rotation
         turned = points @ rotation.T
         in_cam = turned + view.cam_from_board.translation_mm
         pixels, valid, by_point, by_camera = calibration.camera.project_with_jacobians(in_cam)
-        by_point, by_camera = (np.where(valid[:, None, None], by, 0.0) for by in (by_point, by_camera))
+        if not (valid.all() and np.isfinite(by_point).all() and np.isfinite(by_camera).all()):
+            return None
         pose = np.concatenate([-by_point @ skew(turned - turned.mean(axis=0)), by_point], axis=2)
         centre, _ = calibration.camera.project(np.array([[0.0, 0.0, 1.0]]))
         along_v, along_u = ((pixels - pixels.mean(axis=0)) / calibration.camera.size_px).T[::-1, :, None, None]

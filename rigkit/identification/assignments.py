@@ -15,6 +15,7 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray, IntArray, Points
 from rigkit.core.detections import BoardDetection
+from rigkit.core.errors import DegenerateError
 from rigkit.identification.board_matches import BoardMatch, ImageObservations
 from rigkit.identification.joint_pose import JointPose, refine_joint
 from rigkit.identification.placements import BoardKind
@@ -73,7 +74,10 @@ def _corner_count(matches: Sequence[BoardMatch], view1: ImageObservations, view2
 def ranked_assignments(
     matches: Sequence[BoardMatch], view1: ImageObservations, view2: ImageObservations, kinds: Sequence[BoardKind]
 ) -> list[Assignment]:
-    """Return distinct assignments with their joint fits, best first."""
+    """Return distinct assignments with their joint fits, best first.
+
+    Raises DegenerateError where no motion takes any board along.
+    """
     predictor = _Predictor.build(matches, view2, kinds)
     # Whole boards first: a part whose place on the board is open makes many links, most of them wrong.
     open_places = Counter((s.first, s.second) for s in matches)
@@ -85,10 +89,17 @@ def ranked_assignments(
     starts: dict[frozenset[tuple[int, tuple[int, ...]]], tuple[float, FloatArray, list[int]]] = {}
     for motion, miss in zip(motions, misses, strict=True):
         chosen = _choose(miss, SEED_GATE, matches, kinds)
+        if not chosen:
+            continue
         total = sum(min(float(miss[n]), SEED_GATE) ** 2 for n in chosen) - SEED_GATE**2 * len(chosen)
         name = frozenset((matches[n].first, (matches[n].second, *matches[n].key)) for n in chosen)
         if name not in starts or total < starts[name][0]:
             starts[name] = (total, motion, chosen)
+    if not starts:
+        raise DegenerateError(
+            "pair: no place of the cameras explains a single board in both images; check the sizes of the squares, and "
+            "which calibration belongs to which image"
+        )
     found: dict[frozenset[tuple[int, tuple[int, ...]]], Assignment] = {}
     for _, motion, chosen in sorted(starts.values(), key=lambda s: s[0])[:MAX_ASSIGNMENTS]:
         assignment = _settle(motion, chosen, matches, predictor, view1, view2, kinds)

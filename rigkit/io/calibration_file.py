@@ -106,6 +106,8 @@ def load_calibration(path: str | Path) -> Calibration:
     with damage_named(path):
         camera = camera_from_json(data["camera"], path)
         size = camera.parameters.size
+        boards = tuple(_shape_in(v) for v in data["boards"])
+        sizes = {board.board_id: board.declared.size for board in boards if board.declared is not None}
         return Calibration(
             camera=camera,
             rms_px=real(data["rms_px"]),
@@ -113,12 +115,12 @@ def load_calibration(path: str | Path) -> Calibration:
             covariance=as_covariance(data["covariance"], "covariance", size),
             frame_covariance=as_covariance(data["frame_covariance"], "frame_covariance", size + 6),
             sigma_px=real(data["sigma_px"]),
-            views=tuple(_view_in(v) for v in data["views"]),
+            views=tuple(_view_in(v, sizes) for v in data["views"]),
             dropped=tuple((str(image), str(reason)) for image, reason in data["dropped"]),
             outliers=tuple(_entry(Outlier, _finite(v)) for v in data["outliers"]),
             candidates=tuple(_entry(Candidate, _finite(v, ("rms_px",))) for v in data["candidates"]),
             convergence=_entry(Convergence, data["convergence"]),
-            boards=tuple(_shape_in(v) for v in data["boards"]),
+            boards=boards,
             verdicts=findings_from_json(data["verdicts"]),
             overdispersion=float(data.get("overdispersion", 1.0)),
             freedom=float(data.get("freedom") or math.inf),
@@ -221,15 +223,21 @@ def _view_out(view: ViewResult) -> dict[str, Any]:
     }
 
 
-def _view_in(data: dict[str, Any]) -> ViewResult:
+def _view_in(data: dict[str, Any], sizes: Mapping[str, tuple[int, int]]) -> ViewResult:
+    """Return a view; `sizes` of the boards as (columns, rows), those that are declared."""
+    grid, kept = np.array(data["grid"], dtype=np.int64).reshape(-1, 2), data["kept"]
+    if not all(isinstance(one, bool) for one in kept):
+        raise ValueError("what 'kept' says of a corner must be true or false")
+    if ((grid < 0) | (grid >= sizes.get(data["board_id"], grid + 1))).any():
+        raise ValueError(f"corners of '{data['image']}' beyond the board '{data['board_id']}'")
     return ViewResult(
         image=str(data["image"]),
         board_id=str(data["board_id"]),
         cam_from_board=Rigid3.from_matrix(data["cam_from_board"]),
-        grid=np.array(data["grid"], dtype=np.int64).reshape(-1, 2),
+        grid=grid,
         pixels=_array(data["pixels"]),
         residuals_px=_array(data["residuals_px"]),
-        kept=np.array(data["kept"], dtype=bool),
+        kept=np.array(kept, dtype=bool),
     )
 
 

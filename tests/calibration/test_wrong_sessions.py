@@ -236,3 +236,11 @@ def test_what_is_wrong_in_all_images_alike_changes_in_none(rng: np.random.Genera
     views = random_views(lens("reg"), 20, rng, reach_deg=33.0, noise_px=0.05, points_mm=bent)[0]
     for shape in ("flat", "warp"):
         assert changing(calibrate(views, SIZE, model="brown", board=shape)) == []
+
+
+def test_a_lens_beyond_all_numbers_tells_nothing_of_what_changes(rng: np.random.Generator) -> None:
+    result = calibrate(changed_views("rows", rng), SIZE, model="brown", board="flat")
+    parameters = np.array(result.camera.parameters)
+    parameters[4] = -9e14
+    assert changing(result) != []
+    assert changing(replace(result, camera=result.camera.with_parameters(parameters))) == []

@@ -149,7 +149,7 @@ def test_a_session_of_a_person_is_not_replaced(
     assert main(["calibrate", str(folder)]) == 2
     assert "--board 9x6xMM" in capsys.readouterr().err
     assert main(["calibrate", str(folder), "--board", "9x6"]) == 2
-    assert "mm a square" in capsys.readouterr().err
+    assert "say how large a square is" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("layout", ["names", "folders", "two folders"])
