@@ -33,6 +33,7 @@ import zlib
 
 import cv2
 import numpy as np
+from degradations import SAME, Grey, degraded
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
@@ -66,19 +67,18 @@ SAME_CELLS, SAME_SHARE = 0.25, 0.9
 """A lattice is a board seen before where so much of it lies so near, in cells, to corners of that."""
 SHOWN = 10
 WORSE: dict[str, tuple[float, ...]] = {
-    "noisy": (10.0, 25.0),
+    "noise": (10.0, 25.0),
     "faint": (0.15,),
-    "dark": (0.4, 2.5),
-    "blurred": (1.5, 3.0, 4.0),
+    "gamma": (0.4, 2.5),
+    "blur": (1.5, 3.0, 4.0),
     "sharpened": (2.0, 5.0),
-    "compressed": (30.0, 10.0),
-    "small": (0.5, 0.34),
+    "jpeg": (30.0, 10.0),
+    "size": (0.5, 0.34),
     "covered": (0.2,),
     "cut": (0.5,),
     "webcam": (6.0,),
 }
-"""What is done to images, and how much: grey levels of noise, contrast, gamma, px of blur, ..."""
-Grey = NDArray[np.uint8]
+"""What is done to images, and how much: see `degradations`."""
 SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff")
 
 
@@ -122,50 +122,22 @@ def dot_grid(rng: np.random.Generator, size_px: tuple[int, int]) -> NDArray[np.u
 
 
 def worsened(grey: Grey, rng: np.random.Generator) -> tuple[str, Grey, FloatArray]:
-    """Return a name, a worse image, and the scale and place (3,) of the first in it: p' = s p + t."""
+    """Return what was done, a worse image, and the map (2, 3) of the first's pixels into it."""
     name = str(rng.choice(list(WORSE)))
-    values: Any = grey.astype(np.float32)
-    height, width = grey.shape
-    moved = np.array([1.0, 0.0, 0.0])
     amount = WORSE[name][int(rng.integers(len(WORSE[name])))]
-    if name == "noisy":
-        values = values + amount * rng.standard_normal(grey.shape)
-    elif name == "faint":
-        values = 128.0 + amount * (values - 128.0) + 1.5 * rng.standard_normal(grey.shape)
-    elif name == "dark":
-        values = 255.0 * (values / 255.0) ** amount
-    elif name == "blurred":
-        values = cv2.GaussianBlur(values, (0, 0), amount)
-    elif name == "sharpened":
-        values = values + amount * (values - cv2.GaussianBlur(values, (0, 0), 1.2))
-    elif name == "compressed":
-        values = cv2.imdecode(cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, int(amount)])[1], 0)
-    elif name == "small":
-        values = cv2.resize(values, None, fx=amount, fy=amount, interpolation=cv2.INTER_AREA)
-        moved = np.array([amount, 0.5 * amount - 0.5, 0.5 * amount - 0.5])
-    elif name == "covered":
-        for _ in range(4):
-            middle, axes = rng.uniform(0.2, 0.8, 2) * (width, height), rng.uniform(0.02, amount, 2) * height
-            box: Any = (tuple(middle.tolist()), tuple((2.0 * axes).tolist()), float(rng.uniform(0, 180)))
-            cv2.ellipse(values, box, float(rng.uniform(0, 255)), -1)
-    elif name == "cut":
-        left, top = (int(part * amount * rng.random()) for part in (width, height))
-        values, moved = values[top:, left:], np.array([1.0, -left, -top])
-    elif name == "webcam":
-        soft = cv2.GaussianBlur(values, (0, 0), 1.2) + amount * rng.standard_normal(grey.shape)
-        values = soft + 3.0 * (soft - cv2.GaussianBlur(soft, (0, 0), 1.2))
-    return name, np.ascontiguousarray(np.clip(np.rint(values), 0, 255).astype(np.uint8)), moved
+    image, moved = degraded(name, amount, grey, rng)
+    return name, np.asarray(image, np.uint8), moved
 
 
 def looks(name: str, pixels: NDArray[np.generic], times: int) -> Iterator[tuple[str, Grey, FloatArray]]:
-    """Yield (what was done, image, where the first lies in it) of an image and `times` worse ones."""
+    """Yield (what was done, image, map of the first's pixels into it) of an image and `times` worse ones."""
     seen: Any = grey_image(pixels)
     if seen.dtype == np.uint8:
         grey = np.asarray(seen)
     else:
         low, high = float(seen.min()), float(seen.max())
         grey = np.asarray((seen - low) * (255.0 / max(high - low, 1e-6)), np.uint8)
-    yield "", grey, np.array([1.0, 0.0, 0.0])
+    yield "", grey, SAME
     rng = np.random.default_rng(zlib.crc32(name.encode()))
     for _ in range(times):
         yield worsened(grey, rng)
@@ -207,7 +179,7 @@ def judged(kind: str, image: str, board: bool, pixels: NDArray[np.generic], wors
     known = [item.pixels for item in detect_boards(pixels)] if board else []
     out = []
     for done, grey, moved in looks(image, pixels, worse):
-        boards = [moved[0] * corners + moved[1:] for corners in known]
+        boards = [corners @ moved[:, :2].T + moved[:, 2] for corners in known]
         out += _judged(kind, f"{image} {done}".strip(), board, grey, boards)
     return out
 
