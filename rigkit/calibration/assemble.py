@@ -32,10 +32,11 @@ def assemble(
     heldout_px: float | None,
     dropped: tuple[tuple[str, str], ...],
     candidates: tuple[Candidate, ...],
+    clusters: IntArray | None = None,
 ) -> Calibration:
-    """Return the result, without verdicts."""
+    """Return the result, without verdicts; `clusters` (V,) is what `clusters_of` returns, where it is known already."""
     state, sigma = fit.state, fit.sigma_px
-    covariance, clustered = _covariance(observations, fit)
+    covariance, clustered = _covariance(observations, fit, clusters_of(observations) if clusters is None else clusters)
     px = np.where(fit.residuals.valid[..., None], fit.residuals.px, np.nan)
     poses = Rigid3.stack(state.rotation, state.translation_mm)
     p = state.camera.parameters.size
@@ -57,7 +58,7 @@ def assemble(
     )
 
 
-def _covariance(observations: Observations, fit: Fit) -> tuple[FloatArray, Clustered]:
+def _covariance(observations: Observations, fit: Fit, clusters: IntArray) -> tuple[FloatArray, Clustered]:
     """Return the covariance of the parameters and of the mean motion of the boards, (P + 6, P + 6), with the images as
     the independent units, and what the images said."""
     normal = solution_normal(fit)
@@ -69,7 +70,7 @@ def _covariance(observations: Observations, fit: Fit) -> tuple[FloatArray, Clust
     if not (np.isfinite(unit).all() and (variance[:p] > 0.0).all() and (variance >= 0.0).all()):
         raise not_identifiable(fit.state.camera.model)
     products = view_products(observations, fit.state, fit.weight(observations))
-    information, score = reduced_by_cluster(products, n, _clusters(observations))
+    information, score = reduced_by_cluster(products, n, clusters)
     prior = (normal.gg - fit.data.gg)[:n, :n]
     clustered = clustered_covariance(unit[:n, :n], information, score, prior, fit.sigma_px)
     covariance = with_block(unit * fit.sigma_px**2, clustered.covariance, clustered.overdispersion**2)
@@ -77,7 +78,7 @@ def _covariance(observations: Observations, fit: Fit) -> tuple[FloatArray, Clust
     return covariance[np.ix_(chosen, chosen)], clustered
 
 
-def _clusters(observations: Observations) -> IntArray:
+def clusters_of(observations: Observations) -> IntArray:
     """Return the number of the image of each view (V,), images that repeat others taken as one."""
     boards = [view.board.board_id for view in observations.views]
     return cluster_numbers(observations.images, boards, [view.pixels for view in observations.views])
@@ -145,7 +146,8 @@ def identifiable(fit: Fit) -> bool:
         return False
     camera = fit.state.camera
     sigma = fit.sigma_px * np.sqrt(np.diag(normal.covariance()[0])[: camera.parameters.size])
-    return all(_exists(camera, step) or _exists(camera, -step) for step in np.diag(sigma))
+    # Models limit each parameter by itself: where all steps at once lead to a camera, each alone does.
+    return _exists(camera, sigma) or all(_exists(camera, step) or _exists(camera, -step) for step in np.diag(sigma))
 
 
 def _exists(camera: Camera, step: FloatArray) -> bool:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.assemble import assemble, identifiable, not_identifiable, require_determined
+from rigkit.calibration.assemble import assemble, clusters_of, identifiable, not_identifiable, require_determined
 from rigkit.calibration.board_orientation import turned_views, with_views_turned
 from rigkit.calibration.choice import SURELY, Option, choose, described
 from rigkit.calibration.evidence import fit_shapes
@@ -22,7 +22,7 @@ from rigkit.calibration.moved import moved_lens
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.shape import SHAPES, often_seen
-from rigkit.calibration.uncertainty import uncertainty_at_corners
+from rigkit.calibration.uncertainty import FarProjection
 from rigkit.calibration.usable import usable_views
 from rigkit.calibration.verdicts import judge
 from rigkit.cameras.base import Camera
@@ -90,17 +90,20 @@ def calibrate(
             if choose(again.observations, [found.chosen, again.chosen], SURELY) is again.chosen:
                 found, tried, name = again, on_boards, other
     others = _others(observations, tried, name)
+    clusters = clusters_of(found.observations)
     result = assemble(
         found.observations,
         found.chosen.fit,
         found.chosen.heldout_px,
         (*dropped, *found.reasons),
         (*others, *found.candidates),
+        clusters,
     )
     in_force = [name for name, value in (("model", model), ("board_shape", board)) if value == "auto"]
     moved = moved_lens(found.observations, found.chosen.fit) if folds else ()
     also = [*moved, *_at_the_end(found.beyond, result, in_force)]
-    return _judged(result, found.observations, found.chosen.fit, also, in_force)
+    far = _determined(result, found.observations, found.chosen.fit)
+    return replace(result, verdicts=judge(result, also, far=far, clusters=clusters, in_force=in_force))
 
 
 Wanted = list[tuple[str, type[Camera], int | None]]
@@ -164,17 +167,12 @@ def _solved(
     return _Solved(observations, reasons, chosen, candidates, beyond)
 
 
-def _judged(
-    result: Calibration, observations: Observations, fit: Fit, also: Sequence[Finding], in_force: Sequence[str]
-) -> Calibration:
-    """Return the result with its verdicts; `also` and `in_force` as for `judge`.
-
-    Raises DegenerateError where the views do not determine the camera.
-    """
+def _determined(result: Calibration, observations: Observations, fit: Fit) -> FarProjection:
+    """Return how sure the result is far away; raises DegenerateError where the views do not determine the camera."""
     points, _ = fit.state.points_in_cam(observations)
-    at_corners = uncertainty_at_corners(result, points[fit.kept])
-    require_determined(result, at_corners)
-    return replace(result, verdicts=judge(result, also, at_corners_px=at_corners, in_force=in_force))
+    far = FarProjection.of(result, points[fit.kept])
+    require_determined(result, far.at_corners_px)
+    return far
 
 
 def _wanted(model: str, degree: int | None, board: str, folds: int) -> list[tuple[str, type[Camera], int | None]]:

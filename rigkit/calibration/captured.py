@@ -14,11 +14,10 @@ import numpy as np
 from rigkit.calibration.changing import changing
 from rigkit.calibration.coverage import corner_ranges, covered_by_boards
 from rigkit.calibration.mixed import two_cameras
-from rigkit.calibration.repeats import cluster_numbers
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.uncertainty import projection_uncertainty
+from rigkit.calibration.uncertainty import FarProjection, worst_direction
 from rigkit.cameras.compare import grid_pixels
-from rigkit.core.arrays import BoolArray, FloatArray, Pixels
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, Rays
 from rigkit.core.findings import Finding, Severity
 
 FEW_IMAGES = 8
@@ -47,9 +46,11 @@ SMALL_PX = 0.1
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Extent:
-    """Where in the image boards were: `pixels` (N, 2) of a grid over what boards can reach, `covered` (N,) by one."""
+    """Where in the image boards were: `pixels` (N, 2) of a grid over what boards can reach, their `rays` (N, 3), and
+    which are `covered` (N,) by a board."""
 
     pixels: Pixels
+    rays: Rays
     covered: BoolArray
 
     @classmethod
@@ -57,7 +58,7 @@ class Extent:
         pixels = grid_pixels(calibration.camera.size_px, GRID)
         rays, valid = calibration.camera.unproject(pixels)
         asked = valid & (np.where(valid, rays[..., 2], -1.0) > np.cos(np.radians(ASKED_DEG)))
-        return cls(pixels[asked], covered_by_boards(calibration, pixels[asked]))
+        return cls(pixels[asked], rays[asked], covered_by_boards(calibration, pixels[asked]))
 
     @property
     def share(self) -> float:
@@ -65,12 +66,10 @@ class Extent:
         return float(self.covered.mean()) if len(self.covered) else 0.0
 
 
-def judge_capture(calibration: Calibration, extent: Extent) -> list[Finding]:
-    """Return what is wrong with how the images were taken, the gravest first."""
-    views = calibration.views
-    images = [view.image for view in views]
-    # Images that repeat others share their number.
-    clusters = cluster_numbers(images, [view.board_id for view in views], [view.pixels for view in views])
+def judge_capture(calibration: Calibration, extent: Extent, far: FarProjection, clusters: IntArray) -> list[Finding]:
+    """Return what is wrong with how the images were taken, the gravest first; `clusters` (V,) numbers the images of the
+    views, those that repeat others as those."""
+    images = [view.image for view in calibration.views]
     number = clusters.tolist()
     return [
         *two_cameras(calibration, clusters),
@@ -81,7 +80,7 @@ def judge_capture(calibration: Calibration, extent: Extent) -> list[Finding]:
         *_parallel(calibration),
         *_distances(calibration),
         *_upright(calibration),
-        *_extrapolated(calibration, extent),
+        *_extrapolated(calibration, extent, far),
     ]
 
 
@@ -178,17 +177,17 @@ def _distances(c: Calibration) -> list[Finding]:
     """Say where all boards were equally far away: then depth was seen on their tilts alone."""
     if len(c.views) < 2:
         return []
-    far = corner_ranges(c)
-    if np.quantile(far, 0.95) > ONE_DISTANCE * np.quantile(far, 0.05):
+    near, far = np.quantile(corner_ranges(c), [0.05, 0.95])
+    if far > ONE_DISTANCE * near:
         return []
     return [_look("all boards were at one distance", "hold some at half and some at double of it")]
 
 
-def _extrapolated(c: Calibration, extent: Extent) -> list[Finding]:
+def _extrapolated(c: Calibration, extent: Extent, far: FarProjection) -> list[Finding]:
     """Say where most of the image is known from elsewhere, and not well."""
     if extent.share >= MIN_SHARE_COVERED or not len(extent.pixels):
         return []
-    worst = projection_uncertainty(c, extent.pixels[~extent.covered]).worst_px
+    worst = worst_direction(far.covariance(extent.rays[~extent.covered]))
     usual = float(np.sqrt(np.mean(worst**2)))
     error = c.rms_px if c.heldout_rms_px is None else c.heldout_rms_px
     if usual <= MAX_TIMES_ERROR * max(error, SMALL_PX):

@@ -8,14 +8,14 @@ changes from image to image is one of them far above the others.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from rigkit.calibration.result import Calibration, ViewResult
-from rigkit.core.arrays import FloatArray, Points
+from rigkit.core.arrays import FloatArray, IntArray, Points
 from rigkit.core.findings import Finding, Severity
-from rigkit.geometry.rotation import skew
 
 MIN_TELLING_CORNERS = 20
 """A view with fewer corners says too little of its own after its pose."""
@@ -106,87 +106,116 @@ class ViewChange:
 def view_changes(calibration: Calibration) -> dict[str, ViewChange]:
     """Return what each way to change explains; nothing where too few views have enough corners, or where the boards
     are bent alike in all of them while the calibration has them flat."""
-    shapes = {board.board_id: board.points_mm for board in calibration.boards}
-    columns = {
-        name: 1 + max(int(v.grid[:, 0].max()) for v in calibration.views if v.board_id == name) for name in shapes
-    }
-    views = []
-    for view in calibration.views:
-        if np.count_nonzero(view.kept) >= MIN_TELLING_CORNERS:
-            points = shapes[view.board_id][view.grid[view.kept] @ [1, columns[view.board_id]]]
-            own = _OwnPart.of(calibration, view, points)
-            views += [] if own is None else [own]
+    views = [view for view in calibration.views if np.count_nonzero(view.kept) >= MIN_TELLING_CORNERS]
     if len(views) < MIN_TELLING_VIEWS:
         return {}
-    gram = np.sum([view.common.T @ view.common for view in views], axis=0)
-    score = np.sum([view.common.T @ view.residual for view in views], axis=0)
+    rows, count = _rows(calibration, views)
+    # A lens so far off has no pixels, or no slopes, for some views: they tell nothing.
+    told = np.logical_and.reduceat(np.isfinite(rows).all(axis=(0, 1)), np.cumsum(count) - count)
+    if np.count_nonzero(told) < MIN_TELLING_VIEWS:
+        return {}
+    stops = np.cumsum(count)
+    each = [rows[..., stop - n : stop].reshape(len(rows), -1) for n, stop in zip(count[told], stops[told], strict=True)]
+    products = np.array([part @ part.T for part in each])
+    length = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), np.finfo(float).tiny))
+    own = _without_pose(products, length)
+    common, residual = slice(6, -OWN_COLUMNS), -1
+    gram, score = own[:, common, common].sum(axis=0), own[:, common, residual].sum(axis=0)
     scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
     step = np.linalg.lstsq(gram / np.outer(scale, scale), score / scale, rcond=MIN_OWN_PART)[0] / scale
-    residuals = [view.residual - view.common @ step for view in views]
-    total = float(sum(r @ r for r in residuals))
-    freedom = sum(len(r) - 6 for r in residuals) - len(step)
-    if total < (1.0 - MIN_SHARE_EXPLAINED) * sum(float(view.residual @ view.residual) for view in views):
+    before = float(own[:, residual, residual].sum())
+    total = before - float(step @ (2.0 * score - gram @ step))
+    freedom = sum(2 * n - 6 for n in count[told].tolist()) - len(step)
+    if total < (1.0 - MIN_SHARE_EXPLAINED) * before:
         # A bow that all images share was left out of the model: what is left after it is of no fit, and says nothing.
         return {}
     out = {}
-    for name in (*WAYS, NO_CHANGE):
-        squares = float(sum(np.sum((v.ways[name].T @ r) ** 2) for v, r in zip(views, residuals, strict=True)))
-        count = sum(view.ways[name].shape[1] for view in views)
-        if freedom <= 2 * count or not total > squares:
+    along = own[:, :, residual] - own[:, :, common] @ step
+    for name, way in _columns(len(rows)).items():
+        # Directions of the unit vectors' own part, and how much of the residual lies along each.
+        size = length[:, way]
+        sizes, axes = np.linalg.eigh(own[:, way, way] / (size[:, :, None] * size[:, None]))
+        known = sizes > MIN_OWN_PART**2
+        amount = ((along[:, way] / size)[:, None] @ axes)[:, 0]
+        squares = float((amount[known] ** 2 / sizes[known]).sum())
+        directions = int(known.sum())
+        if freedom <= 2 * directions or not total > squares:
             return {}
-        rest = (total - squares) / (freedom - count)
-        criterion = freedom * np.log1p(-squares / total) + count * np.log(freedom)
-        out[name] = ViewChange(squares / count / rest, (squares - count * rest) / total, float(criterion))
+        rest = (total - squares) / (freedom - directions)
+        criterion = freedom * np.log1p(-squares / total) + directions * np.log(freedom)
+        out[name] = ViewChange(squares / directions / rest, (squares - directions * rest) / total, float(criterion))
     return out
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _OwnPart:
-    """What of a view's residuals its pose does not follow.
+WAY_COLUMNS = {"bend": 3, "focus": 1, "shift": 2, "rows": 6, NO_CHANGE: 6}
+"""How many rows of `_rows` each way to change has, in their order before the residual; bends are common, too."""
+OWN_COLUMNS = sum(WAY_COLUMNS.values()) - WAY_COLUMNS["bend"] + 1
+"""Rows of `_rows` that are neither of the pose nor common to all images."""
 
-    Attributes
-    ----------
-    residual : (2 N,) px.
-    common : (2 N, C) how it moves with what all images share: the camera's parameters, a bow of the boards.
-    ways : (2 N, D) orthonormal, the ways to change by name.
+
+def _columns(count: int) -> dict[str, slice]:
+    """Return where the ways to change are among `count` rows of `_rows`."""
+    stops = count - 1 - sum(WAY_COLUMNS.values()) + np.cumsum(list(WAY_COLUMNS.values()))
+    return {
+        name: slice(stop - size, stop) for (name, size), stop in zip(WAY_COLUMNS.items(), stops.tolist(), strict=True)
+    }
+
+
+def _rows(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[FloatArray, IntArray]:
+    """Return how the kept corners of the views move, (K, 2, N) px, and how many there are of each view (V,).
+
+    With what is, in this order: the pose (6), what all images share (the camera's parameters and the 3 bows of the
+    boards), the other ways to change, and the residual last.
     """
+    count = np.array([np.count_nonzero(view.kept) for view in views])
+    start, view = np.cumsum(count) - count, np.repeat(np.arange(len(views)), count)
 
-    residual: FloatArray
-    common: FloatArray
-    ways: dict[str, FloatArray]
+    def centred(values: FloatArray) -> FloatArray:
+        return np.asarray(values - (np.add.reduceat(values, start, axis=-1) / count)[..., view])
 
-    @classmethod
-    def of(cls, calibration: Calibration, view: ViewResult, points: Points) -> _OwnPart | None:
-        """Return it for the `points` kept; None where a lens so far off has no pixels, or no slopes, for them."""
-        rotation = view.cam_from_board.rotation
-        turned = points @ rotation.T
-        in_cam = turned + view.cam_from_board.translation_mm
-        pixels, valid, by_point, by_camera = calibration.camera.project_with_jacobians(in_cam)
-        if not (valid.all() and np.isfinite(by_point).all() and np.isfinite(by_camera).all()):
-            return None
-        pose = np.concatenate([-by_point @ skew(turned - turned.mean(axis=0)), by_point], axis=2)
-        centre, _ = calibration.camera.project(np.array([[0.0, 0.0, 1.0]]))
-        along_v, along_u = ((pixels - pixels.mean(axis=0)) / calibration.camera.size_px).T[::-1, :, None, None]
-        flat = points[:, :2] - points[:, :2].mean(axis=0)
-        x, y = (flat / np.abs(flat).max()).T
-        bow = (by_point @ rotation[:, 2])[:, :, None] * np.stack([x * x, x * y, y * y], axis=1)[:, None, :]
-        ways = {
-            "focus": (pixels - centre)[:, :, None],
-            "shift": np.broadcast_to(np.eye(2), (len(points), 2, 2)),
-            "rows": pose * along_v,
-            "bend": bow,
-            NO_CHANGE: pose * along_u,
-        }
-        own, _ = np.linalg.qr(pose.reshape(-1, 6))
+    points = _points(calibration, views).T
+    rotation = np.array([one.cam_from_board.rotation for one in views])[view].transpose(1, 2, 0)
+    turned = (rotation * points).sum(axis=1)
+    in_cam = turned + np.array([one.cam_from_board.translation_mm for one in views])[view].T
+    pixels, valid, d_pixels_d_point, d_pixels_d_parameters = calibration.camera.project_with_jacobians(in_cam.T)
+    pixels = np.where(valid, pixels.T, np.nan)
+    by_point, by_camera = np.moveaxis(d_pixels_d_point, 0, -1), np.moveaxis(d_pixels_d_parameters, 0, -1)
+    lever, flat = centred(turned), centred(points[:2])
+    x, y = flat / np.maximum.reduceat(np.abs(flat).max(axis=0), start)[view]
+    centre, _ = calibration.camera.project(np.array([0.0, 0.0, 1.0]))
+    along_u, along_v = centred(pixels) / np.array(calibration.camera.size_px)[:, None]
+    p = by_camera.shape[1]
+    rows = np.zeros((p + 6 + sum(WAY_COLUMNS.values()) + 1, 2, points.shape[1]))
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        rows[k] = lever[i] * by_point[:, j] - lever[j] * by_point[:, i]
+        rows[3 + k] = by_point[:, k]
+    rows[6 : 6 + p] = by_camera.swapaxes(0, 1)
+    ways = {name: rows[way] for name, way in _columns(len(rows)).items()}
+    ways["bend"][:] = (by_point * rotation[:, 2]).sum(axis=1) * np.stack([x * x, x * y, y * y])[:, None]
+    ways["focus"][:] = pixels - centre[:, None]
+    ways["shift"][0, 0] = ways["shift"][1, 1] = 1.0
+    ways["rows"][:] = rows[:6] * along_v
+    ways[NO_CHANGE][:] = rows[:6] * along_u
+    rows[-1] = np.concatenate([one.residuals_px[one.kept] for one in views]).T
+    return rows, count
 
-        def free(moves: FloatArray) -> FloatArray:
-            rows = moves.reshape(2 * len(points), -1)
-            return np.asarray(rows - own @ (own.T @ rows))
 
-        bases = {}
-        for name, moves in ways.items():
-            length = np.linalg.norm(moves.reshape(2 * len(points), -1), axis=0)
-            basis, sizes, _ = np.linalg.svd(free(moves) / np.maximum(length, np.finfo(float).tiny), full_matrices=False)
-            bases[name] = basis[:, sizes > MIN_OWN_PART]
-        residual = free(view.residuals_px[view.kept])[:, 0]
-        return cls(residual, free(np.concatenate([by_camera, bow], axis=2)), bases)
+def _points(calibration: Calibration, views: Sequence[ViewResult]) -> Points:
+    """Return the points (N, 3) of the boards that the kept corners of the views are."""
+    shapes = {board.board_id: board.points_mm for board in calibration.boards}
+    columns = {
+        name: 1 + max(int(view.grid[:, 0].max()) for view in calibration.views if view.board_id == name)
+        for name in {view.board_id for view in views}
+    }
+    return np.concatenate([shapes[view.board_id][view.grid[view.kept] @ [1, columns[view.board_id]]] for view in views])
+
+
+def _without_pose(products: FloatArray, length: FloatArray) -> FloatArray:
+    """Return the products (V, K, K) of rows with the part taken out that the first six follow, the pose; `length`
+    (V, K) is that of the rows. Directions that the corners leave open are none of the pose."""
+    pose = length[:, :6]
+    sizes, axes = np.linalg.eigh(products[:, :6, :6] / (pose[:, :, None] * pose[:, None]))
+    whitened = np.where(sizes > MIN_OWN_PART**2, sizes, np.inf) ** -0.5
+    back = np.swapaxes(axes * whitened[:, None], -1, -2) @ (products[:, :6] / pose[:, :, None])
+    return np.asarray(products - np.swapaxes(back, -1, -2) @ back)

@@ -58,8 +58,10 @@ def projection_uncertainty(calibration: Calibration, pixels: Pixels, *, range_mm
     pixels = np.asarray(pixels, dtype=np.float64)
     rays, valid = calibration.camera.unproject(pixels)
     flat = np.where(valid[..., None], rays, [0.0, 0.0, 1.0]).reshape(-1, 3)
-    far = bool(np.isinf(range_mm))
-    found = _far_covariance(calibration, flat, _corner_rays(calibration)) if far else _near(calibration, flat, range_mm)
+    if np.isinf(range_mm):
+        found = FarProjection.of(calibration).covariance(flat)
+    else:
+        found = _propagated(calibration.frame_covariance, projection_design(calibration.camera, flat, range_mm))
     covariance = found.reshape(*valid.shape, 2, 2)
     return Uncertainty(pixels, np.where(valid[..., None, None], covariance, np.nan), valid)
 
@@ -70,30 +72,66 @@ def worst_direction(covariance: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(0.5 * (a + c) + np.hypot(0.5 * (a - c), b)))
 
 
-def _far_covariance(calibration: Calibration, rays: FloatArray, corners: FloatArray) -> FloatArray:
-    """Return the covariance (M, 2, 2) of the projection along rays (M, 3) at infinity, after the rotation that hides a
-    change of the parameters best along the rays `corners` (N, 3)."""
-    p = calibration.camera.parameters.size
-    # Parameters have units of their own: in standard deviations they can be compared.
-    scale = np.sqrt(np.maximum(np.diag(calibration.covariance), 0.0))
-    there = projection_design(calibration.camera, corners).transpose(1, 0, 2).reshape(p + 3, -1)
-    hides = np.linalg.lstsq(there[p:].T, (scale[:, None] * there[:p]).T, rcond=None)[0]
-    here = projection_design(calibration.camera, rays)
-    design = scale[:, None] * here[:, :p] - np.einsum("wp,iwm->ipm", hides, here[:, p:])
-    safe = np.where(scale > 0.0, scale, 1.0)
-    return _propagated(calibration.covariance / np.outer(safe, safe), design)
+@dataclass(frozen=True, eq=False, slots=True)
+class FarProjection:
+    """How sure a calibration is of the projection of points at infinity, after the rotation that hides a change of the
+    parameters best where the boards were.
 
+    Attributes
+    ----------
+    camera : the camera.
+    correlation, sigmas : (P, P) and (P,) of its parameters.
+    rays_valid : (M,) which of up to 400 corners, spread over all views, have a ray.
+    corners : (2, P + 3, N) `projection_design` along the rays of those that have one.
+    hides : (3, P) the rotation that hides a step of one standard deviation of each parameter.
+    """
 
-def _near(calibration: Calibration, rays: FloatArray, range_mm: float) -> FloatArray:
-    """Return the covariance (M, 2, 2) of the projection of points `range_mm` away along unit rays (M, 3)."""
-    return _propagated(calibration.frame_covariance, projection_design(calibration.camera, rays, range_mm))
+    camera: Camera
+    correlation: FloatArray
+    sigmas: FloatArray
+    rays_valid: BoolArray
+    corners: FloatArray
+    hides: FloatArray
 
+    @classmethod
+    def of(cls, calibration: Calibration, points_in_cam: Points | None = None) -> FarProjection:
+        """Return it for a calibration. `points_in_cam` (N, 3) are the boards' corners in the camera frame, of the
+        corners used, where they are known: it saves the way back from the pixels."""
+        camera = calibration.camera
+        if points_in_cam is None:
+            kept = np.concatenate([view.kept for view in calibration.views])
+            pixels = np.concatenate([view.pixels for view in calibration.views])[kept]
+            rays, valid = camera.unproject(pixels[_spread(len(pixels))])
+            rays = rays[valid]
+        else:
+            points = points_in_cam[_spread(len(points_in_cam))]
+            rays, valid = points / np.linalg.norm(points, axis=-1, keepdims=True), np.ones(len(points), dtype=bool)
+        p = camera.parameters.size
+        # Parameters have units of their own: in standard deviations they can be compared.
+        sigmas = np.sqrt(np.maximum(np.diag(calibration.covariance), 0.0))
+        design = projection_design(camera, rays)
+        there = design.transpose(1, 0, 2).reshape(p + 3, -1)
+        hides = np.asarray(
+            np.linalg.lstsq(there[p:].T, (sigmas[:, None] * there[:p]).T, rcond=None)[0], dtype=np.float64
+        )
+        safe = np.where(sigmas > 0.0, sigmas, 1.0)
+        return cls(camera, calibration.covariance / np.outer(safe, safe), sigmas, valid, design, hides)
 
-def _corner_rays(calibration: Calibration) -> FloatArray:
-    """Return the rays of up to 400 of the corners used."""
-    pixels = np.concatenate([view.pixels[view.kept] for view in calibration.views])
-    rays, valid = calibration.camera.unproject(pixels[_spread(len(pixels))])
-    return np.asarray(rays[valid])
+    def covariance(self, rays: FloatArray) -> FloatArray:
+        """Return the covariance (M, 2, 2) of the projection along rays (M, 3)."""
+        return self._covariance(projection_design(self.camera, rays))
+
+    @property
+    def at_corners_px(self) -> FloatArray:
+        """Standard deviation in the worst direction, (M,) px, at the corners; NaN where one has no ray."""
+        out = np.full(len(self.rays_valid), np.nan)
+        out[self.rays_valid] = worst_direction(self._covariance(self.corners))
+        return out
+
+    def _covariance(self, design: FloatArray) -> FloatArray:
+        p = len(self.sigmas)
+        left = self.sigmas[:, None] * design[:, :p] - np.einsum("wp,iwm->ipm", self.hides, design[:, p:])
+        return _propagated(self.correlation, left)
 
 
 def _propagated(parameters: FloatArray, design: FloatArray) -> FloatArray:
@@ -120,21 +158,6 @@ def projection_design(camera: Camera, rays: FloatArray, range_mm: float = np.inf
     if count > p + 3:
         design[:, p + 3 :] = by_x / range_mm
     return design
-
-
-def uncertainty_at_corners(calibration: Calibration, points_in_cam: Points | None = None) -> FloatArray:
-    """Return the standard deviation in the worst direction, (M,) px, at up to 400 of the corners used, at infinity.
-
-    `points_in_cam` (N, 3) are the board's corners in the camera frame, of the corners used, where they are known: it
-    saves the way back from the pixels.
-    """
-    if points_in_cam is None:
-        kept = np.concatenate([view.kept for view in calibration.views])
-        pixels = np.concatenate([view.pixels for view in calibration.views])[kept]
-        return projection_uncertainty(calibration, pixels[_spread(len(pixels))]).worst_px
-    points = points_in_cam[_spread(len(points_in_cam))]
-    rays = points / np.linalg.norm(points, axis=-1, keepdims=True)
-    return worst_direction(_far_covariance(calibration, rays, rays))
 
 
 def _spread(count: int) -> IntArray:

@@ -13,8 +13,9 @@ from typing import Protocol
 import numpy as np
 
 from rigkit.calibration.captured import ASKED_DEG, NEARLY_ALL, SMALL_PX, Extent, judge_capture
+from rigkit.calibration.repeats import cluster_numbers
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.uncertainty import uncertainty_at_corners
+from rigkit.calibration.uncertainty import FarProjection
 from rigkit.cameras.base import image_center
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.findings import Finding, Severity, worst
@@ -58,7 +59,8 @@ def judge(
     calibration: Calibration,
     also: Sequence[Finding] = (),
     *,
-    at_corners_px: FloatArray | None = None,
+    far: FarProjection | None = None,
+    clusters: IntArray | None = None,
     in_force: Collection[str] = (),
 ) -> tuple[Finding, ...]:
     """Return the verdicts, the headline first.
@@ -66,15 +68,18 @@ def judge(
     Parameters
     ----------
     also : verdicts found elsewhere.
-    at_corners_px : what `uncertainty_at_corners` returns, where it is known already.
+    far, clusters : what `FarProjection.of` and `cluster_numbers` (V,) return, where they are known already.
     in_force : of "model" and "board_shape" those that are "auto" already: no remedy to offer.
     """
-    at_corners = uncertainty_at_corners(calibration) if at_corners_px is None else at_corners_px
+    far = FarProjection.of(calibration) if far is None else far
+    if clusters is None:
+        views = calibration.views
+        clusters = cluster_numbers([v.image for v in views], [v.board_id for v in views], [v.pixels for v in views])
     extent = Extent.of(calibration)
     # What says that nobody knows how good the rest is: then it is not good.
     causes = [
         *_not_converged(calibration, in_force),
-        *judge_capture(calibration, extent),
+        *judge_capture(calibration, extent, far, clusters),
         *(finding for finding in also if finding.severity is Severity.BAD),
     ]
     found = [
@@ -89,7 +94,7 @@ def judge(
     ]
     share = extent.share
     where = "" if share >= NEARLY_ALL else f" over the {100.0 * share:.0f} % of the image where boards were"
-    return (*with_headline(calibration, causes, _unsure(calibration, at_corners), where), *found)
+    return (*with_headline(calibration, causes, _unsure(calibration, far.at_corners_px), where), *found)
 
 
 def judge_session(

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.uncertainty import uncertainty_at_corners
+from rigkit.calibration.uncertainty import FarProjection
 from rigkit.core.findings import Severity
 from rigkit.core.tables import Cell, Column, Table
 from rigkit.reconstruction.reconstruct import Reconstruction
@@ -76,7 +76,7 @@ def camera_table(calibrations: Mapping[str, Calibration]) -> Table:
     )
     rows = []
     for name, c in calibrations.items():
-        uncertainty = uncertainty_at_corners(c)
+        uncertainty = FarProjection.of(c).at_corners_px
         middle, high = np.nanquantile(uncertainty, [0.5, 0.95])
         remarks = sum(verdict.severity is not Severity.GOOD for verdict in c.verdicts)
         rows.append(

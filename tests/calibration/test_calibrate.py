@@ -22,7 +22,7 @@ from rigkit.calibration.initialise import initialise
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.poses import find_poses
 from rigkit.calibration.state import State, evaluate
-from rigkit.calibration.uncertainty import uncertainty_at_corners
+from rigkit.calibration.uncertainty import FarProjection
 from rigkit.cameras.double_sphere import DoubleSphere
 from rigkit.cameras.registry import MODELS
 from rigkit.core.boards import Board
@@ -172,8 +172,8 @@ def test_uncertainty_at_corners_from_pixels_or_points(rng: np.random.Generator) 
     views, _, _ = random_views(lens("reg"), 8, rng, reach_deg=33.0)
     result = calibrate(views, SIZE, model="brown", board="flat", folds=0)
     points = np.concatenate([v.cam_from_board.apply(BOARD.points()) for v in result.views])
-    there = uncertainty_at_corners(result, points)
-    assert there == pytest.approx(uncertainty_at_corners(result), rel=0.01)
+    there = FarProjection.of(result, points).at_corners_px
+    assert there == pytest.approx(FarProjection.of(result).at_corners_px, rel=0.01)
 
 
 def test_too_few_images_for_folds(rng: np.random.Generator) -> None:

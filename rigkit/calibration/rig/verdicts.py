@@ -9,7 +9,7 @@ import numpy as np
 
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.uncertainty import transfer_uncertainty
-from rigkit.calibration.uncertainty import uncertainty_at_corners
+from rigkit.calibration.uncertainty import FarProjection
 from rigkit.calibration.verdicts import UNSURE_PX, with_headline
 from rigkit.core.findings import Finding, Severity
 
@@ -78,7 +78,7 @@ def _few_shared(rig: RigCalibration) -> list[Finding]:
 def _unsure(rig: RigCalibration) -> list[Finding]:
     out = []
     for camera in rig.cameras:
-        worst = float(np.nanmax(uncertainty_at_corners(camera.calibration)))
+        worst = float(np.nanmax(FarProjection.of(camera.calibration).at_corners_px))
         if worst > UNSURE_PX:
             out.append(
                 _bad(
