@@ -270,7 +270,7 @@ def _lens_on_boards(found: _Solved, tried: list[Option], how: _How) -> tuple[lis
         start = replace(state, camera=best.fit.state.camera)
         # The scatter that priors are weighed by is known after the first round.
         fit = fit_kept(observations, fit_kept(observations, start, kept).state, kept)
-        options.append(replace(best, fit=fit, heldout=None))
+        options.append(replace(best, name=f"{best.name}, boards as found", fit=fit, heldout=None))
     # What does not even show the images that it was fitted to as well as another one predicts them is no better.
     options.sort(key=lambda o: o.fit.rms_px)
     compared: list[Option] = []

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rigkit.cli.calibrate_arguments import add_arguments as add_arguments
@@ -14,7 +16,7 @@ if TYPE_CHECKING:
     from rigkit.workflows.calibrate import SessionCalibration
     from rigkit.workflows.calibrate_rig import RigSessionCalibration
 
-HELP = "calibrate a camera, or several on one mount, from images of chessboards"
+HELP = "calibrate a camera, or several on one mount, from images of boards"
 
 
 def run(args: argparse.Namespace) -> int:
@@ -51,13 +53,22 @@ def _one(args: argparse.Namespace) -> int:
     started = time.monotonic()
     done = _calibrated(args)
     summary, words, passed = _said(done, json=args.json)
-    note(f"{', '.join(str(p) for p in done.written)} written, {time.monotonic() - started:.1f} s")
+    note(f"{_listed(done.written)} written, {time.monotonic() - started:.1f} s")
     print_json(summary) if args.json else print(words)
     for reason in done.unreadable.values():
         note(f"left out: {reason}")
     if done.unreadable:
         return ExitCode.BAD_INPUT
     return ExitCode.WELL if passed else ExitCode.CHECK_FAILED
+
+
+def _listed(files: Sequence[Path]) -> str:
+    """Return files in words: those of one folder behind its name."""
+    folders = dict.fromkeys(path.parent for path in files)
+    return "; ".join(
+        ("" if folder == Path() else f"{folder}: ") + ", ".join(path.name for path in files if path.parent == folder)
+        for folder in folders
+    )
 
 
 def _calibrated(args: argparse.Namespace) -> SessionCalibration | RigSessionCalibration:

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from rigkit.core.errors import RigkitError
+from rigkit.core.findings import gravest_first
 
 if TYPE_CHECKING:
-    from rigkit.calibration.result import Calibration
+    from rigkit.calibration.result import Calibration, Candidate
     from rigkit.core.boards import Board
     from rigkit.report.page_facts import PageFacts
 
@@ -61,11 +62,18 @@ def describe(calibration: Calibration) -> str:
     for name, value, sigma in zip(camera.parameter_names(), camera.parameters, sigmas, strict=True):
         lines.append(f"  {name:>4} = {rounded_words(float(value), float(sigma))}")
     lines += [f"dropped {image}: {reason}" for image, reason in calibration.dropped]
-    lines += [
-        f"tried {c.name}: held-out {'-' if c.heldout_rms_px is None else format(c.heldout_rms_px, '.4f')} px, "
-        f"training {c.rms_px:.4f} px{f' (chosen: {c.reason})' if c.chosen else ''}"
-        for c in calibration.candidates
-        if math.isfinite(c.rms_px)
-    ]
-    lines += [f"{c.name}: {c.reason}" for c in calibration.candidates if not math.isfinite(c.rms_px)]
-    return "\n".join([*lines, *map(str, calibration.verdicts)])
+    lines += _choices(calibration.candidates)
+    return "\n".join([*lines, *map(str, gravest_first(calibration.verdicts))])
+
+
+def _choices(candidates: Sequence[Candidate]) -> list[str]:
+    """Return what was chosen of how many; the page and --json have every figure."""
+    lines = []
+    for what in ("model", "board"):
+        tried = [c for c in candidates if c.name.startswith("board ") == (what == "board")]
+        taken = [c for c in tried if c.chosen and math.isfinite(c.rms_px)]
+        if len(tried) > 1 and taken:
+            lines.append(
+                f"{what} {taken[-1].name.removeprefix('board ')}, of {len(tried)} compared: {taken[-1].reason}"
+            )
+    return lines

@@ -11,7 +11,7 @@ from rigkit.core.errors import ExitCode, printable
 if TYPE_CHECKING:
     from rigkit.core.detections import BoardDetection
 
-HELP = "corners of every chessboard in the images, to a corners file and overlay pictures"
+HELP = "corners of every board in the images, to a corners file and overlay pictures"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -72,6 +72,7 @@ EXAMPLES: dict[str, str] = {
   rigkit rectify photo.jpg --camera calibration.json -o straight.png
   rigkit rectify photos --camera calibration.json -o straight --crop      a whole folder
   rigkit rectify left right --rig rig.json -o rectified --maps maps.npz       pairs whose rows correspond; K, P, Q, maps
+  rigkit rectify photos --rig rig.json -o rectified          one folder of left01, right01, ...
   rigkit rectify fisheye.jpg --camera fisheye.json -o round.png --projection equirectangular
 """,
     "reconstruct": """\

@@ -23,7 +23,7 @@ from rigkit.core.errors import ExitCode, RigkitError, printable
 VERBS: dict[str, tuple[str, str]] = {
     "demo": ("rigkit.cli.demo", "render a small fisheye capture and run the whole job on it; needs no data"),
     "board": ("rigkit.cli.board", "a board to print, true to scale"),
-    "calibrate": ("rigkit.cli.calibrate", "calibrate a camera from images of chessboards"),
+    "calibrate": ("rigkit.cli.calibrate", "calibrate a camera, or several on one mount, from images of boards"),
     "rectify": ("rigkit.cli.rectify", "perspective, cylindrical, equirectangular or stereo images from any camera's"),
     "export": ("rigkit.cli.export", "cameras in other tools' formats; clouds as PLY, npz or a COLMAP model"),
     "plan": ("rigkit.cli.plan", "which pictures to take next; what a lens, a board and so many pictures will reach"),
@@ -39,7 +39,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "crosscheck": ("rigkit.cli.crosscheck", "the same pairs through pycolmap and other ways"),
     "pose": ("rigkit.cli.pose", "where a camera is in the frame of a board that is laid down"),
     "handeye": ("rigkit.cli.handeye", "where a camera sits on a robot, from its poses and images of a board"),
-    "detect": ("rigkit.cli.detect", "corners of every chessboard in the images"),
+    "detect": ("rigkit.cli.detect", "corners of every board in the images"),
     "simulate": ("rigkit.cli.simulate", "the synthetic study: sweeps over noise, box plots, tables"),
     "fetch": ("rigkit.cli.fetch", "public captures with measured truth: list them, or fetch one"),
     "schema": ("rigkit.cli.schema", "JSON Schema of a file that rigkit reads or writes: for editors and programs"),
@@ -79,6 +79,7 @@ def build_parser(verb: str | None) -> argparse.ArgumentParser:
         if name == verb:
             module = importlib.import_module(module_name)
             sub.formatter_class, sub.epilog = argparse.RawDescriptionHelpFormatter, f"examples:\n{EXAMPLES[name]}"
+            sub.description = module.HELP
             module.add_arguments(sub)
             add_log_arguments(sub)
             sub.set_defaults(run=module.run)

@@ -17,19 +17,24 @@ HELP = "perspective, cylindrical or equirectangular image from any camera's imag
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("image", metavar="IMAGE|FOLDER", help="as the camera took it, or a folder of such images")
+    parser.add_argument("image", metavar="IMAGE|FOLDER", help="as the camera took it, or a folder of them")
     parser.add_argument(
         "image2", metavar="IMAGE2|FOLDER2", nargs="?", help="taken at once by another camera of the rig: stereo"
     )
     parser.add_argument("--camera", metavar="CALIB", help="the camera's calibration.json")
     parser.add_argument(
-        "-o", "--output", required=True, metavar="OUT", help="image (.png, .tif, .jpg) or folder to write"
+        "-o",
+        "--output",
+        required=True,
+        metavar="OUT",
+        help="image to write (.png, .tif, .jpg), or folder to write into",
     )
     parser.add_argument("--maps", type=Path, metavar="FILE.npz", help="also the geometry: K, P, Q, maps for cv2.remap")
     parser.add_argument("--force", action="store_true", help="replace an existing file")
     parser.add_argument("--json", action="store_true", help="the result for programs, on stdout")
     stereo = parser.add_argument_group(
-        "stereo", "writes OUT-1 and OUT-2 (of folders: OUT/ONE/... and OUT/TWO/...), in which a point has the same row"
+        "stereo",
+        "writes OUT/ONE/... and OUT/TWO/... (OUT-1 and OUT-2 of an image's name), in which a point has the same row",
     )
     stereo.add_argument("--rig", metavar="RIG", help="the rig's file, instead of --camera")
     stereo.add_argument(
@@ -74,11 +79,11 @@ def run(args: argparse.Namespace) -> int:
         done = rectify_image(args.image, args.camera, options, progress=progress_on_stderr())
         found = [_summary(one, args.projection) for one in done.images]
         result = {"images": found} if Path(args.image).is_dir() else found[0]
-    elif args.image2 is None or args.rig is None:
-        raise InputError("rectify: a stereo pair needs two images and --rig RIG.json")
+    elif args.rig is None or (args.image2 is None and not Path(args.image).is_dir()):
+        raise InputError("rectify: a stereo pair needs two images, or a folder of both cameras', and --rig RIG.json")
     else:
         names = None if args.names is None else tuple(args.names)
-        both = (args.image, args.image2)
+        both = args.image if args.image2 is None else (args.image, args.image2)
         done = rectify_stereo_images(both, args.rig, options, names, progress=progress_on_stderr())
         result = {"images": [_summary(one, args.projection) for one in done.images]}
         if done.pair is not None:

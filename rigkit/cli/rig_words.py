@@ -7,6 +7,7 @@ from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 from rigkit.cli import calibration_words
+from rigkit.core.findings import gravest_first
 
 if TYPE_CHECKING:
     from rigkit.calibration.rig.result import RigCalibration
@@ -114,5 +115,5 @@ def describe(rig: RigCalibration, checks: Sequence[Check]) -> str:
     lines += [f"frame {frame}, board '{board}' left out: {reason}" for frame, board, reason in rig.left_out]
     for camera, alone in zip(rig.cameras, rig.single, strict=True):
         lines += [f"{camera.name}: dropped {image}: {reason}" for image, reason in alone.dropped]
-        lines += [f"{camera.name} alone: {verdict}" for verdict in alone.verdicts]
-    return "\n".join([*lines, *map(str, rig.verdicts)])
+        lines += [f"{camera.name} alone: {verdict}" for verdict in gravest_first(alone.verdicts)]
+    return "\n".join([*lines, *map(str, gravest_first(rig.verdicts))])

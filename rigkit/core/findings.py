@@ -44,6 +44,12 @@ class Finding:
         return self.message if self.remedy is None else f"{self.message}; {self.remedy}"
 
 
+def gravest_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Return `findings` in the order of their severity, the gravest first; equally grave ones keep theirs."""
+    order = list(Severity)
+    return tuple(sorted(findings, key=lambda finding: -order.index(finding.severity)))
+
+
 def worst(findings: Iterable[Finding]) -> Severity:
     """Return the gravest severity among `findings`; GOOD where there are none."""
     order = list(Severity)

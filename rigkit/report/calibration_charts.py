@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
+from itertools import takewhile
+from pathlib import Path
 
 import numpy as np
 
@@ -18,6 +20,12 @@ INK, MARK, SOFT, WORDS, FAINT_WORDS = "#1f4e8c", "#c2410c", "#8a94a3", "#333", "
 MAX_RESIDUAL_DOTS = 4000
 BARS_NAMED = 24
 """More images are numbered only: their names would lie over each other."""
+MAX_NAME = 16
+"""Longer names of images show their end,"""
+LEVEL_NAME = 3
+"""and those of no more letters stand level."""
+LETTER = 7.4
+"""Width of a letter, at most."""
 BINS = 41
 IMAGE_RINGS = 12
 """Rings of equal numbers of corners, each with its own RMS."""
@@ -28,8 +36,15 @@ TICKS = (1.0, 2.0, 2.5, 5.0, 10.0)
 class _Plot:
     """Axes from data to the drawing."""
 
-    def __init__(self, title: str, x: tuple[float, float], y: tuple[float, float], labels: tuple[str, str]) -> None:
-        self._x, self._y = x, y
+    def __init__(
+        self,
+        title: str,
+        x: tuple[float, float],
+        y: tuple[float, float],
+        labels: tuple[str, str],
+        bottom: float = BOTTOM,
+    ) -> None:
+        self._x, self._y, self.floor = x, y, HEIGHT - bottom
         self.parts = [
             f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH:g} {HEIGHT:g}" role="img" '
             f'font-family="sans-serif" font-size="13"><title>{escape(title)}</title>'
@@ -40,7 +55,7 @@ class _Plot:
             self.words(LEFT - 6, at + 4, f"{value:g}", "end")
         self.words(0.5 * (LEFT + WIDTH - RIGHT), HEIGHT - 6, labels[0], "middle")
         self.parts.append(
-            f'<text transform="translate(13 {0.5 * (TOP + HEIGHT - BOTTOM):.1f}) rotate(-90)" text-anchor="middle" '
+            f'<text transform="translate(13 {0.5 * (TOP + self.floor):.1f}) rotate(-90)" text-anchor="middle" '
             f'fill="{WORDS}">{escape(labels[1])}</text>'
         )
 
@@ -48,14 +63,14 @@ class _Plot:
         return LEFT + (x - self._x[0]) / (self._x[1] - self._x[0]) * (WIDTH - LEFT - RIGHT)
 
     def v(self, y: float) -> float:
-        return HEIGHT - BOTTOM - (y - self._y[0]) / (self._y[1] - self._y[0]) * (HEIGHT - TOP - BOTTOM)
+        return self.floor - (y - self._y[0]) / (self._y[1] - self._y[0]) * (self.floor - TOP)
 
     def words(self, x: float, y: float, text: str, anchor: str = "start", colour: str = WORDS) -> None:
         self.parts.append(f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="{colour}">{escape(text)}</text>')
 
     def below(self, values: Sequence[float]) -> None:
         for value in values:
-            self.words(self.u(value), HEIGHT - BOTTOM + 18, f"{value:g}", "middle")
+            self.words(self.u(value), self.floor + 18, f"{value:g}", "middle")
 
     def line(self, x: FloatArray, y: FloatArray, colour: str, *, width: float = 1.8, dashes: str = "") -> None:
         places = " ".join(f"{self.u(float(a)):.1f},{self.v(float(b)):.1f}" for a, b in zip(x, y, strict=True))
@@ -63,7 +78,7 @@ class _Plot:
         self.parts.append(f'<polyline points="{places}" fill="none" stroke="{colour}" stroke-width="{width}"{dashed}/>')
 
     def done(self) -> str:
-        frame = f'<path d="M{LEFT} {TOP}V{HEIGHT - BOTTOM}H{WIDTH - RIGHT}" fill="none" stroke="#b8c0cc"/></svg>'
+        frame = f'<path d="M{LEFT} {TOP}V{self.floor}H{WIDTH - RIGHT}" fill="none" stroke="#b8c0cc"/></svg>'
         return "".join([*self.parts, frame])
 
 
@@ -71,8 +86,12 @@ def images_svg(calibration: Calibration) -> str:
     """Draw the RMS of every view as a bar, with the RMS of all as a line."""
     rms = np.array([view.rms_px for view in calibration.views])
     rms = np.where(np.isfinite(rms), rms, 0.0)
-    top = _round_up(max(float(rms.max(initial=0.0)), 1e-6))
-    plot = _Plot("RMS by image", (-0.5, len(rms) - 0.5), (0.0, top), ("" if _named(len(rms)) else "view", "RMS, px"))
+    top = _round_up(max(1.1 * float(rms.max(initial=0.0)), 1e-6))
+    names = _short([view.image for view in calibration.views]) if len(rms) <= BARS_NAMED else []
+    longest = max(map(len, names), default=0)
+    upright = longest > LEVEL_NAME
+    bottom = LETTER * longest + 14.0 if upright else BOTTOM
+    plot = _Plot("RMS by image", (-0.5, len(rms) - 0.5), (0.0, top), ("" if names else "view", "RMS, px"), bottom)
     wide = max(0.8 * (plot.u(1.0) - plot.u(0.0)), 0.8)
     for k, (view, value) in enumerate(zip(calibration.views, rms, strict=True)):
         x, y = plot.u(k) - 0.5 * wide, plot.v(float(value))
@@ -81,17 +100,31 @@ def images_svg(calibration: Calibration) -> str:
             f'<rect x="{x:.1f}" y="{y:.1f}" width="{wide:.1f}" height="{plot.v(0.0) - y:.1f}" fill="{INK}">'
             f"<title>{what}</title></rect>"
         )
-        if _named(len(rms)):
-            at = f"translate({plot.u(k) + 4:.1f} {HEIGHT - BOTTOM - 6:.1f}) rotate(-90)"
-            plot.parts.append(
-                f'<text transform="{at}" font-size="12.5" fill="{WORDS}" stroke="#fff" stroke-width="3" '
-                f'paint-order="stroke">{escape(view.image[-28:])}</text>'
-            )
-    if not _named(len(rms)):
+    for k, name in enumerate(names):
+        place = f"translate({plot.u(k) + 4:.1f} {plot.floor + 6:.1f}) rotate(-90)"
+        if not upright:
+            place = f"translate({plot.u(k):.1f} {plot.floor + 18:.1f})"
+        anchor = "end" if upright else "middle"
+        plot.parts.append(
+            f'<text transform="{place}" text-anchor="{anchor}" font-size="12.5" fill="{WORDS}">{escape(name)}</text>'
+        )
+    if not names:
         plot.below(_ticks(0.0, len(rms) - 1.0))
     plot.line(np.array([-0.5, len(rms) - 0.5]), np.full(2, calibration.rms_px), MARK, dashes="5 4")
-    plot.words(WIDTH - RIGHT, plot.v(calibration.rms_px) - 5, f"all: {calibration.rms_px:.3f} px", "end", MARK)
+    plot.words(WIDTH - RIGHT, TOP + 12, f"line: all, {calibration.rms_px:.3f} px", "end", MARK)
     return plot.done()
+
+
+def _short(names: Sequence[str]) -> list[str]:
+    """Return names without what all of them begin and end with, numbers whole; long ones by their end."""
+    stems = [Path(name).stem for name in names]
+    if len(set(stems)) > 1:
+        columns = zip(*stems, strict=False)
+        same = sum(1 for _ in takewhile(lambda letters: len(set(letters)) == 1, columns))
+        while same and stems[0][same - 1].isdigit():
+            same -= 1
+        stems = [stem[same:] for stem in stems]
+    return [stem if len(stem) <= MAX_NAME else f"…{stem[1 - MAX_NAME :]}" for stem in stems]
 
 
 def radius_svg(calibration: Calibration) -> str:
@@ -188,10 +221,6 @@ def _kept(calibration: Calibration) -> tuple[FloatArray, FloatArray]:
     """Return pixels and residuals of the corners used."""
     pixels = np.concatenate([view.pixels[view.kept] for view in calibration.views])
     return pixels, np.concatenate([view.residuals_px[view.kept] for view in calibration.views])
-
-
-def _named(count: int) -> bool:
-    return count <= BARS_NAMED
 
 
 def _ticks(low: float, high: float) -> list[float]:

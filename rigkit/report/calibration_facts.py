@@ -11,7 +11,7 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.uncertainty import uncertainty_map
 from rigkit.core.arrays import FloatArray
-from rigkit.core.findings import Severity, worst
+from rigkit.core.findings import Severity, gravest_first, worst
 from rigkit.core.tables import Cell, Column, Table
 from rigkit.planning.plan import Plan
 from rigkit.report.calibration_drawings import MAP_GRID
@@ -36,7 +36,7 @@ def camera_facts(c: Calibration, plan: Plan | None = None) -> PageFacts:
     if c.dropped:
         rows = tuple((Cell(image), Cell(reason)) for image, reason in c.dropped)
         tables.append(Table(LEFT_OUT, "Left out", (Column("image"), Column("why")), rows))
-    sentences = [*map(str, c.verdicts)]
+    sentences = [*map(str, gravest_first(c.verdicts))]
     if plan is not None:
         sentences += [next_words(plan), *plan_words(plan)]
         tables.append(plan_table(plan))
@@ -58,7 +58,7 @@ def rig_facts(rig: RigCalibration, checks: Sequence[Check], cameras: Mapping[str
         headline=rig_reach(rig, checks),
         badge=BADGE_WORDS[severity],
         passed=PASSED[severity],
-        sentences=tuple(map(str, rig.verdicts)),
+        sentences=tuple(map(str, gravest_first(rig.verdicts))),
         basis=rig_basis(rig),
         tables=rig_tables(rig, checks),
         parts=cameras,
@@ -94,13 +94,13 @@ def _reach(c: Calibration) -> str:
     )
     if not beyond.size:
         return words + "."
-    worst = float(beyond.max())
-    if worst < MAX_RATIO_BEYOND * within.max():
-        return words + f", and to ±{worst:.2g} px at worst outside: use the whole image."
-    return words + (
-        f", and to ±{worst:.2g} px at worst outside: use the part inside the dashed line only, or add pictures with "
-        "the board at the border, tilted by 30 degrees."
-    )
+    words += f", and to ±{beyond.max():.2g} px at worst outside"
+    if worst(c.verdicts) is Severity.BAD:
+        return words + "."
+    if beyond.max() < MAX_RATIO_BEYOND * within.max():
+        return words + ": all of the image can be used."
+    words += ": use the part inside the dashed line only, or add pictures"
+    return words + " with the board at the border, tilted by 30 degrees."
 
 
 def _parameters(c: Calibration) -> Table:

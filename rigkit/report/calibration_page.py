@@ -12,7 +12,7 @@ import numpy as np
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.arrays import Pixels
-from rigkit.core.findings import Finding
+from rigkit.core.findings import Finding, gravest_first
 from rigkit.core.printing import brief
 from rigkit.core.tables import Table
 from rigkit.io.images import Image
@@ -153,5 +153,5 @@ def _kept(c: Calibration) -> Pixels:
 
 
 def _findings(found: Sequence[Finding]) -> list[tuple[str, str, str]]:
-    """Return severity, colour and words of each finding."""
-    return [(str(one.severity), VERDICTS[one.severity], one.text) for one in found]
+    """Return severity, colour and words of each finding, the gravest first."""
+    return [(str(one.severity), VERDICTS[one.severity], one.text) for one in gravest_first(found)]

@@ -82,7 +82,10 @@ function viewer(canvas, scene) {
         const p = project(tip);
         pen.fillStyle = wire;
         pen.font = `${12 * ratio}px sans-serif`;
-        pen.fillText(camera.name, p[0] + 6 * ratio, p[1]);
+        // Beside the tip: on its left where the right has no room.
+        const gap = 6 * ratio, wide = pen.measureText(camera.name).width;
+        const x = p[0] + gap + wide > canvas.width ? p[0] - gap - wide : p[0] + gap;
+        pen.fillText(camera.name, x, Math.max(p[1], 12 * ratio));
       }
     }
     scaleBar(pen, ratio, wire);

@@ -93,7 +93,7 @@ def calibrate_rig_session(
         for camera in rig.cameras:
             own = _beside(session, options.output, camera.name)
             files[own] = calibration_text(judged(camera.calibration), origin)
-            files |= foreign_files(camera.camera, own, options.exports)
+            files |= foreign_files(camera.camera, own, _of_cameras(session, options))
         if session.rigid_boards:
             files[_boards_file(options.output)] = board_rigs_text(rig.board_rigs)
     if options.report is not None:
@@ -112,12 +112,23 @@ def _targets(session: RigSession, options: CalibrateOptions) -> list[Path]:
     if options.output is not None:
         out += [options.output] if len(session.cameras) > 1 else []
         own = [_beside(session, options.output, name) for name in session.cameras]
-        out += [*own, *(path for one in own for path in foreign_paths(one, options.exports))]
-        if len(session.cameras) > 1:
-            rigs = foreign_rig_paths(list(session.cameras), options.output, options.exports)
-            out += [path for places in rigs.values() for path in places]
+        out += [*own, *(path for one in own for path in foreign_paths(one, _of_cameras(session, options)))]
+        out += [path for places in _of_the_rig(session, options).values() for path in places]
         out += [_boards_file(options.output)] if session.rigid_boards else []
     return out if options.report is None else [*out, options.report]
+
+
+def _of_the_rig(session: RigSession, options: CalibrateOptions) -> dict[str, list[Path]]:
+    """Return the files by format, of those asked for, that hold the whole rig."""
+    if options.output is None or len(session.cameras) < 2:
+        return {}
+    return foreign_rig_paths(list(session.cameras), options.output, options.exports)
+
+
+def _of_cameras(session: RigSession, options: CalibrateOptions) -> list[str]:
+    """Return the formats, of those asked for, that get a file a camera: a rig's file has the lenses as well."""
+    whole = _of_the_rig(session, options)
+    return [kind for kind in options.exports if kind not in whole]
 
 
 def _beside(session: RigSession, target: Path, name: str) -> Path:

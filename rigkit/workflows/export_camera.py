@@ -130,7 +130,7 @@ def foreign_rig_files(rig: Rig, beside: Path, kinds: Sequence[str]) -> dict[Path
             _log.warning(f"no {kind} file of the rig: {error}")
             continue
         files |= dict(zip(places, foreign.files.values(), strict=True))
-        _log.info(f"{', '.join(map(str, places))}: {kind}; {'; '.join(foreign.notes)}")
+        _log.info(f"{', '.join(map(str, places))}: {'; '.join(foreign.notes)}")
     return files
 
 
@@ -158,8 +158,9 @@ def foreign_files(camera: Camera, beside: Path, kinds: Sequence[str]) -> dict[Pa
     """
     files = {}
     for kind, path in zip(kinds, foreign_paths(beside, kinds), strict=True):
-        files[path], worst_px, words = _foreign(camera, kind)
-        _log.info(f"{path}: {kind}, at most {worst_px:.4g} px from the calibration" + (f"; {words}" if words else ""))
+        files[path], _, words = _foreign(camera, kind)
+        if words:
+            _log.info(f"{path}: {words}")
     return files
 
 

@@ -18,11 +18,13 @@ from rigkit.core.progress import Progress, silent
 from rigkit.io.files import ensure_writable, write_atomic, write_together
 from rigkit.io.images import IMAGE_ENDINGS, quiet_opencv, read_image, require_pixels
 from rigkit.io.reading import about
+from rigkit.io.rig_session import frames_of_images
 from rigkit.rectification.crop import cropped
 from rigkit.rectification.rectify import RectifyMap, rectify_map, rotation_from_view_angles
 from rigkit.rectification.stereo import StereoRectification, rectify_pair
 from rigkit.rectification.targets import target_camera
 from rigkit.workflows.camera_files import import_camera, import_rig
+from rigkit.workflows.folder_session import cameras_in
 
 Jobs = list[tuple[list[tuple[Path, Path]], RectifyMap]]
 """Of each map: the images, and where they go."""
@@ -34,8 +36,8 @@ class RectifyOptions:
     """The view, and where it goes; a stereo pair's view is decided by its baseline, but for the projection."""
 
     output: Path
-    """Image to write; of a pair, NAME-1 and NAME-2 beside it. Of a folder of images: the folder to write into; of two,
-    each camera's images into a folder of its name there."""
+    """Image to write (of a pair, NAME-1 and NAME-2 beside it), or, without an ending, the folder to write into: images
+    keep their names, those of a rig have a folder a camera there."""
     projection: Literal["perspective", "cylindrical", "equirectangular"] = "perspective"
     """Of the view."""
     hfov_deg: float | None = None
@@ -85,7 +87,10 @@ def rectify_image(
     raised where there is no other. Raises InputError for a view that the camera does not have, a damaged calibration,
     or a file that cannot be written.
     """
-    jobs = _outputs(Path(image), options.output)
+    sources = _images(Path(image)) if Path(image).is_dir() else [Path(image)]
+    if Path(image).is_dir() and options.output.suffix:
+        raise InputError(f"rectify: '{image}' is a folder, so -o must name one too, not '{options.output.name}'")
+    jobs = _outputs(sources, options.output) if _is_folder(options.output) else [(Path(image), options.output)]
     _ensure_all([out for _, out in jobs], options, (*(source for source, _ in jobs), camera))
     source = import_camera(camera)
     hfov_rad = None if options.hfov_deg is None else np.radians(options.hfov_deg)
@@ -102,7 +107,7 @@ def rectify_image(
 
 
 def rectify_stereo_images(
-    images: tuple[str | Path, str | Path],
+    images: tuple[str | Path, str | Path] | str | Path,
     rig: str | Path,
     options: RectifyOptions,
     names: tuple[str, str] | None = None,
@@ -110,11 +115,11 @@ def rectify_stereo_images(
     progress: Progress = silent,
 ) -> RectificationResult:
     """Write two images taken at once by cameras `names` of a rig's file (None: its first two) so that a point has the
-    same row in both, or two folders of such images in the order of their names.
+    same row in both; or two folders of such images, or one folder of both cameras' (left01, right01, or folders left
+    and right), of which those of one name or number belong together, as for `calibrate_folders`.
 
-    Two images of which one cannot be read are left out, as by `rectify_image`. Raises InputError for cameras that are
-    not there, angles or a size of the view, folders with unlike numbers of images, a damaged rig, or a file that cannot
-    be written.
+    Two images of which one cannot be read or has no partner are left out, as by `rectify_image`. Raises InputError for
+    cameras that are not there, angles or a size of the view, a damaged rig, or a file that cannot be written.
     """
     if options.hfov_deg is not None or options.size_px is not None or any(options.angles_deg):
         raise InputError("rectify: the baseline decides the view of a stereo pair; leave out its angles and its size")
@@ -124,14 +129,14 @@ def rectify_stereo_images(
     if missing or len(both) != 2:
         raise InputError(f"'{rig}': no camera '{', '.join(missing)}'; there are {', '.join(cameras)}")
     (camera1, cam1_from_rig), (camera2, cam2_from_rig) = (cameras[name] for name in both)
+    sources, single = _pairs(images, (both[0], both[1]))
     out = options.output
-    if all(Path(image).is_dir() for image in images):
-        jobs = [_outputs(Path(image), out / name) for image, name in zip(images, both, strict=True)]
-        if len(jobs[0]) != len(jobs[1]):
-            counts = f"{len(jobs[0])} and {len(jobs[1])} images"
-            raise InputError(f"rectify: '{images[0]}' and '{images[1]}' have {counts}; leave those taken together")
+    if _is_folder(out):
+        jobs = [_outputs(own, out / name) for own, name in zip(sources, both, strict=True)]
+    elif len(sources[0]) > 1:
+        raise InputError(f"rectify: these are several images, so -o must name a folder, not '{out.name}'")
     else:
-        jobs = [[(Path(one), out.with_name(f"{out.stem}-{i}{out.suffix}"))] for i, one in enumerate(images, start=1)]
+        jobs = [[(own[0], out.with_name(f"{out.stem}-{i}{out.suffix}"))] for i, own in enumerate(sources, start=1)]
     _ensure_all([to for job in jobs for _, to in job], options, (*(source for job in jobs for source, _ in job), rig))
     with about(rig):
         pair = rectify_pair(camera1, camera2, cam2_from_rig @ cam1_from_rig.inverse(), projection=options.projection)
@@ -140,21 +145,60 @@ def rectify_stereo_images(
             pair = replace(pair, map1=map1, map2=map2)
         both_jobs = list(zip(jobs, (pair.map1, pair.map2), strict=True))
         covered = _coverage(both_jobs)
-    done = _write(both_jobs, covered, options, progress)
+    written, failures = _write(both_jobs, covered, options, progress)
     _write_maps([pair.map1, pair.map2], pair, options)
-    return RectificationResult(*done, pair)
+    return RectificationResult(written, {**single, **failures}, pair)
 
 
-def _outputs(image: Path, output: Path) -> list[tuple[Path, Path]]:
-    """Return (image, where it goes): one, or those of a folder with their names in another."""
-    if not image.is_dir():
-        return [(image, output)]
-    found = sorted(path for path in image.iterdir() if path.suffix.lower() in IMAGE_ENDINGS)
+def _pairs(
+    images: tuple[str | Path, str | Path] | str | Path, names: tuple[str, str]
+) -> tuple[list[list[Path]], dict[str, InputError]]:
+    """Return each camera's images, in one order, and why others have no partner."""
+    if isinstance(images, (str, Path)):
+        cameras = cameras_in([Path(images)])
+        missing = [name for name in names if name not in cameras]
+        if missing:
+            there = ", ".join(cameras) if len(cameras) > 1 else "those of one camera only"
+            raise InputError(
+                f"rectify: in '{images}' no images are named after the rig's camera '{missing[0]}': there are {there}; "
+                f"give two folders, that of '{names[0]}' first"
+            )
+        found = [sorted(p for folder, one in cameras[n] for p in folder.glob(one)) for n in names]
+    elif not all(Path(image).is_dir() for image in images):
+        return [[Path(image)] for image in images], {}
+    else:
+        found = [_images(Path(image)) for image in images]
+    try:
+        of_moment = frames_of_images({str(k): [path.name for path in own] for k, own in enumerate(found)})
+    except InputError:
+        if len(found[0]) != len(found[1]):
+            raise
+        return found, {}
+    frames = [{of_moment[str(k)][path.name]: path for path in own} for k, own in enumerate(found)]
+    both = [frame for frame in frames[0] if frame in frames[1]]
+    single = {
+        str(path): InputError(f"'{path}': the other camera has no image of its name or number")
+        for own in frames
+        for frame, path in own.items()
+        if frame not in both
+    }
+    return [[own[frame] for frame in both] for own in frames], single
+
+
+def _images(folder: Path) -> list[Path]:
+    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_ENDINGS)
     if not found:
-        raise InputError(f"rectify: folder '{image}' has no images ({' '.join(IMAGE_ENDINGS)}); give another")
-    if output.suffix:
-        raise InputError(f"rectify: '{image}' is a folder, so -o must name one too, not '{output.name}'")
-    return [(path, output / (path.name if cv2.haveImageWriter(path.name) else f"{path.stem}.png")) for path in found]
+        raise InputError(f"rectify: folder '{folder}' has no images ({' '.join(IMAGE_ENDINGS)}); give another")
+    return found
+
+
+def _is_folder(output: Path) -> bool:
+    return not output.suffix or output.is_dir()
+
+
+def _outputs(images: Sequence[Path], folder: Path) -> list[tuple[Path, Path]]:
+    """Return (image, where it goes): with its name into the folder."""
+    return [(path, folder / (path.name if cv2.haveImageWriter(path.name) else f"{path.stem}.png")) for path in images]
 
 
 def _ensure_all(outputs: list[Path], options: RectifyOptions, inputs: tuple[str | Path, ...]) -> None:
