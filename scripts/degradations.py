@@ -118,8 +118,8 @@ def compressed(grey: Grey, quality: float) -> Degraded:
 def resized(grey: Grey, factor: float) -> Degraded:
     how = cv2.INTER_AREA if factor < 1.0 else cv2.INTER_CUBIC
     out = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=how)
-    exact = np.array(out.shape[::-1]) / grey.shape[::-1]
-    return np.asarray(out), np.column_stack([np.diag(exact), 0.5 * exact - 0.5])
+    # OpenCV scales by what it is told, whatever whole number of pixels comes out.
+    return np.asarray(out), factor * SAME + np.array([[0.0, 0.0, 1.0]]) * (0.5 * factor - 0.5)
 
 
 def turned(grey: Grey, degrees: float) -> Degraded:

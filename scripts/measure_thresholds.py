@@ -40,7 +40,16 @@ from scipy.optimize import minimize
 from rigkit.benchmark.blanks import BLANKS, blank
 from rigkit.benchmark.scenes import CONDITIONS, LENSES, one_board
 from rigkit.core.arrays import FloatArray
-from rigkit.detection.checks.evidence import MIN_BLUR, MIN_MISFIT, MIN_SPACING_CHANGE, OFFSET, SCORE, Evidence
+from rigkit.detection.checks.evidence import (
+    MIN_BLUR,
+    MIN_EXPECTED_CORNERS,
+    MIN_MISFIT,
+    MIN_SPACING_CHANGE,
+    OF_EXPECTED_SIZE,
+    OFFSET,
+    SCORE,
+    Evidence,
+)
 from rigkit.detection.checks.validate import compact, has_edge_offset
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.lattice.lattice import Lattice
@@ -90,6 +99,7 @@ class Candidate:
     image: str
     board: bool
     corners: int
+    size: tuple[int, int]
     cell_px: float
     evidence: Evidence
 
@@ -195,7 +205,7 @@ def _judged(kind: str, image: str, board: bool, pixels: Grey, boards: list[Float
     fitted = refine(grey, candidates(grey, MIN_CORNERS, promising))
     kept = [item for item in fitted if item.lattice.count >= least and compact(item.lattice, size_px)]
     return [
-        Candidate(kind, image, board, item.lattice.count, _cell_px(item.lattice), Evidence.of(item))
+        Candidate(kind, image, board, item.lattice.count, item.lattice.size, _cell_px(item.lattice), Evidence.of(item))
         for item in kept
         if not board or any(_of_board(item.lattice, corners) for corners in boards)
     ]
@@ -248,6 +258,16 @@ def cross_validated(found: list[Candidate]) -> tuple[int, int]:
     return wrong[True], wrong[False]
 
 
+def print_sizes(found: list[Candidate]) -> None:
+    """Print which sizes other patterns have by chance, and what the size of a board that is declared is worth."""
+    large = [frozenset(c.size) for c in found if not c.board and c.corners >= MIN_EXPECTED_CORNERS]
+    print(f"sizes of the {len(large)} of other patterns with {MIN_EXPECTED_CORNERS} corners or more, and log odds:")
+    for size, count in Counter(large).most_common(SHOWN):
+        short, long = min(size), max(size)
+        print(f"  {long} x {short}: {count}, {np.log(len(large) / count):.1f}")
+    print(f"  none of another size: {np.log(max(len(large), 1)):.1f} and more; in use: {OF_EXPECTED_SIZE}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--boards", type=Path, nargs="*", default=[], help="folders of images of boards")
@@ -266,6 +286,7 @@ def main() -> None:
     print("fitted:  ", ", ".join(f"{n} {w:.2f}" for n, w in zip(SCORE, weights, strict=True)), f"offset {offset:.2f}")
     refused, taken = cross_validated(found)
     print(f"without a say of their kind: {refused} boards refused, {taken} other patterns taken for boards")
+    print_sizes(found)
     print("in use:  ", ", ".join(f"{n} {w:.2f}" for n, w in SCORE.items()), f"offset {OFFSET:.2f}")
     print("\n| score | image | corners | sigma, cells | scatter | misfit | spacing change | raggedness | blur, cells |")
     print("|--:|:--|--:|--:|--:|--:|--:|--:|--:|")

@@ -77,6 +77,7 @@ def _identify(args: argparse.Namespace) -> int:
     from rigkit.cli.console import note, progress_on_stderr
     from rigkit.io.board_file import board_text
     from rigkit.io.files import ensure_writable, write_atomic
+    from rigkit.io.video import is_video
     from rigkit.workflows.detect import images_in
     from rigkit.workflows.identify_board import identify_board
 
@@ -85,7 +86,7 @@ def _identify(args: argparse.Namespace) -> int:
     path = None if args.output is None else Path(args.output).with_suffix(".toml")
     if path is not None and args.square_mm is None:
         raise InputError("board identify: images cannot tell the scale; give --square-mm, the side of a square or tag")
-    images = list(images_in(args.images))
+    images = [one for path in map(Path, args.images) for one in ([path] if is_video(path) else images_in([path]))]
     if path is not None:
         ensure_writable(path, force=args.force, inputs=images)
     found = identify_board(images, progress=progress_on_stderr())

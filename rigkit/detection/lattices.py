@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.detection.checks.discontinuity import may_be_discontinuous, split_at_discontinuities, without_outliers
+from rigkit.detection.checks.evidence import MIN_EXPECTED_CORNERS, OF_EXPECTED_SIZE, Evidence
 from rigkit.detection.checks.validate import (
     compact,
     has_edge_offset,
@@ -73,10 +74,9 @@ def fitted(
     grey: GreyImage, boards: Sequence[Lattice], min_corners: int, sizes: Sequence[tuple[int, int]]
 ) -> list[RefinedLattice]:
     """Return those of `boards` that the fit confirms, refined, without what belongs to others that they touch."""
-    refined = zip(boards, refine(grey, boards), strict=True)
     size_px = (grey.shape[1], grey.shape[0])
     out = []
-    for item in (after for before, after in refined if trustworthy(after, before.count, min_corners)):
+    for item in _confirmed(boards, refine(grey, boards), min_corners, sizes):
         own = without_outliers(item, size_px)
         parts = (
             split_at_discontinuities(own, several=too_large(own.lattice, sizes))
@@ -90,6 +90,31 @@ def fitted(
         alone = [part.lattice.trimmed() for part in parts]
         out += fitted(grey, [part for part in alone if large(part, min_corners)], min_corners, sizes)
     return out
+
+
+def _confirmed(
+    boards: Sequence[Lattice], refined: Sequence[RefinedLattice], min_corners: int, sizes: Sequence[tuple[int, int]]
+) -> list[RefinedLattice]:
+    """Return those of `refined` (what the fit left of `boards`) that are boards.
+
+    Where fewer are seen than may be there, lattices with the rows and columns of those that may be there are believed
+    more; their corners may be uncertain, and their sigmas say so. Beside boards that are sure such a lattice would be
+    something else: a board in the background, or a mirror image.
+    """
+    pairs = list(zip(boards, refined, strict=True))
+    sure = [trustworthy(after, before.count, min_corners) for before, after in pairs]
+    room = len(sizes) - sum(sure)
+    if room > 0:
+        asked = {frozenset(size) for size in sizes}
+        expected = [
+            k
+            for k, (before, after) in enumerate(pairs)
+            if not sure[k] and after.lattice.count >= MIN_EXPECTED_CORNERS and frozenset(after.lattice.size) in asked
+            if trustworthy(after, before.count, min_corners, OF_EXPECTED_SIZE)
+        ]
+        for k in sorted(expected, key=lambda k: -Evidence.of(pairs[k][1]).score)[:room]:
+            sure[k] = True
+    return [after for (_, after), taken in zip(pairs, sure, strict=True) if taken]
 
 
 def _promising(grey: GreyImage, finest: Level, lattice: Lattice) -> bool:

@@ -52,6 +52,18 @@ def guess_board(images: Sequence[GreyImage]) -> BoardGuess | None:
     charuco = guessed_charuco(markers)
     if charuco is not None:
         return BoardGuess(charuco, tuple(markers.images))
+    plain = _plain_guess(images)
+    if plain is None:
+        # Blurred frames at the beginning of a video show no markers.
+        for k, image in enumerate(images[MARKER_TRIES:], MARKER_TRIES):
+            markers.look(k, image)
+        charuco = guessed_charuco(markers)
+        return None if charuco is None else BoardGuess(charuco, tuple(markers.images))
+    return plain
+
+
+def _plain_guess(images: Sequence[GreyImage]) -> BoardGuess | None:
+    """Return the chessboard, or grid of circles, that most of the images show; None where none is seen."""
     sizes: dict[int, tuple[int, int]] = {}
     circles = CircleSightings()
     for k, image in enumerate(images):

@@ -28,6 +28,7 @@ from rigkit.io.rig_session import RigSession
 from rigkit.io.session import Session, beside_session
 from rigkit.io.video import Video, is_video, read_timestamps
 from rigkit.workflows.frame_choice import FrameChoice, KeptFrame, describe
+from rigkit.workflows.identify_board import explained
 
 MAX_FRAMES = 40
 """Frames kept of a video: a calibration gains little from more that are spread as well."""
@@ -136,7 +137,10 @@ def frames_of_videos(
     images = keeper.finish()
     if not images:
         names = ", ".join(f"'{path}'" for path in sources.values())
-        raise InputError(f"{names}: no board in {looked_at} frames; check focus, light and the board's size")
+        shown = None if live or not boards else explained(list(sources.values()), boards)
+        raise InputError(
+            f"{names}: no board in {looked_at} frames; {shown or 'check focus, light and the size of the board'}"
+        )
     done = VideoFrames(
         folder=folder,
         images={name: images.get(name, ()) for name in sources},

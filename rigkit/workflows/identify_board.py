@@ -1,8 +1,8 @@
-"""What board the images of a folder show: everything but the scale, which a rule must tell."""
+"""What board images or videos show: everything but the scale, which a rule must tell."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,12 +13,16 @@ from rigkit.detection.saddles.response import GreyImage, grey_image
 from rigkit.detection.unknown import BoardGuess, difference, guess_board
 from rigkit.io.board_words import words_of_board
 from rigkit.io.images import read_image
+from rigkit.io.video import Video, is_video
 
 ENOUGH_IMAGES = 12
 """Images that are looked at, evenly spread: what more of them show is the same board."""
 
 EXPLAINING_IMAGES = 4
 """Images looked at to say what is wrong with a session."""
+
+FRAMES_APART = 10
+"""Frames from one that is looked at to the next, of a video that does not say how many it has."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -43,7 +47,7 @@ class IdentifiedBoard:
 
 
 def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) -> IdentifiedBoard:
-    """Return the board that images show.
+    """Return the board that images, or frames of videos, show.
 
     Raises
     ------
@@ -54,20 +58,19 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
     """
     if not paths:
         raise InputError("board identify: no images; give some, or a folder")
-    chosen = _spread([Path(path) for path in paths], ENOUGH_IMAGES)
     images: dict[str, GreyImage] = {}
     unreadable: list[InputError] = []
-    for k, path in enumerate(chosen):
-        progress("reading", k, len(chosen))
-        try:
-            images[str(path)] = grey_image(read_image(path))
-        except InputError as error:
-            unreadable.append(error)
+    for k, (name, image) in enumerate(_pictures([Path(path) for path in paths], ENOUGH_IMAGES)):
+        progress("reading", k, ENOUGH_IMAGES)
+        if isinstance(image, InputError):
+            unreadable.append(image)
+        else:
+            images[name] = image
     if not images:
         raise unreadable[0]
-    progress("reading", len(chosen), len(chosen))
+    progress("reading", ENOUGH_IMAGES, ENOUGH_IMAGES)
     guess = guess_board(list(images.values()))
-    names = tuple(Path(path).name for path in images)
+    names = tuple(Path(name).name for name in images)
     if guess is None:
         if unreadable:
             raise InputError(f"no board is seen in {len(names)} images, and {unreadable[0]}")
@@ -103,11 +106,34 @@ def suggested_words(paths: Sequence[Path]) -> str | None:
 
 def _guess(paths: Sequence[Path]) -> BoardGuess | None:
     try:
-        return guess_board([grey_image(read_image(path)) for path in _spread(list(paths), EXPLAINING_IMAGES)])
+        pictures = [image for _, image in _pictures(paths, EXPLAINING_IMAGES)]
+        return guess_board([image for image in pictures if not isinstance(image, InputError)])
     except RigkitError:
         return None
 
 
-def _spread(paths: list[Path], most: int) -> list[Path]:
-    step = max(1, -(-len(paths) // most))
-    return paths[::step]
+def _pictures(paths: Sequence[Path], most: int) -> Iterator[tuple[str, GreyImage | InputError]]:
+    """Yield the names and grey levels of about `most` images, evenly spread over `paths`, or why one cannot be read.
+
+    Of videos frames are taken.
+    """
+    for path in paths[:: max(1, -(-len(paths) // most))]:
+        try:
+            if is_video(path):
+                yield from _frames(path, max(1, most // len(paths)))
+            else:
+                yield str(path), grey_image(read_image(path))
+        except InputError as error:
+            yield str(path), error
+
+
+def _frames(path: Path, most: int) -> Iterator[tuple[str, GreyImage]]:
+    """Yield so many frames of a video, evenly spread over it."""
+    with Video(path) as video:
+        step = max(1, video.count // most) if video.count else FRAMES_APART
+        for k in range(most):
+            # The middles of equal parts: at its ends a board is on its way in or out.
+            frame = video.frame(k * step + step // 2)
+            if frame is None:
+                return
+            yield f"{path} frame {video.next_number - 1}", grey_image(frame)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,7 @@ from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
+from rigkit.core.patterns.charuco import Charuco
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.io.images import read_image
@@ -24,15 +26,21 @@ from rigkit.workflows.calibrate_any import FolderOptions, calibrate_folders
 from rigkit.workflows.detect import detect_in_images
 from rigkit.workflows.frame_choice import DIRECTIONS, FrameChoice, KeptFrame
 from rigkit.workflows.frames import frames_of_video, frames_of_videos
+from rigkit.workflows.identify_board import identify_board
 
 BOARD = Board("b", 7, 5, 20.0, 20.0)
 CAMERA = Pinhole((320, 240), np.array([300.0, 300.0, 159.5, 119.5]))
 
 
-def picture(turn: tuple[float, float, float], right_mm: float, *, blur_px: float = 0.7) -> np.ndarray:
+MARKED = Board("c", 5, 4, 26.0, 26.0, pattern=Charuco("DICT_4X4_50", 19.5))
+
+
+def picture(
+    turn: tuple[float, float, float], right_mm: float, *, blur_px: float = 0.7, board: Board = BOARD
+) -> np.ndarray:
     rotation = exp_so3(np.array(turn))
     placed = PlacedBoard(
-        BOARD, Rigid3(rotation, np.array([right_mm, 0.0, 300.0]) - rotation @ np.array([60.0, 40.0, 0.0]))
+        board, Rigid3(rotation, np.array([right_mm, 0.0, 300.0]) - rotation @ np.array([60.0, 40.0, 0.0]))
     )
     light = radiance((placed,), CAMERA, Rigid3.identity(), optics=Optics(blur_px=blur_px))
     return np.asarray(develop(light, Photometry(noise_levels=1.0), np.random.default_rng(0)))
@@ -118,3 +126,16 @@ def test_a_folder_of_videos_is_a_camera_each(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("of two cameras")
     with pytest.raises(InputError, match=r"left\.avi', '.*right\.avi': no board in 2 frames"):
         calibrate_folders([tmp_path], FolderOptions(boards=("7x5x20",)), CalibrateOptions())
+
+
+def test_a_video_tells_its_board_and_why_another_is_not_seen(tmp_path: Path) -> None:
+    """Its first frames are empty."""
+    shown = [picture((0.1 * k, 0.2, 0.0), 5.0 * k, board=MARKED) for k in range(6)]
+    path = video(tmp_path / "a.avi", [np.full((240, 320), 90, np.uint8)] * 6 + shown)
+    found = identify_board([path])
+    assert isinstance(found.board.pattern, Charuco)
+    assert (found.board.size, found.board.pattern.inverted) == ((5, 4), False)
+    assert (len(found.seen), len(found.looked_at)) == (6, 12)
+    other = replace(MARKED, pattern=Charuco("DICT_4X4_50", 19.5, inverted=True))
+    with pytest.raises(InputError, match=r"no board in 12 frames; 5 x 4 inner corners seen .*: set inverted = false"):
+        frames_of_video(path, tmp_path / "out", [other])

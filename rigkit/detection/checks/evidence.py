@@ -40,6 +40,11 @@ covered or cut, and 276 of other patterns. As taken, boards score 0.7 and more a
 less: a page of 1304 discs of 7 px that nearly touch, every second row moved by half a step, -0.6. With what was done to
 the images 10 boards are refused, smeared and shrunk ones, and no other pattern is taken for one."""
 
+OF_EXPECTED_SIZE, MIN_EXPECTED_CORNERS = 4.0, 20
+"""What the score grows by where a lattice of so many corners has the rows and columns of a board that may be there: the
+logarithm of how much rarer that is among other patterns. Of 75 lattices of these 1 or none has the size of a board in
+use (9 x 6, 7 x 10), 3 have 6 x 4 corners; smaller ones chance makes in any size."""
+
 
 class Evidence(NamedTuple):
     """What the fit says of a lattice; (upper) medians over its corners.

@@ -191,12 +191,15 @@ def compact(lattice: Lattice, size_px: tuple[int, int]) -> bool:
     return False
 
 
-def trustworthy(refined: RefinedLattice, before: int, least: int) -> bool:
-    """Return whether what the fit left of a lattice of `before` corners is a board."""
+def trustworthy(refined: RefinedLattice, before: int, least: int, prior: float = 0.0) -> bool:
+    """Return whether what the fit left of a lattice of `before` corners is a board.
+
+    `prior` is added to the score of its evidence: what else speaks for a board.
+    """
     lattice = refined.lattice
     if lattice.count < max(least, (1.0 - MAX_LOST) * before) or min(lattice.size) < MIN_ROWS:
         return False
-    return Evidence.of(refined).score > 0.0
+    return Evidence.of(refined).score + prior > 0.0
 
 
 def too_large(lattice: Lattice, sizes: Sequence[tuple[int, int]]) -> bool:
