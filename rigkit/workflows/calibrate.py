@@ -10,6 +10,8 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.board_ties import suggest_ties
 from rigkit.calibration.verdicts import judge_session
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.findings import Finding, Severity
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.calibration_file import calibration_text
@@ -21,6 +23,7 @@ from rigkit.workflows.corners import Cache, SessionCorners, session_corners, ses
 from rigkit.workflows.export_camera import foreign_files, foreign_paths
 from rigkit.workflows.folder_session import Known
 from rigkit.workflows.given_corners import given_corners
+from rigkit.workflows.identify_board import explained
 from rigkit.workflows.provenance import made
 from rigkit.workflows.session_page import session_page
 
@@ -125,13 +128,32 @@ def calibration_from(session: Session, corners: SessionCorners, *, progress: Pro
     """
     views, size_px, dropped = session_views(session, corners)
     with about(session.path):
-        result = calibrate(
-            views,
-            size_px,
-            model=session.model,
-            degree=session.degree,
-            board=session.board_shape,
-            progress=progress,
-        )
+        try:
+            result = calibrate(
+                views,
+                size_px,
+                model=session.model,
+                degree=session.degree,
+                board=session.board_shape,
+                progress=progress,
+            )
+        except DegenerateError as error:
+            shown = _other_board(session)
+            if shown is None:
+                raise
+            raise InputError(f"{shown} ({error})") from error
     verdicts = judge_session(result, dropped, suggest_ties(views, result))
+    if verdicts[0].severity is Severity.BAD:
+        shown = _other_board(session)
+        if shown is not None:
+            verdicts = (verdicts[0], Finding(severity=Severity.BAD, message=shown), *verdicts[1:])
     return replace(result, dropped=(*dropped, *result.dropped), verdicts=verdicts)
+
+
+def _other_board(session: Session) -> str | None:
+    """Return in words why the images show another board with marks than declared; None where that is not known.
+
+    Some of its marks are at home on the board declared: corners are found, in wrong places. Of chessboards the size of
+    the grids tells (`rigkit.calibration.usable.other_size`).
+    """
+    return explained(session.images, session.boards) if any(board.identified for board in session.boards) else None

@@ -95,7 +95,10 @@ def explained(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     words = [difference(seen, board) for board in boards for seen in (guess.board, *guess.beside)]
     if None in words or not words:
         return None
-    return f"{guess.board.describe().split(', ')[0]} seen in {len(guess.images)} images; {words[0]}"
+    what, count = guess.board.describe().split(", ")[0], len(guess.images)
+    if what in words[0]:
+        return f"in {count} images {words[0]}"
+    return f"{what} seen in {count} images; {words[0]}"
 
 
 def suggested_words(paths: Sequence[Path]) -> str | None:
