@@ -78,7 +78,32 @@ KINDS: dict[str, Kind] = {
             ("export", "{case}", "--to", "opencv", "-o", "{out}/new.yaml"),
             ("rectify", "image.png", "--camera", "{case}", "-o", "{out}/new.png"),
             ("rectify", "image.png", "--camera", "{case}", "-o", "{out}/cut.png", "--crop", "--hfov-deg", "60"),
+            ("export", "{case}", "--to", "mrcal", "-o", "{out}/new.cameramodel"),
+            ("certify", "{case}", "--angle", "20", "--distance", "900", "-r", "{out}/new.html"),
+            ("diff", "calibration.json", "{case}", "-r", "{out}/new.html"),
+            ("history", "history.jsonl", "--add", "{case}", "--to", "{case}"),
         ),
+    ),
+    "lens-at-work": Kind(
+        "calibration.json",
+        (
+            ("pose", "image.png", "--camera", "{case}", "--board", "floor.toml", "--json"),
+            ("detect", "-j", "1", "--camera", "{case}", "--board", "floor.toml", "image.png"),
+            (
+                "reconstruct",
+                "--correspondences",
+                "pairs.csv",
+                "--camera",
+                "{case}",
+                "-o",
+                "{out}/new",
+                "--pose-type",
+                "planar",
+                "--no-pictures",
+            ),
+            ("handeye", "poses.csv", "pairs", "--camera", "{case}", "--board", "floor.toml"),
+        ),
+        judged=True,
     ),
     "rig": Kind(
         "rig.json",
@@ -92,7 +117,14 @@ KINDS: dict[str, Kind] = {
             ("rectify", "image.png", "image.jpg", "--rig", "{case}", "-o", "{out}/cut.png", "--crop", "--json"),
         ),
     ),
-    "board-rigs": Kind("board-rigs.json", (("rigkit.io.rig_file:load_board_rigs", "{case}"),)),
+    "board-rigs": Kind(
+        "board-rigs.json",
+        (
+            ("rigkit.io.rig_file:load_board_rigs", "{case}"),
+            ("diff", "{case}", "board-rigs.json"),
+            ("diff", "{case}", "{case}", "-r", "{out}/new.html"),
+        ),
+    ),
     "corners-json": Kind(
         "corners.json", (("rigkit.io.corners_file:read_corners", "{case}"), ("fuzz_readers:read_cache", "{case}"))
     ),

@@ -34,8 +34,8 @@ ARGUMENTS = (
 )  # fmt: skip
 """In place of a word of a command; nothing that could be written outside of the case's folder."""
 JSON_VALUES: tuple[Any, ...] = (
-    None, True, -1, 0, 1e300, 10**400, 1e-320, "", "x", "nan", [], {}, [[]], [1, [2]], float("nan"), float("inf"),
-    "a\nb", "\u0000", "\ud800", 0.5, [None], {"a": 1},
+    None, True, -1, 0, 1, 3, 0.5, 100.0, 1e4, 1e9, 1e15, 1e160, 1e300, 10**400, 1e-4, 1e-9, 1e-160, 1e-320, "", "x",
+    "nan", [], {}, [[]], [1, [2]], float("nan"), float("inf"), "a\nb", "\u0000", "\ud800", [None], {"a": 1},
 )  # fmt: skip
 SQL_VALUES: tuple[Any, ...] = (
     None, -1, 0, 1, 2, 2**62, -(2**62), 0.5, float("inf"), "", "x", "abc\udcff".encode("utf-8", "surrogateescape"), b"",
@@ -151,13 +151,13 @@ def _json(data: bytes, rng: random.Random) -> bytes:
         tree = json.loads(data)
     except (ValueError, RecursionError):
         return _bytes(data, rng)
-    places: list[tuple[Any, Any]] = []
-    _collect(tree, places)
+    places: dict[tuple[str, ...], list[tuple[Any, Any]]] = {}
+    _collect(tree, (), places)
     if not places:
         return _bytes(data, rng)
-    shallow = [p for p in places if isinstance(p[0], dict)]
-    holder, key = rng.choice(shallow if shallow and rng.random() < 0.6 else places)
-    way = rng.randrange(5)
+    # By what a value is, then by which of them: long tables would take them all.
+    holder, key = rng.choice(places[rng.choice(sorted(places))])
+    way = rng.randrange(7)
     if way == 0:
         del holder[key]
     elif way == 1:
@@ -166,16 +166,29 @@ def _json(data: bytes, rng: random.Random) -> bytes:
         holder.append(holder[key])
     elif way == 3 and isinstance(holder, dict):
         holder[rng.choice(("", "x", "schema", "name"))] = holder.pop(key)
+    elif way == 4:
+        holder[key] = _scaled(holder[key], rng.choice((0.0, -1.0, 1e-9, 1e-3, 1e3, 1e9)))
     else:
         holder[key] = rng.choice(JSON_VALUES)
     return json.dumps(tree).encode()
 
 
-def _collect(node: Any, places: list[tuple[Any, Any]]) -> None:
+def _collect(node: Any, path: tuple[str, ...], places: dict[tuple[str, ...], list[tuple[Any, Any]]]) -> None:
+    """Note in `places` where each value stands, by the keys that lead to it; entries of a list are alike."""
     for key in node if isinstance(node, dict) else range(len(node)):
-        places.append((node, key))
+        here = (*path, key if isinstance(key, str) else "*")
+        places.setdefault(here, []).append((node, key))
         if isinstance(node[key], dict | list):
-            _collect(node[key], places)
+            _collect(node[key], here, places)
+
+
+def _scaled(value: Any, factor: float) -> Any:
+    """Return the value with every number in it multiplied."""
+    if isinstance(value, list):
+        return [_scaled(one, factor) for one in value]
+    if isinstance(value, dict):
+        return {key: _scaled(one, factor) for key, one in value.items()}
+    return value * factor if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
 def _npz(data: bytes, rng: random.Random) -> bytes:

@@ -16,6 +16,9 @@ from rigkit.core.findings import Finding
 from rigkit.core.printing import drawn
 from rigkit.geometry.rigid3 import Rigid3
 
+MAX_OFF_LATTICE = 0.25
+"""Of a square: the corners of a board stand nearer to where they belong, however it is bent."""
+
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class ViewResult:
@@ -205,15 +208,21 @@ def _stretch(board: Board, points_mm: Points) -> tuple[float, float]:
 
 
 def _chessboard_of(board_id: str, points_mm: Points) -> Board:
+    """Return the chessboard whose corners these are, row by row; raises InputError where they are no lattice."""
     back = np.flatnonzero(np.diff(points_mm[:, 0]) < 0.0)
     columns = int(back[0]) + 1 if len(back) else len(points_mm)
-    if len(points_mm) % columns:
-        raise InputError(
-            f"board '{board_id}': its {len(points_mm)} points are no grid of {columns} columns; calibrate again"
-        )
-    lattice = points_mm.reshape(len(points_mm) // columns, columns, 3)
-    across, down = (float(np.linalg.norm(np.diff(lattice, axis=axis), axis=-1).mean()) for axis in (1, 0))
-    return Board(board_id, columns, len(lattice), across, down)
+    rows = len(points_mm) // max(columns, 1)
+    fault = f"board '{board_id}': its {len(points_mm)} points are no grid, row by row; calibrate again"
+    if min(columns, rows) < 2 or rows * columns != len(points_mm):
+        raise InputError(fault)
+    lattice = points_mm.reshape(rows, columns, 3)
+    steps = [np.diff(lattice, axis=axis) for axis in (1, 0)]
+    square_x, square_y = (float(np.linalg.norm(step, axis=-1).mean()) for step in steps)
+    across, down = (step.mean(axis=(0, 1)) for step in steps)
+    flat = lattice[0, 0] + np.arange(columns)[:, None] * across + np.arange(rows)[:, None, None] * down
+    if not np.linalg.norm(lattice - flat, axis=-1).max() < MAX_OFF_LATTICE * min(square_x, square_y):
+        raise InputError(fault)
+    return Board(board_id, columns, rows, square_x, square_y)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

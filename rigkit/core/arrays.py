@@ -20,6 +20,8 @@ NOT_NUMBERS = "bSUmMV"
 """Kinds of arrays that numpy would turn into numbers, and that are none: truth values, words, dates."""
 MAX_ASYMMETRY = 1e-6
 """Of a covariance, in units of the two sigmas: solving leaves 1e-12 of a well-posed problem."""
+MAX_VARIANCE = 1e36
+"""Of a number of at most 1e15 of which nothing is known; products of much larger ones overflow."""
 MIN_EIGENVALUE = -1e-6
 """Of a correlation matrix, for each row that it has: rounding of an inverse makes a zero slightly negative."""
 
@@ -105,6 +107,8 @@ def as_covariance(value: ArrayLike, name: str, size: int) -> FloatArray:
             f"{name}: a variance is negative ({variance.min():.3g}); the numbers were changed or damaged; "
             "calibrate again"
         )
+    if (variance > MAX_VARIANCE).any():
+        raise InputError(f"{name}: a variance is {variance.max():.3g}, which says nothing; calibrate again")
     sigma = np.sqrt(variance)
     # What has no variance has no covariance either.
     scale = np.outer(sigma, sigma)

@@ -10,6 +10,7 @@ import numpy as np
 
 from rigkit.cameras.base import MAX_SIDE_PX, Camera
 from rigkit.cameras.convert import convert_camera
+from rigkit.cameras.plausible import fault_of_lens
 from rigkit.cameras.registry import camera_model
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
@@ -147,9 +148,12 @@ def image_size(value: Any, name: str, key: str) -> tuple[int, int]:
 def camera_of(model: str, size_px: tuple[int, int], parameters: FloatArray, name: str) -> Camera:
     """Return the camera; raises InputError that names the file where the values make none."""
     try:
-        return camera_model(model)(size_px, parameters)
+        camera = camera_model(model)(size_px, parameters)
     except InputError as error:
         raise InputError(f"'{name}': {error}; is it the calibration of this format?") from error
+    if (fault := fault_of_lens(camera)) is not None:
+        raise InputError(f"'{name}': {fault}; is it the calibration of this format?")
+    return camera
 
 
 def unified_with_xi(camera: Camera) -> tuple[float, FloatArray]:

@@ -27,6 +27,8 @@ SPLINED = re.compile(
     r"^LENSMODEL_SPLINED_STEREOGRAPHIC_(?:spline_)?order=(?P<order>\d)_Nx=(?P<nx>\d{1,4})_Ny=(?P<ny>\d{1,4})_fov_x_deg=(?P<fov>\d{1,3})$"
 )
 KNOTS_X = 40
+MAX_FOV_DEG = 350
+"""Of the image: the stereographic plane has no end at 360."""
 MAX_KNOTS_Y = 160
 """An image that is four times as high as wide, in angle: damage rather than a lens, and 330 MB of equations."""
 SMOOTHING = 1e-6
@@ -135,9 +137,14 @@ def _spline_of(camera: Camera) -> tuple[str, FloatArray]:
         raise InputError("mrcal: this camera sees nothing on its image; calibrate again")
     u = _stereographic(rays)
     # The spline covers fov_x_deg on the horizontal, and as much as its knots reach on the vertical.
-    fov_x = int(np.ceil(np.degrees(4.0 * np.arctan(np.abs(u).max(axis=0)[0] / 2.0)))) + 2
+    half_x, half_y = 2.0 * np.arctan(np.abs(u).max(axis=0) / 2.0)
+    fov_x = int(np.ceil(np.degrees(2.0 * half_x))) + 2
+    if max(fov_x, np.degrees(2.0 * half_y)) > MAX_FOV_DEG:
+        raise InputError(
+            f"mrcal: this camera sees beyond {MAX_FOV_DEG} degrees, where its splines end; choose another format"
+        )
     reach = 2.0 * np.tan(np.radians(fov_x) / 4.0)
-    ny = int(np.ceil((KNOTS_X - 3) * np.abs(u).max(axis=0)[1] / reach)) + 4
+    ny = int(np.ceil((KNOTS_X - 3) * 2.0 * np.tan(half_y / 2.0) / reach)) + 4
     if ny > MAX_KNOTS_Y:
         raise InputError(
             f"mrcal: in angle this camera's image is {ny / KNOTS_X:.0f} times as high as wide, which its splines do "

@@ -8,6 +8,7 @@ polynomial is negative on the axis: (x, y, z) of theirs = (y, x, -z) of ours. Th
 from __future__ import annotations
 
 import json
+from typing import cast
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.scaramuzza import DEGREES, Scaramuzza
 from rigkit.core.arrays import FloatArray, Mat3
 from rigkit.core.errors import InputError
-from rigkit.interop.exchange import Accepted, Chosen, Written, best_accepted, image_size, numbers
+from rigkit.interop.exchange import Accepted, Chosen, Written, best_accepted, camera_of, image_size, numbers
 
 ENOUGH_PX = 0.02
 """A polynomial of a higher degree is taken only where the lower one is off by more."""
@@ -126,10 +127,7 @@ def _from_ocam(
     cam_from_ocam = np.zeros((3, 3))
     cam_from_ocam[:2, :2] = rotation @ np.array([[0.0, 1.0], [1.0, 0.0]])
     cam_from_ocam[2, 2] = -1.0
-    try:
-        return Scaramuzza(size_px, parameters), cam_from_ocam
-    except InputError as error:
-        raise InputError(f"'{name}': {error}; is the file whole?") from error
+    return cast(Scaramuzza, camera_of("scaramuzza", size_px, parameters, name)), cam_from_ocam
 
 
 def _scaramuzza(camera: Camera) -> Chosen:

@@ -18,14 +18,15 @@ import numpy as np
 
 from rigkit.calibration.result import BoardShape, Calibration, Candidate, Convergence, Outlier, ViewResult
 from rigkit.cameras.base import Camera
+from rigkit.cameras.plausible import fault_of_lens
 from rigkit.cameras.registry import camera_model
-from rigkit.core.arrays import FloatArray, as_covariance, without_nan
+from rigkit.core.arrays import as_covariance, as_indices, without_nan
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding, Severity
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.board_file import board_of_values, board_values
 from rigkit.io.files import write_atomic
-from rigkit.io.json_reader import read_json, real, whole
+from rigkit.io.json_reader import positive, read_json, real, reals, whole
 from rigkit.io.reading import usable_path
 from rigkit.io.schema_calibration import CALIBRATION_FILE, keys_of
 
@@ -114,7 +115,7 @@ def load_calibration(path: str | Path) -> Calibration:
             heldout_rms_px=None if data["heldout_rms_px"] is None else real(data["heldout_rms_px"]),
             covariance=as_covariance(data["covariance"], "covariance", size),
             frame_covariance=as_covariance(data["frame_covariance"], "frame_covariance", size + 6),
-            sigma_px=real(data["sigma_px"]),
+            sigma_px=positive(data["sigma_px"]),
             views=tuple(_view_in(v, sizes) for v in data["views"]),
             dropped=tuple((str(image), str(reason)) for image, reason in data["dropped"]),
             outliers=tuple(_entry(Outlier, _finite(v)) for v in data["outliers"]),
@@ -122,8 +123,8 @@ def load_calibration(path: str | Path) -> Calibration:
             convergence=_entry(Convergence, data["convergence"]),
             boards=boards,
             verdicts=findings_from_json(data["verdicts"]),
-            overdispersion=float(data.get("overdispersion", 1.0)),
-            freedom=float(data.get("freedom") or math.inf),
+            overdispersion=positive(data.get("overdispersion", 1.0)),
+            freedom=math.inf if data.get("freedom") is None else positive(data["freedom"]),
         )
 
 
@@ -180,7 +181,8 @@ def camera_from_json(data: Any, path: str | Path) -> Camera:
     names = camera.parameter_names()
     if tuple(data["parameters"]) != names:
         raise InputError(f"'{path}': parameters of a {camera.model} camera must be {', '.join(names)}, in this order")
-    refuse_mirrored(camera, path)
+    if (fault := fault_of_lens(camera)) is not None:
+        raise InputError(f"'{path}': camera: {fault}; calibrate again")
     return camera
 
 
@@ -200,16 +202,6 @@ def findings_from_json(data: Sequence[Any]) -> tuple[Finding, ...]:
     return tuple(out)
 
 
-def refuse_mirrored(camera: Camera, path: str | Path) -> None:
-    """Raise InputError that names the file `path` where a focal length is not positive."""
-    for name, value in zip(camera.parameter_names(), camera.parameters.tolist(), strict=True):
-        if name in ("fx", "fy") and not value > 0.0:
-            raise InputError(
-                f"'{path}': {name} = {value:g}; focal lengths are positive here, with x to the right, y down and z "
-                "forward: turn the axes of the program that wrote the file"
-            )
-
-
 def _view_out(view: ViewResult) -> dict[str, Any]:
     return {
         "image": view.image,
@@ -225,7 +217,7 @@ def _view_out(view: ViewResult) -> dict[str, Any]:
 
 def _view_in(data: dict[str, Any], sizes: Mapping[str, tuple[int, int]]) -> ViewResult:
     """Return a view; `sizes` of the boards as (columns, rows), those that are declared."""
-    grid, kept = np.array(data["grid"], dtype=np.int64).reshape(-1, 2), data["kept"]
+    grid, kept = as_indices(data["grid"], (None, 2), "grid"), data["kept"]
     if not all(isinstance(one, bool) for one in kept):
         raise ValueError("what 'kept' says of a corner must be true or false")
     if ((grid < 0) | (grid >= sizes.get(data["board_id"], grid + 1))).any():
@@ -233,22 +225,18 @@ def _view_in(data: dict[str, Any], sizes: Mapping[str, tuple[int, int]]) -> View
     return ViewResult(
         image=str(data["image"]),
         board_id=str(data["board_id"]),
-        cam_from_board=Rigid3.from_matrix(data["cam_from_board"]),
+        cam_from_board=Rigid3.from_matrix(reals(data["cam_from_board"])),
         grid=grid,
-        pixels=_array(data["pixels"]),
-        residuals_px=_array(data["residuals_px"]),
+        pixels=reals(data["pixels"]),
+        residuals_px=reals(data["residuals_px"], nullable=True),
         kept=np.array(kept, dtype=bool),
     )
 
 
 def _shape_in(data: dict[str, Any]) -> BoardShape:
     declared = board_of_values(data["target"], data["board_id"]) if "target" in data else None
-    return _entry(BoardShape, {**{k: v for k, v in data.items() if k != "target"}, "declared": declared})
-
-
-def _array(value: Any) -> FloatArray:
-    """Return the array; null is NaN."""
-    return np.array(value, dtype=np.float64)
+    values = {**data, "points_mm": reals(data["points_mm"]), "declared": declared}
+    return _entry(BoardShape, {k: v for k, v in values.items() if k != "target"})
 
 
 def _finite(values: dict[str, Any], nullable: tuple[str, ...] = ("residual_px",)) -> dict[str, Any]:

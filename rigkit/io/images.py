@@ -128,6 +128,19 @@ def require_pixels(size_px: tuple[int, int], what: str) -> None:
         )
 
 
+def read_image_of(path: str | Path, size_px: tuple[int, int], calibration: str | Path) -> Image:
+    """Return an image of a camera; raises InputError also where it is of another size than `calibration`, the file that
+    the camera is from, says."""
+    image = read_image(path)
+    height, width = image.shape[:2]
+    if (width, height) != size_px:
+        raise InputError(
+            f"image '{path}' is {width}x{height} px, but '{calibration}' is of a camera of {size_px[0]}x{size_px[1]}; "
+            "give images of that size, or calibrate at this one"
+        )
+    return image
+
+
 @contextmanager
 def quiet_opencv() -> Iterator[None]:
     """Keep OpenCV's own lines off stderr: what is wrong is said once, in one line, by the error that follows."""

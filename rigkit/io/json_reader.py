@@ -8,6 +8,9 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 from rigkit.io.numbers import MAX_NUMBER
 from rigkit.io.reading import read_text
@@ -63,6 +66,27 @@ def real(value: Any) -> float:
     if not abs(value) <= MAX_NUMBER:
         raise ValueError(f"{value:g} is larger than anything measured")
     return float(value)
+
+
+def positive(value: Any) -> float:
+    """Return a number above zero; raises ValueError for any other."""
+    number = real(value)
+    if not number > 0.0:
+        raise ValueError(f"{number:g} must be positive")
+    return number
+
+
+def reals(value: Any, *, nullable: bool = False) -> FloatArray:
+    """Return lists of numbers as an array, null as NaN where it is `nullable`; raises ValueError like `real`."""
+    array = np.array(value)
+    if array.dtype.kind not in "iuf":
+        if not nullable or any(one is not None and type(one) not in (int, float) for one in array.flat):
+            raise ValueError("something among the numbers is none")
+        array = np.array(value, dtype=np.float64)
+    array = array.astype(np.float64)
+    if (np.abs(array) > MAX_NUMBER).any():
+        raise ValueError(f"{np.nanmax(np.abs(array)):g} is larger than anything measured")
+    return array
 
 
 def whole(value: Any) -> int:

@@ -11,8 +11,6 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.base import Camera
@@ -23,7 +21,7 @@ from rigkit.core.identifiers import check_identifier
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.board_file import board_of_values, board_values
 from rigkit.io.calibration_file import Made, camera_from_json, camera_to_json, damage_named, findings_to_json
-from rigkit.io.json_reader import json_schema, read_json, real, whole
+from rigkit.io.json_reader import json_schema, positive, read_json, real, reals, whole
 from rigkit.io.schema_calibration import BOARD_RIG_FILE, RIG_FILE, keys_of
 
 RIG_SCHEMA = "rigkit.rig/1"
@@ -107,17 +105,17 @@ def load_saved_rig(path: str | Path) -> SavedRig:
             name = check_identifier(entry["name"], "camera")
             if name in cameras:
                 raise InputError(f"'{path}': two cameras are called '{name}'; calibrate again")
-            cameras[name] = (camera, Rigid3.from_matrix(entry["cam_from_rig"]))
+            cameras[name] = (camera, Rigid3.from_matrix(reals(entry["cam_from_rig"])))
         if not cameras:
             raise InputError(f"'{path}': no camera in it; calibrate again")
         size = sum(camera.parameters.size for camera, _ in cameras.values()) + 6 * (len(cameras) - 1)
         covariance = None
         if "covariance" in data:
             covariance = as_covariance(data["covariance"], "covariance", size)
-        sigma_px = None if "sigma_px" not in data else real(data["sigma_px"])
+        sigma_px = None if "sigma_px" not in data else positive(data["sigma_px"])
         scale_sigma = real(data.get("scale_sigma", 0.0))
-        freedom = math.inf if data.get("freedom") is None else real(data["freedom"])
-        overdispersion = real(data.get("overdispersion", data.get("spread", 1.0)))
+        freedom = math.inf if data.get("freedom") is None else positive(data["freedom"])
+        overdispersion = positive(data.get("overdispersion", data.get("spread", 1.0)))
         boards = tuple(board_of_values(entry["target"], entry["board_id"]) for entry in data.get("boards", ()))
     return SavedRig(
         cameras=cameras,
@@ -198,7 +196,7 @@ def _placed(entry: dict[str, Any], path: str | Path) -> MountedBoard:
         known = None if sigma is None else real(sigma)
         size = whole(columns), whole(rows)
         board = Board(str(entry["board_id"]), *size, real(along_x), real(along_y), square_sigma_mm=known)
-    return MountedBoard(board, np.array(entry["points_mm"]), Rigid3.from_matrix(entry["target_from_board"]))
+    return MountedBoard(board, reals(entry["points_mm"]), Rigid3.from_matrix(reals(entry["target_from_board"])))
 
 
 def _read(path: str | Path, schema: str, keys: set[str]) -> dict[str, Any]:

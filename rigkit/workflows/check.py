@@ -23,7 +23,7 @@ from rigkit.geometry.board_pose import board_pose
 from rigkit.io.calibration_file import camera_to_json, findings_to_json, load_calibration
 from rigkit.io.files import ensure_writable, write_together
 from rigkit.io.history_file import HistoryEntry, add_entry, ensure_register
-from rigkit.io.images import read_image
+from rigkit.io.images import read_image_of
 from rigkit.io.reading import about
 from rigkit.io.rig_file import is_rig_file, load_saved_rig
 from rigkit.planning.candidates import Reach
@@ -107,14 +107,15 @@ def check_pictures(
     if options.scene:
         if len(watched.cameras) < 2:
             raise InputError("check: a scene without boards tells of a rig only; one camera needs pictures of a board")
-        read = [_read(watched, frame, unreadable) for frame in frames]
-        check = check_scene(watched, [images for images in read if images], cost, progress=progress)
+        read = [_read(watched, source, frame, unreadable) for frame in frames]
+        with about(source):
+            check = check_scene(watched, [images for images in read if images], cost, progress=progress)
     else:
         boards = options.boards or known
         if not boards:
             raise InputError(f"check: '{source}' does not say what boards there are; give --board 9x6x25")
-        views = _views(watched, frames, boards, left_out, unreadable, progress)
         with about(source):
+            views = _views(watched, source, frames, boards, left_out, unreadable, progress)
             check = check_views(watched, views, cost)
     words = check_words(check)
     files: dict[Path, str | bytes] = {}
@@ -185,34 +186,24 @@ def _frames(watched: Watched, sources: Sequence[Path]) -> list[list[Path]]:
     return [images[k : k + count] for k in range(0, len(images), count)]
 
 
-def _read(watched: Watched, frame: Sequence[Path], unreadable: list[str]) -> list[Any]:
+def _read(watched: Watched, source: Path, frame: Sequence[Path], unreadable: list[str]) -> list[Any]:
     """Return the images of a moment, none where one cannot be used: why goes to `unreadable`."""
-    images = [_image_of(camera, path, unreadable) for camera, path in zip(watched.cameras, frame, strict=True)]
+    images = [_image_of(camera, source, path, unreadable) for camera, path in zip(watched.cameras, frame, strict=True)]
     return [] if any(image is None for image in images) else images
 
 
-def _image_of(camera: Camera, path: Path, unreadable: list[str]) -> Any:
+def _image_of(camera: Camera, source: Path, path: Path, unreadable: list[str]) -> Any:
     """Return an image of the camera; None where it cannot be used, which goes to `unreadable`."""
     try:
-        return _whole_image_of(camera, path)
+        return read_image_of(path, camera.size_px, source)
     except InputError as error:
         unreadable.append(str(error))
         return None
 
 
-def _whole_image_of(camera: Camera, path: Path) -> Any:
-    image = read_image(path)
-    if (image.shape[1], image.shape[0]) != camera.size_px:
-        width, height = camera.size_px
-        raise InputError(
-            f"image '{path}' is {image.shape[1]}x{image.shape[0]} px, the calibration {width}x{height}; "
-            "take pictures of the size that was calibrated"
-        )
-    return image
-
-
 def _views(
     watched: Watched,
+    source: Path,
     frames: Sequence[Sequence[Path]],
     boards: Sequence[Board],
     left_out: list[tuple[str, str]],
@@ -226,7 +217,7 @@ def _views(
         name = f"{k:04d}"
         for c, path in enumerate(frame):
             progress("corners", k * len(frame) + c, total)
-            image = _image_of(watched.cameras[c], path, unreadable)
+            image = _image_of(watched.cameras[c], source, path, unreadable)
             if image is None:
                 continue
             found, reason = views_of_image(path.name, detect_boards(image, boards, camera=watched.cameras[c]), boards)

@@ -26,7 +26,7 @@ from rigkit.detection.lattices import MIN_BOARD_CORNERS
 from rigkit.io.board_words import board_of_words
 from rigkit.io.corners_file import write_corners
 from rigkit.io.files import ensure_writable, write_atomic
-from rigkit.io.images import IMAGE_ENDINGS, read_image
+from rigkit.io.images import IMAGE_ENDINGS, Image, read_image, read_image_of
 from rigkit.io.video import is_video
 from rigkit.report.overlay import draw_boards
 from rigkit.workflows.camera_files import import_camera
@@ -73,6 +73,7 @@ class _DetectJob:
     overlay: Path | None
     boards: tuple[Board, ...]
     camera: Camera | None
+    calibration: Path | None
     min_corners: int
     force: bool
 
@@ -118,7 +119,7 @@ def detect_in_images(
     read = [*images, *options.boards, *([options.camera] if options.camera else [])]
     ensure_writable(outputs, force=options.force, inputs=read)
     tasks = [
-        _DetectJob(image, overlay, boards, camera, options.min_corners, options.force)
+        _DetectJob(image, overlay, boards, camera, options.camera, options.min_corners, options.force)
         for image, overlay in zip(images, overlays, strict=True)
     ]
     outcomes, doubtful = _over_images(tasks, options.jobs, progress)
@@ -210,7 +211,7 @@ def _detect(job: _DetectJob) -> tuple[Outcome, str | None]:
     result is what is seen, but not trusted, where there is no board."""
     cv2.setNumThreads(1)
     try:
-        image = read_image(job.image)
+        image = _read(job)
         found = _boards_in(image, job)
         seen = None if found else doubtful_grid(image)
     except InputError as error:
@@ -224,13 +225,13 @@ def _detect(job: _DetectJob) -> tuple[Outcome, str | None]:
     return found, seen
 
 
+def _read(job: _DetectJob) -> Image:
+    if job.camera is None or job.calibration is None:
+        return read_image(job.image)
+    return read_image_of(job.image, job.camera.size_px, job.calibration)
+
+
 def _boards_in(image: NDArray[Any], job: _DetectJob) -> tuple[BoardDetection, ...]:
-    size = (image.shape[1], image.shape[0])
-    if job.camera is not None and size != job.camera.size_px:
-        raise InputError(
-            f"image '{job.image}' is {size[0]}x{size[1]} px but the calibration is for {job.camera.size_px[0]}x"
-            f"{job.camera.size_px[1]}; use that camera's images, or leave --camera out"
-        )
     try:
         return detect_boards(image, job.boards, min_corners=job.min_corners, camera=job.camera)
     except InputError as error:

@@ -17,7 +17,7 @@ from rigkit.interop.ocamcalib import write_ocamcalib
 from rigkit.interop.opencv import write_opencv
 from rigkit.interop.rigs import RIG_FORMATS, Rig, write_rig
 from rigkit.interop.ros import write_camera_info
-from rigkit.io.calibration_file import refuse_mirrored, save_camera
+from rigkit.io.calibration_file import save_camera
 from rigkit.io.files import ensure_writable, write_atomic, write_together
 from rigkit.io.reading import about
 from rigkit.workflows.camera_files import import_camera, import_rig
@@ -78,7 +78,6 @@ def export_camera(source: str | Path, options: ExportCameraOptions) -> ExportedC
     ensure_writable(options.output, force=options.force, inputs=[source])
     with about(source):
         camera = import_camera(source, options.source_kind, size_px=options.size_px)
-    refuse_mirrored(camera, source)
     if kind == "rigkit":
         save_camera(options.output, camera, force=options.force)
         return ExportedCamera(camera=camera, kind=kind, max_error_px=0.0)

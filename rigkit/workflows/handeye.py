@@ -20,7 +20,7 @@ from rigkit.detection.detect import detect_boards
 from rigkit.geometry.board_pose import BoardPose, board_poses
 from rigkit.io.board_words import board_of_words
 from rigkit.io.files import ensure_writable, write_atomic
-from rigkit.io.images import read_image
+from rigkit.io.images import read_image_of
 from rigkit.io.reading import about
 from rigkit.io.robot_poses import read_robot_poses
 from rigkit.workflows.camera_files import import_camera
@@ -100,7 +100,7 @@ def calibrate_hand_eye(
     views, stands, unreadable = [], [], []
     for done, path in enumerate(paths, start=1):
         try:
-            view = _view(path, board, camera)
+            view = _view(path, board, camera, options.camera)
         except InputError as error:
             if len(paths) == 1:
                 raise
@@ -129,7 +129,7 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
     Raises InputError for files that cannot be read, CheckFailed where the image does not show the board.
     """
     known, lens = board_of_words(str(board)), import_camera(camera)
-    view = _view(Path(image), known, lens)
+    view = _view(Path(image), known, lens, camera)
     if view is None:
         raise CheckFailed(f"'{image}' does not show board '{known.board_id}'; check focus and the board's file")
     rays, valid = lens.unproject(view.pixels)
@@ -151,8 +151,8 @@ def _one_way_up(board: Board) -> Board:
     return board
 
 
-def _view(path: Path, board: Board, camera: Camera) -> BoardView | None:
-    image = read_image(path)
+def _view(path: Path, board: Board, camera: Camera, calibration: str | Path) -> BoardView | None:
+    image = read_image_of(path, camera.size_px, calibration)
     found = [d for d in detect_boards(image, [board], camera=camera) if d.board_id == board.board_id]
     return BoardView.from_detection(path.name, max(found, key=lambda d: len(d.grid)), [board]) if found else None
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -15,7 +14,7 @@ from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.planes import Planes
 from rigkit.detection.detect import detect_boards
-from rigkit.io.images import read_image, to_grey
+from rigkit.io.images import read_image_of, to_grey
 from rigkit.io.manifest import Pair
 from rigkit.reconstruction.board_planes import BoardPlanes
 from rigkit.reconstruction.geometry import PairGeometry, pair_geometry
@@ -38,7 +37,7 @@ def find_boards(pair: Pair, camera1: Camera, camera2: Camera) -> tuple[Detection
     images = []
     found: list[Detections] = []
     for path, camera, entry in ((pair.image1, camera1, pair.camera1), (pair.image2, camera2, pair.camera2)):
-        image = read_for(camera, path, f"pair '{pair.pair_id}', camera '{entry.camera_id}'")
+        image = read_image_of(path, camera.size_px, entry.calibration)
         detections = detect_boards(to_grey(image), pair.boards, camera=camera)
         if not detections:
             sizes = ", ".join(sorted({f"{b.columns}x{b.rows}" for b in pair.boards}))
@@ -48,18 +47,6 @@ def find_boards(pair: Pair, camera1: Camera, camera2: Camera) -> tuple[Detection
         images.append(image)
         found.append(detections)
     return found[0], found[1], images[0], images[1]
-
-
-def read_for(camera: Camera, path: str | Path, whose: str) -> Image:
-    """Return an image; raises InputError also where it is of another size than the camera was calibrated at."""
-    image = read_image(path)
-    size = (image.shape[1], image.shape[0])
-    if size != camera.size_px:
-        raise InputError(
-            f"{whose}: image '{path}' is {size[0]}x{size[1]} px but the calibration is for "
-            f"{camera.size_px[0]}x{camera.size_px[1]}; use images of that size, or recalibrate"
-        )
-    return image
 
 
 def match_images(

@@ -17,6 +17,7 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.io.images import read_image_of
 from rigkit.io.ply import ply_bytes
 from rigkit.reconstruction.growing.dense import DenseScene, grow_scene
 from rigkit.reconstruction.growing.fuse import FusedCloud, PosedCloud, fuse_clouds
@@ -24,7 +25,6 @@ from rigkit.reconstruction.scene import reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.report.figures import cloud_png
 from rigkit.workflows.camera_files import import_rig
-from rigkit.workflows.pairs import read_for
 from rigkit.workflows.reconstruct_scene import CLOUD
 from rigkit.workflows.results import require_folder, write_results
 
@@ -172,7 +172,12 @@ def _views(options: RigSceneOptions) -> list[_View]:
         raise InputError("a cloud needs two images or more")
     rig_from_first = cameras[names[0]][1].inverse()
     views = [
-        _View(name, cameras[name][0], cameras[name][1] @ rig_from_first, read_for(cameras[name][0], path, f"'{name}'"))
+        _View(
+            name,
+            cameras[name][0],
+            cameras[name][1] @ rig_from_first,
+            read_image_of(path, cameras[name][0].size_px, options.rig),
+        )
         for name, path in zip(names, options.images, strict=True)
     ]
     for k, view in enumerate(views):

@@ -20,6 +20,7 @@ from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.correspondences import correspondences_text, read_correspondences
+from rigkit.io.images import read_image_of
 from rigkit.io.npz import npz_bytes
 from rigkit.io.ply import ply_bytes
 from rigkit.io.reading import about, read_text
@@ -29,7 +30,6 @@ from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.report.figures import cloud_png, epipolar_png
 from rigkit.report.scene_figure import normals_png
 from rigkit.workflows.camera_files import import_camera, import_rig
-from rigkit.workflows.pairs import read_for
 from rigkit.workflows.results import require_folder, write_results
 
 CLOUD = "scene.ply"
@@ -146,7 +146,8 @@ def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> 
     images = None
     if options.images:
         a, b = options.images
-        images = (read_for(camera1, a, "image A"), read_for(camera2, b, "image B"))
+        of1, of2 = options.rig or options.camera, options.rig or options.camera2 or options.camera
+        images = (read_image_of(a, camera1.size_px, str(of1)), read_image_of(b, camera2.size_px, str(of2)))
         if np.array_equal(*images):
             raise InputError(
                 f"images A '{a}' and B '{b}' are the same picture to the last pixel: no baseline; give two images "

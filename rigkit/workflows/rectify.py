@@ -16,7 +16,7 @@ from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.files import ensure_writable, write_atomic, write_together
-from rigkit.io.images import IMAGE_ENDINGS, quiet_opencv, read_image, require_pixels
+from rigkit.io.images import IMAGE_ENDINGS, Image, quiet_opencv, read_image_of, require_pixels
 from rigkit.io.reading import about
 from rigkit.io.rig_session import frames_of_images
 from rigkit.rectification.crop import cropped
@@ -101,7 +101,7 @@ def rectify_image(
         if options.crop:
             (remap,) = cropped([remap])
         covered = _coverage([(jobs, remap)])
-    done = _write([(jobs, remap)], covered, options, progress)
+    done = _write([(jobs, remap)], covered, camera, options, progress)
     _write_maps([remap], None, options)
     return RectificationResult(*done)
 
@@ -145,7 +145,7 @@ def rectify_stereo_images(
             pair = replace(pair, map1=map1, map2=map2)
         both_jobs = list(zip(jobs, (pair.map1, pair.map2), strict=True))
         covered = _coverage(both_jobs)
-    written, failures = _write(both_jobs, covered, options, progress)
+    written, failures = _write(both_jobs, covered, rig, options, progress)
     _write_maps([pair.map1, pair.map2], pair, options)
     return RectificationResult(written, {**single, **failures}, pair)
 
@@ -221,17 +221,17 @@ def _coverage(jobs: Jobs) -> list[float]:
 
 
 def _write(
-    jobs: Jobs, covered: Sequence[float], options: RectifyOptions, progress: Progress
+    jobs: Jobs, covered: Sequence[float], calibration: str | Path, options: RectifyOptions, progress: Progress
 ) -> tuple[tuple[RectifiedImage, ...], dict[str, InputError]]:
     """Resample and write the images of each map, one after the other; two images of a pair come together or not."""
     total, done, failures = len(jobs[0][0]), [], {}
     resamplers = [remap.resampler(interpolation=options.interpolation) for _, remap in jobs]
     for i in range(total):
         files: dict[Path, str | bytes] = {}
-        for (job, _), resample in zip(jobs, resamplers, strict=True):
+        for (job, remap), resample in zip(jobs, resamplers, strict=True):
             source, to = job[i]
             try:
-                files[to] = _rectified(source, to, resample)
+                files[to] = _rectified(source, to, remap.camera.size_px, calibration, resample)
             except InputError as error:
                 if total == 1:
                     raise
@@ -243,9 +243,11 @@ def _write(
     return tuple(done), failures
 
 
-def _rectified(source: Path, to: Path, resample: Callable[[NDArray[Any]], NDArray[Any]]) -> bytes:
+def _rectified(
+    source: Path, to: Path, size_px: tuple[int, int], calibration: str | Path, resample: Callable[[Image], Image]
+) -> bytes:
     """Return the file of one image; raises InputError that names it."""
-    image = read_image(source)
+    image = read_image_of(source, size_px, calibration)
     try:
         return _encoded(resample(image), to)
     except InputError as error:

@@ -1,0 +1,49 @@
+"""What no lens can be, told of cameras that come from files: numbers that were mistyped, damaged or left in another
+unit would only overflow later, in the middle of some computation."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.cameras.base import MAX_SIDE_PX, Camera
+
+MIN_FOCAL_PX, MAX_FOCAL_PX = 1.0, 1e7
+"""A pixel that sees a radian, and one that sees a fiftieth of an arc second."""
+MAX_ASPECT = 1e3
+"""Of the focal lengths along x and y; line scanners have tens."""
+GRID = (32, 24)
+"""Pixels, spread over the image, that are asked what they see."""
+MIN_SEEN = 4
+"""Of those."""
+
+
+def fault_of_lens(camera: Camera) -> str | None:
+    """Return what shows that no lens has these parameters, in words; None where nothing does.
+
+    Looked at are the pixel on the optical axis, how many pixels a radian takes there, and how much of the image is
+    seen at all.
+    """
+    with np.errstate(all="ignore"):
+        pixels, valid, by_point, _ = camera.project_with_jacobians(np.array([[0.0, 0.0, 1.0]]))
+        scales = by_point[0, :, :2]
+        if not valid[0] or not np.isfinite(scales).all() or not np.isfinite(pixels).all():
+            return "its numbers overflow on the optical axis, as no lens's do"
+        if np.abs(pixels).max() > MAX_SIDE_PX:
+            return f"its axis meets the image plane at ({pixels[0, 0]:g}, {pixels[0, 1]:g}) px, far from any image"
+        if not (np.diag(scales) > 0.0).all():
+            return (
+                f"its focal lengths are {scales[0, 0]:g} and {scales[1, 1]:g} px; they are positive here, with x to "
+                "the right, y down and z forward: turn the axes of the program that wrote the file"
+            )
+        longest, shortest = np.linalg.svd(scales, compute_uv=False).tolist()
+        if not MIN_FOCAL_PX <= shortest <= longest <= min(MAX_FOCAL_PX, MAX_ASPECT * shortest):
+            return (
+                f"its focal length is {shortest:g} to {longest:g} px, no lens's: a lens has {MIN_FOCAL_PX:g} to "
+                f"{MAX_FOCAL_PX:g} px, along x and y nearly the same"
+            )
+        u, v = (np.linspace(0.0, side - 1.0, count) for side, count in zip(camera.size_px, GRID, strict=True))
+        rays, seen = camera.unproject(np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2))
+        if np.count_nonzero(seen & np.isfinite(rays).all(axis=-1)) < MIN_SEEN:
+            width, height = camera.size_px
+            return f"with these numbers the lens sees nothing of its image of {width}x{height} px"
+    return None
