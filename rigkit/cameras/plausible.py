@@ -9,7 +9,7 @@ from rigkit.cameras.base import MAX_SIDE_PX, Camera
 
 MIN_FOCAL_PX, MAX_FOCAL_PX = 1.0, 1e7
 """A pixel that sees a radian, and one that sees a fiftieth of an arc second."""
-MAX_ASPECT = 1e3
+MAX_ASPECT = 100.0
 """Of the focal lengths along x and y; line scanners have tens."""
 GRID = (32, 24)
 """Pixels, spread over the image, that are asked what they see."""
@@ -21,7 +21,7 @@ def fault_of_lens(camera: Camera) -> str | None:
     """Return what shows that no lens has these parameters, in words; None where nothing does.
 
     Looked at are the pixel on the optical axis, how many pixels a radian takes there, and how much of the image is
-    seen at all.
+    seen at all: by a ray that comes back to its pixel.
     """
     with np.errstate(all="ignore"):
         pixels, valid, by_point, _ = camera.project_with_jacobians(np.array([[0.0, 0.0, 1.0]]))
@@ -42,8 +42,10 @@ def fault_of_lens(camera: Camera) -> str | None:
                 f"{MAX_FOCAL_PX:g} px, along x and y nearly the same"
             )
         u, v = (np.linspace(0.0, side - 1.0, count) for side, count in zip(camera.size_px, GRID, strict=True))
-        rays, seen = camera.unproject(np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2))
-        if np.count_nonzero(seen & np.isfinite(rays).all(axis=-1)) < MIN_SEEN:
+        asked = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+        rays, _ = camera.unproject(asked)
+        again, seen = camera.project(rays)
+        if np.count_nonzero(seen & (np.abs(again - asked).max(axis=-1) < 1.0)) < MIN_SEEN:
             width, height = camera.size_px
             return f"with these numbers the lens sees nothing of its image of {width}x{height} px"
     return None

@@ -175,27 +175,29 @@ def load_board_rigs(path: str | Path) -> tuple[BoardRig, ...]:
     """Return the boards on one mount; raises InputError like `load_saved_rig`."""
     data = _read(path, BOARDS_SCHEMA, keys_of(BOARD_RIG_FILE))
     with damage_named(path):
-        return tuple(
-            BoardRig(
-                tuple(_placed(entry, path) for entry in rig["boards"]),
-                as_covariance(rig["covariance"], "covariance", 6 * (len(rig["boards"]) - 1)),
-                whole(rig["image_count"]),
-                real(rig["scale_sigma"]),
-            )
-            for rig in data["rigs"]
-        )
+        return tuple(_mount(rig, path) for rig in data["rigs"])
+
+
+def _mount(rig: dict[str, Any], path: str | Path) -> BoardRig:
+    boards = tuple(_placed(entry, path) for entry in rig["boards"])
+    names = [placed.board.board_id for placed in boards]
+    if len(set(names)) < max(len(names), 2):
+        raise ValueError(f"a mount has two boards or more, each with another name, here {', '.join(names)}")
+    covariance = as_covariance(rig["covariance"], "covariance", 6 * (len(boards) - 1))
+    return BoardRig(boards, covariance, whole(rig["image_count"]), real(rig["scale_sigma"]))
 
 
 def _placed(entry: dict[str, Any], path: str | Path) -> MountedBoard:
     if set(entry) | {"target"} != PLACED_KEYS:
         raise InputError(f"'{path}': a board must have the keys {', '.join(sorted(PLACED_KEYS))}, and no others")
+    name = check_identifier(entry["board_id"], "board")
     if "target" in entry:
-        board = board_of_values(entry["target"], str(entry["board_id"]))
+        board = board_of_values(entry["target"], name)
     else:
         (columns, rows), (along_x, along_y), sigma = entry["size"], entry["square_mm"], entry["square_sigma_mm"]
         known = None if sigma is None else real(sigma)
         size = whole(columns), whole(rows)
-        board = Board(str(entry["board_id"]), *size, real(along_x), real(along_y), square_sigma_mm=known)
+        board = Board(name, *size, real(along_x), real(along_y), square_sigma_mm=known)
     return MountedBoard(board, reals(entry["points_mm"]), Rigid3.from_matrix(reals(entry["target_from_board"])))
 
 

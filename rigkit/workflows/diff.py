@@ -92,7 +92,8 @@ def diff(a: Path, b: Path, options: DiffOptions | None = None) -> CameraPair | R
             )
         if options.output is not None:
             raise InputError(f"diff: a map is of two cameras, '{a}' and '{b}' are boards; leave out -o")
-        return _boards(a, b)
+        with about(a, b):
+            return _boards(a, b)
     rigs = [is_rig(path) for path in (a, b)]
     if all(rigs):
         if options.output is not None:
@@ -100,7 +101,8 @@ def diff(a: Path, b: Path, options: DiffOptions | None = None) -> CameraPair | R
                 f"diff: a map is of two cameras, '{a}' and '{b}' are rigs; give the calibrations beside them, "
                 "rig-CAMERA.json"
             )
-        return _rigs(a, b)
+        with about(a, b):
+            return _rigs(a, b)
     if any(rigs):
         other = b if rigs[0] else a
         raise InputError(f"diff: a rig and a camera; compare '{other}' with the calibration beside the rig")

@@ -162,3 +162,25 @@ def test_pictures_of_one_channel_and_sixteen_bits_are_shown() -> None:
     for picture in (np.full((8, 8), 200, np.uint8), np.full((8, 8, 3), 200 << 8, np.uint16)):
         shown = cv2.imdecode(np.frombuffer(_preview(picture), np.uint8), cv2.IMREAD_GRAYSCALE)
         assert shown is not None and abs(int(shown[4, 4]) - 200) <= 2
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "pose image.png --camera turned.json --board floor.toml",
+        "handeye poses.csv pairs/view1.png --camera turned.json --board floor.toml",
+        "detect -j 1 image.png --camera turned.json --board floor.toml",
+        "check turned.json image.png --board floor.toml",
+        "rectify image.png --camera turned.json -o out.png",
+        "reconstruct --images image.png image.jpg --camera turned.json -o out",
+    ],
+    ids=lambda words: words.split()[0],
+)
+def test_an_image_of_another_size_than_its_camera(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Nothing can be measured in it; which of the two is wrong nobody can tell, so both are named."""
+    data = json.loads(Path("calibration.json").read_text())
+    data["camera"]["size_px"].reverse()
+    Path("turned.json").write_text(json.dumps(data))
+    assert main(words.split()) == 2
+    said = capsys.readouterr().err
+    assert "turned.json" in said and next(word for word in words.split() if word.endswith(".png")) in said

@@ -108,6 +108,11 @@ def test_a_file_has_a_size_that_it_may_have(tmp_path: Path) -> None:
         ('"fx": 500.0', '"fx": 400.0, "fx": 500.0'),
         ('"fx": 500.0', '"fx": ' + "[" * 100_000),
         ('"pinhole"', '["pinhole"]'),
+        ('"fx": 500.0', '"fx": -500.0'),
+        ('"fx": 500.0', '"fx": 1e-5'),
+        ('"fx": 500.0', '"fx": 1e9'),
+        ('"fx": 500.0', '"fx": 1.0'),
+        ('"cx": ', '"cx": 1e8, "x": '),
     ],
 )
 def test_cameras(tmp_path: Path, old: str, new: str) -> None:
