@@ -79,7 +79,7 @@ KINDS: dict[str, Kind] = {
             ("rectify", "image.png", "--camera", "{case}", "-o", "{out}/new.png"),
             ("rectify", "image.png", "--camera", "{case}", "-o", "{out}/cut.png", "--crop", "--hfov-deg", "60"),
             ("export", "{case}", "--to", "mrcal", "-o", "{out}/new.cameramodel"),
-            ("certify", "{case}", "--angle", "20", "--distance", "900", "-r", "{out}/new.html"),
+            ("certify", "{case}", "--plane", "200", "--distance", "900", "-r", "{out}/new.html"),
             ("diff", "calibration.json", "{case}", "-r", "{out}/new.html"),
             ("history", "history.jsonl", "--add", "{case}", "--to", "{case}"),
         ),

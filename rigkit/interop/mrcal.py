@@ -135,14 +135,14 @@ def _spline_of(camera: Camera) -> tuple[str, FloatArray]:
     pixels, rays = _samples(camera, SPLINE_GRID)
     if not len(rays):
         raise InputError("mrcal: this camera sees nothing on its image; calibrate again")
+    if (rays[:, 2] < np.cos(np.radians(MAX_FOV_DEG / 2.0))).any():
+        raise InputError(
+            f"mrcal: this camera sees beyond {MAX_FOV_DEG} degrees, where its splines end; choose another format"
+        )
     u = _stereographic(rays)
     # The spline covers fov_x_deg on the horizontal, and as much as its knots reach on the vertical.
     half_x, half_y = 2.0 * np.arctan(np.abs(u).max(axis=0) / 2.0)
     fov_x = int(np.ceil(np.degrees(2.0 * half_x))) + 2
-    if max(fov_x, np.degrees(2.0 * half_y)) > MAX_FOV_DEG:
-        raise InputError(
-            f"mrcal: this camera sees beyond {MAX_FOV_DEG} degrees, where its splines end; choose another format"
-        )
     reach = 2.0 * np.tan(np.radians(fov_x) / 4.0)
     ny = int(np.ceil((KNOTS_X - 3) * 2.0 * np.tan(half_y / 2.0) / reach)) + 4
     if ny > MAX_KNOTS_Y:

@@ -94,6 +94,9 @@ def rectify_image(
     _ensure_all([out for _, out in jobs], options, (*(source for source, _ in jobs), camera))
     source = import_camera(camera)
     hfov_rad = None if options.hfov_deg is None else np.radians(options.hfov_deg)
+    if len(jobs) == 1:
+        # Before its map, which takes as long as the image is large.
+        read_image_of(jobs[0][0], source.size_px, camera)
     with about(camera):
         target = target_camera(source, options.projection, hfov_rad=hfov_rad, size_px=options.size_px)
         rotation = rotation_from_view_angles(*np.radians(options.angles_deg))
