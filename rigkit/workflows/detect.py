@@ -65,7 +65,7 @@ class DetectionResult:
     __repr__ = brief
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class _DetectJob:
     """What one process needs to know of one image."""
 
@@ -119,7 +119,15 @@ def detect_in_images(
     read = [*images, *options.boards, *([options.camera] if options.camera else [])]
     ensure_writable(outputs, force=options.force, inputs=read)
     tasks = [
-        _DetectJob(image, overlay, boards, camera, options.camera, options.min_corners, options.force)
+        _DetectJob(
+            image=image,
+            overlay=overlay,
+            boards=boards,
+            camera=camera,
+            calibration=options.camera,
+            min_corners=options.min_corners,
+            force=options.force,
+        )
         for image, overlay in zip(images, overlays, strict=True)
     ]
     outcomes, doubtful = _over_images(tasks, options.jobs, progress)
