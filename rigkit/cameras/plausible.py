@@ -9,11 +9,11 @@ from rigkit.cameras.base import MAX_SIDE_PX, Camera
 
 MIN_FOCAL_PX, MAX_FOCAL_PX = 1.0, 1e7
 """A pixel that sees a radian, and one that sees a fiftieth of an arc second."""
-MAX_ASPECT = 100.0
+MAX_FOCAL_RATIO = 100.0
 """Of the focal lengths along x and y; line scanners have tens."""
-GRID = (32, 24)
+ASKED_PIXELS = (32, 24)
 """Pixels, spread over the image, that are asked what they see."""
-MIN_SEEN = 4
+MIN_ANSWERS = 4
 """Of those."""
 
 
@@ -36,16 +36,16 @@ def fault_of_lens(camera: Camera) -> str | None:
                 "the right, y down and z forward: turn the axes of the program that wrote the file"
             )
         longest, shortest = np.linalg.svd(scales, compute_uv=False).tolist()
-        if not MIN_FOCAL_PX <= shortest <= longest <= min(MAX_FOCAL_PX, MAX_ASPECT * shortest):
+        if not MIN_FOCAL_PX <= shortest <= longest <= min(MAX_FOCAL_PX, MAX_FOCAL_RATIO * shortest):
             return (
                 f"its focal length is {shortest:g} to {longest:g} px, no lens's: a lens has {MIN_FOCAL_PX:g} to "
                 f"{MAX_FOCAL_PX:g} px, along x and y nearly the same"
             )
-        u, v = (np.linspace(0.0, side - 1.0, count) for side, count in zip(camera.size_px, GRID, strict=True))
+        u, v = (np.linspace(0.0, side - 1.0, count) for side, count in zip(camera.size_px, ASKED_PIXELS, strict=True))
         asked = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
         rays, _ = camera.unproject(asked)
         again, seen = camera.project(rays)
-        if np.count_nonzero(seen & (np.abs(again - asked).max(axis=-1) < 1.0)) < MIN_SEEN:
+        if np.count_nonzero(seen & (np.abs(again - asked).max(axis=-1) < 1.0)) < MIN_ANSWERS:
             width, height = camera.size_px
             return f"with these numbers the lens sees nothing of its image of {width}x{height} px"
     return None

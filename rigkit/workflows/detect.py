@@ -65,7 +65,7 @@ class DetectionResult:
     __repr__ = brief
 
 
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+@dataclass(frozen=True, eq=False, slots=True)
 class _DetectJob:
     """What one process needs to know of one image."""
 
@@ -73,9 +73,7 @@ class _DetectJob:
     overlay: Path | None
     boards: tuple[Board, ...]
     camera: Camera | None
-    calibration: Path | None
-    min_corners: int
-    force: bool
+    options: DetectOptions
 
 
 def detect_in_images(
@@ -119,16 +117,7 @@ def detect_in_images(
     read = [*images, *options.boards, *([options.camera] if options.camera else [])]
     ensure_writable(outputs, force=options.force, inputs=read)
     tasks = [
-        _DetectJob(
-            image=image,
-            overlay=overlay,
-            boards=boards,
-            camera=camera,
-            calibration=options.camera,
-            min_corners=options.min_corners,
-            force=options.force,
-        )
-        for image, overlay in zip(images, overlays, strict=True)
+        _DetectJob(image, overlay, boards, camera, options) for image, overlay in zip(images, overlays, strict=True)
     ]
     outcomes, doubtful = _over_images(tasks, options.jobs, progress)
     failures = bad | {name: outcome for name, outcome in outcomes.items() if isinstance(outcome, InputError)}
@@ -229,18 +218,18 @@ def _detect(job: _DetectJob) -> tuple[Outcome, str | None]:
         return InputError(words), None
     if job.overlay is not None:
         picture = cv2.cvtColor(draw_boards(image, found), cv2.COLOR_RGB2BGR)
-        write_atomic(job.overlay, np.asarray(cv2.imencode(".png", picture)[1]).tobytes(), force=job.force)
+        write_atomic(job.overlay, np.asarray(cv2.imencode(".png", picture)[1]).tobytes(), force=job.options.force)
     return found, seen
 
 
 def _read(job: _DetectJob) -> Image:
-    if job.camera is None or job.calibration is None:
+    if job.camera is None or job.options.camera is None:
         return read_image(job.image)
-    return read_image_of(job.image, job.camera.size_px, job.calibration)
+    return read_image_of(job.image, job.camera.size_px, job.options.camera)
 
 
 def _boards_in(image: NDArray[Any], job: _DetectJob) -> tuple[BoardDetection, ...]:
     try:
-        return detect_boards(image, job.boards, min_corners=job.min_corners, camera=job.camera)
+        return detect_boards(image, job.boards, min_corners=job.options.min_corners, camera=job.camera)
     except InputError as error:
         raise InputError(f"'{job.image}': {error}") from error
