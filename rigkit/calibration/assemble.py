@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from rigkit.calibration.between_models import RivalFit, between_models
 from rigkit.calibration.clustered import Clustered, clustered_covariance, reduced_by_cluster, with_block
 from rigkit.calibration.fit import Fit
 from rigkit.calibration.linearise import view_products
@@ -32,14 +35,18 @@ def assemble(
     heldout_px: float | None,
     dropped: tuple[tuple[str, str], ...],
     candidates: tuple[Candidate, ...],
+    rivals: Sequence[RivalFit] = (),
+    *,
     clusters: IntArray | None = None,
 ) -> Calibration:
-    """Return the result, without verdicts; `clusters` (V,) is what `clusters_of` returns, where it is known already."""
+    """Return the result, without verdicts; `rivals` are other lenses that the images support about as well, `clusters`
+    (V,) is what `clusters_of` returns, where it is known already."""
     state, sigma = fit.state, fit.sigma_px
     covariance, clustered = _covariance(observations, fit, clusters_of(observations) if clusters is None else clusters)
+    p = state.camera.parameters.size
+    covariance += between_models(observations, fit, rivals, np.sqrt(np.diag(covariance)[:p]))
     px = np.where(fit.residuals.valid[..., None], fit.residuals.px, np.nan)
     poses = Rigid3.stack(state.rotation, state.translation_mm)
-    p = state.camera.parameters.size
     return Calibration(
         camera=state.camera,
         rms_px=fit.rms_px,
@@ -55,6 +62,7 @@ def assemble(
         candidates=candidates,
         convergence=fit.convergence,
         boards=board_shapes(observations, state.shape, state.unknowns),
+        rivals=tuple(one.rival for one in rivals),
     )
 
 

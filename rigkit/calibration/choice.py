@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,13 +10,17 @@ import numpy as np
 from rigkit.calibration.fit import Fit
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Candidate
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray
 
 MARGIN = 0.02
 """A model or a board shape with more numbers must lower the held-out error by this part to be chosen,"""
 SURELY = 1.0
 """or, a model, by this many standard errors of the difference, as images have it: a lens that is not quite right hides
 in the poses, and 0.3 % of held-out error may be three times the error of the lens."""
+BOOTSTRAP_DRAWS = 2000
+"""Draws that tell how likely an option is the best one: to 0.01."""
+CLEARLY = 2.0
+"""A camera has a lens of its own, and not that of its twins, where theirs errs by so many standard errors more."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -43,18 +48,73 @@ def choose(observations: Observations, options: list[Option], surely: float | No
     Reference: L. Breiman et al., "Classification and Regression Trees" (1984), section 3.4.3: the one-standard-error
     rule, here paired over images.
     """
-    judged = [(o.heldout, o) for o in options if o.heldout is not None]
+    judged = [o for o in options if o.heldout is not None]
     if not judged:
         return min(options, key=lambda o: _bic(observations, o))
-    best = min((heldout for heldout, _ in judged), key=lambda heldout: float(heldout.sum()))
-    good = []
-    for heldout, option in judged:
-        more = heldout - best
-        chance = float(np.sqrt(len(more)) * more.std(ddof=1))
-        within = float(heldout.sum()) <= float(best.sum()) * (1.0 + MARGIN) ** 2
-        if within and (surely is None or float(more.sum()) <= surely * chance):
-            good.append(option)
-    return min(good, key=lambda o: o.count)
+    good = _as_good(np.array([o.heldout for o in judged]), surely)
+    return min((o for o, fine in zip(judged, good, strict=True) if fine), key=lambda o: o.count)
+
+
+def _as_good(heldout: FloatArray, surely: float | None) -> BoolArray:
+    """Return which of M options are as good as the best, from their squared held-out residuals (M, N) of N images."""
+    total = heldout.sum(axis=1)
+    within = total <= float(total.min()) * (1.0 + MARGIN) ** 2
+    if surely is None:
+        return np.asarray(within)
+    more, chance = _against(heldout, int(total.argmin()))
+    return np.asarray(within & (more <= surely * chance))
+
+
+def _against(heldout: FloatArray, best: int) -> tuple[FloatArray, FloatArray]:
+    """Return by how much more options (M, N) err than the `best` one, and the standard error of that, (M,) each."""
+    more = heldout - heldout[best]
+    return more.sum(axis=1), np.sqrt(more.shape[1]) * more.std(axis=1, ddof=1)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Evidence:
+    """What the images of one camera, or of several that are alike, say of the options that all of them have: names,
+    numbers (most of the cameras') and squared held-out residuals (M, N), of each camera in units of its smallest mean:
+    cameras differ in how sharp they are."""
+
+    names: list[str]
+    counts: list[int]
+    heldout: FloatArray
+
+    @classmethod
+    def of(cls, cameras: Sequence[Sequence[Option]]) -> Evidence:
+        """Put the evidence of cameras with their options together."""
+        known = [{o.name: o for o in options if o.heldout is not None} for options in cameras]
+        names = [name for name in known[0] if all(name in own for own in known)]
+        counts = [max(own[name].count for own in known) for name in names]
+        parts = [np.array([own[name].heldout for name in names]) for own in known]
+        scaled = [part / max(float(part.mean(axis=1).min()), np.finfo(float).tiny) for part in parts if len(names)]
+        return cls(names, counts, np.concatenate(scaled, axis=1) if names else np.empty((0, 0)))
+
+    def chosen(self) -> str:
+        """Return the name that `choose` prefers."""
+        good = np.flatnonzero(_as_good(self.heldout, SURELY)).tolist()
+        return self.names[min(good, key=lambda k: self.counts[k])]
+
+    def contradicts(self, name: str, own: str) -> bool:
+        """Say whether `name` is clearly worse than `own`."""
+        more, chance = _against(self.heldout, self.names.index(own))
+        k = self.names.index(name)
+        return bool(more[k] > CLEARLY * chance[k])
+
+    def likely(self, seed: int = 0) -> dict[str, float]:
+        """Return how likely each option is the best one: how often it has the smallest held-out error where images
+        count by chance more or less (the Bayesian bootstrap).
+
+        References: S. T. Buckland, K. P. Burnham, N. H. Augustin, "Model selection: an integral part of inference",
+        Biometrics 53 (1997): weights by how often data like these would choose each model. D. B. Rubin, "The Bayesian
+        bootstrap", Annals of Statistics 9 (1981).
+        """
+        if not self.names:
+            return {}
+        drawn = np.random.default_rng(seed).dirichlet(np.ones(self.heldout.shape[1]), BOOTSTRAP_DRAWS)
+        first = np.bincount((drawn @ self.heldout.T).argmin(axis=1), minlength=len(self.names))
+        return dict(zip(self.names, (first / BOOTSTRAP_DRAWS).tolist(), strict=True))
 
 
 def _bic(observations: Observations, option: Option) -> float:

@@ -126,6 +126,16 @@ class Candidate:
     reason: str
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class Rival:
+    """A lens of another model (or size) than the one chosen that the images support about as well: its name among the
+    candidates, the camera, and how likely it is the better one, 0 to 1."""
+
+    name: str
+    camera: Camera
+    likely: float
+
+
 @dataclass(frozen=True, slots=True)
 class Convergence:
     """How the last solve ended.
@@ -250,6 +260,8 @@ class Calibration:
     convergence : of the final solve.
     boards : shapes of the boards.
     verdicts : what is good and what is not, the headline first.
+    rivals : other lenses that the images support about as well: how far they differ is in the covariances. Files do not
+        keep them.
     """
 
     camera: Camera
@@ -267,6 +279,7 @@ class Calibration:
     verdicts: tuple[Finding, ...] = ()
     overdispersion: float = 1.0
     freedom: float = float("inf")
+    rivals: tuple[Rival, ...] = ()
 
     _repr_html_ = drawn
 

@@ -115,7 +115,7 @@ def compare_cameras(
     weight = np.ones((rows, columns)) if weights is None else weights
     b_from_a = np.eye(3)
     if fit_rotation and covered.sum() >= MIN_PIXELS:
-        b_from_a = _best_rotation(rays[covered], pixels[covered], weight[covered], b)
+        b_from_a = best_rotation(rays[covered], pixels[covered], weight[covered], b)
     projected, seen = b.project(rays @ b_from_a.T)
     covered = covered & seen
     if covered.sum() < MIN_PIXELS:
@@ -141,7 +141,7 @@ def grid_pixels(size_px: tuple[int, int], grid: tuple[int, int]) -> Pixels:
     return np.stack(np.meshgrid(u, v), axis=-1)
 
 
-def _best_rotation(rays: FloatArray, pixels: FloatArray, weight: FloatArray, b: Camera) -> Mat3:
+def best_rotation(rays: FloatArray, pixels: FloatArray, weight: FloatArray, b: Camera) -> Mat3:
     """Return the rotation b_from_a at which `b` projects `rays` nearest to `pixels`: rays first, then pixels.
 
     Undamped Gauss-Newton: the fit of the rays starts it within pixels of the end, with hundreds of rays for three

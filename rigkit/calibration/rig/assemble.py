@@ -10,6 +10,7 @@ import numpy as np
 from rigkit.calibration.assemble import board_shapes, motion_of_world
 from rigkit.calibration.clustered import with_block
 from rigkit.calibration.result import Calibration, ViewResult
+from rigkit.calibration.rig.between_models import between_rig_models
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
 from rigkit.calibration.rig.clustered import clustered_by_frame
 from rigkit.calibration.rig.flatness import shape_error
@@ -45,6 +46,7 @@ def assemble_rig(
     covariance += _error_of_held(joint, names, layout, single, unit)
     off = shape_error(observations, state, sigma * overdispersion)
     covariance[: len(off), : len(off)] += np.outer(off, off)
+    covariance += between_rig_models(joint, single, np.sqrt(np.diag(covariance)))
     own *= (sigma * overdispersion) ** 2
     boards = observations.cameras[0].boards
     points = observations.shape.points(state.unknowns)

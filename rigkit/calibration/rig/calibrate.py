@@ -11,7 +11,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from rigkit.calibration.calibrate import FOLDS, calibrate
+from rigkit.calibration.calibrate import FOLDS, calibrate_together
+from rigkit.calibration.models_tried import How
 from rigkit.calibration.posed import posed_calibration
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.assemble import assemble_rig
@@ -154,28 +155,23 @@ class _Options:
 
     def each_alone(self, views: Views, progress: Progress) -> tuple[Calibration, ...]:
         """Return the calibration of each camera alone; errors name the camera."""
-        single = []
-        for i, (name, own) in enumerate(views.items()):
-            progress("cameras", i, len(views))
-            try:
-                if self.known is not None and name in self.known.cameras:
-                    lens, _ = self.known.cameras[name]
-                    single.append(posed_calibration([view for _, view in own], lens, self.known.of_lens(name)))
-                    continue
-                single.append(
-                    calibrate(
-                        [view for _, view in own],
-                        self.sizes_px[name],
-                        model=self.model if isinstance(self.model, str) else self.model[name],
-                        degree=self.degree[name] if isinstance(self.degree, Mapping) else self.degree,
-                        board=self.board,
-                        folds=self.folds,
-                    )
-                )
-            except (InputError, DegenerateError) as error:
-                raise type(error)(f"camera '{name}': {error}") from error
-        progress("cameras", len(views), len(views))
-        return tuple(single)
+        found: dict[str, Calibration] = {}
+        asked = []
+        for name, own in views.items():
+            alone = [view for _, view in own]
+            if self.known is not None and name in self.known.cameras:
+                lens, _ = self.known.cameras[name]
+                try:
+                    found[name] = posed_calibration(alone, lens, self.known.of_lens(name))
+                except (InputError, DegenerateError) as error:
+                    raise type(error)(f"camera '{name}': {error}") from error
+                continue
+            model = self.model if isinstance(self.model, str) else self.model[name]
+            degree = self.degree[name] if isinstance(self.degree, Mapping) else self.degree
+            asked.append((name, alone, How(self.sizes_px[name], model, degree, self.board, self.folds, silent)))
+        names = [name for name, _, _ in asked]
+        found |= dict(zip(names, calibrate_together(asked, progress=progress), strict=True))
+        return tuple(found[name] for name in views)
 
 
 def _boards(views: Views, groups: Sequence[Sequence[str]]) -> dict[str, Board]:

@@ -1,0 +1,138 @@
+"""What nobody knows of a lens because nobody knows its model: the difference between models that the images support
+about as well.
+
+A covariance is that of one model's numbers. Where others predict images that took no part as well, each of them may be
+the better one, and the lens chosen is wrong by the difference: with weights w_m that say how likely that is,
+
+    Cov = Cov_chosen + sum_m w_m d_m d_m^T,
+
+where d_m is how the unknowns of the chosen model move to follow model m where the boards were, after the rotation of
+the rays that boards leave open, and with the boards' motions that go with it. Where one model is clearly the best all
+w_m are zero.
+
+Reference: S. T. Buckland, K. P. Burnham, N. H. Augustin, "Model selection: an integral part of inference", Biometrics
+53 (1997), eq. 9, about the estimate chosen in place of the average.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rigkit.calibration.choice import Option
+from rigkit.calibration.fit import Fit, fit_kept
+from rigkit.calibration.observations import Observations
+from rigkit.calibration.result import Candidate, Rival
+from rigkit.calibration.state import State
+from rigkit.calibration.uncertainty import projection_design
+from rigkit.cameras.base import Camera
+from rigkit.cameras.compare import best_rotation
+from rigkit.core.arrays import FloatArray, Mat3, Rays
+from rigkit.core.errors import RigkitError
+from rigkit.geometry.rotation import exp_so3, log_so3, skew
+
+MIN_LIKELY = 0.05
+"""A model that is less likely the better one adds next to nothing, however far it is off."""
+RAYS = 400
+"""So many corners, spread over all views, are enough to follow another lens."""
+FOLLOWED = 1e-6
+"""Combinations of parameters with less than this part of the largest effect at the corners stay where they are."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RivalFit:
+    """A rival, and the state with its lens that fits the views."""
+
+    rival: Rival
+    state: State
+
+
+def rival_fits(
+    observations: Observations, chosen: Fit, options: Sequence[Option], likely: Mapping[str, float]
+) -> list[RivalFit]:
+    """Return the `options` that are likely enough the better ones, fitted to the corners kept, with the boards as the
+    chosen fit has them but for their warps."""
+    own = chosen.state.camera
+    found = []
+    for option in options:
+        camera = option.fit.state.camera
+        same = (camera.model, camera.parameters.size) == (own.model, own.parameters.size)
+        if same or likely.get(option.name, 0.0) < MIN_LIKELY:
+            continue
+        start = replace(chosen.state.with_corners_held(), camera=camera)
+        try:
+            # The scatter that priors are weighed by is known after the first round.
+            fit = fit_kept(observations, fit_kept(observations, start, chosen.kept).state, chosen.kept)
+        except RigkitError:
+            continue
+        found.append(RivalFit(Rival(option.name, fit.state.camera, likely[option.name]), fit.state))
+    return found
+
+
+def with_rivals(candidates: Sequence[Candidate], rivals: Sequence[Rival]) -> tuple[Candidate, ...]:
+    """Return the candidates with what is to be said of the rivals among them."""
+    likely = {_lens(rival.name): f"{100.0 * rival.likely:.0f} %" for rival in rivals}
+    counted = "of images drawn anew; by how much it differs is in all sigmas"
+    return tuple(
+        one
+        if one.chosen or _lens(one.name) not in likely
+        else replace(one, reason=f"{one.reason}; the best in {likely[_lens(one.name)]} {counted}")
+        for one in candidates
+    )
+
+
+def _lens(name: str) -> str:
+    """Return the name of a lens without what it was fitted on."""
+    return name.partition(",")[0]
+
+
+def between_models(
+    observations: Observations, chosen: Fit, rivals: Sequence[RivalFit], sigmas: FloatArray
+) -> FloatArray:
+    """Return what the rivals add to the covariance (P + 6, P + 6) of the chosen camera's parameters and of the mean
+    motion of the boards; `sigmas` (P,) are the standard deviations of the parameters without that."""
+    p = chosen.state.camera.parameters.size
+    out = np.zeros((p + 6, p + 6))
+    points, _ = chosen.state.points_in_cam(observations)
+    rays = spread_rays(points[chosen.kept])
+    here = chosen.state
+    for one in rivals:
+        step, turn = followed(here.camera, one.rival.camera, rays, sigmas)
+        # As the axes of the chosen lens have it.
+        moved = np.concatenate(
+            [
+                log_so3(turn.T @ one.state.rotation @ np.swapaxes(here.rotation, -1, -2)),
+                one.state.translation_mm @ turn - here.translation_mm,
+            ],
+            axis=1,
+        )
+        shift = moved[:, 3:] + np.einsum("vij,vj->vi", skew(here.translation_mm), moved[:, :3])
+        used = chosen.kept.any(axis=1)
+        way = np.concatenate([step, moved[used, :3].mean(axis=0), shift[used].mean(axis=0)])
+        out += one.rival.likely * np.outer(way, way)
+    return out
+
+
+def spread_rays(points_in_cam: FloatArray) -> Rays:
+    """Return unit rays (M, 3) to up to 400 of the points (N, 3)."""
+    chosen = np.linspace(0, len(points_in_cam) - 1, min(RAYS, len(points_in_cam))).astype(np.int64)
+    points = points_in_cam[chosen]
+    return np.asarray(points / np.linalg.norm(points, axis=-1, keepdims=True))
+
+
+def followed(camera: Camera, other: Camera, rays: Rays, sigmas: FloatArray) -> tuple[FloatArray, Mat3]:
+    """Return by how much the parameters (P,) of a camera change for it to project `rays` (N, 3) as another one does,
+    and the rotation other_from_camera (3, 3) of the rays that goes with it; `sigmas` (P,) make them comparable."""
+    pixels, valid = camera.project(rays)
+    rays, pixels = rays[valid], pixels[valid]
+    turn = best_rotation(rays, pixels, np.ones(len(rays)), other)
+    there, seen = other.project(rays @ turn.T)
+    # Part of that rotation may be the parameters': both are found together.
+    rows = projection_design(camera, rays[seen]).transpose(2, 0, 1).reshape(-1, len(sigmas) + 3)
+    rows[:, :-3] *= sigmas
+    size = np.linalg.norm(rows, axis=0)
+    size = np.where(size > 0.0, size, 1.0)
+    step = np.linalg.lstsq(rows / size, (there - pixels)[seen].reshape(-1), rcond=FOLLOWED)[0] / size
+    return sigmas * step[:-3], turn @ exp_so3(-step[-3:])

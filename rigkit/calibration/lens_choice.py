@@ -1,0 +1,130 @@
+"""Which camera model shows the views of a camera best; twins, cameras that are alike, share one.
+
+Models are compared on the same corners: with flat boards first, and, since boards that are not flat bend the lenses to
+themselves, again with boards as they were found. Cameras of one rig with images of one size and (nearly) one focal
+length are two pieces of one product: what the images of each say of the models is put together, and all get the same
+model, unless the images of one contradict it clearly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rigkit.calibration.choice import SURELY, Evidence, Option, choose
+from rigkit.calibration.fit import fit_kept, heldout_squares
+from rigkit.calibration.models_tried import How, agreeing, compared, fit_of_views, reweighted
+from rigkit.calibration.observations import Observations
+from rigkit.calibration.one_model import Solved
+from rigkit.cameras.base import Camera
+
+SAME_FOCAL = 0.05
+"""Lenses of one kind have focal lengths within this part of each other: makers state no more."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Lenses:
+    """Camera models compared on the same corners of one camera."""
+
+    observations: Observations
+    options: list[Option]
+
+    @property
+    def models(self) -> list[str]:
+        """The camera models among them."""
+        return list(dict.fromkeys(option.fit.state.camera.model for option in self.options))
+
+    @property
+    def alone(self) -> Option:
+        """The option that this camera alone would choose."""
+        return choose(self.observations, self.options, SURELY)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Choice:
+    """The camera model chosen, and how likely each option is the best one, by name."""
+
+    model: str
+    likely: dict[str, float]
+
+
+def lenses_on_flat_boards(observations: Observations, options: list[Option], how: How) -> Lenses:
+    """Return the options as they compare on the same corners of the views that agree with them."""
+    keep, _ = agreeing(observations, options)
+    seen = observations.subset(np.flatnonzero(keep))
+    same = options if keep.all() else [replace(o, fit=fit_of_views(seen, o.fit, keep)) for o in options]
+    seen = reweighted(seen, same)
+    return Lenses(seen, compared(seen, same, how.folds, how.progress))
+
+
+def best_sizes(cameras: Sequence[Lenses]) -> list[str]:
+    """Return the name of the best size of each model, as flat boards tell well enough, of cameras that are alike."""
+    sizes = []
+    for model in dict.fromkeys(model for lenses in cameras for model in lenses.models):
+        own = [[o for o in lenses.options if o.fit.state.camera.model == model] for lenses in cameras]
+        evidence = Evidence.of(own)
+        if evidence.names:
+            sizes.append(evidence.chosen())
+        else:
+            sizes += {choose(c.observations, o, SURELY).name for c, o in zip(cameras, own, strict=True) if o}
+    return sizes
+
+
+def lenses_on_boards(found: Solved, tried: Lenses, names: Sequence[str], how: How) -> Lenses:
+    """Return the lenses tried, those of the `names`, fitted to boards with their corners as they were found and warps
+    that are free again."""
+    observations, kept = found.observations, found.chosen.fit.kept
+    state = found.chosen.fit.state.with_corners_held()
+    options = []
+    for option in tried.options:
+        if option.name not in names:
+            continue
+        start = replace(state, camera=option.fit.state.camera)
+        # The scatter that priors are weighed by is known after the first round.
+        fit = fit_kept(observations, fit_kept(observations, start, kept).state, kept)
+        options.append(replace(option, name=f"{option.name}, boards as found", fit=fit, heldout=None))
+    # What does not even show the images that it was fitted to as well as another one predicts them is no better.
+    options.sort(key=lambda o: o.fit.rms_px)
+    judged: list[Option] = []
+    for option in options:
+        if all(option.fit.rms_px <= (o.heldout_px or np.inf) for o in judged):
+            judged.append(replace(option, heldout=heldout_squares(observations, option.fit, how.folds)))
+    return Lenses(observations, judged)
+
+
+def choose_lenses(cameras: Sequence[Lenses]) -> list[Choice]:
+    """Return the model of each of some cameras that are alike: what their images say is put together, and who clearly
+    contradicts the others has a lens of its own."""
+    own = [lenses.alone for lenses in cameras]
+    each = [Evidence.of([lenses.options]) for lenses in cameras]
+    out = [Choice(option.fit.state.camera.model, evidence.likely()) for option, evidence in zip(own, each, strict=True)]
+    together = [k for k, evidence in enumerate(each) if evidence.names]
+    while len(together) > 1:
+        evidence = Evidence.of([cameras[k].options for k in together])
+        if not evidence.names:
+            break
+        name = evidence.chosen()
+        agree = [k for k in together if not each[k].contradicts(name, own[k].name)]
+        if agree == together:
+            model = next(o for o in cameras[together[0]].options if o.name == name).fit.state.camera.model
+            for k in together:
+                out[k] = Choice(model, evidence.likely())
+            break
+        together = agree
+    return out
+
+
+def twins(cameras: Sequence[Camera]) -> list[list[int]]:
+    """Return which cameras are alike, as lists of their numbers: images of one size, nearly one focal length."""
+    groups: list[list[int]] = []
+    for k, camera in enumerate(cameras):
+        for group in groups:
+            first = cameras[group[0]]
+            if first.size_px == camera.size_px and abs(camera.focal_px / first.focal_px - 1.0) <= SAME_FOCAL:
+                group.append(k)
+                break
+        else:
+            groups.append([k])
+    return groups

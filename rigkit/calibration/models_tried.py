@@ -1,0 +1,155 @@
+"""Camera models in question: each fitted to all views, and all of them compared on the same corners."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rigkit.calibration.assemble import identifiable, not_identifiable
+from rigkit.calibration.choice import Option
+from rigkit.calibration.fit import Fit, fit_kept, fit_model, heldout_squares, robust_sigma
+from rigkit.calibration.observations import Observations
+from rigkit.calibration.result import Candidate
+from rigkit.calibration.shape import SHAPES
+from rigkit.cameras.base import Camera
+from rigkit.cameras.registry import MODELS, camera_model, check_order
+from rigkit.core.arrays import BoolArray
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.progress import Progress
+
+COMPARABLE = 1.5
+"""Corners are outliers only if every model with a scatter within this factor of the best one says so."""
+MIN_KEPT_SHARE = 0.5
+"""A view in which fewer of the corners agree with the other views is dropped."""
+DEGREES_TRIED: dict[str, tuple[int | None, ...]] = {"scaramuzza": (4, 5, 6, 7, 8), "brown": (5,)}
+"""Sizes tried of models that come in several, where none is asked for,"""
+DEGREES_BEYOND: dict[str, tuple[int, ...]] = {"scaramuzza": (9, 10)}
+"""and those tried where the largest of them is the best: precise corners, or lenses of more than 200 degrees."""
+
+
+Wanted = list[tuple[str, type[Camera], int | None]]
+"""Name, camera model and size of what is to be fitted."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class How:
+    """What `calibrate` was asked for."""
+
+    size_px: tuple[int, int]
+    model: str
+    degree: int | None
+    board: str
+    folds: int
+    progress: Progress
+
+
+def wanted_models(how: How) -> Wanted:
+    """Return name, camera model and size of what is to be fitted. Raises InputError for options without a meaning."""
+    if how.board not in (*SHAPES, "auto"):
+        raise InputError(f"board shape '{how.board}' is unknown; known: auto, {', '.join(SHAPES)}")
+    if how.folds < 0 or how.folds == 1:
+        raise InputError(f"cross-validation in {how.folds} folds: give 2 or more, or 0 for none")
+    if how.degree is not None:
+        check_order(how.model, how.degree)
+    out: Wanted = []
+    for name in list(MODELS) if how.model == "auto" else [how.model]:
+        cls = camera_model(name)
+        orders = (how.degree,) if how.degree is not None else DEGREES_TRIED.get(name, (None,))
+        out += [(name if order is None else f"{name} {order}", cls, order) for order in orders]
+    return out
+
+
+def larger_sizes(chosen: Option) -> Wanted:
+    """Return the larger sizes to try of the model chosen, if it is of the largest size tried so far."""
+    camera = chosen.fit.state.camera
+    tried, more = DEGREES_TRIED.get(camera.model, (None,)), DEGREES_BEYOND.get(camera.model, ())
+    if chosen.name != f"{camera.model} {tried[-1]}":
+        return []
+    return [(f"{camera.model} {order}", type(camera), order) for order in more]
+
+
+def fit_all(
+    observations: Observations,
+    size_px: tuple[int, int],
+    wanted: Wanted,
+    progress: Progress,
+    known: Sequence[Option] = (),
+) -> tuple[list[Option], list[Candidate]]:
+    """Return the options `known` and those `wanted`, fitted, and which could not be; raises where there is none."""
+    options = list(known)
+    failed: list[Candidate] = []
+    error: Exception | None = None
+    for i, (name, cls, order) in enumerate(wanted):
+        progress("models", i, len(wanted))
+        try:
+            fit = fit_model(observations, size_px, cls, order)
+            if not identifiable(fit):
+                raise not_identifiable(name)
+            options.append(Option(name, fit))
+        except (DegenerateError, InputError) as caught:
+            error = caught
+            failed.append(Candidate(name, 0, float("nan"), None, False, str(caught)))
+    progress("models", len(wanted), len(wanted))
+    if not options:
+        assert error is not None
+        raise error
+    return options, failed
+
+
+def fit_of_views(observations: Observations, fit: Fit, keep: BoolArray) -> Fit:
+    """Return the fit of the views to keep (V,), `observations`, from that of all of them."""
+    chosen = np.flatnonzero(keep)
+    return fit_kept(observations, fit.state.subset(chosen), fit.kept[chosen], settle=True)
+
+
+def agreeing(observations: Observations, options: list[Option]) -> tuple[BoolArray, tuple[tuple[str, str], ...]]:
+    """Return which views to keep, and the reason for each that goes, judged by the model with the least scatter."""
+    best = _best(observations, options)
+    kept = best.fit.kept.sum(axis=1)
+    total = observations.present.sum(axis=1)
+    keep = kept >= np.maximum(MIN_KEPT_SHARE * total, 4)
+    reasons = tuple(
+        (view.image, f"only {k} of {n} corners of board '{view.board.board_id}' agree with the other views; retake it")
+        for view, k, n, ok in zip(observations.views, kept, total, keep, strict=True)
+        if not ok
+    )
+    if not keep.any():
+        raise DegenerateError("calibration: no view agrees with the others; check the board's size and the images")
+    return keep, reasons
+
+
+def _best(observations: Observations, options: list[Option]) -> Option:
+    """Return the option with the least scatter."""
+    if len(options) == 1:
+        return options[0]
+    return min(options, key=lambda o: robust_sigma(o.fit, observations))
+
+
+def reweighted(observations: Observations, options: list[Option]) -> Observations:
+    """Return the observations with weights that count the error which the best model leaves to all corners alike."""
+    if float(np.ptp(observations.sigma_px[observations.present])) == 0.0:
+        return observations
+    best = _best(observations, options)
+    squared = (best.fit.residuals.px**2).sum(axis=-1)
+    return observations.with_common_error(squared, best.fit.kept)
+
+
+def compared(observations: Observations, options: list[Option], folds: int, progress: Progress) -> list[Option]:
+    """Return the options refitted to the same corners, with their held-out errors, where they are not yet."""
+    sigma = [robust_sigma(o.fit, observations) for o in options] if len(options) > 1 else [0.0]
+    near = [o.fit.kept for o, s in zip(options, sigma, strict=True) if s <= COMPARABLE * min(sigma)]
+    kept = np.any(near, axis=0)
+    out = []
+    unequal = float(np.ptp(observations.weight[observations.present])) > 0.0
+    for i, option in enumerate(options):
+        progress("cross-validation", i, len(options))
+        if option.heldout is not None and (option.fit.kept == kept).all():
+            out.append(option)
+            continue
+        same = (option.fit.kept == kept).all() and not unequal
+        fit = option.fit if same else fit_kept(observations, option.fit.state, kept)
+        out.append(replace(option, fit=fit, heldout=heldout_squares(observations, fit, folds)))
+    progress("cross-validation", len(options), len(options))
+    return out

@@ -1,0 +1,91 @@
+"""What one camera model comes to: which views agree with it, its size, and the boards' shape that goes with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rigkit.calibration.board_orientation import turned_views, with_views_turned
+from rigkit.calibration.choice import SURELY, Option, choose, described
+from rigkit.calibration.evidence import fit_shapes
+from rigkit.calibration.fit import Fit
+from rigkit.calibration.linearise import normal_equations
+from rigkit.calibration.models_tried import How, Wanted, agreeing, compared, fit_all, larger_sizes, reweighted
+from rigkit.calibration.observations import Observations
+from rigkit.calibration.result import Candidate
+from rigkit.calibration.shape import often_seen
+from rigkit.core.progress import Progress
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Solved:
+    """What one camera model came to: the observations used, why views were left out, the size and board shape chosen,
+    what was tried, which larger sizes were, and the sizes compared on flat boards."""
+
+    observations: Observations
+    reasons: tuple[tuple[str, str], ...]
+    chosen: Option
+    candidates: list[Candidate]
+    beyond: Wanted
+    sizes: list[Option]
+
+
+def only(options: list[Option], wanted: Wanted, model: str) -> tuple[list[Option], Wanted]:
+    """Return the options and what was wanted of one camera model."""
+    own = [option for option in options if option.fit.state.camera.model == model]
+    return own, [w for w in wanted if w[1].model == model]
+
+
+def solved(
+    observations: Observations, options: list[Option], wanted: Wanted, failed: list[Candidate], how: How
+) -> Solved:
+    """Return what one camera model comes to; what else was tried changes nothing."""
+    size_px, board, folds, progress = how.size_px, how.board, how.folds, how.progress
+    keep, reasons = agreeing(observations, options)
+    if reasons:
+        observations = observations.subset(np.flatnonzero(keep))
+        options, failed = fit_all(observations, size_px, wanted, progress)
+    observations = reweighted(observations, options)
+    options = compared(observations, options, folds, progress)
+    chosen = choose(observations, options, SURELY)
+    beyond = [] if how.degree is not None else larger_sizes(chosen)
+    if beyond:
+        options, unfit = fit_all(observations, size_px, beyond, progress, options)
+        options = compared(observations, options, folds, progress)
+        chosen, failed = choose(observations, options, SURELY), [*failed, *unfit]
+    candidates = [*described(options, chosen, rivals=how.model == "auto"), *failed]
+    if board != "flat" and often_seen(observations).any():
+        observations, chosen, fits = _fit_shapes(observations, chosen, board)
+        shapes, spared = _shapes(observations, fits, board, folds, progress)
+        shapes = [*([chosen] if board == "auto" else []), *shapes]
+        chosen = choose(observations, shapes)
+        candidates += [*(c for c in described(shapes, chosen) if "board" in c.name), *spared]
+    return Solved(observations, reasons, chosen, candidates, beyond, options)
+
+
+def _fit_shapes(observations: Observations, flat: Option, board: str) -> tuple[Observations, Option, dict[str, Fit]]:
+    """Return the shapes fitted, and views and flat boards with every board that looks the same turned numbered from the
+    same end, where the shapes tell."""
+    fits = fit_shapes(observations, flat.fit, board)
+    for quarter_turns in (1, 2):
+        *_, richest = fits.values()
+        views = turned_views(observations, richest, quarter_turns)
+        if views.any():
+            observations, state = with_views_turned(observations, flat.fit.state, views, quarter_turns)
+            data = normal_equations(observations, state, flat.fit.weight(observations))
+            flat = replace(flat, fit=replace(flat.fit, state=state, data=data))
+            fits = fit_shapes(observations, flat.fit, board)
+    return observations, flat, fits
+
+
+def _shapes(
+    observations: Observations, fits: dict[str, Fit], board: str, folds: int, progress: Progress
+) -> tuple[list[Option], list[Candidate]]:
+    """Return the shapes in the running, and what was not tried."""
+    options = [Option(f"board {kind}", fit) for kind, fit in fits.items()]
+    spared = []
+    if board == "auto" and "released" not in fits:
+        reason = "not tried: corners stray from the warp by no more than chance"
+        spared.append(Candidate("board released", 0, float("nan"), None, False, reason))
+    return compared(observations, options, folds, progress), spared

@@ -1,0 +1,97 @@
+"""What nobody knows of a rig because nobody knows its lenses' models: `rigkit.calibration.between_models` for a rig.
+
+The rig is solved again with each rival of its lenses, of all cameras that have it at once: cameras that are alike have
+one model, whichever that is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from rigkit.calibration.between_models import followed, spread_rays
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.rig.joint import JointRig
+from rigkit.calibration.rig.solver import solve_rig
+from rigkit.calibration.rig.state import RigState
+from rigkit.core.arrays import FloatArray, Mat3, Rays
+from rigkit.core.errors import RigkitError
+from rigkit.geometry.rotation import log_so3
+
+RIVAL_TOLERANCE = 1e-6
+"""A rival's solution begins at that of the lens chosen: a step that promises less of the cost changes no digit."""
+
+
+def between_rig_models(joint: JointRig, single: Sequence[Calibration], sigmas: FloatArray) -> FloatArray:
+    """Return what the rivals of the lenses add to the covariance (G, G) of all globals; `sigmas` (G,) are the standard
+    deviations without that. Lenses that are held near what each camera says alone bring their rivals with them."""
+    here, layout = joint.solution.state, joint.solution.state.layout(joint.observations)
+    out = np.zeros((layout.count, layout.count))
+    if joint.observations.held or joint.known is not None:
+        return out
+    rays = []
+    for c, weight in enumerate(joint.observations.weights):
+        points, _ = here.of_camera(c, joint.observations).points_in_cam(joint.observations.cameras[c])
+        rays.append(spread_rays(points[weight > 0.0]))
+    for name in dict.fromkeys(rival.name for calibration in single for rival in calibration.rivals):
+        own = [next((r for r in calibration.rivals if r.name == name), None) for calibration in single]
+        start = replace(
+            here,
+            cameras=tuple(c if r is None else r.camera for c, r in zip(here.cameras, own, strict=True)),
+        )
+        try:
+            turns = _turns(here, start, rays, sigmas, joint)[1]
+            there = solve_rig(joint.observations, _turned(start, turns), joint.sigma_px, RIVAL_TOLERANCE).state
+            way = _way(here, there, rays, sigmas, joint)
+        except RigkitError:
+            continue
+        likely = [r.likely for r in own if r is not None]
+        out += np.mean(likely) * np.outer(way, way)
+    return out
+
+
+def _turns(
+    here: RigState, there: RigState, rays: Sequence[Rays], sigmas: FloatArray, joint: JointRig
+) -> tuple[list[FloatArray], list[Mat3]]:
+    """Return how the parameters of each camera follow the others, and the rotations there_from_here of their rays."""
+    steps, turns = [], []
+    layout = here.layout(joint.observations)
+    for camera, other, own, run in zip(here.cameras, there.cameras, rays, layout.cameras, strict=True):
+        step, turn = followed(camera, other, own, sigmas[run])
+        steps.append(step)
+        turns.append(turn)
+    return steps, turns
+
+
+def _turned(state: RigState, turns: Sequence[Mat3]) -> RigState:
+    """Return the state with camera c turned by `turns[c]`, the rig with the first."""
+    turn, first = np.array(turns), turns[0]
+    return replace(
+        state,
+        mount_rotation=turn @ state.mount_rotation @ first.T,
+        mount_mm=np.einsum("cij,cj->ci", turn, state.mount_mm),
+        frame_rotation=first @ state.frame_rotation,
+        frame_mm=state.frame_mm @ first.T,
+    )
+
+
+def _way(here: RigState, there: RigState, rays: Sequence[Rays], sigmas: FloatArray, joint: JointRig) -> FloatArray:
+    """Return how far the globals (G,) must move for the rig to be as it is there."""
+    layout = here.layout(joint.observations)
+    steps, turns = _turns(here, there, rays, sigmas, joint)
+    back = _turned(there, [turn.T for turn in turns])
+    way = np.zeros(layout.count)
+    for lens, step in zip(layout.cameras, steps, strict=True):
+        way[lens] = step
+    for runs, before, after in (
+        (layout.mounts, (here.mount_rotation, here.mount_mm), (back.mount_rotation, back.mount_mm)),
+        (layout.boards, (here.board_rotation, here.board_mm), (back.board_rotation, back.board_mm)),
+    ):
+        moved = np.concatenate([log_so3(after[0] @ np.swapaxes(before[0], -1, -2)), after[1] - before[1]], axis=1)
+        for k, run in enumerate(runs):
+            if run is not None:
+                way[run] = moved[k]
+    way[layout.shape] = there.unknowns - here.unknowns
+    return way

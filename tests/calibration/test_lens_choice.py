@@ -1,0 +1,146 @@
+"""Twins share a model, and what nobody knows of the model is in the sigmas."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.calibration_scenes import REACH_DEG, SIZE, lens, projection_difference, random_views
+
+from rigkit.calibration import calibrate as module
+from rigkit.calibration.between_models import followed
+from rigkit.calibration.calibrate import calibrate, calibrate_together
+from rigkit.calibration.choice import Evidence, Option
+from rigkit.calibration.fit import Fit, fit_model
+from rigkit.calibration.lens_choice import Lenses, choose_lenses, twins
+from rigkit.calibration.models_tried import How
+from rigkit.calibration.observations import Observations
+from rigkit.calibration.uncertainty import projection_design, uncertainty_at_corners
+from rigkit.cameras.kannala_brandt import KannalaBrandt
+from rigkit.cameras.registry import camera_model
+from rigkit.core.progress import silent
+from rigkit.geometry.rotation import exp_so3
+
+IMAGES = 12
+FOLLOWED_PX = 1e-4
+"""A lens that another model can show is followed to second order of a difference of a tenth of a pixel."""
+
+
+@pytest.fixture(scope="module")
+def fits() -> dict[str, tuple[Observations, Fit]]:
+    """Return fits of three models to one set of views."""
+    views, *_ = random_views(lens("reg"), IMAGES, np.random.default_rng(3), reach_deg=REACH_DEG["reg"])
+    observations = Observations.from_views(views)
+    return {name: (observations, fit_model(observations, SIZE, camera_model(name), None)) for name in ("ucm", "eucm")}
+
+
+def lenses(fits: dict[str, tuple[Observations, Fit]], eucm_better_by: np.ndarray) -> Lenses:
+    """Return two models, of which eucm errs by so much less in each image."""
+    base = 1.0 + 0.1 * np.sin(np.arange(IMAGES))
+    options = [
+        Option("ucm", fits["ucm"][1], base),
+        Option("eucm", fits["eucm"][1], base - eucm_better_by),
+    ]
+    return Lenses(fits["ucm"][0], options)
+
+
+def scatter(mean: float, size: float) -> np.ndarray:
+    way = np.where(np.arange(IMAGES) % 2, 1.0, -1.0)
+    return mean + size * way
+
+
+def test_twins_share_the_model_that_their_images_together_support(fits: dict[str, tuple[Observations, Fit]]) -> None:
+    # Each alone is within a standard error, both together are not.
+    unsure = lenses(fits, scatter(0.03, 0.14))
+    sure = lenses(fits, scatter(0.06, 0.1))
+    assert [c.model for c in choose_lenses([unsure])] == ["ucm"]
+    assert [c.model for c in choose_lenses([sure])] == ["eucm"]
+    together = choose_lenses([unsure, sure])
+    assert [c.model for c in together] == ["eucm", "eucm"]
+    assert together[0].likely == together[1].likely
+
+
+def test_a_camera_that_clearly_contradicts_its_twins_keeps_a_lens_of_its_own(
+    fits: dict[str, tuple[Observations, Fit]],
+) -> None:
+    against = lenses(fits, scatter(-0.2, 0.05))
+    sure = lenses(fits, scatter(0.6, 0.1))
+    assert [c.model for c in choose_lenses([sure, against, sure])] == ["eucm", "ucm", "eucm"]
+
+
+def test_likely_is_how_often_images_drawn_anew_choose_a_model() -> None:
+    rng = np.random.default_rng(0)
+    same, worse = 1.0 + 0.1 * rng.normal(size=(2, 40))
+    even = Evidence(["a", "b"], [1, 1], np.stack([same, worse - worse.mean() + same.mean()])).likely()
+    assert 0.4 < even["a"] < 0.6
+    clear = Evidence(["a", "b"], [1, 1], np.stack([same, same + 0.01])).likely()
+    assert clear == {"a": 1.0, "b": 0.0}
+
+
+def test_twins_have_images_of_one_size_and_nearly_one_focal_length() -> None:
+    reg, wide = lens("reg"), lens("wide")
+    near = reg.with_parameters(reg.parameters * np.array([1.03, 1.03, *[1.0] * 7]))
+    assert twins([reg, wide, near]) == [[0, 2], [1]]
+    small = KannalaBrandt((800, 600), wide.parameters)
+    assert twins([wide, small]) == [[0], [1]]
+
+
+def test_another_lens_is_followed_where_the_model_can() -> None:
+    camera = lens("wide")
+    rng = np.random.default_rng(1)
+    rays = np.stack([*rng.uniform(-0.7, 0.7, (2, 300)), np.ones(300)], axis=-1)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    step = 1e-4 * camera.parameters
+    turn = exp_so3(np.array([0.002, -0.001, 0.003]))
+    other = camera.with_parameters(camera.parameters + step)
+    found, rotation = followed(camera, other, rays @ turn.T, np.abs(step))
+    pixels = camera.project(rays @ turn.T)[0]
+    there = other.project(rays @ turn.T @ rotation.T)[0]
+    design = projection_design(camera, rays @ turn.T)[:, : camera.parameters.size]
+    assert np.abs(pixels + np.einsum("ipm,p->mi", design, found) - there).max() < FOLLOWED_PX
+
+
+def test_where_one_model_is_clearly_the_best_the_choice_adds_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    views, *_ = random_views(lens("reg"), 20, np.random.default_rng(3), reach_deg=REACH_DEG["reg"], noise_px=0.02)
+    found = calibrate(views, SIZE, model="auto", board="flat")
+    assert found.camera.model == "brown"
+    assert found.rivals == ()
+    monkeypatch.setattr(module, "rival_fits", lambda *_: [])
+    np.testing.assert_array_equal(calibrate(views, SIZE, model="auto", board="flat").covariance, found.covariance)
+
+
+def test_models_in_doubt_widen_the_sigmas_by_their_difference(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Few and noisy images in a narrow part of the view: many models show them as well.
+    views, *_ = random_views(lens("reg"), 8, np.random.default_rng(5), reach_deg=REACH_DEG["reg"], noise_px=0.4)
+    found = calibrate(views, SIZE, model="auto", board="flat")
+    monkeypatch.setattr(module, "rival_fits", lambda *_: [])
+    alone = calibrate(views, SIZE, model="auto", board="flat")
+    assert found.rivals
+    assert any("images drawn anew" in c.reason for c in found.candidates)
+    np.testing.assert_array_equal(found.camera.parameters, alone.camera.parameters)
+    more = np.linalg.eigvalsh(found.frame_covariance - alone.frame_covariance)
+    assert more.max() > 0.0
+    assert more.min() > -1e-9 * more.max()
+    corners = np.concatenate([view.pixels for view in found.views])
+    differ = max(
+        projection_difference(rival.camera, found.camera, 90.0, covered=corners).max() for rival in found.rivals
+    )
+    widened = np.sqrt(np.nanmax(uncertainty_at_corners(found) ** 2 - uncertainty_at_corners(alone) ** 2))
+    assert 0.0 < widened < differ
+
+
+def test_errors_name_the_camera_of_a_rig() -> None:
+    views, *_ = random_views(lens("reg"), 6, np.random.default_rng(3), reach_deg=REACH_DEG["reg"])
+    how = How(SIZE, "nonsense", None, "flat", 0, silent)
+    with pytest.raises(Exception, match=r"camera 'left': .*nonsense"):
+        calibrate_together([("left", views, how)])
+
+
+def test_cameras_of_a_rig_come_in_their_order() -> None:
+    rng = np.random.default_rng(2)
+    how = How(SIZE, "auto", None, "flat", 0, silent)
+    asked = [
+        (name, random_views(lens(name), 8, rng, reach_deg=REACH_DEG[name])[0], how) for name in ("reg", "wide", "reg")
+    ]
+    found = calibrate_together(asked)
+    focal = [lens(name).focal_px for name in ("reg", "wide", "reg")]
+    np.testing.assert_allclose([c.camera.focal_px for c in found], focal, rtol=0.05)
