@@ -14,7 +14,7 @@ from rigkit.calibration.fit import Fit, fit_model
 from rigkit.calibration.lens_choice import Lenses, choose_lenses, twins
 from rigkit.calibration.models_tried import How
 from rigkit.calibration.observations import Observations
-from rigkit.calibration.uncertainty import projection_design, uncertainty_at_corners
+from rigkit.calibration.uncertainty import FarProjection, projection_design
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.registry import camera_model
 from rigkit.core.progress import silent
@@ -124,7 +124,9 @@ def test_models_in_doubt_widen_the_sigmas_by_their_difference(monkeypatch: pytes
     differ = max(
         projection_difference(rival.camera, found.camera, 90.0, covered=corners).max() for rival in found.rivals
     )
-    widened = np.sqrt(np.nanmax(uncertainty_at_corners(found) ** 2 - uncertainty_at_corners(alone) ** 2))
+    widened = np.sqrt(
+        np.nanmax(FarProjection.of(found).at_corners_px ** 2 - FarProjection.of(alone).at_corners_px ** 2)
+    )
     assert 0.0 < widened < differ
 
 
