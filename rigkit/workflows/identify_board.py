@@ -92,8 +92,9 @@ def explained(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     guess = _guess(paths)
     if guess is None:
         return None
-    words = [difference(seen, board) for board in boards for seen in (guess.board, *guess.beside)]
-    if None in words or not words:
+    told = [difference(seen, board) for board in boards for seen in (guess.board, *guess.beside)]
+    words = [one for one in told if one is not None]
+    if len(words) < len(told) or not words:
         return None
     what, count = guess.board.describe().split(", ")[0], len(guess.images)
     if what in words[0]:
