@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 from rigkit.calibration.assemble import assemble, clusters_of, require_determined
 from rigkit.calibration.between_models import rival_fits, with_rivals
-from rigkit.calibration.choice import SURELY, Evidence, Option, choose, described
+from rigkit.calibration.choice import SURELY, HeldOut, Option, choose, described
 from rigkit.calibration.fit import Fit
 from rigkit.calibration.lens_choice import (
     Choice,
@@ -167,7 +167,7 @@ def _finish(group: Sequence[_Begun]) -> list[Calibration]:
         rivals = tried
     else:
         rivals = [Lenses(one.observations, one.sizes) for one in found]
-        choices = [Choice(c.model, Evidence.of([r.options]).likely()) for c, r in zip(choices, rivals, strict=True)]
+        choices = [Choice(c.model, HeldOut.of([r.options]).likely()) for c, r in zip(choices, rivals, strict=True)]
     out = []
     for begun, one, lenses, choice, compared in zip(group, found, tried, choices, rivals, strict=True):
         with _about_camera(begun.name):
@@ -183,7 +183,7 @@ def _better(found: Sequence[Solved], again: Sequence[Solved]) -> bool:
     ]
     if len(pairs) == 1:
         return choose(again[0].observations, pairs[0], SURELY).name == "again"
-    return Evidence.of(pairs).chosen() == "again"
+    return HeldOut.of(pairs).chosen() == "again"
 
 
 def _result(

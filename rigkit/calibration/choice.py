@@ -72,7 +72,7 @@ def _against(heldout: FloatArray, best: int) -> tuple[FloatArray, FloatArray]:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Evidence:
+class HeldOut:
     """What the images of one camera, or of several that are alike, say of the options that all of them have: names,
     numbers (most of the cameras') and squared held-out residuals (M, N), of each camera in units of its smallest mean:
     cameras differ in how sharp they are."""
@@ -82,7 +82,7 @@ class Evidence:
     heldout: FloatArray
 
     @classmethod
-    def of(cls, cameras: Sequence[Sequence[Option]]) -> Evidence:
+    def of(cls, cameras: Sequence[Sequence[Option]]) -> HeldOut:
         """Put the evidence of cameras with their options together."""
         known = [{o.name: o for o in options if o.heldout is not None} for options in cameras]
         names = [name for name in known[0] if all(name in own for own in known)]

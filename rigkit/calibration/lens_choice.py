@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.choice import SURELY, Evidence, Option, choose
+from rigkit.calibration.choice import SURELY, HeldOut, Option, choose
 from rigkit.calibration.fit import fit_kept, heldout_squares
 from rigkit.calibration.models_tried import How, agreeing, compared, fit_of_views, reweighted
 from rigkit.calibration.observations import Observations
@@ -64,7 +64,7 @@ def best_sizes(cameras: Sequence[Lenses]) -> list[str]:
     sizes = []
     for model in dict.fromkeys(model for lenses in cameras for model in lenses.models):
         own = [[o for o in lenses.options if o.fit.state.camera.model == model] for lenses in cameras]
-        evidence = Evidence.of(own)
+        evidence = HeldOut.of(own)
         if evidence.names:
             sizes.append(evidence.chosen())
         else:
@@ -98,11 +98,11 @@ def choose_lenses(cameras: Sequence[Lenses]) -> list[Choice]:
     """Return the model of each of some cameras that are alike: what their images say is put together, and who clearly
     contradicts the others has a lens of its own."""
     own = [lenses.alone for lenses in cameras]
-    each = [Evidence.of([lenses.options]) for lenses in cameras]
+    each = [HeldOut.of([lenses.options]) for lenses in cameras]
     out = [Choice(option.fit.state.camera.model, evidence.likely()) for option, evidence in zip(own, each, strict=True)]
     together = [k for k, evidence in enumerate(each) if evidence.names]
     while len(together) > 1:
-        evidence = Evidence.of([cameras[k].options for k in together])
+        evidence = HeldOut.of([cameras[k].options for k in together])
         if not evidence.names:
             break
         name = evidence.chosen()

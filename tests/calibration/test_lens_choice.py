@@ -9,7 +9,7 @@ from helpers.calibration_scenes import REACH_DEG, SIZE, lens, projection_differe
 from rigkit.calibration import calibrate as module
 from rigkit.calibration.between_models import followed
 from rigkit.calibration.calibrate import calibrate, calibrate_together
-from rigkit.calibration.choice import Evidence, Option
+from rigkit.calibration.choice import HeldOut, Option
 from rigkit.calibration.fit import Fit, fit_model
 from rigkit.calibration.lens_choice import Lenses, choose_lenses, twins
 from rigkit.calibration.models_tried import How
@@ -70,9 +70,9 @@ def test_a_camera_that_clearly_contradicts_its_twins_keeps_a_lens_of_its_own(
 def test_likely_is_how_often_images_drawn_anew_choose_a_model() -> None:
     rng = np.random.default_rng(0)
     same, worse = 1.0 + 0.1 * rng.normal(size=(2, 40))
-    even = Evidence(["a", "b"], [1, 1], np.stack([same, worse - worse.mean() + same.mean()])).likely()
+    even = HeldOut(["a", "b"], [1, 1], np.stack([same, worse - worse.mean() + same.mean()])).likely()
     assert 0.4 < even["a"] < 0.6
-    clear = Evidence(["a", "b"], [1, 1], np.stack([same, same + 0.01])).likely()
+    clear = HeldOut(["a", "b"], [1, 1], np.stack([same, same + 0.01])).likely()
     assert clear == {"a": 1.0, "b": 0.0}
 
 
