@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,16 @@ import pytest
 def rng(request: pytest.FixtureRequest) -> np.random.Generator:
     """A generator seeded by the test's own name: fixed for the test, different from every other test's."""
     return np.random.default_rng(zlib.crc32(request.node.name.encode()))
+
+
+@pytest.fixture(scope="session")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with left01.jpg, right01.jpg, ... of `helpers.stereo_pictures`, to read, not to write."""
+    from helpers.stereo_pictures import write_pictures
+
+    folder = tmp_path_factory.mktemp("pictures")
+    write_pictures(folder)
+    return folder
 
 
 @pytest.fixture(autouse=True)

@@ -8,9 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from cli.test_calibrate_folder import BOARD as PRINTED
-from cli.test_calibrate_folder import CAMERA as LENS
 from helpers.calibration_scenes import lens, random_views
+from helpers.stereo_pictures import BOARD as PRINTED
+from helpers.stereo_pictures import CAMERA as LENS
 
 from rigkit.calibration.hand_eye import HandEye, hand_eye
 from rigkit.cli.main import main

@@ -8,17 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
+from helpers.stereo_pictures import CAMERA, FRAMES, RIGHT_FROM_LEFT, of_one_camera
 
 from rigkit.cameras.base import Camera
-from rigkit.cameras.brown import Brown
 from rigkit.cli.main import main
-from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
-from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3, nearest_rotation
+from rigkit.geometry.rotation import nearest_rotation
 from rigkit.interop.opencv import read_opencv, write_opencv
 from rigkit.interop.ros import read_camera_info
 from rigkit.io.calibration_file import load_calibration
@@ -26,53 +23,16 @@ from rigkit.io.corners_file import read_corners
 from rigkit.io.rig_file import load_rig, load_saved_rig
 from rigkit.io.rig_session import load_rig_session
 from rigkit.io.session import load_session
-from rigkit.synthetic.photometry import Photometry
-from rigkit.synthetic.placing import place_board, sees_paper
-from rigkit.synthetic.render import Optics, render
 from rigkit.workflows.calibrate import CalibrateOptions
 from rigkit.workflows.calibrate_any import calibrate_session_file
 from rigkit.workflows.camera_files import import_rig
 from rigkit.workflows.folder_session import cameras_in, session_of_folders
 from rigkit.workflows.known_cameras import known_cameras
 
-CAMERA = Brown((640, 480), np.array([520.0, 521.0, 322.3, 236.1, -0.21, 0.06, 4e-4, -3e-4, 0.0]))
-RIGHT_FROM_LEFT = Rigid3(exp_so3(np.array([0.01, -0.04, 0.02])), [-90.0, 1.0, 2.0])
-BOARD = Board("board", 9, 6, 30.0, 30.0)
-FRAMES = 9
 SAME_LENS_PX = 0.1
 """Projections of the camera found against the true one, where boards were: corners of JPEGs to about 0.03 px, 9 images;
 a board of another size, or another format's convention, gives a pixel at least."""
 SIGMAS = 4.0
-
-
-@pytest.fixture(scope="module")
-def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """left01.jpg, right01.jpg, ... of a rig, ray-traced."""
-    folder = tmp_path_factory.mktemp("pictures")
-    rng = np.random.default_rng(11)
-    optics, photometry = Optics(0.7, supersample=2), Photometry(noise_levels=2.0)
-    count = 0
-    while count < FRAMES:
-        spot = np.array([320.0, 240.0]) + rng.uniform(-1.0, 1.0, 2) * np.array([90.0, 60.0])
-        placed = place_board(BOARD, CAMERA, spot, rng.uniform(26.0, 34.0), 40.0, rng)
-        poses = {"left": Rigid3.identity(), "right": RIGHT_FROM_LEFT}
-        if placed is None or not sees_paper(placed, CAMERA, (0.0, 0.0), CAMERA.size_px):
-            continue
-        if not all(placed.see(CAMERA, pose)[1].all() for pose in poses.values()):
-            continue
-        count += 1
-        for name, pose in poses.items():
-            image = render([placed], CAMERA, pose, optics=optics, photometry=photometry, rng=rng)
-            cv2.imwrite(str(folder / f"{name}{count:02d}.jpg"), image, [cv2.IMWRITE_JPEG_QUALITY, 97])
-    return folder
-
-
-def of_one_camera(pictures: Path, folder: Path) -> Path:
-    """Return a folder with the pictures of one camera, as cameras name them."""
-    folder.mkdir(parents=True)
-    for k, path in enumerate(sorted(pictures.glob("left*.jpg"))):
-        shutil.copy(path, folder / f"DSC_{k:04d}.JPG")
-    return folder
 
 
 def undated(path: Path) -> dict[str, Any]:

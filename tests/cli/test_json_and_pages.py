@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cli.test_calibrate_folder import of_one_camera, pictures
 from helpers.pages import assert_all_is_in
 from helpers.reconstructions import make_reconstruction
 from helpers.schemas import faults
+from helpers.stereo_pictures import of_one_camera
 from report.test_first_screen import reported
 
 from rigkit.cli.main import main
@@ -18,8 +18,6 @@ from rigkit.report.page import build_page, validation_facts
 from rigkit.report.validation_page import pair_section, summary_table
 from rigkit.report.validation_verdict import verdict_of
 from rigkit.validation.diagnose import diagnose
-
-__all__ = ["pictures"]
 
 REPEATS = ("held-out RMS",)
 """Figures that the JSON has by name."""

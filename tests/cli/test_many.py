@@ -7,7 +7,6 @@ import shutil
 from pathlib import Path
 
 import pytest
-from cli.test_calibrate_folder import pictures  # noqa: F401 - a fixture
 from helpers.data import REPOSITORY
 
 from rigkit.cli.main import main
@@ -94,7 +93,7 @@ def test_a_session_that_fails_does_not_end_the_rest(
 
 
 @pytest.fixture(name="pictures_of_one")
-def _pictures_of_one(pictures: Path, tmp_path: Path) -> Path:  # noqa: F811
+def _pictures_of_one(pictures: Path, tmp_path: Path) -> Path:
     folder = tmp_path / "photos"
     folder.mkdir()
     for path in pictures.glob("left*.jpg"):

@@ -9,7 +9,6 @@ import textwrap
 from pathlib import Path
 
 import pytest
-from cli.test_calibrate_folder import pictures  # noqa: F401 - a fixture
 from helpers.data import REPOSITORY
 
 from rigkit.cli.main import main
@@ -41,7 +40,7 @@ def set_up(needs: str, folder: Path, images: Path) -> None:
 @pytest.mark.parametrize("page", sorted(p.name for p in PAGES.glob("*.md") if p.name not in MADE_BY_THE_BUILD))
 def test_a_page_does_what_it_says(
     page: str,
-    pictures: Path,  # noqa: F811
+    pictures: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],

@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from cli.test_calibrate_folder import pictures  # noqa: F401 - a fixture
 from helpers.data import REPOSITORY
 
 EXAMPLES = REPOSITORY / "examples"
@@ -24,7 +23,7 @@ def run(
 
 
 def test_one_camera(
-    pictures: Path,  # noqa: F811
+    pictures: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -39,7 +38,7 @@ def test_one_camera(
 
 
 def test_stereo(
-    pictures: Path,  # noqa: F811
+    pictures: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],

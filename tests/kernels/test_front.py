@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 import cv2
@@ -28,12 +29,13 @@ SAME_SHARE = 0.998
 """Tests against a bound may fall the other way by rounding; in noise a few of thousands do."""
 
 
+@functools.cache
 def _images() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(5)
     text = np.full((300, 500), 230, np.uint8)
     for line in range(13):
         cv2.putText(text, "HHH ### xxx 8888 +++ %%% mmm " * 2, (3, 20 + 22 * line), 0, 0.5, 20, 1, cv2.LINE_AA)
-    return {
+    images = {
         "boards": corner_scene(rng, regular(), 1250.0).image(rng),
         "fisheye": corner_scene(rng, fisheye(), 480.0).image(rng, noise_levels=6.0),
         "noise": (rng.random((301, 403)) * 255).astype(np.uint8),
@@ -42,6 +44,11 @@ def _images() -> dict[str, np.ndarray]:
         "black": np.zeros((60, 80), np.uint8),
         **real_images(),
     }
+    assert tuple(images) == NAMES
+    return images
+
+
+NAMES = ("boards", "fisheye", "noise", "small", "text", "black", *real_images())
 
 
 @pytest.fixture
@@ -56,7 +63,7 @@ def in_numpy(monkeypatch: pytest.MonkeyPatch) -> Callable[..., object]:
 
 
 @pytest.mark.parametrize("depth", [np.uint8, np.float32])
-@pytest.mark.parametrize("name", list(_images()))
+@pytest.mark.parametrize("name", NAMES)
 def test_levels(name: str, depth: type, in_numpy: Callable[..., list[Level]]) -> None:
     grey = grey_image(_images()[name].astype(depth))
     assert grey.dtype == depth
@@ -83,7 +90,7 @@ def test_the_brightest_bytes_overflow_nothing() -> None:
         assert np.abs(response._shrunk(white, factor) - 255.0).max() < SMOOTH_LEVELS
 
 
-@pytest.mark.parametrize("name", list(_images()))
+@pytest.mark.parametrize("name", NAMES)
 def test_peaks(name: str, in_numpy: Callable[..., tuple[np.ndarray, np.ndarray]]) -> None:
     for level in pyramid(grey_image(_images()[name])):
         (ours, height), (theirs, _) = peaks(level), in_numpy(peaks, level)
@@ -129,7 +136,7 @@ def test_peaks_beyond_float32_are_the_strongest(
         assert np.array_equal(infinite[0], infinite[1])
 
 
-@pytest.mark.parametrize("name", list(_images()))
+@pytest.mark.parametrize("name", NAMES)
 def test_corners(name: str, in_numpy: Callable[..., tuple[Corners, saddle.Saddles]]) -> None:
     levels = pyramid(grey_image(_images()[name]))
     (ours, all_ours), (theirs, all_theirs) = find_corners(levels), in_numpy(find_corners, levels)

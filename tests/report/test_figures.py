@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.reconstructions import make_reconstruction
-from mpl_toolkits.mplot3d import Axes3D
 
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.report.figures import as_pdf, cloud_figure, corners_figure
@@ -39,6 +38,8 @@ def test_the_cloud_s_axes_and_their_numbers_are_all_in_the_picture(baseline_mm: 
 
 @pytest.mark.parametrize("baseline_mm", [(300.0, 0.0, 0.0), (0.0, 0.0, -150.0), (250.0, 40.0, 90.0)])
 def test_no_axis_name_lies_over_a_number(baseline_mm: tuple[float, float, float]) -> None:
+    from mpl_toolkits.mplot3d import Axes3D
+
     figure = cloud_figure(make_reconstruction(cam2_from_cam1=Rigid3(np.eye(3), np.array(baseline_mm))))
     figure.canvas.draw()
     checked = 0

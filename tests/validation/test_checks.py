@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from dataclasses import replace
 
@@ -217,8 +218,8 @@ class Askew(BoardPlanes):
     """Planes that were fitted otherwise: plane1 turned by a degree about plane2's normal, the baseline 1 mm longer."""
 
     def normal(self, board_id: str) -> FloatArray:
-        turn = exp_so3(np.radians(1.0) * FACES["plane2"]) if board_id == "plane1" else np.eye(3)
-        return np.asarray(turn @ FACES[board_id])
+        turn = exp_so3(np.radians(1.0) * _faces()["plane2"]) if board_id == "plane1" else np.eye(3)
+        return np.asarray(turn @ _faces()[board_id])
 
     def offset_mm(self, board_id: str) -> float:
         raise NotImplementedError
@@ -230,13 +231,15 @@ class Askew(BoardPlanes):
         raise NotImplementedError
 
 
-FACES = {b.board.board_id: b.plane.normal for b in measure(make_reconstruction()).boards.values()}
+@functools.cache
+def _faces() -> dict[str, FloatArray]:
+    return {b.board.board_id: b.plane.normal for b in measure(make_reconstruction()).boards.values()}
 
 
 def test_fitted_planes_stand_beside_the_free_ones_or_judge_in_their_place() -> None:
     t = CAM2_FROM_CAM1.translation_mm
     planes = Askew(
-        board_ids=tuple(FACES),
+        board_ids=tuple(_faces()),
         cam2_from_cam1=Rigid3(CAM2_FROM_CAM1.rotation, t * (1.0 + 1.0 / BASELINE_MM)),
         covariance=np.diag(np.full(24, 1e-6)),
         calibration_moves=np.zeros((0, 24)),

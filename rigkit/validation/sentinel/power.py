@@ -14,9 +14,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chndtr
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
+from scipy.special import chndtr, fdtri, gammaincinv
 
 from rigkit.core.arrays import FloatArray
 from rigkit.validation.sentinel.causes import Cause, lens_goals
@@ -127,8 +125,10 @@ class _Shown:
         root = axes[:, seen] / np.sqrt(size[seen])
         by_axis = np.maximum(np.linalg.eigvalsh(root.T @ normal @ root), 0.0)
         m = len(metric)
-        limit = m * f_distribution.isf(alarm_chance, m, whitened.freedom)
-        return cls(by_axis, m, limit * chi2.ppf(QUANTILES, whitened.freedom) / whitened.freedom)
+        limit = m * fdtri(m, whitened.freedom, 1.0 - alarm_chance)
+        # Of chi-squared with these degrees of freedom; scipy.stats has it too, but takes a second to import.
+        chi2 = 2.0 * gammaincinv(0.5 * whitened.freedom, QUANTILES)
+        return cls(by_axis, m, limit * chi2 / whitened.freedom)
 
     def chance(self, size: FloatArray) -> FloatArray:
         """Return how often changes of `size` (K,) are found, the mean over their axes, (K,)."""
