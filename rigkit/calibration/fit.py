@@ -9,13 +9,13 @@ import numpy as np
 from rigkit.calibration.initialise import initialise
 from rigkit.calibration.linearise import normal_equations
 from rigkit.calibration.normal_equations import NormalEquations, Residuals
-from rigkit.calibration.observations import Observations, median_of
+from rigkit.calibration.observations import Observations
 from rigkit.calibration.poses import find_poses, refine_poses
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.solver import solve
 from rigkit.calibration.state import State, evaluate
 from rigkit.cameras.base import Camera, image_center
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, median_of
 from rigkit.core.errors import DegenerateError
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 

@@ -17,11 +17,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rigkit.calibration.observations import Observations, median_of
+from rigkit.calibration.observations import Observations
 from rigkit.calibration.radial_alignment import TURN_SIGMAS, Alignment, align, distortion_centre
 from rigkit.calibration.state import State
 from rigkit.cameras.base import Camera, RadialCurve, image_center
-from rigkit.core.arrays import FloatArray, Mat3, Points
+from rigkit.core.arrays import FloatArray, Mat3, Points, median_of
 from rigkit.core.errors import InputError
 from rigkit.geometry.rotation import nearest_rotation
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN

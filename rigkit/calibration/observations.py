@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points, median_of
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
@@ -160,13 +160,6 @@ def _check_once(views: Sequence[BoardView], view_of: IntArray, place: IntArray, 
     if count.max(initial=0) > 1:
         view = views[int(count.argmax()) // largest]
         raise InputError(f"image '{view.image}': a corner of board '{view.board.board_id}' comes twice")
-
-
-def median_of(values: FloatArray) -> float:
-    """Return the median of N > 0 numbers, which are reordered. np.median takes four times as long, to look for NaN."""
-    low, high = (values.size - 1) // 2, values.size // 2
-    values.partition((low, high))
-    return 0.5 * float(values[low] + values[high])
 
 
 def _weights(sigma: FloatArray, present: BoolArray) -> FloatArray:

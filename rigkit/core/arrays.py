@@ -175,3 +175,10 @@ def upper_median(values: FloatArray) -> float:
     """Return the median of N > 0 numbers, the upper one of two; for some fifty np.median takes ten times as long."""
     half = len(values) // 2
     return float(np.partition(values, half)[half])
+
+
+def median_of(values: FloatArray) -> float:
+    """Return the median of N > 0 numbers, which are reordered. np.median takes four times as long, to look for NaN."""
+    low, high = (values.size - 1) // 2, values.size // 2
+    values.partition((low, high))
+    return 0.5 * float(values[low] + values[high])

@@ -29,8 +29,8 @@ def uneven_steps(pixels: FloatArray) -> tuple[list[float], list[int], tuple[floa
     pixels = np.ascontiguousarray(pixels, np.float64)
     rows, columns = pixels.shape[:2]
     inner = max(columns - 2, 0) + max(rows - 2, 0)
-    numbers, seen = np.empty(2 * rows * columns + inner + 2), np.empty(inner, np.int64)
-    scratch, typical, every = np.split(numbers, [2 * rows * columns, 2 * rows * columns + inner])
+    scratch, typical, every = np.empty(2 * rows * columns), np.empty(inner), np.empty(2)
+    seen = np.empty(inner, np.int64)
     kernels().uneven_steps(pixels, rows, columns, scratch, inner, typical, seen, every)
     along_rows, along_columns = every.tolist()
     return typical.tolist(), seen.tolist(), (along_rows, along_columns)

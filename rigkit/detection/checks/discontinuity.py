@@ -7,12 +7,13 @@ where the other corners have it; and a lattice whose two sides are each a smooth
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray, upper_median
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, median_of, upper_median
 from rigkit.detection.checks.validate import stray_row
 from rigkit.detection.lattice.local_fit import PLIANT, STIFF, fit_cells
 from rigkit.detection.subpixel.subpixel import RefinedLattice
@@ -198,20 +199,24 @@ def _clearest_split(pixels: FloatArray, sigma_px: FloatArray, several: bool) -> 
 
 def _splits(sums: _Sums, wide: int, several: bool) -> list[_Split]:
     """Return the discontinuities that `wide` columns may lie on; `sums` are over the first columns."""
-    columns, rows = len(sums.columns) - 1, sums.in_row.shape[1]
+    columns, rows = len(sums.values) - 1, sums.in_row.shape[1]
     start = np.arange(1, columns - wide)
     end = start + wide
     left = sums.between(np.maximum(0, start - WINDOW), start)
     right = sums.between(end, np.minimum(columns, end + WINDOW))
-    both = left.with_all_of(right)
-    taken = left.determined() + right.determined()
-    possible = (np.minimum(left.corners, right.corners) >= MIN_BESIDE) & (both.corners - taken >= MIN_FREE)
+    both = _Sums(left.values + right.values)
+    taken, corners = left.determined() + right.determined(), both.corners
+    possible = (np.minimum(left.corners, right.corners) >= MIN_BESIDE) & (corners - taken >= MIN_FREE)
+    if not possible.any():
+        return []
     one, apart1 = left.fitted(QUADRATIC)
     two, apart2 = right.fitted(QUADRATIC)
     _, together = both.fitted(CUBIC)
-    floor = both.variance / np.maximum(both.corners, 1) + FLOOR_CELLS**2
-    alone = (apart1 + apart2) / np.maximum(both.corners - taken, 1) + floor
-    ratio = np.sqrt(together / np.maximum(both.corners - CUBIC, 1) / alone)
+    floor = both.variance / np.maximum(corners, 1) + FLOOR_CELLS**2
+    alone = (apart1 + apart2) / np.maximum(corners - taken, 1) + floor
+    ratio = np.sqrt(together / np.maximum(corners - CUBIC, 1) / alone)
+    if not several and not (possible & (ratio > TWO_SURFACES)).any():
+        return []
     # How far apart the sides have rows that they share, anywhere from the last column of one to the first of the other.
     between = start + MEETING[:, None] * (wide + 1) - 1.0
     terms = _terms(_scaled(between, columns)[..., None], _scaled(np.arange(rows), rows))[..., :QUADRATIC]
@@ -224,23 +229,16 @@ def _splits(sums: _Sums, wide: int, several: bool) -> list[_Split]:
     return [_Split(float(ratio[k]), int(start[k]), int(end[k]), float(np.sqrt(alone[k]))) for k in which]
 
 
-class _Sums(NamedTuple):
+@dataclass(frozen=True, eq=False, slots=True)
+class _Sums:
     """What a polynomial surface through the corners of some columns is made of, in cells; M sets of columns.
 
     Attributes
     ----------
-    normal, right : (M, 10, 10), (M, 10, 2) of the normal equations.
-    square, variance : (M,) sums of the squares of the positions and of the corners' variances per axis.
-    in_row : (M, R) corners in each row.
-    columns : (M,) columns that have corners.
+    values : (M, 123 + R), read by the properties: all are sums, and added and subtracted together.
     """
 
-    normal: FloatArray
-    right: FloatArray
-    square: FloatArray
-    variance: FloatArray
-    in_row: FloatArray
-    columns: FloatArray
+    values: FloatArray
 
     @classmethod
     def of(cls, pixels: FloatArray, sigma_px: FloatArray) -> _Sums:
@@ -248,21 +246,52 @@ class _Sums(NamedTuple):
         known = np.isfinite(pixels[..., 0])
         rows, columns = known.shape
         steps = np.concatenate([np.diff(pixels, axis=axis).reshape(-1, 2) for axis in (0, 1)])
-        cell_px = float(np.nanmedian(np.hypot(steps[:, 0], steps[:, 1])))
+        lengths = np.hypot(steps[:, 0], steps[:, 1])
+        seen = lengths[np.isfinite(lengths)]
+        cell_px = median_of(seen) if seen.size else np.nan
         middle = pixels[known].mean(axis=0)
         place = np.where(known[..., None], (pixels - middle) / cell_px, 0.0).swapaxes(0, 1)
         terms = _terms(_scaled(np.arange(columns), columns)[:, None], _scaled(np.arange(rows), rows))
         terms = np.where(known.T[..., None], terms, 0.0)
         across = terms.swapaxes(1, 2)
-        single: tuple[FloatArray, ...] = (
-            across @ terms,
-            across @ place,
-            np.asarray((place**2).sum(axis=(1, 2))),
-            np.asarray((np.where(known, sigma_px / cell_px, 0.0) ** 2).sum(axis=0)),
-            known.T.astype(np.float64),
-            np.asarray(known.any(axis=0), dtype=np.float64),
-        )
-        return cls(*(np.concatenate([np.zeros_like(a[:1]), a.cumsum(axis=0)]) for a in single))
+        values = np.zeros((columns + 1, CUBIC * CUBIC + 2 * CUBIC + 3 + rows))
+        sums, there = cls(values), cls(values[1:])
+        there.normal[:], there.right[:] = across @ terms, across @ place
+        there.square[:] = (place**2).sum(axis=(1, 2))
+        there.variance[:] = (np.where(known, sigma_px / cell_px, 0.0) ** 2).sum(axis=0)
+        there.columns[:], there.in_row[:] = known.any(axis=0), known.T
+        values.cumsum(axis=0, out=values)
+        return sums
+
+    @property
+    def normal(self) -> FloatArray:
+        """(M, 10, 10) matrices of the normal equations."""
+        return self.values[:, : CUBIC * CUBIC].reshape(-1, CUBIC, CUBIC)
+
+    @property
+    def right(self) -> FloatArray:
+        """(M, 10, 2) their right sides."""
+        return self.values[:, CUBIC * CUBIC : CUBIC * CUBIC + 2 * CUBIC].reshape(-1, CUBIC, 2)
+
+    @property
+    def square(self) -> FloatArray:
+        """(M,) sums of the squares of the positions."""
+        return self.values[:, CUBIC * CUBIC + 2 * CUBIC]
+
+    @property
+    def variance(self) -> FloatArray:
+        """(M,) sums of the corners' variances per axis."""
+        return self.values[:, CUBIC * CUBIC + 2 * CUBIC + 1]
+
+    @property
+    def columns(self) -> FloatArray:
+        """(M,) columns that have corners."""
+        return self.values[:, CUBIC * CUBIC + 2 * CUBIC + 2]
+
+    @property
+    def in_row(self) -> FloatArray:
+        """(M, R) corners in each row."""
+        return self.values[:, CUBIC * CUBIC + 2 * CUBIC + 3 :]
 
     @property
     def corners(self) -> FloatArray:
@@ -270,10 +299,7 @@ class _Sums(NamedTuple):
 
     def between(self, first: IntArray, end: IntArray) -> _Sums:
         """Return those over the columns `first` to `end` (exclusive), (M,) each."""
-        return _Sums(*(a[end] - a[first] for a in self))
-
-    def with_all_of(self, other: _Sums) -> _Sums:
-        return _Sums(*(np.asarray(a + b, dtype=np.float64) for a, b in zip(self, other, strict=True)))
+        return _Sums(self.values[end] - self.values[first])
 
     def determined(self) -> IntArray:
         """Return how many terms of a quadratic surface the columns determine, (M,)."""
@@ -294,6 +320,8 @@ def _scaled(number: NDArray[np.floating | np.integer], count: int) -> FloatArray
 
 def _terms(x: FloatArray, y: FloatArray) -> FloatArray:
     """Return the terms (..., 10) of a cubic surface."""
-    x, y = np.broadcast_arrays(x, y)
     xx, xy, yy = x * x, x * y, y * y
-    return np.stack([np.ones_like(xy), x, y, xx, xy, yy, xx * x, xx * y, x * yy, yy * y], axis=-1)
+    terms = np.empty((*xy.shape, CUBIC))
+    for k, term in enumerate((1.0, x, y, xx, xy, yy, xx * x, xx * y, x * yy, yy * y)):
+        terms[..., k] = term
+    return terms

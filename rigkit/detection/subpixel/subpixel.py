@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, upper_median
-from rigkit.detection.lattice.lattice import Lattice, LatticeStack, padded
+from rigkit.detection.lattice.lattice import Lattice, LatticeStack, padded, turned
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.correlation import sigma_factors
@@ -116,7 +116,7 @@ class RefinedLattice:
 
     def turned(self, quarter_turns: int) -> RefinedLattice:
         """Return this numbered from another corner, as `Lattice.turned`."""
-        rest = (np.rot90(values, -quarter_turns) for values in self._values())
+        rest = (turned(values, quarter_turns) for values in self._values())
         return _refined(self.lattice.turned(quarter_turns), rest, self.scatter)
 
     def filled(self, other: RefinedLattice) -> RefinedLattice:
