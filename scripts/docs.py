@@ -7,6 +7,7 @@ python scripts/docs.py [--serve]
 from __future__ import annotations
 
 import argparse
+import itertools
 import shutil
 import subprocess
 import sys
@@ -164,9 +165,10 @@ def made_pictures() -> None:
 def api_page() -> str:
     """Return the page that lists every public name with its docstring, by module."""
     parts = ["# API\n\nEvery public name of `rigkit`, by the module it comes from.\n"]
-    for module, names in sorted(rigkit._NAMES_OF.items()):
+    homes = sorted((module, name) for name, module in vars(rigkit)["_homes"]().items())
+    for module, names in itertools.groupby(homes, key=lambda home: home[0]):
         parts.append(f"## {module}\n")
-        parts += [f"::: {module}.{name}\n" for name in names]
+        parts += [f"::: {module}.{name}\n" for _, name in names]
     return "\n".join(parts)
 
 
