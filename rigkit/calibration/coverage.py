@@ -46,6 +46,15 @@ def covered_by_boards(calibration: Calibration, pixels: Pixels) -> BoolArray:
     return found.reshape(np.shape(pixels)[:-1])
 
 
+def outline_of_corners(calibration: Calibration) -> Pixels:
+    """Return the convex outline of all corners used, (N, 2), each of its corners once."""
+    from scipy.spatial import ConvexHull
+
+    corners = np.concatenate([view.pixels[view.kept] for view in calibration.views])
+    # QJ: corners on one line have an outline as well, a thin one.
+    return np.asarray(corners[ConvexHull(corners, qhull_options="QJ").vertices])
+
+
 def _reach_px(views: Sequence[ViewResult], corners: Pixels) -> FloatArray:
     """Return for each of the `corners` kept in all views (N, 2), view by view, how far its board's squares reach (N,).
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.cameras.registry import camera_model
-from rigkit.core.arrays import FloatArray, Pixels, Rays
+from rigkit.core.arrays import BoolArray, FloatArray, Pixels, Rays
 from rigkit.core.errors import InputError
 from rigkit.optim.damping import Damping, Stop
 from rigkit.optim.levenberg_marquardt import DenseStep, LinearisedProblem, damped_step, minimise
@@ -27,6 +27,8 @@ MAX_CONVERT_STEPS = 60
 HALVINGS = 8
 CONVERT_SETTLED = 1e-10
 """The fit stops where a step gains less than this share of the cost,"""
+OUTSIDE_WEIGHT = 0.02
+"""An error outside the outline of what was seen counts by this much: there the lens is but extrapolated."""
 ROUNDING_PX = 1e-10
 """or where pixels are met this well."""
 CONVERT_DAMPING = Damping(start=1e-6, ceiling=1e6)
@@ -40,7 +42,8 @@ class Conversion:
 
     Attributes
     ----------
-    max_px, rms_px : error of projection over the part of the image that the new camera covers.
+    max_px, rms_px : error of projection over the part of the image that the new camera covers, inside the outline.
+    outside_px : largest error of projection over the rest of that part; 0 without an outline.
     covered : that part, as a share of the pixels that the source covers.
     reach_rad : that part, as an angle from the optical axis; pi where nothing was left out.
     """
@@ -48,17 +51,26 @@ class Conversion:
     camera: Camera
     max_px: float
     rms_px: float
+    outside_px: float
     covered: float
     reach_rad: float
 
 
-def convert_camera(camera: Camera, model: str, *, order: int | None = None, fixed: Sequence[str] = ()) -> Conversion:
+def convert_camera(
+    camera: Camera,
+    model: str,
+    *,
+    order: int | None = None,
+    fixed: Sequence[str] = (),
+    outline: Pixels | None = None,
+) -> Conversion:
     """Return the camera of `model` nearest to `camera` over its image, in the same frame: poses stay as they are.
 
     Parameters
     ----------
     order : Brown's number of terms or Scaramuzza's degree, as in `Camera.from_radial_curve`.
     fixed : names of parameters that keep the values of the start, which has no tangential terms and no skew.
+    outline : (N, 2) convex, of the part of the image where the camera is known, which then counts; None: all of it.
 
     Raises
     ------
@@ -72,6 +84,10 @@ def convert_camera(camera: Camera, model: str, *, order: int | None = None, fixe
         raise InputError("camera conversion: the source sees next to nothing of its own image; calibrate it again")
     theta = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
     centre, _ = camera.project(np.array([0.0, 0.0, 1.0]))
+    inside = np.ones(len(pixels), dtype=bool) if outline is None else _inside(outline, pixels)
+    if not inside.any():
+        raise InputError("camera conversion: nothing was seen where the camera looks; calibrate it again")
+    weight = np.where(inside, 1.0, OUTSIDE_WEIGHT)
     found: Conversion | None = None
     for limit in LIMITS_RAD:
         near = theta <= limit
@@ -79,16 +95,29 @@ def convert_camera(camera: Camera, model: str, *, order: int | None = None, fixe
             continue
         try:
             fitted = fit_camera(
-                camera_model(model), camera.size_px, rays[near], pixels[near], centre, order=order, fixed=fixed
+                camera_model(model),
+                camera.size_px,
+                rays[near],
+                pixels[near],
+                centre,
+                order=order,
+                fixed=fixed,
+                weight=weight[near],
             )
         except InputError as error:
             if not isinstance(error, _NoStart):
                 raise
             continue
         projected, seen = fitted.project(rays[near])
-        error_px = np.linalg.norm((projected - pixels[near])[seen], axis=-1)
+        error_px = np.linalg.norm(projected - pixels[near], axis=-1)
+        known, other = error_px[seen & inside[near]], error_px[seen & ~inside[near]]
         trial = Conversion(
-            fitted, float(error_px.max()), float(np.sqrt(np.mean(error_px**2))), seen.sum() / near.size, float(limit)
+            fitted,
+            float(known.max(initial=0.0)),
+            float(np.sqrt(np.mean(known**2))) if known.size else 0.0,
+            float(other.max(initial=0.0)),
+            seen.sum() / near.size,
+            float(limit),
         )
         if found is None or trial.max_px < found.max_px:
             found = trial
@@ -112,25 +141,39 @@ def fit_camera(
     *,
     order: int | None = None,
     fixed: Sequence[str] = (),
+    weight: FloatArray | None = None,
 ) -> Camera:
     """Return the camera of `model` that projects `rays` (N, 3) nearest to `pixels` (N, 2), by least squares.
 
-    Started from the radial curve around `centre_px`. Rays that the model cannot see are left out.
-    Raises InputError where the model has no start for this lens.
+    Started from the radial curve around `centre_px`. Rays that the model cannot see are left out; `weight` (N,) is that
+    of each error, None: all count alike. Raises InputError where the model has no start for this lens.
     """
     theta = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
-    return refit_camera(_start(model, size_px, theta, pixels, centre_px, order), rays, pixels, fixed=fixed)
+    start = _start(model, size_px, theta, pixels, centre_px, order)
+    return refit_camera(start, rays, pixels, fixed=fixed, weight=weight)
 
 
-def refit_camera(start: Camera, rays: Rays, pixels: Pixels, *, fixed: Sequence[str] = ()) -> Camera:
+def refit_camera(
+    start: Camera, rays: Rays, pixels: Pixels, *, fixed: Sequence[str] = (), weight: FloatArray | None = None
+) -> Camera:
     """Return `start` with the parameters, but for those `fixed`, that project `rays` (N, 3) nearest to `pixels` (N, 2).
 
-    Rays that the start cannot see, or only at the edge of its field of view, are left out.
+    Rays that the start cannot see, or only at the edge of its field of view, are left out; `weight` (N,) is that of
+    each error, None: all count alike.
     """
+    weight = np.ones(len(rays)) if weight is None else weight
     theta = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
     used = theta < INSIDE * start.max_angle_rad
     used[used] &= start.project(rays[used])[1]
-    return _descend(start, rays[used], pixels[used], _free(start, fixed))
+    return _descend(start, rays[used], pixels[used], weight[used], _free(start, fixed))
+
+
+def _inside(outline: Pixels, pixels: Pixels) -> BoolArray:
+    """Say which of `pixels` (..., 2) lie inside a convex `outline` (N, 2), in whichever sense it turns, (...,)."""
+    side = np.roll(outline, -1, axis=0) - outline
+    to = pixels[..., None, :] - outline
+    turn = side[:, 0] * to[..., 1] - side[:, 1] * to[..., 0]
+    return np.asarray((turn >= 0.0).all(axis=-1) | (turn <= 0.0).all(axis=-1))
 
 
 def _grid(camera: Camera) -> Pixels:
@@ -172,11 +215,12 @@ def _start(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Conversion(LinearisedProblem):
-    """A camera against rays and pixels, moved along the columns of `free` (P, F)."""
+    """A camera against rays and pixels, weighted (N,), moved along the columns of `free` (P, F)."""
 
     camera: Camera
     rays: Rays
     pixels: Pixels
+    weight: FloatArray
     free: FloatArray
     sum_of_squares: float
 
@@ -187,15 +231,16 @@ class _Conversion(LinearisedProblem):
 
     def step(self, damping: float) -> DenseStep | None:
         projected, _, _, d_pixels_d_parameters = self.camera.project_with_jacobians(self.rays)
-        jacobian = (d_pixels_d_parameters @ self.free).reshape(-1, self.free.shape[1])
-        return damped_step(jacobian, (projected - self.pixels).reshape(-1), damping)
+        jacobian = self.weight[:, None, None] * (d_pixels_d_parameters @ self.free)
+        residuals = self.weight[:, None] * (projected - self.pixels)
+        return damped_step(jacobian.reshape(-1, self.free.shape[1]), residuals.reshape(-1), damping)
 
 
-def _descend(camera: Camera, rays: Rays, pixels: Pixels, free: FloatArray) -> Camera:
+def _descend(camera: Camera, rays: Rays, pixels: Pixels, weight: FloatArray, free: FloatArray) -> Camera:
     """Return the camera after a damped descent of the projection error over the free directions."""
 
     def linearise(state: Camera) -> _Conversion:
-        return _Conversion(state, rays, pixels, free, _cost(state, rays, pixels))
+        return _Conversion(state, rays, pixels, weight, free, _cost(state, rays, pixels, weight))
 
     def moved(state: Camera, step: DenseStep) -> Camera | None:
         change = free @ step.change
@@ -210,7 +255,7 @@ def _descend(camera: Camera, rays: Rays, pixels: Pixels, free: FloatArray) -> Ca
     return minimise(camera, linearise, moved, CONVERT_DAMPING, stop).state
 
 
-def _cost(camera: Camera, rays: Rays, pixels: Pixels) -> float:
-    """Sum of squared projection errors, infinite where a ray is not seen."""
+def _cost(camera: Camera, rays: Rays, pixels: Pixels, weight: FloatArray) -> float:
+    """Sum of squared weighted projection errors, infinite where a ray is not seen."""
     projected, valid = camera.project(rays)
-    return float(np.sum((projected - pixels) ** 2)) if valid.all() else float("inf")
+    return float(np.sum((weight[:, None] * (projected - pixels)) ** 2)) if valid.all() else float("inf")

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import FloatArray, Pixels
 from rigkit.core.errors import InputError
 from rigkit.interop.colmap import HALF_PIXEL
 from rigkit.interop.exchange import Accepted, Written, best_accepted, camera_of, image_size
@@ -43,11 +43,16 @@ LAYOUTS: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 
 
-def write_colmap_cameras(cameras: Mapping[int, Camera]) -> tuple[str, dict[int, Written]]:
-    """Return cameras.txt of cameras by COLMAP's id (from 1), and per camera what was lost (`text` is its line)."""
+def write_colmap_cameras(
+    cameras: Mapping[int, Camera], outlines: Mapping[int, Pixels] | None = None
+) -> tuple[str, dict[int, Written]]:
+    """Return cameras.txt of cameras by COLMAP's id (from 1), and per camera what was lost (`text` is its line).
+
+    `outlines`: by id, as for `best_accepted`.
+    """
     written: dict[int, Written] = {}
     for camera_id, camera in cameras.items():
-        chosen = best_accepted(camera, COLMAP_ACCEPTS, "COLMAP")
+        chosen = best_accepted(camera, COLMAP_ACCEPTS, "COLMAP", (outlines or {}).get(camera_id))
         c = chosen.camera
         name = {"pinhole": "PINHOLE", "kannala_brandt": "OPENCV_FISHEYE", "eucm": "EUCM"}.get(c.model)
         if name is None:

@@ -9,13 +9,15 @@ from typing import Any
 import numpy as np
 
 from rigkit.cameras.base import MAX_SIDE_PX, Camera
-from rigkit.cameras.convert import convert_camera
+from rigkit.cameras.convert import OUTSIDE_WEIGHT, convert_camera
 from rigkit.cameras.plausible import fault_of_lens
 from rigkit.cameras.registry import camera_model
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import FloatArray, Pixels
 from rigkit.core.errors import InputError
 
 MM_PER_M = 1000.0
+WORTH_A_WORD_PX = 0.1
+"""Where a refit is off by more, what would lose nothing is said."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -44,8 +46,8 @@ class Written:
     ----------
     text : the file.
     camera : the camera as the file describes it.
-    max_error_px, rms_error_px : its projection against the camera given, over the part of the image it covers; 0 where
-        the format has the model.
+    max_error_px, rms_error_px : its projection against the camera given, over the part of the image it covers, inside
+        the outline of what was seen where that is known; 0 where the format has the model.
     covered : that part, as a share of the image.
     note : in words, what a user of the file should know; empty where nothing was lost.
     """
@@ -73,35 +75,45 @@ class Chosen:
         return Written(text, self.camera, self.max_error_px, self.rms_error_px, self.covered, self.note)
 
 
-def best_accepted(camera: Camera, accepted: Sequence[Accepted], format_name: str) -> Chosen:
+def best_accepted(
+    camera: Camera, accepted: Sequence[Accepted], format_name: str, outline: Pixels | None = None
+) -> Chosen:
     """Return the camera itself where the format has its model, else the nearest of those that it has.
 
-    Nearest: the one that covers most of the image, then the one with the smallest largest error.
+    Nearest: the one that covers most of the image, then the one with the smallest largest error inside the `outline`
+    (N, 2) of what was seen, convex; None: over all of it. Outside, where the camera given is but extrapolated, errors
+    count by OUTSIDE_WEIGHT.
     Raises InputError where none can follow the lens.
     """
     for same in (camera, *_without_zero_terms(camera)):
         for kind in accepted:
             if kind.holds(same):
                 return Chosen(same, kind)
-    found: list[Chosen] = []
+    found: list[tuple[float, Chosen]] = []
     for kind in accepted:
         try:
-            c = convert_camera(camera, kind.model, order=kind.order, fixed=kind.zero)
+            c = convert_camera(camera, kind.model, order=kind.order, fixed=kind.zero, outline=outline)
         except InputError:
             continue
         fewer = any(k.model == camera.model for k in accepted)
         lacks = f"{camera.model} model" + (" with these terms" if fewer else "")
-        note = f"{format_name} has no {lacks}: refitted as {kind.model}, off by {c.max_px:.3g} px at most"
+        note = f"{format_name} has no {lacks}: refitted as {kind.model}, off by {c.max_px:.2g} px at most"
+        if outline is not None:
+            note += f" where boards were and {c.outside_px:.2g} px elsewhere"
         if c.covered < 1.0:
             reach = min(np.degrees(c.reach_rad), np.degrees(c.camera.max_angle_rad))
             note += f" within {reach:.0f} degrees of the axis ({100.0 * c.covered:.0f} % of the image); wrong beyond"
-        found.append(Chosen(c.camera, kind, c.max_px, c.rms_px, c.covered, note))
+        if c.max_px > WORTH_A_WORD_PX:
+            degree = "" if kind.model != camera.model else f" and degree = {kind.order}"
+            note += f'; with model = "{kind.model}"{degree} in the session nothing is lost'
+        cost = max(c.max_px, OUTSIDE_WEIGHT * c.outside_px)
+        found.append((cost, Chosen(c.camera, kind, c.max_px, c.rms_px, c.covered, note)))
     if not found:
         raise InputError(
             f"{format_name}: none of its models can follow this {camera.model} camera; choose another format"
         )
-    widest = max(c.covered for c in found)
-    return min((c for c in found if c.covered >= widest - 0.01), key=lambda c: c.max_error_px)
+    widest = max(c.covered for _, c in found)
+    return min((entry for entry in found if entry[1].covered >= widest - 0.01), key=lambda entry: entry[0])[1]
 
 
 def _without_zero_terms(camera: Camera) -> list[Camera]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import FloatArray, Pixels
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.interop.exchange import (
@@ -46,12 +46,17 @@ class KalibrChain:
     cameras: tuple[Written, ...]
 
 
-def write_kalibr(cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3] | None = None) -> KalibrChain:
+def write_kalibr(
+    cameras: Sequence[Camera],
+    cam_from_rig: Sequence[Rigid3] | None = None,
+    outlines: Sequence[Pixels | None] | None = None,
+) -> KalibrChain:
     """Return the cameras as a camchain.
 
     Parameters
     ----------
     cam_from_rig : one pose a camera, in mm; needed for more than one camera.
+    outlines : one a camera, as for `best_accepted`; None: not known.
 
     Raises InputError where poses are missing, or Kalibr has no model that follows a lens.
     """
@@ -61,7 +66,7 @@ def write_kalibr(cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3] | Non
         raise InputError(f"camchain: {len(cameras)} cameras, but {len(cam_from_rig)} poses")
     parts = []
     for i, camera in enumerate(cameras):
-        chosen = best_accepted(camera, KALIBR_ACCEPTS, "Kalibr")
+        chosen = best_accepted(camera, KALIBR_ACCEPTS, "Kalibr", None if outlines is None else outlines[i])
         model, intrinsics, distortion_model, distortion = _described(chosen.camera)
         lines = [f"cam{i}:"]
         if i and cam_from_rig is not None:

@@ -48,8 +48,9 @@ CLOSE_ENOUGH_PX = 0.1
 """A parametric model that is off by less is preferred to the spline: other programs can read it."""
 
 
-def write_cameramodel(camera: Camera, cam_from_ref: Rigid3 | None = None) -> Written:
-    """Return the camera as a .cameramodel file; `cam_from_ref` is its pose, by default the identity."""
+def write_cameramodel(camera: Camera, cam_from_ref: Rigid3 | None = None, *, outline: Pixels | None = None) -> Written:
+    """Return the camera as a .cameramodel file; `cam_from_ref` is its pose, by default the identity; `outline` (N, 2)
+    of what was seen is its valid-intrinsics region."""
     pose = Rigid3.identity() if cam_from_ref is None else cam_from_ref
     try:
         chosen = best_accepted(camera, MRCAL_ACCEPTS, "mrcal")
@@ -58,13 +59,13 @@ def write_cameramodel(camera: Camera, cam_from_ref: Rigid3 | None = None) -> Wri
     if chosen is not None and chosen.covered == 1.0 and chosen.max_error_px < CLOSE_ENOUGH_PX:
         p = chosen.camera.parameters
         lens = {4: "PINHOLE", 8: "OPENCV4", 9: "OPENCV5", 12: "OPENCV8"}[p.size]
-        return chosen.written(_text(f"LENSMODEL_{lens}", p, camera.size_px, pose))
+        return chosen.written(_text(f"LENSMODEL_{lens}", p, camera.size_px, pose, outline))
     lens, intrinsics = _spline_of(camera)
     pixels, rays = _samples(camera, CHECK_GRID)
     projected, inside = _spline_project(rays, lens, intrinsics)
     error = np.linalg.norm(projected - pixels, axis=-1)[inside]
     note = f"written as a spline of {(intrinsics.size - 4) // 2} knots, off by {error.max():.2g} px at most"
-    text = _text(lens, intrinsics, camera.size_px, pose)
+    text = _text(lens, intrinsics, camera.size_px, pose, outline)
     return Written(text, camera, float(error.max()), float(np.sqrt(np.mean(error**2))), float(inside.mean()), note)
 
 
@@ -104,8 +105,12 @@ def read_cameramodel(
     return camera, pose, error_px
 
 
-def _text(lens: str, intrinsics: FloatArray, size_px: tuple[int, int], pose: Rigid3) -> str:
+def _text(lens: str, intrinsics: FloatArray, size_px: tuple[int, int], pose: Rigid3, outline: Pixels | None) -> str:
     rt = [*log_so3(pose.rotation).tolist(), *(pose.translation_mm / MM_PER_M).tolist()]
+    region = ""
+    if outline is not None:
+        closed = ", ".join(f"[ {x:.1f}, {y:.1f} ]" for x, y in [*outline, outline[0]])
+        region = f"\n    # where boards were seen\n    'valid_intrinsics_region': [ {closed},],\n"
     return (
         "# lengths in metres, pixels with (0, 0) at the centre of the top-left one\n"
         "{\n"
@@ -114,7 +119,7 @@ def _text(lens: str, intrinsics: FloatArray, size_px: tuple[int, int], pose: Rig
         "    # rotation vector and translation of the camera against the reference\n"
         f"    'extrinsics': [ {', '.join(repr(float(v)) for v in rt)},],\n\n"
         f"    'imagersize': [ {size_px[0]}, {size_px[1]},],\n"
-        "}\n"
+        f"{region}}}\n"
     )
 
 

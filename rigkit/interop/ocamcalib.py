@@ -14,7 +14,7 @@ import numpy as np
 
 from rigkit.cameras.base import Camera
 from rigkit.cameras.scaramuzza import DEGREES, Scaramuzza
-from rigkit.core.arrays import FloatArray, Mat3
+from rigkit.core.arrays import FloatArray, Mat3, Pixels
 from rigkit.core.errors import InputError
 from rigkit.interop.exchange import Accepted, Chosen, Written, best_accepted, camera_of, image_size, numbers
 
@@ -33,12 +33,12 @@ TITLES = (
 )
 
 
-def write_ocamcalib(camera: Camera) -> Written:
-    """Return the camera as calib_results.txt.
+def write_ocamcalib(camera: Camera, outline: Pixels | None = None) -> Written:
+    """Return the camera as calib_results.txt; `outline`: as for `best_accepted`.
 
     The note says how well their inverse polynomial follows, which only their world2cam uses.
     """
-    chosen = _scaramuzza(camera)
+    chosen = _scaramuzza(camera, outline)
     c = chosen.camera
     polynomial = np.insert(c.parameters[:-4], 1, 0.0)
     cx, cy, stretch, shear = c.parameters[-4:]
@@ -130,11 +130,11 @@ def _from_ocam(
     return cast(Scaramuzza, camera_of("scaramuzza", size_px, parameters, name)), cam_from_ocam
 
 
-def _scaramuzza(camera: Camera) -> Chosen:
+def _scaramuzza(camera: Camera, outline: Pixels | None) -> Chosen:
     """Return the camera itself, or the refit of the lowest degree that follows it."""
     best: Chosen | None = None
     for degree in (4, 6, 8, 10):
-        chosen = best_accepted(camera, (Accepted("scaramuzza", degree),), "OCamCalib")
+        chosen = best_accepted(camera, (Accepted("scaramuzza", degree),), "OCamCalib", outline)
         if best is None or chosen.max_error_px < 0.5 * best.max_error_px:
             best = chosen
         if best.max_error_px <= ENOUGH_PX:

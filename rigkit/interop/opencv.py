@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray, Mat3
+from rigkit.core.arrays import FloatArray, Mat3, Pixels
 from rigkit.core.errors import InputError
 from rigkit.interop.exchange import (
     Accepted,
@@ -35,9 +35,9 @@ OPENCV_ACCEPTS = (
 )
 
 
-def write_opencv(camera: Camera) -> Written:
-    """Return the camera as OpenCV's YAML; `cv2.FileStorage` reads it."""
-    chosen = best_accepted(camera, OPENCV_ACCEPTS, "OpenCV")
+def write_opencv(camera: Camera, outline: Pixels | None = None) -> Written:
+    """Return the camera as OpenCV's YAML; `cv2.FileStorage` reads it. `outline`: as for `best_accepted`."""
+    chosen = best_accepted(camera, OPENCV_ACCEPTS, "OpenCV", outline)
     c = chosen.camera
     extra = "fisheye_model: 1\n" if c.model == "kannala_brandt" else ""
     if c.model == "ucm":

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray, Mat3
+from rigkit.core.arrays import FloatArray, Mat3, Pixels
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
@@ -50,16 +50,19 @@ class OpenCVStereo:
     text: str
 
 
-def opencv_stereo(camera1: Camera, camera2: Camera, cam2_from_cam1: Rigid3) -> OpenCVStereo:
+def opencv_stereo(
+    camera1: Camera, camera2: Camera, cam2_from_cam1: Rigid3, outlines: Sequence[Pixels | None] = (None, None)
+) -> OpenCVStereo:
     """Return the pair with OpenCV's own rectification (cv2.stereoRectify, cv2.fisheye.stereoRectify).
 
+    `outlines`: one a camera, as for `best_accepted`.
     Raises InputError where the images differ in size, which OpenCV's rectification does not take, or no family of
     OpenCV's models follows both lenses.
     """
     if camera1.size_px != camera2.size_px:
         sizes = " and ".join(f"{width}x{height}" for width, height in (camera1.size_px, camera2.size_px))
         raise InputError(f"OpenCV stereo: images of {sizes} px are not rectified together; take another format")
-    chosen, fisheye = _family(camera1, camera2)
+    chosen, fisheye = _family(camera1, camera2, outlines)
     (K1, D1), (K2, D2) = (opencv_arrays(one.camera) for one in chosen)
     R, T = cam2_from_cam1.rotation, cam2_from_cam1.translation_mm
     R1, R2, P1, P2, Q = _rectified((K1, D1, K2, D2), camera1.size_px, R, T.reshape(3, 1), fisheye=fisheye)
@@ -94,12 +97,15 @@ def read_opencv_stereo(text: str, name: str = "OpenCV stereo") -> tuple[tuple[Ca
         raise InputError(f"'{name}': R is no rotation; is the file whole?") from error
 
 
-def _family(camera1: Camera, camera2: Camera) -> tuple[tuple[Chosen, Chosen], bool]:
+def _family(camera1: Camera, camera2: Camera, outlines: Sequence[Pixels | None]) -> tuple[tuple[Chosen, Chosen], bool]:
     """Return both cameras in that family of models that covers more of them, then follows them better."""
     found = []
     for fisheye, accepted in enumerate(FAMILIES):
         try:
-            pair = (best_accepted(camera1, accepted, "OpenCV"), best_accepted(camera2, accepted, "OpenCV"))
+            pair = (
+                best_accepted(camera1, accepted, "OpenCV", outlines[0]),
+                best_accepted(camera2, accepted, "OpenCV", outlines[1]),
+            )
         except InputError:
             continue
         missed = 1.0 - min(one.covered for one in pair)

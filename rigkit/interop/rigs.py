@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from rigkit.cameras.base import Camera
+from rigkit.core.arrays import Pixels
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.interop.colmap_cameras import write_colmap_cameras
@@ -20,6 +21,8 @@ from rigkit.interop.ros import write_camera_info
 
 Rig = Mapping[str, tuple[Camera, Rigid3]]
 """Camera and cam_from_rig (mm) by name."""
+Outlines = Mapping[str, Pixels]
+"""Of what cameras saw, by name: see `best_accepted`."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -42,7 +45,7 @@ class ForeignRig:
 class RigFormat:
     """How a format is written, whether it has a file a camera, and whether it has two cameras only."""
 
-    write: Callable[[Rig], ForeignRig]
+    write: Callable[[Rig, Outlines], ForeignRig]
     per_camera: bool = False
     stereo_only: bool = False
 
@@ -51,19 +54,20 @@ class RigFormat:
         return list(names) if self.per_camera else [""]
 
 
-def write_rig(rig: Rig, kind: str) -> ForeignRig:
-    """Return the rig in the format `kind`, one of RIG_FORMATS.
+def write_rig(rig: Rig, kind: str, outlines: Outlines | None = None) -> ForeignRig:
+    """Return the rig in the format `kind`, one of RIG_FORMATS; `outlines` of what each camera saw, where it is known.
 
     Raises InputError for another format, a rig of other than two cameras where the format has stereo pairs only, and
     lenses that no model of the format follows.
     """
     if kind not in RIG_FORMATS:
         raise InputError(f"'{kind}' has no rigs; known are {', '.join(RIG_FORMATS)}; or export the cameras one by one")
-    return RIG_FORMATS[kind].write(rig)
+    return RIG_FORMATS[kind].write(rig, outlines or {})
 
 
-def _kalibr(rig: Rig) -> ForeignRig:
-    chain = write_kalibr([camera for camera, _ in rig.values()], [pose for _, pose in rig.values()])
+def _kalibr(rig: Rig, outlines: Outlines) -> ForeignRig:
+    cameras, poses = zip(*rig.values(), strict=True)
+    chain = write_kalibr(cameras, poses, [outlines.get(name) for name in rig])
     notes = [
         f"cam{k} is '{name}'" + (f"; {one.note}" if one.note else "")
         for k, (name, one) in enumerate(zip(rig, chain.cameras, strict=True))
@@ -71,25 +75,27 @@ def _kalibr(rig: Rig) -> ForeignRig:
     return ForeignRig({"": chain.text}, max(one.max_error_px for one in chain.cameras), tuple(notes))
 
 
-def _mrcal(rig: Rig) -> ForeignRig:
-    written = {name: write_cameramodel(camera, pose) for name, (camera, pose) in rig.items()}
+def _mrcal(rig: Rig, outlines: Outlines) -> ForeignRig:
+    written = {
+        name: write_cameramodel(camera, pose, outline=outlines.get(name)) for name, (camera, pose) in rig.items()
+    }
     notes = tuple(f"'{name}': {one.note}" for name, one in written.items() if one.note)
     return ForeignRig(
         {name: one.text for name, one in written.items()}, max(one.max_error_px for one in written.values()), notes
     )
 
 
-def _opencv(rig: Rig) -> ForeignRig:
+def _opencv(rig: Rig, outlines: Outlines) -> ForeignRig:
     (one, (camera1, pose1)), (two, (camera2, pose2)) = _two(rig, "OpenCV")
-    stereo = opencv_stereo(camera1, camera2, pose2 @ pose1.inverse())
+    stereo = opencv_stereo(camera1, camera2, pose2 @ pose1.inverse(), (outlines.get(one), outlines.get(two)))
     notes = [f"1 is '{one}', 2 is '{two}'; lengths in mm"]
     notes += [f"'{name}': {c.note}" for name, c in zip(rig, stereo.cameras, strict=True) if c.note]
     return ForeignRig({"": stereo.text}, max(c.max_error_px for c in stereo.cameras), tuple(notes))
 
 
-def _ros(rig: Rig) -> ForeignRig:
+def _ros(rig: Rig, outlines: Outlines) -> ForeignRig:
     (one, (camera1, pose1)), (two, (camera2, pose2)) = _two(rig, "ROS")
-    stereo = opencv_stereo(camera1, camera2, pose2 @ pose1.inverse())
+    stereo = opencv_stereo(camera1, camera2, pose2 @ pose1.inverse(), (outlines.get(one), outlines.get(two)))
     P2 = stereo.P2.copy()
     P2[:, 3] /= MM_PER_M
     views = {one: (stereo.R1, stereo.P1), two: (stereo.R2, P2)}
@@ -102,9 +108,11 @@ def _ros(rig: Rig) -> ForeignRig:
     return ForeignRig(files, max(c.max_error_px for c in stereo.cameras), tuple(notes))
 
 
-def _colmap(rig: Rig) -> ForeignRig:
+def _colmap(rig: Rig, outlines: Outlines) -> ForeignRig:
     """Return COLMAP's rig_config.json; the first camera is the rig's reference, images lie in a folder a camera."""
-    _, written = write_colmap_cameras({k: camera for k, (camera, _) in enumerate(rig.values(), start=1)})
+    ids = {name: k for k, name in enumerate(rig, start=1)}
+    seen = {ids[name]: outline for name, outline in outlines.items() if name in ids}
+    _, written = write_colmap_cameras({ids[name]: camera for name, (camera, _) in rig.items()}, seen)
     reference = next(iter(rig.values()))[1]
     cameras: list[dict[str, object]] = []
     for (name, (_, pose)), line in zip(rig.items(), written.values(), strict=True):

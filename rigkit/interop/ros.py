@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray, Mat3
+from rigkit.core.arrays import FloatArray, Mat3, Pixels
 from rigkit.core.errors import InputError
 from rigkit.interop.exchange import Accepted, Written, best_accepted, camera_of, field, image_size, numbers
 from rigkit.interop.yaml_text import flow, parse_yaml
@@ -28,16 +28,21 @@ ROS_ACCEPTS = (
 
 
 def write_camera_info(
-    camera: Camera, camera_name: str = "camera", *, rectification: Rectification | None = None
+    camera: Camera,
+    camera_name: str = "camera",
+    *,
+    rectification: Rectification | None = None,
+    outline: Pixels | None = None,
 ) -> Written:
     """Return the camera as a camera_info YAML file called `camera_name` inside.
 
-    `rectification` is that of a camera of a stereo pair; by default the camera stands alone. Raises InputError for
+    `rectification` is that of a camera of a stereo pair; by default the camera stands alone. `outline`: as for
+    `best_accepted`. Raises InputError for
     a name that ROS does not take.
     """
     if not camera_name or not camera_name.replace("_", "").isalnum():
         raise InputError(f"camera_info: name '{camera_name}'; ROS takes letters, digits and underscores")
-    chosen = best_accepted(camera, ROS_ACCEPTS, "ROS")
+    chosen = best_accepted(camera, ROS_ACCEPTS, "ROS", outline)
     c = chosen.camera
     p = c.parameters
     fx, fy, cx, cy = p[:4].tolist()

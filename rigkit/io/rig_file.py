@@ -5,16 +5,17 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+from rigkit.calibration.coverage import outline_of_corners
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray, as_covariance
+from rigkit.core.arrays import FloatArray, Pixels, as_array, as_covariance
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier
@@ -37,7 +38,8 @@ class SavedRig:
     cameras but the first, and the corners' sigma; None in a file that does not say (another tool's rig). `scale_sigma`
     is how well all lengths are known from the boards' squares, relative; 0 where nobody stated it. `freedom` are the
     degrees of freedom of the covariance, `overdispersion` is by how much more frames disagree than corners; `boards`
-    are those it was calibrated with, none in a file that does not say."""
+    are those it was calibrated with, none in a file that does not say; `outlines` by name are convex, (N, 2) px, around
+    all corners that a camera saw, of those of which the file says it."""
 
     cameras: dict[str, tuple[Camera, Rigid3]]
     covariance: FloatArray | None
@@ -46,6 +48,7 @@ class SavedRig:
     freedom: float = math.inf
     overdispersion: float = 1.0
     boards: tuple[Board, ...] = ()
+    outlines: Mapping[str, Pixels] = field(default_factory=dict)
 
 
 def rig_text(rig: RigCalibration, made: Made | None = None) -> str:
@@ -68,6 +71,7 @@ def rig_text(rig: RigCalibration, made: Made | None = None) -> str:
                 "camera": camera_to_json(c.camera),
                 "cam_from_rig": c.cam_from_rig.matrix()[:3].tolist(),
                 "rms_px": c.rms_px,
+                "outline_px": outline_of_corners(c.calibration).round(1).tolist(),
             }
             for c in rig.cameras
         ],
@@ -95,9 +99,10 @@ def load_saved_rig(path: str | Path) -> SavedRig:
     """
     data = _read(path, RIG_SCHEMA, RIG_KEYS)
     cameras: dict[str, tuple[Camera, Rigid3]] = {}
+    outlines: dict[str, Pixels] = {}
     with damage_named(path):
         for entry in data["cameras"]:
-            if set(entry) != RIG_CAMERA_KEYS:
+            if set(entry) | {"outline_px"} != RIG_CAMERA_KEYS:
                 raise InputError(
                     f"'{path}': a camera must have the keys {', '.join(sorted(RIG_CAMERA_KEYS))}, no others"
                 )
@@ -106,6 +111,8 @@ def load_saved_rig(path: str | Path) -> SavedRig:
             if name in cameras:
                 raise InputError(f"'{path}': two cameras are called '{name}'; calibrate again")
             cameras[name] = (camera, Rigid3.from_matrix(reals(entry["cam_from_rig"])))
+            if "outline_px" in entry:
+                outlines[name] = as_array(reals(entry["outline_px"]), (None, 2), "outline_px")
         if not cameras:
             raise InputError(f"'{path}': no camera in it; calibrate again")
         size = sum(camera.parameters.size for camera, _ in cameras.values()) + 6 * (len(cameras) - 1)
@@ -125,6 +132,7 @@ def load_saved_rig(path: str | Path) -> SavedRig:
         freedom=freedom,
         overdispersion=overdispersion,
         boards=boards,
+        outlines=outlines,
     )
 
 

@@ -116,6 +116,7 @@ RIG_FILE = file(
                 "camera": said(_CAMERA, "as all cameras together have it"),
                 "cam_from_rig": _POSE,
                 "rms_px": said(NUMBER, "training error in the rig"),
+                "outline_px?": said(matrix(columns=2), "convex, around all corners that it saw"),
             },
             "the first is the rig's frame",
             least=1,

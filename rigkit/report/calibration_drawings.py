@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from html import escape
 
-import cv2
 import numpy as np
 
+from rigkit.calibration.coverage import outline_of_corners
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import projection_uncertainty, uncertainty_map
 from rigkit.core.arrays import FloatArray, Pixels
@@ -140,12 +140,10 @@ def uncertainty_svg(calibration: Calibration) -> str:
     words = f"{best:.3g} px at best, {worst:.3g} px at worst (a point at infinity, worst direction)"
     out = [_open(calibration, "projection uncertainty, px"), '<g shape-rendering="crispEdges">']
     for j, i in np.argwhere(known):
-        place = f'x="{i * w:.1f}" y="{j * h:.1f}" width="{w:.1f}" height="{h:.1f}"'
+        place = f'x="{i * w:.1f}" y="{j * h:.1f}" width="{w + 0.2:.1f}" height="{h + 0.2:.1f}"'
         out.append(f'<rect {place} fill="{_colour(float(level[j, i]))}"/>')
     out += ["</g>", _contours(grid.worst_px, w, h), _colour_bar(zoom * height + 7.0, low, high)]
-    pixels, _, kept = _corners(calibration)
-    hull = cv2.convexHull(pixels[kept].astype(np.float32))[:, 0]
-    outline = " ".join(f"{x:.1f},{y:.1f}" for x, y in zoom * hull)
+    outline = " ".join(f"{x:.1f},{y:.1f}" for x, y in zoom * outline_of_corners(calibration))
     out.append(f'<polygon points="{outline}" fill="none" stroke="#fff" stroke-width="1.5" stroke-dasharray="6 4"/>')
     out += _numbers(calibration)
     return "".join([*out, _foot(calibration, words, "dashed: around all corners that were seen")])

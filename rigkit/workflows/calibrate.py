@@ -93,7 +93,7 @@ def calibrate_session(
     files: dict[Path, str] = {}
     if options.output is not None:
         files[options.output] = calibration_text(calibration, made(session.path, {"": session.images}))
-        files |= foreign_files(calibration.camera, options.output, options.exports)
+        files |= foreign_files(calibration, options.output, options.exports)
     if options.report is not None:
         files[options.report] = session_page(session, calibration, corners, files)
     if files:

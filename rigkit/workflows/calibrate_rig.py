@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from rigkit.calibration.coverage import outline_of_corners
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.board_ties import suggest_ties
 from rigkit.calibration.rig.calibrate import calibrate_rig
@@ -89,11 +90,12 @@ def calibrate_rig_session(
         if len(session.cameras) > 1:
             files[options.output] = rig_text(rig, origin)
             mounted = {c.name: (c.camera, c.cam_from_rig) for c in rig.cameras}
-            files |= foreign_rig_files(mounted, options.output, options.exports)
+            outlines = {c.name: outline_of_corners(c.calibration) for c in rig.cameras}
+            files |= foreign_rig_files(mounted, options.output, options.exports, outlines)
         for camera in rig.cameras:
             own = _beside(session, options.output, camera.name)
             files[own] = calibration_text(judged(camera.calibration), origin)
-            files |= foreign_files(camera.camera, own, _of_cameras(session, options))
+            files |= foreign_files(camera.calibration, own, _of_cameras(session, options))
         if session.rigid_boards:
             files[_boards_file(options.output)] = board_rigs_text(rig.board_rigs)
     if options.report is not None:

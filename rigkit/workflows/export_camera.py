@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from rigkit.calibration.coverage import outline_of_corners
+from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
+from rigkit.core.arrays import Pixels
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 from rigkit.interop.colmap_cameras import write_colmap_cameras
+from rigkit.interop.exchange import Written
 from rigkit.interop.kalibr import write_kalibr
 from rigkit.interop.mrcal import write_cameramodel
 from rigkit.interop.ocamcalib import write_ocamcalib
 from rigkit.interop.opencv import write_opencv
-from rigkit.interop.rigs import RIG_FORMATS, Rig, write_rig
+from rigkit.interop.rigs import RIG_FORMATS, Outlines, Rig, write_rig
 from rigkit.interop.ros import write_camera_info
-from rigkit.io.calibration_file import save_camera
+from rigkit.io.calibration_file import is_calibration, load_calibration, save_camera
 from rigkit.io.files import ensure_writable, write_atomic, write_together
 from rigkit.io.reading import about
-from rigkit.workflows.camera_files import import_camera, import_rig
+from rigkit.io.rig_file import is_rig_file, load_saved_rig
+from rigkit.workflows.camera_files import import_camera, import_rig, is_ours
 from rigkit.workflows.formats import CAMERA_FORMATS, FOREIGN_ENDINGS
 
 RIG_ENDINGS = {"colmap": ".json"}
@@ -82,7 +87,8 @@ def export_camera(source: str | Path, options: ExportCameraOptions) -> ExportedC
         save_camera(options.output, camera, force=options.force)
         return ExportedCamera(camera=camera, kind=kind, max_error_px=0.0)
     with about(source):
-        text, worst_px, words = _foreign(camera, kind)
+        outline = outline_of_corners(load_calibration(source)) if _is_calibration(source) else None
+        text, worst_px, words = _foreign(camera, kind, outline)
     write_atomic(options.output, text, force=options.force)
     if words:
         _log.info(words)
@@ -106,7 +112,8 @@ def export_rig(source: str | Path, options: ExportCameraOptions, names: Sequence
         )
     rig = {name: rig[name] for name in names or rig}
     with about(source):
-        foreign = write_rig(rig, kind)
+        outlines = load_saved_rig(source).outlines if is_rig_file(source) else {}
+        foreign = write_rig(rig, kind, outlines)
     files = {_of_camera(options.output, key): text for key, text in foreign.files.items()}
     ensure_writable(list(files), force=options.force, inputs=[source])
     write_together(dict(files), force=options.force)
@@ -115,16 +122,17 @@ def export_rig(source: str | Path, options: ExportCameraOptions, names: Sequence
     return ExportedRig(kind=kind, max_error_px=foreign.max_error_px, written=tuple(files))
 
 
-def foreign_rig_files(rig: Rig, beside: Path, kinds: Sequence[str]) -> dict[Path, str]:
+def foreign_rig_files(rig: Rig, beside: Path, kinds: Sequence[str], outlines: Outlines) -> dict[Path, str]:
     """Return the files (path -> content) of a rig in those of the formats that have rigs of so many cameras, named
-    after the rig's file `beside` which they lie; what a user of them should know goes to the log.
+    after the rig's file `beside` which they lie, with the `outlines` of what cameras saw; what a user of them should
+    know goes to the log.
 
     A format that cannot follow this rig is left out, which the log says: the calibration is not lost for it.
     """
     files: dict[Path, str] = {}
     for kind, places in foreign_rig_paths(list(rig), beside, kinds).items():
         try:
-            foreign = write_rig(rig, kind)
+            foreign = write_rig(rig, kind, outlines)
         except InputError as error:
             _log.warning(f"no {kind} file of the rig: {error}")
             continue
@@ -149,15 +157,16 @@ def _of_camera(path: Path, name: str) -> Path:
     return path.with_name(f"{path.stem}-{name}{path.suffix}") if name else path
 
 
-def foreign_files(camera: Camera, beside: Path, kinds: Sequence[str]) -> dict[Path, str]:
-    """Return the files (path -> content) of a camera in other tools' formats, named after the calibration `beside`
-    which they lie; what a user of them should know goes to the log.
+def foreign_files(calibration: Calibration, beside: Path, kinds: Sequence[str]) -> dict[Path, str]:
+    """Return the files (path -> content) of a camera in other tools' formats, named after its calibration's file
+    `beside` which they lie; what a user of them should know goes to the log.
 
     Raises InputError for a format that cannot follow the camera.
     """
     files = {}
+    outline = outline_of_corners(calibration) if kinds else None
     for kind, path in zip(kinds, foreign_paths(beside, kinds), strict=True):
-        files[path], _, words = _foreign(camera, kind)
+        files[path], _, words = _foreign(calibration.camera, kind, outline)
         if words:
             _log.info(f"{path}: {words}")
     return files
@@ -171,20 +180,24 @@ def foreign_paths(beside: Path, kinds: Sequence[str]) -> list[Path]:
     return [beside.with_name(f"{beside.stem}-{kind}{FOREIGN_ENDINGS[kind]}") for kind in kinds]
 
 
-def _foreign(camera: Camera, kind: str) -> tuple[str, float, str]:
-    """Return the file's text, its largest error in px, and what a user should know."""
+def _is_calibration(source: str | Path) -> bool:
+    return is_ours(source) and is_calibration(source)
+
+
+def _foreign(camera: Camera, kind: str, outline: Pixels | None) -> tuple[str, float, str]:
+    """Return the file's text, its largest error in px (inside the `outline`), and what a user should know."""
     if kind == "kalibr":
-        chain = write_kalibr([camera])
+        chain = write_kalibr([camera], outlines=[outline])
         one = chain.cameras[0]
         return chain.text, one.max_error_px, one.note
     if kind == "colmap":
-        text, lines = write_colmap_cameras({1: camera})
+        text, lines = write_colmap_cameras({1: camera}, {} if outline is None else {1: outline})
         return text, lines[1].max_error_px, lines[1].note
-    write = {
+    write: dict[str, Callable[..., Written]] = {
         "opencv": write_opencv,
         "ros": write_camera_info,
         "ocamcalib": write_ocamcalib,
         "mrcal": write_cameramodel,
-    }[kind]
-    done = write(camera)
+    }
+    done = write[kind](camera, outline=outline)
     return done.text, done.max_error_px, done.note
