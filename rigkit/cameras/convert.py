@@ -94,31 +94,13 @@ def convert_camera(
         if near.sum() < MIN_COVERED_SAMPLES or (found is not None and near.mean() == found.covered):
             continue
         try:
-            fitted = fit_camera(
-                camera_model(model),
-                camera.size_px,
-                rays[near],
-                pixels[near],
-                centre,
-                order=order,
-                fixed=fixed,
-                weight=weight[near],
-            )
+            start = _start(camera_model(model), camera.size_px, theta[near], pixels[near], centre, order)
+            fitted = refit_camera(start, rays[near], pixels[near], fixed=fixed, weight=weight[near])
         except InputError as error:
             if not isinstance(error, _NoStart):
                 raise
             continue
-        projected, seen = fitted.project(rays[near])
-        error_px = np.linalg.norm(projected - pixels[near], axis=-1)
-        known, other = error_px[seen & inside[near]], error_px[seen & ~inside[near]]
-        trial = Conversion(
-            fitted,
-            float(known.max(initial=0.0)),
-            float(np.sqrt(np.mean(known**2))) if known.size else 0.0,
-            float(other.max(initial=0.0)),
-            seen.sum() / near.size,
-            float(limit),
-        )
+        trial = _held_against(fitted, rays, pixels, near, inside, float(limit))
         if found is None or trial.max_px < found.max_px:
             found = trial
         if found.max_px < FOLLOWS_PX or fitted.max_angle_rad > np.pi / 2 or theta.max() < WIDE_RAD:
@@ -126,6 +108,21 @@ def convert_camera(
     if found is None:
         raise InputError(f"camera conversion: a {model} camera cannot follow this lens")
     return found
+
+
+def _held_against(
+    fitted: Camera, rays: Rays, pixels: Pixels, near: BoolArray, inside: BoolArray, limit_rad: float
+) -> Conversion:
+    """Return the conversion into `fitted`, its errors at the rays `near` the axis, those `inside` the outline apart."""
+    projected, seen = fitted.project(rays)
+    error_px = np.linalg.norm(projected - pixels, axis=-1)
+    seen &= near
+    known, other = error_px[seen & inside], error_px[seen & ~inside]
+    if not known.size:
+        known = other
+    rms = float(np.sqrt(np.mean(known**2)))
+    covered = seen.sum() / near.size
+    return Conversion(fitted, float(known.max()), rms, float(other.max(initial=0.0)), covered, limit_rad)
 
 
 class _NoStart(InputError):
@@ -141,16 +138,15 @@ def fit_camera(
     *,
     order: int | None = None,
     fixed: Sequence[str] = (),
-    weight: FloatArray | None = None,
 ) -> Camera:
     """Return the camera of `model` that projects `rays` (N, 3) nearest to `pixels` (N, 2), by least squares.
 
-    Started from the radial curve around `centre_px`. Rays that the model cannot see are left out; `weight` (N,) is that
-    of each error, None: all count alike. Raises InputError where the model has no start for this lens.
+    Started from the radial curve around `centre_px`. Rays that the model cannot see are left out.
+    Raises InputError where the model has no start for this lens.
     """
     theta = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
     start = _start(model, size_px, theta, pixels, centre_px, order)
-    return refit_camera(start, rays, pixels, fixed=fixed, weight=weight)
+    return refit_camera(start, rays, pixels, fixed=fixed)
 
 
 def refit_camera(
