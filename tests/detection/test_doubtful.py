@@ -21,6 +21,9 @@ from rigkit.workflows.detect import detect_in_images
 HONEST_RATIO = 1.6
 """Largest rms of errors over their sigmas of a board blurred by two fifths of a square: measured 0.9 to 1.3."""
 
+SMEARED_PX = 1.5
+"""Largest error of a corner smeared over 15 px; another place in the board is 30 px off."""
+
 
 def too_blurred() -> np.ndarray:
     image = read_image(shared_data("real/bouguet-stereo") / "left07.jpg")
@@ -71,3 +74,22 @@ def test_a_board_in_the_background_takes_no_name_from_one_that_is_sure(name: str
     (found,) = detect_boards(image, [Board("b", 9, 6, 30.0, 30.0)])
     assert found.board_id == "b"
     assert found.pixels[:, 0].min() > 100.0
+
+
+def smeared(image: np.ndarray) -> np.ndarray:
+    """Return what a camera sees that moves by 15 px, 30 degrees downwards, during the exposure."""
+    along = np.linspace(-7.5, 7.5, 301)
+    kernel = np.histogram2d(0.5 * along, np.sqrt(0.75) * along, bins=17, range=((-8.5, 8.5), (-8.5, 8.5)))[0]
+    return cv2.filter2D(image, -1, kernel / kernel.sum())
+
+
+@pytest.mark.parametrize("name", ["left10.jpg", "right05.jpg", "left02.jpg"])
+def test_a_row_that_motion_hides_is_found_on_its_side(name: str) -> None:
+    image = read_image(shared_data("real/bouguet-stereo") / name)
+    board = Board("b", 9, 6, 30.0, 30.0)
+    (sharp,) = detect_boards(image, [board])
+    (found,) = detect_boards(smeared(image), [board])
+    assert found.board_id == "b"
+    assert len(found.grid) >= 50
+    off = found.pixels - sharp.lattice()[found.grid[:, 1], found.grid[:, 0]]
+    assert np.abs(off).max() < SMEARED_PX
