@@ -296,8 +296,7 @@ def real(name: str, data: Path, cache: Path, draws: int) -> None:
     views = [view for own in found.values() for view in own[:1]]
     full = calibrate(views, size)
     camera = full.camera
-    degree = {"scaramuzza": camera.parameters.size - 5, "brown": 5}.get(camera.model)
-    how = (camera.model, degree if degree is None or degree in type(camera).orders else None, "auto")
+    how = (camera.model, camera.parameters.size - 4 if type(camera).orders else None, "auto")
     mask = covered_by_boards(full, grid_pixels(size, GRID))
     covered = grid_pixels(size, GRID)[mask]
 
