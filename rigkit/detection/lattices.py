@@ -15,6 +15,7 @@ from rigkit.detection.checks.evidence import MIN_EXPECTED_CORNERS, OF_EXPECTED_S
 from rigkit.detection.checks.validate import (
     compact,
     has_edge_offset,
+    known_part,
     large,
     sample_of,
     separate,
@@ -101,20 +102,20 @@ def _confirmed(
     more; their corners may be uncertain, and their sigmas say so. Beside boards that are sure such a lattice would be
     something else: a board in the background, or a mirror image.
     """
-    pairs = list(zip(boards, refined, strict=True))
-    sure = [trustworthy(after, before.count, min_corners) for before, after in pairs]
-    room = len(sizes) - sum(sure)
-    if room > 0:
-        asked = {frozenset(size) for size in sizes}
-        expected = [
-            k
-            for k, (before, after) in enumerate(pairs)
-            if not sure[k] and after.lattice.count >= MIN_EXPECTED_CORNERS and frozenset(after.lattice.size) in asked
-            if trustworthy(after, before.count, min_corners, OF_EXPECTED_SIZE)
-        ]
-        for k in sorted(expected, key=lambda k: -Evidence.of(pairs[k][1]).score)[:room]:
-            sure[k] = True
-    return [after for (_, after), taken in zip(pairs, sure, strict=True) if taken]
+    every = list(zip(boards, refined, strict=True))
+    sure = [after for before, after in every if trustworthy(after, before.count, min_corners)]
+    room = len(sizes) - len(sure)
+    if room <= 0:
+        return sure
+    rest = [(before.count, known_part(after, sizes)) for before, after in every if not any(after is s for s in sure)]
+    asked = {frozenset(size) for size in sizes}
+    likely = [
+        after
+        for before, after in rest
+        if after.lattice.count >= MIN_EXPECTED_CORNERS and frozenset(after.lattice.size) in asked
+        if trustworthy(after, min(before, after.lattice.known.size), min_corners, OF_EXPECTED_SIZE)
+    ]
+    return sure + sorted(likely, key=lambda item: -Evidence.of(item).score)[:room]
 
 
 def _promising(grey: GreyImage, finest: Level, lattice: Lattice) -> bool:
