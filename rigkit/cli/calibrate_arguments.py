@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rigkit.core.errors import InputError
 from rigkit.workflows.formats import FOREIGN_ENDINGS
 
 if TYPE_CHECKING:
@@ -56,7 +58,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     folders = parser.add_argument_group("folders", "the session used is kept as session.toml for the next time")
     folders.add_argument(
-        "--board", action="append", default=[], metavar="CxRxMM|BOARD.toml", help="such as 9x6x25 (repeatable)"
+        "--board",
+        action="append",
+        default=[],
+        metavar="BOARD",
+        help="9x6x25 (inner corners, mm a square), circles:10x8x25,diameter_mm=15, a board file, ... (repeatable)",
+    )
+    folders.add_argument(
+        "--square-mm",
+        type=float,
+        metavar="MM",
+        help="instead: the board is what the images show, with squares (tags, distances of circles) of so many mm",
     )
     folders.add_argument("--timestamps", type=Path, metavar="FILE.csv", help="which frames of videos are of one moment")
     folders.add_argument("--model", help="camera model (default: auto, the one that predicts best)")
@@ -83,4 +95,8 @@ def folder_options(args: argparse.Namespace) -> FolderOptions:
     """Return what folders of images do not tell of themselves."""
     from rigkit.workflows.calibrate_any import FolderOptions
 
-    return FolderOptions(boards=tuple(args.board), model=args.model, timestamps=args.timestamps)
+    if args.square_mm is not None and not (math.isfinite(args.square_mm) and args.square_mm > 0.0):
+        raise InputError(f"calibrate: --square-mm {args.square_mm}: a positive number of mm is needed")
+    return FolderOptions(
+        boards=tuple(args.board), square_mm=args.square_mm, model=args.model, timestamps=args.timestamps
+    )

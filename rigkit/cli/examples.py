@@ -24,6 +24,7 @@ EXAMPLES: dict[str, str] = {
 """,
     "calibrate": """\
   rigkit calibrate photos --board 9x6x25 -r          one camera; 9x6 inner corners, squares of 25 mm; with a page
+  rigkit calibrate photos --square-mm 25 -r          the same: which board it is the images say
   rigkit calibrate left right --board board.toml     a rig, one folder a camera; so is a folder of left01, right01, ...
   rigkit calibrate photos --board 9x6x25 --export opencv ros
   rigkit calibrate left right --board 9x6x25 --only-extrinsics left.json right.json -o rig.json
@@ -104,7 +105,8 @@ EXAMPLES: dict[str, str] = {
   rigkit fetch caliper-board -o data
 """,
     "init": """\
-  rigkit init lab --square-mm 50 --calibration camera.json --pose-type general --baseline-mm first=300+-2
+  rigkit init lab --square-mm 50 --calibration camera.json --pose-type general --baseline-mm first=300+-2 \\
+      --angle-deg 90+-0.3                            what a rule and a set square say; then rigkit validate lab
   rigkit init lab --square-mm 50 --calibration left.json --calibration right.json --pose-type standard
   rigkit init lab --square-mm 50 --calibration wide=w.json --calibration tele=t.json \\
       --cameras 'w-*=wide,wide' --cameras 't-*=tele,tele' --pose-type 'w-*=forward' --pose-type general

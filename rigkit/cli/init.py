@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Any
 from rigkit.cli.console import note, progress_on_stderr
 from rigkit.cli.manifest_words import (
     POSE_TYPES,
+    angle_of,
     ask,
     cameras_of,
     pose_type_of,
     require_told,
+    told_angles,
     told_baselines,
     told_calibrations,
     told_length,
@@ -60,6 +62,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PAIR=MM+-SIGMA",
         help="measured baseline of a pair, such as first=300+-2 (repeatable)",
     )
+    parser.add_argument(
+        "--angle-deg",
+        **repeatable,
+        metavar="[PAIRS=]DEG+-SIGMA",
+        help="measured angle between every two boards, such as 90+-0.3, of all pairs or of those whose names match "
+        "(repeatable; the first that matches counts)",
+    )
     parser.add_argument("-o", "--output", type=Path, help="default: dataset.toml (session.toml) in the folder")
     parser.add_argument("--force", action="store_true", help="replace an existing file")
     parser.add_argument(
@@ -81,7 +90,14 @@ def _session(args: argparse.Namespace) -> int:
     from rigkit.io.files import write_together
     from rigkit.workflows.folder_session import session_of_folders
 
-    if args.square_mm is not None or args.calibration or args.cameras or args.pose_type or args.baseline_mm:
+    if (
+        args.square_mm is not None
+        or args.calibration
+        or args.cameras
+        or args.pose_type
+        or args.baseline_mm
+        or args.angle_deg
+    ):
         raise InputError("init --session: takes --board and --model; the other options are of manifests")
     path = args.output or args.folder / "session.toml"
     made = session_of_folders([args.folder], args.board, path, model=args.model or "auto")
@@ -119,7 +135,7 @@ def _manifest(args: argparse.Namespace) -> int:
     told = _told_boards(args.board)
     if args.square_mm is not None:
         told_length("--square-mm", args.square_mm)
-    poses_told = told_poses(args.pose_type)
+    poses_told, angles_told = told_poses(args.pose_type), told_angles(args.angle_deg)
     root = usable_path(args.folder).resolve()
     target = args.output or root / "dataset.toml"
     images = find_images(root)
@@ -147,6 +163,7 @@ def _manifest(args: argparse.Namespace) -> int:
         cameras=cameras,
         pose_types=poses,
         baselines=told_baselines(args.baseline_mm, names),
+        angles={name: angle for name in names if (angle := angle_of(angles_told, name)) is not None},
     )
     incomplete = write_manifest(new, target, force=args.force)
     print(target)

@@ -105,6 +105,27 @@ def told_baselines(told: Sequence[str], pairs: Sequence[str]) -> dict[str, tuple
     return out
 
 
+def told_angles(told: Sequence[str]) -> list[tuple[str, float, float]]:
+    """Return (pattern of pairs, degrees, sigma) from [PAIRS=]DEG+-SIGMA; raises InputError for what is no angle."""
+    out = []
+    for text in told:
+        pattern, _, value = text.rpartition("=")
+        number, _, sigma = value.partition("+-")
+        try:
+            degrees, sigma_deg = float(number), float(sigma)
+        except ValueError:
+            degrees = sigma_deg = math.nan
+        if not (0.0 <= degrees <= 180.0 and 0.0 < sigma_deg <= 180.0):
+            raise InputError(f"--angle-deg '{text}': write [PAIRS=]DEG+-SIGMA, such as 90+-0.3")
+        out.append((pattern or "*", degrees, sigma_deg))
+    return out
+
+
+def angle_of(told: Sequence[tuple[str, float, float]], name: str) -> tuple[float, float] | None:
+    """Return the first angle, with its sigma, that is told of the pair `name`, or None."""
+    return next(((value, sigma) for pattern, value, sigma in told if fnmatch(name, pattern)), None)
+
+
 def told_length(what: str, value: str | float) -> float:
     """Return a length in mm; raises InputError where it is no positive number."""
     try:

@@ -87,6 +87,16 @@ def words_of_board(board: Board) -> str:
     return re.sub(r"_mm=([0-9.]+)", r"_mm=(\1 MM)", words)
 
 
+def with_length(words: str, length_mm: float) -> str:
+    """Return the words of `words_of_board` with the length that was to be put in.
+
+    >>> with_length("circles:10x8xMM,diameter_mm=(0.6 MM)", 25.0)
+    'circles:10x8x25,diameter_mm=15'
+    """
+    words = re.sub(r"\(([0-9.]+) MM\)", lambda part: f"{float(part[1]) * length_mm:.4g}", words)
+    return words.replace("xMM", f"x{length_mm:.8g}")
+
+
 def _written(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 

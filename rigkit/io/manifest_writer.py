@@ -8,6 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 
 from rigkit.core.boards import Board
@@ -144,6 +145,7 @@ def manifest_text(
     cameras: Mapping[str, tuple[str, str]],
     pose_types: Mapping[str, str],
     baselines: Mapping[str, tuple[float, float]],
+    angles: Mapping[str, tuple[float, float]],
 ) -> str:
     """Return the manifest as text, with what was found as comments.
 
@@ -157,6 +159,7 @@ def manifest_text(
     cameras : pair -> the cameras of its two images.
     pose_types : pair -> pose type.
     baselines : pair -> (mm, sigma mm), where measured.
+    angles : pair -> (deg, sigma deg) between every two boards, where measured.
     """
     if not pairs:
         raise InputError(
@@ -186,9 +189,9 @@ def manifest_text(
         out += ["# with its own calibration, and name it in camera2 below."]
     for camera, calibration in calibrations.items():
         out += ["[[cameras]]", f"id = {_quoted(camera)}", f"calibration = {_quoted(calibration)}", ""]
-    boards = ", ".join(_quoted(board_id) for board_id in ids)
     for pair in pairs:
-        out += _pair_lines(pair, root, cameras[pair.name], pose_types[pair.name], boards, baselines.get(pair.name))
+        out += _pair_lines(pair, root, cameras[pair.name], pose_types[pair.name], ids)
+        out += _truth_lines(baselines.get(pair.name), angles.get(pair.name), ids)
     return "\n".join(out)
 
 
@@ -197,20 +200,33 @@ def _pair_lines(
     root: Path,
     cameras: tuple[str, str],
     pose_type: str,
-    boards: str,
-    baseline: tuple[float, float] | None,
+    boards: Sequence[str],
 ) -> list[str]:
     seen = " and ".join(_words(s) for s in (pair.first, pair.second))
     out = [f"# Complete boards found: {seen}.", "[[pairs]]", f'id = "{pair.name}"']
     out += [f"camera{i} = {_quoted(camera)}" for i, camera in enumerate(cameras, start=1)]
     out += [f"image{i} = {_quoted(_relative(s.image, root))}" for i, s in enumerate((pair.first, pair.second), start=1)]
-    out += [f'pose_type = "{pose_type}"', f"boards = [{boards}]", "", "[pairs.truth]"]
+    return [*out, f'pose_type = "{pose_type}"', f"boards = [{', '.join(map(_quoted, boards))}]", ""]
+
+
+def _truth_lines(
+    baseline: tuple[float, float] | None, angle: tuple[float, float] | None, boards: Sequence[str]
+) -> list[str]:
+    """Return what was measured of a pair; examples, as comments, of what was not."""
+    out = ["[pairs.truth]"]
     if baseline is not None:
         value, sigma = baseline
         out.append(f'baseline = {{ value_mm = {value:g}, sigma_mm = {sigma:g}, how = "as told to rigkit init" }}')
     else:
         out.append('# baseline = { value_mm = 300.0, sigma_mm = 2.0, how = "steel rule between tripod marks" }')
-    out.append('# angles = [ { a = "plane1", b = "plane2", value_deg = 90.0, sigma_deg = 0.3, how = "set square" } ]')
+    if angle is not None and len(boards) > 1:
+        tail = f'value_deg = {angle[0]:g}, sigma_deg = {angle[1]:g}, how = "as told to rigkit init"'
+        rows = [f"    {{ a = {_quoted(a)}, b = {_quoted(b)}, {tail} }}," for a, b in combinations(boards, 2)]
+        out += ["angles = [", *rows, "]"]
+    else:
+        out.append(
+            '# angles = [ { a = "plane1", b = "plane2", value_deg = 90.0, sigma_deg = 0.3, how = "set square" } ]'
+        )
     return [*out, ""]
 
 

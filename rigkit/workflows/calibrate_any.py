@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -19,8 +20,10 @@ from rigkit.io.session import SESSION_NAME, Session, load_session
 from rigkit.io.video import VIDEO_ENDINGS, is_video
 from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration, calibrate_session, session_inputs
 from rigkit.workflows.calibrate_rig import RigSessionCalibration, calibrate_rig_session
-from rigkit.workflows.folder_session import session_of_folders
+from rigkit.workflows.folder_session import boards_seen, session_of_folders
 from rigkit.workflows.frames import frames_folder, frames_of_video, frames_of_videos, timestamps_beside, with_frames
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,6 +32,8 @@ class FolderOptions:
 
     boards: tuple[str, ...] = ()
     """COLUMNSxROWSxMM (inner corners along and across, mm a square), or files of boards."""
+    square_mm: float | None = None
+    """Side of a square (of a tag, or the distance of two circles) where the images say the rest of the board."""
     model: str | None = None
     """A camera model, or "auto"; None: the same."""
     timestamps: Path | None = None
@@ -44,14 +49,16 @@ def calibrate_sources(
     Raises as `calibrate_folders` and `calibrate_session_file` do.
     """
     first = sources[0]
-    is_told = bool(folder_options.boards) or folder_options.model is not None
+    is_told = folder_options != FolderOptions(timestamps=folder_options.timestamps)
     if len(sources) == 1 and not is_told and (first / SESSION_NAME).is_file():
         first = first / SESSION_NAME
     # An image alone is told what would do instead.
     if len(sources) > 1 or first.is_dir() or is_video(first) or first.suffix.lower() in IMAGE_ENDINGS:
         return calibrate_folders(sources, folder_options, options, progress=progress)
     if is_told:
-        raise InputError(f"calibrate: '{first}' says itself what board and model it has; leave out --board and --model")
+        raise InputError(
+            f"calibrate: '{first}' says itself what board and model it has; leave out --board, --square-mm and --model"
+        )
     return calibrate_session_file(first, options, progress=progress)
 
 
@@ -95,7 +102,8 @@ def calibrate_folders(
     time: beside `options.output`, or in the one folder that holds all of them.
 
     A session that is there is kept where it says the same, refused where it says something else, and replaced with
-    `options.force`. Where nothing comes out, all is as before.
+    `options.force`. Where nothing comes out, all is as before, but for the corners kept for the next try
+    (`options.cache`).
 
     Raises
     ------
@@ -107,7 +115,7 @@ def calibrate_folders(
     places = _folders_of([Path(folder) for folder in folders], folder_options, options, progress)
     wanted = session_of_folders(
         places,
-        folder_options.boards,
+        _boards(places, folder_options, progress),
         _session_path(places, options.output),
         model=folder_options.model or "auto",
         output=options.output,
@@ -130,6 +138,19 @@ def calibrate_folders(
             with suppress(OSError):
                 path.unlink()
         raise
+
+
+def _boards(places: Sequence[Path], told: FolderOptions, progress: Progress) -> tuple[str, ...]:
+    """Return the boards that are told, or those that images show, with squares as large as is told."""
+    if told.boards and told.square_mm is not None:
+        raise InputError("calibrate: --board says how large squares are; leave --square-mm out")
+    if told.square_mm is None:
+        return told.boards
+    progress("looking which board it is", 0, 1)
+    boards = boards_seen(places, told.square_mm)
+    progress("looking which board it is", 1, 1)
+    _log.info(f"the images show --board {' --board '.join(boards)}")
+    return boards
 
 
 @contextmanager
@@ -167,7 +188,7 @@ def _folders_of(
     boards = [board_of_words(words) for words in told.boards]
     if not boards:
         raise InputError(
-            "calibrate: frames cannot tell how large the squares are; give the board, such as --board 9x6x25"
+            "calibrate: of a video the board has to be told, such as --board 9x6x25; rigkit board identify shows which"
         )
     folder = frames_folder(videos)
     if options.output is not None:

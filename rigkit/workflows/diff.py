@@ -49,7 +49,8 @@ class CameraPair:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RigPair:
-    """The differences of two rigs' mounts, and by name of the cameras whose calibrations lie beside the rigs."""
+    """The differences of two rigs' mounts, and by name those of their lenses: judged where the calibrations lie beside
+    both rigs."""
 
     mounts: RigDifference
     cameras: Mapping[str, CameraPair]
@@ -147,6 +148,8 @@ def _rigs(a: Path, b: Path) -> RigPair:
         beside = [path.with_name(f"{path.stem}-{name}.json") for path in (a, b)]
         if all(path.is_file() for path in beside):
             cameras[name] = _cameras(*beside)
+        else:
+            cameras[name] = CameraPair(compare_cameras(first.cameras[name][0], second.cameras[name][0]), None)
     return RigPair(mounts, cameras)
 
 

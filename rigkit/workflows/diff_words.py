@@ -17,6 +17,7 @@ from rigkit.report.page_facts import PageFacts
 from rigkit.workflows.diff import BoardsPair, CameraPair, RigPair
 from rigkit.workflows.provenance import digest_line, software_facts
 
+NO_VERDICT = "no verdict: only rigkit's calibrations state how unsure they are, and one of these is another tool's"
 Pair = CameraPair | RigPair | BoardsPair
 
 
@@ -141,7 +142,7 @@ def _camera_in_words(figures: dict[str, Any]) -> str:
         f"of {figures['rotation_deg']:.4f} deg\n"
     )
     if not known:
-        return line + "no verdict: a file has no covariance"
+        return line + NO_VERDICT
     low, high = figures["usual_px"]
     at = f" at {figures['rms_px']:.2g} px" if figures["verdict"] == CameraVerdict.UNIMPORTANT else ""
     return line + (
@@ -187,7 +188,7 @@ def _rigs_in_words(pair: RigPair, figures: dict[str, Any]) -> list[str]:
     lines = _mounts_in_words(pair.mounts)
     lines += [f"{name}: {_camera_in_words(own)}".replace("\n", "; ") for name, own in figures["cameras"].items()]
     if figures["same"] is None:
-        return [*lines, "no verdict: a file has no covariance"]
+        return [*(line.removesuffix(f"; {NO_VERDICT}") for line in lines), NO_VERDICT]
     chance = "" if figures["chance"] is None else f" (mounts together: chance {figures['chance']:.3g})"
     verdict = "the same rig" if figures["same"] else "NOT the same rig: a camera or a lens moved"
     return [*lines, f"{verdict}{chance}"]

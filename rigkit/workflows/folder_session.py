@@ -13,7 +13,7 @@ from pathlib import Path
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier
 from rigkit.io.board_file import board_text
-from rigkit.io.board_words import WORDS_HELP, board_in_words, board_of_words
+from rigkit.io.board_words import WORDS_HELP, board_in_words, board_of_words, with_length
 from rigkit.io.images import IMAGE_ENDINGS
 from rigkit.io.session import SESSION_NAME, SESSION_SCHEMA
 from rigkit.workflows.identify_board import suggested_words
@@ -154,14 +154,31 @@ def session_to_come(patterns: Mapping[str, str], boards: Sequence[str], place: P
     return FolderSession(path, files)
 
 
+def boards_seen(folders: Sequence[Path], side_mm: float) -> tuple[str, ...]:
+    """Return the boards that images show, in words, with squares (tags, distances of circles) of `side_mm`.
+
+    Raises InputError where none is seen.
+    """
+    shown = _shown(folders)
+    if shown is None:
+        raise InputError(f"calibrate: no board is seen in the images; give it, such as --board {WORDS_HELP}")
+    return tuple(with_length(words, side_mm) for words in shown.split(" --board "))
+
+
+def _shown(folders: Sequence[Path]) -> str | None:
+    entries = [entry for found in cameras_in(folders).values() for entry in found]
+    return suggested_words(sorted(image for folder, pattern in entries for image in folder.glob(pattern)))
+
+
 def _untold(folders: Sequence[Path]) -> str:
     """Return what to say where no board is given: what the images show of it."""
-    entries = [entry for found in cameras_in(folders).values() for entry in found]
-    shown = suggested_words(sorted(image for folder, pattern in entries for image in folder.glob(pattern)))
+    shown = _shown(folders)
     if shown is None:
         such = f"give the board, such as --board {WORDS_HELP}, or --board board.toml"
     else:
-        such = f"they show --board {shown}: measure the squares, and say that with the mm of one for MM"
+        such = (
+            f"they show --board {shown}: measure the squares, and say that with the mm of one for MM, or as --square-mm"
+        )
     return f"calibrate: images cannot tell how large squares are; {such}"
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from rigkit.core.boards import Board
@@ -33,8 +33,8 @@ class NewManifest:
 
     `root` is the folder of the images; `name` defaults to its name. `told` are the boards, or the side of a square of
     all chessboards found, mm. `calibrations` maps a camera to the path of its
-    file, absolute or from the folder of the manifest. `cameras`, `pose_types` and `baselines` (mm, sigma mm) go by the
-    names of the pairs.
+    file, absolute or from the folder of the manifest. `cameras`, `pose_types`, `baselines` (mm, sigma mm) and `angles`
+    between every two boards (deg, sigma deg) go by the names of the pairs.
     """
 
     root: Path
@@ -44,6 +44,7 @@ class NewManifest:
     cameras: Mapping[str, tuple[str, str]]
     pose_types: Mapping[str, str]
     baselines: Mapping[str, tuple[float, float]]
+    angles: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     name: str | None = None
 
 
@@ -88,6 +89,7 @@ def write_manifest(new: NewManifest, path: Path, *, force: bool = False) -> Inpu
         new.cameras,
         new.pose_types,
         new.baselines,
+        new.angles,
     )
     write_atomic(path, text, force=force)
     try:

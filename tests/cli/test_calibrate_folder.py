@@ -267,3 +267,28 @@ def test_lenses_that_are_known_stay_and_a_camera_is_added_to_a_rig(
     one = of_one_camera(pictures, tmp_path / "one")
     assert main(["calibrate", str(one), "--board", "9x6x30", "--only-extrinsics", str(lens)]) == 2
     assert "rigkit pose" in capsys.readouterr().err
+
+
+def test_the_square_is_enough_where_images_show_the_board(pictures: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for path in pictures.glob("left*.jpg"):
+        shutil.copy(path, folder)
+    assert main(["calibrate", str(folder), "--square-mm", "30", "--model", "brown"]) == 0
+    assert 'board = "board-9x6x30.toml"' in (folder / "session.toml").read_text()
+    # What the session says is kept: again without a word.
+    assert main(["calibrate", str(folder), "--force"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        (["--square-mm", "nan"], "a positive number of mm"),
+        (["--square-mm", "30", "--board", "9x6x30"], "leave --square-mm out"),
+    ],
+)
+def test_a_square_that_says_nothing_is_refused(
+    told: list[str], words: str, pictures: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["calibrate", str(pictures), *told]) == 2
+    assert words in capsys.readouterr().err

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import shutil
+from itertools import combinations
 from pathlib import Path
 
 import pytest
@@ -20,7 +21,8 @@ def test_a_folder_becomes_a_manifest_that_loads(tmp_path: Path, capsys: pytest.C
     for side, number in (("left", 1), ("right", 2)):
         shutil.copy(IMAGES / "fisheye-standard" / f"view{number}.jpg", tmp_path / f"second_{side}.jpg")
     options = ["--square-mm", "50", "--pose-type", "general", "--calibration", str(CALIBRATION)]
-    assert main(["init", str(tmp_path), *options, "--baseline-mm", "second=300+-2", "--name", "mine"]) == 0
+    measured = ["--baseline-mm", "second=300+-2", "--angle-deg", "f*=90+-0.3"]
+    assert main(["init", str(tmp_path), *options, *measured, "--name", "mine"]) == 0
     dataset = load_dataset(tmp_path)
     assert dataset.name == "mine"
     assert [pair.pair_id for pair in dataset.pairs] == ["first", "second"]
@@ -29,6 +31,9 @@ def test_a_folder_becomes_a_manifest_that_loads(tmp_path: Path, capsys: pytest.C
     assert (second.image1.name, second.image2.name) == ("second_left.jpg", "second_right.jpg")
     assert second.truth.baseline is not None
     assert (second.truth.baseline.value_mm, second.truth.baseline.sigma_mm) == (300.0, 2.0)
+    assert second.truth.angles == ()
+    angles = [(a.a, a.b, a.value_deg, a.sigma_deg) for a in dataset.pair("first").truth.angles]
+    assert angles == [(a, b, 90.0, 0.3) for a, b in combinations(("plane1", "plane2", "plane3"), 2)]
     before = (tmp_path / "dataset.toml").read_text()
     assert main(["init", str(tmp_path), *options]) == 2
     assert (tmp_path / "dataset.toml").read_text() == before
@@ -128,3 +133,11 @@ def test_a_session_of_two_cameras_is_written_and_loads(tmp_path: Path, capsys: p
     assert session.cameras["left"].boards[0].square_x_mm == 50.0
     assert main(command) == 2
     assert main([*command, "--square-mm", "50", "--force"]) == 2
+
+
+@pytest.mark.parametrize("told", ["90", "first=90+-x", "190+-1", "90+-0"])
+def test_angles_that_are_none(told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "first").mkdir()
+    shutil.copy(IMAGES / "fisheye-general" / "view1.jpg", tmp_path / "first")
+    assert main(["init", str(tmp_path), "--square-mm", "50", "--angle-deg", told]) == 2
+    assert f"--angle-deg '{told}': write" in capsys.readouterr().err
