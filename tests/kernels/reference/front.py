@@ -63,6 +63,8 @@ def typical(smooth: FloatImage, step: int) -> tuple[FloatImage, FloatImage]:
 
 def peaks(smooth: FloatImage, threshold: float, limit: int, side: int, finest: int) -> tuple[IntArray, FloatImage]:
     response = _response(smooth)
+    # What overflows twice is no number: a maximum with it is another one on each processor, and no peak.
+    response = np.where(np.isnan(response), np.float32(-np.inf), response)
     highest = cv2.dilate(response, np.ones((5, 5), np.uint8))
     mask = (response >= highest) & (response > threshold)
     mask[:2] = mask[-2:] = False
