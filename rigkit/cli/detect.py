@@ -65,8 +65,10 @@ def run(args: argparse.Namespace) -> int:
             nothing = " (".join(["no board", *([f"{done.doubtful[image]})"] if image in done.doubtful else [])])
             print(f"{printable(image)}: " + (", ".join(_words(item) for item in items) or nothing))
         missing = sum(not items for items in done.found.values())
-        total = len(done.found)
-        print(f"{sum(map(len, done.found.values()))} boards in {total - missing} of {total} images")
+        shown = len(done.found) - missing
+        total = len(done.found) + len(done.failures)
+        left_out = f"; {len(done.failures)} cannot be used" if done.failures else ""
+        print(f"{sum(map(len, done.found.values()))} boards in {shown} of {total} images{left_out}")
     return ExitCode.BAD_INPUT if done.failures else ExitCode.WELL
 
 

@@ -7,6 +7,7 @@ Every message names the file, the table and the key, and says what to write.
 from __future__ import annotations
 
 import difflib
+import os
 import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -145,9 +146,12 @@ class TomlTable:
         return self.beside(self.text(key, hint=hint))
 
     def beside(self, name: str) -> Path:
-        """Return the absolute path of `name`, taken from the folder of the file."""
+        """Return the absolute path of `name`, taken from the folder of the file, as both are written."""
         try:
-            return named_path(usable_path(self.path.parent / name))
+            path = usable_path(self.path.parent / name)
+            # Without links: a folder's ".." is where the link leads to.
+            written = Path(os.path.abspath(path))
+            return written if written.resolve() == path.resolve() else named_path(path)
         except InputError as error:
             raise self.error(str(error)) from error
 

@@ -28,6 +28,7 @@ from rigkit.io.manifest import load_dataset
 from rigkit.io.ply import ply_bytes, read_ply
 from rigkit.io.reading import read_bytes, read_text
 from rigkit.io.rig_file import load_rig
+from rigkit.io.toml_reader import TomlTable
 
 BOARD = 'schema = "rigkit.board/1"\ncolumns = 9\nrows = 6\nsquare_mm = 30.0\n'
 CAMERA = {
@@ -82,6 +83,20 @@ def test_paths(tmp_path: Path, name: str) -> None:
         with pytest.raises(InputError) as caught:
             read(path)
         assert ";" in str(caught.value) and "\0" not in str(caught.value)
+
+
+def test_a_path_is_shown_as_it_is_written(tmp_path: Path) -> None:
+    """Not as what its links lead to, which a person may never have seen; `..` of a link is where it leads to."""
+    for name in ("here", "far/store", "far/other"):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "far/store/b.toml").write_text(BOARD + "x = 1\n")
+    (tmp_path / "far/other/b.toml").write_text(BOARD)
+    (tmp_path / "here/boards").symlink_to(tmp_path / "far/store")
+    table = TomlTable({"a": "boards/b.toml", "b": "boards/../other/b.toml"}, tmp_path / "here/session.toml")
+    assert table.path_to("a", hint="") == tmp_path / "here/boards/b.toml"
+    assert load_board(table.path_to("b", hint="")).size == (9, 6)
+    with pytest.raises(InputError, match="here/boards"):
+        load_board(table.path_to("a", hint=""))
 
 
 def test_a_file_has_a_size_that_it_may_have(tmp_path: Path) -> None:
