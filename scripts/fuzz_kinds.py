@@ -44,7 +44,54 @@ MATCHES = (
      "{out}/new", "--sparse", "--no-pictures"),
 )  # fmt: skip
 
+VIEWS = ("--no-cache", "-o", "{out}/new.json")
+RECONSTRUCT = ("-o", "{out}/new", "--no-pictures")
+
+AT_WORK: dict[str, Kind] = {
+    "corners-at-work": Kind("views.csv", (("calibrate", "views.toml", "--corners", "{case}", *VIEWS),), judged=True),
+    "corners-kept": Kind("kept.json", (("fuzz_readers:calibrate_kept", "{case}"),), names_file=False),
+    "session-at-work": Kind("views.toml", (("calibrate", "{case}", *VIEWS),), judged=True),
+    "board-at-work": Kind(
+        "floor.toml",
+        (
+            ("detect", "-j", "1", "--board", "{case}", "image.png"),
+            ("calibrate", "views", "--board", "{case}", "--model", "pinhole", *VIEWS),
+            ("plan", "--lens", "60", "--size", "320x240", "--board", "{case}", "--views", "4"),
+            ("pose", "image.png", "--camera", "calibration.json", "--board", "{case}"),
+        ),
+        judged=True,
+    ),
+    "study-at-work": Kind(
+        "study.toml", (("simulate", "{case}", "--trials", "1", "-o", "{out}/new", "-j", "1"),), judged=True
+    ),
+    "pairs-at-work": Kind(
+        "matched.csv", (("reconstruct", "--correspondences", "{case}", "--rig", "rig.json", *RECONSTRUCT),), judged=True
+    ),
+    "pairs-npz-at-work": Kind(
+        "matched.npz", (("reconstruct", "--correspondences", "{case}", "--rig", "rig.json", *RECONSTRUCT),), judged=True
+    ),
+    "hand": Kind(
+        "hand.csv", (("handeye", "{case}", "views", "--camera", "pinhole.json", "--board", "floor.toml"),), judged=True
+    ),
+    "pose-at-work": Kind(
+        "pose.txt",
+        (
+            ("reconstruct", "--images", "scene1.png", "scene2.png", "--camera", "calibration.json", "--pose", "{case}",
+             *RECONSTRUCT),
+        ),
+        judged=True,
+    ),
+    "register": Kind(
+        "history.jsonl",
+        (("check", "calibration.json", "image.png", "--board", "floor.toml", "--register", "{case}"),),
+        judged=True,
+    ),
+    "catalogue": Kind("public.toml", (("fuzz_readers:fetch_listed", "{case}"),), names_file=False),
+}  # fmt: skip
+"""Files that a whole piece of work uses, not only a reader."""
+
 KINDS: dict[str, Kind] = {
+    **AT_WORK,
     "png": Kind(
         "image.png",
         (

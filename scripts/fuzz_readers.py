@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 from pathlib import Path
 
+from rigkit.cli.main import main
 from rigkit.coach.coach import Coach
 from rigkit.coach.guide import GuideOptions
 from rigkit.coach.sources import video_frames, watched_frames
 from rigkit.core.boards import Board
+from rigkit.core.errors import RigkitError
 from rigkit.interop.ocamcalib import read_py_ocamcalib
 from rigkit.io.corner_cache import CornerCache
 from rigkit.io.corners_file import read_corners
 from rigkit.io.correspondences import read_correspondences
 from rigkit.io.reading import read_text
+from rigkit.io.session import load_session
 from rigkit.io.truth_csv import load_truth_csv
 from rigkit.io.video import read_timestamps
+from rigkit.workflows.calibrate import calibrate_session
 from rigkit.workflows.coach import CoachOptions, coach_frames, open_coach
 from rigkit.workflows.frames import frames_of_video
 
@@ -43,6 +48,22 @@ def read_cache(path: Path) -> None:
     cache = CornerCache(path, [SMALL])
     for name in cache.images:
         cache.get(name, cache.digest(name))
+
+
+def calibrate_kept(path: Path) -> None:
+    """Calibrate from corners that were kept beside a session whose images are gone."""
+    shutil.copy(path, "corners.json")
+    session = load_session(Path("gone.toml"))
+    with contextlib.suppress(RigkitError):
+        # The message is about the session: what was kept is no input of a person's.
+        calibrate_session(session)
+
+
+def fetch_listed(path: Path) -> None:
+    """List a catalogue with a damaged entry, and fetch it."""
+    shutil.copy(path, "catalogue/small.toml")
+    for words in (["fetch"], ["fetch", "small", "-o", "out/set"]):
+        assert main([*words, "--catalogue", "catalogue"]) in (0, 1, 2, 3), words
 
 
 def read_frames(path: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import fuzz_media
 import fuzz_scenes
+import fuzz_views
 import numpy as np
 
 from rigkit.affine.correspondences import Correspondences
@@ -152,6 +153,7 @@ def write_seeds(folder: Path) -> None:
     _write_tables(folder)
     fuzz_media.write_media(folder)
     fuzz_scenes.write_scenes(folder)
+    fuzz_views.write_views(folder)
     (folder / "other").mkdir()
     (folder / "other" / "dataset.toml").write_text(TOMLS["dataset.toml"].replace('"small"', '"other"', 1))
 

@@ -121,7 +121,9 @@ class BoardView:
         for board in boards:
             if board.board_id == detection.board_id:
                 return cls(image, board, detection.grid, detection.pixels, detection.sigma_px)
-        raise InputError(f"image '{image}': no board is called '{detection.board_id}'")
+        raise InputError(
+            f"image '{image}': no board is called '{detection.board_id}'; known: {', '.join(b.board_id for b in boards)}"
+        )
 
     def points(self) -> Points:
         """Return the corners in the board frame, (N, 3) mm."""

@@ -88,7 +88,8 @@ def calibrate_session(
     if options.output is not None:
         targets += foreign_paths(options.output, options.exports)
     ensure_writable(targets, force=options.force, inputs=session_inputs(session, options))
-    corners = corners_of(session, options, progress=progress)
+    with about(session.path):
+        corners = corners_of(session, options, progress=progress)
     calibration = calibration_from(session, corners, progress=progress)
     files: dict[Path, str] = {}
     if options.output is not None:

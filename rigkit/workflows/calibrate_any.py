@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -79,11 +79,12 @@ def calibrate_session_file(
         # The videos are read as well as the frames in their place.
         results = [file for file in (output, report) if file is not None]
         ensure_writable(results, force=options.force, inputs=session_inputs(listed, options))
-    if isinstance(session, RigSession):
-        return calibrate_rig_session(session, options, progress=progress)
-    if options.known.files:
+    if isinstance(session, Session) and options.known.files:
         raise InputError("one camera has no mounts to find; `rigkit pose` says where it is against a board")
-    return calibrate_session(session, options, progress=progress)
+    with about(options.corners) if options.corners else nullcontext():
+        if isinstance(session, RigSession):
+            return calibrate_rig_session(session, options, progress=progress)
+        return calibrate_session(session, options, progress=progress)
 
 
 def default_output(session: Session | RigSession) -> Path:

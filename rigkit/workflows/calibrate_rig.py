@@ -80,8 +80,8 @@ def calibrate_rig_session(
         require_distinct(session)
     targets = _targets(session, options)
     ensure_writable(targets, force=options.force, inputs=session_inputs(session, options))
-    corners = {name: corners_of(own, options, progress=progress) for name, own in session.cameras.items()}
     with about(session.path):
+        corners = {name: corners_of(own, options, progress=progress) for name, own in session.cameras.items()}
         rig = rig_from(session, corners, progress=progress)
         checks = measured_checks(session, rig)
     files: dict[Path, str] = {}

@@ -153,7 +153,7 @@ def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> 
                 f"images A '{a}' and B '{b}' are the same picture to the last pixel: no baseline; give two images "
                 "taken from different places"
             )
-    told = (options.correspondences, options.rig, options.camera, options.camera2)
+    told = (options.correspondences, options.rig, options.camera, options.camera2, options.pose)
     with about(*(path for path in told if path is not None)):
         scene, found = _sparse(options, (camera1, camera2), known_pose, images, progress)
     maps: Mapping[str, NDArray[Any]] = {}
