@@ -121,9 +121,8 @@ class BoardView:
         for board in boards:
             if board.board_id == detection.board_id:
                 return cls(image, board, detection.grid, detection.pixels, detection.sigma_px)
-        raise InputError(
-            f"image '{image}': no board is called '{detection.board_id}'; known: {', '.join(b.board_id for b in boards)}"
-        )
+        known = ", ".join(board.board_id for board in boards)
+        raise InputError(f"image '{image}': no board is called '{detection.board_id}'; known: {known}")
 
     def points(self) -> Points:
         """Return the corners in the board frame, (N, 3) mm."""
