@@ -46,7 +46,7 @@ def normal_equations(
         # Per view only what involves its pose; the globals among themselves in one product over all corners.
         each = np.moveaxis(rows, (1, 2), (0, 1))
         product = (each @ np.swapaxes(each[:, :, count:], -1, -2)).sum(axis=0)
-        flat = rows[:count].reshape(count, -1)
+        flat = rows[:count].reshape(count, rows[0].size)
         gg += flat @ flat.T
         g += product[:, :count, 6].sum(axis=0)
         gp[block], pp[block], p[block] = product[:, :count, :6], product[:, count:-1, :6], product[:, count:-1, 6]

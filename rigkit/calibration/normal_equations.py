@@ -221,7 +221,8 @@ def _inverse(pp: FloatArray) -> FloatArray:
 
 def _gemm(gp: FloatArray, back: FloatArray) -> FloatArray:
     """Return sum over views of gp_v @ back_v as one matrix product."""
-    return np.asarray(gp.transpose(1, 0, 2).reshape(gp.shape[1], -1) @ back.reshape(-1, back.shape[-1]))
+    views, count, six = gp.shape
+    return np.asarray(gp.transpose(1, 0, 2).reshape(count, views * six) @ back.reshape(views * six, -1))
 
 
 def _solve_positive(matrix: FloatArray, rhs: FloatArray) -> FloatArray:

@@ -55,13 +55,23 @@ def solved(
         options = compared(observations, options, folds, progress)
         chosen, failed = choose(observations, options, SURELY), [*failed, *unfit]
     candidates = [*described(options, chosen, rivals=how.model == "auto"), *failed]
-    if board != "flat" and often_seen(observations).any():
-        observations, chosen, fits = _fit_shapes(observations, chosen, board)
-        shapes, spared = _shapes(observations, fits, board, folds, progress)
-        shapes = [*([chosen] if board == "auto" else []), *shapes]
-        chosen = choose(observations, shapes)
-        candidates += [*(c for c in described(shapes, chosen) if "board" in c.name), *spared]
-    return Solved(observations, reasons, chosen, candidates, beyond, options)
+    observations, chosen, shapes = with_board_shape(observations, chosen, board, folds, progress)
+    return Solved(observations, reasons, chosen, [*candidates, *shapes], beyond, options)
+
+
+def with_board_shape(
+    observations: Observations, flat: Option, board: str, folds: int, progress: Progress
+) -> tuple[Observations, Option, list[Candidate]]:
+    """Return the fit with boards of the shape asked for, `board`, from that with `flat` ones, and what was tried: with
+    "auto" the shape that predicts other images best. The views are those with boards that look the same turned numbered
+    from one end."""
+    if board == "flat" or not often_seen(observations).any():
+        return observations, flat, []
+    observations, flat, fits = _fit_shapes(observations, flat, board)
+    shapes, spared = _shapes(observations, fits, board, folds, progress)
+    shapes = [*([flat] if board == "auto" else []), *shapes]
+    chosen = choose(observations, shapes)
+    return observations, chosen, [*(c for c in described(shapes, chosen) if "board" in c.name), *spared]
 
 
 def _fit_shapes(observations: Observations, flat: Option, board: str) -> tuple[Observations, Option, dict[str, Fit]]:

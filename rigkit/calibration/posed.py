@@ -8,11 +8,24 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.calibration.assemble import board_shapes, outliers_of
-from rigkit.calibration.fit import CAUCHY_SIGMAS, OUTLIER_SIGMAS, SETTLE_ROUNDS, Fit, inliers, sigma_of
+from rigkit.calibration.calibrate import FOLDS
+from rigkit.calibration.choice import Option
+from rigkit.calibration.fit import (
+    CAUCHY_SIGMAS,
+    OUTLIER_SIGMAS,
+    SETTLE_ROUNDS,
+    Fit,
+    fit_kept,
+    heldout_squares,
+    inliers,
+    sigma_of,
+)
+from rigkit.calibration.held_lens import HeldLens
 from rigkit.calibration.linearise import normal_equations
 from rigkit.calibration.observations import Observations
+from rigkit.calibration.one_model import with_board_shape
 from rigkit.calibration.poses import find_poses, refine_poses
-from rigkit.calibration.result import Calibration, Convergence, ViewResult
+from rigkit.calibration.result import Calibration, Candidate, Convergence, ViewResult
 from rigkit.calibration.state import State, evaluate
 from rigkit.calibration.usable import usable_views
 from rigkit.calibration.verdicts import judge
@@ -21,6 +34,7 @@ from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError
 from rigkit.core.findings import Finding, Severity
+from rigkit.core.progress import silent
 from rigkit.geometry.rigid3 import Rigid3
 
 START_MM = 1000.0
@@ -30,16 +44,24 @@ MAX_LENS_MISFIT_PX = 1.0
 """A known lens that leaves more than this, 2-D RMS, is another lens, or the images are of another size or focus."""
 
 
-def posed_calibration(views: Sequence[BoardView], camera: Camera, covariance: FloatArray | None = None) -> Calibration:
-    """Return a calibration of which only the boards' poses were solved for: the lens is `camera`, boards are flat.
+def posed_calibration(
+    views: Sequence[BoardView],
+    camera: Camera,
+    covariance: FloatArray | None = None,
+    *,
+    board: str = "flat",
+    folds: int = FOLDS,
+) -> Calibration:
+    """Return a calibration of which only the boards, poses and shapes, were solved for: the lens is `camera`.
 
-    Its held-out error is its training error: no image took part in the lens.
+    With flat boards its held-out error is its training error: no image took part in the lens.
 
     Parameters
     ----------
     views : boards as they were seen.
     camera : the lens, which stays as it is.
     covariance : (P, P) of its parameters; None: it is exact.
+    board, folds : the boards' shape, and of the cross-validation that chooses it, as for `calibrate`.
 
     Raises
     ------
@@ -48,6 +70,35 @@ def posed_calibration(views: Sequence[BoardView], camera: Camera, covariance: Fl
     DegenerateError
         No view fits the lens.
     """
+    observations, fit, dropped = _on_flat_boards(views, camera)
+    observations, fit, heldout_px, candidates = _shaped(observations, fit, board, folds)
+    state, kept = fit.state, fit.kept
+    px = np.where(fit.residuals.valid[..., None], fit.residuals.px, np.nan)
+    p = camera.parameters.size
+    own = np.zeros((p, p)) if covariance is None else covariance
+    frame = np.zeros((p + 6, p + 6))
+    frame[:p, :p] = own
+    result = Calibration(
+        camera=camera,
+        rms_px=fit.rms_px,
+        heldout_rms_px=heldout_px,
+        covariance=own,
+        frame_covariance=frame,
+        sigma_px=fit.sigma_px,
+        views=ViewResult.of_views(observations.views, Rigid3.stack(state.rotation, state.translation_mm), px, kept),
+        dropped=dropped,
+        outliers=outliers_of(observations, fit),
+        candidates=candidates,
+        convergence=fit.convergence,
+        boards=board_shapes(observations, state.shape, state.unknowns),
+    )
+    return replace(result, verdicts=judge(result, _misfit(result), in_force=("model", "board_shape")))
+
+
+def _on_flat_boards(
+    views: Sequence[BoardView], camera: Camera
+) -> tuple[Observations, Fit, tuple[tuple[str, str], ...]]:
+    """Return the views that fit the lens, their poses before flat boards, and why the others were dropped."""
     used, dropped = usable_views(views, camera.size_px)
     observations = Observations.from_views(used)
     state, kept = _posed(observations, camera)
@@ -66,27 +117,22 @@ def posed_calibration(views: Sequence[BoardView], camera: Camera, covariance: Fl
     if freedom <= 0:
         raise DegenerateError("as many unknowns as corners; take views with more corners")
     sigma = float(np.sqrt(data.costs.sum() / freedom))
-    fit = Fit(state, data, kept, sigma, Convergence(0, True, "only poses were solved for"))
-    px = np.where(fit.residuals.valid[..., None], fit.residuals.px, np.nan)
-    p = camera.parameters.size
-    own = np.zeros((p, p)) if covariance is None else covariance
-    frame = np.zeros((p + 6, p + 6))
-    frame[:p, :p] = own
-    result = Calibration(
-        camera=camera,
-        rms_px=fit.rms_px,
-        heldout_rms_px=fit.rms_px,
-        covariance=own,
-        frame_covariance=frame,
-        sigma_px=fit.sigma_px,
-        views=ViewResult.of_views(observations.views, Rigid3.stack(state.rotation, state.translation_mm), px, kept),
-        dropped=dropped,
-        outliers=outliers_of(observations, fit),
-        candidates=(),
-        convergence=fit.convergence,
-        boards=board_shapes(observations, state.shape, state.unknowns),
-    )
-    return replace(result, verdicts=judge(result, _misfit(result), in_force=("model", "board_shape")))
+    return observations, Fit(state, data, kept, sigma, Convergence(0, True, "only poses were solved for")), dropped
+
+
+def _shaped(
+    observations: Observations, fit: Fit, board: str, folds: int
+) -> tuple[Observations, Fit, float | None, tuple[Candidate, ...]]:
+    """Return the fit with boards of the shape asked for, its held-out error, and what was tried; the lens stays."""
+    lens = fit.state.camera
+    held = fit_kept(observations, replace(fit.state, camera=HeldLens.of(lens)), fit.kept)
+    flat = Option("board flat", held, heldout_squares(observations, held, folds))
+    observations, chosen, candidates = with_board_shape(observations, flat, board, folds, silent)
+    if chosen is flat:
+        return observations, fit, fit.rms_px, tuple(candidates)
+    state = replace(chosen.fit.state, camera=lens)
+    data = normal_equations(observations, state, chosen.fit.weight(observations))
+    return observations, replace(chosen.fit, state=state, data=data), chosen.heldout_px, tuple(candidates)
 
 
 def _posed(observations: Observations, camera: Camera) -> tuple[State, BoolArray]:

@@ -162,7 +162,9 @@ class _Options:
             if self.known is not None and name in self.known.cameras:
                 lens, _ = self.known.cameras[name]
                 try:
-                    found[name] = posed_calibration(alone, lens, self.known.of_lens(name))
+                    found[name] = posed_calibration(
+                        alone, lens, self.known.of_lens(name), board=self.board, folds=self.folds
+                    )
                 except (InputError, DegenerateError) as error:
                     raise type(error)(f"camera '{name}': {error}") from error
                 continue
