@@ -148,16 +148,24 @@ def _entry(data: Any) -> HistoryEntry:
     texts = {name: data.pop(name) for name in ("date", "kind", "source", "verdict")}
     if not all(isinstance(text, str) for text in texts.values()):
         raise ValueError("date, kind, source and verdict are words")
-    datetime.fromisoformat(texts["date"])
+    if not datetime.fromisoformat(texts["date"]).year > 1:
+        raise ValueError("its date is of the year 1")
     entry = HistoryEntry(
         holds=holds,
         chance=chance,
         frames=whole(data.pop("frames")),
         rms_px=real(data.pop("rms_px")),
         temperature_c=None if temperature is None else real(temperature),
-        amounts={str(name): (real(a), real(s)) for name, (a, s) in data.pop("amounts").items()},
+        amounts={str(name): (real(a), _sigma(s)) for name, (a, s) in data.pop("amounts").items()},
         **texts,
     )
     if data:
         raise ValueError(f"unknown key {next(iter(data))!r}")
     return entry
+
+
+def _sigma(value: Any) -> float:
+    number = real(value)
+    if number < 0.0:
+        raise ValueError(f"a standard deviation is {number:g}")
+    return number

@@ -221,7 +221,7 @@ def drift_svg(entries: Sequence[HistoryEntry], name: str) -> str:
     days = np.array([datetime.fromisoformat(entry.date).timestamp() / 86400.0 for entry in own])
     value, sigma = np.array([entry.amounts[name] for entry in own]).T
     limit = CONTROL_SIGMAS * float(np.median(sigma))
-    top = 1.1 * max(limit, float((np.abs(value) + sigma).max()))
+    top = 1.1 * max(limit, float((np.abs(value) + sigma).max()), np.finfo(float).tiny)
     span = max(float(np.ptp(days)), 1e-9)
     x = MARGIN + (DRAWN_WIDTH - MARGIN - 14.0) * ((days - days[0]) / span if len(own) > 1 else np.full(1, 0.5))
     middle = 0.5 * (DRIFT_HEIGHT - 24.0)
