@@ -115,8 +115,8 @@ def view_changes(calibration: Calibration) -> dict[str, ViewChange]:
     if np.count_nonzero(told) < MIN_TELLING_VIEWS:
         return {}
     stops = np.cumsum(count)
-    each = [rows[..., stop - n : stop].reshape(len(rows), -1) for n, stop in zip(count[told], stops[told], strict=True)]
-    products = np.array([part @ part.T for part in each])
+    each = [rows[..., stop - n : stop] for n, stop in zip(count[told], stops[told], strict=True)]
+    products = np.array([part[0] @ part[0].T + part[1] @ part[1].T for part in each])
     length = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), np.finfo(float).tiny))
     own = _without_pose(products, length)
     common, residual = slice(6, -OWN_COLUMNS), -1
@@ -131,7 +131,7 @@ def view_changes(calibration: Calibration) -> dict[str, ViewChange]:
         return {}
     out = {}
     along = own[:, :, residual] - own[:, :, common] @ step
-    for name, way in _columns(len(rows)).items():
+    for name, way in _columns(rows.shape[1]).items():
         # Directions of the unit vectors' own part, and how much of the residual lies along each.
         size = length[:, way]
         sizes, axes = np.linalg.eigh(own[:, way, way] / (size[:, :, None] * size[:, None]))
@@ -162,7 +162,7 @@ def _columns(count: int) -> dict[str, slice]:
 
 
 def _rows(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[FloatArray, IntArray]:
-    """Return how the kept corners of the views move, (K, 2, N) px, and how many there are of each view (V,).
+    """Return how the kept corners of the views move, (2, K, N) px, and how many there are of each view (V,).
 
     With what is, in this order: the pose (6), what all images share (the camera's parameters and the 3 bows of the
     boards), the other ways to change, and the residual last.
@@ -177,27 +177,28 @@ def _rows(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[FloatA
     rotation = np.array([one.cam_from_board.rotation for one in views])[view].transpose(1, 2, 0)
     turned = (rotation * points).sum(axis=1)
     in_cam = turned + np.array([one.cam_from_board.translation_mm for one in views])[view].T
-    pixels, valid, d_pixels_d_point, d_pixels_d_parameters = calibration.camera.project_with_jacobians(in_cam.T)
-    pixels = np.where(valid, pixels.T, np.nan)
-    by_point, by_camera = np.moveaxis(d_pixels_d_point, 0, -1), np.moveaxis(d_pixels_d_parameters, 0, -1)
+    p = calibration.camera.parameters.size
+    rows = np.zeros((2, p + 6 + sum(WAY_COLUMNS.values()) + 1, points.shape[1]))
+    by_point = rows[:, 3:6]
+    u, v, valid = calibration.camera.derivatives(*in_cam, by_point, rows[:, 6 : 6 + p])
+    pixels = np.where(valid, [u, v], np.nan)
     lever, flat = centred(turned), centred(points[:2])
     x, y = flat / np.maximum.reduceat(np.abs(flat).max(axis=0), start)[view]
     centre, _ = calibration.camera.project(np.array([0.0, 0.0, 1.0]))
     along_u, along_v = centred(pixels) / np.array(calibration.camera.size_px)[:, None]
-    p = by_camera.shape[1]
-    rows = np.zeros((p + 6 + sum(WAY_COLUMNS.values()) + 1, 2, points.shape[1]))
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
-        rows[k] = lever[i] * by_point[:, j] - lever[j] * by_point[:, i]
-        rows[3 + k] = by_point[:, k]
-    rows[6 : 6 + p] = by_camera.swapaxes(0, 1)
-    ways = {name: rows[way] for name, way in _columns(len(rows)).items()}
-    ways["bend"][:] = (by_point * rotation[:, 2]).sum(axis=1) * np.stack([x * x, x * y, y * y])[:, None]
-    ways["focus"][:] = pixels - centre[:, None]
+        np.multiply(lever[i], by_point[:, j], out=rows[:, k])
+        rows[:, k] -= lever[j] * by_point[:, i]
+    ways = {name: rows[:, way] for name, way in _columns(rows.shape[1]).items()}
+    out_of_plane = (by_point * rotation[:, 2]).sum(axis=1)
+    for k, bow in enumerate((x * x, x * y, y * y)):
+        np.multiply(out_of_plane, bow, out=ways["bend"][:, k])
+    np.subtract(pixels, centre[:, None], out=ways["focus"][:, 0])
     ways["shift"][0, 0] = ways["shift"][1, 1] = 1.0
-    ways["rows"][:] = rows[:6] * along_v
-    ways[NO_CHANGE][:] = rows[:6] * along_u
-    rows[-1] = np.concatenate([one.residuals_px[one.kept] for one in views]).T
+    np.multiply(rows[:, :6], along_v, out=ways["rows"])
+    np.multiply(rows[:, :6], along_u, out=ways[NO_CHANGE])
+    rows[:, -1] = np.concatenate([one.residuals_px[one.kept] for one in views]).T
     return rows, count
 
 

@@ -44,10 +44,9 @@ def cluster_numbers(images: Sequence[str], boards: Sequence[str], pixels: Sequen
 
 def close_pairs(points: FloatArray, reach: float) -> tuple[IntArray, IntArray]:
     """Return which of the points (N, D) are within `reach` of each other along every axis: i and j (P,), i < j."""
-    axis = int(np.argmax(np.ptp(points, axis=0)))
-    order = np.argsort(points[:, axis], kind="stable")
-    sorted_points = points[order]
-    along = sorted_points[:, axis]
+    axes = np.argsort(-np.ptp(points, axis=0), kind="stable")
+    order = np.argsort(points[:, axes[0]], kind="stable")
+    along, *others = points[order][:, axes].T.copy()
     # Every point with those that follow it along the axis in which they are the furthest apart.
     ahead = np.searchsorted(along, along + reach, side="right") - np.arange(len(order)) - 1
     found = [np.zeros((2, 0), np.int64)]
@@ -55,8 +54,11 @@ def close_pairs(points: FloatArray, reach: float) -> tuple[IntArray, IntArray]:
         count = ahead[block]
         first = np.repeat(block, count)
         second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(count) - count, count)
-        close = (np.abs(sorted_points[first] - sorted_points[second]) <= reach).all(axis=1)
-        found.append(order[np.stack([first, second])[:, close]])
+        for values in others:
+            # Most pairs are told apart by the first of the other axes.
+            close = np.abs(values[first] - values[second]) <= reach
+            first, second = first[close], second[close]
+        found.append(order[np.stack([first, second])])
     pairs = np.sort(np.concatenate(found, axis=1), axis=0)
     return pairs[0], pairs[1]
 
