@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import combinations
@@ -21,9 +20,9 @@ from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import RigkitError
-from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.images import read_image
+from rigkit.io.robot_poses import read_robot_poses
 
 HELD_OUT = "held-out rms"
 MOST_RELEASED = 100
@@ -205,29 +204,21 @@ def ov_plane(bench: Bench) -> Iterator[Row]:
     yield from mrcal_rows(bench, quantity, [*train, *test], size_px, True, [held])
 
 
-def tracked_poses(path: Path) -> tuple[np.ndarray, list[Rigid3]]:
-    """Return times in ns and poses, mm, of a file of motion capture."""
-    rows = [row for row in csv.reader(path.read_text().splitlines()) if row and row[0].strip().isdigit()]
-    times = np.array([int(row[0]) for row in rows])
-    poses = []
-    for row in rows:
-        x, y, z, w = (float(v) for v in row[4:8])
-        skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        rotation = np.eye(3) + 2.0 * (w * skew + skew @ skew) / (w * w + x * x + y * y + z * z)
-        poses.append(Rigid3(rotation, 1000.0 * np.array([float(v) for v in row[1:4]])))
-    return times, poses
+def tracked_poses(path: Path, work: Path, views: Views) -> dict[str, Rigid3]:
+    """Return the poses of a file of motion capture at the moments of the images, mm."""
+    named = work / f"{path.parent.name}-{path.name}"
+    rows = path.read_text().splitlines()[1:]
+    named.write_text("\n".join(["timestamp_ns,x_m,y_m,z_m,qx,qy,qz,qw", *rows]) + "\n")
+    return read_robot_poses(named, [view.image for view in views])
 
 
 def aprilgrid_mocap(bench: Bench) -> Iterator[Row]:
     """Yield the board's poses against motion capture, after one hand-eye fit for each tool's camera."""
     found = bench.alone("cam0/data/*.jpg").calibration
     views, size_px = kept_views(found, bench.found.described.boards), found.camera.size_px
-    body, target = (tracked_poses(bench.found.files(name)[0]) for name in ("body0.csv", "target0/data.csv"))
-    stands = []
-    for view in views:
-        when = int(Path(view.image).stem)
-        world_from = [poses[int(np.argmin(np.abs(times - when)))] for times, poses in (body, target)]
-        stands.append(world_from[0].inverse() @ world_from[1])
+    files = (bench.found.files(name)[0] for name in ("body0.csv", "target0/data.csv"))
+    body, target = (tracked_poses(path, bench.work, views) for path in files)
+    stands = [body[view.image].inverse() @ target[view.image] for view in views]
     fits = {(RIGKIT, f"board {found.boards[0].kind}"): found.camera}
     for peer, fit in peers.CAMERA_FITS.items():
         if not peer.variant:
@@ -241,15 +232,7 @@ def _pose_rows(
     bench: Bench, tool: str, variant: str, camera: Camera, views: Views, stands: Sequence[Rigid3]
 ) -> Iterator[Row]:
     fitted = hand_eye(camera, views, stands)
-    off_mm, off_deg = [], []
-    for view, stand in zip(views, stands, strict=True):
-        rays, valid = camera.unproject(view.pixels)
-        seen = board_pose(rays[valid], view.points()[valid]).cam_from_board
-        known = fitted.cam_from_mount @ stand @ fitted.stand_from_board
-        middle = view.points().mean(axis=0)
-        off_mm.append(np.linalg.norm(seen.apply(middle) - known.apply(middle)))
-        cosine = 0.5 * (np.trace(seen.rotation @ known.rotation.T) - 1.0)
-        off_deg.append(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
     how = f"median of {len(views)} images after one hand-eye fit"
-    yield bench.row("board against motion capture", tool, float(np.median(off_mm)), "mm", variant=variant, how=how)
-    yield bench.row("board's turn, likewise", tool, float(np.median(off_deg)), "deg", variant=variant, how=how)
+    off_mm, turned = float(np.median(fitted.apart_mm)), float(np.degrees(np.median(fitted.apart_rad)))
+    yield bench.row("board against motion capture", tool, off_mm, "mm", variant=variant, how=how)
+    yield bench.row("board's turn, likewise", tool, turned, "deg", variant=variant, how=how)

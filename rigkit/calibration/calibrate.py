@@ -28,6 +28,7 @@ from rigkit.calibration.models_tried import How, Wanted, fit_all, wanted_models
 from rigkit.calibration.moved import moved_lens
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.one_model import Solved, only, solved
+from rigkit.calibration.repeats import cluster_numbers
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.uncertainty import FarProjection
 from rigkit.calibration.usable import usable_views
@@ -92,14 +93,23 @@ def calibrate_together(
 
 
 @contextmanager
-def _about_camera(name: str) -> Iterator[None]:
-    """Name the camera in errors."""
+def _about_camera(name: str, views: Sequence[BoardView]) -> Iterator[None]:
+    """Name the camera in errors; where its images repeat each other, nothing else needs to be looked for."""
     try:
         yield
     except (InputError, DegenerateError) as error:
-        if not name:
+        words = str(error)
+        images = [view.image for view in views]
+        if isinstance(error, DegenerateError) and len(set(images)) > 1:
+            place = cluster_numbers(images, [v.board.board_id for v in views], [v.pixels for v in views])
+            if not place.any():
+                words = (
+                    f"calibration: all {len(set(images))} images show the board in one and the same place, and "
+                    f"count as one; move it from image to image ({words})"
+                )
+        if not name and words == str(error):
             raise
-        raise type(error)(f"camera '{name}': {error}") from error
+        raise type(error)(f"camera '{name}': {words}" if name else words) from error
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -118,12 +128,12 @@ class _Begun:
 
     def solved(self, model: str) -> Solved:
         """Return what a camera model comes to."""
-        with _about_camera(self.name):
+        with _about_camera(self.name, self.observations.views):
             return solved(self.observations, *only(self.options, self.wanted, model), self.failed, self.how)
 
 
 def _begin(name: str, views: Sequence[BoardView], how: How) -> _Begun:
-    with _about_camera(name):
+    with _about_camera(name, views):
         wanted = wanted_models(how)
         used, dropped = usable_views(views, how.size_px)
         observations = Observations.from_views(used)
@@ -170,7 +180,7 @@ def _finish(group: Sequence[_Begun]) -> list[Calibration]:
         choices = [Choice(c.model, HeldOut.of([r.options]).likely()) for c, r in zip(choices, rivals, strict=True)]
     out = []
     for begun, one, lenses, choice, compared in zip(group, found, tried, choices, rivals, strict=True):
-        with _about_camera(begun.name):
+        with _about_camera(begun.name, begun.observations.views):
             out.append(_result(begun, one, lenses, compared.options, choice.likely))
     return out
 

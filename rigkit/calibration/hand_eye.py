@@ -55,6 +55,8 @@ class HandEye:
         resampling the images: what the robot does not tell exactly is in it.
     rms_px : 2-D RMS of all corners.
     image_rms_px : by image.
+    apart_mm, apart_rad : (N,) of the images used, in their order: how far the middle of the board, and its turn, as the
+        camera sees the board, are from where the robot has them.
     left_out : by image, by how much (rad) its turns differ from the robot's.
     """
 
@@ -63,6 +65,8 @@ class HandEye:
     covariance: FloatArray
     rms_px: float
     image_rms_px: dict[str, float]
+    apart_mm: FloatArray
+    apart_rad: FloatArray
     left_out: dict[str, float]
 
     __repr__ = brief
@@ -109,12 +113,15 @@ def hand_eye(
         problem.views[i].image: float(np.sqrt(squared[problem.image == i].sum(axis=1).mean()))
         for i in range(len(problem.views))
     }
+    apart_mm, apart_rad = _apart(*found.state, problem, [seen[i] for i in use])
     return HandEye(
         cam_from_mount=found.state[0],
         stand_from_board=found.state[1],
         covariance=covariance,
         rms_px=float(np.sqrt(squared.sum(axis=1).mean())),
         image_rms_px=by_image,
+        apart_mm=apart_mm,
+        apart_rad=apart_rad,
         left_out={views[i].image: float(mismatch[i]) for i in range(len(views)) if i not in use},
     )
 
@@ -147,6 +154,19 @@ class _AllCorners:
         residual = np.where(valid[:, None], (pixels - self.pixels) * scale, np.inf)
         jacobian = np.where(valid[:, None, None], jacobian * scale[..., None], 0.0)
         return DenseProblem(residual.reshape(-1), jacobian.reshape(-1, UNKNOWNS))
+
+
+def _apart(
+    cam_from_mount: Rigid3, stand_from_board: Rigid3, problem: _AllCorners, seen: Sequence[Rigid3]
+) -> tuple[FloatArray, FloatArray]:
+    """Return how far the boards as they are seen are from where the robot has them, (N,) mm and (N,) rad."""
+    off_mm, turned = [], []
+    for view, arm, cam_from_board in zip(problem.views, problem.robot, seen, strict=True):
+        told = cam_from_mount @ arm @ stand_from_board
+        middle = view.points().mean(axis=0)
+        off_mm.append(np.linalg.norm(cam_from_board.apply(middle) - told.apply(middle)))
+        turned.append(cam_from_board.rotation @ told.rotation.T)
+    return np.array(off_mm), rotation_angle(np.array(turned))
 
 
 def _moved(state: tuple[Rigid3, Rigid3], step: DenseStep) -> tuple[Rigid3, Rigid3]:

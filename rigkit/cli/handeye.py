@@ -11,7 +11,9 @@ HELP = "where a camera sits on a robot's hand, or before it, from the robot's po
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("poses", metavar="POSES.csv", help="image,x_mm,y_mm,z_mm,qx,qy,qz,qw: base_from_hand")
+    parser.add_argument(
+        "poses", metavar="POSES.csv", help="image (or timestamp_ns),x_mm,y_mm,z_mm,qx,qy,qz,qw: base_from_hand"
+    )
     parser.add_argument("images", metavar="IMAGES", nargs="+", help="images of the board, or their folder")
     parser.add_argument("--camera", type=Path, required=True, metavar="CALIB", help="the camera's calibration")
     parser.add_argument("--board", type=Path, required=True, metavar="CxRxMM|BOARD.toml", help="such as 9x6x25")
@@ -48,7 +50,11 @@ def run(args: argparse.Namespace) -> int:
     first, second = POSE_NAMES[args.board_on_hand]
     print(pose_in_words(first, result.cam_from_mount, turns[0], moves[0]))
     print(pose_in_words(second, result.stand_from_board, turns[1], moves[1]))
-    print(f"{len(result.image_rms_px)} images, RMS {result.rms_px:.3f} px")
+    print(
+        f"{len(result.image_rms_px)} images, RMS {result.rms_px:.3f} px; boards as seen are "
+        f"{np.median(result.apart_mm):.2f} mm and {np.degrees(np.median(result.apart_rad)):.3f} deg (medians) from where "
+        "the poses have them"
+    )
     for image, mismatch in result.left_out.items():
         print(f"left out: '{image}' turned otherwise than the robot, by {np.degrees(mismatch):.1f} degrees")
     return code

@@ -190,6 +190,8 @@ HAND_EYE_FILE = file(
         "covariance": said(matrix(), "of both poses (rad, mm), twelve by twelve"),
         "rms_px": NUMBER,
         "image_rms_px?": said(table(NUMBER), "by image"),
+        "median_apart_mm?": said(NUMBER, "of the boards' middles as seen from where the robot has them, median"),
+        "median_apart_deg?": said(NUMBER, "of the boards' turns, likewise"),
         "left_out_deg?": said(table(NUMBER), "images whose pose does not go with them, and by what angle"),
     },
 )

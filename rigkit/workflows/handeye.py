@@ -92,7 +92,7 @@ def calibrate_hand_eye(
     paths = list(images_in([Path(path) for path in images]))
     if options.output is not None:
         ensure_writable(options.output, force=options.force, inputs=[poses, *paths, options.camera, options.board])
-    robot = read_robot_poses(poses)
+    robot = read_robot_poses(poses, [path.name for path in paths])
     missing = [path.name for path in paths if path.name not in robot]
     if missing:
         raise InputError(f"'{poses}': no pose of image '{missing[0]}' ({len(missing)} in all); add the rows")
@@ -167,6 +167,8 @@ def hand_eye_text(result: HandEye, options: HandEyeOptions) -> str:
         "covariance": result.covariance.tolist(),
         "rms_px": result.rms_px,
         "image_rms_px": result.image_rms_px,
+        "median_apart_mm": float(np.median(result.apart_mm)),
+        "median_apart_deg": float(np.degrees(np.median(result.apart_rad))),
         "left_out_deg": {name: float(np.degrees(value)) for name, value in result.left_out.items()},
     }
     return json.dumps(data, indent=1, allow_nan=False) + "\n"

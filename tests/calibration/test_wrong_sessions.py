@@ -16,6 +16,7 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import compare_cameras
 from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardView
+from rigkit.core.errors import DegenerateError
 from rigkit.core.findings import Severity, worst
 from rigkit.geometry.rotation import exp_so3
 
@@ -244,3 +245,10 @@ def test_a_lens_beyond_all_numbers_tells_nothing_of_what_changes(rng: np.random.
     parameters[4] = -9e14
     assert changing(result) != []
     assert changing(replace(result, camera=result.camera.with_parameters(parameters))) == []
+
+
+def test_one_image_many_times_is_named(rng: np.random.Generator) -> None:
+    views, *_ = random_views(lens("reg"), 1, rng, reach_deg=30.0)
+    again = [replace(views[0], image=f"{k:02d}.png") for k in range(12)]
+    with pytest.raises(DegenerateError, match="all 12 images show the board in one and the same place"):
+        calibrate(again, SIZE)
