@@ -47,8 +47,8 @@ def read_robot_poses(path: str | Path, images: Sequence[str] = ()) -> dict[str, 
     key = "image" if "image" in head else "timestamp_ns"
     if key not in head or length is None or not (turn or all(key in head for key in QUATERNION)):
         raise InputError(
-            f"'{source}': the first line must name the columns image (or timestamp_ns), x_mm, y_mm, z_mm (or _m), and qx, qy, qz, qw or "
-            "rx_rad, ry_rad, rz_rad (or _deg)"
+            f"'{source}': the first line must name the columns image (or timestamp_ns), x_mm, y_mm, z_mm (or _m), and "
+            "qx, qy, qz, qw or rx_rad, ry_rad, rz_rad (or _deg)"
         )
     poses: dict[str, Rigid3] = {}
     for line, row in rows[1:]:
