@@ -52,7 +52,7 @@ def shown_table(table: Table, pictures: Sequence[str | None] = ()) -> dict[str, 
 def _shown_cell(cell: Cell, column: Column) -> dict[str, Any]:
     if isinstance(cell.value, str):
         text = "text words" if len(cell.value) > LONG_WORDS else "text"
-        kind = "fail" if cell.failed else "pass" if cell.value == "pass" else text
+        kind = f"{text} fail" if cell.failed else "pass" if cell.value == "pass" else text
         return {"words": cell.value, "kind": kind, "best": False, "paper": None}
     words = "–"
     if cell.value is not None and np.isfinite(cell.value):

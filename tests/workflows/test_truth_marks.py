@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from itertools import product
 
 import cv2
 import numpy as np
@@ -19,6 +20,8 @@ from truth_marks import fit_similarity, lattice_affinities, mark_lattice
 ROWS, COLUMNS, STEP_PX, HALF_PX = 6, 5, 60.0, 9.0
 MAX_CENTRE_PX = 0.05
 """Corners are drawn at sixteenths of a pixel, in 8 bits: up to .044 px remain."""
+MAX_BENT = 1e-3
+"""Of affinities of about one: differences of the nearest marks alone are off by fifteen times that."""
 OVERSAMPLING = 16
 
 
@@ -48,14 +51,29 @@ def test_marks_are_found_where_they_are(turn: float) -> None:
 
 def test_affinities_are_those_of_the_map() -> None:
     A = np.array([[0.9, 0.1], [-0.05, 1.1]])
-    marks = {(c, r): np.array([50.0 * c + 3.0 * r, 60.0 * r]) for c in range(4) for r in range(3)}
+    marks = {(c, r): np.array([50.0 * c + 3.0 * r, 60.0 * r]) for c in range(6) for r in range(5)}
     moved = {key: A @ pixel + 7.0 for key, pixel in marks.items()}
     keys, pixels1, pixels2, A21 = lattice_affinities(marks, moved)
-    assert keys == [(1, 1), (2, 1)]
+    assert keys == [(2, 2), (3, 2)]
     assert np.allclose(A21, A)
     assert np.allclose(pixels2, pixels1 @ A.T + 7.0)
-    with pytest.raises(DegenerateError, match="four neighbours"):
+    with pytest.raises(DegenerateError, match="two neighbours on each side"):
         lattice_affinities(marks, {})
+
+
+def test_affinities_of_a_surface_that_bends() -> None:
+    """Marks every 12 degrees around a cylinder, from two directions and near: as the tangent has them."""
+
+    def marks(part: float, turn: float) -> dict[tuple[int, int], np.ndarray]:
+        out = {}
+        for column, row in product(range(-2, 3), repeat=2):
+            around = part * np.radians(12.0) * column - turn
+            depth = 400.0 - 57.0 * np.cos(around)
+            out[column, row] = 2000.0 / depth * np.array([57.0 * np.sin(around), 12.0 * part * row])
+        return out
+
+    (found,), (exact,) = (lattice_affinities(marks(part, -0.5), marks(part, 0.4))[3] for part in (1.0, 1e-3))
+    assert np.abs(found - exact).max() < MAX_BENT
 
 
 def test_no_marks_are_said() -> None:
