@@ -20,8 +20,8 @@ from truth_marks import fit_similarity, lattice_affinities, mark_lattice
 ROWS, COLUMNS, STEP_PX, HALF_PX = 6, 5, 60.0, 9.0
 MAX_CENTRE_PX = 0.05
 """Corners are drawn at sixteenths of a pixel, in 8 bits: up to .044 px remain."""
-MAX_BENT = 1e-3
-"""Of affinities of about one: differences of the nearest marks alone are off by fifteen times that."""
+MAX_BENT = 1.5e-4
+"""Of affinities of about one: differences of the nearest marks alone are off by five times that."""
 OVERSAMPLING = 16
 
 
