@@ -30,7 +30,7 @@ POSES = tuple(
 def files(tmp_path: Path) -> tuple[Path, list[str], Corner]:
     """A folder with the rig's file, three images, and the exact scene."""
     rng = np.random.default_rng(5)
-    corner = Corner.random(rng)
+    corner = Corner.of_a_room()
     names = []
     for k, pose in enumerate(POSES):
         names.append(str(tmp_path / f"{k}.png"))

@@ -77,7 +77,7 @@ def test_other_layouts_of_the_file(files: tuple[Path, Rigid3], layout: str, caps
 
 
 def test_two_images(tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]) -> None:
-    corner = Corner.random(rng)
+    corner = Corner.of_a_room()
     save_camera(tmp_path / "camera.json", SMALL)
     names = []
     for name, pose in (("a.png", Rigid3.identity()), ("b.png", CAM2_FROM_CAM1)):
@@ -98,7 +98,7 @@ def test_two_images(tmp_path: Path, rng: np.random.Generator, capsys: pytest.Cap
 
 
 def test_a_measured_pose_is_kept(tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]) -> None:
-    corner = Corner.random(rng)
+    corner = Corner.of_a_room()
     save_camera(tmp_path / "camera.json", SMALL)
     names = []
     for name, pose in (("a.png", Rigid3.identity()), ("b.png", CAM2_FROM_CAM1)):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rigkit.benchmark.scenes import BenchScene, bench_camera
+from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, BenchScene, bench_camera
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.detection.checks.border import Side, sides
@@ -17,6 +17,7 @@ from rigkit.detection.saddles.response import grey_image
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.synthetic.placing import place_board
+from rigkit.synthetic.render import Optics
 from rigkit.synthetic.scene import Panel, PlacedBoard
 
 SIZES = ((11, 8), (9, 6), (8, 6), (7, 7), (10, 7), (6, 5))
@@ -71,7 +72,8 @@ def count(seeds: range, lens: str, covered: bool) -> tuple[int, int, int]:
     for seed in seeds:
         scene, rng = part_scene(seed, lens, covered)
         noise, blur = rng.choice([0.0, 2.0, 5.0]), rng.choice([0.5, 0.8, 1.2])
-        image = scene.render(noise_levels=noise, blur_px=blur, rng=rng)
+        photometry = replace(BENCH_PHOTOMETRY, noise_levels=noise)
+        image = scene.render(optics=Optics(blur, supersample=2), photometry=photometry, rng=rng)
         board = scene.boards[0].board
         without = {d.columns * d.rows for d in detect_boards(image)}
         for found in detect_boards(image, [board]):

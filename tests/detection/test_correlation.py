@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -12,7 +13,7 @@ import pytest
 from kernels.reference import edges as reference
 from scipy.spatial import cKDTree
 
-from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, one_board, small_board
+from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, BenchScene, one_board, small_board
 from rigkit.core.boards import Board
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.subpixel import edge_fit, subpixel
@@ -126,6 +127,14 @@ def compressed(levels: np.ndarray) -> np.ndarray:
     return np.asarray(cv2.imdecode(cv2.imencode(".jpg", levels, [cv2.IMWRITE_JPEG_QUALITY, 80])[1], 0))
 
 
+@functools.cache
+def small_scene(seed: int, blur_px: float) -> tuple[BenchScene, np.ndarray]:
+    """A board of sixteen corners, and its picture before noise in grey levels."""
+    board = Board("a", 4, 4, 30.0, 30.0)
+    scene = one_board(np.random.default_rng(700 + seed), size_px=(200, 160), board=board, square_px=23.0)
+    return scene, 255.0 * scene.radiance(Optics(blur_px)) * BENCH_PHOTOMETRY.exposure
+
+
 @pytest.mark.parametrize(
     ("degrade", "blur_px", "noise", "scale", "guided"),
     [
@@ -140,16 +149,14 @@ def test_boards_in_images_as_they_come(
     degrade: Callable[[np.ndarray], np.ndarray], blur_px: float, noise: float, scale: float, guided: bool
 ) -> None:
     """Boards of sixteen corners: too few for their scatter about smooth rows to tell."""
-    board = Board("a", 4, 4, 30.0, 30.0)
     errors, sigmas = [], []
     for seed in range(24):
-        scene = one_board(np.random.default_rng(700 + seed), size_px=(200, 160), board=board, square_px=23.0)
-        levels = 255.0 * scene.radiance(Optics(blur_px)) * BENCH_PHOTOMETRY.exposure
+        scene, levels = small_scene(seed, blur_px)
         white = noise * np.random.default_rng(seed).standard_normal(levels.shape)
         image = degrade(np.clip(np.rint(levels + white), 0, 255).astype(np.uint8))
         (truth,) = scene.truth()
         tree = cKDTree((truth.pixels + 0.5) * scale - 0.5)
-        (found,) = detect_boards(image, [board], camera=scene.camera if guided else None)
+        (found,) = detect_boards(image, [scene.boards[0].board], camera=scene.camera if guided else None)
         distance, nearest = tree.query(found.pixels)
         errors.append((found.pixels - tree.data[nearest])[distance < scale])
         sigmas.append(found.sigma_px[distance < scale])

@@ -13,6 +13,8 @@ from helpers.data import REPOSITORY
 
 from rigkit.cli.main import main
 
+FRAMES = 6
+"""Photos that a page starts with: enough to calibrate."""
 PAGES = REPOSITORY / "docs" / "pages"
 MADE_BY_THE_BUILD = ("made/", "api.md", "keys.md")
 BLOCK = re.compile(r"^( *)```(console|python)\n(.*?)^ *```$", re.MULTILINE | re.DOTALL)
@@ -25,12 +27,12 @@ def set_up(needs: str, folder: Path, images: Path) -> None:
     for need in needs.split():
         if need == "photos":
             (folder / "photos").mkdir()
-            for k, path in enumerate(sorted(images.glob("left*.jpg"))):
+            for k, path in enumerate(sorted(images.glob("left*.jpg"))[:FRAMES]):
                 shutil.copy(path, folder / "photos" / f"{k}.jpg")
         elif need == "rig":
             for side in ("left", "right"):
                 (folder / side).mkdir()
-                for path in images.glob(f"{side}*.jpg"):
+                for path in sorted(images.glob(f"{side}*.jpg"))[:FRAMES]:
                     shutil.copy(path, folder / side / path.name.replace(side, "IMG"))
         else:
             assert need == "lab"

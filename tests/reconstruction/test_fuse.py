@@ -29,7 +29,7 @@ CAM_FROM_WORLD = tuple(
 @cache
 def corner_clouds() -> tuple[Corner, list[PosedCloud]]:
     rng = np.random.default_rng(5)
-    corner = Corner.random(rng)
+    corner = Corner.of_a_room()
     images = [corner.image(CAMERA, pose, rng) for pose in CAM_FROM_WORLD]
     clouds = []
     for i, j in ((0, 1), (0, 2), (2, 1)):

@@ -35,7 +35,7 @@ SEAM_PX = 12.0
 @cache
 def grown_corner(lens: str) -> tuple[SceneReconstruction, DenseScene, Corner]:
     rng = np.random.default_rng(5)
-    corner, camera = Corner.random(rng), LENSES[lens]
+    corner, camera = Corner.of_a_room(), LENSES[lens]
     images = [corner.image(camera, pose, rng) for pose in (Rigid3.identity(), CAM2_FROM_CAM1)]
     seeds = match_affine_features(*images, tilts=TILTS)
     sparse = reconstruct_scene(seeds, camera, camera, baseline_mm=BASELINE_MM, image1=images[0])
@@ -91,7 +91,7 @@ def test_windows_of_curved_maps_do_not_shift_the_surface() -> None:
     """Between fisheyes an affine warp is off by 0.033 px at the middle of a window, everywhere to the same side."""
     camera = LENSES["fisheye"]
     rng = np.random.default_rng(11)
-    corner = Corner.random(rng)
+    corner = Corner.of_a_room()
     images = [corner.image(camera, pose, rng) for pose in (Rigid3.identity(), CAM2_FROM_CAM1)]
     seeds = match_affine_features(*images)
     exact = KnownPose(CAM2_FROM_CAM1, np.zeros((6, 6)))
