@@ -31,7 +31,10 @@ from rigkit.core.truth import PairTruth as PairTruth
 from rigkit.detection.detect import detect_boards as detect_boards
 from rigkit.detection.guided.guided import complete_boards as complete_boards
 from rigkit.geometry.rigid3 import Rigid3 as Rigid3
+from rigkit.geometry.triangulation import triangulate_pixels as triangulate_pixels
+from rigkit.geometry.triangulation import triangulate_rays as triangulate_rays
 from rigkit.identification.identify import identify_pair as identify_pair
+from rigkit.interop.open3d import to_open3d as to_open3d
 from rigkit.io.calibration_file import load_calibration as load_calibration
 from rigkit.io.calibration_file import load_camera as load_camera
 from rigkit.io.calibration_file import save_calibration as save_calibration

@@ -83,6 +83,7 @@ def board_scales_and_gradients(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return every board's scale, its variance (B,) with the squares' own, and how it moves with the points.
 
+    Boards that disagree by many standard deviations have a wrong square size or a wrong pose under them.
     The gradients are (B, N, 3); scales that nothing tells are NaN. Parameters, errors as of `metric_scale`.
     """
     scales, sigmas, slopes = _fit_boards(points_unit, board_index, grid, boards, covariances)
@@ -97,22 +98,6 @@ def board_scales_and_gradients(
 def square_sigmas(boards: Sequence[Board]) -> FloatArray:
     """Return the standard deviations (B,) of the squares as parts of them; 0 where none is stated."""
     return np.array([(b.square_sigma_mm or 0.0) / min(b.square_x_mm, b.square_y_mm) for b in boards])
-
-
-def board_scales(
-    points_unit: Points,
-    board_index: IntArray,
-    grid: IntArray,
-    boards: Sequence[Board],
-    covariances: FloatArray | None = None,
-) -> tuple[FloatArray, FloatArray]:
-    """Return scale and standard deviation of every board by itself (B,), NaN where it has too few corners.
-
-    Boards that disagree by many standard deviations have a wrong square size or a wrong pose under them. Parameters as
-    in `metric_scale`; the squares' own sigma is not included here.
-    """
-    scales, sigmas, _ = _fit_boards(points_unit, board_index, grid, boards, covariances)
-    return scales, sigmas
 
 
 def _fit_boards(

@@ -10,7 +10,7 @@ import pytest
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import exp_so3
-from rigkit.reconstruction.scale import board_scales, metric_scale, scale_and_gradient
+from rigkit.reconstruction.scale import board_scales_and_gradients, metric_scale, scale_and_gradient
 
 BOARDS = (Board("a", 8, 6, 40.0, 40.0), Board("b", 7, 5, 30.0, 31.0))
 TRUE = 250.0
@@ -81,16 +81,16 @@ def test_stated_square_sigma_enters(rng):
     scale, sigma = metric_scale(points, index, grid, boards, covariance)
     # 1 % of one board and 0.01 % of the other: the second decides.
     assert sigma == pytest.approx(scale * 1e-4, rel=0.2)
-    each, _ = board_scales(points, index, grid, boards, covariance)
+    each, *_ = board_scales_and_gradients(points, index, grid, boards, covariance)
     assert abs(scale - each[1]) < 0.05 * abs(each[0] - each[1]) + 1e-6
 
 
 def test_boards_are_also_judged_singly(rng):
     points, index, grid, covariance = reconstruction(rng, 1e-4)
     wrong = (BOARDS[0], replace(BOARDS[1], square_x_mm=33.0, square_y_mm=34.1))
-    each, sigma = board_scales(points, index, grid, wrong, covariance)
+    each, variance, _ = board_scales_and_gradients(points, index, grid, wrong, covariance)
     assert each[1] / each[0] == pytest.approx(1.1, abs=0.01)
-    assert abs(each[1] - each[0]) > 10.0 * np.hypot(*sigma)
+    assert abs(each[1] - each[0]) > 10.0 * np.sqrt(variance.sum())
 
 
 def test_too_few_corners_is_an_error(rng):
