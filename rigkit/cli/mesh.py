@@ -20,8 +20,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--one-view",
-        action="store_true",
-        help="all was seen from the origin, as from a pair of images: nothing hangs between near and far",
+        action=argparse.BooleanOptionalAction,
+        help="all was seen from the origin, as from a pair of images: nothing hangs between near and far (default: as "
+        "the file's header says)",
     )
     parser.add_argument("--force", action="store_true", help="replace an existing file")
     parser.add_argument("--json", action="store_true", help="print the result for programs")

@@ -28,6 +28,7 @@ class OrientedCloud:
     board_ids : names of the boards.
     calibration_in_sigmas : whether the sigmas include the uncertainty of the cameras' calibrations; else the cameras
         count as exact, and the corners' noise and the relative pose are all that is in them.
+    from_origin : whether all points were seen from the origin, as those of one pair: the way to them is empty.
     """
 
     points_mm: Points
@@ -39,6 +40,7 @@ class OrientedCloud:
     normal_sigma_rad: FloatArray
     board_ids: tuple[str, ...]
     calibration_in_sigmas: bool = False
+    from_origin: bool = False
 
     __repr__ = brief
 
@@ -51,8 +53,9 @@ class OrientedCloud:
         object.__setattr__(self, "sigma_mm", as_array(self.sigma_mm, (n,), "sigma_mm", finite=False))
         sigma = as_array(self.normal_sigma_rad, (n,), "normal_sigma_rad", finite=False)
         object.__setattr__(self, "normal_sigma_rad", sigma)
-        if not isinstance(self.calibration_in_sigmas, bool | np.bool_):
-            raise InputError(f"calibration_in_sigmas: True or False is needed, got {self.calibration_in_sigmas!r}")
+        for name in ("calibration_in_sigmas", "from_origin"):
+            if not isinstance(value := getattr(self, name), bool | np.bool_):
+                raise InputError(f"{name}: True or False is needed, got {value!r}")
         colours = np.array(self.colours, dtype=np.uint8)
         if colours.shape != (n, 3):
             raise InputError(f"colours: expected {n}x3, got {colours.shape}")

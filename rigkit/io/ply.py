@@ -46,6 +46,8 @@ SIGMAS_COMMENT = {
     False: f"{SIGMA_COMMENT}; the calibrations count as exact",
 }
 """What the sigmas include, by `OrientedCloud.calibration_in_sigmas`."""
+FROM_ORIGIN_COMMENT = "all points were seen from the origin"
+"""Of clouds that are `OrientedCloud.from_origin`."""
 
 
 def write_ply(
@@ -110,6 +112,7 @@ def ply_bytes(
         table[name] = values
     notes = ["rigkit oriented point cloud", f"units {unit}", "frame camera 1: x right, y down, z forward"]
     notes.append(SIGMAS_COMMENT[cloud.calibration_in_sigmas])
+    notes += [FROM_ORIGIN_COMMENT] * cloud.from_origin
     notes += [f"{BOARD_COMMENT}{i} {_one_line(board_id)}" for i, board_id in enumerate(cloud.board_ids)]
     notes += [_one_line(line) for line in comments]
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in notes)]
@@ -159,6 +162,7 @@ def read_ply(path: str | Path) -> OrientedCloud:
             normal_sigma_rad=np.deg2rad(column("normal_sigma_deg", np.nan).astype(np.float64)),
             board_ids=board_ids,
             calibration_in_sigmas=f"\ncomment {SIGMAS_COMMENT[True]}\n".encode() in data[:start],
+            from_origin=f"\ncomment {FROM_ORIGIN_COMMENT}\n".encode() in data[:start],
         )
     except InputError as error:
         raise InputError(f"point cloud '{source}': {error}; write it again") from error

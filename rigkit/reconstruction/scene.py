@@ -232,7 +232,7 @@ def _cloud(
     sure = cloud.sigma_mm < MAX_RANGE_SIGMA * np.linalg.norm(cloud.points_mm, axis=1)
     if not sure.any():
         raise DegenerateError("no point's distance is known; the baseline is too short for this scene")
-    return cloud.select(sure), np.flatnonzero(kept)[sure], affinities
+    return replace(cloud.select(sure), from_origin=True), np.flatnonzero(kept)[sure], affinities
 
 
 def in_unit(pose: Rigid3, covariance: FloatArray, scale: float) -> tuple[Rigid3, FloatArray]:

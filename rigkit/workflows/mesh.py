@@ -28,9 +28,9 @@ class MeshOptions:
     """Of the octree: 2^depth cells along the longest side."""
     cut: float = 0.02
     """Share of the vertices, those with the fewest points near, that is cut off."""
-    one_view: bool = False
+    one_view: bool | None = None
     """All of the cloud was seen from its origin, as that of one pair of images: where near and far points meet in the
-    picture, the surface is a line of sight."""
+    picture, the surface is a line of sight. None: as the file's header says."""
     force: bool = False
     """Replace an existing file; the cloud is never replaced."""
 
@@ -51,7 +51,7 @@ def mesh_cloud(cloud: str | Path, options: MeshOptions, *, progress: Progress = 
         raise InputError(f"mesh: the share that is cut off must be from 0 to below 1, got {options.cut}")
     ensure_writable(options.output, force=options.force, inputs=[Path(cloud)])
     points = read_ply(cloud)
-    if options.one_view:
+    if points.from_origin if options.one_view is None else options.one_view:
         points = with_lines_of_sight(points)
     progress("fitting the surface", 0, 1)
     with about(cloud):

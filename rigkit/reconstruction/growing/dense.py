@@ -22,6 +22,7 @@ from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 from rigkit.reconstruction.growing.curvature import without_curvature
 from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKnowledge, grow, grow_both_ways
 from rigkit.reconstruction.growing.surface import GrownSurface, fit_surface, measure, own_planes
+from rigkit.reconstruction.growing.sweep import filled
 from rigkit.reconstruction.growing.systematic import SystematicPose, pose_with_field
 from rigkit.reconstruction.metric import POSE_STEP_RAD
 from rigkit.reconstruction.reconstruct import Reconstruction, colours_at
@@ -122,6 +123,8 @@ def grow_scene(
             f"no surface grows from {len(agreeing)} correspondences; check that the images are sharp and "
             "show surfaces with texture"
         )
+    measured = measure(grown, r.camera1, r.camera2, pose)
+    grown = filled(grown, measured, view1, view2, pose)
     measured = measure(grown, r.camera1, r.camera2, pose)
     surface = fit_surface(measured, step, even.pose.amplitude_px)
     by_pose, of_pose = _moved_planes(grown, r, pose, covariance)
@@ -268,5 +271,6 @@ def _cloud(
         sigma_mm=sigma_mm[sure],
         normal_sigma_rad=np.sqrt(np.trace(of_normal[sure], axis1=1, axis2=2)),
         board_ids=(),
+        from_origin=True,
     )
     return cloud, at[sure]

@@ -28,6 +28,8 @@ MAX_MOVE_PX = 2.0
 """From where a neighbour predicts a patch."""
 MAX_SIGMA_PX = 0.15
 """Along the axis of which least is known; beyond, a patch slides along an edge."""
+MAX_SIGMA_ON_LINE_PX = 0.3
+"""The same where the epipolar line is known, on which alone it slides; beyond, a sweep knows the surface better."""
 MAX_TRIES = 3
 """Of a node, from different neighbours."""
 MAX_RETURN_PX = 1.0
@@ -38,9 +40,10 @@ RAY_SPACING_PX = 8.0
 
 @dataclass(frozen=True, eq=False, slots=True)
 class GrowingView:
-    """An image as growing sees it: the camera, the pyramid, and the rays on a coarse grid."""
+    """An image as growing sees it: the camera, grey levels, the pyramid, and the rays on a coarse grid."""
 
     camera: Camera
+    grey: NDArray[np.generic]
     pyramid: Pyramid
     size_px: tuple[int, int]
     rays: FloatArray
@@ -53,7 +56,7 @@ class GrowingView:
         counts = int(np.ceil(width / RAY_SPACING_PX)) + 2, int(np.ceil(height / RAY_SPACING_PX)) + 2
         at = np.stack(np.meshgrid(*(RAY_SPACING_PX * np.arange(n) for n in counts)), axis=-1)
         rays, valid = camera.unproject(at)
-        return cls(camera, patch_pyramid(grey), (width, height), np.where(valid[..., None], rays, np.nan))
+        return cls(camera, grey, patch_pyramid(grey), (width, height), np.where(valid[..., None], rays, np.nan))
 
     def nodes(self, step: int) -> Pixels:
         """Return the pixels (R, C, 2) every `step` px."""
@@ -92,6 +95,7 @@ class GrownPatches:
     step : px between nodes.
     pixels1, pixels2 : (R, C, 2); A21 : (R, C, 2, 2).
     correlation, coarser : (R, C) of the patches; levels by which they were aligned more coarsely for want of texture.
+        Pairs of a sweep have none: zero.
     covariance : (R, C, 6, 6) of (u2, v2, a11, a12, a21, a22), as the patches alone show it.
     """
 
@@ -107,6 +111,11 @@ class GrownPatches:
     def valid(self) -> BoolArray:
         """Which nodes (R, C) have a pair."""
         return np.isfinite(self.correlation)
+
+    @property
+    def swept(self) -> BoolArray:
+        """Which nodes (R, C) have a pair that no patch was aligned for."""
+        return self.correlation == 0.0
 
     def __len__(self) -> int:
         return int(self.valid.sum())
@@ -185,7 +194,7 @@ def grow(
         coarsest=COARSEST,
         most_move=MAX_MOVE_PX,
         least_correlation=min_correlation,
-        most_sigma=MAX_SIGMA_PX,
+        most_sigma=MAX_SIGMA_ON_LINE_PX if np.isfinite(line.sigma_px) else MAX_SIGMA_PX,
     )
     assert seeds.A21 is not None
     starts = starts_of(seeds.pixels1, seeds.pixels2, seeds.A21)

@@ -22,10 +22,10 @@ from rigkit.geometry.rotation import angle_between
 from rigkit.geometry.triangulation import triangulate_rays
 from rigkit.kernels.planes import fitted_planes
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
-from rigkit.reconstruction.growing.grow import GrownPatches
+from rigkit.reconstruction.growing.grow import HALF_WIDTH, GrownPatches
 
-PLANE_REACH_PX = 9.0
-"""To either side, of the nodes that a plane is fitted to."""
+PLANE_REACH_PX = 2.0 * HALF_WIDTH
+"""To either side, of the nodes that a plane is fitted to: those further away share no texture with the middle one."""
 PLANE_ROUNDS = 5
 TURN_OF_LOSS = 2.385
 """In standard deviations a component: from there on a neighbour is on another surface rather than noisy."""
@@ -43,12 +43,14 @@ class NodeMeasurements:
     covariance : (R, C, 3, 3) of z, from the noise along the epipolar line alone.
     frame : (R, C, 3, 3) ray and columns of the ray Jacobian in rows: z = frame m for the plane m . X = 1.
     slope : (R, C) px along the epipolar line by which the place moves with the inverse range.
+    swept : (R, C) bool, found by a sweep and not by patches.
     """
 
     z: FloatArray
     covariance: FloatArray
     frame: FloatArray
     slope: FloatArray
+    swept: BoolArray
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -110,7 +112,9 @@ def measure(grown: GrownPatches, camera1: Camera, camera2: Camera, cam2_from_cam
         out[at[good]] = values[good]
         return out.reshape(*shape, *values.shape[1:])
 
-    return NodeMeasurements(z=spread(z), covariance=spread(covariance), frame=spread(frame), slope=spread(slope))
+    return NodeMeasurements(
+        z=spread(z), covariance=spread(covariance), frame=spread(frame), slope=spread(slope), swept=grown.swept
+    )
 
 
 def own_planes(measured: NodeMeasurements) -> FloatArray:
@@ -125,7 +129,8 @@ def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -
     """Return the planes around all nodes, which are `step` px apart.
 
     Their covariance is scaled by what planes disagree by that share no node: neighbouring patches share their pixels,
-    and surfaces are not flat. `shared_px` is what all places around err by together along their epipolar lines.
+    and surfaces are not flat. Those of a sweep are scaled apart: its errors are alike further around. `shared_px` is
+    what all places around err by together along their epipolar lines.
 
     Notes
     -----
@@ -153,7 +158,9 @@ def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -
         misfit = (measured.z[..., 0] - inverse) * measured.slope
     spread = np.full(normal.shape, np.nan)
     spread[keep] = _inverse(normal[keep])
-    spread *= max(_disagreement(_where(keep, normals), _where(keep, plane), spread, 2 * reach), 1.0) ** 2
+    for alike in (keep & measured.swept, keep & ~measured.swept):
+        scale = _disagreement(_where(alike, normals), _where(alike, plane), _where(alike, spread), 2 * reach)
+        spread[alike] *= max(scale, 1.0) ** 2
     spread += ((shared_px / measured.slope) ** 2)[..., None, None] * ray[..., :, None] * ray[..., None, :]
     return GrownSurface(
         points=_where(keep, points),

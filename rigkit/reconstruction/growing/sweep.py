@@ -1,0 +1,300 @@
+"""Surfaces where patches say too little: semi-global matching of a sweep through the ranges, of any central cameras.
+
+At a range every ray of image 1 is seen somewhere in image 2. Read there, image 2 is image 1 where that is the range of
+the surface (R. T. Collins, "A Space-Sweep Approach to True Multi-Image Matching", CVPR 1996). Both are compared by
+their census (R. Zabih and J. Woodfill, ECCV 1994), and neighbours are asked to lie on one surface along eight paths
+(H. Hirschmueller, "Stereo Processing by Semiglobal Matching and Mutual Information", PAMI 2008). Levels of a sweep are
+equally spaced in inverse range, so that a plane rises evenly through them; nothing is rectified.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from rigkit.affine.refine_patches import MIN_CONTRAST
+from rigkit.affine.surface import linear_gauge
+from rigkit.core.arrays import BoolArray, FloatArray, Pixels
+from rigkit.geometry.projection_jacobian import pair_projection_jacobians
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
+from rigkit.reconstruction.growing.grow import HALF_WIDTH, GrowingView, GrownPatches
+from rigkit.reconstruction.growing.surface import NodeMeasurements
+
+FINER = 2
+"""Samples of the sweep from node to node."""
+MOST_LEVELS = 160
+MARGIN = 0.1
+"""Of the range of inverse ranges that grew, to either side."""
+CENSUS_REACH = 2
+BITS = (2 * CENSUS_REACH + 1) ** 2 - 1
+BEND_COST = BITS // 6
+"""Of a step to the next level, in bits of the census."""
+JUMP_COST = 2 * BITS
+"""Of any larger step, where the brightness is even; less where it changes."""
+EVEN_LEVELS = 8.0
+"""Grey levels from sample to sample by which a jump becomes half as dear."""
+SMOOTHED = 0.4
+"""Standard deviation by which the images are smoothed, in samples: finer detail than samples show disturbs."""
+TABLE_SPACING = 8
+"""Samples between those that are projected; in between the places are interpolated."""
+SMALLEST = 60
+"""Samples of a surface that patches agree with; smaller ones are chance."""
+SMALLEST_UNSEEN = 120
+"""The same where no patch agrees, as beside many edges of depth."""
+MAX_MISFIT_LEVELS = 1.0
+"""By which the sweep disagrees with the grown pairs, as a standard deviation, for it to be believed elsewhere."""
+SIGMA_A = 0.3
+"""Of an affinity that only says that the surface is seen at all: the sweep does not measure slants."""
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class _Sweep:
+    """Levels of inverse range (K,), samples (R, C, 2) of image 1 with their rays (NaN where there is none), and a table
+    (K, r, c, 2) of places in image 2 at every few of them."""
+
+    inverse: FloatArray
+    pixels1: NDArray[np.float32]
+    rays1: FloatArray
+    step_px: float
+    table: NDArray[np.float32]
+
+    def places(self, level: int) -> NDArray[np.float32]:
+        """Return the places (R, C, 2) of a level; far outside where there is none."""
+        rows, columns = self.pixels1.shape[:2]
+        at = np.meshgrid(*(np.arange(n, dtype=np.float32) / TABLE_SPACING for n in (columns, rows)))
+        out = cv2.remap(self.table[level], at[0], at[1], cv2.INTER_LINEAR)
+        return np.nan_to_num(np.asarray(out, np.float32), nan=-1e4)
+
+
+def filled(
+    grown: GrownPatches, measured: NodeMeasurements, view1: GrowingView, view2: GrowingView, cam2_from_cam1: Rigid3
+) -> GrownPatches:
+    """Return the pairs with those of a sweep at nodes where none grew; as they were where the sweep disagrees.
+
+    The sigma of the sweep's ranges is what they are off by where both say something.
+    """
+    if not np.isfinite(measured.z).any():
+        return grown
+    sweep = _prepared(grown, measured, view1, view2, cam2_from_cam1)
+    samples1 = _at(_smooth(view1, sweep.step_px), sweep.pixels1)
+    total = _aggregated(_costs(sweep, samples1, view2), samples1)
+    level, good = _winners(total, sweep, view2, cam2_from_cam1)
+    good &= _at(_contrast(view1), sweep.pixels1) > MIN_CONTRAST
+    spacing = sweep.inverse[1] - sweep.inverse[0]
+    of_grown = np.full(level.shape, np.nan)
+    of_grown[::FINER, ::FINER] = (measured.z[..., 0] - sweep.inverse[0]) / spacing
+    good = _believed(level, good, of_grown)
+    off = np.abs(level - of_grown)[good & np.isfinite(of_grown)]
+    misfit = SIGMA_OF_MEDIAN * float(np.median(off)) if off.size else np.inf
+    if not misfit < MAX_MISFIT_LEVELS:
+        return grown
+    inverse = np.where(good, sweep.inverse[0] + spacing * level, np.nan)[::FINER, ::FINER]
+    return _with(grown, inverse, misfit * spacing, view1, view2, cam2_from_cam1)
+
+
+def _prepared(
+    grown: GrownPatches, measured: NodeMeasurements, view1: GrowingView, view2: GrowingView, cam2_from_cam1: Rigid3
+) -> _Sweep:
+    inverse = measured.z[..., 0]
+    low, high = np.nanquantile(inverse, [0.001, 0.999])
+    margin = MARGIN * (high - low)
+    low, high = max(low - margin, 0.0), high + margin
+    pixel = 1.0 / float(np.nanquantile(measured.slope, 0.9))
+    count = int(np.clip(np.ceil((high - low) / pixel) + 1, 3, MOST_LEVELS))
+    levels = np.linspace(low, high, count)
+    step = grown.step / FINER
+    width, height = view1.size_px
+    shape = int((height - 1) // step) + 1, int((width - 1) // step) + 1
+    coarse = [np.arange(0, n + TABLE_SPACING, TABLE_SPACING) * step for n in reversed(shape)]
+    rays, seen = view1.camera.unproject(np.stack(np.meshgrid(*coarse), axis=-1))
+    places, valid = view2.camera.project(_turned(rays, levels[:, None, None], cam2_from_cam1))
+    table = np.where((valid & seen)[..., None], places, np.nan).astype(np.float32)
+    fine = np.stack(np.meshgrid(*(step * np.arange(n) for n in reversed(shape))), axis=-1)
+    rays1, seen1 = view1.camera.unproject(fine)
+    return _Sweep(
+        inverse=levels,
+        pixels1=fine.astype(np.float32),
+        rays1=np.where(seen1[..., None], rays1, np.nan),
+        step_px=step,
+        table=table,
+    )
+
+
+def _turned(rays: FloatArray, inverse: FloatArray, cam2_from_cam1: Rigid3) -> FloatArray:
+    """Return points at inverse ranges on rays (..., 3) in the frame of camera 2, over their ranges."""
+    return np.asarray(rays @ cam2_from_cam1.rotation.T + inverse[..., None] * cam2_from_cam1.translation_mm)
+
+
+def _at(image: NDArray[np.float32], places: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the image at places (R, C, 2); NaN outside."""
+    nan = float("nan")
+    return np.asarray(cv2.remap(image, places, None, cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, nan), np.float32)
+
+
+def _smooth(view: GrowingView, step_px: float) -> NDArray[np.float32]:
+    """Return the image as sharp as samples `step_px` apart can show it."""
+    return np.asarray(cv2.GaussianBlur(np.asarray(view.grey, np.float32), (0, 0), SMOOTHED * step_px), np.float32)
+
+
+def _contrast(view: GrowingView) -> NDArray[np.float32]:
+    """Return the standard deviation of the brightness over patches around all pixels."""
+    image, side = np.asarray(view.grey, np.float32), (2 * HALF_WIDTH + 1,) * 2
+    variance = cv2.blur(image * image, side) - cv2.blur(image, side) ** 2
+    return np.sqrt(np.maximum(variance, 0.0))
+
+
+def _census(samples: NDArray[np.float32]) -> NDArray[np.uint32]:
+    """Return which neighbours of each sample (R, C) are darker, one bit each; those beyond the border are not."""
+    reach = CENSUS_REACH
+    padded = np.pad(samples, reach, constant_values=np.inf)
+    rows, columns = samples.shape
+    out = np.zeros((rows, columns), np.uint32)
+    for dr in range(2 * reach + 1):
+        for dc in range(2 * reach + 1):
+            if (dr, dc) != (reach, reach):
+                out <<= np.uint32(1)
+                out |= padded[dr : dr + rows, dc : dc + columns] < samples
+    return out
+
+
+def _costs(sweep: _Sweep, samples1: NDArray[np.float32], view2: GrowingView) -> NDArray[np.int16]:
+    """Return the bits (R, C, K) in which the census of both images differs at each level; half where there is none."""
+    first, image2 = _census(samples1), _smooth(view2, sweep.step_px)
+    out = np.empty((*samples1.shape, len(sweep.inverse)), np.int16)
+    for k in range(len(sweep.inverse)):
+        there = _at(image2, sweep.places(k))
+        out[..., k] = np.where(np.isfinite(there), np.bitwise_count(first ^ _census(there)), BITS // 2)
+    return out
+
+
+def _aggregated(costs: NDArray[np.int16], samples1: NDArray[np.float32]) -> NDArray[np.int16]:
+    """Return the costs (R, C, K) with those of the best surfaces that lead there along eight paths."""
+    total = np.zeros(costs.shape, np.int16)
+    for turned in (False, True):
+        # Paths along columns, downwards and upwards, then along rows; diagonals go with the first.
+        there, image = (np.swapaxes(v, 0, 1) if turned else v for v in (costs, samples1))
+        here = np.swapaxes(total, 0, 1) if turned else total
+        for lines in (range(len(there)), range(len(there) - 1, -1, -1)):
+            for aside in (0,) if turned else (-1, 0, 1):
+                _along(there, image, lines, aside, here)
+    return total
+
+
+def _along(
+    costs: NDArray[np.int16], image: NDArray[np.float32], lines: range, aside: int, total: NDArray[np.int16]
+) -> None:
+    """Add to `total` the costs of paths that go from line to line, `aside` samples to the side each time."""
+    before: NDArray[np.int16] | None = None
+    last = lines[0]
+    for line in lines:
+        now = costs[line].copy()
+        if before is not None:
+            came = np.roll(before, aside, axis=0)
+            least = came.min(axis=1, keepdims=True)
+            change = np.abs(image[line] - np.roll(image[last], aside))
+            jump = BEND_COST + (JUMP_COST - BEND_COST) / (1.0 + change / EVEN_LEVELS)
+            best = np.minimum(came, least + jump.astype(np.int16)[:, None])
+            np.minimum(best[:, 1:], came[:, :-1] + np.int16(BEND_COST), out=best[:, 1:])
+            np.minimum(best[:, :-1], came[:, 1:] + np.int16(BEND_COST), out=best[:, :-1])
+            best -= least
+            if aside:
+                # Nothing comes from beyond the border.
+                best[0 if aside > 0 else -1] = 0
+            now += best
+        total[line] += now
+        before, last = now, line
+
+
+def _winners(
+    total: NDArray[np.int16], sweep: _Sweep, view2: GrowingView, cam2_from_cam1: Rigid3
+) -> tuple[FloatArray, BoolArray]:
+    """Return the best level (R, C), between levels by a parabola, and where image 2 sees that surface."""
+    count = total.shape[2]
+    best = np.argmin(total, axis=2)
+    inner = np.clip(best, 1, count - 2)[..., None]
+    left, middle, right = (np.take_along_axis(total, inner + k, axis=2)[..., 0].astype(np.float64) for k in (-1, 0, 1))
+    bend = left - 2.0 * middle + right
+    with np.errstate(divide="ignore", invalid="ignore"):
+        part = np.where(bend > 0.0, 0.5 * (left - right) / bend, 0.0)
+    level = np.clip(inner[..., 0] + part, 0.0, count - 1.0)
+    # At either end the surface may be beyond.
+    inside = (best > 0) & (best < count - 1)
+    place, seen = view2.camera.project(_turned(sweep.rays1, sweep.inverse[best], cam2_from_cam1))
+    inside &= seen
+    width, height = view2.size_px
+    with np.errstate(invalid="ignore"):
+        inside &= ((place >= 0.0) & (place <= np.array([width - 1, height - 1]))).all(axis=-1)
+    place = np.where(inside[..., None], place, 0.0)
+    cost = np.where(inside, np.take_along_axis(total, best[..., None], axis=2)[..., 0], np.iinfo(np.int16).max)
+    good = inside & _foremost(place, best, cost, sweep.step_px, view2)
+    return level, good
+
+
+def _believed(level: FloatArray, good: BoolArray, grown: FloatArray) -> BoolArray:
+    """Return which samples (R, C) are on surfaces that are large enough to be no chance.
+
+    A surface goes on where neighbours are no more than a level apart; `grown` are the levels (R, C) of patches.
+    """
+    number = np.arange(level.size).reshape(level.shape)
+    links = []
+    for one, other in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        same = good[one] & good[other] & (np.abs(level[one] - level[other]) <= 1.0)
+        links.append((number[one][same], number[other][same]))
+    rows, columns = (np.concatenate(ends) for ends in zip(*links, strict=True))
+    graph = coo_array((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(level.size, level.size))
+    _, label = connected_components(graph, directed=False)
+    with np.errstate(invalid="ignore"):
+        agrees = good & (np.abs(level - grown) <= 1.0)
+    least = np.where(np.bincount(label, weights=agrees.ravel()) > 0.0, SMALLEST, SMALLEST_UNSEEN)
+    return np.asarray(good & (np.bincount(label) >= least)[label].reshape(level.shape))
+
+
+def _foremost(
+    place: Pixels, best: NDArray[np.int64], cost: NDArray[np.int16], step_px: float, view2: GrowingView
+) -> BoolArray:
+    """Return which samples (R, C) agree with the cheapest that claims the same place of image 2."""
+    columns = int(view2.size_px[0] // step_px) + 2
+    cell = np.rint(place / step_px).astype(np.int64)
+    cell = (cell[..., 1] * columns + cell[..., 0]).ravel()
+    order = np.argsort(-cost.ravel(), kind="stable")
+    claimed = np.zeros(cell.max() + 1, dtype=np.int64)
+    claimed[cell[order]] = best.ravel()[order]
+    return np.asarray(np.abs(claimed[cell].reshape(best.shape) - best) <= 1)
+
+
+def _with(
+    grown: GrownPatches,
+    inverse: FloatArray,
+    sigma: float,
+    view1: GrowingView,
+    view2: GrowingView,
+    cam2_from_cam1: Rigid3,
+) -> GrownPatches:
+    """Return the pairs, at nodes without one with those of the inverse ranges (R, C; NaN: unknown) instead."""
+    at = np.isfinite(inverse) & (inverse > 0.0) & ~grown.valid
+    pixels1 = view1.nodes(grown.step)[at]
+    rays, _ = view1.camera.unproject(pixels1)
+    points = rays / inverse[at][:, None]
+    pixels2, seen = view2.camera.project(cam2_from_cam1.apply(points))
+    rays2, seen2 = view2.camera.unproject(pixels2)
+    B1, B2 = view1.camera.ray_jacobian(pixels1), view2.camera.ray_jacobian(pixels2)
+    J1, J2 = pair_projection_jacobians(points, rays, B1, rays2, B2, cam2_from_cam1)
+    # The surface that faces the camera.
+    A21, by_range, _ = linear_gauge(J1, J2)
+    sigma_px = sigma * np.linalg.norm(by_range, axis=1) / inverse[at] ** 2
+    good = seen & seen2 & np.isfinite(A21).all(axis=(1, 2))
+    at[at] = good
+    out = {name: getattr(grown, name).copy() for name in ("pixels1", "pixels2", "A21", "correlation", "coarser")}
+    new = {"pixels1": pixels1[good], "pixels2": pixels2[good], "A21": A21[good], "correlation": 0.0, "coarser": 0.0}
+    for name, values in new.items():
+        out[name][at] = values
+    spread = grown.covariance.copy()
+    spread[at] = SIGMA_A**2 * np.eye(6)
+    spread[at, 0, 0] = spread[at, 1, 1] = sigma_px[good] ** 2
+    return replace(grown, covariance=spread, **out)

@@ -1,0 +1,101 @@
+"""A sweep through the ranges fills what patches leave open, and says how well it knows it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from helpers.textured_scene import Corner
+from numpy.typing import NDArray
+
+from rigkit.affine.correspondences import Correspondences
+from rigkit.cameras.kannala_brandt import KannalaBrandt
+from rigkit.cameras.pinhole import Pinhole
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
+from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKnowledge, grow_both_ways
+from rigkit.reconstruction.growing.surface import NodeMeasurements, measure
+from rigkit.reconstruction.growing.sweep import filled
+from rigkit.relative_pose.solvers.pose import essential_from_pose
+
+SIZE = (320, 240)
+LENSES = {
+    "pinhole": Pinhole(SIZE, np.array([280.0, 280.0, 159.5, 119.5])),
+    "fisheye": KannalaBrandt(SIZE, np.array([150.0, 150.0, 160.0, 120.0, -0.02, 0.002, 0.0, 0.0])),
+}
+TURN = exp_so3(np.array([0.05, -0.25, 0.1]))
+CAM2_FROM_CAM1 = Rigid3(TURN, -TURN @ [320.0, -60.0, 60.0])
+STEP = 3
+HOLE = np.s_[25:55, 35:75]
+"""Nodes that patches are taken from."""
+FLAT = np.s_[45:70, 190:230]
+"""Pixels of image 1 without any texture."""
+
+
+@cache
+def grown_with_hole(lens: str) -> tuple[GrownPatches, NodeMeasurements, tuple[GrowingView, GrowingView], Corner]:
+    rng = np.random.default_rng(5)
+    corner, camera = Corner.random(rng), LENSES[lens]
+    images: list[NDArray[np.generic]] = [
+        np.asarray(corner.image(camera, pose, rng)) for pose in (Rigid3.identity(), CAM2_FROM_CAM1)
+    ]
+    greys = [image if image.ndim == 2 else image.mean(axis=2).astype(np.uint8) for image in images]
+    greys[0] = greys[0].copy()
+    greys[0][FLAT] = 90
+    view1, view2 = (GrowingView.of(grey, camera) for grey in greys)
+    pixels = np.stack(np.meshgrid(np.arange(20.0, 300.0, 20.0), np.arange(20.0, 220.0, 20.0)), axis=-1).reshape(-1, 2)
+    pixels2, seen = camera.project(CAM2_FROM_CAM1.apply(corner.surface(camera, pixels)[0]))
+    near = [camera.project(CAM2_FROM_CAM1.apply(corner.surface(camera, pixels + d)[0]))[0] for d in np.eye(2)]
+    A21 = np.stack([each - pixels2 for each in near], axis=-1)
+    seeds = Correspondences(pixels, pixels2, A21, None, None, None).select(seen)
+    known = LineKnowledge(essential_from_pose(CAM2_FROM_CAM1), 0.7, 0.1, 0.01)
+    grown = grow_both_ways(view1, view2, seeds, step=STEP, known=known).centred()
+    keep = np.ones(grown.valid.shape, dtype=bool)
+    keep[HOLE] = False
+    grown = grown.where(keep)
+    return grown, measure(grown, camera, camera, CAM2_FROM_CAM1), (view1, view2), corner
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_what_patches_leave_open_is_filled_as_well_as_stated(lens: str) -> None:
+    grown, measured, views, corner = grown_with_hole(lens)
+    done = filled(grown, measured, *views, CAM2_FROM_CAM1)
+    assert (done.swept & ~grown.valid).sum() == done.swept.sum()
+    np.testing.assert_array_equal(done.pixels2[grown.valid], grown.pixels2[grown.valid])
+    hole = np.zeros(done.valid.shape, dtype=bool)
+    hole[HOLE] = True
+    camera = LENSES[lens]
+    place, _ = camera.project(CAM2_FROM_CAM1.apply(corner.surface(camera, views[0].nodes(STEP)[hole])[0]))
+    inside = ((place > 10.0) & (place < np.array(SIZE) - 11.0)).all(axis=1)
+    filling = done.swept & hole
+    assert inside.sum() > 400
+    assert filling[hole][inside].mean() > 0.9
+    expected, _ = camera.project(CAM2_FROM_CAM1.apply(corner.surface(camera, done.pixels1[filling])[0]))
+    off = np.linalg.norm(done.pixels2[filling] - expected, axis=1)
+    sigma = np.sqrt(done.covariance[filling, 0, 0])
+    assert np.median(off) < 0.5
+    # Of one component the median is 0.67 standard deviations.
+    assert 0.3 < np.median(off / sigma) < 1.2
+    assert np.mean(off > 3.0) < 0.02
+
+
+def test_nothing_is_filled_where_there_is_no_texture() -> None:
+    grown, measured, views, _ = grown_with_hole("pinhole")
+    done = filled(grown, measured, *views, CAM2_FROM_CAM1)
+    rows, columns = (np.arange(n) * STEP for n in done.valid.shape)
+    inside = np.zeros(done.valid.shape, dtype=bool)
+    v, u = FLAT
+    # Patches of the middle do not reach the border.
+    middle = (rows > v.start + 8) & (rows < v.stop - 8), (columns > u.start + 8) & (columns < u.stop - 8)
+    inside[np.ix_(*middle)] = True
+    assert inside.sum() > 10
+    assert not done.valid[inside].any()
+
+
+def test_a_sweep_that_contradicts_the_patches_is_not_believed() -> None:
+    grown, measured, (view1, view2), _ = grown_with_hole("pinhole")
+    unrelated = np.random.default_rng(1).uniform(0.0, 255.0, view2.grey.shape)
+    other = replace(view2, grey=unrelated.astype(np.uint8))
+    assert filled(grown, measured, view1, other, CAM2_FROM_CAM1) is grown
