@@ -115,7 +115,7 @@ class GrownPatches:
     @property
     def swept(self) -> BoolArray:
         """Which nodes (R, C) have a pair that no patch was aligned for."""
-        return self.correlation == 0.0
+        return np.asarray(self.correlation == 0.0)
 
     def __len__(self) -> int:
         return int(self.valid.sum())

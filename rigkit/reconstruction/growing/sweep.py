@@ -26,10 +26,10 @@ from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 from rigkit.reconstruction.growing.grow import HALF_WIDTH, GrowingView, GrownPatches
 from rigkit.reconstruction.growing.surface import NodeMeasurements
 
-FINER = 2
-"""Samples of the sweep from node to node."""
-MOST_LEVELS = 160
-MARGIN = 0.1
+SAMPLES_A_NODE = 2
+"""From node to node, along either axis."""
+MAX_SWEEP_LEVELS = 160
+MARGIN_OF_RANGES = 0.1
 """Of the range of inverse ranges that grew, to either side."""
 CENSUS_REACH = 2
 BITS = (2 * CENSUS_REACH + 1) ** 2 - 1
@@ -88,13 +88,13 @@ def filled(
     good &= _at(_contrast(view1), sweep.pixels1) > MIN_CONTRAST
     spacing = sweep.inverse[1] - sweep.inverse[0]
     of_grown = np.full(level.shape, np.nan)
-    of_grown[::FINER, ::FINER] = (measured.z[..., 0] - sweep.inverse[0]) / spacing
+    of_grown[::SAMPLES_A_NODE, ::SAMPLES_A_NODE] = (measured.z[..., 0] - sweep.inverse[0]) / spacing
     good = _believed(level, good, of_grown)
     off = np.abs(level - of_grown)[good & np.isfinite(of_grown)]
     misfit = SIGMA_OF_MEDIAN * float(np.median(off)) if off.size else np.inf
     if not misfit < MAX_MISFIT_LEVELS:
         return grown
-    inverse = np.where(good, sweep.inverse[0] + spacing * level, np.nan)[::FINER, ::FINER]
+    inverse = np.where(good, sweep.inverse[0] + spacing * level, np.nan)[::SAMPLES_A_NODE, ::SAMPLES_A_NODE]
     return _with(grown, inverse, misfit * spacing, view1, view2, cam2_from_cam1)
 
 
@@ -103,12 +103,12 @@ def _prepared(
 ) -> _Sweep:
     inverse = measured.z[..., 0]
     low, high = np.nanquantile(inverse, [0.001, 0.999])
-    margin = MARGIN * (high - low)
+    margin = MARGIN_OF_RANGES * (high - low)
     low, high = max(low - margin, 0.0), high + margin
     pixel = 1.0 / float(np.nanquantile(measured.slope, 0.9))
-    count = int(np.clip(np.ceil((high - low) / pixel) + 1, 3, MOST_LEVELS))
+    count = int(np.clip(np.ceil((high - low) / pixel) + 1, 3, MAX_SWEEP_LEVELS))
     levels = np.linspace(low, high, count)
-    step = grown.step / FINER
+    step = grown.step / SAMPLES_A_NODE
     width, height = view1.size_px
     shape = int((height - 1) // step) + 1, int((width - 1) // step) + 1
     coarse = [np.arange(0, n + TABLE_SPACING, TABLE_SPACING) * step for n in reversed(shape)]
@@ -133,8 +133,9 @@ def _turned(rays: FloatArray, inverse: FloatArray, cam2_from_cam1: Rigid3) -> Fl
 
 def _at(image: NDArray[np.float32], places: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the image at places (R, C, 2); NaN outside."""
-    nan = float("nan")
-    return np.asarray(cv2.remap(image, places, None, cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, nan), np.float32)
+    outside = cv2.BORDER_CONSTANT
+    read = cv2.remap(image, places, np.zeros(0), cv2.INTER_LINEAR, borderMode=outside, borderValue=float("nan"))
+    return np.asarray(read, np.float32)
 
 
 def _smooth(view: GrowingView, step_px: float) -> NDArray[np.float32]:
@@ -146,7 +147,7 @@ def _contrast(view: GrowingView) -> NDArray[np.float32]:
     """Return the standard deviation of the brightness over patches around all pixels."""
     image, side = np.asarray(view.grey, np.float32), (2 * HALF_WIDTH + 1,) * 2
     variance = cv2.blur(image * image, side) - cv2.blur(image, side) ** 2
-    return np.sqrt(np.maximum(variance, 0.0))
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)), np.float32)
 
 
 def _census(samples: NDArray[np.float32]) -> NDArray[np.uint32]:
@@ -178,7 +179,8 @@ def _aggregated(costs: NDArray[np.int16], samples1: NDArray[np.float32]) -> NDAr
     total = np.zeros(costs.shape, np.int16)
     for turned in (False, True):
         # Paths along columns, downwards and upwards, then along rows; diagonals go with the first.
-        there, image = (np.swapaxes(v, 0, 1) if turned else v for v in (costs, samples1))
+        there = np.swapaxes(costs, 0, 1) if turned else costs
+        image = samples1.T if turned else samples1
         here = np.swapaxes(total, 0, 1) if turned else total
         for lines in (range(len(there)), range(len(there) - 1, -1, -1)):
             for aside in (0,) if turned else (-1, 0, 1):
