@@ -133,8 +133,9 @@ def _turned(rays: FloatArray, inverse: FloatArray, cam2_from_cam1: Rigid3) -> Fl
 
 def _at(image: NDArray[np.float32], places: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the image at places (R, C, 2); NaN outside."""
-    outside = cv2.BORDER_CONSTANT
-    read = cv2.remap(image, places, np.zeros(0), cv2.INTER_LINEAR, borderMode=outside, borderValue=float("nan"))
+    u, v = (np.ascontiguousarray(places[..., k]) for k in (0, 1))
+    nan = float("nan")
+    read = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=nan)
     return np.asarray(read, np.float32)
 
 
