@@ -1,5 +1,6 @@
 """The public names, for type checkers and, read on first use, for `rigkit/__init__.py`: the only list of them."""
 
+from rigkit.affine.affinities import DirectionNoise as DirectionNoise
 from rigkit.affine.affinities import EpipolarNormals as EpipolarNormals
 from rigkit.affine.homography import affines_from_homography as affines_from_homography
 from rigkit.affine.homography import homography_from_affines as homography_from_affines

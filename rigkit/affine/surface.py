@@ -30,7 +30,7 @@ def linear_gauge(J1: FloatArray, J2: FloatArray) -> LinearGauge:
     Notes
     -----
     d = unit(grad u1 x grad v1), G = J2 J1^T (J1 J1^T)^-1, h = J2 d. Equivalent to the form of Molnar and Chetverikov
-    that Hajder uses (`affines_from_normals_by_minors`).
+    that Hajder uses (tests/affine/test_surface.py, with an erratum).
     """
     ux, uy, uz = (J1[..., 0, i] for i in range(3))
     vx, vy, vz = (J1[..., 1, i] for i in range(3))
@@ -67,20 +67,3 @@ def affines_from_normals(J1: FloatArray, J2: FloatArray, normals: Normals) -> tu
         A21 = G - h[..., :, None] * y[..., None, :]
     valid = np.isfinite(A21).all(axis=(-2, -1))
     return np.where(valid[..., None, None], A21, np.nan), valid
-
-
-def affines_from_normals_by_minors(J1: FloatArray, J2: FloatArray, normals: Normals) -> Affines:
-    """Return A21 as `affines_from_normals`, by the 2x2 minors of Molnar and Chetverikov.
-
-    Notes
-    -----
-    A = [n.w1, n.w2; n.w3, n.w4] / n.w5. Erratum: the paper prints w1 = grad v1 x grad u1, the same as w5; it is
-    w1 = grad v1 x grad u2 (tests/affine/test_surface.py).
-    """
-    u1, v1, u2, v2 = J1[..., 0, :], J1[..., 1, :], J2[..., 0, :], J2[..., 1, :]
-    minors = np.stack(
-        [np.cross(v1, u2), np.cross(u2, u1), np.cross(v1, v2), np.cross(v2, u1), np.cross(v1, u1)], axis=-2
-    )
-    products = np.einsum("...ki,...i->...k", minors, normals)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray((products[..., :4] / products[..., 4:]).reshape(*products.shape[:-1], 2, 2))

@@ -8,7 +8,7 @@ from helpers.affine_scenes import FISHEYE, REGULAR, Corners, see
 from tolerances import EXACT_REL, ROUNDING
 
 from rigkit.affine.affinities import EpipolarNormals
-from rigkit.affine.surface import affines_from_normals, affines_from_normals_by_minors, linear_gauge
+from rigkit.affine.surface import affines_from_normals, linear_gauge
 from rigkit.cameras.base import Camera
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit
@@ -72,6 +72,23 @@ def test_the_fisheye_scene_goes_beyond_90_degrees() -> None:
     off_axis = np.degrees(np.arccos(unit(c.points)[:, 2]))
     assert (off_axis > 90.0).sum() > 20
     assert (off_axis < 45.0).sum() > 20
+
+
+def affines_from_normals_by_minors(J1: np.ndarray, J2: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Return A21 as `affines_from_normals`, by the 2x2 minors of Molnar and Chetverikov.
+
+    Notes
+    -----
+    A = [n.w1, n.w2; n.w3, n.w4] / n.w5. Erratum: the paper prints w1 = grad v1 x grad u1, the same as w5; it is
+    w1 = grad v1 x grad u2.
+    """
+    u1, v1, u2, v2 = J1[..., 0, :], J1[..., 1, :], J2[..., 0, :], J2[..., 1, :]
+    minors = np.stack(
+        [np.cross(v1, u2), np.cross(u2, u1), np.cross(v1, v2), np.cross(v2, u1), np.cross(v1, u1)], axis=-2
+    )
+    products = np.einsum("...ki,...i->...k", minors, normals)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray((products[..., :4] / products[..., 4:]).reshape(*products.shape[:-1], 2, 2))
 
 
 @CAMERAS
