@@ -215,7 +215,7 @@ def scene(seeds: int, noise_px: float, name: str) -> None:
             for c, mount in enumerate((Rigid3.identity(), MOUNT)):
                 view = seen(camera, mount @ board, f"{k:02d}", noise_px, rng)
                 views += [] if view is None else [FreshView(f"{k:02d}", c, view)]
-        watched, walls = watched_rig(views, camera), Corner.random(rng)
+        watched, walls = watched_rig(views, camera), Corner.of_a_room(seed)
         left = walls.image(camera, Rigid3.identity(), rng)
         for what, checks in found.items():
             pose = turned(MOUNT, SCENE_TURNED_DEG if what == "rotation" else 0.0, rng)

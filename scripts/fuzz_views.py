@@ -58,6 +58,7 @@ def write_views(folder: Path) -> None:
     (folder / "views.csv").write_text(corners_text(found))
     matched = Correspondences(PLACES, PLACES @ H21[:2, :2].T + H21[:2, 2], np.tile(H21[:2, :2], (len(PLACES), 1, 1)))
     (folder / "matched.csv").write_text(correspondences_text(matched))
+    assert matched.A21 is not None
     np.savez(folder / "matched.npz", pixels1=matched.pixels1, pixels2=matched.pixels2, A21=matched.A21)
     (folder / "hand.csv").write_text("\n".join(rows) + "\n")
     kept = CornerCache(folder / "kept.json", [load_board(folder / "floor.toml")])

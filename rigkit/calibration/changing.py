@@ -180,7 +180,7 @@ def _rows(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[FloatA
     p = calibration.camera.parameters.size
     rows = np.zeros((2, p + 6 + sum(WAY_COLUMNS.values()) + 1, points.shape[1]))
     by_point = rows[:, 3:6]
-    u, v, valid = calibration.camera.derivatives(*in_cam, by_point, rows[:, 6 : 6 + p])
+    u, v, valid = calibration.camera.derivatives(in_cam[0], in_cam[1], in_cam[2], by_point, rows[:, 6 : 6 + p])
     pixels = np.where(valid, [u, v], np.nan)
     lever, flat = centred(turned), centred(points[:2])
     x, y = flat / np.maximum.reduceat(np.abs(flat).max(axis=0), start)[view]

@@ -37,12 +37,12 @@ class Corner:
 
     @classmethod
     @functools.cache
-    def of_a_room(cls) -> Corner:
-        """A corner 1.3 m in front of camera 1, its diagonal towards the camera, the floor below."""
+    def of_a_room(cls, seed: int = 20) -> Corner:
+        """A corner 1.3 m in front of camera 1, its diagonal towards the camera, the floor below, textures drawn."""
         diagonal = unit(np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]).sum(axis=0))
         turn = exp_so3(unit(np.cross(diagonal, [0, 0, -1.0])) * np.arccos(diagonal @ [0, 0, -1.0]))
         axes = exp_so3(np.array([0.1, -0.15, 0.4])) @ turn
-        rng = np.random.default_rng(20)
+        rng = np.random.default_rng(seed)
         return cls(axes, np.array([10.0, 20.0, 1300.0]), tuple(texture(rng) for _ in range(3)))
 
     def hit(self, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
