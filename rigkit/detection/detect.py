@@ -53,7 +53,8 @@ def detect_boards(
     InputError
         `image` is not an image of a supported type.
     """
-    search = Search(without_bad_pixels(without_mosaic(grey_image(image))), boards or (), min_corners, camera)
+    stored = without_mosaic(grey_image(image))
+    search = Search(without_bad_pixels(stored), boards or (), min_corners, camera, stored)
     found: list[BoardDetection] = []
     for kind, finder in FINDERS.items():
         own = [board for board in search.boards if board.pattern.type == kind]

@@ -39,15 +39,17 @@ MIN_BOARD_CORNERS = 9
 
 
 def find_lattices(
-    image: NDArray[np.generic], min_corners: int, sizes: Sequence[tuple[int, int]] = ()
+    image: NDArray[np.generic], min_corners: int, sizes: Sequence[tuple[int, int]] = (), *, marked: bool = False
 ) -> list[RefinedLattice]:
     """Return the lattices of all boards of `image`, refined, in no particular order and orientation.
 
     `sizes` : (columns, rows) of all boards that may be in it, if known.
+    `marked` : whether some of them may have markers in their squares, into which blur takes the edges: lattices with
+    edges aside of their corners (`has_edge_offset`) are then among those returned.
     """
     grey = grey_image(image)
     size_px = (grey.shape[1], grey.shape[0])
-    found = fitted(grey, candidates(grey, min_corners, _promising), min_corners, sizes)
+    found = fitted(grey, candidates(grey, min_corners, _sampled if marked else _promising), min_corners, sizes)
     return [item for item in found if min_corners < MIN_BOARD_CORNERS or compact(item.lattice, size_px)]
 
 
@@ -120,8 +122,11 @@ def _confirmed(
 
 def _promising(grey: GreyImage, finest: Level, lattice: Lattice) -> bool:
     """Return whether `lattice` may be a board, as far as a quick look at its edges and a sample of it tell."""
-    if lattice.solid and has_edge_offset(lattice, finest):
-        return False
+    return not (lattice.solid and has_edge_offset(lattice, finest)) and _sampled(grey, finest, lattice)
+
+
+def _sampled(grey: GreyImage, _: Level, lattice: Lattice) -> bool:
+    """Return whether `lattice` may be a board, as far as a sample of it tells."""
     sample = sample_of(lattice)
     if sample is None:
         return True

@@ -10,6 +10,7 @@ import numpy as np
 from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
+from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.detection.lattices import MIN_BOARD_CORNERS, find_lattices, fitted
 from rigkit.detection.saddles.local_contrast import equalised, stretched
@@ -26,10 +27,19 @@ class Search:
     boards : all boards that may be there.
     min_corners : boards with fewer points are not reported, but for whole ones of `boards`.
     camera : the calibrated camera, if known.
+    stored : the grey levels before bad pixels were replaced: modules of small markers look like these.
     """
 
-    def __init__(self, grey: GreyImage, boards: Sequence[Board], min_corners: int, camera: Camera | None) -> None:
+    def __init__(
+        self,
+        grey: GreyImage,
+        boards: Sequence[Board],
+        min_corners: int,
+        camera: Camera | None,
+        stored: GreyImage | None = None,
+    ) -> None:
         self.grey = grey
+        self.stored = grey if stored is None else stored
         self.boards = tuple(boards)
         self.min_corners = min_corners
         self.camera = camera
@@ -66,7 +76,8 @@ class Search:
     def _found_lattices(self) -> list[RefinedLattice]:
         plain = all(board.pattern.type == Chessboard.type for board in self.boards)
         only = self.chessboard_sizes if plain else ()
-        found = find_lattices(self.grey, self.fewest, only)
+        marked = any(board.pattern.type == Charuco.type for board in self.boards)
+        found = find_lattices(self.grey, self.fewest, only, marked=marked)
         if not found and self.grey.dtype != np.uint8:
             # Beyond 8 bits the squares of a board may be a hundredth of the range of brightness.
             seen = [item.lattice for item in find_lattices(equalised(self.grey), self.fewest, only)]

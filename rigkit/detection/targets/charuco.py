@@ -17,10 +17,11 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.charuco import Charuco
+from rigkit.detection.checks.validate import has_edge_offset
 from rigkit.detection.guided.guided import completed, fit_corners
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
-from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.saddles.response import GreyImage, pyramid
 from rigkit.detection.subpixel.subpixel import RefinedLattice, refine
 from rigkit.detection.tags.codes import homographies, transferred
 from rigkit.detection.targets.base import Finder, Search
@@ -40,28 +41,29 @@ class CharucoFinder(Finder):
 
     def find(self, search: Search, boards: Sequence[Board]) -> list[BoardDetection]:
         lattices = search.lattices
-        found, rest = _charuco_boards(search.grey, lattices, boards, search.min_corners)
-        search.leave(rest)
+        found, rest = _charuco_boards(search, lattices, boards)
+        finest = pyramid(search.grey)[0] if rest else None
+        search.leave([item for item in rest if finest and not has_edge_offset(item.lattice, finest)])
         return [completed(search.grey, item, boards, search.camera) for item in found]
 
 
 def _charuco_boards(
-    image: GreyImage, found: Sequence[RefinedLattice], boards: Sequence[Board], min_corners: int
+    search: Search, found: Sequence[RefinedLattice], boards: Sequence[Board]
 ) -> tuple[list[BoardDetection], list[RefinedLattice]]:
     """Return the ChArUco boards in an image, named and on their own grids, and the lattices that are none.
 
     Parameters
     ----------
-    image : grey, 0..255.
+    search : the image.
     found : all lattices of the image.
     boards : the ChArUco boards that may be there.
-    min_corners : boards with fewer corners are not returned.
     """
-    eight_bit = np.clip(np.rint(image), 0, 255).astype(np.uint8)
-    rest = list(found)
+    image, rest = search.grey, list(found)
+    pictures = [image] if search.stored is image else [image, search.stored]
+    eight_bit = [np.clip(np.rint(picture), 0, 255).astype(np.uint8) for picture in pictures]
     out = []
     for board in boards:
-        grid, pixels = _marked_corners(eight_bit, board)
+        grid, pixels = max((_marked_corners(picture, board) for picture in eight_bit), key=lambda seen: len(seen[0]))
         if not len(grid):
             continue
         whole = _empty(board)
@@ -75,7 +77,7 @@ def _charuco_boards(
         whole = _united(whole, _of(board, grid, pixels))
         (refined,) = refine(image, [whole])
         refined = _beside_markers(image, refined, board)
-        if refined.lattice.count >= min_corners:
+        if refined.lattice.count >= search.min_corners:
             out.append(_detection(refined, board))
             rest = left
     return out, rest
