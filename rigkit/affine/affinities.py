@@ -74,6 +74,8 @@ class DirectionNoise:
     covariance1: FloatArray
     covariance2: FloatArray
 
+    __repr__ = brief
+
     def __post_init__(self) -> None:
         shape = np.asarray(self.covariance1).shape
         if len(shape) != 3 or shape[1] != shape[2] or shape[1] % 2:
