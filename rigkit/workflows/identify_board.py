@@ -6,9 +6,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from rigkit.core.boards import Board
 from rigkit.core.errors import CheckFailed, InputError, RigkitError
 from rigkit.core.progress import Progress, silent
+from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import GreyImage, grey_image
 from rigkit.detection.unknown import BoardGuess, difference, guess_board
 from rigkit.io.board_words import words_of_board
@@ -89,6 +92,9 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
 
 def explained(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     """Return in words why images do not show the boards declared; None where that is not known."""
+    mirrored = _mirrored(paths, [board for board in boards if board.identified])
+    if mirrored is not None:
+        return mirrored
     guess = _guess(paths)
     if guess is None:
         return None
@@ -100,6 +106,31 @@ def explained(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     if what in words[0]:
         return f"in {count} images {words[0]}"
     return f"{what} seen in {count} images; {words[0]}"
+
+
+def _mirrored(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
+    """Say that images are mirrored, where boards with marks are seen in them only when they are flipped; None else. A
+    chessboard in a mirror is a chessboard: nothing tells."""
+    if not boards:
+        return None
+    names = []
+    for name, image in _pictures(paths, EXPLAINING_IMAGES):
+        if isinstance(image, InputError):
+            continue
+        straight, flipped = (
+            any(found.board_id is not None for found in detect_boards(seen, boards))
+            for seen in (image, np.ascontiguousarray(image[:, ::-1]))
+        )
+        if straight:
+            return None
+        if flipped:
+            names.append(name)
+    if not names:
+        return None
+    return (
+        f"the images are mirrored: '{Path(names[0]).name}' shows its board only when it is flipped left to right; "
+        "switch off mirroring in the camera or the program that writes them, or flip all of them"
+    )
 
 
 def suggested_words(paths: Sequence[Path]) -> str | None:

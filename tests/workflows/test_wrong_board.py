@@ -31,3 +31,12 @@ def test_corners_in_wrong_places_of_a_board_have_their_cause(folder: Path, capsy
     assert main(["calibrate", str(folder), "--board", words, "-o", str(folder / "out.json")]) != 0
     said = "".join(capsys.readouterr())
     assert "7 x 7 inner corners are seen, 8 x 8 are declared" in said
+
+
+def test_mirrored_images_are_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for path in folder.glob("*.png"):
+        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)[:, ::-1])
+    words = "charuco:7x7x30,dictionary=DICT_4X4_1000,marker_mm=22.5"
+    assert main(["calibrate", str(folder), "--board", words, "-o", str(folder / "out.json")]) != 0
+    said = "".join(capsys.readouterr())
+    assert "the images are mirrored: '0.png' shows its board only when it is flipped" in said
