@@ -13,7 +13,7 @@ from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import InputError
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, repr=False)
 class HeldLens(Camera):
     """The camera `lens`, without a parameter."""
 

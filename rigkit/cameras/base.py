@@ -122,6 +122,12 @@ class Camera(ABC):
         with np.errstate(all="ignore"):
             self._prepare()
 
+    def __repr__(self) -> str:
+        values = ", ".join(
+            f"{name}={value:.6g}" for name, value in zip(self.parameter_names(), self.parameters.tolist(), strict=True)
+        )
+        return f"{type(self).__name__}({self.size_px[0]}x{self.size_px[1]} px: {values})"
+
     def _prepare(self) -> None:
         """Check the values of the parameters and compute what the formulas need of them."""
         return

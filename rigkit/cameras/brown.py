@@ -22,7 +22,7 @@ NEWTON_SETTLED = 1e-13
 """Newton in the plane stops where the next step would be this small, in units of the focal length."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, repr=False)
 class Brown(Camera):
     """With (x, y) = (X/Z, Y/Z) and t = x^2 + y^2:  m = L(t) (x, y) + tangential,  u = fx m_x + cx, v = fy m_y + cy.
 

@@ -19,7 +19,7 @@ DOUBLE_SPHERE_STARTS = ((0.0, 0.1), (0.0, 0.5), (0.0, 0.6), (0.0, 0.7), (-0.2, 0
 """(xi, alpha) from a nearly perspective lens to a fisheye."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, repr=False)
 class DoubleSphere(FocalCamera):
     """m = (x, y) / (alpha d2 + (1 - alpha) (xi d1 + z)), d1 = |X|, d2 = sqrt(x^2 + y^2 + (xi d1 + z)^2).
 

@@ -20,7 +20,7 @@ EUCM_STARTS = ((0.1, 1.0), (0.5, 1.0), (0.6, 1.0), (0.7, 1.0))
 """(alpha, beta) from a nearly perspective lens to a fisheye."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, repr=False)
 class EUCM(FocalCamera):
     """m = (x, y) / (alpha d + (1 - alpha) z), d = sqrt(beta (x^2 + y^2) + z^2); u = fx m_x + cx, v = fy m_y + cy.
 

@@ -12,7 +12,7 @@ from rigkit.cameras.radial import FocalCamera, ScaleDerivatives
 from rigkit.core.arrays import BoolArray, FloatArray, Mat3
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, repr=False)
 class Pinhole(FocalCamera):
     """u = fx x/z + cx, v = fy y/z + cy; points with z <= 0 are not seen.
 

@@ -35,7 +35,7 @@ class ScaleDerivatives(NamedTuple):
     by_shape: tuple[FloatArray, ...]
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, repr=False)
 class RadialCamera(Camera):
     """What radially symmetric models have in common; see the module."""
 
@@ -106,7 +106,7 @@ class RadialCamera(Camera):
         return l00 * mx + l01 * my + cx, l11 * my + cy, d.valid
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, repr=False)
 class FocalCamera(RadialCamera):
     """Radial models whose parameters are fx, fy, cx, cy in px and then the shape."""
 

@@ -25,7 +25,7 @@ BEYOND_CORNERS = 1.5
 """The polynomial is taken to hold out to this multiple of the distance to the farthest corner of the image."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, repr=False)
 class Scaramuzza(RadialCamera):
     """The ray of (u', v') is along (u', v', f(rho)), rho = |(u', v')|, f(rho) = a0 + a2 rho^2 + ... + aN rho^N.
 

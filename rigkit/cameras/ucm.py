@@ -12,7 +12,7 @@ from typing import ClassVar
 from rigkit.cameras.eucm import EUCM
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, repr=False)
 class UCM(EUCM):
     """m = (x, y) / (alpha |X| + (1 - alpha) z); u = fx m_x + cx, v = fy m_y + cy: the enhanced model with beta = 1.
 

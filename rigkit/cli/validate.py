@@ -92,6 +92,7 @@ def _options(args: argparse.Namespace, common: dict[str, Any]) -> ValidateOption
 def _many(args: argparse.Namespace) -> int:
     """Validate several data sets, each in a folder of its own; print one table."""
     import os
+    from dataclasses import replace
 
     from rigkit.report.tables import tables_to_json, tables_to_text
     from rigkit.workflows.validate_many import validate_datasets
@@ -102,7 +103,9 @@ def _many(args: argparse.Namespace) -> int:
     jobs = args.jobs or os.cpu_count() or 1
     progress = progress_on_stderr()
     done = validate_datasets(args.dataset, _options(args, common), jobs=jobs, cluster=args.cluster, progress=progress)
-    print(tables_to_json([done.table]) if args.json else tables_to_text([done.table]))
+    # Sentences stand below the table, not in it.
+    short = replace(done.table, columns=done.table.columns[:-1], rows=tuple(row[:-1] for row in done.table.rows))
+    print(tables_to_json([done.table]) if args.json else tables_to_text([short]))
     for path, outcome in zip(args.dataset, done.outcomes, strict=True):
         if outcome.error:
             note(f"'{path}': {outcome.error}")

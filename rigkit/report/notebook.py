@@ -13,7 +13,7 @@ import numpy as np
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.arrays import FloatArray
-from rigkit.core.findings import Finding, Severity, worst
+from rigkit.core.findings import Finding, Severity, gravest_first, worst
 from rigkit.core.progress import Progress, silent
 from rigkit.geometry.rotation import exp_so3
 from rigkit.reconstruction.reconstruct import Reconstruction
@@ -36,9 +36,9 @@ def html_of(result: Calibration | RigCalibration | Reconstruction) -> str:
     """Return a result as a notebook shows it: what it is, the verdict, and its 3D scene as a drawing."""
     if isinstance(result, Calibration):
         scene = boards_scene(result.views, result.boards)
-        return _shown(repr(result), result.verdicts[:2], scene)
+        return _shown(repr(result), gravest_first(result.verdicts)[:2], scene)
     if isinstance(result, RigCalibration):
-        return _shown(f"{result!r}\n  {rig_reach(result, ())}", result.verdicts[:2], rig_scene(result))
+        return _shown(f"{result!r}\n  {rig_reach(result, ())}", gravest_first(result.verdicts)[:2], rig_scene(result))
     baseline = measured_words(result.baseline_mm, result.baseline_sigma_mm, 2)
     words = (
         f"Reconstruction of '{result.pair_id}', {result.pose_type}, {result.affine_method}: {len(result.cloud)} "

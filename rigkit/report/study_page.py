@@ -22,7 +22,10 @@ def study_page(found: StudyTable, provenance: Mapping[str, str]) -> str:
             headline=headline,
             badge="" if not count else "all hold" if held == count else "not all hold",
             passed=held == count if count else None,
-            sentences=(study_setup(found.study).capitalize() + ".",),
+            sentences=(
+                *(f"{v.text}: {v.words}." for v in found.verdicts if not v.holds),
+                study_setup(found.study).capitalize() + ".",
+            ),
             tables=tuple(study_tables(found)),
         ),
         provenance,

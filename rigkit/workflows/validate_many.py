@@ -32,7 +32,7 @@ class SetOutcome:
     ----------
     name : of the data set, which is also its folder of results.
     code : the exit code that it alone would have had.
-    error : why nothing came out, or which pairs failed; empty where all were validated.
+    error : why nothing came out, which pairs failed, or the probable cause of checks that did; empty where all is well.
     pairs, checks_failed : how many.
     worst_angle_deg, mean_normal_deg, worst_baseline_sigmas : over the pairs' best estimators; None where unknown.
     seconds : how long it took.
@@ -90,7 +90,9 @@ def validate_datasets(
     names = [name for name, _ in named]
     twice = [name for name in names if names.count(name) > 1]
     if twice:
-        raise InputError(f"two data sets are called '{twice[0]}', which names a folder of results; rename one")
+        raise InputError(
+            f"two data sets are called '{twice[0]}', as is the folder of results; change `name` in one's dataset.toml"
+        )
     require_folder(options.output, force=options.force)
     work = partial(_one, options=replace(options, output=options.output.resolve(), jobs=1))
     found: dict[int, SetOutcome] = {}
@@ -129,11 +131,13 @@ def _one(named: tuple[str, Path], *, options: ValidateOptions) -> SetOutcome:
     judged = [*(report.checks for report in best), *(other.checks for other in done.crosschecks)]
     angles = [a.error_deg for report in best for a in report.angles if a.error_deg is not None]
     baselines = [c.k for report in best for c in report.checks if c.kind == "baseline"]
+    why = [*map(str, done.failures), *(cause.text for cause in done.causes)]
+    more = f" (and {len(why) - 1} more on its page)" if len(why) > 1 else ""
     failed = done.failures[0].error.exit_code if done.failures else ExitCode.CHECK_FAILED
     return SetOutcome(
         name=name,
         code=ExitCode.WELL if done.passed else failed,
-        error="; ".join(str(failure) for failure in done.failures),
+        error="".join([*why[:1], more]),
         pairs=len(done.pairs),
         checks_failed=sum(not c.passed for checks in judged for c in checks),
         worst_angle_deg=max(angles, default=None),

@@ -1,0 +1,18 @@
+"""A camera says in one line what it is: its model, size and every number by its name."""
+
+from __future__ import annotations
+
+import pytest
+from helpers.cameras import sample_cameras
+
+CAMERAS = sample_cameras()
+
+
+@pytest.mark.parametrize("label", CAMERAS)
+def test_a_camera_says_its_numbers_by_name(label: str) -> None:
+    camera = CAMERAS[label]
+    head, _, values = repr(camera).removesuffix(")").partition(": ")
+    assert head == f"{type(camera).__name__}({camera.size_px[0]}x{camera.size_px[1]} px"
+    said = dict(value.split("=") for value in values.split(", "))
+    assert tuple(said) == camera.parameter_names()
+    assert [float(value) for value in said.values()] == pytest.approx(camera.parameters.tolist(), rel=1e-5)
