@@ -26,7 +26,7 @@ from rigkit.core.findings import Finding, Severity
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.board_file import board_of_values, board_values
 from rigkit.io.files import write_atomic
-from rigkit.io.json_reader import positive, read_json, real, reals, whole
+from rigkit.io.json_reader import freedom, positive, read_json, real, reals, whole
 from rigkit.io.reading import usable_path
 from rigkit.io.schema_calibration import CALIBRATION_FILE, keys_of
 
@@ -109,6 +109,8 @@ def load_calibration(path: str | Path) -> Calibration:
         size = camera.parameters.size
         boards = tuple(_shape_in(v) for v in data["boards"])
         sizes = {board.board_id: board.declared.size for board in boards if board.declared is not None}
+        if strangers := {str(view["board_id"]) for view in data["views"]} - {board.board_id for board in boards}:
+            raise ValueError(f"a view of board '{min(strangers)}', which is not among 'boards'")
         return Calibration(
             camera=camera,
             rms_px=real(data["rms_px"]),
@@ -124,7 +126,7 @@ def load_calibration(path: str | Path) -> Calibration:
             boards=boards,
             verdicts=findings_from_json(data["verdicts"]),
             overdispersion=positive(data.get("overdispersion", 1.0)),
-            freedom=math.inf if data.get("freedom") is None else positive(data["freedom"]),
+            freedom=freedom(data.get("freedom")),
         )
 
 
@@ -137,7 +139,11 @@ def damage_named(path: str | Path) -> Iterator[None]:
         words = " ".join(str(error).split())
         # What we say ends with what to do.
         words = words if isinstance(error, InputError) else words[:200]
-        raise InputError(words if str(path) in words else f"'{path}': damaged ({words}); calibrate again") from error
+        if str(path) not in words:
+            # What a value's own reader says to do is said once.
+            told = f"damaged: {words}" if words.endswith("calibrate again") else f"damaged ({words}); calibrate again"
+            words = f"'{path}': {told}"
+        raise InputError(words) from error
 
 
 def _read(path: str | Path) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
-from rigkit.io.numbers import MAX_NUMBER
+from rigkit.io.numbers import MAX_NUMBER, MIN_POSITIVE
 from rigkit.io.reading import read_text
 
 MAX_JSON_DIGITS = 18
@@ -69,10 +69,19 @@ def real(value: Any) -> float:
 
 
 def positive(value: Any) -> float:
-    """Return a number above zero; raises ValueError for any other."""
+    """Return a number of at least `MIN_POSITIVE`; raises ValueError for any other."""
     number = real(value)
-    if not number > 0.0:
-        raise ValueError(f"{number:g} must be positive")
+    if not number >= MIN_POSITIVE:
+        raise ValueError(f"{number:g} must be positive, at least {MIN_POSITIVE:g}")
+    return number
+
+
+def freedom(value: Any) -> float:
+    """Return degrees of freedom, null being infinitely many; raises ValueError for less than one."""
+    if value is None:
+        return math.inf
+    if not (number := real(value)) >= 1.0:
+        raise ValueError(f"{number:g} degrees of freedom; there are one or more")
     return number
 
 

@@ -22,7 +22,7 @@ from rigkit.core.identifiers import check_identifier
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.board_file import board_of_values, board_values
 from rigkit.io.calibration_file import Made, camera_from_json, camera_to_json, damage_named, findings_to_json
-from rigkit.io.json_reader import json_schema, positive, read_json, real, reals, whole
+from rigkit.io.json_reader import freedom, json_schema, positive, read_json, real, reals, whole
 from rigkit.io.schema_calibration import BOARD_RIG_FILE, RIG_FILE, keys_of
 
 RIG_SCHEMA = "rigkit.rig/1"
@@ -121,7 +121,7 @@ def load_saved_rig(path: str | Path) -> SavedRig:
             covariance = as_covariance(data["covariance"], "covariance", size)
         sigma_px = None if "sigma_px" not in data else positive(data["sigma_px"])
         scale_sigma = real(data.get("scale_sigma", 0.0))
-        freedom = math.inf if data.get("freedom") is None else positive(data["freedom"])
+        of_freedom = freedom(data.get("freedom"))
         overdispersion = positive(data.get("overdispersion", data.get("spread", 1.0)))
         boards = tuple(board_of_values(entry["target"], entry["board_id"]) for entry in data.get("boards", ()))
     return SavedRig(
@@ -129,7 +129,7 @@ def load_saved_rig(path: str | Path) -> SavedRig:
         covariance=covariance,
         sigma_px=sigma_px,
         scale_sigma=scale_sigma,
-        freedom=freedom,
+        freedom=of_freedom,
         overdispersion=overdispersion,
         boards=boards,
         outlines=outlines,

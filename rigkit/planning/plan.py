@@ -9,7 +9,7 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
-from rigkit.core.errors import InputError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.candidates import Reach, held_boards
 from rigkit.planning.goal import Goal
@@ -87,6 +87,11 @@ def choose_views(
             pick = int(np.argmin(after))
         else:
             good = np.flatnonzero(before - after >= (1.0 - NEARLY) * (before - after.min()))
+            if not good.size:
+                raise DegenerateError(
+                    "plan: nothing can be said of any view: the calibration's numbers, or its board, are no real ones; "
+                    "calibrate again"
+                )
             pick = int(good[np.argmin(effort(last)[left[good]])])
         last = int(left[pick])
         information = information + views[last]

@@ -193,7 +193,7 @@ def _a_contrario_test(matches: Matches, pose: Rigid3, inliers: BoolArray, freedo
     if log_false_alarms(matches, pose, inliers, fits, freedom, GATE) > np.log(MAX_FALSE_ALARMS):
         raise DegenerateError(
             f"{int(inliers.sum())} of {len(inliers)} correspondences agree with one pose, as many as wrong ones might "
-            "by chance; the scene has too little texture, or looks the same in many places"
+            "by chance; take a scene with more texture, which does not look the same in many places"
         )
 
 

@@ -13,7 +13,7 @@ from rigkit.calibration.hand_eye import HandEye, hand_eye
 from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
-from rigkit.core.errors import CheckFailed, InputError
+from rigkit.core.errors import CheckFailed, DegenerateError, InputError
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
@@ -135,7 +135,10 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
     rays, valid = lens.unproject(view.pixels)
     unit = np.linalg.norm(lens.ray_jacobian(view.pixels[valid]), axis=(1, 2)) / np.sqrt(2.0)
     points = view.points()[valid]
-    found = board_poses(rays[valid], points, view.sigma_px[valid] * unit)
+    with about(camera, image):
+        found = board_poses(rays[valid], points, view.sigma_px[valid] * unit)
+        if not np.isfinite(found[0].covariance).all():
+            raise DegenerateError("the lens is too steep at the board to say where it is; check the calibration")
     seen, _ = lens.project(found[0].cam_from_board.apply(points))
     rms = float(np.sqrt(((seen - view.pixels[valid]) ** 2).sum(axis=1).mean()))
     ambiguous = len(found) > 1 and found[1].rms_rad < PLANAR_AMBIGUITY * found[0].rms_rad

@@ -13,6 +13,7 @@ from rigkit.core.errors import InputError
 from rigkit.io.calibration_file import load_calibration
 from rigkit.io.files import ensure_writable, write_atomic
 from rigkit.io.history_file import HistoryEntry, add_entry, ensure_register, load_history
+from rigkit.io.reading import about
 from rigkit.report.check_page import history_page
 from rigkit.validation.sentinel.evidence import MIN_SIGMA_PX, FreshEvidence, Watched
 from rigkit.validation.sentinel.judge import judge_evidence
@@ -51,7 +52,8 @@ def add_calibration(register: Path, new: Path, reference: Path, *, temperature_c
             f"history: '{new}' is a {now.camera.model} camera, '{reference}' a {before.camera.model}; calibrate with "
             "the same model and degree to compare them number by number, or see `rigkit diff`"
         )
-    check = judge_evidence(watched_camera(before, reference.stem), lambda watched: _as_evidence(watched, now))
+    with about(new, reference):
+        check = judge_evidence(watched_camera(before, reference.stem), lambda watched: _as_evidence(watched, now))
     entry = HistoryEntry.of_check(check, new, kind="calibration", temperature_c=temperature_c)
     add_entry(register, entry)
 

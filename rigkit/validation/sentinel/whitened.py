@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.core.arrays import FloatArray
+from rigkit.core.errors import DegenerateError
 from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
 
 COMMON_FREEDOM = 10.0
@@ -19,6 +20,8 @@ COMMON_FREEDOM = 10.0
 board bend in some ways more than in others. Where measured, the variances of directions scatter around their mean by
 about half of it, as a mean square of so many values does."""
 NULL_RANK = 1e-9
+MAX_CONDITION = 1e15
+"""Of a covariance that rounding leaves something of."""
 LARGE_FREEDOM = 1e6
 """As good as infinite, which the F distribution does not take."""
 
@@ -36,6 +39,10 @@ class Whitened:
     def of(cls, watched: Watched, evidence: FreshEvidence) -> Whitened:
         information = evidence.information.sum(axis=0) / evidence.variance_px2
         score = evidence.score.sum(axis=0) / evidence.variance_px2
+        if not np.isfinite(information).all():
+            raise DegenerateError(
+                "check: the pictures and the lens do not go together; check the calibration's numbers"
+            )
         # Scaled to a unit diagonal: parameters differ by many powers of ten.
         scale = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
         values, vectors = np.linalg.eigh(information * scale[:, None] * scale)
@@ -44,6 +51,11 @@ class Whitened:
         left = vectors[:, seen] * root / scale[:, None]
         own = (vectors[:, seen] * scale[:, None]).T @ score / root
         covariance = np.eye(len(own)) + left.T @ watched.covariance @ left
+        if not len(own) or np.linalg.cond(covariance) > MAX_CONDITION:
+            raise DegenerateError(
+                "check: beside these pictures, what the calibration says of its own numbers is worth nothing (its "
+                "covariance, or the lens); calibrate again"
+            )
         return cls(own, covariance, left.T, _freedom(watched, len(own)))
 
 
