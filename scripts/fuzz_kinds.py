@@ -127,7 +127,7 @@ KINDS: dict[str, Kind] = {
             ("rectify", "image.png", "--camera", "{case}", "-o", "{out}/cut.png", "--crop", "--hfov-deg", "60"),
             ("export", "{case}", "--to", "mrcal", "-o", "{out}/new.cameramodel"),
             ("certify", "{case}", "--length", "200", "--distance", "900", "-r", "{out}/new.html"),
-            ("diff", "calibration.json", "{case}", "-r", "{out}/new.html"),
+            ("diff", "calibration.json", "{case}", "-r", "{out}/diff.html"),
             ("history", "history.jsonl", "--add", "{case}", "--to", "{case}"),
         ),
     ),
