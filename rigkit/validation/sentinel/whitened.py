@@ -20,7 +20,7 @@ COMMON_FREEDOM = 10.0
 board bend in some ways more than in others. Where measured, the variances of directions scatter around their mean by
 about half of it, as a mean square of so many values does."""
 NULL_RANK = 1e-9
-MAX_CONDITION = 1e15
+MAX_CONDITION_NUMBER = 1e15
 """Of a covariance that rounding leaves something of."""
 LARGE_FREEDOM = 1e6
 """As good as infinite, which the F distribution does not take."""
@@ -51,7 +51,7 @@ class Whitened:
         left = vectors[:, seen] * root / scale[:, None]
         own = (vectors[:, seen] * scale[:, None]).T @ score / root
         covariance = np.eye(len(own)) + left.T @ watched.covariance @ left
-        if not len(own) or np.linalg.cond(covariance) > MAX_CONDITION:
+        if not len(own) or np.linalg.cond(covariance) > MAX_CONDITION_NUMBER:
             raise DegenerateError(
                 "check: beside these pictures, what the calibration says of its own numbers is worth nothing (its "
                 "covariance, or the lens); calibrate again"
