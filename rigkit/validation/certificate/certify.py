@@ -108,10 +108,11 @@ def _findings(certificate: Certificate) -> list[Finding]:
     found = []
     coarse = float(np.mean(certificate.coarse[certificate.in_view]))
     if coarse > 0.0:
+        share = "less than 1" if coarse < 0.01 else f"{100.0 * coarse:.0f}"
         found.append(
             Finding(
                 severity=Severity.LOOK,
-                message=f"in {100.0 * coarse:.0f} % of the view the bound is but a lower one: the lines of sight "
+                message=f"in {share} % of the view the bound is but a lower one: the lines of sight "
                 "hardly cross there, and points are uncertain by more than a tenth of what is measured",
                 remedy="measure elsewhere in the image, nearer, or move the cameras apart",
             )
