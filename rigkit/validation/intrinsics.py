@@ -20,10 +20,10 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, Normals
 from rigkit.core.errors import InputError
 from rigkit.core.matches import Matches
-from rigkit.geometry.principal_axes import principal_axes
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.metric import triangulate_matches
+from rigkit.reconstruction.moved_cameras import moved_cameras
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.reconstruction.scale import metric_scale
 from rigkit.relative_pose.refinement.refine import refine_pose
@@ -72,13 +72,7 @@ def calibration_shifts(
     level_sigma_rad : as in the reconstruction.
     """
     camera1, camera2 = reconstruction.camera1, reconstruction.camera2
-    cameras: list[tuple[Camera, Camera]] = []
-    for axis in principal_axes(covariance1):
-        shifted = camera1.with_parameters(camera1.parameters + axis)
-        cameras.append((shifted, shifted if covariance2 is None else camera2))
-    for axis in [] if covariance2 is None else principal_axes(covariance2):
-        cameras.append((camera1, camera2.with_parameters(camera2.parameters + axis)))
-    cameras.insert(0, (camera1, camera2))
+    cameras = [(camera1, camera2), *moved_cameras(camera1, camera2, covariance1, covariance2)]
     # A corner at the rim of the field can lie outside a moved camera's: then it says nothing here, of no camera.
     seen = np.logical_and.reduce(
         [

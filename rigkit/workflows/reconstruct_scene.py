@@ -19,17 +19,18 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.io.calibration_file import is_calibration, load_calibration
 from rigkit.io.correspondences import correspondences_text, read_correspondences
 from rigkit.io.images import read_image_of
 from rigkit.io.npz import npz_bytes
 from rigkit.io.ply import ply_bytes
 from rigkit.io.reading import about, read_text
-from rigkit.reconstruction.growing.dense import grow_scene
+from rigkit.reconstruction.growing.dense import Calibrations, grow_scene
 from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.report.figures import cloud_png, epipolar_png
 from rigkit.report.scene_figure import normals_png
-from rigkit.workflows.camera_files import import_camera, import_rig
+from rigkit.workflows.camera_files import import_camera, import_rig, is_ours
 from rigkit.workflows.results import require_folder, write_results
 
 CLOUD = "scene.ply"
@@ -158,7 +159,8 @@ def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> 
         scene, found = _sparse(options, (camera1, camera2), known_pose, images, progress)
     maps: Mapping[str, NDArray[Any]] = {}
     if images and options.grow:
-        scene, found, maps = _grown(scene, found, images, progress, pose_is_known=known_pose is not None)
+        known, of = known_pose is not None, _calibrations(options, camera1, camera2)
+        scene, found, maps = _grown(scene, found, images, progress, pose_is_known=known, of=of)
     r = scene.reconstruction
     scene = replace(scene, reconstruction=replace(r, notes=(*notes, *r.notes)))
     files = _files(options, scene, found, images)
@@ -192,6 +194,21 @@ def _cameras(options: SceneOptions) -> tuple[Camera, Camera, KnownPose | None, l
     if options.camera2 is None:
         notes.append("one calibration is used for both images: right if one camera was moved, else name the other's")
     return camera1, camera2, known, notes
+
+
+def _calibrations(options: SceneOptions, camera1: Camera, camera2: Camera) -> Calibrations | None:
+    """Return the covariances of the cameras' parameters, zero for one whose file has none; None where none has."""
+    known = [
+        load_calibration(path).covariance if path is not None and is_ours(path) and is_calibration(path) else None
+        for path in (options.camera, options.camera2)
+    ]
+    if all(covariance is None for covariance in known):
+        return None
+    first, second = (
+        np.zeros((camera.parameters.size,) * 2) if covariance is None else covariance
+        for camera, covariance in zip((camera1, camera2), known, strict=True)
+    )
+    return first, None if options.camera2 is None else second
 
 
 def _read_pose(path: Path) -> Rigid3:
@@ -256,12 +273,18 @@ def _sparse(
 
 
 def _grown(
-    scene: SceneReconstruction, seeds: Correspondences, images: Images, progress: Progress, *, pose_is_known: bool
+    scene: SceneReconstruction,
+    seeds: Correspondences,
+    images: Images,
+    progress: Progress,
+    *,
+    pose_is_known: bool,
+    of: Calibrations | None,
 ) -> tuple[SceneReconstruction, Correspondences, Mapping[str, NDArray[Any]]]:
     """Return the dense scene, its correspondences and maps; where nothing grows, the sparse one that says why."""
     progress("growing correspondences", 0, 1)
     try:
-        dense = grow_scene(scene, seeds, *images, pose_is_known=pose_is_known)
+        dense = grow_scene(scene, seeds, *images, pose_is_known=pose_is_known, calibrations=of)
     except DegenerateError as error:
         notes = (*scene.reconstruction.notes, f"no dense cloud: {error}")
         return replace(scene, reconstruction=replace(scene.reconstruction, notes=notes)), seeds, {}

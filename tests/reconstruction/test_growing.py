@@ -14,7 +14,7 @@ from rigkit.affine.features import TILTS, match_affine_features
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import angle_between, exp_so3
+from rigkit.geometry.rotation import angle_between, exp_so3, log_so3
 from rigkit.reconstruction.growing.dense import DenseScene, grow_scene
 from rigkit.reconstruction.growing.grow import GrowingView, LineKnowledge, grow, grow_both_ways
 from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene
@@ -127,3 +127,28 @@ def test_no_place_of_image_2_is_grown_from_two_places_of_image_1() -> None:
     places = once.pixels2[once.valid]
     apart = np.linalg.norm(places[:, None] - places[None], axis=-1)
     assert apart[~np.eye(len(places), dtype=bool)].min() > 1.5
+
+
+def test_what_the_calibration_leaves_open_is_in_the_sigmas() -> None:
+    """A camera whose focal length and centre are one standard deviation off, of its covariance."""
+    corner, true = Corner.of_a_room(), LENSES["pinhole"]
+    rng = np.random.default_rng(5)
+    images = [corner.image(true, pose, rng) for pose in (Rigid3.identity(), CAM2_FROM_CAM1)]
+    seeds = match_affine_features(*images, tilts=TILTS)
+    sigmas = np.array([4.0, 4.0, 3.0, 3.0])
+    camera = true.with_parameters(true.parameters + np.array([1.0, 1.0, -1.0, 1.0]) * sigmas)
+    sparse = reconstruct_scene(seeds, camera, camera, baseline_mm=BASELINE_MM)
+    in_sigmas = {}
+    for calibrations in (None, (np.diag(sigmas**2), None)):
+        r = grow_scene(sparse, seeds, *images, calibrations=calibrations).scene.reconstruction
+        told = calibrations is not None
+        assert r.cloud.calibration_in_sigmas == told and r.pose_covariance is not None
+        turn = log_so3(CAM2_FROM_CAM1.rotation @ r.cam2_from_cam1.rotation.T)
+        pose = np.sqrt(turn @ np.linalg.solve(r.pose_covariance[:3, :3], turn) / 3.0)
+        points, _ = corner.surface(true, r.pixels1)
+        off = np.abs(np.linalg.norm(r.cloud.points_mm, axis=1) - np.linalg.norm(points, axis=1))
+        in_sigmas[told] = pose, np.median(off / r.cloud.sigma_mm)
+    # Four parameters at one sigma each.
+    assert in_sigmas[True][0] < 2.0 < in_sigmas[False][0]
+    assert 0.2 < in_sigmas[True][1] < 2.0
+    assert in_sigmas[False][1] > 2.0 * in_sigmas[True][1]

@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.features import grey_of
+from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
 from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import DegenerateError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3, rotation_angle, unit
+from rigkit.geometry.rotation import exp_so3, log_so3, rotation_angle, unit
 from rigkit.geometry.sampson import sampson_distances
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 from rigkit.reconstruction.growing.curvature import without_curvature
 from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKnowledge, grow, grow_both_ways
-from rigkit.reconstruction.growing.surface import GrownSurface, fit_surface, measure, own_planes
+from rigkit.reconstruction.growing.surface import GrownSurface, NodeMeasurements, fit_surface, measure, own_planes
 from rigkit.reconstruction.growing.sweep import filled
 from rigkit.reconstruction.growing.systematic import SystematicPose, pose_with_field
 from rigkit.reconstruction.metric import POSE_STEP_RAD
+from rigkit.reconstruction.moved_cameras import moved_cameras
 from rigkit.reconstruction.reconstruct import Reconstruction, colours_at
 from rigkit.reconstruction.scene import MAX_RANGE_SIGMA, SceneReconstruction, in_unit
 from rigkit.reconstruction.scene_pose import GATE, KnownPose, fit_scene_pose, known_scene_pose
@@ -47,6 +49,9 @@ SHARED_ERROR = 0.5
 """Of the errors of pairs, in their median: no pair is much better than the others (measured: by likelihood)."""
 OVERLAP = 3.5
 """Pairs on the nodes of a pose whose windows share their pixels: 4 pi 4.2^2 px^2 of a window to 64 px^2 of a node."""
+
+Calibrations: TypeAlias = tuple[FloatArray, FloatArray | None]
+"""Covariances of the parameters of both cameras; None: the second is the first."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -98,10 +103,12 @@ def grow_scene(
     image2: NDArray[np.generic],
     *,
     pose_is_known: bool = False,
+    calibrations: Calibrations | None = None,
 ) -> DenseScene:
     """Return the dense cloud of two images whose `seeds` gave the reconstruction `sparse`.
 
-    With `pose_is_known` its pose is not estimated again.
+    With `pose_is_known` its pose is not estimated again. With `calibrations`, the covariances of the cameras'
+    parameters, what these leave open is in the covariance of the pose and in the cloud's sigmas.
 
     Raises
     ------
@@ -128,7 +135,12 @@ def grow_scene(
     measured = measure(grown, r.camera1, r.camera2, pose)
     surface = fit_surface(measured, step, even.pose.amplitude_px)
     by_pose, of_pose = _moved_planes(grown, r, pose, covariance)
+    if calibrations is not None:
+        moves = _moved_poses(even, r, calibrations, view1.size_px, fixed=pose_is_known)
+        by_pose, of_pose = _with_calibrations(measured, grown, pose, moves, by_pose, of_pose)
+        covariance = covariance + sum((np.outer(m.change, m.change) for m in moves), np.zeros((6, 6)))
     cloud, nodes = _cloud(grown, surface, by_pose, of_pose, image1)
+    cloud = replace(cloud, calibration_in_sigmas=calibrations is not None)
     matches, seen = grown.correspondences().matches(r.camera1, r.camera2)
     chosen = np.cumsum(grown.valid.ravel())[nodes] - 1
     # A pair at the border of a field of view has no match; nor has it a plane.
@@ -235,6 +247,64 @@ def _moved_planes(
     return np.stack(each, axis=-1), np.asarray(to_five @ covariance @ to_five.T)
 
 
+class _Moved(NamedTuple):
+    """Cameras moved by one standard deviation along an axis of their covariance, and the pose (6,) that moves with
+    them: left rotation perturbation, rad, and translation."""
+
+    cameras: tuple[Camera, Camera]
+    change: FloatArray
+
+
+def _moved_poses(
+    even: _EvenPose, r: Reconstruction, calibrations: Calibrations, size_px: tuple[int, int], *, fixed: bool
+) -> list[_Moved]:
+    pixels1, pixels2, sigma = even.matches.pixels1, even.matches.pixels2, even.matches.sigma1_px
+    each = [(r.camera1, r.camera2), *moved_cameras(r.camera1, r.camera2, *calibrations)]
+    seen = np.logical_and.reduce([a.unproject(pixels1)[1] & b.unproject(pixels2)[1] for a, b in each])
+    start, level = even.pose.cam2_from_cam1, r.level_sigma_rad
+    poses = []
+    for cameras in each:
+        if fixed:
+            poses.append(start)
+            continue
+        matches = Matches.from_cameras(
+            *cameras, pixels1[seen], pixels2[seen], sigma1_px=sigma[seen], sigma2_px=sigma[seen]
+        )
+        poses.append(pose_with_field(matches, start, size_px, r.pose_type, level, OVERLAP).cam2_from_cam1)
+    base, length = poses[0], r.baseline_mm
+    return [
+        _Moved(
+            cameras,
+            np.concatenate(
+                [
+                    log_so3(pose.rotation @ base.rotation.T),
+                    length * (pose.translation_mm - base.translation_mm),
+                ]
+            ),
+        )
+        for cameras, pose in zip(each[1:], poses[1:], strict=True)
+    ]
+
+
+def _with_calibrations(
+    measured: NodeMeasurements,
+    grown: GrownPatches,
+    pose: Rigid3,
+    moves: list[_Moved],
+    by_pose: FloatArray,
+    of_pose: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Return what `_moved_planes` returns with a column more for each move, of variance one."""
+    here = own_planes(measured)
+    planes = []
+    for cameras, change in moves:
+        there = Rigid3(exp_so3(change[:3]) @ pose.rotation, pose.translation_mm + change[3:])
+        planes.append(own_planes(measure(grown, *cameras, there)) - here)
+    ends = np.eye(of_pose.shape[0] + len(moves))
+    ends[: of_pose.shape[0], : of_pose.shape[0]] = of_pose
+    return np.stack([*np.moveaxis(by_pose, -1, 0), *planes], axis=-1), ends
+
+
 def _cloud(
     grown: GrownPatches,
     surface: GrownSurface,
@@ -242,7 +312,7 @@ def _cloud(
     pose_covariance: FloatArray,
     image1: NDArray[np.generic],
 ) -> tuple[OrientedCloud, NDArray[np.int64]]:
-    """Return the cloud of the planes whose range is known, and their nodes; the pose is (5, 5) as in `by_pose`."""
+    """Return the cloud of the planes whose range is known, and their nodes; the covariance goes with `by_pose`."""
     at = np.flatnonzero(surface.valid.ravel())
 
     def flat(values: FloatArray) -> FloatArray:
