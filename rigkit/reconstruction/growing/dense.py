@@ -141,6 +141,21 @@ def grow_scene(
         covariance = covariance + sum((np.outer(m.change, m.change) for m in moves), np.zeros((6, 6)))
     cloud, nodes = _cloud(grown, surface, by_pose, of_pose, image1)
     cloud = replace(cloud, calibration_in_sigmas=calibrations is not None)
+    scene = _scene(sparse, grown, cloud, nodes, known, pose, covariance)
+    return DenseScene(scene=scene, grown=grown, surface=surface, nodes=nodes)
+
+
+def _scene(
+    sparse: SceneReconstruction,
+    grown: GrownPatches,
+    cloud: OrientedCloud,
+    nodes: NDArray[np.int64],
+    known: LineKnowledge,
+    pose: Rigid3,
+    covariance: FloatArray,
+) -> SceneReconstruction:
+    """Return the scene of the cloud whose row k is node `nodes[k]` of the grown pairs."""
+    r = sparse.reconstruction
     matches, seen = grown.correspondences().matches(r.camera1, r.camera2)
     chosen = np.cumsum(grown.valid.ravel())[nodes] - 1
     # A pair at the border of a field of view has no match; nor has it a plane.
@@ -159,8 +174,7 @@ def grow_scene(
     )
     inliers = np.zeros(len(seen), dtype=bool)
     inliers[chosen] = True
-    scene = SceneReconstruction(dense, sparse.metric, inliers, chosen, known.sigma_px, known.sigma_A)
-    return DenseScene(scene=scene, grown=grown, surface=surface, nodes=nodes)
+    return SceneReconstruction(dense, sparse.metric, inliers, chosen, known.sigma_px, known.sigma_A)
 
 
 class _EvenPose(NamedTuple):
