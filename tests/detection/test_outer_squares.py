@@ -74,7 +74,12 @@ def test_squares_cut_short_do_not_pull_at_corners(
 
 @pytest.mark.parametrize(
     ("lens", "blur_px", "most"),
-    [("regular", 2.0, 1.2), ("regular", 4.0, 1.2), ("fisheye", 3.0, 1.2), ("fisheye", 4.0, 1.2)],
+    [
+        ("regular", 2.0, 1.2),
+        pytest.param("regular", 4.0, 1.2, marks=pytest.mark.slow),
+        pytest.param("fisheye", 3.0, 1.2, marks=pytest.mark.slow),
+        ("fisheye", 4.0, 1.2),
+    ],
 )
 def test_errors_out_of_focus_are_near_the_bound(lens: str, blur_px: float, most: float) -> None:
     scene = three_boards(np.random.default_rng(0), lens=lens)

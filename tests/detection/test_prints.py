@@ -24,13 +24,20 @@ def print_of(grow: float, rounding: float, rng: np.random.Generator, scale: int 
     fine = [(np.arange(size * parts) + 0.5) / parts - 0.5 for size in (width, height)]
     x, y = np.moveaxis((np.stack(np.meshgrid(*fine), axis=-1) - first) @ np.linalg.inv(axes).T, -1, 0)
     black = np.zeros(x.shape, bool)
-    # A square reaches into its neighbours: all that are near are asked.
-    for near in np.ndindex(3, 3):
-        column, row = np.floor(x) + near[0] - 1, np.floor(y) + near[1] - 1
-        off = np.abs(np.stack([x - column, y - row]) - 0.5) - (0.5 + grow - rounding)
+    cell = np.floor(np.stack([x, y]))
+    part = np.stack([x, y]) - cell
+    # A square reaches into its neighbours, no farther than it has grown: there these are asked too.
+    grown = max(grow, 0.0) + 1e-9
+    may = {-1: part <= grown, 0: np.ones(part.shape, bool), 1: part >= 1.0 - grown}
+    odd = cell.sum(axis=0) % 2 == 1
+    for across, down in np.ndindex(3, 3):
+        asked = may[across - 1][0] & may[down - 1][1] & (odd == ((across + down) % 2 == 1))
+        step = np.array([[across - 1], [down - 1]])
+        column, row = cell[:, asked] + step
+        off = np.abs(part[:, asked] - step - 0.5) - (0.5 + grow - rounding)
         inside = np.hypot(*np.maximum(off, 0.0)) + np.minimum(off.max(axis=0), 0.0) < rounding
-        board = (column >= -1) & (column < COLUMNS) & (row >= -1) & (row < ROWS) & ((column + row) % 2 == 0)
-        black |= inside & board
+        board = (column >= -1) & (column < COLUMNS) & (row >= -1) & (row < ROWS)
+        black[asked] |= inside & board
     levels = np.where(black, 20.0, 200.0).reshape(height, parts, width, parts).mean(axis=(1, 3))
     image = cv2.GaussianBlur(levels, (0, 0), 0.6) + 2.0 * rng.standard_normal(levels.shape)
     grid = np.stack(np.meshgrid(np.arange(COLUMNS), np.arange(ROWS)), axis=-1).reshape(-1, 2)
