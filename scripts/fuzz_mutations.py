@@ -148,13 +148,17 @@ def _lines(data: bytes, rng: random.Random) -> bytes:
 
 def _json(data: bytes, rng: random.Random) -> bytes:
     try:
-        tree = json.loads(data)
-    except (ValueError, RecursionError):
+        return _changed_tree(json.loads(data), rng)
+    except (ValueError, TypeError, RecursionError, OverflowError):
+        # A change before this one left no JSON, or one that Python's own writer does not take.
         return _bytes(data, rng)
+
+
+def _changed_tree(tree: Any, rng: random.Random) -> bytes:
     places: dict[tuple[str, ...], list[tuple[Any, Any]]] = {}
     _collect(tree, (), places)
     if not places:
-        return _bytes(data, rng)
+        raise ValueError("nothing in it")
     # By what a value is, then by which of them: long tables would take them all.
     holder, key = rng.choice(places[rng.choice(sorted(places))])
     way = rng.randrange(7)
