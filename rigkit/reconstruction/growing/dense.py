@@ -134,7 +134,7 @@ def grow_scene(
     grown = filled(grown, measured, view1, view2, pose)
     measured = measure(grown, r.camera1, r.camera2, pose)
     surface = fit_surface(measured, step, even.pose.amplitude_px)
-    by_pose, of_pose = _moved_planes(grown, r, pose, covariance)
+    by_pose, of_pose = _moved_planes(measured, grown, r, pose, covariance)
     if calibrations is not None:
         moves = _moved_poses(even, r, calibrations, view1.size_px, fixed=pose_is_known)
         by_pose, of_pose = _with_calibrations(measured, grown, pose, moves, by_pose, of_pose)
@@ -244,7 +244,7 @@ def _knowledge(matches: Matches, pose: Rigid3) -> LineKnowledge:
 
 
 def _moved_planes(
-    grown: GrownPatches, r: Reconstruction, pose: Rigid3, covariance: FloatArray
+    measured: NodeMeasurements, grown: GrownPatches, r: Reconstruction, pose: Rigid3, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the derivatives (R, C, 3, 5) of the nodes' own planes by the pose, and the pose's covariance (5, 5) so."""
     length = float(np.linalg.norm(pose.translation_mm))
@@ -256,7 +256,9 @@ def _moved_planes(
         there = Rigid3(exp_so3(step[:3]) @ pose.rotation, length * unit(t + step[3:]))
         return own_planes(measure(grown, r.camera1, r.camera2, there))
 
-    each = [(planes(POSE_STEP_RAD * d) - planes(-POSE_STEP_RAD * d)) / (2.0 * POSE_STEP_RAD) for d in directions]
+    # Sigmas need no better derivatives than forward differences.
+    here = own_planes(measured)
+    each = [(planes(POSE_STEP_RAD * d) - here) / POSE_STEP_RAD for d in directions]
     to_five = directions / np.array([1.0, 1.0, 1.0, length, length, length])
     return np.stack(each, axis=-1), np.asarray(to_five @ covariance @ to_five.T)
 
