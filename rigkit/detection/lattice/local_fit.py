@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -128,7 +129,12 @@ def fit_cells(
         neighbours leave open from running wild.
     leave_out : ignore the corner of the cell itself, to predict it from its neighbours.
     """
-    return _local_fit(fit(lattice, cells, FitRules(degree, radius, leave_out, width, ridge)))
+    return _local_fit(fit(lattice, cells, _rules(degree, radius, leave_out, width, ridge)))
+
+
+@functools.cache
+def _rules(degree: int, radius: int, leave_out: bool, width: float, ridge: tuple[float, float]) -> FitRules:
+    return FitRules(degree, radius, leave_out, width, ridge)
 
 
 def _local_fit(rows: FloatArray) -> LocalFit:
