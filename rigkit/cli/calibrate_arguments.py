@@ -33,7 +33,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write a page to look at; without a name beside the output",
     )
     parser.add_argument(
-        "--export", nargs="+", default=[], choices=sorted(FOREIGN_ENDINGS), help="also in these formats, beside it"
+        "--export",
+        nargs="+",
+        default=[],
+        choices=sorted(FOREIGN_ENDINGS),
+        metavar="FORMAT",
+        help=f"also for other tools, beside it: {', '.join(sorted(FOREIGN_ENDINGS))}",
     )
     parser.add_argument("--corners", type=Path, metavar="FILE", help="use these: corners.csv, corners.json, .vnl")
     parser.add_argument(

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rigkit.workflows.paper import PaperOptions
     from rigkit.workflows.validate import ValidateOptions
 
-HELP = "the tables against measured truth, report and PLY; exit code 1 if a check fails"
+HELP = "captures beside what a person measured of them: a page, tables, oriented clouds; exit 1 if a check fails"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
