@@ -46,6 +46,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--force", action="store_true", help="replace existing results")
     parser.add_argument("--json", action="store_true", help="print the result for programs")
+    _add_known(parser)
+    _add_of_folders(parser)
+
+
+def _add_known(parser: argparse.ArgumentParser) -> None:
     rigs = parser.add_argument_group("rigs", "what is known stays; how unsure it is counts in all results")
     rigs.add_argument(
         "--only-extrinsics",
@@ -61,6 +66,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="RIG",
         help="cameras of this rig stay, lens and mount: the others are added to it",
     )
+
+
+def _add_of_folders(parser: argparse.ArgumentParser) -> None:
     folders = parser.add_argument_group("folders", "the session used is kept as session.toml for the next time")
     folders.add_argument(
         "--board",
