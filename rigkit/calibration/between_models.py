@@ -55,10 +55,13 @@ def rival_fits(
     """Return the `options` that are likely enough the better ones, fitted to the corners kept, with the boards as the
     chosen fit has them but for their warps."""
     own = chosen.state.camera
+    cameras = [option.fit.state.camera for option in options]
+    alike = [camera.model == own.model and camera.parameters.size == own.parameters.size for camera in cameras]
+    if not any(alike):
+        # The chosen lens stands among them in another size.
+        alike = [camera.model == own.model for camera in cameras]
     found = []
-    for option in options:
-        camera = option.fit.state.camera
-        same = (camera.model, camera.parameters.size) == (own.model, own.parameters.size)
+    for option, camera, same in zip(options, cameras, alike, strict=True):
         if same or likely.get(option.name, 0.0) < MIN_LIKELY:
             continue
         start = replace(chosen.state.with_corners_held(), camera=camera)

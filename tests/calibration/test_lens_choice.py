@@ -7,7 +7,7 @@ import pytest
 from helpers.calibration_scenes import REACH_DEG, SIZE, lens, projection_difference, random_views
 
 from rigkit.calibration import calibrate as module
-from rigkit.calibration.between_models import followed
+from rigkit.calibration.between_models import followed, rival_fits
 from rigkit.calibration.calibrate import calibrate, calibrate_together
 from rigkit.calibration.choice import HeldOut, Option
 from rigkit.calibration.fit import Fit, fit_model
@@ -146,3 +146,13 @@ def test_cameras_of_a_rig_come_in_their_order() -> None:
     found = calibrate_together(asked)
     focal = [lens(name).focal_px for name in ("reg", "wide", "reg")]
     np.testing.assert_allclose([c.camera.focal_px for c in found], focal, rtol=0.05)
+
+
+def test_the_chosen_lens_in_another_size_is_no_rival(fits: dict[str, tuple[Observations, Fit]]) -> None:
+    observations, eucm = fits["eucm"]
+    small, large = (fit_model(observations, SIZE, camera_model("scaramuzza"), order) for order in (4, 6))
+    options = [Option("scaramuzza 6", large), Option("eucm", eucm)]
+    likely = {"scaramuzza 6": 0.7, "eucm": 0.3}
+    assert [one.rival.name for one in rival_fits(observations, small, options, likely)] == ["eucm"]
+    both = [*options, Option("scaramuzza 4", small)]
+    assert [one.rival.name for one in rival_fits(observations, small, both, likely)] == ["scaramuzza 6", "eucm"]
