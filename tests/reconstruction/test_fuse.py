@@ -61,7 +61,11 @@ def test_what_pairs_say_of_one_place_becomes_one_point_and_more_exact() -> None:
     posed = clouds[fused.source[0]]
     alone = distances(corner, posed.world_from_cam.apply(posed.cloud.points_mm))
     assert first.sum() == len(alone)
-    assert np.median(distances(corner, fused.cloud.points_mm)[first & merged]) < np.median(alone[merged[first]])
+    together, alone = distances(corner, fused.cloud.points_mm)[first & merged], alone[merged[first]]
+    assert np.sqrt(np.mean(together**2)) < np.sqrt(np.mean(alone**2))
+    assert np.quantile(together, 0.9) < np.quantile(alone, 0.9)
+    # Half of the points are as good as the interpolation of the images, in which all pairs err alike.
+    assert np.median(together) < 1.1 * np.median(alone)
     # Towards the camera that saw the point, and turned by no more than grown normals are.
     centres = np.array([c.world_from_cam.translation_mm for c in clouds])[fused.source]
     assert (np.sum(fused.cloud.normals * (fused.cloud.points_mm - centres), axis=1) < 0.0).all()

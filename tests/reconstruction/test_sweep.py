@@ -99,3 +99,13 @@ def test_a_sweep_that_contradicts_the_patches_is_not_believed() -> None:
     unrelated = np.random.default_rng(1).uniform(0.0, 255.0, view2.grey.shape)
     other = replace(view2, grey=unrelated.astype(np.uint8))
     assert filled(grown, measured, view1, other, CAM2_FROM_CAM1) is grown
+
+
+def test_a_wall_at_one_range_is_swept_without_a_fault() -> None:
+    """All that grew says the same range: the sweep still has levels around it."""
+    grown, measured, views, _ = grown_with_hole("pinhole")
+    same = measured.z.copy()
+    same[..., 0] = np.where(np.isfinite(same[..., 0]), np.nanmedian(same[..., 0]), np.nan)
+    with np.errstate(all="raise", under="ignore"):
+        done = filled(grown, replace(measured, z=same), *views, CAM2_FROM_CAM1)
+    assert done.valid.sum() >= grown.valid.sum()

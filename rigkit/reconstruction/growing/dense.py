@@ -274,6 +274,7 @@ class _Moved(NamedTuple):
 def _moved_poses(
     even: _EvenPose, r: Reconstruction, calibrations: Calibrations, size_px: tuple[int, int], *, fixed: bool
 ) -> list[_Moved]:
+    """Return the moved cameras with their poses, found from the same pairs unless the pose is `fixed`."""
     pixels1, pixels2, sigma = even.matches.pixels1, even.matches.pixels2, even.matches.sigma1_px
     each = [(r.camera1, r.camera2), *moved_cameras(r.camera1, r.camera2, *calibrations)]
     seen = np.logical_and.reduce([a.unproject(pixels1)[1] & b.unproject(pixels2)[1] for a, b in each])

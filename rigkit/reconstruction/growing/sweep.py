@@ -103,9 +103,10 @@ def _prepared(
 ) -> _Sweep:
     inverse = measured.z[..., 0]
     low, high = np.nanquantile(inverse, [0.001, 0.999])
-    margin = MARGIN_OF_RANGES * (high - low)
-    low, high = max(low - margin, 0.0), high + margin
     pixel = 1.0 / float(np.nanquantile(measured.slope, 0.9))
+    # A wall that faces the camera is all at one range.
+    margin = max(MARGIN_OF_RANGES * (high - low), 2.0 * pixel)
+    low, high = max(low - margin, 0.0), high + margin
     count = int(np.clip(np.ceil((high - low) / pixel) + 1, 3, MAX_SWEEP_LEVELS))
     levels = np.linspace(low, high, count)
     step = grown.step / SAMPLES_A_NODE
@@ -200,7 +201,8 @@ def _along(
         if before is not None:
             came = np.roll(before, aside, axis=0)
             least = came.min(axis=1, keepdims=True)
-            change = np.abs(image[line] - np.roll(image[last], aside))
+            # The last row and column are read from beyond the image too: no brightness.
+            change = np.nan_to_num(np.abs(image[line] - np.roll(image[last], aside)))
             jump = BEND_COST + (JUMP_COST - BEND_COST) / (1.0 + change / EVEN_LEVELS)
             best = np.minimum(came, least + jump.astype(np.int16)[:, None])
             np.minimum(best[:, 1:], came[:, :-1] + np.int16(BEND_COST), out=best[:, 1:])
@@ -217,7 +219,7 @@ def _along(
 def _winners(
     total: NDArray[np.int16], sweep: _Sweep, view2: GrowingView, cam2_from_cam1: Rigid3
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the best level (R, C), between levels by a parabola, and where image 2 sees that surface."""
+    """Return the best levels (R, C), between whole ones by a parabola, and where image 2 sees that surface."""
     count = total.shape[2]
     best = np.argmin(total, axis=2)
     inner = np.clip(best, 1, count - 2)[..., None]
