@@ -20,6 +20,7 @@ rotation that is taken out are the same; here in closed form).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -72,7 +73,7 @@ def worst_direction(covariance: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(0.5 * (a + c) + np.hypot(0.5 * (a - c), b)))
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class FarProjection:
     """How sure a calibration is of the projection of points at infinity, after the rotation that hides a change of the
     parameters best where the boards were.
@@ -121,7 +122,7 @@ class FarProjection:
         """Return the covariance (M, 2, 2) of the projection along rays (M, 3)."""
         return self._covariance(projection_design(self.camera, rays))
 
-    @property
+    @cached_property
     def at_corners_px(self) -> FloatArray:
         """Standard deviation in the worst direction, (M,) px, at the corners; NaN where one has no ray."""
         out = np.full(len(self.rays_valid), np.nan)
