@@ -59,6 +59,7 @@ AT_WORK: dict[str, Kind] = {
             ("plan", "--lens", "60", "--size", "320x240", "--board", "{case}", "--views", "4"),
             ("pose", "image.png", "--camera", "calibration.json", "--board", "{case}"),
         ),
+        names_file=False,
         judged=True,
     ),
     "study-at-work": Kind(
