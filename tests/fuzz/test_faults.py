@@ -169,6 +169,8 @@ def test_two_runs_at_once(force: bool, place: Path) -> None:
 
 def test_two_calibrations_share_their_kept_corners(place: Path) -> None:
     (place / "calibration.json").unlink()
+    session = place / "session.toml"
+    session.write_text(session.read_text().replace("board.toml", "floor.toml"))
     programs = [rigkit("calibrate", "session.toml", "-o", f"new{k}.json") for k in range(2)]
     for program in programs:
         assert ended(program)[0] == 3
