@@ -1,0 +1,43 @@
+"""What rivals of a lens add to a rig: as much as the rig differs when it is calibrated with them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from calibration.test_rig import MODELS, rig_views, sizes
+
+from rigkit.calibration.result import Rival
+from rigkit.calibration.rig import assemble
+from rigkit.calibration.rig.between_models import between_rig_models
+from rigkit.calibration.rig.calibrate import calibrate_rig
+
+LIKELY = 0.25
+FIRST_ORDER = 0.1
+"""A lens is followed to first order, by a model that cannot show all of it."""
+
+
+def test_a_rival_widens_the_baseline_by_its_own_difference(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    views = {name: own for name, own in rig_views(rng, 12).items() if name != "fish"}
+    given = {}
+
+    def keep(*arguments: object) -> np.ndarray:
+        given["arguments"] = arguments
+        return between_rig_models(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(assemble, "between_rig_models", keep)
+    other = calibrate_rig(views, sizes(), model={**MODELS, "wide": "double_sphere"})
+    rig = calibrate_rig(views, sizes(), model=MODELS)
+    joint, single, sigmas = given["arguments"]
+    rival = Rival("double_sphere", other.single[1].camera, LIKELY)
+    extra = between_rig_models(joint, (single[0], replace(single[1], rivals=(rival,))), sigmas)  # type: ignore[arg-type, index]
+    count = len(rig.covariance)
+    length, _ = rig.baseline_mm("reg", "wide")
+    apart = abs(other.baseline_mm("reg", "wide")[0] - length)
+    alone = replace(rig, covariance=extra[:count, :count], scale_sigma=0.0)
+    assert apart > 0.01
+    assert alone.baseline_mm("reg", "wide")[1] == pytest.approx(np.sqrt(LIKELY) * apart, rel=FIRST_ORDER)
+    assert not between_rig_models(joint, single, sigmas).any()  # type: ignore[arg-type]
