@@ -232,7 +232,11 @@ def _sigma(state: State, total: float, kept: BoolArray) -> float:
 
 def heldout_squares(observations: Observations, fit: Fit, folds: int) -> FloatArray | None:
     """Return the sum of squared residuals, px^2, of the kept corners of each image while it took no part: camera and
-    shape from the other images, only the poses of its boards refitted. None with fewer images than folds."""
+    shape from the other images, only the poses of its boards refitted. None with fewer images than folds.
+
+    Residuals are weighted as in the solution, those of a corner of median quality: what blurred images say of a lens
+    decides no more than it is worth.
+    """
     images = list(dict.fromkeys(observations.images))
     if folds < 2 or len(images) < folds:
         return None
@@ -254,6 +258,6 @@ def heldout_squares(observations: Observations, fit: Fit, folds: int) -> FloatAr
         start = fit.state.subset(test)
         moved = replace(solved, rotation=start.rotation, translation_mm=start.translation_mm)
         found, _ = refine_poses(part, moved, weight[test])
-        own = np.where(fit.kept[test], (evaluate(found, part).px ** 2).sum(axis=-1), 0.0)
+        own = np.where(fit.kept[test], weight[test] ** 2 * (evaluate(found, part).px ** 2).sum(axis=-1), 0.0)
         np.add.at(squared, image[test], own.sum(axis=-1))
     return squared

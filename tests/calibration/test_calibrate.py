@@ -143,6 +143,23 @@ def test_partial_views_and_unequal_sigmas(rng: np.random.Generator) -> None:
     assert errors[0] < errors[1]
 
 
+def test_blurred_views_say_no_more_of_the_headline_than_they_are_worth(rng: np.random.Generator) -> None:
+    truth = lens("fish")
+    views, _, _ = random_views(truth, 12, rng, reach_deg=REACH_DEG["fish"])
+    blurred = 10.0 * NOISE_PX
+    poor = [
+        replace(
+            v, pixels=v.pixels + blurred * rng.standard_normal(v.pixels.shape), sigma_px=np.full(len(v.grid), blurred)
+        )
+        for v in views[:4]
+    ]
+    sharp = calibrate(views[4:], SIZE, model="kannala_brandt", board="flat")
+    both = calibrate([*poor, *views[4:]], SIZE, model="kannala_brandt", board="flat")
+    assert len(both.views) == 12
+    # Not weighted, the four would make it six times as large.
+    assert heldout(both) == pytest.approx(heldout(sharp), rel=0.15)
+
+
 def test_input_is_not_modified(rng: np.random.Generator) -> None:
     views, _, _ = random_views(lens("wide"), 6, rng, reach_deg=55.0)
     before = [v.pixels.copy() for v in views]

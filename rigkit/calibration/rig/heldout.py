@@ -18,7 +18,8 @@ def heldout_rms(joint: JointRig, folds: int) -> tuple[float | None, tuple[float 
     and shapes of boards from the other frames, only one pose a target refitted, by all cameras at once. None with fewer
     frames than folds, or where those of one fold alone tell where a camera sits.
 
-    It counts what a held-out error of single cameras cannot see: cameras that disagree.
+    It counts what a held-out error of single cameras cannot see: cameras that disagree. Residuals are weighted
+    as in the solution.
     """
     observations, state = joint.observations, joint.solution.state
     frame = joint.frames
@@ -37,7 +38,7 @@ def heldout_rms(joint: JointRig, folds: int) -> tuple[float | None, tuple[float 
         for c, (own, weight) in enumerate(zip(part.cameras, part.weights, strict=True)):
             used = weight > 0.0
             px = evaluate(found.of_camera(c, part), own).px
-            squared[c] += float((px**2).sum(axis=-1)[used].sum())
+            squared[c] += float((weight**2 * (px**2).sum(axis=-1))[used].sum())
             count[c] += float(used.sum())
     each = tuple(float(np.sqrt(s / n)) if n else None for s, n in zip(squared, count, strict=True))
     return float(np.sqrt(squared.sum() / count.sum())), each
