@@ -119,7 +119,7 @@ def test_wrong_board_size(write: Write, capsys: pytest.CaptureFixture[str]) -> N
 def test_other_image_size(write: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     image = cv2.imread(str(IMAGES / "view1.jpg"), cv2.IMREAD_GRAYSCALE)
     cv2.imwrite(str(tmp_path / "small.png"), cv2.resize(np.asarray(image), (812, 620)))
-    check(*run(write(image1="small.png"), capsys), 2, "812x620", "1624x1240", "fisheye")
+    check(*run(write(image1="small.png"), capsys), 2, "812x620", "1624x1240", "mvca020_fe185")
 
 
 def test_unknown_key(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
