@@ -19,6 +19,7 @@ from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.files import ensure_writable, write_atomic, write_together
+from rigkit.io.reading import about
 from rigkit.io.sources import source_hash
 from rigkit.io.study_file import load_study
 from rigkit.report.study_figure import study_figure
@@ -80,18 +81,21 @@ def run_studies(
         raise InputError(f"simulate: two studies have the same name ({', '.join(sorted(names))}); rename one")
     for study in studies:
         ensure_writable(_files_of(study, options).values(), force=options.force, inputs=paths)
-    for study in studies:
+    for path, study in zip(paths, studies, strict=True):
         parts = None if options.output is None else options.output / f".{study.name}.parts"
-        table = tabulate(study, run_study(study, jobs=options.jobs, dask=options.dask, parts=parts, progress=progress))
-        places = _files_of(study, options)
-        if places:
-            contents: dict[str, str | bytes] = {
-                "csv": tables_to_csv([cell_table(table)]),
-                "json": json.dumps(table.to_dict(), indent=1, allow_nan=False) + "\n",
-                "md": tables_to_markdown(study_tables(table)),
-                options.figure: study_figure(table, options.figure),
-                "html": study_page(table, software_facts()),
-            }
+        with about(path):
+            table = tabulate(
+                study, run_study(study, jobs=options.jobs, dask=options.dask, parts=parts, progress=progress)
+            )
+            places = _files_of(study, options)
+            if places:
+                contents: dict[str, str | bytes] = {
+                    "csv": tables_to_csv([cell_table(table)]),
+                    "json": json.dumps(table.to_dict(), indent=1, allow_nan=False) + "\n",
+                    "md": tables_to_markdown(study_tables(table)),
+                    options.figure: study_figure(table, options.figure),
+                    "html": study_page(table, software_facts()),
+                }
             write_together({path: contents[suffix] for suffix, path in places.items()}, force=options.force)
         yield StudyResult(study, table, tuple(places.values()))
 
