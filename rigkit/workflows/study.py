@@ -96,7 +96,7 @@ def run_studies(
                     options.figure: study_figure(table, options.figure),
                     "html": study_page(table, software_facts()),
                 }
-            write_together({path: contents[suffix] for suffix, path in places.items()}, force=options.force)
+                write_together({to: contents[suffix] for suffix, to in places.items()}, force=options.force)
         yield StudyResult(study, table, tuple(places.values()))
 
 
