@@ -35,7 +35,7 @@ def test_corners_in_wrong_places_of_a_board_have_their_cause(folder: Path, capsy
 
 def test_mirrored_images_are_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for path in folder.glob("*.png"):
-        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)[:, ::-1])
+        cv2.imwrite(str(path), np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))[:, ::-1])
     words = "charuco:7x7x30,dictionary=DICT_4X4_1000,marker_mm=22.5"
     assert main(["calibrate", str(folder), "--board", words, "-o", str(folder / "out.json")]) != 0
     said = "".join(capsys.readouterr())
