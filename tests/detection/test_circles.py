@@ -124,6 +124,22 @@ def test_a_cut_grid_gets_its_place_where_its_borders_show() -> None:
     assert np.abs(errors(found, truth)).max() < SINGLE_PX
 
 
+@pytest.mark.parametrize("turn_deg", [-65.0, -55.0, 55.0])
+def test_a_board_whose_corner_is_cut_off_is_told_from_a_larger_one(turn_deg: float) -> None:
+    small, large = (replace(REGULAR, board_id=f"of {n}", columns=n, rows=6) for n in (7, 8))
+    turn = exp_so3(np.radians([20.0, 0.0, turn_deg]))
+    place = Rigid3(turn, np.array([0.0, 0.0, 420.0]) - turn @ small.points().mean(axis=0))
+    scene = BenchScene("regular", (PlacedBoard(small, place),), (), bench_camera("regular"), bench_field_deg("regular"))
+    truth = scene.truth()[0]
+    lowest = truth.pixels[:, 1].argmax()
+    image = scene.render()[: int(truth.pixels[lowest, 1])]
+    for boards in ([small, large], [large, small]):
+        (found,) = detect_boards(image, boards)
+        assert found.board_id == small.board_id
+        assert len(found.grid) == small.corner_count - 1
+        assert np.abs(errors(found, truth)).max() < SINGLE_PX
+
+
 def test_circles_that_something_covers_are_left_out() -> None:
     rng = np.random.default_rng(3)
     scene = one_board(rng, lens="regular", board=HEXAGONAL)

@@ -7,7 +7,7 @@ such place (or several that look the same), a part as many as its own borders le
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +19,8 @@ from rigkit.core.patterns.circles import Circles
 from rigkit.detection.circles.find import CircleGrid
 
 TELLING = 2
-"""A place in the board is preferred to another that leaves more than so many more places empty."""
+"""A place in a board is preferred to another, in it or in another board, that leaves more than so many more places
+empty."""
 MAX_EMPTY = 0.2
 """Part of a board's circles that may be covered where the others show their place."""
 EMPTY_LINE = 0.5
@@ -34,8 +35,27 @@ class _Place:
     empty: int
 
 
+def boards_meant(found: CircleGrid, boards: Sequence[Board]) -> list[tuple[Board, BoardDetection]]:
+    """Return which of the boards the lattice can be, the likeliest first, each with the circles on its grid, unnamed.
+
+    A lattice that is a whole board is that one, though a larger board may have room for it. Other boards are compared
+    as places in one board are (`TELLING`): where the image's border cuts off the corner of a board, the paper beside it
+    is seen, where a larger board would have circles.
+    """
+    fits = [(board, place) for board in boards if (place := _place_on(found, board)) is not None]
+    least = min((place.empty for _, place in fits), default=0)
+    likely = sorted((fit for fit in fits if fit[1].empty <= least + TELLING), key=lambda fit: fit[1].empty)
+    whole = [(board, place) for board, place in fits if len(place.grid) == board.corner_count]
+    return [(board, _detection(found, place.grid, board.size)) for board, place in whole or likely]
+
+
 def placed_on(found: CircleGrid, board: Board) -> BoardDetection | None:
     """Return the circles on the board's grid, unnamed, or None where the image does not tell their place."""
+    place = _place_on(found, board)
+    return None if place is None else _detection(found, place.grid, board.size)
+
+
+def _place_on(found: CircleGrid, board: Board) -> _Place | None:
     pattern = board.pattern
     if not isinstance(pattern, Circles) or pattern.inverted != found.bright:
         return None
@@ -48,7 +68,7 @@ def placed_on(found: CircleGrid, board: Board) -> BoardDetection | None:
     good = [place for place in places if place.empty <= least + TELLING]
     if len({_key(place.grid, board) for place in good}) > 1:
         return None
-    return _detection(found, max(good, key=lambda place: _upright(place.grid, found.pixels)).grid, board.size)
+    return max(good, key=lambda place: _upright(place.grid, found.pixels))
 
 
 def lone_part(found: CircleGrid, board: Board) -> BoardDetection | None:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.detection.circles.find import find_grids
-from rigkit.detection.circles.place import lone_part, placed_on
+from rigkit.detection.circles.place import boards_meant, lone_part
 from rigkit.detection.circles.through_lens import seen_through
 from rigkit.detection.targets.base import Finder, Search
 
@@ -21,14 +21,12 @@ class CirclesFinder(Finder):
         out: list[BoardDetection] = []
         names: list[str | None] = []
         for grid in find_grids(search.grey, fewest):
-            fits = [(board, placed) for board in boards if (placed := placed_on(grid, board)) is not None]
-            # A grid that is a whole board is that one, though a larger board may have room for it.
-            fits = [fit for fit in fits if fit[1].complete] or fits
+            fits = boards_meant(grid, boards)
             if fits:
                 board, placed = fits[0]
                 camera = search.camera
                 out.append(placed if camera is None else seen_through(search.grey, grid, placed, board, camera))
-                names.append(fits[0][0].board_id if len(fits) == 1 else None)
+                names.append(board.board_id if len(fits) == 1 else None)
                 continue
             parts = [part for board in boards if (part := lone_part(grid, board)) is not None]
             if parts:
