@@ -214,7 +214,9 @@ def test_rig_and_its_check_and_certificate(lab: Lab, capsys: pytest.CaptureFixtu
     both = [lab.path("left"), lab.path("right")]
     assert main(["calibrate", *both, "--board", lab.target, "--model", "pinhole", "-o", rig, "--force"]) == 0
     saved = load_saved_rig(rig)
-    assert [board.pattern for board in saved.boards] == [lab.board.pattern]
+    (board,) = saved.boards
+    # In words: the calibrated board may be stretched, here by rounding.
+    assert board.describe() == lab.board.describe()
     poses = [pose for _, pose in saved.cameras.values()]
     found = (poses[1] @ poses[0].inverse()).translation_mm
     true = RIGHT_FROM_LEFT.translation_mm

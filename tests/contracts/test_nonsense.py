@@ -26,12 +26,12 @@ def test_no_file_s_camera_has_a_focal_length_that_is_not_positive(
     ours, theirs = tmp_path / "camera.json", tmp_path / "camera.yml"
     rigkit.io.calibration_file.save_camera(ours, PINHOLE)
     ours.write_text(ours.read_text().replace('"fy": 500.0', f'"fy": {focal}'))
-    with pytest.raises(InputError, match=r"camera.json': fy = .*positive"):
+    with pytest.raises(InputError, match=r"camera.json': .*focal lengths are 500 and .*positive"):
         rigkit.load_camera(ours)
     matrix = f"[500.0, 0.0, 320.0, 0.0, {focal}, 240.0, 0.0, 0.0, 1.0]"
     theirs.write_text(f"image_width: 640\nimage_height: 480\ncamera_matrix: {matrix}\n")
     assert main(["export", str(theirs), "--from", "opencv", "-o", str(tmp_path / "new.json")]) == 2
-    assert "camera.yml': fy = " in capsys.readouterr().err
+    assert "camera.yml': its focal lengths are 500 and " in capsys.readouterr().err
     assert not (tmp_path / "new.json").exists()
 
 
