@@ -6,9 +6,11 @@ import argparse
 import logging
 import re
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TextIO
 
 from rigkit.core.errors import InputError, printable
 from rigkit.io.reading import usable_path
@@ -69,9 +71,21 @@ class _OnStderr(logging.Handler):
             return
 
 
+def _noted(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    logging.getLogger("rigkit.warnings").debug("%s: %s (%s:%d)", category.__name__, message, filename, lineno)
+
+
 @contextmanager
 def logging_to(*, verbose: bool, log_file: Path | None) -> Iterator[None]:
-    """Let the log of the package go to stderr (details if `verbose`) and to `log_file` within the block.
+    """Let the log of the package go to stderr (details if `verbose`) and to `log_file` within the block. Warnings of
+    numpy about numbers that are refused afterwards are details, not messages.
 
     Raises InputError where the file cannot be written.
     """
@@ -85,7 +99,9 @@ def logging_to(*, verbose: bool, log_file: Path | None) -> Iterator[None]:
     for handler in handlers:
         root.addHandler(handler)
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.showwarning = _noted
+            yield
     finally:
         root.setLevel(before)
         for handler in handlers:

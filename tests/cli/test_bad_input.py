@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -308,3 +310,11 @@ def test_names_that_no_file_system_takes(
     assert main([word.format(**known) for word in words.split()]) == 2
     assert capsys.readouterr().err.splitlines()[-1].startswith("rigkit: ")
     assert not any(tmp_path.iterdir())
+
+
+def test_numbers_that_overflow_are_told_in_one_line(tmp_path: Path) -> None:
+    """In a process of its own, as the tests keep warnings to themselves."""
+    cloud = Path(__file__).parents[1] / "corpus" / "ply" / "point-not-finite.ply"
+    words = [sys.executable, "-m", "rigkit", "mesh", str(cloud), "-o", str(tmp_path / "mesh.ply")]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1 and "point-not-finite" in done.stderr
