@@ -1,14 +1,11 @@
 """Every camera model, and a rig, through every format and back: the largest error over the image, px, and what the
 other programs' own readers make of the files. The tables are part of the documentation.
 
-python scripts/round_trips.py
+python scripts/round_trips.py     (what is read by whom: own_readers.py)
 """
 
 from __future__ import annotations
 
-import ast
-import json
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
@@ -16,8 +13,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import own_readers
 import yaml
-from scipy.spatial.transform import Rotation
 
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import grid_pixels
@@ -39,11 +36,6 @@ from rigkit.interop.ros import read_camera_info, write_camera_info
 LENS = KannalaBrandt((1280, 960), np.array([720.0, 721.0, 643.2, 477.9, -0.03, 0.004, -0.0008, 0.0]))
 """A lens of 85 by 65 degrees that every model can follow nearly."""
 GRID = (41, 31)
-SYSTEM_PYTHON = "/usr/bin/python3"
-PROJECT = (
-    "import sys, mrcal, numpy as np; lens = mrcal.cameramodel(sys.argv[1]).intrinsics(); "
-    "np.save(sys.argv[3], mrcal.project(np.load(sys.argv[2]), *lens))"
-)
 EXACT_PX = 1e-6
 """Below this a file brings the same camera back: text has every digit."""
 FORMATS: dict[str, tuple[Callable[[Camera], Written], Callable[[str], Camera]]] = {
@@ -56,9 +48,13 @@ FORMATS: dict[str, tuple[Callable[[Camera], Written], Callable[[str], Camera]]] 
 }
 
 
-def lens_as(model: str) -> Camera:
-    """Return the lens as a camera of a model."""
-    return convert_camera(LENS, model, order={"brown": 5, "scaramuzza": 6}.get(model)).camera
+ORDERS = {"brown": (4, 5, 8), "scaramuzza": (6,)}
+"""Terms, or degree, of the models that have several."""
+
+
+def lens_as(model: str, order: int | None = None) -> Camera:
+    """Return the lens as a camera of a model; without an `order` as good a one as it needs."""
+    return convert_camera(LENS, model, order=order or {"brown": 5, "scaramuzza": 6}.get(model)).camera
 
 
 def pixels_and_rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -123,17 +119,24 @@ def by_pycolmap(camera: Camera) -> float | None:
 
 
 def by_mrcal(camera: Camera) -> float | None:
-    """Return the largest error of mrcal's own projection with what its own reader has of the file; None where the
-    system's Python has no mrcal (Debian: python3-mrcal)."""
-    if subprocess.run([SYSTEM_PYTHON, "-c", "import mrcal"], capture_output=True, check=False).returncode != 0:
-        return None
+    """Return the largest error of mrcal's own projection with what its own reader has of the file."""
     pixels, rays = pixels_and_rays(camera)
-    with tempfile.TemporaryDirectory() as folder:
-        path, given, found = (Path(folder) / name for name in ("camera.cameramodel", "rays.npy", "pixels.npy"))
-        path.write_text(write_cameramodel(camera).text)
-        np.save(given, rays)
-        subprocess.run([SYSTEM_PYTHON, "-c", PROJECT, str(path), str(given), str(found)], check=True)
-        return float(np.linalg.norm(np.load(found) - pixels, axis=1).max())
+    found = own_readers.mrcal_projects(write_cameramodel(camera).text, rays)
+    return None if found is None else float(np.linalg.norm(found[0] - pixels, axis=1).max())
+
+
+def by_ros(camera: Camera) -> float | None:
+    """Return the largest error of a projection with what ROS's own reader has of the file."""
+    pixels, rays = pixels_and_rays(camera)
+    found = own_readers.ros_projects(write_camera_info(camera).text, rays)
+    return None if found is None else float(np.linalg.norm(found - pixels, axis=1).max())
+
+
+def by_kalibr(camera: Camera) -> float | None:
+    """Return the largest error of a projection with what Kalibr's own reader has of the file."""
+    pixels, rays = pixels_and_rays(camera)
+    found = own_readers.kalibr_reads(write_kalibr([camera]).text, rays)
+    return None if found is None else float(np.linalg.norm(found[0][0] - pixels, axis=1).max())
 
 
 RIGHT_FROM_LEFT = Rigid3(exp_so3(np.array([0.02, -0.1, 0.03])), [-250.0, 4.0, 9.0])
@@ -159,35 +162,33 @@ def _mount_by_ros(left: str, right: str) -> Rigid3:
 
 
 def _mount_by_kalibr(text: str) -> Rigid3:
+    found = own_readers.kalibr_reads(text, np.array([[0.0, 0.0, 1.0]]))
+    if found is not None:
+        return found[1][1]
     pose = np.array(yaml.safe_load(text)["cam1"]["T_cn_cnm1"])
     return Rigid3(pose[:3, :3], MM_PER_M * pose[:3, 3])
 
 
-def _mount_by_mrcal(right: str) -> Rigid3:
-    pose = np.array(ast.literal_eval(right)["extrinsics"])
-    return Rigid3(cv2.Rodrigues(pose[:3])[0], MM_PER_M * pose[3:])
+def _mount_by_mrcal(right: str) -> Rigid3 | None:
+    found = own_readers.mrcal_projects(right, np.array([[0.0, 0.0, 1.0]]))
+    return None if found is None else found[1]
 
 
-def _mount_by_colmap(text: str) -> Rigid3:
-    camera = json.loads(text)[0]["cameras"][1]
-    w, x, y, z = camera["cam_from_rig_rotation"]
-    return Rigid3(Rotation.from_quat([x, y, z, w]).as_matrix(), camera["cam_from_rig_translation"])
-
-
-MOUNTS: dict[str, Callable[..., Rigid3]] = {
+MOUNTS: dict[str, Callable[..., Rigid3 | None]] = {
     "opencv": lambda text: _mount_by_opencv(text),
     "ros": _mount_by_ros,
     "kalibr": lambda text: _mount_by_kalibr(text),
     "mrcal": lambda _, right: _mount_by_mrcal(right),
-    "colmap": lambda text: _mount_by_colmap(text),
+    "colmap": own_readers.colmap_mount,
 }
-"""Format -> right_from_left of its files, by the rules of that format, with nothing of rigkit's own readers."""
+"""Format -> right_from_left of its files, by the rules of that format, with nothing of rigkit's own readers; None where
+its own reader is not installed."""
 READ_BY = {
     "opencv": "`cv2.FileStorage`: R, T",
     "ros": "a YAML parser: R and P of both",
-    "kalibr": "a YAML parser: T_cn_cnm1",
-    "mrcal": "Python's literals, `cv2.Rodrigues`",
-    "colmap": "a JSON parser, SciPy's quaternions",
+    "kalibr": "Kalibr's `ConfigReader`: T_cn_cnm1",
+    "mrcal": "`mrcal.cameramodel`",
+    "colmap": "`pycolmap.read_rig_config`",
 }
 
 
@@ -204,6 +205,9 @@ def rigs_table() -> str:
     for kind in RIG_FORMATS:
         written = write_rig(rig, kind)
         found = MOUNTS[kind](*written.files.values())
+        if found is None:
+            lines.append(f"| {kind} | {READ_BY[kind]} | - | - | {written.max_error_px:.1e} | - |")
+            continue
         change = found @ RIGHT_FROM_LEFT.inverse()
         turned = np.degrees(np.linalg.norm(cv2.Rodrigues(change.rotation)[0]))
         moved = float(np.linalg.norm(found.inverse().translation_mm - RIGHT_FROM_LEFT.inverse().translation_mm))
@@ -211,21 +215,51 @@ def rigs_table() -> str:
         off = float(np.linalg.norm(seen - truth, axis=1)[both & there].max())
         figures = " | ".join(f"{value:.1e}" for value in (turned, moved, written.max_error_px, off))
         lines.append(f"| {kind} | {READ_BY[kind]} | {figures} |")
+    by_ros = stereo_by_ros()
+    if by_ros is not None:
+        lines.append(
+            "\nROS's own reader and `image_geometry.StereoCameraModel`, a stereo pair of Brown lenses: raw pixels of "
+            f"points within {by_ros[0]:.1e} px, the points of their disparities within {by_ros[1]:.1e} mm."
+        )
     return "\n".join(lines) + "\n"
 
 
-READERS = {"OpenCV's own": by_opencv, "pycolmap's own": by_pycolmap, "mrcal's own": by_mrcal}
+def stereo_by_ros() -> tuple[float, float] | None:
+    """Return how far raw pixels (px) and points of disparities (mm) by ROS's own code are from ours, of points 1 m away
+    that both cameras of a stereo pair of Brown lenses see."""
+    lens = lens_as("brown")
+    files = write_rig({"left": (lens, Rigid3.identity()), "right": (lens, RIGHT_FROM_LEFT)}, "ros").files
+    rays = pixels_and_rays(lens)[1]
+    points = rays / rays[:, 2:] * MM_PER_M
+    there, seen = lens.project(RIGHT_FROM_LEFT.apply(points))
+    points = points[seen & np.all((there >= 0.0) & (there < lens.size_px), axis=1)]
+    ours = np.stack([lens.project(pose.apply(points))[0] for pose in (Rigid3.identity(), RIGHT_FROM_LEFT)])
+    turn = np.array(yaml.safe_load(files["left"])["rectification_matrix"]["data"]).reshape(3, 3)
+    read = own_readers.ros_stereo(files["left"], files["right"], points @ turn.T)
+    if read is None:
+        return None
+    raw, found = read
+    return float(np.linalg.norm(raw - ours, axis=2).max()), float(np.linalg.norm(found @ turn - points, axis=1).max())
+
+
+READERS = {
+    "OpenCV's own": by_opencv,
+    "ROS's own": by_ros,
+    "Kalibr's own": by_kalibr,
+    "pycolmap's own": by_pycolmap,
+    "mrcal's own": by_mrcal,
+}
 
 
 def table() -> str:
     """Return the table as Markdown."""
     head = ["model", *FORMATS, *READERS]
     lines = [f"| {' | '.join(head)} |", "| :-- " + "| --: " * (len(head) - 1) + "|"]
-    for model in MODELS:
-        camera = lens_as(model)
+    for model, order in ((name, order) for name in MODELS for order in ORDERS.get(name, (None,))):
+        camera = lens_as(model, order)
         own = [reader(camera) for reader in READERS.values()]
         cells = [cell(camera, kind) for kind in FORMATS] + ["-" if v is None else f"{v:.1e}" for v in own]
-        lines.append(f"| `{model}` | {' | '.join(cells)} |")
+        lines.append(f"| `{model}`{'' if order is None else f' {order}'} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 

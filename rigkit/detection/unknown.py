@@ -6,17 +6,34 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.circles import Circles
+from rigkit.core.progress import Progress, silent
 from rigkit.detection.circles.unknown import CircleSightings, guessed_circles
 from rigkit.detection.detect import detect_boards
-from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.saddles.response import GreyImage, sample
 from rigkit.detection.tags.unknown_charuco import MarkerSightings, guessed_charuco
 from rigkit.detection.tags.unknown_tags import TagSightings, guessed_grids
 
 MIN_IMAGES_OF_GUESS = 2
 """A size of chessboards is told from so many images, or from the only one."""
+
+LOOKING = "looking which board it is"
+"""What progress is told of."""
+
+MIN_SURE_CORNERS = 20
+"""Lattices of as many corners are no chance."""
+
+INSIDE = np.linspace(0.2, 0.8, 9)
+"""Where in a square its levels are looked at, along either side."""
+
+MAX_LEVELS_APART = 0.35
+"""Levels within an empty square differ by less, of black to white: shade and noise; a marker's by all of it, or by half
+where it is blurred."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -35,39 +52,71 @@ class BoardGuess:
     beside: tuple[Board, ...] = ()
 
 
-def guess_board(images: Sequence[GreyImage]) -> BoardGuess | None:
+def guess_board(images: Sequence[GreyImage], progress: Progress = silent) -> BoardGuess | None:
     """Return the board that most of the images (grey levels 0..255) show; None where none is seen.
 
     Boards with marks are told by these: AprilGrids, ChArUco boards (also of the pattern before OpenCV 4.6, and
     inverted). Otherwise it is the largest chessboard that is seen often, or a grid of circles that more images show.
+    `progress` is told after every image.
     """
     tags, markers = TagSightings(), MarkerSightings()
+    plain: list[list[BoardDetection]] = []
     for k, image in enumerate(images):
+        progress(LOOKING, k, len(images))
+        plain.append([d for d in detect_boards(image) if d.complete])
+        if any(_without_marks(image, found) for found in plain[-1]):
+            continue
         # Many dictionaries take a second a picture: a board without markers is not asked for ever.
         if not tags.look(k, image) and (markers.images or k < MARKER_TRIES):
             markers.look(k, image)
+    guess = _guess_of(images, plain, tags, markers)
+    progress(LOOKING, len(images), len(images))
+    return guess
+
+
+def _guess_of(
+    images: Sequence[GreyImage],
+    plain: Sequence[Sequence[BoardDetection]],
+    tags: TagSightings,
+    markers: MarkerSightings,
+) -> BoardGuess | None:
     grids = guessed_grids(tags)
     if grids:
         return BoardGuess(*grids[0], tuple(board for board, _ in grids[1:]))
     charuco = guessed_charuco(markers)
-    if charuco is not None:
-        return BoardGuess(charuco, tuple(markers.images))
-    plain = _plain_guess(images)
-    if plain is None:
+    if charuco is None:
+        guess = _plain_guess(images, plain)
+        if guess is not None:
+            return guess
         # Blurred frames at the beginning of a video show no markers.
-        for k, image in enumerate(images[MARKER_TRIES:], MARKER_TRIES):
-            markers.look(k, image)
+        for every in (False, True):
+            if not markers.images:
+                for k, image in enumerate(images):
+                    markers.look(k, image, every=every)
         charuco = guessed_charuco(markers)
-        return None if charuco is None else BoardGuess(charuco, tuple(markers.images))
-    return plain
+    return None if charuco is None else BoardGuess(charuco, tuple(markers.images))
 
 
-def _plain_guess(images: Sequence[GreyImage]) -> BoardGuess | None:
+def _without_marks(image: GreyImage, found: BoardDetection) -> bool:
+    """Say whether a lattice is a chessboard beyond doubt: large, and with nothing in its squares."""
+    if len(found.grid) < MIN_SURE_CORNERS:
+        return False
+    pixels = found.pixels.reshape(found.rows, found.columns, 2)
+    v, u = INSIDE[:, None, None, None, None], INSIDE[None, :, None, None, None]
+    top = (1.0 - u) * pixels[:-1, :-1] + u * pixels[:-1, 1:]
+    bottom = (1.0 - u) * pixels[1:, :-1] + u * pixels[1:, 1:]
+    levels = sample(image, ((1.0 - v) * top + v * bottom).reshape(-1, 2)).reshape(len(INSIDE) ** 2, -1)
+    row, column = np.indices((found.rows - 1, found.columns - 1))
+    odd = ((row + column) % 2).ravel() == 1
+    contrast = abs(float(levels[:, odd].mean() - levels[:, ~odd].mean()))
+    return all(float(np.median(np.ptp(levels[:, of], axis=0))) < MAX_LEVELS_APART * contrast for of in (odd, ~odd))
+
+
+def _plain_guess(images: Sequence[GreyImage], plain: Sequence[Sequence[BoardDetection]]) -> BoardGuess | None:
     """Return the chessboard, or grid of circles, that most of the images show; None where none is seen."""
     sizes: dict[int, tuple[int, int]] = {}
     circles = CircleSightings()
-    for k, image in enumerate(images):
-        found = [d for d in detect_boards(image) if d.complete]
+    for k, (image, found) in enumerate(zip(images, plain, strict=True)):
         if found:
             sizes[k] = (max(found[0].columns, found[0].rows), min(found[0].columns, found[0].rows))
         else:

@@ -113,10 +113,12 @@ def calibrate_folders(
     DegenerateError
         The views do not determine a camera.
     """
-    places = _folders_of([Path(folder) for folder in folders], folder_options, options, progress)
+    given = [inside for folder in folders for inside in _videos_inside(Path(folder))]
+    boards = _boards(given, folder_options, progress)
+    places = _folders_of(given, boards, folder_options.timestamps, options, progress)
     wanted = session_of_folders(
         places,
-        _boards(places, folder_options, progress),
+        boards,
         _session_path(places, options.output),
         model=folder_options.model or "auto",
         output=options.output,
@@ -147,9 +149,7 @@ def _boards(places: Sequence[Path], told: FolderOptions, progress: Progress) -> 
         raise InputError("calibrate: --board says how large squares are; leave --square-mm out")
     if told.square_mm is None:
         return told.boards
-    progress("looking which board it is", 0, 1)
-    boards = boards_seen(places, told.square_mm)
-    progress("looking which board it is", 1, 1)
+    boards = boards_seen(places, told.square_mm, progress)
     _log.info(f"the images show --board {' --board '.join(boards)}")
     return boards
 
@@ -177,31 +177,35 @@ def _session_path(places: Sequence[Path], output: Path | None) -> Path:
 
 
 def _folders_of(
-    places: Sequence[Path], told: FolderOptions, options: CalibrateOptions, progress: Progress
+    places: Sequence[Path],
+    boards: Sequence[str],
+    timestamps: Path | None,
+    options: CalibrateOptions,
+    progress: Progress,
 ) -> list[Path]:
     """Return the folders of images, those of videos' frames in the place of the videos."""
-    places = [inside for place in places for inside in _videos_inside(place)]
     videos = [place for place in places if is_video(place)]
     if not videos:
         return list(places)
     if len(videos) < len(places):
         raise InputError("calibrate: videos together with folders of images; give all cameras one way")
-    boards = [board_of_words(words) for words in told.boards]
     if not boards:
         raise InputError(
-            "calibrate: of a video the board has to be told, such as --board 9x6x25; rigkit board identify shows which"
+            "calibrate: how large are the squares in the video? give --square-mm, the side of one, or the board, such "
+            "as --board 9x6x25; rigkit board identify shows which"
         )
+    seen = [board_of_words(words) for words in boards]
     folder = frames_folder(videos)
     if options.output is not None:
         folder = options.output.parent / folder.name
     if len(videos) == 1:
-        frames_of_video(videos[0], folder, boards, progress=progress)
+        frames_of_video(videos[0], folder, seen, progress=progress)
         return [folder]
     cameras = {video.stem: video for video in videos}
     if len(cameras) < len(videos):
         raise InputError("calibrate: two videos have the same name, which names a camera; rename one")
-    timestamps = told.timestamps or timestamps_beside(videos)
-    frames_of_videos(cameras, folder, boards, timestamps=timestamps, progress=progress)
+    times = timestamps or timestamps_beside(videos)
+    frames_of_videos(cameras, folder, seen, timestamps=times, progress=progress)
     return [folder / name for name in cameras]
 
 

@@ -12,10 +12,12 @@ from pathlib import Path
 
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier
+from rigkit.core.progress import Progress, silent
 from rigkit.io.board_file import board_text
 from rigkit.io.board_words import WORDS_HELP, board_in_words, board_of_words, with_length
 from rigkit.io.images import IMAGE_ENDINGS
 from rigkit.io.session import SESSION_NAME, SESSION_SCHEMA
+from rigkit.io.video import is_video
 from rigkit.workflows.identify_board import suggested_words
 
 SIDE = r"left|right|cam(?:era)?[_-]?\d{1,3}"
@@ -154,20 +156,23 @@ def session_to_come(patterns: Mapping[str, str], boards: Sequence[str], place: P
     return FolderSession(path, files)
 
 
-def boards_seen(folders: Sequence[Path], side_mm: float) -> tuple[str, ...]:
-    """Return the boards that images show, in words, with squares (tags, distances of circles) of `side_mm`.
+def boards_seen(places: Sequence[Path], side_mm: float, progress: Progress = silent) -> tuple[str, ...]:
+    """Return the boards that folders of images, or videos, show, in words, with squares (tags, distances of circles) of
+    `side_mm`.
 
     Raises InputError where none is seen.
     """
-    shown = _shown(folders)
+    shown = _shown(places, progress)
     if shown is None:
         raise InputError(f"calibrate: no board is seen in the images; give it, such as --board {WORDS_HELP}")
     return tuple(with_length(words, side_mm) for words in shown.split(" --board "))
 
 
-def _shown(folders: Sequence[Path]) -> str | None:
-    entries = [entry for found in cameras_in(folders).values() for entry in found]
-    return suggested_words(sorted(image for folder, pattern in entries for image in folder.glob(pattern)))
+def _shown(places: Sequence[Path], progress: Progress = silent) -> str | None:
+    if any(is_video(place) for place in places):
+        return suggested_words(places, progress)
+    entries = [entry for found in cameras_in(places).values() for entry in found]
+    return suggested_words(sorted(image for folder, pattern in entries for image in folder.glob(pattern)), progress)
 
 
 def _untold(folders: Sequence[Path]) -> str:

@@ -72,7 +72,7 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
     if not images:
         raise unreadable[0]
     progress("reading", ENOUGH_IMAGES, ENOUGH_IMAGES)
-    guess = guess_board(list(images.values()))
+    guess = guess_board(list(images.values()), progress)
     names = tuple(Path(name).name for name in images)
     if guess is None:
         if unreadable:
@@ -133,16 +133,16 @@ def _mirrored(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     )
 
 
-def suggested_words(paths: Sequence[Path]) -> str | None:
+def suggested_words(paths: Sequence[Path], progress: Progress = silent) -> str | None:
     """Return the board that images show as `--board` takes it; None where none is seen."""
-    guess = _guess(paths)
+    guess = _guess(paths, progress)
     return None if guess is None else " --board ".join(words_of_board(board) for board in (guess.board, *guess.beside))
 
 
-def _guess(paths: Sequence[Path]) -> BoardGuess | None:
+def _guess(paths: Sequence[Path], progress: Progress = silent) -> BoardGuess | None:
     try:
         pictures = [image for _, image in _pictures(paths, EXPLAINING_IMAGES)]
-        return guess_board([image for image in pictures if not isinstance(image, InputError)])
+        return guess_board([image for image in pictures if not isinstance(image, InputError)], progress)
     except RigkitError:
         return None
 

@@ -13,8 +13,10 @@ from rigkit.core.patterns.base import Pattern
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.patterns.circles import Circles
-from rigkit.detection.saddles.response import grey_image
-from rigkit.detection.unknown import difference, guess_board
+from rigkit.detection.saddles.response import GreyImage, grey_image
+from rigkit.detection.tags.unknown_charuco import MarkerSightings
+from rigkit.detection.tags.unknown_tags import TagSightings
+from rigkit.detection.unknown import LOOKING, difference, guess_board
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
@@ -65,6 +67,34 @@ def test_everything_but_the_scale_is_told(size: tuple[int, int], pattern: Patter
         assert found.diameter_mm == pytest.approx((pattern.diameter_mm or 0.0) / 60.0, abs=PLACES[1])
     else:
         assert found == pattern
+
+
+def test_empty_squares_are_a_chessboard_without_reading_marks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten dictionaries in two polarities take seconds a picture."""
+
+    def asked(*_: object) -> bool:
+        raise AssertionError("marks are read")
+
+    monkeypatch.setattr(TagSightings, "look", asked)
+    monkeypatch.setattr(MarkerSightings, "look", asked)
+    image = shown(Board("b", 8, 6, 60.0, 60.0))
+    told: list[tuple[str, int, int]] = []
+    guess = guess_board([image, image], lambda *what: told.append(what))
+    assert guess is not None and guess.board.size == (8, 6)
+    assert told == [(LOOKING, 0, 2), (LOOKING, 1, 2), (LOOKING, 2, 2)]
+
+
+def test_markers_far_into_a_dictionary_are_told() -> None:
+    board = Board("b", 8, 5, 60.0, 60.0, pattern=Charuco("DICT_5X5_1000", 45.0, first_marker=600))
+    guess = guess_board([shown(board)])
+    assert guess is not None and isinstance(guess.board.pattern, Charuco)
+    assert guess.board.pattern.first_marker == 600 and guess.board.size == (8, 5)
+
+
+def shown(board: Board) -> GreyImage:
+    rng = np.random.default_rng(0)
+    scene = one_board(rng, board=board, max_tilt_deg=35.0)
+    return grey_image(scene.render(optics=Optics(0.5), noise_levels=2.0, rng=rng))
 
 
 def test_two_aprilgrids_beside_each_other_are_two() -> None:

@@ -24,6 +24,7 @@ from rigkit.synthetic.scene import PlacedBoard
 from rigkit.workflows.calibrate import CalibrateOptions
 from rigkit.workflows.calibrate_any import FolderOptions, calibrate_folders
 from rigkit.workflows.detect import detect_in_images
+from rigkit.workflows.folder_session import boards_seen
 from rigkit.workflows.frame_choice import DIRECTIONS, FrameChoice, KeptFrame
 from rigkit.workflows.frames import frames_of_video, frames_of_videos
 from rigkit.workflows.identify_board import identify_board
@@ -139,3 +140,10 @@ def test_a_video_tells_its_board_and_why_another_is_not_seen(tmp_path: Path) -> 
     other = replace(MARKED, pattern=Charuco("DICT_4X4_50", 19.5, inverted=True))
     with pytest.raises(InputError, match=r"no board in 12 frames; 5 x 4 inner corners seen .*: set inverted = false"):
         frames_of_video(path, tmp_path / "out", [other])
+
+
+def test_the_board_of_a_video_is_identified(tmp_path: Path) -> None:
+    path = video(tmp_path / "a.avi", [picture((0.2 * k - 0.4, 0.3 * k - 0.5, 0.0), 5.0 * k) for k in range(5)])
+    assert boards_seen([path], 12.5) == (f"{BOARD.columns}x{BOARD.rows}x12.5",)
+    with pytest.raises(InputError, match="how large are the squares in the video"):
+        calibrate_folders([path], FolderOptions(), CalibrateOptions())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -31,6 +32,9 @@ MIN_MARKER_SIDE = 0.35
 MIN_MARKERS_READ = 3
 """Markers of one dictionary in an image whose numbers fit one board: one or two may be chance."""
 
+SURE_OF_KIND = 2
+"""Images with markers after which only kinds seen before are looked for."""
+
 OFF_SQUARE = 0.2
 """A marker's middle lies within so many squares of that of its square, as another marker beside it has it."""
 
@@ -56,21 +60,38 @@ class MarkerSightings:
     kinds: Counter[tuple[str, bool]] = field(default_factory=Counter)
     markers: list[tuple[tuple[str, bool], Markers]] = field(default_factory=list)
 
-    def look(self, index: int, image: GreyImage) -> bool:
-        """Read the markers of an image; say whether there are some that lie in squares."""
+    def look(self, index: int, image: GreyImage, *, every: bool = True) -> bool:
+        """Read the markers of an image, or only the first ones of each dictionary; say whether some lie in squares."""
         grey = np.clip(np.rint(image), 0, 255).astype(np.uint8)
-        # What was seen before is tried first.
-        kinds = [kind for kind, _ in self.kinds.most_common(2)]
-        kinds += [(name, inverted) for inverted in (False, True) for name in DICTIONARIES]
-        for kind in dict.fromkeys(kinds):
-            quads, numbers = _markers(255 - grey if kind[1] else grey, kind[0])
-            own = _in_squares(quads, numbers) if len(numbers) >= MIN_MARKERS_READ else None
+        both = {False: grey, True: 255 - grey}
+        for kind, dictionary in self._tries(every):
+            own = _in_squares(*_markers(both[kind[1]], dictionary))
+            if own is not None and dictionary != kind[0]:
+                own = _in_squares(*_markers(both[kind[1]], kind[0]))
             if own is not None:
                 self.kinds[kind] += len(own[0])
                 self.markers.append((kind, own))
                 self.images.append(index)
                 return True
         return False
+
+    def _tries(self, every: bool) -> Iterator[tuple[tuple[str, bool], str]]:
+        """Yield the kinds and what is read of them: what was seen before is tried first; then, as the time goes by the
+        number of markers and most boards begin with marker 0, the first ones of every kind, then all."""
+        before = [kind for kind, _ in self.kinds.most_common(2)]
+        yield from ((kind, kind[0]) for kind in before)
+        if len(self.images) >= SURE_OF_KIND:
+            return
+        kinds = [(name, inverted) for inverted in (False, True) for name in DICTIONARIES]
+        yield from ((kind, _beginning(kind[0])) for kind in kinds)
+        if every:
+            yield from ((kind, kind[0]) for kind in kinds if kind not in before and _beginning(kind[0]) != kind[0])
+
+
+def _beginning(dictionary: str) -> str:
+    """Return the dictionary of a kind's first markers, where OpenCV has one."""
+    kind, _, count = dictionary.rpartition("_")
+    return f"{kind}_{SIZES[0]}" if count == str(SIZES[-1]) else dictionary
 
 
 def _markers(grey: np.ndarray[Any, np.dtype[np.uint8]], dictionary: str) -> tuple[FloatArray, IntArray]:
@@ -83,6 +104,8 @@ def _markers(grey: np.ndarray[Any, np.dtype[np.uint8]], dictionary: str) -> tupl
 
 def _in_squares(quads: FloatArray, numbers: IntArray) -> Markers | None:
     """Return the largest group of markers whose places in squares follow from each other; None for too few."""
+    if len(numbers) < MIN_MARKERS_READ:
+        return None
     middle = quads.mean(axis=1)
     inverse = np.linalg.inv(homographies(quads))
     seen = np.concatenate([middle, np.ones((len(middle), 1))], axis=1) @ np.swapaxes(inverse, 1, 2)

@@ -1,0 +1,205 @@
+"""Files of ours as the other programs' own code reads and projects them, none of rigkit's: for `round_trips.py`.
+
+What is not installed gives None: mrcal (Debian: python3-mrcal), ROS (Debian: python3-camera-calibration-parsers,
+python3-image-geometry), Kalibr (its checkout's `aslam_offline_calibration/kalibr/python` in KALIBR_PYTHON; its readers
+are Python, what they hand to Kalibr's compiled cameras is projected by OpenCV or by the models' published formulas).
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import cv2
+import numpy as np
+
+from rigkit.geometry.rigid3 import Rigid3
+
+SYSTEM_PYTHON = "/usr/bin/python3"
+MM_PER_M = 1000.0
+MRCAL = """
+import sys, mrcal, numpy as np
+model = mrcal.cameramodel(sys.argv[1])
+np.savez(sys.argv[3], pixels=mrcal.project(np.load(sys.argv[2]), *model.intrinsics()),
+         pose=model.extrinsics_rt_fromref())
+"""
+ROS = """
+import sys, numpy as np
+from camera_calibration_parsers import readCalibration
+name, info = readCalibration(sys.argv[1])
+np.savez(sys.argv[2], K=np.array(info.K), D=np.array(info.D), model=info.distortion_model)
+"""
+ROS_STEREO = """
+import sys, cv2, numpy as np
+from camera_calibration_parsers import readCalibration
+from image_geometry import StereoCameraModel
+pair = StereoCameraModel()
+pair.fromCameraInfo(*(readCalibration(path)[1] for path in sys.argv[1:3]))
+points, zero = np.load(sys.argv[3]), np.zeros(3)
+seen = [pair.project3dToPixel(p) for p in points]
+raw = []
+for side, camera in enumerate((pair.left, pair.right)):
+    rays = np.array([camera.projectPixelTo3dRay(two[side]) for two in seen]) @ np.array(camera.rotationMatrix())
+    K, D = camera.intrinsicMatrix(), camera.distortionCoeffs()
+    raw.append(cv2.projectPoints(rays, zero, zero, K, D)[0].reshape(-1, 2))
+np.savez(sys.argv[4], raw=raw, found=[pair.projectPixelTo3d(l, l[0] - r[0]) for l, r in seen])
+"""
+"""Where raw images see points, by way of the rectified ones, and where the disparities say that they are, m. (Its
+rectifyPoint stops after five iterations, which are too few for strong lenses.)"""
+
+
+def _runs(module: str) -> bool:
+    done = subprocess.run([SYSTEM_PYTHON, "-c", f"import {module}"], capture_output=True, check=False)
+    return done.returncode == 0
+
+
+@cache
+def have_mrcal() -> bool:
+    return Path(SYSTEM_PYTHON).exists() and _runs("mrcal")
+
+
+@cache
+def have_ros() -> bool:
+    return Path(SYSTEM_PYTHON).exists() and _runs("camera_calibration_parsers, image_geometry")
+
+
+def mrcal_projects(text: str, rays: np.ndarray) -> tuple[np.ndarray, Rigid3] | None:
+    """Return the pixels (N, 2) of rays (N, 3), and cam_from_reference in mm, by mrcal."""
+    if not have_mrcal():
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        path, given, found = (Path(folder) / name for name in ("camera.cameramodel", "rays.npy", "found.npz"))
+        path.write_text(text)
+        np.save(given, rays)
+        subprocess.run([SYSTEM_PYTHON, "-c", MRCAL, path, given, found], check=True)
+        with np.load(found) as read:
+            turn, shift = read["pose"][:3], read["pose"][3:]
+            return read["pixels"], Rigid3(cv2.Rodrigues(turn)[0], MM_PER_M * shift)
+
+
+def ros_projects(text: str, rays: np.ndarray) -> np.ndarray | None:
+    """Return the pixels (N, 2) of rays (N, 3): camera_info by camera_calibration_parsers, projected by OpenCV as ROS
+    does."""
+    if not have_ros():
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        path, found = Path(folder) / "camera.yaml", Path(folder) / "found.npz"
+        path.write_text(text)
+        subprocess.run([SYSTEM_PYTHON, "-c", ROS, path, found], check=True)
+        with np.load(found) as read:
+            return _projected(read["K"].reshape(3, 3), read["D"], rays, fisheye=str(read["model"]) == "equidistant")
+
+
+def ros_stereo(left: str, right: str, points: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the raw pixels (2, N, 2) of points (N, 3), mm in the left camera's rectified frame, by image_geometry's
+    stereo model, and where (N, 3) it says that their disparities are."""
+    if not have_ros():
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        one, two, given, found = (Path(folder) / name for name in ("left.yaml", "right.yaml", "given.npy", "found.npz"))
+        one.write_text(left)
+        two.write_text(right)
+        np.save(given, points / MM_PER_M)
+        subprocess.run([SYSTEM_PYTHON, "-c", ROS_STEREO, one, two, given, found], check=True)
+        with np.load(found) as read:
+            return read["raw"], MM_PER_M * read["found"]
+
+
+@cache
+def _kalibr() -> ModuleType | None:
+    """Return Kalibr's reader; what it takes of Kalibr's compiled modules only holds what it is given."""
+    place = os.environ.get("KALIBR_PYTHON")
+    if place is None:
+        return None
+
+    class Holding(ModuleType):
+        def __getattr__(self, name: str) -> Any:
+            if name.startswith("_"):
+                raise AttributeError(name)
+            return lambda *given: (name, given)
+
+    class Transformation:
+        def __init__(self, matrix: np.ndarray) -> None:
+            self.matrix = matrix
+
+        def T(self) -> np.ndarray:
+            return self.matrix
+
+    for name in ("aslam_cv", "aslam_cv_backend", "sm"):
+        sys.modules[name] = Holding(name)
+    sys.modules["sm"].Transformation = Transformation  # type: ignore[attr-defined]
+    sys.path.insert(0, place)
+    return importlib.import_module("kalibr_common.ConfigReader")
+
+
+def kalibr_reads(text: str, rays: np.ndarray) -> list[tuple[np.ndarray, Rigid3]] | None:
+    """Return the pixels (N, 2) of rays (N, 3) for every camera of a camchain, and its pose from the one before, mm."""
+    reader = _kalibr()
+    if reader is None:
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "camchain.yaml"
+        path.write_text(text)
+        chain = reader.CameraChainParameters(str(path))
+    out = []
+    for k in range(chain.numCameras()):
+        _, ((name, given),) = reader.AslamCamera.fromParameters(chain.getCameraParameters(k)).geometry
+        pose = np.eye(4) if k == 0 else chain.getExtrinsicsLastCamToHere(k).T()
+        out.append((_kalibr_projected(name, given, rays), Rigid3(pose[:3, :3], MM_PER_M * pose[:3, 3])))
+    return out
+
+
+def _kalibr_projected(name: str, given: tuple[Any, ...], rays: np.ndarray) -> np.ndarray:
+    """Return the pixels of rays by what Kalibr hands to its projection `name`."""
+    if name in ("DistortedPinholeProjection", "EquidistantPinholeProjection"):
+        *core, _, _, (_, distortion) = given
+        fisheye = name.startswith("Equidistant")
+        return _projected(_matrix(*core), np.array(distortion), rays, fisheye=fisheye)
+    *first, fu, fv, cu, cv, _, _ = given
+    x, y, z = (rays / np.linalg.norm(rays, axis=1)[:, None]).T
+    if name == "OmniProjection":
+        # Mei and Rives 2007, equation 5.
+        depth = z + first[0]
+    elif name == "ExtendedUnifiedProjection":
+        # Khomutenko et al. 2016, equation 5.
+        alpha, beta = first
+        depth = alpha * np.sqrt(beta * (x**2 + y**2) + z**2) + (1.0 - alpha) * z
+    elif name == "DoubleSphereProjection":
+        # Usenko et al. 2018, equation 40.
+        xi, alpha = first
+        depth = alpha * np.sqrt(x**2 + y**2 + (xi + z) ** 2) + (1.0 - alpha) * (xi + z)
+    else:
+        raise ValueError(f"no formula for Kalibr's {name}")
+    return np.stack([fu * x / depth + cu, fv * y / depth + cv], axis=1)
+
+
+def colmap_mount(text: str) -> Rigid3:
+    """Return the second camera's pose from the first's by pycolmap's own reader of rig_config.json, mm."""
+    import pycolmap
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "rig_config.json"
+        path.write_text(json.dumps(json.loads(text)))
+        _, second = pycolmap.read_rig_config(path)[0].cameras
+    pose: Any = second.cam_from_rig
+    return Rigid3(pose.rotation.matrix(), np.asarray(pose.translation))
+
+
+def _matrix(fu: float, fv: float, cu: float, cv: float) -> np.ndarray:
+    return np.array([[fu, 0.0, cu], [0.0, fv, cv], [0.0, 0.0, 1.0]])
+
+
+def _projected(K: np.ndarray, distortion: np.ndarray, rays: np.ndarray, *, fisheye: bool) -> np.ndarray:
+    """Return the pixels of rays (N, 3) by OpenCV."""
+    points, zero = np.ascontiguousarray(rays[:, None, :]), np.zeros(3)
+    if fisheye:
+        return cv2.fisheye.projectPoints(points, zero, zero, K, distortion.reshape(-1, 1))[0].reshape(-1, 2)
+    return cv2.projectPoints(points, zero, zero, K, distortion)[0].reshape(-1, 2)
