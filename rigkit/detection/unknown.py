@@ -28,7 +28,7 @@ LOOKING = "looking which board it is"
 MIN_SURE_CORNERS = 20
 """Lattices of as many corners are no chance."""
 
-INSIDE = np.linspace(0.2, 0.8, 9)
+WITHIN_SQUARES = np.linspace(0.2, 0.8, 9)
 """Where in a square its levels are looked at, along either side."""
 
 MAX_LEVELS_APART = 0.35
@@ -102,10 +102,10 @@ def _without_marks(image: GreyImage, found: BoardDetection) -> bool:
     if len(found.grid) < MIN_SURE_CORNERS:
         return False
     pixels = found.pixels.reshape(found.rows, found.columns, 2)
-    v, u = INSIDE[:, None, None, None, None], INSIDE[None, :, None, None, None]
+    v, u = WITHIN_SQUARES[:, None, None, None, None], WITHIN_SQUARES[None, :, None, None, None]
     top = (1.0 - u) * pixels[:-1, :-1] + u * pixels[:-1, 1:]
     bottom = (1.0 - u) * pixels[1:, :-1] + u * pixels[1:, 1:]
-    levels = sample(image, ((1.0 - v) * top + v * bottom).reshape(-1, 2)).reshape(len(INSIDE) ** 2, -1)
+    levels = sample(image, ((1.0 - v) * top + v * bottom).reshape(-1, 2)).reshape(len(WITHIN_SQUARES) ** 2, -1)
     row, column = np.indices((found.rows - 1, found.columns - 1))
     odd = ((row + column) % 2).ravel() == 1
     contrast = abs(float(levels[:, odd].mean() - levels[:, ~odd].mean()))
