@@ -22,6 +22,8 @@ OFTEN = 3
 """Whole grids of one size: parts of a larger board, as the frame cuts them, come in many sizes."""
 MIN_SHARE_LARGER = 0.25
 """Images that show a whole larger grid instead of a listed board, as a part of all: fewer may be something else."""
+MAX_SHARE_REACHING = 0.1
+"""Images in which a stray corner beside a smaller board makes it reach as far as a listed one, as a part of all."""
 MIN_SPREAD = 1e-6
 """Corners on a line: the determinant of their scatter, as a part of its squared trace, is rounding (of a row of the
 board), or noise (of a board seen edge-on: it is then a thousandth as high as it is wide)."""
@@ -87,9 +89,10 @@ def other_size(detections: Mapping[str, Sequence[BoardDetection]], boards: Seque
     """Return in words which size the boards of a session's images (name -> detections) have, where it is clearly none
     of those listed.
 
-    Where most of the grids are whole and of one size that is not listed, and none is of a listed size, the boards are
-    of that size; and where images show whole grids that are larger than a listed board, and that board nowhere, part
-    of a larger board was taken for it in the others.
+    Where most of the grids are whole and of one size that is not listed, and hardly any reaches from end to end of a
+    listed board, the boards are of that size: a smaller board passes for part of a listed one. And where images show
+    whole grids that are larger than a listed board, and that board nowhere, part of a larger board was taken for it in
+    the others.
     """
     listed = {frozenset(board.size) for board in boards}
     found = [own for own in detections.values() if own]
@@ -100,10 +103,17 @@ def other_size(detections: Mapping[str, Sequence[BoardDetection]], boards: Seque
     words = f"{size[0]} x {size[1]} inner corners are seen in {count} of {len(found)} images, {sizes} are declared"
     if count < OFTEN:
         return None
-    if len(without) == len(found):
+    reaching = [own for own in found if any(frozenset(_reach(d)) in listed for d in own)]
+    if len(reaching) <= MAX_SHARE_REACHING * len(found):
         return words if 2 * count > sum(len(own) for own in found) else None
     larger = any(max(board.size) <= size[0] and min(board.size) <= size[1] for board in boards)
     return words if larger and count >= MIN_SHARE_LARGER * len(found) else None
+
+
+def _reach(found: BoardDetection) -> tuple[int, int]:
+    """Return the columns and rows from the first corner found to the last."""
+    columns, rows = (np.ptp(found.grid, axis=0) + 1).tolist()
+    return columns, rows
 
 
 def views_of_image(

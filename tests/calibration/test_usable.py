@@ -40,6 +40,16 @@ def test_a_larger_board_of_which_part_was_taken() -> None:
     assert other_size({f"{k}.png": [grid(8, 6), grid(9, 6)] for k in range(10)}, declared) is None
 
 
+def test_a_smaller_board_that_passes_for_part_of_the_stated_one() -> None:
+    part = grid(9, 6)
+    as_part = BoardDetection("stated", 9, 7, part.grid, part.pixels, part.sigma_px)
+    reaching = grid(9, 7, corners=55)
+    smaller = {f"{k}.png": [one] for k, one in enumerate([part] * 7 + [as_part] * 3 + [reaching])}
+    assert other_size(smaller, STATED) == "9 x 6 inner corners are seen in 7 of 11 images, 9 x 7 are declared"
+    seen = {f"{k}.png": [one] for k, one in enumerate([part] * 7 + [reaching] * 3)}
+    assert other_size(seen, STATED) is None
+
+
 def test_parts_of_the_stated_board_are_not() -> None:
     assert other_size(shown(grid(9, 6), grid(8, 7), grid(9, 5), grid(7, 7), grid(9, 6)), STATED) is None
     assert other_size(shown(*[grid(9, 6)] * 4, grid(7, 9, corners=40)), STATED) is None
