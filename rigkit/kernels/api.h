@@ -355,4 +355,34 @@ EXPORT void fit_planes(
     const plane_grid_t *grid, ARRAY(double, planes, grid.rows, grid.columns, 3),
     ARRAY(double, normals, grid.rows, grid.columns, 3, 3), ARRAY(double, support, grid.rows, grid.columns));
 
+/* Samples of image 1 (rows x columns), and at every `spacing`-th of them where image 2 shows a surface at each of the ranges
+ * of a sweep (reconstruction.growing.sweep); NaN where nowhere. In between places are interpolated. */
+typedef struct {
+    ARRAY(const float, table, levels, table_rows, table_columns, 2);
+    int64_t levels, table_rows, table_columns, spacing, rows, columns;
+} sweep_t;
+
+/* Costs of a step to the next level, and of any larger one: `jump` where the brightness is even, half of what that is more
+ * where it changes by `even`. */
+typedef struct {
+    int64_t rows, columns, levels, bend, jump;
+    double even;
+} surface_rules_t;
+
+EXPORT int64_t sweep_levels(int64_t levels);
+EXPORT int64_t sweep_cost_memory(int64_t columns);
+EXPORT int64_t sweep_path_memory(int64_t columns, int64_t levels);
+EXPORT void sweep_costs(
+    const sweep_t *sweep, const image_t *image2, ARRAY(const float, samples1, sweep.rows, sweep.columns),
+    ARRAY(float, memory, sweep_cost_memory(sweep.columns)),
+    ARRAY(uint8_t, costs, sweep.rows, sweep.columns, sweep_levels(sweep.levels)));
+EXPORT void sweep_surfaces(
+    const surface_rules_t *rules, ARRAY(const uint8_t, costs, rules.rows, rules.columns, sweep_levels(rules.levels)),
+    ARRAY(const float, samples1, rules.rows, rules.columns),
+    ARRAY(uint8_t, memory, sweep_path_memory(rules.columns, rules.levels)),
+    ARRAY(uint16_t, total, rules.rows, rules.columns, sweep_levels(rules.levels)));
+EXPORT void sweep_winners(
+    const surface_rules_t *rules, ARRAY(const uint16_t, total, rules.rows, rules.columns, sweep_levels(rules.levels)),
+    ARRAY(int32_t, best, rules.rows, rules.columns), ARRAY(int32_t, around, rules.rows, rules.columns, 4));
+
 #endif

@@ -1,158 +1,168 @@
 /* Planes through what the nodes of a grid say of a surface, robustly: tests/kernels/reference/planes.py says what is
- * computed. */
+ * computed. Nodes side by side are fitted together, one in each lane of a vector. */
 #include "kernels.h"
 
+enum { LANES = 8, UPPER = 6, XX = 0, XY, XZ, YY, YZ, ZZ };
+
+/* What each node adds to the fit of a plane m: |z - F m|^2 in sigmas is m'N m - 2 b'm + c. Zero where it says nothing, as
+ * around the grid: `reach` nodes to each side, and what fills up the last lanes. */
 typedef struct {
-    double m[3][3];
-} m3_t;
+    int64_t columns, size;
+    double *terms;
+} sums_t;
 
-INLINE m3_t read_m3(const double *at)
-{
-    m3_t out;
-    memcpy(&out, at, sizeof out);
-    return out;
-}
+enum { TERM_N = 0, TERM_B = UPPER, TERM_C = UPPER + 3, TERM_SEEN = UPPER + 4, TERMS = UPPER + 5 };
 
-/* Return the inverse of a symmetric matrix, and whether it has one; scaled first, its units differ by thousands. */
-INLINE int inverse_of(const m3_t *M, m3_t *out)
+static int make_sums(const plane_grid_t *g, sums_t *out)
 {
-    double s[3];
-    m3_t a;
-    for (int64_t i = 0; i < 3; i++) {
-        if (!(M->m[i][i] > 0.0))
-            return 0;
-        s[i] = 1.0 / sqrt(M->m[i][i]);
-    }
-    for (int64_t i = 0; i < 3; i++)
-        for (int64_t j = 0; j < 3; j++)
-            a.m[i][j] = M->m[i][j] * s[i] * s[j];
-    for (int64_t i = 0; i < 3; i++) {
-        for (int64_t j = 0; j < 3; j++) {
-            const int64_t p = (j + 1) % 3, q = (j + 2) % 3, r = (i + 1) % 3, t = (i + 2) % 3;
-            out->m[i][j] = a.m[p][r] * a.m[q][t] - a.m[p][t] * a.m[q][r];
-        }
-    }
-    const double determinant = a.m[0][0] * out->m[0][0] + a.m[0][1] * out->m[1][0] + a.m[0][2] * out->m[2][0];
-    if (!(determinant > 1e-13))
+    out->columns = g->columns + 2 * g->reach + LANES;
+    out->size = out->columns * (g->rows + 2 * g->reach);
+    out->terms = calloc((size_t)(TERMS * out->size), sizeof(double));
+    if (out->terms == NULL)
         return 0;
-    for (int64_t i = 0; i < 3; i++)
-        for (int64_t j = 0; j < 3; j++)
-            out->m[i][j] *= s[i] * s[j] / determinant;
+    for (int64_t k = 0; k < g->rows * g->columns; k++) {
+        const double *z = g->values + 3 * k, *W = g->information + 9 * k, *F = g->frames + 9 * k;
+        if (!isfinite(z[0]))
+            continue;
+        double *at = out->terms + (k / g->columns + g->reach) * out->columns + k % g->columns + g->reach;
+        double WF[3][3], Wz[3], c = 0.0;
+        for (int64_t i = 0; i < 3; i++) {
+            Wz[i] = W[3 * i] * z[0] + W[3 * i + 1] * z[1] + W[3 * i + 2] * z[2];
+            c += z[i] * Wz[i];
+            for (int64_t j = 0; j < 3; j++)
+                WF[i][j] = W[3 * i] * F[j] + W[3 * i + 1] * F[3 + j] + W[3 * i + 2] * F[6 + j];
+        }
+        for (int64_t i = 0, next = 0; i < 3; i++) {
+            for (int64_t j = i; j < 3; j++, next++)
+                at[(TERM_N + next) * out->size] = F[i] * WF[0][j] + F[3 + i] * WF[1][j] + F[6 + i] * WF[2][j];
+            at[(TERM_B + i) * out->size] = F[i] * Wz[0] + F[3 + i] * Wz[1] + F[6 + i] * Wz[2];
+        }
+        at[TERM_C * out->size] = c;
+        at[TERM_SEEN * out->size] = 1.0;
+    }
     return 1;
 }
 
-INLINE void apply_m3(const m3_t *M, const double v[3], double out[3])
+/* Write x with N x = b for a symmetric matrix by its upper triangle, and whether it has an inverse; scaled first, its units
+ * differ by thousands. */
+INLINE int solve3(const double N[UPPER], const double b[3], double x[3])
 {
-    for (int64_t i = 0; i < 3; i++)
-        out[i] = M->m[i][0] * v[0] + M->m[i][1] * v[1] + M->m[i][2] * v[2];
+    const double s0 = 1.0 / sqrt(N[XX]), s1 = 1.0 / sqrt(N[YY]), s2 = 1.0 / sqrt(N[ZZ]);
+    const double p = N[XY] * s0 * s1, q = N[XZ] * s0 * s2, r = N[YZ] * s1 * s2;
+    const double xx = 1.0 - r * r, yy = 1.0 - q * q, zz = 1.0 - p * p, xy = q * r - p, xz = p * r - q, yz = p * q - r;
+    const double determinant = xx + p * xy + q * xz, part = 1.0 / determinant;
+    const double b0 = b[0] * s0, b1 = b[1] * s1, b2 = b[2] * s2;
+    x[0] = s0 * part * (xx * b0 + xy * b1 + xz * b2);
+    x[1] = s1 * part * (xy * b0 + yy * b1 + yz * b2);
+    x[2] = s2 * part * (xz * b0 + yz * b1 + zz * b2);
+    return N[XX] > 0.0 && N[YY] > 0.0 && N[ZZ] > 0.0 && determinant > 1e-13;
 }
 
-/* Return A^T B C, or with `turned` A B C^T where A is C. */
-INLINE m3_t congruent(const m3_t *F, const m3_t *M, int turned)
-{
-    m3_t half, out;
-    for (int64_t i = 0; i < 3; i++)
-        for (int64_t j = 0; j < 3; j++)
-            half.m[i][j] = turned ? F->m[i][0] * M->m[0][j] + F->m[i][1] * M->m[1][j] + F->m[i][2] * M->m[2][j]
-                                  : F->m[0][i] * M->m[0][j] + F->m[1][i] * M->m[1][j] + F->m[2][i] * M->m[2][j];
-    for (int64_t i = 0; i < 3; i++)
-        for (int64_t j = 0; j < 3; j++)
-            out.m[i][j] = turned ? half.m[i][0] * F->m[j][0] + half.m[i][1] * F->m[j][1] + half.m[i][2] * F->m[j][2]
-                                 : half.m[i][0] * F->m[0][j] + half.m[i][1] * F->m[1][j] + half.m[i][2] * F->m[2][j];
-    return out;
-}
+/* LANES planes with the sums of their last fit and of the one before. */
+typedef struct {
+    double plane[3][LANES], sum[TERMS][LANES], own[UPPER][LANES];
+} fits_t;
 
-INLINE double square_in(const m3_t *M, const double v[3])
+/* Add what the neighbours at `there` say to the sums of a round, each with the weight of its distance from the plane; in
+ * the first round the node's own plane is as uncertain as its neighbours say of theirs. */
+INLINE void add_neighbours(const sums_t *sums, const double *there, const int first, double loss, fits_t *fits)
 {
-    double turned[3];
-    apply_m3(M, v, turned);
-    return v[0] * turned[0] + v[1] * turned[1] + v[2] * turned[2];
-}
-
-/* Fit the plane of one node; return the sum of weights, negative where there is no plane. */
-INLINE double fit_plane(const plane_grid_t *g, int64_t row, int64_t column, double plane[3], m3_t *normal)
-{
-    const int64_t here = row * g->columns + column;
-    m3_t spread;
-    const m3_t F = read_m3(g->frames + 9 * here), W = read_m3(g->information + 9 * here);
-    double value[3], right[3];
-    *normal = congruent(&F, &W, 0);
-    apply_m3(&W, g->values + 3 * here, value);
-    for (int64_t i = 0; i < 3; i++)
-        right[i] = F.m[0][i] * value[0] + F.m[1][i] * value[1] + F.m[2][i] * value[2];
-    if (!inverse_of(normal, &spread))
-        return -1.0;
-    apply_m3(&spread, right, plane);
-    const int64_t top = row > g->reach ? row - g->reach : 0, left = column > g->reach ? column - g->reach : 0;
-    const int64_t bottom = row + g->reach < g->rows - 1 ? row + g->reach : g->rows - 1;
-    const int64_t end = column + g->reach < g->columns - 1 ? column + g->reach : g->columns - 1;
-    double support = 0.0;
-    for (int64_t round = 0; round < g->rounds; round++) {
-        memset(normal, 0, sizeof *normal);
-        memset(right, 0, sizeof right);
-        support = 0.0;
-        for (int64_t r = top; r <= bottom; r++) {
-            for (int64_t c = left; c <= end; c++) {
-                const int64_t there = r * g->columns + c;
-                const double *z = g->values + 3 * there;
-                if (!isfinite(z[0]))
-                    continue;
-                const m3_t Fj = read_m3(g->frames + 9 * there), Wj = read_m3(g->information + 9 * there);
-                double miss[3], seen[3];
-                apply_m3(&Fj, plane, seen);
-                for (int64_t i = 0; i < 3; i++)
-                    miss[i] = z[i] - seen[i];
-                double square;
-                if (round == 0) {
-                    /* The node's own plane is as uncertain as its neighbours say of theirs. */
-                    m3_t both, inner, doubt = congruent(&Fj, &spread, 1);
-                    if (!inverse_of(&Wj, &both))
-                        continue;
-                    for (int64_t i = 0; i < 3; i++)
-                        for (int64_t j = 0; j < 3; j++)
-                            both.m[i][j] += doubt.m[i][j];
-                    if (!inverse_of(&both, &inner))
-                        continue;
-                    square = square_in(&inner, miss);
-                } else {
-                    square = square_in(&Wj, miss);
-                }
-                double weight = 1.0 / (1.0 + square / (3.0 * g->turn * g->turn));
-                weight *= weight;
-                const m3_t own = congruent(&Fj, &Wj, 0);
-                apply_m3(&Wj, z, value);
-                for (int64_t i = 0; i < 3; i++) {
-                    right[i] += weight * (Fj.m[0][i] * value[0] + Fj.m[1][i] * value[1] + Fj.m[2][i] * value[2]);
-                    for (int64_t j = 0; j < 3; j++)
-                        normal->m[i][j] += weight * own.m[i][j];
-                }
-                support += weight;
-            }
+#pragma omp simd
+    for (int64_t l = 0; l < LANES; l++) {
+        const double *at = there + l;
+        double N[UPPER], b[3], g[3];
+        for (int64_t k = 0; k < UPPER; k++)
+            N[k] = at[(TERM_N + k) * sums->size];
+        for (int64_t k = 0; k < 3; k++)
+            b[k] = at[(TERM_B + k) * sums->size];
+        const double x = fits->plane[0][l], y = fits->plane[1][l], z = fits->plane[2][l];
+        g[0] = b[0] - (N[XX] * x + N[XY] * y + N[XZ] * z);
+        g[1] = b[1] - (N[XY] * x + N[YY] * y + N[YZ] * z);
+        g[2] = b[2] - (N[XZ] * x + N[YZ] * y + N[ZZ] * z);
+        double square = at[TERM_C * sums->size] - (b[0] + g[0]) * x - (b[1] + g[1]) * y - (b[2] + g[2]) * z;
+        if (first) {
+            /* With the plane's own covariance S: (W^-1 + F S F')^-1 = W - W F (S^-1 + F'W F)^-1 F'W. */
+            double both[UPPER], less[3];
+            for (int64_t k = 0; k < UPPER; k++)
+                both[k] = fits->own[k][l] + N[k];
+            solve3(both, g, less);
+            square -= g[0] * less[0] + g[1] * less[1] + g[2] * less[2];
         }
-        if (!inverse_of(normal, &spread))
-            return -1.0;
-        apply_m3(&spread, right, plane);
+        square = square < 0.0 ? 0.0 : square;
+        const double part = 1.0 / (1.0 + square * loss), weight = at[TERM_SEEN * sums->size] * part * part;
+        for (int64_t k = 0; k < TERM_C; k++)
+            fits->sum[k][l] += weight * at[k * sums->size];
+        fits->sum[TERM_SEEN][l] += weight;
     }
-    return support;
+}
+
+/* Solve for the planes of the sums; lanes without one become NaN. */
+INLINE void solve_planes(fits_t *fits)
+{
+#pragma omp simd
+    for (int64_t l = 0; l < LANES; l++) {
+        double N[UPPER], b[3], x[3];
+        for (int64_t k = 0; k < UPPER; k++)
+            N[k] = fits->sum[TERM_N + k][l];
+        for (int64_t k = 0; k < 3; k++)
+            b[k] = fits->sum[TERM_B + k][l];
+        const int good = solve3(N, b, x);
+        for (int64_t k = 0; k < 3; k++)
+            fits->plane[k][l] = good ? x[k] : NAN;
+    }
 }
 
 /* Fill planes, the normal matrices of their fits, and the sums of weights; NaN where there is no plane. */
-FOR_EACH_PROCESSOR void fit_planes(const plane_grid_t *grid, double *planes, double *normals, double *support)
+FOR_EACH_PROCESSOR void fit_planes(const plane_grid_t *g, double *planes, double *normals, double *support)
 {
-    for (int64_t row = 0; row < grid->rows; row++) {
-        for (int64_t column = 0; column < grid->columns; column++) {
-            const int64_t at = row * grid->columns + column;
-            m3_t normal;
-            support[at] = isfinite(grid->values[3 * at]) ? fit_plane(grid, row, column, planes + 3 * at, &normal) : -1.0;
-            if (support[at] >= 0.0) {
-                memcpy(normals + 9 * at, &normal, sizeof normal);
+    static const int entry[9] = {XX, XY, XZ, XY, YY, YZ, XZ, YZ, ZZ};
+    const double loss = 1.0 / (3.0 * g->turn * g->turn);
+    for (int64_t k = 0; k < g->rows * g->columns; k++) {
+        support[k] = NAN;
+        for (int64_t n = 0; n < 3; n++)
+            planes[3 * k + n] = NAN;
+        for (int64_t n = 0; n < 9; n++)
+            normals[9 * k + n] = NAN;
+    }
+    sums_t sums;
+    if (!make_sums(g, &sums))
+        return;
+    for (int64_t row = 0; row < g->rows; row++) {
+        for (int64_t start = 0; start < g->columns; start += LANES) {
+            const double *here = sums.terms + (row + g->reach) * sums.columns + start + g->reach;
+            fits_t fits;
+            double seen = 0.0;
+            for (int64_t l = 0; l < LANES; l++)
+                seen += here[TERM_SEEN * sums.size + l];
+            if (!(seen > 0.0))
                 continue;
+            for (int64_t k = 0; k < TERMS; k++)
+                memcpy(fits.sum[k], here + k * sums.size, sizeof fits.sum[k]);
+            memcpy(fits.own, fits.sum, sizeof fits.own);
+            solve_planes(&fits);
+            for (int64_t round = 0; round < g->rounds; round++) {
+                memset(fits.sum, 0, sizeof fits.sum);
+                for (int64_t dr = -g->reach; dr <= g->reach; dr++)
+                    for (int64_t dc = -g->reach; dc <= g->reach; dc++) {
+                        const double *there = here + dr * sums.columns + dc;
+                        if (round == 0)
+                            add_neighbours(&sums, there, 1, loss, &fits);
+                        else
+                            add_neighbours(&sums, there, 0, loss, &fits);
+                    }
+                solve_planes(&fits);
             }
-            support[at] = NAN;
-            for (int64_t k = 0; k < 3; k++)
-                planes[3 * at + k] = NAN;
-            for (int64_t k = 0; k < 9; k++)
-                normals[9 * at + k] = NAN;
+            for (int64_t l = 0; l < LANES && start + l < g->columns; l++) {
+                const int64_t at = row * g->columns + start + l;
+                if (!(here[TERM_SEEN * sums.size + l] > 0.0 && isfinite(fits.plane[0][l])))
+                    continue;
+                support[at] = fits.sum[TERM_SEEN][l];
+                for (int64_t k = 0; k < 3; k++)
+                    planes[3 * at + k] = fits.plane[k][l];
+                for (int64_t k = 0; k < 9; k++)
+                    normals[9 * at + k] = fits.sum[TERM_N + entry[k]][l];
+            }
         }
     }
+    free(sums.terms);
 }

@@ -22,6 +22,7 @@ from rigkit.affine.surface import linear_gauge
 from rigkit.core.arrays import BoolArray, FloatArray, Pixels
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.kernels.sweep import swept_costs, swept_surfaces
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 from rigkit.reconstruction.growing.grow import HALF_WIDTH, GrowingView, GrownPatches
 from rigkit.reconstruction.growing.surface import NodeMeasurements
@@ -31,8 +32,8 @@ SAMPLES_A_NODE = 2
 MAX_SWEEP_LEVELS = 160
 MARGIN_OF_RANGES = 0.1
 """Of the range of inverse ranges that grew, to either side."""
-CENSUS_REACH = 2
-BITS = (2 * CENSUS_REACH + 1) ** 2 - 1
+BITS = 24
+"""Of the census: whether each of the neighbours in 5 x 5 samples is darker."""
 BEND_COST = BITS // 6
 """Of a step to the next level, in bits of the census."""
 JUMP_COST = 2 * BITS
@@ -64,13 +65,6 @@ class _Sweep:
     step_px: float
     table: NDArray[np.float32]
 
-    def places(self, level: int) -> NDArray[np.float32]:
-        """Return the places (R, C, 2) of a level; far outside where there is none."""
-        rows, columns = self.pixels1.shape[:2]
-        at = np.meshgrid(*(np.arange(n, dtype=np.float32) / TABLE_SPACING for n in (columns, rows)))
-        out = cv2.remap(self.table[level], at[0], at[1], cv2.INTER_LINEAR)
-        return np.nan_to_num(np.asarray(out, np.float32), nan=-1e4)
-
 
 def filled(
     grown: GrownPatches, measured: NodeMeasurements, view1: GrowingView, view2: GrowingView, cam2_from_cam1: Rigid3
@@ -83,8 +77,11 @@ def filled(
         return grown
     sweep = _prepared(grown, measured, view1, view2, cam2_from_cam1)
     samples1 = _at(_smooth(view1, sweep.step_px), sweep.pixels1)
-    total = _aggregated(_costs(sweep, samples1, view2), samples1)
-    level, good = _winners(total, sweep, view2, cam2_from_cam1)
+    costs = swept_costs(_smooth(view2, sweep.step_px), samples1, sweep.table, TABLE_SPACING)
+    best, around = swept_surfaces(
+        costs, len(sweep.inverse), samples1, bend=BEND_COST, jump=JUMP_COST, even=EVEN_LEVELS
+    )
+    level, good = _winners(best, around, sweep, view2, cam2_from_cam1)
     good &= _at(_contrast(view1), sweep.pixels1) > MIN_CONTRAST
     spacing = sweep.inverse[1] - sweep.inverse[0]
     of_grown = np.full(level.shape, np.nan)
@@ -152,82 +149,17 @@ def _contrast(view: GrowingView) -> NDArray[np.float32]:
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)), np.float32)
 
 
-def _census(samples: NDArray[np.float32]) -> NDArray[np.uint32]:
-    """Return which neighbours of each sample (R, C) are darker, one bit each; those beyond the border are not."""
-    reach = CENSUS_REACH
-    padded = np.pad(samples, reach, constant_values=np.inf)
-    rows, columns = samples.shape
-    out = np.zeros((rows, columns), np.uint32)
-    for dr in range(2 * reach + 1):
-        for dc in range(2 * reach + 1):
-            if (dr, dc) != (reach, reach):
-                out <<= np.uint32(1)
-                out |= padded[dr : dr + rows, dc : dc + columns] < samples
-    return out
-
-
-def _costs(sweep: _Sweep, samples1: NDArray[np.float32], view2: GrowingView) -> NDArray[np.int16]:
-    """Return the bits (R, C, K) in which the census of both images differs at each level; half where there is none."""
-    first, image2 = _census(samples1), _smooth(view2, sweep.step_px)
-    out = np.empty((*samples1.shape, len(sweep.inverse)), np.int16)
-    for k in range(len(sweep.inverse)):
-        there = _at(image2, sweep.places(k))
-        out[..., k] = np.where(np.isfinite(there), np.bitwise_count(first ^ _census(there)), BITS // 2)
-    return out
-
-
-def _aggregated(costs: NDArray[np.int16], samples1: NDArray[np.float32]) -> NDArray[np.int16]:
-    """Return the costs (R, C, K) with those of the best surfaces that lead there along eight paths."""
-    total = np.zeros(costs.shape, np.int16)
-    for turned in (False, True):
-        # Paths along columns, downwards and upwards, then along rows; diagonals go with the first.
-        there = np.swapaxes(costs, 0, 1) if turned else costs
-        image = samples1.T if turned else samples1
-        here = np.swapaxes(total, 0, 1) if turned else total
-        for lines in (range(len(there)), range(len(there) - 1, -1, -1)):
-            for aside in (0,) if turned else (-1, 0, 1):
-                _along(there, image, lines, aside, here)
-    return total
-
-
-def _along(
-    costs: NDArray[np.int16], image: NDArray[np.float32], lines: range, aside: int, total: NDArray[np.int16]
-) -> None:
-    """Add to `total` the costs of paths that go from line to line, `aside` samples to the side each time."""
-    before: NDArray[np.int16] | None = None
-    last = lines[0]
-    for line in lines:
-        now = costs[line].copy()
-        if before is not None:
-            came = np.roll(before, aside, axis=0)
-            least = came.min(axis=1, keepdims=True)
-            # The last row and column are read from beyond the image too: no brightness.
-            change = np.nan_to_num(np.abs(image[line] - np.roll(image[last], aside)))
-            jump = BEND_COST + (JUMP_COST - BEND_COST) / (1.0 + change / EVEN_LEVELS)
-            best = np.minimum(came, least + jump.astype(np.int16)[:, None])
-            np.minimum(best[:, 1:], came[:, :-1] + np.int16(BEND_COST), out=best[:, 1:])
-            np.minimum(best[:, :-1], came[:, 1:] + np.int16(BEND_COST), out=best[:, :-1])
-            best -= least
-            if aside:
-                # Nothing comes from beyond the border.
-                best[0 if aside > 0 else -1] = 0
-            now += best
-        total[line] += now
-        before, last = now, line
-
-
 def _winners(
-    total: NDArray[np.int16], sweep: _Sweep, view2: GrowingView, cam2_from_cam1: Rigid3
+    best: NDArray[np.int32], around: NDArray[np.int32], sweep: _Sweep, view2: GrowingView, cam2_from_cam1: Rigid3
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the best levels (R, C), between whole ones by a parabola, and where image 2 sees that surface."""
-    count = total.shape[2]
-    best = np.argmin(total, axis=2)
-    inner = np.clip(best, 1, count - 2)[..., None]
-    left, middle, right = (np.take_along_axis(total, inner + k, axis=2)[..., 0].astype(np.float64) for k in (-1, 0, 1))
+    """Return the levels (R, C), between the `best` by a parabola, and where image 2 sees that surface."""
+    count = len(sweep.inverse)
+    inner = np.clip(best, 1, count - 2)
+    left, middle, right = np.moveaxis(around[..., 1:].astype(np.float64), -1, 0)
     bend = left - 2.0 * middle + right
     with np.errstate(divide="ignore", invalid="ignore"):
         part = np.where(bend > 0.0, 0.5 * (left - right) / bend, 0.0)
-    level = np.clip(inner[..., 0] + part, 0.0, count - 1.0)
+    level = np.clip(inner + part, 0.0, count - 1.0)
     # At either end the surface may be beyond.
     inside = (best > 0) & (best < count - 1)
     place, seen = view2.camera.project(_turned(sweep.rays1, sweep.inverse[best], cam2_from_cam1))
@@ -236,7 +168,7 @@ def _winners(
     with np.errstate(invalid="ignore"):
         inside &= ((place >= 0.0) & (place <= np.array([width - 1, height - 1]))).all(axis=-1)
     place = np.where(inside[..., None], place, 0.0)
-    cost = np.where(inside, np.take_along_axis(total, best[..., None], axis=2)[..., 0], np.iinfo(np.int16).max)
+    cost = np.where(inside, around[..., 0], np.iinfo(np.int32).max)
     good = inside & _foremost(place, best, cost, sweep.step_px, view2)
     return level, good
 
@@ -261,14 +193,14 @@ def _believed(level: FloatArray, good: BoolArray, grown: FloatArray) -> BoolArra
 
 
 def _foremost(
-    place: Pixels, best: NDArray[np.int64], cost: NDArray[np.int16], step_px: float, view2: GrowingView
+    place: Pixels, best: NDArray[np.int32], cost: NDArray[np.int32], step_px: float, view2: GrowingView
 ) -> BoolArray:
     """Return which samples (R, C) agree with the cheapest that claims the same place of image 2."""
     columns = int(view2.size_px[0] // step_px) + 2
     cell = np.rint(place / step_px).astype(np.int64)
     cell = (cell[..., 1] * columns + cell[..., 0]).ravel()
     order = np.argsort(-cost.ravel(), kind="stable")
-    claimed = np.zeros(cell.max() + 1, dtype=np.int64)
+    claimed = np.zeros(cell.max() + 1, dtype=np.int32)
     claimed[cell[order]] = best.ravel()[order]
     return np.asarray(np.abs(claimed[cell].reshape(best.shape) - best) <= 1)
 

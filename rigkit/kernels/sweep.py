@@ -1,0 +1,64 @@
+"""Calls of the kernels in sweep.c: the costs of a sweep through the ranges, and its surfaces of least cost."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.kernels import kernels
+from rigkit.kernels.calls import Struct, structure
+from rigkit.kernels.front import ImageOf
+
+
+@structure("sweep_t")
+class _Sweep(Struct):
+    """Samples of image 1, and where image 2 shows them at each range."""
+
+
+@structure("surface_rules_t")
+class _SurfaceRules(Struct):
+    """What steps of a surface from level to level cost."""
+
+
+def swept_costs(
+    image2: NDArray[np.float32], samples1: NDArray[np.float32], table: NDArray[np.float32], spacing: int
+) -> NDArray[np.uint8]:
+    """Return the bits in which the census of `samples1` (R, C) and of image 2 differ at each of K levels, (R, C, K').
+
+    `table` (K, r, c, 2) are the places in image 2 of every `spacing`-th sample, NaN where there is none. Where image 2
+    shows nothing it is half of the bits. K' is K and what fills up vectors: levels of high cost.
+    """
+    rows, columns = samples1.shape
+    levels, table_rows, table_columns = table.shape[:3]
+    sweep = _Sweep.of(
+        table=np.ascontiguousarray(table, np.float32),
+        levels=levels,
+        table_rows=table_rows,
+        table_columns=table_columns,
+        spacing=spacing,
+        rows=rows,
+        columns=columns,
+    )
+    image = ImageOf.make(np.ascontiguousarray(image2, np.float32))
+    memory = np.empty(kernels().sweep_cost_memory(columns), np.float32)
+    costs = np.empty((rows, columns, kernels().sweep_levels(levels)), np.uint8)
+    kernels().sweep_costs(sweep, image, np.ascontiguousarray(samples1, np.float32), memory, costs)
+    return costs
+
+
+def swept_surfaces(
+    costs: NDArray[np.uint8], levels: int, samples1: NDArray[np.float32], *, bend: int, jump: int, even: float
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return the best of `levels` >= 3 for each sample (R, C), and costs (R, C, 4): its own; of the three around it.
+
+    A step to the next level costs `bend`, any larger one `jump` where the brightness of `samples1` is even. Both
+    together are below 120.
+    """
+    rows, columns = samples1.shape
+    rules = _SurfaceRules.of(rows=rows, columns=columns, levels=levels, bend=bend, jump=jump, even=even)
+    memory = np.empty(kernels().sweep_path_memory(columns, levels), np.uint8)
+    total = np.empty(costs.shape, np.uint16)
+    kernels().sweep_surfaces(rules, costs, np.ascontiguousarray(samples1, np.float32), memory, total)
+    best, around = np.empty((rows, columns), np.int32), np.empty((rows, columns, 4), np.int32)
+    kernels().sweep_winners(rules, total, best, around)
+    return best, around

@@ -1,0 +1,70 @@
+"""What kernels/sweep.c computes, in numpy: a level of the sweep, or a line of a path, after the other."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+REACH = 2
+BITS = (2 * REACH + 1) ** 2 - 1
+
+
+def census(samples: np.ndarray) -> np.ndarray:
+    """Return which neighbours of each sample (R, C) are darker, one bit each; those beyond the border are not."""
+    padded = np.pad(samples, REACH, constant_values=np.inf)
+    rows, columns = samples.shape
+    out = np.zeros((rows, columns), np.uint32)
+    for dr in range(2 * REACH + 1):
+        for dc in range(2 * REACH + 1):
+            if (dr, dc) != (REACH, REACH):
+                out <<= np.uint32(1)
+                out |= padded[dr : dr + rows, dc : dc + columns] < samples
+    return out
+
+
+def swept_costs(image2: np.ndarray, samples1: np.ndarray, table: np.ndarray, spacing: int) -> np.ndarray:
+    """Return the bits (R, C, K) in which the census of both images differs at each level; half where there is none."""
+    rows, columns = samples1.shape
+    first = census(samples1)
+    at = np.meshgrid(*(np.arange(n, dtype=np.float32) / spacing for n in (columns, rows)))
+    out = np.empty((rows, columns, len(table)), np.uint8)
+    for k, places in enumerate(table):
+        u, v = np.moveaxis(cv2.remap(places, at[0], at[1], cv2.INTER_LINEAR), -1, 0)
+        height, width = image2.shape
+        with np.errstate(invalid="ignore"):
+            inside = (u >= 0.0) & (v >= 0.0) & (u <= width - 1.0) & (v <= height - 1.0)
+        u, v = np.where(inside, u, 0.0), np.where(inside, v, 0.0)
+        left, top = (np.minimum(x.astype(int), n - 2) for x, n in ((u, width), (v, height)))
+        right, below = u - left, v - top
+        upper = image2[top, left] * (1.0 - right) + image2[top, left + 1] * right
+        lower = image2[top + 1, left] * (1.0 - right) + image2[top + 1, left + 1] * right
+        there = np.where(inside, upper * (1.0 - below) + lower * below, np.nan).astype(np.float32)
+        out[..., k] = np.where(inside, np.bitwise_count(first ^ census(there)), BITS // 2)
+    return out
+
+
+def total_costs(costs: np.ndarray, samples1: np.ndarray, *, bend: int, jump: int, even: float) -> np.ndarray:
+    """Return the costs (R, C, K) with those of the best surfaces that lead there along eight paths."""
+    total = np.zeros(costs.shape, np.int64)
+    for turned in (False, True):
+        # Paths along columns, downwards and upwards, then along rows; diagonals go with the first.
+        there, image, here = (np.swapaxes(x, 0, 1) if turned else x for x in (costs, samples1, total))
+        for lines in (range(len(there)), range(len(there) - 1, -1, -1)):
+            for aside in (0,) if turned else (-1, 0, 1):
+                before, last = there[lines[0]].astype(np.int64), lines[0]
+                here[last] += before
+                for line in lines[1:]:
+                    came = np.roll(before, aside, axis=0)
+                    least = came.min(axis=1, keepdims=True)
+                    change = np.nan_to_num(np.abs(image[line] - np.roll(image[last], aside)))
+                    far = least + (bend + (jump - bend) / (1.0 + change / even)).astype(int)[:, None]
+                    best = np.minimum(came, far)
+                    best[:, 1:] = np.minimum(best[:, 1:], came[:, :-1] + bend)
+                    best[:, :-1] = np.minimum(best[:, :-1], came[:, 1:] + bend)
+                    best -= least
+                    if aside:
+                        # Nothing comes from beyond the border.
+                        best[0 if aside > 0 else -1] = 0
+                    before, last = there[line] + best, line
+                    here[line] += before
+    return total

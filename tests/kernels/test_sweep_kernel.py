@@ -1,0 +1,48 @@
+"""The kernels of a sweep agree with their definitions in numpy."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from kernels.reference import sweep as reference
+
+from rigkit.kernels.sweep import swept_costs, swept_surfaces
+
+SPACING = 8
+RULES = {"bend": 4, "jump": 48, "even": 8.0}
+MAX_DIFFERING = 2e-3
+"""Share of costs: brightnesses that differ by less than single precision may be darker or not."""
+
+
+def scene(rng: np.random.Generator, levels: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """An image, samples of another, and a table of places: a shift that grows from level to level."""
+    image = cv2.GaussianBlur(rng.uniform(0.0, 255.0, (90, 120)), (0, 0), 1.5).astype(np.float32)
+    samples = np.ascontiguousarray(image[:61, :75])
+    at = np.stack(np.meshgrid(np.arange(0.0, 75.0 + SPACING, SPACING), np.arange(0.0, 61.0 + SPACING, SPACING)), axis=-1)
+    table = at + np.array([0.7, 0.1]) * (np.arange(levels)[:, None, None, None] - 5.0)
+    table[:, :2, :2] = np.nan
+    samples[-1] = np.nan
+    return image, samples, table.astype(np.float32)
+
+
+@pytest.mark.parametrize("levels", [3, 16, 37])
+def test_costs_and_surfaces_are_as_defined(rng: np.random.Generator, levels: int) -> None:
+    image, samples, table = scene(rng, levels)
+    ours, theirs = (fit(image, samples, table, SPACING) for fit in (swept_costs, reference.swept_costs))
+    assert np.mean(ours[..., :levels] != theirs) < MAX_DIFFERING
+    assert ours[..., :levels].max() > 18
+    best, around = swept_surfaces(ours, levels, samples, **RULES)
+    total = reference.total_costs(ours[..., :levels], samples, **RULES)
+    np.testing.assert_array_equal(best, np.argmin(total, axis=2))
+    np.testing.assert_array_equal(around[..., 0], total.min(axis=2))
+    inner = np.clip(best, 1, levels - 2)[..., None]
+    for k in (-1, 0, 1):
+        np.testing.assert_array_equal(around[..., 2 + k], np.take_along_axis(total, inner + k, axis=2)[..., 0])
+
+
+def test_the_surface_is_found_where_both_images_are_one(rng: np.random.Generator) -> None:
+    image, samples, table = scene(rng, 16)
+    best, _ = swept_surfaces(swept_costs(image, samples, table, SPACING), 16, samples, **RULES)
+    # Level 5 is that without a shift; beside the hole of the table and the row without brightness little is known.
+    assert np.mean(best[12:-3, 12:-3] == 5) > 0.99
