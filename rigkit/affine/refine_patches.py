@@ -72,6 +72,7 @@ def patch_rules(
     least_correlation: float = -1.0,
     most_sigma: float = np.inf,
     excess_noise: float = 1.0,
+    settled_px: float = SETTLED_PX,
 ) -> PatchRules:
     """Return how patches are aligned.
 
@@ -82,13 +83,14 @@ def patch_rules(
     most_move : px of its level by which a patch may move.
     least_correlation, most_sigma : of a good one; sigma in px of image 2, along the axis of which least is known.
     excess_noise : factor of the variance that the patches show.
+    settled_px : move of a patch's border at which it is done.
     """
     return PatchRules(
         half=half_width,
         coarsest=coarsest,
         most_steps=PATCH_STEPS,
         width=WINDOW_OF_PATCH * half_width,
-        settled=SETTLED_PX,
+        settled=settled_px,
         most_move=most_move,
         least_contrast=MIN_CONTRAST,
         least_correlation=least_correlation,

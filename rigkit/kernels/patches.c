@@ -6,35 +6,74 @@
  * The functions in numpy that say what is computed are in tests/kernels/reference/patches.py. */
 #include "kernels.h"
 
-enum { MOST_SIDE = 2 * MOST_HALF + 1, MOST_SAMPLES = MOST_SIDE * MOST_SIDE, UNKNOWNS = 6 };
+/* Samples of a patch are filled up to whole vectors by ones without weight. */
+enum { MOST_SIDE = 2 * MOST_HALF + 1, MOST_SAMPLES = (MOST_SIDE * MOST_SIDE + 15) / 16 * 16, UNKNOWNS = 6 };
 
 typedef float four_t __attribute__((vector_size(16), aligned(4)));
 
-/* Weights of four neighbours at the fraction t after the second (Catmull and Rom). */
-INLINE four_t cubic(float t)
+/* Write the weights of four neighbours at the fraction t after the second (Catmull and Rom). */
+#define CUBIC(t, w0, w1, w2, w3)                                                                                       \
+    do {                                                                                                               \
+        (w0) = (t) * (-0.5f + (t) * (1.0f - 0.5f * (t)));                                                              \
+        (w1) = 1.0f + (t) * (t) * (-2.5f + 1.5f * (t));                                                                \
+        (w2) = (t) * (0.5f + (t) * (2.0f - 1.5f * (t)));                                                               \
+        (w3) = (t) * (t) * (-0.5f + 0.5f * (t));                                                                       \
+    } while (0)
+
+/* Read `image` at the `count` places (u, v) + A (x, y), which lie at least a pixel inside; count is a multiple of 16. */
+INLINE void read_samples(
+    const image_t image, float u, float v, const float A[4], const float *x, const float *y, int64_t count, float *out)
 {
-    const four_t c0 = {0.0f, 1.0f, 0.0f, 0.0f}, c1 = {-0.5f, 0.0f, 0.5f, 0.0f};
-    const four_t c2 = {1.0f, -2.5f, 2.0f, -0.5f}, c3 = {-0.5f, 1.5f, -1.5f, 0.5f};
-    return c0 + t * (c1 + t * (c2 + t * c3));
+    int32_t at[MOST_SAMPLES];
+    float across[4][MOST_SAMPLES], down[4][MOST_SAMPLES], sums[4 * MOST_SAMPLES];
+    const int32_t width = (int32_t)image.width;
+#pragma omp simd
+    for (int64_t n = 0; n < count; n++) {
+        const float place_u = u + A[0] * x[n] + A[1] * y[n], place_v = v + A[2] * x[n] + A[3] * y[n];
+        const int32_t left = (int32_t)place_u, top = (int32_t)place_v;
+        const float s = place_u - (float)left, t = place_v - (float)top;
+        at[n] = (top - 1) * width + left - 1;
+        CUBIC(s, across[0][n], across[1][n], across[2][n], across[3][n]);
+        CUBIC(t, down[0][n], down[1][n], down[2][n], down[3][n]);
+    }
+    for (int64_t n = 0; n < count; n++) {
+        const float *from = image.brightness + at[n];
+        four_t row, sum;
+        memcpy(&row, from, sizeof row);
+        sum = down[0][n] * row;
+        memcpy(&row, from + width, sizeof row);
+        sum += down[1][n] * row;
+        memcpy(&row, from + 2 * (ptrdiff_t)width, sizeof row);
+        sum += down[2][n] * row;
+        memcpy(&row, from + 3 * (ptrdiff_t)width, sizeof row);
+        sum += down[3][n] * row;
+        memcpy(sums + 4 * n, &sum, sizeof sum);
+    }
+#pragma omp simd
+    for (int64_t n = 0; n < count; n++)
+        out[n] = (across[0][n] * sums[4 * n] + across[1][n] * sums[4 * n + 1]) +
+                 (across[2][n] * sums[4 * n + 2] + across[3][n] * sums[4 * n + 3]);
 }
 
-/* Return `image` at (u, v), which lies at least a pixel inside. */
-INLINE float cubic_at(const image_t image, float u, float v)
+/* Read `image` at side x side places a pixel apart, from (u, v), which lies at least a pixel inside. */
+INLINE void read_square(const image_t image, float u, float v, int64_t side, float *out)
 {
+    enum { MOST_LINE = MOST_SIDE + 2 };
     const int32_t left = (int32_t)u, top = (int32_t)v;
-    const four_t across = cubic(u - (float)left), down = cubic(v - (float)top);
-    const float *at = image.brightness + (ptrdiff_t)(top - 1) * (ptrdiff_t)image.width + (left - 1);
-    four_t row, sum;
-    memcpy(&row, at, sizeof row);
-    sum = down[0] * row;
-    memcpy(&row, at + image.width, sizeof row);
-    sum += down[1] * row;
-    memcpy(&row, at + 2 * image.width, sizeof row);
-    sum += down[2] * row;
-    memcpy(&row, at + 3 * image.width, sizeof row);
-    sum += down[3] * row;
-    sum *= across;
-    return (sum[0] + sum[1]) + (sum[2] + sum[3]);
+    const float s = u - (float)left, t = v - (float)top;
+    float across[4], down[4], lines[(MOST_LINE + 3) * MOST_LINE];
+    CUBIC(s, across[0], across[1], across[2], across[3]);
+    CUBIC(t, down[0], down[1], down[2], down[3]);
+    for (int64_t j = 0; j < side + 3; j++) {
+        const float *from = image.brightness + (ptrdiff_t)(top - 1 + j) * (ptrdiff_t)image.width + (left - 1);
+        for (int64_t i = 0; i < side; i++)
+            lines[j * side + i] =
+                across[0] * from[i] + across[1] * from[i + 1] + across[2] * from[i + 2] + across[3] * from[i + 3];
+    }
+    for (int64_t j = 0; j < side; j++)
+        for (int64_t i = 0; i < side; i++)
+            out[j * side + i] = down[0] * lines[j * side + i] + down[1] * lines[(j + 1) * side + i] +
+                                down[2] * lines[(j + 2) * side + i] + down[3] * lines[(j + 3) * side + i];
 }
 
 INLINE int is_inside(const image_t image, double u, double v, double margin)
@@ -50,6 +89,7 @@ typedef struct {
     float window[MOST_SAMPLES], u[MOST_SAMPLES], v[MOST_SAMPLES];
     float values[MOST_SAMPLES], weighted[MOST_SAMPLES], there[MOST_SAMPLES];
     float steep[UNKNOWNS][MOST_SAMPLES];
+    float mean;
     double total, effective, energy, normal[UNKNOWNS][UNKNOWNS];
 } patch_t;
 
@@ -70,6 +110,8 @@ static void make_window(const patch_rules_t *rules, patch_t *patch)
             squares += w * w;
         }
     }
+    for (; patch->count % 16; patch->count++)
+        patch->u[patch->count] = patch->v[patch->count] = patch->window[patch->count] = 0.0f;
     /* As many samples of equal weight as the window is worth. */
     patch->effective = patch->total * patch->total / squares;
 }
@@ -83,6 +125,23 @@ INLINE double product(const float *a, const float *b, int64_t count)
     return (double)sum;
 }
 
+/* The products of six rows of samples with one. */
+INLINE void six_products(float rows[UNKNOWNS][MOST_SAMPLES], const float *with, int64_t count, double out[UNKNOWNS])
+{
+    float s0 = 0.0f, s1 = 0.0f, s2 = 0.0f, s3 = 0.0f, s4 = 0.0f, s5 = 0.0f;
+#pragma omp simd reduction(+ : s0, s1, s2, s3, s4, s5)
+    for (int64_t k = 0; k < count; k++) {
+        s0 += rows[0][k] * with[k];
+        s1 += rows[1][k] * with[k];
+        s2 += rows[2][k] * with[k];
+        s3 += rows[3][k] * with[k];
+        s4 += rows[4][k] * with[k];
+        s5 += rows[5][k] * with[k];
+    }
+    const double sums[UNKNOWNS] = {(double)s0, (double)s1, (double)s2, (double)s3, (double)s4, (double)s5};
+    memcpy(out, sums, sizeof sums);
+}
+
 /* Read the patch around (u, v) of `image`; return 0 where it has too little contrast or reaches beyond the image. */
 INLINE int take_patch(const image_t image, double u, double v, double least_contrast, patch_t *p)
 {
@@ -91,10 +150,9 @@ INLINE int take_patch(const image_t image, double u, double v, double least_cont
         !is_inside(image, u + (double)half + 1.0, v + (double)half + 1.0, 0.0))
         return 0;
     float around[(MOST_SIDE + 2) * (MOST_SIDE + 2)];
-    for (int64_t j = 0; j < wide; j++)
-        for (int64_t i = 0; i < wide; i++)
-            around[j * wide + i] = cubic_at(image, (float)(u + (double)(i - half - 1)), (float)(v + (double)(j - half - 1)));
-    float gradient_u[MOST_SAMPLES], gradient_v[MOST_SAMPLES];
+    read_square(image, (float)(u - (double)(half + 1)), (float)(v - (double)(half + 1)), wide, around);
+    float gradient_u[MOST_SAMPLES] = {0.0f}, gradient_v[MOST_SAMPLES] = {0.0f};
+    memset(p->values + side * side, 0, (size_t)(count - side * side) * sizeof(float));
     double mean = 0.0;
     for (int64_t j = 0, k = 0; j < side; j++) {
         const float *at = around + (j + 1) * wide + 1;
@@ -105,9 +163,9 @@ INLINE int take_patch(const image_t image, double u, double v, double least_cont
             mean += (double)(p->window[k] * at[i]);
         }
     }
-    mean /= p->total;
+    p->mean = (float)(mean / p->total);
     for (int64_t k = 0; k < count; k++) {
-        p->values[k] -= (float)mean;
+        p->values[k] -= p->mean;
         p->weighted[k] = p->window[k] * p->values[k];
     }
     p->energy = product(p->values, p->weighted, count);
@@ -121,9 +179,11 @@ INLINE int take_patch(const image_t image, double u, double v, double least_cont
         p->steep[4][k] = gradient_u[k];
         p->steep[5][k] = gradient_v[k];
     }
+    double levels[UNKNOWNS], slopes[UNKNOWNS];
+    six_products(p->steep, p->window, count, levels);
+    six_products(p->steep, p->weighted, count, slopes);
     for (int64_t n = 0; n < UNKNOWNS; n++) {
-        const float level = (float)(product(p->steep[n], p->window, count) / p->total);
-        const float slope = (float)(product(p->steep[n], p->weighted, count) / p->energy);
+        const float level = (float)(levels[n] / p->total), slope = (float)(slopes[n] / p->energy);
         for (int64_t k = 0; k < count; k++)
             p->steep[n][k] -= level + slope * p->values[k];
     }
@@ -133,8 +193,7 @@ INLINE int take_patch(const image_t image, double u, double v, double least_cont
         for (int64_t k = 0; k < count; k++)
             p->steep[n][k] *= p->window[k];
     for (int64_t m = 0; m < UNKNOWNS; m++)
-        for (int64_t n = 0; n <= m; n++)
-            p->normal[m][n] = p->normal[n][m] = product(plain[m], p->steep[n], count);
+        six_products(plain, p->steep[m], count, p->normal[m]);
     return 1;
 }
 
@@ -280,6 +339,35 @@ INLINE int line_knowledge(const line_t *line, const place_t *at, double scale, k
     return 1;
 }
 
+/* Say how the patch read from image 2 (`there`) agrees with that of image 1: its products with `steep` and with the patch,
+ * and its own energy, free of offset. `steep` and the weighted patch sum up to nothing: an offset is no part of theirs. */
+INLINE void compare(patch_t *p, double sums[UNKNOWNS], double *common, double *energy)
+{
+    float s0 = 0.0f, s1 = 0.0f, s2 = 0.0f, s3 = 0.0f, s4 = 0.0f, s5 = 0.0f, with = 0.0f, level = 0.0f, square = 0.0f;
+#pragma omp simd reduction(+ : s0, s1, s2, s3, s4, s5, with, level, square)
+    for (int64_t n = 0; n < p->count; n++) {
+        /* Less the mean of image 1: small numbers keep their digits. */
+        const float there = p->there[n] - p->mean, weighted = p->window[n] * there;
+        s0 += p->steep[0][n] * there;
+        s1 += p->steep[1][n] * there;
+        s2 += p->steep[2][n] * there;
+        s3 += p->steep[3][n] * there;
+        s4 += p->steep[4][n] * there;
+        s5 += p->steep[5][n] * there;
+        with += p->weighted[n] * there;
+        level += weighted;
+        square += weighted * there;
+    }
+    sums[0] = (double)s0;
+    sums[1] = (double)s1;
+    sums[2] = (double)s2;
+    sums[3] = (double)s3;
+    sums[4] = (double)s4;
+    sums[5] = (double)s5;
+    *common = (double)with;
+    *energy = (double)square - (double)level * (double)level / p->total;
+}
+
 /* Align the patch `p`, taken `scale1` pixels a sample around (u1, v1), with `image2` of `scale2` pixels a sample; return
  * whether it settled. */
 INLINE int align_patch(
@@ -289,44 +377,29 @@ INLINE int align_patch(
     const int64_t count = p->count;
     const double half = (double)p->half, u0 = place->u2, v0 = place->v2;
     double step[UNKNOWNS], matrix[UNKNOWNS][UNKNOWNS];
-    int settled = 0, fixed = 0;
-    for (int64_t k = 0;; k++) {
+    int fixed = 0;
+    for (int64_t k = 0; k <= rules->most_steps; k++) {
         const double ratio = scale1 / scale2;
-        const float a = (float)(ratio * place->A[0]), b = (float)(ratio * place->A[1]);
-        const float c = (float)(ratio * place->A[2]), d = (float)(ratio * place->A[3]);
+        const float A[4] = {
+            (float)(ratio * place->A[0]), (float)(ratio * place->A[1]), (float)(ratio * place->A[2]),
+            (float)(ratio * place->A[3])};
         const double u = place->u2 / scale2, v = place->v2 / scale2;
-        const double wide = half * (fabs((double)a) + fabs((double)b)), high = half * (fabs((double)c) + fabs((double)d));
+        const double wide = half * (double)(fabsf(A[0]) + fabsf(A[1])), high = half * (double)(fabsf(A[2]) + fabsf(A[3]));
         if (!(is_inside(image2, u - wide, v - high, 0.01) && is_inside(image2, u + wide, v + high, 0.01)))
             return 0;
-        const float at_u = (float)u, at_v = (float)v;
-        for (int64_t n = 0; n < count; n++)
-            p->there[n] = cubic_at(image2, at_u + a * p->u[n] + b * p->v[n], at_v + c * p->u[n] + d * p->v[n]);
-        const double mean = product(p->there, p->window, count) / p->total;
-#pragma omp simd
-        for (int64_t n = 0; n < count; n++)
-            p->there[n] -= (float)mean;
-        const double common = product(p->there, p->weighted, count);
-        double energy = 0.0;
-        {
-            float sum = 0.0f;
-#pragma omp simd reduction(+ : sum)
-            for (int64_t n = 0; n < count; n++)
-                sum += p->window[n] * p->there[n] * p->there[n];
-            energy = (double)sum;
-        }
+        read_samples(image2, (float)u, (float)v, A, p->u, p->v, count, p->there);
+        double sums[UNKNOWNS];
+        double common, energy;
+        compare(p, sums, &common, &energy);
         if (!(common > 0.0))
             return 0;
         out->correlation = common / sqrt(p->energy * energy);
         /* What the patches differ by, beyond gain and offset, a sample; the unknowns and those two are fitted. */
         out->noise = p->energy * (1.0 - out->correlation * out->correlation) / p->total;
         out->noise = out->noise * p->effective / (p->effective - UNKNOWNS - 2.0) + rules->least_noise * rules->least_noise;
-        if (settled)
-            break;
-        if (k == rules->most_steps)
-            return 0;
         const double gain = p->energy / common;
         for (int64_t n = 0; n < UNKNOWNS; n++)
-            step[n] = gain * product(p->steep[n], p->there, count);
+            step[n] = gain * sums[n];
         if (line != NULL || !fixed) {
             memcpy(matrix, p->normal, sizeof matrix);
             if (line != NULL) {
@@ -353,11 +426,11 @@ INLINE int align_patch(
         const double determinant = e * h - f * g;
         if (!(determinant > 0.1 && determinant < 10.0))
             return 0;
-        const double A[4] = {place->A[0], place->A[1], place->A[2], place->A[3]};
-        place->A[0] = (A[0] * h - A[1] * g) / determinant;
-        place->A[1] = (A[1] * e - A[0] * f) / determinant;
-        place->A[2] = (A[2] * h - A[3] * g) / determinant;
-        place->A[3] = (A[3] * e - A[2] * f) / determinant;
+        const double before[4] = {place->A[0], place->A[1], place->A[2], place->A[3]};
+        place->A[0] = (before[0] * h - before[1] * g) / determinant;
+        place->A[1] = (before[1] * e - before[0] * f) / determinant;
+        place->A[2] = (before[2] * h - before[3] * g) / determinant;
+        place->A[3] = (before[3] * e - before[2] * f) / determinant;
         place->u2 -= scale1 * (place->A[0] * step[4] + place->A[1] * step[5]);
         place->v2 -= scale1 * (place->A[2] * step[4] + place->A[3] * step[5]);
         const double away_u = (place->u2 - u0) / scale2, away_v = (place->v2 - v0) / scale2;
@@ -366,9 +439,11 @@ INLINE int align_patch(
         double border = fabs(step[4]) + fabs(step[5]);
         for (int64_t n = 0; n < 4; n++)
             border += half * fabs(step[n]);
-        settled = border < rules->settled;
+        /* So small a step changes nothing that the patches were compared by. */
+        if (border < rules->settled)
+            return place->A[0] * place->A[3] - place->A[1] * place->A[2] > 0.0;
     }
-    return place->A[0] * place->A[3] - place->A[1] * place->A[2] > 0.0;
+    return 0;
 }
 
 /* Write the covariance (upper triangle) of (u2, v2, A) from the normal matrix; return the larger standard deviation of the

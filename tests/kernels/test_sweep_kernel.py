@@ -19,7 +19,9 @@ def scene(rng: np.random.Generator, levels: int) -> tuple[np.ndarray, np.ndarray
     """An image, samples of another, and a table of places: a shift that grows from level to level."""
     image = cv2.GaussianBlur(rng.uniform(0.0, 255.0, (90, 120)), (0, 0), 1.5).astype(np.float32)
     samples = np.ascontiguousarray(image[:61, :75])
-    at = np.stack(np.meshgrid(np.arange(0.0, 75.0 + SPACING, SPACING), np.arange(0.0, 61.0 + SPACING, SPACING)), axis=-1)
+    at = np.stack(
+        np.meshgrid(np.arange(0.0, 75.0 + SPACING, SPACING), np.arange(0.0, 61.0 + SPACING, SPACING)), axis=-1
+    )
     table = at + np.array([0.7, 0.1]) * (np.arange(levels)[:, None, None, None] - 5.0)
     table[:, :2, :2] = np.nan
     samples[-1] = np.nan

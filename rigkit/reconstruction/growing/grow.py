@@ -30,6 +30,8 @@ MAX_SIGMA_PX = 0.15
 """Along the axis of which least is known; beyond, a patch slides along an edge."""
 MAX_SIGMA_ON_LINE_PX = 0.3
 """The same where the epipolar line is known, on which alone it slides; beyond, a sweep knows the surface better."""
+SETTLED_PX = 0.01
+"""Move of a patch's border at which it is done: a few times less than what its noise leaves open."""
 MAX_TRIES = 3
 """Of a node, from different neighbours."""
 MAX_RETURN_PX = 1.0
@@ -174,11 +176,15 @@ def grow(
     step: int,
     known: LineKnowledge | None = None,
     min_correlation: float = MIN_CORRELATION,
+    wanted: BoolArray | None = None,
 ) -> GrownPatches:
-    """Return the pairs that grow from `seeds`, which have affinities, on a grid every `step` px of image 1."""
+    """Return the pairs that grow from `seeds`, which have affinities, on a grid every `step` px of image 1.
+
+    Where only some of its nodes (R, C) are `wanted`, none grows elsewhere.
+    """
     at = view1.nodes(step)
     rays, seen = view1.camera.unproject(at)
-    rays = np.where(seen[..., None], rays, np.nan)
+    rays = np.where((seen if wanted is None else seen & wanted)[..., None], rays, np.nan)
     jacobians = view1.camera.ray_jacobian(at)
     line = known if known is not None else LineKnowledge(np.zeros((3, 3)), np.inf)
     knowledge = EpipolarKnowledge.make(
@@ -194,6 +200,7 @@ def grow(
         coarsest=COARSEST,
         most_move=MAX_MOVE_PX,
         least_correlation=min_correlation,
+        settled_px=SETTLED_PX,
         most_sigma=MAX_SIGMA_ON_LINE_PX if np.isfinite(line.sigma_px) else MAX_SIGMA_PX,
     )
     assert seeds.A21 is not None
@@ -224,10 +231,12 @@ def grow_both_ways(
     pixels2 = there.pixels2[at]
     A12 = np.asarray(np.linalg.inv(there.A21[at]), dtype=np.float64)
     ends = Correspondences(pixels2, there.pixels1[at], A12, None, None, None)
-    back = grow(view2, view1, ends, step=step, known=known.swapped())
-    rows, columns = back.valid.shape
+    width, height = view2.size_px
     column, row = np.rint(pixels2 / step).astype(np.int64).T
-    node = np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)
+    node = np.clip(row, 0, (height - 1) // step), np.clip(column, 0, (width - 1) // step)
+    wanted = np.zeros(((height - 1) // step + 1, (width - 1) // step + 1), dtype=bool)
+    wanted[node] = True
+    back = grow(view2, view1, ends, step=step, known=known.swapped(), wanted=wanted)
     found = back.pixels2[node] + np.einsum("nij,nj->ni", back.A21[node], pixels2 - back.pixels1[node])
     keep = at.copy()
     # Where nothing grows back that distance is NaN, and no return.

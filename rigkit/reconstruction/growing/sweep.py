@@ -78,9 +78,7 @@ def filled(
     sweep = _prepared(grown, measured, view1, view2, cam2_from_cam1)
     samples1 = _at(_smooth(view1, sweep.step_px), sweep.pixels1)
     costs = swept_costs(_smooth(view2, sweep.step_px), samples1, sweep.table, TABLE_SPACING)
-    best, around = swept_surfaces(
-        costs, len(sweep.inverse), samples1, bend=BEND_COST, jump=JUMP_COST, even=EVEN_LEVELS
-    )
+    best, around = swept_surfaces(costs, len(sweep.inverse), samples1, bend=BEND_COST, jump=JUMP_COST, even=EVEN_LEVELS)
     level, good = _winners(best, around, sweep, view2, cam2_from_cam1)
     good &= _at(_contrast(view1), sweep.pixels1) > MIN_CONTRAST
     spacing = sweep.inverse[1] - sweep.inverse[0]

@@ -56,15 +56,13 @@ def aligned(
     H = J.T @ (w[:, None] * J)
     T = T - (w @ T) / w.sum()
     effective = w.sum() ** 2 / (w @ w)
-    A, q2, settled = A.copy(), q2.copy(), False
+    A, q2 = A.copy(), q2.copy()
     for _ in range(STEPS + 1):
         there = cubic_at(image2, q2[0] + A[0, 0] * u + A[0, 1] * v, q2[1] + A[1, 0] * u + A[1, 1] * v)
         there = there - (w @ there) / w.sum()
         energy, common = w @ (T * T), w @ (T * there)
         correlation = common / np.sqrt(energy * (w @ (there * there)))
         noise = energy * (1 - correlation**2) / w.sum() * effective / (effective - 8.0) + least_noise**2
-        if settled:
-            break
         step, normal = energy / common * J.T @ (w * there), H.copy()
         if prior is not None:
             rows, values = prior(q2, A)
@@ -73,7 +71,8 @@ def aligned(
         step = np.linalg.solve(normal, step)
         A = A @ np.linalg.inv(np.eye(2) + step[:4].reshape(2, 2))
         q2 = q2 - A @ step[4:]
-        settled = half * np.abs(step[:4]).sum() + np.abs(step[4:]).sum() < SETTLED
+        if half * np.abs(step[:4]).sum() + np.abs(step[4:]).sum() < SETTLED:
+            break
     by = np.zeros((6, 6))
     by[:2, 4:] = -A
     by[2:, :4] = -np.kron(A, np.eye(2))
