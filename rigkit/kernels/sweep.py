@@ -11,7 +11,7 @@ from rigkit.kernels.front import ImageOf
 
 
 @structure("sweep_t")
-class _Sweep(Struct):
+class _SweptRanges(Struct):
     """Samples of image 1, and where image 2 shows them at each range."""
 
 
@@ -30,7 +30,7 @@ def swept_costs(
     """
     rows, columns = samples1.shape
     levels, table_rows, table_columns = table.shape[:3]
-    sweep = _Sweep.of(
+    sweep = _SweptRanges.of(
         table=np.ascontiguousarray(table, np.float32),
         levels=levels,
         table_rows=table_rows,

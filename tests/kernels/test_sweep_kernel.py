@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from kernels.reference import sweep as reference
 from rigkit.kernels.sweep import swept_costs, swept_surfaces
 
 SPACING = 8
-RULES = {"bend": 4, "jump": 48, "even": 8.0}
+RULES: dict[str, Any] = {"bend": 4, "jump": 48, "even": 8.0}
 MAX_DIFFERING = 2e-3
 """Share of costs: brightnesses that differ by less than single precision may be darker or not."""
 

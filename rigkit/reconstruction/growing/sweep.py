@@ -157,7 +157,7 @@ def _winners(
     bend = left - 2.0 * middle + right
     with np.errstate(divide="ignore", invalid="ignore"):
         part = np.where(bend > 0.0, 0.5 * (left - right) / bend, 0.0)
-    level = np.clip(inner + part, 0.0, count - 1.0)
+    level = np.asarray(np.clip(inner + part, 0.0, count - 1.0), np.float64)
     # At either end the surface may be beyond.
     inside = (best > 0) & (best < count - 1)
     place, seen = view2.camera.project(_turned(sweep.rays1, sweep.inverse[best], cam2_from_cam1))
