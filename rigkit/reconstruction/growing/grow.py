@@ -30,7 +30,7 @@ MAX_SIGMA_PX = 0.15
 """Along the axis of which least is known; beyond, a patch slides along an edge."""
 MAX_SIGMA_ON_LINE_PX = 0.3
 """The same where the epipolar line is known, on which alone it slides; beyond, a sweep knows the surface better."""
-SETTLED_PX = 0.01
+GROWN_SETTLED_PX = 0.01
 """Move of a patch's border at which it is done: a few times less than what its noise leaves open."""
 MAX_TRIES = 3
 """Of a node, from different neighbours."""
@@ -200,7 +200,7 @@ def grow(
         coarsest=COARSEST,
         most_move=MAX_MOVE_PX,
         least_correlation=min_correlation,
-        settled_px=SETTLED_PX,
+        settled_px=GROWN_SETTLED_PX,
         most_sigma=MAX_SIGMA_ON_LINE_PX if np.isfinite(line.sigma_px) else MAX_SIGMA_PX,
     )
     assert seeds.A21 is not None
