@@ -7,13 +7,18 @@ import math
 import os
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier
 from rigkit.core.posetype import PoseType
 from rigkit.io.reading import usable_path
+
+if TYPE_CHECKING:
+    from rigkit.io.manifest_writer import ToldBoard
 
 POSE_TYPES = tuple(map(str, PoseType))
 ONE_CAMERA, TWO_CAMERAS = ("camera",), ("camera1", "camera2")
@@ -49,6 +54,22 @@ def told_calibrations(told: Sequence[str], folder: Path) -> dict[str, str]:
         if not typed.is_absolute() and typed.exists():
             path = Path(os.path.relpath(typed, folder)).as_posix()
         out[name] = path
+    return out
+
+
+def told_boards(words: Sequence[str]) -> list[ToldBoard]:
+    """Return the boards that are told: files keep their names, words are called plane1, plane2, ... in their order."""
+    from rigkit.io.board_file import load_board
+    from rigkit.io.board_words import board_in_words
+    from rigkit.io.manifest_writer import ToldBoard
+
+    out = []
+    for number, text in enumerate(words, start=1):
+        board = board_in_words(text)
+        if board is None:
+            out.append(ToldBoard(load_board(text), Path(text)))
+        else:
+            out.append(ToldBoard(replace(board, board_id=f"plane{number}")))
     return out
 
 

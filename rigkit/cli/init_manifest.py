@@ -1,0 +1,72 @@
+"""`rigkit init` of a manifest: the pairs of a folder of images, and what images cannot tell, told or asked for."""
+
+from __future__ import annotations
+
+import argparse
+
+from rigkit.cli.console import note, progress_on_stderr
+from rigkit.cli.manifest_words import (
+    POSE_TYPES,
+    angle_of,
+    ask,
+    cameras_of,
+    pose_type_of,
+    require_told,
+    told_angles,
+    told_baselines,
+    told_boards,
+    told_calibrations,
+    told_length,
+    told_poses,
+)
+from rigkit.core.errors import ExitCode, InputError
+from rigkit.io.reading import usable_path
+
+
+def run_manifest(args: argparse.Namespace) -> int:
+    from rigkit.io.files import ensure_writable
+    from rigkit.io.manifest_writer import find_images
+    from rigkit.workflows.new_manifest import NewManifest, find_pairs, write_manifest
+
+    if args.model:
+        raise InputError("init: --model is of --session")
+    if args.board and args.square_mm is not None:
+        raise InputError("init: --board says how large squares are; leave --square-mm out")
+    told = told_boards(args.board)
+    if args.square_mm is not None:
+        told_length("--square-mm", args.square_mm)
+    poses_told, angles_told = told_poses(args.pose_type), told_angles(args.angle_deg)
+    root = usable_path(args.folder).resolve()
+    target = args.output or root / "dataset.toml"
+    images = find_images(root)
+    calibrations = told_calibrations(args.calibration, target.parent)
+    read = [*images, *(target.parent / path for path in calibrations.values())]
+    ensure_writable(target, force=args.force, inputs=read)
+    require_told(args)
+    found = find_pairs(root, images, [one.board for one in told], on_progress=progress_on_stderr())
+    for error in found.unreadable:
+        note(f"left out: {error}")
+    names = [pair.name for pair in found.pairs]
+    for pair in found.pairs:
+        note(f"pair '{pair.name}': {pair.first.image.name}, {pair.second.image.name}")
+    squares_mm = 0.0 if told else args.square_mm or told_length("--square-mm", ask("side of a square, mm"))
+    if not calibrations:
+        calibrations = told_calibrations([ask("path of calibration.json")], target.parent)
+    cameras = cameras_of(names, calibrations, args.cameras)
+    poses = {name: pose_type_of(poses_told, name) or ask(f"pose type of '{name}'", POSE_TYPES) for name in names}
+    new = NewManifest(
+        root=root,
+        name=args.name,
+        pairs=found.pairs,
+        told=told or squares_mm,
+        calibrations=calibrations,
+        cameras=cameras,
+        pose_types=poses,
+        baselines=told_baselines(args.baseline_mm, names),
+        angles={name: angle for name in names if (angle := angle_of(angles_told, name)) is not None},
+    )
+    incomplete = write_manifest(new, target, force=args.force)
+    print(target)
+    if incomplete is not None:
+        note(f"to be completed: {incomplete}")
+    return ExitCode.BAD_INPUT if found.unreadable else ExitCode.WELL
