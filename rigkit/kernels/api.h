@@ -237,6 +237,32 @@ EXPORT void find_paper(
     ARRAY(double, scratch, 2 * rules.step_count + 4 * count), ARRAY(uint8_t, memory, paper_memory(count)),
     ARRAY(int64_t, near, 4 * count), ARRAY(double, paper, count, 2, 2), ARRAY(double, out_gaps, count, 2, 2));
 
+/* surface.c */
+
+/* Degree of the polynomial that a lens adds to a perspective, at most, and how many terms x^i y^j that has. */
+enum { SURFACE_DEGREE = 8, SURFACE_TERMS = (SURFACE_DEGREE + 1) * (SURFACE_DEGREE + 2) / 2 };
+
+EXPORT double fit_perspective(
+    ARRAY(const double, places, count, 2), ARRAY(const double, pixels, count, 2), int64_t count, ARRAY(double, out, 3, 3));
+EXPORT int64_t fit_polynomials(
+    ARRAY(const double, places, count, 2), ARRAY(const double, values, count, 2), int64_t count, double middle_x,
+    double middle_y, double size, int64_t terms, double most_leverage, ARRAY(double, basis, terms, count),
+    ARRAY(double, triangle, terms, terms), ARRAY(double, told, terms, 2), ARRAY(double, scratch, 4, count),
+    ARRAY(double, misses, SURFACE_DEGREE + 1), ARRAY(double, foretold, count, 2), ARRAY(double, leverage, count));
+EXPORT void polynomial_at(
+    ARRAY(const double, wanted, count, 2), int64_t count, double middle_x, double middle_y, double size, int64_t terms,
+    int64_t degree, ARRAY(const double, triangle, terms, terms), ARRAY(const double, told, terms, 2),
+    ARRAY(double, out, 5, count, 2));
+EXPORT void surest_polynomial(
+    ARRAY(const double, wanted, count, 2), int64_t count, double middle_x, double middle_y, double size, int64_t terms,
+    ARRAY(const double, triangle, terms, terms), ARRAY(const double, told, terms, 2),
+    ARRAY(const double, misses, SURFACE_DEGREE + 1), ARRAY(double, out, count, 3));
+EXPORT void read_modules(
+    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height,
+    ARRAY(const double, maps, count, 3, 3), int64_t count, int64_t side,
+    ARRAY(const double, patterns, patterns_count, side * side), int64_t patterns_count, ARRAY(double, bright, side * side),
+    ARRAY(double, spread, count), ARRAY(double, likeness, count, patterns_count));
+
 /* circles.c */
 
 /* What comes out of a circle: u, v, the map (4), covariance of (u, v) at noise of variance 1 (uu, uv, vv), blur, brightness

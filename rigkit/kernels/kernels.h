@@ -212,4 +212,33 @@ INLINE void fill_squares(const double *points, int64_t count, double side, int32
         order[--first[square[i]]] = (int32_t)i;
 }
 
+/* Return what `at` of the `values` are not above and the others not below; the values change places (Hoare's FIND). */
+INLINE double ranked(double *values, int64_t count, int64_t at)
+{
+    int64_t low = 0, high = count - 1;
+    while (low < high) {
+        const double pivot = values[at];
+        int64_t i = low, j = high;
+        while (i <= j) {
+            while (values[i] < pivot)
+                i++;
+            while (pivot < values[j])
+                j--;
+            if (i <= j) {
+                const double swap = values[i];
+                values[i++] = values[j];
+                values[j--] = swap;
+            }
+        }
+        low = j < at ? i : low;
+        high = at < i ? j : high;
+    }
+    return values[at];
+}
+
+INLINE double quick_median(double *values, int64_t count)
+{
+    return 0.5 * (ranked(values, count, (count - 1) / 2) + ranked(values, count, count / 2));
+}
+
 #endif

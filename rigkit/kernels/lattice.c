@@ -5,35 +5,6 @@
  * subpixel.scatter, checks.validate. */
 #include "kernels.h"
 
-/* Return what `at` of the `values` are not above and the others not below; the values change places (Hoare's FIND). */
-static double ranked(double *values, int64_t count, int64_t at)
-{
-    int64_t low = 0, high = count - 1;
-    while (low < high) {
-        const double pivot = values[at];
-        int64_t i = low, j = high;
-        while (i <= j) {
-            while (values[i] < pivot)
-                i++;
-            while (pivot < values[j])
-                j--;
-            if (i <= j) {
-                const double swap = values[i];
-                values[i++] = values[j];
-                values[j--] = swap;
-            }
-        }
-        low = j < at ? i : low;
-        high = at < i ? j : high;
-    }
-    return values[at];
-}
-
-static double median(double *values, int64_t count)
-{
-    return 0.5 * (ranked(values, count, (count - 1) / 2) + ranked(values, count, count / 2));
-}
-
 /* Set `typical` to the median of how neighbouring steps differ at each inner column of `rows` x `columns` pixels, so many
  * doubles apart, and `seen` to how many steps these are; return the upper median of all, NaN for none. */
 static double uneven_columns(
@@ -55,7 +26,7 @@ static double uneven_columns(
                 here[count++] = every[all++] = relative;
         }
         seen[column] = count;
-        typical[column] = count ? median(here, count) : NAN;
+        typical[column] = count ? quick_median(here, count) : NAN;
     }
     return all ? ranked(every, all, all / 2) : NAN;
 }
@@ -107,7 +78,7 @@ static double roughness(const part_t part, int64_t order, const scatter_rules_t 
                 }
             }
     }
-    return count >= rules->fewest_differences ? median(part.room, count) / rules->median_of_normal : NAN;
+    return count >= rules->fewest_differences ? quick_median(part.room, count) / rules->median_of_normal : NAN;
 }
 
 /* Solve `matrix` x = `right` for a positive definite matrix, of which the lower half is given, in place; return whether it

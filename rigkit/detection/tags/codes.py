@@ -14,7 +14,8 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.patterns.aprilgrid import AprilGrid
-from rigkit.detection.saddles.response import GreyImage, sample
+from rigkit.detection.saddles.response import GreyImage
+from rigkit.kernels.surface import read_modules
 
 MIN_LIKENESS = 0.7
 """Correlation of a tag with its code at least. Of a code of 36 bits, bits at random reach 0.7 with one of 600 tags once
@@ -83,14 +84,8 @@ def read_tags(image: GreyImage, quads: FloatArray, codes: Codes) -> TagCode:
     """Return the codes in the quadrilaterals (N, 4, 2), corners in order of growing angle from u to v."""
     if not len(quads):
         return TagCode(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
-    side = codes.modules
-    middle = (np.arange(side) + 0.5) / side
-    places = np.stack(np.meshgrid(middle, middle), axis=-1).reshape(-1, 2)
-    bright = sample(image, transferred(homographies(quads), places)).astype(np.float64)
-    bright -= bright.mean(axis=1, keepdims=True)
-    length = np.linalg.norm(bright, axis=1, keepdims=True)
-    likeness = (bright / np.maximum(length, 1e-9)) @ codes.patterns.T
-    likeness[length[:, 0] < MIN_CODE_CONTRAST * side] = 0.0
+    likeness, spread = read_modules(image, homographies(quads), codes.patterns, codes.modules)
+    likeness[spread < MIN_CODE_CONTRAST] = 0.0
     best = likeness.argmax(axis=1)
     own = codes.numbers[best]
     others = np.where(codes.numbers == own[:, None], -1.0, likeness).max(axis=1)

@@ -70,11 +70,8 @@ def tag_corners(image: GreyImage, tags: TagBoard, pixels: FloatArray, camera: Ca
     state = fitter.first(pixels)
     if np.count_nonzero(state.known) < MIN_TAG_CORNERS:
         return None
-    for _ in range(MAX_TAG_ROUNDS):
-        more = fitter.added(state)
-        if more is None:
-            break
-        state = more
+    # What the lattice lacks is added before all corners are fitted again; what only finer ones foretell, after that.
+    state = fitter.completed(fitter.again(fitter.completed(state)))
     state = fitter.without_outliers(state)
     row, column = np.nonzero(state.known)
     if len(row) < MIN_TAG_CORNERS:
@@ -171,7 +168,7 @@ class _Fitter:
         return np.asarray((row + column) % 2 == 1)
 
     def first(self, pixels: FloatArray) -> BoardState:
-        """Return the rough corners fitted once, those that failed left out."""
+        """Return the rough corners fitted quickly, those that failed left out."""
         nothing = np.full(pixels.shape[:2], np.nan)
         state = BoardState(pixels, nothing, nothing, nothing, nothing, nothing)
         cells = state.known
@@ -179,11 +176,16 @@ class _Fitter:
             cells, self.map_of(state).at(self.places[cells]), pixels[cells], FIRST_BLUR, FIRST_PASS, mirrored=False
         )
         good = fit.valid & (fit.contrast > 0.0)
-        empty = state.without(np.ones_like(cells))
-        state = empty.with_fit(cells, fit, good)
-        if np.count_nonzero(good) < MIN_TAG_CORNERS:
-            return state
-        return self.again(state)
+        return state.without(np.ones_like(cells)).with_fit(cells, fit, good)
+
+    def completed(self, state: BoardState) -> BoardState:
+        """Return the state with the missing corners that are seen, each round of them foretold by those before."""
+        for _ in range(MAX_TAG_ROUNDS):
+            more = self.added(state)
+            if more is None:
+                break
+            state = more
+        return state
 
     def again(self, state: BoardState) -> BoardState:
         """Return the known corners fitted with lines that bend as the corners have it; the fit is kept."""

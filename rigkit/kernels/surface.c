@@ -1,0 +1,340 @@
+/* The smooth map from a board's plane to an image: a perspective, and polynomials for what that leaves; and the
+ * brightness of the modules of tags.
+ *
+ * The definitions in numpy are in tests/kernels/reference/surface.py, the numbers in rigkit.detection.tags. */
+#include "kernels.h"
+
+enum { ENTRIES = 9, SWEEPS = 12 };
+
+/* Set `least` to the eigenvector of the smallest eigenvalue of the symmetric A (Jacobi's rotations). */
+static void least_eigenvector(double A[ENTRIES][ENTRIES], double least[ENTRIES])
+{
+    double V[ENTRIES][ENTRIES] = {{0.0}};
+    for (int64_t i = 0; i < ENTRIES; i++)
+        V[i][i] = 1.0;
+    for (int64_t sweep = 0; sweep < SWEEPS; sweep++) {
+        double off = 0.0, all = 0.0;
+        for (int64_t p = 0; p < ENTRIES; p++) {
+            all += A[p][p] * A[p][p];
+            for (int64_t q = p + 1; q < ENTRIES; q++)
+                off += A[p][q] * A[p][q];
+        }
+        if (!(off > 1e-32 * all))
+            break;
+        for (int64_t p = 0; p < ENTRIES; p++)
+            for (int64_t q = p + 1; q < ENTRIES; q++) {
+                if (A[p][q] == 0.0)
+                    continue;
+                const double slope = 0.5 * (A[q][q] - A[p][p]) / A[p][q];
+                const double t = (slope >= 0.0 ? 1.0 : -1.0) / (fabs(slope) + sqrt(slope * slope + 1.0));
+                const double c = 1.0 / sqrt(t * t + 1.0), s = t * c;
+                for (int64_t k = 0; k < ENTRIES; k++) {
+                    const double a = A[k][p], b = A[k][q];
+                    A[k][p] = c * a - s * b;
+                    A[k][q] = s * a + c * b;
+                }
+                for (int64_t k = 0; k < ENTRIES; k++) {
+                    const double a = A[p][k], b = A[q][k];
+                    A[p][k] = c * a - s * b;
+                    A[q][k] = s * a + c * b;
+                }
+                for (int64_t k = 0; k < ENTRIES; k++) {
+                    const double a = V[k][p], b = V[k][q];
+                    V[k][p] = c * a - s * b;
+                    V[k][q] = s * a + c * b;
+                }
+            }
+    }
+    int64_t best = 0;
+    for (int64_t i = 1; i < ENTRIES; i++)
+        best = A[i][i] < A[best][best] ? i : best;
+    for (int64_t i = 0; i < ENTRIES; i++)
+        least[i] = V[i][best];
+}
+
+/* Set `middle` and `size` to the mean of `count` points and their standard deviation, both axes together. */
+static void centred(const double *points, int64_t count, double middle[2], double *size)
+{
+    double both = 0.0, squares = 0.0;
+    middle[0] = middle[1] = 0.0;
+    for (int64_t i = 0; i < count; i++) {
+        middle[0] += points[2 * i] / (double)count;
+        middle[1] += points[2 * i + 1] / (double)count;
+    }
+    both = 0.5 * (middle[0] + middle[1]);
+    for (int64_t i = 0; i < 2 * count; i++)
+        squares += (points[i] - both) * (points[i] - both);
+    *size = sqrt(squares / (2.0 * (double)count));
+    *size = *size > 1e-9 ? *size : 1e-9;
+}
+
+double fit_perspective(const double *places, const double *pixels, int64_t count, double *out)
+{
+    double from[2], to[2], from_size, to_size, A[ENTRIES][ENTRIES] = {{0.0}}, own[ENTRIES];
+    centred(places, count, from, &from_size);
+    centred(pixels, count, to, &to_size);
+    for (int64_t i = 0; i < count; i++) {
+        const double x = (places[2 * i] - from[0]) / from_size, y = (places[2 * i + 1] - from[1]) / from_size;
+        const double u = (pixels[2 * i] - to[0]) / to_size, v = (pixels[2 * i + 1] - to[1]) / to_size;
+        const double rows[2][ENTRIES] = {{x, y, 1.0, 0.0, 0.0, 0.0, -u * x, -u * y, -u},
+                                         {0.0, 0.0, 0.0, x, y, 1.0, -v * x, -v * y, -v}};
+        for (int64_t r = 0; r < 2; r++)
+            for (int64_t p = 0; p < ENTRIES; p++)
+                for (int64_t q = 0; q < ENTRIES; q++)
+                    A[p][q] += rows[r][p] * rows[r][q];
+    }
+    least_eigenvector(A, own);
+    for (int64_t r = 0; r < 3; r++) {
+        double *row = out + 3 * r;
+        for (int64_t c = 0; c < 3; c++)
+            row[c] = r < 2 ? to_size * own[3 * r + c] + to[r] * own[6 + c] : own[6 + c];
+        row[2] -= (row[0] * from[0] + row[1] * from[1]) / from_size;
+        row[0] /= from_size;
+        row[1] /= from_size;
+    }
+    const double middle = out[6] * from[0] + out[7] * from[1] + out[8];
+    for (int64_t k = 0; k < ENTRIES; k++)
+        out[k] /= middle;
+    double least = INFINITY;
+    for (int64_t i = 0; i < count; i++) {
+        const double depth = out[6] * places[2 * i] + out[7] * places[2 * i + 1] + out[8];
+        if (!isfinite(depth))
+            return -INFINITY;
+        least = depth < least ? depth : least;
+    }
+    return least;
+}
+
+/* Powers 0 to SURFACE_DEGREE of x. */
+INLINE void powers_of(double x, double powers[SURFACE_DEGREE + 1])
+{
+    powers[0] = 1.0;
+    for (int64_t k = 1; k <= SURFACE_DEGREE; k++)
+        powers[k] = powers[k - 1] * x;
+}
+
+/* Set `row` to the terms x^i y^j of each degree in turn, x's power falling. */
+INLINE void terms_at(double x, double y, int64_t terms, double *row)
+{
+    double px[SURFACE_DEGREE + 1], py[SURFACE_DEGREE + 1];
+    powers_of(x, px);
+    powers_of(y, py);
+    for (int64_t degree = 0, k = 0; k < terms; degree++)
+        for (int64_t j = 0; j <= degree; j++, k++)
+            row[k] = px[degree - j] * py[j];
+}
+
+#define TERMS_TO(degree) (((degree) + 1) * ((degree) + 2) / 2)
+
+/* A column that is another's sum but for so small a part of its length says nothing. */
+#define SAME_COLUMN 1e-9
+
+/* Make column `k` of the `basis` orthogonal to those before it and of length 1, or 0 where they say the same (Gram and
+ * Schmidt, modified: monomials up to degree 8 stay orthogonal to 1e-10), and take its share of the values, `left`. */
+INLINE void add_column(
+    double *basis, int64_t count, int64_t terms, int64_t k, double *triangle, double *told, double *left, double *gain)
+{
+    double *own = basis + k * count, before = 0.0, after = 0.0, u = 0.0, v = 0.0;
+#pragma omp simd reduction(+ : before)
+    for (int64_t i = 0; i < count; i++)
+        before += own[i] * own[i];
+    for (int64_t j = 0; j < k; j++) {
+        const double *other = basis + j * count;
+        double along = 0.0;
+#pragma omp simd reduction(+ : along)
+        for (int64_t i = 0; i < count; i++)
+            along += own[i] * other[i];
+        triangle[j * terms + k] = along;
+#pragma omp simd
+        for (int64_t i = 0; i < count; i++)
+            own[i] -= along * other[i];
+    }
+#pragma omp simd reduction(+ : after)
+    for (int64_t i = 0; i < count; i++)
+        after += own[i] * own[i];
+    const double length = after > SAME_COLUMN * SAME_COLUMN * before ? sqrt(after) : 0.0;
+    const double scale = length > 0.0 ? 1.0 / length : 0.0;
+    triangle[k * terms + k] = length;
+    double *left_v = left + count;
+#pragma omp simd reduction(+ : u, v)
+    for (int64_t i = 0; i < count; i++) {
+        own[i] *= scale;
+        u += own[i] * left[i];
+        v += own[i] * left_v[i];
+    }
+    told[2 * k] = u;
+    told[2 * k + 1] = v;
+#pragma omp simd
+    for (int64_t i = 0; i < count; i++) {
+        left[i] -= u * own[i];
+        left_v[i] -= v * own[i];
+        gain[i] += own[i] * own[i];
+    }
+}
+
+FOR_EACH_PROCESSOR int64_t fit_polynomials(
+    const double *places, const double *values, int64_t count, double middle_x, double middle_y, double size, int64_t terms,
+    double most_leverage, double *basis, double *triangle, double *told, double *scratch, double *misses, double *foretold,
+    double *leverage)
+{
+    double *off = scratch, *left = scratch + count, *gain = scratch + 3 * count;
+    for (int64_t i = 0; i < count; i++) {
+        left[i] = values[2 * i];
+        left[count + i] = values[2 * i + 1];
+        gain[i] = 0.0;
+    }
+    int64_t best = 0;
+    for (int64_t degree = 0, k = 0; degree <= SURFACE_DEGREE; degree++) {
+        misses[degree] = INFINITY;
+        /* What a perspective leaves of a lens begins with degree 3; one that is the same all around has odd terms alone. */
+        if (TERMS_TO(degree) > terms || degree > (best > 3 ? best + 2 : 5))
+            continue;
+        for (int64_t i = 0; i < count; i++) {
+            double px[SURFACE_DEGREE + 1], py[SURFACE_DEGREE + 1];
+            powers_of((places[2 * i] - middle_x) / size, px);
+            powers_of((places[2 * i + 1] - middle_y) / size, py);
+            for (int64_t j = 0; j <= degree; j++)
+                basis[(k + j) * count + i] = px[degree - j] * py[j];
+        }
+        for (; k < TERMS_TO(degree); k++)
+            add_column(basis, count, terms, k, triangle, told, left, gain);
+        for (int64_t i = 0; i < count; i++) {
+            const double rest = 1.0 - (gain[i] < most_leverage ? gain[i] : most_leverage);
+            off[i] = sqrt(left[i] * left[i] + left[count + i] * left[count + i]) / rest;
+        }
+        misses[degree] = quick_median(off, count);
+        if (degree > 0 && !(misses[degree] < misses[best]))
+            continue;
+        best = degree;
+        for (int64_t i = 0; i < count; i++) {
+            leverage[i] = gain[i] < most_leverage ? gain[i] : most_leverage;
+            foretold[2 * i] = left[i] / (1.0 - leverage[i]);
+            foretold[2 * i + 1] = left[count + i] / (1.0 - leverage[i]);
+        }
+    }
+    return best;
+}
+
+void polynomial_at(
+    const double *wanted, int64_t count, double middle_x, double middle_y, double size, int64_t terms, int64_t degree,
+    const double *triangle, const double *told, double *out)
+{
+    const int64_t end = TERMS_TO(degree);
+    double factors[SURFACE_TERMS][2];
+    for (int64_t k = end - 1; k >= 0; k--)
+        for (int64_t axis = 0; axis < 2; axis++) {
+            double left = told[2 * k + axis];
+            for (int64_t j = k + 1; j < end; j++)
+                left -= triangle[k * terms + j] * factors[j][axis];
+            const double pivot = triangle[k * terms + k];
+            factors[k][axis] = pivot > 0.0 ? left / pivot : 0.0;
+        }
+    for (int64_t i = 0; i < count; i++) {
+        double px[SURFACE_DEGREE + 1], py[SURFACE_DEGREE + 1], sum[5][2] = {{0.0}};
+        powers_of((wanted[2 * i] - middle_x) / size, px);
+        powers_of((wanted[2 * i + 1] - middle_y) / size, py);
+        for (int64_t n = 0, k = 0; n <= degree; n++)
+            for (int64_t j = 0; j <= n; j++, k++) {
+                const int64_t m = n - j;
+                const double x1 = m > 0 ? (double)m * px[m - 1] / size : 0.0;
+                const double y1 = j > 0 ? (double)j * py[j - 1] / size : 0.0;
+                const double x2 = m > 1 ? (double)(m * (m - 1)) * px[m - 2] / (size * size) : 0.0;
+                const double y2 = j > 1 ? (double)(j * (j - 1)) * py[j - 2] / (size * size) : 0.0;
+                const double part[5] = {px[m] * py[j], x1 * py[j], px[m] * y1, x2 * py[j], px[m] * y2};
+                for (int64_t s = 0; s < 5; s++) {
+                    sum[s][0] += part[s] * factors[k][0];
+                    sum[s][1] += part[s] * factors[k][1];
+                }
+            }
+        for (int64_t s = 0; s < 5; s++) {
+            out[(s * count + i) * 2] = sum[s][0];
+            out[(s * count + i) * 2 + 1] = sum[s][1];
+        }
+    }
+}
+
+void surest_polynomial(
+    const double *wanted, int64_t count, double middle_x, double middle_y, double size, int64_t terms,
+    const double *triangle, const double *told, const double *misses, double *out)
+{
+    for (int64_t i = 0; i < count; i++) {
+        double part[SURFACE_TERMS], square = 0.0, u = 0.0, v = 0.0, least = INFINITY;
+        terms_at((wanted[2 * i] - middle_x) / size, (wanted[2 * i + 1] - middle_y) / size, terms, part);
+        for (int64_t degree = 0, k = 0; degree <= SURFACE_DEGREE && isfinite(misses[degree]); degree++) {
+            for (; k < TERMS_TO(degree); k++) {
+                for (int64_t j = 0; j < k; j++)
+                    part[k] -= triangle[j * terms + k] * part[j];
+                const double pivot = triangle[k * terms + k];
+                part[k] = pivot > 0.0 ? part[k] / pivot : 0.0;
+                square += part[k] * part[k];
+                u += part[k] * told[2 * k];
+                v += part[k] * told[2 * k + 1];
+            }
+            const double gain = sqrt(square), off = misses[degree] * (gain > 1.0 ? gain : 1.0);
+            if (degree == 0 || off < least) {
+                least = off;
+                out[3 * i] = u;
+                out[3 * i + 1] = v;
+                out[3 * i + 2] = gain;
+            }
+        }
+    }
+}
+
+/* Return the grey level at (u, v), bilinear, the border repeated; 0 where that is no place. */
+INLINE double grey_at(const void *grey, int64_t bytes, int64_t width, int64_t height, double u, double v)
+{
+    if (!(isfinite(u) && isfinite(v)))
+        return 0.0;
+    u = u > 0.0 ? u : 0.0;
+    v = v > 0.0 ? v : 0.0;
+    u = u < (double)(width - 1) ? u : (double)(width - 1);
+    v = v < (double)(height - 1) ? v : (double)(height - 1);
+    int64_t left = (int64_t)u, top = (int64_t)v;
+    left = left < width - 2 ? left : width - 2;
+    top = top < height - 2 ? top : height - 2;
+    const double right = u - (double)left, below = v - (double)top;
+    const int64_t at = top * width + left;
+    double a, b, c, d;
+    if (bytes) {
+        const uint8_t *image = (const uint8_t *)grey + at;
+        a = image[0], b = image[1], c = image[width], d = image[width + 1];
+    } else {
+        const float *image = (const float *)grey + at;
+        a = image[0], b = image[1], c = image[width], d = image[width + 1];
+    }
+    const double upper = a + right * (b - a), lower = c + right * (d - c);
+    return upper + below * (lower - upper);
+}
+
+FOR_EACH_PROCESSOR void read_modules(
+    const void *grey, int64_t bytes, int64_t width, int64_t height, const double *maps, int64_t count, int64_t side,
+    const double *patterns, int64_t patterns_count, double *bright, double *spread, double *likeness)
+{
+    const int64_t modules = side * side;
+    for (int64_t n = 0; n < count; n++) {
+        const double *h = maps + 9 * n;
+        double mean = 0.0, square = 0.0;
+        for (int64_t k = 0; k < modules; k++) {
+            const double x = ((double)(k % side) + 0.5) / (double)side, y = ((double)(k / side) + 0.5) / (double)side;
+            const double depth = h[6] * x + h[7] * y + h[8];
+            const double u = (h[0] * x + h[1] * y + h[2]) / depth, v = (h[3] * x + h[4] * y + h[5]) / depth;
+            bright[k] = grey_at(grey, bytes, width, height, u, v);
+            mean += bright[k] / (double)modules;
+        }
+        for (int64_t k = 0; k < modules; k++) {
+            bright[k] -= mean;
+            square += bright[k] * bright[k];
+        }
+        spread[n] = sqrt(square / (double)modules);
+        const double scale = square > 1e-18 ? 1.0 / sqrt(square) : 0.0;
+        for (int64_t p = 0; p < patterns_count; p++) {
+            const double *pattern = patterns + p * modules;
+            double sum = 0.0;
+#pragma omp simd reduction(+ : sum)
+            for (int64_t k = 0; k < modules; k++)
+                sum += bright[k] * pattern[k];
+            likeness[n * patterns_count + p] = sum * scale;
+        }
+    }
+}

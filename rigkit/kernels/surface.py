@@ -1,0 +1,116 @@
+"""The kernels in surface.c: the map from a board's plane to an image, and the brightness of the modules of tags."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.core.arrays import FloatArray
+from rigkit.kernels import kernels
+from rigkit.kernels.declarations import header
+
+SURFACE_DEGREE, SURFACE_TERMS = (header().constants[name] for name in ("SURFACE_DEGREE", "SURFACE_TERMS"))
+"""Of the polynomial that a lens adds to a perspective: a board that fills a fisheye of 180 degrees takes degree 7."""
+
+TERMS_OF_DEGREE = tuple((degree + 1) * (degree + 2) // 2 for degree in range(SURFACE_DEGREE + 1))
+"""How many terms x^i y^j there are up to a degree."""
+
+
+def perspective(places: FloatArray, pixels: FloatArray) -> tuple[FloatArray, float]:
+    """Return the homography (3, 3) that takes `places` (N, 2) nearest to `pixels` (N, 2), of depth 1 at their mean, and
+    the least depth of a place (Hartley and Zisserman, Multiple View Geometry, 2004, algorithm 4.2).
+    """
+    out = np.empty((3, 3))
+    known = (np.ascontiguousarray(part, np.float64) for part in (places, pixels))
+    return out, float(kernels().fit_perspective(*known, len(places), out))
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Polynomials:
+    """Polynomials of every degree through N points, in T terms x^i y^j of places in units of `size` from `middle`.
+
+    Attributes
+    ----------
+    triangle : (T, T) and told : (T, 2), the QR decomposition of the terms at the points, and the values in its basis;
+        the diagonal of a term that the others are as good as at these points is 0.
+    misses : (D,) how far off points usually lie where the others have them, by degree; infinite where that was not
+        tried, for there are too few points, or from degree 6 on no better ones among the two degrees before.
+    best : degree with the smallest.
+    foretold : (N, 2) how far the points lie off where the others have them, by that degree.
+    leverage : (N,) of each point on its own value.
+    """
+
+    middle: FloatArray
+    size: float
+    triangle: FloatArray
+    told: FloatArray
+    misses: FloatArray
+    best: int
+    foretold: FloatArray
+    leverage: FloatArray
+
+    @classmethod
+    def through(
+        cls, places: FloatArray, values: FloatArray, middle: FloatArray, size: float, most: int, most_leverage: float
+    ) -> Polynomials:
+        """Return those through `values` (N, 2) at `places` (N, 2), of `most` terms at most."""
+        terms, count = max(end for end in TERMS_OF_DEGREE if end <= most), len(places)
+        triangle, told, misses = np.zeros((terms, terms)), np.empty((terms, 2)), np.empty(SURFACE_DEGREE + 1)
+        foretold, leverage = np.empty((count, 2)), np.empty(count)
+        best = kernels().fit_polynomials(
+            *(np.ascontiguousarray(part, np.float64) for part in (places, values)),
+            *(count, float(middle[0]), float(middle[1]), size, terms, most_leverage, np.empty((terms, count))),
+            *(triangle, told, np.empty((4, count)), misses, foretold, leverage),
+        )
+        return cls(
+            middle=middle,
+            size=size,
+            triangle=triangle,
+            told=told,
+            misses=misses,
+            best=int(best),
+            foretold=foretold,
+            leverage=leverage,
+        )
+
+    def at(self, wanted: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the values at `wanted` (M, 2) by the best degree, and their first and second derivatives along x and
+        along y, (M, 2, 2)."""
+        out = np.empty((5, len(wanted), 2))
+        kernels().polynomial_at(*self._asked(wanted), self.best, self.triangle, self.told, out)
+        return out[0], out[1:3].transpose(1, 0, 2), out[3:].transpose(1, 0, 2)
+
+    def surest(self, wanted: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the values at `wanted` (M, 2), each by the degree that is surest there, and their gain (M,): the
+        standard deviation for points of standard deviation 1.
+
+        Beyond the points high degrees run wild: what counts is the usual miss times the gain.
+        """
+        out = np.empty((len(wanted), 3))
+        kernels().surest_polynomial(*self._asked(wanted), self.triangle, self.told, self.misses, out)
+        return out[:, :2], out[:, 2]
+
+    def _asked(self, wanted: FloatArray) -> tuple[FloatArray, int, float, float, float, int]:
+        x, y = self.middle
+        return np.ascontiguousarray(wanted, np.float64), len(wanted), float(x), float(y), self.size, len(self.told)
+
+
+def read_modules(
+    image: NDArray[np.uint8] | NDArray[np.float32], maps: FloatArray, patterns: FloatArray, side: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the correlation of N tags with the P `patterns` (P, side * side), (N, P), and the standard deviation of
+    their modules' brightness, (N,).
+
+    `maps` (N, 3, 3) take the unit square to each tag; brightness is bilinear at the middles of `side` x `side` modules,
+    that of the border beyond it. Patterns have mean 0 and length 1.
+    """
+    grey = np.ascontiguousarray(image, None if image.dtype == np.uint8 else np.float32)
+    spread, likeness = np.empty(len(maps)), np.empty((len(maps), len(patterns)))
+    height, width = grey.shape
+    kernels().read_modules(
+        *(grey, grey.dtype == np.uint8, width, height, np.ascontiguousarray(maps, np.float64), len(maps), side),
+        *(np.ascontiguousarray(patterns, np.float64), len(patterns), np.empty(side * side), spread, likeness),
+    )
+    return likeness, spread

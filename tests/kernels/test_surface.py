@@ -1,0 +1,84 @@
+"""The kernels of the map from a board's plane to an image agree with their definitions in numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from kernels.reference import surface as reference
+
+from rigkit.core.arrays import FloatArray
+from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.tags.codes import homographies
+from rigkit.detection.tags.surface import MAX_LEVERAGE, SmoothMap
+from rigkit.kernels.surface import TERMS_OF_DEGREE, Polynomials, perspective, read_modules
+
+SAME = 1e-7
+"""px: two ways to solve for 45 powers of numbers up to 1 agree so well."""
+
+
+def seen(rng: np.random.Generator, *, bend: float) -> tuple[FloatArray, FloatArray]:
+    """Return a grid of 12 x 10 points and where a slanted camera with a lens of the fifth order has them."""
+    places = np.stack(np.meshgrid(np.arange(12.0), np.arange(10.0)), axis=-1).reshape(-1, 2)
+    flat = (
+        np.column_stack([places, np.ones(len(places))])
+        @ np.array([[40.0, 3.0, 60.0], [-2.0, 38.0, 40.0], [0.02, 0.01, 1.0]]).T
+    )
+    pixels = flat[:, :2] / flat[:, 2:]
+    off = (pixels - [300.0, 200.0]) / 300.0
+    square = (off**2).sum(axis=1, keepdims=True)
+    return places, pixels + 300.0 * bend * off * (square + square**2) + rng.normal(0.0, 0.02, pixels.shape)
+
+
+def test_perspective(rng: np.random.Generator) -> None:
+    places, pixels = seen(rng, bend=0.0)
+    matrix, nearest = perspective(places, pixels)
+    np.testing.assert_allclose(matrix, reference.perspective(places, pixels), rtol=1e-6, atol=1e-9)
+    assert nearest == pytest.approx((places @ matrix[2, :2] + matrix[2, 2]).min())
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.1, 0.6])
+def test_polynomials(bend: float, rng: np.random.Generator) -> None:
+    places, pixels = seen(rng, bend=bend)
+    middle, size = np.array([5.5, 4.5]), 5.5
+    ours = Polynomials.through(places, pixels, middle, size, len(places) // 2, MAX_LEVERAGE)
+    tried = int(np.isfinite(ours.misses).sum())
+    assert tried == min(len(TERMS_OF_DEGREE), max(6, ours.best + 3))
+    whole = reference.Polynomials(places, pixels, middle, size, tried - 1)
+    assert ours.best == int(whole.misses.argmin())
+    np.testing.assert_allclose(ours.misses[:tried], whole.misses, rtol=1e-6)
+    np.testing.assert_allclose(ours.foretold, whole.foretold[ours.best], atol=SAME)
+    np.testing.assert_allclose(ours.leverage, whole.leverage[:, TERMS_OF_DEGREE[ours.best] - 1], atol=1e-9)
+    wanted = rng.uniform([-2.0, -2.0], [13.0, 11.0], (50, 2))
+    for one, two in zip(ours.at(wanted), whole.at(wanted, ours.best), strict=True):
+        np.testing.assert_allclose(one, two, atol=100.0 * SAME)
+    for one, two in zip(ours.surest(wanted), whole.surest(wanted, tried), strict=True):
+        np.testing.assert_allclose(one, two, atol=100.0 * SAME)
+
+
+def test_points_on_two_lines_leave_what_they_do_not_say_out(rng: np.random.Generator) -> None:
+    places, pixels = seen(rng, bend=0.0)
+    two = places[:, 1] < 2.0
+    surface = SmoothMap(places[two], pixels[two]).at(places[two])
+    assert np.abs(surface.pixels - pixels[two]).max() < 0.2
+    assert np.isfinite(surface.sides).all()
+    assert np.abs(surface.sides).max() < 60.0
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_modules(dtype: type, rng: np.random.Generator) -> None:
+    image: GreyImage = rng.uniform(0.0, 255.0, (60, 80)).astype(dtype)
+    quads = np.array(
+        [
+            [[10.0, 12.0], [40.0, 9.0], [45.0, 44.0], [7.0, 39.0]],
+            [[60.0, 40.0], [85.0, 38.0], [88.0, 66.0], [61.0, 59.0]],
+        ]
+    )
+    patterns = rng.normal(size=(7, 36))
+    patterns -= patterns.mean(axis=1, keepdims=True)
+    patterns /= np.linalg.norm(patterns, axis=1, keepdims=True)
+    maps = homographies(quads)
+    for one, two in zip(
+        read_modules(image, maps, patterns, 6), reference.read_modules(image, maps, patterns, 6), strict=True
+    ):
+        # OpenCV's remap has places to 1/32 px.
+        np.testing.assert_allclose(one, two, atol=2.0 if one.ndim == 1 else 0.03)
