@@ -129,6 +129,18 @@ class FarProjection:
         out[self.rays_valid] = worst_direction(self._covariance(self.corners))
         return out
 
+    @property
+    def usual_px(self) -> float:
+        """Standard deviation where the boards were: rms over the corners; infinite where none has a ray."""
+        known = self.at_corners_px[np.isfinite(self.at_corners_px)]
+        return float(np.sqrt(np.mean(known**2))) if known.size else float("inf")
+
+    @property
+    def worst_px(self) -> float:
+        """The same of the worst corner."""
+        known = self.at_corners_px[np.isfinite(self.at_corners_px)]
+        return float(known.max()) if known.size else float("inf")
+
     def _covariance(self, design: FloatArray) -> FloatArray:
         p = len(self.sigmas)
         left = self.sigmas[:, None] * design[:, :p] - np.einsum("wp,iwm->ipm", self.hides, design[:, p:])

@@ -94,7 +94,7 @@ def judge(
     ]
     share = extent.share
     where = "" if share >= NEARLY_ALL else f" over the {100.0 * share:.0f} % of the image where boards were"
-    return (*with_headline(calibration, causes, _unsure(calibration, far.at_corners_px), where), *found)
+    return (*with_headline(calibration, causes, _unsure(calibration, far), where), *found)
 
 
 def judge_session(
@@ -269,10 +269,9 @@ def _overfit(c: Calibration) -> list[Finding]:
     ]
 
 
-def _unsure(c: Calibration, inside: FloatArray) -> list[Finding]:
-    worst = float(np.nanmax(inside)) if np.isfinite(inside).any() else np.inf
+def _unsure(c: Calibration, far: FarProjection) -> list[Finding]:
+    usual, worst, inside = far.usual_px, far.worst_px, far.at_corners_px
     if worst <= UNSURE_PX:
-        usual = float(np.sqrt(np.nanmean(inside**2)))
         error = c.rms_px if c.heldout_rms_px is None else c.heldout_rms_px
         if usual <= max(error, SMALL_PX):
             return []

@@ -9,7 +9,7 @@ import numpy as np
 from rigkit.calibration.coverage import covered_by_boards
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.result import RigCalibration
-from rigkit.calibration.uncertainty import uncertainty_map
+from rigkit.calibration.uncertainty import FarProjection, uncertainty_map
 from rigkit.core.arrays import FloatArray
 from rigkit.core.findings import Severity, gravest_first, worst
 from rigkit.core.tables import Cell, Column, Table
@@ -82,14 +82,13 @@ def _basis(c: Calibration) -> str:
 
 def _reach(c: Calibration) -> str:
     """Say how sure the projection is where boards were and beyond, in pixels."""
-    grid = uncertainty_map(c, grid=MAP_GRID)
-    known = np.isfinite(grid.worst_px)
-    inside = covered_by_boards(c, grid.pixels) & known
-    if not inside.any():
+    far = FarProjection.of(c)
+    if not np.isfinite(far.worst_px):
         return ""
-    within, beyond = grid.worst_px[inside], grid.worst_px[known & ~inside]
+    grid = uncertainty_map(c, grid=MAP_GRID)
+    beyond = grid.worst_px[np.isfinite(grid.worst_px) & ~covered_by_boards(c, grid.pixels)]
     words = (
-        f"A far point is projected to ±{np.median(within):.2g} px where boards were (±{within.max():.2g} px at worst; "
+        f"A far point is projected to ±{far.usual_px:.2g} px where boards were (±{far.worst_px:.2g} px at worst; "
         "one standard deviation)"
     )
     if not beyond.size:
@@ -97,7 +96,7 @@ def _reach(c: Calibration) -> str:
     words += f", and to ±{beyond.max():.2g} px at worst outside"
     if worst(c.verdicts) is Severity.BAD:
         return words + "."
-    if beyond.max() < MAX_RATIO_BEYOND * within.max():
+    if beyond.max() < MAX_RATIO_BEYOND * far.worst_px:
         return words + ": all of the image can be used."
     words += ": use the part inside the dashed line only, or add pictures"
     return words + " with the board at the border, tilted by 30 degrees."

@@ -14,7 +14,8 @@ from report.test_page_in_browser import MIN_FONT_PX, QUIET, chromium, measured_a
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.uncertainty import projection_uncertainty
+from rigkit.calibration.uncertainty import FarProjection, projection_uncertainty
+from rigkit.calibration.verdicts import judge
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import Knowledge
 from rigkit.planning.plan import plan_views
@@ -167,6 +168,18 @@ def test_the_pictures_to_take_next_are_on_the_page(calibration: Calibration) -> 
     text = build_calibration_page("t", "l", [CalibrationSection("cam", calibration, {}, plan)], {})
     assert "Take these 2 next" in text and plan_words(plan)[1] in text
     assert "Take these" not in build_calibration_page("t", "l", [CalibrationSection("cam", calibration)], {})
+
+
+def test_the_headline_and_the_finding_have_one_figure(calibration: Calibration) -> None:
+    unsure = replace(
+        calibration, covariance=25.0 * calibration.covariance / FarProjection.of(calibration).worst_px ** 2
+    )
+    judged = replace(unsure, verdicts=judge(unsure))
+    text = page(judged)
+    headline = re.search(r"where boards were \(±([\d.]+) px at worst", text)
+    finding = re.search(r"uncertain by up to ([\d.]+) px \(one standard deviation\) where the boards were", text)
+    assert headline is not None and finding is not None
+    assert float(headline[1]) == float(finding[1]) == 5.0
 
 
 def test_the_sentence_and_the_map_have_one_worst_place(calibration: Calibration) -> None:

@@ -78,7 +78,7 @@ def _few_shared(rig: RigCalibration) -> list[Finding]:
 def _unsure(rig: RigCalibration) -> list[Finding]:
     out = []
     for camera in rig.cameras:
-        worst = float(np.nanmax(FarProjection.of(camera.calibration).at_corners_px))
+        worst = FarProjection.of(camera.calibration).worst_px
         if worst > UNSURE_PX:
             out.append(
                 _bad(
