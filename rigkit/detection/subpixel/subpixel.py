@@ -38,8 +38,8 @@ LOOSE_CURVATURE = 0.5
 sigmas of the first pass: the edges then know them better. Everywhere it would take a quarter more time."""
 
 PAPER_ROUNDS, SETTLED_PX = 4, 0.03
-"""What lies beyond the outermost squares is read with the corners as they are fitted so far, and again if these move by
-more than the second number."""
+"""What lies beyond the outermost squares is read with the corners as they are fitted so far, and again for those that
+then move by more than the second number."""
 
 REACHED = 0.25
 """Of the corners of a board: where blur brings the edges of neighbouring lines into so many windows, all are fitted
@@ -255,11 +255,14 @@ def _last_pass(
         geometry = tilted(geometry, known)
     fit = fitted(slice(None), geometry)
     again = beside_paper(geometry, fit, mine)
+    moving = again
     for _ in range(PAPER_ROUNDS if again.any() else 0):
-        before = fit.pixels[again]
         beside = with_paper(image, geometry.of(again), fit.of(again), signs[known][again], mine[again])
-        fit = fit.with_part(again, fitted(again, beside))
-        if np.abs(fit.pixels[again] - before).max() < SETTLED_PX:
+        before, which = fit.pixels[moving], moving[again]
+        fit = fit.with_part(moving, fitted(moving, beside.of(which)))
+        moving = moving.copy()
+        moving[moving] = np.linalg.norm(fit.pixels[moving] - before, axis=1) >= SETTLED_PX
+        if not moving.any():
             break
     factors = sigma_factors(fit, fit.valid & (fit.contrast > 0.0), shape.sides, mine, len(parts), radius_px)
     reached = np.zeros(known.shape, np.bool_)
