@@ -95,7 +95,7 @@ def certificate_page(
         title,
         certificate_facts(certificate, limit),
         {**basis(certificate), **provenance},
-        pictures=[("The bound over the image and its causes", "image/png", as_png(bound_figure(certificate)))],
+        pictures=[("The bound over the image and its causes", lambda: as_png(bound_figure(certificate)))],
         signed=True,
     )
 

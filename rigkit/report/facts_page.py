@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
+from rigkit.report.figures import drawn_dark
 from rigkit.report.page_facts import PageFacts
 from rigkit.report.render import data_uri, drawing, render, shown_table
 
@@ -16,7 +17,7 @@ def build_facts_page(
     provenance: Mapping[str, str],
     *,
     links: Sequence[tuple[str, str]] = (),
-    pictures: Sequence[tuple[str, str, bytes]] = (),
+    pictures: Sequence[tuple[str, Callable[[], bytes]]] = (),
     drawings: Sequence[tuple[str, str]] = (),
     signed: bool = False,
 ) -> str:
@@ -26,7 +27,7 @@ def build_facts_page(
     ----------
     title, facts, provenance : what every page has.
     links : (words, page) below the sentences.
-    pictures : (words for those who cannot see them, MIME type, bytes).
+    pictures : (words for those who cannot see them, what draws a figure as PNG), drawn for light and for dark screens.
     drawings : (heading, SVG of rigkit itself).
     signed : whether it ends in lines for date, name and signature.
     """
@@ -37,7 +38,9 @@ def build_facts_page(
         told={"words": facts.badge, "colour": BADGES[facts.passed], "headline": facts.headline},
         sentences=facts.sentences,
         links=links,
-        pictures=[(words, data_uri(mime, data)) for words, mime, data in pictures],
+        pictures=[
+            (words, *(data_uri("image/png", data) for data in (draw(), drawn_dark(draw)))) for words, draw in pictures
+        ],
         drawings=[(name, drawing(svg)) for name, svg in drawings],
         tables=[shown_table(table) for table in facts.tables],
         signed=signed,

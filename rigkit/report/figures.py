@@ -6,7 +6,7 @@ All figures are drawn with matplotlib's object interface (no global state, no di
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -48,6 +48,10 @@ SIDE_PAD, ABOVE_PAD = 10.0, 24.0
 
 CURVE_SAMPLES = 240
 JPEG_QUALITY = 85
+PAIR_RIM, PAIR_TOP = 0.005, 0.95
+"""Where two images stand in their figure; the title is above."""
+DARK_GROUND, DARK_WORDS = "#14181f", "#c8cfda"
+"""Of pages by night."""
 
 
 def board_colour(index: int) -> str:
@@ -275,7 +279,7 @@ def pair_axes(image1: NDArray[Any], image2: NDArray[Any]) -> tuple[Figure, Seque
     figure = Figure(figsize=(14, 7 * aspect + 0.35), dpi=DPI)
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, 2)
-    figure.subplots_adjust(left=0.005, right=0.995, bottom=0.005, top=0.95, wspace=0.01)
+    figure.subplots_adjust(left=PAIR_RIM, right=1.0 - PAIR_RIM, bottom=PAIR_RIM, top=PAIR_TOP, wspace=0.01)
     for axis, image in zip(axes, (image1, image2), strict=True):
         height, width = image.shape[:2]
         fitted = _fitted(image, axis.bbox.width, axis.bbox.height)
@@ -309,12 +313,26 @@ def as_png(figure: Figure) -> bytes:
     return bytes(cv2.imencode(".png", _drawn(figure), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
 
 
-def as_jpeg(png: bytes) -> bytes:
-    """Return a picture as JPEG: a tenth of the size, for pages that carry many."""
+def drawn_dark(draw: Callable[[], bytes]) -> bytes:
+    """Return what `draw` makes of a figure, for pages on a dark ground."""
+    import matplotlib
+
+    grounds = ("figure.facecolor", "axes.facecolor", "savefig.facecolor")
+    words = ("axes.edgecolor", "axes.labelcolor", "text.color", "xtick.color", "ytick.color")
+    colours: dict[Any, str] = dict.fromkeys(grounds, DARK_GROUND) | dict.fromkeys(words, DARK_WORDS)
+    with matplotlib.rc_context(colours):
+        return draw()
+
+
+def pair_jpeg(png: bytes) -> bytes:
+    """Return a figure of `pair_axes` as JPEG without the title and the rim: a page says it below, on its own ground."""
     import cv2
 
     picture = np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR))
-    return bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1])
+    height, width = picture.shape[:2]
+    top, rim = round((1.0 - PAIR_TOP) * height) + 1, round(PAIR_RIM * width)
+    cut = picture[top : height - round(PAIR_RIM * height), rim : width - rim]
+    return bytes(cv2.imencode(".jpg", cut, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1])
 
 
 def _drawn(figure: Figure) -> NDArray[np.uint8]:

@@ -27,6 +27,9 @@ def render(template: str, **context: Any) -> str:
 
 def data_uri(mime: str, data: bytes) -> str:
     """Return what stands in an image's `src`, so that the page needs no other file."""
+    if mime == "image/svg+xml":
+        head, sign, rest = data.decode().partition(">")
+        data = f"{head}{sign}<style>{asset('drawings.css')}</style>{rest}".encode()
     return f"data:{mime};base64,{base64.b64encode(data).decode()}"
 
 
@@ -74,11 +77,11 @@ def _environment() -> Environment:
     )
     # Also "<" in a string of JSON is escaped, so no name in it can end or open a script element.
     made.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
-    made.globals["asset"] = _asset
+    made.globals["asset"] = asset
     return made
 
 
 @functools.cache
-def _asset(name: str) -> Any:
+def asset(name: str) -> Any:
     """Return a style sheet or script of the package, as it is."""
     return drawing(resources.files("rigkit.report").joinpath(name).read_text(encoding="utf-8"))

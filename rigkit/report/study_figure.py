@@ -37,7 +37,7 @@ def study_figure(table: StudyTable, file_format: str = "png") -> bytes:
             title = f"{pose_type} motion" + (f", plane {plane}" if plane else "")
             axis.set_title(title, fontsize=9)
             axis.set_ylim(bottom=0.0)
-            axis.grid(axis="y", color="#dddddd", linewidth=0.6)
+            axis.grid(axis="y", linewidth=0.6, alpha=0.5)
             axis.set_axisbelow(True)
         axes[r, 0].set_ylabel("normal error, deg")
     _label_x(axes[-1], table)
@@ -67,6 +67,8 @@ def _boxes(axis: Any, table: StudyTable, pose_type: str, plane: int) -> None:
 
 
 def _box(axis: Any, cell: StudyCell, position: float, width: float, colour: str) -> None:
+    from matplotlib import rcParams
+
     statistics = {
         "med": cell.median_deg,
         "q1": cell.q25_deg,
@@ -82,7 +84,7 @@ def _box(axis: Any, cell: StudyCell, position: float, width: float, colour: str)
         patch_artist=True,
         manage_ticks=False,
         boxprops={"facecolor": colour, "alpha": 0.45, "edgecolor": colour},
-        medianprops={"color": "black"},
+        medianprops={"color": rcParams["text.color"]},
         whiskerprops={"color": colour},
         capprops={"color": colour},
     )

@@ -29,5 +29,5 @@ def study_page(found: StudyTable, provenance: Mapping[str, str]) -> str:
             tables=tuple(study_tables(found)),
         ),
         provenance,
-        pictures=[(f"Normal errors: {found.study.title}", "image/png", study_figure(found))],
+        pictures=[(f"Normal errors: {found.study.title}", lambda: study_figure(found))],
     )

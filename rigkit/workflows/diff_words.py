@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +63,7 @@ def facts_of(pair: Pair) -> PageFacts:
 def write_diff_page(path: Path, pair: Pair, files: tuple[Path, Path], *, force: bool) -> None:
     """Write the difference of two `files` as a page; its place was looked at by `diff`."""
     pictures = [
-        (f"{name} difference over the image".strip(), "image/png", difference_png(own.difference))
+        (f"{name} difference over the image".strip(), partial(difference_png, own.difference))
         for name, own in _cameras_of(pair).items()
     ]
     provenance = software_facts() | {f"{which} {p.name}": digest_line(p) for which, p in zip("AB", files, strict=True)}

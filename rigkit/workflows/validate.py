@@ -23,7 +23,7 @@ from rigkit.reconstruction.geometry import PairGeometry
 from rigkit.reconstruction.pairing import MatchedPair
 from rigkit.reconstruction.reconstruct import Reconstruction, on_planes, reconstruct_from
 from rigkit.report.drawings import normal_errors_svg, residuals_svg
-from rigkit.report.figures import as_jpeg, as_pdf, as_png, cloud_figure, corners_figure, epipolar_figure
+from rigkit.report.figures import as_pdf, as_png, cloud_figure, corners_figure, epipolar_figure, pair_jpeg
 from rigkit.report.page import PairSection
 from rigkit.report.page_facts import PageFacts
 from rigkit.report.validation_page import crosscheck_table, pair_section
@@ -271,9 +271,11 @@ def _section(
     drawn: Mapping[str, bytes],
 ) -> PairSection:
     """Return the pair's section of the page, with the pictures `drawn` as JPEG."""
+    corners, epipolar = (drawn[f"{shown.pair_id}/{name}.png"] for name in ("corners", "epipolar"))
+    rms, jpeg = shown.sampson_rms_px, "image/jpeg"
     pictures = [
-        ("Corners as found and matched", "image/jpeg", as_jpeg(drawn[f"{shown.pair_id}/corners.png"])),
-        ("Epipolar curves of every seventh corner", "image/jpeg", as_jpeg(drawn[f"{shown.pair_id}/epipolar.png"])),
+        ("Corners as found and matched (ring: first corner of a board)", jpeg, pair_jpeg(corners)),
+        (f"Epipolar curves of every seventh corner, Sampson rms {rms:.3f} px", jpeg, pair_jpeg(epipolar)),
         ("What the corners leave over", "image/svg+xml", residuals_svg(shown).encode()),
         ("Normal errors of the estimators", "image/svg+xml", normal_errors_svg(reconstructions, reports).encode()),
     ]

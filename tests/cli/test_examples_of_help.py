@@ -9,6 +9,8 @@ import sys
 
 import pytest
 
+from rigkit.cameras import registry
+from rigkit.cli import calibrate_arguments
 from rigkit.cli.examples import EXAMPLES, FIRST_STEPS
 from rigkit.cli.main import VERBS, build_parser
 
@@ -44,3 +46,7 @@ def test_without_a_verb_the_first_steps_are_shown() -> None:
     for line in FIRST_STEPS.split("\n\n")[0].splitlines()[1:-1]:
         (_, verb, *words), *_ = typed(line)
         build_parser(verb).parse_args([verb, *words])
+
+
+def test_help_lists_the_camera_models() -> None:
+    assert tuple(registry.MODELS) == calibrate_arguments.MODELS

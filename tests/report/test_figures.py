@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import base64
+import re
+
 import numpy as np
 import pytest
+from helpers.calibration_scenes import lens, random_views
 from helpers.reconstructions import make_reconstruction
 
+from rigkit.calibration.calibrate import calibrate
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.report.calibration_charts import histogram_svg, images_svg, lens_svg, radius_svg
+from rigkit.report.calibration_drawings import coverage_svg, pattern_svg, residuals_svg
 from rigkit.report.figures import as_pdf, cloud_figure, corners_figure
+from rigkit.report.render import asset, data_uri
 
 
 def test_a_pdf_has_vectors_real_fonts_and_no_date() -> None:
@@ -56,3 +64,17 @@ def test_no_axis_name_lies_over_a_number(baseline_mm: tuple[float, float, float]
             assert not any(name.get_window_extent().overlaps(number) for number in numbers), name.get_text()
             checked += len(numbers)
     assert checked > 40
+
+
+def test_words_and_lines_of_drawings_have_a_colour_for_the_night(rng: np.random.Generator) -> None:
+    camera = lens("reg")
+    found = calibrate(random_views(camera, 6, rng, reach_deg=25.0)[0], camera.size_px, model="brown", board="flat")
+    drawings = [draw(found) for draw in (images_svg, histogram_svg, radius_svg, lens_svg)]
+    drawings += [draw(found) for draw in (residuals_svg, pattern_svg, coverage_svg)]
+    used = {colour for svg in drawings for colour in re.findall(r'<text [^>]*fill="(#[0-9a-f]+)"', svg)}
+    used |= {colour for svg in drawings for colour in re.findall(r'<rect [^>]*fill="(#[0-9a-f]+)"', svg)}
+    known = set(re.findall(r'\[fill="(#[0-9a-f]+)"\]', str(asset("drawings.css"))))
+    assert len(used) >= 4
+    assert used <= known
+    coded = data_uri("image/svg+xml", drawings[0].encode()).partition(",")[2]
+    assert b"prefers-color-scheme: dark" in base64.b64decode(coded)
