@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rigkit.workflows.calibrate import CalibrateOptions
     from rigkit.workflows.calibrate_any import FolderOptions
 
-MODELS = ("pinhole", "brown", "kannala_brandt", "scaramuzza", "ucm", "eucm", "double_sphere")
+MODEL_NAMES = ("pinhole", "brown", "kannala_brandt", "scaramuzza", "ucm", "eucm", "double_sphere")
 """Their names as `rigkit.cameras.registry` has them, which takes too long to load for a help text."""
 
 
@@ -87,7 +87,7 @@ def _add_of_folders(parser: argparse.ArgumentParser) -> None:
         help="instead: the board is what the images show, with squares (tags, distances of circles) of so many mm",
     )
     folders.add_argument("--timestamps", type=Path, metavar="FILE.csv", help="which frames of videos are of one moment")
-    folders.add_argument("--model", help=f"{', '.join(MODELS)} (default: auto, the one that predicts best)")
+    folders.add_argument("--model", help=f"{', '.join(MODEL_NAMES)} (default: auto, the one that predicts best)")
 
 
 def calibrate_options(args: argparse.Namespace) -> CalibrateOptions:

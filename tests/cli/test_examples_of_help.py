@@ -49,4 +49,4 @@ def test_without_a_verb_the_first_steps_are_shown() -> None:
 
 
 def test_help_lists_the_camera_models() -> None:
-    assert tuple(registry.MODELS) == calibrate_arguments.MODELS
+    assert tuple(registry.MODELS) == calibrate_arguments.MODEL_NAMES
