@@ -68,6 +68,9 @@ class SessionCalibration:
 
     __repr__ = brief
 
+    def _repr_html_(self) -> str:
+        return self.calibration._repr_html_()
+
 
 def calibrate_session(
     session: Session | str | Path, options: CalibrateOptions | None = None, *, progress: Progress = silent

@@ -52,6 +52,9 @@ class RigSessionCalibration:
 
     __repr__ = brief
 
+    def _repr_html_(self) -> str:
+        return self.rig._repr_html_()
+
     @property
     def passed(self) -> bool:
         """Whether everything that was measured agrees."""

@@ -17,6 +17,8 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.core.progress import silent
 from rigkit.report.notebook import notebook_progress
+from rigkit.workflows.calibrate import SessionCalibration
+from rigkit.workflows.calibrate_rig import RigSessionCalibration
 
 MAX_HTML = 60_000
 """A notebook keeps what it shows."""
@@ -49,6 +51,10 @@ def test_a_calibration_and_a_rig_show_their_boards_and_the_verdict(rng: np.rando
         assert str(result.verdicts[0])[:20] in html
         assert sum(e.tag.endswith("text") for e in drawing(html).iter()) == cameras
     assert "apart" in rig._repr_html_()
+    session = SessionCalibration(None, alone, {}, ())  # type: ignore[arg-type]
+    assert session._repr_html_() == alone._repr_html_()
+    of_rig = RigSessionCalibration(None, rig, (), {}, ())  # type: ignore[arg-type]
+    assert of_rig._repr_html_() == rig._repr_html_()
 
 
 def test_progress_is_silent_without_a_notebook_and_a_bar_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
