@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import re
 from dataclasses import replace
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -51,9 +52,10 @@ def test_a_calibration_and_a_rig_show_their_boards_and_the_verdict(rng: np.rando
         assert str(result.verdicts[0])[:20] in html
         assert sum(e.tag.endswith("text") for e in drawing(html).iter()) == cameras
     assert "apart" in rig._repr_html_()
-    session = SessionCalibration(None, alone, {}, ())  # type: ignore[arg-type]
+    kept: dict[str, Any] = {"session": None, "unreadable": {}, "written": ()}
+    session = SessionCalibration(calibration=alone, **kept)
     assert session._repr_html_() == alone._repr_html_()
-    of_rig = RigSessionCalibration(None, rig, (), {}, ())  # type: ignore[arg-type]
+    of_rig = RigSessionCalibration(rig=rig, checks=(), **kept)
     assert of_rig._repr_html_() == rig._repr_html_()
 
 
