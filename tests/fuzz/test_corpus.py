@@ -61,7 +61,7 @@ def test_faults_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "exit 70" in str(fuzz.fault_of(["export"], None, sound=False))
 
 
-QUICK = 12
+QUICK = 5
 """Cases of a class, beyond its sound ones; `scripts/fuzz.py --count 1000` looks longer."""
 
 

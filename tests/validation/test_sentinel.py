@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +45,10 @@ POWER_WITHIN = 0.27
 """Three standard deviations of the share of 30 that is found one time in two."""
 
 
-def _held(camera: Camera, count: int, reach: Reach | None = None) -> list[Rigid3]:
+@cache
+def _held(name: str, count: int, reach: Reach | None = None) -> list[Rigid3]:
+    """Return where boards are best held before a lens of `calibration_scenes`."""
+    camera = lens(name)
     known = Knowledge.guessed(camera, CornerError(NOISE_PX))
     plan = plan_views(known, [BOARD], projection_goal(camera), count, reach=reach)
     return [view.cam_from_board for view in plan.views]
@@ -60,12 +64,12 @@ def _view(camera: Camera, pose: Rigid3, name: str, rng: np.random.Generator, noi
 @pytest.fixture(scope="module")
 def calibration() -> Calibration:
     camera, rng = lens("reg"), np.random.default_rng(2)
-    views = [_view(camera, pose, f"{k}", rng) for k, pose in enumerate(_held(camera, 14))]
+    views = [_view(camera, pose, f"{k}", rng) for k, pose in enumerate(_held("reg", 14))]
     return calibrate(views, camera.size_px, model="brown", degree=5, board="flat")
 
 
 def _checked(calibration: Calibration, camera: Camera, rng: np.random.Generator) -> SentinelCheck:
-    poses = _held(lens("reg"), 3)
+    poses = _held("reg", 3)
     views = [FreshView(f"{k}", 0, _view(camera, pose, f"{k}", rng)) for k, pose in enumerate(poses)]
     return check_views(watched_camera(calibration, "cam"), views)
 
@@ -78,7 +82,7 @@ def _changed(what: Callable[[np.ndarray], np.ndarray]) -> Camera:
 
 
 def test_unchanged_cameras_hold(calibration: Calibration) -> None:
-    checks = [_checked(calibration, lens("reg"), np.random.default_rng(seed)) for seed in range(12)]
+    checks = [_checked(calibration, lens("reg"), np.random.default_rng(seed)) for seed in range(8)]
     assert all(check.holds for check in checks)
     # P-values of one and the same calibration's error are all alike, but none is impossible.
     assert min(check.chance for check in checks) > 1e-3
@@ -109,7 +113,7 @@ def test_what_changed_is_found_named_and_undone(
 
 def test_changes_are_found_as_often_as_the_check_says() -> None:
     camera, found, said = lens("reg"), [], []
-    poses, fresh = _held(camera, 10), _held(camera, 3)
+    poses, fresh = _held("reg", 10), _held("reg", 3)
     focus = camera.parameters * [1, 1, 0, 0, 0, 0, 0, 0, 0]
     for seed in range(POWER_DRAWS):
         rng = np.random.default_rng(seed)
@@ -180,16 +184,19 @@ def _rig() -> Watched:
     )
 
 
+NEAR = Reach(nearest_mm=300.0)
+
+
 def _rig_check(pose: Rigid3, second: Camera, rng: np.random.Generator) -> SentinelCheck:
     rig, views = _rig(), []
-    for k, held in enumerate(_held(rig.cameras[0], 3, Reach(nearest_mm=300.0))):
+    for k, held in enumerate(_held("wide", 3, NEAR)):
         views.append(FreshView(f"{k}", 0, _view(rig.cameras[0], held, f"{k}", rng)))
         views.append(FreshView(f"{k}", 1, _view(second, pose @ held, f"{k}", rng)))
     return check_views(rig, views)
 
 
 def test_a_rig_that_nobody_touched_holds() -> None:
-    checks = [_rig_check(MOUNT, lens("wide"), np.random.default_rng(seed)) for seed in range(8)]
+    checks = [_rig_check(MOUNT, lens("wide"), np.random.default_rng(seed)) for seed in range(5)]
     assert all(check.holds for check in checks)
     powers = {(p.kind, p.camera): p for p in checks[0].powers}
     assert set(powers) == {(k, c) for k in ("focus", "principal point", "distortion") for c in ("left", "right")} | {

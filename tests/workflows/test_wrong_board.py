@@ -18,7 +18,7 @@ BOARD = Board("c", 7, 7, 30.0, 30.0, pattern=Charuco("DICT_4X4_1000", 22.5))
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    for seed in range(6):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
         picture = one_board(rng, board=BOARD).render(blur_px=0.7, noise_levels=1.0, rng=rng)
         cv2.imwrite(str(tmp_path / f"{seed}.png"), np.asarray(picture))
