@@ -9,6 +9,8 @@ import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+import pytest
+
 PACKAGE = Path(__file__).resolve().parents[1] / "rigkit"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
@@ -230,15 +232,16 @@ def test_nothing_refers_to_a_workplace() -> None:
         assert "/work/" not in path.read_text(), path
 
 
-def test_help_imports_nothing_heavy() -> None:
+@pytest.mark.parametrize(("option", "shown"), [("--help", "VERB"), ("--version", "kernels")])
+def test_help_and_version_import_nothing_heavy(option: str, shown: str) -> None:
     code = (
         "import sys; from rigkit.cli.main import main\n"
-        "try: main(['--help'])\nexcept SystemExit: pass\n"
+        f"try: main([{option!r}])\nexcept SystemExit: pass\n"
         f"print([m for m in {NEVER_AT_IMPORT!r} if m in sys.modules], file=sys.stderr)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr.strip() == "[]"
-    assert "VERB" in done.stdout
+    assert shown in done.stdout
 
 
 def test_public_names_exist() -> None:

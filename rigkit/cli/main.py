@@ -14,6 +14,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Sequence
+from typing import Any
 
 from rigkit.cli.examples import EXAMPLES, FIRST_STEPS
 from rigkit.cli.log import add_log_arguments, logged_run, logging_to
@@ -64,6 +65,16 @@ class _Version(argparse.Action):
         parser.exit()
 
 
+class _VerbParser(argparse.ArgumentParser):
+    """A verb's parser: of an argument that it does not know it shows its own usage, not that of all verbs."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
+        known, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return known, unknown
+
+
 def build_parser(verb: str | None) -> argparse.ArgumentParser:
     """Return the parser; only the module of `verb` is imported, all others show their one-line help."""
     parser = argparse.ArgumentParser(
@@ -73,7 +84,7 @@ def build_parser(verb: str | None) -> argparse.ArgumentParser:
         epilog=FIRST_STEPS,
     )
     parser.add_argument("--version", action=_Version, help="show version, compiled kernels and platform, and exit")
-    verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
+    verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True, parser_class=_VerbParser)
     for name, (module_name, summary) in VERBS.items():
         sub = verbs.add_parser(name, help=summary, description=summary)
         if name == verb:

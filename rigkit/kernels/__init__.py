@@ -10,13 +10,15 @@ from __future__ import annotations
 import ctypes
 import functools
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from rigkit.core.errors import InstallationError
 from rigkit.kernels.building import library_name, mismatch, source_hash
 
 FOLDER = Path(__file__).parent
+Library = TypeVar("Library")
 
 
 class Kernels:
@@ -38,12 +40,17 @@ class Kernels:
 @functools.cache
 def kernels() -> Kernels:
     """Return the kernels; raises InstallationError where they are missing, damaged or built from other sources."""
+    return _loaded(Kernels)
+
+
+def _loaded(load: Callable[[Path], Library]) -> Library:
+    """Return what `load` makes of the library; raises InstallationError as `kernels` does."""
     path = FOLDER / library_name()
     wrong = mismatch(path)
     if wrong is not None:
         raise InstallationError(f"the compiled kernels {wrong} ({path}); {_remedy()}")
     try:
-        return Kernels(path)
+        return load(path)
     except OSError as error:
         raise InstallationError(f"the compiled kernels do not load ({error}); {_remedy()}") from error
 
@@ -51,10 +58,12 @@ def kernels() -> Kernels:
 def about() -> str:
     """Return what `rigkit --version` says of the kernels: the hash of their sources, and the instruction set."""
     try:
-        chosen = kernels().instruction_set().decode()
+        # Without the checks of arrays, which import numpy: this takes no array.
+        instruction_set = _loaded(lambda path: ctypes.CDLL(str(path))).instruction_set
     except InstallationError as error:
         return str(error)
-    return f"{source_hash(FOLDER)}, {chosen}"
+    instruction_set.restype = ctypes.c_char_p
+    return f"{source_hash(FOLDER)}, {instruction_set().decode()}"
 
 
 def _remedy() -> str:

@@ -318,3 +318,11 @@ def test_numbers_that_overflow_are_told_in_one_line(tmp_path: Path) -> None:
     words = [sys.executable, "-m", "rigkit", "mesh", str(cloud), "-o", str(tmp_path / "mesh.ply")]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1 and "point-not-finite" in done.stderr
+
+
+def test_an_unknown_option_shows_the_usage_of_its_verb(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["diff", "a.json", "b.json", "--nonsense"])
+    assert stop.value.code == 2
+    said = capsys.readouterr().err
+    assert said.startswith("usage: rigkit diff") and "unrecognized arguments: --nonsense" in said
