@@ -37,7 +37,16 @@ def _terminal_silent() -> Iterator[None]:
 
 
 class _Pool(ProcessPoolExecutor):
-    """A pool that starts its processes silently, as it does where work is submitted."""
+    """A pool that starts its processes silently, all where the first work is submitted.
+
+    Started one by one, as work comes, a process that begins while another is found dead is neither ended nor fed, and
+    waited for for ever (CPython: `terminate_broken` does not know of it).
+    """
+
+    def __init__(self, count: int, initializer: Callable[[], None]) -> None:
+        # "spawn": a fork after OpenCV has started its threads can hang.
+        super().__init__(count, mp_context=multiprocessing.get_context("spawn"), initializer=initializer)
+        self._safe_to_dynamically_spawn_children = False
 
     def submit(
         self, fn: Callable[Arguments, Result], /, *args: Arguments.args, **kwargs: Arguments.kwargs
@@ -62,9 +71,8 @@ def worker_pool(count: int) -> Iterator[ProcessPoolExecutor]:
     is killed, its workers notice and end. If a worker is killed, InputError says so.
     """
     others = set(multiprocessing.active_children())
-    # "spawn": a fork after OpenCV has started its threads can hang.
     with _terminal_silent():
-        pool = _Pool(count, mp_context=multiprocessing.get_context("spawn"), initializer=_end_with_parent)
+        pool = _Pool(count, _end_with_parent)
     try:
         yield pool
     except BrokenProcessPool as error:

@@ -8,7 +8,9 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -114,6 +116,23 @@ def _ends(_: int) -> None:
 def test_a_worker_that_is_killed_is_told_in_words() -> None:
     with pytest.raises(InputError, match="-j 1"), worker_pool(1) as pool:
         list(pool.map(_ends, [0]))
+
+
+def test_a_worker_that_is_killed_while_another_starts_is_told_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The pool would close its queues under the one that starts, or wait for it for ever."""
+    start = ProcessPoolExecutor._spawn_process  # type: ignore[attr-defined]
+
+    def late(pool: Any) -> None:
+        for process in pool._processes.values():
+            process.kill()
+            process.join()
+            # Time enough for the pool to see it.
+            time.sleep(0.5)
+        start(pool)
+
+    monkeypatch.setattr(ProcessPoolExecutor, "_spawn_process", late)
+    with pytest.raises(InputError, match="-j 1"), worker_pool(2) as pool:
+        list(pool.map(_twice, range(4)))
 
 
 def _twice(number: int) -> int:
